@@ -1,0 +1,1 @@
+"""Range imaging: read the light, triangulate, assemble."""

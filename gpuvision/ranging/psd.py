@@ -1,0 +1,262 @@
+"""Position sensitive devices: pairs of currents become positions of the light.
+
+The two currents of a PSD strip divide inversely to the light's distances from its ends, so that
+``u = (L/2) (I_right - I_left) / (I_right + I_left)`` is the centre of gravity of *all* light on the strip,
+whatever its shape and strength: ``u`` in [-L/2, L/2], positive towards the right electrode.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.tables import finite
+
+ELECTRON = 1.602176634e-19  # C
+_SAMPLES_PER_STRIP = 4096  # as in psd.cl
+_LANES = 16
+_CODES = {"float32": "float", "float64": "double", "uint16": "ushort"}
+
+
+class PsdReading(NamedTuple):
+    """What a PSD says, each array of the shape of the batch; fields not asked for are ``None``.
+
+    Attributes
+    ----------
+    position
+        u [m]; NaN where the status is not OK.
+    total
+        Sum of both currents after dark level and gain [A].
+    status
+        uint8 `Status` flags: DARK (total not above the minimum), SATURATED (either channel), OUT_OF_RANGE (beyond
+        the strip's ends), NOT_FINITE; HORIZON and FOLDED from the triangulation.
+    sigma
+        Predicted standard deviation of the position [m].
+    g, h
+        The point in the sheet of light [m], where the readout has a triangulation.
+    """
+
+    position: Any = None
+    total: Any = None
+    status: Any = None
+    sigma: Any = None
+    g: Any = None
+    h: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PsdNoise:
+    """What moves the position of a steady light; three covariances of the two currents' noise.
+
+    Parameters
+    ----------
+    independent
+        Standard deviation of each channel's own noise [A]: amplifiers. Grows towards the ends of the strip:
+        ``L s / S sqrt((1 + xi^2) / 2)``, with ``xi = 2 u / L`` and the total S.
+    opposed
+        Standard deviation of noise that leaves at one electrode what enters at the other [A]: the Johnson current of
+        the strip's resistance, ``sqrt(4 k T B / R_ie)``. The same everywhere: ``L s / S``.
+    spot
+        Standard deviation of the light spot [m]; its electrons divide together, so that shot noise leaves
+        ``spot / sqrt(N)`` with N electrons within the time constant.
+    bandwidth
+        B [Hz]; ``N = S / (2 q B)``.
+    """
+
+    independent: float = 0.0
+    opposed: float = 0.0
+    spot: float = 0.0
+    bandwidth: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("independent", "opposed", "spot", "bandwidth"):
+            if finite(getattr(self, name), f"PsdNoise.{name}") < 0.0:
+                raise ValueError(f"PsdNoise.{name} is {getattr(self, name)}, expected a number >= 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PsdReadout(Operation[PsdReading]):
+    """Pairs of PSD currents to positions: ``readout(currents) -> PsdReading``.
+
+    Takes float32 or float64 currents [A] or uint16 codes, of shape (..., 2) with (left, right) side by side, or
+    (2, ...) with ``layout="planar"``. The axis before the pair (the last one, if planar) counts the strips.
+
+    Parameters
+    ----------
+    strip_length
+        L, between the electrodes [m].
+    ampere
+        Amperes per unit of the input: 1 for currents, the converter's step for codes.
+    dark
+        Dark current of (left, right), subtracted first [A].
+    right_gain
+        Gain of the right channel over the left one's; divided out.
+    interelectrode_resistance, load_resistance
+        R_ie and the load R_L at either end [Ohm]: the position shrinks to R_ie / (R_ie + 2 R_L); undone exactly.
+    minimum_total
+        The total that makes a position trustworthy [A]; at or below it the sample is DARK.
+    saturation
+        Current at which a channel saturates, dark level included [A]; ``None``: the highest code of integer input,
+        and no limit for currents.
+    linearity
+        A row of corrections per strip [m], added to the position; the row's knots divide the strip evenly from
+        -L/2 to L/2, linear between them.
+    noise
+        For the output ``sigma``. The quantisation of integer codes is added by itself.
+    triangulation, axes
+        Fuses sensor -> sheet into the same pass (outputs ``g`` and ``h``): u is the position, v the strip's number
+        as ``axes`` places it.
+    layout : {"pairs", "planar"}
+    outputs
+        Names of the `PsdReading` fields to compute; what is not asked for is not compiled. ``None``: position,
+        total and status, with sigma if there is ``noise``, with g and h if there is a ``triangulation``.
+    precision
+        Of the arithmetic and the outputs; ``None`` follows the input.
+    walk
+        Wide strips or one item per sample; ``"auto"`` follows the device.
+
+    Raises
+    ------
+    ValueError
+        A parameter is out of its range.
+
+    Notes
+    -----
+    Error: single precision adds at most 2 roundings of L/2 to the position, 6e-8 of L/2 near the middle included,
+    since the difference of nearby currents is exact; 16-bit codes keep single precision's bound.
+    """
+
+    Result: ClassVar[type[Any]] = PsdReading
+
+    strip_length: float
+    ampere: float = 1.0
+    dark: tuple[float, float] = (0.0, 0.0)
+    right_gain: float = 1.0
+    interelectrode_resistance: float | None = None
+    load_resistance: float = 0.0
+    minimum_total: float = 0.0
+    saturation: float | None = None
+    linearity: tuple[tuple[float, ...], ...] | None = None
+    noise: PsdNoise | None = None
+    triangulation: Triangulation | None = None
+    axes: SampleAxes = SampleAxes()  # noqa: RUF009 (frozen, no state)
+    layout: Literal["pairs", "planar"] = "pairs"
+    outputs: tuple[str, ...] | None = None
+    precision: Precision = None
+    walk: Walk = "auto"
+
+    def __post_init__(self) -> None:
+        for name in ("strip_length", "ampere", "right_gain"):
+            if finite(getattr(self, name), f"PsdReadout.{name}") <= 0.0:
+                raise ValueError(f"PsdReadout.{name} is {getattr(self, name)}, expected a number > 0")
+        for name in ("minimum_total", "load_resistance"):
+            if finite(getattr(self, name), f"PsdReadout.{name}") < 0.0:
+                raise ValueError(f"PsdReadout.{name} is {getattr(self, name)}, expected a number >= 0")
+        if self.load_resistance and not self.interelectrode_resistance:
+            raise ValueError("PsdReadout.load_resistance needs interelectrode_resistance [Ohm] beside it")
+        if self.layout not in ("pairs", "planar"):
+            raise ValueError(f"PsdReadout.layout is {self.layout!r}, expected 'pairs' or 'planar'")
+        object.__setattr__(self, "outputs", self._chosen())
+        self._check_linearity()
+
+    def _chosen(self) -> tuple[str, ...]:
+        sheet = ("g", "h") if self.triangulation is not None else ()
+        if self.outputs is None:
+            return ("position", "total", "status", *(("sigma",) if self.noise is not None else ()), *sheet)
+        possible = ("position", "total", "status", "sigma", *sheet)
+        for name in self.outputs:
+            if name not in possible:
+                raise ValueError(f"PsdReadout.outputs has {name!r}, expected some of {', '.join(possible)}")
+        return tuple(self.outputs)
+
+    def _check_linearity(self) -> None:
+        if self.linearity is None:
+            return
+        rows = tuple(tuple(finite(x, "PsdReadout.linearity") for x in row) for row in self.linearity)
+        if not rows or min(map(len, rows)) < 2 or len(set(map(len, rows))) != 1:
+            raise ValueError("PsdReadout.linearity: expected a row per strip, all of one length of at least 2 knots")
+        object.__setattr__(self, "linearity", rows)
+
+    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        if dtype.name not in _CODES:
+            raise TypeError(f"PsdReadout takes float32, float64 or uint16 currents, got {dtype}")
+        pair_axis = -1 if self.layout == "pairs" else 0
+        if not shape or shape[pair_axis] != 2:
+            expected = "(..., 2)" if self.layout == "pairs" else "(2, ...)"
+            raise ValueError(f"PsdReadout takes {self.layout} of shape {expected}, got {shape}")
+        batch = shape[:-1] if self.layout == "pairs" else shape[1:]
+        strips = batch[-1] if batch else 1
+        if self.linearity is not None and len(self.linearity) != strips:
+            raise ValueError(f"PsdReadout.linearity has {len(self.linearity)} rows, the input has {strips} strips")
+        samples = math.prod(batch)
+        if samples >= 2**30:
+            raise ValueError(f"PsdReadout takes fewer than 2**30 samples at once, got {samples}; split the batch")
+        real = real_of(self.precision, dtype)
+        strip = in_strips(self.walk, device) and samples >= _LANES
+        items = max(samples // _SAMPLES_PER_STRIP, 1) if strip else samples
+        sheet = self.triangulation
+        table = None if self.linearity is None else np.array(self.linearity, real)
+        return Launch(
+            stem="psd",
+            kernel="psd_readout",
+            inputs=[(shape, dtype)],
+            outputs=self._outputs(batch, real),
+            global_size=(items,),
+            defines=self._defines(device, real, dtype, strip),
+            arguments=[
+                self._packed(real, dtype),
+                np.int32(samples),
+                table,
+                np.int32(strips),
+                np.int32(0 if table is None else table.shape[1]),
+                None if sheet is None else sheet.packed(real, self.axes),
+            ],
+        )
+
+    def _outputs(self, batch: tuple[int, ...], real: np.dtype[Any]) -> dict[str, Any]:
+        chosen = self.outputs or ()
+        types = dict.fromkeys(PsdReading._fields, real) | {"status": np.dtype(np.uint8)}
+        return {name: (batch, types[name]) if name in chosen else None for name in PsdReading._fields}
+
+    def _defines(self, device: Device, real: np.dtype[Any], dtype: np.dtype[Any], strip: bool) -> dict[str, Any]:
+        chosen = self.outputs or ()
+        defines: dict[str, Any] = real_defines(device, real)
+        code = _CODES[dtype.name]
+        defines |= {"CODE": code, "CODE16": f"{code}16"}
+        defines |= {f"WITH_{name.upper()}": None for name in ("position", "total", "status", "sigma") if name in chosen}
+        if self.triangulation is not None:
+            defines |= {"WITH_SHEET": None} | self.triangulation.defines
+        present = {"PLANAR": self.layout == "planar", "STRIP": strip, "LINEARITY": self.linearity is not None}
+        return defines | {name: None for name, is_present in present.items() if is_present}
+
+    def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any]) -> Any:
+        """Return the parameters of ``psd.cl``, in its order."""
+        limit = 1.0
+        if self.interelectrode_resistance:
+            limit = self.interelectrode_resistance / (self.interelectrode_resistance + 2.0 * self.load_resistance)
+        codes = dtype.kind == "u"
+        saturation = self.saturation
+        if saturation is None:
+            saturation = np.iinfo(dtype).max * self.ampere if codes else np.inf
+        noise = self.noise or PsdNoise()
+        step = self.ampere / math.sqrt(12.0) if codes else 0.0
+        return np.array(
+            [
+                0.5 * self.strip_length / limit,
+                limit,
+                self.minimum_total,
+                saturation,
+                self.ampere,
+                *self.dark,
+                1.0 / self.right_gain,
+                noise.independent**2 + step**2,
+                noise.opposed**2,
+                noise.spot**2 * 2.0 * ELECTRON * noise.bandwidth,
+            ],
+            real,
+        )

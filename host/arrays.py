@@ -1,0 +1,74 @@
+"""Arrays that the device reads and writes, and how NumPy sees them."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+from numpy.typing import NDArray
+
+DeviceArray: TypeAlias = cl.array.Array
+HostArray: TypeAlias = NDArray[Any]
+
+SHARED_FLAGS = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUFFER
+
+
+class _Shared:
+    """Show shared memory to NumPy; the array that NumPy makes keeps this object, and so the memory, alive."""
+
+    def __init__(self, array: DeviceArray) -> None:
+        self.memory = array.base_data
+        self.__array_interface__ = {
+            "version": 3,
+            "shape": array.shape,
+            "typestr": array.dtype.str,
+            "data": (self.memory.svm_ptr, False),
+        }
+
+
+def host_view(array: DeviceArray) -> HostArray:
+    """Return shared device memory as a NumPy array: no copy, no map.
+
+    The host may touch it only while no kernel that uses it runs: wait for the event first.
+
+    Raises
+    ------
+    ValueError
+        The array lies in memory that the host does not share; `array.get()` copies it.
+    """
+    if not isinstance(array.base_data, cl.SVMPointer):
+        raise ValueError("the array lies in device memory; copy it with array.get(), host_view needs shared memory")
+    return np.asarray(_Shared(array))
+
+
+def memory_of(array: DeviceArray) -> Any:
+    """Return the memory object of a whole, C-contiguous device array.
+
+    Raises
+    ------
+    ValueError
+        The array is a part of another one, or not C-contiguous.
+    """
+    if array.offset or not array.flags.c_contiguous:
+        raise ValueError("expected a whole C-contiguous device array, got a part or another layout; use array.copy()")
+    return array.base_data
+
+
+def check_host(array: HostArray, shape: tuple[int, ...], dtype: np.dtype[Any], what: str) -> None:
+    """Check that a NumPy array is what a kernel will take.
+
+    Raises
+    ------
+    TypeError
+        The dtype is another one.
+    ValueError
+        The shape is another one, or the array is not C-contiguous.
+    """
+    if array.dtype != dtype:
+        raise TypeError(f"{what}: expected dtype {dtype}, got {array.dtype}; convert it with .astype")
+    if array.shape != shape:
+        raise ValueError(f"{what}: expected shape {shape}, got {array.shape}")
+    if not array.flags.c_contiguous:
+        raise ValueError(f"{what}: expected a C-contiguous array; use np.ascontiguousarray")

@@ -1,0 +1,184 @@
+"""A device that works: chosen, named, or taken over from the caller."""
+
+from __future__ import annotations
+
+import functools
+import os
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+from numpy.typing import DTypeLike
+
+from gpuvision.host import discovery
+from gpuvision.host.arrays import SHARED_FLAGS, DeviceArray
+from gpuvision.host.errors import DeviceUnusableError, NoDeviceError
+
+VARIABLE = "GPUVISION_DEVICE"
+
+
+class Device:
+    """An OpenCL device with its context and a default queue.
+
+    Get one from `best`, `named`, `all` or `of`; two calls for one device return one object.
+
+    Attributes
+    ----------
+    handle : pyopencl.Device
+    context : pyopencl.Context
+    queue : pyopencl.CommandQueue
+        The in-order queue on which operations run unless they are given another.
+    label, kind, name, driver : str
+        Short unique name, maker (``pocl``, ``intel``, ``nvidia``, ...), full name, driver version.
+    is_cpu : bool
+        Whether kernels should walk strips with wide vectors (CPU runtimes) or run one item per sample.
+    shares_memory : bool
+        Whether host and device read and write the same allocations with no map or copy (fine-grained SVM).
+    has_double : bool
+        Whether `precision="double"` works here.
+    """
+
+    def __init__(self, handle: Any, label: str, kind: str, queue: Any = None) -> None:
+        self.handle = handle
+        self.label, self.kind = label, kind
+        self.name, self.driver = handle.name.strip(), handle.driver_version
+        self.context = queue.context if queue is not None else cl.Context([handle])
+        self.queue = queue if queue is not None else cl.CommandQueue(self.context, handle)
+        self.is_cpu = bool(handle.type & cl.device_type.CPU)
+        self.has_double = bool(handle.double_fp_config)
+        self.shares_memory = self.is_cpu and _has_fine_grained_memory(handle)
+
+    def __repr__(self) -> str:
+        return f"Device({self.label}: {self.name}, driver {self.driver})"
+
+    @staticmethod
+    def all() -> tuple[Device, ...]:
+        """Return every healthy device, the best first."""
+        healthy = [each for each in discovery.candidates() if each.healthy]
+        return tuple(_open(each) for each in sorted(healthy, key=_rank))
+
+    @staticmethod
+    def best() -> Device:
+        """Return the device to use when nobody asked for one.
+
+        The variable ``GPUVISION_DEVICE`` names it; else a healthy GPU, else PoCL, else Intel's CPU runtime,
+        else any other.
+
+        Raises
+        ------
+        NoDeviceError
+            Nothing healthy is there; the message says what to install.
+        """
+        asked = os.environ.get(VARIABLE)
+        if asked:
+            return Device.named(asked)
+        healthy = Device.all()
+        if not healthy:
+            listed = discovery.candidates()
+            seen = "; ".join(f"{each.label}: {each.reason}" for each in listed) or "no OpenCL platform"
+            raise NoDeviceError(f"no healthy OpenCL device ({seen}); {discovery.INSTALL_HINT}")
+        return healthy[0]
+
+    @staticmethod
+    def named(name: str) -> Device:
+        """Return the one healthy device of that label, or with `name` in its label, name or platform.
+
+        Raises
+        ------
+        NoDeviceError
+            No device, or more than one healthy device, answers to the name. Never another device instead.
+        DeviceUnusableError
+            The device is there and its probe failed.
+        """
+        listed = discovery.candidates()
+        asked = name.lower()
+        matching = [each for each in listed if each.label == asked] or [
+            each for each in listed if asked in f"{each.label} {each.name} {each.platform}".lower()
+        ]
+        healthy = [each for each in matching if each.healthy]
+        if len(healthy) == 1:
+            return _open(healthy[0])
+        if len(healthy) > 1:
+            labels = ", ".join(each.label for each in healthy)
+            raise NoDeviceError(f"{len(healthy)} devices answer to {name!r}: {labels}; ask for one of these")
+        if matching:
+            broken = matching[0]
+            raise DeviceUnusableError(f"device {broken.label} does not work: {broken.reason}; {broken.advice}")
+        labels = ", ".join(each.label for each in listed) or "none"
+        raise NoDeviceError(f"no device answers to {name!r}; there are: {labels}; {discovery.INSTALL_HINT}")
+
+    @staticmethod
+    def of(handle: Any) -> Device:
+        """Return the device behind a queue, context, or device array that the caller already owns.
+
+        Parameters
+        ----------
+        handle : pyopencl.CommandQueue, pyopencl.Context or pyopencl.array.Array
+
+        Raises
+        ------
+        TypeError
+            `handle` is none of these.
+        """
+        if isinstance(handle, cl.array.Array):
+            handle = handle.queue if handle.queue is not None else handle.context
+        if isinstance(handle, cl.Context):
+            handle = _default_queue(handle)
+        if not isinstance(handle, cl.CommandQueue):
+            kind = type(handle).__name__
+            raise TypeError(f"expected a pyopencl queue, context or array to take the device from, got {kind}")
+        return _adopt(handle)
+
+    def new_queue(self, *, profiling: bool = False) -> Any:
+        """Return another in-order queue; with `profiling`, its events carry device times."""
+        flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
+        return cl.CommandQueue(self.context, self.handle, properties=flags)
+
+    def empty(self, shape: tuple[int, ...], dtype: DTypeLike, queue: Any = None) -> DeviceArray:
+        """Return an uninitialised device array; on shared memory `arrays.host_view` shows it to NumPy."""
+        queue = self.queue if queue is None else queue
+        dtype = np.dtype(dtype)
+        if not self.shares_memory:
+            return cl.array.Array(queue, shape, dtype)
+        # An allocation of no bytes is an error in OpenCL, and a batch of no frames is none here.
+        size = max(int(np.prod(shape, dtype=np.int64)) * dtype.itemsize, 1)
+        memory = cl.SVMAllocation(self.context, size, 0, SHARED_FLAGS, queue)
+        return cl.array.Array(queue, shape, dtype, data=memory)
+
+
+def _has_fine_grained_memory(handle: Any) -> bool:
+    try:
+        return bool(handle.svm_capabilities & cl.device_svm_capabilities.FINE_GRAIN_BUFFER)
+    except cl.Error:  # OpenCL 1.x does not know the question
+        return False
+
+
+def _rank(candidate: discovery.Candidate) -> tuple[bool, int, str]:
+    order = ("pocl", "intel")
+    place = order.index(candidate.kind) if candidate.kind in order else len(order)
+    return (not candidate.is_gpu, place + 10 * (candidate.kind == "oclgrind"), candidate.label)
+
+
+@functools.cache
+def _open(candidate: discovery.Candidate) -> Device:
+    platform = discovery.platforms()[candidate.platform_index]
+    return Device(platform.get_devices()[candidate.device_index], candidate.label, candidate.kind)
+
+
+@functools.lru_cache(maxsize=32)
+def _default_queue(context: Any) -> Any:
+    return cl.CommandQueue(context)
+
+
+@functools.lru_cache(maxsize=32)
+def _adopt(queue: Any) -> Device:
+    for each in Device.all():
+        if each.context == queue.context:
+            return each if each.queue == queue else Device(queue.device, each.label, each.kind, queue)
+    platform = queue.device.platform
+    for candidate in discovery.candidates():
+        listed = discovery.platforms()[candidate.platform_index].get_devices()[candidate.device_index]
+        if listed == queue.device:
+            return Device(queue.device, candidate.label, candidate.kind, queue)
+    return Device(queue.device, platform.name, platform.name.split()[0].lower(), queue)

@@ -1,0 +1,400 @@
+"""The one concept: an operation is described once, bound to a device and a shape, then called.
+
+``op(array)`` is convenience: it binds behind the scene and keeps the bound instance. ``op.bind(...)`` is the hot
+path: after it nothing is compiled, allocated or copied.
+"""
+
+from __future__ import annotations
+
+import collections
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Generic, Literal, TypeVar
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+from numpy.typing import DTypeLike
+
+from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
+from gpuvision.host.device import Device
+from gpuvision.host.program import Define, build
+
+Precision = Literal["single", "double"] | None
+Walk = Literal["auto", "strip", "item"]
+Spec = tuple[tuple[int, ...], np.dtype[Any]]
+R = TypeVar("R", bound=tuple[Any, ...])
+
+_KEPT_BOUND = 16
+
+
+@dataclass(frozen=True)
+class Launch:
+    """What to build and run for one shape on one device; the kernel takes inputs, outputs, arguments in order.
+
+    Attributes
+    ----------
+    stem, kernel : str
+        File in ``kernels/`` without its ending, and the function in it.
+    inputs : sequence of (shape, dtype)
+    outputs : mapping of str to (shape, dtype) or None
+        By the names of the result's fields, in the kernel's order. ``None``: the kernel has the argument and gets
+        a null pointer; the field stays ``None``.
+    global_size, local_size : tuple of int, optional
+        ``local_size=None`` leaves the choice to the runtime.
+    defines : mapping
+        What changes the code.
+    arguments : sequence
+        NumPy scalars, passed by value; NumPy arrays, uploaded once: tables and parameter packs; ``None``: a null
+        pointer for a table that this build has no code for.
+    """
+
+    stem: str
+    kernel: str
+    inputs: Sequence[Spec]
+    outputs: Mapping[str, Spec | None]
+    global_size: tuple[int, ...]
+    local_size: tuple[int, ...] | None = None
+    defines: Mapping[str, Define] = field(default_factory=dict)
+    arguments: Sequence[Any] = ()
+
+
+class Operation(Generic[R]):
+    """Base of the operations: frozen dataclasses of physics and units, validated once.
+
+    A subclass names its result type in `Result` and says in `_launch` what runs.
+    """
+
+    Result: ClassVar[type[Any]]
+
+    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Check shape and dtype and say what to build and run.
+
+        Raises
+        ------
+        TypeError, ValueError
+            The operation does not take such input; says what it takes.
+        """
+        raise NotImplementedError
+
+    def bind(
+        self, device: Device | None, shape: tuple[int, ...], dtype: DTypeLike, *, queue: Any = None
+    ) -> Bound[R]:
+        """Prepare the operation for frames of one shape: build, allocate, and warm up with a launch.
+
+        Parameters
+        ----------
+        device : Device or None
+            ``None`` takes `Device.best`.
+        shape : tuple of int
+            Shape of the (first) input.
+        dtype : dtype
+            Its dtype.
+        queue : pyopencl.CommandQueue, optional
+            Where it runs; the device's default queue otherwise.
+
+        Returns
+        -------
+        Bound
+            Not safe to share between threads: bind once per thread.
+
+        Raises
+        ------
+        TypeError, ValueError
+            The operation does not take such input.
+        BuildError
+            The kernel does not compile on this device.
+        """
+        return Bound(self, Device.best() if device is None else device, shape, np.dtype(dtype), queue)
+
+    def __call__(self, *inputs: Any, device: Device | None = None, out: R | None = None) -> R:
+        """Run once on NumPy arrays (and wait) or on device arrays (and return at once).
+
+        Parameters
+        ----------
+        *inputs : numpy.ndarray or pyopencl.array.Array
+            C-contiguous. All of one kind.
+        device : Device, optional
+            Where to run; device arrays run where they lie, on their own queue.
+        out : Result, optional
+            Arrays of the same kind as the inputs to write into; the same object is returned. Fields that the
+            operation does not compute are ``None``.
+
+        Returns
+        -------
+        Result
+            NumPy in, NumPy out; device arrays in, device arrays out.
+
+        Raises
+        ------
+        TypeError, ValueError
+            Wrong dtype, shape, layout or device: nothing is converted behind the caller's back.
+        """
+        if all(isinstance(each, cl.array.Array) for each in inputs):
+            return self._on_device(inputs, device, out)
+        if all(isinstance(each, np.ndarray) for each in inputs):
+            bound = self._bound(Device.best() if device is None else device, None, inputs[0])
+            return bound.on_host(inputs, out)
+        kinds = ", ".join(type(each).__name__ for each in inputs)
+        raise TypeError(f"expected NumPy arrays or pyopencl arrays, all of one kind, got {kinds}")
+
+    def _on_device(self, inputs: Sequence[DeviceArray], device: Device | None, out: R | None) -> R:
+        home = Device.of(inputs[0])
+        if device is not None and device.context != home.context:
+            raise ValueError(f"the input lies on {home.label}, not on {device.label}; copy it there first")
+        bound = self._bound(home, inputs[0].queue, inputs[0])
+        result = bound.allocate() if out is None else out
+        event = bound(*inputs, out=result)
+        for array in result:
+            if array is not None:
+                array.add_event(event)
+        return result
+
+    def _bound(self, device: Device, queue: Any, first: HostArray | DeviceArray) -> Bound[R]:
+        """Return the bound instance of this thread for such an input, from the few kept ones."""
+        kept: collections.OrderedDict[Any, Bound[R]] = _kept_bound()
+        key = (self, device, queue, first.shape, first.dtype)
+        if key not in kept:
+            kept[key] = self.bind(device, first.shape, first.dtype, queue=queue)
+            if len(kept) > _KEPT_BOUND:
+                kept.popitem(last=False)
+        kept.move_to_end(key)
+        return kept[key]
+
+
+# Kernel objects are not safe to share between threads: each thread keeps its own.
+_thread = threading.local()
+
+
+def _kept_bound() -> Any:
+    if not hasattr(_thread, "bound"):
+        _thread.bound = collections.OrderedDict()
+    return _thread.bound
+
+
+class Bound(Generic[R]):
+    """An operation bound to a device, a queue and a shape: call it with frames.
+
+    Attributes
+    ----------
+    inputs : tuple of pyopencl.array.Array
+        Its own input slot: fill it (`arrays.host_view` where memory is shared) and call with no arguments.
+    outputs : Result of pyopencl.array.Array
+        What each call writes, unless it is given ``out``; ``None`` where nothing is computed.
+    """
+
+    def __init__(
+        self, operation: Operation[R], device: Device, shape: tuple[int, ...], dtype: np.dtype[Any], queue: Any
+    ) -> None:
+        launch = operation._launch(device, shape, dtype)
+        self.operation, self.device = operation, device
+        self.queue = device.queue if queue is None else queue
+        self._launch = launch
+        self._computed_specs = {name: spec for name, spec in launch.outputs.items() if spec is not None}
+        self._kernel = cl.Kernel(build(device, launch.stem, launch.defines), launch.kernel)
+        self._global, self._local = launch.global_size, launch.local_size
+        self._empty = not all(launch.global_size)
+        self.inputs = tuple(device.empty(shape, dtype, self.queue) for shape, dtype in launch.inputs)
+        self.outputs = self.allocate()
+        # The runtime may abort the process on a freed buffer: whatever the kernel was given stays referenced.
+        self._tables = [self._upload(each) for each in launch.arguments if isinstance(each, np.ndarray)]
+        self._in_flight: collections.deque[tuple[Any, Any]] = collections.deque()
+        self._own = (*self.inputs, *self._computed(self.outputs))
+        self._given: tuple[Any, ...] = (None,) * len(self._own)
+        self._places = self._set_constants()
+        for array in self.inputs:
+            self._clear(array)
+        self().wait()
+
+    def allocate(self) -> R:
+        """Return fresh device arrays for the outputs."""
+        arrays = {
+            name: self.device.empty(shape, dtype, self.queue)
+            for name, (shape, dtype) in self._computed_specs.items()
+        }
+        return self._result(arrays)
+
+    def __call__(self, *frames: DeviceArray, out: R | None = None, wait_for: Sequence[Any] | None = None) -> Any:
+        """Enqueue the operation and return its event.
+
+        Parameters
+        ----------
+        *frames : pyopencl.array.Array
+            Device arrays of the bound shape and dtype; none: the instance's own `inputs`.
+        out : Result of pyopencl.array.Array, optional
+            Where to write instead of `outputs`.
+        wait_for : sequence of pyopencl.Event, optional
+
+        Returns
+        -------
+        pyopencl.Event
+
+        Raises
+        ------
+        TypeError, ValueError
+            A frame is not what the instance was bound to.
+        """
+        if not frames and out is None:
+            given = self._own
+        else:
+            given = (*(frames or self.inputs), *self._computed(self.outputs if out is None else out))
+        if given is not self._given:
+            self._set_arrays(given)
+        if self._empty:
+            return cl.enqueue_marker(self.queue, wait_for=wait_for)
+        event = cl.enqueue_nd_range_kernel(self.queue, self._kernel, self._global, self._local, wait_for=wait_for)
+        self._hold(event, given)
+        return event
+
+    def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
+        """Run on NumPy arrays and wait; on shared memory the kernel reads and writes them in place."""
+        if len(frames) != len(self.inputs):
+            raise TypeError(f"expected {len(self.inputs)} input arrays, got {len(frames)}")
+        for number, (frame, (shape, dtype)) in enumerate(zip(frames, self._launch.inputs, strict=True)):
+            check_host(frame, shape, dtype, f"input {number}")
+        if out is None:
+            out = self._result({k: np.empty(shape, dtype) for k, (shape, dtype) in self._computed_specs.items()})
+        targets = self._computed(out)
+        for (name, (shape, dtype)), array in zip(self._computed_specs.items(), targets, strict=True):
+            check_host(array, shape, dtype, f"out.{name}")
+        if self._empty:
+            return out
+        if self.device.shares_memory:
+            self._run_in_place(frames, targets)
+        else:
+            self._run_with_copies(frames, targets)
+        return out
+
+    def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
+        flags, context = cl.mem_flags, self.device.context
+        read = [cl.Buffer(context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in frames]
+        write = [cl.Buffer(context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in targets]
+        self._given = (None,) * len(self._own)
+        for index, memory in zip(self._places, (*read, *write), strict=True):
+            self._kernel.set_arg(index, memory)
+        event = cl.enqueue_nd_range_kernel(self.queue, self._kernel, self._global, self._local)
+        for memory, array in zip(write, targets, strict=True):
+            # The map is what makes the kernel's writes visible to the host; the address stays the same.
+            mapped, event = cl.enqueue_map_buffer(
+                self.queue, memory, cl.map_flags.READ, 0, (array.nbytes,), np.uint8, is_blocking=False
+            )
+            mapped.base.release(self.queue)
+        self.queue.finish()
+        # The next call binds others before these go away: a preset argument must never dangle.
+        self._set_arrays(self._own)
+
+    def _run_with_copies(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
+        for array, frame in zip(self.inputs, frames, strict=True):
+            cl.enqueue_copy(self.queue, array.base_data, frame, is_blocking=False)
+        self()
+        for array, target in zip(self._computed(self.outputs), targets, strict=True):
+            cl.enqueue_copy(self.queue, target, array.base_data, is_blocking=False)
+        self.queue.finish()
+
+    def _computed(self, result: R) -> tuple[Any, ...]:
+        return tuple(getattr(result, name) for name in self._computed_specs)
+
+    def _result(self, arrays: Mapping[str, Any]) -> R:
+        result: R = self.operation.Result(**{name: arrays.get(name) for name in self.operation.Result._fields})
+        return result
+
+    def _set_arrays(self, given: tuple[Any, ...]) -> None:
+        specs = (*self._launch.inputs, *self._computed_specs.values())
+        if len(given) != len(specs):
+            raise TypeError(f"expected {len(self.inputs)} input arrays, got {len(given) - len(specs) + len(self.inputs)}")
+        for place, array, before, spec in zip(self._places, given, self._given, specs, strict=True):
+            if array is not before:
+                self._check(array, *spec)
+                self._kernel.set_arg(place, memory_of(array))
+        self._given = given
+
+    def _check(self, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        if not isinstance(array, cl.array.Array):
+            raise TypeError(f"expected a pyopencl array on {self.device.label}, got {type(array).__name__}")
+        if array.dtype != dtype:
+            raise TypeError(f"expected dtype {dtype}, got {array.dtype}; bind the operation to it")
+        if array.shape != shape:
+            raise ValueError(f"expected shape {shape}, got {array.shape}; bind the operation to it")
+        if array.context != self.device.context:
+            raise ValueError(f"the array lies on another device than {self.device.label}; copy it there first")
+
+    def _clear(self, array: DeviceArray) -> None:
+        if self.device.shares_memory:
+            host_view(array).fill(0)
+        elif array.nbytes:
+            cl.enqueue_fill_buffer(self.queue, array.base_data, np.uint8(0), 0, array.nbytes)
+
+    def _set_constants(self) -> list[int]:
+        """Set what no call changes; return the places of the arrays that calls bind."""
+        launch = self._launch
+        after_inputs = len(launch.inputs)
+        after_outputs = after_inputs + len(launch.outputs)
+        places = list(range(after_inputs))
+        for place, spec in enumerate(launch.outputs.values(), after_inputs):
+            if spec is None:
+                self._kernel.set_arg(place, None)
+            else:
+                places.append(place)
+        tables = iter(self._tables)
+        for place, value in enumerate(launch.arguments, after_outputs):
+            self._kernel.set_arg(place, next(tables) if isinstance(value, np.ndarray) else value)
+        return places
+
+    def _upload(self, table: HostArray) -> Any:
+        flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+        return cl.Buffer(self.device.context, flags, hostbuf=np.ascontiguousarray(table))
+
+    def _hold(self, event: Any, given: tuple[Any, ...]) -> None:
+        """Keep what a running kernel uses until it has run."""
+        flight = self._in_flight
+        while flight and flight[0][0].command_execution_status <= cl.command_execution_status.COMPLETE:
+            flight.popleft()
+        flight.append((event, given))
+
+
+def real_of(precision: Precision, dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the real type of an operation: asked for, or following the input (float64 computes in double)."""
+    if precision is None:
+        return np.dtype(np.float64 if dtype == np.float64 else np.float32)
+    if precision not in ("single", "double"):
+        raise ValueError(f"precision must be 'single', 'double' or None, got {precision!r}")
+    if precision == "single" and dtype == np.float64:
+        raise TypeError("precision='single' does not take float64 input; convert it, or ask for 'double'")
+    return np.dtype(np.float64 if precision == "double" else np.float32)
+
+
+def real_defines(device: Device, real: np.dtype[Any]) -> dict[str, Define]:
+    """Return the defines that select the real type.
+
+    Raises
+    ------
+    ValueError
+        The device does not compute in double.
+    """
+    if real == np.float32:
+        return {}
+    if not device.has_double:
+        raise ValueError(f"device {device.label} has no double precision; use precision='single'")
+    return {"REAL_IS_DOUBLE": None}
+
+
+def in_strips(walk: Walk, device: Device) -> bool:
+    """Decide between wide strips (CPU runtimes) and one item per sample; both are tested on every device."""
+    if walk not in ("auto", "strip", "item"):
+        raise ValueError(f"walk must be 'auto', 'strip' or 'item', got {walk!r}")
+    return device.is_cpu if walk == "auto" else walk == "strip"
+
+
+__all__ = [
+    "Bound",
+    "Launch",
+    "Operation",
+    "Precision",
+    "Spec",
+    "Walk",
+    "host_view",
+    "in_strips",
+    "real_defines",
+    "real_of",
+]

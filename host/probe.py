@@ -1,0 +1,65 @@
+"""Does a device really work? Build, launch and check kernels on it, in a process of its own.
+
+A runtime may list itself and fail every build, compute wrongly, or abort the process: run as
+``python -m gpuvision.host.probe PLATFORM DEVICE``, only this process is lost. Prints a line of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from gpuvision.host.runtime import expose_installed_runtime
+
+# Everything that the library's kernels lean on: wide vectors, a loop, local memory with a barrier, saturation.
+_SOURCE = """
+kernel void probe(global const uchar *bytes, global uint *sums, local uint *shared, int rows)
+{
+    uint16 sum = 0;
+    for (int row = 0; row < rows; row++)
+        sum += convert_uint16(sub_sat(vload16(row, bytes), (uchar16)20));
+    uint8 half_ = sum.lo + sum.hi;
+    uint4 quarter = half_.lo + half_.hi;
+    shared[get_local_id(0)] = quarter.x + quarter.y + quarter.z + quarter.w + (uint)get_global_id(0);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    sums[get_global_id(0)] = shared[get_local_size(0) - 1 - get_local_id(0)];
+}
+"""
+_ROWS, _ITEMS, _GROUP = 37, 64, 16
+
+
+def probe(device: Any) -> str:
+    """Return why `device` is not healthy; an empty string when it is."""
+    try:
+        context = cl.Context([device])
+        queue = cl.CommandQueue(context)
+        kernel = cl.Kernel(cl.Program(context, _SOURCE).build(cache_dir=False), "probe")
+        values = (np.arange(16 * _ROWS) * 7 % 256).astype(np.uint8)
+        sums = np.zeros(_ITEMS, np.uint32)
+        source = cl.Buffer(context, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR, hostbuf=values)
+        target = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, sums.nbytes)
+        kernel(queue, (_ITEMS,), (_GROUP,), source, target, cl.LocalMemory(4 * _GROUP), np.int32(_ROWS))
+        cl.enqueue_copy(queue, sums, target)
+    except cl.Error as error:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        said = [line for line in lines if "error" in line.lower()] or lines
+        return "; ".join(said[:2])[:300]
+    total = int(np.maximum(values.astype(int) - 20, 0).sum())
+    item = np.arange(_ITEMS)
+    expected = total + item // _GROUP * _GROUP + (_GROUP - 1 - item % _GROUP)
+    return "" if np.array_equal(sums, expected) else "the probe kernel ran and gave wrong numbers"
+
+
+def main() -> None:
+    """Probe the device of the two indices on the command line."""
+    expose_installed_runtime()
+    platform, device = (int(word) for word in sys.argv[1:3])
+    print(json.dumps({"reason": probe(cl.get_platforms()[platform].get_devices()[device])}))
+
+
+if __name__ == "__main__":
+    main()

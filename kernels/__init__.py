@@ -1,0 +1,1 @@
+"""The OpenCL C sources, one stem per operation; ``gpuvision.host.program`` builds them."""

@@ -1,0 +1,51 @@
+// One body of code for both shapes: under STRIP a value is 16 samples of a CPU's strip, else it is one sample.
+// Loads and stores go through element-aligned vector types: PoCL's vstore16 of bytes costs more than a whole PSD
+// readout, a plain assignment does not, and a caller's array need not be aligned to a vector.
+#ifndef LANES_H
+#define LANES_H
+
+#include "real.h"
+
+#ifdef STRIP
+#define LANES 16
+typedef real16 reals;
+typedef bits16 masks;
+typedef uchar16 bytes;
+typedef real16 reals_at __attribute__((aligned(sizeof(real))));
+typedef uchar16 bytes_at __attribute__((aligned(1)));
+#define LANED(name) name##16
+#define mask_of(comparison) (comparison)
+#define convert_bytes convert_uchar16
+#define as_masks as_bits16
+#define as_reals LANED(as_real)
+#ifdef REAL_IS_DOUBLE
+#define as_real16 as_double16
+#else
+#define as_real16 as_float16
+#endif
+#else
+#define LANES 1
+typedef real reals;
+typedef bits masks;
+typedef uchar bytes;
+typedef real reals_at;
+typedef uchar bytes_at;
+#define LANED(name) name
+#define mask_of(comparison) (-(bits)(comparison))
+#define convert_bytes convert_uchar
+#define as_masks as_bits
+#define as_reals as_real
+#endif
+
+#define NAN_BITS as_bits(REAL_NAN)
+
+// NaN where the mask is set: every bit of a quiet NaN put on top of a number makes a NaN.
+inline reals nan_where(masks mask, reals value) { return as_reals(as_masks(value) | (mask & (masks)NAN_BITS)); }
+
+// Zero where the mask is set.
+inline reals zero_where(masks mask, reals value) { return as_reals(as_masks(value) & ~mask); }
+
+inline void store_reals(reals value, global real *to) { *(global reals_at *)to = value; }
+inline void store_bytes(bytes value, global uchar *to) { *(global bytes_at *)to = value; }
+
+#endif

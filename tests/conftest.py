@@ -1,0 +1,40 @@
+"""Devices for the tests: every healthy one, and failure rather than silence where there is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpuvision.host import Device
+from gpuvision.host.discovery import INSTALL_HINT
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test that asks for a ``device`` on every healthy one."""
+    if "device" in metafunc.fixturenames:
+        devices = Device.all()
+        metafunc.parametrize("device", devices or [None], ids=lambda each: each.label if each else "none")
+
+
+@pytest.fixture(autouse=True)
+def _a_device_is_there(request: pytest.FixtureRequest) -> None:
+    if "device" in request.fixturenames and request.getfixturevalue("device") is None:
+        pytest.fail(f"this test needs a healthy OpenCL device; {INSTALL_HINT}", pytrace=False)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Random numbers, the same in every run."""
+    return np.random.default_rng(20080107)
+
+
+@pytest.fixture
+def data() -> Path:
+    """The folder of the real recordings; a test that uses it is marked ``realdata``."""
+    if not DATA.is_dir():
+        pytest.skip("the recordings in ../shared/data are not here")
+    return DATA

@@ -6,6 +6,8 @@ import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
+import numpy as np
+
 
 def checked_keys(
     table: Mapping[str, Any], allowed: Collection[str], required: Collection[str], what: str
@@ -43,3 +45,24 @@ def finite(value: Any, what: str) -> float:
     if not math.isfinite(number):
         raise ValueError(f"{what} must be finite, got {number}")
     return number
+
+
+def numbers(values: Any, shape: tuple[int, ...], what: str) -> Any:
+    """Return an array of numbers, of one or two dimensions, as nested tuples of floats.
+
+    Raises
+    ------
+    TypeError
+        They are no numbers.
+    ValueError
+        The shape is another one, or a number is infinite or NaN.
+    """
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(f"{what} must be numbers of shape {shape}, got {values!r}") from None
+    if array.shape != shape:
+        raise ValueError(f"{what} has shape {array.shape}, expected {shape}")
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{what} has a number that is not finite")
+    return tuple(map(tuple, array.tolist())) if array.ndim == 2 else tuple(array.tolist())

@@ -1,0 +1,160 @@
+"""The radial lens model which the readouts undo in the coordinates they measure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.tables import checked_keys, finite
+
+_NEWTON_STEPS = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """Radial distortion about a centre, as a direct polynomial from measured to undistorted coordinates.
+
+    ``C = C_c + (C' - C_c)(1 + k1 r^2 + k2 r^4)``, the same for R, ``r^2 = (R' - R_c)^2 + (C' - C_c)^2``
+    (F. de Jong, eq. 3.11-3.13). The model is isotropic, so it holds in any square sensor coordinate: pixels,
+    or metres on a PSD.
+
+    Parameters
+    ----------
+    k1, k2
+        Distortion coefficients, in coordinate units to the power -2 and -4 (pixel^-2, pixel^-4; or metre^-2,
+        metre^-4).
+    centre
+        (C_c, R_c): column and row of the optical axis, in coordinate units.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite.
+    """
+
+    k1: float
+    k2: float = 0.0
+    centre: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in ("k1", "k2"):
+            object.__setattr__(self, name, finite(getattr(self, name), f"Lens.{name}"))
+        if len(self.centre) != 2:
+            raise ValueError(f"Lens.centre has {len(self.centre)} numbers, expected (column, row)")
+        object.__setattr__(self, "centre", tuple(finite(each, "Lens.centre") for each in self.centre))
+
+    @property
+    def defines(self) -> dict[str, None]:
+        """What ``kernels/lens.h`` has to compile: ``LENS`` always, ``LENS_K2`` only where k2 is not 0."""
+        return {"LENS": None, "LENS_K2": None} if self.k2 != 0.0 else {"LENS": None}
+
+    def packed(self, origin: Sequence[float], scale: float) -> npt.NDArray[np.float64]:
+        """Return the table of ``kernels/lens.h`` for a kernel which works in (point - origin) scale.
+
+        Parameters
+        ----------
+        origin, scale
+            About 1 at the sensor's border keeps single precision sharp; ``origin`` in the order of
+            ``centre``.
+
+        Returns
+        -------
+        numpy.ndarray
+            Both coordinates of the centre, k1, k2 and the squared fold radius, in the kernel's units.
+        """
+        centre = [(c - o) * scale for c, o in zip(self.centre, origin, strict=True)]
+        return np.array([*centre, self.k1 / scale**2, self.k2 / scale**4, (self.fold_radius * scale) ** 2])
+
+    def swapped(self) -> Lens:
+        """Return the same lens for points in (row, column) order."""
+        return replace(self, centre=self.centre[::-1])
+
+    @property
+    def fold_radius(self) -> float:
+        """Measured radius at which the polynomial turns back: no scene point lies beyond it (inf: never)."""
+        # d/dr of r (1 + k1 r^2 + k2 r^4) is 1 + 3 k1 s + 5 k2 s^2 in s = r^2; no 0/0 where k2 is 0.
+        discriminant = 9.0 * self.k1**2 - 20.0 * self.k2
+        if discriminant < 0.0:
+            return math.inf
+        slope = -3.0 * self.k1 + math.copysign(math.sqrt(discriminant), -self.k1)
+        roots = [2.0 / slope if slope != 0.0 else math.inf]
+        if self.k2 != 0.0:
+            roots.append(slope / (10.0 * self.k2))
+        positive = [s for s in roots if s > 0.0]
+        return math.sqrt(min(positive)) if positive else math.inf
+
+    def undistort(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Undistorted (column, row) of measured points, shape (..., 2); NaN beyond the fold."""
+        offset = np.asarray(points, dtype=np.float64) - self.centre
+        square = np.sum(offset**2, axis=-1, keepdims=True)
+        stretched = offset * (square * (self.k1 + self.k2 * square))
+        # Displacement form: adding the small stretch to the point itself keeps its digits.
+        inside = square < self.fold_radius**2
+        return np.where(inside, np.asarray(points, dtype=np.float64) + stretched, np.nan)
+
+    def jacobian(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """d(undistorted column, row) / d(measured column, row), shape (..., 2, 2)."""
+        offset = np.asarray(points, dtype=np.float64) - self.centre
+        square = np.sum(offset**2, axis=-1)[..., None, None]
+        growth = 1.0 + square * (self.k1 + self.k2 * square)
+        slope = 2.0 * (self.k1 + 2.0 * self.k2 * square)
+        return growth * np.eye(2) + slope * offset[..., :, None] * offset[..., None, :]
+
+    def distort(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Measured (column, row) of undistorted points, shape (..., 2): the inverse, by Newton steps.
+
+        NaN where no measured point inside the fold has this undistorted position.
+        """
+        offset = np.asarray(points, dtype=np.float64) - self.centre
+        target = np.hypot(offset[..., 0], offset[..., 1])
+        radius = self._measured_radius(target)
+        with np.errstate(invalid="ignore"):
+            shrink = np.where(target > 0.0, radius / np.where(target > 0.0, target, 1.0), 1.0)
+        return self.centre + offset * np.where(np.isfinite(target), shrink, np.nan)[..., None]
+
+    def _measured_radius(self, target: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Solve r (1 + k1 r^2 + k2 r^4) = target on the monotone stretch [0, fold)."""
+        fold = self.fold_radius
+        if math.isfinite(fold):
+            high = np.full_like(target, fold)
+            reachable = target < fold * (1.0 + fold**2 * (self.k1 + self.k2 * fold**2))
+        else:
+            # Without a fold the slope is at least this, so the root is at most target / slope.
+            least_slope = 1.0 - 9.0 * self.k1**2 / (20.0 * self.k2) if self.k1 < 0.0 else 1.0
+            high = target / least_slope
+            reachable = np.isfinite(target)
+        low = np.zeros_like(target)
+        radius = np.where(reachable, np.minimum(target, high), np.nan)
+        for _ in range(_NEWTON_STEPS):
+            square = radius**2
+            excess = radius * (1.0 + square * (self.k1 + self.k2 * square)) - target
+            if not np.any(np.abs(excess) > 2e-16 * target):
+                break
+            high = np.where(excess > 0.0, radius, high)
+            low = np.where(excess < 0.0, radius, low)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                step = radius - excess / (1.0 + square * (3.0 * self.k1 + 5.0 * self.k2 * square))
+            radius = np.where(
+                (step >= low) & (step <= high), step, np.where(reachable, 0.5 * (low + high), np.nan)
+            )
+        return radius
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and lists, as TOML holds them."""
+        return {"k1": self.k1, "k2": self.k2, "centre": list(self.centre)}
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Lens:
+        """Build a lens from ``{"k1": ..., "k2": ..., "centre": [column, row]}``.
+
+        Raises
+        ------
+        ValueError
+            If a key is unknown or missing, or a value is no finite number.
+        """
+        return cls(**checked_keys(table, ("k1", "k2", "centre"), ("k1",), "lens"))

@@ -42,6 +42,23 @@ typedef uchar bytes_at;
 // NaN where the mask is set: every bit of a quiet NaN put on top of a number makes a NaN.
 inline reals nan_where(masks mask, reals value) { return as_reals(as_masks(value) | (mask & (masks)NAN_BITS)); }
 
+// Whether the mask is set in any lane. (PoCL takes any() apart into scalars.)
+#if defined(STRIP) && defined(REAL_IS_DOUBLE)
+inline int any_lane(masks mask) {
+    const long8 half_of_it = mask.lo | mask.hi;
+    const long4 quarter = half_of_it.lo | half_of_it.hi;
+    return (quarter.x | quarter.y | quarter.z | quarter.w) != 0;
+}
+#elif defined(STRIP)
+inline int any_lane(masks mask) {
+    const int8 half_of_it = mask.lo | mask.hi;
+    const long2 quarter = as_long2(half_of_it.lo | half_of_it.hi);
+    return (quarter.x | quarter.y) != 0;
+}
+#else
+inline int any_lane(masks mask) { return mask != 0; }
+#endif
+
 // Zero where the mask is set.
 inline reals zero_where(masks mask, reals value) { return as_reals(as_masks(value) & ~mask); }
 

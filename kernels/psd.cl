@@ -2,26 +2,27 @@
 //
 // The currents divide inversely to the distances from the electrodes: u = (L/2)(right - left)/(right + left).
 // Inputs are pairs (left, right) side by side, or under PLANAR all left values before all right ones. CODE is their
-// type; AMPERE brings it to amperes. WITH_... say which outputs exist, in the order of the arguments.
+// type, and the unit of everything until it is written out. WITH_... say which outputs are wanted.
 #include "lanes.h"
 #include "sheet.h"
 #include "status.h"
 
-// The parameters, as PsdReadout packs them.
-#define HALF_LENGTH 0   // L/2 times the correction for the load resistors [m]
-#define LIMIT 1         // what |right - left| / total is at the strip's ends, load resistors considered
-#define MINIMUM 2       // of the total [A]
-#define SATURATION 3    // of either channel, dark level included [A]
-#define AMPERE 4        // per unit of the input
-#define DARK_LEFT 5     // [A]
-#define DARK_RIGHT 6    // [A]
-#define RIGHT_GAIN 7    // brings the right channel to the left one's gain
-#define INDEPENDENT 8   // noise of each channel, squared [A^2]
-#define OPPOSED 9       // noise that leaves one electrode and enters the other, squared [A^2]
-#define COMMON 10       // variance of the place times the total: a spot of finitely many electrons [m^2 A]
+// The parameters, as PsdReadout packs them, in the input's unit where none is given.
+#define HALF_LENGTH 0  // L/2 times the correction for the load resistors [m]
+#define LIMIT 1        // what |right - left| / sum is at the strip's ends, load resistors considered
+#define MINIMUM 2      // of the sum
+#define SATURATION 3   // of either channel, dark level included
+#define AMPERE 4       // per unit of the input
+#define DARK_LEFT 5
+#define DARK_RIGHT 6
+#define RIGHT_GAIN 7   // brings the right channel to the left one's gain
+#define INDEPENDENT 8  // noise of each channel, squared
+#define OPPOSED 9      // noise that leaves one electrode and enters the other, squared
+#define COMMON 10      // variance of the place times the sum: a spot of finitely many electrons [m^2]
 
 #ifdef STRIP
 #define SAMPLES_PER_STRIP 4096
+#define BLOCK 8  // vectors that are judged together
 typedef CODE16 codes_at __attribute__((aligned(sizeof(CODE))));
 #ifdef REAL_IS_DOUBLE
 #define to_reals convert_double16
@@ -85,71 +86,95 @@ inline reals strip_numbers(int sample, int strips) {
 #ifdef WITH_SIGMA
 // Standard deviation of the place: independent noise grows towards the ends, opposed noise acts alike everywhere,
 // common noise (the electrons of one spot divide together) leaves only the spot's own width.
-inline reals sigma_of(reals balance, reals total, constant real *p) {
+inline reals sigma_of(reals balance, reals sum, constant real *p) {
     const reals spread = p[INDEPENDENT] * (1 + balance * balance) / 2 + p[OPPOSED];
-    return sqrt(4 * p[HALF_LENGTH] * p[HALF_LENGTH] * spread / (total * total) + p[COMMON] / total);
+    return sqrt(4 * p[HALF_LENGTH] * p[HALF_LENGTH] * spread / (sum * sum) + p[COMMON] / sum);
 }
 #endif
 
-// Reads the sample(s) at `sample` and writes what is asked for there.
-inline void read_out(global const CODE *currents, global real *position, global real *total, global uchar *status,
-                     global real *sigma, global real *g, global real *h, constant real *p, int samples, int sample,
-                     global const real *table, int strips, int knots, constant real *sheet) {
+// Why samples are not good; the weightiest reason comes last.
+inline masks reasons(reals left, reals right, masks saturated, reals sum, reals difference, constant real *p) {
+    masks flags = fabs(difference) > p[LIMIT] * sum ? (masks)STATUS_OUT_OF_RANGE : (masks)STATUS_OK;
+    flags = sum <= p[MINIMUM] ? (masks)STATUS_DARK : flags;
+    flags |= saturated & STATUS_SATURATED;
+    return LANED(not_finite)(left) | LANED(not_finite)(right) ? (masks)STATUS_NOT_FINITE : flags;
+}
+
+// Reads the sample(s) at `sample`, writes what is asked for there, and says which are not good. Unless it is told to
+// be careful it writes as if all were good: the caller comes again where some are not.
+inline masks read_out(const int careful, int sample, global const CODE *currents, global real *position,
+                      global real *total, global uchar *status, global real *sigma, global real *g, global real *h,
+                      constant real *p, int samples, global const real *table, int strips, int knots,
+                      constant real *sheet) {
     reals left, right;
     load_pair(currents, sample, samples, &left, &right);
-    left *= p[AMPERE];
-    right *= p[AMPERE];
-    const masks saturated = mask_of(left >= p[SATURATION]) | mask_of(right >= p[SATURATION]);
+    const reals larger = left > right ? left : right;
+    const masks saturated = mask_of(larger >= p[SATURATION]);
+    masks good = mask_of(left < p[SATURATION]) & mask_of(right < p[SATURATION]);
+#ifdef DARK
     left -= p[DARK_LEFT];
-    right = (right - p[DARK_RIGHT]) * p[RIGHT_GAIN];
-    const reals sum = left + right, difference = right - left;
-    const masks wrong = LANED(not_finite)(sum);  // infinite minus infinite is NaN: the sum tells for both channels
-    const masks dark = mask_of(sum <= p[MINIMUM]) & ~wrong;
-    const masks outside = mask_of(fabs(difference) > p[LIMIT] * sum) & ~dark & ~wrong;
-    const masks untrusted = saturated | wrong | dark | outside;
-    const reals balance = difference / sum;
-    masks flags = (wrong & STATUS_NOT_FINITE) | (dark & STATUS_DARK) | (saturated & STATUS_SATURATED) |
-                  (outside & STATUS_OUT_OF_RANGE);
-    reals u = p[HALF_LENGTH] * balance;
-#ifdef LINEARITY
-    u = corrected(zero_where(untrusted, u), sample, strips, table, knots, p[HALF_LENGTH] * p[LIMIT]);
+    right -= p[DARK_RIGHT];
 #endif
-    u = nan_where(untrusted, u);
+#ifdef GAIN
+    right *= p[RIGHT_GAIN];
+#endif
+    const reals sum = left + right, difference = right - left;
+    // Comparisons that hold: NaN fails them, and the saturation limit keeps infinity and an overflowing sum out.
+    good &= mask_of(sum > p[MINIMUM]) & mask_of(fabs(difference) <= p[LIMIT] * sum);
+    const reals balance = difference / sum;
+    reals u = p[HALF_LENGTH] * balance;
+    masks flags = STATUS_OK;
+    if (careful) {
+        flags = reasons(left, right, saturated, sum, difference, p);
+        u = nan_where(~good, u);
+    }
+#ifdef LINEARITY
+    u = nan_where(~good, corrected(zero_where(~good, u), sample, strips, table, knots, p[HALF_LENGTH] * p[LIMIT]));
+#endif
 #ifdef WITH_POSITION
     store_reals(u, position + sample);
 #endif
 #ifdef WITH_TOTAL
-    store_reals(sum, total + sample);
+    store_reals(sum * p[AMPERE], total + sample);
 #endif
 #ifdef WITH_SIGMA
-    store_reals(nan_where(untrusted, sigma_of(balance, sum, p)), sigma + sample);
+    store_reals(nan_where(~good, sigma_of(balance, sum, p)), sigma + sample);
 #endif
 #ifdef WITH_SHEET
     reals at_g, at_h;
     const bytes lost = LANED(sheet_point)(u, strip_numbers(sample, strips), sheet, &at_g, &at_h);
-    // The sheet sees NaN where the reading was untrusted: the reason is the reading's own.
-    flags |= LANED(convert_bits)(lost) & ~untrusted;
+    // The sheet sees NaN where the reading was bad: the reason is the reading's own.
+    flags |= LANED(convert_bits)(lost) & good;
     store_reals(at_g, g + sample);
     store_reals(at_h, h + sample);
 #endif
 #ifdef WITH_STATUS
     store_bytes(convert_bytes(flags), status + sample);
 #endif
+    return ~good;
 }
 
 kernel void psd_readout(global const CODE *currents, global real *position, global real *total, global uchar *status,
                         global real *sigma, global real *g, global real *h, constant real *p, int samples,
                         global const real *table, int strips, int knots, constant real *sheet) {
+#define READ_OUT(careful, sample)                                                                                      \
+    read_out(careful, sample, currents, position, total, status, sigma, g, h, p, samples, table, strips, knots, sheet)
 #ifdef STRIP
     // The last strip takes the remainder too, and its last vector overlaps the one before: no sample is left over,
     // and no other work-item writes there.
-    const int first = get_global_id(0) * SAMPLES_PER_STRIP;
-    const int end = get_global_id(0) + 1 == get_global_size(0) ? samples : first + SAMPLES_PER_STRIP;
-    for (int sample = first; sample < end; sample += LANES)
-        read_out(currents, position, total, status, sigma, g, h, p, samples, min(sample, end - LANES), table, strips,
-                 knots, sheet);
+    int sample = get_global_id(0) * SAMPLES_PER_STRIP;
+    const int end = get_global_id(0) + 1 == get_global_size(0) ? samples : sample + SAMPLES_PER_STRIP;
+    int trouble = 0;  // which comes in runs: what was so before is expected again
+    for (; sample + BLOCK * LANES <= end; sample += BLOCK * LANES) {
+        masks bad = 0;
+        if (!trouble)
+            for (int k = 0; k < BLOCK; k++) bad |= READ_OUT(0, sample + k * LANES);
+        if (trouble || any_lane(bad))
+            for (int k = 0; k < BLOCK; k++) bad |= READ_OUT(1, sample + k * LANES);
+        trouble = any_lane(bad);
+    }
+    for (; sample < end; sample += LANES) READ_OUT(1, min(sample, end - LANES));
 #else
-    const int sample = get_global_id(0);
-    read_out(currents, position, total, status, sigma, g, h, p, samples, sample, table, strips, knots, sheet);
+    READ_OUT(1, get_global_id(0));
 #endif
 }

@@ -207,6 +207,7 @@ class PsdReadout(Operation[PsdReading]):
             inputs=[(shape, dtype)],
             outputs=self._outputs(batch, real),
             global_size=(items,),
+            local_size=(1,) if strip else None,
             defines=self._defines(device, real, dtype, strip),
             arguments=[
                 self._packed(real, dtype),
@@ -231,32 +232,40 @@ class PsdReadout(Operation[PsdReading]):
         defines |= {f"WITH_{name.upper()}": None for name in ("position", "total", "status", "sigma") if name in chosen}
         if self.triangulation is not None:
             defines |= {"WITH_SHEET": None} | self.triangulation.defines
-        present = {"PLANAR": self.layout == "planar", "STRIP": strip, "LINEARITY": self.linearity is not None}
+        present = {
+            "STRIP": strip,
+            "PLANAR": self.layout == "planar",
+            "DARK": any(self.dark),
+            "GAIN": self.right_gain != 1.0,
+            "LINEARITY": self.linearity is not None,
+        }
         return defines | {name: None for name, is_present in present.items() if is_present}
 
     def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any]) -> Any:
-        """Return the parameters of ``psd.cl``, in its order."""
+        """Return the parameters of ``psd.cl``, in its order and in the input's unit."""
         limit = 1.0
         if self.interelectrode_resistance:
             limit = self.interelectrode_resistance / (self.interelectrode_resistance + 2.0 * self.load_resistance)
-        codes = dtype.kind == "u"
-        saturation = self.saturation
-        if saturation is None:
-            saturation = np.iinfo(dtype).max * self.ampere if codes else np.inf
         noise = self.noise or PsdNoise()
-        step = self.ampere / math.sqrt(12.0) if codes else 0.0
+        if dtype.kind == "u":
+            ceiling, quantisation = float(np.iinfo(dtype).max), 1.0 / 12.0
+        else:
+            # A finite limit whose double is finite too: nothing beyond it may reach the arithmetic.
+            ceiling, quantisation = float(np.finfo(real).max) / 4.0, 0.0
+        saturation = ceiling if self.saturation is None else min(self.saturation / self.ampere, ceiling)
         return np.array(
             [
                 0.5 * self.strip_length / limit,
                 limit,
-                self.minimum_total,
+                self.minimum_total / self.ampere,
                 saturation,
                 self.ampere,
-                *self.dark,
+                self.dark[0] / self.ampere,
+                self.dark[1] / self.ampere,
                 1.0 / self.right_gain,
-                noise.independent**2 + step**2,
-                noise.opposed**2,
-                noise.spot**2 * 2.0 * ELECTRON * noise.bandwidth,
+                (noise.independent / self.ampere) ** 2 + quantisation,
+                (noise.opposed / self.ampere) ** 2,
+                noise.spot**2 * 2.0 * ELECTRON * noise.bandwidth / self.ampere,
             ],
             real,
         )

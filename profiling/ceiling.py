@@ -1,0 +1,57 @@
+"""The device's own limits, measured: what to hold a kernel against."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pyopencl as cl
+
+from gpuvision.host import Device
+from gpuvision.host.program import build
+
+_VECTOR = 64  # bytes
+_ITEMS_PER_UNIT = 64
+_FLOPS_PER_STEP = 8 * 16 * 2
+
+
+def move(device: Device, read: int, written: int) -> Callable[[], None]:
+    """Return a call that reads and writes so many bytes in order, and waits.
+
+    Timed beside a kernel of the same traffic it gives the part of that kernel's time that the traffic alone costs,
+    launch included, in the same cache or memory.
+    """
+    reads, writes = max(read // _VECTOR, 1), written // _VECTOR
+    source = device.empty((reads * 16,), np.float32)
+    target = device.empty((max(writes, 1) * 16,), np.float32)
+    source.fill(1.0).finish()
+    target.fill(1.0).finish()
+    kernel = cl.Kernel(build(device, "ceiling", {}), "move" if device.is_cpu else "move_items")
+    kernel.set_args(source.base_data, target.base_data, np.int64(reads), np.int64(writes))
+    items = device.handle.max_compute_units * _ITEMS_PER_UNIT * (1 if device.is_cpu else 64)
+
+    def run(kept: object = (source, target)) -> None:
+        cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.is_cpu else None).wait()
+
+    run()
+    return run
+
+
+def flop_rate(device: Device, *, seconds: float = 0.15) -> float:
+    """Measure single-precision multiply-adds on all cores, as operations per second.
+
+    The median of short launches: a machine that changes its speed between two calls shows it here.
+    """
+    items = device.handle.max_compute_units * (4 if device.is_cpu else 4096)
+    target = device.empty((items * 16,), np.float32)
+    kernel = cl.Kernel(build(device, "ceiling", {}), "compute")
+    steps = 20_000 if device.is_cpu else 2_000
+    kernel.set_args(target.base_data, np.float32(1.0), np.float32(0.5), np.int32(steps))
+    rates: list[float] = []
+    end = time.perf_counter() + seconds
+    while len(rates) < 5 or time.perf_counter() < end:
+        start = time.perf_counter()
+        cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.is_cpu else None).wait()
+        rates.append(items * steps * _FLOPS_PER_STEP / (time.perf_counter() - start))
+    return float(np.median(rates[1:]))

@@ -1,0 +1,30 @@
+"""Arrays between guards: a kernel that writes beyond its output is found out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_GUARD = 256
+_BYTE = 0xA5
+
+
+class Guarded:
+    """Output arrays for ``out=``, each in the middle of a longer one filled with a known byte."""
+
+    def __init__(self, like: Any) -> None:
+        self._whole: list[NDArray[np.uint8]] = []
+        self.out = type(like)(*(None if each is None else self._array(each) for each in like))
+
+    def _array(self, like: NDArray[Any]) -> NDArray[Any]:
+        whole = np.full(like.nbytes + 2 * _GUARD, _BYTE, np.uint8)
+        self._whole.append(whole)
+        return whole[_GUARD : _GUARD + like.nbytes].view(like.dtype).reshape(like.shape)
+
+    def assert_intact(self) -> None:
+        """Assert that nothing was written before or behind any output."""
+        for whole in self._whole:
+            assert (whole[:_GUARD] == _BYTE).all()
+            assert (whole[-_GUARD:] == _BYTE).all()

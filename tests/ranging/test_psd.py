@@ -1,0 +1,337 @@
+"""PSD readout against the float64 oracle, on every device and in both walks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from canary import Guarded
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import gpuvision as gv
+from gpuvision.host import host_view
+from gpuvision.ranging.psd import PsdNoise, PsdReadout
+from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.status import Status
+from reference import psd as reference
+
+WALKS = ("strip", "item")
+LENGTH = 6e-3
+# Roundings of L/2 in the position: of the difference, the sum, the quotient and the product, and of the packed
+# constant itself; and of the parameters where they act.
+POSITION_ULPS = {np.dtype(np.float32): 4, np.dtype(np.float64): 4}
+
+
+def tolerance(real, readout=None) -> float:
+    return POSITION_ULPS[np.dtype(real)] * np.finfo(real).eps * LENGTH / 2
+
+
+def currents(rng, shape, dtype=np.float32, scale=1e-6):
+    values = rng.uniform(0.01, 1.0, shape)
+    return (values * 60_000).astype(dtype) if np.dtype(dtype).kind == "u" else (values * scale).astype(dtype)
+
+
+def assert_like_reference(readout, reading, left, right):
+    expected = reference.read_out(readout, left, right)
+    real = reading.position.dtype
+    np.testing.assert_array_equal(reading.status, expected.status)
+    np.testing.assert_array_equal(np.isnan(reading.position), expected.status != 0)
+    np.testing.assert_allclose(reading.position, expected.position, rtol=0, atol=tolerance(real))
+    finite = np.isfinite(expected.total)
+    np.testing.assert_allclose(reading.total[finite], expected.total[finite], rtol=4 * np.finfo(real).eps)
+    if reading.sigma is not None:
+        np.testing.assert_allclose(reading.sigma, expected.sigma, rtol=2e-5 if real == np.float32 else 1e-12)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("dtype", ["float32", "float64", "uint16"])
+@pytest.mark.parametrize("layout", ["pairs", "planar"])
+@pytest.mark.parametrize("batch", [(1,), (15,), (16,), (17,), (3, 5), (4095,), (4097,), (8193,), (7, 1023)])
+def test_like_float64(device, rng, walk, dtype, layout, batch):
+    readout = PsdReadout(strip_length=LENGTH, walk=walk, layout=layout, ampere=1e-11 if dtype == "uint16" else 1.0)
+    values = currents(rng, (2, *batch), dtype)
+    given_ = np.ascontiguousarray(np.moveaxis(values, 0, -1)) if layout == "pairs" else values
+    reading = readout(given_, device=device)
+    assert reading.position.shape == batch
+    assert_like_reference(readout, reading, *values)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_everything_at_once(device, rng, walk):
+    strips = 37
+    linearity = tuple(map(tuple, rng.normal(0, 20e-6, (strips, 9))))
+    readout = PsdReadout(
+        strip_length=LENGTH,
+        ampere=2e-11,
+        dark=(3e-9, 5e-9),
+        right_gain=1.07,
+        interelectrode_resistance=50e3,
+        load_resistance=1e3,
+        minimum_total=1e-7,
+        saturation=1.1e-6,
+        linearity=linearity,
+        noise=PsdNoise(independent=1e-11, opposed=2e-12, spot=50e-6, bandwidth=100e3),
+        walk=walk,
+    )
+    codes = rng.integers(0, 65_536, (200, strips, 2)).astype(np.uint16)
+    # A code that float32 and float64 put on two sides of a limit is no test of either.
+    reading = readout(codes, device=device)
+    expected = reference.read_out(readout, codes[..., 0], codes[..., 1])
+    agree = reading.status == expected.status
+    assert agree.mean() > 0.999
+    good = agree & (expected.status == 0)
+    assert good.mean() > 0.3
+    np.testing.assert_allclose(reading.position[good], expected.position[good], rtol=0, atol=2 * tolerance(np.float32))
+    np.testing.assert_allclose(reading.sigma[good], expected.sigma[good], rtol=2e-5)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_every_reason_is_told(device, walk):
+    nan, inf = np.nan, np.inf
+    cases = [
+        ((1.0, 3.0), Status.OK),
+        ((0.0, 0.0), Status.DARK),
+        ((0.04, 0.05), Status.DARK),
+        ((-0.5, 0.2), Status.DARK),
+        ((-0.1, 2.0), Status.OUT_OF_RANGE),
+        ((2.0, -0.1), Status.OUT_OF_RANGE),
+        ((0.0, 2.0), Status.OK),
+        ((2.0, 0.0), Status.OK),
+        ((8.0, 1.0), Status.SATURATED),
+        ((1.0, 9.0), Status.SATURATED),
+        ((nan, 1.0), Status.NOT_FINITE),
+        ((1.0, nan), Status.NOT_FINITE),
+        ((inf, 1.0), Status.NOT_FINITE),
+        ((1.0, -inf), Status.NOT_FINITE),
+        ((inf, inf), Status.NOT_FINITE),
+        ((-inf, inf), Status.NOT_FINITE),
+    ]
+    readout = PsdReadout(strip_length=2.0, minimum_total=0.1, saturation=8.0, walk=walk)
+    for repeat in (1, 64):  # within one vector, and in blocks that are read twice
+        pairs = np.repeat(np.array([pair for pair, _ in cases], np.float32), repeat, axis=0)
+        reading = readout(pairs, device=device)
+        expected = np.repeat([int(status) for _, status in cases], repeat)
+        np.testing.assert_array_equal(reading.status, expected)
+        np.testing.assert_array_equal(np.isnan(reading.position), expected != 0)
+    assert readout(np.array([[0.0, 2.0]], np.float32), device=device).position[0] == 1.0
+    assert readout(np.array([[2.0, 0.0]], np.float32), device=device).position[0] == -1.0
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+def test_a_sum_that_overflows_is_flagged(device, walk, real):
+    largest = np.finfo(real).max
+    pairs = np.array([[0.7 * largest, 0.9 * largest]] * 20, real)
+    reading = PsdReadout(strip_length=LENGTH, walk=walk)(pairs, device=device)
+    assert (reading.status == Status.SATURATED).all()
+    assert np.isnan(reading.position).all()
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_denormal_currents_keep_their_ratio_or_are_dark(device, walk):
+    tiny = np.full((32, 2), 1e-40, np.float32) * np.array([1.0, 3.0], np.float32)
+    reading = PsdReadout(strip_length=2.0, walk=walk)(tiny, device=device)
+    good = reading.status == 0
+    # A runtime may flush denormals: then the light is dark, not anywhere.
+    np.testing.assert_allclose(reading.position[good], 0.5, rtol=1e-4)
+    assert (reading.status[~good] == Status.DARK).all()
+
+
+def test_a_thousandfold_change_of_light_does_not_move_the_position(device):
+    level = np.geomspace(1e-9, 1e-6, 31)
+    pairs = (level[:, None] * np.array([0.3, 0.7])).astype(np.float32)
+    position = PsdReadout(strip_length=LENGTH)(pairs, device=device).position
+    assert np.ptp(position) <= 2 * tolerance(np.float32)
+
+
+def test_two_lights_meet_at_their_centre_of_gravity(device):
+    places, powers = np.array([-1e-3, 2e-3]), np.array([1e-6, 0.5e-6])
+    right = (powers * (0.5 + places / LENGTH)).sum()
+    left = powers.sum() - right
+    reading = PsdReadout(strip_length=LENGTH)(np.array([[left, right]]), device=device)
+    assert reading.position[0] == pytest.approx((powers * places).sum() / powers.sum(), abs=1e-15)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+def test_quantised_codes_err_within_their_predicted_sigma(device, rng, bits):
+    steps = 2**bits
+    place = rng.uniform(-0.45, 0.45, 20_000)
+    total = steps * rng.uniform(0.6, 0.9, place.size)  # a fixed total would tie the two roundings together
+    codes = np.round(np.stack([total * (0.5 - place), total * (0.5 + place)], axis=-1)).astype(np.uint16)
+    readout = PsdReadout(strip_length=1.0, saturation=float(steps), noise=PsdNoise())
+    reading = readout(codes, device=device)
+    assert (reading.status == 0).all()
+    scaled = (reading.position - place) / reading.sigma
+    # 20 000 draws know a standard deviation to 0.5 %; three of these.
+    assert np.std(scaled) == pytest.approx(1.0, abs=0.015)
+
+
+@pytest.mark.parametrize("model", ["independent", "opposed", "common"])
+@pytest.mark.parametrize("xi", [-0.9, 0.0, 0.5])
+def test_noise_models_predict_what_draws_scatter(device, rng, model, xi):
+    total, draws = 1e-6, 40_000
+    mean = total * np.array([0.5 - xi / 2, 0.5 + xi / 2])
+    if model == "independent":
+        noise, pairs = PsdNoise(independent=1e-9), mean + rng.normal(0, 1e-9, (draws, 2))
+    elif model == "opposed":
+        leaves = rng.normal(0, 1e-9, draws)
+        noise, pairs = PsdNoise(opposed=1e-9), mean + np.stack([-leaves, leaves], axis=-1)
+    else:
+        noise = PsdNoise(spot=100e-6, bandwidth=1e9)
+        electrons = total / (2 * reference.ELECTRON * 1e9)
+        place = xi / 2 + rng.normal(0, 100e-6 / LENGTH / np.sqrt(electrons), draws)
+        pairs = total * np.stack([0.5 - place, 0.5 + place], axis=-1)
+    reading = PsdReadout(strip_length=LENGTH, noise=noise)(pairs, device=device)
+    good = reading.status == 0
+    # 40 000 draws know a standard deviation to 0.35 %; three of these.
+    assert np.std(reading.position[good]) == pytest.approx(np.mean(reading.sigma[good]), rel=0.0125)
+
+
+def test_ambient_light_pulls_to_the_electrical_centre_and_the_dark_level_undoes_it(device):
+    ambient = 100e-6
+    pair = np.array([[0.2e-6 + ambient, 0.8e-6 + ambient]])
+    pulled = PsdReadout(strip_length=LENGTH)(pair, device=device).position[0]
+    undone = PsdReadout(strip_length=LENGTH, dark=(ambient, ambient))(pair, device=device).position[0]
+    assert pulled == pytest.approx(0.3 * LENGTH * 1e-6 / (1e-6 + 2 * ambient), rel=1e-9)
+    assert undone == pytest.approx(0.3 * LENGTH, rel=1e-9)
+
+
+def test_load_resistors_shrink_and_the_readout_undoes_it(device):
+    shrunk = 0.6 / (1 + 2 * 1e3 / 50e3)
+    pair = np.array([[0.5 - shrunk / 2, 0.5 + shrunk / 2]])
+    readout = PsdReadout(strip_length=LENGTH, interelectrode_resistance=50e3, load_resistance=1e3)
+    assert readout(pair, device=device).position[0] == pytest.approx(0.6 * LENGTH / 2, rel=1e-12)
+    beyond = np.array([[0.001, 0.999]])
+    assert readout(beyond, device=device).status[0] == Status.OUT_OF_RANGE
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_the_sheet_in_the_same_pass(device, rng, walk):
+    sheet = Triangulation(
+        homography=((0.8, 0.01, 1e-3), (0.02, 1.0, 2e-3), (5.0, 0.3, 1.0)),
+        region=((-3e-3, 3e-3), (-4e-3, 4e-3)),
+    )
+    axes = SampleAxes(sample_pitch=1e-4, sample_origin=-32e-4)
+    pairs = currents(rng, (50, 65, 2))
+    pairs[3, 7] = np.nan
+    readout = PsdReadout(strip_length=LENGTH, triangulation=sheet, axes=axes, walk=walk)
+    reading = readout(pairs, device=device)
+    expected = reference.read_out(readout, pairs[..., 0], pairs[..., 1])
+    v = -32e-4 + 1e-4 * np.arange(65)
+    matrix = np.array(sheet.homography)
+    sensor = np.stack(np.broadcast_arrays(expected.position, v, 1.0))
+    place = np.einsum("ij,j...->i...", matrix, sensor)
+    good = expected.status == 0
+    np.testing.assert_array_equal(reading.status, expected.status)
+    # The slopes of G and H over u are below 1.2 in this sheet.
+    for value, row in ((reading.g, 0), (reading.h, 1)):
+        np.testing.assert_allclose(value[good], (place[row] / place[2])[good], rtol=0, atol=3 * tolerance(np.float32))
+        assert np.isnan(value[~good]).all()
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    batch=st.lists(st.integers(1, 90), min_size=0, max_size=3).map(tuple),
+    dtype=st.sampled_from(["float32", "float64", "uint16"]),
+    layout=st.sampled_from(["pairs", "planar"]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_any_shape(device, walk, batch, dtype, layout, seed):
+    values = currents(np.random.default_rng(seed), (2, *batch), dtype)
+    given_ = np.ascontiguousarray(np.moveaxis(values, 0, -1)) if layout == "pairs" else values
+    readout = PsdReadout(strip_length=LENGTH, layout=layout, walk=walk)
+    guarded = Guarded(readout(given_, device=device))
+    reading = readout(given_, device=device, out=guarded.out)
+    assert reading is guarded.out
+    guarded.assert_intact()
+    assert_like_reference(readout, reading, *values)
+
+
+def test_outputs_are_chosen(device, rng):
+    reading = PsdReadout(strip_length=LENGTH, outputs=("status",))(currents(rng, (40, 2)), device=device)
+    assert reading.position is None
+    assert reading.total is None
+    assert (reading.status == 0).all()
+
+
+def test_an_empty_batch_is_no_error(device):
+    reading = PsdReadout(strip_length=LENGTH)(np.zeros((0, 4, 2), np.float32), device=device)
+    assert reading.position.shape == (0, 4)
+
+
+def test_bound_and_device_arrays_say_the_same(device, rng):
+    readout = PsdReadout(strip_length=LENGTH)
+    pairs = currents(rng, (1000, 2))
+    expected = readout(pairs, device=device)
+    bound = readout.bind(device, pairs.shape, pairs.dtype)
+    frame = device.empty(pairs.shape, pairs.dtype)
+    frame.set(pairs)
+    bound(frame).wait()
+    np.testing.assert_array_equal(bound.outputs.position.get(), expected.position)
+    np.testing.assert_array_equal(readout(frame).position.get(), expected.position)
+    if device.shares_memory:
+        host_view(bound.inputs[0])[...] = pairs[::-1]
+        bound().wait()
+        np.testing.assert_array_equal(host_view(bound.outputs.position), expected.position[::-1])
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "message"),
+    [
+        (np.zeros((4, 2), np.int32), TypeError, "float32, float64 or uint16"),
+        (np.zeros((4, 3), np.float32), ValueError, r"\(\.\.\., 2\)"),
+        (np.zeros((8, 4), np.float32)[:, ::2], ValueError, "C-contiguous"),
+        ([[1.0, 2.0]], TypeError, "NumPy arrays or pyopencl arrays"),
+    ],
+)
+def test_wrong_input_is_told(device, values, error, message):
+    with pytest.raises(error, match=message):
+        PsdReadout(strip_length=LENGTH)(values, device=device)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"strip_length": 0.0}, "strip_length"),
+        ({"strip_length": float("nan")}, "strip_length"),
+        ({"right_gain": -1.0}, "right_gain"),
+        ({"load_resistance": 5.0}, "interelectrode_resistance"),
+        ({"layout": "rows"}, "layout"),
+        ({"outputs": ("place",)}, "'place'"),
+        ({"outputs": ("g",)}, "'g'"),
+        ({"linearity": ((0.0,),)}, "knots"),
+        ({"linearity": ((0.0, 1.0), (0.0, 1.0, 2.0))}, "knots"),
+    ],
+)
+def test_wrong_parameters_are_told(changes, message):
+    with pytest.raises(ValueError, match=message):
+        PsdReadout(**({"strip_length": LENGTH} | changes))
+
+
+def test_precision_is_never_lowered_in_silence(device):
+    with pytest.raises(TypeError, match="single"):
+        PsdReadout(strip_length=LENGTH, precision="single")(np.ones((4, 2)), device=device)
+    double = PsdReadout(strip_length=LENGTH, precision="double")(np.ones((4, 2), np.float32), device=device)
+    assert double.position.dtype == np.float64
+
+
+def test_wrong_out_is_told(device, rng):
+    readout, pairs = PsdReadout(strip_length=LENGTH), currents(rng, (32, 2))
+    out = readout(pairs, device=device)
+    with pytest.raises(TypeError, match=r"out\.position"):
+        readout(pairs, device=device, out=out._replace(position=out.position.astype(float)))
+    with pytest.raises(ValueError, match=r"out\.status"):
+        readout(pairs, device=device, out=out._replace(status=out.status[:5]))
+
+
+def test_strips_must_match_the_linearity_table(device):
+    readout = replace(PsdReadout(strip_length=LENGTH), linearity=((0.0, 0.0),) * 3)
+    with pytest.raises(ValueError, match="3 rows, the input has 4 strips"):
+        readout(np.ones((2, 4, 2), np.float32), device=device)
+
+
+def test_the_public_name(device, rng):
+    assert gv.PsdReadout is PsdReadout

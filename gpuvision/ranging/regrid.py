@@ -1,0 +1,368 @@
+"""Regular resampling: an organised range image becomes a height map over x by y cells.
+
+A range scan samples its surface where the light happens to fall (F. de Jong, fig. 2.5). Standard image processing wants
+regular cells. Resampling runs twice along lines of the organised points: along the samples of each profile, which
+carries the other coordinate with it, and then along the profiles. Everything is linear between neighbours, holes stay
+holes, and steps in height stay steps.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Bound, Device, DeviceArray, Launch, Operation, Precision, real_defines, real_of
+from gpuvision.tables import finite
+
+R = TypeVar("R", bound=tuple[Any, ...])
+Direction = Literal["x", "-x", "y", "-y"]
+_DIRECTIONS = ("x", "-x", "y", "-y")
+_INPUTS = {"float32": "float", "float64": "double"}
+
+
+class HeightMap(NamedTuple):
+    """Heights over the cells of a grid, each array (rows, columns).
+
+    Attributes
+    ----------
+    z
+        Height [m]; NaN in holes.
+    intensity
+        Of the light, in the units of the input; NaN in holes.
+    status
+        uint8 `Status` flags. HOLE: no measurement near enough, with the flags of the bad samples in the gap.
+        FOLDED: the sampling ran backwards here. SATURATED and AMBIGUOUS come with a value.
+    """
+
+    z: Any
+    intensity: Any
+    status: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """Regular cells, laid out as a picture: x grows with the column, y falls with the row.
+
+    Parameters
+    ----------
+    left, top
+        Centre of the cell [0, 0] [m]: lowest x, highest y.
+    cell_x, cell_y
+        Distance between cells [m].
+    columns, rows
+        Their numbers.
+
+    Raises
+    ------
+    ValueError
+        A number is not finite, or not above 0 where it has to be.
+    """
+
+    left: float
+    top: float
+    cell_x: float
+    cell_y: float
+    columns: int
+    rows: int
+
+    def __post_init__(self) -> None:
+        for name in ("left", "top", "cell_x", "cell_y"):
+            object.__setattr__(self, name, finite(getattr(self, name), f"Grid.{name}"))
+        for name in ("cell_x", "cell_y", "columns", "rows"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"Grid.{name} is {getattr(self, name)}, expected a number above 0")
+
+    @classmethod
+    def covering(cls, x: npt.ArrayLike, y: npt.ArrayLike, cell: float) -> Grid:
+        """Return the grid of square cells that covers all finite points.
+
+        Raises
+        ------
+        ValueError
+            There is no finite point.
+        """
+        x, y = np.asarray(x), np.asarray(y)
+        good = np.isfinite(x) & np.isfinite(y)
+        if not good.any():
+            raise ValueError("no finite point to lay a grid over; expected at least one valid sample")
+        low, high = [np.array([f(x[good]), f(y[good])], dtype=np.float64) for f in (np.min, np.max)]
+        first, last = np.floor(low / cell), np.ceil(high / cell)
+        columns, rows = (last - first).astype(int) + 1
+        return cls(
+            left=float(first[0]) * cell,
+            top=float(last[1]) * cell,
+            cell_x=cell,
+            cell_y=cell,
+            columns=int(columns),
+            rows=int(rows),
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of a map over this grid."""
+        return self.rows, self.columns
+
+    @property
+    def x(self) -> npt.NDArray[np.float64]:
+        """Centres of the columns [m]."""
+        return self.left + self.cell_x * np.arange(self.columns, dtype=np.float64)
+
+    @property
+    def y(self) -> npt.NDArray[np.float64]:
+        """Centres of the rows [m], falling."""
+        return self.top - self.cell_y * np.arange(self.rows, dtype=np.float64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Regrid:
+    """An organised range image -> heights over regular cells.
+
+    ``op(x, y, z, intensity, status)``, each (profiles, samples), float32 or float64 (uint8 status), NumPy or device
+    arrays; returns a `HeightMap`.
+
+    Linear between neighbouring good samples, in x and in y. Two samples are neighbours over at most `max_gap` (bad ones
+    between them are bridged then) and at most `max_step` in height.
+
+    Where the coordinate along a line runs backwards (dX/di <= 0), two surfaces share the cells: all cells from there to
+    the furthest point reached before are FOLDED. Noise makes a fine sampling run backwards by a little everywhere:
+    `fold_tolerance` says how much is noise.
+
+    Error: interpolation of a surface with curvature k between samples at a distance d errs by k d^2 / 8; in single
+    precision a cell's place is good to 6e-8 of its distance from the origin.
+
+    Parameters
+    ----------
+    grid
+        The cells.
+    max_gap, max_step
+        Largest distance between neighbours along x or y, and in height [m].
+    along
+        Scene direction in which the samples of a profile advance.
+    across
+        Scene direction in which the profiles advance: y for samples along x, and the other way round. None takes the
+        positive one.
+    fold_tolerance
+        How far a line may fall back before it counts as folded [m].
+    folded
+        ``"drop"``: FOLDED cells are NaN. ``"top"``: they keep the highest surface found, with the flag.
+    precision
+        ``"single"``, ``"double"``, or None: follows the input.
+
+    Raises
+    ------
+    ValueError
+        A length is negative or not finite, or the directions are not one of x and one of y.
+    """
+
+    grid: Grid
+    max_gap: float
+    max_step: float
+    along: Direction = "x"
+    across: Direction | None = None
+    fold_tolerance: float = 0.0
+    folded: Literal["drop", "top"] = "drop"
+    precision: Precision = None
+
+    def __post_init__(self) -> None:
+        for name in ("max_gap", "max_step", "fold_tolerance"):
+            object.__setattr__(self, name, finite(getattr(self, name), f"Regrid.{name}"))
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"Regrid.{name} is {getattr(self, name)}, expected metres, 0 or more")
+        if self.along not in _DIRECTIONS:
+            raise ValueError(f"Regrid.along is {self.along!r}, expected one of {', '.join(_DIRECTIONS)}")
+        if self.across is not None and (self.across not in _DIRECTIONS or self.across[-1] == self.along[-1]):
+            raise ValueError(f"Regrid.across is {self.across!r}, expected the axis other than along={self.along!r}")
+        if self.folded not in ("drop", "top"):
+            raise ValueError(f"Regrid.folded is {self.folded!r}, expected 'drop' or 'top'")
+
+    @property
+    def directions(self) -> tuple[Direction, Direction]:
+        """Scene directions along the samples and across the profiles, the default one filled in."""
+        positive: Direction = "y" if self.along[-1] == "x" else "x"
+        return self.along, self.across or positive
+
+    def bind(
+        self, device: Device | None, shape: tuple[int, ...], dtype: npt.DTypeLike, *, queue: Any = None
+    ) -> BoundRegrid:
+        """Prepare for range images of one shape, as `Operation.bind` does."""
+        return BoundRegrid(self, Device.best() if device is None else device, shape, np.dtype(dtype), queue)
+
+    def __call__(
+        self,
+        x: Any,
+        y: Any,
+        z: Any,
+        intensity: Any,
+        status: Any,
+        *,
+        device: Device | None = None,
+        out: HeightMap | None = None,
+    ) -> HeightMap:
+        """Run once: NumPy in, NumPy out; device arrays in, device arrays out.
+
+        Raises
+        ------
+        TypeError, ValueError
+            Wrong dtype, shape, layout or device.
+        """
+        along, across = (x, y) if self.along[-1] == "x" else (y, x)
+        lines = self._along_samples()(along, z, intensity, status, across, device=device)
+        return self._along_profiles()(lines.across, lines.z, lines.intensity, lines.status, device=device, out=out)
+
+    def _along_samples(self) -> _AlongSamples:
+        return _AlongSamples(regrid=self, direction=self.along)
+
+    def _along_profiles(self) -> _AlongProfiles:
+        return _AlongProfiles(regrid=self, direction=self.directions[1])
+
+
+class BoundRegrid:
+    """A `Regrid` bound to a device, a queue and a shape; use it as `gpuvision.host.Bound`.
+
+    Attributes
+    ----------
+    inputs : tuple of pyopencl.array.Array
+        x, y, z, intensity, status: its own input slot.
+    outputs : HeightMap of pyopencl.array.Array
+    """
+
+    def __init__(
+        self, regrid: Regrid, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any], queue: Any
+    ) -> None:
+        self.operation, self.device = regrid, device
+        self._x_first = regrid.along[-1] == "x"
+        self._samples: Bound[_Lines] = regrid._along_samples().bind(device, shape, dtype, queue=queue)
+        self._lines = self._samples.outputs
+        self._profiles: Bound[HeightMap] = regrid._along_profiles().bind(
+            device, self._lines.z.shape, self._lines.z.dtype, queue=queue
+        )
+        along, z, intensity, status, across = self._samples.inputs
+        self.inputs = (along, across, z, intensity, status) if self._x_first else (across, along, z, intensity, status)
+        self.outputs = self._profiles.outputs
+
+    def __call__(self, *frames: DeviceArray, out: HeightMap | None = None, wait_for: Any = None) -> Any:
+        """Enqueue both passes and return the event of the second.
+
+        Parameters
+        ----------
+        *frames : pyopencl.array.Array
+            x, y, z, intensity, status; none: the instance's own `inputs`.
+        out : HeightMap, optional
+            Where to write instead of `outputs`.
+        wait_for : sequence of pyopencl.Event, optional
+
+        Raises
+        ------
+        TypeError, ValueError
+            A frame is not what the instance was bound to.
+        """
+        if len(frames) not in (0, 5):
+            raise TypeError(f"expected x, y, z, intensity and status, got {len(frames)} arrays")
+        x, y, z, intensity, status = frames or self.inputs
+        along, across = (x, y) if self._x_first else (y, x)
+        first = self._samples(along, z, intensity, status, across, wait_for=wait_for)
+        lines = self._lines
+        return self._profiles(lines.across, lines.z, lines.intensity, lines.status, out=out, wait_for=[first])
+
+
+class _Lines(NamedTuple):
+    """Profiles resampled along their samples, each array (profiles, cells)."""
+
+    z: Any
+    intensity: Any
+    status: Any
+    across: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pass(Operation[R]):
+    """One pass of a `Regrid`: lines of an array onto the cells of one direction."""
+
+    regrid: Regrid
+    direction: Direction
+
+    def _numbers(self) -> npt.NDArray[np.float64]:
+        """``GRID_*`` of regrid.cl."""
+        grid, regrid = self.regrid.grid, self.regrid
+        on_x = self.direction[-1] == "x"
+        origin = grid.left if on_x else grid.top
+        # Rows run against y.
+        per_metre = 1.0 / grid.cell_x if on_x else -1.0 / grid.cell_y
+        sense = math.copysign(1.0, per_metre) * (-1.0 if self.direction.startswith("-") else 1.0)
+        per_length = abs(per_metre)
+        gap, tolerance = regrid.max_gap * per_length, regrid.fold_tolerance * per_length
+        return np.array([origin, per_metre, sense, gap, regrid.max_step, tolerance])
+
+    def _cells(self) -> int:
+        return self.regrid.grid.columns if self.direction[-1] == "x" else self.regrid.grid.rows
+
+    def _real(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.dtype[Any]:
+        if dtype not in (np.float32, np.float64):
+            raise TypeError(f"Regrid takes float32 or float64 points, got {dtype}")
+        if len(shape) != 2 or 0 in shape:
+            raise ValueError(f"Regrid takes arrays (profiles, samples) with one sample at least, got shape {shape}")
+        return real_of(self.regrid.precision, dtype)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _AlongSamples(_Pass[_Lines]):
+    """The first pass: every profile is a line, and the other coordinate rides along."""
+
+    Result: ClassVar[type[Any]] = _Lines
+
+    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        real = self._real(device, shape, dtype)
+        profiles, samples = shape
+        cells = self._cells()
+        value, flags = (shape, dtype), (shape, np.dtype(np.uint8))
+        made = (profiles, cells)
+        return Launch(
+            stem="regrid",
+            kernel="resample",
+            defines={**real_defines(device, real), "CARRY": None, "INPUT": _INPUTS[dtype.name]},
+            inputs=(value, value, value, flags, value),
+            outputs={
+                "z": (made, real),
+                "intensity": (made, real),
+                "status": (made, np.dtype(np.uint8)),
+                "across": (made, real),
+            },
+            arguments=(
+                np.array([samples, samples, 1, cells, cells, 1, 0], dtype=np.uint32),
+                self._numbers().astype(real),
+            ),
+            global_size=(profiles,),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _AlongProfiles(_Pass[HeightMap]):
+    """The second pass: every cell of the first one's is a line across the profiles."""
+
+    Result: ClassVar[type[Any]] = HeightMap
+
+    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        real = self._real(device, shape, dtype)
+        profiles, lines = shape
+        cells = self._cells()
+        value, flags = (shape, dtype), (shape, np.dtype(np.uint8))
+        made = self.regrid.grid.shape
+        # A line is a row of the map or a column of it.
+        line_pitch, cell_pitch = (cells, 1) if self.direction[-1] == "x" else (1, lines)
+        drop = int(self.regrid.folded == "drop")
+        return Launch(
+            stem="regrid",
+            kernel="resample",
+            defines={**real_defines(device, real), "INPUT": _INPUTS[dtype.name]},
+            inputs=(value, value, value, flags),
+            outputs={"z": (made, real), "intensity": (made, real), "status": (made, np.dtype(np.uint8))},
+            arguments=(
+                np.array([profiles, 1, lines, cells, line_pitch, cell_pitch, drop], dtype=np.uint32),
+                self._numbers().astype(real),
+            ),
+            global_size=(lines,),
+        )

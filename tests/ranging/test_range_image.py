@@ -1,0 +1,299 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import hypothesis
+import hypothesis.strategies as st
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+from hypothesis.extra import numpy as hnp
+
+from gpuvision import Device, Status
+from gpuvision.camera.lens import Lens
+from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
+from reference import range_image as reference
+
+WALKS = ("strip", "item")
+DTYPES = (np.float32, np.float64)
+LENSES = (None, Lens(k1=2e-8, centre=(500.0, 390.0)), Lens(k1=-1e-6, k2=1e-14, centre=(500.0, 390.0)))
+SHAPES = ((1, 1), (3, 15), (2, 16), (5, 17), (2, 1024), (3, 1043))
+TILTED = StraightTransport(
+    step=1e-4,
+    start=-2e-3,
+    g_axis=(0.0, 1.0, 0.0),
+    h_axis=(math.tan(0.7), 0.1, 1.0),
+    direction=(1.0, 0.2, 0.0),
+    origin=(0.01, -0.02, 0.03),
+)
+HEAD = RotatingSheet(
+    focal_length_px=900.0,
+    principal_point_px=(511.5, 380.25),
+    axis_point=(0.12, 0.01, -0.02),
+    axis_direction=(0.02, 1.0, -0.01),
+    sheet_normal=(1.0, 0.1, -0.05),
+    sheet_offset=0.004,
+    first_angle=-0.5,
+    angle_step=0.2,
+    scene_axes=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
+    scene_origin=(0.1, 0.7, 1.0),
+)
+
+
+def close(made: RangePoints, points: np.ndarray, status: np.ndarray, tolerance: np.ndarray | float) -> None:
+    np.testing.assert_array_equal(made.status, status)
+    for axis, values in enumerate(made[:3]):
+        truth = points[..., axis]
+        np.testing.assert_array_equal(np.isnan(values), np.isnan(truth))
+        good = np.isfinite(truth)
+        assert np.all(np.abs(values - truth)[good] <= np.broadcast_to(tolerance, truth.shape)[good])
+
+
+def expect_straight(op: RangeImage, g, h, transport, given):
+    points = reference.straight(op.geometry, g, h, transport)
+    unknown = ~np.isfinite(g) | ~np.isfinite(h) | ~np.isfinite(transport)[:, None]
+    none = np.zeros(g.shape, bool)
+    return reference.judged(points, given, unknown, none, none, op.limits)
+
+
+def expect_rotating(op: RangeImage, position, transport, given):
+    points, facing, folded = reference.rotating(op.geometry, position, transport)
+    unknown = ~np.isfinite(position) | ~np.isfinite(transport)[:, None]
+    missed = ~(facing > op.geometry.horizon)
+    return (*reference.judged(points, given, unknown, missed, folded, op.limits), facing)
+
+
+def depth_tolerance(op: RangeImage, points: np.ndarray, facing: np.ndarray, dtype: type) -> np.ndarray:
+    """Rounding of n . r (some five terms of at most 2) turns into depth by 1 / (n . r)."""
+    pinhole = op.geometry.packed()[:3]
+    distance = np.linalg.norm(points - pinhole, axis=-1)
+    with np.errstate(divide="ignore"):
+        return np.finfo(dtype).eps * (distance * (8.0 + 10.0 / np.abs(facing)) + 4.0)
+
+
+def beside_an_edge(op: RangeImage, position: np.ndarray, facing: np.ndarray) -> np.ndarray:
+    """Samples so near the horizon or the lens' fold that rounding decides."""
+    near = np.abs(facing - op.geometry.horizon) < 1e-5
+    if op.geometry.lens is None:
+        return near
+    pixels = [position, np.broadcast_to(np.arange(position.shape[1]), position.shape)]
+    if op.geometry.along == "columns":
+        pixels.reverse()
+    column, row = op.geometry.lens.centre
+    return near | (np.abs(np.hypot(pixels[0] - column, pixels[1] - row) - op.geometry.lens.fold_radius) < 1e-2)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_straight_transport_lays_profiles_side_by_side(device, rng, shape, dtype, walk):
+    g, h = rng.uniform(-0.05, 0.05, (2, *shape)).astype(dtype)
+    transport = TILTED.transport(shape[0]).astype(dtype)
+    given = rng.choice(np.array([0, 0, 0, 1, 2, 16, 32], np.uint8), shape)
+    op = RangeImage(geometry=TILTED, walk=walk)
+    # Terms are below 0.1 m, of which a handful are added.
+    close(
+        op(g, h, transport, given, device=device),
+        *expect_straight(op, g, h, transport, given),
+        tolerance=6 * 0.1 * np.finfo(dtype).eps,
+    )
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("along", ["rows", "columns"])
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_rotating_sheet_meets_the_rays(device, rng, lens, along, dtype, walk):
+    shape = (6, 1043)
+    position = rng.uniform(0, 1000, shape).astype(dtype)
+    geometry = dataclasses.replace(HEAD, lens=lens, along=along)
+    transport = geometry.transport(shape[0]).astype(dtype)
+    given = rng.choice(np.array([0, 0, 0, 1, 2, 16, 32], np.uint8), shape)
+    op = RangeImage(geometry=geometry, walk=walk)
+    points, status, facing = expect_rotating(op, position, transport, given)
+    assert {0, Status.HORIZON} <= set(np.unique(status).tolist())
+    assert lens is None or lens.k1 > 0 or np.any(status == Status.FOLDED)
+    edge = beside_an_edge(op, position, facing)
+    assert edge.mean() < 0.01
+    made = op(position, transport, given, device=device)
+    made = RangePoints(*(np.where(edge, np.nan, each) for each in made[:3]), np.where(edge, 0, made.status))
+    points[edge], status[edge] = np.nan, 0
+    close(made, points, status, depth_tolerance(op, points, facing, dtype))
+
+
+def test_a_point_of_the_scene_comes_back_from_where_the_camera_sees_it(device, rng):
+    points = rng.uniform((-0.4, -0.3, 0.8), (0.4, 0.3, 2.0), (4, 50, 3))
+    geometry = dataclasses.replace(
+        HEAD, axis_direction=(0.0, 1.0, 0.0), axis_point=(0.1, 0.0, 0.0), sheet_normal=(1.0, 0.0, 0.0), sheet_offset=0.0
+    )
+    # One profile per point: the angle at which the sheet through the axis holds it.
+    for x, y, z in points.reshape(-1, 3)[:20]:
+        angle = np.array([math.atan2(x - 0.1, z)])
+        column, row = 511.5 + 900.0 * x / z, 380.25 + 900.0 * y / z
+        seen = dataclasses.replace(geometry, principal_point_px=(511.5, 380.25 - row))
+        made = RangeImage(geometry=seen)(np.array([[column]]), angle, np.zeros((1, 1), np.uint8), device=device)
+        truth = np.array(geometry.scene_axes) @ (np.array([x, y, z]) - geometry.scene_origin)
+        np.testing.assert_allclose([made.x[0, 0], made.y[0, 0], made.z[0, 0]], truth, atol=1e-11)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_what_cannot_be_trusted_is_flagged_and_nan(device, walk):
+    bad = np.array([np.nan, np.inf, -np.inf, 0.0, 0.0, 0.0, 0.0, 3e38], np.float32)
+    given = np.array([0, 0, 1, 1, 2, 16, 18, 0], np.uint8)
+    geometry = StraightTransport(g_axis=(3.0, 0.0, 0.0))
+    made = RangeImage(geometry=geometry, walk=walk)(
+        bad[None], np.zeros((1, 8), np.float32), np.zeros(1, np.float32), given[None], device=device
+    )
+    # Flags that came with a value, and those without, pass; a result that overflows is no number.
+    assert made.status[0].tolist() == [8, 8, 1, 1, 2, 16, 18, 8]
+    assert np.isfinite(made.z[0]).tolist() == [False] * 4 + [True] * 3 + [False]
+    assert np.array_equal(np.isfinite(made.x), np.isfinite(made.z))
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("geometry", [TILTED, HEAD], ids=["straight", "rotating"])
+def test_an_unknown_transport_spoils_its_profile_only(device, geometry, walk):
+    profile = np.full((3, 20), 300.0 if geometry is HEAD else 0.01, np.float32)
+    transport = geometry.transport(3).astype(np.float32)
+    given = np.zeros(profile.shape, np.uint8)
+    op = RangeImage(geometry=geometry, walk=walk)
+    frames = (profile,) * geometry.inputs
+    whole = op(*frames, transport, given, device=device)
+    transport[1] = np.nan
+    spoilt = op(*frames, transport, given, device=device)
+    assert np.all(spoilt.status[1] == Status.NOT_FINITE)
+    assert np.all(np.isnan(spoilt.x[1]))
+    np.testing.assert_array_equal(spoilt.x[::2], whole.x[::2])
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_limits_are_inclusive(device, walk):
+    g = np.array([[-0.5, -0.25, 0.0, 0.25, 0.5]], np.float32)
+    op = RangeImage(geometry=StraightTransport(), limits=((-0.25, 0.25), (-1, 1), (0, 1)), walk=walk)
+    made = op(g, np.zeros_like(g), np.zeros(1, np.float32), np.zeros(g.shape, np.uint8), device=device)
+    assert made.status[0].tolist() == [4, 0, 0, 0, 4]
+    assert np.isnan(made.y[0]).tolist() == [True, False, False, False, True]
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_a_sheet_through_the_pinhole_measures_nothing(device, walk):
+    geometry = dataclasses.replace(HEAD, axis_point=(0.0, 0.0, 0.0), sheet_offset=0.0)
+    position = np.linspace(0, 1000, 40, dtype=np.float32)[None]
+    made = RangeImage(geometry=geometry, walk=walk)(
+        position, np.zeros(1, np.float32), np.zeros(position.shape, np.uint8), device=device
+    )
+    assert np.all(made.status == Status.HORIZON)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_nothing_is_written_beyond_the_image(device, walk):
+    shape, canary = (3, 37), 1234.5
+    op = RangeImage(geometry=StraightTransport(), walk=walk)
+    bound = op.bind(device, shape, np.float32)
+    room = [cl.array.zeros(device.queue, (5, 37), np.float32) + canary for _ in range(3)]
+    status = cl.array.zeros(device.queue, (5, 37), np.uint8) + 77
+    # The first three profiles of larger arrays: what lies behind them stays.
+    small = [cl.array.Array(device.queue, shape, each.dtype, data=each.base_data) for each in (*room, status)]
+    bound(out=RangePoints(*small)).wait()
+    for each in room:
+        assert np.all(each.get()[3:] == canary)
+        assert np.all(each.get()[:3] == 0)
+    assert np.all(status.get()[3:] == 77)
+
+
+@hypothesis.settings(max_examples=25, deadline=None)
+@hypothesis.given(data=st.data(), shape=hnp.array_shapes(min_dims=2, max_dims=2, min_side=0, max_side=40))
+def test_any_shape_and_any_number(data, shape):
+    values = st.floats(width=32, allow_nan=True, allow_infinity=True, allow_subnormal=False)
+    g = data.draw(hnp.arrays(np.float32, shape, elements=values))
+    given = data.draw(hnp.arrays(np.uint8, shape, elements=st.sampled_from([0, 1, 2, 16, 32, 64])))
+    transport = np.linspace(0, 1, shape[0], dtype=np.float32)
+    results = [
+        RangeImage(geometry=StraightTransport(), walk=walk)(g, g, transport, given, device=device)
+        for device in Device.all()
+        for walk in WALKS
+    ]
+    for made in results:
+        good = (made.status & ~np.uint8(Status.SATURATED | Status.AMBIGUOUS)) == 0
+        for values in made[:3]:
+            np.testing.assert_array_equal(np.isfinite(values), good)
+        np.testing.assert_array_equal(made.status, results[0].status)
+        np.testing.assert_array_equal(made.x, np.where(good, g, np.nan))
+
+
+def test_bound_and_device_arrays_give_the_same(device, rng):
+    g, h = rng.uniform(-0.05, 0.05, (2, 4, 100)).astype(np.float32)
+    transport, given = TILTED.transport(4).astype(np.float32), np.zeros((4, 100), np.uint8)
+    op = RangeImage(geometry=TILTED)
+    truth = op(g, h, transport, given, device=device)
+    frames = [cl.array.to_device(device.queue, each) for each in (g, h, transport, given)]
+    on_device = op(*frames)
+    bound = op.bind(device, g.shape, g.dtype)
+    bound(*frames).wait()
+    for name in RangePoints._fields:
+        np.testing.assert_array_equal(getattr(on_device, name).get(), getattr(truth, name))
+        np.testing.assert_array_equal(getattr(bound.outputs, name).get(), getattr(truth, name))
+
+
+def test_double_is_asked_for_by_precision(device):
+    g = np.full((1, 3), 0.1, np.float32)
+    op = RangeImage(geometry=StraightTransport(), precision="double")
+    made = op(g, g, np.zeros(1, np.float32), np.zeros((1, 3), np.uint8), device=device)
+    assert made.x.dtype == np.float64
+    assert made.x[0, 0] == float(np.float32(0.1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"focal_length_px": 0.0}, "focal_length_px is 0.0, expected a number above 0"),
+        ({"horizon": -1.0}, "horizon is -1.0"),
+        ({"principal_point_px": (1.0,)}, "has 1 numbers, expected \\(column, row\\)"),
+        ({"axis_point": (0.0, math.nan, 0.0)}, "axis_point must be finite"),
+        ({"axis_direction": (0.0, 0.0, 0.0)}, "axis_direction is 0, expected a direction"),
+        ({"sheet_normal": HEAD.axis_direction}, "normal lies along the axis"),
+        ({"along": "row"}, "expected 'rows' or 'columns'"),
+        ({"scene_axes": ((1, 0, 0), (0, 1, 0), (0, 1, 0))}, "not three orthonormal vectors"),
+    ],
+)
+def test_a_wrong_rotating_sheet_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(HEAD, **change)
+
+
+def test_a_wrong_transport_is_refused():
+    with pytest.raises(ValueError, match="lie in one plane"):
+        StraightTransport(direction=(1.0, 0.0, 1.0))
+    with pytest.raises(ValueError, match="step is 0"):
+        StraightTransport(step=0.0)
+    with pytest.raises(ValueError, match="has no step; give the encoder's positions"):
+        StraightTransport().transport(3)
+    with pytest.raises(ValueError, match="has no angle_step; give the encoder's angles"):
+        dataclasses.replace(HEAD, angle_step=None).transport(3)
+    with pytest.raises(ValueError, match="expected \\(lowest, highest\\) for x, y and z"):
+        RangeImage(geometry=TILTED, limits=((0, 0), (0, 1), (0, 1)))
+
+
+def test_wrong_input_is_refused(device):
+    op = RangeImage(geometry=StraightTransport())
+    g, transport, given = np.zeros((2, 3), np.float32), np.zeros(2, np.float32), np.zeros((2, 3), np.uint8)
+    with pytest.raises(TypeError, match="float32 or float64 profiles, got int32"):
+        op(g.astype(np.int32), g, transport, given, device=device)
+    with pytest.raises(ValueError, match="takes \\(profiles, samples\\), got an array of shape \\(6,\\)"):
+        op(g.ravel(), g.ravel(), transport, given, device=device)
+    with pytest.raises(ValueError, match="expected shape \\(2,\\), got \\(3,\\)"):
+        op(g, g, np.zeros(3, np.float32), given, device=device)
+    with pytest.raises(TypeError, match="expected 4 input arrays, got 3"):
+        op(g, transport, given, device=device)
+
+
+@pytest.mark.parametrize("geometry", [TILTED, dataclasses.replace(HEAD, lens=Lens(k1=1e-8, centre=(4.0, 5.0)))])
+def test_a_geometry_survives_its_table(geometry):
+    assert type(geometry).from_dict(geometry.to_dict()) == geometry
+
+
+def test_an_unknown_key_of_a_table_is_named():
+    with pytest.raises(ValueError, match="unknown key 'angle'"):
+        RotatingSheet.from_dict({**HEAD.to_dict(), "angle": 3})

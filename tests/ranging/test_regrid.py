@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import hypothesis
+import hypothesis.strategies as st
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+from hypothesis.extra import numpy as hnp
+
+from gpuvision import Device, Status
+from gpuvision.ranging.regrid import Grid, HeightMap, Regrid
+from reference import regrid as reference
+
+DTYPES = (np.float32, np.float64)
+GRID = Grid(left=-1.0, top=2.0, cell_x=0.125, cell_y=0.25, columns=17, rows=13)
+OP = Regrid(grid=GRID, max_gap=0.5, max_step=0.25)
+
+
+def flat(shape: tuple[int, int], dtype: type = np.float64) -> list[np.ndarray]:
+    """A scan of samples along x and profiles along y, over GRID and a little more, at height x + y / 2."""
+    x, y = np.meshgrid(np.linspace(-1.05, 1.05, shape[1]), np.linspace(-1.1, 2.1, shape[0]))
+    return [each.astype(dtype) for each in (x, y, x + y / 2, 10 * x)] + [np.zeros(shape, np.uint8)]
+
+
+def close(made: HeightMap, truth: HeightMap, tolerance: float) -> None:
+    np.testing.assert_array_equal(made.status, truth.status)
+    for values, right in zip(made[:2], truth[:2], strict=True):
+        np.testing.assert_allclose(values, right, rtol=0, atol=tolerance, equal_nan=True)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("transposed", [False, True])
+def test_a_plane_is_resampled_exactly(device, dtype, transposed):
+    frames = flat((40, 61), dtype)
+    op = OP
+    if transposed:
+        frames = [np.ascontiguousarray(each.T) for each in frames]
+        op = dataclasses.replace(op, along="y")
+    made = op(*frames, device=device)
+    x, y = np.meshgrid(GRID.x, GRID.y)
+    assert np.all(made.status == 0)
+    # Linear interpolation has no error on a plane but rounding of numbers up to 10, by a few operations.
+    np.testing.assert_allclose(made.z, x + y / 2, rtol=0, atol=8 * 2 * np.finfo(dtype).eps)
+    np.testing.assert_allclose(made.intensity, 10 * x, rtol=0, atol=8 * 10 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("directions", [("x", "y"), ("-x", "y"), ("x", "-y"), ("-y", "-x"), ("y", "x")])
+def test_the_direction_of_the_scan_does_not_matter(device, directions):
+    frames = flat((40, 61))
+    truth = OP(*frames, device=device)
+    along, across = directions
+    if along[-1] == "y":
+        frames = [each.T for each in frames]
+    frames = [
+        np.ascontiguousarray(each[:: 1 if len(across) == 1 else -1, :: 1 if len(along) == 1 else -1]) for each in frames
+    ]
+    made = dataclasses.replace(OP, along=along, across=across)(*frames, device=device)
+    close(made, truth, 1e-14)
+
+
+def test_a_scan_against_its_direction_is_folded_all_over(device):
+    x, y, z, intensity, status = flat((40, 61))
+    made = dataclasses.replace(OP, along="-x")(x, y, z, intensity, status, device=device)
+    assert np.all(made.status == Status.FOLDED)
+    assert np.all(np.isnan(made.z))
+
+
+def test_a_gap_stays_a_hole_that_says_why(device):
+    frames = flat((40, 61))
+    x, y, status = frames[0], frames[1], frames[4]
+    status[8:32, 20:40] = Status.DARK
+    made = OP(*frames, device=device)
+    inside = (GRID.x > x[0, 19]) & (GRID.x < x[0, 40])
+    assert inside.sum() > 3
+    within = (GRID.y > y[7, 0]) & (GRID.y < y[32, 0])
+    gap = within[:, None] & inside
+    assert np.all(made.status[gap] == Status.HOLE | Status.DARK)
+    assert np.all(np.isnan(made.z[gap]))
+    assert np.all(made.status[~gap] == 0)
+    bridged = dataclasses.replace(OP, max_gap=0.8, max_step=0.8)(*frames, device=device)
+    np.testing.assert_allclose(bridged.z, GRID.x + GRID.y[:, None] / 2, atol=1e-14)
+
+
+def test_a_step_is_not_joined(device):
+    x, y, z, intensity, status = flat((40, 61))
+    z = np.where(x > 0.03, 0.3, 0.0)
+    made = OP(x, y, z, intensity, status, device=device)
+    edge = (GRID.x > x[x <= 0.03].max()) & (GRID.x < x[x > 0.03].min())
+    profile = np.where(edge, np.nan, np.where(GRID.x > 0.03, 0.3, 0.0))
+    np.testing.assert_array_equal(made.z, np.broadcast_to(profile, GRID.shape))
+    joined = dataclasses.replace(OP, max_step=0.31)(x, y, z, intensity, status, device=device)
+    assert np.all(np.isfinite(joined.z))
+
+
+def test_flags_that_inform_ride_along(device):
+    x, y, z, intensity, status = flat((40, 61))
+    status[:, 30] = Status.SATURATED
+    status[10, :] |= np.uint8(Status.AMBIGUOUS)
+    made = OP(x, y, z, intensity, status, device=device)
+    assert np.all(np.isfinite(made.z))
+    near_column = np.abs(GRID.x - x[0, 30]) < x[0, 1] - x[0, 0]
+    np.testing.assert_array_equal((made.status & Status.SATURATED) != 0, np.broadcast_to(near_column, GRID.shape))
+    near_row = np.abs(GRID.y - y[10, 0]) < y[1, 0] - y[0, 0]
+    np.testing.assert_array_equal((made.status & Status.AMBIGUOUS) != 0, np.broadcast_to(near_row[:, None], GRID.shape))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_scan_that_turns_back_is_folded_where_it_does(device, dtype):
+    # x rises to 0.5, falls to -0.5 and rises again: what lies between was passed three times.
+    turns = np.concatenate([np.arange(-72, 32), np.arange(32, -32, -1), np.arange(-32, 72)]) / 64
+    shape = (20, len(turns))
+    x = np.broadcast_to(turns, shape).astype(dtype)
+    y = np.broadcast_to(np.linspace(-2, 3, 20)[:, None], shape).astype(dtype)
+    z = np.full(shape, 0.5, dtype)
+    frames = [np.ascontiguousarray(each) for each in (x, y, z, z)] + [np.zeros(shape, np.uint8)]
+    made = OP(*frames, device=device)
+    folded = (GRID.x >= -0.5) & (GRID.x <= 0.5)
+    np.testing.assert_array_equal(made.status, np.broadcast_to(np.where(folded, Status.FOLDED, 0), GRID.shape))
+    assert np.all(np.isnan(made.z[:, folded]))
+    kept = dataclasses.replace(OP, folded="top")(*frames, device=device)
+    np.testing.assert_array_equal(kept.status, made.status)
+    assert np.all(kept.z == 0.5)
+
+
+def test_of_two_surfaces_the_higher_one_is_kept(device):
+    x = np.array([[0.0, 0.5, 1.0, 0.25, 0.75, 1.0]]).repeat(2, 0)
+    z = np.array([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]]).repeat(2, 0)
+    y = np.array([[2.0], [1.75]]).repeat(6, 1)
+    status = np.zeros(x.shape, np.uint8)
+    op = dataclasses.replace(OP, folded="top", across="-y")
+    made = op(x, y, z, z, status, device=device)
+    row = made.z[0, (GRID.x >= 0) & (GRID.x <= 1)]
+    np.testing.assert_array_equal(row, np.ones(9))
+    flags = made.status[0, (GRID.x >= 0) & (GRID.x <= 1)]
+    np.testing.assert_array_equal(flags, [0, 0] + [Status.FOLDED] * 7)
+
+
+def test_noise_within_the_tolerance_is_no_fold(device, rng):
+    x, y, z, intensity, status = flat((40, 61))
+    x = x + rng.uniform(-0.03, 0.03, x.shape)
+    assert np.any(np.diff(x, axis=1) < 0)
+    assert np.any(OP(x, y, z, intensity, status, device=device).status & Status.FOLDED)
+    made = dataclasses.replace(OP, fold_tolerance=0.1)(x, y, z, intensity, status, device=device)
+    assert not np.any(made.status & Status.FOLDED)
+
+
+def test_samples_on_one_place_are_folded_there(device):
+    x, y, z, intensity, status = flat((40, 61))
+    x[:] = np.linspace(-1.0, 1.4, 61)
+    x[:, 26] = x[:, 25]  # = 0.0, the centre of a cell
+    made = OP(x, y, z, intensity, status, device=device)
+    np.testing.assert_array_equal(np.flatnonzero(made.status[3] == Status.FOLDED), [8])
+
+
+@hypothesis.settings(max_examples=60, deadline=None)
+@hypothesis.given(data=st.data(), shape=hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12))
+def test_as_the_oracle(data, shape):
+    # Places and heights on a fine dyadic raster are exact in single precision: the decisions must be the same.
+    def numbers(low, high, part):
+        return data.draw(hnp.arrays(np.float32, shape, elements=st.integers(low, high).map(lambda n: n / part)))
+
+    ramp = np.broadcast_to(np.linspace(-1, 1, shape[1]).round(4), shape)
+    x = (np.round(ramp * 64) / 64 + numbers(-8, 24, 64)).astype(np.float32)
+    y = (np.broadcast_to(np.arange(shape[0])[:, None] / 4, shape) - 0.5 + numbers(-6, 6, 32)).astype(np.float32)
+    z, intensity = numbers(0, 12, 16), numbers(0, 100, 1)
+    holes = st.sampled_from([np.nan, np.inf, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])
+    z = z + data.draw(hnp.arrays(np.float32, shape, elements=holes))
+    given = data.draw(hnp.arrays(np.uint8, shape, elements=st.sampled_from([0] * 8 + [1, 2, 4, 16, 64])))
+    op = Regrid(
+        grid=GRID,
+        max_gap=data.draw(st.sampled_from([0.0, 0.25, 0.5, 1.0])),
+        max_step=data.draw(st.sampled_from([0.0, 0.25, 1.0])),
+        along=data.draw(st.sampled_from(["x", "-x"])),
+        across=data.draw(st.sampled_from(["y", "-y"])),
+        fold_tolerance=data.draw(st.sampled_from([0.0, 0.0625, 0.25])),
+        folded=data.draw(st.sampled_from(["drop", "top"])),
+        precision="double",
+    )
+    truth = reference.regrid(op, x, y, z, intensity, given)
+    for device in Device.all():
+        close(op(x, y, z, intensity, given, device=device), truth, 1e-12)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_large_scan_as_the_oracle(device, rng, dtype):
+    shape = (50, 130)
+    x, y, _, intensity, status = flat(shape)
+    x, y = x + rng.normal(0, 0.002, shape), y + 0.1 * x
+    z = np.sin(3 * x) * np.cos(2 * y)
+    status[rng.random(shape) < 0.1] = Status.DARK
+    frames = [each.astype(dtype) for each in (x, y, z, intensity)] + [status]
+    made, truth = OP(*frames, device=device), reference.regrid(OP, *frames)
+    # In single precision a sample next to a cell's centre may fall on its other side: the value is the same there.
+    assert np.mean(made.status != truth.status) <= (0.0 if dtype is np.float64 else 0.01)
+    both = np.isfinite(made.z) & np.isfinite(truth.z)
+    assert both.mean() > 0.9
+    np.testing.assert_allclose(made.z[both], truth.z[both], rtol=0, atol=40 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1)])
+def test_too_few_points_are_holes(device, shape):
+    frames = [np.zeros(shape, np.float32) for _ in range(4)] + [np.zeros(shape, np.uint8)]
+    made = OP(*frames, device=device)
+    assert made.z.shape == GRID.shape
+    assert np.all((made.status & Status.HOLE) != 0)
+    assert np.all(np.isnan(made.z))
+
+
+def test_bound_out_and_device_arrays_give_the_same(device):
+    frames = flat((40, 61), np.float32)
+    truth = OP(*frames, device=device)
+    out = HeightMap(*(np.empty_like(each) for each in truth))
+    assert OP(*frames, device=device, out=out) is out
+    arrays = [cl.array.to_device(device.queue, each) for each in frames]
+    on_device = OP(*arrays)
+    for along in ("x", "y"):
+        op = dataclasses.replace(OP, along=along)
+        bound = op.bind(device, frames[0].shape, np.float32)
+        bound(*arrays).wait()
+        right = op(*frames, device=device)
+        for array, frame in zip(bound.inputs, frames, strict=True):
+            cl.enqueue_copy(device.queue, array.base_data, frame) if not device.shares_memory else array.set(frame)
+        for name in HeightMap._fields:
+            np.testing.assert_array_equal(getattr(bound.outputs, name).get(), getattr(right, name))
+    for name in HeightMap._fields:
+        np.testing.assert_array_equal(getattr(out, name), getattr(truth, name))
+        np.testing.assert_array_equal(getattr(on_device, name).get(), getattr(truth, name))
+
+
+def test_a_grid_covers_the_points():
+    grid = Grid.covering([0.013, np.nan, -0.021], [0.5, 7.0, 0.42], 0.01)
+    assert (grid.columns, grid.rows) == (6, 9)
+    np.testing.assert_allclose([grid.x[0], grid.x[-1], grid.y[0], grid.y[-1]], [-0.03, 0.02, 0.5, 0.42], atol=1e-15)
+    with pytest.raises(ValueError, match="no finite point"):
+        Grid.covering([np.nan], [1.0], 0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"max_gap": -1.0}, "max_gap is -1.0, expected metres, 0 or more"),
+        ({"max_step": math.nan}, "max_step must be finite"),
+        ({"along": "z"}, "along is 'z', expected one of x, -x, y, -y"),
+        ({"across": "-x"}, "expected the axis other than along='x'"),
+        ({"folded": "keep"}, "expected 'drop' or 'top'"),
+    ],
+)
+def test_a_wrong_regrid_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(OP, **change)
+
+
+def test_wrong_input_is_refused(device):
+    x, y, z, intensity, status = flat((4, 5))
+    with pytest.raises(TypeError, match="float32 or float64 points, got int64"):
+        OP(x.astype(np.int64), y, z, intensity, status, device=device)
+    with pytest.raises(ValueError, match="one sample at least, got shape \\(20,\\)"):
+        OP(*(each.ravel() for each in (x, y, z, intensity, status)), device=device)
+    with pytest.raises(ValueError, match="one sample at least, got shape \\(0, 5\\)"):
+        OP(*(each[:0] for each in (x, y, z, intensity, status)), device=device)
+    with pytest.raises(ValueError, match="columns is 0, expected a number above 0"):
+        dataclasses.replace(GRID, columns=0)
+    bound = OP.bind(device, (4, 5), np.float64)
+    with pytest.raises(TypeError, match="expected x, y, z, intensity and status, got 1 arrays"):
+        bound(x)

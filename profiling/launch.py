@@ -1,0 +1,57 @@
+"""What a bound operation costs over pyopencl's own enqueue, from Python: a hundred launches of next to no work."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pyopencl as cl
+
+from gpuvision.host import Device
+from gpuvision.profiling.harness import Case
+from gpuvision.ranging.psd import PsdReadout
+
+_LAUNCHES = 100
+_REPEATS = 50
+
+
+def cases(device: Device) -> Iterator[Case]:
+    """Yield `bound`: preset arguments; and `given`: another input array with each call."""
+    bound = PsdReadout(strip_length=6e-3).bind(device, (16, 2), np.float32)
+    frames = [device.empty((16, 2), np.float32) for _ in range(2)]
+    for frame in frames:
+        frame.set(np.ones((16, 2), np.float32))
+    # A bound instance's own kernel and sizes, launched without it.
+    kernel, sizes = bound._kernel, (bound._global, bound._local)
+
+    def plain() -> None:
+        for _ in range(_LAUNCHES):
+            cl.enqueue_nd_range_kernel(device.queue, kernel, *sizes)
+        device.queue.finish()
+
+    def preset() -> None:
+        for _ in range(_LAUNCHES):
+            bound()
+        device.queue.finish()
+
+    def given() -> None:
+        for number in range(_LAUNCHES):
+            bound(frames[number % 2])
+        device.queue.finish()
+
+    for name, call in (("bound", preset), ("given", given)):
+        facts = {"overhead_us": _overhead(call, plain) * 1e6}
+        yield Case("launch", f"{name}/{_LAUNCHES}", call, {"pyopencl": plain}, error=0.0, facts=facts)
+
+
+def _overhead(call: Callable[[], None], plain: Callable[[], None]) -> float:
+    """Return the median extra time of one launch [s]."""
+    extra = []
+    for _ in range(_REPEATS):
+        start = time.perf_counter()
+        call()
+        between = time.perf_counter()
+        plain()
+        extra.append((between - start - (time.perf_counter() - between)) / _LAUNCHES)
+    return float(np.median(extra))

@@ -1,0 +1,193 @@
+"""Bind and call: checks, lifetimes, threads, and memory that is shared or not."""
+
+from __future__ import annotations
+
+import gc
+import threading
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from gpuvision.host import BuildError, Device, host_view
+from gpuvision.host.arrays import memory_of
+from gpuvision.host.program import build, options
+from gpuvision.ranging.psd import PsdReadout
+
+READOUT = PsdReadout(strip_length=2.0)
+
+
+@pytest.fixture
+def pairs(rng):
+    return rng.uniform(0.1, 1.0, (1000, 2)).astype(np.float32)
+
+
+@pytest.fixture(params=["shared", "copied"])
+def memory(request, device):
+    """The device as it is, and as if it had memory of its own, like a graphics card."""
+    if request.param == "shared" and not device.shares_memory:
+        pytest.skip("this device has memory of its own")
+    if request.param == "shared":
+        return device
+    separate = Device(device.handle, device.label, device.kind)
+    separate.shares_memory = False
+    return separate
+
+
+def expected(pairs):
+    left, right = pairs.astype(np.float64).T
+    return (right - left) / (right + left)
+
+
+def test_numpy_goes_in_and_comes_out(memory, pairs):
+    position = READOUT(pairs, device=memory).position
+    assert isinstance(position, np.ndarray)
+    np.testing.assert_allclose(position, expected(pairs), atol=5e-7)
+
+
+def test_out_is_written_and_returned(memory, pairs):
+    first = READOUT(pairs, device=memory)
+    addresses = [array.ctypes.data for array in first if array is not None]
+    again = READOUT(pairs[::-1].copy(), device=memory, out=first)
+    assert again is first
+    assert [array.ctypes.data for array in again if array is not None] == addresses
+    np.testing.assert_allclose(again.position, expected(pairs[::-1]), atol=5e-7)
+
+
+def test_a_read_only_input_is_fine(memory, pairs):
+    pairs.flags.writeable = False
+    np.testing.assert_allclose(READOUT(pairs, device=memory).position, expected(pairs), atol=5e-7)
+
+
+def test_device_arrays_stay_on_the_device(memory, pairs):
+    frame = memory.empty(pairs.shape, pairs.dtype)
+    frame.set(pairs)
+    reading = READOUT(frame)
+    assert isinstance(reading.position, cl.array.Array)
+    np.testing.assert_allclose(reading.position.get(), expected(pairs), atol=5e-7)
+
+
+def test_a_bound_instance_keeps_what_a_running_kernel_uses(memory):
+    many = np.ones((400_000, 2), np.float32)
+    bound = READOUT.bind(memory, many.shape, many.dtype)
+    events = []
+    for number in range(20):
+        frame = memory.empty(many.shape, many.dtype)
+        frame.set(many * np.array([1, number + 1], np.float32))
+        events.append(bound(frame))
+        del frame
+        gc.collect()
+    cl.wait_for_events(events)
+    np.testing.assert_allclose(bound.outputs.position.get(), 19 / 21, atol=1e-6)
+
+
+def test_own_input_after_a_given_one(memory, pairs):
+    bound = READOUT.bind(memory, pairs.shape, pairs.dtype)
+    bound.inputs[0].set(pairs)
+    other = memory.empty(pairs.shape, pairs.dtype)
+    other.set(pairs[::-1].copy())
+    bound(other).wait()
+    np.testing.assert_allclose(bound.outputs.position.get(), expected(pairs[::-1]), atol=5e-7)
+    bound().wait()
+    np.testing.assert_allclose(bound.outputs.position.get(), expected(pairs), atol=5e-7)
+
+
+def test_calls_wait_for_events(device, pairs):
+    gate = cl.UserEvent(device.context)
+    bound = READOUT.bind(device, pairs.shape, pairs.dtype)
+    event = bound(wait_for=[gate])
+    assert event.command_execution_status != cl.command_execution_status.COMPLETE
+    gate.set_status(cl.command_execution_status.COMPLETE)
+    event.wait()
+
+
+def test_threads_do_not_share_a_kernel(device, rng):
+    batches = [rng.uniform(0.1, 1.0, (2000, 2)).astype(np.float32) for _ in range(4)]
+    wrong = []
+
+    def work(batch):
+        for _ in range(50):
+            position = READOUT(batch, device=device).position
+            if not np.allclose(position, expected(batch), atol=5e-7):
+                wrong.append(batch)
+
+    threads = [threading.Thread(target=work, args=(batch,)) for batch in batches]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_another_dtype_shape_kind_or_number_is_told(device, pairs):
+    bound = READOUT.bind(device, pairs.shape, pairs.dtype)
+    with pytest.raises(TypeError, match="expected dtype float32, got float64"):
+        bound(device.empty(pairs.shape, np.float64))
+    with pytest.raises(ValueError, match=r"expected shape \(1000, 2\), got \(999, 2\)"):
+        bound(device.empty((999, 2), np.float32))
+    with pytest.raises(TypeError, match="expected a pyopencl array"):
+        bound(pairs)
+    with pytest.raises(TypeError, match="expected 1 input arrays, got 2"):
+        bound(bound.inputs[0], bound.inputs[0])
+    with pytest.raises(TypeError, match="expected 1 input arrays, got 2"):
+        READOUT(pairs, pairs, device=device)
+    with pytest.raises(TypeError, match="all of one kind"):
+        READOUT(pairs, bound.inputs[0], device=device)
+    bound().wait()  # what was refused has not spoilt it
+
+
+def test_an_array_of_another_device_is_refused(pairs):
+    devices = Device.all()
+    if len(devices) < 2:
+        pytest.skip("there is one device only")
+    frame = devices[0].empty(pairs.shape, pairs.dtype)
+    with pytest.raises(ValueError, match="copy it there first"):
+        READOUT(frame, device=devices[1])
+    with pytest.raises(ValueError, match="another device"):
+        READOUT.bind(devices[1], pairs.shape, pairs.dtype)(frame)
+
+
+def test_a_part_of_an_array_is_refused(device):
+    whole = device.empty((10, 2), np.float32)
+    assert memory_of(whole) is whole.base_data
+    with pytest.raises(ValueError, match="whole C-contiguous"):
+        memory_of(whole[2:])
+
+
+def test_host_view_is_the_memory_itself(device):
+    if not device.shares_memory:
+        pytest.skip("this device has memory of its own")
+    array = device.empty((5, 3), np.float32)
+    view = host_view(array)
+    view[...] = 7.0
+    np.testing.assert_array_equal(array.get(), 7.0)
+    del array
+    gc.collect()
+    view[...] = 8.0  # the view keeps the memory
+    assert (view == 8.0).all()
+
+
+def test_host_view_refuses_memory_that_is_not_shared(device):
+    buffer = cl.array.Array(device.queue, (4,), np.float32)
+    with pytest.raises(ValueError, match="array.get"):
+        host_view(buffer)
+
+
+def test_a_program_is_built_once(device):
+    defines = {"CODE": "float", "CODE16": "float16", "WITH_POSITION": None}
+    assert build(device, "psd", defines) is build(device, "psd", dict(reversed(defines.items())))
+
+
+def test_a_kernel_that_does_not_compile_is_told_with_its_log(device):
+    with pytest.raises(BuildError, match=r"kernels/psd\.cl does not build with .*-DCODE=nonsense"):
+        build(device, "psd", {"CODE": "nonsense", "CODE16": "float16"})
+
+
+def test_no_option_gives_up_on_nan():
+    words = " ".join(options({"A": 1, "B": None}))
+    assert words == "-cl-mad-enable -DA=1 -DB"
+
+
+def test_the_memory_of_a_caller_without_contiguity_is_refused(device, pairs):
+    with pytest.raises(ValueError, match="ascontiguousarray"):
+        READOUT(pairs[::2], device=device)

@@ -1,0 +1,306 @@
+"""Light lines in camera frames: every column (or row) of a frame becomes a sub-pixel position of the light.
+
+The line crosses the frame along its columns axis (``along="columns"``: a row coordinate for every column) or along
+its rows axis (``along="rows"``: a column coordinate for every row). One such column or row of samples is a *profile*.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.tables import finite
+
+Method = Literal["whole", "windowed", "gauss3", "fir", "ml"]
+Choice = Literal["strongest", "first", "last", "nearest"]
+
+METHODS = ("whole", "windowed", "gauss3", "fir", "ml")
+CHOICES = ("strongest", "first", "last", "nearest")
+LONGEST_PROFILE = 32767  # samples: indices of narrow lanes are 16 bits
+WIDEST_WINDOW = 180  # samples either side: moments of 16-bit samples in 32 bits
+_CODES = {"uint8": ("uchar", 8), "uint16": ("ushort", 16), "float32": ("float", 32)}
+_LANES = 16
+_STRIP = 1024  # columns of a strip at most, MAX_STRIP in line_strip.h
+_WIDE_BYTES = 64  # of neighbouring samples that a strip works on at once
+
+
+class LineReading(NamedTuple):
+    """What a frame's line says, each array of shape (batch..., samples); fields not asked for are ``None``.
+
+    Attributes
+    ----------
+    position
+        Place of the light along the profile [pixel]; NaN where the status has DARK, OUT_OF_RANGE or NOT_FINITE.
+    peak
+        The peak's sample as recorded; the strongest sample where there is no peak.
+    width
+        Samples over the threshold: in the run that holds the peak, for ``method="whole"`` in the whole profile.
+    total
+        Light over the threshold [grey levels]: in the window, for ``method="whole"`` in the whole profile.
+    status
+        uint8 `Status` flags. DARK: no peak that the parameters allow, or too little light beside it for the method.
+        OUT_OF_RANGE: the border cuts the window (for ``"whole"``: a border sample has half the peak's light or
+        more). NOT_FINITE: a sample of the profile is NaN or infinite. With a value: SATURATED (the peak is at the
+        saturation level), AMBIGUOUS (a second peak is comparable, or the fit fell back to the middle of a flat top).
+        HORIZON and FOLDED come from the triangulation.
+    g, h
+        The point in the sheet of light [m], where the readout has a triangulation.
+    """
+
+    position: Any = None
+    peak: Any = None
+    width: Any = None
+    total: Any = None
+    status: Any = None
+    g: Any = None
+    h: Any = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineReadout(Operation[LineReading]):
+    """Light lines to positions: ``readout(frames) -> LineReading``.
+
+    Takes uint8, uint16 or float32 frames of shape (..., rows, columns). Light is what a sample has over the
+    threshold. Of samples that tie for the peak the first one counts; a flat top counts by its middle.
+
+    Parameters
+    ----------
+    method : {"windowed", "whole", "gauss3", "fir", "ml"}
+        ``"whole"``: centre of gravity of all light in the profile. The others look at the window around one peak:
+        ``"windowed"`` takes its centre of gravity, ``"gauss3"`` a parabola through the logarithms of the peak and
+        its neighbours, ``"fir"`` the zero crossing of a derivative filter (Blais and Rioux, 1986), ``"ml"`` the most
+        likely pixel-integrated Gaussian on an unknown background, for noise of variance
+        ``read_noise**2 + gain * level``.
+    along : {"columns", "rows"}
+        Which axis of the frame the line runs along: a profile is a column, or a row.
+    threshold
+        Level below which a sample counts as no light [grey levels]; for integer frames a whole number.
+    window
+        Samples either side of the peak that count.
+    choice : {"strongest", "first", "last", "nearest"}
+        Which peak, where there are several. A peak is the strongest sample of a run of samples over the threshold.
+        ``"nearest"``: to the position of an earlier reading, given as a second input of shape (..., samples) in the
+        readout's precision, rounded to whole pixels; where that is NaN, the strongest.
+    minimum_peak
+        Weakest sample that can be a peak [grey levels].
+    minimum_width, maximum_width
+        Of the run of samples over the threshold (for ``"whole"``: of their number) [pixel]. A hot pixel is a run
+        of 1.
+    saturation
+        Level at which a sample is saturated; ``None``: the highest code of integer frames, no limit for float32.
+        ``"ml"`` leaves saturated samples out of the fit.
+    ambiguity
+        Share of the peak's light from which on a sample outside the window makes the reading AMBIGUOUS;
+        ``None`` does not look.
+    fir_length : {4, 8}
+        Taps of the derivative filter.
+    read_noise, gain
+        For ``"ml"``: standard deviation of a dark sample [grey levels], and variance per grey level of light (grey
+        levels per electron).
+    triangulation, axes
+        Fuses sensor -> sheet into the same pass (outputs ``g`` and ``h``): u is the position, v the number of the
+        profile, as ``axes`` places them.
+    outputs
+        Names of the `LineReading` fields to compute; what is not asked for is not compiled. ``None``: all.
+    precision
+        Of the arithmetic and the outputs; ``None`` is single.
+    walk
+        Wide strips or one item per profile; ``"auto"`` follows the device. Frames smaller than a strip's vectors
+        are walked by items.
+
+    Raises
+    ------
+    ValueError
+        A parameter is out of its range.
+
+    Notes
+    -----
+    Error: integer samples are summed exactly, float32 samples with their rounding kept, so that the position has a
+    few roundings of its own size at most.
+    """
+
+    Result: ClassVar[type[Any]] = LineReading
+
+    method: Method = "windowed"
+    along: Literal["columns", "rows"] = "columns"
+    threshold: float = 0.0
+    window: int = 8
+    choice: Choice = "strongest"
+    minimum_peak: float | None = None
+    minimum_width: int = 1
+    maximum_width: int | None = None
+    saturation: float | None = None
+    ambiguity: float | None = None
+    fir_length: Literal[4, 8] = 4
+    read_noise: float = 1.0
+    gain: float = 0.0
+    triangulation: Triangulation | None = None
+    axes: SampleAxes = SampleAxes()  # noqa: RUF009 (frozen, no state)
+    outputs: tuple[str, ...] | None = None
+    precision: Precision = None
+    walk: Walk = "auto"
+
+    def __post_init__(self) -> None:
+        self._check_names()
+        self._check_numbers()
+        possible = LineReading._fields if self.triangulation is not None else LineReading._fields[:5]
+        for name in self.outputs or ():
+            if name not in possible:
+                raise ValueError(f"LineReadout.outputs has {name!r}, expected some of {', '.join(possible)}")
+        object.__setattr__(self, "outputs", possible if self.outputs is None else tuple(self.outputs))
+
+    def _check_names(self) -> None:
+        allowed: dict[str, tuple[Any, ...]] = {
+            "method": METHODS,
+            "along": ("columns", "rows"),
+            "choice": CHOICES,
+            "fir_length": (4, 8),
+        }
+        for name, values in allowed.items():
+            if getattr(self, name) not in values:
+                listed = ", ".join(map(str, values))
+                raise ValueError(f"LineReadout.{name} is {getattr(self, name)!r}, expected one of {listed}")
+        if self.method == "whole" and (self.choice != "strongest" or self.ambiguity is not None):
+            raise ValueError("LineReadout: method 'whole' knows no peaks; choice and ambiguity need another method")
+        if self.triangulation is not None and self.triangulation.along != self.along:
+            raise ValueError(
+                f"LineReadout.along is {self.along!r}, its triangulation was made for {self.triangulation.along!r}"
+            )
+
+    def _check_numbers(self) -> None:
+        finite(self.threshold, "LineReadout.threshold")
+        for name in ("minimum_peak", "saturation"):
+            if getattr(self, name) is not None:
+                finite(getattr(self, name), f"LineReadout.{name}")
+        for name in ("read_noise", "gain"):
+            if finite(getattr(self, name), f"LineReadout.{name}") < 0.0:
+                raise ValueError(f"LineReadout.{name} is {getattr(self, name)}, expected a number >= 0")
+        if self.method == "ml" and self.read_noise == 0.0 and self.gain == 0.0:
+            raise ValueError("LineReadout: method 'ml' weighs samples by their noise; read_noise or gain must be > 0")
+        if self.ambiguity is not None and not 0.0 < finite(self.ambiguity, "LineReadout.ambiguity") <= 1.0:
+            raise ValueError(f"LineReadout.ambiguity is {self.ambiguity}, expected a share of the peak, 0 < share <= 1")
+        smallest = 3 if self.method == "ml" else 1
+        if self.window != int(self.window) or not smallest <= self.window <= WIDEST_WINDOW:
+            raise ValueError(
+                f"LineReadout.window is {self.window}, expected a whole number from {smallest} to {WIDEST_WINDOW}"
+            )
+        widths = (self.minimum_width, self.minimum_width if self.maximum_width is None else self.maximum_width)
+        if not 1 <= widths[0] <= widths[1]:
+            raise ValueError(
+                f"LineReadout: widths from {self.minimum_width} to {self.maximum_width}, expected 1 <= min <= max"
+            )
+
+    @property
+    def _judges_width(self) -> bool:
+        return self.minimum_width > 1 or self.maximum_width is not None
+
+    @property
+    def _has_candidates(self) -> bool:
+        return self.method != "whole" and (self.choice != "strongest" or self._judges_width)
+
+    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        if dtype.name not in _CODES:
+            raise TypeError(f"LineReadout takes uint8, uint16 or float32 frames, got {dtype}")
+        if len(shape) < 2 or 0 in shape[-2:]:
+            raise ValueError(f"LineReadout takes frames of shape (..., rows, columns), got {shape}")
+        batch, (rows, columns) = shape[:-2], shape[-2:]
+        length, samples = (rows, columns) if self.along == "columns" else (columns, rows)
+        if length > LONGEST_PROFILE or rows * columns >= 2**31:
+            raise ValueError(
+                f"LineReadout takes profiles of up to {LONGEST_PROFILE} samples in frames below 2**31, got {shape}"
+            )
+        real = real_of(self.precision, dtype)
+        strip = in_strips(self.walk, device) and self._fits_strip(rows, columns, dtype)
+        frames = math.prod(batch)
+        inputs: list[Any] = [(shape, dtype)]
+        if self.choice == "nearest":
+            inputs.append(((*batch, samples), real))
+        chosen = self.outputs or ()
+        types = dict.fromkeys(LineReading._fields, real) | {"status": np.dtype(np.uint8)}
+        return Launch(
+            stem="line",
+            kernel="line_readout",
+            inputs=inputs,
+            outputs={name: ((*batch, samples), types[name]) if name in chosen else None for name in types},
+            global_size=(self._items(device, strip, frames, samples), frames),
+            local_size=(1, 1) if strip else None,
+            defines=self._defines(device, real, dtype, strip, length),
+            arguments=[
+                np.int32(rows),
+                np.int32(columns),
+                *self._levels(dtype),
+                self._packed(real, dtype, length),
+                None if self.triangulation is None else self.triangulation.packed(real, self.axes),
+            ],
+        )
+
+    def _fits_strip(self, rows: int, columns: int, dtype: np.dtype[Any]) -> bool:
+        wide = _LANES if self._has_candidates else _WIDE_BYTES // dtype.itemsize
+        return columns >= wide and (self.along == "columns" or rows >= _LANES)
+
+    def _items(self, device: Device, strip: bool, frames: int, samples: int) -> int:
+        """Return how many items work on a frame: few wide ones, but enough to keep every core busy."""
+        if not strip:
+            return samples
+        if self.along == "rows" or self._has_candidates:
+            return math.ceil(samples / _LANES)
+        units = int(device.handle.max_compute_units)
+        busy = math.ceil(2 * units / max(frames, 1)) if frames < 2 * units else 1
+        return min(max(math.ceil(samples / _STRIP), busy), max(samples // 128, 1))
+
+    def _levels(self, dtype: np.dtype[Any]) -> list[Any]:
+        """Return threshold, saturation and weakest peak in the frames' own type."""
+        if dtype.kind == "f":
+            saturation = np.inf if self.saturation is None else self.saturation
+            weakest = -np.inf if self.minimum_peak is None else self.minimum_peak
+            return [dtype.type(level) for level in (self.threshold, saturation, weakest)]
+        top = np.iinfo(dtype).max
+        if self.threshold != int(self.threshold) or not 0 <= self.threshold <= top:
+            raise ValueError(
+                f"LineReadout.threshold is {self.threshold}, expected a whole number from 0 to {top} for {dtype} frames"
+            )
+        saturation = top if self.saturation is None else math.ceil(self.saturation)
+        weakest = 0 if self.minimum_peak is None else math.ceil(self.minimum_peak)
+        for name, level in (("saturation", saturation), ("minimum_peak", weakest)):
+            if not 0 <= level <= top:
+                raise ValueError(f"LineReadout.{name} is {level}, expected 0 to {top} for {dtype} frames")
+        return [dtype.type(level) for level in (self.threshold, saturation, weakest)]
+
+    def _defines(
+        self, device: Device, real: np.dtype[Any], dtype: np.dtype[Any], strip: bool, length: int
+    ) -> dict[str, Any]:
+        code, width = _CODES[dtype.name]
+        defines: dict[str, Any] = real_defines(device, real)
+        defines |= {"CODE": code, "CODE16": f"{code}16", "CODE_BITS": width}
+        defines |= {f"METHOD_{self.method.upper()}": None, f"CHOICE_{self.choice.upper()}": None}
+        defines |= {"RADIUS": self.window, "REACH": self.window, "FIR_HALF": self.fir_length // 2}
+        if self.method == "fir":
+            defines["REACH"] = self.window + self.fir_length // 2
+        chosen = self.outputs or ()
+        defines |= {f"WITH_{name.upper()}": None for name in LineReading._fields[:5] if name in chosen}
+        if self.triangulation is not None:
+            defines |= {"WITH_SHEET": None} | self.triangulation.defines
+        present = {
+            "STRIP": strip,
+            "PREFETCH": device.is_cpu,
+            "ALONG_ROWS": self.along == "rows",
+            "AMBIGUITY": self.ambiguity is not None,
+            "CANDIDATES": self._has_candidates,
+            "WIDTH_LIMITS": self._judges_width,
+            "WITH_LIT": "width" in chosen or (self.method == "whole" and self._judges_width),
+            "LONG_MOMENT": width < 32 and length**2 // 2 * np.iinfo(f"uint{width}").max >= 2**32,
+        }
+        return defines | {name: None for name, is_present in present.items() if is_present}
+
+    def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any], length: int) -> Any:
+        """Return the parameters of ``line.cl``, in its order."""
+        widest = length if self.maximum_width is None else self.maximum_width
+        return np.array(
+            [self.minimum_width, widest, self.ambiguity or 0.0, self.read_noise**2, self.gain],
+            real,
+        )

@@ -1,0 +1,192 @@
+// Light lines in camera frames: every profile (a column, or under ALONG_ROWS a row) -> position, peak, width, total,
+// status, and under WITH_SHEET the point in the sheet of light. METHOD_... says how; line.py documents the defines.
+#include "line_peak.h"
+#include "line_whole.h"
+#include "line_window.h"
+#include "sheet.h"
+#ifdef STRIP
+#include "line_wide_peak.h"
+#endif
+#if defined(METHOD_GAUSS3) || defined(METHOD_FIR)
+#include "line_points.h"
+#endif
+#ifdef METHOD_ML
+#include "line_ml.h"
+#endif
+
+// The parameters, as LineReadout packs them.
+#define MIN_WIDTH 0
+#define MAX_WIDTH 1
+#define AMBIGUOUS_RATIO 2
+#define READ_VARIANCE 3  // of a dark sample [level^2]
+#define GAIN 4           // variance per level of light
+#define NO_LIGHT 5       // the level that no light has
+
+typedef struct {
+    global real *position, *peak, *width, *total;
+    global uchar *status;
+    global real *g, *h;
+    constant real *sheet;
+} Outputs;
+
+// Lanes that go to samples first, first + 1, ... of the output.
+inline void store_reading(const Outputs *to, ulong first, int sample, reals position, codes peak, reals width, reals total, ints flags) {
+    const ints lost = ~INT_MASK((flags & (STATUS_DARK | STATUS_OUT_OF_RANGE | STATUS_NOT_FINITE)) == 0);
+    const ints not_finite = ~INT_MASK((flags & STATUS_NOT_FINITE) == 0);
+    position = nan_where(to_masks(lost), position);
+#ifdef WITH_SHEET
+    reals g, h;
+    const ints sheet_flags = to_ints(LANED(sheet_point)(position, to_reals((ints)sample + lane_numbers), to->sheet, &g, &h));
+    flags |= sheet_flags & ~lost;
+    store_reals(g, to->g + first);
+    store_reals(h, to->h + first);
+#endif
+#ifdef WITH_POSITION
+    store_reals(position, to->position + first);
+#endif
+#ifdef WITH_PEAK
+    store_reals(nan_where(to_masks(not_finite), to_reals(peak)), to->peak + first);
+#endif
+#ifdef WITH_WIDTH
+    store_reals(nan_where(to_masks(not_finite), width), to->width + first);
+#endif
+#ifdef WITH_TOTAL
+    store_reals(nan_where(to_masks(not_finite), total), to->total + first);
+#endif
+#ifdef WITH_STATUS
+    store_bytes(convert_bytes(flags), to->status + first);
+#endif
+}
+
+inline ints common_flags(const Profiles *profiles, codes peak, ints lost) {
+    return flag_where(CODE_MASK(peak >= (codes)profiles->saturation), STATUS_SATURATED) | flag_where(lost, STATUS_NOT_FINITE);
+}
+
+#ifdef METHOD_WHOLE
+inline void finish_whole(const Profiles *profiles, const Gravity *gravity, constant real *p, const Outputs *to, ulong first, int sample) {
+    ints dark = dark_lanes(profiles, gravity->peak);
+#ifdef WIDTH_LIMITS
+    dark |= REAL_MASK(gravity->lit < p[MIN_WIDTH]) | REAL_MASK(gravity->lit > p[MAX_WIDTH]);
+#endif
+    // Light whose half maximum lies outside: its centre of gravity does not.
+    const reals least = over_threshold(gravity->peak, profiles->threshold) / 2;
+    const ints cut = REAL_MASK(over_threshold(sample_of(profiles, 0), profiles->threshold) >= least) |
+                     REAL_MASK(over_threshold(sample_of(profiles, profiles->length - 1), profiles->threshold) >= least);
+    const ints flags = flag_where(dark, STATUS_DARK) | flag_where(cut & ~dark, STATUS_OUT_OF_RANGE) |
+                       common_flags(profiles, gravity->peak, gravity->lost);
+    store_reading(to, first, sample, gravity->centre + gravity->offset / gravity->total, gravity->peak, gravity->lit, gravity->total, flags);
+}
+#else
+inline void finish_peak(const Profiles *profiles, Peak *peak, const Place *place, constant real *p, const Outputs *to, ulong first, int sample) {
+    ints flags = place->flags | flag_where(~peak->found, STATUS_DARK) | flag_where(cut_lanes(profiles, peak->at) & peak->found, STATUS_OUT_OF_RANGE) |
+                 common_flags(profiles, peak->level, peak->lost);
+#ifdef AMBIGUITY
+    flags |= flag_where(has_second(profiles, peak, p[AMBIGUOUS_RATIO]) & peak->found, STATUS_AMBIGUOUS);
+#endif
+#ifdef WITH_LIT
+    const reals width = run_length(profiles, peak);
+#else
+    const reals width = 0;
+#endif
+    const reals total = choose_reals(peak->found, place->total, 0);
+    store_reading(to, first, sample, to_reals(peak->at) + place->at, peak->level, width, total, flags);
+}
+
+// The window of every lane by itself, by any method.
+inline Place place_apart(const Profiles *profiles, Peak *peak, constant real *p) {
+    CODE window[(2 * REACH + 1) * LANES];
+    const ints equals = settle(profiles, peak, REACH, window);
+#if defined(METHOD_WINDOWED)
+    return window_gravity(window, REACH, profiles->threshold);
+#elif defined(METHOD_ML)
+    return likeliest_place(window, profiles, peak, p + READ_VARIANCE);
+#else
+    return place_by_points(window, profiles, peak, equals);
+#endif
+}
+#endif
+
+#ifdef STRIP
+#include "line_strip.h"
+#endif
+
+#define ARGUMENTS                                                                                                      \
+    global const CODE *restrict frames, INPUT_PREVIOUS global real *restrict position, global real *restrict peak,     \
+        global real *restrict width, global real *restrict total, global uchar *restrict status,                       \
+        global real *restrict g, global real *restrict h, const int rows, const int columns, const CODE threshold,     \
+        const CODE saturation, const CODE minimum, constant real *p, constant real *sheet
+#ifdef CHOICE_NEAREST
+#define INPUT_PREVIOUS global const real *restrict previous,
+#else
+#define INPUT_PREVIOUS
+#endif
+#define OUTPUTS {position, peak, width, total, status, g, h, sheet}
+
+#ifdef ALONG_ROWS
+#define LENGTH columns
+#define SAMPLES rows
+#define STRIDE 1
+#define LANE_STRIDE columns
+#else
+#define LENGTH rows
+#define SAMPLES columns
+#define STRIDE columns
+#define LANE_STRIDE 1
+#endif
+
+inline Profiles profiles_at(global const CODE *frame, int sample, int rows, int columns, CODE threshold, CODE saturation, CODE minimum) {
+    const Profiles profiles = {frame + (long)sample * LANE_STRIDE, STRIDE, LANE_STRIDE, LENGTH, threshold, saturation, minimum};
+    return profiles;
+}
+
+#if defined(CANDIDATES) || (!defined(STRIP) && !defined(METHOD_WHOLE))
+// LANES profiles, by a walk along them.
+kernel void line_readout(ARGUMENTS) {
+    const Outputs to = OUTPUTS;
+    const int frame = get_global_id(1), sample = min((int)get_global_id(0) * LANES, SAMPLES - LANES);
+    const Profiles profiles = profiles_at(frames + (ulong)frame * rows * columns, sample, rows, columns, threshold, saturation, minimum);
+    const ulong first = (ulong)frame * SAMPLES + sample;
+#ifdef CANDIDATES
+    ints nearest = -1;
+#ifdef CHOICE_NEAREST
+    const reals before = *(global const reals_at *)(previous + first);
+    nearest = choose_ints(REAL_MASK(before >= 0) & REAL_MASK(before < (real)LENGTH), to_ints(rint(before)), -1);
+#endif
+    Peak found = choose_peak(&profiles, nearest, (int)p[MIN_WIDTH], (int)p[MAX_WIDTH]);
+#else
+    Peak found = strongest_peak(&profiles);
+#endif
+    const Place place = place_apart(&profiles, &found, p);
+    finish_peak(&profiles, &found, &place, p, &to, first, sample);
+}
+
+#elif defined(METHOD_WHOLE) && !defined(STRIP)
+kernel void line_readout(ARGUMENTS) {
+    const Outputs to = OUTPUTS;
+    const int frame = get_global_id(1), sample = get_global_id(0);
+    const Profiles profiles = profiles_at(frames + (ulong)frame * rows * columns, sample, rows, columns, threshold, saturation, minimum);
+    const Gravity gravity = whole_gravity(&profiles);
+    finish_whole(&profiles, &gravity, p, &to, (ulong)frame * SAMPLES + sample, sample);
+}
+
+#elif !defined(ALONG_ROWS)
+// A strip of columns, from the first row to the last: blocks of rows outside, groups of WIDE columns inside, so that
+// memory is read nearly in sequence while the sums of a group stay in registers.
+kernel void line_readout(ARGUMENTS) {
+    const Outputs to = OUTPUTS;
+    const int strip = (columns / (int)get_global_size(0) + WIDE - 1) / WIDE * WIDE, frame = get_global_id(1);
+    const int begin = (int)get_global_id(0) * strip, end = min(begin + strip, columns);
+    const Profiles profiles = profiles_at(frames + (ulong)frame * rows * columns, 0, rows, columns, threshold, saturation, minimum);
+    for (int part = begin; part < end; part += MAX_STRIP) {
+        read_strip(&profiles, part, min(part + MAX_STRIP, end), p, &to, (ulong)frame * columns);
+    }
+}
+#else
+// Sixteen rows.
+kernel void line_readout(ARGUMENTS) {
+    const Outputs to = OUTPUTS;
+    const int frame = get_global_id(1), sample = min((int)get_global_id(0) * LANES, SAMPLES - LANES);
+    const Profiles profiles = profiles_at(frames + (ulong)frame * rows * columns, sample, rows, columns, threshold, saturation, minimum);
+    read_rows(&profiles, p, &to, (ulong)frame * SAMPLES + sample, sample);
+}
+#endif

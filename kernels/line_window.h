@@ -1,0 +1,83 @@
+// The window of samples around the peak, and the centre of gravity in it.
+#ifndef LINE_WINDOW_H
+#define LINE_WINDOW_H
+
+#include "line_peak.h"
+
+#define WINDOW (2 * RADIUS + 1)
+
+typedef struct {
+    reals at;     // position relative to the peak
+    reals total;  // light over the threshold in the window
+    ints flags;
+} Place;
+
+// Copies [peak - reach, peak + reach] of every lane side by side; beyond the border its last sample is repeated.
+inline void gather(const Profiles *profiles, ints peak, int reach, CODE *window) {
+    int at[LANES];
+    *(ints_at *)at = peak;
+    for (int lane = 0; lane < LANES; lane++) {
+        global const CODE *profile = profiles->first + (long)lane * profiles->lane_stride;
+        for (int k = -reach; k <= reach; k++) {
+            const int index = clamp(at[lane] + k, 0, profiles->length - 1);
+            window[(k + reach) * LANES + lane] = profile[(long)index * profiles->stride];
+        }
+    }
+}
+
+inline codes window_level(const CODE *window, int k) { return *(const codes_at *)(window + k * LANES); }
+
+// How far beyond its first sample a flat top's middle lies, by the samples that equal the peak.
+inline ints middle_of_top(ints equals) { return (equals - 1) >> 1; }
+
+// Gathers the window about the middle of the peak's flat top, to which the peak moves.
+inline ints settle(const Profiles *profiles, Peak *peak, int reach, CODE *window) {
+    gather(profiles, peak->at, reach, window);
+    ints equals = 0;
+    for (int k = reach; k <= reach + RADIUS; k++) equals -= CODE_MASK(window_level(window, k) == peak->level) & INT_MASK(peak->at + (k - reach) < profiles->length);
+    const ints shift = middle_of_top(equals) & peak->found;
+    if (any_lane(INT_MASK(shift > 0))) {
+        peak->at += max(shift, (ints)0);
+        gather(profiles, peak->at, reach, window);
+    }
+    return equals;
+}
+
+inline ints cut_lanes(const Profiles *profiles, ints at) {
+    return INT_MASK(at < RADIUS) | INT_MASK(at + RADIUS >= profiles->length);
+}
+
+// Centre of gravity about the middle of the window.
+inline Place window_gravity(const CODE *window, int reach, CODE threshold) {
+    reals total = 0, moment = 0;
+    for (int k = -RADIUS; k <= RADIUS; k++) {
+        const reals v = over_threshold(window_level(window, k + reach), threshold);
+        total += v;
+        moment += v * (real)k;
+    }
+    Place place;
+    place.at = moment / total;
+    place.total = total;
+    place.flags = 0;
+    return place;
+}
+
+#ifdef WITH_LIT
+// Samples in the run over the threshold that holds the peak.
+inline reals run_length(const Profiles *profiles, const Peak *peak) {
+    int at[LANES], length[LANES];
+    *(ints_at *)at = peak->at;
+    *(ints_at *)length = peak->found;
+    for (int lane = 0; lane < LANES; lane++) {
+        if (!length[lane]) continue;
+        global const CODE *profile = profiles->first + (long)lane * profiles->lane_stride;
+        int begin = at[lane], end = at[lane];
+        while (begin > 0 && profile[(long)(begin - 1) * profiles->stride] > profiles->threshold) begin--;
+        while (end < profiles->length - 1 && profile[(long)(end + 1) * profiles->stride] > profiles->threshold) end++;
+        length[lane] = end - begin + 1;
+    }
+    return to_reals(*(const ints_at *)length);
+}
+#endif
+
+#endif

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import threading
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,7 @@ class Device:
     def all() -> tuple[Device, ...]:
         """Return every healthy device, the best first."""
         healthy = [each for each in discovery.candidates() if each.healthy]
-        return tuple(_open(each) for each in sorted(healthy, key=_rank))
+        return tuple(_open(each) for each in sorted(healthy, key=lambda each: each.rank))
 
     @staticmethod
     def best() -> Device:
@@ -132,8 +133,9 @@ class Device:
 
     def new_queue(self, *, profiling: bool = False) -> Any:
         """Return another in-order queue; with `profiling`, its events carry device times."""
-        flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
-        return cl.CommandQueue(self.context, self.handle, properties=flags)
+        if not profiling:
+            return cl.CommandQueue(self.context, self.handle)
+        return cl.CommandQueue(self.context, self.handle, properties=cl.command_queue_properties.PROFILING_ENABLE)
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike, queue: Any = None) -> DeviceArray:
         """Return an uninitialised device array; on shared memory `arrays.host_view` shows it to NumPy."""
@@ -154,16 +156,16 @@ def _has_fine_grained_memory(handle: Any) -> bool:
         return False
 
 
-def _rank(candidate: discovery.Candidate) -> tuple[bool, int, str]:
-    order = ("pocl", "intel")
-    place = order.index(candidate.kind) if candidate.kind in order else len(order)
-    return (not candidate.is_gpu, place + 10 * (candidate.kind == "oclgrind"), candidate.label)
+# One device, one context: arrays of two contexts do not meet. The lock keeps two threads from opening it twice.
+_opened: dict[str, Device] = {}
+_opening = threading.Lock()
 
 
-@functools.cache
-def _open(candidate: discovery.Candidate) -> Device:
-    platform = discovery.platforms()[candidate.platform_index]
-    return Device(platform.get_devices()[candidate.device_index], candidate.label, candidate.kind)
+def _open(listed: discovery.Listed) -> Device:
+    with _opening:
+        if listed.label not in _opened:
+            _opened[listed.label] = Device(listed.handle, listed.label, listed.kind)
+        return _opened[listed.label]
 
 
 @functools.lru_cache(maxsize=32)
@@ -173,12 +175,12 @@ def _default_queue(context: Any) -> Any:
 
 @functools.lru_cache(maxsize=32)
 def _adopt(queue: Any) -> Device:
-    for each in Device.all():
-        if each.context == queue.context:
-            return each if each.queue == queue else Device(queue.device, each.label, each.kind, queue)
-    platform = queue.device.platform
-    for candidate in discovery.candidates():
-        listed = discovery.platforms()[candidate.platform_index].get_devices()[candidate.device_index]
-        if listed == queue.device:
-            return Device(queue.device, candidate.label, candidate.kind, queue)
-    return Device(queue.device, platform.name, platform.name.split()[0].lower(), queue)
+    """Give the caller's own queue a device: nothing is probed, and no other device is opened."""
+    for each in _opened.values():
+        if each.queue == queue:
+            return each
+    for listed in discovery.listing():
+        if listed.handle == queue.device:
+            return Device(queue.device, listed.label, listed.kind, queue)
+    kind = discovery.kind_of(queue.device)
+    return Device(queue.device, kind, kind, queue)

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
 import subprocess
 import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import pyopencl as cl
 
-from gpuvision.host.runtime import cache_folder, expose_installed_runtime, write_whole
+from gpuvision.host.runtime import cache_folder, expose_installed_runtime, provide_cache, write_whole
 
 INSTALL_HINT = (
     "install one: `apt-get install pocl-opencl-icd` (as root), or `pip install 'gpuvision[cpu]'` "
@@ -29,11 +30,13 @@ _KINDS = {
     "amd": "amd",
     "apple": "apple",
 }
+_PREFERRED = ("pocl", "intel")
+_SIMULATORS = ("oclgrind",)
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A device as the OpenCL loader lists it, and the verdict of its probe.
+class Listed:
+    """A device as the OpenCL loader lists it; nothing is known yet about whether it works.
 
     Attributes
     ----------
@@ -42,18 +45,49 @@ class Candidate:
         several devices are of one kind. `Device.named` takes it.
     platform_index, device_index : int
         The loader's own indices; platforms may share a name, so a name identifies nothing.
-    reason : str
-        Why the device is not healthy; empty when it is.
+    handle : pyopencl.Device
+    key : str
+        Names what a verdict depends on: the driver, the device, and the probe itself.
     """
 
     label: str
     kind: str
-    name: str
-    platform: str
-    driver: str
-    is_gpu: bool
     platform_index: int
     device_index: int
+    handle: Any
+    key: str
+
+    @property
+    def name(self) -> str:
+        """The device's full name."""
+        return str(self.handle.name).strip()
+
+    @property
+    def platform(self) -> str:
+        """The platform's name."""
+        return str(self.handle.platform.name).strip()
+
+    @property
+    def driver(self) -> str:
+        """The driver's version."""
+        return str(self.handle.driver_version).strip()
+
+    @property
+    def is_gpu(self) -> bool:
+        """Whether it is a GPU."""
+        return bool(self.handle.type & cl.device_type.GPU)
+
+
+@dataclass(frozen=True)
+class Candidate(Listed):
+    """A listed device with the verdict of its probe.
+
+    Attributes
+    ----------
+    reason : str
+        Why the device is not healthy; empty when it is.
+    """
+
     reason: str
 
     @property
@@ -70,16 +104,25 @@ class Candidate:
             return "this PoCL is too old for the processor; use Debian's: apt-get install pocl-opencl-icd"
         return f"update or remove this driver; meanwhile {INSTALL_HINT}"
 
+    @property
+    def rank(self) -> tuple[bool, int, str]:
+        """Sorts by preference: a GPU, else PoCL, else Intel's CPU runtime, else any other; simulators last."""
+        place = _PREFERRED.index(self.kind) if self.kind in _PREFERRED else len(_PREFERRED)
+        return (not self.is_gpu, place + len(_PREFERRED) * (self.kind in _SIMULATORS), self.label)
 
-def _kind(platform: Any, device: Any) -> str:
-    words = f"{platform.name} {platform.vendor} {device.vendor}".lower()
-    kind = next((short for word, short in _KINDS.items() if word in words), platform.name.split()[0].lower())
-    return f"{kind}-gpu" if kind == "intel" and device.type & cl.device_type.GPU else kind
+
+def kind_of(handle: Any) -> str:
+    """Return a device's maker in a word: ``pocl``, ``intel``, ``intel-gpu``, ``nvidia``, ..."""
+    words = f"{handle.platform.name} {handle.platform.vendor} {handle.vendor}".lower()
+    other = (handle.platform.name.lower().split() or ["unknown"])[0]
+    kind = next((short for word, short in _KINDS.items() if word in words), other)
+    return f"{kind}-gpu" if kind == "intel" and handle.type & cl.device_type.GPU else kind
 
 
-def _key(platform: Any, device: Any) -> str:
-    """Name what a verdict depends on: the driver, the device, and the probe itself."""
-    parts = (platform.name, platform.version, device.name, device.driver_version, device.extensions)
+def _key(handle: Any, twin: int) -> str:
+    """Name what a verdict depends on; `twin` counts the devices before it that are the same in everything."""
+    platform = handle.platform
+    parts = (platform.name, platform.version, handle.name, handle.driver_version, handle.extensions, twin)
     source = Path(__file__).with_name("probe.py").read_bytes()
     return hashlib.sha256(repr(parts).encode() + source).hexdigest()[:24]
 
@@ -93,19 +136,34 @@ def _read_verdicts() -> dict[str, str]:
         read = json.loads(_verdicts_file().read_text())
     except (OSError, ValueError):
         return {}
-    return read if isinstance(read, dict) else {}
+    kept = read.items() if isinstance(read, dict) else ()
+    return {key: reason for key, reason in kept if isinstance(reason, str)}
+
+
+def _keep_verdicts(fresh: dict[str, str]) -> None:
+    # An unwritable cache costs a second at the next start, nothing else.
+    with contextlib.suppress(OSError):
+        write_whole(_verdicts_file(), json.dumps(_read_verdicts() | fresh, indent=1))
 
 
 def _ask_probe(platform_index: int, device_index: int) -> str:
     """Run the probe in its own process; a crash or a hang is a verdict too."""
-    command = [sys.executable, "-m", "gpuvision.host.probe", str(platform_index), str(device_index)]
+    # -P: a folder named gpuvision where the user stands is not the package.
+    command = [sys.executable, "-P", "-m", "gpuvision.host.probe", str(platform_index), str(device_index)]
     try:
-        ran = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_SECONDS, check=False)
+        ran = subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_PROBE_SECONDS,
+            check=False,
+        )
     except subprocess.TimeoutExpired:
         return f"the probe kernel did not finish within {_PROBE_SECONDS} s"
     try:
         return str(json.loads(ran.stdout.splitlines()[-1])["reason"])
-    except (IndexError, KeyError, ValueError):
+    except (IndexError, KeyError, TypeError, ValueError):
         last = (ran.stderr.strip().splitlines() or ["no message"])[-1]
         return f"the runtime ended the probe's process (exit {ran.returncode}: {last[:200]})"
 
@@ -113,6 +171,7 @@ def _ask_probe(platform_index: int, device_index: int) -> str:
 @functools.cache
 def platforms() -> tuple[Any, ...]:
     """Return the OpenCL platforms, Intel's pip-installed runtime among them; empty where there are none."""
+    provide_cache()
     expose_installed_runtime()
     try:
         return tuple(cl.get_platforms())
@@ -128,34 +187,44 @@ def _devices_of(platform: Any) -> list[Any]:
 
 
 @functools.cache
+def listing() -> tuple[Listed, ...]:
+    """List every device by its label, without asking whether it works."""
+    found = [(p, d, handle) for p, platform in enumerate(platforms()) for d, handle in enumerate(_devices_of(platform))]
+    kinds = [kind_of(handle) for _, _, handle in found]
+    count, seen, twins = Counter(kinds), Counter[str](), Counter[str]()
+    listed = []
+    for kind, (p, d, handle) in zip(kinds, found, strict=True):
+        label = kind if count[kind] == 1 else f"{kind}:{seen[kind]}"
+        seen[kind] += 1
+        first = _key(handle, 0)
+        listed.append(Listed(label, kind, p, d, handle, _key(handle, twins[first])))
+        twins[first] += 1
+    return tuple(listed)
+
+
 def candidates(*, probe_again: bool = False) -> tuple[Candidate, ...]:
     """List every device with its verdict.
 
-    A verdict is kept in the user's cache under the driver's version; `probe_again` asks anew where the last
-    one was bad. The first call on a machine takes about a second per device.
+    A verdict is kept in the user's cache under the driver's version; `probe_again` asks anew where the last one was
+    bad. The first call on a machine takes about a second per device.
     """
-    known = _read_verdicts()
+    if probe_again:
+        _candidates.cache_clear()
+    return _candidates(trust_bad=not probe_again)
+
+
+@functools.cache
+def _candidates(*, trust_bad: bool) -> tuple[Candidate, ...]:
+    known = {key: reason for key, reason in _read_verdicts().items() if trust_bad or not reason}
     fresh: dict[str, str] = {}
-    listed = [
-        (p, d, platform, device)
-        for p, platform in enumerate(platforms())
-        for d, device in enumerate(_devices_of(platform))
-    ]
-    kinds = [_kind(platform, device) for _, _, platform, device in listed]
-    count, seen = Counter(kinds), Counter[str]()
-    found = []
-    for kind, (p, d, platform, device) in zip(kinds, listed, strict=True):
-        key = _key(platform, device)
-        if key not in known or (probe_again and known[key]):
-            known[key] = fresh[key] = _ask_probe(p, d)
-        label = kind if count[kind] == 1 else f"{kind}:{seen[kind]}"
-        seen[kind] += 1
-        is_gpu = bool(device.type & cl.device_type.GPU)
-        name, driver = device.name.strip(), device.driver_version
-        found.append(Candidate(label, kind, name, platform.name, driver, is_gpu, p, d, known[key]))
+    for each in listing():
+        if each.key not in known:
+            fresh[each.key] = _ask_probe(each.platform_index, each.device_index)
     if fresh:
-        try:
-            write_whole(_verdicts_file(), json.dumps(_read_verdicts() | fresh, indent=1))
-        except OSError:
-            pass  # an unwritable cache costs a second at the next start, nothing else
-    return tuple(found)
+        _keep_verdicts(fresh)
+    verdicts = known | fresh
+    return tuple(_judged(each, verdicts[each.key]) for each in listing())
+
+
+def _judged(listed: Listed, reason: str) -> Candidate:
+    return Candidate(**{field.name: getattr(listed, field.name) for field in fields(Listed)}, reason=reason)

@@ -37,7 +37,8 @@ def probe(device: Any) -> str:
     try:
         context = cl.Context([device])
         queue = cl.CommandQueue(context)
-        kernel = cl.Kernel(cl.Program(context, _SOURCE).build(cache_dir=False), "probe")
+        program: Any = cl.Program(context, _SOURCE)
+        kernel: Any = cl.Kernel(program.build(cache_dir=False), "probe")
         values = (np.arange(16 * _ROWS) * 7 % 256).astype(np.uint8)
         sums = np.zeros(_ITEMS, np.uint32)
         source = cl.Buffer(context, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR, hostbuf=values)

@@ -8,16 +8,21 @@ before the first platform query.
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import ctypes
 import hashlib
 import importlib.metadata
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
 import platformdirs
 
 SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
+_VARIABLE = "OCL_ICD_VENDORS"
+_ENTRY = "gpuvision-intel.icd"
 _DRIVER = "libintelocl.so"
 # The driver finds its siblings by name only; they must be in the process before it is opened.
 _SIBLINGS = ("libintlc.so.5", "libirng.so", "libimf.so", "libsvml.so")
@@ -26,6 +31,22 @@ _SIBLINGS = ("libintlc.so.5", "libirng.so", "libimf.so", "libsvml.so")
 def cache_folder() -> Path:
     """Return the folder for what may be lost: verdicts on devices, lists of vendors."""
     return platformdirs.user_cache_path("gpuvision")
+
+
+def provide_cache() -> None:
+    """Give this process a cache folder of its own where the user's cannot be written.
+
+    pyopencl keeps compiled kernels there, and fails rather than does without on a home that is missing or read-only.
+    Must run before the first platform query.
+    """
+    try:
+        cache_folder().mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=cache_folder()):
+            return
+    except OSError:
+        folder = tempfile.mkdtemp(prefix="gpuvision-cache-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        os.environ["XDG_CACHE_HOME"] = folder
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -55,33 +76,44 @@ def _wheel_libraries() -> dict[str, Path]:
     return found if _DRIVER in found else {}
 
 
-def expose_installed_runtime() -> None:
-    """Name Intel's runtime to the OpenCL loader where its wheels are installed; else do nothing.
-
-    Leaves alone an ``OCL_ICD_VENDORS`` that the user has set. Must run before the first platform query.
-    """
-    if "OCL_ICD_VENDORS" in os.environ:
-        return
-    libraries = _wheel_libraries()
-    if not libraries:
-        return
+def _load_siblings(libraries: dict[str, Path]) -> bool:
     try:
         for name in _SIBLINGS:
             if name in libraries:
                 ctypes.CDLL(str(libraries[name]), mode=ctypes.RTLD_GLOBAL)
     except OSError:
-        return  # another machine's wheel: the system's runtimes stay as they are
-    entries = {path.name: path.read_text() for path in SYSTEM_VENDORS.glob("*.icd")}
-    entries["gpuvision-intel.icd"] = str(libraries[_DRIVER])
+        return False  # another machine's wheel: the system's runtimes stay as they are
+    return True
+
+
+def _system_entries() -> dict[str, str]:
+    entries = {}
+    for path in SYSTEM_VENDORS.glob("*.icd"):
+        with contextlib.suppress(OSError):  # what this user may not read, the loader may not either
+            entries[path.name] = path.read_text()
+    return entries
+
+
+def _vendors_folder(entries: dict[str, str]) -> Path:
     # The folder's name is its content: a change of drivers makes another folder, never half of one.
     digest = hashlib.sha256(repr(sorted(entries.items())).encode()).hexdigest()[:12]
-    try:
-        folder = cache_folder() / "vendors" / digest
-        for name, text in entries.items():
-            if not (folder / name).exists():
-                write_whole(folder / name, text)
-    except OSError:  # a home that cannot be written: this process only
-        folder = Path(tempfile.mkdtemp(prefix="gpuvision-vendors-"))
-        for name, text in entries.items():
+    folder = cache_folder() / "vendors" / digest
+    for name, text in entries.items():
+        if not (folder / name).exists():
             write_whole(folder / name, text)
-    os.environ["OCL_ICD_VENDORS"] = str(folder)
+    return folder
+
+
+def expose_installed_runtime() -> None:
+    """Name Intel's runtime to the OpenCL loader where its wheels are installed; else do nothing.
+
+    Leaves alone an ``OCL_ICD_VENDORS`` that the user has set. Must run before the first platform query.
+    """
+    named = os.environ.get(_VARIABLE)
+    if named is not None and not Path(named, _ENTRY).exists():
+        return
+    libraries = _wheel_libraries()
+    if not libraries or not _load_siblings(libraries):
+        return
+    if named is None:  # else it is inherited from a process of ours
+        os.environ[_VARIABLE] = str(_vendors_folder(_system_entries() | {_ENTRY: str(libraries[_DRIVER])}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,20 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture(autouse=True)
 def _a_device_is_there(request: pytest.FixtureRequest) -> None:
-    if "device" in request.fixturenames and request.getfixturevalue("device") is None:
+    if "device" not in request.fixturenames:
+        return
+    device = request.getfixturevalue("device")
+    if device is None:
         pytest.fail(f"this test needs a healthy OpenCL device; {INSTALL_HINT}", pytrace=False)
+    request.node.user_properties.append(("device", device.label))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say how many tests passed on which device; CI reads it."""
+    passed = terminalreporter.getreports("passed")
+    labels = Counter(label for each in passed for name, label in each.user_properties if name == "device")
+    counts = ", ".join(f"{label} {count}" for label, count in sorted(labels.items())) or "on no device"
+    terminalreporter.write_line(f"kernel tests passed: {counts}")
 
 
 @pytest.fixture

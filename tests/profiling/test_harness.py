@@ -1,0 +1,83 @@
+"""The harness: ratios within rounds, runs that are voided, and the file it writes."""
+
+from __future__ import annotations
+
+import json
+import types
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba", reason="the extra 'profile' is not installed")
+
+from gpuvision.profiling import ceiling, harness
+
+
+def case(**changes):
+    fields = {
+        "operation": "psd",
+        "name": "float32/16",
+        "ours": lambda: None,
+        "peers": {"numpy": lambda: sum(range(2000))},
+        "error": 1e-9,
+    }
+    return harness.Case(**(fields | changes))
+
+
+def test_a_row_holds_a_peer_against_us(device):
+    (row,) = harness.measure(case(), device, seconds=0.01)
+    assert (row.peer, row.peer_version, row.case) == ("numpy", np.__version__, "float32/16")
+    assert row.ratio > 1.0  # summing 2000 numbers takes longer than nothing
+    assert row.fraction is None
+
+
+def test_the_ceiling_moves_the_bytes_of_the_case(device):
+    moved = ceiling.move(device, 1 << 20, 1 << 20)
+    (row,) = harness.measure(case(ours=moved, traffic=(1 << 20, 1 << 20)), device, seconds=0.05)
+    assert row.fraction == pytest.approx(1.0, abs=0.5)  # the same kernel against itself
+
+
+def test_the_flop_rate_is_that_of_multiply_adds(device):
+    assert 1e8 < ceiling.flop_rate(device, seconds=0.01) < 1e15
+
+
+def test_facts_stand_beside_the_columns(device):
+    (row,) = harness.measure(case(facts={"p50_us": 12.0}), device, seconds=0.01)
+    assert row.to_dict()["p50_us"] == 12.0
+    assert "facts" not in row.to_dict()
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    """An operation of one empty case, and a machine whose speed the test sets."""
+    module = types.SimpleNamespace(cases=lambda device: iter([case()]))
+    monkeypatch.setattr(harness.importlib, "import_module", lambda name: module)
+    speeds = iter(())
+
+    def set_speeds(*values):
+        nonlocal speeds
+        speeds = iter(values)
+
+    monkeypatch.setattr(ceiling, "flop_rate", lambda device, **_: next(speeds, 100.0))
+    return set_speeds
+
+
+def test_a_section_is_measured_again_when_the_machine_changed_its_speed(fake, device, tmp_path):
+    fake(100.0, 55.0, 100.0, 99.0)
+    lines = []
+    run = harness.profile(["psd"], [device], seconds=0.01, told=lines.append)
+    assert run.valid
+    assert len(run.rows) == 1
+    assert sum("changed its speed" in line for line in lines) == 1
+
+
+def test_a_machine_that_never_holds_its_speed_voids_the_run(fake, device, tmp_path):
+    fake(*[100.0, 55.0] * 4)
+    run = harness.profile(["psd"], [device], seconds=0.01)
+    assert not run.valid
+    run.write(tmp_path / "run.json")
+    table = json.loads((tmp_path / "run.json").read_text())
+    assert table["valid"] is False
+    expected = {"operation", "case", "device", "seconds", "peer", "peer_version", "peer_seconds", "ratio", "error"}
+    assert expected | {"fraction"} <= set(table["rows"][0])
+    assert table["machine"]["devices"][device.label]["driver"] == device.driver

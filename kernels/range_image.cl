@@ -68,17 +68,21 @@ inline Pose pose_of(real angle, constant real *table) {
 #define UNDISTORT(SUFFIX, a, b, table) 0
 #endif
 
+#define ALONG_RAY(axis)                                                                                                \
+    (table[POINT_ORIGIN + (axis)] +                                                                                    \
+     depth * (table[POINT_E1 + (axis)] * a + table[POINT_E2 + (axis)] * b + table[POINT_E3 + (axis)]))
 #define POINT(SUFFIX, REAL, BITS)                                                                                      \
-    inline BITS point##SUFFIX(REAL position, REAL sample, Pose pose, constant real *table, REAL *x, REAL *y, REAL *z) { \
+    inline BITS point##SUFFIX(REAL position, REAL sample, Pose pose, constant real *table, REAL *x, REAL *y,           \
+                              REAL *z) {                                                                               \
         REAL a = (position - table[RAY_POSITION_ORIGIN]) * table[RAY_SCALE];                                           \
         REAL b = (sample - table[RAY_SAMPLE_ORIGIN]) * table[RAY_SCALE];                                               \
         const BITS folded = UNDISTORT(SUFFIX, a, b, table);                                                            \
         const REAL facing = pose.position * a + pose.sample * b + pose.depth;                                          \
         const REAL depth = pose.reach / facing;                                                                        \
-        *x = table[POINT_ORIGIN] + depth * (table[POINT_E1] * a + table[POINT_E2] * b + table[POINT_E3]);              \
-        *y = table[POINT_ORIGIN + 1] + depth * (table[POINT_E1 + 1] * a + table[POINT_E2 + 1] * b + table[POINT_E3 + 1]); \
-        *z = table[POINT_ORIGIN + 2] + depth * (table[POINT_E1 + 2] * a + table[POINT_E2 + 2] * b + table[POINT_E3 + 2]); \
-        const BITS missed = facing > pose.horizon ? (BITS)0 : (BITS)STATUS_HORIZON;                            \
+        *x = ALONG_RAY(0);                                                                                             \
+        *y = ALONG_RAY(1);                                                                                             \
+        *z = ALONG_RAY(2);                                                                                             \
+        const BITS missed = facing > pose.horizon ? (BITS)0 : (BITS)STATUS_HORIZON;                                    \
         return folded ? (BITS)STATUS_FOLDED : missed;                                                                  \
     }
 
@@ -113,9 +117,9 @@ POINT(16, real16, bits16)
 // One point with its flags: NaN wherever a flag says that there is none. The causes rank: what came in, the lens'
 // fold and the horizon, then the limits; a later one is not looked at where an earlier one holds.
 #define JUDGED(SUFFIX, REAL, BITS)                                                                                     \
-    inline BITS judged##SUFFIX(REAL first, REAL second, BITS given, Pose pose, constant real *table, REAL *x, REAL *y,  \
-                               REAL *z) {                                                                              \
-        const BITS unknown = not_finite##SUFFIX(first) | not_finite##SUFFIX(second) | (BITS)pose.unknown;                               \
+    inline BITS judged##SUFFIX(REAL first, REAL second, BITS given, Pose pose, constant real *table, REAL *x,          \
+                               REAL *y, REAL *z) {                                                                     \
+        const BITS unknown = not_finite##SUFFIX(first) | not_finite##SUFFIX(second) | (BITS)pose.unknown;              \
         const BITS withheld = given & (BITS)(~STATUS_INFORMS & 0xff);                                                  \
         BITS status = point##SUFFIX(first, second, pose, table, x, y, z);                                              \
         const BITS lost = not_finite##SUFFIX(*x) | not_finite##SUFFIX(*y) | not_finite##SUFFIX(*z);                    \

@@ -1,10 +1,12 @@
-// One-dimensional resampling of lines of points onto regular cells; regrid.py runs it along the samples of every profile
-// and then along the profiles. One work-item per line: whether the sampling runs backwards is known only in order.
+// One-dimensional resampling of lines of points onto regular cells; regrid.py runs it along the samples of every
+// profile and then along the profiles. One work-item per line: whether the sampling runs backwards is known only in
+// order.
 //
 // A line carries a coordinate along itself, a height, and what rides along: the intensity, and, under CARRY, the other
 // coordinate. Between two neighbouring good samples everything is linear in the coordinate; a pair further apart than
 // max_gap or with a larger step in height than max_step is not joined. Where the line has fallen back by at least
-// fold_tolerance behind the furthest point it had reached, all cells up to that point are FOLDED: two surfaces share them.
+// fold_tolerance behind the furthest point it had reached, all cells up to that point are FOLDED: two surfaces share
+// them.
 #include "real.h"
 #include "status.h"
 
@@ -32,7 +34,7 @@ typedef struct {
 
 #ifdef CARRY
 #define LINES_IN                                                                                                       \
-    global const INPUT *restrict along, global const INPUT *restrict height, global const INPUT *restrict intensity,      \
+    global const INPUT *restrict along, global const INPUT *restrict height, global const INPUT *restrict intensity,   \
         global const uchar *restrict given, global const INPUT *restrict other
 #define LINES_OUT                                                                                                      \
     global real *restrict out_height, global real *restrict out_intensity, global uchar *restrict out_status,          \
@@ -42,7 +44,7 @@ typedef struct {
 #define SET_OTHER(i, value) out_other[i] = value
 #else
 #define LINES_IN                                                                                                       \
-    global const INPUT *restrict along, global const INPUT *restrict height, global const INPUT *restrict intensity,      \
+    global const INPUT *restrict along, global const INPUT *restrict height, global const INPUT *restrict intensity,   \
         global const uchar *restrict given
 #define LINES_OUT                                                                                                      \
     global real *restrict out_height, global real *restrict out_intensity, global uchar *restrict out_status

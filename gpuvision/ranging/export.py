@@ -1,0 +1,344 @@
+"""Range images as files: TIFF, 16-bit PNG, PLY and NPZ, each written whole or not at all.
+
+==========  =================================================================================================
+TIFF        float32 heights [m], NaN in holes; the resolution tags and a JSON description hold the cells
+16-bit PNG  height = Offset + Scale (code - 1), code 0 is a hole; both numbers are text chunks in the file
+PLY         binary, one vertex per sample in scan order (organised): NaN in holes, so that neighbours stay
+            neighbours; ``obj_info num_cols`` and ``num_rows`` give the shape
+NPZ         all arrays, and their units as JSON
+==========  =================================================================================================
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import secrets
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import tifffile
+
+from gpuvision.ranging.regrid import Grid
+
+_GRID_KEYS = ("left", "top", "cell_x", "cell_y")
+_NO_DATA_TAG = 42113  # GDAL_NODATA: what geographic and image tools take as a hole
+_CENTIMETRE = 0.01
+_HIGHEST_CODE = 65535
+_LEAST_SCALE = 1e-9  # m per code, for heights that are all the same
+_PNG_HEAD = 8 + 25  # signature and IHDR
+_PLY_TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "uint16": "ushort", "uint32": "uint"}
+_PLY_DTYPES = {name: np.dtype(dtype).newbyteorder("<") for dtype, name in _PLY_TYPES.items()}
+_UNITS_KEY = "units"
+
+Array = npt.NDArray[Any]
+
+
+class HeightFile(NamedTuple):
+    """What a file of heights holds.
+
+    Attributes
+    ----------
+    z
+        Heights [m], (rows, columns); NaN in holes.
+    grid
+        Where the cells lie; None where the file does not say.
+    """
+
+    z: Array
+    grid: Grid | None
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a file that takes the place of `path` when the block ends well, and vanishes when it does not.
+
+    The bytes are on the disk before the name is: whoever opens `path` sees the old file or the whole new one.
+
+    Raises
+    ------
+    FileNotFoundError
+        The folder does not exist.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
+    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        with beside.open("xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _heights(z: Any, grid: Grid | None) -> Array:
+    heights: Array = np.asarray(z)
+    if heights.ndim != 2 or heights.size == 0:
+        raise ValueError(f"heights have shape {heights.shape}, expected (rows, columns)")
+    if grid is not None and heights.shape != grid.shape:
+        raise ValueError(f"heights have shape {heights.shape}, the grid has {grid.shape}; expected the same")
+    return heights
+
+
+def _grid_of(table: Mapping[str, Any], shape: tuple[int, ...]) -> Grid | None:
+    if not all(key in table for key in _GRID_KEYS):
+        return None
+    return Grid(**{key: float(table[key]) for key in _GRID_KEYS}, rows=shape[0], columns=shape[1])
+
+
+def _grid_table(grid: Grid | None) -> dict[str, float]:
+    return {} if grid is None else {key: getattr(grid, key) for key in _GRID_KEYS}
+
+
+# ---- TIFF ------------------------------------------------------------------------------------------------------
+
+
+def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None) -> None:
+    """Write heights as float32 TIFF: metres, NaN in holes.
+
+    With a grid the resolution tags say cells per centimetre. The description is JSON: unit, hole, and the grid.
+
+    Raises
+    ------
+    ValueError
+        `z` is not (rows, columns), or not of the grid's shape.
+    """
+    z = _heights(z, grid).astype(np.float32)
+    cells: dict[str, Any] = (
+        {} if grid is None else {"resolution": (_CENTIMETRE / grid.cell_x, _CENTIMETRE / grid.cell_y)}
+    )
+    with replacing(path) as file:
+        tifffile.imwrite(
+            file,
+            z,
+            photometric="minisblack",
+            description=json.dumps({"quantity": "height", "unit": "m", "hole": "NaN", **_grid_table(grid)}),
+            metadata=None,
+            software="gpuvision",
+            resolutionunit="CENTIMETER" if cells else None,
+            extratags=[(_NO_DATA_TAG, "s", 0, "nan", True)],
+            **cells,
+        )
+
+
+def read_tiff(path: str | os.PathLike[str]) -> HeightFile:
+    """Read what `write_tiff` wrote."""
+    with tifffile.TiffFile(path) as file:
+        page: Any = file.pages[0]
+        z = page.asarray()
+        return HeightFile(z, _grid_of(json.loads(page.description), z.shape))
+
+
+# ---- 16-bit PNG ------------------------------------------------------------------------------------------------
+
+
+def write_png16(
+    path: str | os.PathLike[str],
+    z: Any,
+    grid: Grid | None = None,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+) -> None:
+    """Write heights as 16-bit PNG: ``height = Offset + Scale (code - 1)`` in metres, code 0 is a hole.
+
+    The codes 1 to 65535 span `low` to `high`, so that a height is off by half a step at most. Both numbers, the unit
+    and the grid are text chunks of the file.
+
+    Parameters
+    ----------
+    path, z, grid
+        As for `write_tiff`.
+    low, high
+        Heights of the first and the last code [m]; None takes the lowest and highest there is. Heights outside are
+        holes, not the nearest code.
+
+    Raises
+    ------
+    ValueError
+        `z` is not (rows, columns), or not of the grid's shape, or `low` is not below `high`.
+    """
+    z = _heights(z, grid).astype(np.float64)
+    finite = z[np.isfinite(z)]
+    low = float(finite.min(initial=math.inf)) if low is None else low
+    high = float(finite.max(initial=-math.inf)) if high is None else high
+    if not finite.size:
+        low = high = 0.0
+    if not low <= high:
+        raise ValueError(f"low is {low} and high is {high}, expected low below high")
+    scale = max((high - low) / (_HIGHEST_CODE - 1), _LEAST_SCALE)
+    with np.errstate(invalid="ignore"):
+        codes = np.where((z >= low) & (z <= high), np.rint((z - low) / scale) + 1, 0).astype(np.uint16)
+    done, image = cv2.imencode(".png", codes)
+    if not done:
+        raise ValueError(f"cannot encode heights of shape {z.shape} as PNG; expected less than 2^31 cells a side")
+    text = {
+        "Description": "height = Offset + Scale * (code - 1); code 0 is a hole",
+        "Unit": "m",
+        "Offset": repr(low),
+        "Scale": repr(scale),
+        **{key: repr(value) for key, value in _grid_table(grid).items()},
+    }
+    with replacing(path) as file:
+        encoded = image.tobytes()
+        file.write(encoded[:_PNG_HEAD])
+        for key, value in text.items():
+            file.write(_text_chunk(key, value))
+        file.write(encoded[_PNG_HEAD:])
+
+
+def _text_chunk(key: str, value: str) -> bytes:
+    body = b"tEXt" + key.encode("latin-1") + b"\0" + value.encode("latin-1")
+    return struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+
+
+def _text_chunks(encoded: bytes) -> dict[str, str]:
+    text, at = {}, 8
+    while at + 8 <= len(encoded):
+        (length,) = struct.unpack_from(">I", encoded, at)
+        if encoded[at + 4 : at + 8] == b"tEXt":
+            key, value = encoded[at + 8 : at + 8 + length].split(b"\0", 1)
+            text[key.decode("latin-1")] = value.decode("latin-1")
+        at += length + 12
+    return text
+
+
+def read_png16(path: str | os.PathLike[str]) -> HeightFile:
+    """Read what `write_png16` wrote.
+
+    Raises
+    ------
+    ValueError
+        The file is no 16-bit PNG, or does not say how codes become heights.
+    """
+    encoded = Path(path).read_bytes()
+    codes = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+    text = _text_chunks(encoded)
+    if codes is None or codes.dtype != np.uint16 or "Scale" not in text or "Offset" not in text:
+        raise ValueError(f"{path} is no 16-bit PNG with Offset and Scale; expected one that write_png16 wrote")
+    z = float(text["Offset"]) + float(text["Scale"]) * (codes.astype(np.float64) - 1)
+    return HeightFile(np.where(codes == 0, np.nan, z), _grid_of(text, z.shape))
+
+
+# ---- PLY -------------------------------------------------------------------------------------------------------
+
+
+def write_ply(
+    path: str | os.PathLike[str],
+    x: Any,
+    y: Any,
+    z: Any,
+    intensity: Any = None,
+    status: Any = None,
+    *,
+    organised: bool = True,
+) -> None:
+    """Write points as binary little-endian PLY, in metres.
+
+    Parameters
+    ----------
+    path
+        Where to.
+    x, y, z
+        (profiles, samples), float32 or float64; the file keeps the type.
+    intensity, status
+        Of the same shape; left out where None.
+    organised
+        All samples in scan order, with NaN in holes, and ``obj_info num_cols`` (samples) and ``num_rows`` (profiles).
+        False: the valid points only, for viewers that know no NaN.
+
+    Raises
+    ------
+    ValueError
+        The arrays are not all (profiles, samples).
+    TypeError
+        A PLY file has no such type.
+    """
+    arrays = {"x": x, "y": y, "z": z, "intensity": intensity, "status": status}
+    fields = {name: np.asarray(each) for name, each in arrays.items() if each is not None}
+    shape = fields["x"].shape
+    for name, each in fields.items():
+        if each.ndim != 2 or each.shape != shape:
+            raise ValueError(f"{name} has shape {each.shape}, expected (profiles, samples), the same for all arrays")
+        if each.dtype.name not in _PLY_TYPES:
+            raise TypeError(f"{name} is {each.dtype}, a PLY file holds one of {', '.join(_PLY_TYPES)}")
+    vertices = np.empty(shape, [(name, each.dtype.newbyteorder("<")) for name, each in fields.items()])
+    for name, each in fields.items():
+        vertices[name] = each
+    if not organised:
+        vertices = vertices[np.isfinite(fields["x"]) & np.isfinite(fields["y"]) & np.isfinite(fields["z"])]
+    layout = [f"obj_info num_cols {shape[1]}", f"obj_info num_rows {shape[0]}"] if organised else []
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment gpuvision range image, metres" + (", NaN in holes, profile after profile" if organised else ""),
+        *layout,
+        f"element vertex {vertices.size}",
+        *(f"property {_PLY_TYPES[each.dtype.name]} {name}" for name, each in fields.items()),
+        "end_header",
+    ]
+    with replacing(path) as file:
+        file.write(("\n".join(header) + "\n").encode("ascii"))
+        file.write(vertices.tobytes())
+
+
+def read_ply(path: str | os.PathLike[str]) -> dict[str, Array]:
+    """Read what `write_ply` wrote: arrays by name, (profiles, samples) where the file is organised.
+
+    Raises
+    ------
+    ValueError
+        The file is of another kind of PLY, or shorter than its header says.
+    """
+    with Path(path).open("rb") as file:
+        lines = []
+        while (line := file.readline().decode("ascii", "replace").strip()) not in ("end_header", ""):
+            lines.append(line.split())
+        content = file.read()
+    if ["format", "binary_little_endian", "1.0"] not in lines or any("list" in each for each in lines):
+        raise ValueError(f"{path} is no binary little-endian PLY of points; expected one that write_ply wrote")
+    layout = [(each[2], _PLY_DTYPES[each[1]]) for each in lines if each[0] == "property"]
+    (count,) = (int(each[2]) for each in lines if each[:2] == ["element", "vertex"])
+    if len(content) != count * np.dtype(layout).itemsize:
+        raise ValueError(f"{path} holds {len(content)} bytes of points, its header says {count} points; it was cut")
+    vertices = np.frombuffer(content, layout)
+    sides = {each[1]: int(each[2]) for each in lines if each[0] == "obj_info"}
+    shape = (sides["num_rows"], sides["num_cols"]) if sides else (count,)
+    return {name: vertices[name].reshape(shape) for name, _ in layout}
+
+
+# ---- NPZ -------------------------------------------------------------------------------------------------------
+
+
+def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], units: Mapping[str, str]) -> None:
+    """Write arrays by name, with the unit of each.
+
+    Raises
+    ------
+    ValueError
+        An array has no unit, or a unit no array (``""`` is the unit of what has none).
+    """
+    if _UNITS_KEY in arrays or set(units) != set(arrays):
+        odd = ", ".join(sorted(set(units) ^ set(arrays))) or _UNITS_KEY
+        raise ValueError(f"arrays and units do not belong together: {odd}; expected one unit for every array")
+    with replacing(path) as file:
+        held: dict[str, Any] = {**arrays, _UNITS_KEY: np.array(json.dumps(dict(units)))}
+        np.savez(file, **held)
+
+
+def read_npz(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, str]]:
+    """Read what `write_npz` wrote: the arrays and their units, by name."""
+    with np.load(path) as file:
+        units: dict[str, str] = json.loads(str(file[_UNITS_KEY]))
+        return {name: file[name] for name in file.files if name != _UNITS_KEY}, units

@@ -50,12 +50,11 @@
         const REAL p = x / w, q = y / w;                                                                               \
         const REAL at_g = sheet[SHEET_G_TERMS] + (sheet[SHEET_G_TERMS + 1] * p + sheet[SHEET_G_TERMS + 2] * q);        \
         const REAL at_h = sheet[SHEET_H_TERMS] + (sheet[SHEET_H_TERMS + 1] * p + sheet[SHEET_H_TERMS + 2] * q);        \
-        const BITS lost = not_finite##SUFFIX(position) | not_finite##SUFFIX(sample);                                   \
-        const BITS too_large = not_finite##SUFFIX(at_g) | not_finite##SUFFIX(at_h);                                    \
-        BITS status = too_large ? (BITS)STATUS_NOT_FINITE : (BITS)STATUS_OK;                                           \
-        status = w <= sheet[SHEET_HORIZON] ? (BITS)STATUS_HORIZON : status;                                            \
+        const BITS hidden = w <= sheet[SHEET_HORIZON];                                                                 \
+        const REAL all = position + sample + (hidden ? (REAL)0 : at_g + at_h);                                         \
+        BITS status = hidden ? (BITS)STATUS_HORIZON : (BITS)STATUS_OK;                                                 \
         status = folded ? (BITS)STATUS_FOLDED : status;                                                                \
-        status = lost ? (BITS)STATUS_NOT_FINITE : status;                                                              \
+        status = not_finite##SUFFIX(all) ? (BITS)STATUS_NOT_FINITE : status;                                           \
         *g = status == (BITS)STATUS_OK ? at_g : (REAL)REAL_NAN;                                                        \
         *h = status == (BITS)STATUS_OK ? at_h : (REAL)REAL_NAN;                                                        \
         return TO_STATUS(status);                                                                                      \

@@ -92,10 +92,12 @@ class Lens:
         """Undistorted (column, row) of measured points, shape (..., 2); NaN beyond the fold."""
         offset = np.asarray(points, dtype=np.float64) - self.centre
         square = np.sum(offset**2, axis=-1, keepdims=True)
-        stretched = offset * (square * (self.k1 + self.k2 * square))
-        # Displacement form: adding the small stretch to the point itself keeps its digits.
         inside = square < self.fold_radius**2
-        return np.where(inside, np.asarray(points, dtype=np.float64) + stretched, np.nan)
+        # Displacement form: adding the small stretch to the point itself keeps its digits.
+        with np.errstate(invalid="ignore", over="ignore"):
+            stretched = offset * (square * (self.k1 + self.k2 * square))
+        straight: npt.NDArray[np.float64] = np.where(inside, np.asarray(points) + stretched, np.nan)
+        return straight
 
     def jacobian(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """d(undistorted column, row) / d(measured column, row), shape (..., 2, 2)."""
@@ -103,7 +105,7 @@ class Lens:
         square = np.sum(offset**2, axis=-1)[..., None, None]
         growth = 1.0 + square * (self.k1 + self.k2 * square)
         slope = 2.0 * (self.k1 + 2.0 * self.k2 * square)
-        return growth * np.eye(2) + slope * offset[..., :, None] * offset[..., None, :]
+        return np.asarray(growth * np.eye(2) + slope * offset[..., :, None] * offset[..., None, :])
 
     def distort(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Measured (column, row) of undistorted points, shape (..., 2): the inverse, by Newton steps.
@@ -139,9 +141,7 @@ class Lens:
             low = np.where(excess < 0.0, radius, low)
             with np.errstate(divide="ignore", invalid="ignore"):
                 step = radius - excess / (1.0 + square * (3.0 * self.k1 + 5.0 * self.k2 * square))
-            radius = np.where(
-                (step >= low) & (step <= high), step, np.where(reachable, 0.5 * (low + high), np.nan)
-            )
+            radius = np.where((step >= low) & (step <= high), step, np.where(reachable, 0.5 * (low + high), np.nan))
         return radius
 
     def to_dict(self) -> dict[str, Any]:

@@ -42,6 +42,7 @@ MODELS: dict[str, npt.NDArray[np.bool_]] = {
 """By name: which elements of sheet -> sensor are free (one of them is the scale)."""
 
 _RANK_LIMIT = 1e-10
+_BOTH_SIDES = "points lie on both sides of the horizon; expected points in front of the sensor"
 # Residuals below this part of the coordinates are rounding; to test them against each other would be noise.
 _ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 
@@ -103,9 +104,10 @@ def inverse(matrix: Float64) -> Float64:
         If it is singular: the sheet of light is seen edge-on.
     """
     try:
-        return np.linalg.inv(matrix)
+        inverted = np.linalg.inv(matrix)
     except np.linalg.LinAlgError:
         raise ValueError("the homography is singular: the sensor sees the sheet of light edge-on") from None
+    return np.asarray(inverted, dtype=np.float64)
 
 
 def to_displacement(matrix: Float64, *, rank: int = 3) -> Float64:
@@ -124,9 +126,7 @@ def to_displacement(matrix: Float64, *, rank: int = 3) -> Float64:
         If x = y = 0 lies on the horizon, or the matrix is singular.
     """
     if abs(matrix[2, 2]) <= _RANK_LIMIT * np.max(np.abs(matrix[2])):
-        raise ValueError(
-            "the middle of the region lies on the horizon; expected a region that sees the sheet"
-        )
+        raise ValueError("the middle of the region lies on the horizon; expected a region that sees the sheet")
     scaled = matrix / matrix[2, 2]
     slopes = scaled[:2, :2] - np.outer(scaled[:2, 2], scaled[2, :2])
     steepness = np.linalg.svd(slopes, compute_uv=False)
@@ -155,7 +155,7 @@ def packed_factor(covariance: npt.ArrayLike, which: Sequence[int]) -> Float64:
     """Lower triangular factor of a part of a covariance, which may be singular, column after column."""
     part = np.asarray(covariance, dtype=np.float64)[np.ix_(which, which)]
     values, vectors = np.linalg.eigh(part)
-    triangle = np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r").T
+    triangle = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r")).T
     return np.concatenate([triangle[column:, column] for column in range(len(which))])
 
 
@@ -166,9 +166,7 @@ def seen_by_camera(
     plane: Sequence[npt.ArrayLike],
 ) -> Float64:
     """Sheet -> (column, row) for a pinhole camera; ``plane``: G axis, H axis and origin in the world."""
-    turned = np.asarray(rotation, dtype=np.float64) @ np.column_stack(
-        [np.asarray(each, np.float64) for each in plane]
-    )
+    turned = np.asarray(rotation, dtype=np.float64) @ np.column_stack([np.asarray(each, np.float64) for each in plane])
     turned[:, 2] += np.asarray(translation, dtype=np.float64)
     return np.asarray(camera_matrix, dtype=np.float64) @ turned
 
@@ -270,21 +268,18 @@ def compare(
         raise ValueError(f"got {len(sensor)} sensor points and {len(sheet)} sheet points, expected pairs")
     straight = sensor if lens is None else lens.undistort(sensor)
     if not np.all(np.isfinite(straight)):
-        raise ValueError(
-            "a sensor point lies beyond the fold of the lens polynomial; check the lens, or drop it"
-        )
+        raise ValueError("a sensor point lies beyond the fold of the lens polynomial; check the lens, or drop it")
     spread = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, dtype=np.float64), sensor.shape)
     if not np.all(spread > 0.0):
         raise ValueError("sigma must be positive everywhere, got a value that is not")
-    if models is None:
-        beam = np.ptp(sensor[:, 1]) == 0.0 or np.ptp(sheet[:, 0]) == 0.0
-        models = ("C3",) if beam else ("C4", "D6", "H8")
+    beam = np.ptp(sensor[:, 1]) == 0.0 or np.ptp(sheet[:, 0]) == 0.0
+    family: tuple[Model, ...] = ("C3",) if beam else ("C4", "D6", "H8")
     bend = np.eye(2) if lens is None else lens.jacobian(sensor)
-    data = _Calibration(straight, sheet, np.linalg.inv(bend * spread[:, None, :]), symmetry)
+    data = _Calibration(straight, sheet, bend * spread[:, None, :], symmetry)
     frame = shift_and_scale(*middle_and_half(box(sensor) if region is None else region))
     fits: list[tuple[ModelFit, float]] = []
     reasons: list[DegenerateError] = []
-    for model in models:
+    for model in family if models is None else models:
         try:
             fits.append(_fit(data, model, frame))
         except DegenerateError as error:
@@ -295,11 +290,11 @@ def compare(
 
 
 class _Calibration(NamedTuple):
-    """Undistorted (u, v); (G, H); matrices that take sensor residuals to unit variance; the symmetry's v."""
+    """Undistorted (u, v); (G, H); matrices that take unit variance to the sensor's; the symmetry's v."""
 
     sensor: Float64
     sheet: Float64
-    whitening: Float64
+    spread: Float64
     symmetry: float
 
 
@@ -312,12 +307,10 @@ def _points(values: npt.ArrayLike, name: str) -> Float64:
     return points
 
 
-def _tested(
-    fits: Sequence[tuple[ModelFit, float]], data: _Calibration, sigma_known: bool
-) -> tuple[ModelFit, ...]:
+def _tested(fits: Sequence[tuple[ModelFit, float]], data: _Calibration, sigma_known: bool) -> tuple[ModelFit, ...]:
     """Add the F test against the last fit; scale the covariance by the residuals where no sigma is known."""
-    whitened = np.einsum("nij,nj->ni", data.whitening, data.sensor)
-    floor = (_ROUNDING * float(np.max(np.abs(whitened)))) ** 2
+    reach = np.max(np.abs(np.linalg.solve(data.spread, data.sensor[..., None])))
+    floor = (_ROUNDING * float(reach)) ** 2
     full, full_sum = fits[-1]
     variance = max(full_sum / max(full.degrees_of_freedom, 1), floor)
     tested = []
@@ -328,33 +321,31 @@ def _tested(
         if extra and full.degrees_of_freedom:
             ratio = max(squares - full_sum, 0.0) / (extra * variance)
             fit = fit._replace(p_value=float(scipy.special.fdtrc(extra, full.degrees_of_freedom, ratio)))
-        if not sigma_known:
-            known = fit.covariance is not None and spare > 0
-            fit = fit._replace(covariance=fit.covariance * (squares / spare) if known else None)
+        if not sigma_known and fit.covariance is not None:
+            fit = fit._replace(covariance=fit.covariance * (squares / spare) if spare else None)
         tested.append(fit)
     return tuple(tested)
 
 
 def _fit(data: _Calibration, model: Model, frame: Float64) -> tuple[ModelFit, float]:
     """Direct linear transform, then Levenberg-Marquardt on the sensor residuals; with the sum of squares."""
-    sensor, sheet, whitening, symmetry = data
     free = MODELS[model]
     seen = (0,) if model == "C3" else (0, 1)
-    to_sensor = _conditioning(sensor, (None, symmetry if model == "C4" else None))
-    to_sheet = _conditioning(sheet, (0.0 if model == "C4" else None, None))
-    x = project(np.linalg.inv(to_sensor), sensor)
-    points = np.column_stack([project(np.linalg.inv(to_sheet), sheet), np.ones(len(sheet))])
-    excess = len(sensor) * len(seen) - (np.count_nonzero(free) - 1)
-    if excess < 0:
-        raise DegenerateError(f"{len(sensor)} points are too few for the model {model}; measure more")
-    start = _direct_linear(x, points, free, seen, model)
+    to_sensor = _conditioning(data.sensor, (None, data.symmetry if model == "C4" else None))
+    to_sheet = _conditioning(data.sheet, (0.0 if model == "C4" else None, None))
+    x = project(inverse(to_sensor), data.sensor)
+    points = np.column_stack([project(inverse(to_sheet), data.sheet), np.ones(len(data.sheet))])
     # The scale is free: the denominator in the middle of the points is 1.
     elements = np.argwhere(free)[:-1]
-    white = (
-        (whitening * np.diag(to_sensor)[:2])[:, :, seen]
-        if len(seen) == 2
-        else whitening[:, :1, :1] * to_sensor[0, 0]
-    )
+    excess = len(x) * len(seen) - len(elements)
+    if excess < 0:
+        raise DegenerateError(f"{len(x)} points are too few for the model {model}; measure more")
+    start = _direct_linear(x, points, free, seen, model)
+    if model == "C3":
+        # The marginal spread of u: a beam's v is not compared.
+        white = to_sensor[0, 0] / np.linalg.norm(data.spread[:, :1], axis=-1, keepdims=True)
+    else:
+        white = np.linalg.inv(data.spread) * np.diag(to_sensor)[:2]
 
     def assemble(values: Float64) -> Float64:
         matrix = np.zeros((3, 3))
@@ -364,15 +355,16 @@ def _fit(data: _Calibration, model: Model, frame: Float64) -> tuple[ModelFit, fl
 
     def residuals(values: Float64) -> Float64:
         lifted = points @ assemble(values).T
-        return np.einsum("nij,nj->ni", white, (lifted[:, :2] / lifted[:, 2:] - x)[:, seen]).ravel()
+        missed = (lifted[:, :2] / lifted[:, 2:] - x)[:, seen]
+        return np.asarray(np.einsum("nij,nj->ni", white, missed)).ravel()
 
     def slopes(values: Float64) -> Float64:
         lifted = points @ assemble(values).T
         change = np.zeros((len(points), 3, len(elements)))
         change[:, elements[:, 0], np.arange(len(elements))] = points[:, elements[:, 1]]
         moved = change[:, :2] - (lifted[:, :2] / lifted[:, 2:])[:, :, None] * change[:, 2:]
-        moved = moved / lifted[:, 2:, None]
-        return np.einsum("nij,njp->nip", white, moved[:, seen]).reshape(-1, len(elements))
+        moved = (moved / lifted[:, 2:, None])[:, seen]
+        return np.asarray(np.einsum("nij,njp->nip", white, moved)).reshape(-1, len(elements))
 
     solution = scipy.optimize.least_squares(
         residuals,
@@ -384,24 +376,20 @@ def _fit(data: _Calibration, model: Model, frame: Float64) -> tuple[ModelFit, fl
         gtol=1e-15,
     )
     squares = 2.0 * float(solution.cost)
-    inverse = np.linalg.inv(solution.jac.T @ solution.jac)
     matrix = assemble(solution.x)
     if np.any(points @ matrix[2] <= 0.0):
-        raise DegenerateError(
-            "points lie on both sides of the horizon; expected points in front of the sensor"
-        )
+        raise DegenerateError(_BOTH_SIDES)
     homography, changes = _to_sheet(matrix, elements, to_sensor, to_sheet, model)
     slope = displacement_slopes(homography @ frame, changes @ frame)
-    covariance = slope.T @ inverse @ slope
-    rms = float(np.sqrt(squares / (len(sensor) * len(seen))))
-    return ModelFit(model, homography, covariance, rms, excess, 1.0), squares
+    # (J' J)^-1 by the triangular factor of J: squaring J would square its condition.
+    spread = slope.T @ np.linalg.inv(np.linalg.qr(solution.jac, mode="r"))
+    rms = float(np.sqrt(squares / (len(x) * len(seen))))
+    return ModelFit(model, homography, spread @ spread.T, rms, excess, 1.0), squares
 
 
 def _conditioning(points: Float64, fixed: tuple[float | None, float | None]) -> Float64:
     """Matrix from coordinates about -1 to 1 to the points' own; a fixed origin keeps a model's symmetry."""
-    origin = [
-        np.mean(column) if value is None else value for column, value in zip(points.T, fixed, strict=True)
-    ]
+    origin = [np.mean(column) if value is None else value for column, value in zip(points.T, fixed, strict=True)]
     unit = np.max(np.abs(points - origin), axis=0)
     return shift_and_scale(origin, np.where(unit > 0.0, unit, 1.0))
 
@@ -416,16 +404,16 @@ def _direct_linear(
         equations[:, row] = points
         equations[:, 2] = -x[:, row, None] * points
         blocks.append(equations[:, free])
-    _, values, vectors = np.linalg.svd(np.concatenate(blocks))
+    # The row of zeros makes sure of a last singular vector where the equations are one too few to need the fit.
+    blocks.append(np.zeros((1, np.count_nonzero(free))))
+    _, values, vectors = np.linalg.svd(np.concatenate(blocks), full_matrices=False)
     if values[np.count_nonzero(free) - 2] <= _RANK_LIMIT * values[0]:
         raise DegenerateError(f"the points do not fix the model {model}; spread them over the sheet")
     matrix = np.zeros((3, 3))
     matrix[free] = vectors[-1]
     if abs(matrix[2, 2]) <= _RANK_LIMIT:
-        raise DegenerateError(
-            "points lie on both sides of the horizon; expected points in front of the sensor"
-        )
-    return matrix / matrix[2, 2]
+        raise DegenerateError(_BOTH_SIDES)
+    return np.asarray(matrix / matrix[2, 2])
 
 
 def _to_sheet(
@@ -436,12 +424,12 @@ def _to_sheet(
         # A beam has no v: any will do to invert, and G stays where the points have it.
         matrix = matrix.copy()
         matrix[1, 0] = 1.0
-    inside = np.linalg.inv(matrix)
+    inside = inverse(matrix)
     unit = np.zeros((len(elements), 3, 3))
     unit[np.arange(len(elements)), elements[:, 0], elements[:, 1]] = 1.0
     changes = -inside @ unit @ inside
     if model == "C3":
         inside[0] = 0.0
         changes[:, 0] = 0.0
-    outside = np.linalg.inv(to_sensor)
-    return to_sheet @ inside @ outside, to_sheet @ changes @ outside
+    outside = inverse(to_sensor)
+    return to_sheet @ inside @ outside, np.asarray(to_sheet @ changes @ outside)

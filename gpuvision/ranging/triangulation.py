@@ -27,6 +27,8 @@ Along = Literal["columns", "rows"]
 Matrix = tuple[tuple[float, float, float], ...]
 Float64 = npt.NDArray[np.float64]
 
+# Points per work-group: a CPU runtime pays for every group, a GPU hides its latency with several.
+_GROUP_CPU, _GROUP_GPU = 1024, 256
 _KEYS = ("homography", "region", "model", "along", "lens", "covariance", "sigma", "horizon")
 
 
@@ -69,9 +71,7 @@ class SampleAxes:
         for name in ("sample_origin", "sample_pitch", "position_origin", "position_pitch"):
             finite(getattr(self, name), f"SampleAxes.{name}")
         if self.sample_pitch == 0.0 or self.position_pitch == 0.0:
-            raise ValueError(
-                "SampleAxes: a pitch is 0, expected the distance between samples in sensor units"
-            )
+            raise ValueError("SampleAxes: a pitch is 0, expected the distance between samples in sensor units")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,9 +129,7 @@ class Triangulation(Operation[SheetPoints]):
         object.__setattr__(self, "homography", numbers(self.homography, (3, 3), "Triangulation.homography"))
         object.__setattr__(self, "region", numbers(self.region, (2, 2), "Triangulation.region"))
         if self.covariance is not None:
-            object.__setattr__(
-                self, "covariance", numbers(self.covariance, (8, 8), "Triangulation.covariance")
-            )
+            object.__setattr__(self, "covariance", numbers(self.covariance, (8, 8), "Triangulation.covariance"))
         if self.sigma is not None:
             object.__setattr__(self, "sigma", numbers(self.sigma, (2,), "Triangulation.sigma"))
         self._check()
@@ -139,21 +137,15 @@ class Triangulation(Operation[SheetPoints]):
     def _check(self) -> None:
         (u_min, u_max), (v_min, v_max) = self.region
         if not (u_min < u_max and v_min <= v_max):
-            raise ValueError(
-                f"Triangulation.region is {self.region}, expected ((u_min, u_max), (v_min, v_max))"
-            )
+            raise ValueError(f"Triangulation.region is {self.region}, expected ((u_min, u_max), (v_min, v_max))")
         if self.model not in homography.MODELS:
-            raise ValueError(
-                f"Triangulation.model is {self.model!r}, expected one of {', '.join(homography.MODELS)}"
-            )
+            raise ValueError(f"Triangulation.model is {self.model!r}, expected one of {', '.join(homography.MODELS)}")
         if self.along not in ("columns", "rows"):
             raise ValueError(f"Triangulation.along is {self.along!r}, expected 'columns' or 'rows'")
         if not 0.0 < self.horizon < 1.0:
             raise ValueError(f"Triangulation.horizon is {self.horizon}, expected a number between 0 and 1")
         if self.sigma is not None and min(self.sigma) < 0.0:
-            raise ValueError(
-                f"Triangulation.sigma is {self.sigma}, expected (sigma_u, sigma_v), neither negative"
-            )
+            raise ValueError(f"Triangulation.sigma is {self.sigma}, expected (sigma_u, sigma_v), neither negative")
         self.conditioned()
 
     # ---- what the kernels take -----------------------------------------------------------------------------
@@ -215,9 +207,7 @@ class Triangulation(Operation[SheetPoints]):
             return np.zeros(15), np.zeros(15)
         covariance = np.array(self.covariance)
         seen_by_g, seen_by_h = (0, 1, 2, 6, 7), (3, 4, 5, 6, 7)
-        return homography.packed_factor(covariance, seen_by_g), homography.packed_factor(
-            covariance, seen_by_h
-        )
+        return homography.packed_factor(covariance, seen_by_g), homography.packed_factor(covariance, seen_by_h)
 
     def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         if dtype not in (np.float32, np.float64):
@@ -225,20 +215,22 @@ class Triangulation(Operation[SheetPoints]):
         real = real_of(self.precision, dtype)
         code = "float" if dtype == np.float32 else "double"
         defines = {**self.defines, **real_defines(device, real), "INPUT": code}
+        points = math.prod(shape)
+        group = max(min(points, _GROUP_CPU if device.is_cpu else _GROUP_GPU), 1)
         spread = None
         if self.sigma is not None:
             defines["SHEET_SIGMAS"], spread = None, (shape, real)
         sigma = self.sigma or (0.0, 0.0)
         outputs = {"g": (shape, real), "h": (shape, real), "status": (shape, np.dtype(np.uint8))}
-        outputs |= {"sigma_g": spread, "sigma_h": spread}
         return Launch(
             stem="triangulation",
             kernel="triangulate",
             defines=defines,
             inputs=((shape, dtype), (shape, dtype)),
-            outputs=outputs,
-            arguments=(self.packed(real), real.type(sigma[0]), real.type(sigma[1])),
-            global_size=(math.prod(shape),),
+            outputs={**outputs, "sigma_g": spread, "sigma_h": spread},
+            arguments=(np.uint64(points), self.packed(real), real.type(sigma[0]), real.type(sigma[1])),
+            global_size=(-(-points // group) * group,),
+            local_size=(group,),
         )
 
     # ---- on the host: simulators, planners, error budgets --------------------------------------------------
@@ -263,7 +255,7 @@ class Triangulation(Operation[SheetPoints]):
         return straight if self._lens is None else self._lens.distort(straight)
 
     def covariance_at(self, points: npt.ArrayLike) -> Float64:
-        """Covariance of (G, H) at measured points (u, v): (..., 2) to (..., 2, 2), in double.
+        """Covariance of (G, H) at measured points (u, v): (..., 2) to (..., 2, 2); NaN beyond the horizon.
 
         ``J diag(sigma_u^2, sigma_v^2) J'``, with J over lens and homography, and the parameters' own part.
 
@@ -278,14 +270,15 @@ class Triangulation(Operation[SheetPoints]):
         origin, unit = self._middle_and_half()
         x = ((points if self._lens is None else self._lens.undistort(points)) - origin) / unit
         _, gx, gy, _, hx, hy, dx, dy = self.conditioned()
-        p = x / (1.0 + x @ np.array([dx, dy]))[..., None]
+        w = 1.0 + x @ np.array([dx, dy])
+        w = np.where(w > self.horizon, w, np.nan)
+        p = x / w[..., None]
         values = p @ np.array([[gx, hx], [gy, hy]])
         slopes = np.array([[gx, gy], [hx, hy]]) - values[..., None] * np.array([dx, dy])
         bend = np.eye(2) if self._lens is None else self._lens.jacobian(points)
-        slopes = slopes / (1.0 + x @ np.array([dx, dy]))[..., None, None] @ bend / unit
-        total = (
-            slopes * np.square((0.0, 0.0) if self.sigma is None else self.sigma) @ np.swapaxes(slopes, -1, -2)
-        )
+        slopes = (slopes / w[..., None, None]) @ bend / unit
+        spread = slopes * np.array(self.sigma or (0.0, 0.0))
+        total: Float64 = spread @ np.swapaxes(spread, -1, -2)
         if self.covariance is None:
             return total
         design = np.zeros((*points.shape[:-1], 2, 8))
@@ -293,7 +286,8 @@ class Triangulation(Operation[SheetPoints]):
             design[..., row, 3 * row] = 1.0
             design[..., row, 3 * row + 1 : 3 * row + 3] = p
         design[..., 6:] = -values[..., None] * p[..., None, :]
-        return total + design @ np.array(self.covariance) @ np.swapaxes(design, -1, -2)
+        total += design @ np.array(self.covariance) @ np.swapaxes(design, -1, -2)
+        return total
 
     @property
     def _lens(self) -> Lens | None:

@@ -1,4 +1,4 @@
-"""Triangulation in float64 NumPy, written from the equations: undo the lens, multiply by the homography, divide."""
+"""Triangulation in float64 NumPy, from the equations: undo the lens, multiply by the homography, divide."""
 
 from __future__ import annotations
 

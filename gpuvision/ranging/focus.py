@@ -1,0 +1,186 @@
+"""Depth from focus with parallel pinholes: the intensities behind K pinholes give the distance of sharpest focus.
+
+Partly transparent mirrors spread the light of one illuminated point over K pinholes at equally spaced image
+distances (F. de Jong, Figure 2.6). Behind each the intensity falls off like a Gaussian with the defocus; its peak is
+the image distance LI, and the thin lens ``1/f = 1/LI + 1/LO`` (eq. 2.1) turns that into the object distance LO.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.status import Status
+from gpuvision.tables import finite
+
+Float64 = npt.NDArray[np.float64]
+
+# A parabola through logarithms of equal intensities has a curvature of this many roundings, of either sign.
+_ROUNDINGS = 16.0 * float(np.finfo(np.float64).eps)
+
+
+class FocusReading(NamedTuple):
+    """What the pinholes say, each array of the batch's shape; NaN where the status is not OK.
+
+    Attributes
+    ----------
+    image_distance
+        LI, of the sharpest image behind the lens [m].
+    object_distance
+        LO, of the point in front of the lens [m].
+    width
+        Standard deviation of the Gaussian through the intensities [m].
+    sigma_image, sigma_object
+        Predicted standard deviations of LI and LO [m]; None unless ``sigma_intensity`` is known.
+    status
+        uint8 `Status` flags: NOT_FINITE; DARK (fewer than three pinholes above the minimum; with three pinholes: one
+        of them not); AMBIGUOUS (no maximum: equal intensities, or a valley); OUT_OF_RANGE (the peak lies outside the
+        pinholes, or no object in front of the lens has its image there).
+    """
+
+    image_distance: Float64
+    object_distance: Float64
+    width: Float64
+    sigma_image: Float64 | None
+    sigma_object: Float64 | None
+    status: npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthFromFocus:
+    """Parallel pinholes behind one lens: call it with intensities, shape (..., K).
+
+    Three pinholes have a closed form: with z from the middle one and spacing d,
+    ``z = d/2 (ln I- - ln I+) / (ln I- - 2 ln I0 + ln I+)``. With more, a parabola is fitted to ln I with weights
+    I^2 (equal noise on every I), or dim pinholes would dominate.
+
+    Parameters
+    ----------
+    first
+        Image distance of the first pinhole [m].
+    spacing
+        Of the pinholes [m].
+    focal_length
+        Of the lens, f [m].
+    minimum
+        Intensity that a pinhole must exceed to be used.
+    sigma_intensity
+        Standard deviation of an intensity, the same for every pinhole; asks for the sigmas.
+
+    Raises
+    ------
+    ValueError
+        If the pinholes do not lie beyond the focal length, or a number is out of range.
+    """
+
+    first: float
+    spacing: float
+    focal_length: float
+    minimum: float = 0.0
+    sigma_intensity: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("first", "spacing", "focal_length"):
+            if not finite(getattr(self, name), f"DepthFromFocus.{name}") > 0.0:
+                raise ValueError(f"DepthFromFocus.{name} is {getattr(self, name)}, expected a positive length [m]")
+        if not self.first > self.focal_length:
+            raise ValueError(
+                f"DepthFromFocus.first is {self.first} m, expected beyond the focal length, {self.focal_length} m"
+            )
+        if not finite(self.minimum, "DepthFromFocus.minimum") >= 0.0:
+            raise ValueError(f"DepthFromFocus.minimum is {self.minimum}, expected 0 or more")
+        if self.sigma_intensity is not None and not finite(self.sigma_intensity, "sigma_intensity") > 0.0:
+            raise ValueError(f"DepthFromFocus.sigma_intensity is {self.sigma_intensity}, expected a positive number")
+
+    def __call__(self, intensities: npt.ArrayLike) -> FocusReading:
+        """Find the sharpest focus.
+
+        Parameters
+        ----------
+        intensities
+            Shape (..., K), K >= 3, behind the first pinhole to the last.
+
+        Raises
+        ------
+        ValueError
+            If there are fewer than three pinholes.
+        """
+        light = np.asarray(intensities, dtype=np.float64)
+        if not light.ndim or light.shape[-1] < 3:
+            raise ValueError(f"intensities have shape {light.shape}, expected (..., K) with at least 3 pinholes")
+        count = light.shape[-1]
+        known = np.all(np.isfinite(light), axis=-1)
+        lit = np.isfinite(light) & (light > self.minimum)
+        enough = known & (np.count_nonzero(lit, axis=-1) >= 3)
+        safe = np.where(lit, light, 1.0)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            peak, curvature, spread = self._peak(np.log(safe), self._weights(safe, lit), lit, safe)
+            # In units of the spacing, from the middle of the pinholes.
+            image = self.first + self.spacing * (peak + 0.5 * (count - 1))
+            width = self.spacing * np.sqrt(-0.5 / curvature)
+        flat = _ROUNDINGS * np.max(np.abs(np.log(safe)), axis=-1)
+        status = np.zeros(light.shape[:-1], dtype=np.uint8)
+        status[~(np.abs(peak) <= 0.5 * (count - 1))] = Status.OUT_OF_RANGE
+        status[~(curvature < -flat)] = Status.AMBIGUOUS
+        status[~enough] = Status.DARK
+        status[~known] = Status.NOT_FINITE
+        good = status == Status.OK
+        image = np.where(good, image, np.nan)
+        sigma = None if spread is None else np.where(good, self.spacing * spread, np.nan)
+        slope = self.focal_length / (image - self.focal_length)
+        return FocusReading(
+            image_distance=image,
+            object_distance=conjugate(image, self.focal_length),
+            width=np.where(good, width, np.nan),
+            sigma_image=sigma,
+            sigma_object=None if sigma is None else sigma * slope**2,
+            status=status,
+        )
+
+    def _weights(self, light: Float64, lit: npt.NDArray[np.bool_]) -> Float64:
+        """I^2 relative to the brightest; three pinholes are met exactly, whatever the weights."""
+        if light.shape[-1] == 3:
+            return np.where(lit, 1.0, 0.0)
+        brightest = np.max(np.where(lit, light, 0.0), axis=-1, keepdims=True)
+        return np.where(lit, (light / np.where(brightest > 0.0, brightest, 1.0)) ** 2, 0.0)
+
+    def _peak(
+        self, log: Float64, weights: Float64, lit: npt.NDArray[np.bool_], light: Float64
+    ) -> tuple[Float64, Float64, Float64 | None]:
+        """Peak and curvature of the weighted parabola, in spacings, and the peak's standard deviation.
+
+        Polynomials orthogonal under the weights keep the fit well conditioned where few pinholes carry the weight.
+        """
+        count = log.shape[-1]
+        place = np.arange(count) - 0.5 * (count - 1)
+        total = np.sum(weights, axis=-1, keepdims=True)
+        middle = np.sum(weights * place, axis=-1, keepdims=True) / total
+        offset = place - middle
+        second = np.sum(weights * offset**2, axis=-1, keepdims=True)
+        skew = np.sum(weights * offset**3, axis=-1, keepdims=True) / second
+        bow = offset * (offset - skew) - second / total
+        to_slope = weights * offset / second
+        to_curvature = weights * bow / np.sum(weights * bow**2, axis=-1, keepdims=True)
+        slope = np.sum(to_slope * log, axis=-1, keepdims=True)
+        curvature = np.sum(to_curvature * log, axis=-1, keepdims=True)
+        step = -0.5 * slope / curvature
+        peak = (middle + 0.5 * skew + step)[..., 0]
+        if self.sigma_intensity is None:
+            return peak, curvature[..., 0], None
+        gain = (-0.5 * to_slope - step * to_curvature) / curvature
+        noise = np.where(lit, self.sigma_intensity / light, 0.0)
+        return peak, curvature[..., 0], np.sqrt(np.sum((gain * noise) ** 2, axis=-1))
+
+
+def conjugate(distance: npt.ArrayLike, focal_length: float) -> Float64:
+    """Distance on the other side of a thin lens [m]: ``1/f = 1/LI + 1/LO``, either way.
+
+    NaN where there is none: at the focal length or nearer.
+    """
+    reach = np.asarray(distance, dtype=np.float64)
+    beyond = reach > finite(focal_length, "focal_length")
+    return np.where(beyond, focal_length * (reach / np.where(beyond, reach - focal_length, math.inf)), np.nan)

@@ -1,0 +1,211 @@
+"""Scanning geometries that sample a surface irregularly: the polygon mirror, and the beam at 45 degrees.
+
+Polygon mirror (F. de Jong, Figures 2.7 and 2.8): a horizontal beam hits a facet of a turning polygon at the
+height of the facet's middle and is thrown down on the surface. With R the polygon's apothem, D the drop from
+the hit point to the surface and phi the rotation, 0 where the facet lies at 45 degrees and is hit in its middle::
+
+    x_h = R (1 + sin(psi)/sqrt(2)) / cos(psi),  psi = phi - pi/4
+    x = x_h(phi) - x_h(0) + D tan(2 phi)
+
+The second term of x is the polygon's own; it makes the scan asymmetric in second order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.status import Status
+from gpuvision.tables import finite
+
+Float64 = npt.NDArray[np.float64]
+
+_STEPS = 80
+_HALF_ROOT = math.sqrt(0.5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolygonMirror:
+    """A turning polygon mirror that scans a beam over a surface.
+
+    Parameters
+    ----------
+    apothem
+        R, from the axis to the middle of a facet [m].
+    facets
+        Number of mirrors; the beam stays on one for 2 pi / facets.
+    height
+        H, of the polygon above the surface [m].
+    height_from
+        "centre": H is measured from the polygon's axis, and D = H - R/sqrt(2); "hit": from the point where the
+        beam hits the facet, and D = H.
+
+    Raises
+    ------
+    ValueError
+        If a length is not positive, there are fewer than 3 facets, or the surface lies above the hit point.
+    """
+
+    apothem: float
+    facets: int
+    height: float
+    height_from: Literal["centre", "hit"] = "centre"
+
+    def __post_init__(self) -> None:
+        for name in ("apothem", "height"):
+            if not finite(getattr(self, name), f"PolygonMirror.{name}") > 0.0:
+                raise ValueError(f"PolygonMirror.{name} is {getattr(self, name)}, expected a positive length [m]")
+        if self.facets < 3:
+            raise ValueError(f"PolygonMirror.facets is {self.facets}, expected at least 3")
+        if self.height_from not in ("centre", "hit"):
+            raise ValueError(f"PolygonMirror.height_from is {self.height_from!r}, expected 'centre' or 'hit'")
+        if not self.drop > 0.0:
+            raise ValueError(
+                f"PolygonMirror.height is {self.height} m from the centre, expected more than apothem/sqrt(2) = "
+                f"{self.apothem * _HALF_ROOT} m"
+            )
+
+    @property
+    def drop(self) -> float:
+        """D, from the point where the beam hits the facet down to the surface [m]."""
+        return self.height - self.apothem * _HALF_ROOT if self.height_from == "centre" else self.height
+
+    def position(self, rotation: npt.ArrayLike) -> Float64:
+        """Place x on the surface [m] for rotations phi [rad]; NaN outside `limits`."""
+        phi = np.asarray(rotation, dtype=np.float64)
+        low, high = self.limits
+        return np.where((phi >= low) & (phi <= high), self._position(phi), np.nan)
+
+    def slope(self, rotation: npt.ArrayLike) -> Float64:
+        """dx/dphi [m/rad]; 2 D in the middle of the scan."""
+        phi = np.asarray(rotation, dtype=np.float64)
+        facet = 0.25 * math.pi - phi
+        own = self.apothem * (_HALF_ROOT - np.sin(facet)) / np.cos(facet) ** 2
+        return np.asarray(own + 2.0 * self.drop / np.cos(2.0 * phi) ** 2)
+
+    def rotation(self, position: npt.ArrayLike) -> Float64:
+        """Rotation phi [rad] that throws the beam to x [m]: the inverse of `position`; NaN where none does.
+
+        Bracketed Newton steps; the round trip is exact to rounding.
+        """
+        x = np.asarray(position, dtype=np.float64)
+        bounds = self.limits
+        first, last = self._position(np.array(bounds))
+        reachable = (x >= first) & (x <= last)
+        low, high = np.full_like(x, bounds[0]), np.full_like(x, bounds[1])
+        # Without the polygon's own term this is the answer.
+        phi = np.where(reachable, np.clip(0.5 * np.arctan(x / self.drop), *bounds), np.nan)
+        for _ in range(_STEPS):
+            excess = self._position(phi) - x
+            high = np.where(excess > 0.0, phi, high)
+            low = np.where(excess < 0.0, phi, low)
+            step = phi - excess / self.slope(phi)
+            inside = (step >= low) & (step <= high)
+            better = np.where(inside | ~reachable, step, 0.5 * (low + high))
+            if np.array_equal(better, phi, equal_nan=True):
+                break
+            phi = better
+        return phi
+
+    def times(self, positions: npt.ArrayLike, angular_speed: float) -> Float64:
+        """Return the times [s] at which a turning mirror throws the beam to ``positions`` [m].
+
+        Sampling at these times, counted from the middle of the facet, gives equidistant samples where the positions
+        are so. The next facet repeats them after ``2 pi / (facets angular_speed)``, with ``angular_speed`` in rad/s.
+        """
+        if not finite(angular_speed, "angular_speed") > 0.0:
+            raise ValueError(f"angular_speed is {angular_speed}, expected a positive one [rad/s]")
+        return self.rotation(positions) / angular_speed
+
+    def facet_position(self, rotation: npt.ArrayLike) -> Float64:
+        """Where the beam hits the facet, from its middle along the facet [m]."""
+        facet = 0.25 * math.pi - np.asarray(rotation, dtype=np.float64)
+        return np.asarray(self.apothem * (_HALF_ROOT - np.sin(facet)) / np.cos(facet))
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Smallest and largest phi [rad] of a scan.
+
+        The beam hits the facet, |facet_position| <= R tan(pi / facets); it is thrown down, |phi| < pi/4; and x grows
+        with phi, which at small drops it stops to do towards negative phi.
+        """
+        half = math.pi / self.facets
+        middle = 0.25 * math.pi - math.asin(_HALF_ROOT * math.cos(half))
+        edge = np.nextafter(0.25 * math.pi, 0.0)
+        return max(middle - half, self._fold(), -edge), min(middle + half, edge)
+
+    def _position(self, phi: Float64) -> Float64:
+        facet = 0.25 * math.pi - phi
+        # x_h(phi) - x_h(0) as one quotient, 2 R sin^2(phi/2) (...): the difference itself cancels near phi = 0.
+        own = 2.0 * self.apothem * np.sin(0.5 * phi) ** 2 / np.cos(facet)
+        return np.asarray(own + self.drop * np.tan(2.0 * phi))
+
+    def _fold(self) -> float:
+        """Negative phi at which dx/dphi vanishes; -pi/4 where it never does."""
+        # With s = sin(pi/4 - phi), dx/dphi has the sign of D/(2 s^2) + R/sqrt(2) - R s, which falls with s.
+        roots = np.roots([-self.apothem, self.apothem * _HALF_ROOT, 0.0, 0.5 * self.drop])
+        real = roots[np.abs(roots.imag) < 1e-9].real
+        folded = real[(real > _HALF_ROOT) & (real < 1.0)]
+        return 0.25 * math.pi - math.asin(folded.min()) if len(folded) else -0.25 * math.pi
+
+
+class ShearedProfile(NamedTuple):
+    """Where the samples of a slanted beam lie.
+
+    Attributes
+    ----------
+    x
+        X of every sample [m], folded ones too; NaN where H is not finite.
+    status
+        uint8 `Status` flags: NOT_FINITE (H is not), FOLDED (X does not advance from the sample before it: the
+        surface is steeper than the beam, or two samples coincide).
+    """
+
+    x: Float64
+    status: npt.NDArray[np.uint8]
+
+
+def sheared(start: npt.ArrayLike, height: npt.ArrayLike, angle: float = 0.25 * math.pi) -> ShearedProfile:
+    """Place the samples of a beam that comes down at an angle: ``X = X0 + H tan(angle)`` (F. de Jong, Figure 2.5).
+
+    Parameters
+    ----------
+    start
+        X0, where each beam meets H = 0 [m]; (..., n), monotone along the last axis.
+    height
+        H of the sample [m], of the same shape.
+    angle
+        Between the beam and the H axis [rad].
+
+    Returns
+    -------
+    ShearedProfile
+        A sample after a hole is compared with the last one before it.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, ``start`` is not strictly monotone, or the angle is not within a right angle.
+    """
+    x0, h = np.asarray(start, dtype=np.float64), np.asarray(height, dtype=np.float64)
+    if x0.shape != h.shape or not x0.ndim:
+        raise ValueError(f"start has shape {x0.shape} and height {h.shape}, expected the same, (..., n)")
+    if not abs(finite(angle, "angle")) < 0.5 * math.pi:
+        raise ValueError(f"angle is {angle} rad, expected less than a right angle")
+    steps = np.diff(x0, axis=-1)
+    if not (np.all(steps > 0.0) or np.all(steps < 0.0)):
+        raise ValueError("start is not strictly monotone along the last axis; expected the order of the scan")
+    forward = 1.0 if np.all(steps > 0.0) else -1.0
+    x = x0 + h * math.tan(angle)
+    known = np.isfinite(x)
+    # The furthest sample's number so far that is known: forward fill of the holes.
+    number = np.maximum.accumulate(np.where(known, np.arange(x.shape[-1]), -1), axis=-1)
+    before = np.take_along_axis(x, np.maximum(number[..., :-1], 0), axis=-1)
+    folded = known[..., 1:] & (number[..., :-1] >= 0) & (forward * (x[..., 1:] - before) <= 0.0)
+    status = np.where(known, 0, Status.NOT_FINITE).astype(np.uint8)
+    status[..., 1:][folded] = Status.FOLDED
+    return ShearedProfile(np.where(known, x, np.nan), status)

@@ -1,0 +1,437 @@
+"""Stream frames: source -> upload -> operations -> download -> consumer, over a fixed ring of slots.
+
+Two threads and two queues of slots. The *producer* (the stream's own thread) takes a free slot, lets the source fill
+it, launches the slot's operations and hands it on. The *consumer* (the caller's thread) takes the oldest launched
+slot, waits for its device event, reads the results, and gives the slot back with its next step. Slots carry their
+events and times; nothing is allocated, compiled or bound per frame. Where host and device share memory the source
+writes into what the kernel reads and the consumer reads what the kernel wrote.
+"""
+
+from __future__ import annotations
+
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Generic, Literal, TypeVar
+
+import numpy as np
+
+from gpuvision.host.arrays import HostArray
+from gpuvision.host.device import Device
+from gpuvision.host.errors import StreamError
+from gpuvision.host.operation import Operation
+from gpuvision.host.report import Account, StreamReport
+from gpuvision.host.ring import Queues, SharedSlot, Slot, StagedSlot, Step, check_chain, rebuilt
+from gpuvision.host.sources import ArraySource, Clock, Source
+from gpuvision.host.trace import Trace
+
+Policy = Literal["block", "drop_oldest", "raise"]
+R = TypeVar("R", bound=tuple[Any, ...])
+
+_DEFAULT_BATCH_BYTES = 1 << 22
+_PATIENCE_S = 10.0
+_CALIBRATIONS = 3
+
+
+@dataclass(slots=True)
+class Batch(Generic[R]):
+    """Some consecutive frames and their results, in the stream's own memory.
+
+    The arrays are good until the next batch is asked for; `copy` keeps them.
+
+    Attributes
+    ----------
+    number : int
+        Of the first frame, counted by the source from 0.
+    frames : (count, *shape) array
+    result : Result of arrays
+        As the operation returns it, with the frames along the first axis.
+    arrived : (count,) int64 array
+        When each frame came [ns of the stream's clock], as the other times.
+    launched, delivered : int
+        When the batch was given to the device, and when its results were in host memory.
+    started, ended : int or None
+        When the device computed it, on the host's clock, where the stream profiles.
+    """
+
+    number: int
+    frames: HostArray
+    result: R
+    arrived: HostArray
+    launched: int
+    started: int | None
+    ended: int | None
+    delivered: int
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def copy(self) -> Batch[R]:
+        """Return the batch with arrays of its own."""
+        result = rebuilt(self.result, np.copy)
+        times = (self.launched, self.started, self.ended, self.delivered)
+        return Batch(self.number, self.frames.copy(), result, self.arrived.copy(), *times)
+
+
+@dataclass
+class _Failure:
+    stage: str
+    number: int
+    error: BaseException
+
+
+class Pipeline(Generic[R]):
+    """A stream of frames through operations: ``with Pipeline(source, operation) as stream: for batch in stream: ...``.
+
+    Parameters
+    ----------
+    source : Source or array
+        An array holds frames along its first axis. The stream closes the source.
+    operation : Operation or sequence of Operation and Step
+        A chain hands its arrays on in device memory; the last operation's results are delivered. Every result must
+        have the batch as its first axis.
+    device : Device, optional
+        `Device.best` otherwise.
+    batch : int, optional
+        Frames per launch, see `plan`; otherwise what makes some 4 MB, the right size for a recording that has no
+        rate.
+    ring : int
+        Slots, at least 2: one is the consumer's, the others are filled, computed, or wait. Under ``"drop_oldest"``
+        they bound the age of what the consumer gets.
+    policy : {"block", "drop_oldest", "raise"}
+        What happens to a frame that arrives when no slot is free: it waits; or the oldest batch that the consumer has
+        not asked for is given up; or the stream ends with a `StreamError`.
+    zero_copy : bool, optional
+        Host and device use the same memory; otherwise pinned memory and copies. As the device can, unless given.
+    profile : bool
+        Take the times of the device.
+    trace : Trace, optional
+        Gets the timeline, written at the end; asks for ``profile`` by itself.
+    warm_up : int, optional
+        Batches at the start that the report leaves out; otherwise one per slot.
+    clock : callable
+        Nanoseconds; the same as the source's.
+
+    Raises
+    ------
+    TypeError, ValueError
+        The operation does not take such frames, or a parameter is out of its range.
+    """
+
+    def __init__(
+        self,
+        source: Source | HostArray,
+        operation: Operation[R] | Sequence[Operation[Any] | Step],
+        *,
+        device: Device | None = None,
+        batch: int | None = None,
+        ring: int = 4,
+        policy: Policy = "block",
+        zero_copy: bool | None = None,
+        profile: bool = False,
+        trace: Trace | None = None,
+        warm_up: int | None = None,
+        clock: Clock = time.perf_counter_ns,
+    ) -> None:
+        self.source = ArraySource(source) if isinstance(source, np.ndarray) else source
+        self.device = Device.best() if device is None else device
+        self.batch = default_batch(self.source, ring) if batch is None else batch
+        self.ring, self.policy, self.trace = ring, policy, trace
+        self.zero_copy = self.device.shares_memory if zero_copy is None else zero_copy
+        self.profile = profile or trace is not None
+        self._steps = _steps(operation)
+        self._clock = clock
+        self._check()
+        self._account = Account(ring if warm_up is None else warm_up)
+        self._dropped = 0
+        self._state: Literal["new", "open", "closed"] = "new"
+
+    def _check(self) -> None:
+        if self.batch < 1:
+            raise ValueError(f"Pipeline.batch is {self.batch}, expected at least 1")
+        if self.ring < 2:
+            raise ValueError(f"Pipeline.ring is {self.ring}, expected at least 2 slots")
+        if self.policy not in ("block", "drop_oldest", "raise"):
+            raise ValueError(f"Pipeline.policy is {self.policy!r}, expected 'block', 'drop_oldest' or 'raise'")
+        if self.zero_copy and not self.device.shares_memory:
+            raise ValueError(f"device {self.device.label} does not share memory with the host; use zero_copy=None")
+        check_chain(self._steps, self.device, self.batch, self.source.shape, self.source.dtype)
+
+    def __enter__(self) -> Pipeline[R]:
+        """Bind the slots and start the producer."""
+        if self._state != "new":
+            raise StreamError("a stream runs once; make another Pipeline")
+        self._state = "open"
+        kind = SharedSlot if self.zero_copy else StagedSlot
+        source = self.source
+        try:
+            self._queues = Queues(self.device, zero_copy=self.zero_copy, profiling=self.profile)
+            self._slots: list[Slot[R]] = [
+                kind(self._steps, self.device, self._queues, self.batch, source.shape, source.dtype)
+                for _ in range(self.ring)
+            ]
+            self._offset = self._calibrated() if self.profile else 0
+        except BaseException:
+            self._state = "closed"
+            source.close()
+            raise
+        # The slot given back last is taken first, while it is in the cache; a token per free slot is what to wait for.
+        self._free: list[Slot[R]] = []
+        self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._ready: queue.SimpleQueue[Slot[R] | None] = queue.SimpleQueue()
+        for slot in self._slots:
+            self._give_back(slot)
+        self._held: Slot[R] | None = None
+        self._held_spans: dict[str, tuple[int, int]] = {}
+        self._failure: _Failure | None = None
+        self._stopping = self._ended = False
+        self._account.started = self._clock()
+        self._producer = threading.Thread(target=self._produce, name="gpuvision stream", daemon=True)
+        self._producer.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the stream, whatever happened."""
+        self.close()
+
+    def close(self) -> None:
+        """Stop the source and the producer, wait for the device, and free both; the report stays.
+
+        Raises
+        ------
+        StreamError
+            The source does not come back from a read.
+        """
+        if self._state != "open":
+            self._state = "closed"
+            return
+        self._state = "closed"
+        self._stopping = True
+        self._tokens.put(None)
+        self.source.stop()
+        self._producer.join(_PATIENCE_S)
+        if self._producer.is_alive():
+            raise StreamError(
+                f"the source has not returned from a read for {_PATIENCE_S:.0f} s after the stream's end; "
+                "give it a stop() that ends the read"
+            )
+        self._queues.finish()
+        self._release(self._clock())
+        self._slots.clear()
+        self.source.close()
+        if self.trace is not None:
+            self.trace.write()
+
+    # The producer's side ---------------------------------------------------------------------------------------
+
+    def _produce(self) -> None:
+        """Fill and launch slots until the source ends, fails, or the stream is closed."""
+        number, stage = 0, "source"
+        clock, source, ready = self._clock, self.source, self._ready
+        try:
+            while not self._stopping and source.wait():
+                asked = clock()
+                stage = "ring"
+                slot = self._free_slot(number)
+                if slot is None:
+                    break
+                stage = "source"
+                slot.asked, slot.taken = asked, clock()
+                slot.number, slot.count = number, source.read_into(slot.frames, slot.arrived)
+                if not slot.count:
+                    break
+                stage = "operation"
+                slot.filled = clock()
+                slot.launch()
+                slot.enqueued = clock()
+                stage = "source"
+                number += slot.count
+                ready.put(slot)
+        except BaseException as error:  # whatever it is, the consumer's thread raises it
+            self._failure = _Failure(stage, number, error)
+        ready.put(None)
+
+    def _free_slot(self, number: int) -> Slot[R] | None:
+        """Take a slot as the policy says; ``None`` at shutdown."""
+        if self.policy == "block":
+            self._tokens.get()
+            return None if self._stopping else self._free.pop()
+        while not self._stopping:
+            try:
+                self._tokens.get_nowait()
+            except queue.Empty:
+                pass
+            else:
+                return None if self._stopping else self._free.pop()
+            if self.policy == "raise":
+                raise StreamError(
+                    f"no slot was free for it: the consumer holds up a ring of {self.ring} x {self.batch} frames"
+                )
+            try:
+                oldest = self._ready.get_nowait()
+            except queue.Empty:  # the consumer took it just now and gave another one back
+                continue
+            assert oldest is not None  # only the producer's own end is
+            oldest.wait()
+            self._dropped += oldest.count
+            return oldest
+        return None
+
+    # The consumer's side ---------------------------------------------------------------------------------------
+
+    def __iter__(self) -> Pipeline[R]:
+        return self
+
+    def __next__(self) -> Batch[R]:
+        """Give the last batch's memory back and deliver the next one.
+
+        Raises
+        ------
+        StreamError
+            A stage failed (the cause is chained, the frame is named), or the stream is not open.
+        """
+        if self._state != "open":
+            raise StreamError("the stream is not open; use `with Pipeline(...) as stream`")
+        if self._ended:
+            raise StopIteration
+        clock = self._clock
+        now = clock()
+        self._release(now)
+        slot = self._ready.get()
+        if slot is None:
+            self._ended = True
+            self._raise_failure()
+            raise StopIteration
+        self._held = slot
+        taken = clock()
+        try:
+            slot.wait()
+        except BaseException as error:
+            self._failure = _Failure("operation", slot.number, error)
+            self._ended = True
+            self._raise_failure()
+        return self._delivered(slot, taken, clock())
+
+    def _delivered(self, slot: Slot[R], taken: int, delivered: int) -> Batch[R]:
+        arrived = slot.arrived[: slot.count]
+        account = self._account
+        account.book(delivered, delivered - arrived, self._ready.qsize() + 1)
+        account.add("slot", slot.taken - slot.asked)
+        account.add("source", slot.filled - slot.taken)
+        account.add("launch", slot.enqueued - slot.filled)
+        account.add("queue", max(taken - slot.enqueued, 0))
+        account.add("wait", delivered - taken)
+        started = ended = None
+        spans: dict[str, tuple[int, int]] = {}
+        if self.profile:
+            spans = self._device_spans(slot, delivered)
+            for stage, (start, end) in spans.items():
+                account.add(stage, end - start)
+            started, ended = spans["compute"]
+        if self.trace is not None and not self.trace.is_full:
+            spans["slot"] = (slot.asked, slot.taken)
+            spans["source"] = (slot.taken, slot.filled)
+            spans["launch"] = (slot.filled, slot.enqueued)
+            spans["wait"] = (taken, delivered)
+        self._held_spans = spans
+        slot.delivered = delivered
+        frames = slot.frames if slot.count == self.batch else slot.frames[: slot.count]
+        return Batch(slot.number, frames, slot.cut(), arrived, slot.filled, started, ended, delivered)
+
+    def _release(self, now: int) -> None:
+        """Give the slot in the consumer's hands back to the producer."""
+        slot = self._held
+        if slot is None:
+            return
+        self._held = None
+        if slot.delivered:
+            self._account.add("sink", now - slot.delivered)
+            if self.trace is not None:
+                self.trace.add({**self._held_spans, "sink": (slot.delivered, now)}, slot.number, slot.count)
+            slot.delivered = 0
+        self._give_back(slot)
+
+    def _give_back(self, slot: Slot[R]) -> None:
+        self._free.append(slot)
+        self._tokens.put(None)
+
+    def _raise_failure(self) -> None:
+        failure = self._failure
+        if failure is not None:
+            raise StreamError(f"the stream stopped at frame {failure.number} ({failure.stage}): {failure.error}") from (
+                failure.error
+            )
+
+    def run(self, sink: Callable[[Batch[R]], object] | None = None) -> StreamReport:
+        """Open the stream, hand every batch to `sink`, close it, and return the report.
+
+        Raises
+        ------
+        StreamError
+            The source, an operation or the sink failed; the cause is chained.
+        """
+        with self:
+            for batch in self:
+                if sink is None:
+                    continue
+                try:
+                    sink(batch)
+                except BaseException as error:
+                    self._failure = _Failure("sink", batch.number, error)
+                    self._raise_failure()
+        return self.report()
+
+    def report(self) -> StreamReport:
+        """Return the account of the stream so far; from the consumer's thread."""
+        return self._account.report(
+            dropped=self._dropped,
+            batch=self.batch,
+            ring=self.ring,
+            policy=self.policy,
+            device=self.device.label,
+            zero_copy=self.zero_copy,
+        )
+
+    # The device's clock ----------------------------------------------------------------------------------------
+
+    def _calibrated(self) -> int:
+        """Return what to add to the device's times to have the host's, from a few empty launches."""
+        offsets = []
+        for _ in range(_CALIBRATIONS):
+            slot = self._slots[0]
+            slot.launch()
+            slot.wait()
+            now = self._clock()
+            offsets.append(now - max(end for _, end in slot.spans().values()))
+        return min(offsets)
+
+    def _device_spans(self, slot: Slot[R], delivered: int) -> dict[str, tuple[int, int]]:
+        """Return the device's stages on the host's clock.
+
+        A stage cannot end after its wait returned: what remains of the clocks' difference shows there, and the
+        smallest one that was seen is the best.
+        """
+        spans = slot.spans()
+        self._offset = min(self._offset, delivered - max(end for _, end in spans.values()))
+        low, offset = slot.filled, self._offset
+        return {stage: (max(start + offset, low), max(end + offset, low)) for stage, (start, end) in spans.items()}
+
+
+def default_batch(source: Source, ring: int) -> int:
+    """Return a batch of some 4 MB, and not so large that a short recording would not use the ring."""
+    size = max(math.prod(source.shape) * source.dtype.itemsize, 1)
+    batch = max(_DEFAULT_BATCH_BYTES // size, 1)
+    return batch if source.length is None else max(min(batch, -(-source.length // ring)), 1)
+
+
+def _steps(operation: Operation[Any] | Sequence[Operation[Any] | Step]) -> list[Step]:
+    given = [operation] if isinstance(operation, Operation) else list(operation)
+    if not given:
+        raise ValueError("expected an operation, or a chain of at least one")
+    return [each if isinstance(each, Step) else Step(each) for each in given]

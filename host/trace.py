@@ -1,0 +1,64 @@
+"""The timeline of a stream, for chrome://tracing or ui.perfetto.dev."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from gpuvision.host.runtime import write_whole
+
+_PRODUCER, _DEVICE, _CONSUMER = "producer", "device", "consumer"
+_LANES = {
+    "slot": _PRODUCER,
+    "source": _PRODUCER,
+    "launch": _PRODUCER,
+    "upload": f"{_DEVICE} upload",
+    "compute": f"{_DEVICE} compute",
+    "download": f"{_DEVICE} download",
+    "wait": _CONSUMER,
+    "sink": _CONSUMER,
+}
+
+
+class Trace:
+    """Collects the spans of a stream's first batches and writes them as Chrome's trace format.
+
+    Parameters
+    ----------
+    path : path
+        JSON file to write when the stream closes.
+    limit : int
+        Batches to keep: a long stream stays bounded.
+    """
+
+    def __init__(self, path: str | Path, limit: int = 20_000) -> None:
+        self.path, self.limit = Path(path), limit
+        self._spans: list[tuple[str, int, int, int, int]] = []
+        self._batches = 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the limit is reached."""
+        return self._batches >= self.limit
+
+    def add(self, spans: dict[str, tuple[int, int]], number: int, count: int) -> None:
+        """Add the stages of a batch: start and end [ns], all on the host's clock."""
+        if self.is_full:
+            return
+        self._batches += 1
+        self._spans.extend((stage, start, end, number, count) for stage, (start, end) in spans.items())
+
+    def write(self) -> None:
+        """Write the file, whole or not at all."""
+        lanes = list(dict.fromkeys(_LANES.values()))
+        origin = min((start for _, start, *_ in self._spans), default=0)
+        events: list[dict[str, Any]] = [
+            {"ph": "M", "name": "thread_name", "pid": 1, "tid": tid, "args": {"name": lane}}
+            for tid, lane in enumerate(lanes)
+        ]
+        for stage, start, end, number, count in self._spans:
+            event = {"ph": "X", "name": stage, "pid": 1, "tid": lanes.index(_LANES[stage])}
+            event |= {"ts": (start - origin) / 1e3, "dur": (end - start) / 1e3}
+            events.append(event | {"args": {"frame": number, "frames": count}})
+        write_whole(self.path, json.dumps({"traceEvents": events, "displayTimeUnit": "ns"}))

@@ -18,13 +18,13 @@ SHARED_FLAGS = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUF
 class _Shared:
     """Show shared memory to NumPy; the array that NumPy makes keeps this object, and so the memory, alive."""
 
-    def __init__(self, array: DeviceArray) -> None:
-        self.memory = array.base_data
+    def __init__(self, array: DeviceArray, memory: cl.SVMPointer) -> None:
+        self.memory = memory
         self.__array_interface__ = {
             "version": 3,
             "shape": array.shape,
             "typestr": array.dtype.str,
-            "data": (self.memory.svm_ptr, False),
+            "data": (memory.svm_ptr, False),
         }
 
 
@@ -38,9 +38,10 @@ def host_view(array: DeviceArray) -> HostArray:
     ValueError
         The array lies in memory that the host does not share; `array.get()` copies it.
     """
-    if not isinstance(array.base_data, cl.SVMPointer):
+    memory = array.base_data
+    if not isinstance(memory, cl.SVMPointer):
         raise ValueError("the array lies in device memory; copy it with array.get(), host_view needs shared memory")
-    return np.asarray(_Shared(array))
+    return np.asarray(_Shared(array, memory))
 
 
 def memory_of(array: DeviceArray) -> Any:

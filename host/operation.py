@@ -273,11 +273,11 @@ class Bound(Generic[R]):
         self._given = (None,) * len(self._own)
         for index, memory in zip(self._places, (*read, *write), strict=True):
             self._kernel.set_arg(index, memory)
-        event = cl.enqueue_nd_range_kernel(self.queue, self._kernel, self._global, self._local)
+        cl.enqueue_nd_range_kernel(self.queue, self._kernel, self._global, self._local)
         for memory, array in zip(write, targets, strict=True):
             # The map is what makes the kernel's writes visible to the host; the address stays the same.
-            mapped, event = cl.enqueue_map_buffer(
-                self.queue, memory, cl.map_flags.READ, 0, (array.nbytes,), np.uint8, is_blocking=False
+            mapped, _ = cl.enqueue_map_buffer(
+                self.queue, memory, cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
             )
             mapped.base.release(self.queue)
         self.queue.finish()
@@ -286,10 +286,10 @@ class Bound(Generic[R]):
 
     def _run_with_copies(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
         for array, frame in zip(self.inputs, frames, strict=True):
-            cl.enqueue_copy(self.queue, array.base_data, frame, is_blocking=False)
+            cl.enqueue_copy(self.queue, memory_of(array), frame, is_blocking=False)
         self()
         for array, target in zip(self._computed(self.outputs), targets, strict=True):
-            cl.enqueue_copy(self.queue, target, array.base_data, is_blocking=False)
+            cl.enqueue_copy(self.queue, target, memory_of(array), is_blocking=False)
         self.queue.finish()
 
     def _computed(self, result: R) -> tuple[Any, ...]:
@@ -323,7 +323,7 @@ class Bound(Generic[R]):
         if self.device.shares_memory:
             host_view(array).fill(0)
         elif array.nbytes:
-            cl.enqueue_fill_buffer(self.queue, array.base_data, np.uint8(0), 0, array.nbytes)
+            cl.enqueue_fill_buffer(self.queue, memory_of(array), np.zeros(1, np.uint8), 0, array.nbytes)
 
     def _set_constants(self) -> list[int]:
         """Set what no call changes; return the places of the arrays that calls bind."""

@@ -9,6 +9,7 @@ import numpy as np
 import pyopencl as cl
 
 from gpuvision.host import Device
+from gpuvision.host.arrays import memory_of
 from gpuvision.host.program import build
 
 _VECTOR = 64  # bytes
@@ -28,7 +29,7 @@ def move(device: Device, read: int, written: int) -> Callable[[], None]:
     source.set(np.ones(source.shape, np.float32))
     target.set(np.ones(target.shape, np.float32))  # touches the pages before anything is timed
     kernel = cl.Kernel(build(device, "ceiling", {}), "move" if device.is_cpu else "move_items")
-    kernel.set_args(source.base_data, target.base_data, np.int64(reads), np.int64(writes))
+    kernel.set_args(memory_of(source), memory_of(target), np.int64(reads), np.int64(writes))
     items = device.handle.max_compute_units * _ITEMS_PER_UNIT * (1 if device.is_cpu else 64)
 
     def run(kept: object = (source, target)) -> None:
@@ -47,7 +48,7 @@ def flop_rate(device: Device, *, seconds: float = 0.15) -> float:
     target = device.empty((items * 16,), np.float32)
     kernel = cl.Kernel(build(device, "ceiling", {}), "compute")
     steps = 20_000 if device.is_cpu else 2_000
-    kernel.set_args(target.base_data, np.float32(1.0), np.float32(0.5), np.int32(steps))
+    kernel.set_args(memory_of(target), np.float32(1.0), np.float32(0.5), np.int32(steps))
     rates: list[float] = []
     end = time.perf_counter() + seconds
     while len(rates) < 5 or time.perf_counter() < end:

@@ -16,7 +16,7 @@ from gpuvision.ranging.psd import PsdReadout
 LENGTH, MINIMUM, SATURATION = 6e-3, 100.0, 60_000.0
 
 
-@numba.njit(parallel=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(parallel=True, error_model="numpy")
 def _numba_planar(left, right, position, status, half, minimum, saturation):  # type: ignore[no-untyped-def]
     """Read out on all cores; branch-free, so that LLVM vectorises it."""
     for i in numba.prange(position.shape[0]):
@@ -28,7 +28,7 @@ def _numba_planar(left, right, position, status, half, minimum, saturation):  # 
         status[i] = np.uint8(dark) | (np.uint8(high) << np.uint8(1))
 
 
-@numba.njit(parallel=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(parallel=True, error_model="numpy")
 def _numba_pairs(currents, position, status, half, minimum, saturation):  # type: ignore[no-untyped-def]
     for i in numba.prange(position.shape[0]):
         a, b = np.float32(currents[2 * i]), np.float32(currents[2 * i + 1])

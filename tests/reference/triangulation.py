@@ -29,19 +29,17 @@ def triangulate(u, v, homography, region, *, horizon=1e-3, lens=None, along="col
     matrix = np.asarray(homography, dtype=np.float64)
     status = np.zeros(u.shape, dtype=np.uint8)
     middle = np.array([np.mean(region[0]), np.mean(region[1]), 1.0])
-    finite = np.isfinite(u) & np.isfinite(v)
     straight_u, straight_v = u, v
     with np.errstate(all="ignore"):
         if lens is not None:
             k1, k2, centre = lens
             column, row = (v, u) if along == "columns" else (u, v)
-            status[beyond_fold(column, row, k1, k2, centre)] = FOLDED
+            status = np.where(beyond_fold(column, row, k1, k2, centre), FOLDED, status)
             column, row = undistort(column, row, k1, k2, centre)
             straight_u, straight_v = (row, column) if along == "columns" else (column, row)
         g, h, w = (line[0] * straight_u + line[1] * straight_v + line[2] for line in matrix)
-        status[(w / (matrix[2] @ middle) <= horizon) & (status == 0)] = HORIZON
-        status[~finite] = NOT_FINITE
+        hidden = w / (matrix[2] @ middle) <= horizon
         g, h = g / w, h / w
-    g[status != 0] = np.nan
-    h[status != 0] = np.nan
-    return g, h, status
+    status = np.where(hidden & (status == 0), HORIZON, status)
+    status = np.where(np.isfinite(u) & np.isfinite(v), status, NOT_FINITE).astype(np.uint8)
+    return np.where(status == 0, g, np.nan), np.where(status == 0, h, np.nan), status

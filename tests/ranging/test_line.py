@@ -1,0 +1,284 @@
+"""Line readout against the float64 oracle: both axes, both walks, every dtype, odd shapes and extremes."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gpuvision.host import Device
+from gpuvision.ranging.line import LineReading, LineReadout
+from tests.reference.line import AMBIGUOUS, DARK, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
+
+TOP = {"uint8": 180.0, "uint16": 40_000.0, "float32": 100.0}
+LEVEL = {"uint8": 20, "uint16": 4000, "float32": 8.5}
+WALKS = ("strip", "item")
+EVERY = list(itertools.product(TOP, ("columns", "rows"), WALKS))
+
+
+def line_frames(rng, dtype, shape, along="columns", sigma=1.7):
+    """A wandering Gaussian line over noise, some profiles dark, some with the line at the border."""
+    *batch, rows, columns = shape
+    length, samples = (rows, columns) if along == "columns" else (columns, rows)
+    k, i = np.arange(length)[:, None], np.arange(samples)
+    place = length * (0.5 + 0.45 * np.sin(0.05 * i)) + rng.uniform(-0.5, 0.5, (*batch, samples))[..., None, :]
+    light = np.where(rng.random((*batch, samples)) < 0.06, 0.0, rng.uniform(0.3, 1.0, (*batch, samples)))
+    frames = light[..., None, :] * np.exp(-((k - place) ** 2) / (2 * sigma**2))
+    frames = TOP[dtype] * (frames + rng.uniform(0.0, 0.07, frames.shape))
+    if along == "rows":
+        frames = np.swapaxes(frames, -1, -2)
+    return np.ascontiguousarray(frames.astype(dtype))
+
+
+def assert_same(reading, expected, precision=np.float32, slack=1.0):
+    """Status, peak and width equal; the position within roundings of its own size."""
+    np.testing.assert_array_equal(reading.status, expected["status"])
+    np.testing.assert_array_equal(reading.peak, expected["peak"])
+    np.testing.assert_array_equal(reading.width, expected["width"])
+    eps = np.finfo(precision).eps
+    # Three roundings of the position itself, and those of some ten sums of light in the window.
+    np.testing.assert_allclose(reading.position, expected["position"], rtol=3 * eps, atol=slack * 40 * eps)
+    inside = ~np.isnan(expected["total"])
+    np.testing.assert_allclose(reading.total[inside], expected["total"][inside], rtol=20 * eps)
+
+
+@pytest.mark.parametrize("method", ["whole", "windowed"])
+@pytest.mark.parametrize(("dtype", "along", "walk"), EVERY)
+def test_centre_of_gravity(device, rng, method, dtype, along, walk):
+    parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": 6}
+    readout = LineReadout(walk=walk, **parameters)
+    for shape in ((2, 137, 201), (64, 64), (3, 1023) if along == "rows" else (1023, 67)):
+        frames = line_frames(rng, dtype, shape, along)
+        # Along a thousand samples the light far from the line, up to the threshold, weighs by its distance.
+        assert_same(readout(frames, device=device), read_lines(frames, **parameters), slack=4.0)
+
+
+@pytest.mark.parametrize(
+    ("method", "dtype", "along", "walk"),
+    [
+        ("gauss3", "uint8", "columns", "strip"),
+        ("gauss3", "float32", "rows", "item"),
+        ("fir", "uint16", "rows", "strip"),
+        ("fir", "uint8", "columns", "item"),
+        ("ml", "uint8", "columns", "strip"),
+        ("ml", "uint16", "rows", "item"),
+    ],
+)
+def test_fits(device, rng, method, dtype, along, walk):
+    noise = {"read_noise": TOP[dtype] * 0.02, "gain": 0.3} if method == "ml" else {}
+    parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": 7, **noise}
+    frames = line_frames(rng, dtype, (40, 83) if along == "columns" else (83, 40), along)
+    if dtype == "uint8":
+        frames = np.pad(frames, ((5, 5), (0, 0)))
+    reading = LineReadout(walk=walk, **parameters)(frames, device=device)
+    expected = read_lines(frames, **parameters)
+    if method == "ml":
+        # The fit stops when a step moves less than 1e-4 px; the next one would move less than a tenth of that.
+        np.testing.assert_array_equal(reading.status & ~np.uint8(AMBIGUOUS), expected["status"])
+        settled = (reading.status & AMBIGUOUS) == 0
+        assert settled.mean() > 0.95
+        np.testing.assert_allclose(reading.position[settled], expected["position"][settled], atol=1e-4)
+    else:
+        # A logarithm's or a quotient's roundings grow where the peak is flat.
+        assert_same(reading, expected, slack=20.0)
+
+
+@pytest.mark.parametrize("choice", ["first", "last", "nearest", "strongest"])
+@pytest.mark.parametrize(
+    ("dtype", "along", "walk"),
+    [("uint8", "columns", "strip"), ("uint16", "rows", "strip"), ("float32", "columns", "item")],
+)
+def test_choice(device, rng, choice, dtype, along, walk):
+    parameters = {"along": along, "threshold": LEVEL[dtype], "window": 3, "choice": choice}
+    parameters |= {"minimum_width": 2, "maximum_width": 9, "minimum_peak": LEVEL[dtype] * 2}
+    shape = (2, 90, 50) if along == "columns" else (2, 50, 90)
+    frames = np.maximum(line_frames(rng, dtype, shape, along), line_frames(rng, dtype, shape, along, sigma=0.8))
+    frames[..., 20, 30] = TOP[dtype] * 1.2  # hot
+    second = ()
+    if choice == "nearest":
+        previous = rng.uniform(-5, 95, (2, 50)).astype(np.float32)
+        previous[0, ::7] = np.nan
+        second = (previous,)
+        parameters["previous"] = previous
+    expected = read_lines(frames, **parameters)
+    parameters.pop("previous", None)
+    assert_same(LineReadout(walk=walk, **parameters)(frames, *second, device=device), expected)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_double(device, rng, walk):
+    if not device.has_double:
+        pytest.skip("no double precision on this device")
+    frames = line_frames(rng, "float32", (130, 33))
+    for method in ("whole", "windowed"):
+        parameters = {"method": method, "threshold": 8.5, "window": 6}
+        reading = LineReadout(walk=walk, precision="double", **parameters)(frames, device=device)
+        assert reading.position.dtype == np.float64
+        assert_same(reading, read_lines(frames, **parameters), np.float64, slack=10.0)
+
+
+@given(rows=st.integers(1, 90), columns=st.integers(1, 150), frames=st.integers(1, 3), seed=st.integers(0, 99))
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
+def test_any_shape(rows, columns, frames, seed):
+    rng = np.random.default_rng(seed)
+    image = line_frames(rng, "uint8", (frames, rows, columns))
+    for device, method, walk in itertools.product(Device.all(), ("whole", "windowed"), WALKS):
+        parameters = {"method": method, "threshold": 20, "window": 6}
+        assert_same(
+            LineReadout(walk=walk, **parameters)(image, device=device), read_lines(image, **parameters), slack=4.0
+        )
+
+
+@pytest.mark.parametrize(("method", "walk"), [("whole", "strip"), ("windowed", "strip"), ("windowed", "item")])
+@pytest.mark.parametrize("along", ["columns", "rows"])
+def test_writes_nothing_else(device, rng, method, walk, along):
+    shape = (2, 71, 83)
+    samples = 83 if along == "columns" else 71
+    frames = line_frames(rng, "uint8", shape, along)
+    guarded = {
+        name: np.full(2 * samples + 64, 77, np.uint8 if name == "status" else np.float32)
+        for name in LineReading._fields[:5]
+    }
+    out = LineReading(**{name: array[32:-32].reshape(2, samples) for name, array in guarded.items()})
+    readout = LineReadout(method=method, walk=walk, along=along, threshold=20, window=6)
+    assert readout(frames, device=device, out=out) is out
+    for name, array in guarded.items():
+        assert set(array[:32]) == set(array[-32:]) == {77}, name
+    assert_same(out, read_lines(frames, method=method, along=along, threshold=20, window=6), slack=4.0)
+
+
+def test_outputs(device, rng):
+    frames = line_frames(rng, "uint8", (64, 70))
+    full = LineReadout(threshold=20, window=6)(frames, device=device)
+    some = LineReadout(threshold=20, window=6, outputs=("position", "status"))(frames, device=device)
+    assert {name for name, array in some._asdict().items() if array is not None} == {"position", "status"}
+    np.testing.assert_array_equal(some.position, full.position)
+
+
+def column(*values, dtype=np.uint8):
+    """A frame of 64 equal columns."""
+    return np.repeat(np.array(values, dtype)[:, None], 64, axis=1)
+
+
+DARKNESS = (0,) * 6
+EXTREMES = {
+    "all zero": (column(*[0] * 20), DARK),
+    "flat top": (column(*DARKNESS, 90, 255, 255, 255, 255, 255, 60, *DARKNESS), SATURATED),
+    "top wider than half the window": (column(*DARKNESS, *[255] * 8, *DARKNESS), SATURATED | AMBIGUOUS),
+    "edge": (column(200, 90, 10, *DARKNESS, *DARKNESS), OUT_OF_RANGE),
+    "last row": (column(*DARKNESS, *DARKNESS, 10, 90, 200), OUT_OF_RANGE),
+    "two equal peaks": (column(*DARKNESS, 50, 100, 50, *DARKNESS, 50, 100, 50, *DARKNESS), AMBIGUOUS),
+    "tie of neighbours": (column(*DARKNESS, 30, 90, 90, 30, *DARKNESS), 0),
+    "one pixel": (column(*DARKNESS, 200, *DARKNESS), 0),
+    "narrow": (column(*DARKNESS, 1, 250, 3, *DARKNESS), 0),
+    "plateau at the threshold": (column(*DARKNESS, 5, 5, 5, 5, *DARKNESS), DARK),
+    "all saturated": (column(*[255] * 20), SATURATED | OUT_OF_RANGE | AMBIGUOUS),
+}
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("along", ["columns", "rows"])
+def test_extremes(device, walk, along):
+    readout = LineReadout(threshold=5, window=4, ambiguity=0.8, along=along, walk=walk)
+    for name, (frame, status) in EXTREMES.items():
+        frame = frame if along == "columns" else np.ascontiguousarray(np.pad(frame.T, ((0, 0), (0, 64))))
+        if along == "rows" and name in ("last row", "all saturated"):
+            continue  # the padding takes the border away
+        reading = readout(frame, device=device)
+        assert_same(reading, read_lines(frame, threshold=5, window=4, ambiguity=0.8, along=along))
+        assert set(reading.status.ravel()) == {status}, name
+        assert np.all(np.isnan(reading.position) == bool(status & (DARK | OUT_OF_RANGE))), name
+
+
+def test_flat_top_is_read_in_its_middle(device):
+    frame = column(*[0] * 9, *[255] * 6, *[0] * 9)
+    for method in ("windowed", "gauss3", "fir"):
+        reading = LineReadout(method=method, threshold=5, window=6)(frame, device=device)
+        np.testing.assert_allclose(reading.position[reading.status & DARK == 0], 11.5)
+
+
+def test_fit_leaves_saturated_samples_out(device):
+    k = np.arange(41)[:, None]
+    place = 20 + np.linspace(-0.5, 0.5, 64)
+    frame = np.minimum(np.rint(600 * np.exp(-((k - place) ** 2) / (2 * 2.5**2)) + 10), 255).astype(np.uint8)
+    reading = LineReadout(method="ml", threshold=10, window=14, read_noise=1.0)(frame, device=device)
+    assert np.all(reading.status == SATURATED)
+    # Quantisation of the flanks; the centre of gravity of the flat top is no better.
+    np.testing.assert_allclose(reading.position, place, atol=0.02)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("along", ["columns", "rows"])
+def test_not_finite(device, rng, walk, along):
+    for method in ("whole", "windowed"):
+        frames = line_frames(rng, "float32", (60, 70), along) - 50.0  # negative after a dark frame
+        frames[7, 20], frames[11, 21], frames[13, 22] = np.nan, np.inf, -np.inf
+        parameters = {"method": method, "threshold": -40.0, "window": 6, "along": along, "saturation": 1e9}
+        reading, expected = (
+            LineReadout(walk=walk, **parameters)(frames, device=device),
+            read_lines(frames, **parameters),
+        )
+        lost = expected["status"] & NOT_FINITE != 0
+        assert lost.sum() == 3
+        np.testing.assert_array_equal(reading.status & NOT_FINITE != 0, lost)
+        assert all(np.isnan(getattr(reading, name)[lost]).all() for name in ("position", "peak", "width", "total"))
+        np.testing.assert_allclose(reading.position[~lost], expected["position"][~lost], rtol=4e-7, atol=2e-5)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_large_moments_are_exact(device, rng, walk):
+    """16 bit, 4100 rows on a bright background: the moment needs 40 bits."""
+    frame = rng.integers(2900, 3100, (4100, 64)).astype(np.uint16)
+    frame[3270:3275] = 65_535
+    reading = LineReadout(method="whole", walk=walk)(frame, device=device)
+    expected = read_lines(frame, method="whole")
+    np.testing.assert_allclose(reading.position, expected["position"], rtol=1.2e-7)
+
+
+def test_wide_window_of_16_bits(device, rng):
+    frame = np.zeros((400, 64), np.uint16)
+    frame[50:350] = rng.integers(60_000, 65_535, (300, 64))
+    parameters = {"threshold": 0, "window": 180}
+    frame[200] = 65_535
+    assert_same(LineReadout(**parameters)(frame, device=device), read_lines(frame, **parameters), slack=200.0)
+
+
+def test_tall_frames(device, rng):
+    """More blocks of rows than a byte counts, and peaks far apart within a group."""
+    frame = np.zeros((9000, 70), np.uint8)
+    frame[rng.integers(20, 8980, 70), np.arange(70)] = 200
+    parameters = {"threshold": 5, "window": 4}
+    assert_same(LineReadout(walk="strip", **parameters)(frame, device=device), read_lines(frame, **parameters))
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"method": "best"}, "method"),
+        ({"along": "x"}, "along"),
+        ({"window": 0}, "window"),
+        ({"outputs": ("g",)}, "outputs"),
+        ({"minimum_width": 5, "maximum_width": 2}, "widths"),
+        ({"method": "whole", "choice": "first"}, "whole"),
+        ({"method": "ml", "read_noise": 0.0}, "read_noise"),
+        ({"ambiguity": 2.0}, "ambiguity"),
+        ({"threshold": float("nan")}, "threshold"),
+    ],
+)
+def test_bad_parameters(parameters, words):
+    with pytest.raises(ValueError, match=words):
+        LineReadout(**parameters)
+
+
+def test_bad_frames(device):
+    with pytest.raises(TypeError, match="int64"):
+        LineReadout()(np.zeros((4, 4), np.int64), device=device)
+    with pytest.raises(ValueError, match=r"\(\.\.\., rows, columns\)"):
+        LineReadout()(np.zeros(4, np.uint8), device=device)
+    with pytest.raises(ValueError, match="whole number"):
+        LineReadout(threshold=2.5)(np.zeros((4, 4), np.uint8), device=device)
+    with pytest.raises(ValueError, match="saturation"):
+        LineReadout(saturation=300)(np.zeros((4, 4), np.uint8), device=device)

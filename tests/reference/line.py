@@ -1,0 +1,170 @@
+"""Line readout in float64 NumPy, one profile at a time, written from the definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import optimize, special
+
+DARK, SATURATED, OUT_OF_RANGE, NOT_FINITE, AMBIGUOUS = 1, 2, 4, 8, 16
+
+
+def read_lines(frames, *, along="columns", previous=None, **settings):
+    """Dictionary of position, peak, width, total (float64) and status (uint8) of shape (..., samples)."""
+    profiles = np.asarray(frames)
+    if along == "columns":
+        profiles = np.swapaxes(profiles, -1, -2)
+    saturation = settings.pop("saturation", None)
+    if saturation is None:
+        saturation = np.iinfo(profiles.dtype).max if profiles.dtype.kind == "u" else np.inf
+    flat = profiles.reshape(-1, profiles.shape[-1]).astype(np.float64)
+    before = np.full(len(flat), np.nan) if previous is None else np.asarray(previous, np.float64).reshape(-1)
+    rows = [read_profile(x, saturation=saturation, previous=b, **settings) for x, b in zip(flat, before, strict=True)]
+    names = ("position", "peak", "width", "total", "status")
+    out = {k: np.array([row[i] for row in rows]).reshape(profiles.shape[:-1]) for i, k in enumerate(names)}
+    out["status"] = out["status"].astype(np.uint8)
+    return out
+
+
+def read_profile(x, *, saturation, previous, method="windowed", threshold=0.0, window=8, **settings):
+    """(position, peak, width, total, status) of one float64 profile."""
+    if not np.all(np.isfinite(x)):
+        known = x[~np.isnan(x)]
+        bright = len(known) and known.max() >= saturation
+        return np.nan, np.nan, np.nan, np.nan, NOT_FINITE | (SATURATED if bright else 0)
+    if method == "whole":
+        return read_whole(x, threshold, saturation, **settings)
+    return read_peak(x, method, threshold, window, saturation, previous, **settings)
+
+
+def read_whole(x, threshold, saturation, *, minimum_peak=-np.inf, minimum_width=1, maximum_width=None, **_):
+    v = np.maximum(x - threshold, 0.0)
+    lit = int(np.sum(v > 0.0))
+    status = SATURATED if x.max() >= saturation else 0
+    widest = len(x) if maximum_width is None else maximum_width
+    if lit == 0 or x.max() < minimum_peak or not minimum_width <= lit <= widest:
+        return np.nan, x.max(), lit, v.sum(), status | DARK
+    if max(v[0], v[-1]) >= v.max() / 2.0:
+        return np.nan, x.max(), lit, v.sum(), status | OUT_OF_RANGE
+    return np.sum(v * np.arange(len(x))) / v.sum(), x.max(), lit, v.sum(), status
+
+
+def runs_of(x, threshold):
+    """(begin, end) of the runs of samples over the threshold."""
+    lit = np.concatenate([[False], x > threshold, [False]])
+    steps = np.flatnonzero(lit[1:] != lit[:-1])
+    return list(zip(steps[::2], steps[1::2], strict=True))
+
+
+def choose(x, threshold, previous, choice, minimum_peak, minimum_width, maximum_width):
+    """(index of the peak, width of its run), or None."""
+    widest = len(x) if maximum_width is None else maximum_width
+    peaks = [(b + int(np.argmax(x[b:e])), e - b) for b, e in runs_of(x, threshold) if minimum_width <= e - b <= widest]
+    peaks = [(at, width) for at, width in peaks if x[at] >= minimum_peak]
+    if not peaks:
+        return None
+    if choice == "first":
+        return peaks[0]
+    if choice == "last":
+        return peaks[-1]
+    if choice == "nearest" and 0.0 <= previous < len(x):
+        return min(peaks, key=lambda peak: abs(peak[0] - int(np.rint(previous))))
+    return max(peaks, key=lambda peak: x[peak[0]])
+
+
+def read_peak(
+    x, method, threshold, window, saturation, previous, *, choice="strongest", minimum_peak=-np.inf,
+    minimum_width=1, maximum_width=None, ambiguity=None, fir_length=4, read_noise=1.0, gain=0.0,
+):  # fmt: skip
+    found = choose(x, threshold, previous, choice, minimum_peak, minimum_width, maximum_width)
+    if found is None:
+        return np.nan, x.max(), 0, 0.0, DARK | (SATURATED if x.max() >= saturation else 0)
+    at, width = found
+    top = x[at]
+    equals = int(np.sum(x[at : at + window + 1] == top))
+    at += (equals - 1) // 2
+    status = SATURATED if top >= saturation else 0
+    v = np.maximum(x - threshold, 0.0)
+    inside = np.abs(np.arange(len(x)) - at) <= window
+    if ambiguity is not None and np.any(~inside):
+        second = v[~inside].max()
+        status |= AMBIGUOUS if second > 0.0 and second >= ambiguity * (top - threshold) else 0
+    if at < window or at + window >= len(x):
+        return np.nan, top, width, np.nan, status | OUT_OF_RANGE
+    near = x[at - window : at + window + 1]
+    total = np.maximum(near - threshold, 0.0).sum()
+    if method == "windowed":
+        offset, flag = np.sum(v[inside] * np.arange(-window, window + 1)) / total, 0
+    elif method == "gauss3":
+        offset, flag = gauss3(v, at, equals)
+    elif method == "fir":
+        offset, flag = fir(x, at, window, fir_length // 2)
+    else:
+        offset, flag = likeliest(near, window, saturation, read_noise, gain), 0
+    return (np.nan if flag & DARK else at + offset), top, width, total, status | flag
+
+
+def gauss3(v, at, equals):
+    if v[at - 1] <= 0.0 or v[at + 1] <= 0.0:
+        return np.nan, DARK
+    a, b, c = np.log(v[at - 1 : at + 2])
+    bend = a - 2.0 * b + c
+    if bend >= 0.0 or abs(0.5 * (a - c) / bend) > 1.0:
+        return ((equals - 1) % 2) / 2.0, AMBIGUOUS
+    return 0.5 * (a - c) / bend, 0
+
+
+def fir(x, at, window, half):
+    padded = np.pad(x, half + window, mode="edge")
+    index = np.arange(at - window, at + window + 1) + half + window
+    g = np.array([padded[i - half : i].sum() - padded[i + 1 : i + half + 1].sum() for i in index])
+    k = np.arange(-window, window)
+    nearest = []
+    for crosses in ((g[:-1] < 0.0) & (g[1:] >= 0.0), (g[:-1] <= 0.0) & (g[1:] > 0.0)):
+        if not crosses.any():
+            return np.nan, DARK
+        places = k[crosses] + g[:-1][crosses] / (g[:-1] - g[1:])[crosses]
+        nearest.append(places[np.argmin(np.abs(places))])
+    return np.mean(nearest), 0
+
+
+def pixel_gaussian(k, place, sigma, amplitude, background):
+    """Light of a Gaussian in whole pixels."""
+    low, high = ((k + half - place) / (sigma * np.sqrt(2.0)) for half in (-0.5, 0.5))
+    return background + amplitude * sigma * np.sqrt(np.pi / 2.0) * (special.erf(high) - special.erf(low))
+
+
+def likeliest(y, window, saturation, read_noise, gain):
+    """Weighted least squares, the weights those of the fitted model: repeated until nothing changes."""
+    k = np.arange(-window, window + 1)
+    good = y < saturation
+    background = (y[0] + y[-1]) / 2.0
+    over = np.maximum(y - background, 0.0)
+    over[over < over.max() / 4.0] = 0.0
+    guess = np.array([np.sum(over * k) / over.sum(), over.sum() / (2.266 * over.max()), over.max(), background])
+    for _ in range(40):
+        deviation = np.sqrt(read_noise**2 + gain * np.maximum(pixel_gaussian(k, *guess), 0.0))
+        fit = optimize.least_squares(
+            lambda p, d: ((pixel_gaussian(k, *p) - y) / d)[good], guess, x_scale=np.abs(guess) + 0.1,
+            args=(deviation,), xtol=1e-12, ftol=1e-12, gtol=1e-12,
+        )  # fmt: skip
+        if np.max(np.abs(fit.x - guess)) < 1e-9:
+            break
+        guess = fit.x
+    return guess[0]
+
+
+def cramer_rao(sigma, amplitude, background, read_noise, length, places):
+    """Root mean square over the places of the bound on the deviation of the place, all four parameters unknown."""
+    k = np.arange(length)
+    variances = []
+    for place in places:
+        truth = np.array([place, sigma, amplitude, background])
+        slopes = []
+        for i, size in enumerate((1e-5, 1e-5 * sigma, 1e-5 * amplitude, 1e-3)):
+            shift = np.zeros(4)
+            shift[i] = size
+            slopes.append((pixel_gaussian(k, *(truth + shift)) - pixel_gaussian(k, *(truth - shift))) / (2.0 * size))
+        design = np.array(slopes)
+        variance = read_noise**2 + pixel_gaussian(k, *truth)
+        variances.append(np.linalg.inv((design / variance) @ design.T)[0, 0])
+    return np.sqrt(np.mean(variances))

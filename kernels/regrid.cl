@@ -57,21 +57,15 @@ typedef struct {
 inline int first_cell(real low) { return (int)clamp(ceil(low), (real)0, (real)0x1000000); }
 inline int last_cell(real high, int cells) { return (int)clamp(floor(high), (real)-1, (real)(cells - 1)); }
 
-// What lies between two neighbouring good samples: the line through them, or, where they are not joined, a hole with
-// the reasons of the bad samples between them.
-inline void fill_between(Sample before, Sample now, uint reasons, LINES_OUT, ulong out, constant uint *count,
-                         constant real *grid) {
+// What lies between two neighbouring good samples: the line through them, where they are joined.
+inline void fill_between(Sample before, Sample now, LINES_OUT, ulong out, constant uint *count, constant real *grid) {
     const real length = now.at - before.at, rise = now.height - before.height;
-    const int joined = fabs(length) <= grid[GRID_MAX_GAP] && fabs(rise) <= grid[GRID_MAX_STEP];
+    if (fabs(length) > grid[GRID_MAX_GAP] || fabs(rise) > grid[GRID_MAX_STEP]) return;
     const uint found = (before.status | now.status) & STATUS_INFORMS;
     const int last = last_cell(fmax(before.at, now.at), count[COUNT_CELLS]);
     for (int cell = first_cell(fmin(before.at, now.at)); cell <= last; ++cell) {
         const ulong i = out + (ulong)cell * count[COUNT_CELL_PITCH];
         const uint old = out_status[i];
-        if (!joined) {
-            if (old & STATUS_HOLE) out_status[i] = old | reasons;
-            continue;
-        }
         const real part = length == 0 ? 0 : (cell - before.at) / length;
         const real height = before.height + part * rise;
         // A cell that was passed before keeps the higher surface; within a step the later one is as good.
@@ -109,21 +103,17 @@ kernel void resample(LINES_IN, LINES_OUT, constant uint *count, constant real *g
 
     Sample before;
     int started = 0;
-    uint reasons = 0;
     real furthest = 0, back = 0; // how far the line has come, and how far it has fallen back since
     for (uint sample = 0; sample < count[COUNT_SAMPLES]; ++sample) {
         const ulong i = in + (ulong)sample * count[COUNT_SAMPLE_PITCH];
         const Sample now = {(along[i] - grid[GRID_ORIGIN]) * grid[GRID_PER_METRE], height[i], intensity[i], OTHER_OF(i),
                             given[i]};
-        if ((now.status & ~STATUS_INFORMS) || not_finite(now.at) || not_finite(now.height)) {
-            reasons |= now.status;
-            continue;
-        }
+        if ((now.status & ~STATUS_INFORMS) || not_finite(now.at) || not_finite(now.height)) continue;
         const real reached = sense * now.at;
         if (!started) {
             furthest = back = reached;
         } else {
-            fill_between(before, now, reasons, OUT_ARRAYS, out, count, grid);
+            fill_between(before, now, OUT_ARRAYS, out, count, grid);
             if (reached > furthest) {
                 furthest = back = reached;
             } else if (reached <= furthest - tolerance && reached <= back) {
@@ -133,7 +123,6 @@ kernel void resample(LINES_IN, LINES_OUT, constant uint *count, constant real *g
         }
         before = now;
         started = 1;
-        reasons = 0;
     }
     if (count[COUNT_DROP_FOLDED]) clear(OUT_ARRAYS, out, count, STATUS_FOLDED, STATUS_FOLDED);
 }

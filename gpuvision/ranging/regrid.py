@@ -34,8 +34,8 @@ class HeightMap(NamedTuple):
     intensity
         Of the light, in the units of the input; NaN in holes.
     status
-        uint8 `Status` flags. HOLE: no measurement near enough, with the flags of the bad samples in the gap.
-        FOLDED: the sampling ran backwards here. SATURATED and AMBIGUOUS come with a value.
+        uint8 `Status` flags. HOLE: no measurement near enough. FOLDED: the sampling ran backwards here. SATURATED and
+        AMBIGUOUS come with a value.
     """
 
     z: Any

@@ -69,7 +69,7 @@ def test_a_scan_against_its_direction_is_folded_all_over(device):
     assert np.all(np.isnan(made.z))
 
 
-def test_a_gap_stays_a_hole_that_says_why(device):
+def test_a_gap_stays_a_hole(device):
     frames = flat((40, 61))
     x, y, status = frames[0], frames[1], frames[4]
     status[8:32, 20:40] = Status.DARK
@@ -78,7 +78,7 @@ def test_a_gap_stays_a_hole_that_says_why(device):
     assert inside.sum() > 3
     within = (GRID.y > y[7, 0]) & (GRID.y < y[32, 0])
     gap = within[:, None] & inside
-    assert np.all(made.status[gap] == Status.HOLE | Status.DARK)
+    assert np.all(made.status[gap] == Status.HOLE)
     assert np.all(np.isnan(made.z[gap]))
     assert np.all(made.status[~gap] == 0)
     bridged = dataclasses.replace(OP, max_gap=0.8, max_step=0.8)(*frames, device=device)
@@ -159,13 +159,14 @@ def test_samples_on_one_place_are_folded_there(device):
 @hypothesis.settings(max_examples=60, deadline=None)
 @hypothesis.given(data=st.data(), shape=hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12))
 def test_as_the_oracle(data, shape):
-    # Places and heights on a fine dyadic raster are exact in single precision: the decisions must be the same.
+    # Places on a fine dyadic raster are exact, and no difference of heights is near max_step: all decisions are clear.
     def numbers(low, high, part):
         return data.draw(hnp.arrays(np.float32, shape, elements=st.integers(low, high).map(lambda n: n / part)))
 
     ramp = np.broadcast_to(np.linspace(-1, 1, shape[1]).round(4), shape)
     x = (np.round(ramp * 64) / 64 + numbers(-8, 24, 64)).astype(np.float32)
-    y = (np.broadcast_to(np.arange(shape[0])[:, None] / 4, shape) - 0.5 + numbers(-6, 6, 32)).astype(np.float32)
+    shifts = data.draw(hnp.arrays(np.float32, (shape[0], 1), elements=st.integers(-12, 12).map(lambda n: n / 32)))
+    y = np.ascontiguousarray(np.broadcast_to(np.arange(shape[0], dtype=np.float32)[:, None] / 4 - 0.5 + shifts, shape))
     z, intensity = numbers(0, 12, 16), numbers(0, 100, 1)
     holes = st.sampled_from([np.nan, np.inf, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])
     z = z + data.draw(hnp.arrays(np.float32, shape, elements=holes))
@@ -173,7 +174,7 @@ def test_as_the_oracle(data, shape):
     op = Regrid(
         grid=GRID,
         max_gap=data.draw(st.sampled_from([0.0, 0.25, 0.5, 1.0])),
-        max_step=data.draw(st.sampled_from([0.0, 0.25, 1.0])),
+        max_step=data.draw(st.sampled_from([0.00013, 0.25013, 1.00013])),
         along=data.draw(st.sampled_from(["x", "-x"])),
         across=data.draw(st.sampled_from(["y", "-y"])),
         fold_tolerance=data.draw(st.sampled_from([0.0, 0.0625, 0.25])),

@@ -27,8 +27,6 @@ def resample_line(
         over = (centres >= low) & (centres <= high)
         length, rise = at[second] - at[first], values[0, second] - values[0, first]
         if abs(length) > regrid.max_gap or abs(rise) > regrid.max_step:
-            reasons = np.bitwise_or.reduce(given[first + 1 : second], initial=0)
-            status[over & np.isnan(made[0])] |= np.uint8(reasons)
             continue
         part = (centres - at[first]) / length if length else np.zeros(len(centres))
         new = values[:, [first]] + part * (values[:, [second]] - values[:, [first]])

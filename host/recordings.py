@@ -122,7 +122,7 @@ def _open_tiff(path: Path) -> tifffile.TiffFile:
 
 def _next_page(file: tifffile.TiffFile) -> bytes:
     """Return the link after the last page: zeros, unless the file breaks off and the reader has given up there."""
-    file.filehandle.seek(file.pages.next_page_offset)
+    file.filehandle.seek(file.pages.next_page_offset or 0)
     link: bytes = file.filehandle.read(file.tiff.offsetsize)
     return link
 

@@ -1,0 +1,217 @@
+"""Line readout against Numba in strips of 256 columns and against NumPy: position, total and status.
+
+Frames of 512 rows and 1024 columns, 8 bit, of a line that wanders over half the frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from gpuvision.camera.lens import Lens
+from gpuvision.host import Device, host_view
+from gpuvision.profiling.harness import Case
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.triangulation import Triangulation
+
+ROWS, COLUMNS, THRESHOLD, SATURATION, WINDOW = 512, 1024, 25, 255, 8
+OUTPUTS = ("position", "total", "status")
+_STRIP = 256
+_DISTINCT = 8
+Frames = NDArray[np.uint8]
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def _add_row(line, totals, moments, tops, threshold):  # type: ignore[no-untyped-def]
+    """Sum a strip's row; the moment is the sum of the running totals, without a multiplication."""
+    for c in range(line.size):
+        x = line[c]
+        total = totals[c] + np.uint32(max(x, threshold) - threshold)
+        totals[c] = total
+        moments[c] += total
+        tops[c] = max(tops[c], x)
+
+
+@numba.njit(parallel=True)  # type: ignore[untyped-decorator]
+def _numba_whole(frames, threshold, saturation, position, total, status):  # type: ignore[no-untyped-def]
+    count, rows, columns = frames.shape
+    strips = (columns + _STRIP - 1) // _STRIP
+    for item in numba.prange(count * strips):
+        f, first = item // strips, item % strips * _STRIP
+        n = min(_STRIP, columns - first)
+        totals, moments = np.zeros(_STRIP, np.uint32), np.zeros(_STRIP, np.uint32)
+        tops = np.zeros(_STRIP, np.uint8)
+        for r in range(rows):
+            _add_row(frames[f, r, first : first + n], totals, moments, tops, threshold)
+        for c in range(n):
+            s = totals[c]
+            dark = s == 0
+            position[f, first + c] = (
+                np.float32(np.nan) if dark else np.float32(np.uint32(rows) * s - moments[c]) / np.float32(s)
+            )
+            total[f, first + c] = s
+            status[f, first + c] = np.uint8(dark) | (np.uint8(tops[c] >= saturation) << np.uint8(1))
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def _raise_tops(line, row, tops, at):  # type: ignore[no-untyped-def]
+    for c in range(line.size):
+        x = line[c]
+        at[c] = row if x > tops[c] else at[c]
+        tops[c] = max(tops[c], x)
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def _add_window(line, row, at, totals, moments, threshold, window):  # type: ignore[no-untyped-def]
+    for c in range(line.size):
+        d = row - np.int32(at[c])
+        v = max(np.int32(line[c]) - threshold, 0)
+        v = v if (d <= window) & (d >= -window) else np.int32(0)
+        totals[c] += v
+        moments[c] += v * d
+
+
+@numba.njit(parallel=True)  # type: ignore[untyped-decorator]
+def _numba_windowed(frames, threshold, saturation, window, position, total, status):  # type: ignore[no-untyped-def]
+    count, rows, columns = frames.shape
+    strips = (columns + _STRIP - 1) // _STRIP
+    for item in numba.prange(count * strips):
+        f, first = item // strips, item % strips * _STRIP
+        n = min(_STRIP, columns - first)
+        tops, at = np.zeros(_STRIP, np.uint8), np.zeros(_STRIP, np.uint16)
+        for r in range(rows):
+            _raise_tops(frames[f, r, first : first + n], np.uint16(r), tops, at)
+        begin = max(np.int64(at[:n].min()) - window, 0)
+        end = min(np.int64(at[:n].max()) + window + 1, rows)
+        totals, moments = np.zeros(_STRIP, np.int32), np.zeros(_STRIP, np.int32)
+        for r in range(begin, end):
+            _add_window(frames[f, r, first : first + n], np.int32(r), at, totals, moments, threshold, window)
+        for c in range(n):
+            s = totals[c]
+            cut = (at[c] < window) | (at[c] + window >= rows)
+            flags = np.uint8(s == 0) | (np.uint8(tops[c] >= saturation) << np.uint8(1))
+            flags |= np.uint8(cut) << np.uint8(2)
+            place = np.float32(at[c]) + np.float32(moments[c]) / np.float32(max(s, 1))
+            position[f, first + c] = np.float32(np.nan) if (s == 0) | cut else place
+            total[f, first + c] = s
+            status[f, first + c] = flags
+
+
+def _numpy_whole(frames: Frames) -> tuple[NDArray[Any], ...]:
+    light = np.maximum(frames, THRESHOLD) - np.uint8(THRESHOLD)
+    total = light.sum(axis=1, dtype=np.uint32)
+    moment = np.einsum("frc,r->fc", light, np.arange(frames.shape[1], dtype=np.uint32), dtype=np.uint32)
+    with np.errstate(invalid="ignore"):
+        return moment / total.astype(np.float32), total, (total == 0) | (frames.max(axis=1) >= SATURATION)
+
+
+def _numpy_windowed(frames: Frames) -> tuple[NDArray[Any], ...]:
+    at = frames.argmax(axis=1)
+    around = np.arange(-WINDOW, WINDOW + 1)
+    index = np.clip(at[:, None, :] + around[None, :, None], 0, frames.shape[1] - 1)
+    light = np.take_along_axis(frames, index, axis=1)
+    light = np.maximum(light, THRESHOLD).astype(np.float32) - THRESHOLD
+    total = light.sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        return at + np.einsum("fkc,k->fc", light, around.astype(np.float32)) / total, total, total == 0
+
+
+def line_frames(count: int) -> Frames:
+    """Return frames with a Gaussian line of 2 px and 3 levels of noise, a few distinct ones in turn."""
+    rng = np.random.default_rng(1)
+    row, column = np.arange(ROWS)[:, None], np.arange(COLUMNS)
+    distinct = np.empty((min(count, _DISTINCT), ROWS, COLUMNS), np.uint8)
+    for f, frame in enumerate(distinct):
+        place = ROWS * (0.5 + 0.25 * np.sin(6.0 * column / COLUMNS + f))
+        light = 10.0 + 180.0 * np.exp(-((row - place) ** 2) / 8.0) + rng.normal(0.0, 3.0, frame.shape)
+        frame[...] = np.clip(np.rint(light), 0, 255)
+    return np.ascontiguousarray(np.resize(distinct, (count, ROWS, COLUMNS)))
+
+
+def cases(device: Device) -> Iterator[Case]:
+    """Yield both centres of gravity on 1, 16 and 64 frames, the fits and the fused readouts on 16."""
+    for method in ("whole", "windowed"):
+        for count in (1, 16, 64):
+            yield _case(device, LineReadout(method=method, **_SETTINGS), count, f"{method}/{count}")
+    for method in ("gauss3", "fir", "ml"):
+        yield _case(device, LineReadout(method=method, gain=0.1, **_SETTINGS), 16, f"{method}/16")
+    yield _case(device, LineReadout(method="windowed", along="rows", **_SETTINGS), 16, "windowed-rows/16")
+    for method in ("whole", "windowed"):
+        for count in (1, 16):
+            yield _fused_case(device, method, count)
+
+
+_SETTINGS: Mapping[str, Any] = {"threshold": THRESHOLD, "window": WINDOW, "outputs": OUTPUTS}
+
+
+def _case(device: Device, readout: LineReadout, count: int, name: str) -> Case:
+    frames = line_frames(count)
+    if readout.along == "rows":
+        frames = np.ascontiguousarray(np.swapaxes(frames, 1, 2))
+    bound, frames = _bound(device, readout, frames)
+    peers: dict[str, Callable[[], object]] = {}
+    across = np.swapaxes(frames, 1, 2) if readout.along == "rows" else frames
+    if readout.along == "columns":
+        results = tuple(np.empty((count, COLUMNS), each) for each in (np.float32, np.uint32, np.uint8))
+        if readout.method == "whole":
+            peers["numba"] = lambda: _numba_whole(frames, np.uint8(THRESHOLD), SATURATION, *results)
+        else:
+            peers["numba"] = lambda: _numba_windowed(frames, np.int32(THRESHOLD), SATURATION, WINDOW, *results)
+    peers["numpy"] = lambda: (_numpy_whole if readout.method == "whole" else _numpy_windowed)(across)
+    error = _error(bound.outputs, across, readout)
+    return Case("line", name, lambda: bound().wait(), peers, error, (frames.nbytes, 9 * count * COLUMNS))
+
+
+def _fused_case(device: Device, method: Any, count: int) -> Case:
+    """With coordinates undistorted and triangulated in the same pass; the peer is our readout alone."""
+    sheet = Triangulation(
+        homography=((1.1e-5, 2.0e-4, -0.1), (-2.2e-4, 1.0e-6, 0.06), (2.0e-4, 1.0e-5, 1.0)),
+        region=((0.0, ROWS - 1.0), (0.0, COLUMNS - 1.0)),
+        lens=Lens(k1=4e-8, k2=1e-14, centre=(COLUMNS / 2.0, ROWS / 2.0)),
+    )
+    settings = {**_SETTINGS, "outputs": (*OUTPUTS, "g", "h")}
+    alone, frames = _bound(device, LineReadout(method=method, **_SETTINGS), line_frames(count))
+    fused = LineReadout(method=method, triangulation=sheet, **settings).bind(device, frames.shape, frames.dtype)
+    shared = alone.inputs[0]
+    fused(shared).wait()
+    expected = sheet(
+        fused.outputs.position.get(), np.tile(np.arange(COLUMNS, dtype=np.float32), (count, 1)), device=device
+    )
+    error = float(np.nanmax(np.abs(fused.outputs.h.get() - expected.h)))
+    peers = {"gpuvision": lambda: alone(shared).wait()}
+    return Case(
+        "line",
+        f"{method}-fused/{count}",
+        lambda: fused(shared).wait(),
+        peers,
+        error,
+        (frames.nbytes, 17 * count * COLUMNS),
+    )
+
+
+def _bound(device: Device, readout: LineReadout, frames: Frames) -> tuple[Any, Frames]:
+    """Return the bound readout with the frames in its input slot, and the frames where peers should read them."""
+    bound = readout.bind(device, frames.shape, frames.dtype)
+    if device.shares_memory:
+        host_view(bound.inputs[0])[...] = frames
+        frames = host_view(bound.inputs[0])
+    else:
+        bound.inputs[0].set(frames)
+    bound().wait()
+    return bound, frames
+
+
+def _error(reading: Any, frames: Frames, readout: LineReadout) -> float:
+    """Return the largest deviation from float64 of the same definition; of a fit, from the windowed centre."""
+    position, status = reading.position.get(), reading.status.get()
+    light = np.maximum(frames[:_DISTINCT].astype(np.float64) - THRESHOLD, 0.0)
+    row = np.arange(frames.shape[1])[None, :, None]
+    if readout.method != "whole":
+        light = light * (np.abs(row - frames[:_DISTINCT].argmax(axis=1)[:, None, :]) <= WINDOW)
+    truth = (light * row).sum(axis=1) / light.sum(axis=1)
+    good = status[:_DISTINCT] == 0
+    return float(np.max(np.abs(position[:_DISTINCT] - truth)[good]))

@@ -74,7 +74,7 @@ inline void finish_whole(const Profiles *profiles, const Gravity *gravity, const
                      REAL_MASK(over_threshold(sample_of(profiles, profiles->length - 1), profiles->threshold) >= least);
     const ints flags = flag_where(dark, STATUS_DARK) | flag_where(cut & ~dark, STATUS_OUT_OF_RANGE) |
                        common_flags(profiles, gravity->peak, gravity->lost);
-    store_reading(to, first, sample, gravity->centre + gravity->offset / gravity->total, gravity->peak, gravity->lit, gravity->total, flags);
+    store_reading(to, first, sample, gravity->position, gravity->peak, gravity->lit, gravity->total, flags);
 }
 #else
 inline void finish_peak(const Profiles *profiles, Peak *peak, const Place *place, constant real *p, const Outputs *to, ulong first, int sample) {

@@ -24,7 +24,7 @@ inline void read_strip(const Profiles *frame, int begin, int end, constant real 
     for (int row = 0; row < frame->length; row += STEPS) {
         global const CODE *at = frame->first + (long)row * columns;
         const int steps = min(STEPS, frame->length - row);
-        Ahead ahead = ahead_of(at + (long)STEPS * columns + begin, groups * WIDE, columns);
+        Ahead ahead = ahead_of(at + (long)BLOCKS_AHEAD * STEPS * columns + begin, groups * WIDE, columns);
         for (int i = 0; i < groups; i++) {
             add_steps(&sums[i], at + group_start(begin, i, columns), columns, steps, row, frame->threshold, &ahead);
         }
@@ -56,7 +56,7 @@ inline void read_rows(const Profiles *profiles, constant real *p, const Outputs 
     RowSums rows[LANES];
     for (int i = 0; i < LANES; i++) {
         global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
-        Ahead ahead = ahead_of(row + 2 * profiles->lane_stride, profiles->length, profiles->length);
+        Ahead ahead = ahead_of(row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride, profiles->length, profiles->length);
         read_row(row, profiles->length, profiles->threshold, &rows[i], &ahead);
     }
     const Gravity gravity = row_gravity(rows);
@@ -105,7 +105,7 @@ inline void read_strip(const Profiles *frame, int begin, int end, constant real 
     for (int row = 0; row < frame->length; row += tall) {
         global const CODE *at = frame->first + (long)row * columns;
         const int steps = min(tall, frame->length - row);
-        Ahead ahead = ahead_of(at + (long)tall * columns + begin, groups * WIDE, columns);
+        Ahead ahead = ahead_of(at + (long)BLOCKS_AHEAD * tall * columns + begin, groups * WIDE, columns);
         for (int i = 0; i < groups; i++) {
             find_steps(&peaks[i], at + group_start(begin, i, columns), columns, steps, row / tall, &ahead);
         }
@@ -125,7 +125,7 @@ inline void read_rows(const Profiles *profiles, constant real *p, const Outputs 
     CODE level[LANES];
     for (int i = 0; i < LANES; i++) {
         global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
-        Ahead ahead = ahead_of(row + 2 * profiles->lane_stride, profiles->length, profiles->length);
+        Ahead ahead = ahead_of(row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride, profiles->length, profiles->length);
         find_in_row(row, profiles->length, &at[i], &level[i], &lost[i], &ahead);
     }
     Peak peak;

@@ -10,9 +10,9 @@
 #define STEPS 16  // samples of a profile that are summed in narrow numbers before they are widened
 
 typedef struct {
-    reals centre, offset, total, lit;  // the position is centre + offset / total; lit counts the samples over threshold
+    reals position, total, lit;  // lit counts the samples over the threshold
     codes peak;
-    ints lost;                         // lanes with a sample that is not finite
+    ints lost;                   // lanes with a sample that is not finite
 } Gravity;
 
 #if CODE_BITS == 32
@@ -47,9 +47,9 @@ inline Sums no_sums(void) {
 inline Gravity gravity_of(const Sums *sums) {
     Gravity gravity;
     gravity.total = sums->total + sums->total_rest;
-    gravity.centre = rint(sums->moment / gravity.total);
-    gravity.offset = fma(-gravity.centre, sums->total, sums->moment) +
-                     (sums->moment_rest - gravity.centre * sums->total_rest);
+    const reals per_light = 1 / gravity.total, centre = rint(sums->moment * per_light);
+    const reals offset = fma(-centre, sums->total, sums->moment) + (sums->moment_rest - centre * sums->total_rest);
+    gravity.position = centre + offset * per_light;
     gravity.lit = sums->lit;
     gravity.peak = sums->peak;
     gravity.lost = not_finite_lanes(sums->lost) | not_finite_lanes(gravity.total);
@@ -117,9 +117,11 @@ typedef signed_big signed_bigs;
 inline Gravity gravity_of_integers(uints total, bigs moment, uints lit, codes peak) {
     Gravity gravity;
     gravity.total = to_reals(total);
-    const reals light = choose_reals(INT_MASK(total == 0u), 1, gravity.total);
-    gravity.centre = rint(to_reals(moment) / light);
-    gravity.offset = to_reals(to_signed_bigs(moment) - to_signed_bigs(gravity.centre) * to_signed_bigs(total));
+    // A whole number near the position, which the moment is taken about: the rest is small and loses nothing.
+    const reals per_light = 1 / choose_reals(INT_MASK(total == 0u), 1, gravity.total);
+    const reals centre = rint(to_reals(moment) * per_light);
+    const signed_bigs offset = to_signed_bigs(moment) - to_signed_bigs(centre) * to_signed_bigs(total);
+    gravity.position = centre + to_reals(offset) * per_light;
     gravity.lit = to_reals(lit);
     gravity.peak = peak;
     gravity.lost = 0;
@@ -221,9 +223,8 @@ inline Gravity row_gravity(const RowSums *rows) {
         peak[i] = rows[i].peak;
     }
     Gravity gravity;
-    gravity.centre = *(const reals_at *)centre;
-    gravity.offset = *(const reals_at *)offset;
     gravity.total = *(const reals_at *)total;
+    gravity.position = *(const reals_at *)centre + *(const reals_at *)offset / gravity.total;
     gravity.lit = *(const reals_at *)lit;
     gravity.peak = *(const codes_at *)peak;
     gravity.lost = not_finite_lanes(*(const reals_at *)lost) | not_finite_lanes(gravity.total);

@@ -29,14 +29,15 @@ typedef wides wides_at __attribute__((aligned(sizeof(CODE))));
 
 inline wides wide_load(global const CODE *at) { return *(global const wides_at *)at; }
 
-// A load of what is needed 16 rows later: the hardware does not guess a walk in blocks.
+// Into the second cache what is needed some blocks later: the hardware does not guess a walk in blocks.
+#define BLOCKS_AHEAD 4
 #ifdef PREFETCH
-#define prefetch_line(at) __builtin_prefetch((const void *)(ulong)(at), 0, 3)
+#define prefetch_line(at) __builtin_prefetch((const void *)(ulong)(at), 0, 2)
 #else
 #define prefetch_line(at)
 #endif
 
-// Where the next block is fetched from: line by line in the order of memory, whatever order the block is worked in.
+// Where a later block is fetched from: line by line in the order of memory, whatever order the block is worked in.
 typedef struct {
     global const CODE *at, *end;
     int gap, extent;

@@ -19,6 +19,7 @@ from types import TracebackType
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
+import pyopencl as cl
 
 from gpuvision.host.arrays import HostArray
 from gpuvision.host.device import Device
@@ -75,13 +76,6 @@ class Batch(Generic[R]):
         result = rebuilt(self.result, np.copy)
         times = (self.launched, self.started, self.ended, self.delivered)
         return Batch(self.number, self.frames.copy(), result, self.arrived.copy(), *times)
-
-
-@dataclass
-class _Failure:
-    stage: str
-    number: int
-    error: BaseException
 
 
 class Pipeline(Generic[R]):
@@ -170,11 +164,11 @@ class Pipeline(Generic[R]):
         source = self.source
         try:
             self._queues = Queues(self.device, zero_copy=self.zero_copy, profiling=self.profile)
-            self._slots: list[Slot[R]] = [
+            slots: list[Slot[R]] = [
                 kind(self._steps, self.device, self._queues, self.batch, source.shape, source.dtype)
                 for _ in range(self.ring)
             ]
-            self._offset = self._calibrated() if self.profile else 0
+            self._offset = self._calibrated(slots[0]) if self.profile else 0
         except BaseException:
             self._state = "closed"
             source.close()
@@ -183,11 +177,11 @@ class Pipeline(Generic[R]):
         self._free: list[Slot[R]] = []
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._ready: queue.SimpleQueue[Slot[R] | None] = queue.SimpleQueue()
-        for slot in self._slots:
+        for slot in slots:
             self._give_back(slot)
         self._held: Slot[R] | None = None
         self._held_spans: dict[str, tuple[int, int]] = {}
-        self._failure: _Failure | None = None
+        self._failure: StreamError | None = None
         self._stopping = self._ended = False
         self._account.started = self._clock()
         self._producer = threading.Thread(target=self._produce, name="gpuvision stream", daemon=True)
@@ -221,10 +215,15 @@ class Pipeline(Generic[R]):
                 f"the source has not returned from a read for {_PATIENCE_S:.0f} s after the stream's end; "
                 "give it a stop() that ends the read"
             )
-        self._queues.finish()
-        self._release(self._clock())
-        self._slots.clear()
-        self.source.close()
+        try:
+            self._queues.finish()
+        finally:
+            self._release(self._clock())
+            # Slots hold device memory: with the last reference it goes, whoever keeps the stream for its report.
+            del self._queues
+            self._free.clear()
+            self._ready = queue.SimpleQueue()
+            self.source.close()
         if self.trace is not None:
             self.trace.write()
 
@@ -254,7 +253,8 @@ class Pipeline(Generic[R]):
                 number += slot.count
                 ready.put(slot)
         except BaseException as error:  # whatever it is, the consumer's thread raises it
-            self._failure = _Failure(stage, number, error)
+            self._failure = _stopped(number, stage, error)
+            self._failure.__cause__ = error
         ready.put(None)
 
     def _free_slot(self, number: int) -> Slot[R] | None:
@@ -306,16 +306,16 @@ class Pipeline(Generic[R]):
         slot = self._ready.get()
         if slot is None:
             self._ended = True
-            self._raise_failure()
+            if self._failure is not None:
+                raise self._failure from self._failure.__cause__
             raise StopIteration
         self._held = slot
         taken = clock()
         try:
             slot.wait()
-        except BaseException as error:
-            self._failure = _Failure("operation", slot.number, error)
+        except cl.Error as error:
             self._ended = True
-            self._raise_failure()
+            raise _stopped(slot.number, "operation", error) from error
         return self._delivered(slot, taken, clock())
 
     def _delivered(self, slot: Slot[R], taken: int, delivered: int) -> Batch[R]:
@@ -325,7 +325,7 @@ class Pipeline(Generic[R]):
         account.add("slot", slot.taken - slot.asked)
         account.add("source", slot.filled - slot.taken)
         account.add("launch", slot.enqueued - slot.filled)
-        account.add("queue", max(taken - slot.enqueued, 0))
+        account.add("queue", taken - slot.enqueued)
         account.add("wait", delivered - taken)
         started = ended = None
         spans: dict[str, tuple[int, int]] = {}
@@ -361,13 +361,6 @@ class Pipeline(Generic[R]):
         self._free.append(slot)
         self._tokens.put(None)
 
-    def _raise_failure(self) -> None:
-        failure = self._failure
-        if failure is not None:
-            raise StreamError(f"the stream stopped at frame {failure.number} ({failure.stage}): {failure.error}") from (
-                failure.error
-            )
-
     def run(self, sink: Callable[[Batch[R]], object] | None = None) -> StreamReport:
         """Open the stream, hand every batch to `sink`, close it, and return the report.
 
@@ -382,9 +375,8 @@ class Pipeline(Generic[R]):
                     continue
                 try:
                     sink(batch)
-                except BaseException as error:
-                    self._failure = _Failure("sink", batch.number, error)
-                    self._raise_failure()
+                except Exception as error:
+                    raise _stopped(batch.number, "sink", error) from error
         return self.report()
 
     def report(self) -> StreamReport:
@@ -400,11 +392,10 @@ class Pipeline(Generic[R]):
 
     # The device's clock ----------------------------------------------------------------------------------------
 
-    def _calibrated(self) -> int:
+    def _calibrated(self, slot: Slot[R]) -> int:
         """Return what to add to the device's times to have the host's, from a few empty launches."""
         offsets = []
         for _ in range(_CALIBRATIONS):
-            slot = self._slots[0]
             slot.launch()
             slot.wait()
             now = self._clock()
@@ -428,6 +419,10 @@ def default_batch(source: Source, ring: int) -> int:
     size = max(math.prod(source.shape) * source.dtype.itemsize, 1)
     batch = max(_DEFAULT_BATCH_BYTES // size, 1)
     return batch if source.length is None else max(min(batch, -(-source.length // ring)), 1)
+
+
+def _stopped(number: int, stage: str, error: BaseException) -> StreamError:
+    return StreamError(f"the stream stopped at frame {number} ({stage}): {error or type(error).__name__}")
 
 
 def _steps(operation: Operation[Any] | Sequence[Operation[Any] | Step]) -> list[Step]:

@@ -106,7 +106,7 @@ class ArraySource(Source):
     def __init__(self, frames: HostArray, count: int | None = None, *, clock: Clock = time.perf_counter_ns) -> None:
         if frames.ndim < 2:
             raise ValueError(f"expected frames along the first axis of 2 or more, got shape {frames.shape}")
-        if not len(frames) and count != 0 and count is not None:
+        if count and not len(frames):
             raise ValueError(f"there are no frames to make {count} of")
         self._frames, self._clock, self._next = frames, clock, 0
         self.shape, self.dtype = frames.shape[1:], frames.dtype.newbyteorder("=")
@@ -254,30 +254,49 @@ class PacedSource(Source):
         self._stopped = threading.Event()
         self._sleep = self._stopped.wait if sleep is None else sleep
         self._start: int | None = None
+        self._arrived: int | None = None
         self._taken = 0
+        self._error: RecordingError | None = None
 
     def wait(self) -> bool:
         """Wait until the next frame is due."""
-        return self._source.wait() and self._arrival() is not None
+        if self._arrived is None and self._source.wait():
+            self._arrived = self._arrival()
+        return self._arrived is not None
 
     def read_into(self, out: HostArray, arrived: Arrivals) -> int:
-        """Fill a batch as its frames fall due; frames that are overdue are read in one go."""
+        """Fill a batch as its frames fall due; frames that are overdue are read in one go.
+
+        An error does not lose the frames of its batch, as with `FrameSource`.
+        """
+        if self._error is not None:
+            raise self._error
         filled = 0
         while filled < len(out):
-            arrival = self._arrival()
-            if arrival is None:
+            try:
+                read = self._read_due(out[filled:], arrived[filled:]) if self.wait() else 0
+            except RecordingError as error:
+                if not filled:
+                    raise
+                self._error = error
                 break
-            overdue = int((self._clock() - self._due(0)) * self._rate_ns) + 1 - self._taken
-            wanted = max(min(len(out) - filled, overdue), 1)
-            read = self._source.read_into(out[filled : filled + wanted], arrived[filled : filled + wanted])
             if not read:
                 break
-            arrived[filled] = arrival
-            for k in range(1, read):
-                arrived[filled + k] = self._due(self._taken + k)
             filled += read
-            self._taken += read
         return filled
+
+    def _read_due(self, out: HostArray, arrived: Arrivals) -> int:
+        first, now = self._taken, self._clock()
+        self.late = max(self.late, now - self._due(first))
+        due = int((now - self._due(0)) * self._rate_ns) + 1 - first
+        wanted = max(min(len(out), due), 1)
+        read = self._source.read_into(out[:wanted], arrived[:wanted])
+        for k in range(read):
+            arrived[k] = self._due(first + k)
+        if read and self._arrived is not None:
+            arrived[0], self._arrived = self._arrived, None
+        self._taken += read
+        return read
 
     @property
     def _rate_ns(self) -> float:
@@ -286,7 +305,7 @@ class PacedSource(Source):
 
     def _due(self, number: int) -> int:
         assert self._start is not None  # the first `_arrival` sets it
-        return self._start + int(number / self._rate_ns)
+        return self._start + round(number / self._rate_ns)
 
     def _arrival(self) -> int | None:
         """Wait for the next frame and say when it arrived; ``None`` when stopped."""
@@ -295,7 +314,6 @@ class PacedSource(Source):
             self._start = now
         due = self._due(self._taken)
         if now >= due:
-            self.late = max(self.late, now - due)
             return None if self._stopped.is_set() else due
         while now < due:
             if self._stopped.is_set():

@@ -1,21 +1,20 @@
 // Profiles over a moving sheet of light -> organised range image: x, y, z per (profile, sample).
 //
-// Two geometries (GEOMETRY_ROTATING or not), the same two walks for both:
-//   straight: point = origin + G g + H h + L d                   (g, h in the sheet, L travelled along d)
-//   rotating: the ray r = (a, b, 1) of a camera at rest meets the sheet n.(X - p) = e, whose normal turns about an axis
-//             through p:  depth = (e + n.p) / (n.r),  point = origin + depth (r.x ex + r.y ey + ez)
-// The tables are StraightTransport.packed and RotatingSheet.packed in range_image.py, folded on the host in double.
-//
-// assemble_item:  one work-item per sample, coalesced (GPUs).
-// assemble_strip: one work-item per STRIP samples of a profile, 16 at a time (CPU runtimes).
-#include "real.h"
+// Two geometries:
+//   straight:            point = origin + G g + H h + L d        (g, h in the sheet, L travelled along d)
+//   GEOMETRY_ROTATING:   the ray r = (a, b, 1) of a camera at rest meets the sheet n.(X - p) = e, whose normal turns
+//                        about an axis through p:
+//                        depth = (e + n.p) / (n.r),  point = origin + depth (a ex + b ey + ez)
+// The table is RangeImage.packed in range_image.py, folded on the host in double. INPUT is the profiles' type.
+#include "lanes.h"
+#include "lens.h"
 #include "status.h"
 
-#include "lens.h"
-
-#define STRIP 1024
+#define SAMPLES_PER_STRIP 1024
+#define BLOCK 8  // vectors that are judged together
 // These flags come with a value; every other one withholds it.
 #define STATUS_INFORMS (STATUS_SATURATED | STATUS_AMBIGUOUS)
+#define STATUS_WITHHOLDS (~STATUS_INFORMS & 0xff)
 
 #define LIMIT_LOW 0
 #define LIMIT_HIGH 3
@@ -24,6 +23,16 @@
 #define POINT_E2 12
 #define POINT_E3 15
 
+#ifdef STRIP
+#define NEXT_LANES (real16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
+typedef INPUT16 inputs_at __attribute__((aligned(sizeof(INPUT))));
+#else
+#define NEXT_LANES 0
+typedef INPUT inputs_at;
+#endif
+
+inline reals load(global const INPUT *from) { return LANED(convert_real)(*(global const inputs_at *)from); }
+
 #ifdef GEOMETRY_ROTATING
 
 #define RAY_POSITION_ORIGIN 18
@@ -31,8 +40,6 @@
 #define RAY_SCALE 20
 #define SHEET_HORIZON 21
 #define SHEET_NORMAL 22
-#define SHEET_NORMAL_COS 25
-#define SHEET_NORMAL_SIN 28
 #define SHEET_REACH 31
 #define RAY_LENS 34
 
@@ -62,29 +69,28 @@ inline Pose pose_of(real angle, constant real *table) {
     return pose;
 }
 
+// The point of a light position; `missed` and `folded` say where there is none.
+inline void locate(reals position, reals sample, Pose pose, constant real *table, reals *x, reals *y, reals *z,
+                   masks *missed, masks *folded) {
+    reals a = (position - table[RAY_POSITION_ORIGIN]) * table[RAY_SCALE];
+    reals b = (sample - table[RAY_SAMPLE_ORIGIN]) * table[RAY_SCALE];
 #ifdef LENS
-#define UNDISTORT(SUFFIX, a, b, table) lens_undistort##SUFFIX(&a, &b, table + RAY_LENS)
+    *folded = mask_of(LANED(lens_undistort)(&a, &b, table + RAY_LENS));
 #else
-#define UNDISTORT(SUFFIX, a, b, table) 0
+    *folded = 0;
 #endif
+    const reals facing = pose.position * a + (pose.sample * b + pose.depth);
+    const reals depth = pose.reach / facing;
+    *missed = ~mask_of(facing > pose.horizon);
+    constant real *e1 = table + POINT_E1, *e2 = table + POINT_E2, *e3 = table + POINT_E3, *o = table + POINT_ORIGIN;
+    *x = o[0] + depth * (e1[0] * a + (e2[0] * b + e3[0]));
+    *y = o[1] + depth * (e1[1] * a + (e2[1] * b + e3[1]));
+    *z = o[2] + depth * (e1[2] * a + (e2[2] * b + e3[2]));
+}
 
-#define ALONG_RAY(axis)                                                                                                \
-    (table[POINT_ORIGIN + (axis)] +                                                                                    \
-     depth * (table[POINT_E1 + (axis)] * a + table[POINT_E2 + (axis)] * b + table[POINT_E3 + (axis)]))
-#define POINT(SUFFIX, REAL, BITS)                                                                                      \
-    inline BITS point##SUFFIX(REAL position, REAL sample, Pose pose, constant real *table, REAL *x, REAL *y,           \
-                              REAL *z) {                                                                               \
-        REAL a = (position - table[RAY_POSITION_ORIGIN]) * table[RAY_SCALE];                                           \
-        REAL b = (sample - table[RAY_SAMPLE_ORIGIN]) * table[RAY_SCALE];                                               \
-        const BITS folded = UNDISTORT(SUFFIX, a, b, table);                                                            \
-        const REAL facing = pose.position * a + pose.sample * b + pose.depth;                                          \
-        const REAL depth = pose.reach / facing;                                                                        \
-        *x = ALONG_RAY(0);                                                                                             \
-        *y = ALONG_RAY(1);                                                                                             \
-        *z = ALONG_RAY(2);                                                                                             \
-        const BITS missed = facing > pose.horizon ? (BITS)0 : (BITS)STATUS_HORIZON;                                    \
-        return folded ? (BITS)STATUS_FOLDED : missed;                                                                  \
-    }
+#define PROFILES global const INPUT *restrict position, global const INPUT *restrict transport
+#define FIRST(i) load(position + i)
+#define SECOND(i, sample) ((real)(sample) + (reals)NEXT_LANES)
 
 #else
 
@@ -94,103 +100,91 @@ typedef struct {
     int unknown;
 } Pose;
 
-inline Pose pose_of(real travel, constant real *table) {
-    Pose pose = {table[POINT_ORIGIN] + table[POINT_E3] * travel, table[POINT_ORIGIN + 1] + table[POINT_E3 + 1] * travel,
-                 table[POINT_ORIGIN + 2] + table[POINT_E3 + 2] * travel, not_finite(travel)};
+inline Pose pose_of(real travelled, constant real *table) {
+    constant real *d = table + POINT_E3, *o = table + POINT_ORIGIN;
+    Pose pose = {o[0] + d[0] * travelled, o[1] + d[1] * travelled, o[2] + d[2] * travelled, not_finite(travelled)};
     return pose;
 }
 
-#define POINT(SUFFIX, REAL, BITS)                                                                                      \
-    inline BITS point##SUFFIX(REAL g, REAL h, Pose pose, constant real *table, REAL *x, REAL *y, REAL *z) {            \
-        *x = pose.x + (table[POINT_E1] * g + table[POINT_E2] * h);                                                     \
-        *y = pose.y + (table[POINT_E1 + 1] * g + table[POINT_E2 + 1] * h);                                             \
-        *z = pose.z + (table[POINT_E1 + 2] * g + table[POINT_E2 + 2] * h);                                             \
-        return (BITS)0;                                                                                                \
-    }
-
-#endif
-POINT(, real, int)
-POINT(16, real16, bits16)
-
-#define OUTSIDE(v, axis) ((v < table[LIMIT_LOW + axis]) | (v > table[LIMIT_HIGH + axis]))
-
-// One point with its flags: NaN wherever a flag says that there is none. The causes rank: what came in, the lens'
-// fold and the horizon, then the limits; a later one is not looked at where an earlier one holds.
-#define JUDGED(SUFFIX, REAL, BITS)                                                                                     \
-    inline BITS judged##SUFFIX(REAL first, REAL second, BITS given, Pose pose, constant real *table, REAL *x,          \
-                               REAL *y, REAL *z) {                                                                     \
-        const BITS unknown = not_finite##SUFFIX(first) | not_finite##SUFFIX(second) | (BITS)pose.unknown;              \
-        const BITS withheld = given & (BITS)(~STATUS_INFORMS & 0xff);                                                  \
-        BITS status = point##SUFFIX(first, second, pose, table, x, y, z);                                              \
-        const BITS lost = not_finite##SUFFIX(*x) | not_finite##SUFFIX(*y) | not_finite##SUFFIX(*z);                    \
-        const BITS outside = OUTSIDE(*x, 0) | OUTSIDE(*y, 1) | OUTSIDE(*z, 2);                                         \
-        status = (status == (BITS)0) & (lost != (BITS)0) ? (BITS)STATUS_NOT_FINITE : status;                           \
-        status = (status == (BITS)0) & (outside != (BITS)0) ? (BITS)STATUS_OUT_OF_RANGE : status;                      \
-        status = unknown != (BITS)0 ? (BITS)STATUS_NOT_FINITE : status;                                                \
-        status = withheld != (BITS)0 ? (BITS)0 : status;                                                               \
-        const BITS gone = (status | withheld) != (BITS)0;                                                              \
-        *x = gone ? (REAL)REAL_NAN : *x;                                                                               \
-        *y = gone ? (REAL)REAL_NAN : *y;                                                                               \
-        *z = gone ? (REAL)REAL_NAN : *z;                                                                               \
-        return given | status;                                                                                         \
-    }
-JUDGED(, real, int)
-JUDGED(16, real16, bits16)
-
-#ifdef GEOMETRY_ROTATING
-#define PROFILES global const INPUT *restrict position, global const INPUT *restrict travel
-#define FIRST_AT(i) ((real)position[i])
-#define SECOND_AT(i, sample) ((real)(sample))
-#define FIRST_16(i) convert_real16(vload16(0, position + (i)))
-#define SECOND_16(i, sample) ((real)(sample) + COUNT_16)
-#define COUNT_16 (real16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
-#else
-#define PROFILES                                                                                                       \
-    global const INPUT *restrict g, global const INPUT *restrict h, global const INPUT *restrict travel
-#define FIRST_AT(i) ((real)g[i])
-#define SECOND_AT(i, sample) ((real)h[i])
-#define FIRST_16(i) convert_real16(vload16(0, g + (i)))
-#define SECOND_16(i, sample) convert_real16(vload16(0, h + (i)))
-#endif
-#define IMAGE                                                                                                          \
-    global const uchar *restrict given, global real *restrict x, global real *restrict y, global real *restrict z,     \
-        global uchar *restrict status, constant real *table, const uint samples
-
-// Columns across, profiles down: (samples, profiles) work-items.
-kernel void assemble_item(PROFILES, IMAGE) {
-    const uint sample = get_global_id(0), profile = get_global_id(1);
-    const ulong i = (ulong)profile * samples + sample;
-    const Pose pose = pose_of((real)travel[profile], table);
-    real px, py, pz;
-    status[i] = (uchar)judged(FIRST_AT(i), SECOND_AT(i, sample), given[i], pose, table, &px, &py, &pz);
-    x[i] = px;
-    y[i] = py;
-    z[i] = pz;
+inline void locate(reals g, reals h, Pose pose, constant real *table, reals *x, reals *y, reals *z, masks *missed,
+                   masks *folded) {
+    constant real *e1 = table + POINT_E1, *e2 = table + POINT_E2;
+    *missed = *folded = 0;
+    *x = pose.x + (e1[0] * g + e2[0] * h);
+    *y = pose.y + (e1[1] * g + e2[1] * h);
+    *z = pose.z + (e1[2] * g + e2[2] * h);
 }
 
-// Strips across, profiles down.
-kernel void assemble_strip(PROFILES, IMAGE) {
-    const uint start = get_global_id(0) * STRIP, profile = get_global_id(1);
-    const uint end = min(start + STRIP, samples);
+#define PROFILES                                                                                                       \
+    global const INPUT *restrict g, global const INPUT *restrict h, global const INPUT *restrict transport
+#define FIRST(i) load(g + i)
+#define SECOND(i, sample) load(h + i)
+
+#endif
+
+// Assembles the sample(s) from element i on, and says which are not good. Unless it is told to be careful it writes as
+// if all were good: the caller comes again where some are not.
+inline masks assemble(const int careful, ulong i, reals first, reals second, Pose pose, global const uchar *given,
+                      global real *out_x, global real *out_y, global real *out_z, global uchar *status,
+                      constant real *table) {
+    constant real *low = table + LIMIT_LOW, *high = table + LIMIT_HIGH;
+    const bytes flags_in = *(global const bytes_at *)(given + i);
+    const masks flags = LANED(convert_bits)(flags_in);
+    reals x, y, z;
+    masks missed, folded;
+    locate(first, second, pose, table, &x, &y, &z, &missed, &folded);
+    // Comparisons that hold: NaN fails them, and limits that are finite keep infinity out.
+    const masks inside = mask_of(x >= low[0]) & mask_of(x <= high[0]) & mask_of(y >= low[1]) & mask_of(y <= high[1]) &
+                         mask_of(z >= low[2]) & mask_of(z <= high[2]);
+    const masks withheld = mask_of((flags & STATUS_WITHHOLDS) != 0);
+    const masks good = inside & ~missed & ~folded & ~withheld;
+    if (careful) {
+        const masks lost =
+            mask_of(LANED(not_finite)(x)) | mask_of(LANED(not_finite)(y)) | mask_of(LANED(not_finite)(z));
+        const masks unknown =
+            mask_of(LANED(not_finite)(first)) | mask_of(LANED(not_finite)(second)) | (masks)(pose.unknown ? -1 : 0);
+        // Why a sample is not good; the weightiest reason comes last, and what came in with one keeps it.
+        masks reason = ~inside & STATUS_OUT_OF_RANGE;
+        reason = (reason & ~lost) | (lost & STATUS_NOT_FINITE);
+        reason = (reason & ~missed) | (missed & STATUS_HORIZON);
+        reason = (reason & ~folded) | (folded & STATUS_FOLDED);
+        reason = (reason & ~unknown) | (unknown & STATUS_NOT_FINITE);
+        store_bytes(convert_bytes(flags | (reason & ~withheld)), status + i);
+        x = nan_where(~good, x);
+        y = nan_where(~good, y);
+        z = nan_where(~good, z);
+    } else {
+        store_bytes(flags_in, status + i);
+    }
+    store_reals(x, out_x + i);
+    store_reals(y, out_y + i);
+    store_reals(z, out_z + i);
+    return ~good;
+}
+
+// Items: (samples, profiles). Strips: (strips, profiles).
+kernel void assemble_profiles(PROFILES, global const uchar *restrict given, global real *restrict x,
+                              global real *restrict y, global real *restrict z, global uchar *restrict status,
+                              constant real *table, const uint samples) {
+    const uint profile = get_global_id(1);
     const ulong row = (ulong)profile * samples;
-    const Pose pose = pose_of((real)travel[profile], table);
-    uint sample = start;
-    for (; sample + 16 <= end; sample += 16) {
-        const ulong i = row + sample;
-        real16 px, py, pz;
-        const bits16 flags = convert_bits16(vload16(0, given + i));
-        const bits16 found = judged16(FIRST_16(i), SECOND_16(i, sample), flags, pose, table, &px, &py, &pz);
-        vstore16(convert_uchar16(found), 0, status + i);
-        vstore16(px, 0, x + i);
-        vstore16(py, 0, y + i);
-        vstore16(pz, 0, z + i);
+    const Pose pose = pose_of((real)transport[profile], table);
+#define ASSEMBLE(careful, sample)                                                                                      \
+    assemble(careful, row + (sample), FIRST(row + (sample)), SECOND(row + (sample), sample), pose, given, x, y, z,     \
+             status, table)
+#ifdef STRIP
+    // The last strip takes the remainder too, and its last vector overlaps the one before: no sample is left over, and
+    // no other work-item writes there.
+    uint sample = get_global_id(0) * SAMPLES_PER_STRIP;
+    const uint end = get_global_id(0) + 1 == get_global_size(0) ? samples : sample + SAMPLES_PER_STRIP;
+    for (; sample + BLOCK * LANES <= end; sample += BLOCK * LANES) {
+        masks bad = 0;
+        for (uint k = 0; k < BLOCK; k++) bad |= ASSEMBLE(0, sample + k * LANES);
+        if (any_lane(bad))
+            for (uint k = 0; k < BLOCK; k++) ASSEMBLE(1, sample + k * LANES);
     }
-    for (; sample < end; ++sample) {
-        const ulong i = row + sample;
-        real px, py, pz;
-        status[i] = (uchar)judged(FIRST_AT(i), SECOND_AT(i, sample), given[i], pose, table, &px, &py, &pz);
-        x[i] = px;
-        y[i] = py;
-        z[i] = pz;
-    }
+    for (; sample < end; sample += LANES) ASSEMBLE(1, min(sample, end - LANES));
+#else
+    ASSEMBLE(1, get_global_id(0));
+#endif
 }

@@ -48,7 +48,7 @@ _REASONS = (
     (Status.HORIZON, "#17becf", "horizon: the ray misses the sheet"),
     (Status.AMBIGUOUS, "#b07aa1", "ambiguous: more than one peak"),
     (Status.SATURATED, "#bcbd22", "saturated"),
-    (Status.DARK, "#4b5563", "dark: no light came back"),
+    (Status.DARK, "#4b5563", "dark: no light that counts"),
 )
 # These come with a height, which is shown under a tint; a saturated line is as good as another one.
 _TINTED = Status.FOLDED | Status.AMBIGUOUS

@@ -25,7 +25,8 @@ from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
 from gpuvision.tables import checked_keys, finite
 
-_STRIP = 1024  # as in range_image.cl
+_STRIP = 1024  # samples, as in range_image.cl
+_LANES = 16
 _INPUTS = {"float32": "float", "float64": "double"}
 _PARALLEL = 1e-9
 # A vector so near length 1 is one that was divided by its length: what was written reads back as it was.
@@ -366,9 +367,12 @@ class RangeImage(Operation[RangePoints]):
             raise ValueError(f"RangeImage.limits are {self.limits}, expected (lowest, highest) for x, y and z")
         object.__setattr__(self, "limits", limits)
 
-    def packed(self) -> npt.NDArray[np.float64]:
-        """Table of ``kernels/range_image.cl``."""
-        return np.concatenate([np.array(self.limits).T.ravel(), self.geometry.packed()])
+    def packed(self, real: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+        """Table of ``kernels/range_image.cl`` in the device's real type."""
+        # Finite limits keep infinite results out by the same comparisons.
+        largest = np.finfo(np.dtype(real)).max
+        limits = np.clip(np.array(self.limits).T.ravel(), -largest, largest)
+        return np.concatenate([limits, self.geometry.packed()]).astype(real)
 
     def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         if dtype.name not in _INPUTS:
@@ -376,15 +380,21 @@ class RangeImage(Operation[RangePoints]):
         if len(shape) != 2:
             raise ValueError(f"RangeImage takes (profiles, samples), got an array of shape {shape}")
         real = real_of(self.precision, dtype)
-        strips = in_strips(self.walk, device)
         profiles, samples = shape
+        strips = samples >= _LANES and in_strips(self.walk, device)
         byte = np.dtype(np.uint8)
         return Launch(
             stem="range_image",
-            kernel="assemble_strip" if strips else "assemble_item",
-            defines={**self.geometry.defines, **real_defines(device, real), "INPUT": _INPUTS[dtype.name]},
+            kernel="assemble_profiles",
+            defines={
+                **self.geometry.defines,
+                **real_defines(device, real),
+                **({"STRIP": None} if strips else {}),
+                "INPUT": _INPUTS[dtype.name],
+                "INPUT16": f"{_INPUTS[dtype.name]}16",
+            },
             inputs=(*[(shape, dtype)] * self.geometry.inputs, ((profiles,), dtype), (shape, byte)),
             outputs={"x": (shape, real), "y": (shape, real), "z": (shape, real), "status": (shape, byte)},
-            arguments=(self.packed().astype(real), np.uint32(samples)),
-            global_size=(math.ceil(samples / _STRIP) if strips else samples, profiles),
+            arguments=(self.packed(real), np.uint32(samples)),
+            global_size=(max(samples // _STRIP, 1) if strips else samples, profiles),
         )

@@ -1,0 +1,189 @@
+"""Assembly and regular resampling of range images against Numba loops and NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from gpuvision.host import Device
+from gpuvision.profiling.harness import Case
+from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
+from gpuvision.ranging.regrid import Grid, Regrid
+
+Array = NDArray[Any]
+
+STRAIGHT = StraightTransport(step=1e-4, h_axis=(0.0, 0.7, 1.0))
+ROTATING = RotatingSheet(
+    focal_length_px=1700.0,
+    principal_point_px=(511.5, 511.5),
+    axis_point=(0.2, 0.0, 0.0),
+    axis_direction=(0.0, 1.0, 0.0),
+    sheet_normal=(1.0, 0.0, 0.0),
+    first_angle=-0.6,
+    angle_step=4e-4,
+)
+SHAPE = (1000, 1000)
+
+
+@numba.njit(parallel=True, error_model="numpy")
+def _numba_straight(g, h, transport, given, table, x, y, z, status):  # type: ignore[no-untyped-def]
+    nan = table.dtype.type(np.nan)
+    for profile in numba.prange(g.shape[0]):
+        for sample in range(g.shape[1]):
+            a, b, along = g[profile, sample], h[profile, sample], transport[profile]
+            px = table[6] + table[15] * along + (table[9] * a + table[12] * b)
+            py = table[7] + table[16] * along + (table[10] * a + table[13] * b)
+            pz = table[8] + table[17] * along + (table[11] * a + table[14] * b)
+            out = (px < table[0]) | (px > table[3]) | (py < table[1]) | (py > table[4])
+            out |= (pz < table[2]) | (pz > table[5])
+            flags = given[profile, sample]
+            if not np.isfinite(a + b + along):
+                flags |= np.uint8(8)
+            elif out:
+                flags |= np.uint8(4)
+            good = (flags & np.uint8(0xED)) == 0
+            x[profile, sample] = px if good else nan
+            y[profile, sample] = py if good else nan
+            z[profile, sample] = pz if good else nan
+            status[profile, sample] = flags
+
+
+@numba.njit(parallel=True, error_model="numpy")
+def _numba_rotating(position, transport, given, table, x, y, z, status):  # type: ignore[no-untyped-def]
+    nan = table.dtype.type(np.nan)
+    for profile in numba.prange(position.shape[0]):
+        cosine, sine = np.cos(transport[profile]), np.sin(transport[profile])
+        n0 = table[22] + table[25] * cosine + table[28] * sine
+        n1 = table[23] + table[26] * cosine + table[29] * sine
+        n2 = table[24] + table[27] * cosine + table[30] * sine
+        reach = table[31] + table[32] * cosine + table[33] * sine
+        for sample in range(position.shape[1]):
+            a = (position[profile, sample] - table[18]) * table[20]
+            b = (np.float32(sample) - table[19]) * table[20]
+            facing = n0 * a + n1 * b + n2
+            depth = reach / facing
+            px = table[6] + depth * (table[9] * a + table[12] * b + table[15])
+            py = table[7] + depth * (table[10] * a + table[13] * b + table[16])
+            pz = table[8] + depth * (table[11] * a + table[14] * b + table[17])
+            out = (px < table[0]) | (px > table[3]) | (py < table[1]) | (py > table[4])
+            out |= (pz < table[2]) | (pz > table[5])
+            flags = given[profile, sample]
+            if not np.isfinite(a):
+                flags |= np.uint8(8)
+            elif facing <= table[21]:
+                flags |= np.uint8(32)
+            elif out:
+                flags |= np.uint8(4)
+            good = (flags & np.uint8(0xED)) == 0
+            x[profile, sample] = px if good else nan
+            y[profile, sample] = py if good else nan
+            z[profile, sample] = pz if good else nan
+            status[profile, sample] = flags
+
+
+def _numpy_straight(g: Array, h: Array, transport: Array, given: Array, table: Array) -> RangePoints:
+    low, high, origin, first, second, third = table.reshape(-1, 3)
+    along = transport[:, None]
+    points = [origin[k] + third[k] * along + (first[k] * g + second[k] * h) for k in range(3)]
+    return _numpy_flags(points, np.isfinite(g + h + along), given, low, high)
+
+
+def _numpy_rotating(position: Array, transport: Array, given: Array, table: Array) -> RangePoints:
+    low, high, origin, first, second, third = table[:18].reshape(-1, 3)
+    cosine, sine = np.cos(transport)[:, None], np.sin(transport)[:, None]
+    normal = [table[22 + k] + table[25 + k] * cosine + table[28 + k] * sine for k in range(3)]
+    reach = table[31] + table[32] * cosine + table[33] * sine
+    a = (position - table[18]) * table[20]
+    b = (np.arange(position.shape[1], dtype=position.dtype) - table[19]) * table[20]
+    depth = reach / (normal[0] * a + normal[1] * b + normal[2])
+    points = [origin[k] + depth * (first[k] * a + second[k] * b + third[k]) for k in range(3)]
+    return _numpy_flags(points, np.isfinite(position), given, low, high)
+
+
+def _numpy_flags(points: list[Array], known: Array, given: Array, low: Array, high: Array) -> RangePoints:
+    status = given.copy()
+    outside = np.zeros(known.shape, bool)
+    for axis, values in enumerate(points):
+        outside |= (values < low[axis]) | (values > high[axis])
+    status[known & outside] |= 4
+    status[~known] |= 8
+    bad = (status & 0xED) != 0
+    for values in points:
+        values[bad] = np.nan
+    return RangePoints(*points, status)
+
+
+def _numpy_regrid(x: Array, y: Array, z: Array, intensity: Array, grid: Grid) -> tuple[Array, Array]:
+    """Interpolate along the samples, then along the profiles: no holes, no steps, no folds are looked for."""
+    columns, rows = grid.x, grid.y[::-1]
+    lines = [[np.interp(columns, x[n], each[n]) for each in (y, z, intensity)] for n in range(len(x))]
+    passed = np.array(lines)
+    maps = [[np.interp(rows, passed[:, 0, n], passed[:, k, n]) for k in (1, 2)] for n in range(grid.columns)]
+    made = np.array(maps).transpose(1, 2, 0)[:, ::-1]
+    return made[0], made[1]
+
+
+def cases(device: Device) -> Iterator[Case]:
+    """Yield a million points over a straight transport and a rotating sheet, and their resampling."""
+    yield _assembly(device, RangeImage(geometry=STRAIGHT), "straight/1e6", _numba_straight, _numpy_straight)
+    yield _assembly(device, RangeImage(geometry=ROTATING), "rotating/1e6", _numba_rotating, _numpy_rotating)
+    yield _resampling(device)
+
+
+def _assembly(
+    device: Device,
+    operation: RangeImage,
+    name: str,
+    loop: Callable[..., object],
+    plain: Callable[..., RangePoints],
+) -> Case:
+    rng = np.random.default_rng(1)
+    spread = (0.0, 1000.0) if operation.geometry.inputs == 1 else (-0.05, 0.05)
+    profiles = [rng.uniform(*spread, SHAPE) for _ in range(operation.geometry.inputs)]
+    if operation.geometry.inputs == 1:
+        # Only what the camera sees in front of the sheet: positions to the right of the sheet's own direction.
+        direction = np.tan(operation.geometry.transport(SHAPE[0]))[:, None]
+        profiles = [511.5 + 1700.0 * (direction + profiles[0] / 5000 + 0.1)]
+    given = np.zeros(SHAPE, np.uint8)
+    frames = [each.astype(np.float32) for each in (*profiles, operation.geometry.transport(SHAPE[0]))]
+    bound = operation.bind(device, SHAPE, np.float32)
+    for array, values in zip(bound.inputs, (*frames, given), strict=True):
+        array.set(values)
+    table = operation.packed(np.float32)
+    out = [np.empty(SHAPE, np.float32) for _ in range(3)] + [np.empty(SHAPE, np.uint8)]
+    bound().wait()
+    exact = plain(*(each.astype(np.float64) for each in frames), given, operation.packed())
+    differences = [np.abs(ours.get() - truth) for ours, truth in zip(bound.outputs[:3], exact[:3], strict=True)]
+    error = max(float(np.max(each)) for each in differences)
+    peers: dict[str, Callable[[], object]] = {
+        "numba": lambda: loop(*frames, given, table, *out),
+        "numpy": lambda: plain(*frames, given, table),
+    }
+    samples = given.size
+    traffic = ((4 * operation.geometry.inputs + 1) * samples, 13 * samples)
+    return Case("range_image", name, lambda: bound().wait(), peers, error, traffic)
+
+
+def _resampling(device: Device) -> Case:
+    profile, sample = np.meshgrid(np.arange(SHAPE[0]), np.arange(SHAPE[1]), indexing="ij")
+    x, y = sample * 1e-4, profile * 1e-4
+    z = 5e-3 * np.sin(80 * x) * np.cos(60 * y)
+    x, y = x + 0.2 * z, y + 0.1 * z
+    frames = [each.astype(np.float32) for each in (x, y, z, np.ones(SHAPE))]
+    grid = Grid(left=0.002, top=0.098, cell_x=1e-4, cell_y=1e-4, columns=960, rows=960)
+    operation = Regrid(grid=grid, max_gap=1e-3, max_step=1e-3)
+    bound = operation.bind(device, SHAPE, np.float32)
+    for array, values in zip(bound.inputs, (*frames, np.zeros(SHAPE, np.uint8)), strict=True):
+        array.set(values)
+    bound().wait()
+    exact = _numpy_regrid(*(each.astype(np.float64) for each in frames), grid)
+    error = float(np.max(np.abs(bound.outputs.z.get() - exact[0])))
+    peers: dict[str, Callable[[], object]] = {"numpy": lambda: _numpy_regrid(*frames, grid)}
+    cells = grid.columns * grid.rows
+    lines = SHAPE[0] * grid.columns
+    traffic = (17 * SHAPE[0] * SHAPE[1] + 13 * lines, 13 * lines + 9 * cells)
+    return Case("range_image", "regrid/1e6", lambda: bound().wait(), peers, error, traffic)

@@ -44,6 +44,7 @@ class Device:
         self.handle = handle
         self.label, self.kind = label, kind
         self.name, self.driver = handle.name.strip(), handle.driver_version
+        # Held for the queue's sake too: Intel's runtime lets a context go while a queue of it lives.
         self.context = queue.context if queue is not None else cl.Context([handle])
         self.queue = queue if queue is not None else cl.CommandQueue(self.context, handle)
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
@@ -93,9 +94,9 @@ class Device:
             The device is there and its probe failed.
         """
         listed = discovery.candidates()
-        asked = name.lower()
+        asked = name.strip().lower()
         matching = [each for each in listed if each.label == asked] or [
-            each for each in listed if asked in f"{each.label} {each.name} {each.platform}".lower()
+            each for each in listed if asked and asked in f"{each.label} {each.name} {each.platform}".lower()
         ]
         healthy = [each for each in matching if each.healthy]
         if len(healthy) == 1:

@@ -100,8 +100,11 @@ class Candidate(Listed):
         """What a user can do about an unhealthy device."""
         if self.healthy:
             return ""
-        if self.kind == "pocl" and "unknown target CPU" in self.reason:
-            return "this PoCL is too old for the processor; use Debian's: apt-get install pocl-opencl-icd"
+        if self.kind == "pocl" and "debian" not in self.driver:
+            return (
+                "this PoCL does not suit the processor; use Debian's (as root: apt-get install pocl-opencl-icd) "
+                "or Intel's runtime (pip install 'gpuvision[cpu]')"
+            )
         return f"update or remove this driver; meanwhile {INSTALL_HINT}"
 
     @property

@@ -57,8 +57,7 @@ def _show(listed: list[Candidate]) -> None:
     for each in listed:
         works = "[green]yes[/]" if each.healthy else "[red]no[/]"
         table.add_row(each.label, each.name, each.platform, each.driver, works)
-    console = Console()
-    console.print(table)
+    Console().print(table)
     for each in listed:
         if not each.healthy:
-            console.print(f"{each.label}: {each.reason}\n  {each.advice}", markup=False, highlight=False)
+            typer.echo(f"{each.label} does not work: {each.reason}\n    {each.advice}")

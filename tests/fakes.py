@@ -1,0 +1,34 @@
+"""Platforms and devices that exist on paper, for what no machine at hand has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pyopencl as cl
+
+
+@dataclass(eq=False)
+class FakeDevice:
+    name: str = "Some CPU"
+    vendor: str = "Someone"
+    driver_version: str = "1.0"
+    extensions: str = ""
+    type: int = cl.device_type.CPU
+    platform: FakePlatform | None = None
+
+
+@dataclass(eq=False)
+class FakePlatform:
+    name: str = "Portable Computing Language"
+    version: str = "OpenCL 3.0 PoCL"
+    vendor: str = "The pocl project"
+    devices: list[FakeDevice] = field(default_factory=lambda: [FakeDevice()])
+
+    def __post_init__(self) -> None:
+        for each in self.devices:
+            each.platform = self
+
+    def get_devices(self) -> list[FakeDevice]:
+        if not self.devices:
+            raise cl.LogicError("clGetDeviceIDs", -1, "DEVICE_NOT_FOUND")
+        return self.devices

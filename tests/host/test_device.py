@@ -1,0 +1,209 @@
+"""Devices chosen, named and taken over; what is asked for and missing is an error, never another device."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+
+from fakes import FakeDevice, FakePlatform
+from gpuvision.host import Device, DeviceUnusableError, NoDeviceError, discovery, host_view
+from gpuvision.host import device as module
+
+Paper = Callable[..., None]
+
+
+@pytest.fixture
+def paper(monkeypatch: pytest.MonkeyPatch) -> Paper:
+    """Make the machine have devices of these labels, each with the reason why it does not work."""
+
+    def install(**reasons: str) -> None:
+        listed = []
+        for label, reason in reasons.items():
+            label = label.replace("_", ":")
+            handle = FakePlatform(f"Platform of {label}", devices=[FakeDevice(f"Name of {label}")]).devices[0]
+            listed.append(discovery.Candidate(label, label.split(":")[0], 0, 0, handle, "", reason))
+        monkeypatch.setattr(discovery, "candidates", lambda: tuple(listed))
+        monkeypatch.setattr(module, "_open", lambda candidate: candidate.label)
+        monkeypatch.delenv(module.VARIABLE, raising=False)
+
+    return install
+
+
+def test_best_prefers_pocl_and_skips_the_broken(paper: Paper) -> None:
+    paper(other="", intel="", pocl_0="broken", pocl_1="")
+    assert Device.all() == ("pocl:1", "intel", "other")
+    assert Device.best() == "pocl:1"
+
+
+@pytest.mark.parametrize(
+    ("asked", "label"),
+    [("pocl:1", "pocl:1"), ("intel", "intel"), ("INTEL", "intel"), ("name of intel", "intel"), ("nvidia", "nvidia")],
+)
+def test_named(paper: Paper, monkeypatch: pytest.MonkeyPatch, asked: str, label: str) -> None:
+    paper(pocl_0="", pocl_1="", intel="", nvidia="")
+    assert Device.named(asked) == label
+    monkeypatch.setenv(module.VARIABLE, asked)
+    assert Device.best() == label
+
+
+def test_name_of_a_healthy_and_a_broken_one(paper: Paper) -> None:
+    paper(pocl_0="broken", pocl_1="")
+    assert Device.named("pocl") == "pocl:1"
+    with pytest.raises(DeviceUnusableError, match="pocl:0 does not work: broken; "):
+        Device.named("pocl:0")
+
+
+def test_label_beats_a_part_of_other_names(paper: Paper) -> None:
+    paper(intel="", **{"intel-gpu": ""})
+    assert Device.named("intel") == "intel"
+
+
+def test_ambiguous_name(paper: Paper) -> None:
+    paper(pocl_0="", pocl_1="", intel="")
+    with pytest.raises(NoDeviceError, match=r"2 devices answer to 'pocl': pocl:0, pocl:1; ask for one"):
+        Device.named("pocl")
+
+
+@pytest.mark.parametrize("name", ["", "  "])
+def test_empty_name(paper: Paper, name: str) -> None:
+    paper(pocl="")
+    with pytest.raises(NoDeviceError, match="no device answers to"):
+        Device.named(name)
+
+
+def test_missing_device_names_what_is_there(paper: Paper, monkeypatch: pytest.MonkeyPatch) -> None:
+    paper(pocl="", intel="broken")
+    expected = r"no device answers to 'nvidia'; there are: pocl, intel; install one: .*pocl-opencl-icd"
+    with pytest.raises(NoDeviceError, match=expected):
+        Device.named("nvidia")
+    monkeypatch.setenv(module.VARIABLE, "nvidia")
+    with pytest.raises(NoDeviceError, match=expected):
+        Device.best()
+
+
+def test_broken_device_gives_its_reason_and_advice(paper: Paper) -> None:
+    paper(pocl="unknown target CPU 'generic'")
+    expected = r"pocl does not work: unknown target CPU 'generic'; .*apt-get install"
+    with pytest.raises(DeviceUnusableError, match=expected):
+        Device.named("pocl")
+    with pytest.raises(
+        NoDeviceError, match=r"no healthy OpenCL device \(pocl: unknown target CPU 'generic'\); install"
+    ):
+        Device.best()
+
+
+def test_no_platform_at_all(paper: Paper) -> None:
+    paper()
+    assert Device.all() == ()
+    with pytest.raises(NoDeviceError, match=r"\(no OpenCL platform\); install one: .*apt-get.*gpuvision\[cpu\]"):
+        Device.best()
+    with pytest.raises(NoDeviceError, match="there are: none; install one"):
+        Device.named("pocl")
+
+
+def test_one_device_one_object(device: Device) -> None:
+    assert Device.named(device.label) is device
+    assert device in Device.all()
+    assert Device.of(device.queue) is device
+    assert Device.of(cl.array.Array(device.queue, (3,), np.float32)) is device
+    assert device.label in repr(device)
+
+
+def test_threads_that_open_together_share_a_context(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_opened", {})
+    (listed,) = [each for each in discovery.listing() if each.label == device.label]
+    barrier, found = threading.Barrier(4), []
+
+    def open_it() -> None:
+        barrier.wait()
+        found.append(module._open(listed))
+
+    threads = [threading.Thread(target=open_it) for _ in range(4)]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    assert len(set(map(id, found))) == 1
+
+
+def test_callers_own_queue(device: Device) -> None:
+    context = cl.Context([device.handle])
+    queue = cl.CommandQueue(context)
+    mine = Device.of(queue)
+    assert mine is not device
+    assert (mine.queue, mine.context) == (queue, context)
+    assert (mine.label, mine.kind, mine.is_cpu) == (device.label, device.kind, device.is_cpu)
+    assert Device.of(queue) is mine
+
+
+def test_callers_own_context(device: Device) -> None:
+    context = cl.Context([device.handle])
+    mine = Device.of(context)
+    assert mine.context == context
+    assert Device.of(context) is mine
+    array = cl.array.Array(context, (2,), np.uint8)
+    assert Device.of(array).context == context
+
+
+def test_second_queue_of_our_context(device: Device) -> None:
+    queue = device.new_queue()
+    mine = Device.of(queue)
+    assert mine.queue == queue
+    assert mine.context == device.context
+
+
+def test_taking_over_asks_nothing(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A handle that the caller owns works or not; other devices are none of its business."""
+    monkeypatch.setattr(discovery, "candidates", lambda: pytest.fail("nothing is to be probed"))
+    context = cl.Context([device.handle])
+    assert Device.of(context).label == device.label
+
+
+def test_device_that_the_loader_does_not_list(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(discovery, "listing", tuple)
+    context = cl.Context([device.handle])
+    mine = Device.of(context)
+    assert mine.label == mine.kind == device.kind
+
+
+@pytest.mark.parametrize("handle", [None, 3, "pocl", np.zeros(3)])
+def test_not_a_handle(handle: Any) -> None:
+    with pytest.raises(TypeError, match="expected a pyopencl queue, context or array"):
+        Device.of(handle)
+
+
+@pytest.mark.parametrize("profiling", [False, True])
+def test_new_queue(device: Device, profiling: bool) -> None:
+    queue = device.new_queue(profiling=profiling)
+    assert queue != device.queue
+    assert queue.context == device.context
+    assert bool(queue.properties & cl.command_queue_properties.PROFILING_ENABLE) is profiling
+    assert not queue.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
+    event = cl.enqueue_marker(queue)
+    event.wait()
+    if profiling:
+        assert event.profile.end >= event.profile.queued
+
+
+@pytest.mark.parametrize("shape", [(5,), (2, 3, 4), (), (0,), (3, 0)])
+def test_empty(device: Device, shape: tuple[int, ...]) -> None:
+    array = device.empty(shape, "float32")
+    assert (array.shape, array.dtype, array.context) == (shape, np.float32, device.context)
+    if device.shares_memory:
+        view = host_view(array)
+        view[...] = 7.0
+        assert np.all(array.get() == 7.0)
+    else:
+        with pytest.raises(ValueError, match=r"array\.get"):
+            host_view(array)
+
+
+def test_empty_on_another_queue(device: Device) -> None:
+    queue = device.new_queue()
+    assert device.empty((4,), np.uint8, queue).queue == queue

@@ -1,0 +1,209 @@
+"""Which devices are there, which work: labels, verdicts and their cache, on platforms made of paper."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pyopencl as cl
+import pytest
+
+from fakes import FakeDevice, FakePlatform
+from gpuvision.host import Device, discovery
+
+Probe = Callable[[int, int], str]
+
+
+def _forget() -> None:
+    discovery.listing.cache_clear()
+    discovery._candidates.cache_clear()
+
+
+@pytest.fixture
+def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An empty cache folder."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "gpuvision"
+
+
+@pytest.fixture
+def see(monkeypatch: pytest.MonkeyPatch, cache: Path) -> Iterator[Callable[..., list[tuple[int, int]]]]:
+    """Make the loader list the platforms given; returns the log of what is probed."""
+
+    def install(*platforms: FakePlatform, probe: Probe = lambda p, d: "") -> list[tuple[int, int]]:
+        asked: list[tuple[int, int]] = []
+
+        def ask(p: int, d: int) -> str:
+            asked.append((p, d))
+            return probe(p, d)
+
+        monkeypatch.setattr(discovery, "platforms", lambda: platforms)
+        monkeypatch.setattr(discovery, "_ask_probe", ask)
+        _forget()
+        return asked
+
+    yield install
+    _forget()
+
+
+def _program(folder: Path, text: str) -> str:
+    path = folder / "python"
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return str(path)
+
+
+def test_platforms_of_one_name_are_told_apart(see: Any) -> None:
+    see(
+        FakePlatform(version="3.1+debian", devices=[FakeDevice(driver_version="3.1+debian")]),
+        FakePlatform(version="3.0", devices=[FakeDevice(driver_version="3.0")]),
+        probe=lambda p, d: "cannot compile" if p == 1 else "",
+    )
+    good, bad = discovery.candidates()
+    assert (good.label, good.healthy, good.platform_index) == ("pocl:0", True, 0)
+    assert (bad.label, bad.healthy, bad.reason) == ("pocl:1", False, "cannot compile")
+
+
+def test_twins_are_each_asked(see: Any) -> None:
+    """Two devices that agree in every string may still differ in health: two cards, two installations."""
+    twins = FakePlatform("NVIDIA CUDA", vendor="NVIDIA", devices=[FakeDevice(), FakeDevice()])
+    asked = see(twins, probe=lambda p, d: "broken" if d == 1 else "")
+    assert [each.healthy for each in discovery.candidates()] == [True, False]
+    assert asked == [(0, 0), (0, 1)]
+
+
+@pytest.mark.parametrize(
+    ("platform", "vendor", "gpu", "kind"),
+    [
+        ("Portable Computing Language", "The pocl project", False, "pocl"),
+        ("Intel(R) OpenCL", "Intel(R) Corporation", False, "intel"),
+        ("Intel(R) OpenCL Graphics", "Intel(R) Corporation", True, "intel-gpu"),
+        ("NVIDIA CUDA", "NVIDIA Corporation", True, "nvidia"),
+        ("AMD Accelerated Parallel Processing", "Advanced Micro Devices, Inc.", True, "amd"),
+        ("Rusticl Mesa", "Mesa", True, "rusticl"),
+        ("", "", False, "unknown"),
+    ],
+)
+def test_kinds(platform: str, vendor: str, gpu: bool, kind: str) -> None:
+    device = FakeDevice(vendor=vendor, type=cl.device_type.GPU if gpu else cl.device_type.CPU)
+    FakePlatform(platform, vendor=vendor, devices=[device])
+    assert discovery.kind_of(device) == kind
+
+
+def test_order_of_preference(see: Any) -> None:
+    names = ["Oclgrind", "Intel(R) OpenCL", "Other", "Portable Computing Language"]
+    gpu = FakePlatform("NVIDIA CUDA", devices=[FakeDevice(type=cl.device_type.GPU)])
+    see(*(FakePlatform(name, vendor="") for name in names), gpu)
+    ranked = sorted(discovery.candidates(), key=lambda each: each.rank)
+    assert [each.kind for each in ranked] == ["nvidia", "pocl", "intel", "other", "oclgrind"]
+
+
+def test_platform_without_devices(see: Any) -> None:
+    see(FakePlatform(devices=[]), FakePlatform())
+    (only,) = discovery.candidates()
+    assert (only.label, only.platform_index) == ("pocl", 1)
+
+
+def test_verdicts_are_kept_by_driver(see: Any) -> None:
+    asked = see(FakePlatform())
+    discovery.candidates()
+    assert asked == [(0, 0)]
+    asked = see(FakePlatform())
+    discovery.candidates()
+    assert asked == [], "the verdict is in the cache"
+    asked = see(FakePlatform(devices=[FakeDevice(driver_version="1.1")]))
+    discovery.candidates()
+    assert asked == [(0, 0)], "another driver is another question"
+
+
+def test_probing_again_asks_only_the_unhealthy(see: Any) -> None:
+    two = FakePlatform(devices=[FakeDevice("good"), FakeDevice("bad")])
+    see(two, probe=lambda p, d: "broken" if d == 1 else "")
+    discovery.candidates()
+    asked = see(two)
+    assert [each.healthy for each in discovery.candidates()] == [True, False]
+    assert asked == []
+    assert [each.healthy for each in discovery.candidates(probe_again=True)] == [True, True]
+    assert asked == [(0, 1)]
+    assert [each.healthy for each in discovery.candidates()] == [True, True], "the better verdict stays"
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1]", '{"a": 1}', '"text"', "\x00"])
+def test_corrupt_cache_is_asked_anew(see: Any, cache: Path, content: str) -> None:
+    cache.mkdir()
+    (cache / "devices.json").write_text(content)
+    asked = see(FakePlatform())
+    assert discovery.candidates()[0].healthy
+    assert asked == [(0, 0)]
+    assert list(json.loads((cache / "devices.json").read_text()).values()) == [""]
+
+
+def test_unwritable_cache_costs_only_the_question(see: Any, cache: Path) -> None:
+    cache.write_text("a file where the folder should be")
+    asked = see(FakePlatform())
+    assert discovery.candidates()[0].healthy
+    _forget()
+    assert discovery.candidates()[0].healthy
+    assert asked == [(0, 0), (0, 0)]
+
+
+def test_no_platform(see: Any) -> None:
+    see()
+    assert discovery.candidates() == ()
+
+
+def test_loader_without_platforms(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> None:
+        raise cl.LogicError("clGetPlatformIDs", -1001, "PLATFORM_NOT_FOUND_KHR")
+
+    monkeypatch.setattr(cl, "get_platforms", none)
+    assert discovery.platforms.__wrapped__() == ()
+
+
+@pytest.mark.parametrize(
+    ("driver", "platform", "advice"),
+    [
+        ("3.0", "Portable Computing Language", "apt-get install pocl-opencl-icd"),
+        ("3.1+debian", "Portable Computing Language", "update or remove this driver"),
+        ("1", "Other", "gpuvision[cpu]"),
+    ],
+)
+def test_advice_for_the_unhealthy(see: Any, driver: str, platform: str, advice: str) -> None:
+    device = FakeDevice(driver_version=driver)
+    see(FakePlatform(platform, vendor="", devices=[device]), probe=lambda p, d: "unknown target CPU 'generic'")
+    (broken,) = discovery.candidates()
+    assert advice in broken.advice
+    see(FakePlatform(platform, vendor="", version="good"))
+    assert discovery.candidates()[0].advice == ""
+
+
+@pytest.mark.parametrize(
+    ("script", "reason"),
+    [
+        ("echo 'LLVM ERROR: no such CPU' >&2; kill -ABRT $$", r"exit -6: LLVM ERROR: no such CPU"),
+        ("kill -SEGV $$", r"exit -11: no message"),
+        ("exit 0", r"exit 0: no message"),
+        ("echo '[]'", r"ended the probe's process"),
+        ("echo 'noise'; echo '{\"reason\": \"wrong numbers\"}'", r"^wrong numbers$"),
+        ("exec sleep 60", r"did not finish within 0.2 s"),
+    ],
+)
+def test_crash_and_hang_are_verdicts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str, reason: str) -> None:
+    monkeypatch.setattr(sys, "executable", _program(tmp_path, script))
+    if "sleep" in script:
+        monkeypatch.setattr(discovery, "_PROBE_SECONDS", 0.2)
+    said = discovery._ask_probe(0, 0)
+    assert re.search(reason, said), said
+
+
+def test_probe_in_its_own_process(device: Device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Also where the user stands beside a folder that bears the package's name."""
+    (tmp_path / "gpuvision").mkdir()
+    (tmp_path / "gpuvision" / "__init__.py").write_text("raise SystemExit('not the package')")
+    monkeypatch.chdir(tmp_path)
+    (listed,) = [each for each in discovery.listing() if each.label == device.label]
+    assert discovery._ask_probe(listed.platform_index, listed.device_index) == ""

@@ -1,0 +1,116 @@
+"""What is done before the loader is asked: Intel's wheels made visible, a cache where the home has none."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from gpuvision.host import runtime
+
+
+@pytest.fixture
+def vendors(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A system with one driver and an installed wheel, a user with an empty cache; returns the system's folder."""
+    system = tmp_path / "system"
+    system.mkdir()
+    (system / "pocl.icd").write_text("libpocl.so.2\n")
+    monkeypatch.setattr(runtime, "SYSTEM_VENDORS", system)
+    monkeypatch.setattr(runtime, "_wheel_libraries", lambda: {"libintelocl.so": Path("/wheel/libintelocl.so")})
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("OCL_ICD_VENDORS", raising=False)
+    return system
+
+
+def _exposed() -> Path:
+    runtime.expose_installed_runtime()
+    return Path(os.environ["OCL_ICD_VENDORS"])
+
+
+def test_wheel_stands_beside_the_systems_drivers(vendors: Path) -> None:
+    folder = _exposed()
+    assert {path.name: path.read_text() for path in folder.iterdir()} == {
+        "pocl.icd": "libpocl.so.2\n",
+        "gpuvision-intel.icd": "/wheel/libintelocl.so",
+    }
+
+
+def test_folder_follows_the_systems_drivers(vendors: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = _exposed()
+    monkeypatch.delenv("OCL_ICD_VENDORS")
+    assert _exposed() == first
+    (vendors / "nvidia.icd").write_text("libnvidia-opencl.so.1\n")
+    monkeypatch.delenv("OCL_ICD_VENDORS")
+    second = _exposed()
+    assert second != first
+    assert (second / "nvidia.icd").exists()
+
+
+def test_users_own_choice_is_left_alone(vendors: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("OCL_ICD_VENDORS", "/opt/mine")
+    monkeypatch.setattr(runtime, "_load_siblings", lambda _: pytest.fail("nothing is to be loaded"))
+    assert _exposed() == Path("/opt/mine")
+    assert not (tmp_path / "cache").exists()
+
+
+def test_inherited_folder_still_loads_the_siblings(vendors: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The probe's process inherits the variable and needs the driver's siblings as its parent does."""
+    folder = _exposed()
+    loaded = []
+    monkeypatch.setattr(runtime, "_load_siblings", lambda libraries: loaded.append(libraries) or True)
+    assert _exposed() == folder
+    assert len(loaded) == 1
+
+
+@pytest.mark.parametrize("libraries", [{}, {"libintelocl.so": Path("/x"), "libimf.so": Path("/not/there/libimf.so")}])
+def test_no_usable_wheel_changes_nothing(
+    vendors: Path, monkeypatch: pytest.MonkeyPatch, libraries: dict[str, Path]
+) -> None:
+    monkeypatch.setattr(runtime, "_wheel_libraries", lambda: libraries)
+    runtime.expose_installed_runtime()
+    assert "OCL_ICD_VENDORS" not in os.environ
+
+
+def test_system_without_any_driver(vendors: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "SYSTEM_VENDORS", vendors / "not-there")
+    assert [path.name for path in _exposed().iterdir()] == ["gpuvision-intel.icd"]
+
+
+def test_missing_wheel_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> None:
+        raise runtime.importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(runtime.importlib.metadata, "files", missing)
+    assert runtime._wheel_libraries() == {}
+
+
+def test_home_that_cannot_be_written(vendors: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file" / "below"))
+    monkeypatch.setattr(runtime.tempfile, "tempdir", str(tmp_path))
+    runtime.provide_cache()
+    cache = Path(os.environ["XDG_CACHE_HOME"])
+    assert cache.parent == tmp_path
+    assert _exposed().is_relative_to(cache)
+
+
+def test_home_that_can_be_written_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "new"))
+    runtime.provide_cache()
+    assert os.environ["XDG_CACHE_HOME"] == str(tmp_path / "new")
+    assert list((tmp_path / "new" / "gpuvision").iterdir()) == []
+
+
+def test_written_whole_or_not_at_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "folder" / "file"
+    runtime.write_whole(path, "old")
+
+    def fail(source: str, target: str) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        runtime.write_whole(path, "new")
+    assert [each.name for each in path.parent.iterdir()] == ["file"]
+    assert path.read_text() == "old"

@@ -21,19 +21,23 @@
 #define LENS_STRETCH_SLOPE(square, lens) ((lens)[LENS_K1_TERM])
 #endif
 
-// Moves (x, y) to its undistorted place; true where the measured point lies at or beyond the fold of the polynomial,
-// where no scene point can be. One body for a sample and for 16.
-#define LENS_UNDISTORT(NAME, REAL, BITS)                                                                               \
-    inline BITS NAME(REAL *x, REAL *y, constant real *lens) {                                                          \
+// lens_straighten moves (x, y) to its undistorted place and returns the measured point's squared distance from the
+// centre. lens_undistort tells instead whether the measured point lies at or beyond the fold of the polynomial, where no
+// scene point can be. One body for a sample and for 16.
+#define LENS_UNDISTORT(SUFFIX, REAL, BITS)                                                                             \
+    inline REAL lens_straighten##SUFFIX(REAL *x, REAL *y, constant real *lens) {                                       \
         const REAL along = *x - lens[LENS_CENTRE_X], across = *y - lens[LENS_CENTRE_Y];                                \
         const REAL square = along * along + across * across;                                                           \
         const REAL stretch = LENS_STRETCH(square, lens);                                                               \
         *x += along * stretch;                                                                                         \
         *y += across * stretch;                                                                                        \
-        return square >= lens[LENS_FOLD_SQUARE];                                                                       \
+        return square;                                                                                                 \
+    }                                                                                                                  \
+    inline BITS lens_undistort##SUFFIX(REAL *x, REAL *y, constant real *lens) {                                        \
+        return lens_straighten##SUFFIX(x, y, lens) >= lens[LENS_FOLD_SQUARE];                                          \
     }
-LENS_UNDISTORT(lens_undistort, real, int)
-LENS_UNDISTORT(lens_undistort16, real16, bits16)
+LENS_UNDISTORT(, real, int)
+LENS_UNDISTORT(16, real16, bits16)
 
 // Takes a gradient over undistorted (x, y) back to one over the measured (x, y) given.
 #define LENS_PULL_BACK(NAME, REAL)                                                                                     \

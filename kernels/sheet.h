@@ -30,39 +30,48 @@
 #define SHEET_X(position, sheet) (((position) - (sheet)[SHEET_POSITION_ORIGIN]) * (sheet)[SHEET_POSITION_SCALE])
 #define SHEET_Y(sample, sheet) (((sample) - (sheet)[SHEET_SAMPLE_ORIGIN]) * (sheet)[SHEET_SAMPLE_SCALE])
 
+// Undoes the lens, where there is one, and returns the squared distance from its centre or from the sensor's middle.
 #ifdef LENS
-#define SHEET_UNDISTORT(SUFFIX, x, y, sheet) lens_undistort##SUFFIX(x, y, sheet + SHEET_LENS)
+#define SHEET_STRAIGHTEN(SUFFIX, x, y, sheet) lens_straighten##SUFFIX(&x, &y, sheet + SHEET_LENS)
+#define SHEET_FOLDED(square, sheet) (square >= sheet[SHEET_LENS + LENS_FOLD_SQUARE])
 #define SHEET_PULL_BACK(SUFFIX, x, y, sheet, slope_x, slope_y)                                                         \
     lens_pull_back##SUFFIX(x, y, sheet + SHEET_LENS, slope_x, slope_y)
 #else
-#define SHEET_UNDISTORT(SUFFIX, x, y, sheet) 0
+#define SHEET_STRAIGHTEN(SUFFIX, x, y, sheet) (x * x + y * y)
+#define SHEET_FOLDED(square, sheet) 0
 #define SHEET_PULL_BACK(SUFFIX, x, y, sheet, slope_x, slope_y)
 #endif
 
+// Squared distance, in half the sensor's extent, from which a coordinate counts as not finite: nothing
+// below overflows, and one comparison of bits finds what is larger, infinite or NaN.
+#define SHEET_REACH as_bits((real)1e12)
+
 // sheet_point, sheet_point16: writes G and H (NaN where the status is not 0) and returns the status:
-// NOT_FINITE (what came in, or a result beyond the real type), FOLDED (beyond the lens' fold), HORIZON (the ray does
-// not meet the sheet in front of the sensor, or so far away that the place means nothing).
-#define SHEET_POINT(SUFFIX, REAL, BITS, STATUS, TO_STATUS)                                                             \
+// NOT_FINITE, FOLDED (beyond the lens' fold), HORIZON (the ray does not meet the sheet in front of the sensor, or so
+// far away that the place means nothing). Straight-line code in a form that PoCL vectorises across work-items: a second
+// test for NaN, or an | of tests, makes LLVM pair scalars up first and then give up.
+#define SHEET_POINT(SUFFIX, REAL, BITS, FLAGS, STATUS, TO_STATUS)                                                      \
     inline STATUS sheet_point##SUFFIX(REAL position, REAL sample, constant real *sheet, REAL *g, REAL *h) {            \
         REAL x = SHEET_X(position, sheet), y = SHEET_Y(sample, sheet);                                                 \
-        const BITS folded = SHEET_UNDISTORT(SUFFIX, &x, &y, sheet);                                                    \
+        const REAL square = SHEET_STRAIGHTEN(SUFFIX, x, y, sheet);                                                     \
+        const BITS lost = as_bits##SUFFIX(square) >= SHEET_REACH;                                                      \
+        const BITS folded = SHEET_FOLDED(square, sheet);                                                               \
         const REAL w = 1 + sheet[SHEET_W_TERMS] * x + sheet[SHEET_W_TERMS + 1] * y;                                    \
+        const BITS hidden = w <= sheet[SHEET_HORIZON];                                                                 \
         const REAL p = x / w, q = y / w;                                                                               \
         const REAL at_g = sheet[SHEET_G_TERMS] + (sheet[SHEET_G_TERMS + 1] * p + sheet[SHEET_G_TERMS + 2] * q);        \
         const REAL at_h = sheet[SHEET_H_TERMS] + (sheet[SHEET_H_TERMS + 1] * p + sheet[SHEET_H_TERMS + 2] * q);        \
-        const BITS hidden = w <= sheet[SHEET_HORIZON];                                                                 \
-        const REAL all = position + sample + (hidden ? (REAL)0 : at_g + at_h);                                         \
-        BITS status = hidden ? (BITS)STATUS_HORIZON : (BITS)STATUS_OK;                                                 \
-        status = folded ? (BITS)STATUS_FOLDED : status;                                                                \
-        status = not_finite##SUFFIX(all) ? (BITS)STATUS_NOT_FINITE : status;                                           \
-        *g = status == (BITS)STATUS_OK ? at_g : (REAL)REAL_NAN;                                                        \
-        *h = status == (BITS)STATUS_OK ? at_h : (REAL)REAL_NAN;                                                        \
-        return TO_STATUS(status);                                                                                      \
+        FLAGS flags = hidden ? (FLAGS)STATUS_HORIZON : (FLAGS)STATUS_OK;                                               \
+        flags = folded ? (FLAGS)STATUS_FOLDED : flags;                                                                 \
+        flags = lost ? (FLAGS)STATUS_NOT_FINITE : flags;                                                               \
+        *g = flags != (FLAGS)STATUS_OK ? (REAL)REAL_NAN : at_g;                                                        \
+        *h = flags != (FLAGS)STATUS_OK ? (REAL)REAL_NAN : at_h;                                                        \
+        return TO_STATUS(flags);                                                                                       \
     }
-SHEET_POINT(, real, int, uchar, (uchar))
-SHEET_POINT(16, real16, bits16, uchar16, convert_uchar16)
+SHEET_POINT(, real, int, uchar, uchar, (uchar))
+SHEET_POINT(16, real16, bits16, bits16, uchar16, convert_uchar16)
 
-// The variance that the parameters' covariance brings in: |factor' d|^2 with d = (1, p, q, -r p, -r q), r = value - value0.
+// The variance that the parameters' covariance brings in: |factor' d|^2, d = (1, p, q, -r p, -r q), r = value - value0.
 #define SHEET_SQUARE(value) ((value) * (value))
 #define SHEET_PARAMETER_VARIANCE(f, p, q, r)                                                                           \
     (SHEET_SQUARE((f)[0] + (f)[1] * (p) + (f)[2] * (q) - (r) * ((f)[3] * (p) + (f)[4] * (q))) +                        \
@@ -89,7 +98,7 @@ SHEET_POINT(16, real16, bits16, uchar16, convert_uchar16)
                                     constant real *sheet, REAL *sigma_g, REAL *sigma_h) {                              \
         const REAL measured_x = SHEET_X(position, sheet), measured_y = SHEET_Y(sample, sheet);                         \
         REAL x = measured_x, y = measured_y;                                                                           \
-        (void)SHEET_UNDISTORT(SUFFIX, &x, &y, sheet);                                                                  \
+        (void)SHEET_STRAIGHTEN(SUFFIX, x, y, sheet);                                                                   \
         constant real *in_w = sheet + SHEET_W_TERMS, *in_g = sheet + SHEET_G_TERMS, *in_h = sheet + SHEET_H_TERMS;     \
         const REAL w = 1 + in_w[0] * x + in_w[1] * y;                                                                  \
         const REAL p = x / w, q = y / w;                                                                               \

@@ -194,8 +194,17 @@ class Pipeline(Generic[R]):
         """Close the stream, whatever happened."""
         self.close()
 
+    def stop(self) -> None:
+        """Take no more frames; what is under way is still delivered, then the loop ends. From any thread."""
+        if self._state == "open":
+            self._stopping = True
+            self._tokens.put(None)
+            self.source.stop()
+
     def close(self) -> None:
         """Stop the source and the producer, wait for the device, and free both; the report stays.
+
+        From the consumer's thread, as ``with`` does it; another thread may `stop` the stream.
 
         Raises
         ------
@@ -205,10 +214,8 @@ class Pipeline(Generic[R]):
         if self._state != "open":
             self._state = "closed"
             return
+        self.stop()
         self._state = "closed"
-        self._stopping = True
-        self._tokens.put(None)
-        self.source.stop()
         self._producer.join(_PATIENCE_S)
         if self._producer.is_alive():
             raise StreamError(
@@ -415,7 +422,7 @@ class Pipeline(Generic[R]):
 
 
 def default_batch(source: Source, ring: int) -> int:
-    """Return a batch of some 4 MB, and not so large that a short recording would not use the ring."""
+    """Return a batch of some 4 MB, not so large that a short recording would not use the ring."""
     size = max(math.prod(source.shape) * source.dtype.itemsize, 1)
     batch = max(_DEFAULT_BATCH_BYTES // size, 1)
     return batch if source.length is None else max(min(batch, -(-source.length // ring)), 1)

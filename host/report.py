@@ -7,11 +7,13 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-# Bins of a hundredth of their value, up to three hours.
-_STEP = math.log(1.01)
-_BINS = int(math.log(1e13) / _STEP) + 1
-_PENDING = 4096
+# A bin is a float32's exponent and 7 bits of its mantissa, less than a hundredth of the value wide; up to five hours.
+_DROPPED_BITS = 16
+_LOWEST = int(np.float32(1.0).view(np.int32)) >> _DROPPED_BITS
+_BINS = (int(np.float32(2.0**44).view(np.int32)) >> _DROPPED_BITS) - _LOWEST
+_PENDING = 1024
 
 
 @dataclass(frozen=True)
@@ -31,27 +33,36 @@ class Durations:
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS, np.int64)
-        self._pending: list[Any] = []
-        self._total = 0
-        self._maximum = 0
+        self._pending = np.zeros(_PENDING, np.int64)
+        self._filled = 0
+        self._total = self._maximum = 0
 
-    def add(self, nanoseconds: Any) -> None:
-        """Count an integer or an integer array of durations [ns]."""
-        self._pending.append(nanoseconds)
-        if len(self._pending) >= _PENDING:
+    def add(self, nanoseconds: int) -> None:
+        """Count a duration [ns]."""
+        self._pending[self._filled] = nanoseconds
+        self._filled += 1
+        if self._filled == _PENDING:
             self._fold()
 
+    def add_all(self, nanoseconds: NDArray[np.int64]) -> None:
+        """Count at most as many durations [ns] as are kept pending, 1024."""
+        count = len(nanoseconds)
+        if self._filled + count > _PENDING:
+            self._fold()
+        self._pending[self._filled : self._filled + count] = nanoseconds
+        self._filled += count
+
     def _fold(self) -> None:
-        values = np.concatenate([np.atleast_1d(each) for each in self._pending]).astype(np.int64)
-        self._pending.clear()
-        bins = np.log(np.maximum(values, 1)) / _STEP
-        self._counts += np.bincount(np.minimum(bins.astype(np.int64), _BINS - 1), minlength=_BINS)
+        values = self._pending[: self._filled]
+        bins = (np.maximum(values, 1).astype(np.float32).view(np.int32) >> _DROPPED_BITS) - _LOWEST
+        self._counts += np.bincount(np.minimum(bins, _BINS - 1), minlength=_BINS)
         self._total += int(values.sum())
         self._maximum = max(self._maximum, int(values.max()))
+        self._filled = 0
 
     def spread(self) -> Spread:
         """Return the spread of what was counted so far."""
-        if self._pending:
+        if self._filled:
             self._fold()
         count = int(self._counts.sum())
         if not count:
@@ -60,7 +71,9 @@ class Durations:
 
         def quantile(share: float) -> float:
             place = int(np.searchsorted(upto, max(share * count, 1.0)))
-            return min(math.exp((place + 0.5) * _STEP), self._maximum) * 1e-9
+            low, high = np.array([place, place + 1], np.int32) + _LOWEST << _DROPPED_BITS
+            middle = 0.5 * (float(low.view(np.float32)) + float(high.view(np.float32)))
+            return min(middle, self._maximum) * 1e-9
 
         return Spread(
             count=count,
@@ -87,7 +100,8 @@ class StreamReport:
     seconds
         From the start to the last delivery, warm-up included [s].
     latency
-        From a frame's arrival to its result in host memory, warm-up excluded.
+        From a frame's arrival to its result in host memory, warm-up excluded; of batches of more than 1024 frames,
+        so many of them, the oldest one among them.
     warm_up
         Frames at the start that `throughput`, `latency` and `stages` leave out; 0 where the stream was no longer
         than that.
@@ -145,7 +159,7 @@ class Account:
         self._stages: dict[str, Durations] = {}
         self._fill = self._fill_maximum = self._fill_count = 0
 
-    def book(self, delivered: int, latencies: Any, fill: int) -> None:
+    def book(self, delivered: int, latencies: NDArray[np.int64], fill: int) -> None:
         """Book a batch at its delivery."""
         if self._left == 0 and self.batches:
             self._restart(self.last)
@@ -153,7 +167,7 @@ class Account:
         self.frames += len(latencies)
         self.batches += 1
         self.last = delivered
-        self._latency.add(latencies)
+        self._latency.add_all(latencies[:: max(-(-len(latencies) // _PENDING), 1)])
         self._fill += fill
         self._fill_count += 1
         if fill > self._fill_maximum:

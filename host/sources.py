@@ -255,7 +255,7 @@ class PacedSource(Source):
         self._sleep = self._stopped.wait if sleep is None else sleep
         self._start: int | None = None
         self._arrived: int | None = None
-        self._taken = 0
+        self._taken = self._last = 0
         self._error: RecordingError | None = None
 
     def wait(self) -> bool:
@@ -292,9 +292,9 @@ class PacedSource(Source):
         wanted = max(min(len(out), due), 1)
         read = self._source.read_into(out[:wanted], arrived[:wanted])
         for k in range(read):
-            arrived[k] = self._due(first + k)
-        if read and self._arrived is not None:
-            arrived[0], self._arrived = self._arrived, None
+            # The reader may oversleep: frames that fall due before it wakes come when it does.
+            self._last = arrived[k] = max(self._due(first + k), self._last, self._arrived or 0)
+            self._arrived = None
         self._taken += read
         return read
 
@@ -308,7 +308,7 @@ class PacedSource(Source):
         return self._start + round(number / self._rate_ns)
 
     def _arrival(self) -> int | None:
-        """Wait for the next frame and say when it arrived; ``None`` when stopped."""
+        """Wait for the next frame and return when it arrived; ``None`` when stopped."""
         now = self._clock()
         if self._start is None:
             self._start = now

@@ -21,7 +21,7 @@
 #define LENS_STRETCH_SLOPE(square, lens) ((lens)[LENS_K1_TERM])
 #endif
 
-// lens_straighten moves (x, y) to its undistorted place and returns the measured point's squared distance from the
+// lens_straighten moves (x, y) to its undistorted place and returns the squared distance of the measured point from the
 // centre. lens_undistort tells instead whether the measured point lies at or beyond the fold of the polynomial, where no
 // scene point can be. One body for a sample and for 16.
 #define LENS_UNDISTORT(SUFFIX, REAL, BITS)                                                                             \

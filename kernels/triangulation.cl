@@ -1,25 +1,41 @@
-// Sensor coordinates (u, v) -> points (G, H) in the sheet of light, one work-item per point. The body is straight-line
-// code, which CPU runtimes vectorise across work-items; explicit 16-wide strips were slower on both of them.
+// Sensor coordinates (u, v) -> points (G, H) in the sheet of light. CPU runtimes take strips of 16-wide vectors, GPUs an
+// item per point.
+#include "lanes.h"
 #include "sheet.h"
+
+#ifdef STRIP
+typedef INPUT16 inputs_at __attribute__((aligned(sizeof(INPUT))));
+#define LOAD(from) convert_real16(*(global const inputs_at *)(from))
+#else
+#define LOAD(from) ((real)*(from))
+#endif
 
 kernel void triangulate(global const INPUT *restrict u, global const INPUT *restrict v, global real *restrict g,
                         global real *restrict h, global uchar *restrict status, global real *restrict sigma_g,
                         global real *restrict sigma_h, const ulong points, constant real *sheet, const real sigma_u,
                         const real sigma_v) {
-    // The last group moves back to end with the last point, and does some points twice: a test for the end in the body
-    // would cost the vectorisation, and a group size that divides every number of points does not exist.
-    const size_t start = min(get_group_id(0) * get_local_size(0), (size_t)points - get_local_size(0));
-    const size_t i = start + get_local_id(0);
-    const real position = u[i], sample = v[i];
-    real at_g, at_h;
-    const uchar flags = sheet_point(position, sample, sheet, &at_g, &at_h);
-    g[i] = at_g;
-    h[i] = at_h;
-    status[i] = flags;
-#ifdef SHEET_SIGMAS
-    real of_g, of_h;
-    sheet_sigma(position, sample, sigma_u, sigma_v, sheet, &of_g, &of_h);
-    sigma_g[i] = flags ? REAL_NAN : of_g;
-    sigma_h[i] = flags ? REAL_NAN : of_h;
+    // The last vector, or work-group, moves back to end with the last point, and does some points twice: a test for the
+    // end within it would cost more than they do.
+#ifdef STRIP
+    const size_t first = get_global_id(0) * STRIP_POINTS, end = min(first + STRIP_POINTS, (size_t)points);
+    for (size_t next = first; next < end; next += LANES) {
+        const size_t i = min(next, (size_t)points - LANES);
+#else
+    {
+        const size_t group = get_group_id(0) * get_local_size(0);
+        const size_t i = min(group, (size_t)points - get_local_size(0)) + get_local_id(0);
 #endif
+        const reals position = LOAD(u + i), sample = LOAD(v + i);
+        reals at_g, at_h;
+        store_bytes(LANED(sheet_point)(position, sample, sheet, &at_g, &at_h), status + i);
+        store_reals(at_g, g + i);
+        store_reals(at_h, h + i);
+#ifdef SHEET_SIGMAS
+        reals of_g, of_h;
+        LANED(sheet_sigma)(position, sample, (reals)sigma_u, (reals)sigma_v, sheet, &of_g, &of_h);
+        const masks missing = mask_of(LANED(not_finite)(at_g));
+        store_reals(nan_where(missing, of_g), sigma_g + i);
+        store_reals(nan_where(missing, of_h), sigma_h + i);
+#endif
+    }
 }

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Operation, Precision, real_defines, real_of
+from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
 from gpuvision.ranging import homography
 from gpuvision.ranging.homography import Model
 from gpuvision.tables import checked_keys, finite, numbers
@@ -27,8 +27,8 @@ Along = Literal["columns", "rows"]
 Matrix = tuple[tuple[float, float, float], ...]
 Float64 = npt.NDArray[np.float64]
 
-# Points per work-group: a CPU runtime pays for every group, a GPU hides its latency with several.
-_GROUP_CPU, _GROUP_GPU = 1024, 256
+# Points per work-item of a strip, and per work-group where every point has an item.
+_STRIP, _GROUP, _LANES = 1024, 256, 16
 _KEYS = ("homography", "region", "model", "along", "lens", "covariance", "sigma", "horizon")
 
 
@@ -105,6 +105,8 @@ class Triangulation(Operation[SheetPoints]):
         1/horizon times the usual distance is flagged HORIZON.
     precision
         Of the arithmetic and the outputs; None follows the input.
+    walk
+        "strip" (16-wide vectors, for CPU runtimes), "item" (a work-item per point, for GPUs), or "auto".
 
     Raises
     ------
@@ -124,6 +126,7 @@ class Triangulation(Operation[SheetPoints]):
     sigma: tuple[float, float] | None = None
     horizon: float = 1e-3
     precision: Precision = None
+    walk: Walk = "auto"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "homography", numbers(self.homography, (3, 3), "Triangulation.homography"))
@@ -214,9 +217,12 @@ class Triangulation(Operation[SheetPoints]):
             raise TypeError(f"Triangulation takes float32 or float64 coordinates u and v, got {dtype}")
         real = real_of(self.precision, dtype)
         code = "float" if dtype == np.float32 else "double"
-        defines = {**self.defines, **real_defines(device, real), "INPUT": code}
+        defines = {**self.defines, **real_defines(device, real), "INPUT": code, "INPUT16": f"{code}16"}
         points = math.prod(shape)
-        group = max(min(points, _GROUP_CPU if device.is_cpu else _GROUP_GPU), 1)
+        strip = in_strips(self.walk, device) and points >= _LANES
+        if strip:
+            defines |= {"STRIP": None, "STRIP_POINTS": _STRIP}
+        group = max(min(points, _GROUP), 1)
         spread = None
         if self.sigma is not None:
             defines["SHEET_SIGMAS"], spread = None, (shape, real)
@@ -229,8 +235,8 @@ class Triangulation(Operation[SheetPoints]):
             inputs=((shape, dtype), (shape, dtype)),
             outputs={**outputs, "sigma_g": spread, "sigma_h": spread},
             arguments=(np.uint64(points), self.packed(real), real.type(sigma[0]), real.type(sigma[1])),
-            global_size=(-(-points // group) * group,),
-            local_size=(group,),
+            global_size=(-(-points // _STRIP),) if strip else (-(-points // group) * group,),
+            local_size=None if strip else (group,),
         )
 
     # ---- on the host: simulators, planners, error budgets --------------------------------------------------

@@ -20,7 +20,6 @@
 #define AMBIGUOUS_RATIO 2
 #define READ_VARIANCE 3  // of a dark sample [level^2]
 #define GAIN 4           // variance per level of light
-#define NO_LIGHT 5       // the level that no light has
 
 typedef struct {
     global real *position, *peak, *width, *total;
@@ -30,13 +29,15 @@ typedef struct {
 } Outputs;
 
 // Lanes that go to samples first, first + 1, ... of the output.
-inline void store_reading(const Outputs *to, ulong first, int sample, reals position, codes peak, reals width, reals total, ints flags) {
+inline void store_reading(const Outputs *to, ulong first, int sample, reals position, codes peak, reals width,
+                          reals total, ints flags) {
     const ints lost = ~INT_MASK((flags & (STATUS_DARK | STATUS_OUT_OF_RANGE | STATUS_NOT_FINITE)) == 0);
     const ints not_finite = ~INT_MASK((flags & STATUS_NOT_FINITE) == 0);
     position = nan_where(to_masks(lost), position);
 #ifdef WITH_SHEET
     reals g, h;
-    const ints sheet_flags = to_ints(LANED(sheet_point)(position, to_reals((ints)sample + lane_numbers), to->sheet, &g, &h));
+    const reals samples = to_reals((ints)sample + lane_numbers);
+    const ints sheet_flags = to_ints(LANED(sheet_point)(position, samples, to->sheet, &g, &h));
     flags |= sheet_flags & ~lost;
     store_reals(g, to->g + first);
     store_reals(h, to->h + first);
@@ -59,27 +60,36 @@ inline void store_reading(const Outputs *to, ulong first, int sample, reals posi
 }
 
 inline ints common_flags(const Profiles *profiles, codes peak, ints lost) {
-    return flag_where(CODE_MASK(peak >= (codes)profiles->saturation), STATUS_SATURATED) | flag_where(lost, STATUS_NOT_FINITE);
+    return flag_where(CODE_MASK(peak >= (codes)profiles->saturation), STATUS_SATURATED) |
+           flag_where(lost, STATUS_NOT_FINITE);
 }
 
 #ifdef METHOD_WHOLE
-inline void finish_whole(const Profiles *profiles, const Gravity *gravity, constant real *p, const Outputs *to, ulong first, int sample) {
+// Light over the threshold of sample k.
+inline reals light_at(const Profiles *profiles, int k) {
+    return over_threshold(sample_of(profiles, k), profiles->threshold);
+}
+
+inline void finish_whole(const Profiles *profiles, const Gravity *gravity, constant real *p, const Outputs *to,
+                         ulong first, int sample) {
     ints dark = dark_lanes(profiles, gravity->peak);
 #ifdef WIDTH_LIMITS
     dark |= REAL_MASK(gravity->lit < p[MIN_WIDTH]) | REAL_MASK(gravity->lit > p[MAX_WIDTH]);
 #endif
     // Light whose half maximum lies outside: its centre of gravity does not.
     const reals least = over_threshold(gravity->peak, profiles->threshold) / 2;
-    const ints cut = REAL_MASK(over_threshold(sample_of(profiles, 0), profiles->threshold) >= least) |
-                     REAL_MASK(over_threshold(sample_of(profiles, profiles->length - 1), profiles->threshold) >= least);
+    const reals begin = light_at(profiles, 0), end = light_at(profiles, profiles->length - 1);
+    const ints cut = REAL_MASK(begin >= least) | REAL_MASK(end >= least);
     const ints flags = flag_where(dark, STATUS_DARK) | flag_where(cut & ~dark, STATUS_OUT_OF_RANGE) |
                        common_flags(profiles, gravity->peak, gravity->lost);
     store_reading(to, first, sample, gravity->position, gravity->peak, gravity->lit, gravity->total, flags);
 }
 #else
-inline void finish_peak(const Profiles *profiles, Peak *peak, const Place *place, constant real *p, const Outputs *to, ulong first, int sample) {
-    ints flags = place->flags | flag_where(~peak->found, STATUS_DARK) | flag_where(cut_lanes(profiles, peak->at) & peak->found, STATUS_OUT_OF_RANGE) |
-                 common_flags(profiles, peak->level, peak->lost);
+inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place *place, constant real *p,
+                        const Outputs *to, ulong first, int sample) {
+    const ints cut = cut_lanes(profiles, peak->at) & peak->found;
+    ints flags = place->flags | common_flags(profiles, peak->level, peak->lost);
+    flags |= flag_where(~peak->found, STATUS_DARK) | flag_where(cut, STATUS_OUT_OF_RANGE);
 #ifdef AMBIGUITY
     flags |= flag_where(has_second(profiles, peak, p[AMBIGUOUS_RATIO]) & peak->found, STATUS_AMBIGUOUS);
 #endif
@@ -134,17 +144,17 @@ inline Place place_apart(const Profiles *profiles, Peak *peak, constant real *p)
 #define LANE_STRIDE 1
 #endif
 
-inline Profiles profiles_at(global const CODE *frame, int sample, int rows, int columns, CODE threshold, CODE saturation, CODE minimum) {
-    const Profiles profiles = {frame + (long)sample * LANE_STRIDE, STRIDE, LANE_STRIDE, LENGTH, threshold, saturation, minimum};
-    return profiles;
-}
+// The LANES profiles from a given one on.
+#define PROFILES_FROM(sample)                                                                                          \
+    {frames + (ulong)frame * rows * columns + (long)(sample) * LANE_STRIDE,                                            \
+     STRIDE, LANE_STRIDE, LENGTH, threshold, saturation, minimum}
 
 #if defined(CANDIDATES) || (!defined(STRIP) && !defined(METHOD_WHOLE))
 // LANES profiles, by a walk along them.
 kernel void line_readout(ARGUMENTS) {
     const Outputs to = OUTPUTS;
     const int frame = get_global_id(1), sample = min((int)get_global_id(0) * LANES, SAMPLES - LANES);
-    const Profiles profiles = profiles_at(frames + (ulong)frame * rows * columns, sample, rows, columns, threshold, saturation, minimum);
+    const Profiles profiles = PROFILES_FROM(sample);
     const ulong first = (ulong)frame * SAMPLES + sample;
 #ifdef CANDIDATES
     ints nearest = -1;
@@ -164,7 +174,7 @@ kernel void line_readout(ARGUMENTS) {
 kernel void line_readout(ARGUMENTS) {
     const Outputs to = OUTPUTS;
     const int frame = get_global_id(1), sample = get_global_id(0);
-    const Profiles profiles = profiles_at(frames + (ulong)frame * rows * columns, sample, rows, columns, threshold, saturation, minimum);
+    const Profiles profiles = PROFILES_FROM(sample);
     const Gravity gravity = whole_gravity(&profiles);
     finish_whole(&profiles, &gravity, p, &to, (ulong)frame * SAMPLES + sample, sample);
 }
@@ -174,9 +184,10 @@ kernel void line_readout(ARGUMENTS) {
 // memory is read nearly in sequence while the sums of a group stay in registers.
 kernel void line_readout(ARGUMENTS) {
     const Outputs to = OUTPUTS;
-    const int strip = (columns / (int)get_global_size(0) + WIDE - 1) / WIDE * WIDE, frame = get_global_id(1);
+    const int strips = get_global_size(0), frame = get_global_id(1);
+    const int strip = ((columns + strips - 1) / strips + WIDE - 1) / WIDE * WIDE;
     const int begin = (int)get_global_id(0) * strip, end = min(begin + strip, columns);
-    const Profiles profiles = profiles_at(frames + (ulong)frame * rows * columns, 0, rows, columns, threshold, saturation, minimum);
+    const Profiles profiles = PROFILES_FROM(0);
     for (int part = begin; part < end; part += MAX_STRIP) {
         read_strip(&profiles, part, min(part + MAX_STRIP, end), p, &to, (ulong)frame * columns);
     }
@@ -186,7 +197,7 @@ kernel void line_readout(ARGUMENTS) {
 kernel void line_readout(ARGUMENTS) {
     const Outputs to = OUTPUTS;
     const int frame = get_global_id(1), sample = min((int)get_global_id(0) * LANES, SAMPLES - LANES);
-    const Profiles profiles = profiles_at(frames + (ulong)frame * rows * columns, sample, rows, columns, threshold, saturation, minimum);
+    const Profiles profiles = PROFILES_FROM(sample);
     read_rows(&profiles, p, &to, (ulong)frame * SAMPLES + sample, sample);
 }
 #endif

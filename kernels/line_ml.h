@@ -18,7 +18,7 @@ typedef struct {
     reals place, sigma, amplitude, background;
 } Gaussian;
 
-// From the centre of a pixel's edge: exp(-z^2/2), and the integral of it up to there over sqrt(2 pi), less a half.
+// At a pixel's edge, z sigmas from the place: exp(-z^2/2), and the share of the light before it less a half.
 typedef struct {
     reals slope, integral;
 } Edge;
@@ -28,7 +28,8 @@ inline Edge edge_at(reals z) {
     const reals size = fabs(z) * (real)0.70710678118654752, t = 1 / (1 + (real)0.3275911 * size);
     Edge edge;
     edge.slope = exp(-size * size);
-    const reals tail = t * ((real)0.254829592 + t * ((real)-0.284496736 + t * ((real)1.421413741 + t * ((real)-1.453152027 + t * (real)1.061405429))));
+    const reals late = (real)1.421413741 + t * ((real)-1.453152027 + t * (real)1.061405429);
+    const reals tail = t * ((real)0.254829592 + t * ((real)-0.284496736 + t * late));
     const reals half_erf = (1 - tail * edge.slope) / 2;
     edge.integral = z < 0 ? -half_erf : half_erf;
     return edge;
@@ -68,11 +69,14 @@ inline Normal normal_equations(const CODE *window, Gaussian at, CODE saturation,
         const reals z_right = z + per_sigma;
         const Edge right = edge_at(z_right);
         const reals light = scale * (right.integral - left.integral);
-        const reals column[ML_UNKNOWNS] = {left.slope - right.slope, light - at.sigma * (z_right * right.slope - z * left.slope), light, (reals)1};
+        const reals by_place = left.slope - right.slope;
+        const reals by_sigma = light - at.sigma * (z_right * right.slope - z * left.slope);
+        const reals column[ML_UNKNOWNS] = {by_place, by_sigma, light, (reals)1};
         const reals model = at.background + at.amplitude * light;
         const codes level = window_level(window, k + RADIUS);
         const reals variance = noise[0] + noise[1] * fmax(model, (reals)0);
-        const reals weight = choose_reals(CODE_MASK(level >= (codes)saturation), 0, at.amplitude * at.amplitude / fmax(variance, (reals)1e-12f));
+        const reals trust = at.amplitude * at.amplitude / fmax(variance, (reals)1e-12f);
+        const reals weight = choose_reals(CODE_MASK(level >= (codes)saturation), 0, trust);
         const reals residual = (to_reals(level) - model) / at.amplitude * weight;
         for (int i = 0, n = 0; i < ML_UNKNOWNS; i++) {
             normal.right[i] += column[i] * residual;
@@ -112,7 +116,8 @@ inline reals step(Gaussian *at, Normal *normal) {
     at->background += at->amplitude * by[3];
     at->amplitude *= clamp(1 + by[2], (reals)0.5f, (reals)2);
     at->place += move;
-    at->sigma = clamp(at->sigma * exp(clamp(by[1], (reals)-0.5f, (reals)0.5f)), (reals)ML_NARROWEST, (reals)(2 * RADIUS));
+    const reals growth = exp(clamp(by[1], (reals)-0.5f, (reals)0.5f));
+    at->sigma = clamp(at->sigma * growth, (reals)ML_NARROWEST, (reals)(2 * RADIUS));
     return fabs(move);
 }
 

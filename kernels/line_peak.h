@@ -29,9 +29,11 @@ typedef struct {
 } Choice;
 
 // At the end of a run: is it a candidate, and better than the one chosen so far?
-inline void close_run(Choice *choice, const Profiles *profiles, ints closing, int end, ints nearest, int min_width, int max_width) {
+inline void close_run(Choice *choice, const Profiles *profiles, ints closing, int end, ints nearest, int min_width,
+                      int max_width) {
     const ints width = end - choice->start;
-    const ints fits = INT_MASK(width >= min_width) & INT_MASK(width <= max_width) & ~dark_lanes(profiles, choice->level);
+    const ints allowed = INT_MASK(width >= min_width) & INT_MASK(width <= max_width);
+    const ints fits = allowed & ~dark_lanes(profiles, choice->level);
 #if defined(CHOICE_FIRST)
     const ints better = ~choice->found;
 #elif defined(CHOICE_LAST)
@@ -49,6 +51,24 @@ inline void close_run(Choice *choice, const Profiles *profiles, ints closing, in
     choice->found |= take;
 }
 
+#ifdef ALONG_ROWS
+#if CODE_BITS == 32
+#define any_light(x, threshold) (any(!((x) <= (threshold))) || any((x) == (CODE16)DARKEST))
+#else
+#define any_light(x, threshold) any((x) > (threshold))
+#endif
+
+// Passes by 16 samples at a time without light, and keeps the highest of them. A sample that is not finite lights.
+inline int pass_dark(const Profiles *profiles, int k, CODE16 *highest) {
+    for (; k + 16 <= profiles->length; k += 16) {
+        const CODE16 x = *(global const code16_at *)(profiles->first + k);
+        if (any_light(x, (CODE16)profiles->threshold)) break;
+        *highest = higher_of(x, *highest);
+    }
+    return k;
+}
+#endif
+
 // Walks all lanes along their profiles; samples which no lane has over the threshold are passed by quickly.
 inline Peak choose_peak(const Profiles *profiles, ints nearest, int min_width, int max_width) {
     Choice choice;
@@ -56,7 +76,13 @@ inline Peak choose_peak(const Profiles *profiles, ints nearest, int min_width, i
     choice.level = choice.chosen_level = (codes)DARKEST;
     codes strongest = (codes)DARKEST;
     ints lost = 0;
+#ifdef ALONG_ROWS
+    CODE16 highest = (CODE16)DARKEST;
+#endif
     for (int k = 0; k < profiles->length; k++) {
+#ifdef ALONG_ROWS
+        if (!choice.run) k = min(pass_dark(profiles, k, &highest), profiles->length - 1);
+#endif
         const codes x = sample_of(profiles, k);
         lost |= lost_lanes(x);
         strongest = x > strongest ? x : strongest;
@@ -70,6 +96,9 @@ inline Peak choose_peak(const Profiles *profiles, ints nearest, int min_width, i
         choice.level = choose_codes(higher, x, choice.level);
         choice.run = bright;
     }
+#ifdef ALONG_ROWS
+    strongest = higher_of(strongest, highest_level(highest));
+#endif
     close_run(&choice, profiles, choice.run, profiles->length, nearest, min_width, max_width);
     Peak peak;
     peak.at = choice.chosen;
@@ -99,16 +128,33 @@ inline Peak strongest_peak(const Profiles *profiles) {
 #endif
 
 #ifdef AMBIGUITY
+// The highest sample of every lane outside the window.
+inline codes highest_outside(const Profiles *profiles, ints peak) {
+#ifdef ALONG_ROWS
+    int at[LANES];
+    CODE level[LANES];
+    *(ints_at *)at = peak;
+    for (int lane = 0; lane < LANES; lane++) {
+        global const CODE *row = profiles->first + (long)lane * profiles->lane_stride;
+        const CODE before = highest_in(row, 0, at[lane] - RADIUS);
+        level[lane] = higher_of(before, highest_in(row, at[lane] + RADIUS + 1, profiles->length));
+    }
+    return *(const codes_at *)level;
+#else
+    codes highest = (codes)DARKEST;
+    for (int k = 0; k < profiles->length; k++) {
+        const codes x = sample_of(profiles, k);
+        const ints outside = INT_MASK(abs(k - peak) > RADIUS);
+        highest = choose_codes(outside & CODE_MASK(x > highest), x, highest);
+    }
+    return highest;
+#endif
+}
+
 // Lanes where a sample outside the window is comparable to the peak.
 inline ints has_second(const Profiles *profiles, const Peak *peak, real ratio) {
-    codes second = (codes)DARKEST;
-    for (int k = 0; k < profiles->length; k++) {
-        const ints outside = INT_MASK(abs(k - peak->at) > RADIUS);
-        const codes x = sample_of(profiles, k);
-        second = choose_codes(outside & CODE_MASK(x > second), x, second);
-    }
-    const reals over = over_threshold(second, profiles->threshold);
-    return REAL_MASK(over > 0) & REAL_MASK(over >= ratio * over_threshold(peak->level, profiles->threshold));
+    const reals second = over_threshold(highest_outside(profiles, peak->at), profiles->threshold);
+    return REAL_MASK(second > 0) & REAL_MASK(second >= ratio * over_threshold(peak->level, profiles->threshold));
 }
 #endif
 

@@ -35,8 +35,8 @@ inline reals balance(const CODE *window, int k) {
     return sum;
 }
 
-// The zero crossing nearest to the peak, linear between samples (F. Blais and M. Rioux, 1986). On a flat top the balance
-// stays at zero: the middle between where it gets there and where it leaves.
+// The zero crossing nearest to the peak, linear between samples (F. Blais and M. Rioux, 1986). On a flat top the
+// balance stays at zero: the middle between where it gets there and where it leaves.
 inline Place place_by_points(const CODE *window, const Profiles *profiles, const Peak *peak, ints equals) {
     reals reached = 2 * RADIUS, left = 2 * RADIUS, before = balance(window, -RADIUS);
     for (int k = -RADIUS; k < RADIUS; k++) {

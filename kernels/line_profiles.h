@@ -91,6 +91,30 @@ inline codes sample_of(const Profiles *profiles, int k) {
 #endif
 }
 
+#if CODE_BITS == 32
+#define higher_of fmax
+#else
+#define higher_of max
+#endif
+
+inline CODE highest_level(CODE16 v) {
+    const CODE8 a = higher_of(v.lo, v.hi);
+    const CODE4 b = higher_of(a.lo, a.hi);
+    return higher_of(higher_of(b.x, b.y), higher_of(b.z, b.w));
+}
+
+typedef CODE16 code16_at __attribute__((aligned(sizeof(CODE))));
+
+// The highest of neighbouring samples: begin <= index < end.
+inline CODE highest_in(global const CODE *row, int begin, int end) {
+    CODE16 highest = (CODE16)DARKEST;
+    int k = begin;
+    for (; k + 16 <= end; k += 16) highest = higher_of(*(global const code16_at *)(row + k), highest);
+    CODE level = highest_level(highest);
+    for (; k < end; k++) level = higher_of(row[k], level);
+    return level;
+}
+
 inline ints dark_lanes(const Profiles *profiles, codes peak) {
     return ~CODE_MASK(peak > (codes)profiles->threshold) | CODE_MASK(peak < (codes)profiles->minimum);
 }

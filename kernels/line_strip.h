@@ -56,7 +56,8 @@ inline void read_rows(const Profiles *profiles, constant real *p, const Outputs 
     RowSums rows[LANES];
     for (int i = 0; i < LANES; i++) {
         global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
-        Ahead ahead = ahead_of(row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride, profiles->length, profiles->length);
+        global const CODE *later = row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride;
+        Ahead ahead = ahead_of(later, profiles->length, profiles->length);
         read_row(row, profiles->length, profiles->threshold, &rows[i], &ahead);
     }
     const Gravity gravity = row_gravity(rows);
@@ -69,7 +70,8 @@ inline void read_rows(const Profiles *profiles, constant real *p, const Outputs 
 #ifndef ALONG_ROWS
 
 // Sixteen columns of which the peaks' levels and blocks are known.
-inline void finish_group(const Profiles *profiles, const WidePeak *wide, int i, int tall, constant real *p, const Outputs *to, ulong first, int sample) {
+inline void finish_group(const Profiles *profiles, const WidePeak *wide, int i, int tall, constant real *p,
+                         const Outputs *to, ulong first, int sample) {
     Peak peak;
     peak.level = ((const codes *)&wide->level)[i];
     peak.found = ~dark_lanes(profiles, peak.level);
@@ -125,7 +127,8 @@ inline void read_rows(const Profiles *profiles, constant real *p, const Outputs 
     CODE level[LANES];
     for (int i = 0; i < LANES; i++) {
         global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
-        Ahead ahead = ahead_of(row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride, profiles->length, profiles->length);
+        global const CODE *later = row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride;
+        Ahead ahead = ahead_of(later, profiles->length, profiles->length);
         find_in_row(row, profiles->length, &at[i], &level[i], &lost[i], &ahead);
     }
     Peak peak;

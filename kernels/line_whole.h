@@ -1,4 +1,4 @@
-// Centre of gravity of a whole profile. Integer samples are summed exactly: moments of 2^32 and beyond under LONG_MOMENT.
+// Centre of gravity of a whole profile. Integer samples are summed exactly, moments beyond 2^32 under LONG_MOMENT.
 //
 // No sample is multiplied by its index. A running sum s += v, m += s gives m = sum of (steps - k) v over a block of
 // steps, and one multiplication per block puts the block in its place.
@@ -119,9 +119,9 @@ inline Gravity gravity_of_integers(uints total, bigs moment, uints lit, codes pe
     gravity.total = to_reals(total);
     // A whole number near the position, which the moment is taken about: the rest is small and loses nothing.
     const reals per_light = 1 / choose_reals(INT_MASK(total == 0u), 1, gravity.total);
-    const reals centre = rint(to_reals(moment) * per_light);
-    const signed_bigs offset = to_signed_bigs(moment) - to_signed_bigs(centre) * to_signed_bigs(total);
-    gravity.position = centre + to_reals(offset) * per_light;
+    const signed_bigs centre = to_signed_bigs(to_reals(moment) * per_light);
+    const signed_bigs offset = to_signed_bigs(moment) - centre * to_signed_bigs(total);
+    gravity.position = to_reals(centre) + to_reals(offset) * per_light;
     gravity.lit = to_reals(lit);
     gravity.peak = peak;
     gravity.lost = 0;
@@ -155,7 +155,8 @@ inline Gravity whole_gravity(const Profiles *profiles) {
 typedef Sums WideSums;
 inline void clear_sums(WideSums *sums) { *sums = no_sums(); }
 
-inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold, Ahead *ahead) {
+inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold,
+                      Ahead *ahead) {
     reals s = 0, m = 0, lit = 0, lost = sums->lost;
     codes peak = sums->peak;
     for (int k = 0; k < steps; k++, at += stride) {
@@ -193,7 +194,8 @@ typedef struct {
 inline void sum_lanes(const WideSums *wide, RowSums *sums) {
     const real total = sum_of(wide->total + wide->total_rest);
     const real centre = total > 0 ? rint(sum_of(wide->moment) / total) : 0;
-    const real16 offset = fma(-(real16)centre, wide->total, wide->moment) + (wide->moment_rest - centre * wide->total_rest);
+    const real16 rest = wide->moment_rest - centre * wide->total_rest;
+    const real16 offset = fma(-(real16)centre, wide->total, wide->moment) + rest;
     sums->centre = centre * WIDE;
     sums->offset = sum_of(WIDE * offset + to_reals(lane_numbers) * (wide->total + wide->total_rest));
     sums->total = total;
@@ -234,7 +236,7 @@ inline Gravity row_gravity(const RowSums *rows) {
 
 #else
 
-// Sums of WIDE profiles, of the even and the odd ones apart: that is how halves of double width fall out of the samples.
+// Sums of WIDE profiles, of the even and the odd ones apart: so numbers of double width fall out of the samples.
 typedef struct {
     uint16 total[QUARTERS], lit[QUARTERS];
     big16 moment[QUARTERS];
@@ -280,7 +282,8 @@ inline void add_quarter(WideSums *sums, int i, uint16 s, uint16 m, int first, in
     sums->moment[i] += convert_big16(s) * (big)(first + steps) - convert_big16(m);
 }
 
-inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold, Ahead *ahead) {
+inline void add_steps(WideSums *sums, global const CODE *at, int stride, int steps, int first, CODE threshold,
+                      Ahead *ahead) {
     halves s = 0, s_odd = 0, m = 0, m_odd = 0;
 #ifdef WITH_LIT
     halves lit = 0, lit_odd = 0;

@@ -63,15 +63,4 @@ inline int lowest(int16 v) {
 }
 inline int highest(int16 v) { return -lowest(-v); }
 
-#if CODE_BITS == 32
-inline CODE highest_level(codes v) {
-    const float8 a = fmax(v.lo, v.hi);
-    const float4 b = fmax(a.lo, a.hi);
-    const float2 c = fmax(b.lo, b.hi);
-    return fmax(c.x, c.y);
-}
-#else
-inline CODE highest_level(codes v) { return (CODE)highest(convert_int16(v)); }
-#endif
-
 #endif

@@ -34,7 +34,10 @@ inline ints middle_of_top(ints equals) { return (equals - 1) >> 1; }
 inline ints settle(const Profiles *profiles, Peak *peak, int reach, CODE *window) {
     gather(profiles, peak->at, reach, window);
     ints equals = 0;
-    for (int k = reach; k <= reach + RADIUS; k++) equals -= CODE_MASK(window_level(window, k) == peak->level) & INT_MASK(peak->at + (k - reach) < profiles->length);
+    for (int k = 0; k <= RADIUS; k++) {
+        const ints inside = INT_MASK(peak->at + k < profiles->length);
+        equals -= CODE_MASK(window_level(window, k + reach) == peak->level) & inside;
+    }
     const ints shift = middle_of_top(equals) & peak->found;
     if (any_lane(INT_MASK(shift > 0))) {
         peak->at += max(shift, (ints)0);

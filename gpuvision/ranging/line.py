@@ -240,8 +240,10 @@ class LineReadout(Operation[LineReading]):
         )
 
     def _fits_strip(self, rows: int, columns: int, dtype: np.dtype[Any]) -> bool:
-        wide = _LANES if self._has_candidates else _WIDE_BYTES // dtype.itemsize
-        return columns >= wide and (self.along == "columns" or rows >= _LANES)
+        if self._has_candidates:
+            # Along a row one profile is walked at a time, whatever the walk: its dark parts are passed by in vectors.
+            return self.along == "columns" and columns >= _LANES
+        return columns >= _WIDE_BYTES // dtype.itemsize and (self.along == "columns" or rows >= _LANES)
 
     def _items(self, device: Device, strip: bool, frames: int, samples: int) -> int:
         """Return how many items work on a frame: few wide ones, but enough to keep every core busy."""
@@ -276,7 +278,7 @@ class LineReadout(Operation[LineReading]):
     ) -> dict[str, Any]:
         code, width = _CODES[dtype.name]
         defines: dict[str, Any] = real_defines(device, real)
-        defines |= {"CODE": code, "CODE16": f"{code}16", "CODE_BITS": width}
+        defines |= {"CODE": code, "CODE_BITS": width} | {f"CODE{n}": f"{code}{n}" for n in (4, 8, 16)}
         defines |= {f"METHOD_{self.method.upper()}": None, f"CHOICE_{self.choice.upper()}": None}
         defines |= {"RADIUS": self.window, "REACH": self.window, "FIR_HALF": self.fir_length // 2}
         if self.method == "fir":

@@ -53,17 +53,22 @@ typedef struct {
 #define SET_OTHER(i, value)
 #endif
 
-// First and last cell whose centre lies in [low, high]; none where first > last.
-inline int first_cell(real low) { return (int)clamp(ceil(low), (real)0, (real)0x1000000); }
-inline int last_cell(real high, int cells) { return (int)clamp(floor(high), (real)-1, (real)(cells - 1)); }
+// First and last cell whose centre lies in [low, high]; none where first > last. (Casts, because the library's ceil,
+// floor and fmax cost PoCL more than all else here.)
+inline int first_cell(real low, int cells) {
+    const real kept = low < 0 ? 0 : low < cells ? low : cells;
+    const int cell = (int)kept;
+    return cell < kept ? cell + 1 : cell;
+}
+inline int last_cell(real high, int cells) { return high < 0 ? -1 : high < cells ? (int)high : cells - 1; }
 
 // What lies between two neighbouring good samples: the line through them, where they are joined.
 inline void fill_between(Sample before, Sample now, LINES_OUT, ulong out, constant uint *count, constant real *grid) {
     const real length = now.at - before.at, rise = now.height - before.height;
     if (fabs(length) > grid[GRID_MAX_GAP] || fabs(rise) > grid[GRID_MAX_STEP]) return;
     const uint found = (before.status | now.status) & STATUS_INFORMS;
-    const int last = last_cell(fmax(before.at, now.at), count[COUNT_CELLS]);
-    for (int cell = first_cell(fmin(before.at, now.at)); cell <= last; ++cell) {
+    const int cells = count[COUNT_CELLS], last = last_cell(length < 0 ? before.at : now.at, cells);
+    for (int cell = first_cell(length < 0 ? now.at : before.at, cells); cell <= last; ++cell) {
         const ulong i = out + (ulong)cell * count[COUNT_CELL_PITCH];
         const uint old = out_status[i];
         const real part = length == 0 ? 0 : (cell - before.at) / length;
@@ -78,8 +83,8 @@ inline void fill_between(Sample before, Sample now, LINES_OUT, ulong out, consta
 }
 
 inline void mark_folded(real from, real to, global uchar *restrict out_status, ulong out, constant uint *count) {
-    const int last = last_cell(fmax(from, to), count[COUNT_CELLS]);
-    for (int cell = first_cell(fmin(from, to)); cell <= last; ++cell)
+    const int cells = count[COUNT_CELLS], last = last_cell(from < to ? to : from, cells);
+    for (int cell = first_cell(from < to ? from : to, cells); cell <= last; ++cell)
         out_status[out + (ulong)cell * count[COUNT_CELL_PITCH]] |= STATUS_FOLDED;
 }
 
@@ -103,23 +108,19 @@ kernel void resample(LINES_IN, LINES_OUT, constant uint *count, constant real *g
 
     Sample before;
     int started = 0;
-    real furthest = 0, back = 0; // how far the line has come, and how far it has fallen back since
+    real furthest = 0, back = 0;  // how far the line has come, and how far it has fallen back since
     for (uint sample = 0; sample < count[COUNT_SAMPLES]; ++sample) {
         const ulong i = in + (ulong)sample * count[COUNT_SAMPLE_PITCH];
         const Sample now = {(along[i] - grid[GRID_ORIGIN]) * grid[GRID_PER_METRE], height[i], intensity[i], OTHER_OF(i),
                             given[i]};
         if ((now.status & ~STATUS_INFORMS) || not_finite(now.at) || not_finite(now.height)) continue;
         const real reached = sense * now.at;
-        if (!started) {
+        if (started) fill_between(before, now, OUT_ARRAYS, out, count, grid);
+        if (!started || reached > furthest) {
             furthest = back = reached;
-        } else {
-            fill_between(before, now, OUT_ARRAYS, out, count, grid);
-            if (reached > furthest) {
-                furthest = back = reached;
-            } else if (reached <= furthest - tolerance && reached <= back) {
-                mark_folded(sense * reached, sense * back, out_status, out, count);
-                back = reached;
-            }
+        } else if (reached <= furthest - tolerance && reached <= back) {
+            mark_folded(sense * reached, sense * back, out_status, out, count);
+            back = reached;
         }
         before = now;
         started = 1;

@@ -114,11 +114,12 @@ def _numpy_flags(points: list[Array], known: Array, given: Array, low: Array, hi
     bad = (status & 0xED) != 0
     for values in points:
         values[bad] = np.nan
-    return RangePoints(*points, status)
+    return RangePoints(points[0], points[1], points[2], status)
 
 
-def _numpy_regrid(x: Array, y: Array, z: Array, intensity: Array, grid: Grid) -> tuple[Array, Array]:
+def _numpy_regrid(frames: list[Array], grid: Grid) -> tuple[Array, Array]:
     """Interpolate along the samples, then along the profiles: no holes, no steps, no folds are looked for."""
+    x, y, z, intensity = frames
     columns, rows = grid.x, grid.y[::-1]
     lines = [[np.interp(columns, x[n], each[n]) for each in (y, z, intensity)] for n in range(len(x))]
     passed = np.array(lines)
@@ -149,9 +150,9 @@ def _assembly(
         direction = np.tan(operation.geometry.transport(SHAPE[0]))[:, None]
         profiles = [511.5 + 1700.0 * (direction + profiles[0] / 5000 + 0.1)]
     given = np.zeros(SHAPE, np.uint8)
-    frames = [each.astype(np.float32) for each in (*profiles, operation.geometry.transport(SHAPE[0]))]
+    frames: list[Array] = [each.astype(np.float32) for each in (*profiles, operation.geometry.transport(SHAPE[0]))]
     bound = operation.bind(device, SHAPE, np.float32)
-    for array, values in zip(bound.inputs, (*frames, given), strict=True):
+    for array, values in zip(bound.inputs, [*frames, given], strict=True):
         array.set(values)
     table = operation.packed(np.float32)
     out = [np.empty(SHAPE, np.float32) for _ in range(3)] + [np.empty(SHAPE, np.uint8)]
@@ -173,16 +174,16 @@ def _resampling(device: Device) -> Case:
     x, y = sample * 1e-4, profile * 1e-4
     z = 5e-3 * np.sin(80 * x) * np.cos(60 * y)
     x, y = x + 0.2 * z, y + 0.1 * z
-    frames = [each.astype(np.float32) for each in (x, y, z, np.ones(SHAPE))]
+    frames: list[Array] = [each.astype(np.float32) for each in (x, y, z, np.ones(SHAPE))]
     grid = Grid(left=0.002, top=0.098, cell_x=1e-4, cell_y=1e-4, columns=960, rows=960)
     operation = Regrid(grid=grid, max_gap=1e-3, max_step=1e-3)
     bound = operation.bind(device, SHAPE, np.float32)
-    for array, values in zip(bound.inputs, (*frames, np.zeros(SHAPE, np.uint8)), strict=True):
+    for array, values in zip(bound.inputs, [*frames, np.zeros(SHAPE, np.uint8)], strict=True):
         array.set(values)
     bound().wait()
-    exact = _numpy_regrid(*(each.astype(np.float64) for each in frames), grid)
+    exact = _numpy_regrid([each.astype(np.float64) for each in frames], grid)
     error = float(np.max(np.abs(bound.outputs.z.get() - exact[0])))
-    peers: dict[str, Callable[[], object]] = {"numpy": lambda: _numpy_regrid(*frames, grid)}
+    peers: dict[str, Callable[[], object]] = {"numpy": lambda: _numpy_regrid(frames, grid)}
     cells = grid.columns * grid.rows
     lines = SHAPE[0] * grid.columns
     traffic = (17 * SHAPE[0] * SHAPE[1] + 13 * lines, 13 * lines + 9 * cells)

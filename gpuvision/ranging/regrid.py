@@ -278,6 +278,11 @@ class _Lines(NamedTuple):
     across: Any
 
 
+def _alone(device: Device) -> tuple[int, ...] | None:
+    """Group size: a CPU runtime that walks lines side by side spills what each of them keeps."""
+    return (1,) if device.is_cpu else None
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Pass(Operation[R]):
     """One pass of a `Regrid`: lines of an array onto the cells of one direction."""
@@ -336,6 +341,7 @@ class _AlongSamples(_Pass[_Lines]):
                 self._numbers().astype(real),
             ),
             global_size=(profiles,),
+            local_size=_alone(device),
         )
 
 
@@ -365,4 +371,5 @@ class _AlongProfiles(_Pass[HeightMap]):
                 self._numbers().astype(real),
             ),
             global_size=(lines,),
+            local_size=_alone(device),
         )

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.ranging.line import LineReading, LineReadout
+from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.status import Status
 from tests.reference.line import AMBIGUOUS, DARK, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
+from tests.reference.triangulation import triangulate
 
 TOP = {"uint8": 180.0, "uint16": 40_000.0, "float32": 100.0}
 LEVEL = {"uint8": 20, "uint16": 4000, "float32": 8.5}
@@ -290,3 +295,58 @@ def test_bad_frames(device):
         LineReadout(threshold=2.5)(np.zeros((4, 4), np.uint8), device=device)
     with pytest.raises(ValueError, match="saturation"):
         LineReadout(saturation=300)(np.zeros((4, 4), np.uint8), device=device)
+
+
+SHEET = Triangulation(
+    homography=((1.1e-5, 2.0e-4, -0.1), (-2.2e-4, 1.0e-6, 0.06), (2.0e-4, 1.0e-5, 1.0)),
+    region=((0.0, 700.0), (0.0, 900.0)),
+)
+LENS = Lens(k1=4e-8, k2=1e-14, centre=(450.0, 350.0))
+
+
+@pytest.mark.parametrize(("along", "walk"), itertools.product(("columns", "rows"), WALKS))
+def test_triangulates_in_the_same_pass(device, rng, along, walk):
+    sheet = replace(SHEET, along=along, lens=LENS)
+    frames = line_frames(rng, "uint8", (2, 99, 130), along)
+    axes = SampleAxes(position_origin=300.0, sample_origin=400.0, sample_pitch=2.0)
+    for method in ("whole", "windowed"):
+        parameters = {"method": method, "along": along, "threshold": 20, "window": 6}
+        reading = LineReadout(walk=walk, triangulation=sheet, axes=axes, **parameters)(frames, device=device)
+        expected = read_lines(frames, **parameters)
+        samples = np.broadcast_to(400.0 + 2.0 * np.arange(reading.position.shape[1]), reading.position.shape)
+        g, h, status = triangulate(
+            expected["position"] + 300.0,
+            samples,
+            sheet.homography,
+            sheet.region,
+            lens=(LENS.k1, LENS.k2, LENS.centre),
+            along=along,
+        )
+        good = expected["status"] == 0
+        assert good.any()
+        assert not status[good].any()
+        np.testing.assert_array_equal(reading.status, expected["status"])
+        # 0.2 mm a pixel, of which single precision knows 4e-5 at 400 px.
+        np.testing.assert_allclose(reading.g[good], g[good], atol=2e-8)
+        np.testing.assert_allclose(reading.h[good], h[good], atol=2e-8)
+        lost = np.isnan(expected["position"])
+        assert np.isnan(reading.g[lost]).all()
+        assert np.isnan(reading.h[lost]).all()
+
+
+def test_triangulation_flags_its_own(device):
+    """Beyond the horizon: H and G are lost, the position is not."""
+    sheet = Triangulation(
+        homography=((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (-1.0 / 30.0, 0.0, 1.0)), region=((0.0, 40.0), (0.0, 64.0))
+    )
+    frame = np.zeros((60, 64), np.uint8)
+    frame[10, :32] = frame[45, 32:] = 200
+    reading = LineReadout(threshold=20, window=3, triangulation=sheet)(frame, device=device)
+    np.testing.assert_array_equal(reading.status, np.repeat([0, Status.HORIZON], 32))
+    np.testing.assert_array_equal(reading.position, np.repeat([10.0, 45.0], 32))
+    np.testing.assert_array_equal(np.isnan(reading.h), np.repeat([False, True], 32))
+
+
+def test_triangulation_of_another_axis():
+    with pytest.raises(ValueError, match="along"):
+        LineReadout(along="rows", triangulation=SHEET)

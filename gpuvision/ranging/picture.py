@@ -37,7 +37,7 @@ _PICTURE_PX = 1100  # the map's longer side
 _INK, _PAPER, _FAINT = "#22262b", "#ffffff", "#6b7280"
 # Light from the upper left, 50 degrees above the plane, and some from everywhere.
 _LIGHT = np.array([-0.455, 0.455, 0.766])
-_AMBIENT, _FLAT, _STEEPEST = 0.3, 0.95, 4.0
+_AMBIENT, _FLAT, _STEEPEST, _USUAL_SLOPE = 0.3, 0.95, 4.0, 0.33
 _GREY = 0.78  # of a flat surface in the grey relief
 # Of several reasons the first one is shown: the rarer and graver before the common.
 _REASONS = (
@@ -76,7 +76,17 @@ def round_length(length: float) -> float:
     return max(each * power for each in (1.0, 2.0, 5.0) if each * power <= length * (1 + 1e-9))
 
 
-def relief(z: Array, cell_x: float, cell_y: float, blur: float = 1.5) -> Array:
+def steepness(z: Array, cell_x: float, cell_y: float) -> float:
+    """Return by how much slopes have to be exaggerated for a relief to show them: 1, 2, 5, 10 or 20.
+
+    Nine tenths of the slopes then stay below a third, whatever the edges do.
+    """
+    slopes = np.hypot(_slope(z, 1) / cell_x, _slope(z, 0) / cell_y)[np.isfinite(z)]
+    usual = float(np.percentile(slopes, 90)) if slopes.size else 0.0
+    return round_length(min(max(_USUAL_SLOPE / max(usual, 1e-9), 1.0), 20.0))
+
+
+def relief(z: Array, cell_x: float, cell_y: float, *, exaggeration: float = 1.0, blur: float = 1.5) -> Array:
     """Light that a matt surface throws back, lit from the upper left; 0.95 where it is flat.
 
     Parameters
@@ -85,6 +95,8 @@ def relief(z: Array, cell_x: float, cell_y: float, blur: float = 1.5) -> Array:
         Heights [m], rows downwards; NaN in holes.
     cell_x, cell_y
         Distance between cells [m].
+    exaggeration
+        Of the heights.
     blur
         Standard deviation of the smoothing of slopes, in cells: a relief shows noise first.
 
@@ -94,7 +106,8 @@ def relief(z: Array, cell_x: float, cell_y: float, blur: float = 1.5) -> Array:
         As `z`; NaN in holes.
     """
     known = np.isfinite(z)
-    slopes = [-_blurred(_slope(z, 1) / cell_x, known, blur), _blurred(_slope(z, 0) / cell_y, known, blur)]
+    steep = exaggeration * _slope(z, 1) / cell_x, exaggeration * _slope(z, 0) / cell_y
+    slopes = [-_blurred(steep[0], known, blur), _blurred(steep[1], known, blur)]
     normal = np.stack([*slopes, np.ones(z.shape)])
     # What lies flat is nearly white, so that slopes darken and lighten the heights' colours but keep them.
     lit = np.tensordot(_LIGHT / _LIGHT[2], normal, 1) / np.linalg.norm(normal, axis=0)
@@ -176,9 +189,12 @@ def draw_height_map(
     if z.shape != grid.shape:
         raise ValueError(f"heights have shape {z.shape}, the grid has {grid.shape}; expected the same")
     span = _span_of(z) if span is None else span
-    picture, legend = paint(z, status, relief(z, grid.cell_x, grid.cell_y), span, style)
+    steeper = steepness(z, grid.cell_x, grid.cell_y)
+    shade = relief(z, grid.cell_x, grid.cell_y, exaggeration=steeper)
+    picture, legend = paint(z, status, shade, span, style)
+    told = _told(z, _cells(grid)) + (f"  ·  relief {steeper:.0f} ×" if steeper > 1 else "")
     width, height = grid.columns * grid.cell_x, grid.rows * grid.cell_y
-    sheet = _Sheet(picture, width / height, legend, title, _told(z, _cells(grid)), span if style == "colour" else None)
+    sheet = _Sheet(picture, width / height, legend, title, told, span if style == "colour" else None)
     sheet.length_bar(width)
     sheet.write(path)
 

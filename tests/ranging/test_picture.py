@@ -53,6 +53,21 @@ def test_relief_is_a_slope_not_a_number_of_cells():
     np.testing.assert_allclose(picture.relief(x, 1.0, 1.0), picture.relief(0.01 * x, 0.01, 0.01), rtol=1e-12)
 
 
+@pytest.mark.parametrize(("slope", "times"), [(1.0, 1), (0.1, 2), (0.03, 10), (1e-3, 20), (0.0, 20)])
+def test_gentle_slopes_are_exaggerated(slope, times):
+    z = slope * 0.01 * np.tile(np.arange(20.0), (15, 1))
+    z[3, 4:9] = np.nan
+    z[10, 10] += 5.0  # an edge is no slope to go by
+    assert picture.steepness(z, 0.01, 0.01) == times
+
+
+def test_exaggeration_is_of_the_heights():
+    z = np.cos(np.arange(20.0) / 3) * np.ones((15, 1))
+    np.testing.assert_allclose(
+        picture.relief(z, 1.0, 1.0, exaggeration=5.0), picture.relief(5 * z, 1.0, 1.0), rtol=1e-12
+    )
+
+
 def test_relief_stops_at_holes():
     z = np.zeros((20, 20))
     z[5:9, 5:9] = np.nan

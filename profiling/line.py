@@ -5,12 +5,14 @@ Frames of 512 rows and 1024 columns, 8 bit, of a line that wanders over half the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, host_view
@@ -19,6 +21,7 @@ from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.triangulation import Triangulation
 
 ROWS, COLUMNS, THRESHOLD, SATURATION, WINDOW = 512, 1024, 25, 255, 8
+GAIN = 0.1  # of the likelihood's noise
 OUTPUTS = ("position", "total", "status")
 _STRIP = 256
 _DISTINCT = 8
@@ -120,6 +123,64 @@ def _numpy_windowed(frames: Frames) -> tuple[NDArray[Any], ...]:
         return at + np.einsum("fkc,k->fc", light, around.astype(np.float32)) / total, total, total == 0
 
 
+def _windows(frames: Frames, reach: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the peaks' rows, and the samples about them as float64 of shape (frames, 2 reach + 1, columns)."""
+    at = frames.argmax(axis=1)
+    index = np.clip(at[:, None, :] + np.arange(-reach, reach + 1)[None, :, None], 0, frames.shape[1] - 1)
+    return at, np.take_along_axis(frames, index, axis=1).astype(np.float64)
+
+
+def _numpy_gauss3(frames: Frames) -> NDArray[Any]:
+    at, near = _windows(frames, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b, c = np.moveaxis(np.log(np.maximum(near - THRESHOLD, 0.0)), 1, 0)
+        return at + 0.5 * (a - c) / (a - 2.0 * b + c)
+
+
+def _numpy_fir(frames: Frames) -> NDArray[Any]:
+    at, near = _windows(frames, WINDOW + 2)
+    balance = near[:, :-4] + near[:, 1:-3] - near[:, 3:-1] - near[:, 4:]
+    before, after = balance[:, :-1], balance[:, 1:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        place = np.arange(-WINDOW, WINDOW)[None, :, None] + before / (before - after)
+    place = np.where((before < 0.0) & (after >= 0.0), place, np.inf)
+    nearest = np.abs(place).argmin(axis=1, keepdims=True)
+    return at + np.take_along_axis(place, nearest, axis=1)[:, 0]
+
+
+def _numpy_ml(frames: Frames, steps: int = 12) -> NDArray[Any]:
+    """Fisher scoring for a pixel-integrated Gaussian on a background, all columns at once."""
+    at, near = _windows(frames, WINDOW)
+    y = np.moveaxis(near, 1, 2)
+    edge = np.arange(2 * WINDOW + 2) - WINDOW - 0.5
+    background = (y[..., 0] + y[..., -1]) / 2.0
+    amplitude = np.maximum(y.max(axis=-1) - background, 1.0)
+    over = y - background[..., None]
+    over = np.where(over > amplitude[..., None] / 4.0, over, 0.0)
+    place = (over * np.arange(-WINDOW, WINDOW + 1)).sum(axis=-1) / over.sum(axis=-1)
+    sigma = np.clip(over.sum(axis=-1) / (2.266 * amplitude), 0.3, WINDOW)
+    for _ in range(steps):
+        z = (edge - place[..., None]) / sigma[..., None]
+        slope = np.exp(-0.5 * z * z)
+        light = sigma[..., None] * math.sqrt(2.0 * math.pi) * np.diff(special.ndtr(z), axis=-1)
+        by_sigma = light - sigma[..., None] * np.diff(z * slope, axis=-1)
+        design = np.stack([-np.diff(slope, axis=-1), by_sigma, light, np.ones_like(light)], axis=-1)
+        model = background[..., None] + amplitude[..., None] * light
+        weight = np.where(y < SATURATION, amplitude[..., None] ** 2 / (1.0 + GAIN * np.maximum(model, 0.0)), 0.0)
+        weighted = design * weight[..., None]
+        normal = np.swapaxes(weighted, -1, -2) @ design + 1e-9 * np.eye(4)
+        right = (weighted * ((y - model) / amplitude[..., None])[..., None]).sum(axis=-2)
+        step = np.linalg.solve(normal, right[..., None])[..., 0]
+        background = background + amplitude * step[..., 3]
+        amplitude = amplitude * np.clip(1.0 + step[..., 2], 0.5, 2.0)
+        place = place + np.clip(step[..., 0], -sigma, sigma)
+        sigma = np.clip(sigma * np.exp(np.clip(step[..., 1], -0.5, 0.5)), 0.15, 2.0 * WINDOW)
+    return at + place
+
+
+_NUMPY_FITS = {"gauss3": _numpy_gauss3, "fir": _numpy_fir, "ml": _numpy_ml}
+
+
 def line_frames(count: int) -> Frames:
     """Return frames with a Gaussian line of 2 px and 3 levels of noise, a few distinct ones in turn."""
     rng = np.random.default_rng(1)
@@ -133,12 +194,12 @@ def line_frames(count: int) -> Frames:
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield both centres of gravity on 1, 16 and 64 frames, the fits and the fused readouts on 16."""
+    """Yield both centres of gravity on 1, 16 and 64 frames, the fits, along rows, and fused with the triangulation."""
     for method in ("whole", "windowed"):
         for count in (1, 16, 64):
             yield _case(device, LineReadout(method=method, **_SETTINGS), count, f"{method}/{count}")
     for method in ("gauss3", "fir", "ml"):
-        yield _case(device, LineReadout(method=method, gain=0.1, **_SETTINGS), 16, f"{method}/16")
+        yield _case(device, LineReadout(method=method, gain=GAIN, **_SETTINGS), 16, f"{method}/16")
     yield _case(device, LineReadout(method="windowed", along="rows", **_SETTINGS), 16, "windowed-rows/16")
     for method in ("whole", "windowed"):
         for count in (1, 16):
@@ -153,17 +214,26 @@ def _case(device: Device, readout: LineReadout, count: int, name: str) -> Case:
     if readout.along == "rows":
         frames = np.ascontiguousarray(np.swapaxes(frames, 1, 2))
     bound, frames = _bound(device, readout, frames)
-    peers: dict[str, Callable[[], object]] = {}
     across = np.swapaxes(frames, 1, 2) if readout.along == "rows" else frames
-    if readout.along == "columns":
-        results = tuple(np.empty((count, COLUMNS), each) for each in (np.float32, np.uint32, np.uint8))
-        if readout.method == "whole":
-            peers["numba"] = lambda: _numba_whole(frames, np.uint8(THRESHOLD), SATURATION, *results)
-        else:
-            peers["numba"] = lambda: _numba_windowed(frames, np.int32(THRESHOLD), SATURATION, WINDOW, *results)
-    peers["numpy"] = lambda: (_numpy_whole if readout.method == "whole" else _numpy_windowed)(across)
+    peers = _peers(readout, frames, across)
     error = _error(bound.outputs, across, readout)
     return Case("line", name, lambda: bound().wait(), peers, error, (frames.nbytes, 9 * count * COLUMNS))
+
+
+def _peers(readout: LineReadout, frames: Frames, across: Frames) -> dict[str, Callable[[], object]]:
+    """Return who does the same; across has the profiles in columns."""
+    if readout.method in _NUMPY_FITS:
+        return {"numpy": lambda: _NUMPY_FITS[readout.method](across)}
+    whole = readout.method == "whole"
+    peers: dict[str, Callable[[], object]] = {"numpy": lambda: (_numpy_whole if whole else _numpy_windowed)(across)}
+    results = tuple(np.empty((len(frames), COLUMNS), each) for each in (np.float32, np.uint32, np.uint8))
+    if readout.along == "rows":
+        return peers
+    if whole:
+        peers["numba"] = lambda: _numba_whole(frames, np.uint8(THRESHOLD), SATURATION, *results)
+    else:
+        peers["numba"] = lambda: _numba_windowed(frames, np.int32(THRESHOLD), SATURATION, WINDOW, *results)
+    return peers
 
 
 def _fused_case(device: Device, method: Any, count: int) -> Case:
@@ -206,12 +276,15 @@ def _bound(device: Device, readout: LineReadout, frames: Frames) -> tuple[Any, F
 
 
 def _error(reading: Any, frames: Frames, readout: LineReadout) -> float:
-    """Return the largest deviation from float64 of the same definition; of a fit, from the windowed centre."""
-    position, status = reading.position.get(), reading.status.get()
-    light = np.maximum(frames[:_DISTINCT].astype(np.float64) - THRESHOLD, 0.0)
-    row = np.arange(frames.shape[1])[None, :, None]
-    if readout.method != "whole":
-        light = light * (np.abs(row - frames[:_DISTINCT].argmax(axis=1)[:, None, :]) <= WINDOW)
-    truth = (light * row).sum(axis=1) / light.sum(axis=1)
-    good = status[:_DISTINCT] == 0
-    return float(np.max(np.abs(position[:_DISTINCT] - truth)[good]))
+    """Return the largest deviation from float64 of the same definition."""
+    position, status = (each.get()[:_DISTINCT] for each in (reading.position, reading.status))
+    frames = frames[:_DISTINCT]
+    if readout.method in _NUMPY_FITS:
+        truth = _NUMPY_FITS[readout.method](frames)
+    else:
+        light = np.maximum(frames.astype(np.float64) - THRESHOLD, 0.0)
+        row = np.arange(frames.shape[1])[None, :, None]
+        if readout.method == "windowed":
+            light = light * (np.abs(row - frames.argmax(axis=1)[:, None, :]) <= WINDOW)
+        truth = (light * row).sum(axis=1) / light.sum(axis=1)
+    return float(np.max(np.abs(position - truth)[status == 0]))

@@ -304,7 +304,7 @@ SHEET = Triangulation(
 LENS = Lens(k1=4e-8, k2=1e-14, centre=(450.0, 350.0))
 
 
-@pytest.mark.parametrize(("along", "walk"), itertools.product(("columns", "rows"), WALKS))
+@pytest.mark.parametrize(("along", "walk"), list(itertools.product(("columns", "rows"), WALKS)))
 def test_triangulates_in_the_same_pass(device, rng, along, walk):
     sheet = replace(SHEET, along=along, lens=LENS)
     frames = line_frames(rng, "uint8", (2, 99, 130), along)

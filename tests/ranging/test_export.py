@@ -223,7 +223,7 @@ def test_wrong_arrays_are_refused(tmp_path, z):
     with pytest.raises(ValueError, match="y has shape \\(7, 5\\)"):
         export.write_ply(tmp_path / "a", z, z.T, z)
     with pytest.raises(TypeError, match="intensity is int64"):
-        export.write_ply(tmp_path / "a", z, z, z, z.astype(np.int64))
+        export.write_ply(tmp_path / "a", z, z, z, np.zeros(z.shape, np.int64))
     (tmp_path / "plain.png").write_bytes(cv2.imencode(".png", np.zeros((2, 2), np.uint16))[1].tobytes())
     with pytest.raises(ValueError, match="no 16-bit PNG with Offset and Scale"):
         export.read_png16(tmp_path / "plain.png")

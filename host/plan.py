@@ -78,7 +78,7 @@ def plan(
     rate: float | None = None,
     latency: float | None = None,
     margin: float = 1.25,
-    stall: float = 0.02,
+    stall: float = 0.1,
     device: Device | None = None,
     zero_copy: bool | None = None,
     batches: Sequence[int] = BATCHES,

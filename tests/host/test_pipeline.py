@@ -597,7 +597,7 @@ def test_the_plan_takes_the_smallest_batch_that_keeps_up() -> None:
     assert chosen.batch == 4  # 1240 frames/s are not 1.25 times the rate
     assert [trial.batch for trial in chosen.trials] == [1, 2, 4]
     assert chosen.trials[-1].latency == pytest.approx(3 / 1000.0 + 1.5e-3)
-    assert chosen.ring == 7  # 20 frames of a stall of 20 ms in batches of 4, the consumer's and the source's
+    assert chosen.ring == 27  # 100 frames of a stall of 0.1 s in batches of 4, the consumer's and the source's
     assert plan(frames_source(), READOUT, rate=100.0, measure=measured.__getitem__).batch == 1
     assert json.loads(json.dumps(chosen.to_dict()))["trials"][2]["service_rate"] == 3000.0
 

@@ -10,6 +10,9 @@ The family is written for the direction sheet -> sensor, in which the calibratio
 axis is not
   square to the measured one; H still follows from u alone.
 - H8: all elements. Any pinhole sensor and any sheet; with a sensor rolled about its axis H depends on v too.
+
+F. de Jong lists C1-C4 and D1-D6 among the symbols; their equations are derived here: C4 is the one map of four
+constants that a symmetric setup has, D6 the smallest extension of it by offsets that keeps H independent of v.
 """
 
 from __future__ import annotations

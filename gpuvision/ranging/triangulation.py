@@ -236,7 +236,8 @@ class Triangulation(Operation[SheetPoints]):
             outputs={**outputs, "sigma_g": spread, "sigma_h": spread},
             arguments=(np.uint64(points), self.packed(real), real.type(sigma[0]), real.type(sigma[1])),
             global_size=(-(-points // _STRIP),) if strip else (-(-points // group) * group,),
-            local_size=None if strip else (group,),
+            # Left to itself PoCL may put all strips into one group, and so on one core.
+            local_size=(1,) if strip else (group,),
         )
 
     # ---- on the host: simulators, planners, error budgets --------------------------------------------------

@@ -150,10 +150,11 @@ inline Place place_apart(const Profiles *profiles, Peak *peak, constant real *p)
      STRIDE, LANE_STRIDE, LENGTH, threshold, saturation, minimum}
 
 #if defined(CANDIDATES) || (!defined(STRIP) && !defined(METHOD_WHOLE))
-// LANES profiles, by a walk along them.
+// LANES profiles, by a walk along them. Items beyond the last profile fill up a work-group.
 kernel void line_readout(ARGUMENTS) {
     const Outputs to = OUTPUTS;
     const int frame = get_global_id(1), sample = min((int)get_global_id(0) * LANES, SAMPLES - LANES);
+    if ((int)get_global_id(0) * LANES >= SAMPLES) return;
     const Profiles profiles = PROFILES_FROM(sample);
     const ulong first = (ulong)frame * SAMPLES + sample;
 #ifdef CANDIDATES
@@ -174,6 +175,7 @@ kernel void line_readout(ARGUMENTS) {
 kernel void line_readout(ARGUMENTS) {
     const Outputs to = OUTPUTS;
     const int frame = get_global_id(1), sample = get_global_id(0);
+    if (sample >= SAMPLES) return;
     const Profiles profiles = PROFILES_FROM(sample);
     const Gravity gravity = whole_gravity(&profiles);
     finish_whole(&profiles, &gravity, p, &to, (ulong)frame * SAMPLES + sample, sample);

@@ -185,8 +185,9 @@ inline void find_in_row(global const CODE *row, int length, int *at, CODE *level
         peak.lost += x * 0;
 #endif
     }
-    CODE highest = DARKEST;
-    for (int i = 0; i < QUARTERS; i++) highest = max(highest, highest_level(((const codes *)&peak.level)[i]));
+    codes levels = ((const codes *)&peak.level)[0];
+    for (int i = 1; i < QUARTERS; i++) levels = higher_of(((const codes *)&peak.level)[i], levels);
+    const CODE highest = highest_level(levels);
     *at = locate_in_row(row, highest, &peak);
     *level = highest;
     *lost = 0;

@@ -25,6 +25,7 @@ LONGEST_PROFILE = 32767  # samples: indices of narrow lanes are 16 bits
 WIDEST_WINDOW = 180  # samples either side: moments of 16-bit samples in 32 bits
 _CODES = {"uint8": ("uchar", 8), "uint16": ("ushort", 16), "float32": ("float", 32)}
 _LANES = 16
+_GROUP = 64  # items of a work-group
 _STRIP = 1024  # columns of a strip at most, MAX_STRIP in line_strip.h
 _WIDE_BYTES = 64  # of neighbouring samples that a strip works on at once
 
@@ -228,7 +229,7 @@ class LineReadout(Operation[LineReading]):
             inputs=inputs,
             outputs={name: ((*batch, samples), types[name]) if name in chosen else None for name in types},
             global_size=(self._items(device, strip, frames, samples), frames),
-            local_size=(1, 1) if strip else None,
+            local_size=(1, 1) if strip else (_GROUP, 1),
             defines=self._defines(device, real, dtype, strip, length),
             arguments=[
                 np.int32(rows),
@@ -248,7 +249,7 @@ class LineReadout(Operation[LineReading]):
     def _items(self, device: Device, strip: bool, frames: int, samples: int) -> int:
         """Return how many items work on a frame: few wide ones, but enough to keep every core busy."""
         if not strip:
-            return samples
+            return math.ceil(samples / _GROUP) * _GROUP
         if self.along == "rows" or self._has_candidates:
             return math.ceil(samples / _LANES)
         units = int(device.handle.max_compute_units)

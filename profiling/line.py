@@ -17,7 +17,7 @@ from scipy import special
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, host_view
 from gpuvision.profiling.harness import Case
-from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.line import LineReadout, Method
 from gpuvision.ranging.triangulation import Triangulation
 
 ROWS, COLUMNS, THRESHOLD, SATURATION, WINDOW = 512, 1024, 25, 255, 8
@@ -28,7 +28,7 @@ _DISTINCT = 8
 Frames = NDArray[np.uint8]
 
 
-@numba.njit  # type: ignore[untyped-decorator]
+@numba.njit(error_model="numpy")
 def _add_row(line, totals, moments, tops, threshold):  # type: ignore[no-untyped-def]
     """Sum a strip's row; the moment is the sum of the running totals, without a multiplication."""
     for c in range(line.size):
@@ -39,7 +39,7 @@ def _add_row(line, totals, moments, tops, threshold):  # type: ignore[no-untyped
         tops[c] = max(tops[c], x)
 
 
-@numba.njit(parallel=True)  # type: ignore[untyped-decorator]
+@numba.njit(parallel=True, error_model="numpy")
 def _numba_whole(frames, threshold, saturation, position, total, status):  # type: ignore[no-untyped-def]
     count, rows, columns = frames.shape
     strips = (columns + _STRIP - 1) // _STRIP
@@ -60,7 +60,7 @@ def _numba_whole(frames, threshold, saturation, position, total, status):  # typ
             status[f, first + c] = np.uint8(dark) | (np.uint8(tops[c] >= saturation) << np.uint8(1))
 
 
-@numba.njit  # type: ignore[untyped-decorator]
+@numba.njit(error_model="numpy")
 def _raise_tops(line, row, tops, at):  # type: ignore[no-untyped-def]
     for c in range(line.size):
         x = line[c]
@@ -68,7 +68,7 @@ def _raise_tops(line, row, tops, at):  # type: ignore[no-untyped-def]
         tops[c] = max(tops[c], x)
 
 
-@numba.njit  # type: ignore[untyped-decorator]
+@numba.njit(error_model="numpy")
 def _add_window(line, row, at, totals, moments, threshold, window):  # type: ignore[no-untyped-def]
     for c in range(line.size):
         d = row - np.int32(at[c])
@@ -78,7 +78,7 @@ def _add_window(line, row, at, totals, moments, threshold, window):  # type: ign
         moments[c] += v * d
 
 
-@numba.njit(parallel=True)  # type: ignore[untyped-decorator]
+@numba.njit(parallel=True, error_model="numpy")
 def _numba_windowed(frames, threshold, saturation, window, position, total, status):  # type: ignore[no-untyped-def]
     count, rows, columns = frames.shape
     strips = (columns + _STRIP - 1) // _STRIP
@@ -116,8 +116,8 @@ def _numpy_windowed(frames: Frames) -> tuple[NDArray[Any], ...]:
     at = frames.argmax(axis=1)
     around = np.arange(-WINDOW, WINDOW + 1)
     index = np.clip(at[:, None, :] + around[None, :, None], 0, frames.shape[1] - 1)
-    light = np.take_along_axis(frames, index, axis=1)
-    light = np.maximum(light, THRESHOLD).astype(np.float32) - THRESHOLD
+    near = np.take_along_axis(frames, index, axis=1)
+    light = np.maximum(near, THRESHOLD).astype(np.float32) - np.float32(THRESHOLD)
     total = light.sum(axis=1)
     with np.errstate(invalid="ignore"):
         return at + np.einsum("fkc,k->fc", light, around.astype(np.float32)) / total, total, total == 0
@@ -130,14 +130,14 @@ def _windows(frames: Frames, reach: int) -> tuple[NDArray[Any], NDArray[Any]]:
     return at, np.take_along_axis(frames, index, axis=1).astype(np.float64)
 
 
-def _numpy_gauss3(frames: Frames) -> NDArray[Any]:
+def _numpy_gauss3(frames: Frames) -> Any:
     at, near = _windows(frames, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b, c = np.moveaxis(np.log(np.maximum(near - THRESHOLD, 0.0)), 1, 0)
         return at + 0.5 * (a - c) / (a - 2.0 * b + c)
 
 
-def _numpy_fir(frames: Frames) -> NDArray[Any]:
+def _numpy_fir(frames: Frames) -> Any:
     at, near = _windows(frames, WINDOW + 2)
     balance = near[:, :-4] + near[:, 1:-3] - near[:, 3:-1] - near[:, 4:]
     before, after = balance[:, :-1], balance[:, 1:]
@@ -148,7 +148,7 @@ def _numpy_fir(frames: Frames) -> NDArray[Any]:
     return at + np.take_along_axis(place, nearest, axis=1)[:, 0]
 
 
-def _numpy_ml(frames: Frames, steps: int = 12) -> NDArray[Any]:
+def _numpy_ml(frames: Frames, steps: int = 12) -> Any:
     """Fisher scoring for a pixel-integrated Gaussian on a background, all columns at once."""
     at, near = _windows(frames, WINDOW)
     y = np.moveaxis(near, 1, 2)
@@ -195,13 +195,15 @@ def line_frames(count: int) -> Frames:
 
 def cases(device: Device) -> Iterator[Case]:
     """Yield both centres of gravity on 1, 16 and 64 frames, the fits, along rows, and fused with the triangulation."""
-    for method in ("whole", "windowed"):
+    centres: tuple[Method, ...] = ("whole", "windowed")
+    fits: tuple[Method, ...] = ("gauss3", "fir", "ml")
+    for method in centres:
         for count in (1, 16, 64):
             yield _case(device, LineReadout(method=method, **_SETTINGS), count, f"{method}/{count}")
-    for method in ("gauss3", "fir", "ml"):
+    for method in fits:
         yield _case(device, LineReadout(method=method, gain=GAIN, **_SETTINGS), 16, f"{method}/16")
     yield _case(device, LineReadout(method="windowed", along="rows", **_SETTINGS), 16, "windowed-rows/16")
-    for method in ("whole", "windowed"):
+    for method in centres:
         for count in (1, 16):
             yield _fused_case(device, method, count)
 
@@ -236,7 +238,7 @@ def _peers(readout: LineReadout, frames: Frames, across: Frames) -> dict[str, Ca
     return peers
 
 
-def _fused_case(device: Device, method: Any, count: int) -> Case:
+def _fused_case(device: Device, method: Method, count: int) -> Case:
     """With coordinates undistorted and triangulated in the same pass; the peer is our readout alone."""
     sheet = Triangulation(
         homography=((1.1e-5, 2.0e-4, -0.1), (-2.2e-4, 1.0e-6, 0.06), (2.0e-4, 1.0e-5, 1.0)),

@@ -10,13 +10,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from canary import Guarded
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
-from gpuvision.ranging.line import LineReading, LineReadout
+from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.status import Status
-from tests.reference.line import AMBIGUOUS, DARK, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
-from tests.reference.triangulation import triangulate
+from reference.line import AMBIGUOUS, DARK, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
+from reference.triangulation import triangulate
 
 TOP = {"uint8": 180.0, "uint16": 40_000.0, "float32": 100.0}
 LEVEL = {"uint8": 20, "uint16": 4000, "float32": 8.5}
@@ -142,18 +143,12 @@ def test_any_shape(rows, columns, frames, seed):
 @pytest.mark.parametrize("along", ["columns", "rows"])
 def test_writes_nothing_else(device, rng, method, walk, along):
     shape = (2, 71, 83)
-    samples = 83 if along == "columns" else 71
     frames = line_frames(rng, "uint8", shape, along)
-    guarded = {
-        name: np.full(2 * samples + 64, 77, np.uint8 if name == "status" else np.float32)
-        for name in LineReading._fields[:5]
-    }
-    out = LineReading(**{name: array[32:-32].reshape(2, samples) for name, array in guarded.items()})
     readout = LineReadout(method=method, walk=walk, along=along, threshold=20, window=6)
-    assert readout(frames, device=device, out=out) is out
-    for name, array in guarded.items():
-        assert set(array[:32]) == set(array[-32:]) == {77}, name
-    assert_same(out, read_lines(frames, method=method, along=along, threshold=20, window=6), slack=4.0)
+    guarded = Guarded(readout(frames, device=device))
+    assert readout(frames, device=device, out=guarded.out) is guarded.out
+    guarded.assert_intact()
+    assert_same(guarded.out, read_lines(frames, method=method, along=along, threshold=20, window=6), slack=4.0)
 
 
 def test_outputs(device, rng):

@@ -55,7 +55,7 @@ make_environment() {
 
 install() {
   say "pip install $1"
-  .venv/bin/python -m pip --quiet --disable-pip-version-check --no-input install --editable "$1"
+  .venv/bin/python -m pip -qq --disable-pip-version-check --no-input install --editable "$1"
 }
 
 device_works() { .venv/bin/gpuvision devices --probe >/dev/null 2>&1; }
@@ -75,6 +75,6 @@ case "${1:-}" in
     install .
     ensure_device
     ;;
-  tests) install ".[test,cpu]" ;; # both CPU runtimes are tested where both can run
+  tests) install ".[test,cpu,profile]" ;; # both CPU runtimes are tested where both can run; benchmarks too
   *) fail "expected no argument or 'tests', got '$1'" ;;
 esac

@@ -10,7 +10,10 @@ import sys
 
 import typer
 
+from gpuvision.commands.demo import demo
 from gpuvision.commands.devices import devices
+from gpuvision.commands.profile import profile
+from gpuvision.commands.scan import scan
 from gpuvision.host.errors import GpuVisionError
 
 TRACEBACK = "GPUVISION_TRACEBACK"
@@ -24,12 +27,8 @@ app = typer.Typer(
 )
 
 
-@app.callback()
-def _commands() -> None:
-    """Keep ``gpuvision devices`` a command of its own while it is the only one."""
-
-
-app.command()(devices)
+for command in (scan, demo, devices, profile):
+    app.command()(command)
 
 
 def one_line(error: Exception) -> str:

@@ -1,0 +1,96 @@
+"""``gpuvision scan``: a recording becomes a range image, pictures and a report."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Arithmetic(StrEnum):
+    """What ``--precision`` takes."""
+
+    single = "single"
+    double = "double"
+
+
+class NoRoom(StrEnum):
+    """What ``--policy`` takes."""
+
+    block = "block"
+    drop_oldest = "drop_oldest"
+    stop = "raise"
+
+
+def scan(
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            metavar="INPUT",
+            help="Of a camera: a video, a TIFF stack, a folder of images, an NPY array (frames, rows, columns). "
+            "Of a PSD: an NPY array (frames, strips, 2).",
+        ),
+    ],
+    sensor: Annotated[
+        str, typer.Option(help="The sensor's TOML file, or one that comes along: camera_line, corner_scene, psd_line.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the range image, the pictures and report.json.")],
+    device: Annotated[str | None, typer.Option(help="Label of an OpenCL device, see `gpuvision devices`.")] = None,
+    precision: Annotated[
+        Arithmetic | None, typer.Option(help="Of the arithmetic; otherwise as the recording has it.")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Replay at so many frames per second, as a sensor would send them.")
+    ] = None,
+    policy: Annotated[
+        NoRoom | None,
+        typer.Option(
+            help="Where no room is left for a frame: it waits; the oldest is given up (so with --rate); stop."
+        ),
+    ] = None,
+    trace: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Timeline for chrome://tracing or ui.perfetto.dev.")
+    ] = None,
+) -> None:
+    """Scan a recording: range image, pictures and a report in DIR.
+
+    Nothing is written before all of the recording was understood.
+    """
+    from gpuvision.host import Device
+    from gpuvision.scan import check_folder
+    from gpuvision.scan import scan as run
+    from gpuvision.sensor import Sensor
+
+    described = Sensor.load(sensor)
+    check_folder(out)
+    chosen = None if device is None else Device.named(device)
+    with progress_bar(f"scanning {recording.name}") as progress:
+        done = run(
+            recording,
+            described,
+            device=chosen,
+            precision=None if precision is None else precision.value,
+            rate=rate,
+            policy=None if policy is None else policy.value,
+            trace=trace,
+            progress=progress,
+        )
+    done.write(out)
+    typer.echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}")
+
+
+@contextlib.contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[int, int | None], object]]:
+    """Show progress on stderr where that is a terminal; give what takes (frames done, of how many)."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, of: bar.update(task, completed=done, total=of)

@@ -7,7 +7,7 @@
 
 #include "line_profiles.h"
 
-#define STEPS 16  // samples of a profile that are summed in narrow numbers before they are widened
+#define STEPS 20  // samples of a profile summed before they are widened: up to 22 bytes, moment included, fit 16 bits
 
 typedef struct {
     reals position, total, lit;  // lit counts the samples over the threshold
@@ -291,7 +291,7 @@ inline void add_steps(WideSums *sums, global const CODE *at, int stride, int ste
     const wides limit = threshold;
     wides peak = sums->peak;
     if (steps == STEPS) {
-        ADD_FOUR_STEPS ADD_FOUR_STEPS ADD_FOUR_STEPS ADD_FOUR_STEPS
+        ADD_FOUR_STEPS ADD_FOUR_STEPS ADD_FOUR_STEPS ADD_FOUR_STEPS ADD_FOUR_STEPS
     } else {
         for (int k = 0; k < steps; k++) ADD_STEP
     }

@@ -15,7 +15,8 @@ from typing import Any
 
 import pyopencl as cl
 
-from gpuvision.host.runtime import cache_folder, expose_installed_runtime, provide_cache, write_whole
+from gpuvision.host.files import write_whole
+from gpuvision.host.runtime import cache_folder, expose_installed_runtime, provide_cache
 
 INSTALL_HINT = (
     "install one: `apt-get install pocl-opencl-icd` (as root), or `pip install 'gpuvision[cpu]'` "

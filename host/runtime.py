@@ -20,6 +20,8 @@ from pathlib import Path
 
 import platformdirs
 
+from gpuvision.host.files import write_whole
+
 SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
 _VARIABLE = "OCL_ICD_VENDORS"
 _ENTRY = "gpuvision-intel.icd"
@@ -47,19 +49,6 @@ def provide_cache() -> None:
         folder = tempfile.mkdtemp(prefix="gpuvision-cache-")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         os.environ["XDG_CACHE_HOME"] = folder
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write `text` so that a reader sees the old file or the new one, never a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.name)
-    try:
-        with os.fdopen(handle, "w") as file:
-            file.write(text)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
 
 
 def _wheel_libraries() -> dict[str, Path]:

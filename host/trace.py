@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from gpuvision.host.runtime import write_whole
+from gpuvision.host.files import write_whole
 
 _PRODUCER, _DEVICE, _CONSUMER = "producer", "device", "consumer"
 _LANES = {

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from gpuvision.host import Device
-from gpuvision.host.runtime import write_whole
+from gpuvision.host.files import write_whole
 from gpuvision.profiling import ceiling
 
 OPERATIONS = ("psd", "line", "triangulation", "range_image", "launch", "stream")

@@ -11,22 +11,21 @@ NPZ         all arrays, and their units as JSON
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
-import secrets
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import tifffile
 
+from gpuvision.host.files import replacing
 from gpuvision.ranging.regrid import Grid
 
 _GRID_KEYS = ("left", "top", "cell_x", "cell_y")
@@ -55,31 +54,6 @@ class HeightFile(NamedTuple):
 
     z: Array
     grid: Grid | None
-
-
-@contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Open a file that takes the place of `path` when the block ends well, and vanishes when it does not.
-
-    The bytes are on the disk before the name is: whoever opens `path` sees the old file or the whole new one.
-
-    Raises
-    ------
-    FileNotFoundError
-        The folder does not exist.
-    """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
-    beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        with beside.open("xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
 
 
 def _heights(z: Any, grid: Grid | None) -> Array:

@@ -22,7 +22,7 @@ from matplotlib.colors import ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from gpuvision.ranging.export import replacing
+from gpuvision.host.files import replacing
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.status import Status
 

@@ -100,17 +100,3 @@ def test_home_that_can_be_written_is_used(monkeypatch: pytest.MonkeyPatch, tmp_p
     runtime.provide_cache()
     assert os.environ["XDG_CACHE_HOME"] == str(tmp_path / "new")
     assert list((tmp_path / "new" / "gpuvision").iterdir()) == []
-
-
-def test_written_whole_or_not_at_all(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    path = tmp_path / "folder" / "file"
-    runtime.write_whole(path, "old")
-
-    def fail(source: str, target: str) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OSError, match="disk full"):
-        runtime.write_whole(path, "new")
-    assert [each.name for each in path.parent.iterdir()] == ["file"]
-    assert path.read_text() == "old"

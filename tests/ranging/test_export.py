@@ -155,25 +155,6 @@ def test_an_npz_holds_all_arrays_and_their_units(tmp_path, rng):
         export.write_npz(tmp_path / "all.npz", arrays, {"x": "m"})
 
 
-@pytest.mark.parametrize("old", [None, b"what was there"])
-def test_a_failure_leaves_what_was_there(tmp_path, old):
-    path = tmp_path / "map.tiff"
-    if old is not None:
-        path.write_bytes(old)
-    before = sorted(os.listdir(tmp_path))
-
-    def write_half() -> None:
-        with export.replacing(path) as file:
-            file.write(b"half of it")
-            assert sorted(os.listdir(tmp_path)) != before
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_half()
-    assert sorted(os.listdir(tmp_path)) == before
-    assert old is None or path.read_bytes() == old
-
-
 WRITERS = {
     "tiff": lambda path: export.write_tiff(path, np.zeros((2, 2))),
     "png": lambda path: export.write_png16(path, np.zeros((2, 2))),
@@ -199,13 +180,6 @@ def test_every_writer_is_atomic(tmp_path, kind, monkeypatch):
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == [path.name]
     assert len(written) > 10
-
-
-def test_a_file_is_as_open_to_others_as_any_new_one(tmp_path):
-    with export.replacing(tmp_path / "a") as file:
-        file.write(b"x")
-    (tmp_path / "b").write_bytes(b"x")
-    assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
 
 
 def test_a_missing_folder_is_named(tmp_path):

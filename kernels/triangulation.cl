@@ -1,5 +1,5 @@
-// Sensor coordinates (u, v) -> points (G, H) in the sheet of light. CPU runtimes take strips of 16-wide vectors, GPUs an
-// item per point.
+// Sensor coordinates (u, v) -> points (G, H) in the sheet of light. CPU runtimes take strips of 16-wide vectors, GPUs
+// an item per point; `each` is the number of points of a strip, or of a work-group.
 #include "lanes.h"
 #include "sheet.h"
 
@@ -12,18 +12,17 @@ typedef INPUT16 inputs_at __attribute__((aligned(sizeof(INPUT))));
 
 kernel void triangulate(global const INPUT *restrict u, global const INPUT *restrict v, global real *restrict g,
                         global real *restrict h, global uchar *restrict status, global real *restrict sigma_g,
-                        global real *restrict sigma_h, const ulong points, constant real *sheet, const real sigma_u,
-                        const real sigma_v) {
+                        global real *restrict sigma_h, const ulong points, const ulong each, constant real *sheet,
+                        const real sigma_u, const real sigma_v) {
     // The last vector, or work-group, moves back to end with the last point, and does some points twice: a test for the
     // end within it would cost more than they do.
 #ifdef STRIP
-    const size_t first = get_global_id(0) * STRIP_POINTS, end = min(first + STRIP_POINTS, (size_t)points);
-    for (size_t next = first; next < end; next += LANES) {
-        const size_t i = min(next, (size_t)points - LANES);
+    const ulong first = get_global_id(0) * each, end = min(first + each, points);
+    for (ulong next = first; next < end; next += LANES) {
+        const ulong i = min(next, points - LANES);
 #else
     {
-        const size_t group = get_group_id(0) * get_local_size(0);
-        const size_t i = min(group, (size_t)points - get_local_size(0)) + get_local_id(0);
+        const ulong i = min(get_group_id(0) * each, points - each) + get_local_id(0);
 #endif
         const reals position = LOAD(u + i), sample = LOAD(v + i);
         reals at_g, at_h;

@@ -6,9 +6,8 @@ The family is written for the direction sheet -> sensor, in which the calibratio
 - C3: ``u = (a H + b)/(c H + 1)``. A single beam: only u and H.
 - C4: also ``v = d G/(c H + 1)``. Symmetric about G = 0 and v = ``symmetry``: De Bakker's four constants,
   ``H = (C1 u + C2)/(u + C3)``, ``G = C4 v/(u + C3)``.
-- D6: also ``v = (d G + e H + f)/(c H + 1)``. The sensor's and the sheet's middle are offset, the profile
-axis is not
-  square to the measured one; H still follows from u alone.
+- D6: also ``v = (d G + e H + f)/(c H + 1)``. The sensor's and the sheet's middle are offset, the profile axis is
+  not square to the measured one; H still follows from u alone.
 - H8: all elements. Any pinhole sensor and any sheet; with a sensor rolled about its axis H depends on v too.
 
 F. de Jong lists C1-C4 and D1-D6 among the symbols; their equations are derived here: C4 is the one map of four

@@ -27,8 +27,9 @@ Along = Literal["columns", "rows"]
 Matrix = tuple[tuple[float, float, float], ...]
 Float64 = npt.NDArray[np.float64]
 
-# Points per work-item of a strip, and per work-group where every point has an item.
-_STRIP, _GROUP, _LANES = 1024, 256, 16
+_LANES, _GROUP = 16, 256
+# Points of a strip: long ones keep the prefetchers running, several per core keep the cores even.
+_SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
 _KEYS = ("homography", "region", "model", "along", "lens", "covariance", "sigma", "horizon")
 
 
@@ -221,8 +222,10 @@ class Triangulation(Operation[SheetPoints]):
         points = math.prod(shape)
         strip = in_strips(self.walk, device) and points >= _LANES
         if strip:
-            defines |= {"STRIP": None, "STRIP_POINTS": _STRIP}
-        group = max(min(points, _GROUP), 1)
+            defines["STRIP"] = None
+        share = -(-points // (_STRIPS_PER_CORE * _LANES * device.handle.max_compute_units)) * _LANES
+        each = min(max(share, _SHORTEST_STRIP), _LONGEST_STRIP) if strip else max(min(points, _GROUP), 1)
+        items = -(-points // each)
         spread = None
         if self.sigma is not None:
             defines["SHEET_SIGMAS"], spread = None, (shape, real)
@@ -234,10 +237,10 @@ class Triangulation(Operation[SheetPoints]):
             defines=defines,
             inputs=((shape, dtype), (shape, dtype)),
             outputs={**outputs, "sigma_g": spread, "sigma_h": spread},
-            arguments=(np.uint64(points), self.packed(real), real.type(sigma[0]), real.type(sigma[1])),
-            global_size=(-(-points // _STRIP),) if strip else (-(-points // group) * group,),
+            arguments=(np.uint64(points), np.uint64(each), self.packed(real), *map(real.type, sigma)),
             # Left to itself PoCL may put all strips into one group, and so on one core.
-            local_size=(1,) if strip else (group,),
+            global_size=(items,) if strip else (items * each,),
+            local_size=(1,) if strip else (each,),
         )
 
     # ---- on the host: simulators, planners, error budgets --------------------------------------------------

@@ -95,7 +95,7 @@ def test_any_shape(device: Device, shape: tuple[int, ...], walk: Any, seed: int)
     assert_close(result, operation, u, v)
 
 
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 31, 255, 256, 257, 1023, 1024, 1025, 5000])
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 31, 255, 256, 257, 1023, 1024, 1025, 5000, 300_001])
 @pytest.mark.parametrize("walk", ["strip", "item"])
 def test_sizes_around_the_groups_and_canaries(device: Device, count: int, walk: Any, rng: np.random.Generator) -> None:
     operation = scanner(sigma=(0.1, 0.1), walk=walk)
@@ -265,7 +265,7 @@ def test_fused_strips_take_positions_and_sample_numbers(
     axes = SampleAxes(sample_origin=1100.0, sample_pitch=-4.0, position_origin=40.0, position_pitch=0.5)
     covariance = np.diag(rng.uniform(1e-12, 1e-10, 8))
     operation = scanner(lens=lens, covariance=tuple(map(tuple, covariance)), sigma=(0.05, 0.2))
-    defines = {**operation.defines, **({"REAL_IS_DOUBLE": None} if dtype == np.float64 else {})}
+    defines = {**operation.defines, "STRIP": None, **({"REAL_IS_DOUBLE": None} if dtype == np.float64 else {})}
     program = cl.Program(device.context, FUSED).build([*options(defines), "-I", str(kernel_folder())])
     position = rng.uniform(0.0, 1800.0, 256).astype(dtype)
     position[[17, 200]] = math.nan

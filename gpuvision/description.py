@@ -151,12 +151,16 @@ class Section:
             raise self._wrong(key, value, "", expected + (f' (did you mean "{close[0]}"?)' if close else ""))
         return value  # type: ignore[no-any-return]
 
-    def text(self, key: str, default: str = _REQUIRED) -> str:
+    @overload
+    def text(self, key: str, default: str = ...) -> str: ...
+    @overload
+    def text(self, key: str, default: None) -> str | None: ...
+    def text(self, key: str, default: Any = _REQUIRED) -> str | None:
         """Return a string; as `number`."""
         value = self._value(key, "text", default)
-        if not isinstance(value, str):
+        if value is not default and not isinstance(value, str):
             raise self._wrong(key, value, "", "text")
-        return value
+        return value  # type: ignore[no-any-return]
 
     def finish(self) -> None:
         """Check that every key was asked for.

@@ -38,6 +38,7 @@ from gpuvision.ranging.regrid import Direction, Grid, HeightMap, Regrid
 from gpuvision.sensor import Sensor
 from gpuvision.status import Status
 
+LATE = 0.01  # s: a recording read later than this did not hold the rate that was asked for
 _MOST_CELLS = 1 << 26
 
 Array = npt.NDArray[Any]
@@ -94,11 +95,15 @@ class Scan:
 
     def summary(self) -> str:
         """Return what came out, in a line."""
-        stream = self.stream
-        dropped = f", {stream.dropped} dropped" if stream.dropped else ""
+        stream, usual, late = self.stream, self.sensor.recording.rate, self.facts["late"]
+        dropped = f" ({stream.dropped} dropped)" if stream.dropped else ""
+        speed = f"{self.throughput:,.0f} frames/s on {self.device.label}"
+        if usual is not None and self.facts["rate"] is None:
+            speed += f" ({self.throughput / usual:.1f} times the sensor's rate)"
+        good = f"{100 * self.valid_fraction:.1f} % of the samples valid"
+        overdue = f"; frames were read up to {1e3 * late:.0f} ms late" if late and late > LATE else ""
         return (
-            f"{stream.frames} frames{dropped} at {self.throughput:.4g} frames/s on {self.device.label}, "
-            f"{100 * self.valid_fraction:.1f} % of the samples valid, {self.grid.columns} x {self.grid.rows} cells"
+            f"{stream.frames} frames{dropped} at {speed}, {good}, {self.grid.columns} x {self.grid.rows} cells{overdue}"
         )
 
     @property
@@ -153,7 +158,7 @@ class Scan:
             draw_scan(inside / "scan.png", points.z, points.status, samples="down" if upright else "across")
             report = self.report()
             report["seconds"]["write"] = time.perf_counter() - start
-            (inside / "report.json").write_text(json.dumps(report, indent=1) + "\n")
+            (inside / "report.json").write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
 
     def _title(self) -> str:
         return self.sensor.name or "Height map"
@@ -249,6 +254,7 @@ def scan(
             "recording": name,
             "sensor": sensor.name,
             "kind": sensor.kind,
+            "sensor_rate": sensor.recording.rate,
             "rate": rate,
             "late": paced.late * 1e-9 if isinstance(paced, PacedSource) else None,
         },
@@ -260,7 +266,7 @@ def _opened(recording: str | Path | Source | Array, sensor: Sensor) -> tuple[Sou
         return recording, type(recording).__name__
     if isinstance(recording, np.ndarray):
         return ArraySource(recording), "array"
-    return open_recording(recording, channel=sensor.recording.channel), str(recording)
+    return open_recording(recording, channel=sensor.recording.channel, key=sensor.recording.key), str(recording)
 
 
 def _asking_for(sensor: Sensor, precision: Precision) -> LineReadout | PsdReadout:

@@ -2,18 +2,21 @@
 
 Tables of the file (the ones in ``gpuvision/sensors`` are commented examples):
 
-=================  ==========================================================================================
-``kind``, ``name`` ``"camera"`` or ``"psd"``; a name for the report
-``[recording]``    channel of a colour recording, frame rate of the sensor
-``[line]``         camera: fields of `LineReadout`
-``[psd]``          PSD: number of strips, fields of `PsdReadout`; ``[psd.noise]``: fields of `PsdNoise`
-``[frame]``        camera: columns and rows of a frame; needed for a triangulation
-``[axes]``         where positions and samples lie in the triangulation's coordinates, see `SampleAxes`
-``[lens]``         radial distortion, see `Lens`
-``[triangulation]``  sensor to sheet, by one of five ways: see `_triangulation`
-``[transport]``    ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`
-``[output]``       cells of the height map, what bridges its gaps, limits of the scene
-=================  ==========================================================================================
+====================  ==================================================================================================
+``kind``, ``name``    ``"camera"`` or ``"psd"``; a name for the report
+``[recording]``       see `Recording`
+``[line]``            camera: fields of `LineReadout`
+``[psd]``             PSD: number of strips, fields of `PsdReadout`; ``[psd.noise]``: fields of `PsdNoise`
+``[frame]``           camera: columns and rows of a frame; needed for a triangulation
+``[axes]``            where positions and samples lie in the triangulation's coordinates, see `SampleAxes`
+``[lens]``            radial distortion, see `Lens`
+``[triangulation]``   sensor to sheet, for a straight transport: ``baseline``, ``stand_off`` and so on (see
+                      `Triangulation.from_stand_off`); or a camera's ``focal_length_px``, ``principal_point_px`` and the
+                      sheet in its frame, ``sheet_origin``, ``g_axis``, ``h_axis``; or ``homography``; or ``constants``
+                      (`Triangulation.from_constants`); or ``points``: calibration points (u, v, G, H) to fit
+``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`
+``[output]``          see `Output`
+====================  ==================================================================================================
 """
 
 from __future__ import annotations
@@ -41,9 +44,20 @@ Ambiguous = Literal["drop", "keep"]
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """How the sensor was recorded: which channel of colour frames holds the line, and frames per second."""
+    """How the sensor was recorded.
+
+    Attributes
+    ----------
+    channel
+        Which channel of colour frames holds the line.
+    key
+        Which array of an NPZ file, if it holds more than one.
+    rate
+        Frames per second of the sensor; a scan says how many times faster it is.
+    """
 
     channel: Channel = "grey"
+    key: str | None = None
     rate: float | None = None
 
 
@@ -190,8 +204,9 @@ def _recording(table: Section | None) -> Recording:
         return Recording()
     channel = table.choice("channel", CHANNELS, "grey")
     rate = table.number("rate", "frames/s", None, above=0.0)
+    key = table.text("key", None)
     table.finish()
-    return Recording(channel=channel, rate=rate)
+    return Recording(channel=channel, key=key, rate=rate)
 
 
 def _lens(table: Section | None) -> Lens | None:

@@ -7,6 +7,7 @@ import re
 import sys
 import time
 from dataclasses import replace
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -350,6 +351,26 @@ def test_bad_arguments_are_a_line_and_leave_nothing(tmp_path: Path, run: Any) ->
     for args in (("--policy", "sometimes"), ("--precision", "half")):
         assert run("scan", plane, "--sensor", "psd_line", "--out", out, *args).code == 2
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_smallest_recordings_are_scanned() -> None:
+    sensor = Sensor.load("psd_line")
+    one = scan(currents(1), sensor)
+    assert one.valid_fraction == 1.0
+    assert one.grid.rows == 1
+    line = scan(line_frames(np.full((1, 480), 30.0)), Sensor.load("camera_line"))
+    assert line.points.z.shape == (1, 480)
+    assert line.valid_fraction == 1.0
+
+
+def test_one_array_of_several_is_named_by_its_key(tmp_path: Path, run: Any) -> None:
+    np.savez(tmp_path / "both.npz", dark=currents(3), light=currents(5))
+    text = resources.files("gpuvision").joinpath("sensors", "psd_line.toml").read_text(encoding="utf-8")
+    keyed = tmp_path / "keyed.toml"
+    keyed.write_text(text.replace("[recording]", "[recording]\nkey = 'light'"))
+    assert scan(tmp_path / "both.npz", Sensor.load(keyed)).points.z.shape == (5, 96)
+    ran = run("scan", tmp_path / "both.npz", "--sensor", "psd_line", "--out", tmp_path / "out")
+    check_refused(ran, r"holds several arrays; name one of dark, light as key")
 
 
 def test_a_map_too_large_to_hold_is_refused() -> None:

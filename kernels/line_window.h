@@ -18,9 +18,15 @@ inline void gather(const Profiles *profiles, ints peak, int reach, CODE *window)
     *(ints_at *)at = peak;
     for (int lane = 0; lane < LANES; lane++) {
         global const CODE *profile = profiles->first + (long)lane * profiles->lane_stride;
-        for (int k = -reach; k <= reach; k++) {
-            const int index = clamp(at[lane] + k, 0, profiles->length - 1);
-            window[(k + reach) * LANES + lane] = profile[(long)index * profiles->stride];
+        const int begin = at[lane] - reach;
+        if (begin >= 0 && at[lane] + reach < profiles->length) {
+            global const CODE *sample = profile + (long)begin * profiles->stride;
+            for (int k = 0; k <= 2 * reach; k++, sample += profiles->stride) window[k * LANES + lane] = *sample;
+        } else {
+            for (int k = 0; k <= 2 * reach; k++) {
+                const int index = clamp(begin + k, 0, profiles->length - 1);
+                window[k * LANES + lane] = profile[(long)index * profiles->stride];
+            }
         }
     }
 }

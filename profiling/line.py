@@ -239,7 +239,11 @@ def _peers(readout: LineReadout, frames: Frames, across: Frames) -> dict[str, Ca
 
 
 def _fused_case(device: Device, method: Method, count: int) -> Case:
-    """With coordinates undistorted and triangulated in the same pass; the peer is our readout alone."""
+    """With coordinates undistorted and triangulated in the same pass; the peer is our readout alone.
+
+    No traffic is named: the copy that would measure the device's limit empties the caches, for whoever comes after
+    it and not for the other, and the difference is a few percent.
+    """
     sheet = Triangulation(
         homography=((1.1e-5, 2.0e-4, -0.1), (-2.2e-4, 1.0e-6, 0.06), (2.0e-4, 1.0e-5, 1.0)),
         region=((0.0, ROWS - 1.0), (0.0, COLUMNS - 1.0)),
@@ -255,14 +259,7 @@ def _fused_case(device: Device, method: Method, count: int) -> Case:
     )
     error = float(np.nanmax(np.abs(fused.outputs.h.get() - expected.h)))
     peers = {"gpuvision": lambda: alone(shared).wait()}
-    return Case(
-        "line",
-        f"{method}-fused/{count}",
-        lambda: fused(shared).wait(),
-        peers,
-        error,
-        (frames.nbytes, 17 * count * COLUMNS),
-    )
+    return Case("line", f"{method}-fused/{count}", lambda: fused(shared).wait(), peers, error)
 
 
 def _bound(device: Device, readout: LineReadout, frames: Frames) -> tuple[Any, Frames]:

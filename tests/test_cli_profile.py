@@ -27,6 +27,7 @@ ROW = Row(
     ratio=3.14159,
     error=1.5e-9,
     fraction=0.5,
+    facts={"rate": 4000, "p50": 1e-4},
 )
 
 
@@ -47,10 +48,19 @@ def test_what_was_asked_for_is_measured_and_shown(asked: dict[str, Any], tmp_pat
     label = Device.best().label
     file = tmp_path / "rows.json"
     args = ["profile", "psd", "line", "--device", label, "--seconds", "0.5", "--json", str(file)]
-    ran = CliRunner().invoke(app, args, env={"COLUMNS": "160"})
+    ran = CliRunner().invoke(app, args, env={"COLUMNS": "80"})
     assert ran.exit_code == 0
     assert (asked["operations"], asked["devices"], asked["seconds"]) == (["psd", "line"], [label], 0.5)
-    for shown in ("float32/1e6", "12.3 ms", "numpy 2.9", "45.6 µs", "3.14", "1.5e-09", "50 %"):
+    for shown in (
+        "float32/1e6",
+        "12.3 ms",
+        "numpy",
+        "45.6 µs",
+        "3.14",
+        "1.5e-09",
+        "50 %",
+        "float32/1e6 on pocl: rate 4000, p50 0.0001",
+    ):
         assert shown in ran.output
     written = json.loads(file.read_text())
     assert (written["valid"], written["machine"]) == (True, {"processor": "abacus"})

@@ -52,25 +52,33 @@ def profile(
 
 
 def _show(rows: list[Row]) -> None:
+    """Print a table for each operation, narrow enough for a terminal of 80 columns."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    table = Table()
-    for heading in ("operation", "case", "device", "time", "peer", "its time", "ratio", "error", "of ceiling"):
-        table.add_column(heading, justify="left" if heading in ("operation", "case", "device", "peer") else "right")
-    for each in rows:
-        table.add_row(
-            each.operation,
-            each.case,
-            each.device,
-            _time(each.seconds),
-            f"{each.peer} {each.peer_version}",
-            _time(each.peer_seconds),
-            f"{each.ratio:.2f}",
-            f"{each.error:.1e}",
-            "" if each.fraction is None else f"{100 * each.fraction:.0f} %",
-        )
-    Console().print(table)
+    console = Console()
+    for operation in dict.fromkeys(each.operation for each in rows):
+        table = Table(title=operation, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for heading in ("case", "device", "time", "peer", "its time", "ratio", "error", "ceiling"):
+            words = heading in ("case", "device", "peer")
+            table.add_column(heading, justify="left" if words else "right", no_wrap=heading != "case", overflow="fold")
+        for each in rows:
+            if each.operation == operation:
+                table.add_row(*_cells(each))
+        console.print(table)
+        for told in dict.fromkeys(_facts(each) for each in rows if each.operation == operation and each.facts):
+            console.print(told, highlight=False, markup=False)
+
+
+def _facts(row: Row) -> str:
+    return f" {row.case} on {row.device}: " + ", ".join(f"{name} {value}" for name, value in row.facts.items())
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    fraction = "" if row.fraction is None else f"{100 * row.fraction:.0f} %"
+    times = (_time(row.seconds), row.peer, _time(row.peer_seconds))
+    return row.case, row.device, *times, f"{row.ratio:.2f}", f"{row.error:.1e}", fraction
 
 
 def _time(seconds: float) -> str:

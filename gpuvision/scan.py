@@ -230,15 +230,16 @@ def scan(
         paced = PacedSource(source, rate)
         fitting = plan(paced, operation, device=device)
         setup = {"policy": policy or "drop_oldest", "batch": fitting.batch, "ring": fitting.ring}
-    stream = Pipeline(
-        paced, operation, device=device, profile=True, trace=None if trace is None else Trace(trace), **setup
-    )
+    timeline = None if trace is None else _Timeline(trace)
+    stream = Pipeline(paced, operation, device=device, profile=True, trace=timeline, **setup)
     parts, numbers = _streamed(stream, source.length, progress)
     fields = {key: np.concatenate([getattr(each, key) for each in parts]) for key in readout.outputs or ()}
     start = time.perf_counter()
     points, intensity = _assembled(sensor, fields, numbers, stream.device)
     assembled = time.perf_counter()
     heights, grid = _resampled(sensor, points, intensity, stream.device)
+    if timeline is not None:
+        timeline.write_now()
     seconds = {"assemble": assembled - start, "resample": time.perf_counter() - assembled}
     return Scan(
         sensor=sensor,
@@ -259,6 +260,17 @@ def scan(
             "late": paced.late * 1e-9 if isinstance(paced, PacedSource) else None,
         },
     )
+
+
+class _Timeline(Trace):
+    """A trace that waits for the end of the scan: bad input leaves no file."""
+
+    def write(self) -> None:
+        """Do nothing at the end of the stream."""
+
+    def write_now(self) -> None:
+        """Write the file."""
+        super().write()
 
 
 def _opened(recording: str | Path | Source | Array, sensor: Sensor) -> tuple[Source, str]:

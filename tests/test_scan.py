@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -248,8 +249,8 @@ def test_the_command_scans(tmp_path: Path, run: Any) -> None:
     assert json.loads(trace.read_text())["traceEvents"]
 
 
-def video(path: Path, frames: Any) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, frames.shape[:0:-1])
+def video(path: Path, frames: Any, codec: str = "MJPG") -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 25.0, frames.shape[:0:-1])
     assert writer.isOpened()
     for frame in frames:
         writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
@@ -318,7 +319,8 @@ BAD_RECORDINGS = [
 def test_a_bad_recording_is_a_line_and_leaves_nothing(make: Any, message: str, tmp_path: Path, run: Any) -> None:
     recording = make(tmp_path)
     before = sorted(tmp_path.rglob("*"))
-    ran = run("scan", recording, "--sensor", "camera_line", "--out", tmp_path / "new" / "out")
+    out = tmp_path / "new" / "out"
+    ran = run("scan", recording, "--sensor", "camera_line", "--out", out, "--trace", out / "trace.json")
     check_refused(ran, message)
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -329,6 +331,19 @@ def check_refused(ran: Ran, message: str) -> None:
     assert ran.err.count("\n") == 1
     assert ran.out == ""
     assert re.search(message, ran.err), ran.err
+
+
+def test_the_decoder_of_videos_keeps_quiet(tmp_path: Path) -> None:
+    """Everything on stderr is one line, what the libraries below write there included."""
+    whole = video(tmp_path / "whole.mp4", two_lines().repeat(8, 0), "mp4v")
+    cut = tmp_path / "cut.mp4"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    command = [sys.executable, "-c", "from gpuvision.cli import main; main()", "scan", str(cut)]
+    command += ["--sensor", "camera_line", "--out", str(tmp_path / "out")]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ran.returncode == 1
+    assert re.fullmatch(r"gpuvision: .*cut\.mp4: no frame of this video can be decoded.*\n", ran.stderr)
+    assert not (tmp_path / "out").exists()
 
 
 def test_bad_arguments_are_a_line_and_leave_nothing(tmp_path: Path, run: Any) -> None:

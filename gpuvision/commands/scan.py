@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -60,6 +61,9 @@ def scan(
 
     Nothing is written before all of the recording was understood.
     """
+    # The decoder would speak for itself on stderr; what is wrong with a video is in our own line.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host import Device
     from gpuvision.scan import check_folder
     from gpuvision.scan import scan as run

@@ -108,7 +108,8 @@ inline void solve(Normal *normal) {
     }
 }
 
-// A step no longer than the first order holds for; returns how far the place moves.
+// A step no longer than the first order holds for; returns how far place or sigma move: the place alone may rest by
+// chance while the others have yet to settle.
 inline reals step(Gaussian *at, Normal *normal) {
     solve(normal);
     const reals *by = normal->right;
@@ -118,7 +119,7 @@ inline reals step(Gaussian *at, Normal *normal) {
     at->place += move;
     const reals growth = exp(clamp(by[1], (reals)-0.5f, (reals)0.5f));
     at->sigma = clamp(at->sigma * growth, (reals)ML_NARROWEST, (reals)(2 * RADIUS));
-    return fabs(move);
+    return fmax(fabs(move), fabs(by[1]) * at->sigma);
 }
 
 inline Place likeliest_place(const CODE *window, const Profiles *profiles, const Peak *peak, constant real *noise) {

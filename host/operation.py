@@ -78,9 +78,7 @@ class Operation(Generic[R]):
         """
         raise NotImplementedError
 
-    def bind(
-        self, device: Device | None, shape: tuple[int, ...], dtype: DTypeLike, *, queue: Any = None
-    ) -> Bound[R]:
+    def bind(self, device: Device | None, shape: tuple[int, ...], dtype: DTypeLike, *, queue: Any = None) -> Bound[R]:
         """Prepare the operation for frames of one shape: build, allocate, and warm up with a launch.
 
         Parameters
@@ -210,8 +208,7 @@ class Bound(Generic[R]):
     def allocate(self) -> R:
         """Return fresh device arrays for the outputs."""
         arrays = {
-            name: self.device.empty(shape, dtype, self.queue)
-            for name, (shape, dtype) in self._computed_specs.items()
+            name: self.device.empty(shape, dtype, self.queue) for name, (shape, dtype) in self._computed_specs.items()
         }
         return self._result(arrays)
 
@@ -302,7 +299,9 @@ class Bound(Generic[R]):
     def _set_arrays(self, given: tuple[Any, ...]) -> None:
         specs = (*self._launch.inputs, *self._computed_specs.values())
         if len(given) != len(specs):
-            raise TypeError(f"expected {len(self.inputs)} input arrays, got {len(given) - len(specs) + len(self.inputs)}")
+            raise TypeError(
+                f"expected {len(self.inputs)} input arrays, got {len(given) - len(specs) + len(self.inputs)}"
+            )
         for place, array, before, spec in zip(self._places, given, self._given, specs, strict=True):
             if array is not before:
                 self._check(array, *spec)

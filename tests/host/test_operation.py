@@ -169,7 +169,7 @@ def test_host_view_is_the_memory_itself(device):
 
 def test_host_view_refuses_memory_that_is_not_shared(device):
     buffer = cl.array.Array(device.queue, (4,), np.float32)
-    with pytest.raises(ValueError, match="array.get"):
+    with pytest.raises(ValueError, match=r"array\.get"):
         host_view(buffer)
 
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from canary import Guarded
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import gpuvision as gv
+from canary import Guarded
 from gpuvision.host import host_view
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation

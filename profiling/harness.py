@@ -125,20 +125,22 @@ def _take_turns(calls: Mapping[str, Callable[[], object]], seconds: float) -> di
     for call in calls.values():  # compiles, allocates, warms the caches
         call()
     start = time.perf_counter()
-    _round(calls)
+    _round(calls, 0)
     rounds = int(seconds / max(time.perf_counter() - start, 1e-6))
     low, high = _ROUND_LIMITS
     times: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(min(max(rounds, low), high)):
-        for name, taken in _round(calls).items():
+    for number in range(min(max(rounds, low), high)):
+        for name, taken in _round(calls, number).items():
             times[name].append(taken)
     return times
 
 
-def _round(calls: Mapping[str, Callable[[], object]]) -> dict[str, float]:
+def _round(calls: Mapping[str, Callable[[], object]], number: int) -> dict[str, float]:
+    """Time each call once, in another order each round: whoever comes after a neighbour that fills the caches pays."""
     taken = {}
-    for name, call in calls.items():
-        call()  # each meets the caches as it leaves them itself, not as its neighbour did
+    for name in np.random.default_rng(number).permutation(list(calls)):
+        call = calls[name]
+        call()  # each meets the caches as it leaves them itself
         start = time.perf_counter()
         call()
         taken[name] = time.perf_counter() - start

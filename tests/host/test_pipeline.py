@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from streams import READOUT, Gated, currents_of, numbers, producer_ended
 
 from gpuvision.host import Device, RecordingError, StreamError
 from gpuvision.host.pipeline import Batch, Pipeline, default_batch
@@ -22,6 +21,7 @@ from gpuvision.host.ring import Step
 from gpuvision.host.sources import ArraySource, IteratedSource
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.triangulation import Triangulation
+from streams import READOUT, Gated, currents_of, numbers, producer_ended
 
 # Results ----------------------------------------------------------------------------------------------------------
 

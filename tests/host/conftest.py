@@ -1,0 +1,31 @@
+"""Memory paths for the tests of the stream, and a watch for threads that it leaves."""
+
+from __future__ import annotations
+
+import copy
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from gpuvision.host import Device
+
+
+@pytest.fixture(params=["shared", "staged", "separate"])
+def memory(request: pytest.FixtureRequest, device: Device) -> dict[str, Any]:
+    """Options for a device and a memory path: shared, copied within shared memory, or copied to memory of its own."""
+    if request.param == "separate":
+        device = copy.copy(device)
+        device.shares_memory = False
+    elif request.param == "shared" and not device.shares_memory:
+        pytest.skip(f"{device.label} does not share memory with the host")
+    return {"device": device, "zero_copy": request.param == "shared"}
+
+
+@pytest.fixture(autouse=True)
+def _no_thread_is_left() -> Iterator[None]:
+    """No test may leave the stream's thread behind."""
+    yield
+    left = [thread.name for thread in threading.enumerate() if thread.name == "gpuvision stream"]
+    assert not left

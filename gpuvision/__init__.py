@@ -11,10 +11,7 @@ or bind it to a device and a shape for the hot path, or stream frames through it
 """
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, GpuVisionError, host_view
-from gpuvision.host.pipeline import Pipeline
-from gpuvision.host.recordings import open_recording
-from gpuvision.host.ring import Step
+from gpuvision.host import Device, GpuVisionError, Pipeline, Step, host_view, open_recording
 from gpuvision.ranging.line import LineReading, LineReadout
 from gpuvision.ranging.psd import PsdNoise, PsdReading, PsdReadout
 from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport

@@ -11,8 +11,17 @@ from gpuvision.host.errors import (
     StreamError,
 )
 from gpuvision.host.operation import Bound, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host.pipeline import Batch, Pipeline
+from gpuvision.host.plan import Plan, plan
+from gpuvision.host.recordings import open_recording
+from gpuvision.host.report import StreamReport
+from gpuvision.host.ring import Step
+from gpuvision.host.sources import ArraySource, PacedSource, Source
+from gpuvision.host.trace import Trace
 
 __all__ = [
+    "ArraySource",
+    "Batch",
     "Bound",
     "BuildError",
     "Device",
@@ -23,12 +32,21 @@ __all__ = [
     "Launch",
     "NoDeviceError",
     "Operation",
+    "PacedSource",
+    "Pipeline",
+    "Plan",
     "Precision",
     "RecordingError",
+    "Source",
+    "Step",
     "StreamError",
+    "StreamReport",
+    "Trace",
     "Walk",
     "host_view",
     "in_strips",
+    "open_recording",
+    "plan",
     "real_defines",
     "real_of",
 ]

@@ -92,12 +92,18 @@ inline reals sigma_of(reals balance, reals sum, constant real *p) {
 }
 #endif
 
-// Why samples are not good; the weightiest reason comes last.
+// Why samples are not good; the weightiest reason comes last. Codes without a dark level are finite and not negative.
 inline masks reasons(reals left, reals right, masks saturated, reals sum, reals difference, constant real *p) {
-    masks flags = fabs(difference) > p[LIMIT] * sum ? (masks)STATUS_OUT_OF_RANGE : (masks)STATUS_OK;
+    masks flags = STATUS_OK;
+#ifdef SIGNED
+    flags = fabs(difference) > p[LIMIT] * sum ? (masks)STATUS_OUT_OF_RANGE : flags;
+#endif
     flags = sum <= p[MINIMUM] ? (masks)STATUS_DARK : flags;
     flags |= saturated & STATUS_SATURATED;
-    return LANED(not_finite)(left) | LANED(not_finite)(right) ? (masks)STATUS_NOT_FINITE : flags;
+#ifdef SIGNED
+    flags = LANED(not_finite)(left) | LANED(not_finite)(right) ? (masks)STATUS_NOT_FINITE : flags;
+#endif
+    return flags;
 }
 
 // Reads the sample(s) at `sample`, writes what is asked for there, and says which are not good. Unless it is told to
@@ -110,7 +116,11 @@ inline masks read_out(const int careful, int sample, global const CODE *currents
     load_pair(currents, sample, samples, &left, &right);
     const reals larger = left > right ? left : right;
     const masks saturated = mask_of(larger >= p[SATURATION]);
+#ifdef SIGNED
     masks good = mask_of(left < p[SATURATION]) & mask_of(right < p[SATURATION]);
+#else
+    masks good = ~saturated;
+#endif
 #ifdef DARK
     left -= p[DARK_LEFT];
     right -= p[DARK_RIGHT];
@@ -120,7 +130,10 @@ inline masks read_out(const int careful, int sample, global const CODE *currents
 #endif
     const reals sum = left + right, difference = right - left;
     // Comparisons that hold: NaN fails them, and the saturation limit keeps infinity and an overflowing sum out.
-    good &= mask_of(sum > p[MINIMUM]) & mask_of(fabs(difference) <= p[LIMIT] * sum);
+    good &= mask_of(sum > p[MINIMUM]);
+#ifdef SIGNED
+    good &= mask_of(fabs(difference) <= p[LIMIT] * sum);
+#endif
     const reals balance = difference / sum;
     reals u = p[HALF_LENGTH] * balance;
     masks flags = STATUS_OK;

@@ -16,38 +16,84 @@ from gpuvision.ranging.psd import PsdReadout
 LENGTH, MINIMUM, SATURATION = 6e-3, 100.0, 60_000.0
 
 
+@numba.njit(error_model="numpy")
+def _read_out(a, b, half, minimum, saturation):  # type: ignore[no-untyped-def]
+    """Read out one sample; without a branch, so that LLVM vectorises the loops below."""
+    total = a + b
+    difference = b - a
+    dark = total <= minimum
+    high = (a >= saturation) | (b >= saturation)
+    lost = ~((np.abs(a) < np.inf) & (np.abs(b) < np.inf))
+    outside = (np.abs(difference) > total) & ~dark
+    good = ~(dark | high | lost | outside)
+    flags = np.uint8(dark) | (np.uint8(high) << np.uint8(1)) | (np.uint8(outside) << np.uint8(2))
+    return half * difference / total if good else np.float32(np.nan), np.uint8(8) if lost else flags
+
+
+@numba.njit(error_model="numpy")
+def _read_out_codes(a, b, half, minimum, saturation):  # type: ignore[no-untyped-def]
+    """Read out one sample of codes, which are finite and not negative."""
+    total = a + b
+    dark = total <= minimum
+    high = (a >= saturation) | (b >= saturation)
+    flags = np.uint8(dark) | (np.uint8(high) << np.uint8(1))
+    return np.float32(np.nan) if dark | high else half * (b - a) / total, flags
+
+
 @numba.njit(parallel=True, error_model="numpy")
 def _numba_planar(left, right, position, status, half, minimum, saturation):  # type: ignore[no-untyped-def]
-    """Read out on all cores; branch-free, so that LLVM vectorises it."""
+    for i in numba.prange(position.shape[0]):
+        position[i], status[i] = _read_out(left[i], right[i], half, minimum, saturation)
+
+
+@numba.njit(parallel=True, error_model="numpy")
+def _numba_planar_codes(left, right, position, status, half, minimum, saturation):  # type: ignore[no-untyped-def]
     for i in numba.prange(position.shape[0]):
         a, b = np.float32(left[i]), np.float32(right[i])
-        total = a + b
-        dark = total <= minimum
-        high = (a >= saturation) | (b >= saturation)
-        position[i] = np.float32(np.nan) if dark | high else half * (b - a) / total
-        status[i] = np.uint8(dark) | (np.uint8(high) << np.uint8(1))
+        position[i], status[i] = _read_out_codes(a, b, half, minimum, saturation)
 
 
 @numba.njit(parallel=True, error_model="numpy")
 def _numba_pairs(currents, position, status, half, minimum, saturation):  # type: ignore[no-untyped-def]
     for i in numba.prange(position.shape[0]):
+        position[i], status[i] = _read_out(currents[2 * i], currents[2 * i + 1], half, minimum, saturation)
+
+
+@numba.njit(parallel=True, error_model="numpy")
+def _numba_pairs_codes(currents, position, status, half, minimum, saturation):  # type: ignore[no-untyped-def]
+    for i in numba.prange(position.shape[0]):
         a, b = np.float32(currents[2 * i]), np.float32(currents[2 * i + 1])
-        total = a + b
-        dark = total <= minimum
-        high = (a >= saturation) | (b >= saturation)
-        position[i] = np.float32(np.nan) if dark | high else half * (b - a) / total
-        status[i] = np.uint8(dark) | (np.uint8(high) << np.uint8(1))
+        position[i], status[i] = _read_out_codes(a, b, half, minimum, saturation)
 
 
 def _numpy(left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    a, b = left.astype(np.float32), right.astype(np.float32)
-    total = a + b
+    a, b = left.astype(np.float32, copy=False), right.astype(np.float32, copy=False)
+    total, difference = a + b, b - a
     dark = total <= np.float32(MINIMUM)
     high = (a >= np.float32(SATURATION)) | (b >= np.float32(SATURATION))
+    bad = dark | high
+    status = dark.astype(np.uint8) | (high.astype(np.uint8) << np.uint8(1))
+    if left.dtype.kind == "f":
+        outside = (np.abs(difference) > total) & ~dark
+        lost = ~np.isfinite(total)
+        status |= outside.astype(np.uint8) << np.uint8(2)
+        status[lost] = 8
+        bad |= outside | lost
     with np.errstate(divide="ignore", invalid="ignore"):
-        position = np.float32(LENGTH / 2) * (b - a) / total
-    position[dark | high] = np.nan
-    return position, dark.astype(np.uint8) | (high.astype(np.uint8) << np.uint8(1))
+        position = np.float32(LENGTH / 2) * difference / total
+    position[bad] = np.nan
+    return position, status
+
+
+def scan_currents(dtype: str, count: int) -> NDArray[Any]:
+    """Return (2, count) currents of a scan: 5 % of the samples dark, 1 % saturated, in runs, as scenes have them."""
+    rng = np.random.default_rng(1)
+    place = rng.uniform(0.1, 0.9, count)
+    level = rng.uniform(1_000.0, 50_000.0, count)
+    for share, run, value in ((0.05, 1000, 50.0), (0.01, 200, 130_000.0)):
+        for start in rng.integers(0, count, round(share * count / run)):
+            level[start : start + run] = value
+    return np.minimum([level * (1.0 - place), level * place], 65_535.0).astype(dtype)
 
 
 def cases(device: Device) -> Iterator[Case]:
@@ -69,22 +115,21 @@ def _case(device: Device, dtype: str, count: int, name: str, layout: Any) -> Cas
     )
     shape = (2, count) if layout == "planar" else (count, 2)
     bound = readout.bind(device, shape, dtype)
-    currents = np.random.default_rng(1).integers(0, 65_000, shape).astype(dtype)
+    planar = scan_currents(dtype, count)
+    currents = planar if layout == "planar" else np.ascontiguousarray(planar.T)
     _fill(bound.inputs[0], currents)
     left, right = (currents[0], currents[1]) if layout == "planar" else (currents[:, 0], currents[:, 1])
     position, status = np.empty(count, np.float32), np.empty(count, np.uint8)
     constants = (np.float32(LENGTH / 2), np.float32(MINIMUM), np.float32(SATURATION))
+    codes = dtype == "uint16"
     if layout == "planar":
-        peers = {
-            "numba": lambda: _numba_planar(left, right, position, status, *constants),
-            "numpy": lambda: _numpy(left, right),
-        }
+        loop, arrays = _numba_planar_codes if codes else _numba_planar, (left, right)
     else:
-        flat = currents.reshape(-1)
-        peers = {
-            "numba": lambda: _numba_pairs(flat, position, status, *constants),
-            "numpy": lambda: _numpy(left, right),
-        }
+        loop, arrays = _numba_pairs_codes if codes else _numba_pairs, (currents.reshape(-1),)
+    peers = {
+        "numba": lambda: loop(*arrays, position, status, *constants),
+        "numpy": lambda: _numpy(left, right),
+    }
     bound().wait()
     error = _error(bound.outputs.position.get(), bound.outputs.status.get(), left, right)
     traffic = (currents.nbytes, 5 * count)

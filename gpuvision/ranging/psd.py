@@ -236,6 +236,8 @@ class PsdReadout(Operation[PsdReading]):
             "STRIP": strip,
             "PLANAR": self.layout == "planar",
             "DARK": any(self.dark),
+            # Where a current can be negative or not finite, or the load resistors shrink the range.
+            "SIGNED": dtype.kind == "f" or any(self.dark) or self.load_resistance > 0.0,
             "GAIN": self.right_gain != 1.0,
             "LINEARITY": self.linearity is not None,
         }

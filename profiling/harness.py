@@ -24,7 +24,9 @@ from gpuvision.host.files import write_whole
 from gpuvision.profiling import ceiling
 
 OPERATIONS = ("psd", "line", "triangulation", "range_image", "launch", "stream")
-_ROUND_LIMITS = (7, 201)
+_ROUND_LIMITS = (7, 101)
+_WARM_UP = 1e-3  # s
+_CALLS_PER_TURN = 3
 _STEADY = 0.2
 _ATTEMPTS = 4
 
@@ -136,15 +138,23 @@ def _take_turns(calls: Mapping[str, Callable[[], object]], seconds: float) -> di
 
 
 def _round(calls: Mapping[str, Callable[[], object]], number: int) -> dict[str, float]:
-    """Time each call once, in another order each round: whoever comes after a neighbour that fills the caches pays."""
-    taken = {}
-    for name in np.random.default_rng(number).permutation(list(calls)):
-        call = calls[name]
-        call()  # each meets the caches as it leaves them itself
+    """Give each call a turn, in another order each round: whoever follows a neighbour that fills the caches pays."""
+    order = np.random.default_rng(number).permutation(list(calls))
+    return {name: _turn(calls[name]) for name in order}
+
+
+def _turn(call: Callable[[], object]) -> float:
+    """Return the median of a few calls, after it had the machine for a moment and left the caches its own way."""
+    begun = time.perf_counter()
+    call()
+    while time.perf_counter() - begun < _WARM_UP:
+        call()
+    times = []
+    for _ in range(_CALLS_PER_TURN):
         start = time.perf_counter()
         call()
-        taken[name] = time.perf_counter() - start
-    return taken
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
 
 
 def peer_version(peer: str) -> str:

@@ -122,6 +122,8 @@ class Device:
         ------
         TypeError
             `handle` is none of these.
+        ValueError
+            The queue runs out of order.
         """
         if isinstance(handle, cl.array.Array):
             handle = handle.queue if handle.queue is not None else handle.context
@@ -130,6 +132,8 @@ class Device:
         if not isinstance(handle, cl.CommandQueue):
             kind = type(handle).__name__
             raise TypeError(f"expected a pyopencl queue, context or array to take the device from, got {kind}")
+        if handle.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE:
+            raise ValueError("the queue runs out of order; operations follow each other, expected an in-order queue")
         return _adopt(handle)
 
     def new_queue(self, *, profiling: bool = False) -> Any:

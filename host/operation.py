@@ -7,8 +7,9 @@ path: after it nothing is compiled, allocated or copied.
 from __future__ import annotations
 
 import collections
+import operator
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
@@ -104,7 +105,12 @@ class Operation(Generic[R]):
         BuildError
             The kernel does not compile on this device.
         """
-        return Bound(self, Device.best() if device is None else device, shape, np.dtype(dtype), queue)
+        device, dtype = _device(device), np.dtype(dtype)
+        if not dtype.isnative:
+            raise TypeError(
+                f"expected native byte order, got {dtype.str}; convert it with .astype(dtype.newbyteorder('='))"
+            )
+        return Bound(self, device, tuple(map(operator.index, shape)), dtype, queue)
 
     def __call__(self, *inputs: Any, device: Device | None = None, out: R | None = None) -> R:
         """Run once on NumPy arrays (and wait) or on device arrays (and return at once).
@@ -129,21 +135,23 @@ class Operation(Generic[R]):
         TypeError, ValueError
             Wrong dtype, shape, layout or device: nothing is converted behind the caller's back.
         """
-        if all(isinstance(each, cl.array.Array) for each in inputs):
+        if out is not None and not isinstance(out, self.Result):
+            raise TypeError(f"out: expected a {self.Result.__name__} of arrays, got {type(out).__name__}")
+        if inputs and all(isinstance(each, cl.array.Array) for each in inputs):
             return self._on_device(inputs, device, out)
-        if all(isinstance(each, np.ndarray) for each in inputs):
-            bound = self._bound(Device.best() if device is None else device, None, inputs[0])
-            return bound.on_host(inputs, out)
-        kinds = ", ".join(type(each).__name__ for each in inputs)
+        if inputs and all(isinstance(each, np.ndarray) for each in inputs):
+            return self._bound(_device(device), None, inputs[0]).on_host(inputs, out)
+        kinds = ", ".join(type(each).__name__ for each in inputs) or "none"
         raise TypeError(f"expected NumPy arrays or pyopencl arrays, all of one kind, got {kinds}")
 
     def _on_device(self, inputs: Sequence[DeviceArray], device: Device | None, out: R | None) -> R:
         home = Device.of(inputs[0])
-        if device is not None and device.context != home.context:
+        if device is not None and _device(device).context != home.context:
             raise ValueError(f"the input lies on {home.label}, not on {device.label}; copy it there first")
         bound = self._bound(home, inputs[0].queue, inputs[0])
         result = bound.allocate() if out is None else out
-        event = bound(*inputs, out=result)
+        # Another queue may still be writing the inputs.
+        event = bound(*inputs, out=result, wait_for=[event for array in inputs for event in array.events])
         for array in result:
             if array is not None:
                 array.add_event(event)
@@ -235,6 +243,8 @@ class Bound(Generic[R]):
         if not frames and out is None:
             given = self._own
         else:
+            if out is not None and out is not self.outputs:
+                self._check_fields(out)
             given = (*(frames or self.inputs), *self._computed(self.outputs if out is None else out))
         if given is not self._given:
             self._set_arrays(given)
@@ -253,8 +263,10 @@ class Bound(Generic[R]):
         if out is None:
             out = self._result({k: np.empty(shape, dtype) for k, (shape, dtype) in self._computed_specs.items()})
         targets = self._computed(out)
+        self._check_fields(out)
         for (name, (shape, dtype)), array in zip(self._computed_specs.items(), targets, strict=True):
             check_host(array, shape, dtype, f"out.{name}")
+        _check_apart(frames, targets, np.may_share_memory)
         if self._empty:
             return out
         if self.device.shares_memory:
@@ -302,11 +314,21 @@ class Bound(Generic[R]):
             raise TypeError(
                 f"expected {len(self.inputs)} input arrays, got {len(given) - len(specs) + len(self.inputs)}"
             )
-        for place, array, before, spec in zip(self._places, given, self._given, specs, strict=True):
+        for array, before, spec in zip(given, self._given, specs, strict=True):
             if array is not before:
                 self._check(array, *spec)
+        inputs = len(self.inputs)
+        _check_apart(given[:inputs], given[inputs:], lambda a, b: a.base_data is b.base_data)
+        for place, array, before in zip(self._places, given, self._given, strict=True):
+            if array is not before:
                 self._kernel.set_arg(place, memory_of(array))
         self._given = given
+
+    def _check_fields(self, out: R) -> None:
+        for name, array in zip(self.operation.Result._fields, out, strict=True):
+            if (array is not None) != (name in self._computed_specs):
+                what = "is missing" if array is None else "is not computed; expected None"
+                raise ValueError(f"out.{name} {what}")
 
     def _check(self, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         if not isinstance(array, cl.array.Array):
@@ -350,6 +372,19 @@ class Bound(Generic[R]):
         while flight and flight[0][0].command_execution_status <= cl.command_execution_status.COMPLETE:
             flight.popleft()
         flight.append((event, given))
+
+
+def _device(device: Device | None) -> Device:
+    if device is not None and not isinstance(device, Device):
+        raise TypeError(f"expected a Device, got {type(device).__name__}; Device.named finds one by name")
+    return Device.best() if device is None else device
+
+
+def _check_apart(inputs: Sequence[Any], outputs: Sequence[Any], same: Callable[[Any, Any], bool]) -> None:
+    """Check that no output is an input or another output: kernels read and write in an order of their own."""
+    for number, output in enumerate(outputs):
+        if any(same(output, other) for other in (*inputs, *outputs[:number])):
+            raise ValueError("an output shares its memory with an input or another output; expected arrays apart")
 
 
 def real_of(precision: Precision, dtype: np.dtype[Any]) -> np.dtype[Any]:

@@ -29,7 +29,7 @@ class PsdReading(NamedTuple):
     Attributes
     ----------
     position
-        u [m]; NaN where the status is not OK.
+        u [m]; NaN where the status has DARK, SATURATED, OUT_OF_RANGE or NOT_FINITE.
     total
         Sum of both currents after dark level and gain [A].
     status
@@ -157,12 +157,26 @@ class PsdReadout(Operation[PsdReading]):
         for name in ("minimum_total", "load_resistance"):
             if finite(getattr(self, name), f"PsdReadout.{name}") < 0.0:
                 raise ValueError(f"PsdReadout.{name} is {getattr(self, name)}, expected a number >= 0")
+        self._check_currents()
         if self.load_resistance and not self.interelectrode_resistance:
             raise ValueError("PsdReadout.load_resistance needs interelectrode_resistance [Ohm] beside it")
         if self.layout not in ("pairs", "planar"):
             raise ValueError(f"PsdReadout.layout is {self.layout!r}, expected 'pairs' or 'planar'")
         object.__setattr__(self, "outputs", self._chosen())
         self._check_linearity()
+
+    def _check_currents(self) -> None:
+        try:
+            left, right = (finite(each, "PsdReadout.dark") for each in self.dark)
+        except TypeError:
+            raise TypeError(f"PsdReadout.dark is {self.dark!r}, expected two currents (left, right)") from None
+        object.__setattr__(self, "dark", (left, right))
+        for name in ("saturation", "interelectrode_resistance"):
+            value = getattr(self, name)
+            if value is not None and finite(value, f"PsdReadout.{name}") <= 0.0:
+                raise ValueError(f"PsdReadout.{name} is {value}, expected a number > 0, or None")
+        if self.noise is not None and not isinstance(self.noise, PsdNoise):
+            raise TypeError(f"PsdReadout.noise is {self.noise!r}, expected a PsdNoise or None")
 
     def _chosen(self) -> tuple[str, ...]:
         sheet = ("g", "h") if self.triangulation is not None else ()
@@ -177,7 +191,10 @@ class PsdReadout(Operation[PsdReading]):
     def _check_linearity(self) -> None:
         if self.linearity is None:
             return
-        rows = tuple(tuple(finite(x, "PsdReadout.linearity") for x in row) for row in self.linearity)
+        try:
+            rows = tuple(tuple(finite(x, "PsdReadout.linearity") for x in row) for row in self.linearity)
+        except TypeError:
+            raise TypeError("PsdReadout.linearity: expected a row of corrections per strip") from None
         if not rows or min(map(len, rows)) < 2 or len(set(map(len, rows))) != 1:
             raise ValueError("PsdReadout.linearity: expected a row per strip, all of one length of at least 2 knots")
         object.__setattr__(self, "linearity", rows)
@@ -252,8 +269,8 @@ class PsdReadout(Operation[PsdReading]):
         if dtype.kind == "u":
             ceiling, quantisation = float(np.iinfo(dtype).max), 1.0 / 12.0
         else:
-            # A finite limit whose double is finite too: nothing beyond it may reach the arithmetic.
-            ceiling, quantisation = float(np.finfo(real).max) / 4.0, 0.0
+            # A limit whose double is finite, in amperes too: nothing beyond it may reach the arithmetic.
+            ceiling, quantisation = float(np.finfo(real).max) / (4.0 * max(self.ampere, 1.0)), 0.0
         saturation = ceiling if self.saturation is None else min(self.saturation / self.ampere, ceiling)
         return np.array(
             [

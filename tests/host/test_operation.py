@@ -136,6 +136,64 @@ def test_another_dtype_shape_kind_or_number_is_told(device, pairs):
     bound().wait()  # what was refused has not spoilt it
 
 
+def test_foreign_byte_order_is_refused(memory, pairs):
+    with pytest.raises(TypeError, match="native byte order"):
+        READOUT(pairs.astype(">f4"), device=memory)
+
+
+def test_outputs_must_lie_apart(memory, pairs):
+    out = READOUT(pairs, device=memory)
+    with pytest.raises(ValueError, match="shares its memory"):
+        READOUT(pairs, device=memory, out=out._replace(total=out.position))
+    with pytest.raises(ValueError, match="shares its memory"):
+        READOUT(pairs, device=memory, out=out._replace(position=pairs.reshape(-1)[:1000]))
+    bound = READOUT.bind(memory, pairs.shape, pairs.dtype)
+    with pytest.raises(ValueError, match="shares its memory"):
+        bound(out=bound.outputs._replace(total=bound.outputs.position))
+
+
+def test_out_of_another_kind_is_told(memory, pairs):
+    out = READOUT(pairs, device=memory)
+    with pytest.raises(TypeError, match="expected a PsdReading"):
+        READOUT(pairs, device=memory, out=tuple(out))
+    with pytest.raises(ValueError, match=r"out\.total is missing"):
+        READOUT(pairs, device=memory, out=out._replace(total=None))
+    with pytest.raises(ValueError, match=r"out\.sigma is not computed"):
+        READOUT(pairs, device=memory, out=out._replace(sigma=np.empty_like(out.total)))
+
+
+def test_no_input_and_no_device_are_told(memory, pairs):
+    with pytest.raises(TypeError, match="got none"):
+        READOUT(device=memory)
+    with pytest.raises(TypeError, match=r"Device\.named"):
+        READOUT(pairs, device="pocl")
+    assert READOUT.bind(memory, [1000, 2], "float32").outputs.position.shape == (1000,)
+
+
+def test_an_input_that_another_queue_still_writes_is_waited_for(device):
+    if not device.shares_memory:
+        pytest.skip("this device has memory of its own")
+    many = np.tile(np.array([1.0, 3.0], np.float32), (200_000, 1))
+    gate = cl.UserEvent(device.context)
+    frame = device.empty(many.shape, many.dtype)
+    frame.set(many * 0)
+    frame.add_event(gate)
+    reading = READOUT(frame)
+    host_view(frame)[...] = many
+    gate.set_status(cl.command_execution_status.COMPLETE)
+    np.testing.assert_array_equal(reading.position.get(), 0.5)
+
+
+def test_an_out_of_order_queue_is_refused(device):
+    flags = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
+    try:
+        queue = cl.CommandQueue(device.context, properties=flags)
+    except cl.Error:
+        pytest.skip("this device has no out-of-order queues")
+    with pytest.raises(ValueError, match="in-order"):
+        Device.of(queue)
+
+
 def test_an_array_of_another_device_is_refused(pairs):
     devices = Device.all()
     if len(devices) < 2:

@@ -303,12 +303,33 @@ def test_wrong_input_is_told(device, values, error, message):
         ({"outputs": ("place",)}, "'place'"),
         ({"outputs": ("g",)}, "'g'"),
         ({"linearity": ((0.0,),)}, "knots"),
+        ({"saturation": -1.0}, "saturation"),
+        ({"saturation": float("nan")}, "saturation"),
+        ({"interelectrode_resistance": -5.0, "load_resistance": 1.0}, "interelectrode_resistance"),
+        ({"dark": (float("nan"), 0.0)}, "dark"),
+        ({"dark": (1e-9,)}, "dark|unpack"),
         ({"linearity": ((0.0, 1.0), (0.0, 1.0, 2.0))}, "knots"),
     ],
 )
 def test_wrong_parameters_are_told(changes, message):
     with pytest.raises(ValueError, match=message):
         PsdReadout(**({"strip_length": LENGTH} | changes))
+
+
+@pytest.mark.parametrize("changes", [{"dark": 3.0}, {"noise": 3}, {"linearity": 5}])
+def test_parameters_of_another_kind_are_told(changes):
+    with pytest.raises(TypeError, match=next(iter(changes))):
+        PsdReadout(strip_length=LENGTH, **changes)
+
+
+def test_a_list_of_dark_currents_is_as_good(device):
+    pairs = np.full((20, 2), 1.0, np.float32)
+    assert PsdReadout(strip_length=LENGTH, dark=[0.5, 0.5])(pairs, device=device).total[0] == 1.0
+
+
+def test_a_scale_that_overflows_the_total_is_flagged(device):
+    reading = PsdReadout(strip_length=LENGTH, ampere=1e38)(np.full((20, 2), 4.0, np.float32), device=device)
+    assert (reading.status == Status.SATURATED).all()
 
 
 def test_precision_is_never_lowered_in_silence(device):

@@ -131,24 +131,20 @@ class Pipeline(Generic[R]):
         warm_up: int | None = None,
         clock: Clock = time.perf_counter_ns,
     ) -> None:
-        self.source = ArraySource(source) if isinstance(source, np.ndarray) else source
+        self.source = _source(source)
+        self.ring, self.policy, self.trace = _whole(ring, "ring", 2, " slots"), policy, trace
+        self.batch = default_batch(self.source, self.ring) if batch is None else _whole(batch, "batch", 1)
         self.device = Device.best() if device is None else device
-        self.batch = default_batch(self.source, ring) if batch is None else batch
-        self.ring, self.policy, self.trace = ring, policy, trace
         self.zero_copy = self.device.shares_memory if zero_copy is None else zero_copy
         self.profile = profile or trace is not None
         self._steps = _steps(operation)
         self._clock = clock
         self._check()
-        self._account = Account(ring if warm_up is None else warm_up)
+        self._account = Account(self.ring if warm_up is None else warm_up)
         self._dropped = 0
         self._state: Literal["new", "open", "closed"] = "new"
 
     def _check(self) -> None:
-        if self.batch < 1:
-            raise ValueError(f"Pipeline.batch is {self.batch}, expected at least 1")
-        if self.ring < 2:
-            raise ValueError(f"Pipeline.ring is {self.ring}, expected at least 2 slots")
         if self.policy not in ("block", "drop_oldest", "raise"):
             raise ValueError(f"Pipeline.policy is {self.policy!r}, expected 'block', 'drop_oldest' or 'raise'")
         if self.zero_copy and not self.device.shares_memory:
@@ -426,6 +422,26 @@ def default_batch(source: Source, ring: int) -> int:
     size = max(math.prod(source.shape) * source.dtype.itemsize, 1)
     batch = max(_DEFAULT_BATCH_BYTES // size, 1)
     return batch if source.length is None else max(min(batch, -(-source.length // ring)), 1)
+
+
+def _source(given: Source | HostArray) -> Source:
+    if isinstance(given, np.ndarray):
+        return ArraySource(given)
+    if not isinstance(given, Source):
+        kind = type(given).__name__
+        raise TypeError(
+            f"Pipeline takes a source or an array of frames, got a {kind}; wrap what can be iterated as "
+            "gpuvision.host.sources.IteratedSource(...), open files with open_recording(...)"
+        )
+    return given
+
+
+def _whole(value: object, name: str, least: int, unit: str = "") -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"Pipeline.{name} is {value!r}, expected a whole number of at least {least}{unit}")
+    if value < least:
+        raise ValueError(f"Pipeline.{name} is {value}, expected at least {least}{unit}")
+    return int(value)
 
 
 def _stopped(number: int, stage: str, error: BaseException) -> StreamError:

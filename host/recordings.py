@@ -139,7 +139,7 @@ class TiffStack(FrameSource):
         self.length: int = len(file.pages)
         self._pick = _picker(channel, self._page_shape, str(path))
 
-    def wait(self) -> bool:
+    def _ready(self) -> bool:
         """Say whether a page is left."""
         return self._next < self.length
 
@@ -178,7 +178,7 @@ class Video(FrameSource):
         self._pick = _picker(channel, self._colour.shape, str(path))
         self._next = 0
 
-    def wait(self) -> bool:
+    def _ready(self) -> bool:
         """Advance to the next frame, if there is one."""
         if not self._grabbed:
             self._grabbed = self._capture.grab()
@@ -217,7 +217,7 @@ class ImageFolder(FrameSource):
         self.length: int = len(self._files)
         self._next = 0
 
-    def wait(self) -> bool:
+    def _ready(self) -> bool:
         """Say whether an image is left."""
         return self._next < self.length
 

@@ -131,36 +131,53 @@ class ArraySource(Source):
 
 
 class FrameSource(Source):
-    """Base of the sources that get one frame at a time: `_decode` puts the next one in place.
+    """Base of the sources that get one frame at a time: `_ready` says whether one is there, `_decode` puts it in place.
 
     An error in the middle of a batch does not lose the frames before it: the batch is cut short there, and the
-    error comes with the next call.
+    error comes with the next call, of `wait` or of `read_into`.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any], *, clock: Clock = time.perf_counter_ns) -> None:
         self.shape, self.dtype = shape, dtype
         self._clock = clock
-        self._error: RecordingError | None = None
+        self._error: Exception | None = None
+
+    def wait(self) -> bool:
+        """Wait for the next frame; ``False`` at the end.
+
+        Raises
+        ------
+        RecordingError
+            The next frame cannot be read: found out now, or while the frames before it were.
+        """
+        if self._error is None:
+            try:
+                return self._ready()
+            except Exception as error:  # it stays: a generator that has raised would only say that it is at its end
+                self._error = error
+        raise self._error
 
     def read_into(self, out: HostArray, arrived: Arrivals) -> int:
         """Decode frames into the batch, one after the other."""
-        if self._error is not None:
-            raise self._error
         for filled in range(len(out)):
             try:
                 if not self.wait():
                     return filled
                 self._decode(out[filled])
-            except RecordingError as error:
+            except Exception as error:  # whatever a decoder or a camera says, the frames before are good
+                self._error = error
                 if not filled:
                     raise
-                self._error = error
                 return filled
             arrived[filled] = self._clock()
         return len(out)
 
+    def _ready(self) -> bool:
+        """Wait until a frame is there; ``False`` at the end."""
+        return True
+
     def _decode(self, out: HostArray) -> None:
-        """Put the next frame, which `wait` has promised, into `out`."""
+        """Put the next frame, which `_ready` has promised, into `out`."""
         raise NotImplementedError
 
 
@@ -170,7 +187,8 @@ class IteratedSource(FrameSource):
     Parameters
     ----------
     frames : iterable of array
-        All of the shape and dtype of the first one, which is taken at once.
+        All of the shape and dtype of the first one, which is taken at once. What the iterator raises becomes a
+        `RecordingError` that names the frame, with the cause chained.
     rate : float, optional
         Frames per second, if they come at a rate.
     stop : callable, optional
@@ -178,6 +196,8 @@ class IteratedSource(FrameSource):
 
     Raises
     ------
+    TypeError
+        Not something to iterate.
     RecordingError
         There is no first frame.
     """
@@ -190,22 +210,35 @@ class IteratedSource(FrameSource):
         stop: Callable[[], object] | None = None,
         clock: Clock = time.perf_counter_ns,
     ) -> None:
-        self._iterator = iter(frames)
-        self._frame: HostArray | None = next(self._iterator, None)
+        self._iterator, self._number = iter(frames), 0
+        self._frame = self._taken()
         if self._frame is None:
             raise RecordingError("the source has no first frame to tell shape and dtype from")
         super().__init__(self._frame.shape, self._frame.dtype, clock=clock)
-        self.rate, self._stop, self._number = rate, stop, 0
+        self.rate, self._stop = rate, stop
 
-    def wait(self) -> bool:
+    def _ready(self) -> bool:
         """Get the next frame from the iterator, if there is none in hand."""
         if self._frame is None:
-            self._frame = next(self._iterator, None)
+            self._frame = self._taken()
         return self._frame is not None
+
+    def _taken(self) -> HostArray | None:
+        try:
+            frame = next(self._iterator)
+        except StopIteration:
+            return None
+        except Exception as error:  # a camera's driver raises what it likes
+            name = type(error).__name__
+            raise RecordingError(f"frame {self._number} did not come: {name}: {error}".rstrip(": ")) from error
+        if not isinstance(frame, np.ndarray):
+            kind = type(frame).__name__
+            raise RecordingError(f"frame {self._number} is of type {kind}, expected a NumPy array")
+        return frame
 
     def _decode(self, out: HostArray) -> None:
         frame, self._frame = self._frame, None
-        assert frame is not None  # `wait` has said so
+        assert frame is not None  # `_ready` has said so
         check_frame(frame, self.shape, self.dtype, f"frame {self._number}")
         np.copyto(out, frame)
         self._number += 1
@@ -256,10 +289,12 @@ class PacedSource(Source):
         self._start: int | None = None
         self._arrived: int | None = None
         self._taken = self._last = 0
-        self._error: RecordingError | None = None
+        self._error: Exception | None = None
 
     def wait(self) -> bool:
-        """Wait until the next frame is due."""
+        """Wait until the next frame is due; an error as `FrameSource.wait`."""
+        if self._error is not None:
+            raise self._error
         if self._arrived is None and self._source.wait():
             self._arrived = self._arrival()
         return self._arrived is not None
@@ -275,10 +310,10 @@ class PacedSource(Source):
         while filled < len(out):
             try:
                 read = self._read_due(out[filled:], arrived[filled:]) if self.wait() else 0
-            except RecordingError as error:
+            except Exception as error:  # as in `FrameSource`
+                self._error = error
                 if not filled:
                     raise
-                self._error = error
                 break
             if not read:
                 break

@@ -360,6 +360,35 @@ def test_options_out_of_range(device: Device, options: dict[str, Any], message: 
         Pipeline(currents_of(3), READOUT, device=device, **options)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"batch": 2.5}, r"Pipeline.batch is 2.5, expected a whole number of at least 1"),
+        ({"ring": "4"}, r"Pipeline.ring is '4', expected a whole number of at least 2 slots"),
+    ],
+)
+def test_options_of_another_type(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        Pipeline(currents_of(3), READOUT, **options)
+
+
+@pytest.mark.parametrize("frames", [[np.ones((5, 2))], (np.ones((5, 2)) for _ in range(2)), "frames.npy"])
+def test_what_is_no_source_is_told_how_to_become_one(frames: Any) -> None:
+    with pytest.raises(TypeError, match=r"takes a source or an array .*IteratedSource\(...\)") as caught:
+        Pipeline(frames, READOUT)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("batch", [1, 2, 4])
+def test_an_error_in_the_last_frame_is_not_taken_for_the_end(device: Device, batch: int) -> None:
+    frames = [*currents_of(2), currents_of(1, strips=4)[0]]
+    got: list[int] = []
+    stream = Pipeline(IteratedSource(frames), READOUT, device=device, batch=batch)
+    with pytest.raises(StreamError, match=r"stopped at frame 2 \(source\): frame 2: 4x2 float32"):
+        stream.run(lambda each: got.append(len(each)))
+    assert sum(got) == 2
+
+
 def test_what_a_stream_cannot_run_is_said_before_a_frame_is_taken(device: Device) -> None:
     source = ArraySource(np.zeros((4, 2, 6), np.float32))
     planar = PsdReadout(strip_length=6e-3, layout="planar")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,56 @@ def test_an_error_does_not_lose_the_frames_of_its_batch(paced: bool) -> None:
     assert out[0, 0, 0] == 4
     with pytest.raises(RecordingError, match="frame 5 is broken"):
         source.read_into(out, arrived)
+
+
+def broken_camera(good: int) -> Iterator[np.ndarray]:
+    for k in range(good):
+        yield np.full((2, 3), float(k))
+    raise OSError("the cable is out")
+
+
+def changing(good: int) -> Iterator[np.ndarray]:
+    yield from np.zeros((good, 2, 3))
+    yield np.zeros((2, 4))
+
+
+def no_array(good: int) -> Iterator[Any]:
+    yield from np.zeros((good, 2, 3))
+    yield None
+
+
+@pytest.mark.parametrize("paced", [False, True])
+@pytest.mark.parametrize("batch", [1, 2, 4])
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (broken_camera, "frame 2 did not come: OSError: the cable is out"),
+        (changing, "frame 2: 2x4 float64 where the first frame was 2x3"),
+        (no_array, "frame 2 is of type NoneType, expected a NumPy array"),
+    ],
+)
+def test_an_error_in_the_last_frame_comes_after_the_good_ones(
+    frames: Any, message: str, batch: int, paced: bool
+) -> None:
+    """As a stream reads: `wait` first. The end of the iterator must not hide the error before it."""
+    source: Source = IteratedSource(frames(2))
+    if paced:
+        source = PacedSource(source, 1e6)
+    out, arrived = np.zeros((batch, 2, 3)), np.zeros(batch, np.int64)
+    got = 0
+    while got < 2:
+        assert source.wait()
+        got += source.read_into(out, arrived)
+    for _ in range(2):  # and it stays
+        with pytest.raises(RecordingError, match=message) as caught:
+            source.wait() and source.read_into(out, arrived)
+    assert got == 2
+    assert frames is not broken_camera or isinstance(caught.value.__cause__, OSError)
+
+
+def test_a_camera_that_fails_at_once() -> None:
+    with pytest.raises(RecordingError, match="frame 0 did not come: OSError: the cable is out"):
+        IteratedSource(broken_camera(0))
 
 
 # On a clock -------------------------------------------------------------------------------------------------------

@@ -136,8 +136,8 @@ inline codes highest_outside(const Profiles *profiles, ints peak) {
     *(ints_at *)at = peak;
     for (int lane = 0; lane < LANES; lane++) {
         global const CODE *row = profiles->first + (long)lane * profiles->lane_stride;
-        const CODE before = highest_in(row, 0, at[lane] - RADIUS);
-        level[lane] = higher_of(before, highest_in(row, at[lane] + RADIUS + 1, profiles->length));
+        const CODE before = highest_in(row, 0, min(at[lane] - RADIUS, profiles->length));
+        level[lane] = higher_of(before, highest_in(row, max(at[lane] + RADIUS + 1, 0), profiles->length));
     }
     return *(const codes_at *)level;
 #else

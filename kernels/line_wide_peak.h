@@ -169,7 +169,8 @@ inline int locate_in_row(global const CODE *row, CODE level, const WidePeak *pea
         const ints here = CODE_MASK(*(global const codes_at *)(row + first + 16 * i) == (codes)level);
         lane = min(lane, choose_ints(here, lane_numbers + 16 * i, NO_INDEX));
     }
-    return first + lowest(lane);
+    // A row of nothing but NaN and -infinity may hold no sample of the level.
+    return first + min(lowest(lane), WIDE - 1);
 }
 
 inline void find_in_row(global const CODE *row, int length, int *at, CODE *level, int *lost, Ahead *ahead) {

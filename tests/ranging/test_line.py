@@ -236,6 +236,18 @@ def test_not_finite(device, rng, walk, along):
         np.testing.assert_allclose(reading.position[~lost], expected["position"][~lost], rtol=4e-7, atol=2e-5)
 
 
+@pytest.mark.parametrize(("along", "walk"), list(itertools.product(("columns", "rows"), WALKS)))
+@pytest.mark.parametrize("method", ["whole", "windowed", "fir"])
+def test_nothing_finite(device, along, walk, method):
+    """Profiles without any number have no peak whose place could be looked up."""
+    second = {} if method == "whole" else {"ambiguity": 0.5}
+    readout = LineReadout(along=along, walk=walk, method=method, threshold=1, **second)
+    for value in (np.nan, -np.inf, np.inf):
+        reading = readout(np.full((64, 64), value, np.float32), device=device)
+        assert np.all(reading.status & NOT_FINITE)
+        assert np.isnan(reading.position).all()
+
+
 @pytest.mark.parametrize("walk", WALKS)
 def test_large_moments_are_exact(device, rng, walk):
     """16 bit, 4100 rows on a bright background: the moment needs 40 bits."""

@@ -208,7 +208,7 @@ def scan(
     policy
         What happens to a frame for which there is no room; None: the recording waits, a replay drops the oldest.
     trace
-        File for the timeline.
+        File for the timeline; tried before the scan.
     progress
         Called with the frames done, and of how many (None: unknown).
 
@@ -218,7 +218,11 @@ def scan(
         The recording cannot be read, or no plan keeps up with the rate.
     TypeError, ValueError
         The frames are not the sensor's, or no sample is valid.
+    OSError
+        The timeline cannot be written there.
     """
+    if trace is not None:
+        check_file(trace)
     source, name = _opened(recording, sensor)
     sensor.check_frame(source.shape, name)
     readout = _asking_for(sensor, precision)
@@ -357,17 +361,46 @@ def _directions(points: RangePoints) -> tuple[Direction, Direction]:
 
 
 def check_folder(folder: str | Path) -> None:
-    """Check that a name can be a folder to write into.
+    """Check that a folder is there to write into, or can be made.
 
     Raises
     ------
-    NotADirectoryError
-        There is a file of that name, or one in its place on the way there.
+    ValueError
+        The name is empty.
+    OSError
+        There is a file of that name, or one in its place on the way there; or nothing can be written there.
     """
+    if not os.fspath(folder):
+        raise ValueError("the name of the folder to write into is empty; give one, or . for this folder")
     path = Path(folder).absolute()
     for each in (path, *path.parents):
-        if each.exists() and not each.is_dir():
+        if os.path.lexists(each) and not each.is_dir():
             raise NotADirectoryError(f"cannot write into {folder}: {each} is a file, expected a folder")
+    place = next(each for each in (path, *path.parents) if each.is_dir())
+    # Rights do not tell: who may do everything still cannot write into a read-only or a virtual file system.
+    trial = _beside(place)
+    try:
+        trial.mkdir()
+        trial.rmdir()
+    except OSError as error:
+        raise type(error)(f"cannot write into {folder}: {place}: {error.strerror}; give another folder") from error
+
+
+def check_file(file: str | Path) -> None:
+    """Check that a file can be written there.
+
+    Raises
+    ------
+    ValueError
+        The name is empty.
+    OSError
+        There is a folder of that name, or its folder cannot be written.
+    """
+    if not os.fspath(file):
+        raise ValueError("the name of the file to write is empty; give one")
+    if Path(file).is_dir():
+        raise IsADirectoryError(f"cannot write {file}: it is a folder, expected a file")
+    check_folder(Path(file).parent)
 
 
 @contextmanager
@@ -376,17 +409,19 @@ def whole_folder(folder: str | Path) -> Iterator[Path]:
 
     Raises
     ------
-    NotADirectoryError
-        There is a file of that name.
+    ValueError, OSError
+        See `check_folder`; or something in the folder is in the way of a file.
     """
     check_folder(folder)
     folder = Path(folder).absolute()
     made = [each for each in (folder.parent, *folder.parent.parents) if not each.exists()]
     folder.parent.mkdir(parents=True, exist_ok=True)
-    inside = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.part")
-    inside.mkdir()
+    # Within a folder that is there: it may be a mounted one, and the one above not ours.
+    inside = _beside(folder if folder.is_dir() else folder.parent)
     try:
+        inside.mkdir()
         yield inside
+        _check_room(inside, folder)
         _move(inside, folder)
         made = []
     finally:
@@ -395,10 +430,26 @@ def whole_folder(folder: str | Path) -> Iterator[Path]:
             each.rmdir()
 
 
+def _beside(place: Path) -> Path:
+    return place / f".gpuvision.{secrets.token_hex(4)}.part"
+
+
+def _check_room(inside: Path, folder: Path) -> None:
+    """Check that nothing stands in the way of a file, before the first one is moved."""
+    for each in sorted(inside.rglob("*")):
+        target = folder / each.relative_to(inside)
+        if each.is_dir() and target.exists() and not target.is_dir():
+            raise NotADirectoryError(f"cannot write into {target}: it is a file, expected a folder; move it away")
+        if not each.is_dir() and target.is_dir():
+            raise IsADirectoryError(f"cannot write {target}: it is a folder, expected a file; move it away")
+        if target.is_dir():
+            check_folder(target)
+
+
 def _move(inside: Path, folder: Path) -> None:
     """Move files over those of the same name, and leave the others."""
     folder.mkdir(exist_ok=True)
-    for each in inside.iterdir():
+    for each in list(inside.iterdir()):
         if each.is_dir():
             _move(each, folder / each.name)
         else:

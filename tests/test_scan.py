@@ -16,13 +16,13 @@ import cv2
 import numpy as np
 import pytest
 
-from gpuvision import cli
 from gpuvision.host import Device, RecordingError, StreamError
 from gpuvision.host.sources import ArraySource
 from gpuvision.ranging.export import read_npz, read_ply, read_png16, read_tiff
 from gpuvision.scan import Scan, scan, whole_folder
 from gpuvision.sensor import Sensor
 from gpuvision.status import Status
+from scanning import Ran, check_refused, currents, line_frames
 
 FILES = {
     "range_image.tiff",
@@ -33,22 +33,6 @@ FILES = {
     "scan.png",
     "report.json",
 }
-
-
-def currents(frames: int, height: float = 2e-3, total: float = 1e-6) -> Any:
-    """Codes of the shipped PSD sensor that looks at a plane of some height; left and right as they divide."""
-    sensor = Sensor.load("psd_line")
-    readout: Any = sensor.readout
-    (u, _v) = readout.triangulation.to_sensor([0.0, height])
-    share = u / readout.strip_length
-    pair = np.array([0.5 - share, 0.5 + share]) * total + np.array(readout.dark)
-    return np.broadcast_to(np.rint(pair / readout.ampere), (frames, 96, 2)).astype(np.uint16)
-
-
-def line_frames(rows: Any, sigma: float = 1.2, peak: float = 200.0) -> Any:
-    """Frames (n, 64, 480) of the shipped camera with a line at a row for each frame and column."""
-    distance = np.arange(64)[None, :, None] - np.asarray(rows)[:, None, :]
-    return np.rint(peak * np.exp(-0.5 * (distance / sigma) ** 2)).astype(np.uint8)
 
 
 # ---- what comes out -------------------------------------------------------------------------------------------------
@@ -214,19 +198,6 @@ def test_a_folder_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
 # ---- the command and bad input --------------------------------------------------------------------------------------
 
 
-class Ran:
-    """``gpuvision`` with arguments: exit code and what it said."""
-
-    def __init__(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *args: object) -> None:
-        monkeypatch.setattr(sys, "argv", ["gpuvision", *map(str, args)])
-        try:
-            cli.main()
-            self.code: Any = 0
-        except SystemExit as left:
-            self.code = left.code
-        self.out, self.err = capsys.readouterr()
-
-
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Any:
     return lambda *args: Ran(capsys, monkeypatch, *args)
@@ -323,14 +294,6 @@ def test_a_bad_recording_is_a_line_and_leaves_nothing(make: Any, message: str, t
     ran = run("scan", recording, "--sensor", "camera_line", "--out", out, "--trace", out / "trace.json")
     check_refused(ran, message)
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def check_refused(ran: Ran, message: str) -> None:
-    assert ran.code == 1
-    assert ran.err.startswith("gpuvision: ")
-    assert ran.err.count("\n") == 1
-    assert ran.out == ""
-    assert re.search(message, ran.err), ran.err
 
 
 def test_the_decoder_of_videos_keeps_quiet(tmp_path: Path) -> None:

@@ -8,11 +8,13 @@ from typing import Annotated, Any
 
 import typer
 
+from gpuvision.commands.arguments import named_path
+
 
 def demo(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for recordings, range images and pictures.")] = Path(
-        "out/demo"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", parser=named_path, help="Folder for recordings, range images and pictures.")
+    ] = Path("out/demo"),
     seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 1,
     device: Annotated[str | None, typer.Option(help="Label of an OpenCL device, see `gpuvision devices`.")] = None,
 ) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gpuvision.commands.arguments import named_path
 from gpuvision.host.errors import GpuVisionError
 
 if TYPE_CHECKING:
@@ -22,7 +23,9 @@ def profile(
         list[str] | None, typer.Option(help="Label of a device, see `gpuvision devices`; may be repeated.")
     ] = None,
     seconds: Annotated[float, typer.Option(help="About how long to measure each case.", min=0.01)] = 2.0,
-    as_json: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the rows there.")] = None,
+    as_json: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", parser=named_path, help="Write the rows there.")
+    ] = None,
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
 

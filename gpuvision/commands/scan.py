@@ -11,6 +11,8 @@ from typing import Annotated
 
 import typer
 
+from gpuvision.commands.arguments import named_path
+
 
 class Arithmetic(StrEnum):
     """What ``--precision`` takes."""
@@ -32,6 +34,7 @@ def scan(
         Path,
         typer.Argument(
             metavar="INPUT",
+            parser=named_path,
             help="Of a camera: a video, a TIFF stack, a folder of images, an NPY array (frames, rows, columns). "
             "Of a PSD: an NPY array (frames, strips, 2).",
         ),
@@ -39,7 +42,12 @@ def scan(
     sensor: Annotated[
         str, typer.Option(help="The sensor's TOML file, or one that comes along: camera_line, corner_scene, psd_line.")
     ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the range image, the pictures and report.json.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR", parser=named_path, help="Folder for the range image, the pictures and report.json."
+        ),
+    ],
     device: Annotated[str | None, typer.Option(help="Label of an OpenCL device, see `gpuvision devices`.")] = None,
     precision: Annotated[
         Arithmetic | None, typer.Option(help="Of the arithmetic; otherwise as the recording has it.")
@@ -54,7 +62,8 @@ def scan(
         ),
     ] = None,
     trace: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Timeline for chrome://tracing or ui.perfetto.dev.")
+        Path | None,
+        typer.Option(metavar="FILE", parser=named_path, help="Timeline for chrome://tracing or ui.perfetto.dev."),
     ] = None,
 ) -> None:
     """Scan a recording: range image, pictures and a report in DIR.
@@ -65,12 +74,16 @@ def scan(
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host import Device
-    from gpuvision.scan import check_folder
+    from gpuvision.scan import check_file, check_folder
     from gpuvision.scan import scan as run
     from gpuvision.sensor import Sensor
 
     described = Sensor.load(sensor)
     check_folder(out)
+    if trace is not None:
+        check_file(trace)
+        if trace.absolute() in (out.absolute(), *out.absolute().parents):
+            raise ValueError(f"--trace is {trace}, the folder of --out or one above it; give a file")
     chosen = None if device is None else Device.named(device)
     with progress_bar(f"scanning {recording.name}") as progress:
         done = run(

@@ -16,6 +16,10 @@ from typing import Any, TypeVar, overload
 
 Choice = TypeVar("Choice", bound=str)
 _REQUIRED: Any = object()
+# Larger numbers are slips, and would leave single precision somewhere on their way to a point.
+_LARGEST = {"m": 1e6, "m per profile": 1e3, "pixel": 1e6}
+_LARGEST_OF_ALL = 1e20
+_LARGEST_WHOLE = (1 << 31) - 1
 
 
 class DescriptionError(ValueError):
@@ -109,6 +113,8 @@ class Section:
             return value if value is None else int(value)
         if isinstance(value, bool) or not isinstance(value, int) or not _within(value, limits):
             raise self._wrong(key, value, "", expected)
+        if abs(value) > _LARGEST_WHOLE:
+            raise self._wrong(key, value, "", f"a whole number of at most {_LARGEST_WHOLE}")
         return value
 
     @overload
@@ -128,13 +134,13 @@ class Section:
         return tuple(self._checked(key, each, unit, {}) for each in value)
 
     def rows(self, key: str, unit: str, width: int | None = None, default: Any = _REQUIRED) -> Any:
-        """Return a list of rows of finite numbers, of one width if it is given; as `number`."""
+        """Return a list of rows of finite numbers, one row at least, of one width if it is given; as `number`."""
         expected = f"a list of rows of {'' if width is None else f'{width} '}numbers{_in(unit)}"
         value = self._value(key, expected, default)
         if value is default:
             return value
         rows: list[Any] = value if isinstance(value, list) else [None]
-        if not all(isinstance(row, list) and len(row) == (width or len(row)) for row in rows):
+        if not rows or not all(isinstance(row, list) and row and len(row) == (width or len(row)) for row in rows):
             raise self._wrong(key, value, "", expected)
         return tuple(tuple(self._checked(key, each, unit, {}) for each in row) for row in rows)
 
@@ -189,8 +195,13 @@ class Section:
 
     def _checked(self, key: str, value: Any, unit: str, limits: Mapping[str, float]) -> float:
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not math.isfinite(value) or not _within(value, limits):
+        # A whole number of TOML may be too large for a float: look at its size first.
+        is_finite = is_number and (isinstance(value, int) or math.isfinite(value))
+        if not is_finite or not _within(value, limits):
             raise self._wrong(key, value, unit if is_number else "", _expected(unit, limits))
+        largest = _LARGEST.get(unit, _LARGEST_OF_ALL)
+        if abs(value) > largest:
+            raise self._wrong(key, value, unit, f"a size of at most {largest:g}")
         return float(value)
 
     def _wrong(self, key: str, value: Any, unit: str, expected: str) -> DescriptionError:

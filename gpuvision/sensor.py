@@ -146,7 +146,7 @@ class Sensor:
             sensor = cls._read(top)
         except DescriptionError:
             raise
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise top.error(str(error)) from error
         return sensor
 

@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.tables import checked_keys, finite
+from gpuvision.tables import checked_keys, finite, numbers
 
 _NEWTON_STEPS = 64
+# No lens comes near them in any unit, and they keep the powers of fold radius and table within single precision.
+_LARGEST = {"k1": 1e10, "k2": 1e20}
+_FARTHEST = 1e9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +37,9 @@ class Lens:
     Raises
     ------
     ValueError
-        If a number is not finite.
+        If a number is not finite, or beyond any lens.
+    TypeError
+        If something is no number.
     """
 
     k1: float
@@ -44,9 +49,13 @@ class Lens:
     def __post_init__(self) -> None:
         for name in ("k1", "k2"):
             object.__setattr__(self, name, finite(getattr(self, name), f"Lens.{name}"))
-        if len(self.centre) != 2:
-            raise ValueError(f"Lens.centre has {len(self.centre)} numbers, expected (column, row)")
-        object.__setattr__(self, "centre", tuple(finite(each, "Lens.centre") for each in self.centre))
+            if abs(getattr(self, name)) > _LARGEST[name]:
+                raise ValueError(
+                    f"Lens.{name} is {getattr(self, name):g}, expected a size of at most {_LARGEST[name]:g}"
+                )
+        object.__setattr__(self, "centre", numbers(self.centre, (2,), "Lens.centre (column, row)"))
+        if max(map(abs, self.centre)) > _FARTHEST:
+            raise ValueError(f"Lens.centre is {self.centre}, expected coordinates of at most {_FARTHEST:g}")
 
     @property
     def defines(self) -> dict[str, None]:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
-from gpuvision.tables import checked_keys, finite
+from gpuvision.tables import checked_keys, finite, numbers
 
 _STRIP = 1024  # samples, as in range_image.cl
 _LANES = 16
@@ -57,20 +57,18 @@ class RangePoints(NamedTuple):
 
 
 def _vector(value: Any, what: str) -> Vector:
-    numbers = tuple(finite(each, what) for each in value)
-    if len(numbers) != 3:
-        raise ValueError(f"{what} has {len(numbers)} numbers, expected 3")
-    return numbers
+    x, y, z = numbers(value, (3,), what)
+    return x, y, z
 
 
 def _unit(value: Any, what: str) -> Vector:
-    numbers = np.array(_vector(value, what))
-    length = float(np.linalg.norm(numbers))
-    if length == 0.0:
-        raise ValueError(f"{what} is 0, expected a direction")
+    given = _vector(value, what)
+    length = math.hypot(*given)
+    if not 0.0 < length < math.inf:
+        raise ValueError(f"{what} has length {length:g}, expected a direction")
     if abs(length - 1.0) <= _UNIT_ROUNDING:
-        return _vector(value, what)
-    x, y, z = (numbers / length).tolist()
+        return given
+    x, y, z = (each / length for each in given)
     return x, y, z
 
 
@@ -231,9 +229,7 @@ class RotatingSheet:
             object.__setattr__(self, "angle_step", finite(self.angle_step, "RotatingSheet.angle_step"))
         if self.along not in ("rows", "columns"):
             raise ValueError(f"RotatingSheet.along is {self.along!r}, expected 'rows' or 'columns'")
-        point = tuple(finite(each, "RotatingSheet.principal_point_px") for each in self.principal_point_px)
-        if len(point) != 2:
-            raise ValueError(f"RotatingSheet.principal_point_px has {len(point)} numbers, expected (column, row)")
+        point = numbers(self.principal_point_px, (2,), "RotatingSheet.principal_point_px (column, row)")
         object.__setattr__(self, "principal_point_px", point)
         self._check_directions()
 
@@ -244,8 +240,8 @@ class RotatingSheet:
             object.__setattr__(self, name, _unit(getattr(self, name), f"RotatingSheet.{name}"))
         if np.linalg.norm(np.cross(self.axis_direction, self.sheet_normal)) <= _PARALLEL:
             raise ValueError("RotatingSheet: the sheet's normal lies along the axis, so that turning does not move it")
-        axes = tuple(_vector(each, "RotatingSheet.scene_axes") for each in self.scene_axes)
-        if len(axes) != 3 or np.max(np.abs(np.array(axes) @ np.array(axes).T - np.eye(3))) > 1e-6:
+        axes = numbers(self.scene_axes, (3, 3), "RotatingSheet.scene_axes")
+        if np.max(np.abs(np.array(axes) @ np.array(axes).T - np.eye(3))) > 1e-6:
             raise ValueError("RotatingSheet.scene_axes are not three orthonormal vectors")
         object.__setattr__(self, "scene_axes", axes)
 

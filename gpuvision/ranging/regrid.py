@@ -83,8 +83,10 @@ class Grid:
         Raises
         ------
         ValueError
-            There is no finite point.
+            There is no finite point, or the cell is not above 0.
         """
+        if finite(cell, "the cell of a grid") <= 0.0:
+            raise ValueError(f"the cell of a grid is {cell}, expected metres above 0")
         x, y = np.asarray(x), np.asarray(y)
         good = np.isfinite(x) & np.isfinite(y)
         if not good.any():

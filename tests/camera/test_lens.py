@@ -125,7 +125,11 @@ def test_table_round_trip() -> None:
         ({"k2": 0.0}, "'k1' is missing"),
         ({"k1": "x"}, "k1 must be a number"),
         ({"k1": math.nan}, "k1 must be finite"),
-        ({"k1": 0.0, "centre": [1.0]}, "expected \\(column, row\\)"),
+        ({"k1": 0.0, "centre": [1.0]}, r"centre \(column, row\) has shape \(1,\), expected \(2,\)"),
+        ({"k1": 0.0, "centre": 5}, r"centre \(column, row\) has shape \(\), expected \(2,\)"),
+        ({"k1": 0.0, "centre": [1e300, 0.0]}, r"centre is \(1e\+300, 0.0\), expected coordinates of at most 1e\+09"),
+        ({"k1": 1e308}, r"k1 is 1e\+308, expected a size of at most 1e\+10"),
+        ({"k1": 0.0, "k2": -1e308}, r"k2 is -1e\+308, expected a size of at most 1e\+20"),
     ],
 )
 def test_bad_tables_say_what_is_wrong(table: dict[str, object], message: str) -> None:

@@ -250,11 +250,12 @@ def test_double_is_asked_for_by_precision(device):
     [
         ({"focal_length_px": 0.0}, "focal_length_px is 0.0, expected a number above 0"),
         ({"horizon": -1.0}, "horizon is -1.0"),
-        ({"principal_point_px": (1.0,)}, "has 1 numbers, expected \\(column, row\\)"),
+        ({"principal_point_px": (1.0,)}, "\\(column, row\\) has shape \\(1,\\), expected \\(2,\\)"),
         ({"axis_point": (0.0, math.nan, 0.0)}, "axis_point must be finite"),
-        ({"axis_direction": (0.0, 0.0, 0.0)}, "axis_direction is 0, expected a direction"),
+        ({"axis_direction": (0.0, 0.0, 0.0)}, "axis_direction has length 0, expected a direction"),
         ({"sheet_normal": HEAD.axis_direction}, "normal lies along the axis"),
         ({"along": "row"}, "expected 'rows' or 'columns'"),
+        ({"scene_axes": 5}, r"scene_axes has shape \(\), expected \(3, 3\)"),
         ({"scene_axes": ((1, 0, 0), (0, 1, 0), (0, 1, 0))}, "not three orthonormal vectors"),
     ],
 )
@@ -264,6 +265,11 @@ def test_a_wrong_rotating_sheet_is_refused(change, message):
 
 
 def test_a_wrong_transport_is_refused():
+    for name in ("g_axis", "origin", "direction"):
+        with pytest.raises(ValueError, match=rf"StraightTransport.{name} has shape \(\), expected \(3,\)"):
+            StraightTransport(**{name: 5})
+    with pytest.raises(ValueError, match="direction has length inf, expected a direction"):
+        StraightTransport(direction=(1e308, 1e308, 1e308))
     with pytest.raises(ValueError, match="lie in one plane"):
         StraightTransport(direction=(1.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="step is 0"):

@@ -236,6 +236,9 @@ def test_a_grid_covers_the_points():
     grid = Grid.covering([0.013, np.nan, -0.021], [0.5, 7.0, 0.42], 0.01)
     assert (grid.columns, grid.rows) == (6, 9)
     np.testing.assert_allclose([grid.x[0], grid.x[-1], grid.y[0], grid.y[-1]], [-0.03, 0.02, 0.5, 0.42], atol=1e-15)
+    for cell in (0, -1e-3):
+        with pytest.raises(ValueError, match=rf"cell of a grid is {cell}, expected metres above 0"):
+            Grid.covering([0.0, 1.0], [0.0, 1.0], cell)
     with pytest.raises(ValueError, match="no finite point"):
         Grid.covering([np.nan], [1.0], 0.01)
 

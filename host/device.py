@@ -17,6 +17,7 @@ from gpuvision.host.arrays import SHARED_FLAGS, DeviceArray
 from gpuvision.host.errors import DeviceUnusableError, NoDeviceError
 
 VARIABLE = "GPUVISION_DEVICE"
+_LEAST_LAST_CACHE = 32 << 20  # Intel's runtime tells of the second level only
 
 
 class Device:
@@ -38,6 +39,8 @@ class Device:
         Whether host and device read and write the same allocations with no map or copy (fine-grained SVM).
     has_double : bool
         Whether `precision="double"` works here.
+    cache_bytes : int
+        Size of the last cache; more than that comes from memory and goes there.
     """
 
     def __init__(self, handle: Any, label: str, kind: str, queue: Any = None) -> None:
@@ -49,6 +52,7 @@ class Device:
         self.queue = queue if queue is not None else cl.CommandQueue(self.context, handle)
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
         self.has_double = bool(handle.double_fp_config)
+        self.cache_bytes = max(int(handle.global_mem_cache_size), _LEAST_LAST_CACHE)
         self.shares_memory = self.is_cpu and _has_fine_grained_memory(handle)
 
     def __repr__(self) -> str:

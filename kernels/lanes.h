@@ -62,7 +62,21 @@ inline int any_lane(masks mask) { return mask != 0; }
 // Zero where the mask is set.
 inline reals zero_where(masks mask, reals value) { return as_reals(as_masks(value) & ~mask); }
 
+#ifdef PAST_CACHES
+// Outputs that the caches cannot hold go past them: a line that is written whole need not be read first. Only whole,
+// aligned vectors can.
+inline int aligned_to(size_t size, global const void *to) { return ((size_t)to & (size - 1)) == 0; }
+inline void store_reals(reals value, global real *to) {
+    if (aligned_to(sizeof(reals), to)) __builtin_nontemporal_store(value, (global reals *)to);
+    else *(global reals_at *)to = value;
+}
+inline void store_bytes(bytes value, global uchar *to) {
+    if (aligned_to(sizeof(bytes), to)) __builtin_nontemporal_store(value, (global bytes *)to);
+    else *(global bytes_at *)to = value;
+}
+#else
 inline void store_reals(reals value, global real *to) { *(global reals_at *)to = value; }
 inline void store_bytes(bytes value, global uchar *to) { *(global bytes_at *)to = value; }
+#endif
 
 #endif

@@ -218,14 +218,17 @@ class PsdReadout(Operation[PsdReading]):
         items = max(samples // _SAMPLES_PER_STRIP, 1) if strip else samples
         sheet = self.triangulation
         table = None if self.linearity is None else np.array(self.linearity, real)
+        outputs = self._outputs(batch, real)
+        moved = samples * (2 * dtype.itemsize + sum(spec[1].itemsize for spec in outputs.values() if spec))
+        past_caches = {"PAST_CACHES": None} if strip and device.is_cpu and moved > device.cache_bytes else {}
         return Launch(
             stem="psd",
             kernel="psd_readout",
             inputs=[(shape, dtype)],
-            outputs=self._outputs(batch, real),
+            outputs=outputs,
             global_size=(items,),
             local_size=(1,) if strip else None,
-            defines=self._defines(device, real, dtype, strip),
+            defines=self._defines(device, real, dtype, strip) | past_caches,
             arguments=[
                 self._packed(real, dtype),
                 np.int32(samples),

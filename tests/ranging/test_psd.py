@@ -58,6 +58,19 @@ def test_like_float64(device, rng, walk, dtype, layout, batch):
     assert_like_reference(readout, reading, *values)
 
 
+@pytest.mark.parametrize("shift", [0, 1])
+def test_more_than_the_caches_hold(device, rng, shift):
+    """Outputs go past the caches, to addresses that are and are not aligned to a vector."""
+    samples = 2 + device.cache_bytes // 13 * 16 // 15
+    readout = PsdReadout(strip_length=LENGTH, layout="planar", saturation=float(np.float32(0.9e-6)))
+    values = currents(rng, (2, samples))
+    whole = readout(np.ascontiguousarray(values[:, :1]), device=device)
+    out = type(whole)(
+        *(None if each is None else np.zeros(samples + 16, each.dtype)[shift:][:samples] for each in whole)
+    )
+    assert_like_reference(readout, readout(values, device=device, out=out), *values)
+
+
 @pytest.mark.parametrize("walk", WALKS)
 def test_everything_at_once(device, rng, walk):
     strips = 37

@@ -85,10 +85,11 @@ inline void finish_whole(const Profiles *profiles, const Gravity *gravity, const
     store_reading(to, first, sample, gravity->position, gravity->peak, gravity->lit, gravity->total, flags);
 }
 #else
-inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place *place, constant real *p,
+inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place *found, constant real *p,
                         const Outputs *to, ulong first, int sample) {
-    const ints cut = cut_lanes(profiles, peak->at) & peak->found;
-    ints flags = place->flags | common_flags(profiles, peak->level, peak->lost);
+    const Place place = middle_of_wide_top(peak, *found);
+    const ints cut = cut_lanes(profiles, peak) & peak->found;
+    ints flags = place.flags | common_flags(profiles, peak->level, peak->lost);
     flags |= flag_where(~peak->found, STATUS_DARK) | flag_where(cut, STATUS_OUT_OF_RANGE);
 #ifdef AMBIGUITY
     flags |= flag_where(has_second(profiles, peak, p[AMBIGUOUS_RATIO]) & peak->found, STATUS_AMBIGUOUS);
@@ -98,20 +99,20 @@ inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place 
 #else
     const reals width = 0;
 #endif
-    const reals total = choose_reals(peak->found, place->total, 0);
-    store_reading(to, first, sample, to_reals(peak->at) + place->at, peak->level, width, total, flags);
+    const reals total = choose_reals(peak->found, place.total, 0);
+    store_reading(to, first, sample, to_reals(peak->at) + place.at, peak->level, width, total, flags);
 }
 
 // The window of every lane by itself, by any method.
 inline Place place_apart(const Profiles *profiles, Peak *peak, constant real *p) {
     CODE window[(2 * REACH + 1) * LANES];
-    const ints equals = settle(profiles, peak, REACH, window);
+    settle(profiles, peak, REACH, window);
 #if defined(METHOD_WINDOWED)
     return window_gravity(window, REACH, profiles->threshold);
 #elif defined(METHOD_ML)
     return likeliest_place(window, profiles, peak, p + READ_VARIANCE);
 #else
-    return place_by_points(window, profiles, peak, equals);
+    return place_by_points(window, profiles, peak);
 #endif
 }
 #endif

@@ -1,6 +1,6 @@
 // The peak of a profile: the strongest sample, or under CANDIDATES one of the runs of samples over the threshold.
 //
-// Of samples that tie, the first one is the peak; settle() in line_window.h moves it to the middle of a flat top.
+// Of samples that tie, the first one is the peak; centre_top() in line_window.h moves it to the middle of a flat top.
 #ifndef LINE_PEAK_H
 #define LINE_PEAK_H
 
@@ -11,6 +11,7 @@ typedef struct {
     codes level;  // the sample there; the strongest sample in lanes without one
     ints found;
     ints lost;    // lanes with a sample that is not finite
+    ints top;     // samples of the flat top, neighbours that equal the peak; counted where the window is read
 } Peak;
 
 #if CODE_BITS == 32

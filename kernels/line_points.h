@@ -11,7 +11,7 @@ inline reals over_at(const CODE *window, int k, CODE threshold) {
 #ifdef METHOD_GAUSS3
 // The logarithm of a Gaussian is a parabola, here through the peak and its neighbours. Both must have light. Where the
 // three do not bend down (a flat top) or put the summit beyond them, the middle of the top stands in.
-inline Place place_by_points(const CODE *window, const Profiles *profiles, const Peak *peak, ints equals) {
+inline Place place_by_points(const CODE *window, const Profiles *profiles, const Peak *peak) {
     const reals a = over_at(window, -1, profiles->threshold), b = over_at(window, 0, profiles->threshold);
     const reals c = over_at(window, 1, profiles->threshold);
     const ints lit = REAL_MASK(a > 0) & REAL_MASK(c > 0);
@@ -19,7 +19,7 @@ inline Place place_by_points(const CODE *window, const Profiles *profiles, const
     const reals summit = (log_a - log_c) / (2 * bend);
     const ints good = REAL_MASK(bend < 0) & REAL_MASK(fabs(summit) <= 1);
     Place place = window_gravity(window, REACH, profiles->threshold);
-    place.at = choose_reals(good, summit, to_reals(max(equals - 1, (ints)0) & 1) / 2);
+    place.at = choose_reals(good, summit, to_reals((peak->top - 1) & 1) / 2);
     place.flags = flag_where(~lit & peak->found, STATUS_DARK) | flag_where(lit & ~good, STATUS_AMBIGUOUS);
     return place;
 }
@@ -37,7 +37,7 @@ inline reals balance(const CODE *window, int k) {
 
 // The zero crossing nearest to the peak, linear between samples (F. Blais and M. Rioux, 1986). On a flat top the
 // balance stays at zero: the middle between where it gets there and where it leaves.
-inline Place place_by_points(const CODE *window, const Profiles *profiles, const Peak *peak, ints equals) {
+inline Place place_by_points(const CODE *window, const Profiles *profiles, const Peak *peak) {
     reals reached = 2 * RADIUS, left = 2 * RADIUS, before = balance(window, -RADIUS);
     for (int k = -RADIUS; k < RADIUS; k++) {
         const reals after = balance(window, k + 1);

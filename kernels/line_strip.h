@@ -85,6 +85,7 @@ inline void finish_group(const Profiles *profiles, const WidePeak *wide, int i, 
     Place place;
     if (!any(peak.found)) {
         peak.at = 0;
+        peak.top = 1;
         place.at = place.total = 0;
         place.flags = 0;
     } else {

@@ -117,10 +117,10 @@ inline ints locate_apart(const Profiles *profiles, codes level, ints block, int 
 }
 
 // Centre of gravity of all lanes over one span, every lane by a mask in its own window.
-inline Place span_gravity(const Profiles *profiles, const Peak *peak, Span span, ints *equals) {
+inline Place span_gravity(const Profiles *profiles, const Peak *peak, Span span, ints *top) {
     const indices at = to_indices(peak->at);
     sums16 total = 0, moment = 0;
-    indices equal = 0, offset = (indices)span.begin - at;
+    indices equals = 0, offset = (indices)span.begin - at;
     for (int k = span.begin; k < span.end; k++) {
         const codes x = sample_of(profiles, k);
         const indices inside = as_unsigned(offset + (indices)RADIUS) <= (unsigned_indices)(2 * RADIUS);
@@ -131,10 +131,10 @@ inline Place span_gravity(const Profiles *profiles, const Peak *peak, Span span,
 #endif
         total += v;
         moment += v * to_sums(offset);
-        equal -= to_indices(x == peak->level) & inside;
+        equals -= to_indices(x == peak->level) & (offset == equals);  // neighbours only
         offset += (indices)1;
     }
-    *equals = convert_int16(equal);
+    *top = convert_int16(equals);
     Place place;
     place.total = to_reals(total);
     place.at = to_reals(moment) / place.total;
@@ -143,16 +143,12 @@ inline Place span_gravity(const Profiles *profiles, const Peak *peak, Span span,
 }
 
 inline Place gravity_together(const Profiles *profiles, Peak *peak) {
-    ints equals;
+    ints top;
     const Span span = span_of(peak->at, peak->found, RADIUS, RADIUS, profiles->length);
-    Place place = span_gravity(profiles, peak, span, &equals);
-    const ints shift = max(middle_of_top(equals), (ints)0) & peak->found;
-    if (any(shift > 0)) {
-        peak->at += shift;
-        const Span settled = span_of(peak->at, peak->found, RADIUS, RADIUS, profiles->length);
-        place = span_gravity(profiles, peak, settled, &equals);
-    }
-    return place;
+    const Place place = span_gravity(profiles, peak, span, &peak->top);
+    if (!centre_top(profiles, peak)) return place;
+    const Span settled = span_of(peak->at, peak->found, RADIUS, RADIUS, profiles->length);
+    return span_gravity(profiles, peak, settled, &top);
 }
 
 #else

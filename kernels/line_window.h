@@ -33,27 +33,56 @@ inline void gather(const Profiles *profiles, ints peak, int reach, CODE *window)
 
 inline codes window_level(const CODE *window, int k) { return *(const codes_at *)(window + k * LANES); }
 
-// How far beyond its first sample a flat top's middle lies, by the samples that equal the peak.
-inline ints middle_of_top(ints equals) { return (equals - 1) >> 1; }
-
-// Gathers the window about the middle of the peak's flat top, to which the peak moves.
-inline ints settle(const Profiles *profiles, Peak *peak, int reach, CODE *window) {
-    gather(profiles, peak->at, reach, window);
-    ints equals = 0;
-    for (int k = 0; k <= RADIUS; k++) {
-        const ints inside = INT_MASK(peak->at + k < profiles->length);
-        equals -= CODE_MASK(window_level(window, k + reach) == peak->level) & inside;
+// Counts flat tops that reach beyond the window to their ends.
+inline void follow_tops(const Profiles *profiles, Peak *peak) {
+    int at[LANES], top[LANES];
+    CODE level[LANES];
+    *(ints_at *)at = peak->at;
+    *(ints_at *)top = peak->top & peak->found;
+    *(codes_at *)level = peak->level;
+    for (int lane = 0; lane < LANES; lane++) {
+        if (top[lane] <= RADIUS) continue;
+        global const CODE *profile = profiles->first + (long)lane * profiles->lane_stride;
+        int end = at[lane] + top[lane];
+        while (end < profiles->length && profile[(long)end * profiles->stride] == level[lane]) end++;
+        top[lane] = end - at[lane];
     }
-    const ints shift = middle_of_top(equals) & peak->found;
-    if (any_lane(INT_MASK(shift > 0))) {
-        peak->at += max(shift, (ints)0);
-        gather(profiles, peak->at, reach, window);
-    }
-    return equals;
+    peak->top = *(const ints_at *)top;
 }
 
-inline ints cut_lanes(const Profiles *profiles, ints at) {
-    return INT_MASK(at < RADIUS) | INT_MASK(at + RADIUS >= profiles->length);
+// Moves peaks from the first sample of their flat top to its middle; returns whether any moved.
+inline int centre_top(const Profiles *profiles, Peak *peak) {
+    if (any_lane(INT_MASK(peak->top > RADIUS) & peak->found)) follow_tops(profiles, peak);
+    const ints shift = ((peak->top - 1) >> 1) & peak->found;
+    peak->at += shift;
+    return any_lane(INT_MASK(shift > 0));
+}
+
+// Gathers the window about the middle of the peak's flat top, to which the peak moves.
+inline void settle(const Profiles *profiles, Peak *peak, int reach, CODE *window) {
+    gather(profiles, peak->at, reach, window);
+    ints run = -1;
+    peak->top = 0;
+    for (int k = 0; k <= RADIUS; k++) {
+        run &= CODE_MASK(window_level(window, k + reach) == peak->level) & INT_MASK(peak->at + k < profiles->length);
+        peak->top -= run;
+    }
+    if (centre_top(profiles, peak)) gather(profiles, peak->at, reach, window);
+}
+
+// Lanes where the border cuts the window, or a flat top wider than it.
+inline ints cut_lanes(const Profiles *profiles, const Peak *peak) {
+    const ints begin = peak->at - ((peak->top + 1) >> 1), end = peak->at + (peak->top >> 1) + 1;
+    return INT_MASK(peak->at < RADIUS) | INT_MASK(peak->at + RADIUS >= profiles->length) |
+           (INT_MASK(peak->top > WINDOW) & (INT_MASK(begin < 0) | INT_MASK(end >= profiles->length)));
+}
+
+// A flat top wider than the window hides all that the methods go by: its middle, flagged as AMBIGUOUS.
+inline Place middle_of_wide_top(const Peak *peak, Place place) {
+    const ints wide = INT_MASK(peak->top > WINDOW) & peak->found;
+    place.at = choose_reals(wide, to_reals((peak->top - 1) & 1) / 2, place.at);
+    place.flags = choose_ints(wide, STATUS_AMBIGUOUS, place.flags);
+    return place;
 }
 
 // Centre of gravity about the middle of the window.

@@ -45,10 +45,11 @@ class LineReading(NamedTuple):
         Light over the threshold [grey levels]: in the window, for ``method="whole"`` in the whole profile.
     status
         uint8 `Status` flags. DARK: no peak that the parameters allow, or too little light beside it for the method.
-        OUT_OF_RANGE: the border cuts the window (for ``"whole"``: a border sample has half the peak's light or
-        more). NOT_FINITE: a sample of the profile is NaN or infinite. With a value: SATURATED (the peak is at the
-        saturation level), AMBIGUOUS (a second peak is comparable, or the fit fell back to the middle of a flat top).
-        HORIZON and FOLDED come from the triangulation.
+        OUT_OF_RANGE: the border cuts the window, or a flat top wider than it (for ``"whole"``: a border sample has
+        half the peak's light or more). NOT_FINITE: a sample of the profile is NaN or infinite. With a value:
+        SATURATED (the peak is at the saturation level), AMBIGUOUS (a second peak is comparable, a flat top is wider
+        than the window, or the fit fell back to the middle of a flat top). HORIZON and FOLDED come from the
+        triangulation.
     g, h
         The point in the sheet of light [m], where the readout has a triangulation.
     """
@@ -67,7 +68,8 @@ class LineReadout(Operation[LineReading]):
     """Light lines to positions: ``readout(frames) -> LineReading``.
 
     Takes uint8, uint16 or float32 frames of shape (..., rows, columns). Light is what a sample has over the
-    threshold. Of samples that tie for the peak the first one counts; a flat top counts by its middle.
+    threshold. Of samples that tie for the peak the first one counts. It and the neighbours after it that equal it are
+    a flat top, which counts by its middle; one wider than the window is read as that middle and flagged AMBIGUOUS.
 
     Parameters
     ----------

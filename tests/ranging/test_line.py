@@ -168,7 +168,12 @@ DARKNESS = (0,) * 6
 EXTREMES = {
     "all zero": (column(*[0] * 20), DARK),
     "flat top": (column(*DARKNESS, 90, 255, 255, 255, 255, 255, 60, *DARKNESS), SATURATED),
-    "top wider than half the window": (column(*DARKNESS, *[255] * 8, *DARKNESS), SATURATED | AMBIGUOUS),
+    "top wider than half the window": (column(*DARKNESS, *[255] * 8, *DARKNESS), SATURATED),
+    "top as wide as the window": (column(*DARKNESS, *[255] * 9, *DARKNESS), SATURATED),
+    "top wider than the window": (column(*DARKNESS, *[255] * 10, *DARKNESS), SATURATED | AMBIGUOUS),
+    "wide top at the border": (column(*[255] * 12, *DARKNESS), SATURATED | OUT_OF_RANGE | AMBIGUOUS),
+    "wide top at the end": (column(*DARKNESS, *[255] * 12), SATURATED | OUT_OF_RANGE | AMBIGUOUS),
+    "ties apart": (column(*DARKNESS, 100, 250, 100, 250, 250, 100, *DARKNESS), 0),
     "edge": (column(200, 90, 10, *DARKNESS, *DARKNESS), OUT_OF_RANGE),
     "last row": (column(*DARKNESS, *DARKNESS, 10, 90, 200), OUT_OF_RANGE),
     "two equal peaks": (column(*DARKNESS, 50, 100, 50, *DARKNESS, 50, 100, 50, *DARKNESS), AMBIGUOUS),
@@ -186,7 +191,7 @@ def test_extremes(device, walk, along):
     readout = LineReadout(threshold=5, window=4, ambiguity=0.8, along=along, walk=walk)
     for name, (frame, status) in EXTREMES.items():
         frame = frame if along == "columns" else np.ascontiguousarray(np.pad(frame.T, ((0, 0), (0, 64))))
-        if along == "rows" and name in ("last row", "all saturated"):
+        if along == "rows" and name in ("last row", "all saturated", "wide top at the end"):
             continue  # the padding takes the border away
         reading = readout(frame, device=device)
         assert_same(reading, read_lines(frame, threshold=5, window=4, ambiguity=0.8, along=along))
@@ -199,6 +204,32 @@ def test_flat_top_is_read_in_its_middle(device):
     for method in ("windowed", "gauss3", "fir"):
         reading = LineReadout(method=method, threshold=5, window=6)(frame, device=device)
         np.testing.assert_allclose(reading.position[reading.status & DARK == 0], 11.5)
+
+
+METHODS_WITH_PEAKS = ("windowed", "gauss3", "fir", "ml")
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize(("along", "choice"), [("columns", "strongest"), ("rows", "strongest"), ("columns", "last")])
+def test_top_wider_than_the_window(device, walk, along, choice):
+    for method, width in itertools.product(METHODS_WITH_PEAKS, (20, 21)):
+        frame = column(*[0] * 20, *[255] * width, *[0] * 40)
+        frame = frame if along == "columns" else np.ascontiguousarray(frame.T)
+        readout = LineReadout(method=method, threshold=5, window=4, along=along, choice=choice, walk=walk)
+        reading = readout(frame, device=device)
+        np.testing.assert_array_equal(reading.position, 20 + (width - 1) / 2)
+        np.testing.assert_array_equal(reading.status, SATURATED | AMBIGUOUS)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("choice", ["first", "strongest"])
+def test_only_neighbours_make_a_flat_top(device, walk, choice):
+    frame = column(*[0] * 19, 100, 255, 100, *[0] * 4, 100, 255, 255, *[0] * 20)
+    for method in ("gauss3", "fir", "windowed"):
+        parameters = {"method": method, "threshold": 5, "window": 8 if method == "gauss3" else 3, "choice": choice}
+        reading = LineReadout(walk=walk, **parameters)(frame, device=device)
+        np.testing.assert_array_equal(reading.status, SATURATED)
+        np.testing.assert_allclose(reading.position, 20.0, atol=1e-5)
 
 
 def test_fit_leaves_saturated_samples_out(device):

@@ -80,7 +80,9 @@ def read_peak(
         return np.nan, x.max(), 0, 0.0, DARK | (SATURATED if x.max() >= saturation else 0)
     at, width = found
     top = x[at]
-    equals = int(np.sum(x[at : at + window + 1] == top))
+    others = np.flatnonzero(x[at:] != top)
+    equals = int(others[0]) if len(others) else len(x) - at
+    begin, end = at, at + equals
     at += (equals - 1) // 2
     status = SATURATED if top >= saturation else 0
     v = np.maximum(x - threshold, 0.0)
@@ -88,11 +90,15 @@ def read_peak(
     if ambiguity is not None and np.any(~inside):
         second = v[~inside].max()
         status |= AMBIGUOUS if second > 0.0 and second >= ambiguity * (top - threshold) else 0
-    if at < window or at + window >= len(x):
+    is_wide = equals > 2 * window + 1
+    status |= AMBIGUOUS if is_wide else 0
+    if at < window or at + window >= len(x) or (is_wide and (begin == 0 or end == len(x))):
         return np.nan, top, width, np.nan, status | OUT_OF_RANGE
     near = x[at - window : at + window + 1]
     total = np.maximum(near - threshold, 0.0).sum()
-    if method == "windowed":
+    if is_wide:
+        offset, flag = (equals - 1) % 2 / 2.0, 0
+    elif method == "windowed":
         offset, flag = np.sum(v[inside] * np.arange(-window, window + 1)) / total, 0
     elif method == "gauss3":
         offset, flag = gauss3(v, at, equals)

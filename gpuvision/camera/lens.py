@@ -136,7 +136,8 @@ class Lens:
             reachable = target < fold * (1.0 + fold**2 * (self.k1 + self.k2 * fold**2))
         else:
             # Without a fold the slope is at least this, so the root is at most target / slope.
-            least_slope = 1.0 - 9.0 * self.k1**2 / (20.0 * self.k2) if self.k1 < 0.0 else 1.0
+            # (A k1 below 0 alone folds, but too far out for a float where it is all but 0.)
+            least_slope = 1.0 - 9.0 * self.k1**2 / (20.0 * self.k2) if self.k1 < 0.0 < self.k2 else 1.0
             high = target / least_slope
             reachable = np.isfinite(target)
         low = np.zeros_like(target)

@@ -118,6 +118,12 @@ def test_table_round_trip() -> None:
     assert Lens.from_dict({"k1": 1e-7}) == Lens(k1=1e-7)
 
 
+def test_a_fold_too_far_out_for_a_float_is_none() -> None:
+    lens = Lens(k1=-5e-324)
+    assert lens.fold_radius == math.inf
+    np.testing.assert_array_equal(lens.distort([3.0, 4.0]), [3.0, 4.0])
+
+
 @pytest.mark.parametrize(
     ("table", "message"),
     [

@@ -251,7 +251,7 @@ def test_double_is_asked_for_by_precision(device):
         ({"focal_length_px": 0.0}, "focal_length_px is 0.0, expected a number above 0"),
         ({"horizon": -1.0}, "horizon is -1.0"),
         ({"principal_point_px": (1.0,)}, "\\(column, row\\) has shape \\(1,\\), expected \\(2,\\)"),
-        ({"axis_point": (0.0, math.nan, 0.0)}, "axis_point must be finite"),
+        ({"axis_point": (0.0, math.nan, 0.0)}, "axis_point has a number that is not finite"),
         ({"axis_direction": (0.0, 0.0, 0.0)}, "axis_direction has length 0, expected a direction"),
         ({"sheet_normal": HEAD.axis_direction}, "normal lies along the axis"),
         ({"along": "row"}, "expected 'rows' or 'columns'"),
@@ -269,7 +269,7 @@ def test_a_wrong_transport_is_refused():
         with pytest.raises(ValueError, match=rf"StraightTransport.{name} has shape \(\), expected \(3,\)"):
             StraightTransport(**{name: 5})
     with pytest.raises(ValueError, match="direction has length inf, expected a direction"):
-        StraightTransport(direction=(1e308, 1e308, 1e308))
+        StraightTransport(direction=(1.5e308, 1.5e308, 0.0))
     with pytest.raises(ValueError, match="lie in one plane"):
         StraightTransport(direction=(1.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="step is 0"):

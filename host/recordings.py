@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import re
 import zipfile
 import zlib
@@ -23,11 +25,19 @@ CHANNELS: tuple[Channel, ...] = ("grey", "red", "green", "blue", "max")
 _TIFF = (".tif", ".tiff")
 _IMAGES = (".png", ".bmp", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".webp", *_TIFF)
 _VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv", ".ts")
+_NPY, _ZIP = b"\x93NUMPY", b"PK"
 _PLACES = {"blue": 0, "green": 1, "red": 2}
+
+
+# What is wrong with a file is in our own line; who wants tifffile's words too sets up logging, and gets them.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
 def open_recording(path: str | Path, *, channel: Channel = "grey", key: str | None = None) -> Source:
     """Open a recording by what it is: a folder of images, or a file by its suffix.
+
+    A video that is damaged in its middle is not refused: the decoder conceals the damage, and such frames look like
+    others.
 
     Parameters
     ----------
@@ -54,6 +64,8 @@ def open_recording(path: str | Path, *, channel: Channel = "grey", key: str | No
     """
     if channel not in CHANNELS:
         raise ValueError(f"channel is {channel!r}, expected one of {', '.join(CHANNELS)}")
+    if not os.fspath(path):
+        raise RecordingError("the recording's name is empty; give a file or a folder, or . for this one")
     path = Path(path)
     if not path.exists():
         raise RecordingError(f"{path}: no such recording")
@@ -72,8 +84,14 @@ def open_recording(path: str | Path, *, channel: Channel = "grey", key: str | No
 
 def _array_source(path: Path, key: str | None) -> Source:
     try:
-        loaded = np.load(path, mmap_mode="r", allow_pickle=False)
-        frames: HostArray = loaded if isinstance(loaded, np.ndarray) else _member(path, loaded, key)
+        with path.open("rb") as file:
+            begin = file.read(len(_NPY))
+        if begin[:2] == _ZIP:
+            frames = _member(path, key)
+        elif begin == _NPY:
+            frames = np.lib.format.open_memmap(path, mode="r")
+        else:
+            raise RecordingError(f"{path}: not a readable {path.suffix} file: it does not begin as NumPy writes them")
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise RecordingError(f"{path}: not a readable {path.suffix} file: {_line(error)}") from error
     if frames.ndim < 2 or not frames.size:
@@ -81,15 +99,21 @@ def _array_source(path: Path, key: str | None) -> Source:
     return ArraySource(frames)
 
 
-def _member(path: Path, archive: Any, key: str | None) -> HostArray:
-    with archive:
+def _member(path: Path, key: str | None) -> HostArray:
+    with np.load(path, allow_pickle=False) as archive:
         names = list(archive.files)
+        if not names:
+            raise RecordingError(f"{path}: holds no array, expected one of frames")
         if key is None and len(names) == 1:
             key = names[0]
         if key not in names:
             wanted = "several arrays" if key is None else f"no array {key!r}"
-            raise RecordingError(f"{path}: holds {wanted}; name one of {', '.join(names) or 'none'} as key")
-        member: HostArray = archive[key]
+            raise RecordingError(
+                f"{path}: holds {wanted}; name one of {', '.join(names)} as key, in a sensor file under [recording]"
+            )
+        member: object = archive[key]
+        if not isinstance(member, np.ndarray):
+            raise RecordingError(f"{path}: {key} in it is not an array")
         return member
 
 

@@ -348,7 +348,7 @@ def test_one_array_of_several_is_named_by_its_key(tmp_path: Path, run: Any) -> N
     keyed.write_text(text.replace("[recording]", "[recording]\nkey = 'light'"))
     assert scan(tmp_path / "both.npz", Sensor.load(keyed)).points.z.shape == (5, 96)
     ran = run("scan", tmp_path / "both.npz", "--sensor", "psd_line", "--out", tmp_path / "out")
-    check_refused(ran, r"holds several arrays; name one of dark, light as key")
+    check_refused(ran, r"holds several arrays; name one of dark, light as key, in a sensor file under \[recording\]")
 
 
 def test_a_map_too_large_to_hold_is_refused() -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -228,10 +231,22 @@ def test_npy_and_npz(tmp_path: Path, frames: np.ndarray) -> None:
         assert (source.shape, source.dtype, source.length) == (frames.shape[1:], frames.dtype, 7)
         assert np.array_equal(read_all(source), frames)
     assert np.array_equal(read_all(open_recording(tmp_path / "two.npz", key="frames")), frames)
-    with pytest.raises(RecordingError, match=r"several arrays; name one of frames, dark as key"):
+    with pytest.raises(
+        RecordingError, match=r"several arrays; name one of frames, dark as key, in a sensor file under \[recording\]"
+    ):
         open_recording(tmp_path / "two.npz")
     with pytest.raises(RecordingError, match=r"no array 'light'; name one of frames, dark"):
         open_recording(tmp_path / "two.npz", key="light")
+
+
+def test_archives_without_an_array(tmp_path: Path) -> None:
+    np.savez(tmp_path / "none.npz")
+    with pytest.raises(RecordingError, match=r"none\.npz: holds no array, expected one of frames$"):
+        open_recording(tmp_path / "none.npz")
+    with zipfile.ZipFile(tmp_path / "text.npz", "w") as archive:
+        archive.writestr("notes.txt", "hello")
+    with pytest.raises(RecordingError, match=r"text\.npz: notes.txt in it is not an array"):
+        open_recording(tmp_path / "text.npz")
 
 
 def test_currents_that_are_not_finite_are_passed_on(tmp_path: Path) -> None:
@@ -332,6 +347,8 @@ def test_the_real_video(data: Path) -> None:
 def test_what_is_not_there_or_not_a_recording(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no such recording"):
         open_recording(tmp_path / "missing.npy")
+    with pytest.raises(RecordingError, match="name is empty; give a file"):
+        open_recording("")
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(RecordingError, match=r"not a recording by its suffix; expected .*\.npy"):
         open_recording(tmp_path / "notes.txt")
@@ -346,6 +363,7 @@ def test_files_that_are_not_what_they_say(tmp_path: Path, name: str, content: by
     with pytest.raises(RecordingError, match=name) as caught:
         read_all(open_recording(tmp_path / name))
     assert "\n" not in str(caught.value)
+    assert "pickle" not in str(caught.value)
 
 
 def test_arrays_of_no_frames_no_axis_or_objects(tmp_path: Path) -> None:
@@ -373,6 +391,17 @@ def test_truncated_files(tmp_path: Path, rng: np.random.Generator, name: str, sh
     path.write_bytes(whole[: int(len(whole) * share)])
     with pytest.raises(RecordingError, match=name):
         read_all(open_recording(path))
+
+
+def test_the_library_that_reads_tiff_keeps_quiet(tmp_path: Path, rng: np.random.Generator) -> None:
+    """In a process of its own: a test's log handlers would swallow what the library says."""
+    path = tmp_path / "cut.tif"
+    tifffile.imwrite(path, rng.integers(0, 60000, (12, 40, 50), dtype=np.uint16), compression="zlib")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    code = "import sys; from gpuvision.host.recordings import *\n"
+    code += "try: open_recording(sys.argv[1])\nexcept RecordingError: print('refused')"
+    ran = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
+    assert (ran.stdout, ran.stderr) == ("refused\n", "")
 
 
 def test_an_empty_folder(tmp_path: Path) -> None:

@@ -10,14 +10,47 @@ Describe an operation once, then call it::
 or bind it to a device and a shape for the hot path, or stream frames through it with a `Pipeline`.
 """
 
-from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, GpuVisionError, Pipeline, Step, host_view, open_recording
-from gpuvision.ranging.line import LineReading, LineReadout
-from gpuvision.ranging.psd import PsdNoise, PsdReading, PsdReadout
-from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
-from gpuvision.ranging.regrid import Grid, HeightMap, Regrid
-from gpuvision.ranging.triangulation import SampleAxes, SheetPoints, Triangulation
-from gpuvision.status import Status
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gpuvision.camera.lens import Lens
+    from gpuvision.host import Device, GpuVisionError, Pipeline, Step, host_view, open_recording
+    from gpuvision.ranging.line import LineReading, LineReadout
+    from gpuvision.ranging.psd import PsdNoise, PsdReading, PsdReadout
+    from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
+    from gpuvision.ranging.regrid import Grid, HeightMap, Regrid
+    from gpuvision.ranging.triangulation import SampleAxes, SheetPoints, Triangulation
+    from gpuvision.status import Status
+
+# Names come with their first use: the command is there at once, and an interrupt while it loads is not a stack trace.
+_PLACES = {
+    "Device": "gpuvision.host",
+    "GpuVisionError": "gpuvision.host",
+    "Grid": "gpuvision.ranging.regrid",
+    "HeightMap": "gpuvision.ranging.regrid",
+    "Lens": "gpuvision.camera.lens",
+    "LineReading": "gpuvision.ranging.line",
+    "LineReadout": "gpuvision.ranging.line",
+    "Pipeline": "gpuvision.host",
+    "PsdNoise": "gpuvision.ranging.psd",
+    "PsdReading": "gpuvision.ranging.psd",
+    "PsdReadout": "gpuvision.ranging.psd",
+    "RangeImage": "gpuvision.ranging.range_image",
+    "RangePoints": "gpuvision.ranging.range_image",
+    "Regrid": "gpuvision.ranging.regrid",
+    "RotatingSheet": "gpuvision.ranging.range_image",
+    "SampleAxes": "gpuvision.ranging.triangulation",
+    "SheetPoints": "gpuvision.ranging.triangulation",
+    "Status": "gpuvision.status",
+    "Step": "gpuvision.host",
+    "StraightTransport": "gpuvision.ranging.range_image",
+    "Triangulation": "gpuvision.ranging.triangulation",
+    "host_view": "gpuvision.host",
+    "open_recording": "gpuvision.host",
+}
 
 __all__ = [
     "Device",
@@ -44,3 +77,15 @@ __all__ = [
     "host_view",
     "open_recording",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_PLACES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,40 +1,51 @@
 """The command ``gpuvision``.
 
-Exit code 0: done; 1: it could not be done, with one line on stderr that says why; 2: the command line is wrong.
+Exit code 0: done; 1: it could not be done, with one line on stderr that says why; 2: the command line is wrong; 130 and
+143: interrupted or terminated.
+
+What takes time to import is imported within `main`: an interrupt is an exit code from the first moment.
 """
 
 from __future__ import annotations
 
 import os
+import signal
 import sys
+from typing import TYPE_CHECKING, NoReturn
 
-import typer
-
-from gpuvision.commands.demo import demo
-from gpuvision.commands.devices import devices
-from gpuvision.commands.profile import profile
-from gpuvision.commands.scan import scan
-from gpuvision.host.errors import GpuVisionError
+if TYPE_CHECKING:
+    import typer
 
 TRACEBACK = "GPUVISION_TRACEBACK"
 
-app = typer.Typer(
-    help="Range imaging and visual servoing in OpenCL.",
-    epilog=f"The variable {TRACEBACK}=1 shows where an error arose.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
 
+def application() -> typer.Typer:
+    """Return the command line with its commands."""
+    import typer
 
-for command in (scan, demo, devices, profile):
-    app.command()(command)
+    from gpuvision.commands.demo import demo
+    from gpuvision.commands.devices import devices
+    from gpuvision.commands.profile import profile
+    from gpuvision.commands.scan import scan
+
+    app = typer.Typer(
+        help="Range imaging and visual servoing in OpenCL.",
+        epilog=f"The variable {TRACEBACK}=1 shows where an error arose.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+    )
+    for command in (scan, demo, devices, profile):
+        app.command()(command)
+    return app
 
 
 def one_line(error: Exception) -> str:
     """Return an error's message as a single line, with the file's name where the system gave one."""
     if isinstance(error, OSError) and error.strerror:
-        message = f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        # Of two files the second one is where the first, a temporary one, was to go.
+        name = error.filename2 or error.filename
+        message = f"{name}: {error.strerror}" if name else error.strerror
     else:
         message = str(error) or type(error).__name__
     return " ".join(message.split())
@@ -42,9 +53,27 @@ def one_line(error: Exception) -> str:
 
 def main() -> None:
     """Run the command line; what goes wrong becomes a line on stderr and an exit code."""
+    before = signal.signal(signal.SIGTERM, _terminated)
     try:
-        app()
-    except (GpuVisionError, ValueError, TypeError, OSError) as error:
+        _run()
+    except KeyboardInterrupt:
+        sys.exit(128 + signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _terminated(number: int, frame: object) -> NoReturn:
+    """Leave by an exception, so that what is half-written goes; once, whatever comes while it does."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.exit(128 + number)
+
+
+def _run() -> None:
+    from gpuvision.host.errors import GpuVisionError
+
+    try:
+        application()()
+    except (GpuVisionError, ValueError, TypeError, OverflowError, OSError) as error:
         if os.environ.get(TRACEBACK):
             raise
         print(f"gpuvision: {one_line(error)}", file=sys.stderr)

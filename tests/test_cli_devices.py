@@ -40,7 +40,7 @@ def paper(monkeypatch: pytest.MonkeyPatch) -> Paper:
 
 
 def _devices(*words: str) -> Result:
-    return CliRunner(env={"COLUMNS": "150"}).invoke(cli.app, ["devices", *words])
+    return CliRunner(env={"COLUMNS": "150"}).invoke(cli.application(), ["devices", *words])
 
 
 def test_table_shows_the_best_first_and_what_to_do(paper: Paper) -> None:
@@ -125,7 +125,7 @@ def test_errors_are_one_line(
     def app() -> None:
         raise error
 
-    monkeypatch.setattr(cli, "app", app)
+    monkeypatch.setattr(cli, "application", lambda: app)
     monkeypatch.delenv(cli.TRACEBACK, raising=False)
     with pytest.raises(SystemExit) as stopped:
         cli.main()
@@ -149,6 +149,6 @@ def test_defects_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def app() -> None:
         raise KeyError("a defect of ours")
 
-    monkeypatch.setattr(cli, "app", app)
+    monkeypatch.setattr(cli, "application", lambda: app)
     with pytest.raises(KeyError):
         cli.main()

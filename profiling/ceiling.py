@@ -17,8 +17,8 @@ _ITEMS_PER_UNIT = 64
 _FLOPS_PER_STEP = 8 * 16 * 2
 
 
-def move(device: Device, read: int, written: int) -> Callable[[], None]:
-    """Return a call that reads and writes so many bytes in order, and waits.
+def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[[], None]:
+    """Return a call that reads and writes so many bytes in order, `repeats` times back to back, and waits.
 
     Timed beside a kernel of the same traffic it gives the part of that kernel's time that the traffic alone costs,
     launch included, in the same cache or memory.
@@ -33,7 +33,9 @@ def move(device: Device, read: int, written: int) -> Callable[[], None]:
     items = device.handle.max_compute_units * _ITEMS_PER_UNIT * (1 if device.is_cpu else 64)
 
     def run(kept: object = (source, target)) -> None:
-        cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.is_cpu else None).wait()
+        for _ in range(repeats):
+            cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.is_cpu else None)
+        device.queue.finish()
 
     run()
     return run

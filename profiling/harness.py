@@ -47,6 +47,8 @@ class Case:
         Our largest error against float64, in the output's unit, measured on the case's own input.
     traffic
         Bytes (read, written) that the work needs at least, for the fraction of the device's limit.
+    repeats
+        How often every call does the work back to back; a row's times are for one.
     facts
         More columns for the row (latencies, rates).
     """
@@ -57,6 +59,7 @@ class Case:
     peers: Mapping[str, Callable[[], object]]
     error: float
     traffic: tuple[int, int] | None = None
+    repeats: int = 1
     facts: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -100,8 +103,8 @@ def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
     """Let our call, the peers and the device's ceiling take turns for about so many seconds."""
     calls: dict[str, Callable[[], object]] = {"": case.ours, **case.peers}
     if case.traffic is not None:
-        calls["ceiling"] = ceiling.move(device, *case.traffic)
-    times = {name: np.array(list_) for name, list_ in _take_turns(calls, seconds).items()}
+        calls["ceiling"] = ceiling.move(device, *case.traffic, case.repeats)
+    times = {name: np.array(taken) / case.repeats for name, taken in _take_turns(calls, seconds).items()}
     ours = times.pop("")
     limit = times.pop("ceiling", None)
     fraction = None if limit is None else float(np.median(limit / ours))

@@ -42,7 +42,7 @@ def cases(device: Device) -> Iterator[Case]:
 
     for name, call in (("bound", preset), ("given", given)):
         facts = {"overhead_us": _overhead(call, plain) * 1e6}
-        yield Case("launch", f"{name}/{_LAUNCHES}", call, {"pyopencl": plain}, error=0.0, facts=facts)
+        yield Case("launch", name, call, {"pyopencl": plain}, error=0.0, repeats=_LAUNCHES, facts=facts)
 
 
 def _overhead(call: Callable[[], None], plain: Callable[[], None]) -> float:

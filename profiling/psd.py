@@ -14,6 +14,7 @@ from gpuvision.profiling.harness import Case
 from gpuvision.ranging.psd import PsdReadout
 
 LENGTH, MINIMUM, SATURATION = 6e-3, 100.0, 60_000.0
+_IN_A_ROW = 8
 
 
 @numba.njit(error_model="numpy")
@@ -97,15 +98,20 @@ def scan_currents(dtype: str, count: int) -> NDArray[Any]:
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield float32 and uint16 batches of 1e4, 1e6 and 16e6 samples, planar; and 1e6 as pairs."""
-    for count, name in ((10_000, "1e4"), (1_000_000, "1e6"), (16_000_000, "16e6")):
-        for dtype in ("float32", "uint16"):
-            yield _case(device, dtype, count, f"{dtype}/{name}", "planar")
+    """Yield float32 and uint16 batches of 1e4, 1e6 and 16e6 samples, planar, and 1e6 as pairs.
+
+    Small batches come eight in a row, as a stream enqueues them; ``...-alone`` waits for each.
+    """
     for dtype in ("float32", "uint16"):
-        yield _case(device, dtype, 1_000_000, f"{dtype}-pairs/1e6", "pairs")
+        yield _case(device, dtype, 10_000, f"{dtype}/1e4", repeats=_IN_A_ROW)
+        yield _case(device, dtype, 10_000, f"{dtype}/1e4-alone")
+        yield _case(device, dtype, 1_000_000, f"{dtype}/1e6", repeats=_IN_A_ROW)
+        yield _case(device, dtype, 1_000_000, f"{dtype}/1e6-alone")
+        yield _case(device, dtype, 16_000_000, f"{dtype}/16e6")
+        yield _case(device, dtype, 1_000_000, f"{dtype}-pairs/1e6", "pairs", repeats=_IN_A_ROW)
 
 
-def _case(device: Device, dtype: str, count: int, name: str, layout: Any) -> Case:
+def _case(device: Device, dtype: str, count: int, name: str, layout: Any = "planar", repeats: int = 1) -> Case:
     readout = PsdReadout(
         strip_length=LENGTH,
         minimum_total=MINIMUM,
@@ -126,14 +132,24 @@ def _case(device: Device, dtype: str, count: int, name: str, layout: Any) -> Cas
         loop, arrays = _numba_planar_codes if codes else _numba_planar, (left, right)
     else:
         loop, arrays = _numba_pairs_codes if codes else _numba_pairs, (currents.reshape(-1),)
-    peers = {
-        "numba": lambda: loop(*arrays, position, status, *constants),
-        "numpy": lambda: _numpy(left, right),
-    }
+
+    def ours() -> None:
+        for _ in range(repeats):
+            bound()
+        device.queue.finish()
+
+    def with_numba() -> None:
+        for _ in range(repeats):
+            loop(*arrays, position, status, *constants)
+
+    def with_numpy() -> None:
+        for _ in range(repeats):
+            _numpy(left, right)
+
     bound().wait()
     error = _error(bound.outputs.position.get(), bound.outputs.status.get(), left, right)
     traffic = (currents.nbytes, 5 * count)
-    return Case("psd", name, lambda: bound().wait(), peers, error, traffic)
+    return Case("psd", name, ours, {"numba": with_numba, "numpy": with_numpy}, error, traffic, repeats)
 
 
 def _fill(array: Any, values: NDArray[Any]) -> None:

@@ -120,7 +120,8 @@ inline ints locate_apart(const Profiles *profiles, codes level, ints block, int 
 inline Place span_gravity(const Profiles *profiles, const Peak *peak, Span span, ints *top) {
     const indices at = to_indices(peak->at);
     sums16 total = 0, moment = 0;
-    indices equals = 0, offset = (indices)span.begin - at;
+    indices offset = (indices)span.begin - at;
+    unsigned_indices past = as_unsigned((indices)-1);  // the first offset past the flat top; unsigned, none before it is
     for (int k = span.begin; k < span.end; k++) {
         const codes x = sample_of(profiles, k);
         const indices inside = as_unsigned(offset + (indices)RADIUS) <= (unsigned_indices)(2 * RADIUS);
@@ -131,10 +132,11 @@ inline Place span_gravity(const Profiles *profiles, const Peak *peak, Span span,
 #endif
         total += v;
         moment += v * to_sums(offset);
-        equals -= to_indices(x == peak->level) & (offset == equals);  // neighbours only
+        const unsigned_indices other = as_unsigned(offset | to_indices(x == peak->level));
+        past = other < past ? other : past;
         offset += (indices)1;
     }
-    *top = convert_int16(equals);
+    *top = convert_int16(past < as_unsigned(offset) ? past : as_unsigned(offset));
     Place place;
     place.total = to_reals(total);
     place.at = to_reals(moment) / place.total;

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from gpuvision.cli import app
+from gpuvision.cli import application
 from gpuvision.host import Device, GpuVisionError, NoDeviceError
 from gpuvision.profiling import harness
 from gpuvision.profiling.harness import Row, Run
@@ -48,7 +48,7 @@ def test_what_was_asked_for_is_measured_and_shown(asked: dict[str, Any], tmp_pat
     label = Device.best().label
     file = tmp_path / "rows.json"
     args = ["profile", "psd", "line", "--device", label, "--seconds", "0.5", "--json", str(file)]
-    ran = CliRunner().invoke(app, args, env={"COLUMNS": "80"})
+    ran = CliRunner().invoke(application(), args, env={"COLUMNS": "80"})
     assert ran.exit_code == 0
     assert (asked["operations"], asked["devices"], asked["seconds"]) == (["psd", "line"], [label], 0.5)
     for shown in (
@@ -69,7 +69,7 @@ def test_what_was_asked_for_is_measured_and_shown(asked: dict[str, Any], tmp_pat
 
 def test_without_names_everything_is_measured_everywhere(asked: dict[str, Any]) -> None:
     asked["valid"] = False
-    ran = CliRunner().invoke(app, ["profile"])
+    ran = CliRunner().invoke(application(), ["profile"])
     assert asked["operations"] == list(harness.OPERATIONS)
     assert asked["devices"] == [each.label for each in Device.all()]
     assert "not valid: the machine changed its speed" in ran.output
@@ -84,7 +84,7 @@ def test_without_names_everything_is_measured_everywhere(asked: dict[str, Any]) 
 )
 def test_what_is_not_there(asked: dict[str, Any], args: list[str], kind: type[Exception], message: str) -> None:
     with pytest.raises(kind, match=message):
-        CliRunner().invoke(app, ["profile", *args], catch_exceptions=False)
+        CliRunner().invoke(application(), ["profile", *args], catch_exceptions=False)
     assert not asked
 
 
@@ -92,4 +92,4 @@ def test_without_numba_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) 
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "numba" else find(name, *more))
     with pytest.raises(GpuVisionError, match=r"pip install 'gpuvision\[profile\]'"):
-        CliRunner().invoke(app, ["profile", "psd"], catch_exceptions=False)
+        CliRunner().invoke(application(), ["profile", "psd"], catch_exceptions=False)

@@ -127,11 +127,13 @@ def _case(device: Device, dtype: str, count: int, name: str, layout: Any = "plan
     left, right = (currents[0], currents[1]) if layout == "planar" else (currents[:, 0], currents[:, 1])
     position, status = np.empty(count, np.float32), np.empty(count, np.uint8)
     constants = (np.float32(LENGTH / 2), np.float32(MINIMUM), np.float32(SATURATION))
-    codes = dtype == "uint16"
-    if layout == "planar":
-        loop, arrays = _numba_planar_codes if codes else _numba_planar, (left, right)
-    else:
-        loop, arrays = _numba_pairs_codes if codes else _numba_pairs, (currents.reshape(-1),)
+    loop: Any = {
+        ("planar", False): _numba_planar,
+        ("planar", True): _numba_planar_codes,
+        ("pairs", False): _numba_pairs,
+        ("pairs", True): _numba_pairs_codes,
+    }[layout, dtype == "uint16"]
+    arrays = (left, right) if layout == "planar" else (currents.reshape(-1),)
 
     def ours() -> None:
         for _ in range(repeats):

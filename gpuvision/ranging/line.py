@@ -7,6 +7,7 @@ its rows axis (``along="rows"``: a column coordinate for every row). One such co
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -30,6 +31,17 @@ _STRIP = 1024  # columns of a strip at most, MAX_STRIP in line_strip.h
 _WIDE_BYTES = 64  # of neighbouring samples that a strip works on at once
 
 
+def _whole(value: Any, what: str) -> int:
+    """Return a count as an int; a bool is none."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool):
+        raise TypeError(f"{what} must be a whole number, got {value!r}")
+    return number
+
+
 class LineReading(NamedTuple):
     """What a frame's line says, each array of shape (batch..., samples); fields not asked for are ``None``.
 
@@ -46,7 +58,8 @@ class LineReading(NamedTuple):
     status
         uint8 `Status` flags. DARK: no peak that the parameters allow, or too little light beside it for the method.
         OUT_OF_RANGE: the border cuts the window, or a flat top wider than it (for ``"whole"``: a border sample has
-        half the peak's light or more). NOT_FINITE: a sample of the profile is NaN or infinite. With a value:
+        half the peak's light or more). NOT_FINITE: a sample of the profile is NaN or infinite, or the sums are beyond
+        the largest number. With a value:
         SATURATED (the peak is at the saturation level), AMBIGUOUS (a second peak is comparable, a flat top is wider
         than the window, or the fit fell back to the middle of a flat top). HORIZON and FOLDED come from the
         triangulation.
@@ -118,6 +131,8 @@ class LineReadout(Operation[LineReading]):
 
     Raises
     ------
+    TypeError
+        A parameter is no number, or a count no whole one.
     ValueError
         A parameter is out of its range.
 
@@ -149,6 +164,9 @@ class LineReadout(Operation[LineReading]):
     walk: Walk = "auto"
 
     def __post_init__(self) -> None:
+        for name in ("window", "minimum_width", "maximum_width", "fir_length"):
+            if getattr(self, name) is not None or name != "maximum_width":
+                object.__setattr__(self, name, _whole(getattr(self, name), f"LineReadout.{name}"))
         self._check_names()
         self._check_numbers()
         possible = LineReading._fields if self.triangulation is not None else LineReading._fields[:5]
@@ -188,7 +206,7 @@ class LineReadout(Operation[LineReading]):
         if self.ambiguity is not None and not 0.0 < finite(self.ambiguity, "LineReadout.ambiguity") <= 1.0:
             raise ValueError(f"LineReadout.ambiguity is {self.ambiguity}, expected a share of the peak, 0 < share <= 1")
         smallest = 3 if self.method == "ml" else 1
-        if self.window != int(self.window) or not smallest <= self.window <= WIDEST_WINDOW:
+        if not smallest <= self.window <= WIDEST_WINDOW:
             raise ValueError(
                 f"LineReadout.window is {self.window}, expected a whole number from {smallest} to {WIDEST_WINDOW}"
             )
@@ -304,8 +322,8 @@ class LineReadout(Operation[LineReading]):
 
     def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any], length: int) -> Any:
         """Return the parameters of ``line.cl``, in its order."""
-        widest = length if self.maximum_width is None else self.maximum_width
+        widest = length if self.maximum_width is None else min(self.maximum_width, length)
         return np.array(
-            [self.minimum_width, widest, self.ambiguity or 0.0, self.read_noise**2, self.gain],
+            [min(self.minimum_width, length + 1), widest, self.ambiguity or 0.0, self.read_noise**2, self.gain],
             real,
         )

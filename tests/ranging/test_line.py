@@ -317,11 +317,44 @@ def test_tall_frames(device, rng):
         ({"method": "ml", "read_noise": 0.0}, "read_noise"),
         ({"ambiguity": 2.0}, "ambiguity"),
         ({"threshold": float("nan")}, "threshold"),
+        ({"window": 181}, "window"),
+        ({"fir_length": 5}, "fir_length"),
+        ({"minimum_width": 0}, "widths"),
     ],
 )
 def test_bad_parameters(parameters, words):
     with pytest.raises(ValueError, match=words):
         LineReadout(**parameters)
+
+
+@pytest.mark.parametrize("name", ["window", "minimum_width", "maximum_width", "fir_length"])
+@pytest.mark.parametrize("value", [8.0, 2.5, True, float("nan"), "a", np.array([8, 8])])
+def test_parameters_that_count(name, value):
+    with pytest.raises(TypeError, match=rf"^LineReadout\.{name} must be a whole number, got .*$"):
+        LineReadout(**{name: value})
+
+
+def test_counts_of_numpy(device, rng):
+    counts = {"window": 6, "minimum_width": 2, "maximum_width": 30, "fir_length": 8}
+    frame = line_frames(rng, "uint8", (64, 70))
+    plain, same = (
+        LineReadout(threshold=20, method="fir", **{name: kind(count) for name, count in counts.items()})
+        for kind in (int, np.uint8)
+    )
+    assert plain == same
+    np.testing.assert_array_equal(same(frame, device=device).position, plain(frame, device=device).position)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("method", ["whole", "windowed"])
+def test_widths_beyond_the_profile(device, rng, method, walk):
+    frame = line_frames(rng, "uint8", (64, 70))
+    parameters = {"method": method, "threshold": 20, "walk": walk}
+    free = LineReadout(**parameters)(frame, device=device)
+    wide = LineReadout(maximum_width=2**31, **parameters)(frame, device=device)
+    np.testing.assert_array_equal(wide.position, free.position)
+    none = LineReadout(minimum_width=2**31, **parameters)(frame, device=device)
+    assert np.all(none.status & DARK)
 
 
 def test_bad_frames(device):

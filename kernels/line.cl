@@ -31,7 +31,13 @@ typedef struct {
 // Lanes that go to samples first, first + 1, ... of the output.
 inline void store_reading(const Outputs *to, ulong first, int sample, reals position, codes peak, reals width,
                           reals total, ints flags) {
-    const ints lost = ~INT_MASK((flags & (STATUS_DARK | STATUS_OUT_OF_RANGE | STATUS_NOT_FINITE)) == 0);
+    ints lost = ~INT_MASK((flags & (STATUS_DARK | STATUS_OUT_OF_RANGE | STATUS_NOT_FINITE)) == 0);
+#if CODE_BITS == 32
+    // Numbers whose sums are none.
+    const ints overflown = not_finite_lanes(total) | (not_finite_lanes(position) & ~lost);
+    flags |= flag_where(overflown, STATUS_NOT_FINITE);
+    lost |= overflown;
+#endif
     const ints not_finite = ~INT_MASK((flags & STATUS_NOT_FINITE) == 0);
     position = nan_where(to_masks(lost), position);
 #ifdef WITH_SHEET
@@ -108,7 +114,7 @@ inline Place place_apart(const Profiles *profiles, Peak *peak, constant real *p)
     CODE window[(2 * REACH + 1) * LANES];
     settle(profiles, peak, REACH, window);
 #if defined(METHOD_WINDOWED)
-    return window_gravity(window, REACH, profiles->threshold);
+    return window_gravity(window, REACH, profiles, peak);
 #elif defined(METHOD_ML)
     return likeliest_place(window, profiles, peak, p + READ_VARIANCE);
 #else

@@ -122,15 +122,28 @@ inline reals step(Gaussian *at, Normal *normal) {
     return fmax(fabs(move), fabs(by[1]) * at->sigma);
 }
 
+inline Gaussian choose_gaussian(ints mask, Gaussian yes, Gaussian no) {
+    const Gaussian chosen = {choose_reals(mask, yes.place, no.place), choose_reals(mask, yes.sigma, no.sigma),
+                             choose_reals(mask, yes.amplitude, no.amplitude),
+                             choose_reals(mask, yes.background, no.background)};
+    return chosen;
+}
+
+// Where the fit does not settle inside the window, the centre of gravity stands in. Lanes that have settled rest, so
+// that a reading does not depend on its neighbours.
 inline Place likeliest_place(const CODE *window, const Profiles *profiles, const Peak *peak, constant real *noise) {
     Gaussian at = first_guess(window, peak->level);
     reals moved = 1;
-    for (int n = 0; n < ML_STEPS && any_lane(peak->found & ~REAL_MASK(moved <= ML_SETTLED)); n++) {
+    ints moving = peak->found;
+    for (int n = 0; n < ML_STEPS && any_lane(moving); n++) {
         Normal normal = normal_equations(window, at, profiles->saturation, noise);
-        moved = step(&at, &normal);
+        Gaussian next = at;
+        const reals by = step(&next, &normal);
+        at = choose_gaussian(moving, next, at);
+        moved = choose_reals(moving, by, moved);
+        moving &= ~REAL_MASK(moved <= ML_SETTLED);
     }
-    Place place = window_gravity(window, RADIUS, profiles->threshold);
-    place.at = at.place;
+    Place place = window_gravity(window, RADIUS, profiles, peak);
     const ints settled = REAL_MASK(moved <= 100 * ML_SETTLED) & REAL_MASK(fabs(at.place) <= RADIUS);
     place.at = choose_reals(settled, at.place, place.at);
     place.flags = flag_where(~settled & peak->found, STATUS_AMBIGUOUS);

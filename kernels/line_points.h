@@ -18,7 +18,7 @@ inline Place place_by_points(const CODE *window, const Profiles *profiles, const
     const reals log_a = log(a), log_c = log(c), bend = log_a - 2 * log(b) + log_c;
     const reals summit = (log_a - log_c) / (2 * bend);
     const ints good = REAL_MASK(bend < 0) & REAL_MASK(fabs(summit) <= 1);
-    Place place = window_gravity(window, REACH, profiles->threshold);
+    Place place = window_gravity(window, REACH, profiles, peak);
     place.at = choose_reals(good, summit, to_reals((peak->top - 1) & 1) / 2);
     place.flags = flag_where(~lit & peak->found, STATUS_DARK) | flag_where(lit & ~good, STATUS_AMBIGUOUS);
     return place;
@@ -48,7 +48,7 @@ inline Place place_by_points(const CODE *window, const Profiles *profiles, const
         left = choose_reals(leaves, here, left);
         before = after;
     }
-    Place place = window_gravity(window, REACH, profiles->threshold);
+    Place place = window_gravity(window, REACH, profiles, peak);
     place.at = (reached + left) / 2;
     place.flags = flag_where((REAL_MASK(reached > RADIUS) | REAL_MASK(left > RADIUS)) & peak->found, STATUS_DARK);
     return place;

@@ -10,24 +10,28 @@
 
 #ifdef STRIP
 typedef int16 ints;
+typedef uint16 uints;
 typedef CODE16 codes;
 #define INT_MASK(comparison) (comparison)
 #define CODE_MASK(comparison) convert_int16(comparison)
 #define REAL_MASK(comparison) convert_int16(comparison)
 #define any_lane(mask) any(mask)
 #define to_ints convert_int16
+#define as_uints as_uint16
 #define to_reals convert_real16
 #define to_masks convert_bits16
 #define lane_numbers ((int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #define not_finite_lanes(value) convert_int16(not_finite16(value))
 #else
 typedef int ints;
+typedef uint uints;
 typedef CODE codes;
 #define INT_MASK(comparison) (-(comparison))
 #define CODE_MASK(comparison) (-(comparison))
 #define REAL_MASK(comparison) (-(comparison))
 #define any_lane(mask) (mask)
 #define to_ints (int)
+#define as_uints as_uint
 #define to_reals (real)
 #define to_masks (bits)
 #define lane_numbers 0

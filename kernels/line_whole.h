@@ -47,9 +47,9 @@ inline Sums no_sums(void) {
 inline Gravity gravity_of(const Sums *sums) {
     Gravity gravity;
     gravity.total = sums->total + sums->total_rest;
-    const reals per_light = 1 / gravity.total, centre = rint(sums->moment * per_light);
+    const reals centre = rint(sums->moment / gravity.total);  // the faintest light has no finite reciprocal
     const reals offset = fma(-centre, sums->total, sums->moment) + (sums->moment_rest - centre * sums->total_rest);
-    gravity.position = centre + offset * per_light;
+    gravity.position = centre + offset / gravity.total;
     gravity.lit = sums->lit;
     gravity.peak = sums->peak;
     gravity.lost = not_finite_lanes(sums->lost) | not_finite_lanes(gravity.total);
@@ -76,13 +76,6 @@ inline Gravity whole_gravity(const Profiles *profiles) {
 
 #else
 
-#ifdef STRIP
-typedef uint16 uints;
-#define to_uints convert_uint16
-#else
-typedef uint uints;
-#define to_uints (uint)
-#endif
 #ifdef LONG_MOMENT
 typedef ulong big;
 typedef ulong4 big4;

@@ -85,11 +85,12 @@ inline Place middle_of_wide_top(const Peak *peak, Place place) {
     return place;
 }
 
-// Centre of gravity about the middle of the window.
-inline Place window_gravity(const CODE *window, int reach, CODE threshold) {
+// Centre of gravity about the middle of the window; what gather() repeated beyond the border is no light.
+inline Place window_gravity(const CODE *window, int reach, const Profiles *profiles, const Peak *peak) {
     reals total = 0, moment = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
-        const reals v = over_threshold(window_level(window, k + reach), threshold);
+        const ints inside = INT_MASK(as_uints(peak->at + k) < (uints)profiles->length);
+        const reals v = choose_reals(inside, over_threshold(window_level(window, k + reach), profiles->threshold), 0);
         total += v;
         moment += v * (real)k;
     }

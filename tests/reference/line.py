@@ -93,9 +93,9 @@ def read_peak(
     is_wide = equals > 2 * window + 1
     status |= AMBIGUOUS if is_wide else 0
     if at < window or at + window >= len(x) or (is_wide and (begin == 0 or end == len(x))):
-        return np.nan, top, width, np.nan, status | OUT_OF_RANGE
+        return np.nan, top, width, v[inside].sum(), status | OUT_OF_RANGE
     near = x[at - window : at + window + 1]
-    total = np.maximum(near - threshold, 0.0).sum()
+    total = v[inside].sum()
     if is_wide:
         offset, flag = (equals - 1) % 2 / 2.0, 0
     elif method == "windowed":

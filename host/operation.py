@@ -254,6 +254,11 @@ class Bound(Generic[R]):
         self._hold(event, given)
         return event
 
+    def run(self, *frames: DeviceArray, out: R | None = None) -> R:
+        """Call, wait with the least delay, and return what was written: `out`, or `outputs`."""
+        self.device.wait(self(*frames, out=out))
+        return self.outputs if out is None else out
+
     def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
         """Run on NumPy arrays and wait; on shared memory the kernel reads and writes them in place."""
         if len(frames) != len(self.inputs):

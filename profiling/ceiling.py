@@ -34,8 +34,8 @@ def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[
 
     def run(kept: object = (source, target)) -> None:
         for _ in range(repeats):
-            cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.is_cpu else None)
-        device.queue.finish()
+            event = cl.enqueue_nd_range_kernel(device.queue, kernel, (items,), (1,) if device.is_cpu else None)
+        device.wait(event)
 
     run()
     return run

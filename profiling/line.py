@@ -219,7 +219,7 @@ def _case(device: Device, readout: LineReadout, count: int, name: str) -> Case:
     across = np.swapaxes(frames, 1, 2) if readout.along == "rows" else frames
     peers = _peers(readout, frames, across)
     error = _error(bound.outputs, across, readout)
-    return Case("line", name, lambda: bound().wait(), peers, error, (frames.nbytes, 9 * count * COLUMNS))
+    return Case("line", name, bound.run, peers, error, (frames.nbytes, 9 * count * COLUMNS))
 
 
 def _peers(readout: LineReadout, frames: Frames, across: Frames) -> dict[str, Callable[[], object]]:
@@ -258,8 +258,8 @@ def _fused_case(device: Device, method: Method, count: int) -> Case:
         fused.outputs.position.get(), np.tile(np.arange(COLUMNS, dtype=np.float32), (count, 1)), device=device
     )
     error = float(np.nanmax(np.abs(fused.outputs.h.get() - expected.h)))
-    peers = {"gpuvision": lambda: alone(shared).wait()}
-    return Case("line", f"{method}-fused/{count}", lambda: fused(shared).wait(), peers, error)
+    peers = {"gpuvision": lambda: alone.run(shared)}
+    return Case("line", f"{method}-fused/{count}", lambda: fused.run(shared), peers, error)
 
 
 def _bound(device: Device, readout: LineReadout, frames: Frames) -> tuple[Any, Frames]:

@@ -166,7 +166,7 @@ def _assembly(
     }
     samples = given.size
     traffic = ((4 * operation.geometry.inputs + 1) * samples, 13 * samples)
-    return Case("range_image", name, lambda: bound().wait(), peers, error, traffic)
+    return Case("range_image", name, bound.run, peers, error, traffic)
 
 
 def _resampling(device: Device) -> Case:
@@ -187,4 +187,4 @@ def _resampling(device: Device) -> Case:
     cells = grid.columns * grid.rows
     lines = SHAPE[0] * grid.columns
     traffic = (17 * SHAPE[0] * SHAPE[1] + 13 * lines, 13 * lines + 9 * cells)
-    return Case("range_image", "regrid/1e6", lambda: bound().wait(), peers, error, traffic)
+    return Case("range_image", "regrid/1e6", lambda: device.wait(bound()), peers, error, traffic)

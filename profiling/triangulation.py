@@ -109,4 +109,4 @@ def _case(device: Device, operation: Triangulation, dtype: str, count: int, name
     outputs = (bound.outputs.g.get(), bound.outputs.h.get())
     error = max(float(np.nanmax(np.abs(a - b))) for a, b in zip(outputs, exact, strict=False))
     item = u.itemsize
-    return Case("triangulation", name, lambda: bound().wait(), peers, error, (2 * item * count, (2 * item + 1) * count))
+    return Case("triangulation", name, bound.run, peers, error, (2 * item * count, (2 * item + 1) * count))

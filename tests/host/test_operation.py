@@ -136,6 +136,24 @@ def test_another_dtype_shape_kind_or_number_is_told(device, pairs):
     bound().wait()  # what was refused has not spoilt it
 
 
+def test_run_waits_and_returns_what_was_written(memory, pairs):
+    bound = READOUT.bind(memory, pairs.shape, pairs.dtype)
+    frame, out = memory.empty(pairs.shape, pairs.dtype), bound.allocate()
+    frame.set(pairs)
+    bound.inputs[0].set(pairs[::-1].copy())
+    assert bound.run() is bound.outputs
+    assert bound.run(frame, out=out) is out
+    np.testing.assert_allclose(out.position.get(), expected(pairs), atol=5e-7)
+    np.testing.assert_allclose(bound.outputs.position.get(), expected(pairs[::-1]), atol=5e-7)
+
+
+def test_a_wait_outlasts_what_is_watched(device):
+    gate = cl.UserEvent(device.context)
+    threading.Timer(0.02, lambda: gate.set_status(cl.command_execution_status.COMPLETE)).start()
+    device.wait(gate)
+    assert gate.command_execution_status == cl.command_execution_status.COMPLETE
+
+
 def test_foreign_byte_order_is_refused(memory, pairs):
     with pytest.raises(TypeError, match="native byte order"):
         READOUT(pairs.astype(">f4"), device=memory)

@@ -16,7 +16,7 @@ from typing import Any
 import pyopencl as cl
 
 from gpuvision.host.files import write_whole
-from gpuvision.host.runtime import cache_folder, expose_installed_runtime, provide_cache
+from gpuvision.host.runtime import cache_folder, expose_installed_runtime, pin_workers, provide_cache
 
 INSTALL_HINT = (
     "install one: `apt-get install pocl-opencl-icd` (as root), or `pip install 'gpuvision[cpu]'` "
@@ -176,6 +176,7 @@ def _ask_probe(platform_index: int, device_index: int) -> str:
 def platforms() -> tuple[Any, ...]:
     """Return the OpenCL platforms, Intel's pip-installed runtime among them; empty where there are none."""
     provide_cache()
+    pin_workers()
     expose_installed_runtime()
     try:
         return tuple(cl.get_platforms())

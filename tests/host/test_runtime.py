@@ -100,3 +100,12 @@ def test_home_that_can_be_written_is_used(monkeypatch: pytest.MonkeyPatch, tmp_p
     runtime.provide_cache()
     assert os.environ["XDG_CACHE_HOME"] == str(tmp_path / "new")
     assert list((tmp_path / "new" / "gpuvision").iterdir()) == []
+
+
+def test_workers_are_pinned_unless_the_user_decided(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("POCL_AFFINITY", "0")
+    runtime.pin_workers()
+    assert os.environ["POCL_AFFINITY"] == "0"
+    monkeypatch.delenv("POCL_AFFINITY")
+    runtime.pin_workers()
+    assert os.environ["POCL_AFFINITY"] == "1"

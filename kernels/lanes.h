@@ -1,5 +1,5 @@
 // One body of code for both shapes: under STRIP a value is 16 samples of a CPU's strip, else it is one sample.
-// Loads and stores go through element-aligned vector types: PoCL's vstore16 of bytes costs more than a whole PSD
+// Loads and stores go through element-aligned vector types: PoCL's vstore16 nearly doubles the time of a PSD
 // readout, a plain assignment does not, and a caller's array need not be aligned to a vector.
 #ifndef LANES_H
 #define LANES_H

@@ -11,7 +11,6 @@
 #define LENS_K1_TERM 2
 #define LENS_K2_TERM 3
 #define LENS_FOLD_SQUARE 4
-#define LENS_SIZE 5
 
 // k1 r^2 + k2 r^4, and its derivative by r^2.
 #ifdef LENS_K2

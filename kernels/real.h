@@ -5,7 +5,6 @@
 #ifdef REAL_IS_DOUBLE
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 typedef double real;
-typedef double2 real2;
 typedef double4 real4;
 typedef double8 real8;
 typedef double16 real16;
@@ -15,7 +14,6 @@ typedef long16 bits16;
 #define as_bits16 as_long16
 #define as_real as_double
 #define convert_real convert_double
-#define convert_real8 convert_double8
 #define convert_real16 convert_double16
 #define convert_bits convert_long
 #define convert_bits16 convert_long16
@@ -24,7 +22,6 @@ typedef long16 bits16;
 #define REAL_EPSILON 2.220446049250313e-16
 #else
 typedef float real;
-typedef float2 real2;
 typedef float4 real4;
 typedef float8 real8;
 typedef float16 real16;
@@ -34,7 +31,6 @@ typedef int16 bits16;
 #define as_bits16 as_int16
 #define as_real as_float
 #define convert_real convert_float
-#define convert_real8 convert_float8
 #define convert_real16 convert_float16
 #define convert_bits convert_int
 #define convert_bits16 convert_int16

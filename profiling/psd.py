@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.host import Device, host_view
+from gpuvision.host import Device
 from gpuvision.profiling.harness import Case
 from gpuvision.ranging.psd import PsdReadout
 
@@ -123,7 +123,7 @@ def _case(device: Device, dtype: str, count: int, name: str, layout: Any = "plan
     bound = readout.bind(device, shape, dtype)
     planar = scan_currents(dtype, count)
     currents = planar if layout == "planar" else np.ascontiguousarray(planar.T)
-    _fill(bound.inputs[0], currents)
+    bound.inputs[0].set(currents)
     left, right = (currents[0], currents[1]) if layout == "planar" else (currents[:, 0], currents[:, 1])
     position, status = np.empty(count, np.float32), np.empty(count, np.uint8)
     constants = (np.float32(LENGTH / 2), np.float32(MINIMUM), np.float32(SATURATION))
@@ -152,13 +152,6 @@ def _case(device: Device, dtype: str, count: int, name: str, layout: Any = "plan
     error = _error(bound.outputs.position.get(), bound.outputs.status.get(), left, right)
     traffic = (currents.nbytes, 5 * count)
     return Case("psd", name, ours, {"numba": with_numba, "numpy": with_numpy}, error, traffic, repeats)
-
-
-def _fill(array: Any, values: NDArray[Any]) -> None:
-    if isinstance(array.base_data, type(None)) or not hasattr(array.base_data, "svm_ptr"):
-        array.set(values)
-    else:
-        host_view(array)[...] = values
 
 
 def _error(position: NDArray[Any], status: NDArray[Any], left: NDArray[Any], right: NDArray[Any]) -> float:

@@ -127,8 +127,8 @@ class PsdReadout(Operation[PsdReading]):
 
     Notes
     -----
-    Error: single precision adds at most 2 roundings of L/2 to the position, 6e-8 of L/2 near the middle included,
-    since the difference of nearby currents is exact; 16-bit codes keep single precision's bound.
+    Error: the arithmetic adds at most 4 epsilon of L/2 to the position (5e-7 of it in single precision), for 16-bit
+    codes too; near the middle less, since the difference of nearby currents is exact.
     """
 
     Result: ClassVar[type[Any]] = PsdReading

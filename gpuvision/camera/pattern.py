@@ -1,0 +1,90 @@
+"""Calibration patterns in images: what a finder takes and what it returns."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+Float64: TypeAlias = npt.NDArray[np.float64]
+
+LineFamilies: TypeAlias = tuple[tuple[Float64, ...], ...]
+"""Families of lines that are parallel in the world; a line is an array (n, 2) of measured (column, row), in order."""
+
+# A normal distribution's sigma in units of its median absolute deviation.
+_SIGMA_OF_MAD = 1.4826
+_HIGHEST_DIFFERENCE = 6
+_FEWEST_DIFFERENCES = 12
+
+
+class PatternGrid(NamedTuple):
+    """The points of a flat, regular pattern, found in an image.
+
+    The index is the place on the pattern: ``points[i, j]`` lies at (j, i) pitches from ``points[0, 0]``. Columns
+    grow with x and rows with y in the image; which point of the pattern is the first is not known.
+    """
+
+    points: Float64
+    """(rows, columns, 2): measured (column, row) in pixels, NaN where none was found."""
+    sigma: float
+    """Noise of one coordinate in pixels, as `localisation_noise` estimates it from the points."""
+
+
+def grey_image(image: npt.NDArray[np.generic]) -> npt.NDArray[np.float32]:
+    """Return an image as float32 grey levels.
+
+    Parameters
+    ----------
+    image
+        (height, width) or (height, width, 3) of uint8, uint16 or float32; three channels are blue, green, red, as
+        OpenCV reads them.
+
+    Raises
+    ------
+    TypeError
+        If it is no array of these types.
+    ValueError
+        If its shape is another one, or a pixel is no finite number.
+    """
+    if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16, np.float32):
+        what = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
+        raise TypeError(f"image is {what}, expected an array of uint8, uint16 or float32")
+    if image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)) or 0 in image.shape:
+        raise ValueError(f"image has the shape {image.shape}, expected (height, width) or (height, width, 3)")
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    grey = image.astype(np.float32)
+    if image.dtype == np.float32 and not np.isfinite(grey).all():
+        raise ValueError(f"image has {np.count_nonzero(~np.isfinite(grey))} pixels that are no finite numbers")
+    return grey
+
+
+def localisation_noise(points: npt.ArrayLike) -> float:
+    """Estimate the noise of a grid's points from the grid itself: what is not smooth along rows and columns.
+
+    The n-th differences of neighbours hold little but noise, binomial(2n, n) times its variance. Third differences
+    serve where a grid is fine; in a coarse one a lens shows in them, so that the smallest estimate of the third to
+    the sixth counts. The median makes it robust.
+
+    Parameters
+    ----------
+    points
+        (rows, columns, 2); NaN where missing.
+
+    Returns
+    -------
+    float
+        Standard deviation of one coordinate, in the points' units; NaN where too few neighbours are there.
+    """
+    grid = np.asarray(points, dtype=np.float64)
+    estimates = [math.nan]
+    for order in range(3, _HIGHEST_DIFFERENCE + 1):
+        steps = [np.diff(grid, order, axis).ravel() for axis in (0, 1)]
+        known = np.abs(np.concatenate(steps))
+        known = known[np.isfinite(known)]
+        if known.size >= _FEWEST_DIFFERENCES:
+            estimates.append(float(np.median(known)) * _SIGMA_OF_MAD / math.sqrt(math.comb(2 * order, order)))
+    return float(np.fmin.reduce(estimates))

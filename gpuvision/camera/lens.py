@@ -62,7 +62,7 @@ class Lens:
         """What ``kernels/lens.h`` has to compile: ``LENS`` always, ``LENS_K2`` only where k2 is not 0."""
         return {"LENS": None, "LENS_K2": None} if self.k2 != 0.0 else {"LENS": None}
 
-    def packed(self, origin: Sequence[float], scale: float) -> npt.NDArray[np.float64]:
+    def packed(self, origin: Sequence[float], scale: float, *, inverse: bool = False) -> npt.NDArray[np.float64]:
         """Return the table of ``kernels/lens.h`` for a kernel which works in (point - origin) scale.
 
         Parameters
@@ -70,14 +70,19 @@ class Lens:
         origin, scale
             About 1 at the sensor's border keeps single precision sharp; ``origin`` in the order of
             ``centre``.
+        inverse
+            Also for ``lens_distort``.
 
         Returns
         -------
         numpy.ndarray
-            Both coordinates of the centre, k1, k2 and the squared fold radius, in the kernel's units.
+            Both coordinates of the centre, k1, k2 and the squared fold radius, in the kernel's units; for the inverse
+            the squared undistorted radius of the fold as well.
         """
         centre = [(c - o) * scale for c, o in zip(self.centre, origin, strict=True)]
-        return np.array([*centre, self.k1 / scale**2, self.k2 / scale**4, (self.fold_radius * scale) ** 2])
+        fold = self.fold_radius
+        table = [*centre, self.k1 / scale**2, self.k2 / scale**4, (fold * scale) ** 2]
+        return np.array([*table, (self._undistorted_radius(fold) * scale) ** 2] if inverse else table)
 
     def swapped(self) -> Lens:
         """Return the same lens for points in (row, column) order."""
@@ -128,12 +133,18 @@ class Lens:
             shrink = np.where(target > 0.0, radius / np.where(target > 0.0, target, 1.0), 1.0)
         return self.centre + offset * np.where(np.isfinite(target), shrink, np.nan)[..., None]
 
+    def _undistorted_radius(self, radius: float) -> float:
+        """Undistorted radius of a measured one; infinite for an infinite one: then there is no fold."""
+        if math.isinf(radius):
+            return math.inf
+        return radius * (1.0 + radius**2 * (self.k1 + self.k2 * radius**2))
+
     def _measured_radius(self, target: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Solve r (1 + k1 r^2 + k2 r^4) = target on the monotone stretch [0, fold)."""
         fold = self.fold_radius
         if math.isfinite(fold):
             high = np.full_like(target, fold)
-            reachable = target < fold * (1.0 + fold**2 * (self.k1 + self.k2 * fold**2))
+            reachable = target < self._undistorted_radius(fold)
         else:
             # Without a fold the slope is at least this, so the root is at most target / slope.
             # (A k1 below 0 alone folds, but too far out for a float where it is all but 0.)

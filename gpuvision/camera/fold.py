@@ -1,0 +1,108 @@
+"""How far OpenCV's lens terms stay one-to-one: where the determinant of their Jacobian first vanishes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numpy.polynomial import polynomial
+
+_DIRECTIONS = 64
+# Between two of them the fold is hardly nearer than at either.
+_MARGIN = 0.98
+
+Float64 = npt.NDArray[np.float64]
+
+
+class OneToOne(NamedTuple):
+    """The part of the normalised ideal plane where a lens is one-to-one, as squared radii.
+
+    It is where the determinant of the Jacobian is positive, within ``limit``: up to there every ray from the centre
+    meets it vanish once at most. Within ``safe`` it is positive everywhere, so need not be looked at.
+    """
+
+    safe: float
+    limit: float
+
+
+def one_to_one(k: Sequence[float], p: Sequence[float], s: Sequence[float]) -> OneToOne:
+    """Find it for the radial coefficients k1 .. k6, the tangential ones p1, p2 and the thin prism's s1 .. s4."""
+    unit = _characteristic_radius(k, p, s)
+    powers = unit ** np.array([2.0, 4.0, 6.0])
+    over, under = np.r_[1.0, k[:3] * powers], np.r_[1.0, k[3:] * powers]
+    pole = min(_sign_changes(under), default=math.inf)
+    if not any(p) and not any(s):
+        slope = polynomial.polyadd(polynomial.polymul(over, under), _twice_square_times(_wronskian(over, under)))
+        square = min(*_sign_changes(slope), pole, math.inf) * unit**2
+        return OneToOne(square, square)
+    return _decentred(over, under, np.array(p) * unit, np.array(s) * unit ** np.array([1.0, 3.0, 1.0, 3.0]), pole, unit)
+
+
+def _decentred(over: Float64, under: Float64, p: Float64, s: Float64, pole: float, unit: float) -> OneToOne:
+    angles = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
+    rays = [_sign_changes(_along_ray(over, under, p, s, math.cos(each), math.sin(each))) for each in angles]
+    first = [ray[0] if ray else math.inf for ray in rays]
+    again = min(ray[1] if len(ray) > 1 else math.inf for ray in rays)
+    last = max((each for each in first if math.isfinite(each)), default=0.0)
+    if last < again:
+        limit = last * again if last > 0.0 else math.inf
+    else:
+        limit = (_MARGIN * again) ** 2
+    limit = min(limit, pole)
+    return OneToOne(min((_MARGIN * min(first)) ** 2, limit) * unit**2, limit * unit**2)
+
+
+def _characteristic_radius(k: Sequence[float], p: Sequence[float], s: Sequence[float]) -> float:
+    """Return the radius at which the first of the terms reaches 1: it keeps the polynomials' numbers at hand."""
+    orders = (2, 4, 6, 2, 4, 6, 1, 1, 1, 3, 1, 3)
+    radii = [abs(c) ** (-1.0 / order) for c, order in zip((*k, *p, *s), orders, strict=True) if c != 0.0]
+    return min(radii, default=1.0)
+
+
+def _wronskian(over: Float64, under: Float64) -> Any:
+    first = polynomial.polymul(polynomial.polyder(over), under)
+    return polynomial.polysub(first, polynomial.polymul(over, polynomial.polyder(under)))
+
+
+def _twice_square_times(terms: Any) -> Any:
+    return 2.0 * polynomial.polymulx(terms)
+
+
+def _in_radius(terms: Any) -> Float64:
+    """Rewrite a polynomial in the squared radius as one in the radius."""
+    spread = np.zeros(2 * len(terms) - 1)
+    spread[::2] = terms
+    return spread
+
+
+def _along_ray(over: Float64, under: Float64, p: Float64, s: Float64, c: float, d: float) -> Any:
+    """Return the determinant along the ray (c, d), times the fourth power of the denominator; by powers of radius.
+
+    Written as in kernels/camera.h, every term times the squared denominator.
+    """
+    add, mul = polynomial.polyadd, polynomial.polymul
+    square = _in_radius(mul(under, under))
+    turn = mul([0.0, 2.0], _in_radius(_wronskian(over, under)))
+    growth = add(_in_radius(mul(over, under)), mul([0.0, 2.0 * (p[0] * d + p[1] * c)], square))
+    e_x, e_y = add(c * turn, 2.0 * p[1] * square), add(d * turn, 2.0 * p[0] * square)
+    a = mul([2.0 * (p[1] + s[0]), 0.0, 4.0 * s[1]], square)
+    b = mul([2.0 * (p[0] + s[2]), 0.0, 4.0 * s[3]], square)
+    xx, yy = add(growth, mul([0.0, c], add(e_x, a))), add(growth, mul([0.0, d], add(e_y, b)))
+    xy, yx = mul([0.0, 1.0], add(c * e_y, d * a)), mul([0.0, 1.0], add(d * e_x, c * b))
+    return polynomial.polysub(mul(xx, yy), mul(xy, yx))
+
+
+def _sign_changes(terms: Iterable[float]) -> list[float]:
+    """Return the positive places where a polynomial that is 1 at 0 changes its sign, ascending."""
+    roots = polynomial.polyroots(np.trim_zeros(np.asarray(terms, dtype=np.float64), "b"))
+    # Roots that rounding made complex, or that only touch 0, are told apart by the signs between them.
+    near = roots[(roots.real > 0.0) & (np.abs(roots.imag) <= 1e-3 * np.abs(roots.real))]
+    places = np.sort(near.real)
+    if not len(places):
+        return []
+    between = np.r_[0.0, 0.5 * (places[1:] + places[:-1]), 2.0 * places[-1]]
+    signs = np.sign(polynomial.polyval(between, np.asarray(terms)))
+    return [float(place) for place, change in zip(places, np.diff(signs), strict=True) if change != 0.0]

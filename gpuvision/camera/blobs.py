@@ -1,0 +1,123 @@
+"""Blobs of one size on a ground, where neither size nor brightness is known: the dots of a pattern, or its cells."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from gpuvision.camera.lattice import local_bases
+from gpuvision.camera.pattern import Float64
+
+# Cells of the map of thresholds in a window.
+_CELLS = 16
+# Light and dark must differ by this part of what they do in most of the image.
+_CONTRAST = 0.15
+_SMALLEST_AREA = 6
+# Of its bounding box a disc fills 0.785, an ellipse at 45 degrees half as wide as long 0.63.
+_FILLED = (0.4, 0.97)
+_LONGEST = 3.5
+_AREAS = (0.4, 2.5)
+# Windows to try, as parts of the image's smaller side.
+_WINDOWS = (1 / 3, 1 / 6, 1 / 12, 1 / 24, 1 / 48)
+_TRIAL_PIXELS = 3e6
+_MOST_BLOBS = 60_000
+# So many blobs amid symmetric neighbours, and such a share of all, need no further trial.
+_CLEAR_COUNT = 50
+_CLEAR_SHARE = 0.6
+
+
+class Blobs(NamedTuple):
+    """Connected regions beyond the local threshold."""
+
+    points: Float64
+    """(n, 2) centres of gravity, in pixels."""
+    area: Float64
+    """(n,) in pixels."""
+    size: Float64
+    """(n, 2) width and height of the bounding boxes."""
+
+
+class Scale(NamedTuple):
+    """What an image's blobs look like."""
+
+    bright: bool
+    pitch: float
+    """Usual distance to the nearest neighbours, in pixels."""
+    count: int
+
+
+def find_blobs(grey: npt.NDArray[np.float32], window: float, bright: bool) -> Blobs:
+    """Find regions brighter (darker) than the middle between the lightest and the darkest within a window.
+
+    Those that touch the border, and those that fill their bounding box as no ellipse does, are left out.
+    """
+    level, usable = _threshold(grey, window)
+    mask = cv2.compare(grey, level, cv2.CMP_GT if bright else cv2.CMP_LT)
+    cv2.bitwise_and(mask, usable, dst=mask)
+    _, _, stats, centroids = cv2.connectedComponentsWithStats(mask, connectivity=4, ltype=cv2.CV_32S)
+    left, top, width, height, area = stats[1:].T
+    rows, columns = grey.shape
+    inside = (left > 0) & (top > 0) & (left + width < columns) & (top + height < rows)
+    filled = area / (width * height)
+    shaped = (filled > _FILLED[0]) & (filled < _FILLED[1]) | (area < 4 * _SMALLEST_AREA)
+    shaped &= np.maximum(width, height) < _LONGEST * np.minimum(width, height)
+    kept = inside & shaped & (area >= _SMALLEST_AREA)
+    box = np.stack([width, height], axis=1)
+    return Blobs(centroids[1:][kept], area[kept].astype(np.float64), box[kept].astype(np.float64))
+
+
+def _threshold(grey: npt.NDArray[np.float32], window: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
+    """Middle of the local extremes, and where they lie far enough apart (255)."""
+    rows, columns = grey.shape
+    step = max(1, math.floor(window / _CELLS))
+    small = cv2.resize(grey, (-(-columns // step), -(-rows // step)), interpolation=cv2.INTER_AREA)
+    side = 2 * round(0.5 * window / step) + 1
+    kernel = np.ones((side, side), np.uint8)
+    high, low = (cv2.blur(each, (side, side)) for each in (cv2.dilate(small, kernel), cv2.erode(small, kernel)))
+    span = high - low
+    usable = (span > _CONTRAST * np.percentile(span, 90)).astype(np.uint8) * 255
+    full = (columns, rows)
+    middle = cv2.resize(0.5 * (high + low), full, interpolation=cv2.INTER_LINEAR)
+    return middle, cv2.resize(usable, full, interpolation=cv2.INTER_NEAREST)
+
+
+def alike(area: Float64) -> npt.NDArray[np.bool_]:
+    """Which blobs are about as large as most; perspective leaves a factor between them."""
+    usual = np.median(area) if area.size else math.nan
+    return (area > _AREAS[0] * usual) & (area < _AREAS[1] * usual)
+
+
+def find_scale(grey: npt.NDArray[np.float32]) -> Scale:
+    """Try windows and both kinds of contrast; most blobs that lie amid symmetric neighbours win."""
+    shrink = math.ceil(math.sqrt(grey.size / _TRIAL_PIXELS))
+    best = Scale(False, math.nan, 0)
+    for factor in sorted({shrink, 1}, reverse=True):
+        small = cv2.resize(grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
+        for part in _WINDOWS:
+            for bright in (False, True):
+                blobs = find_blobs(small, part * min(small.shape), bright)
+                trial = _judge(blobs, bright)
+                if trial.count > best.count:
+                    best = trial._replace(pitch=trial.pitch * factor)
+                if trial.count > max(_CLEAR_COUNT, _CLEAR_SHARE * len(blobs.area)):
+                    return best
+        if best.count > _CLEAR_COUNT:
+            break
+    return best
+
+
+def _judge(blobs: Blobs, bright: bool) -> Scale:
+    points = blobs.points[alike(blobs.area)]
+    if not 5 <= len(points) <= _MOST_BLOBS:
+        return Scale(bright, math.nan, 0)
+    bases = local_bases(points, cKDTree(points))
+    length = np.linalg.norm(bases, axis=-1).max(axis=1)
+    known = np.isfinite(length)
+    if not known.any():
+        return Scale(bright, math.nan, 0)
+    return Scale(bright, float(np.median(length[known])), int(np.count_nonzero(known)))

@@ -1,0 +1,207 @@
+"""Sub-pixel centres of a lattice's dots: grey-weighted centres of gravity over a sloping ground."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.camera.pattern import Float64
+
+# Pixels with less of a dot than this count as ground: noise on the ground stays out, and the weight is 0 where the
+# window ends.
+_GROUND = 0.2
+# Pixels around the bounding box at half height that may still hold some of the dot.
+_MARGIN = (1.0, 4.0)
+_CHUNK_PIXELS = 1 << 17
+_SMOOTHED = 5
+
+
+class Centroids(NamedTuple):
+    """What was measured at every node of a lattice, (rows, columns); NaN where there is nothing."""
+
+    points: Float64
+    mass: Float64
+    """Covered pixels."""
+    contrast: Float64
+    """Dot less ground, in grey levels."""
+    unevenness: Float64
+    """How far the ground's four corners are from a plane, as a part of the contrast."""
+
+
+def lattice_steps(values: Float64) -> Float64:
+    """Return the steps (rows, columns, 2, n) of n values from a node to the next column and to the next row.
+
+    They are means of what is known, first on both sides, else around.
+    """
+    steps = []
+    for axis in (1, 0):
+        forward = np.diff(values, axis=axis)
+        none = np.full_like(np.take(values, [0], axis), np.nan)
+        pair = np.stack([np.concatenate([forward, none], axis), np.concatenate([none, forward], axis)])
+        known = np.isfinite(pair)
+        count = known.sum(axis=0)
+        mean = np.where(known, pair, 0.0).sum(axis=0) / np.where(count, count, np.nan)
+        steps.append(filled(mean))
+    return np.stack(steps, axis=2)
+
+
+def filled(values: Float64) -> Float64:
+    """Fill what is NaN with the mean of what is known nearby; (rows, columns, channels)."""
+    values = values.copy()
+    known = np.isfinite(values).all(axis=-1)
+    reach = 1
+    while not known.all():
+        reach = 2 * reach + 1
+        weight = cv2.blur(known.astype(np.float64), (reach, reach), borderType=cv2.BORDER_CONSTANT)
+        total = cv2.blur(np.where(known[..., None], values, 0.0), (reach, reach), borderType=cv2.BORDER_CONSTANT)
+        reached = ~known & (weight > 0.5 / reach**2)
+        values[reached] = total.reshape(values.shape)[reached] / weight[reached, None]
+        known |= reached
+    return values
+
+
+def measure_dots(grey: npt.NDArray[np.float32], points: Float64, size: Float64) -> Centroids:
+    """Measure the centres of gravity of dots.
+
+    The ground is a plane through the corners of the dot's cell, the contrast grows as it does from dot to dot. A
+    pixel's weight is the part of it that the dot covers, less a fifth.
+
+    Parameters
+    ----------
+    grey
+        The image.
+    points
+        (rows, columns, 2) about right; NaN where there is none.
+    size
+        (rows, columns, 2) width and height of the dots.
+    """
+    nodes = np.isfinite(points[..., 0])
+    steps = lattice_steps(points)[nodes]
+    at, box = points[nodes], size[nodes]
+    smooth = cv2.blur(grey, (3, 3))
+    ground, slope, unevenness = _ground(smooth, at, steps)
+    contrast = _sampled(smooth, at) - ground
+    whole_contrast = _laid_out(contrast, nodes)
+    growth = np.linalg.solve(steps, lattice_steps(whole_contrast[..., None])[nodes])[..., 0]
+    pitch = np.linalg.norm(steps, axis=-1).min(axis=-1)
+    margin = np.clip(0.5 * (pitch - box.max(axis=-1)), *_MARGIN)
+    half = 0.5 * box + margin[:, None]
+    reach = math.ceil(float(half.max())) + 1
+    chunk = max(1, _CHUNK_PIXELS // (2 * reach + 1) ** 2)
+    moments = np.empty((len(at), 3))
+    for start in range(0, len(at), chunk):
+        part = slice(start, start + chunk)
+        planes = [np.column_stack([each[part], by[part]]) for each, by in ((ground, slope), (contrast, growth))]
+        moments[part] = _moments(grey, at[part], half[part], planes, reach)
+    mass = moments[:, 0]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        centre = np.rint(at) + moments[:, 1:] / mass[:, None]
+    values = (centre, mass, contrast, np.abs(unevenness / contrast))
+    return Centroids(*(_laid_out(each, nodes) for each in values))
+
+
+def _laid_out(values: Float64, nodes: npt.NDArray[np.bool_]) -> Float64:
+    """Lay values of the known nodes out on the lattice; NaN elsewhere."""
+    whole = np.full((*nodes.shape, *values.shape[1:]), np.nan)
+    whole[nodes] = values
+    return whole
+
+
+def _sampled(image: npt.NDArray[np.float32], at: Float64) -> Float64:
+    """Bilinear samples (n,); NaN outside of the image."""
+    # OpenCV's maps have at most 32767 rows.
+    x, y = (at[:, each].astype(np.float32).reshape(1, -1) for each in (0, 1))
+    parts = [
+        cv2.remap(image, x[:, s : s + 32000], y[:, s : s + 32000], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for s in range(0, x.size, 32000)
+    ]
+    values = np.concatenate(parts, axis=1)[0].astype(np.float64)
+    rows, columns = image.shape
+    inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
+    values[~inside[0]] = np.nan
+    return values
+
+
+def _ground(smooth: npt.NDArray[np.float32], at: Float64, steps: Float64) -> tuple[Float64, Float64, Float64]:
+    """Plane through the corners of the cells: level at the dot, slope per pixel, and what is left of four corners."""
+    u, v = 0.5 * steps[:, 0], 0.5 * steps[:, 1]
+    low, right, left, high = (_sampled(smooth, at + each) for each in (-u - v, u - v, v - u, u + v))
+    pairs = np.stack([0.5 * (low + high), 0.5 * (left + right)])
+    level = _mean(pairs)
+    level = np.where(np.isfinite(level), level, _mean(np.stack([low, right, left, high])))
+    along = np.stack([_mean(np.stack([right - low, high - left])), _mean(np.stack([left - low, high - right]))], axis=1)
+    # along = steps @ slope
+    slope = np.linalg.solve(steps, np.nan_to_num(along)[..., None])[..., 0]
+    return level, slope, np.nan_to_num(pairs[0] - pairs[1])
+
+
+def _mean(values: Float64) -> Float64:
+    """Mean over the first axis of what is finite; NaN where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    mean: Float64 = np.where(known, values, 0.0).sum(axis=0) / np.where(count, count, np.nan)
+    return mean
+
+
+def _moments(grey: npt.NDArray[np.float32], at: Float64, half: Float64, planes: list[Float64], reach: int) -> Float64:
+    """Sum of the weights and of the weights times x and y from the nearest pixel, (n, 3).
+
+    ``planes`` are ground and contrast: level at the dot and slopes along x and y, (n, 3).
+    """
+    rows, columns = grey.shape
+    nearest = np.rint(at)
+    offsets = np.arange(-reach, reach + 1)
+    x, y = (nearest[:, each, None].astype(np.int64) + offsets for each in (0, 1))
+    patch = grey[np.clip(y, 0, rows - 1)[:, :, None], np.clip(x, 0, columns - 1)[:, None, :]]
+    from_dot = [(nearest - at)[:, each, None] + offsets for each in (0, 1)]
+    ground, contrast = (
+        (plane[:, :1] + plane[:, 1:2] * from_dot[0]).astype(np.float32)[:, None, :]
+        + (plane[:, 2:] * from_dot[1]).astype(np.float32)[:, :, None]
+        for plane in planes
+    )
+    weight = (patch - ground) / contrast
+    weight -= _GROUND
+    np.clip(weight, 0.0, 1.0, out=weight)
+    within = [
+        ((np.abs(d) <= half[:, each, None]) & (p >= 0) & (p < limit)).astype(np.float32)
+        for each, (d, p, limit) in enumerate(zip(from_dot, (x, y), (columns, rows), strict=True))
+    ]
+    by_x = np.matmul(within[1][:, None, :], weight)[:, 0] * within[0]
+    by_y = np.matmul(weight, within[0][..., None])[..., 0] * within[1]
+    return np.stack([by_x.sum(axis=1), by_x @ offsets, by_y @ offsets], axis=1) / (1.0 - _GROUND)
+
+
+def disc_shift(points: Float64, mass: Float64) -> Float64:
+    """Centre of gravity of a disc's image less the image of its centre, from the curvature of the grid.
+
+    With steps M = (m_u, m_v) of the grid, J = det M, and a disc of radius r pitches: r^2/4 ((m_uu + m_vv)/2 + M grad
+    log J) to second order, as the disc's second moments are r^2/4 and its parts count by their area in the image.
+
+    Parameters
+    ----------
+    points
+        (rows, columns, 2); NaN where missing.
+    mass
+        (rows, columns), the discs' areas in pixels.
+
+    Returns
+    -------
+    numpy.ndarray
+        (rows, columns, 2) in pixels, smoothed over 5 by 5 nodes; 0 where the grid is too small to tell.
+    """
+    steps = lattice_steps(points)
+    area = np.abs(steps[..., 0, 0] * steps[..., 1, 1] - steps[..., 0, 1] * steps[..., 1, 0])
+    if min(area.shape) < _SMOOTHED or not np.isfinite(area).all():
+        return np.zeros_like(points)
+    growth = lattice_steps(np.log(area)[..., None])
+    bend = [np.diff(points, 2, axis) for axis in (1, 0)]
+    wide = [((0, 0), (1, 1), (0, 0)), ((1, 1), (0, 0), (0, 0))]
+    curvature = sum(np.pad(each, pad, constant_values=np.nan) for each, pad in zip(bend, wide, strict=True))
+    shift = 0.5 * curvature + (growth * steps).sum(axis=2)
+    shift *= (mass / (4.0 * math.pi * area))[..., None]
+    smooth = cv2.blur(filled(shift), (_SMOOTHED, _SMOOTHED), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(smooth)

@@ -37,21 +37,8 @@
 #define CAMERA_SAFE 28     // q up to which nothing folds
 #define CAMERA_LIMIT 29    // q from which all is folded; between them the sign of the determinant says
 
-// Steps that suffice for most lenses; who needs more goes on with care.
-#define CAMERA_STEPS 3
-#define CAMERA_CAREFUL_STEPS 100
-// q from which a place counts as not finite: nothing below overflows. One comparison of bits finds what is larger,
-// infinite or NaN.
+// q from which nothing is looked for. One comparison of bits finds what is larger, infinite or NaN.
 #define CAMERA_REACH as_bits((real)1e12)
-// Squares, relative to the place's own: of the last step, after which the next is below rounding; of the distance left
-// that is rounding; of a step that leads nowhere.
-#ifdef REAL_IS_DOUBLE
-#define CAMERA_SETTLED 1e-15
-#else
-#define CAMERA_SETTLED 1e-9f
-#endif
-#define CAMERA_ROUNDING (64 * REAL_EPSILON * REAL_EPSILON)
-#define CAMERA_STUCK (REAL_EPSILON * REAL_EPSILON / 64)
 
 #if CAMERA_RADIAL == 3
 #define CAMERA_OVER(q, k) ((q) * ((k)[0] + (q) * ((k)[1] + (q) * (k)[2])))
@@ -183,55 +170,25 @@ inline masks LANED(camera_newton)(reals x, reals y, reals back_x, reals back_y, 
     return mask_of(q < camera[CAMERA_LIMIT]) & mask_of(determinant > 0);
 }
 
-// The same place from the centre on, where no step leaves the one-to-one part or gains nothing: it is halved instead.
-// Returns where that ends at the fold. Places that others than `wanted` ask for are left alone.
-inline masks LANED(camera_find)(reals x, reals y, masks wanted, constant real *camera, reals *back_x, reals *back_y) {
-    const reals own_x = zero_where(~wanted, x), own_y = zero_where(~wanted, y), square = own_x * own_x + own_y * own_y;
-    // At the centre the lens moves nothing and its Jacobian is 1: the first step leads to the place itself.
-    reals at_x = -own_x, at_y = -own_y, step_x = own_x, step_y = own_y, left = square;
-    masks open = wanted;
-    for (int k = 0; k < CAMERA_CAREFUL_STEPS && any_lane(open); k++) {
-        reals next_x, next_y, next_left;
-        const reals try_x = at_x + step_x, try_y = at_y + step_y;
-        const masks inside =
-            LANED(camera_newton)(own_x, own_y, try_x, try_y, camera, &next_x, &next_y, &next_left);
-        const masks better = inside & mask_of(next_left < left);
-        at_x = better ? try_x : at_x;
-        at_y = better ? try_y : at_y;
-        left = better ? next_left : left;
-        step_x = better ? next_x : step_x / 2;
-        step_y = better ? next_y : step_y / 2;
-        open = mask_of(left > (real)CAMERA_ROUNDING * square) &
-               mask_of(step_x * step_x + step_y * step_y > (real)CAMERA_STUCK * square);
-    }
-    *back_x = wanted ? at_x : *back_x;
-    *back_y = wanted ? at_y : *back_y;
-    return wanted & mask_of(left > (real)CAMERA_ROUNDING * square);
-}
+#define NEWTON_STEP LANED(camera_newton)
+#include "newton.h"
 
-// Moves the measured pixel (column, row) to its ideal one; returns where there is none, past the fold's image, and
-// where the pixel is not finite.
-inline masks LANED(camera_undistort)(reals *column, reals *row, constant real *camera, masks *lost) {
+// Moves the measured pixel (column, row) to its ideal one; returns where there is none, being past the fold's image, a
+// million focal lengths away, or no pixel at all.
+inline masks LANED(camera_undistort)(reals *column, reals *row, constant real *camera) {
     reals x = (*column - camera[CAMERA_CENTRE_X]) * camera[CAMERA_PER_X];
     reals y = (*row - camera[CAMERA_CENTRE_Y]) * camera[CAMERA_PER_Y];
-    *lost = mask_of(as_masks(x * x + y * y) >= CAMERA_REACH);
+    masks folded = mask_of(as_masks(x * x + y * y) >= CAMERA_REACH);
     reals tilt_x = 0, tilt_y = 0;
-    masks folded = 0;
 #ifdef CAMERA_TILTED
-    LANED(camera_tilt)(x, y, camera + CAMERA_TILT, &tilt_x, &tilt_y, &folded);
+    masks behind;
+    LANED(camera_tilt)(x, y, camera + CAMERA_TILT, &tilt_x, &tilt_y, &behind);
+    folded |= behind;
     x += tilt_x;
     y += tilt_y;
 #endif
-    reals back_x = 0, back_y = 0, step_x, step_y, left;
-    masks settled = 0;
-    for (int k = 0; k < CAMERA_STEPS; k++) {
-        settled = LANED(camera_newton)(x, y, back_x, back_y, camera, &step_x, &step_y, &left);
-        back_x += step_x;
-        back_y += step_y;
-    }
-    settled &= mask_of(step_x * step_x + step_y * step_y <= (real)CAMERA_SETTLED * (x * x + y * y));
-    const masks open = ~(settled | folded | *lost);
-    if (any_lane(open)) folded |= LANED(camera_find)(x, y, open, camera, &back_x, &back_y);
+    reals back_x, back_y;
+    folded |= LANED(newton_back)(x, y, folded, camera, &back_x, &back_y);
     LANED(camera_move)(column, row, tilt_x + back_x, tilt_y + back_y, camera);
     return folded;
 }

@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.fold import OneToOne, one_to_one
+from gpuvision.camera.newton import determinant, undo
 from gpuvision.tables import checked_keys, numbers
 
 Matrix = tuple[tuple[float, float, float], ...]
@@ -32,10 +33,6 @@ Direction = Literal["undistort", "distort"]
 
 _NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 _LENGTHS = (4, 5, 8, 12, 14)
-_STEPS = 100
-_EPSILON = float(np.finfo(np.float64).eps)
-# As in camera.h: squares of the distance left that is rounding, and of a step that leads nowhere, both relative.
-_ROUNDING, _STUCK = 64.0 * _EPSILON**2, _EPSILON**2 / 64.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +74,7 @@ class Camera:
     # ---- what the kernels take -----------------------------------------------------------------------------
 
     def defines(self, matrix: npt.ArrayLike | None = None) -> dict[str, int | None]:
-        """What ``kernels/camera.h`` has to compile for this camera, with ideal pixels under ``matrix``."""
+        """Return what ``kernels/camera.h`` has to compile for this camera, with ideal pixels under ``matrix``."""
         k, p, s = self._radial, self._tangential, self._prism
         defines: dict[str, int | None] = {"CAMERA": None, "CAMERA_RADIAL": _terms(k[:3])}
         defines["CAMERA_RATIONAL"] = _terms(k[3:])
@@ -152,7 +149,7 @@ class Camera:
         return np.asarray(ideal[:2, 2] + np.diag(ideal)[:2] * self._seen(points))
 
     def rays(self, points: npt.ArrayLike) -> Float64:
-        """Unit vectors from the camera towards what measured points (..., 2) show, (..., 3); NaN past the fold."""
+        """Return unit vectors (..., 3) towards what measured points (..., 2) show; NaN past the fold."""
         flat = self._seen(points)
         ray = np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], axis=-1)
         return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
@@ -180,7 +177,7 @@ class Camera:
     def jacobian(self, points: npt.ArrayLike) -> Float64:
         """d(ideal column, row) / d(measured column, row) at measured points, shape (..., 2, 2); NaN past the fold."""
         ideal = self._seen(points)
-        _, bend = self._bend(ideal)
+        _, bend, _ = self._bend(ideal)
         far = 1.0 + self._bent(ideal) @ self._tilt[2, :2]
         shown = self._shown(ideal)
         tilt = (self._tilt[:2, :2] - shown[..., :, None] * self._tilt[2, :2]) / far[..., None, None]
@@ -238,8 +235,8 @@ class Camera:
         matrix = np.array(self.matrix)
         return np.asarray(matrix[:2, 2] + np.diag(matrix)[:2] * places)
 
-    def _bend(self, places: Float64) -> tuple[Float64, Float64]:
-        """How far the lens moves normalised ideal places (..., 2), and the Jacobian of the bent places."""
+    def _bend(self, places: Float64) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:
+        """Return how far the lens moves normalised ideal places (..., 2), as `newton.undo` asks for it."""
         q = np.sum(places**2, axis=-1, keepdims=True)
         k1, k2, k3, k4, k5, k6 = self._radial
         (p1, p2), (s1, s2, s3, s4) = self._tangential, self._prism
@@ -253,17 +250,13 @@ class Camera:
         aside = np.array([p2 + s1, p1 + s3]) + second * q
         jacobian = (1.0 + e)[..., None] * np.eye(2) + places[..., :, None] * e_slope[..., None, :]
         jacobian += 2.0 * (aside + second * q)[..., :, None] * places[..., None, :]
-        return places * e + q * aside, jacobian
+        inside = (q[..., 0] < self._one_to_one.limit) & (determinant(jacobian) > 0.0)
+        return places * e + q * aside, jacobian, inside
 
     def _bent(self, places: Float64) -> Float64:
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            move, jacobian = self._bend(places)
-            return np.where(self._unfolded(places, jacobian)[..., None], places + move, np.nan)
-
-    def _unfolded(self, places: Float64, jacobian: Float64) -> npt.NDArray[np.bool_]:
-        """Whether the places lie in the lens' one-to-one part."""
-        within: npt.NDArray[np.bool_] = np.sum(places**2, axis=-1) < self._one_to_one.limit
-        return within & (_determinant(jacobian) > 0.0)
+            move, _, inside = self._bend(places)
+            return np.where(inside[..., None], places + move, np.nan)
 
     def _shown(self, places: Float64) -> Float64:
         """Normalised measured places of normalised ideal ones; NaN past the fold, and behind the tilted sensor."""
@@ -273,34 +266,7 @@ class Camera:
         """Normalised ideal places of measured points; NaN past the fold."""
         matrix = np.array(self.matrix)
         shown = (np.asarray(points, dtype=np.float64) - matrix[:2, 2]) / np.diag(matrix)[:2]
-        return self._straight(_tilted(np.linalg.inv(self._tilt), shown))
-
-    def _straight(self, bent: Float64) -> Float64:
-        """Undo the lens: Newton steps, halved where they leave the one-to-one part or gain nothing.
-
-        The unknown is the way back, which the lens' displacement is small beside: so it keeps its digits. The
-        start is the centre, from which the first step leads to the bent place itself.
-        """
-        wanted = bent.reshape(-1, 2)
-        back, step, square = -wanted, wanted.copy(), np.sum(wanted**2, axis=-1)
-        left = square.copy()
-        with np.errstate(all="ignore"):
-            open_ = np.flatnonzero(np.isfinite(square))
-            for _ in range(_STEPS):
-                if not len(open_):
-                    break
-                trial = back[open_] + step[open_]
-                move, jacobian = self._bend(wanted[open_] + trial)
-                rest = move + trial
-                better = self._unfolded(wanted[open_] + trial, jacobian) & (np.sum(rest**2, axis=-1) < left[open_])
-                taken = open_[better]
-                back[taken], left[taken] = trial[better], np.sum(rest[better] ** 2, axis=-1)
-                step[taken] = -np.linalg.solve(jacobian[better], rest[better][..., None])[..., 0]
-                step[open_[~better]] *= 0.5
-                moving = np.sum(step[open_] ** 2, axis=-1) > _STUCK * square[open_]
-                open_ = open_[(left[open_] > _ROUNDING * square[open_]) & moving]
-            found = left <= _ROUNDING * square
-        return np.asarray(np.where(found[:, None], wanted + back, np.nan).reshape(bent.shape))
+        return undo(self._bend, _tilted(np.linalg.inv(self._tilt), shown))
 
     # ---- tables --------------------------------------------------------------------------------------------
 
@@ -344,7 +310,7 @@ class Camera:
 
 def _checked_matrix(matrix: Any, what: str) -> Matrix:
     rows: Matrix = numbers(matrix, (3, 3), what)
-    (fx, skew, cx), (below, fy, cy), last = rows
+    (fx, skew, _), (below, fy, _), last = rows
     if not (fx > 0.0 and fy > 0.0):
         raise ValueError(f"{what} has focal lengths {fx:g} and {fy:g}, expected numbers above 0")
     if skew != 0.0 or below != 0.0 or last != (0.0, 0.0, 1.0):
@@ -355,10 +321,6 @@ def _checked_matrix(matrix: Any, what: str) -> Matrix:
 def _terms(coefficients: Sequence[float]) -> int:
     """Return how many of them there are up to the last that is not 0."""
     return max((place for place, value in enumerate(coefficients, 1) if value != 0.0), default=0)
-
-
-def _determinant(jacobian: Float64) -> Float64:
-    return np.asarray(jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0])
 
 
 def _tilted(tilt: Float64, places: Float64) -> Float64:

@@ -47,11 +47,12 @@ def _decentred(over: Float64, under: Float64, p: Float64, s: Float64, pole: floa
     first = [ray[0] if ray else math.inf for ray in rays]
     again = min(ray[1] if len(ray) > 1 else math.inf for ray in rays)
     last = max((each for each in first if math.isfinite(each)), default=0.0)
-    if last < again:
-        limit = last * again if last > 0.0 else math.inf
+    if not last:
+        limit = pole
+    elif last < again:
+        limit = min(last * again, pole)
     else:
-        limit = (_MARGIN * again) ** 2
-    limit = min(limit, pole)
+        limit = min((_MARGIN * again) ** 2, pole)
     return OneToOne(min((_MARGIN * min(first)) ** 2, limit) * unit**2, limit * unit**2)
 
 

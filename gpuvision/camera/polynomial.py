@@ -1,0 +1,299 @@
+"""The measurement-plane polynomial: sensor coordinates straight to metres in one plane, without a camera in between."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from math import comb
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.camera.newton import determinant, undo
+from gpuvision.tables import checked_keys, numbers
+
+Float64 = npt.NDArray[np.float64]
+Region = tuple[tuple[float, float], tuple[float, float]]
+
+# Powers (of c, of r) of the terms, in the order of eq. 3.6; eq. 3.7 is the same with c and r exchanged.
+_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (1, 2), (3, 0))
+# The powers of what displaces, in the order of plane.h.
+_BENDING = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+_EDGE = 1.0 + 4.0 * float(np.finfo(np.float64).eps)
+_OUTSKIRTS = 1.25
+_TRIED = 33
+_WORST_CONDITION = 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanePolynomial:
+    """Cubic polynomials from sensor to measurement plane (F. de Jong, eq. 3.6 and 3.7)::
+
+        G = p0 + p1 c + p2 r + p3 c^2 + p4 r c + p5 r^2 + p6 r^2 c + p7 c^3
+        H = q0 + q1 r + q2 c + q3 r^2 + q4 c r + q5 c^2 + q6 c^2 r + q7 r^3
+
+    with c and r the sensor's coordinates, in its unit, and G and H metres in the plane. They take magnification,
+    rotation, the weaker perspective and radial distortion in one, for a sensor about perpendicular to the plane.
+
+    Limits: the numbers are no physical ones, so a lens, a tilt or a pose cannot be read from them, and they hold for
+    this one plane only. The terms are not complete: G has to run about along c, and H along r. The perspective of a
+    sensor 10 degrees aside or the fifth-order part of a strong lens are beyond them. Beyond the points that they were
+    fitted to they mean nothing: cubic terms run away, so points outside ``region`` are NaN. For measuring by
+    triangulation take `Triangulation` with a `Lens`.
+
+    Parameters
+    ----------
+    p, q
+        The eight coefficients of either.
+    region
+        ((c_min, c_max), (r_min, r_max)) of the sensor within which they hold.
+    covariance
+        (2, 8, 8): of the coefficients of G and of H, over sensor coordinates shifted and scaled to -1 .. 1 within the
+        region.
+
+    Raises
+    ------
+    ValueError
+        The polynomials are not one-to-one within the region, or a number or shape is wrong.
+    TypeError
+        Something is no number.
+    """
+
+    p: tuple[float, ...]
+    q: tuple[float, ...]
+    region: Region
+    covariance: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("p", "q"):
+            object.__setattr__(self, name, numbers(getattr(self, name), (8,), f"PlanePolynomial.{name}"))
+        object.__setattr__(self, "region", numbers(self.region, (2, 2), "PlanePolynomial.region"))
+        if any(low >= high for low, high in self.region):
+            raise ValueError(f"PlanePolynomial.region is {self.region}, expected ((c_min, c_max), (r_min, r_max))")
+        if self.covariance is not None:
+            parts = tuple(numbers(part, (8, 8), "PlanePolynomial.covariance[i]") for part in self.covariance)
+            if len(parts) != 2:
+                raise ValueError(f"PlanePolynomial.covariance has {len(parts)} parts, expected one of p and one of q")
+            object.__setattr__(self, "covariance", parts)
+        self._check_one_to_one()
+
+    def _check_one_to_one(self) -> None:
+        _, matrix, _ = self._parts
+        if not np.linalg.cond(matrix) < _WORST_CONDITION:
+            raise ValueError(
+                "PlanePolynomial: its linear terms are not one-to-one, expected a plane seen from its front"
+            )
+        line = np.linspace(-1.0, 1.0, _TRIED)
+        _, jacobian, _ = self._bend(np.stack(np.meshgrid(line, line), -1).reshape(-1, 2))
+        if not np.all(determinant(jacobian) > 0.0):
+            raise ValueError("PlanePolynomial folds within its region; fit it to more points, or to a smaller region")
+
+    # ---- both ways on the host -----------------------------------------------------------------------------
+
+    def to_plane(self, points: npt.ArrayLike) -> Float64:
+        """(G, H) of sensor points, shape (..., 2) [m]; NaN outside the region."""
+        places = self._conditioned(points)
+        offset, matrix, _ = self._parts
+        with np.errstate(all="ignore"):
+            move, _, _ = self._bend(places)
+        return np.asarray(offset + np.where(_within(places, _EDGE)[..., None], places + move, np.nan) @ matrix.T)
+
+    def to_sensor(self, points: npt.ArrayLike) -> Float64:
+        """Sensor coordinates of points (G, H) in the plane, shape (..., 2): the inverse; NaN outside the region."""
+        offset, matrix, _ = self._parts
+        moved = (np.asarray(points, dtype=np.float64) - offset) @ np.linalg.inv(matrix).T
+        places = undo(self._bend, moved)
+        middle, half = self._middle_and_half
+        return np.asarray(middle + half * np.where(_within(places, _EDGE)[..., None], places, np.nan))
+
+    def covariance_at(self, points: npt.ArrayLike) -> Float64:
+        """Covariance of (G, H) at sensor points that the coefficients' own brings, (..., 2) to (..., 2, 2) [m^2].
+
+        Raises
+        ------
+        ValueError
+            The covariance is not known.
+        """
+        if self.covariance is None:
+            raise ValueError("PlanePolynomial.covariance is not known; fit the polynomial to more than eight points")
+        places = self._conditioned(points)
+        designs = _designs(np.where(_within(places, _EDGE)[..., None], places, np.nan))
+        variances = [
+            np.einsum("...i,ij,...j->...", design, np.array(part), design)
+            for design, part in zip(designs, self.covariance, strict=True)
+        ]
+        return np.asarray(np.stack(variances, -1)[..., None] * np.eye(2))
+
+    # ---- what the kernels take -----------------------------------------------------------------------------
+
+    @property
+    def defines(self) -> dict[str, None]:
+        """What ``kernels/plane.h`` needs to be told."""
+        return {"PLANE": None}
+
+    def packed(self, real: npt.DTypeLike) -> npt.NDArray[Any]:
+        """Return the table of ``kernels/plane.h`` for float32 or float64."""
+        middle, half = self._middle_and_half
+        # Origin and scale are rounded before the rest is computed from them.
+        origin = middle.astype(real).astype(np.float64)
+        scale = (1.0 / half).astype(real).astype(np.float64)
+        offset, matrix, bending = _taken_apart(self._powers, origin, 1.0 / scale)
+        back = np.linalg.inv(matrix)
+        table = [origin, scale, 1.0 / scale, offset, matrix.ravel(), back.ravel(), bending.ravel()]
+        return np.concatenate(table).astype(real)
+
+    # ---- parts ---------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _middle_and_half(self) -> tuple[Float64, Float64]:
+        low, high = np.array(self.region).T
+        return 0.5 * (low + high), 0.5 * (high - low)
+
+    def _conditioned(self, points: npt.ArrayLike) -> Float64:
+        middle, half = self._middle_and_half
+        return np.asarray((np.asarray(points, dtype=np.float64) - middle) / half)
+
+    @cached_property
+    def _powers(self) -> Float64:
+        """Coefficients of c^i r^j, of G and of H: (2, 4, 4)."""
+        powers = np.zeros((2, 4, 4))
+        for (i, j), p, q in zip(_TERMS, self.p, self.q, strict=True):
+            powers[0, i, j], powers[1, j, i] = p, q
+        return powers
+
+    @cached_property
+    def _parts(self) -> tuple[Float64, Float64, Float64]:
+        return _taken_apart(self._powers, *self._middle_and_half)
+
+    def _bend(self, places: Float64) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:
+        """Return how far the higher terms move conditioned places (n, 2), as `newton.undo` asks for it."""
+        _, _, bending = self._parts
+        x, y = places[..., 0], places[..., 1]
+        ones = np.ones_like(x)
+        terms = np.stack([x**i * y**j for i, j in _BENDING], -1)
+        by_x = np.stack([i * x ** max(i - 1, 0) * y**j * ones for i, j in _BENDING], -1)
+        by_y = np.stack([j * x**i * y ** max(j - 1, 0) * ones for i, j in _BENDING], -1)
+        jacobian = np.eye(2) + np.stack([by_x @ bending.T, by_y @ bending.T], -1)
+        return terms @ bending.T, jacobian, _within(places, _OUTSKIRTS) & (determinant(jacobian) > 0.0)
+
+    # ---- where one comes from ------------------------------------------------------------------------------
+
+    @classmethod
+    def fit(
+        cls,
+        sensor_points: npt.ArrayLike,
+        plane_points: npt.ArrayLike,
+        *,
+        region: Region | None = None,
+        sigma: float | None = None,
+    ) -> PlanePolynomial:
+        """Fit known points of the plane by linear least squares.
+
+        Parameters
+        ----------
+        sensor_points, plane_points
+            Measured (c, r) and known (G, H) [m], each (..., 2); pairs with NaN are left out.
+        region
+            Where it shall hold; None: the box around the points.
+        sigma
+            Standard deviation of either coordinate in the plane [m], for the covariance; None: from the residuals.
+
+        Raises
+        ------
+        ValueError
+            Shapes differ, the points do not fix the terms, or G does not run along c.
+        """
+        sensor, plane = (np.asarray(each, dtype=np.float64) for each in (sensor_points, plane_points))
+        if sensor.shape != plane.shape or sensor.shape[-1:] != (2,):
+            raise ValueError(f"sensor points {sensor.shape} and plane points {plane.shape}: expected (..., 2), alike")
+        pairs = np.concatenate([sensor, plane], -1).reshape(-1, 4)
+        pairs = pairs[np.isfinite(pairs).all(axis=1)]
+        if len(pairs) < len(_TERMS):
+            raise ValueError(f"{len(pairs)} pairs of points are known, expected eight at least")
+        low, high = pairs[:, :2].min(axis=0), pairs[:, :2].max(axis=0)
+        if not np.all(high > low):
+            raise ValueError("the sensor points lie on one line, expected points all over the measurement plane")
+        box = numbers(np.stack([low, high], -1) if region is None else region, (2, 2), "region")
+        middle, half = 0.5 * np.sum(box, axis=1), 0.5 * np.ptp(box, axis=1)
+        designs = _designs((pairs[:, :2] - middle) / half)
+        fits = [_least_squares(design, pairs[:, 2 + axis], sigma) for axis, design in enumerate(designs)]
+        if not all(abs(value[1]) > abs(value[2]) for value, _ in fits):
+            raise ValueError(
+                "the plane's G does not run along the sensor's c; exchange the plane's axes, or the sensor's"
+            )
+        values = [_in_sensor_units(fits[axis][0], middle, half, axis) for axis in (0, 1)]
+        parts = tuple(numbers(part, (8, 8), "covariance") for _, part in fits if part is not None)
+        return cls(p=values[0], q=values[1], region=box, covariance=parts if len(parts) == 2 else None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and lists, as TOML holds them; what is None is left out."""
+        table: dict[str, Any] = {"p": list(self.p), "q": list(self.q), "region": [list(each) for each in self.region]}
+        if self.covariance is not None:
+            table["covariance"] = [[list(row) for row in part] for part in self.covariance]
+        return table
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> PlanePolynomial:
+        """Build a polynomial from such a table; all but ``covariance`` are needed.
+
+        Raises
+        ------
+        ValueError, TypeError
+            A key is unknown or missing, or a value is not what it must be.
+        """
+        needed = ("p", "q", "region")
+        return cls(**checked_keys(table, (*needed, "covariance"), needed, "plane polynomial"))
+
+
+def _within(places: Float64, edge: float) -> npt.NDArray[np.bool_]:
+    return np.asarray(np.all(np.abs(places) <= edge, axis=-1))
+
+
+def _designs(places: Float64) -> tuple[Float64, Float64]:
+    """Terms of eq. 3.6 and of eq. 3.7 at places (..., 2): each (..., 8)."""
+    x, y = places[..., 0], places[..., 1]
+    return np.stack([x**i * y**j for i, j in _TERMS], -1), np.stack([x**j * y**i for i, j in _TERMS], -1)
+
+
+def _least_squares(design: Float64, values: Float64, sigma: float | None) -> tuple[Float64, Float64 | None]:
+    orthogonal, triangle = np.linalg.qr(design)
+    if not np.linalg.cond(triangle) < _WORST_CONDITION:
+        raise ValueError("the points do not fix eight terms, expected four columns and four rows of points at least")
+    found = np.linalg.solve(triangle, orthogonal.T @ values)
+    spare = len(values) - len(_TERMS)
+    if sigma is None and not spare:
+        return found, None
+    variance = sigma**2 if sigma is not None else float(np.sum((values - design @ found) ** 2)) / spare
+    inverse = np.linalg.inv(triangle)
+    return found, variance * inverse @ inverse.T
+
+
+def _substituted(powers: Float64, origin: Float64, unit: Float64) -> Float64:
+    """Rewrite coefficients (..., 4, 4) of c^i r^j for c = origin + unit x, r likewise."""
+    along, across = (
+        np.array([[comb(i, k) * o ** (i - k) * u**k if k <= i else 0.0 for k in range(4)] for i in range(4)])
+        for o, u in zip(origin, unit, strict=True)
+    )
+    return np.asarray(along.T @ powers @ across)
+
+
+def _in_sensor_units(values: Float64, middle: Float64, half: Float64, axis: int) -> tuple[float, ...]:
+    """Return eq. 3.6's (axis 0) or 3.7's coefficients of those over the conditioned coordinates."""
+    powers = np.zeros((4, 4))
+    order = [(i, j) if axis == 0 else (j, i) for i, j in _TERMS]
+    for place, value in zip(order, values, strict=True):
+        powers[place] = value
+    powers = _substituted(powers, -middle / half, 1.0 / half)
+    return tuple(float(powers[place]) for place in order)
+
+
+def _taken_apart(powers: Float64, origin: Float64, unit: Float64) -> tuple[Float64, Float64, Float64]:
+    """Return offset (2,), matrix (2, 2) and bending terms (2, 7) of plane.h for c = origin + unit x."""
+    terms = _substituted(powers, origin, unit)
+    matrix = np.stack([terms[:, 1, 0], terms[:, 0, 1]], -1)
+    higher = np.stack([terms[:, i, j] for i, j in _BENDING], -1)
+    with np.errstate(all="ignore"):
+        bending = np.linalg.solve(matrix, higher) if np.linalg.cond(matrix) < _WORST_CONDITION else higher
+    return terms[:, 0, 0], matrix, bending

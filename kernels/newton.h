@@ -1,0 +1,63 @@
+// The place (x + back) which a displacement takes to (x, y): Newton's method, for the way back. It is small beside the
+// place, so it keeps its digits in single precision.
+//
+// Who includes this defines NEWTON_STEP(x, y, back_x, back_y, table, &step_x, &step_y, &left): the Newton step from
+// (x, y) + back, and the squared distance `left` there; it returns where the place is in the part that is one-to-one.
+#ifndef NEWTON_H
+#define NEWTON_H
+#include "lanes.h"
+
+// Steps that suffice for most places; who needs more goes on with care.
+#define NEWTON_STEPS 3
+#define NEWTON_CAREFUL_STEPS 100
+// Squares, relative to the place's own: of the last step, after which the next is below rounding; of the distance left
+// that is rounding; of a step that leads nowhere.
+#ifdef REAL_IS_DOUBLE
+#define NEWTON_SETTLED 1e-15
+#else
+#define NEWTON_SETTLED 1e-9f
+#endif
+#define NEWTON_ROUNDING ((real)(64 * REAL_EPSILON * REAL_EPSILON))
+#define NEWTON_STUCK ((real)(REAL_EPSILON * REAL_EPSILON / 64))
+
+// From the centre on, where nothing is displaced, for the places that are wanted: a step that leaves the one-to-one
+// part or gains nothing is halved. Returns where that ends without an answer.
+inline masks LANED(newton_find)(reals x, reals y, masks wanted, constant real *table, reals *back_x, reals *back_y) {
+    const reals own_x = zero_where(~wanted, x), own_y = zero_where(~wanted, y), square = own_x * own_x + own_y * own_y;
+    reals at_x = -own_x, at_y = -own_y, step_x = own_x, step_y = own_y, left = square;
+    masks open = wanted;
+    for (int k = 0; k < NEWTON_CAREFUL_STEPS && any_lane(open); k++) {
+        reals next_x, next_y, next_left;
+        const reals try_x = at_x + step_x, try_y = at_y + step_y;
+        const masks inside = NEWTON_STEP(own_x, own_y, try_x, try_y, table, &next_x, &next_y, &next_left);
+        const masks better = inside & mask_of(next_left < left);
+        at_x = better ? try_x : at_x;
+        at_y = better ? try_y : at_y;
+        left = better ? next_left : left;
+        step_x = better ? next_x : step_x / 2;
+        step_y = better ? next_y : step_y / 2;
+        open = mask_of(left > NEWTON_ROUNDING * square) &
+               mask_of(step_x * step_x + step_y * step_y > NEWTON_STUCK * square);
+    }
+    *back_x = wanted ? at_x : *back_x;
+    *back_y = wanted ? at_y : *back_y;
+    return wanted & mask_of(left > NEWTON_ROUNDING * square);
+}
+
+// The way back for the places that are not in `without`; returns where there is none.
+inline masks LANED(newton_back)(reals x, reals y, masks without, constant real *table, reals *back_x, reals *back_y) {
+    reals step_x, step_y, left;
+    masks settled = 0;
+    *back_x = 0;
+    *back_y = 0;
+    for (int k = 0; k < NEWTON_STEPS; k++) {
+        settled = NEWTON_STEP(x, y, *back_x, *back_y, table, &step_x, &step_y, &left);
+        *back_x += step_x;
+        *back_y += step_y;
+    }
+    settled &= mask_of(step_x * step_x + step_y * step_y <= (real)NEWTON_SETTLED * (x * x + y * y));
+    const masks open = ~(settled | without);
+    return any_lane(open) ? LANED(newton_find)(x, y, open, table, back_x, back_y) : (masks)0;
+}
+
+#endif

@@ -1,0 +1,145 @@
+"""What a calibration's data cannot tell, in words: a small residual does not prove a camera."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gpuvision.camera.camera_fit import Alternative, CameraFit
+
+# Points are seldom measured better, however well a simulation may fit: below, uncertainties are no diagnosis.
+_BEST_NOISE_PX = 0.01
+_LOOSE_FOCUS = 0.02
+_NO_FOCUS = 0.3
+_LOOSE_CENTRE_PX = 3.0
+_FAR_CENTRE = 0.1
+_LEVEL = 0.01
+_TOO_NOISY = 1.2
+_SIGNIFICANT = 3.0
+
+
+def diagnose(fit: CameraFit, size: tuple[int, int], *, noise: float, outliers: int, mirrored: bool) -> tuple[str, ...]:
+    """Return one sentence for each thing that the data leave open.
+
+    Parameters
+    ----------
+    fit
+        The calibration, its warnings yet empty.
+    size
+        (columns, rows) of the images.
+    noise
+        What the residual says of the noise of one coordinate, pixels.
+    outliers
+        Points farther from their place than noise leads, in a fit that trusts every point.
+    mirrored
+        Whether the target is seen from its other side in every view.
+    """
+    said = [
+        _focus(fit),
+        _centre(fit),
+        _tilt_instead(fit, size),
+        *(_as_good(fit, each) for each in fit.alternatives),
+        _small_tilt(fit),
+    ]
+    if not fit.camera.covers(size):
+        said.append("the lens polynomial folds within the image: points beyond the fold cannot be undistorted")
+    if noise > _TOO_NOISY * fit.sigma:
+        said.append(f"the residual is {noise / fit.sigma:.1f} times the noise given: the model does not suffice")
+    if outliers:
+        said.append(f"{outliers} points lie farther off than noise leads: look at the residuals, or take loss='tukey'")
+    if mirrored:
+        said.append(
+            "the target is seen from behind (its Z axis points at the camera): y runs upwards on it, or the images are "
+            "mirrored and the camera found is the mirrored one"
+        )
+    return tuple(each for each in said if each)
+
+
+def fixes_focus(fit: CameraFit) -> bool:
+    """Whether the data fix the focal length at all."""
+    return _loose_focus(fit) < _NO_FOCUS
+
+
+def _deviation(fit: CameraFit, name: str) -> float:
+    """Return the standard deviation of a number at the noise that is to be expected at the best."""
+    if name not in fit.names:
+        return 0.0
+    return fit.uncertainties[name] * max(1.0, _BEST_NOISE_PX / max(fit.sigma, 1e-300))
+
+
+def _loose_focus(fit: CameraFit) -> float:
+    return max(_deviation(fit, "f"), _deviation(fit, "fx")) / fit.camera.matrix[0][0]
+
+
+def _focus(fit: CameraFit) -> str:
+    loose = _loose_focus(fit)
+    if loose < _LOOSE_FOCUS:
+        return ""
+    return (
+        f"the views fix the focal length to {100 * loose:.1f} % only: add views at other angles or give focal_length="
+    )
+
+
+def _loose_centre(fit: CameraFit) -> float:
+    """Return the standard deviation of the centre in the direction in which it is known least, pixels."""
+    if "cx" not in fit.names:
+        return 0.0
+    first = fit.names.index("cx")
+    largest = np.linalg.eigvalsh(fit.covariance[first : first + 2, first : first + 2])[-1]
+    return float(math.sqrt(largest)) * max(1.0, _BEST_NOISE_PX / max(fit.sigma, 1e-300))
+
+
+def _centre(fit: CameraFit) -> str:
+    loose = _loose_centre(fit)
+    if loose < _LOOSE_CENTRE_PX:
+        return ""
+    if "tauX" not in fit.names:
+        return f"the centre is known to {_pixels(loose, fit)} only: add views at other angles"
+    tilt = math.degrees(fit.alpha_sigma)
+    return (
+        f"the lens bends too little to tell tilt from centre: the centre is known to {_pixels(loose, fit)}, "
+        f"the tilt to {min(tilt, 90.0):.2g} degrees, one trading for the other: give centre= if it is known"
+    )
+
+
+def _pixels(loose: float, fit: CameraFit) -> str:
+    return f"{loose:.2g} px" if loose < 2.0 * fit.camera.matrix[0][0] else "no pixel"
+
+
+def _tilt_instead(fit: CameraFit, size: tuple[int, int]) -> str:
+    """Say that a centre far from the image's middle is what a tilted sensor looks like."""
+    if "tauX" in fit.names or "cx" not in fit.names:
+        return ""
+    f, (column, row) = fit.camera.matrix[0][0], (fit.camera.matrix[0][2], fit.camera.matrix[1][2])
+    aside = math.hypot(column - 0.5 * (size[0] - 1), row - 0.5 * (size[1] - 1))
+    if aside < _FAR_CENTRE * math.hypot(*size) + 3.0 * _loose_centre(fit):
+        return ""
+    tilt = math.degrees(math.atan2(aside, f))
+    return (
+        f"the centre lies {aside:.0f} px from the image's middle: a sensor tilted by {tilt:.1f} degrees looks the same "
+        "where the lens bends too little; if it is tilted, give model='tilt' and centre="
+    )
+
+
+def _as_good(fit: CameraFit, other: Alternative) -> str:
+    """Say which model fits as well, and lies elsewhere."""
+    if other.p_value < _LEVEL or other.apart_px < _LOOSE_CENTRE_PX:
+        return ""
+    return (
+        f"model {other.model!r} fits as well (rms {other.rms_px:.4f} px, p = {other.p_value:.2g}) "
+        f"with its centre {other.apart_px:.1f} px away"
+    )
+
+
+def _small_tilt(fit: CameraFit) -> str:
+    if "tauX" not in fit.names:
+        return ""
+    block = fit.covariance[-2:, -2:]
+    tau = np.array(fit.camera.distortion[12:])
+    if tau @ np.linalg.solve(block, tau) > _SIGNIFICANT**2:
+        return ""
+    return (
+        f"the tilt found, {math.degrees(math.hypot(*tau)):.2g} degrees, is within its own uncertainty: "
+        "an untilted sensor fits as well"
+    )

@@ -15,8 +15,10 @@ from gpuvision.camera.pattern import Float64
 
 # Cells of the map of thresholds in a window.
 _CELLS = 16
-# Light and dark must differ by this part of what they do in most of the image.
+# Light and dark must differ by this part of what they do in most of the image, and by so many times the noise: the
+# extremes of noise alone lie 6 times its sigma apart in a window.
 _CONTRAST = 0.15
+_ABOVE_NOISE = 8.0
 _SMALLEST_AREA = 6
 # Of its bounding box a disc fills 0.785, an ellipse at 45 degrees half as wide as long 0.63.
 _FILLED = (0.4, 0.97)
@@ -24,6 +26,7 @@ _LONGEST = 3.5
 _AREAS = (0.4, 2.5)
 # Windows to try, as parts of the image's smaller side.
 _WINDOWS = (1 / 3, 1 / 6, 1 / 12, 1 / 24, 1 / 48)
+_TRIAL_SMOOTHING = 3
 _TRIAL_PIXELS = 3e6
 _MOST_BLOBS = 60_000
 # So many blobs amid symmetric neighbours, and such a share of all, need no further trial.
@@ -51,11 +54,23 @@ class Scale(NamedTuple):
     count: int
 
 
-def find_blobs(grey: npt.NDArray[np.float32], window: float, bright: bool) -> Blobs:
+def find_blobs(grey: npt.NDArray[np.float32], window: float, bright: bool, smoothing: int) -> Blobs:
     """Find regions brighter (darker) than the middle between the lightest and the darkest within a window.
 
     Those that touch the border, and those that fill their bounding box as no ellipse does, are left out.
+
+    Parameters
+    ----------
+    grey
+        The image.
+    window
+        Side in pixels; light and dark are in every window that counts.
+    bright
+        The blobs are brighter than the ground.
+    smoothing
+        Side in pixels, odd, of a box that the image is smoothed with.
     """
+    grey = cv2.blur(grey, (smoothing, smoothing)) if smoothing > 1 else grey
     level, usable = _threshold(grey, window)
     mask = cv2.compare(grey, level, cv2.CMP_GT if bright else cv2.CMP_LT)
     cv2.bitwise_and(mask, usable, dst=mask)
@@ -80,10 +95,17 @@ def _threshold(grey: npt.NDArray[np.float32], window: float) -> tuple[npt.NDArra
     kernel = np.ones((side, side), np.uint8)
     high, low = (cv2.blur(each, (side, side)) for each in (cv2.dilate(small, kernel), cv2.erode(small, kernel)))
     span = high - low
-    usable = (span > _CONTRAST * np.percentile(span, 90)).astype(np.uint8) * 255
+    least = max(_CONTRAST * float(np.percentile(span, 90)), _ABOVE_NOISE * _noise(small))
+    usable = (span > least).astype(np.uint8) * 255
     full = (columns, rows)
     middle = cv2.resize(0.5 * (high + low), full, interpolation=cv2.INTER_LINEAR)
     return middle, cv2.resize(usable, full, interpolation=cv2.INTER_NEAREST)
+
+
+def _noise(image: npt.NDArray[np.float32]) -> float:
+    """Sigma of an image's noise, from the quarter of its second differences that is smallest: there are no edges."""
+    step = np.abs(image[:, 2:] - 2.0 * image[:, 1:-1] + image[:, :-2])
+    return float(np.percentile(step, 25)) / (0.3186 * math.sqrt(6.0)) if step.size else 0.0
 
 
 def alike(area: Float64) -> npt.NDArray[np.bool_]:
@@ -100,7 +122,7 @@ def find_scale(grey: npt.NDArray[np.float32]) -> Scale:
         small = cv2.resize(grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
         for part in _WINDOWS:
             for bright in (False, True):
-                blobs = find_blobs(small, part * min(small.shape), bright)
+                blobs = find_blobs(small, part * min(small.shape), bright, _TRIAL_SMOOTHING)
                 trial = _judge(blobs, bright)
                 if trial.count > best.count:
                     best = trial._replace(pitch=trial.pitch * factor)

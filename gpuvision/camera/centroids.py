@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.grid_polynomial import GridPolynomial
 from gpuvision.camera.pattern import Float64
 
 # Pixels with less of a dot than this count as ground: noise on the ground stays out, and the weight is 0 where the
@@ -16,8 +17,11 @@ from gpuvision.camera.pattern import Float64
 _GROUND = 0.2
 # Pixels around the bounding box at half height that may still hold some of the dot.
 _MARGIN = (1.0, 4.0)
+# Boxes that ground and dot are averaged over: a part of the pitch about the corners of a cell, which no dot reaches,
+# and of the dot.
+_GROUND_BOX = 0.25
+_DOT_BOX = 0.5
 _CHUNK_PIXELS = 1 << 17
-_SMOOTHED = 5
 
 
 class Centroids(NamedTuple):
@@ -82,12 +86,11 @@ def measure_dots(grey: npt.NDArray[np.float32], points: Float64, size: Float64) 
     nodes = np.isfinite(points[..., 0])
     steps = lattice_steps(points)[nodes]
     at, box = points[nodes], size[nodes]
-    smooth = cv2.blur(grey, (3, 3))
-    ground, slope, unevenness = _ground(smooth, at, steps)
-    contrast = _sampled(smooth, at) - ground
+    pitch = np.linalg.norm(steps, axis=-1).min(axis=-1)
+    ground, slope, unevenness = _ground(_smoothed(grey, _GROUND_BOX * pitch), at, steps)
+    contrast = _sampled(_smoothed(grey, _DOT_BOX * box.min(axis=-1)), at) - ground
     whole_contrast = _laid_out(contrast, nodes)
     growth = np.linalg.solve(steps, lattice_steps(whole_contrast[..., None])[nodes])[..., 0]
-    pitch = np.linalg.norm(steps, axis=-1).min(axis=-1)
     margin = np.clip(0.5 * (pitch - box.max(axis=-1)), *_MARGIN)
     half = 0.5 * box + margin[:, None]
     reach = math.ceil(float(half.max())) + 1
@@ -109,6 +112,12 @@ def _laid_out(values: Float64, nodes: npt.NDArray[np.bool_]) -> Float64:
     whole = np.full((*nodes.shape, *values.shape[1:]), np.nan)
     whole[nodes] = values
     return whole
+
+
+def _smoothed(grey: npt.NDArray[np.float32], sides: Float64) -> npt.NDArray[np.float32]:
+    """Smooth with a box of one of the smaller ones of these sides."""
+    side = 2 * int(0.5 * np.percentile(sides, 10)) + 1
+    return np.asarray(cv2.blur(grey, (side, side)), dtype=np.float32)
 
 
 def _sampled(image: npt.NDArray[np.float32], at: Float64) -> Float64:
@@ -165,7 +174,7 @@ def _moments(grey: npt.NDArray[np.float32], at: Float64, half: Float64, planes: 
     )
     weight = (patch - ground) / contrast
     weight -= _GROUND
-    np.clip(weight, 0.0, 1.0, out=weight)
+    np.maximum(weight, 0.0, out=weight)
     within = [
         ((np.abs(d) <= half[:, each, None]) & (p >= 0) & (p < limit)).astype(np.float32)
         for each, (d, p, limit) in enumerate(zip(from_dot, (x, y), (columns, rows), strict=True))
@@ -175,7 +184,7 @@ def _moments(grey: npt.NDArray[np.float32], at: Float64, half: Float64, planes: 
     return np.stack([by_x.sum(axis=1), by_x @ offsets, by_y @ offsets], axis=1) / (1.0 - _GROUND)
 
 
-def disc_shift(points: Float64, mass: Float64) -> Float64:
+def disc_shift(bent: GridPolynomial, mass: Float64) -> Float64:
     """Centre of gravity of a disc's image less the image of its centre, from the curvature of the grid.
 
     With steps M = (m_u, m_v) of the grid, J = det M, and a disc of radius r pitches: r^2/4 ((m_uu + m_vv)/2 + M grad
@@ -183,25 +192,23 @@ def disc_shift(points: Float64, mass: Float64) -> Float64:
 
     Parameters
     ----------
-    points
-        (rows, columns, 2); NaN where missing.
+    bent
+        Polynomial through the grid.
     mass
-        (rows, columns), the discs' areas in pixels.
+        (rows, columns), the discs' areas in pixels; NaN where there is none.
 
     Returns
     -------
     numpy.ndarray
-        (rows, columns, 2) in pixels, smoothed over 5 by 5 nodes; 0 where the grid is too small to tell.
+        (rows, columns, 2) in pixels.
     """
-    steps = lattice_steps(points)
-    area = np.abs(steps[..., 0, 0] * steps[..., 1, 1] - steps[..., 0, 1] * steps[..., 1, 0])
-    if min(area.shape) < _SMOOTHED or not np.isfinite(area).all():
-        return np.zeros_like(points)
-    growth = lattice_steps(np.log(area)[..., None])
-    bend = [np.diff(points, 2, axis) for axis in (1, 0)]
-    wide = [((0, 0), (1, 1), (0, 0)), ((1, 1), (0, 0), (0, 0))]
-    curvature = sum(np.pad(each, pad, constant_values=np.nan) for each, pad in zip(bend, wide, strict=True))
-    shift = 0.5 * curvature + (growth * steps).sum(axis=2)
-    shift *= (mass / (4.0 * math.pi * area))[..., None]
-    smooth = cv2.blur(filled(shift), (_SMOOTHED, _SMOOTHED), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(smooth)
+    orders = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    u, v, uu, uv, vv = (bent.derivative(*order) for order in orders)
+    area = _cross(u, v)
+    growth = (_cross(uu, v) + _cross(u, uv)) / area, (_cross(uv, v) + _cross(u, vv)) / area
+    shift = 0.5 * (uu + vv) + growth[0][..., None] * u + growth[1][..., None] * v
+    return np.asarray(shift * (mass / (4.0 * math.pi * np.abs(area)))[..., None])
+
+
+def _cross(a: Float64, b: Float64) -> Float64:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

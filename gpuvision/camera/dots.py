@@ -7,8 +7,9 @@ import numpy.typing as npt
 
 from gpuvision.camera.blobs import alike, find_blobs, find_scale
 from gpuvision.camera.centroids import Centroids, disc_shift, measure_dots
+from gpuvision.camera.grid_polynomial import GridPolynomial
 from gpuvision.camera.lattice import as_grid, charts, joined
-from gpuvision.camera.pattern import Float64, PatternGrid, grey_image, localisation_noise, off_neighbours
+from gpuvision.camera.pattern import Float64, PatternGrid, grey_image, localisation_noise, nan_median, off_neighbours
 
 Bool = npt.NDArray[np.bool_]
 
@@ -17,6 +18,8 @@ _FEWEST = 9
 _WORTH_JOINING = 0.1
 # Windows hold two steps each way of a regular grid: dots and ground are in all of them.
 _WINDOW_PITCHES = 2.0
+# Half the side of the smoothing before dots are told from the ground.
+_SMOOTHED = 0.04
 # Limits of what a dot may differ from its neighbours: in place, in units of what is usual in this image (and of its
 # pitch), in area, in contrast; and its ground from a plane, in units of its contrast.
 _OFF_SIGMA = 7.0
@@ -57,13 +60,15 @@ def find_dots(image: npt.NDArray[np.generic]) -> PatternGrid:
     scale = find_scale(grey)
     if scale.count == 0:
         raise ValueError(f"no grid of dots found; {_ADVICE}")
-    blobs = find_blobs(grey, _WINDOW_PITCHES * scale.pitch, scale.bright)
+    smoothing = 2 * round(_SMOOTHED * scale.pitch) + 1
+    blobs = find_blobs(grey, _WINDOW_PITCHES * scale.pitch, scale.bright, smoothing)
     kept = alike(blobs.area)
     grid = _indexed(blobs.points[kept])
     place, size = (np.where(grid[..., None] < 0, np.nan, each[kept][grid]) for each in (blobs.points, blobs.size))
     found = measure_dots(grey, place, size)
-    points = found.points - disc_shift(found.points, found.mass)
-    points[~_sound(found, points)] = np.nan
+    bent = GridPolynomial(found.points)
+    points = found.points - disc_shift(bent, found.mass)
+    points[~_sound(found, found.points - bent.derivative(0, 0))] = np.nan
     points = _trimmed(points)
     if np.count_nonzero(np.isfinite(points[..., 0])) < _FEWEST:
         raise ValueError(
@@ -93,11 +98,11 @@ def _indexed(points: Float64) -> npt.NDArray[np.int64]:
     return as_grid(whole, points)
 
 
-def _sound(found: Centroids, points: Float64) -> Bool:
-    """Which dots lie, look and stand out as their neighbours do."""
+def _sound(found: Centroids, waves: Float64) -> Bool:
+    """Which dots lie, look and stand out as their neighbours do; ``waves`` is what no polynomial explains."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        off = np.linalg.norm(off_neighbours(points), axis=-1)
-        pitch = np.nanmedian(np.linalg.norm(np.diff(points, axis=1), axis=-1))
+        off = np.linalg.norm(off_neighbours(waves), axis=-1)
+        pitch = np.nanmedian(np.linalg.norm(np.diff(found.points, axis=1), axis=-1))
         usual = max(float(np.nanmedian(off)), _OFF_PITCH * pitch / _OFF_SIGMA)
         area = np.abs(np.log(found.mass / _around(found.mass)))
         contrast = found.contrast / _around(found.contrast)
@@ -114,7 +119,7 @@ def _around(values: Float64) -> Float64:
     padded = np.pad(values, 1, constant_values=np.nan)
     rows, columns = values.shape
     windows = [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)]
-    return np.asarray(np.nanmedian(windows, axis=0))
+    return nan_median(np.stack(windows))
 
 
 def _trimmed(points: Float64) -> Float64:

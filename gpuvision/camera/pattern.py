@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from typing import NamedTuple, TypeAlias
 
 import cv2
@@ -119,6 +118,13 @@ def off_neighbours(points: Float64) -> Float64:
         cubic = (4.0 * (at[-1] + at[1]) - at[-2] - at[2]) / 6.0
         predictions += [np.where(np.isfinite(cubic), cubic, line)]
         predictions += [3.0 * (at[k] - at[2 * k]) + at[3 * k] for k in (-1, 1)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # nothing predicts a point that stands alone
-        return np.asarray(points - np.nanmedian(predictions, axis=0))
+    return points - nan_median(np.stack(predictions))
+
+
+def nan_median(values: Float64) -> Float64:
+    """Median over the first axis of what is not NaN; NaN where nothing is left."""
+    ordered = np.sort(values, axis=0)  # NaN last
+    count = np.isfinite(values).sum(axis=0)
+    middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2])
+    # Where there is nothing, the first is NaN itself.
+    return np.asarray(np.take_along_axis(ordered, np.minimum(middle, len(values) - 1), 0).mean(axis=0))

@@ -16,7 +16,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gpuvision.camera.dots import find_dots
     from gpuvision.camera.lens import Lens
+    from gpuvision.camera.pattern import PatternGrid
     from gpuvision.host import Device, GpuVisionError, Pipeline, Step, host_view, open_recording
     from gpuvision.ranging.line import LineReading, LineReadout
     from gpuvision.ranging.psd import PsdNoise, PsdReading, PsdReadout
@@ -34,6 +36,7 @@ _PLACES = {
     "Lens": "gpuvision.camera.lens",
     "LineReading": "gpuvision.ranging.line",
     "LineReadout": "gpuvision.ranging.line",
+    "PatternGrid": "gpuvision.camera.pattern",
     "Pipeline": "gpuvision.host",
     "PsdNoise": "gpuvision.ranging.psd",
     "PsdReading": "gpuvision.ranging.psd",
@@ -48,6 +51,7 @@ _PLACES = {
     "Step": "gpuvision.host",
     "StraightTransport": "gpuvision.ranging.range_image",
     "Triangulation": "gpuvision.ranging.triangulation",
+    "find_dots": "gpuvision.camera.dots",
     "host_view": "gpuvision.host",
     "open_recording": "gpuvision.host",
 }
@@ -60,6 +64,7 @@ __all__ = [
     "Lens",
     "LineReading",
     "LineReadout",
+    "PatternGrid",
     "Pipeline",
     "PsdNoise",
     "PsdReading",
@@ -74,6 +79,7 @@ __all__ = [
     "Step",
     "StraightTransport",
     "Triangulation",
+    "find_dots",
     "host_view",
     "open_recording",
 ]

@@ -1,0 +1,190 @@
+"""Families of measured lines: what a straight-line calibration is made from.
+
+A family is a set of lines that are parallel in the scene, so that their images, once undistorted, meet in one
+vanishing point (F. de Jong, 3.3.5). A line is an array of measured points (column, row), in order along the line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Float64 = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+LineFamilies = Sequence[Sequence[npt.ArrayLike]]
+
+_FEWEST = 3
+"""Points of a line that say something about its straightness."""
+_SPREAD = 1e-9
+"""Half-diagonals below which points of a line lie on one place."""
+
+
+def grid_lines(points: npt.ArrayLike, *, diagonals: bool = False) -> tuple[tuple[Float64, ...], ...]:
+    """Lines of a grid of measured points, without the missing ones.
+
+    Parameters
+    ----------
+    points
+        Shape (rows, columns, 2), (column, row) coordinates; NaN where a point is missing.
+    diagonals
+        Both diagonals too: they are parallel in the scene as well.
+
+    Returns
+    -------
+    tuple
+        Families: the rows, the columns and, if asked for, both diagonals. A line that has fewer than three points
+        is left out.
+
+    Raises
+    ------
+    ValueError
+        If the shape is another one.
+    """
+    grid = np.asarray(points, dtype=np.float64)
+    if grid.ndim != 3 or grid.shape[2] != 2:
+        raise ValueError(f"grid points have shape {grid.shape}, expected (rows, columns, 2)")
+    sheets = [grid, grid.swapaxes(0, 1)]
+    if diagonals:
+        sheets += [_diagonals(grid), _diagonals(grid[::-1])]
+    return tuple(_family(sheet) for sheet in sheets)
+
+
+def _diagonals(grid: Float64) -> Float64:
+    """Return diagonals as rows, filled up with NaN."""
+    rows, columns = grid.shape[:2]
+    sheared = np.full((rows + columns - 1, rows, 2), np.nan)
+    row, column = np.indices((rows, columns))
+    sheared[column - row + rows - 1, row] = grid
+    return sheared
+
+
+def _family(sheet: Float64) -> tuple[Float64, ...]:
+    there = np.isfinite(sheet).all(axis=-1)
+    return tuple(line[kept] for line, kept in zip(sheet, there, strict=True) if np.count_nonzero(kept) >= _FEWEST)
+
+
+def families(points: npt.ArrayLike, family: npt.ArrayLike, line: npt.ArrayLike) -> tuple[tuple[Float64, ...], ...]:
+    """Sort a list of points into families of lines.
+
+    Parameters
+    ----------
+    points
+        Shape (n, 2), in order along their lines.
+    family, line
+        Shape (n,): which family a point belongs to, and which line of it; any whole numbers.
+
+    Returns
+    -------
+    tuple
+        Families in the order of their numbers, of lines in the order of theirs.
+    """
+    places = np.asarray(points, dtype=np.float64)
+    labels = np.stack([np.asarray(family), np.asarray(line)])
+    if places.ndim != 2 or places.shape[1] != 2 or labels.shape != (2, len(places)):
+        raise ValueError(f"points have shape {places.shape} and labels {labels.shape[1:]}, expected (n, 2) and (n,)")
+    found: list[tuple[Float64, ...]] = []
+    for which in np.unique(labels[0]):
+        inside = labels[0] == which
+        found.append(tuple(places[inside & (labels[1] == each)] for each in np.unique(labels[1][inside])))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class PackedLines:
+    """All points of all lines in one array, in coordinates of about 1.
+
+    Attributes
+    ----------
+    x, y
+        Coordinates (n,): (pixel - origin) / unit, points of a line side by side.
+    line
+        Index of each point's line (n,).
+    starts, counts
+        First point of each line, and how many it has (lines,).
+    family
+        Index of each line's family (lines,).
+    families
+        How many there are.
+    origin, unit
+        Middle of the points, and half the diagonal of their extent, in pixels.
+    corner
+        Half their extent (2,), in units.
+    used
+        Which of all the points given, one line after the other, these are.
+    """
+
+    x: Float64
+    y: Float64
+    line: Index
+    starts: Index
+    counts: Index
+    family: Index
+    families: int
+    origin: Float64
+    unit: float
+    corner: Float64
+    used: npt.NDArray[np.bool_]
+
+    def sums(self, values: Float64) -> Float64:
+        """Sum of values (..., n) over each line, shape (..., lines)."""
+        return np.asarray(np.add.reduceat(values, self.starts, axis=-1))
+
+    def family_sums(self, values: Float64) -> Float64:
+        """Sum of values (lines, ...) over the lines of each family that has any."""
+        return np.asarray(np.add.reduceat(values, np.flatnonzero(np.diff(self.family, prepend=-1)), axis=0))
+
+
+def pack(given: LineFamilies) -> PackedLines:
+    """Check families and pack them.
+
+    Raises
+    ------
+    TypeError
+        If they are no arrays of numbers.
+    ValueError
+        If nothing in them can say how straight a line is.
+    """
+    lines = [np.asarray(line, dtype=np.float64) for family in given for line in family]
+    owner = np.repeat(np.arange(len(given)), [len(family) for family in given])
+    if not lines:
+        raise ValueError("there are no lines; expected families of lines of at least three points")
+    if any(line.ndim != 2 or line.shape[1] != 2 for line in lines):
+        shape = next(line.shape for line in lines if line.ndim != 2 or line.shape[1] != 2)
+        raise ValueError(f"a line has shape {shape}, expected (points, 2)")
+    counts = np.array([len(line) for line in lines])
+    places = np.concatenate(lines)
+    there = np.isfinite(places[:, 0] + places[:, 1])
+    line = np.repeat(np.arange(len(lines)), counts)
+    if not there.all():
+        places, line = places[there], line[there]
+        counts = np.bincount(line, minlength=len(lines))
+    if counts.min() < _FEWEST:
+        kept = counts >= _FEWEST
+        chosen = kept[line]
+        there[there] = chosen
+        places, line = places[chosen], (np.cumsum(kept) - 1)[line[chosen]]
+        counts, owner = counts[kept], owner[kept]
+    if not len(places):
+        raise ValueError("no line has three finite points; two points are straight however the lens bends")
+    return _normalised(places, line, counts, owner, len(given), there)
+
+
+def _normalised(
+    places: Float64, line: Index, counts: Index, family: Index, families: int, used: npt.NDArray[np.bool_]
+) -> PackedLines:
+    low, high = places.min(axis=0), places.max(axis=0)
+    unit = 0.5 * float(np.hypot(*(high - low)))
+    origin = 0.5 * (low + high)
+    if not unit > 0.0:
+        raise ValueError("all points lie on one place; expected lines across the image")
+    x, y = np.ascontiguousarray(((places - origin) / unit).T)
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    packed = PackedLines(x, y, line, starts, counts, family, families, origin, unit, 0.5 * (high - low) / unit, used)
+    both = np.stack([x, y])
+    widths = np.max(np.maximum.reduceat(both, starts, axis=1) - np.minimum.reduceat(both, starts, axis=1), axis=0)
+    if widths.min() < _SPREAD:
+        raise ValueError(f"all points of line {int(np.argmin(widths))} lie on one place; expected points along it")
+    return packed

@@ -157,22 +157,28 @@ def noise_of(views: Views, chart: Chart, state: State, loss: Loss) -> float:
     return math.sqrt(state.cost / free) if free > 0 else math.nan
 
 
-def covariances(views: Views, chart: Chart, state: State, loss: Loss, sigma: float | None) -> tuple[Floats, Floats]:
-    """Covariance of the camera's free numbers in OpenCV's names, and of the poses in the lens' frame.
+def covariances(
+    views: Views, chart: Chart, state: State, loss: Loss, sigma: float | None
+) -> tuple[Floats, Floats, float]:
+    """Covariances of the camera's numbers (in OpenCV's names) and of the poses (in the lens' frame), deviation of f.
 
     To first order; under a robust loss Huber's, for equal points. What the data do not fix at all comes out as a
-    number far beyond any camera's.
+    number far beyond any camera's. The deviation is relative, of the virtual camera's f: that is fixed even where
+    tilt and centre, and with them f', are not.
     """
     system = linearise(views, chart, state, loss, stiffness=True)
     assert system is not None, "the fit ended where every point is seen"
-    variance = _variance(views, chart, state, loss, sigma)
+    variance = variance_of(views, chart, state, loss, sigma)
     inverse, on_poses, own = _inverted(system)
     to_names = _names_by_numbers(chart, state)
     camera = variance * to_names @ inverse @ to_names.T
-    return camera, variance * _lens_pose_covariance(chart, state, inverse, on_poses, own)
+    by_f = chart.spread(state.numbers)[0]
+    focus = math.sqrt(max(variance * by_f @ inverse @ by_f, 0.0)) / float(state.numbers[0])
+    return camera, variance * _lens_pose_covariance(chart, state, inverse, on_poses, own), focus
 
 
-def _variance(views: Views, chart: Chart, state: State, loss: Loss, sigma: float | None) -> float:
+def variance_of(views: Views, chart: Chart, state: State, loss: Loss, sigma: float | None = None) -> float:
+    """Return what the inverse of the (stiffness) normal equations is multiplied by: the noise squared, if normal."""
     if loss.kind == "linear":
         return (noise_of(views, chart, state, loss) if sigma is None else sigma) ** 2
     length = np.linalg.norm(residuals(views, state), axis=1)[views.weight > 0.0]

@@ -11,15 +11,18 @@ from gpuvision.camera.camera_fit import Alternative, CameraFit
 # Points are seldom measured better, however well a simulation may fit: below, uncertainties are no diagnosis.
 _BEST_NOISE_PX = 0.01
 _LOOSE_FOCUS = 0.02
-_NO_FOCUS = 0.3
 _LOOSE_CENTRE_PX = 3.0
+_NO_FOCUS = 0.3
 _FAR_CENTRE = 0.1
 _LEVEL = 0.01
 _TOO_NOISY = 1.2
 _SIGNIFICANT = 3.0
+_BORDER_POINTS = 17
 
 
-def diagnose(fit: CameraFit, size: tuple[int, int], *, noise: float, outliers: int, mirrored: bool) -> tuple[str, ...]:
+def diagnose(
+    fit: CameraFit, size: tuple[int, int], *, focus: float, noise: float, outliers: int, mirrored: bool
+) -> tuple[str, ...]:
     """Return one sentence for each thing that the data leave open.
 
     Parameters
@@ -28,6 +31,8 @@ def diagnose(fit: CameraFit, size: tuple[int, int], *, noise: float, outliers: i
         The calibration, its warnings yet empty.
     size
         (columns, rows) of the images.
+    focus
+        Relative deviation of the virtual camera's f.
     noise
         What the residual says of the noise of one coordinate, pixels.
     outliers
@@ -36,13 +41,13 @@ def diagnose(fit: CameraFit, size: tuple[int, int], *, noise: float, outliers: i
         Whether the target is seen from its other side in every view.
     """
     said = [
-        _focus(fit),
+        _focus(focus * _floor(fit)),
         _centre(fit),
         _tilt_instead(fit, size),
         *(_as_good(fit, each) for each in fit.alternatives),
         _small_tilt(fit),
     ]
-    if not fit.camera.covers(size):
+    if _folds(fit, size):
         said.append("the lens polynomial folds within the image: points beyond the fold cannot be undistorted")
     if noise > _TOO_NOISY * fit.sigma:
         said.append(f"the residual is {noise / fit.sigma:.1f} times the noise given: the model does not suffice")
@@ -56,29 +61,20 @@ def diagnose(fit: CameraFit, size: tuple[int, int], *, noise: float, outliers: i
     return tuple(each for each in said if each)
 
 
-def fixes_focus(fit: CameraFit) -> bool:
+def fixes_focus(fit: CameraFit, focus: float) -> bool:
     """Whether the data fix the focal length at all."""
-    return _loose_focus(fit) < _NO_FOCUS
+    return focus * _floor(fit) < _NO_FOCUS
 
 
-def _deviation(fit: CameraFit, name: str) -> float:
-    """Return the standard deviation of a number at the noise that is to be expected at the best."""
-    if name not in fit.names:
-        return 0.0
-    return fit.uncertainties[name] * max(1.0, _BEST_NOISE_PX / max(fit.sigma, 1e-300))
+def _floor(fit: CameraFit) -> float:
+    """Return by how much deviations grow at the noise that is to be expected at the best."""
+    return max(1.0, _BEST_NOISE_PX / max(fit.sigma, np.finfo(float).tiny))
 
 
-def _loose_focus(fit: CameraFit) -> float:
-    return max(_deviation(fit, "f"), _deviation(fit, "fx")) / fit.camera.matrix[0][0]
-
-
-def _focus(fit: CameraFit) -> str:
-    loose = _loose_focus(fit)
+def _focus(loose: float) -> str:
     if loose < _LOOSE_FOCUS:
         return ""
-    return (
-        f"the views fix the focal length to {100 * loose:.1f} % only: add views at other angles or give focal_length="
-    )
+    return f"the views fix the focal length to {100 * loose:.1f} % only: add views at other angles, or focal_length="
 
 
 def _loose_centre(fit: CameraFit) -> float:
@@ -87,7 +83,7 @@ def _loose_centre(fit: CameraFit) -> float:
         return 0.0
     first = fit.names.index("cx")
     largest = np.linalg.eigvalsh(fit.covariance[first : first + 2, first : first + 2])[-1]
-    return float(math.sqrt(largest)) * max(1.0, _BEST_NOISE_PX / max(fit.sigma, 1e-300))
+    return float(math.sqrt(largest)) * _floor(fit)
 
 
 def _centre(fit: CameraFit) -> str:
@@ -130,6 +126,13 @@ def _as_good(fit: CameraFit, other: Alternative) -> str:
         f"model {other.model!r} fits as well (rms {other.rms_px:.4f} px, p = {other.p_value:.2g}) "
         f"with its centre {other.apart_px:.1f} px away"
     )
+
+
+def _folds(fit: CameraFit, size: tuple[int, int]) -> bool:
+    """Whether the lens folds before the image's border: tried at the corners and some points between."""
+    across, down = (np.linspace(0.0, last - 1.0, _BORDER_POINTS) for last in size)
+    border = [(x, y) for x in across for y in down[[0, -1]]] + [(x, y) for x in across[[0, -1]] for y in down]
+    return not np.isfinite(fit.camera.undistort(np.array(border))).all()
 
 
 def _small_tilt(fit: CameraFit) -> str:

@@ -19,12 +19,13 @@ from gpuvision.camera.camera_fit import (
     covariances,
     lens_poses,
     noise_of,
+    variance_of,
 )
-from gpuvision.camera.chart import COEFFICIENTS, Chart
+from gpuvision.camera.chart import COEFFICIENTS, Chart, internal_of
 from gpuvision.camera.diagnosis import diagnose, fixes_focus
 from gpuvision.camera.planar_start import Flat, closed_form, flatten, poses
 from gpuvision.camera.target_views import Mask, pack
-from gpuvision.camera.tilted_projection import Floats
+from gpuvision.camera.tilted_projection import Floats, tilt_matrix
 from gpuvision.tables import finite, numbers
 
 LossName = Literal["linear", "huber", "tukey"]
@@ -34,7 +35,9 @@ AUTOMATIC = ("none", "k1", "k1,k2", "tilt,k1", "tilt")
 _LEVEL = 0.01
 # A start that ends this far above what free homographies leave is tried again from elsewhere.
 _SUFFICIENT = 1.5
-_RESCALINGS = 5
+_RESCALINGS = 10
+_SAME_SCALE = 0.01
+_FEWEST_GOOD = 4
 # One of 1e5 points at normal noise.
 _OUTLIER = 5.0
 # Residuals below are rounding: of no use to tell models apart.
@@ -140,7 +143,8 @@ def fit_camera(
         flat=flat,
         middle=middle if known_centre is None else np.array(known_centre),
         radius=radius,
-        loss=Loss(loss, flat.rms if sigma is None else sigma),
+        # Tukey's loss has many minima, Huber's one near the start: models are searched and compared under that.
+        loss=Loss("linear" if loss == "linear" else "huber", flat.rms if sigma is None else sigma),
         scale_is_given=sigma is not None,
         aspect=free_aspect,
         focal_length=known_f,
@@ -149,7 +153,7 @@ def fit_camera(
     models = _check_enough(task, models)
     largest = _searched(task, models[-1])
     candidates = [_refined(task, each, largest) for each in models[:-1]] + [largest]
-    return _result(task, candidates, sigma)
+    return _result(task, candidates, sigma, redescend=loss == "tukey")
 
 
 def _positive(value: float, what: str) -> float:
@@ -242,30 +246,36 @@ def _searched(task: _Task, model: str) -> _Candidate:
 
 def _fitted(task: _Task, candidate: _Candidate) -> _Candidate:
     """Minimise the loss; a robust one at the scale that its own residuals have."""
-    chart, loss = candidate.chart, candidate.loss
-    if loss.kind == "linear":
-        return replace(candidate, state=adjust(task.views, chart, candidate.state, loss))
-    # Huber's loss has one minimum near the start, Tukey's many: it begins where Huber's ends.
-    state = candidate.state
-    for kind in ("huber",) if loss.kind == "huber" else ("huber", "tukey"):
-        for _ in range(_RESCALINGS):
-            before = loss.scale
-            state = adjust(task.views, chart, state, Loss(kind, before))
-            if not np.isfinite(state.cost):
-                return replace(candidate, state=state)
-            if not task.scale_is_given:
-                loss = loss._replace(scale=robust_scale(task.views, state))
-            if abs(loss.scale - before) <= 0.01 * before:
-                break
+    state, loss = candidate.state, candidate.loss
+    for _ in range(1 if loss.kind == "linear" or task.scale_is_given else _RESCALINGS):
+        used = loss
+        state = adjust(task.views, candidate.chart, state, used)
+        if not np.isfinite(state.cost) or loss.kind == "linear":
+            break
+        loss = loss._replace(scale=robust_scale(task.views, state))
+        if abs(loss.scale - used.scale) <= _SAME_SCALE * used.scale:
+            break
     # The cost belongs to the scale it was reached at.
-    return replace(candidate, state=state, loss=loss._replace(scale=before))
+    return replace(candidate, state=state, loss=used)
+
+
+def _without_outliers(task: _Task, candidate: _Candidate) -> _Candidate:
+    """Go on from Huber's minimum to the nearest of Tukey's, in which outliers have no weight."""
+    loss = candidate.loss._replace(kind="tukey")
+    length = np.linalg.norm(residuals(task.views, candidate.state), axis=1)
+    lost = np.flatnonzero(np.sum(task.views.weight * (loss.weight(length) > 0.0), axis=1) < _FEWEST_GOOD)
+    if len(lost):
+        raise ValueError(
+            f"views {lost.tolist()} have no points that fit the others: leave them out or take loss='huber'"
+        )
+    return _fitted(task, replace(candidate, loss=loss))
 
 
 def _is_physical(task: _Task, state: State) -> bool:
-    """Whether every measured point lies before the fold of the lens."""
-    camera = camera_of(state.numbers)
-    seen = np.swapaxes(task.views.seen, 1, 2)[task.views.weight > 0.0]
-    return bool(np.isfinite(camera.undistort(seen)).all())
+    """Whether every point of the target lies before the fold of the lens."""
+    back = tilt_matrix(*internal_of(state.numbers)[0][4:6]).T
+    before = back @ (state.rotations @ task.views.target + state.translations[..., None])
+    return bool(np.isfinite(camera_of(state.numbers).project(np.swapaxes(before, 1, 2))).all())
 
 
 def _refined(task: _Task, model: str, largest: _Candidate) -> _Candidate:
@@ -285,18 +295,19 @@ def _refined(task: _Task, model: str, largest: _Candidate) -> _Candidate:
     return _Candidate(model, chart, state, largest.loss)
 
 
-def _result(task: _Task, candidates: Sequence[_Candidate], sigma: float | None) -> CameraFit:
+def _result(task: _Task, candidates: Sequence[_Candidate], sigma: float | None, redescend: bool) -> CameraFit:
     """Choose the smallest sufficient model and describe it."""
     largest = candidates[-1]
     p_values = [_p_value(task, each, largest) for each in candidates]
-    chosen = next(
+    compared = next(
         each
         for each, p in zip(candidates, p_values, strict=True)
         if each is largest or (p >= _LEVEL and _is_physical(task, each.state))
     )
+    chosen = _without_outliers(task, compared) if redescend else compared
     state, chart = chosen.state, chosen.chart
     noise = noise_of(task.views, chart, state, chosen.loss)
-    covariance, pose_covariance = covariances(task.views, chart, state, chosen.loss, sigma)
+    covariance, pose_covariance, focus = covariances(task.views, chart, state, chosen.loss, sigma)
     errors = residuals(task.views, state)
     fit = CameraFit(
         camera=camera_of(state.numbers),
@@ -312,17 +323,19 @@ def _result(task: _Task, candidates: Sequence[_Candidate], sigma: float | None) 
         alternatives=tuple(
             _alternative(task, each, p, state)
             for each, p in zip(candidates, p_values, strict=True)
-            if each is not chosen
+            if each is not compared
         ),
     )
-    if not fixes_focus(fit):
+    if not fixes_focus(fit, focus):
         raise ValueError(
             "the views do not fix the focal length: views at other angles to the camera, or focal_length=, are needed"
         )
     length = np.linalg.norm(errors, axis=1)
     doubtful = int(np.sum(length > _OUTLIER * robust_scale(task.views, state))) if chosen.loss.kind == "linear" else 0
     mirrored = bool((np.linalg.det(task.flat.homographies) < 0.0).all())
-    return replace(fit, warnings=diagnose(fit, task.size, noise=noise, outliers=doubtful, mirrored=mirrored))
+    return replace(
+        fit, warnings=diagnose(fit, task.size, focus=focus, noise=noise, outliers=doubtful, mirrored=mirrored)
+    )
 
 
 def _rms(task: _Task, state: State) -> float:
@@ -345,11 +358,11 @@ def _p_value(task: _Task, small: _Candidate, large: _Candidate) -> float:
     if more == 0:
         return 1.0
     free = task.views.coordinates - len(large.chart.moved) - 6 * len(task.masks)
-    floor = _EXACT_PX**2 * task.views.coordinates
-    rise = max(small.state.cost - large.state.cost, 0.0) / more
     if free <= 0:
         return 1.0
-    return float(fdtrc(more, free, rise * free / max(large.state.cost, floor)))
+    rise = max(small.state.cost - large.state.cost, 0.0) / more
+    noise = variance_of(task.views, large.chart, large.state, large.loss)
+    return float(fdtrc(more, free, rise / max(noise, _EXACT_PX**2)))
 
 
 def _alternative(task: _Task, other: _Candidate, p_value: float, chosen: State) -> Alternative:

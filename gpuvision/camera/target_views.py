@@ -68,7 +68,8 @@ def pack(views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]) -> tuple[Views, t
         mask = np.isfinite(np.concatenate([seen, points], axis=1)).all(axis=1)
         pairs.append((points[mask, :2], seen[mask]))
         masks.append(mask)
-        _check_spread(index, pairs[-1][0])
+        _check_spread(f"view {index}", pairs[-1][0])
+        _check_spread(f"view {index}, image", pairs[-1][1])
     longest = max(len(target) for target, _ in pairs)
     packed = Views(
         np.zeros((len(pairs), 3, longest)), np.zeros((len(pairs), 2, longest)), np.zeros((len(pairs), longest))
@@ -82,14 +83,14 @@ def pack(views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]) -> tuple[Views, t
     return packed, tuple(masks)
 
 
-def _check_spread(index: int, target: Floats) -> None:
+def _check_spread(what: str, target: Floats) -> None:
     if len(target) < _FEWEST_POINTS:
-        raise ValueError(f"view {index} has {len(target)} measured points, expected at least {_FEWEST_POINTS}")
+        raise ValueError(f"{what}: {len(target)} measured points, expected at least {_FEWEST_POINTS}")
     # One point beside a line does not fix a homography either: the farthest from the line is left out.
     for points in (target, _without_farthest(target)):
         sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if sizes[1] <= _FLAT_TARGET * sizes[0]:
-            raise ValueError(f"view {index}: its points lie on one line, points beside it are needed")
+            raise ValueError(f"{what}: all points lie on one line, points beside it are needed")
 
 
 def _without_farthest(points: Floats) -> Floats:

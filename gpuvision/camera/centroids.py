@@ -30,6 +30,8 @@ class Centroids(NamedTuple):
     points: Float64
     mass: Float64
     """Covered pixels."""
+    spread: Float64
+    """(rows, columns, 2) variance of the covered pixels' column and row."""
     contrast: Float64
     """Dot less ground, in grey levels."""
     unevenness: Float64
@@ -95,15 +97,15 @@ def measure_dots(grey: npt.NDArray[np.float32], points: Float64, size: Float64) 
     half = 0.5 * box + margin[:, None]
     reach = math.ceil(float(half.max())) + 1
     chunk = max(1, _CHUNK_PIXELS // (2 * reach + 1) ** 2)
-    moments = np.empty((len(at), 3))
+    moments = np.empty((len(at), 5))
     for start in range(0, len(at), chunk):
         part = slice(start, start + chunk)
         planes = [np.column_stack([each[part], by[part]]) for each, by in ((ground, slope), (contrast, growth))]
         moments[part] = _moments(grey, at[part], half[part], planes, reach)
     mass = moments[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):
-        centre = np.rint(at) + moments[:, 1:] / mass[:, None]
-    values = (centre, mass, contrast, np.abs(unevenness / contrast))
+        mean, square = moments[:, 1:3] / mass[:, None], moments[:, 3:] / mass[:, None]
+    values = (np.rint(at) + mean, mass, square - mean**2, contrast, np.abs(unevenness / contrast))
     return Centroids(*(_laid_out(each, nodes) for each in values))
 
 
@@ -157,7 +159,7 @@ def _mean(values: Float64) -> Float64:
 
 
 def _moments(grey: npt.NDArray[np.float32], at: Float64, half: Float64, planes: list[Float64], reach: int) -> Float64:
-    """Sum of the weights and of the weights times x and y from the nearest pixel, (n, 3).
+    """Sum of the weights, and of the weights times x, y, x^2, y^2 from the nearest pixel, (n, 5).
 
     ``planes`` are ground and contrast: level at the dot and slopes along x and y, (n, 3).
     """
@@ -181,7 +183,9 @@ def _moments(grey: npt.NDArray[np.float32], at: Float64, half: Float64, planes: 
     ]
     by_x = np.matmul(within[1][:, None, :], weight)[:, 0] * within[0]
     by_y = np.matmul(weight, within[0][..., None])[..., 0] * within[1]
-    return np.stack([by_x.sum(axis=1), by_x @ offsets, by_y @ offsets], axis=1) / (1.0 - _GROUND)
+    powers = np.stack([offsets, offsets**2], axis=1)
+    (x1, x2), (y1, y2) = (by_x @ powers).T, (by_y @ powers).T
+    return np.stack([by_x.sum(axis=1), x1, y1, x2, y2], axis=1) / (1.0 - _GROUND)
 
 
 def disc_shift(bent: GridPolynomial, mass: Float64) -> Float64:
@@ -204,11 +208,12 @@ def disc_shift(bent: GridPolynomial, mass: Float64) -> Float64:
     """
     orders = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     u, v, uu, uv, vv = (bent.derivative(*order) for order in orders)
-    area = _cross(u, v)
-    growth = (_cross(uu, v) + _cross(u, uv)) / area, (_cross(uv, v) + _cross(u, vv)) / area
+    area = cross(u, v)
+    growth = (cross(uu, v) + cross(u, uv)) / area, (cross(uv, v) + cross(u, vv)) / area
     shift = 0.5 * (uu + vv) + growth[0][..., None] * u + growth[1][..., None] * v
     return np.asarray(shift * (mass / (4.0 * math.pi * np.abs(area)))[..., None])
 
 
-def _cross(a: Float64, b: Float64) -> Float64:
+def cross(a: Float64, b: Float64) -> Float64:
+    """Area that two steps span, with its sign."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

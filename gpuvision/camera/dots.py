@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.blobs import alike, find_blobs, find_scale
-from gpuvision.camera.centroids import Centroids, disc_shift, measure_dots
+from gpuvision.camera.centroids import Centroids, cross, disc_shift, measure_dots
 from gpuvision.camera.grid_polynomial import GridPolynomial
 from gpuvision.camera.lattice import as_grid, charts, joined
 from gpuvision.camera.pattern import Float64, PatternGrid, grey_image, localisation_noise, nan_median, off_neighbours
@@ -20,11 +20,11 @@ _WORTH_JOINING = 0.1
 _WINDOW_PITCHES = 2.0
 # Half the side of the smoothing before dots are told from the ground.
 _SMOOTHED = 0.04
-# Limits of what a dot may differ from its neighbours: in place, in units of what is usual in this image (and of its
-# pitch), in area, in contrast; and its ground from a plane, in units of its contrast.
-_OFF_SIGMA = 7.0
+# Limits of what a dot may differ from its neighbours. In place and shape: as many times what is usual in this image,
+# but a small part of the pitch (of the size) always; in contrast; and its ground from a plane, in units of contrast.
+_OFF_USUAL = 7.0
 _OFF_PITCH = 0.003
-_OFF_AREA = 0.25
+_OFF_SHAPE = 0.06
 _LEAST_CONTRAST = 0.25
 _UNEVEN = 0.5
 
@@ -68,7 +68,7 @@ def find_dots(image: npt.NDArray[np.generic]) -> PatternGrid:
     found = measure_dots(grey, place, size)
     bent = GridPolynomial(found.points)
     points = found.points - disc_shift(bent, found.mass)
-    points[~_sound(found, found.points - bent.derivative(0, 0))] = np.nan
+    points[~_sound(found, bent)] = np.nan
     points = _trimmed(points)
     if np.count_nonzero(np.isfinite(points[..., 0])) < _FEWEST:
         raise ValueError(
@@ -98,28 +98,26 @@ def _indexed(points: Float64) -> npt.NDArray[np.int64]:
     return as_grid(whole, points)
 
 
-def _sound(found: Centroids, waves: Float64) -> Bool:
-    """Which dots lie, look and stand out as their neighbours do; ``waves`` is what no polynomial explains."""
+def _sound(found: Centroids, bent: GridPolynomial) -> Bool:
+    """Which dots lie, look and stand out as their neighbours do."""
+    u, v = bent.derivative(1, 0), bent.derivative(0, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        off = np.linalg.norm(off_neighbours(waves), axis=-1)
-        pitch = np.nanmedian(np.linalg.norm(np.diff(found.points, axis=1), axis=-1))
-        usual = max(float(np.nanmedian(off)), _OFF_PITCH * pitch / _OFF_SIGMA)
-        area = np.abs(np.log(found.mass / _around(found.mass)))
-        contrast = found.contrast / _around(found.contrast)
-        return (
-            ~(off > _OFF_SIGMA * usual)
-            & (area < max(_OFF_AREA, 4.0 * float(np.nanmedian(area))))
-            & (contrast > _LEAST_CONTRAST)
-            & (found.unevenness < _UNEVEN)
-        )
+        off = np.linalg.norm(off_neighbours(found.points - bent.derivative(0, 0)), axis=-1)
+        least = _OFF_PITCH * float(np.sqrt(np.median(np.abs(cross(u, v)))))
+        sound = ~(off > max(least, _OFF_USUAL * float(np.nanmedian(off))))
+        # A disc's area, width and height, but for how the grid is bent: about the same everywhere.
+        disc = np.stack([found.mass / np.abs(cross(u, v)), *np.moveaxis(found.spread / (u**2 + v**2), -1, 0)])
+        for each in disc:
+            change = np.abs(np.log(each / _around(each)))
+            sound &= change < max(_OFF_SHAPE, _OFF_USUAL * float(np.nanmedian(change)))
+        return sound & (found.contrast / _around(found.contrast) > _LEAST_CONTRAST) & (found.unevenness < _UNEVEN)
 
 
 def _around(values: Float64) -> Float64:
-    """Median of a node and of its eight neighbours."""
-    padded = np.pad(values, 1, constant_values=np.nan)
+    """Median of a node and of the 24 around it."""
+    padded = np.pad(values, 2, constant_values=np.nan)
     rows, columns = values.shape
-    windows = [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)]
-    return nan_median(np.stack(windows))
+    return nan_median(np.stack([padded[i : i + rows, j : j + columns] for i in range(5) for j in range(5)]))
 
 
 def _trimmed(points: Float64) -> Float64:

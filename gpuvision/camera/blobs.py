@@ -21,9 +21,13 @@ _CONTRAST = 0.15
 _ABOVE_NOISE = 8.0
 _SMALLEST_AREA = 6
 # Of its bounding box a disc fills 0.785, an ellipse at 45 degrees half as wide as long 0.63.
-_FILLED = (0.4, 0.97)
+_LEAST_FILLED = 0.4
 _LONGEST = 3.5
 _AREAS = (0.4, 2.5)
+# A window holds two steps of a regular grid each way: blobs and ground are in all of them.
+_WINDOW_PITCHES = 2.0
+# Half the side of the smoothing before blobs are told from the ground, in steps.
+_SMOOTHED = 0.04
 # Windows to try, as parts of the image's smaller side.
 _WINDOWS = (1 / 3, 1 / 6, 1 / 12, 1 / 24, 1 / 48)
 _TRIAL_SMOOTHING = 3
@@ -45,6 +49,19 @@ class Blobs(NamedTuple):
     """(n, 2) width and height of the bounding boxes."""
 
 
+class PatternBlobs(NamedTuple):
+    """Blobs of a pattern, all of about one size."""
+
+    points: Float64
+    """(n, 2) centres, right to about half a pixel."""
+    size: Float64
+    """(n, 2) width and height in pixels."""
+    bright: bool
+    """They are brighter than the ground."""
+    cover: float
+    """Part of the pattern that they cover."""
+
+
 class Scale(NamedTuple):
     """What an image's blobs look like."""
 
@@ -52,6 +69,18 @@ class Scale(NamedTuple):
     pitch: float
     """Usual distance to the nearest neighbours, in pixels."""
     count: int
+
+
+def find_pattern_blobs(grey: npt.NDArray[np.float32]) -> PatternBlobs:
+    """Find the blobs that a regular pattern is made of, of any size and brightness; maybe none."""
+    scale = find_scale(grey)
+    if scale.count == 0:
+        return PatternBlobs(np.empty((0, 2)), np.empty((0, 2)), False, math.nan)
+    smoothing = 2 * round(_SMOOTHED * scale.pitch) + 1
+    blobs = find_blobs(grey, _WINDOW_PITCHES * scale.pitch, scale.bright, smoothing)
+    kept = alike(blobs.area)
+    cover = float(np.median(blobs.area[kept])) / scale.pitch**2 if kept.any() else math.nan
+    return PatternBlobs(blobs.points[kept], blobs.size[kept], scale.bright, cover)
 
 
 def find_blobs(grey: npt.NDArray[np.float32], window: float, bright: bool, smoothing: int) -> Blobs:
@@ -79,7 +108,7 @@ def find_blobs(grey: npt.NDArray[np.float32], window: float, bright: bool, smoot
     rows, columns = grey.shape
     inside = (left > 0) & (top > 0) & (left + width < columns) & (top + height < rows)
     filled = area / (width * height)
-    shaped = (filled > _FILLED[0]) & (filled < _FILLED[1]) | (area < 4 * _SMALLEST_AREA)
+    shaped = (filled > _LEAST_FILLED) | (area < 4 * _SMALLEST_AREA)
     shaped &= np.maximum(width, height) < _LONGEST * np.minimum(width, height)
     kept = inside & shaped & (area >= _SMALLEST_AREA)
     box = np.stack([width, height], axis=1)

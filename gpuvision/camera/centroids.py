@@ -8,8 +8,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import map_coordinates
 
-from gpuvision.camera.grid_polynomial import GridPolynomial
+from gpuvision.camera.grid_polynomial import GridPolynomial, cross
 from gpuvision.camera.pattern import Float64
 
 # Pixels with less of a dot than this count as ground: noise on the ground stays out, and the weight is 0 where the
@@ -90,7 +91,7 @@ def measure_dots(grey: npt.NDArray[np.float32], points: Float64, size: Float64) 
     at, box = points[nodes], size[nodes]
     pitch = np.linalg.norm(steps, axis=-1).min(axis=-1)
     ground, slope, unevenness = _ground(_smoothed(grey, _GROUND_BOX * pitch), at, steps)
-    contrast = _sampled(_smoothed(grey, _DOT_BOX * box.min(axis=-1)), at) - ground
+    contrast = sampled(_smoothed(grey, _DOT_BOX * box.min(axis=-1)), at) - ground
     whole_contrast = _laid_out(contrast, nodes)
     growth = np.linalg.solve(steps, lattice_steps(whole_contrast[..., None])[nodes])[..., 0]
     margin = np.clip(0.5 * (pitch - box.max(axis=-1)), *_MARGIN)
@@ -122,25 +123,16 @@ def _smoothed(grey: npt.NDArray[np.float32], sides: Float64) -> npt.NDArray[np.f
     return np.asarray(cv2.blur(grey, (side, side)), dtype=np.float32)
 
 
-def _sampled(image: npt.NDArray[np.float32], at: Float64) -> Float64:
-    """Bilinear samples (n,); NaN outside of the image."""
-    # OpenCV's maps have at most 32767 rows.
-    x, y = (at[:, each].astype(np.float32).reshape(1, -1) for each in (0, 1))
-    parts = [
-        cv2.remap(image, x[:, s : s + 32000], y[:, s : s + 32000], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for s in range(0, x.size, 32000)
-    ]
-    values = np.concatenate(parts, axis=1)[0].astype(np.float64)
-    rows, columns = image.shape
-    inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
-    values[~inside[0]] = np.nan
-    return values
+def sampled(image: npt.NDArray[np.float32], at: Float64) -> Float64:
+    """Bilinear samples at (..., 2); NaN outside of the image."""
+    where = at[..., ::-1].transpose(at.ndim - 1, *range(at.ndim - 1))
+    return np.asarray(map_coordinates(image, where, np.float64, order=1, mode="constant", cval=np.nan))
 
 
 def _ground(smooth: npt.NDArray[np.float32], at: Float64, steps: Float64) -> tuple[Float64, Float64, Float64]:
     """Plane through the corners of the cells: level at the dot, slope per pixel, and what is left of four corners."""
     u, v = 0.5 * steps[:, 0], 0.5 * steps[:, 1]
-    low, right, left, high = (_sampled(smooth, at + each) for each in (-u - v, u - v, v - u, u + v))
+    low, right, left, high = (sampled(smooth, at + each) for each in (-u - v, u - v, v - u, u + v))
     pairs = np.stack([0.5 * (low + high), 0.5 * (left + right)])
     level = _mean(pairs)
     level = np.where(np.isfinite(level), level, _mean(np.stack([low, right, left, high])))
@@ -212,8 +204,3 @@ def disc_shift(bent: GridPolynomial, mass: Float64) -> Float64:
     growth = (cross(uu, v) + cross(u, uv)) / area, (cross(uv, v) + cross(u, vv)) / area
     shift = 0.5 * (uu + vv) + growth[0][..., None] * u + growth[1][..., None] * v
     return np.asarray(shift * (mass / (4.0 * math.pi * np.abs(area)))[..., None])
-
-
-def cross(a: Float64, b: Float64) -> Float64:
-    """Area that two steps span, with its sign."""
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -5,21 +5,17 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.blobs import alike, find_blobs, find_scale
-from gpuvision.camera.centroids import Centroids, cross, disc_shift, measure_dots
-from gpuvision.camera.grid_polynomial import GridPolynomial
-from gpuvision.camera.lattice import as_grid, charts, joined
-from gpuvision.camera.pattern import Float64, PatternGrid, grey_image, localisation_noise, nan_median, off_neighbours
+from gpuvision.camera.blobs import find_pattern_blobs
+from gpuvision.camera.centroids import Centroids, disc_shift, measure_dots
+from gpuvision.camera.grid_polynomial import GridPolynomial, cross, on_grid
+from gpuvision.camera.lattice import whole_grid
+from gpuvision.camera.pattern import Float64, PatternGrid, grey_image, localisation_noise, nan_median
 
 Bool = npt.NDArray[np.bool_]
 
 _FEWEST = 9
-# A part that holds less of the largest part's dots and cannot be joined to it is left out.
-_WORTH_JOINING = 0.1
-# Windows hold two steps each way of a regular grid: dots and ground are in all of them.
-_WINDOW_PITCHES = 2.0
-# Half the side of the smoothing before dots are told from the ground.
-_SMOOTHED = 0.04
+# Dots cover at most this part of the grid; squares of a chessboard cover half.
+_MOST_COVER = 0.48
 # Limits of what a dot may differ from its neighbours. In place and shape: as many times what is usual in this image,
 # but a small part of the pitch (of the size) always; in contrast; and its ground from a plane, in units of contrast.
 _OFF_USUAL = 7.0
@@ -57,54 +53,30 @@ def find_dots(image: npt.NDArray[np.generic]) -> PatternGrid:
         If the image is of another type.
     """
     grey = grey_image(image)
-    scale = find_scale(grey)
-    if scale.count == 0:
-        raise ValueError(f"no grid of dots found; {_ADVICE}")
-    smoothing = 2 * round(_SMOOTHED * scale.pitch) + 1
-    blobs = find_blobs(grey, _WINDOW_PITCHES * scale.pitch, scale.bright, smoothing)
-    kept = alike(blobs.area)
-    grid = _indexed(blobs.points[kept])
-    place, size = (np.where(grid[..., None] < 0, np.nan, each[kept][grid]) for each in (blobs.points, blobs.size))
+    blobs = find_pattern_blobs(grey)
+    if blobs.cover > _MOST_COVER:
+        raise ValueError(
+            f"what was found covers {blobs.cover:.0%} of the grid, dots cover at most {_MOST_COVER:.0%}: "
+            "use find_lines for cells between lines, find_chessboard for squares"
+        )
+    grid = whole_grid(blobs.points, _FEWEST, "dots")
+    place, size = (np.where(grid[..., None] < 0, np.nan, each[grid]) for each in (blobs.points, blobs.size))
     found = measure_dots(grey, place, size)
     bent = GridPolynomial(found.points)
     points = found.points - disc_shift(bent, found.mass)
     points[~_sound(found, bent)] = np.nan
+    count = np.count_nonzero(np.isfinite(points[..., 0]))
+    if count < _FEWEST:
+        raise ValueError(f"only {count} of {grid.size} dots are whole and lie on a grid, expected at least {_FEWEST}")
     points = _trimmed(points)
-    if np.count_nonzero(np.isfinite(points[..., 0])) < _FEWEST:
-        raise ValueError(
-            f"only {np.count_nonzero(np.isfinite(points[..., 0]))} of {grid.size} dots are sound; {_ADVICE}"
-        )
     return PatternGrid(points, localisation_noise(points))
-
-
-_ADVICE = "expected at least 9 dots of one size on an even ground: check focus, exposure and what is in the picture"
-
-
-def _indexed(points: Float64) -> npt.NDArray[np.int64]:
-    """Lay dots out in rows and columns: numbers of points, -1 where there is none."""
-    if len(points) < _FEWEST:
-        raise ValueError(f"only {len(points)} dots found; {_ADVICE}")
-    pieces = charts(points, _FEWEST)
-    if not pieces:
-        raise ValueError(f"{len(points)} blobs found, but they lie on no grid; {_ADVICE}")
-    whole, apart = joined(pieces, points)
-    large = [each for each in apart if len(each.members) > _WORTH_JOINING * len(whole.members)]
-    if large:
-        counts = " and ".join(str(len(each.members)) for each in (whole, *large))
-        raise ValueError(
-            f"the grid broke into {len(large) + 1} parts of {counts} dots with too wide a gap between them; "
-            "uncover what lies between them, or crop the image to one part"
-        )
-    return as_grid(whole, points)
 
 
 def _sound(found: Centroids, bent: GridPolynomial) -> Bool:
     """Which dots lie, look and stand out as their neighbours do."""
     u, v = bent.derivative(1, 0), bent.derivative(0, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        off = np.linalg.norm(off_neighbours(found.points - bent.derivative(0, 0)), axis=-1)
-        least = _OFF_PITCH * float(np.sqrt(np.median(np.abs(cross(u, v)))))
-        sound = ~(off > max(least, _OFF_USUAL * float(np.nanmedian(off))))
+        sound = on_grid(found.points, _OFF_USUAL, _OFF_PITCH)
         # A disc's area, width and height, but for how the grid is bent: about the same everywhere.
         disc = np.stack([found.mass / np.abs(cross(u, v)), *np.moveaxis(found.spread / (u**2 + v**2), -1, 0)])
         for each in disc:
@@ -124,6 +96,4 @@ def _trimmed(points: Float64) -> Float64:
     """Cut rows and columns at the border that hold nothing."""
     known = np.isfinite(points[..., 0])
     rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
-    if rows.size == 0:
-        return points[:0, :0]
     return points[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from numpy.polynomial import legendre
 
-from gpuvision.camera.pattern import Float64
+from gpuvision.camera.pattern import Float64, nan_median
 
 _DEGREE = 4
 # Points for every coefficient, so that one that is off does not bend it much.
@@ -41,3 +42,57 @@ class GridPolynomial:
         terms = legendre.legder(self._terms, by_column, self._per_node[0], 0)
         terms = legendre.legder(terms, by_row, self._per_node[1], 1)
         return np.asarray(np.moveaxis(legendre.legval2d(self._u, self._v, terms), 0, -1))
+
+
+def on_grid(points: Float64, usual: float, least: float) -> npt.NDArray[np.bool_]:
+    """Which points lie where their neighbours have them, in grids that lens and perspective bend.
+
+    Parameters
+    ----------
+    points
+        (rows, columns, 2); NaN where missing.
+    usual
+        They may be off by so many times what is usual in this grid,
+    least
+        or by this part of a step.
+
+    Returns
+    -------
+    numpy.ndarray
+        (rows, columns); also where nothing predicts a point that stands alone.
+    """
+    if not np.isfinite(points).any():
+        return np.zeros(points.shape[:2], dtype=np.bool_)
+    bent = GridPolynomial(points)
+    off = np.linalg.norm(_off_neighbours(points - bent.derivative(0, 0)), axis=-1)
+    cell = np.abs(cross(bent.derivative(1, 0), bent.derivative(0, 1)))
+    limit = least * float(np.sqrt(np.median(cell)))
+    if np.isfinite(off).any():
+        limit = max(limit, usual * float(np.nanmedian(off)))
+    return ~(off > limit)
+
+
+def cross(a: Float64, b: Float64) -> Float64:
+    """Area that two steps span, with its sign."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def _off_neighbours(points: Float64) -> Float64:
+    """How far every point of a grid lies from where its neighbours in its row and in its column would have it.
+
+    A cubic through two neighbours on either side, a line through one on either side, and parabolas through three on
+    one side each predict the point; the median counts, so that a neighbour that is off itself does no harm.
+    """
+    rows, columns = points.shape[:2]
+    padded = np.pad(points, ((3, 3), (3, 3), (0, 0)), constant_values=np.nan)
+    predictions = []
+    for down, right in ((0, 1), (1, 0)):
+        at = {
+            k: padded[3 + k * down : 3 + k * down + rows, 3 + k * right : 3 + k * right + columns]
+            for k in (-3, -2, -1, 1, 2, 3)
+        }
+        line = 0.5 * (at[-1] + at[1])
+        cubic = (4.0 * (at[-1] + at[1]) - at[-2] - at[2]) / 6.0
+        predictions += [np.where(np.isfinite(cubic), cubic, line)]
+        predictions += [3.0 * (at[k] - at[2 * k]) + at[3 * k] for k in (-1, 1)]
+    return points - nan_median(np.stack(predictions))

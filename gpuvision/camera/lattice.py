@@ -25,6 +25,8 @@ _TRIES = 12
 # So many points of the whole, and a quarter of the piece, say how a piece continues it; to this part of a step.
 _JOINT = 160
 _FITS = 0.2
+# A part that holds less of the largest part's points and cannot be joined to it is left out.
+_WORTH_JOINING = 0.1
 _STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
 
 
@@ -272,3 +274,33 @@ def _continued(whole: Chart, piece: Chart, points: Float64) -> Int64 | None:
 def _quadratic(at: Float64) -> Float64:
     x, y = at.T
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+
+
+def whole_grid(points: Float64, fewest: int, what: str) -> Int64:
+    """Lay points out in rows and columns, with a way over gaps where the grid goes on behind them.
+
+    Returns
+    -------
+    numpy.ndarray
+        (rows, columns): numbers of points, -1 where there is none.
+
+    Raises
+    ------
+    ValueError
+        If there are too few, if they lie on no grid, or if it falls into parts.
+    """
+    advice = f"expected at least {fewest} {what} on an even ground: check focus, exposure and what is in the picture"
+    if len(points) < fewest:
+        raise ValueError(f"{len(points) or 'no'} {what} found; {advice}")
+    pieces = charts(points, fewest)
+    if not pieces:
+        raise ValueError(f"{len(points)} {what} found, but they lie on no grid; {advice}")
+    whole, apart = joined(pieces, points)
+    large = [each for each in apart if len(each.members) > _WORTH_JOINING * len(whole.members)]
+    if large:
+        counts = " and ".join(str(len(each.members)) for each in (whole, *large))
+        raise ValueError(
+            f"the grid broke into {len(large) + 1} parts of {counts} {what} with too wide a gap between them; "
+            "uncover what lies between them, or crop the image to one part"
+        )
+    return as_grid(whole, points)

@@ -90,37 +90,6 @@ def localisation_noise(points: npt.ArrayLike) -> float:
     return float(np.fmin.reduce(estimates))
 
 
-def off_neighbours(points: Float64) -> Float64:
-    """How far every point of a grid lies from where its neighbours in its row and in its column would have it.
-
-    A cubic through two neighbours on either side, a line through one on either side, and parabolas through three on
-    one side each predict the point; the median counts, so that a neighbour that is off itself does no harm.
-
-    Parameters
-    ----------
-    points
-        (rows, columns, 2); NaN where missing.
-
-    Returns
-    -------
-    numpy.ndarray
-        (rows, columns, 2), NaN where there is no point, or no neighbour to predict it.
-    """
-    rows, columns = points.shape[:2]
-    padded = np.pad(points, ((3, 3), (3, 3), (0, 0)), constant_values=np.nan)
-    predictions = []
-    for down, right in ((0, 1), (1, 0)):
-        at = {
-            k: padded[3 + k * down : 3 + k * down + rows, 3 + k * right : 3 + k * right + columns]
-            for k in (-3, -2, -1, 1, 2, 3)
-        }
-        line = 0.5 * (at[-1] + at[1])
-        cubic = (4.0 * (at[-1] + at[1]) - at[-2] - at[2]) / 6.0
-        predictions += [np.where(np.isfinite(cubic), cubic, line)]
-        predictions += [3.0 * (at[k] - at[2 * k]) + at[3 * k] for k in (-1, 1)]
-    return points - nan_median(np.stack(predictions))
-
-
 def nan_median(values: Float64) -> Float64:
     """Median over the first axis of what is not NaN; NaN where nothing is left."""
     ordered = np.sort(values, axis=0)  # NaN last

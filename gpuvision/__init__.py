@@ -16,9 +16,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gpuvision.camera.camera_fit import CameraFit
     from gpuvision.camera.dots import find_dots
     from gpuvision.camera.lens import Lens
+    from gpuvision.camera.lens_known import fit_tilt
+    from gpuvision.camera.line_pattern import find_lines
     from gpuvision.camera.pattern import PatternGrid
+    from gpuvision.camera.planar_views import fit_camera
+    from gpuvision.camera.scheimpflug import TiltedSensor
+    from gpuvision.camera.target_views import view_of
+    from gpuvision.camera.tsai import fit_tsai
     from gpuvision.host import Device, GpuVisionError, Pipeline, Step, host_view, open_recording
     from gpuvision.ranging.line import LineReading, LineReadout
     from gpuvision.ranging.psd import PsdNoise, PsdReading, PsdReadout
@@ -29,6 +36,7 @@ if TYPE_CHECKING:
 
 # Names come with their first use: the command is there at once, and an interrupt while it loads is not a stack trace.
 _PLACES = {
+    "CameraFit": "gpuvision.camera.camera_fit",
     "Device": "gpuvision.host",
     "GpuVisionError": "gpuvision.host",
     "Grid": "gpuvision.ranging.regrid",
@@ -50,13 +58,20 @@ _PLACES = {
     "Status": "gpuvision.status",
     "Step": "gpuvision.host",
     "StraightTransport": "gpuvision.ranging.range_image",
+    "TiltedSensor": "gpuvision.camera.scheimpflug",
     "Triangulation": "gpuvision.ranging.triangulation",
     "find_dots": "gpuvision.camera.dots",
+    "find_lines": "gpuvision.camera.line_pattern",
+    "fit_camera": "gpuvision.camera.planar_views",
+    "fit_tilt": "gpuvision.camera.lens_known",
+    "fit_tsai": "gpuvision.camera.tsai",
     "host_view": "gpuvision.host",
     "open_recording": "gpuvision.host",
+    "view_of": "gpuvision.camera.target_views",
 }
 
 __all__ = [
+    "CameraFit",
     "Device",
     "GpuVisionError",
     "Grid",
@@ -78,10 +93,16 @@ __all__ = [
     "Status",
     "Step",
     "StraightTransport",
+    "TiltedSensor",
     "Triangulation",
     "find_dots",
+    "find_lines",
+    "fit_camera",
+    "fit_tilt",
+    "fit_tsai",
     "host_view",
     "open_recording",
+    "view_of",
 ]
 
 

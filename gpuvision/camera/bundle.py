@@ -181,8 +181,7 @@ def linearise(views: Views, chart: Chart, state: State, loss: Loss, stiffness: b
 
 def moved(chart: Chart, state: State, camera: Floats, poses: Floats) -> State:
     """Return the state after a step."""
-    numbers = state.numbers.copy()
-    numbers[chart.moved] += camera
+    numbers = state.numbers + chart.basis @ camera
     return replace(
         state,
         numbers=chart.settled(numbers),

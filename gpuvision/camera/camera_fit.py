@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -121,13 +121,17 @@ class CameraFit:
         """Standard deviation of alpha, radians (to first order; where alpha itself is near 0, an upper bound)."""
         if "tauX" not in self.names:
             return 0.0
-        tau_x, tau_y = self.camera.distortion[12:]
-        block = self.covariance[-2:, -2:]
-        sine = math.sqrt(1.0 - (math.cos(tau_x) * math.cos(tau_y)) ** 2)
-        if sine**2 <= block.max():
-            return float(math.sqrt(np.linalg.eigvalsh(block)[-1]))
-        slope = np.array([math.sin(tau_x) * math.cos(tau_y), math.cos(tau_x) * math.sin(tau_y)]) / sine
-        return float(math.sqrt(slope @ block @ slope))
+        return deviation_of_alpha(self.camera.distortion[12:], self.covariance[-2:, -2:])
+
+
+def deviation_of_alpha(tau: Sequence[float], covariance: Floats) -> float:
+    """Return the standard deviation of alpha from the covariance (2, 2) of tauX and tauY, radians."""
+    tau_x, tau_y = tau
+    sine = math.sqrt(1.0 - (math.cos(tau_x) * math.cos(tau_y)) ** 2)
+    if sine**2 <= covariance.max():
+        return float(math.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    slope = np.array([math.sin(tau_x) * math.cos(tau_y), math.cos(tau_x) * math.sin(tau_y)]) / sine
+    return float(math.sqrt(slope @ covariance @ slope))
 
 
 def camera_of(numbers: Floats) -> Camera:
@@ -153,7 +157,7 @@ def noise_of(views: Views, chart: Chart, state: State, loss: Loss) -> float:
     """Estimate the noise of one coordinate from the residual, pixels."""
     if loss.kind != "linear":
         return robust_scale(views, state)
-    free = views.coordinates - len(chart.moved) - 6 * len(views.seen)
+    free = views.coordinates - chart.free - 6 * len(views.seen)
     return math.sqrt(state.cost / free) if free > 0 else math.nan
 
 
@@ -182,7 +186,7 @@ def variance_of(views: Views, chart: Chart, state: State, loss: Loss, sigma: flo
     if loss.kind == "linear":
         return (noise_of(views, chart, state, loss) if sigma is None else sigma) ** 2
     length = np.linalg.norm(residuals(views, state), axis=1)[views.weight > 0.0]
-    free = views.coordinates - len(chart.moved) - 6 * len(views.seen)
+    free = views.coordinates - chart.free - 6 * len(views.seen)
     pull = float(np.sum((loss.weight(length) * length) ** 2))
     return pull / free / float(np.mean(loss.slope(length)))
 

@@ -35,6 +35,9 @@ class Chart:
         f' where it is known, pixels.
     centre
         Whether the centre is free; else it keeps its value.
+    direction
+        Where the sensor's direction of tilt is known, radians from the columns' axis towards the rows': v then moves
+        along it alone.
     """
 
     coefficients: tuple[str, ...]
@@ -42,16 +45,26 @@ class Chart:
     aspect: bool = False
     focal_length: float | None = None
     centre: bool = True
+    direction: float | None = None
 
     @property
-    def moved(self) -> list[int]:
-        """Indices into `NUMBERS` of what is free. Without a tilt the centre moves, and v with it."""
+    def basis(self) -> Floats:
+        """How the free numbers move `NUMBERS`, shape (11, free). Without a tilt the centre moves, and v with it."""
         names = [] if self.focal_length is not None else ["f"]
         names += ["aspect"] if self.aspect else []
-        names += ["v_column", "v_row"] if self.tilt else []
+        names += ["v_column"] if self.tilt else []
+        names += ["v_row"] if self.tilt and self.direction is None else []
         names += ["c_column", "c_row"] if self.centre else []
         names += self.coefficients
-        return [NUMBERS.index(name) for name in names]
+        basis = np.eye(len(NUMBERS))[:, [NUMBERS.index(name) for name in names]]
+        if self.tilt and self.direction is not None:
+            basis[2:4, names.index("v_column")] = np.cos(self.direction), np.sin(self.direction)
+        return basis
+
+    @property
+    def free(self) -> int:
+        """How many numbers are free."""
+        return len(self.basis.T)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -77,7 +90,7 @@ class Chart:
 
     def spread(self, numbers: Floats) -> Floats:
         """d(`NUMBERS`) / d(free numbers), shape (11, free)."""
-        derivative = np.eye(len(NUMBERS))[:, self.moved]
+        derivative = self.basis
         if not self.tilt:
             derivative[2:4] = derivative[4:6]
         elif self.focal_length is not None:
@@ -126,10 +139,3 @@ def opencv_of(numbers: Floats) -> tuple[Floats, Floats]:
     derivative[4:9, 6:] = np.eye(5)
     derivative[9:] = turned[4:6]
     return values, derivative
-
-
-def numbers_of(matrix: Floats, coefficients: Floats, tau_x: float, tau_y: float) -> Floats:
-    """Return the inverse of `opencv_of`: numbers of a camera matrix, (k1, k2, p1, p2, k3) and a tilt."""
-    fx, aspect, cx, cy = matrix[0, 0], matrix[1, 1] / matrix[0, 0], matrix[0, 2], matrix[1, 2]
-    axis = np.array([-np.sin(tau_y) * np.cos(tau_x), np.sin(tau_x), np.cos(tau_y) * np.cos(tau_x)])
-    return np.array([fx * axis[2], aspect, cx - fx * axis[0], cy - aspect * fx * axis[1], cx, cy, *coefficients])

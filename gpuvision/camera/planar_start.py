@@ -36,8 +36,20 @@ class Flat(NamedTuple):
     rms: float
 
 
-def flatten(views: Views, centre: Floats, radius: float, robust: bool) -> Flat:
-    """Fit a homography per view and two radial terms for all, by Gauss-Newton from the linear solution."""
+def flatten(views: Views, centre: Floats, radius: float, *, robust: bool = False, straight: bool = False) -> Flat:
+    """Fit a homography per view and two radial terms for all, by Gauss-Newton from the linear solution.
+
+    Parameters
+    ----------
+    views
+        Points of a flat target, and where they were seen.
+    centre, radius
+        Where the radial terms have their centre, and the pixels that are 1 in their unit.
+    robust
+        Whether there may be outliers.
+    straight
+        Whether the points are undistorted already: no radial terms then.
+    """
     seen = (views.seen - centre[:, None]) / radius
     # Targets in units of their own extent, about their own middle.
     plane, back = _plane_units(views)
@@ -47,6 +59,7 @@ def flatten(views: Views, centre: Floats, radius: float, robust: bool) -> Flat:
     rounds = _ROBUST_ROUNDS if robust else _ROUNDS
     for round_ in range(rounds):
         residual, by_radial, by_homography = _bent(plane, seen, homographies, radial)
+        by_radial *= not straight
         if robust:
             length = np.linalg.norm(residual, axis=1)
             middle = np.median(length[views.weight > 0.0])

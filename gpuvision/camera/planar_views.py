@@ -135,7 +135,7 @@ def fit_camera(
     radius = 0.5 * math.hypot(*size)
     known_f = None if focal_length is None else _positive(focal_length, "focal_length")
     known_centre = None if centre is None else numbers(centre, (2,), "centre (column, row)")
-    flat = flatten(packed, middle if known_centre is None else np.array(known_centre), radius, loss != "linear")
+    flat = flatten(packed, middle if known_centre is None else np.array(known_centre), radius, robust=loss != "linear")
     task = _Task(
         views=packed,
         masks=masks,
@@ -180,7 +180,7 @@ def _parsed(model: str) -> tuple[bool, tuple[str, ...]]:
 
 def _check_enough(task: _Task, models: Sequence[str]) -> list[str]:
     """Return the models that have points enough."""
-    needed = {model: len(task.chart(model).moved) + 6 * len(task.masks) for model in models}
+    needed = {model: task.chart(model).free + 6 * len(task.masks) for model in models}
     enough = [model for model in models if needed[model] <= task.views.coordinates]
     if not enough:
         raise ValueError(
@@ -354,10 +354,10 @@ def _unpacked(task: _Task, errors: Floats) -> tuple[Floats, ...]:
 
 def _p_value(task: _Task, small: _Candidate, large: _Candidate) -> float:
     """F test of a model within a larger one."""
-    more = len(large.chart.moved) - len(small.chart.moved)
+    more = large.chart.free - small.chart.free
     if more == 0:
         return 1.0
-    free = task.views.coordinates - len(large.chart.moved) - 6 * len(task.masks)
+    free = task.views.coordinates - large.chart.free - 6 * len(task.masks)
     if free <= 0:
         return 1.0
     rise = max(small.state.cost - large.state.cost, 0.0) / more
@@ -366,13 +366,13 @@ def _p_value(task: _Task, small: _Candidate, large: _Candidate) -> float:
 
 
 def _alternative(task: _Task, other: _Candidate, p_value: float, chosen: State) -> Alternative:
-    parameters = len(other.chart.moved) + 6 * len(task.masks)
+    parameters = other.chart.free + 6 * len(task.masks)
     cost = max(other.state.cost / task.views.coordinates, _EXACT_PX**2)
     centre = other.state.numbers[4:6]
     return Alternative(
         model=other.model,
         rms_px=_rms(task, other.state),
-        parameters=len(other.chart.moved),
+        parameters=other.chart.free,
         p_value=p_value,
         aic=task.views.coordinates * math.log(cost) + 2.0 * parameters,
         centre=(float(centre[0]), float(centre[1])),

@@ -1,0 +1,156 @@
+"""Tilt and focal length of a Scheimpflug camera whose lens is known (F. de Jong, section 3.3.7).
+
+Vanishing points gave the lens: its distortion and the centre, where the optical axis meets the sensor. Points that it
+has straightened come from the virtual pinhole camera of fig. 3.3, whose principal point lies f' sin(alpha) from the
+centre in the direction of the tilt. A view of a flat target then fixes alpha and f' where that direction is known, by
+linear equations in f' sin(alpha) and f'^2; the pose is Tsai's first stage; both are refined together.
+
+Limits. The lens model is radial in the sensor; behind a real lens distortion is radial in the plane of the lens, which
+differs the more, the larger tilt and distortion are. `fit_camera` with ``model="tilt"`` has the true order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.camera.bundle import Loss, State, Views, adjust
+from gpuvision.camera.camera_fit import Pose, covariances, deviation_of_alpha, lens_poses, noise_of
+from gpuvision.camera.chart import Chart
+from gpuvision.camera.lens import Lens
+from gpuvision.camera.planar_start import flatten
+from gpuvision.camera.scheimpflug import TiltedSensor
+from gpuvision.camera.target_views import pack
+from gpuvision.camera.tilted_projection import Floats
+from gpuvision.camera.tsai import fit_tsai
+
+_NO_FOCUS = 0.3
+_BEST_NOISE_PX = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class TiltFit:
+    """The tilt of a sensor behind a known lens.
+
+    Attributes
+    ----------
+    sensor
+        alpha, its direction, f' and the virtual camera.
+    lens
+        The lens that was given.
+    poses
+        Of the targets, in the frame of the lens.
+    names
+        "f" (that is f'), "tauX", "tauY": what the covariance is of; without "f" where f' was given.
+    covariance
+        Pixels and radians.
+    alpha_sigma
+        Standard deviation of alpha, radians.
+    rms_px
+        Root mean square distance between straightened and projected points.
+    """
+
+    sensor: TiltedSensor
+    lens: Lens
+    poses: tuple[Pose, ...]
+    names: tuple[str, ...]
+    covariance: Floats
+    alpha_sigma: float
+    rms_px: float
+
+
+def fit_tilt(
+    views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]],
+    lens: Lens,
+    *,
+    direction: float | None = None,
+    focal_length: float | None = None,
+) -> TiltFit:
+    """Find alpha, f' and the poses of flat targets once the lens is known.
+
+    Parameters
+    ----------
+    views
+        Per image (points on the target [m], points in the image [px]).
+    lens
+        From measured to undistorted pixels, its centre where the optical axis meets the sensor.
+    direction
+        Direction of the tilt in the image, radians from the columns' axis towards the rows' (or its opposite: alpha
+        comes with the sign that the data have); None: to be found.
+    focal_length
+        f' where it is known, pixels. One view then suffices for the direction too.
+
+    Raises
+    ------
+    ValueError
+        The views do not fix what is sought.
+    """
+    if len(views) == 1 and direction is None and focal_length is None:
+        raise ValueError("one view fixes two numbers of alpha, its direction and f': give direction=, or focal_length=")
+    straight = [(target, lens.undistort(np.asarray(image).reshape(-1, 2))) for target, image in views]
+    packed, masks = pack(straight)
+    centre = np.array(lens.centre)
+    radius = float(np.sqrt(np.max(np.sum((packed.seen - centre[:, None]) ** 2, axis=1))))
+    homographies = flatten(packed, centre, radius, straight=True).homographies
+    f_prime, aside = _closed_form(homographies, direction, None if focal_length is None else focal_length / radius)
+    f = radius * math.sqrt(f_prime - float(aside @ aside))
+    values = np.zeros(11)
+    values[:6] = [f, 1.0, *(centre - radius * aside), *centre]
+    chart = Chart(coefficients=(), tilt=True, centre=False, direction=direction, focal_length=focal_length)
+    poses = [
+        fit_tsai(target, seen, (values[2], values[3]), focal_length=f, distorted=False).pose
+        for (target, seen), mask in zip(straight, masks, strict=True)
+        if mask.any()
+    ]
+    state = State(values, np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
+    state = adjust(packed, chart, state, Loss())
+    return _described(packed, chart, state, lens)
+
+
+def _closed_form(homographies: Floats, direction: float | None, focal_length: float | None) -> tuple[float, Floats]:
+    """Return f'^2 and the way from v to the centre, in the homographies' units about the centre.
+
+    The image of the absolute conic, v = -e: every view gives two equations linear in e and f'^2 = f^2 + e^2.
+    """
+    h1, h2 = homographies[:, :, 0], homographies[:, :, 1]
+    scale = 1.0 / np.sqrt(np.sum(h1**2, axis=1) * np.sum(h2**2, axis=1))
+    constant = np.concatenate([np.sum((h1 * h2)[:, :2], axis=1), 0.5 * np.sum((h1**2 - h2**2)[:, :2], axis=1)])
+    by_aside = np.concatenate(
+        [h1[:, :2] * h2[:, 2:] + h2[:, :2] * h1[:, 2:], h1[:, :2] * h1[:, 2:] - h2[:, :2] * h2[:, 2:]]
+    )
+    by_square = np.concatenate([h1[:, 2] * h2[:, 2], 0.5 * (h1[:, 2] ** 2 - h2[:, 2] ** 2)])
+    basis = np.eye(2) if direction is None else np.array([[math.cos(direction)], [math.sin(direction)]])
+    weight = np.concatenate([scale, scale])
+    along, by_square, side = (by_aside @ basis) * weight[:, None], by_square * weight, -constant * weight
+    if focal_length is None:
+        found = np.linalg.lstsq(np.column_stack([along, by_square]), side, rcond=None)[0]
+        square, aside = float(found[-1]), basis @ found[:-1]
+    else:
+        square = focal_length**2
+        aside = basis @ np.linalg.lstsq(along, side - by_square * square, rcond=None)[0]
+    if not square > float(aside @ aside):
+        raise ValueError("no tilt and f' explain these views: are lens and direction right, and the target oblique?")
+    return square, aside
+
+
+def _described(views: Views, chart: Chart, state: State, lens: Lens) -> TiltFit:
+    covariance, _, focus = covariances(views, chart, state, Loss(), None)
+    noise = noise_of(views, chart, state, Loss())
+    if not focus * max(1.0, _BEST_NOISE_PX / max(noise, np.finfo(float).tiny)) < _NO_FOCUS:
+        raise ValueError("the views do not fix f': a target oblique to the sensor, or focal_length=, is needed")
+    sensor = TiltedSensor.from_virtual(
+        float(state.numbers[0]), (state.numbers[2], state.numbers[3]), (state.numbers[4], state.numbers[5])
+    )
+    return TiltFit(
+        sensor=sensor,
+        lens=lens,
+        poses=lens_poses(state),
+        names=chart.names,
+        covariance=covariance,
+        alpha_sigma=deviation_of_alpha(sensor.tau, covariance[-2:, -2:]),
+        rms_px=math.sqrt(2.0 * state.cost / views.coordinates),
+    )

@@ -44,14 +44,19 @@ class Device:
         Whether `precision="double"` works here.
     cache_bytes : int
         Size of the last cache; more than that comes from memory and goes there.
+    callers_thread : pyopencl.Device or None
+        PoCL's other device, in the same context: it runs a kernel in the thread that enqueues it, which is done before
+        the first one's workers have woken up where there is little to do. Operations go there by themselves.
     """
 
-    def __init__(self, handle: Any, label: str, kind: str, queue: Any = None) -> None:
+    def __init__(self, handle: Any, label: str, kind: str, *, queue: Any = None, callers_thread: Any = None) -> None:
         self.handle = handle
         self.label, self.kind = label, kind
         self.name, self.driver = handle.name.strip(), handle.driver_version
         # Held for the queue's sake too: Intel's runtime lets a context go while a queue of it lives.
-        self.context = queue.context if queue is not None else cl.Context([handle])
+        own = [handle] if callers_thread is None else [handle, callers_thread]
+        self.context = queue.context if queue is not None else cl.Context(own)
+        self.callers_thread = callers_thread
         self.queue = queue if queue is not None else cl.CommandQueue(self.context, handle)
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
         self.has_double = bool(handle.double_fp_config)
@@ -188,7 +193,9 @@ _opening = threading.Lock()
 def _open(listed: discovery.Listed) -> Device:
     with _opening:
         if listed.label not in _opened:
-            _opened[listed.label] = Device(listed.handle, listed.label, listed.kind)
+            _opened[listed.label] = Device(
+                listed.handle, listed.label, listed.kind, callers_thread=listed.callers_thread
+            )
         return _opened[listed.label]
 
 
@@ -205,6 +212,6 @@ def _adopt(queue: Any) -> Device:
             return each
     for listed in discovery.listing():
         if listed.handle == queue.device:
-            return Device(queue.device, listed.label, listed.kind, queue)
+            return Device(queue.device, listed.label, listed.kind, queue=queue)
     kind = discovery.kind_of(queue.device)
-    return Device(queue.device, kind, kind, queue)
+    return Device(queue.device, kind, kind, queue=queue)

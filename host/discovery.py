@@ -9,6 +9,7 @@ import json
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,13 @@ from typing import Any
 import pyopencl as cl
 
 from gpuvision.host.files import write_whole
-from gpuvision.host.runtime import cache_folder, expose_installed_runtime, pin_workers, provide_cache
+from gpuvision.host.runtime import (
+    ask_for_callers_thread,
+    cache_folder,
+    expose_installed_runtime,
+    pin_workers,
+    provide_cache,
+)
 
 INSTALL_HINT = (
     "install one: `apt-get install pocl-opencl-icd` (as root), or `pip install 'gpuvision[cpu]'` "
@@ -49,6 +56,8 @@ class Listed:
     handle : pyopencl.Device
     key : str
         Names what a verdict depends on: the driver, the device, and the probe itself.
+    callers_thread : pyopencl.Device or None
+        The same processor as PoCL offers it to the thread that enqueues: no worker has to wake up.
     """
 
     label: str
@@ -57,6 +66,7 @@ class Listed:
     device_index: int
     handle: Any
     key: str
+    callers_thread: Any
 
     @property
     def name(self) -> str:
@@ -178,6 +188,7 @@ def platforms() -> tuple[Any, ...]:
     provide_cache()
     pin_workers()
     expose_installed_runtime()
+    ask_for_callers_thread()
     try:
         return tuple(cl.get_platforms())
     except cl.Error:  # PLATFORM_NOT_FOUND_KHR is how the loader says "none"
@@ -191,18 +202,28 @@ def _devices_of(platform: Any) -> list[Any]:
         return []
 
 
+def _callers_thread(devices: Sequence[Any]) -> Any:
+    """Return PoCL's device without worker threads where it is there beside the one with them."""
+    with_workers = any(each.name.startswith("pthread-") for each in devices)
+    return next((each for each in devices if with_workers and each.name.startswith("basic-")), None)
+
+
 @functools.cache
 def listing() -> tuple[Listed, ...]:
     """List every device by its label, without asking whether it works."""
-    found = [(p, d, handle) for p, platform in enumerate(platforms()) for d, handle in enumerate(_devices_of(platform))]
-    kinds = [kind_of(handle) for _, _, handle in found]
+    found = []
+    for p, platform in enumerate(platforms()):
+        devices = _devices_of(platform)
+        beside = _callers_thread(devices)
+        found += [(p, d, handle, beside) for d, handle in enumerate(devices) if handle is not beside]
+    kinds = [kind_of(handle) for _, _, handle, _ in found]
     count, seen, twins = Counter(kinds), Counter[str](), Counter[str]()
     listed = []
-    for kind, (p, d, handle) in zip(kinds, found, strict=True):
+    for kind, (p, d, handle, beside) in zip(kinds, found, strict=True):
         label = kind if count[kind] == 1 else f"{kind}:{seen[kind]}"
         seen[kind] += 1
         first = _key(handle, 0)
-        listed.append(Listed(label, kind, p, d, handle, _key(handle, twins[first])))
+        listed.append(Listed(label, kind, p, d, handle, _key(handle, twins[first]), beside))
         twins[first] += 1
     return tuple(listed)
 

@@ -7,11 +7,12 @@ path: after it nothing is compiled, allocated or copied.
 from __future__ import annotations
 
 import collections
+import math
 import operator
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import pyopencl as cl
@@ -28,6 +29,9 @@ Spec = tuple[tuple[int, ...], np.dtype[Any]]
 R = TypeVar("R", bound=tuple[Any, ...])
 
 _KEPT_BOUND = 16
+_COMPLETE = cl.command_execution_status.COMPLETE
+# One core of a PC moves so much in the time in which PoCL wakes two.
+_SHORT_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,9 @@ class Launch:
     arguments : sequence
         NumPy scalars, passed by value; NumPy arrays, uploaded once: tables and parameter packs; ``None``: a null
         pointer for a table that this build has no code for.
+    passes_once : bool
+        Whether the kernel does little more than read and write its memory once: then a little memory takes less time
+        than to wake a worker thread.
     """
 
     stem: str
@@ -59,6 +66,13 @@ class Launch:
     local_size: tuple[int, ...] | None = None
     defines: Mapping[str, Define] = field(default_factory=dict)
     arguments: Sequence[Any] = ()
+    passes_once: bool = False
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of inputs and outputs."""
+        specs = (*self.inputs, *(each for each in self.outputs.values() if each is not None))
+        return sum(math.prod(shape) * dtype.itemsize for shape, dtype in specs)
 
 
 class Operation(Generic[R]):
@@ -179,6 +193,17 @@ def _kept_bound() -> Any:
     return _thread.bound
 
 
+class _Site(NamedTuple):
+    """Where a bound operation runs: a queue, and the kernel as compiled for its device."""
+
+    queue: Any
+    kernel: Any
+
+
+def _kernel(device: Device, launch: Launch, handle: Any) -> Any:
+    return cl.Kernel(build(device, launch.stem, launch.defines, handle=handle), launch.kernel)
+
+
 class Bound(Generic[R]):
     """An operation bound to a device, a queue and a shape: call it with frames.
 
@@ -198,7 +223,11 @@ class Bound(Generic[R]):
         self.queue = device.queue if queue is None else queue
         self._launch = launch
         self._computed_specs = {name: spec for name, spec in launch.outputs.items() if spec is not None}
-        self._kernel = cl.Kernel(build(device, launch.stem, launch.defines), launch.kernel)
+        self._workers = _Site(self.queue, _kernel(device, launch, device.handle))
+        self._here: _Site | None = None
+        if device.callers_thread is not None and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
+            own = cl.CommandQueue(device.context, device.callers_thread, properties=self.queue.properties)
+            self._here = _Site(own, _kernel(device, launch, device.callers_thread))
         self._global, self._local = launch.global_size, launch.local_size
         self._empty = not all(launch.global_size)
         self.inputs = tuple(device.empty(shape, dtype, self.queue) for shape, dtype in launch.inputs)
@@ -212,6 +241,8 @@ class Bound(Generic[R]):
         for array in self.inputs:
             self._clear(array)
         self().wait()
+        if self._here is not None and not self._empty:
+            cl.enqueue_nd_range_kernel(*self._workers, self._global, self._local).wait()
 
     def allocate(self) -> R:
         """Return fresh device arrays for the outputs."""
@@ -250,9 +281,22 @@ class Bound(Generic[R]):
             self._set_arrays(given)
         if self._empty:
             return cl.enqueue_marker(self.queue, wait_for=wait_for)
-        event = cl.enqueue_nd_range_kernel(self.queue, self._kernel, self._global, self._local, wait_for=wait_for)
+        site = self._site(wait_for)
+        if site is self._here:
+            return cl.enqueue_nd_range_kernel(*site, self._global, self._local)
+        event = cl.enqueue_nd_range_kernel(*site, self._global, self._local, wait_for=wait_for)
         self._hold(event, given)
         return event
+
+    def _site(self, wait_for: Sequence[Any] | None = None) -> _Site:
+        """Return where to run: short work in the caller's thread, once all before it in the queue is done.
+
+        Work that must wait is left to the workers: PoCL hangs where one of its devices waits for an event of the other.
+        """
+        if self._here is None or any(each.command_execution_status > _COMPLETE for each in wait_for or ()):
+            return self._workers
+        self.queue.finish()
+        return self._here
 
     def run(self, *frames: DeviceArray, out: R | None = None) -> R:
         """Call, wait with the least delay, and return what was written: `out`, or `outputs`."""
@@ -286,15 +330,16 @@ class Bound(Generic[R]):
         write = [cl.Buffer(context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in targets]
         self._given = (None,) * len(self._own)
         for index, memory in zip(self._places, (*read, *write), strict=True):
-            self._kernel.set_arg(index, memory)
-        cl.enqueue_nd_range_kernel(self.queue, self._kernel, self._global, self._local)
+            self._set_arg(index, memory)
+        site = self._site()
+        cl.enqueue_nd_range_kernel(*site, self._global, self._local)
         for memory, array in zip(write, targets, strict=True):
             # The map is what makes the kernel's writes visible to the host; the address stays the same.
             mapped, _ = cl.enqueue_map_buffer(
-                self.queue, memory, cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
+                site.queue, memory, cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
             )
-            mapped.base.release(self.queue)
-        self.queue.finish()
+            mapped.base.release(site.queue)
+        site.queue.finish()
         # The next call binds others before these go away: a preset argument must never dangle.
         self._set_arrays(self._own)
 
@@ -326,7 +371,7 @@ class Bound(Generic[R]):
         _check_apart(given[:inputs], given[inputs:], lambda a, b: a.base_data is b.base_data)
         for place, array, before in zip(self._places, given, self._given, strict=True):
             if array is not before:
-                self._kernel.set_arg(place, memory_of(array))
+                self._set_arg(place, memory_of(array))
         self._given = given
 
     def _check_fields(self, out: R) -> None:
@@ -359,13 +404,18 @@ class Bound(Generic[R]):
         places = list(range(after_inputs))
         for place, spec in enumerate(launch.outputs.values(), after_inputs):
             if spec is None:
-                self._kernel.set_arg(place, None)
+                self._set_arg(place, None)
             else:
                 places.append(place)
         tables = iter(self._tables)
         for place, value in enumerate(launch.arguments, after_outputs):
-            self._kernel.set_arg(place, next(tables) if isinstance(value, np.ndarray) else value)
+            self._set_arg(place, next(tables) if isinstance(value, np.ndarray) else value)
         return places
+
+    def _set_arg(self, place: int, value: Any) -> None:
+        self._workers.kernel.set_arg(place, value)
+        if self._here is not None:
+            self._here.kernel.set_arg(place, value)
 
     def _upload(self, table: HostArray) -> Any:
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
@@ -374,7 +424,7 @@ class Bound(Generic[R]):
     def _hold(self, event: Any, given: tuple[Any, ...]) -> None:
         """Keep what a running kernel uses until it has run."""
         flight = self._in_flight
-        while flight and flight[0][0].command_execution_status <= cl.command_execution_status.COMPLETE:
+        while flight and flight[0][0].command_execution_status <= _COMPLETE:
             flight.popleft()
         flight.append((event, given))
 

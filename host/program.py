@@ -32,7 +32,7 @@ def options(defines: Mapping[str, Define]) -> list[str]:
     return ["-cl-mad-enable", *words]
 
 
-def build(device: Device, stem: str, defines: Mapping[str, Define]) -> Any:
+def build(device: Device, stem: str, defines: Mapping[str, Define], *, handle: Any = None) -> Any:
     """Return the program of ``kernels/<stem>.cl`` for a device.
 
     Parameters
@@ -42,6 +42,8 @@ def build(device: Device, stem: str, defines: Mapping[str, Define]) -> Any:
         Name of the kernel file without its ending.
     defines : mapping of str to value
         What changes the code: the real type, the terms that exist. Sizes are kernel arguments.
+    handle : pyopencl.Device, optional
+        Which device of the context; ``device.handle`` unless another is named.
 
     Returns
     -------
@@ -52,11 +54,11 @@ def build(device: Device, stem: str, defines: Mapping[str, Define]) -> Any:
     BuildError
         The source does not compile; carries the log.
     """
-    return _build(device.context, stem, tuple(options(defines)))
+    return _build(device.context, device.handle if handle is None else handle, stem, tuple(options(defines)))
 
 
 @functools.lru_cache(maxsize=256)
-def _build(context: Any, stem: str, words: tuple[str, ...]) -> Any:
+def _build(context: Any, handle: Any, stem: str, words: tuple[str, ...]) -> Any:
     folder = kernel_folder()
     source = (folder / f"{stem}.cl").read_text()
     program = cl.Program(context, source)
@@ -64,7 +66,7 @@ def _build(context: Any, stem: str, words: tuple[str, ...]) -> Any:
         with warnings.catch_warnings():
             # Both CPU runtimes report success ("Device ... successfully vectorised") as compiler output.
             warnings.simplefilter("ignore", cl.CompilerWarning)
-            return program.build(options=[*words, "-I", os.fspath(folder)])
+            return program.build(options=[*words, "-I", os.fspath(folder)], devices=[handle])
     except cl.RuntimeError as error:
         said = [line for line in str(error).splitlines() if line.strip()]
         raise BuildError(f"kernels/{stem}.cl does not build with {' '.join(words)}:\n" + "\n".join(said)) from error

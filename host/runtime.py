@@ -13,7 +13,9 @@ import contextlib
 import ctypes
 import hashlib
 import importlib.metadata
+import importlib.util
 import os
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -26,6 +28,7 @@ SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
 _VARIABLE = "OCL_ICD_VENDORS"
 _ENTRY = "gpuvision-intel.icd"
 _DRIVER = "libintelocl.so"
+_POCL_3 = re.compile(r"libpocl\.so\.2\.(9|10)\.")  # 3.0 and 3.1
 # The driver finds its siblings by name only; they must be in the process before it is opened.
 _SIBLINGS = ("libintlc.so.5", "libirng.so", "libimf.so", "libsvml.so")
 
@@ -60,6 +63,20 @@ def pin_workers() -> None:
     os.environ.setdefault("POCL_AFFINITY", "1")
 
 
+def ask_for_callers_thread() -> None:
+    """Have PoCL list the device that runs kernels in the caller's thread beside the one with worker threads.
+
+    To wake a worker takes longer than a frame takes to compute. Left alone where the user decided, and where there is
+    a PoCL of another series than 3: others name their devices otherwise, and a PoCL that is asked for a name that it
+    does not know has none. Must run before the first platform query, after `expose_installed_runtime`.
+    """
+    folder = Path(os.environ.get(_VARIABLE, SYSTEM_VENDORS))
+    installed = [text for text in _entries(folder).values() if "pocl" in text]
+    from_pip = importlib.util.find_spec("pocl_binary_distribution") is not None
+    if installed and not from_pip and all(map(_POCL_3.search, installed)):
+        os.environ.setdefault("POCL_DEVICES", "pthread basic")
+
+
 def _wheel_libraries() -> dict[str, Path]:
     """Find the libraries of the two wheels; empty where either is not installed."""
     found: dict[str, Path] = {}
@@ -84,9 +101,9 @@ def _load_siblings(libraries: dict[str, Path]) -> bool:
     return True
 
 
-def _system_entries() -> dict[str, str]:
+def _entries(folder: Path) -> dict[str, str]:
     entries = {}
-    for path in SYSTEM_VENDORS.glob("*.icd"):
+    for path in folder.glob("*.icd"):
         with contextlib.suppress(OSError):  # what this user may not read, the loader may not either
             entries[path.name] = path.read_text()
     return entries
@@ -114,4 +131,4 @@ def expose_installed_runtime() -> None:
     if not libraries or not _load_siblings(libraries):
         return
     if named is None:  # else it is inherited from a process of ours
-        os.environ[_VARIABLE] = str(_vendors_folder(_system_entries() | {_ENTRY: str(libraries[_DRIVER])}))
+        os.environ[_VARIABLE] = str(_vendors_folder(_entries(SYSTEM_VENDORS) | {_ENTRY: str(libraries[_DRIVER])}))

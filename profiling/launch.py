@@ -23,22 +23,22 @@ def cases(device: Device) -> Iterator[Case]:
     for frame in frames:
         frame.set(np.ones((16, 2), np.float32))
     # A bound instance's own kernel and sizes, launched without it.
-    kernel, sizes = bound._kernel, (bound._global, bound._local)
+    (queue, kernel), sizes = bound._site(), (bound._global, bound._local)
 
     def plain() -> None:
         for _ in range(_LAUNCHES):
-            cl.enqueue_nd_range_kernel(device.queue, kernel, *sizes)
-        device.queue.finish()
+            cl.enqueue_nd_range_kernel(queue, kernel, *sizes)
+        queue.finish()
 
     def preset() -> None:
         for _ in range(_LAUNCHES):
             bound()
-        device.queue.finish()
+        queue.finish()
 
     def given() -> None:
         for number in range(_LAUNCHES):
             bound(frames[number % 2])
-        device.queue.finish()
+        queue.finish()
 
     for name, call in (("bound", preset), ("given", given)):
         facts = {"overhead_us": _overhead(call, plain) * 1e6}

@@ -258,6 +258,7 @@ class LineReadout(Operation[LineReading]):
                 self._packed(real, dtype, length),
                 None if self.triangulation is None else self.triangulation.packed(real, self.axes),
             ],
+            passes_once=strip and self.method in ("whole", "windowed"),
         )
 
     def _fits_strip(self, rows: int, columns: int, dtype: np.dtype[Any]) -> bool:

@@ -237,6 +237,7 @@ class PsdReadout(Operation[PsdReading]):
                 np.int32(0 if table is None else table.shape[1]),
                 None if sheet is None else sheet.packed(real, self.axes),
             ],
+            passes_once=strip,
         )
 
     def _outputs(self, batch: tuple[int, ...], real: np.dtype[Any]) -> dict[str, Any]:

@@ -241,6 +241,7 @@ class Triangulation(Operation[SheetPoints]):
             # Left to itself PoCL may put all strips into one group, and so on one core.
             global_size=(items,) if strip else (items * each,),
             local_size=(1,) if strip else (each,),
+            passes_once=strip,
         )
 
     # ---- on the host: simulators, planners, error budgets --------------------------------------------------

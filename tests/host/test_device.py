@@ -27,7 +27,7 @@ def paper(monkeypatch: pytest.MonkeyPatch) -> Paper:
         for label, reason in reasons.items():
             label = label.replace("_", ":")
             handle = FakePlatform(f"Platform of {label}", devices=[FakeDevice(f"Name of {label}")]).devices[0]
-            listed.append(discovery.Candidate(label, label.split(":")[0], 0, 0, handle, "", reason))
+            listed.append(discovery.Candidate(label, label.split(":")[0], 0, 0, handle, "", None, reason))
         monkeypatch.setattr(discovery, "candidates", lambda: tuple(listed))
         monkeypatch.setattr(module, "_open", lambda candidate: candidate.label)
         monkeypatch.delenv(module.VARIABLE, raising=False)

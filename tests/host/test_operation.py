@@ -101,6 +101,36 @@ def test_calls_wait_for_events(device, pairs):
     event.wait()
 
 
+def test_short_work_runs_in_the_callers_thread(device, pairs):
+    """There it is done on return, and only there; long work goes to the workers."""
+    if device.callers_thread is None:
+        pytest.skip("only PoCL 3 has such a device")
+    complete = cl.command_execution_status.COMPLETE
+    many = np.ones((400_000, 2), np.float32)
+    for frame, here in ((pairs, True), (many, False)):
+        bound = READOUT.bind(device, frame.shape, frame.dtype)
+        host_view(bound.inputs[0])[...] = frame
+        event = bound()
+        assert (event.command_execution_status == complete) or not here
+        event.wait()
+        assert (event.get_info(cl.event_info.COMMAND_QUEUE).device == device.callers_thread) is here
+        np.testing.assert_allclose(host_view(bound.outputs.position), expected(frame), atol=5e-7)
+
+
+def test_short_work_comes_after_the_long_work_before_it(device, rng):
+    long = READOUT.bind(device, (400_000, 2), np.float32)
+    short = READOUT.bind(device, (1000, 2), np.float32)
+    both = cl.array.Array(device.queue, (1000, 2), np.float32, data=long.outputs.position.base_data)
+    frame = device.empty((400_000, 2), np.float32)
+    for _ in range(10):
+        currents = rng.uniform(0.1, 1.0, frame.shape).astype(np.float32) * np.array([0.1, 1.0], np.float32)
+        frame.set(currents)
+        long(frame)
+        short(both).wait()
+        middle = expected(currents)[:2000].reshape(1000, 2)
+        np.testing.assert_allclose(short.outputs.position.get(), expected(middle), atol=1e-5)
+
+
 def test_threads_do_not_share_a_kernel(device, rng):
     batches = [rng.uniform(0.1, 1.0, (2000, 2)).astype(np.float32) for _ in range(4)]
     wrong = []

@@ -102,6 +102,31 @@ def test_home_that_can_be_written_is_used(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert list((tmp_path / "new" / "gpuvision").iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("entries", "asked"),
+    [
+        (["libpocl.so.2.10.0"], True),
+        (["/usr/lib/libpocl.so.2.9.0\n", "libnvidia-opencl.so.1\n"], True),
+        (["libpocl.so.2.10.0", "/opt/lib/libpocl.so.2.14.0"], False),
+        (["libpocl.so.2"], False),
+        ([], False),
+    ],
+)
+def test_callers_thread_is_asked_for_where_its_name_is_known(
+    vendors: Path, monkeypatch: pytest.MonkeyPatch, entries: list[str], asked: bool
+) -> None:
+    monkeypatch.delenv("POCL_DEVICES", raising=False)
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
+    (vendors / "pocl.icd").unlink()
+    for number, text in enumerate(entries):
+        (vendors / f"{number}.icd").write_text(text)
+    runtime.ask_for_callers_thread()
+    assert os.environ.get("POCL_DEVICES") == ("pthread basic" if asked else None)
+    monkeypatch.setenv("POCL_DEVICES", "pthread")
+    runtime.ask_for_callers_thread()
+    assert os.environ["POCL_DEVICES"] == "pthread", "the user decided"
+
+
 def test_workers_are_pinned_unless_the_user_decided(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("POCL_AFFINITY", "0")
     runtime.pin_workers()

@@ -62,7 +62,7 @@ def _diagonals(grid: Float64) -> Float64:
 
 
 def _family(sheet: Float64) -> tuple[Float64, ...]:
-    there = np.isfinite(sheet).all(axis=-1)
+    there = np.isfinite(sheet[..., 0] + sheet[..., 1])
     return tuple(line[kept] for line, kept in zip(sheet, there, strict=True) if np.count_nonzero(kept) >= _FEWEST)
 
 

@@ -11,7 +11,7 @@ import scipy.special
 
 from gpuvision.camera.line_families import Float64, PackedLines
 from gpuvision.camera.straightness import Parameters, bound_lines, projected_columns
-from gpuvision.camera.variable_projection import Minimum, minimise
+from gpuvision.camera.variable_projection import Minimum, linear_start, minimise
 
 Loss = Literal["squared", "huber", "tukey"]
 
@@ -25,7 +25,7 @@ _ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 
 
 def same_points(packed: PackedLines) -> npt.NDArray[np.intp]:
-    """Number (n,) of the measured point that a point of a line is: a point of a grid lies on several lines."""
+    """Return the number (n,) of each measured point: a point of a grid lies on several lines."""
     key = packed.x + packed.y * 0.7548776662466927
     order = np.argsort(key)
     number = np.empty(len(key), dtype=np.intp)
@@ -68,11 +68,10 @@ def chance(
     repeated = residuals[0] / residuals[1]
     gain = max(worse - better, 0.0) / (more * repeated)
     if variance is not None:
-        return float(scipy.special.chdtrc(more, more * gain / variance))
+        return float(scipy.special.chdtrc(more, more * gain / max(variance, _ROUNDING**2)))
     if freedom <= 0:
         return 1.0
-    floor = _ROUNDING**2
-    return float(scipy.special.fdtrc(more, freedom / repeated, gain / max(better / freedom, floor)))
+    return float(scipy.special.fdtrc(more, freedom / repeated, gain / max(better / freedom, _ROUNDING**2)))
 
 
 def covariance(
@@ -147,7 +146,7 @@ def _sandwich(bread: Float64, spreads: list[Float64], order: int, keep_centre: b
 
 
 def influence_slope(ratio: Float64, loss: Loss) -> Float64:
-    """Derivative of weight(x) x at residuals in scales."""
+    """Return the derivative of weight(x) x at residuals in scales."""
     limit = _TUNING[loss]
     inside = np.abs(ratio) < limit
     if loss == "huber":
@@ -162,6 +161,16 @@ def weights(residual: Float64, scale: float, loss: Loss) -> Float64:
     if loss == "huber":
         return np.asarray(limit / np.maximum(np.abs(residual), limit))
     return np.maximum(1.0 - (residual / limit) ** 2, 0.0) ** 2
+
+
+def robust_start(packed: PackedLines, centre: Float64 | None) -> tuple[Parameters, Float64]:
+    """Return `linear_start` where outliers weigh little, and the weights (n,)."""
+    weight = np.ones(len(packed.x))
+    for _ in range(_ROUNDS):
+        start = linear_start(packed, centre, weight)
+        scale = _NORMAL_MAD * float(np.median(np.abs(start.distance)))
+        weight = weights(start.distance, max(scale, _ROUNDING), "huber")
+    return start.at, weight
 
 
 def reweighted(

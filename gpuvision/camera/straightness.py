@@ -128,7 +128,7 @@ def monotone(k: Float64, square: float, *, least: float = 0.0) -> bool:
     places = [square]
     if k2 != 0.0 and 0.0 < -0.3 * k1 / k2 < square:
         places.append(-0.3 * k1 / k2)
-    return min(1.0 + s * (3.0 * k1 + 5.0 * k2 * s) for s in places) > least
+    return all(1.0 + s * (3.0 * k1 + 5.0 * k2 * s) > least for s in places)
 
 
 def moments(packed: PackedLines, x: Float64, y: Float64, weight: Float64 | None) -> Float64:
@@ -224,6 +224,7 @@ def evaluate(
 
 
 def best_lines(packed: PackedLines, at: Parameters, moments: Float64) -> LineSet:
+    """Return lines of least squared distance, through their vanishing points if there are any."""
     lines = free_lines(moments)
     bound = bound_lines(packed, at)
     if at.vanishing is None or not bound.any():

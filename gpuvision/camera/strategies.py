@@ -27,11 +27,10 @@ from gpuvision.camera.straightness import (
 )
 from gpuvision.camera.variable_projection import Minimum
 
-_MOST_ROUNDS = 100
 _SETTLED = 1e-6
 """Part of the sum of squares that a round has to gain to be followed by another."""
 _DESCENTS = 50
-_SIMPLEX = {"xatol": 1e-7, "fatol": 1e-12, "maxfev": 2000}
+_SIMPLEX = {"xatol": 1e-6, "fatol": 1e-11, "maxfev": 2000}
 
 
 class Alternation(NamedTuple):
@@ -82,7 +81,7 @@ class _Objective:
 
 
 def _homogeneous(points: Float64) -> Float64:
-    """Unit vectors of finite points (families, 2)."""
+    """Return unit vectors of finite points (families, 2)."""
     lifted = np.column_stack([points, np.ones(len(points))])
     return np.asarray(lifted / np.linalg.norm(lifted, axis=1, keepdims=True))
 
@@ -132,7 +131,7 @@ STRATEGIES: Mapping[str, Callable[[_Objective, Float64, Float64], Float64]] = {
 }
 
 
-def alternate(packed: PackedLines, order: int, strategy: str) -> Alternation:
+def alternate(packed: PackedLines, order: int, strategy: str, *, rounds: int = 100) -> Alternation:
     """Alternate between vanishing points and lens until neither gains.
 
     Parameters
@@ -143,13 +142,15 @@ def alternate(packed: PackedLines, order: int, strategy: str) -> Alternation:
         Coefficients of the lens.
     strategy
         How the lens is sought: "nelder_mead", "steepest_descent" or "gauss_newton".
+    rounds
+        At most.
     """
     objective = _Objective(packed, order)
     lens = np.concatenate([np.zeros(order), centre_from_curvature(packed)])
     points = points_from_intersections(packed)
-    before, rounds = objective.cost(lens, points), 0
-    while rounds < _MOST_ROUNDS:
-        rounds += 1
+    before, done = objective.cost(lens, points), 0
+    while done < rounds:
+        done += 1
         points = _best_points(objective, lens, points)
         lens = STRATEGIES[strategy](objective, lens, points)
         after = objective.cost(lens, points)
@@ -160,7 +161,7 @@ def alternate(packed: PackedLines, order: int, strategy: str) -> Alternation:
     here = evaluate(packed, at)
     slopes = columns(order, here)
     normal = normal_equations(packed, at, here, slopes)
-    return Alternation(Minimum(at, here, slopes, normal, rounds, ""), objective.evaluations)
+    return Alternation(Minimum(at, here, slopes, normal, done, ""), objective.evaluations)
 
 
 def _best_points(objective: _Objective, lens: Float64, points: Float64) -> Float64:

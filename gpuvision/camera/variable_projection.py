@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from gpuvision.camera.straightness import (
 _MOST_STEPS = 60
 _FARTHEST = 4.0
 """Half-diagonals that the centre may lie off the middle: without a bound the data pull it away (k1 -> 0)."""
-_LEAST_SLOPE = 0.02
+_LEAST_SLOPE = 1e-3
 """Of r (1 + k1 r^2 + ...) over the data, in parts of that at the centre."""
 _NEGLIGIBLE = 1e-3
 """What another step would still gain, in variances, at the end: 0.03 standard deviations of the parameters."""
@@ -78,33 +79,37 @@ def minimise(
     keep_centre
         Whether the centre stays where it is.
     """
-    at, damping, steps, bound, gained = start, _DAMPING[0], 0, "", 0.0
+    at, damping, steps, gained = start, _DAMPING[0], 0, 0.0
     here = evaluate(packed, at, weight=weight) if here is None else here
-    variance = 1.0 / max(len(packed.x) - 2 * len(packed.counts), 1)
+    rounding = _ROUNDING * len(packed.x)
+    variance = _NEGLIGIBLE / max(len(packed.x) - 2 * len(packed.counts), 1)
     while True:
         slopes = columns(len(at.k), here)
         normal = normal_equations(packed, at, here, slopes)
         if keep_centre:
             normal = without_centre(normal, len(at.k))
+        found = Minimum(at, here, slopes, normal, steps, "")
         if not len(normal.gradient):
-            return Minimum(at, here, slopes, normal, steps, bound)
+            return found
+        bounds: set[str] = set()
         while True:
             steps += 1
             step = _damped_step(normal, damping)
             gain = -float(step @ normal.gradient)
             trial, bound = stepped(packed, at, step, keep_centre)
+            bounds.add(bound)
             there = None if bound == "fold" else evaluate(packed, trial, here, weight)
-            if there is not None and there.cost <= here.cost + _ROUNDING * len(packed.x):
+            if there is not None and there.cost <= here.cost + rounding:
                 break
             damping = max(10.0 * damping, _DAMPING[1])
-            if damping > _DAMPING[2] or gain < _NEGLIGIBLE * variance * here.cost or steps >= _MOST_STEPS:
-                return Minimum(at, here, slopes, normal, steps, bound)
+            if damping > _DAMPING[2] or gain < variance * here.cost or steps >= _MOST_STEPS:
+                return replace(found, steps=steps, at_bound=max(bounds))
         at, here, damping = trial, there, 0.1 * damping if damping > _DAMPING[1] else _DAMPING[0]
         # Gains shrink at least as fast as they did last.
         coming = gain * min(gain / gained, 1.0) if gained > 0.0 else gain
         gained = gain
-        if coming <= max(_NEGLIGIBLE * variance * here.cost, _ROUNDING * len(packed.x)) or steps >= _MOST_STEPS:
-            return Minimum(at, here, slopes, normal, steps, bound)
+        if coming <= max(variance * here.cost, rounding) or steps >= _MOST_STEPS:
+            return Minimum(at, here, slopes, normal, steps, max(bounds))
 
 
 def _damped_step(normal: NormalEquations, damping: float) -> Float64:
@@ -132,7 +137,9 @@ def stepped(packed: PackedLines, at: Parameters, step: Float64, keep_centre: boo
         if far > _FARTHEST:
             centre, bound = centre * (_FARTHEST / far), "centre"
     if order and not monotone(k, reach(packed, centre), least=_LEAST_SLOPE):
-        bound = "fold"
+        # The corner of the data's box: rather the farthest point itself.
+        farthest = float(np.max((packed.x - centre[0]) ** 2 + (packed.y - centre[1]) ** 2))
+        bound = bound if monotone(k, farthest, least=_LEAST_SLOPE) else "fold"
     vanishing = at.vanishing
     if vanishing is not None:
         tangent = step[len(step) - 2 * packed.families :].reshape(-1, 2)
@@ -146,14 +153,35 @@ def reach(packed: PackedLines, centre: Float64) -> float:
     return math.hypot(*np.maximum(packed.corner - centre, packed.corner + centre).tolist()) ** 2
 
 
-def linear_start(packed: PackedLines, centre: Float64 | None = None) -> tuple[Parameters, int]:
-    """Return k1 and the centre in closed form, and how many ways the lines could bend (0 to 3; known centre: 0, 1).
+class LinearStart(NamedTuple):
+    """What follows in closed form to first order in the distortion.
+
+    Attributes
+    ----------
+    at
+        k1 and the centre.
+    rank
+        How many ways the lines could bend: 3 fix k1 and the centre; 1 fixes k1 about a known centre.
+    gain
+        By how much the sum of squares falls from that without a lens.
+    distance
+        Distances (n,) that are left.
+    """
+
+    at: Parameters
+    rank: int
+    gain: float
+    distance: Float64
+
+
+def linear_start(packed: PackedLines, centre: Float64 | None = None, weight: Float64 | None = None) -> LinearStart:
+    """Find k1 and the centre in closed form.
 
     To first order in k1 a straight line is bent by ``k1 (n.p)|p|^2 - (k1 c).(|p|^2 n + 2 (n.p) p)``, plus what is
     linear along it and belongs to the line: linear in k1 and k1 c.
     """
     known = np.zeros(2) if centre is None else centre
-    here = evaluate(packed, Parameters(np.empty(0), known, None))
+    here = evaluate(packed, Parameters(np.empty(0), known, None), weight=weight)
     points, nx, ny = here.points, here.nx, here.ny
     # The points' feet on their lines, so that errors do not look like bends.
     x, y, q = points.dx - nx * here.distance, points.dy - ny * here.distance, here.along - here.distance
@@ -161,19 +189,24 @@ def linear_start(packed: PackedLines, centre: Float64 | None = None) -> tuple[Pa
     bends = [q * square]
     if centre is None:
         bends += [-square * nx - 2.0 * q * x, -square * ny - 2.0 * q * y]
-    slopes = Columns(np.stack([*bends, here.residual]), columns(0, here).line)
+    slopes = Columns(np.stack([*(here.inverse * bend for bend in bends), here.residual]), columns(0, here).line)
     normal = normal_equations(packed, Parameters(np.zeros(1), known, None), here, slopes)
     values, vectors = np.linalg.eigh(normal.matrix)
     seen = values > _FLAT * len(q)
-    rank = int(np.count_nonzero(seen))
     vectors = vectors[:, seen]
-    k1, *moved = (-vectors @ (vectors.T @ normal.gradient / values[seen])).tolist()
+    step = -vectors @ (vectors.T @ normal.gradient / values[seen])
+    k1, *moved = step.tolist()
+    mixed = np.append(step, 1.0)
+    own = np.tensordot(mixed, normal.taken, axes=(0, 1))[:, packed.line]
+    left = (mixed @ slopes.lens - own[0] * slopes.line[0] - own[1] * slopes.line[1]) / here.inverse
     if centre is None and math.hypot(*moved) < abs(k1):
         known = np.array(moved) / k1
     k = np.array([k1])
     while not monotone(k, reach(packed, known), least=_LEAST_SLOPE):
         k *= 0.7
-    return Parameters(k, known, None), rank
+    return LinearStart(
+        Parameters(k, known, None), int(np.count_nonzero(seen)), -float(step @ normal.gradient), np.asarray(left)
+    )
 
 
 def vanishing_start(packed: PackedLines, lines: LineSet) -> Float64:

@@ -7,26 +7,20 @@
 #define NEWTON_H
 #include "lanes.h"
 
-// Steps that suffice for most places; who needs more goes on with care.
-#define NEWTON_STEPS 3
-#define NEWTON_CAREFUL_STEPS 100
-// Squares, relative to the place's own: of the last step, after which the next is below rounding; of the distance left
-// that is rounding; of a step that leads nowhere.
-#ifdef REAL_IS_DOUBLE
-#define NEWTON_SETTLED 1e-15
-#else
-#define NEWTON_SETTLED 1e-9f
-#endif
+#define NEWTON_STEPS 100
+// Squares, relative to the place's own: of the distance left that is rounding, and of a step that leads nowhere.
 #define NEWTON_ROUNDING ((real)(64 * REAL_EPSILON * REAL_EPSILON))
 #define NEWTON_STUCK ((real)(REAL_EPSILON * REAL_EPSILON / 64))
 
-// From the centre on, where nothing is displaced, for the places that are wanted: a step that leaves the one-to-one
-// part or gains nothing is halved. Returns where that ends without an answer.
-inline masks LANED(newton_find)(reals x, reals y, masks wanted, constant real *table, reals *back_x, reals *back_y) {
+// The way back for the places that are wanted, from a guess of it. A step that leaves the one-to-one part or gains
+// nothing over the centre, where nothing is displaced, and whatever came after, is halved. Returns where that ends
+// without an answer.
+inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant real *table, reals *back_x, reals *back_y) {
     const reals own_x = zero_where(~wanted, x), own_y = zero_where(~wanted, y), square = own_x * own_x + own_y * own_y;
-    reals at_x = -own_x, at_y = -own_y, step_x = own_x, step_y = own_y, left = square;
+    reals at_x = -own_x, at_y = -own_y, left = square;
+    reals step_x = own_x + zero_where(~wanted, *back_x), step_y = own_y + zero_where(~wanted, *back_y);
     masks open = wanted;
-    for (int k = 0; k < NEWTON_CAREFUL_STEPS && any_lane(open); k++) {
+    for (int k = 0; k < NEWTON_STEPS && any_lane(open); k++) {
         reals next_x, next_y, next_left;
         const reals try_x = at_x + step_x, try_y = at_y + step_y;
         const masks inside = NEWTON_STEP(own_x, own_y, try_x, try_y, table, &next_x, &next_y, &next_left);
@@ -42,22 +36,6 @@ inline masks LANED(newton_find)(reals x, reals y, masks wanted, constant real *t
     *back_x = wanted ? at_x : *back_x;
     *back_y = wanted ? at_y : *back_y;
     return wanted & mask_of(left > NEWTON_ROUNDING * square);
-}
-
-// The way back for the places that are not in `without`; returns where there is none.
-inline masks LANED(newton_back)(reals x, reals y, masks without, constant real *table, reals *back_x, reals *back_y) {
-    reals step_x, step_y, left;
-    masks settled = 0;
-    *back_x = 0;
-    *back_y = 0;
-    for (int k = 0; k < NEWTON_STEPS; k++) {
-        settled = NEWTON_STEP(x, y, *back_x, *back_y, table, &step_x, &step_y, &left);
-        *back_x += step_x;
-        *back_y += step_y;
-    }
-    settled &= mask_of(step_x * step_x + step_y * step_y <= (real)NEWTON_SETTLED * (x * x + y * y));
-    const masks open = ~(settled | without);
-    return any_lane(open) ? LANED(newton_find)(x, y, open, table, back_x, back_y) : (masks)0;
 }
 
 #endif

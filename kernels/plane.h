@@ -22,6 +22,8 @@
 #define PLANE_EDGE ((real)(1 + 4 * REAL_EPSILON))
 // How far out of the region a Newton step may look.
 #define PLANE_OUTSKIRTS ((real)1.25)
+// No bending takes a place in the region as far as that.
+#define PLANE_FARTHEST ((real)1e3)
 
 inline masks LANED(plane_within)(reals x, reals y, real edge) {
     return mask_of(fabs(x) <= edge) & mask_of(fabs(y) <= edge);
@@ -74,9 +76,9 @@ inline masks LANED(plane_show)(reals *g, reals *h, constant real *plane) {
     constant real *back = plane + PLANE_BACK;
     const reals along = *g - plane[PLANE_OFFSET], up = *h - plane[PLANE_OFFSET + 1];
     const reals x = back[0] * along + back[1] * up, y = back[2] * along + back[3] * up;
-    reals back_x, back_y;
-    masks unseen = ~LANED(plane_within)(x, y, 10);
-    unseen |= LANED(newton_back)(x, y, unseen, plane, &back_x, &back_y);
+    reals back_x = 0, back_y = 0;
+    masks unseen = ~LANED(plane_within)(x, y, PLANE_FARTHEST);
+    unseen |= LANED(newton_back)(x, y, ~unseen, plane, &back_x, &back_y);
     unseen |= ~LANED(plane_within)(x + back_x, y + back_y, PLANE_EDGE);
     *g = plane[PLANE_ORIGIN] + plane[PLANE_PER_SCALE] * (x + back_x);
     *h = plane[PLANE_ORIGIN + 1] + plane[PLANE_PER_SCALE + 1] * (y + back_y);

@@ -38,7 +38,7 @@ inline void store_points(reals x, reals y, global real *points, ulong i) {
 }
 
 // Moves (x, y); returns the flag of those that have no such place.
-inline masks LANED(moved)(reals *x, reals *y, constant real *model) {
+__attribute__((always_inline)) inline masks LANED(moved)(reals *x, reals *y, constant real *model) {
 #if defined(PLANE) && defined(INVERSE)
     return LANED(plane_show)(x, y, model) & STATUS_OUT_OF_RANGE;
 #elif defined(PLANE)
@@ -69,14 +69,15 @@ kernel void undistort_points(global const INPUT *restrict points, global real *r
 #endif
         reals x, y;
         load_points(points, i, &x, &y);
-        const masks lost = LANED(not_finite)(x) | LANED(not_finite)(y);
+        const reals given_x = x, given_y = y;
         masks flags = LANED(moved)(&x, &y, model);
         // Flags are rare.
         const masks bad = mask_of(flags != 0) | LANED(not_finite)(x) | LANED(not_finite)(y);
         if (any_lane(bad)) {
+            const masks lost = LANED(not_finite)(given_x) | LANED(not_finite)(given_y) | mask_of(flags == 0);
             x = nan_where(bad, x);
             y = nan_where(bad, y);
-            flags = (lost | mask_of(flags == 0)) & bad ? (masks)STATUS_NOT_FINITE : flags;
+            flags = lost & bad ? (masks)STATUS_NOT_FINITE : flags;
         }
         store_points(x, y, moved_points, i);
         store_bytes(convert_bytes(flags), status + i);

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.fold import OneToOne, one_to_one
+from gpuvision.camera.guess import Guess
 from gpuvision.camera.newton import determinant, undo
 from gpuvision.tables import checked_keys, numbers
 
@@ -31,8 +32,12 @@ Matrix = tuple[tuple[float, float, float], ...]
 Float64 = npt.NDArray[np.float64]
 Direction = Literal["undistort", "distort"]
 
-_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
+NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 _LENGTHS = (4, 5, 8, 12, 14)
+
+
+# Squared, in focal lengths: what lies beyond is not looked for.
+_REACH = 1e12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,11 +80,11 @@ class Camera:
 
     def defines(self, matrix: npt.ArrayLike | None = None) -> dict[str, int | None]:
         """Return what ``kernels/camera.h`` has to compile for this camera, with ideal pixels under ``matrix``."""
-        k, p, s = self._radial, self._tangential, self._prism
-        defines: dict[str, int | None] = {"CAMERA": None, "CAMERA_RADIAL": _terms(k[:3])}
-        defines["CAMERA_RATIONAL"] = _terms(k[3:])
+        k = self._radial
+        defines = {"CAMERA": None, "CAMERA_RADIAL": _terms(k[:3]), "CAMERA_RATIONAL": _terms(k[3:])}
         present = {
-            "CAMERA_DECENTRED": any(p) or any(s),
+            "CAMERA_DECENTRED": self._is_decentred,
+            "CAMERA_PRISM": any(self._prism[1::2]),
             "CAMERA_TILTED": any(self.distortion[12:]),
             "CAMERA_MATRICES": self._ideal_matrix(matrix) != self.matrix,
         }
@@ -116,9 +121,14 @@ class Camera:
                     tilt[2, :2],
                     self._radial,
                     (p1, p2, p2 + s1, s2, p1 + s3, s4),
-                    self._one_to_one,
+                    (self._one_to_one.safe, self._one_to_one.limit, min(self._farthest_bent, _REACH)),
+                    self._guess.packed(real),
                 ]
             ).astype(real)
+
+    def steps(self, real: npt.DTypeLike) -> int:
+        """Return CAMERA_STEPS for ``camera_undistort``: how many steps settle most of the sensor."""
+        return self._guess.steps(real)
 
     # ---- both ways on the host -----------------------------------------------------------------------------
 
@@ -211,9 +221,32 @@ class Camera:
     def _prism(self) -> tuple[float, ...]:
         return self.distortion[8:12]
 
+    @property
+    def _is_decentred(self) -> bool:
+        return any(self._tangential) or any(self._prism)
+
     @cached_property
     def _one_to_one(self) -> OneToOne:
         return one_to_one(self._radial, self._tangential, self._prism)
+
+    @cached_property
+    def _farthest_bent(self) -> float:
+        """Squared radius outside which the lens bends no place to."""
+        with np.errstate(all="ignore"):
+            bent = np.sum((self._one_to_one.edge + self._bend(self._one_to_one.edge)[0]) ** 2, axis=-1)
+        # Between the directions it may be a little more, unless the lens is round.
+        return float(np.max(bent)) * (1.05 if self._is_decentred else 1.0) if np.isfinite(bent).all() else math.inf
+
+    @cached_property
+    def _guess(self) -> Guess:
+        """Made for a sensor about twice as large as its principal point is far in; others take longer, no more."""
+        (fx, _, cx), (_, fy, cy), _ = self.matrix
+        corners = np.array([[a, b] for a in (-cx / fx, cx / fx) for b in (-cy / fy, cy / fy)])
+        bent = _tilted(np.linalg.inv(self._tilt), corners)
+        farthest = float(np.nanmax(np.sum(bent**2, axis=-1), initial=0.0))
+        k1, k2, k3, k4, k5, k6 = self._radial
+        radial = replace(self, distortion=(k1, k2, 0.0, 0.0, k3, k4, k5, k6, *(0.0,) * 6))
+        return Guess(self._bend, radial._bend if self._is_decentred else None, radial._one_to_one.limit, farthest)
 
     @cached_property
     def _tilt(self) -> Float64:
@@ -292,7 +325,7 @@ class Camera:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists, as TOML holds them; coefficients by name, those that are 0 left out."""
-        named = {name: value for name, value in zip(_NAMES, self.distortion, strict=True) if value != 0.0}
+        named = {name: value for name, value in zip(NAMES, self.distortion, strict=True) if value != 0.0}
         return {"matrix": [list(row) for row in self.matrix], **named}
 
     @classmethod
@@ -304,8 +337,8 @@ class Camera:
         ValueError, TypeError
             A key is unknown or missing, or a value is not what it must be.
         """
-        values = checked_keys(table, ("matrix", *_NAMES), ("matrix",), "camera")
-        return cls(matrix=values["matrix"], distortion=tuple(values.get(name, 0.0) for name in _NAMES))
+        values = checked_keys(table, ("matrix", *NAMES), ("matrix",), "camera")
+        return cls(matrix=values["matrix"], distortion=tuple(values.get(name, 0.0) for name in NAMES))
 
 
 def _checked_matrix(matrix: Any, what: str) -> Matrix:

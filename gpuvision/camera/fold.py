@@ -21,11 +21,13 @@ class OneToOne(NamedTuple):
     """The part of the normalised ideal plane where a lens is one-to-one, as squared radii.
 
     It is where the determinant of the Jacobian is positive, within ``limit``: up to there every ray from the centre
-    meets it vanish once at most. Within ``safe`` it is positive everywhere, so need not be looked at.
+    meets it vanish once at most. Within ``safe`` it is positive everywhere, so need not be looked at. ``edge`` are
+    places (directions, 2) all around where it first vanishes, infinite where it never does.
     """
 
     safe: float
     limit: float
+    edge: Float64
 
 
 def one_to_one(k: Sequence[float], p: Sequence[float], s: Sequence[float]) -> OneToOne:
@@ -37,13 +39,13 @@ def one_to_one(k: Sequence[float], p: Sequence[float], s: Sequence[float]) -> On
     if not any(p) and not any(s):
         slope = polynomial.polyadd(polynomial.polymul(over, under), _twice_square_times(_wronskian(over, under)))
         square = min(*_sign_changes(slope), pole, math.inf) * unit**2
-        return OneToOne(square, square)
+        return OneToOne(square, square, math.sqrt(square) * _directions())
     return _decentred(over, under, np.array(p) * unit, np.array(s) * unit ** np.array([1.0, 3.0, 1.0, 3.0]), pole, unit)
 
 
 def _decentred(over: Float64, under: Float64, p: Float64, s: Float64, pole: float, unit: float) -> OneToOne:
-    angles = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
-    rays = [_sign_changes(_along_ray(over, under, p, s, math.cos(each), math.sin(each))) for each in angles]
+    directions = _directions()
+    rays = [_sign_changes(_along_ray(over, under, p, s, c, d)) for c, d in directions]
     first = [ray[0] if ray else math.inf for ray in rays]
     again = min(ray[1] if len(ray) > 1 else math.inf for ray in rays)
     last = max((each for each in first if math.isfinite(each)), default=0.0)
@@ -53,7 +55,13 @@ def _decentred(over: Float64, under: Float64, p: Float64, s: Float64, pole: floa
         limit = min(last * again, pole)
     else:
         limit = min((_MARGIN * again) ** 2, pole)
-    return OneToOne(min((_MARGIN * min(first)) ** 2, limit) * unit**2, limit * unit**2)
+    edge = np.minimum(first, math.sqrt(pole))[:, None] * unit * directions
+    return OneToOne(min((_MARGIN * min(first)) ** 2, limit) * unit**2, limit * unit**2, edge)
+
+
+def _directions() -> Float64:
+    angles = (np.arange(_DIRECTIONS) + 0.5) * (2.0 * math.pi / _DIRECTIONS)
+    return np.stack([np.cos(angles), np.sin(angles)], -1)
 
 
 def _characteristic_radius(k: Sequence[float], p: Sequence[float], s: Sequence[float]) -> float:

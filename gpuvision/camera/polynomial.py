@@ -29,7 +29,9 @@ _WORST_CONDITION = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class PlanePolynomial:
-    """Cubic polynomials from sensor to measurement plane (F. de Jong, eq. 3.6 and 3.7)::
+    """Cubic polynomials from sensor to measurement plane (F. de Jong, eq. 3.6 and 3.7).
+
+    ::
 
         G = p0 + p1 c + p2 r + p3 c^2 + p4 r c + p5 r^2 + p6 r^2 c + p7 c^3
         H = q0 + q1 r + q2 c + q3 r^2 + q4 c r + q5 c^2 + q6 c^2 r + q7 r^3

@@ -103,7 +103,7 @@ class UndistortPoints(Operation[UndistortedPoints]):
             stem="undistort_points",
             kernel="undistort_points",
             defines={
-                **self._model_defines(),
+                **self._model_defines(real),
                 **real_defines(device, real),
                 **{name: None for name, is_present in present.items() if is_present},
                 "INPUT": code,
@@ -117,9 +117,10 @@ class UndistortPoints(Operation[UndistortedPoints]):
             local_size=(1,) if strip else (each,),
         )
 
-    def _model_defines(self) -> dict[str, int | None]:
+    def _model_defines(self, real: np.dtype[Any]) -> dict[str, int | None]:
         if isinstance(self.model, Camera):
-            return self.model.defines(self.matrix)
+            steps = {} if self.inverse else {"CAMERA_STEPS": self.model.steps(real)}
+            return {**self.model.defines(self.matrix), **steps}
         return dict(self.model.defines)
 
     def _packed(self, real: np.dtype[Any]) -> npt.NDArray[Any]:

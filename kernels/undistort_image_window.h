@@ -68,6 +68,13 @@ INLINED void store_codes(float16 value, global CODE *to) {
 #else
     const codes made = value;
 #endif
+#ifdef PAST_CACHES
+    // A line that is written whole need not be read first.
+    if (aligned_to(sizeof(codes), to)) {
+        __builtin_nontemporal_store(made, (global codes *)to);
+        return;
+    }
+#endif
     *(global codes_at *)to = made;
 }
 

@@ -30,7 +30,7 @@ _CUBIC_TOLERANCE = 1e-5
 _ON_PIXEL = 1e-6
 # Places are kept within so many pixels: a whole number that a float holds.
 _FARTHEST = 2.0**24
-_ROWS_AT_ONCE = 128
+_ROWS_AT_ONCE = 32
 
 
 @dataclass(frozen=True, eq=False)

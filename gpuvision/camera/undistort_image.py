@@ -30,6 +30,8 @@ _BORDERS = {
 _CODES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 # An index into a frame, and one into a map, is an int on the device.
 _LARGEST_FRAME = 2**30
+# What a model computes at once stays in the caches.
+_ROWS_AT_ONCE = 32
 
 
 @runtime_checkable
@@ -167,9 +169,13 @@ class UndistortImage(Operation[UndistortedImage]):
         part = slice(first_row, first_row + rows), slice(first_column, first_column + columns)
         if isinstance(self.model, PixelMap):
             return self.model.places[part]
-        grid = np.stack(np.meshgrid(np.arange(columns) + first_column, np.arange(rows) + first_row), axis=-1)
         options = {} if self.matrix is None else {"matrix": self.matrix}
-        places: npt.NDArray[np.float64] = self.model.distort(grid.astype(np.float64), **options)
+        places = np.empty((rows, columns, 2))
+        for first in range(0, rows, _ROWS_AT_ONCE):
+            some = places[first : first + _ROWS_AT_ONCE]
+            some[..., 0] = np.arange(columns) + first_column
+            some[..., 1] = (np.arange(first, first + len(some)) + first_row)[:, None]
+            some[:] = self.model.distort(some, **options)
         return places
 
     def _region(self, shape: tuple[int, int]) -> tuple[int, int, int, int]:
@@ -195,12 +201,14 @@ class UndistortImage(Operation[UndistortedImage]):
         computed = self.coordinates == "computed"
         tables = (None, None, None, self._table(real)) if computed else (*self._packed(rows, columns), None)
         fill = self.value if self.border == "constant" else math.nan if dtype.kind == "f" else 0.0
+        moved = (math.prod(shape) + math.prod(made)) * dtype.itemsize
+        past_caches = {"PAST_CACHES": None} if strip and device.is_cpu and moved > device.cache_bytes else {}
         return Launch(
             stem="undistort_image",
             kernel="undistort",
             inputs=((shape, dtype),),
             outputs={"image": (made, dtype), "status": ((made_rows, made_columns), np.dtype(np.uint8))},
-            defines=real_defines(device, real) | self._defines(dtype, strip),
+            defines=real_defines(device, real) | self._defines(dtype, strip) | past_caches,
             arguments=(
                 *tables,
                 np.array([columns, rows, made_columns, made_rows, *region[:2]], np.int32),

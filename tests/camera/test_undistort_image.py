@@ -340,6 +340,14 @@ def test_device_arrays_bound_and_no_frames(device: Device, rng: np.random.Genera
     assert op(image[:0], device=device).image.shape == (0, 41, 61)
 
 
+@pytest.mark.parametrize("columns", [1008, 1003])
+def test_batches_beyond_the_caches_are_the_same(device: Device, columns: int, rng: np.random.Generator) -> None:
+    image = pixels(rng, (5, 1000, columns), np.float32)
+    assert 2 * image.nbytes > device.cache_bytes
+    op = UndistortImage(model=Lens(k1=3e-8, centre=(500.0, 500.0)))
+    np.testing.assert_array_equal(op(image, device=device).image[4], op(image[4], device=device).image)
+
+
 def test_wide_maps_are_kept_exactly_where_cubics_do_not_do(device: Device, rng: np.random.Generator) -> None:
     image = pixels(rng, (50, 60), np.float32)
     places = map_of((30, 50), image.shape) + rng.uniform(-0.5, 0.5, (30, 50, 2))

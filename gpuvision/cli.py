@@ -23,10 +23,12 @@ def application() -> typer.Typer:
     """Return the command line with its commands."""
     import typer
 
+    from gpuvision.commands.calibrate import calibrate
     from gpuvision.commands.demo import demo
     from gpuvision.commands.devices import devices
     from gpuvision.commands.profile import profile
     from gpuvision.commands.scan import scan
+    from gpuvision.commands.undistort import undistort
 
     app = typer.Typer(
         help="Range imaging and visual servoing in OpenCL.",
@@ -35,7 +37,7 @@ def application() -> typer.Typer:
         add_completion=False,
         pretty_exceptions_enable=False,
     )
-    for command in (scan, demo, devices, profile):
+    for command in (scan, calibrate, undistort, demo, devices, profile):
         app.command()(command)
     return app
 

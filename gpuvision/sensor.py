@@ -33,6 +33,7 @@ import numpy as np
 from gpuvision.camera.lens import Lens
 from gpuvision.description import DescriptionError, Section, read
 from gpuvision.host.recordings import CHANNELS, Channel
+from gpuvision.lens_file import radial_lens
 from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.range_image import Limits, RotatingSheet, StraightTransport, Vector
@@ -155,7 +156,8 @@ class Sensor:
         kind = top.choice("kind", ("camera", "psd"))
         name = top.text("name", "")
         recording = _recording(top.optional_section("recording"))
-        lens = _lens(top.optional_section("lens"))
+        radial = top.optional_section("lens")
+        lens = None if radial is None else radial_lens(radial)
         readout = top.section("line" if kind == "camera" else "psd")
         along: Along = readout.choice("along", ("columns", "rows"), "columns") if kind == "camera" else "columns"
         frame = _frame(kind, top, readout)
@@ -207,16 +209,6 @@ def _recording(table: Section | None) -> Recording:
     key = table.text("key", None)
     table.finish()
     return Recording(channel=channel, key=key, rate=rate)
-
-
-def _lens(table: Section | None) -> Lens | None:
-    if table is None:
-        return None
-    k1 = table.number("k1", "sensor unit^-2")
-    k2 = table.number("k2", "sensor unit^-4", 0.0)
-    column, row = table.numbers("centre", "sensor unit", (2,), (0.0, 0.0))
-    table.finish()
-    return Lens(k1=k1, k2=k2, centre=(column, row))
 
 
 def _frame(kind: str, top: Section, readout: Section) -> tuple[int, int] | None:

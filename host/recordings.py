@@ -236,7 +236,7 @@ class ImageFolder(FrameSource):
         if not self._files:
             raise RecordingError(f"{path}: no images in this folder; expected some of {' '.join(_IMAGES)}")
         self._channel = channel
-        first = _image(self._files[0])
+        first = read_image(self._files[0])
         super().__init__(first.shape[:2], first.dtype)
         self.length: int = len(self._files)
         self._next = 0
@@ -247,7 +247,7 @@ class ImageFolder(FrameSource):
 
     def _decode(self, out: HostArray) -> None:
         file = self._files[self._next]
-        image = _image(file)
+        image = read_image(file)
         check_frame(image if image.ndim == 2 else image[:, :, 0], self.shape, self.dtype, str(file))
         _picker(self._channel, image.shape, str(file))(image, out)
         self._next += 1
@@ -258,8 +258,14 @@ def _natural(path: Path) -> list[Any]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
-def _image(path: Path) -> HostArray:
-    """Read an image: grey, or blue, green, red."""
+def read_image(path: Path) -> HostArray:
+    """Read an image: grey, or blue, green, red.
+
+    Raises
+    ------
+    RecordingError
+        It is none that can be read, or it holds several.
+    """
     if path.suffix.lower() in _TIFF:
         with _open_tiff(path) as file:
             if len(file.pages) != 1:

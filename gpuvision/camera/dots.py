@@ -9,7 +9,7 @@ from gpuvision.camera.blobs import find_pattern_blobs
 from gpuvision.camera.centroids import Centroids, disc_shift, measure_dots
 from gpuvision.camera.grid_polynomial import GridPolynomial, cross, on_grid
 from gpuvision.camera.lattice import whole_grid
-from gpuvision.camera.pattern import Float64, PatternGrid, grey_image, localisation_noise, nan_median
+from gpuvision.camera.pattern import Float64, PatternGrid, grey_image, localisation_noise, nan_median, trimmed
 
 Bool = npt.NDArray[np.bool_]
 
@@ -68,7 +68,7 @@ def find_dots(image: npt.NDArray[np.generic]) -> PatternGrid:
     count = np.count_nonzero(np.isfinite(points[..., 0]))
     if count < _FEWEST:
         raise ValueError(f"only {count} of {grid.size} dots are whole and lie on a grid, expected at least {_FEWEST}")
-    points = _trimmed(points)
+    points = trimmed(points)
     return PatternGrid(points, localisation_noise(points))
 
 
@@ -90,10 +90,3 @@ def _around(values: Float64) -> Float64:
     padded = np.pad(values, 2, constant_values=np.nan)
     rows, columns = values.shape
     return nan_median(np.stack([padded[i : i + rows, j : j + columns] for i in range(5) for j in range(5)]))
-
-
-def _trimmed(points: Float64) -> Float64:
-    """Cut rows and columns at the border that hold nothing."""
-    known = np.isfinite(points[..., 0])
-    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
-    return points[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]

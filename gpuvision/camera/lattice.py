@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from gpuvision.camera.pattern import Float64
+from gpuvision.camera.pattern import Float64, nan_median
 
 Int64 = npt.NDArray[np.int64]
 
@@ -20,6 +20,8 @@ _MIRRORED = 0.25
 _SPANNING = 0.4
 # A prediction is met when the point lies within this part of a step.
 _MET = 0.3
+# Vectors that turn round from neighbour to neighbour have at most this scalar product.
+_TURNED = -0.5
 _SIDE = 1024
 _TRIES = 12
 # So many points of the whole, and a quarter of the piece, say how a piece continues it; to this part of a step.
@@ -37,11 +39,11 @@ class Chart(NamedTuple):
     index: Int64
 
 
-def local_bases(points: Float64, tree: cKDTree) -> Float64:
+def local_bases(points: Float64, tree: cKDTree, turning: Float64 | None = None) -> Float64:
     """Two steps (n, 2, 2) of the lattice about every point; NaN where its neighbours do not lie symmetrically.
 
     The first step leads to the nearest neighbour that has a mirror image about the point, the second to the nearest
-    such neighbour in another direction.
+    such neighbour in another direction. For ``turning`` see `charts`.
     """
     count = min(_NEIGHBOURS + 1, len(points))
     _, near = tree.query(points, count)
@@ -52,6 +54,8 @@ def local_bases(points: Float64, tree: cKDTree) -> Float64:
     sums = square[:, :, None] + square[:, None] + 2.0 * steps @ steps.transpose(0, 2, 1)
     partner = np.argmin(sums, axis=2)
     mirrored = np.take_along_axis(sums, partner[..., None], 2)[..., 0] < _MIRRORED**2 * square
+    if turning is not None:
+        mirrored &= np.einsum("ij,ikj->ik", turning, turning[near[:, 1:]]) < _TURNED
     across = np.take_along_axis(steps, partner[..., None], 1)
     straight = 0.5 * (steps - across)
     rows = np.arange(len(points))
@@ -68,9 +72,10 @@ def local_bases(points: Float64, tree: cKDTree) -> Float64:
 class _Walk:
     """A lattice that grows from a seed: every wave predicts the neighbours of the last one's points."""
 
-    def __init__(self, points: Float64, tree: cKDTree, seed: int, basis: Float64) -> None:
+    def __init__(self, points: Float64, tree: cKDTree, seed: int, basis: Float64, turning: Float64 | None) -> None:
         self.points = points
         self.tree = tree
+        self.turning = turning
         self.at = np.full((_SIDE, _SIDE), -1)
         self.index = np.full((len(points), 2), -1)
         self.bases = np.full((len(points), 2, 2), np.nan)
@@ -91,6 +96,8 @@ class _Walk:
         distance, found = self.tree.query(self.points[parent] + steps)
         error = distance / np.hypot(steps[:, 0], steps[:, 1])
         met = (error < _MET) & (self.index[found, 0] < 0)
+        if self.turning is not None:
+            met &= np.sum(self.turning[parent] * self.turning[found], axis=1) < _TURNED
         order = np.flatnonzero(met)[np.argsort(error[met], kind="stable")]
         # The best prediction of a place, then the best place of a point.
         key = target[:, 0] * _SIDE + target[:, 1]
@@ -115,9 +122,9 @@ class _Walk:
             self.bases[new[known], axis] = total[known] / count[known, None]
 
 
-def walk(points: Float64, tree: cKDTree, seed: int, basis: Float64) -> Chart:
+def _walked(points: Float64, tree: cKDTree, seed: int, basis: Float64, turning: Float64 | None) -> Chart:
     """Index the points that can be reached from a seed, neighbour by neighbour."""
-    lattice = _Walk(points, tree, seed, basis)
+    lattice = _Walk(points, tree, seed, basis, turning)
     wave = np.array([seed])
     while wave.size:
         wave = lattice.grow(wave)
@@ -125,7 +132,7 @@ def walk(points: Float64, tree: cKDTree, seed: int, basis: Float64) -> Chart:
     return Chart(members, lattice.index[members])
 
 
-def charts(points: Float64, fewest: int) -> list[Chart]:
+def charts(points: Float64, fewest: int, turning: Float64 | None = None) -> list[Chart]:
     """Index points that lie on a distorted lattice, in as many pieces as it falls into, the largest first.
 
     Parameters
@@ -134,21 +141,23 @@ def charts(points: Float64, fewest: int) -> list[Chart]:
         (n, 2), with spurious ones among them.
     fewest
         A piece of fewer points is none.
+    turning
+        Unit vectors (n, 2) that point the other way round from neighbour to neighbour, where the pattern has such.
     """
     if len(points) < max(fewest, 5):
         return []
     tree = cKDTree(points)
-    bases = local_bases(points, tree)
+    bases = local_bases(points, tree, turning)
     pieces: list[Chart] = []
     left = np.isfinite(bases[:, 0, 0])
     for _ in range(_TRIES):
         seed = _seed(points, bases, left)
         if seed is None:
             break
-        chart = walk(points, tree, seed, bases[seed])
+        chart = _walked(points, tree, seed, bases[seed], turning)
         left[chart.members] = False
         left[seed] = False
-        if len(chart.members) >= fewest:
+        if len(chart.members) >= fewest and np.ptp(chart.index, axis=0).all():
             pieces.append(chart)
     return _without_overlap(pieces, fewest)
 
@@ -190,7 +199,9 @@ def as_grid(chart: Chart, points: Float64) -> Int64:
     index = chart.index
     place = points[chart.members]
     for _ in range(2):  # the first turn is found on oblique axes where the shortest steps are others
-        index = index @ _turn(_mean_steps(index, place)).T
+        steps = _mean_steps(index, place)
+        if np.isfinite(steps).all():  # they are not in a row of points along a diagonal
+            index = index @ _turn(steps).T
     index = index - index.min(axis=0)
     grid = np.full(index.max(axis=0)[::-1] + 1, -1)
     grid[index[:, 1], index[:, 0]] = chart.members
@@ -202,7 +213,7 @@ def _mean_steps(index: Int64, place: Float64) -> Float64:
     low = index.min(axis=0)
     at = np.full((*(index.max(axis=0) - low + 1), 2), np.nan)
     at[tuple((index - low).T)] = place
-    return np.stack([np.nanmedian(np.diff(at, axis=axis).reshape(-1, 2), axis=0) for axis in (0, 1)])
+    return np.stack([nan_median(np.diff(at, axis=axis).reshape(-1, 2)) for axis in (0, 1)])
 
 
 def _turn(steps: Float64) -> Int64:

@@ -97,3 +97,12 @@ def nan_median(values: Float64) -> Float64:
     middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2])
     # Where there is nothing, the first is NaN itself.
     return np.asarray(np.take_along_axis(ordered, np.minimum(middle, len(values) - 1), 0).mean(axis=0))
+
+
+def trimmed(points: Float64) -> Float64:
+    """Cut rows and columns at the border that hold nothing."""
+    known = np.isfinite(points[..., 0])
+    if not known.any():
+        return points[:0, :0]
+    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+    return points[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gpuvision.camera.camera_fit import CameraFit
+    from gpuvision.camera.chessboard import find_chessboard
     from gpuvision.camera.dots import find_dots
     from gpuvision.camera.lens import Lens
     from gpuvision.camera.lens_known import fit_tilt
@@ -60,6 +61,7 @@ _PLACES = {
     "StraightTransport": "gpuvision.ranging.range_image",
     "TiltedSensor": "gpuvision.camera.scheimpflug",
     "Triangulation": "gpuvision.ranging.triangulation",
+    "find_chessboard": "gpuvision.camera.chessboard",
     "find_dots": "gpuvision.camera.dots",
     "find_lines": "gpuvision.camera.line_pattern",
     "fit_camera": "gpuvision.camera.planar_views",
@@ -95,6 +97,7 @@ __all__ = [
     "StraightTransport",
     "TiltedSensor",
     "Triangulation",
+    "find_chessboard",
     "find_dots",
     "find_lines",
     "fit_camera",

@@ -8,16 +8,17 @@
 #include "lanes.h"
 
 #define NEWTON_STEPS 100
-// Squares, relative to the place's own: of the distance left that is rounding, and of a step that leads nowhere.
+// Squares, relative to the place's own: of a distance or step that is rounding, and of a step that leads nowhere.
 #define NEWTON_ROUNDING ((real)(64 * REAL_EPSILON * REAL_EPSILON))
 #define NEWTON_STUCK ((real)(REAL_EPSILON * REAL_EPSILON / 64))
 
 // The way back for the places that are wanted, from a guess of it. A step that leaves the one-to-one part or gains
-// nothing over the centre, where nothing is displaced, and whatever came after, is halved. Returns where that ends
-// without an answer.
+// nothing over the centre, where nothing is displaced, and whatever came after, is halved. The answer is where the
+// distance left, or the step ahead, is rounding; at the fold, where the search for a place past it ends, neither is.
+// Returns where there is none.
 inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant real *table, reals *back_x, reals *back_y) {
     const reals own_x = zero_where(~wanted, x), own_y = zero_where(~wanted, y), square = own_x * own_x + own_y * own_y;
-    reals at_x = -own_x, at_y = -own_y, left = square;
+    reals at_x = -own_x, at_y = -own_y, left = square, ahead = square;
     reals step_x = own_x + zero_where(~wanted, *back_x), step_y = own_y + zero_where(~wanted, *back_y);
     masks open = wanted;
     for (int k = 0; k < NEWTON_STEPS && any_lane(open); k++) {
@@ -30,12 +31,14 @@ inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant real *t
         left = better ? next_left : left;
         step_x = better ? next_x : step_x / 2;
         step_y = better ? next_y : step_y / 2;
-        open = mask_of(left > NEWTON_ROUNDING * square) &
-               mask_of(step_x * step_x + step_y * step_y > NEWTON_STUCK * square);
+        const reals size = step_x * step_x + step_y * step_y;
+        ahead = better ? size : ahead;
+        open = mask_of(left > NEWTON_ROUNDING * square) & mask_of(ahead > NEWTON_ROUNDING * square) &
+               mask_of(size > NEWTON_STUCK * square);
     }
     *back_x = wanted ? at_x : *back_x;
     *back_y = wanted ? at_y : *back_y;
-    return wanted & mask_of(left > NEWTON_ROUNDING * square);
+    return wanted & mask_of(left > NEWTON_ROUNDING * square) & mask_of(ahead > NEWTON_ROUNDING * square);
 }
 
 #endif

@@ -63,8 +63,8 @@ class Camera:
     -----
     The lens terms fold the plane where the determinant of their Jacobian vanishes. What lies past that on the way
     from the centre has no measured point, and measured points outside the picture of what lies before have no ideal
-    one: both directions answer NaN there. Within, ``distort(undistort(p))`` is p to rounding, which the inverse
-    magnifies by 1/det.
+    one: both directions answer NaN there. Within, ``distort(undistort(p))`` is p to rounding, of the larger of the two,
+    which the inverse magnifies by 1/det.
     """
 
     matrix: Matrix
@@ -111,20 +111,19 @@ class Camera:
         centre = given[:2, 2].astype(real).astype(np.float64)
         growth = focal_made / focal - 1.0
         shift = made[:2, 2] - given[:2, 2] + growth * (centre - given[:2, 2])
-        tilt = self._tilt if direction == "distort" else np.linalg.inv(self._tilt)
+        back = direction == "undistort"
+        tilt = self._untilt if back else self._tilt
         (p1, p2), (s1, s2, s3, s4) = self._tangential, self._prism
+        parts = [
+            *(centre, 1.0 / focal, focal_made, shift, growth),
+            *((tilt - np.eye(3))[:2, :2].ravel(), tilt[2, :2]),
+            *(self._radial, (p1, p2, p2 + s1, s2, p1 + s3, s4)),
+            (self._one_to_one.safe, self._one_to_one.limit),
+        ]
+        if back:
+            parts += [(min(self._farthest_bent, _REACH),), self._guess.packed(real)]
         with np.errstate(over="ignore"):
-            return np.concatenate(
-                [
-                    *(centre, 1.0 / focal, focal_made, shift, growth),
-                    (tilt - np.eye(3))[:2, :2].ravel(),
-                    tilt[2, :2],
-                    self._radial,
-                    (p1, p2, p2 + s1, s2, p1 + s3, s4),
-                    (self._one_to_one.safe, self._one_to_one.limit, min(self._farthest_bent, _REACH)),
-                    self._guess.packed(real),
-                ]
-            ).astype(real)
+            return np.concatenate(parts).astype(real)
 
     def steps(self, real: npt.DTypeLike) -> int:
         """Return CAMERA_STEPS for ``camera_undistort``: how many steps settle most of the sensor."""
@@ -242,7 +241,7 @@ class Camera:
         """Made for a sensor about twice as large as its principal point is far in; others take longer, no more."""
         (fx, _, cx), (_, fy, cy), _ = self.matrix
         corners = np.array([[a, b] for a in (-cx / fx, cx / fx) for b in (-cy / fy, cy / fy)])
-        bent = _tilted(np.linalg.inv(self._tilt), corners)
+        bent = _tilted(self._untilt, corners)
         farthest = float(np.nanmax(np.sum(bent**2, axis=-1), initial=0.0))
         k1, k2, k3, k4, k5, k6 = self._radial
         radial = replace(self, distortion=(k1, k2, 0.0, 0.0, k3, k4, k5, k6, *(0.0,) * 6))
@@ -260,6 +259,10 @@ class Camera:
         # What is 0 but for rounding.
         tilt[:2, 2] = 0.0
         return tilt
+
+    @cached_property
+    def _untilt(self) -> Float64:
+        return np.asarray(np.linalg.inv(self._tilt), dtype=np.float64)
 
     def _ideal_matrix(self, matrix: npt.ArrayLike | None) -> Matrix:
         return self.matrix if matrix is None else _checked_matrix(matrix, "matrix")
@@ -299,7 +302,7 @@ class Camera:
         """Normalised ideal places of measured points; NaN past the fold."""
         matrix = np.array(self.matrix)
         shown = (np.asarray(points, dtype=np.float64) - matrix[:2, 2]) / np.diag(matrix)[:2]
-        return undo(self._bend, _tilted(np.linalg.inv(self._tilt), shown))
+        return undo(self._bend, _tilted(self._untilt, shown))
 
     # ---- tables --------------------------------------------------------------------------------------------
 

@@ -13,6 +13,9 @@ from numpy.polynomial import polynomial
 _DIRECTIONS = 64
 # Between two of them the fold is hardly nearer than at either.
 _MARGIN = 0.98
+# Powers of the radius that k1 .. k6, p1, p2 and s1 .. s4 come with, and the radius at which nothing is looked for.
+_ORDERS = np.array([2.0, 4.0, 6.0, 2.0, 4.0, 6.0, 1.0, 1.0, 1.0, 3.0, 1.0, 3.0])
+_FARTHEST = 1e6
 
 Float64 = npt.NDArray[np.float64]
 
@@ -30,17 +33,22 @@ class OneToOne(NamedTuple):
     edge: Float64
 
 
-def one_to_one(k: Sequence[float], p: Sequence[float], s: Sequence[float]) -> OneToOne:
-    """Find it for the radial coefficients k1 .. k6, the tangential ones p1, p2 and the thin prism's s1 .. s4."""
-    unit = _characteristic_radius(k, p, s)
-    powers = unit ** np.array([2.0, 4.0, 6.0])
-    over, under = np.r_[1.0, k[:3] * powers], np.r_[1.0, k[3:] * powers]
+def one_to_one(radial: Sequence[float], tangential: Sequence[float], prism: Sequence[float]) -> OneToOne:
+    """Find it for the radial coefficients k1 .. k6, the tangential p1, p2 and the thin prism's s1 .. s4."""
+    terms = np.array([*radial, *tangential, *prism])
+    with np.errstate(divide="ignore", over="ignore"):
+        radii = np.abs(terms) ** (-1.0 / _ORDERS)
+    # Terms too weak to matter anywhere would only spoil the numbers. The unit is where the first of the others reaches 1.
+    terms = np.where(radii < _FARTHEST, terms, 0.0)
+    unit = min(float(radii.min()), _FARTHEST)
+    k, p, s = np.split(terms * unit**_ORDERS, [6, 8])
+    over, under = np.r_[1.0, k[:3]], np.r_[1.0, k[3:]]
     pole = min(_sign_changes(under), default=math.inf)
-    if not any(p) and not any(s):
+    if not p.any() and not s.any():
         slope = polynomial.polyadd(polynomial.polymul(over, under), _twice_square_times(_wronskian(over, under)))
         square = min(*_sign_changes(slope), pole, math.inf) * unit**2
         return OneToOne(square, square, math.sqrt(square) * _directions())
-    return _decentred(over, under, np.array(p) * unit, np.array(s) * unit ** np.array([1.0, 3.0, 1.0, 3.0]), pole, unit)
+    return _decentred(over, under, p, s, pole, unit)
 
 
 def _decentred(over: Float64, under: Float64, p: Float64, s: Float64, pole: float, unit: float) -> OneToOne:
@@ -62,13 +70,6 @@ def _decentred(over: Float64, under: Float64, p: Float64, s: Float64, pole: floa
 def _directions() -> Float64:
     angles = (np.arange(_DIRECTIONS) + 0.5) * (2.0 * math.pi / _DIRECTIONS)
     return np.stack([np.cos(angles), np.sin(angles)], -1)
-
-
-def _characteristic_radius(k: Sequence[float], p: Sequence[float], s: Sequence[float]) -> float:
-    """Return the radius at which the first of the terms reaches 1: it keeps the polynomials' numbers at hand."""
-    orders = (2, 4, 6, 2, 4, 6, 1, 1, 1, 3, 1, 3)
-    radii = [abs(c) ** (-1.0 / order) for c, order in zip((*k, *p, *s), orders, strict=True) if c != 0.0]
-    return min(radii, default=1.0)
 
 
 def _wronskian(over: Float64, under: Float64) -> Any:
@@ -108,7 +109,7 @@ def _sign_changes(terms: Iterable[float]) -> list[float]:
     """Return the positive places where a polynomial that is 1 at 0 changes its sign, ascending."""
     roots = polynomial.polyroots(np.trim_zeros(np.asarray(terms, dtype=np.float64), "b"))
     # Roots that rounding made complex, or that only touch 0, are told apart by the signs between them.
-    near = roots[(roots.real > 0.0) & (np.abs(roots.imag) <= 1e-3 * np.abs(roots.real))]
+    near = roots[(roots.real > 0.0) & (np.abs(roots.imag) <= 1e-3 * roots.real) & (roots.real < _FARTHEST**2)]
     places = np.sort(near.real)
     if not len(places):
         return []

@@ -14,7 +14,7 @@ Displacement = Callable[[Float64], tuple[Float64, Float64, npt.NDArray[np.bool_]
 
 _STEPS = 100
 _EPSILON = float(np.finfo(np.float64).eps)
-# Squares, relative to the place's own: of the distance left that is rounding, of a step that leads nowhere.
+# Squares, relative to the place's own: of a distance or step that is rounding, of a step that leads nowhere.
 _ROUNDING, _STUCK = 64.0 * _EPSILON**2, _EPSILON**2 / 64.0
 
 
@@ -23,12 +23,14 @@ def undo(displacement: Displacement, moved: Float64) -> Float64:
 
     The start is the centre, which is not moved and where the Jacobian is 1: the first step leads to the given place
     itself. A step which leaves the one-to-one part or gains nothing is halved. The way back is the unknown: it is small
-    beside the place, so it keeps its digits.
+    beside the place, so it keeps its digits. It is found where the distance left, or the step ahead, is rounding; at
+    the fold, where the search for a place past it ends, neither is.
     """
     wanted = moved.reshape(-1, 2)
-    back, step, square = -wanted, wanted.copy(), np.sum(wanted**2, axis=-1)
-    left = square.copy()
+    back, step = -wanted, wanted.copy()
     with np.errstate(all="ignore"):
+        square = np.sum(wanted**2, axis=-1)
+        left, ahead = square.copy(), square.copy()
         going = np.flatnonzero(np.isfinite(square))
         for _ in range(_STEPS):
             if not len(going):
@@ -42,9 +44,11 @@ def undo(displacement: Displacement, moved: Float64) -> Float64:
             back[taken], left[taken] = trial[better], distance[better]
             step[taken] = -np.linalg.solve(jacobian[better], rest[better][..., None])[..., 0]
             step[going[~better]] *= 0.5
-            moving = np.sum(step[going] ** 2, axis=-1) > _STUCK * square[going]
-            going = going[(left[going] > _ROUNDING * square[going]) & moving]
-        found = left <= _ROUNDING * square
+            sizes = np.sum(step[going] ** 2, axis=-1)
+            ahead[taken] = sizes[better]
+            least = np.minimum(left[going], ahead[going])
+            going = going[(least > _ROUNDING * square[going]) & (sizes > _STUCK * square[going])]
+        found = np.minimum(left, ahead) <= _ROUNDING * square
     return np.asarray(np.where(found[:, None], wanted + back, np.nan).reshape(moved.shape))
 
 

@@ -296,6 +296,5 @@ def _taken_apart(powers: Float64, origin: Float64, unit: Float64) -> tuple[Float
     terms = _substituted(powers, origin, unit)
     matrix = np.stack([terms[:, 1, 0], terms[:, 0, 1]], -1)
     higher = np.stack([terms[:, i, j] for i, j in _BENDING], -1)
-    with np.errstate(all="ignore"):
-        bending = np.linalg.solve(matrix, higher) if np.linalg.cond(matrix) < _WORST_CONDITION else higher
-    return terms[:, 0, 0], matrix, bending
+    bending = np.linalg.solve(matrix, higher) if np.linalg.cond(matrix) < _WORST_CONDITION else higher
+    return terms[:, 0, 0], matrix, np.asarray(bending, dtype=np.float64)

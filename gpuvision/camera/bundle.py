@@ -17,7 +17,7 @@ _STUCK = 1e16
 _UNDAMPED = 1e-11
 # ... or the residual is down to the rounding of pixel coordinates.
 _EXACT_PX = 1e-9
-_MEDIAN_OF_NORM = 1.1774  # of two normal deviates
+MEDIAN_OF_NORM = 1.1774  # of two normal deviates
 # 95 % efficiency for normal noise on two coordinates.
 _HUBER, _TUKEY = 1.5, 5.123
 
@@ -127,7 +127,7 @@ def residuals(views: Views, state: State) -> Floats:
 def robust_scale(views: Views, state: State) -> float:
     """Noise per coordinate from the median length of the residuals, pixels."""
     length = np.linalg.norm(residuals(views, state), axis=1)[views.weight > 0.0]
-    return max(float(np.median(length)) / _MEDIAN_OF_NORM, _EXACT_PX)
+    return max(float(np.median(length)) / MEDIAN_OF_NORM, _EXACT_PX)
 
 
 def solve(system: System, damping: float) -> tuple[Floats, Floats, Floats]:

@@ -14,14 +14,14 @@ _LOOSE_FOCUS = 0.02
 _LOOSE_CENTRE_PX = 3.0
 _NO_FOCUS = 0.3
 _FAR_CENTRE = 0.1
-_LEVEL = 0.01
+_LEVEL = 0.001
 _TOO_NOISY = 1.2
 _SIGNIFICANT = 3.0
 _BORDER_POINTS = 17
 
 
 def diagnose(
-    fit: CameraFit, size: tuple[int, int], *, focus: float, noise: float, outliers: int, mirrored: bool
+    fit: CameraFit, size: tuple[int, int], *, focus: float, settled: bool, noise: float, outliers: int, mirrored: bool
 ) -> tuple[str, ...]:
     """Return one sentence for each thing that the data leave open.
 
@@ -33,6 +33,8 @@ def diagnose(
         (columns, rows) of the images.
     focus
         Relative deviation of the virtual camera's f.
+    settled
+        Whether the fit found its end.
     noise
         What the residual says of the noise of one coordinate, pixels.
     outliers
@@ -49,6 +51,8 @@ def diagnose(
     ]
     if _folds(fit, size):
         said.append("the lens polynomial folds within the image: points beyond the fold cannot be undistorted")
+    if not settled:
+        said.append("the fit had not settled when it was stopped: the uncertainties are those of where it stood")
     if noise > _TOO_NOISY * fit.sigma:
         said.append(f"the residual is {noise / fit.sigma:.1f} times the noise given: the model does not suffice")
     if outliers:
@@ -61,9 +65,9 @@ def diagnose(
     return tuple(each for each in said if each)
 
 
-def fixes_focus(fit: CameraFit, focus: float) -> bool:
-    """Whether the data fix the focal length at all."""
-    return focus * _floor(fit) < _NO_FOCUS
+def fixes_focus(fit: CameraFit, focus: float, *, settled: bool) -> bool:
+    """Whether the data fix the focal length at all. A fit that found no end had better know it well."""
+    return focus * _floor(fit) < (_NO_FOCUS if settled else _LOOSE_FOCUS)
 
 
 def _floor(fit: CameraFit) -> float:

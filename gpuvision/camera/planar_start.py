@@ -7,11 +7,12 @@ the image's centre, common to all views, takes most of it out.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from gpuvision.camera.bundle import Views
+from gpuvision.camera.bundle import MEDIAN_OF_NORM, Views
 from gpuvision.camera.tilted_projection import Floats
 
 _ROUNDS = 4
@@ -27,13 +28,13 @@ class Flat(NamedTuple):
         (views, 3, 3): target's plane to (pixel - centre) / radius.
     radial
         The two coefficients, at that radius.
-    rms
-        What they leave, pixels per point.
+    noise
+        What they leave, pixels per coordinate.
     """
 
     homographies: Floats
     radial: Floats
-    rms: float
+    noise: float
 
 
 def flatten(views: Views, centre: Floats, radius: float, *, robust: bool = False, straight: bool = False) -> Flat:
@@ -71,8 +72,12 @@ def flatten(views: Views, centre: Floats, radius: float, *, robust: bool = False
         homographies = homographies + np.concatenate([steps, np.zeros((len(steps), 1))], axis=1).reshape(-1, 3, 3)
     residual, _, _ = _bent(plane, seen, homographies, radial)
     length = np.linalg.norm(residual, axis=1)[views.weight > 0.0]
-    spread = float(np.median(length) / np.sqrt(np.log(2.0))) if robust else float(np.sqrt(np.mean(length**2)))
-    return Flat(homographies @ back, radial, spread * radius)
+    if robust:
+        noise = float(np.median(length)) / MEDIAN_OF_NORM
+    else:
+        spare = max(views.coordinates - 8 * len(homographies) - 2, 1)
+        noise = math.sqrt(float(np.sum(length**2)) / spare)
+    return Flat(homographies @ back, radial, noise * radius)
 
 
 def _plane_units(views: Views) -> tuple[Floats, Floats]:

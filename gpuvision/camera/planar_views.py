@@ -32,9 +32,9 @@ LossName = Literal["linear", "huber", "tukey"]
 
 AUTOMATIC = ("none", "k1", "k1,k2", "tilt,k1", "tilt")
 """What ``model="auto"`` chooses from, smallest first; "tilt" is "tilt,k1,k2"."""
-_LEVEL = 0.01
+_LEVEL = 0.001
 # A start that ends this far above what free homographies leave is tried again from elsewhere.
-_SUFFICIENT = 1.5
+_SUFFICIENT = 1.3
 _RESCALINGS = 10
 _SAME_SCALE = 0.01
 _FEWEST_GOOD = 4
@@ -101,7 +101,7 @@ def fit_camera(
     model
         What is free beside focal length and centre: "none", or names out of k1, k2, p1, p2, k3 and tilt, joined by
         commas; "tilt" alone is "tilt,k1,k2". "auto" takes the smallest of "none", "k1", "k1,k2", "tilt,k1" and
-        "tilt" that an F test at 1 % does not refuse. Tangential terms beside a tilt are refused: they are
+        "tilt" that an F test at 0.1 % does not refuse. Tangential terms beside a tilt are refused: they are
         confounded.
     focal_length
         f' (fx of a tilted camera) where it is known, pixels: one view then suffices.
@@ -144,7 +144,7 @@ def fit_camera(
         middle=middle if known_centre is None else np.array(known_centre),
         radius=radius,
         # Tukey's loss has many minima, Huber's one near the start: models are searched and compared under that.
-        loss=Loss("linear" if loss == "linear" else "huber", flat.rms if sigma is None else sigma),
+        loss=Loss("linear" if loss == "linear" else "huber", flat.noise if sigma is None else sigma),
         scale_is_given=sigma is not None,
         aspect=free_aspect,
         focal_length=known_f,
@@ -204,7 +204,7 @@ def _starts(task: _Task, chart: Chart) -> Iterator[State]:
         yield _start(task, chart, *closed)
     # v = f tan(alpha) away from the centre, about it in eight directions; f' as given or over the usual range.
     scales = [0.6, 1.2, 2.5, 5.0, 10.0] if task.focal_length is None else [task.focal_length / task.radius]
-    for alpha in (0.0, 0.25, 0.5, 0.8) if chart.tilt else (0.0,):
+    for alpha in (0.0, 0.35, 0.7) if chart.tilt else (0.0,):
         for scale in scales:
             for direction in np.arange(8.0 if alpha else 1.0) * math.pi / 4.0:
                 v = -scale * math.sin(alpha) * np.array([math.cos(direction), math.sin(direction)])
@@ -237,7 +237,7 @@ def _searched(task: _Task, model: str) -> _Candidate:
             continue
         if best is None or tried.state.cost < best.state.cost:
             best = tried
-        if best.state.settled and noise_of(task.views, chart, best.state, best.loss) < _SUFFICIENT * task.flat.rms:
+        if noise_of(task.views, chart, best.state, best.loss) < _SUFFICIENT * task.flat.noise:
             break
     if best is None:
         raise ValueError("no camera explains these views: are target and image points paired, and image_size right?")
@@ -326,7 +326,7 @@ def _result(task: _Task, candidates: Sequence[_Candidate], sigma: float | None, 
             if each is not compared
         ),
     )
-    if not fixes_focus(fit, focus):
+    if not fixes_focus(fit, focus, settled=state.settled):
         raise ValueError(
             "the views do not fix the focal length: views at other angles to the camera, or focal_length=, are needed"
         )
@@ -334,7 +334,10 @@ def _result(task: _Task, candidates: Sequence[_Candidate], sigma: float | None, 
     doubtful = int(np.sum(length > _OUTLIER * robust_scale(task.views, state))) if chosen.loss.kind == "linear" else 0
     mirrored = bool((np.linalg.det(task.flat.homographies) < 0.0).all())
     return replace(
-        fit, warnings=diagnose(fit, task.size, focus=focus, noise=noise, outliers=doubtful, mirrored=mirrored)
+        fit,
+        warnings=diagnose(
+            fit, task.size, focus=focus, settled=state.settled, noise=noise, outliers=doubtful, mirrored=mirrored
+        ),
     )
 
 

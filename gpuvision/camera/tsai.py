@@ -31,6 +31,7 @@ _ROUNDS = 20
 _SETTLED = 1e-12
 _NO_FOCUS = 0.3
 _BEST_NOISE_PX = 0.01
+_NO_FOCUS_SAID = "the view fixes no focal length: the target is too parallel to the sensor, or the centre wrong; give f"
 
 
 class Alignment(NamedTuple):
@@ -145,11 +146,11 @@ def fit_tsai(
     fits = [_second_stage(plane, offset, each, shift, focal_length, distorted) for each in alignment.rotations]
     possible = [fit for fit in fits if fit is not None]
     if not possible:
-        raise ValueError("no focal length explains this view: is the centre right, and the sensor not tilted?")
+        raise ValueError(_NO_FOCUS_SAID)
     values, deviation, rms, rotation = min(possible, key=lambda fit: fit[2])
     f, distance, kappa = values.tolist()
     if deviation > _NO_FOCUS * f:
-        raise ValueError("the target is too parallel to the sensor to tell f from its distance: give focal_length=")
+        raise ValueError(_NO_FOCUS_SAID)
     return TsaiFit(
         focal_length=f,
         lens=Lens(k1=kappa, centre=(float(centre[0]), float(centre[1]))) if distorted else None,

@@ -16,6 +16,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gpuvision.camera.camera import Camera
     from gpuvision.camera.camera_fit import CameraFit
     from gpuvision.camera.chessboard import find_chessboard
     from gpuvision.camera.dots import find_dots
@@ -24,9 +25,11 @@ if TYPE_CHECKING:
     from gpuvision.camera.line_pattern import find_lines
     from gpuvision.camera.pattern import PatternGrid
     from gpuvision.camera.planar_views import fit_camera
+    from gpuvision.camera.polynomial import PlanePolynomial
     from gpuvision.camera.scheimpflug import TiltedSensor
     from gpuvision.camera.target_views import view_of
     from gpuvision.camera.tsai import fit_tsai
+    from gpuvision.camera.undistort_points import UndistortedPoints, UndistortPoints
     from gpuvision.host import Device, GpuVisionError, Pipeline, Step, host_view, open_recording
     from gpuvision.ranging.line import LineReading, LineReadout
     from gpuvision.ranging.psd import PsdNoise, PsdReading, PsdReadout
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
 
 # Names come with their first use: the command is there at once, and an interrupt while it loads is not a stack trace.
 _PLACES = {
+    "Camera": "gpuvision.camera.camera",
     "CameraFit": "gpuvision.camera.camera_fit",
     "Device": "gpuvision.host",
     "GpuVisionError": "gpuvision.host",
@@ -47,6 +51,7 @@ _PLACES = {
     "LineReadout": "gpuvision.ranging.line",
     "PatternGrid": "gpuvision.camera.pattern",
     "Pipeline": "gpuvision.host",
+    "PlanePolynomial": "gpuvision.camera.polynomial",
     "PsdNoise": "gpuvision.ranging.psd",
     "PsdReading": "gpuvision.ranging.psd",
     "PsdReadout": "gpuvision.ranging.psd",
@@ -61,6 +66,8 @@ _PLACES = {
     "StraightTransport": "gpuvision.ranging.range_image",
     "TiltedSensor": "gpuvision.camera.scheimpflug",
     "Triangulation": "gpuvision.ranging.triangulation",
+    "UndistortPoints": "gpuvision.camera.undistort_points",
+    "UndistortedPoints": "gpuvision.camera.undistort_points",
     "find_chessboard": "gpuvision.camera.chessboard",
     "find_dots": "gpuvision.camera.dots",
     "find_lines": "gpuvision.camera.line_pattern",
@@ -73,6 +80,7 @@ _PLACES = {
 }
 
 __all__ = [
+    "Camera",
     "CameraFit",
     "Device",
     "GpuVisionError",
@@ -83,6 +91,7 @@ __all__ = [
     "LineReadout",
     "PatternGrid",
     "Pipeline",
+    "PlanePolynomial",
     "PsdNoise",
     "PsdReading",
     "PsdReadout",
@@ -97,6 +106,8 @@ __all__ = [
     "StraightTransport",
     "TiltedSensor",
     "Triangulation",
+    "UndistortPoints",
+    "UndistortedPoints",
     "find_chessboard",
     "find_dots",
     "find_lines",

@@ -52,13 +52,13 @@ class _Task:
     masks: tuple[Mask, ...]
     size: tuple[int, int]
     flat: Flat
-    middle: Floats
+    origin: Floats
     radius: float
     loss: Loss
-    scale_is_given: bool
+    sigma: float | None
     aspect: bool
     focal_length: float | None
-    centre: tuple[float, float] | None
+    centre_is_known: bool
 
     def chart(self, model: str) -> Chart:
         tilt, coefficients = _parsed(model)
@@ -67,7 +67,7 @@ class _Task:
             tilt=tilt,
             aspect=self.aspect,
             focal_length=self.focal_length,
-            centre=self.centre is None,
+            centre=not self.centre_is_known,
         )
 
 
@@ -129,31 +129,55 @@ def fit_camera(
         raise ValueError(f"sigma is {sigma}, expected a number of pixels above 0")
     models = list(AUTOMATIC) if model == "auto" else [model]
     _parsed(model if model != "auto" else "none")
+    task = _prepared(views, image_size, focal_length, centre, loss, sigma, free_aspect)
+    models = _check_enough(task, models)
+    largest = _searched(task, models[-1])
+    candidates = [_refined(task, each, largest) for each in models[:-1]] + [largest]
+    p_values = [_p_value(task, each, largest) for each in candidates]
+    compared = next(
+        each
+        for each, p in zip(candidates, p_values, strict=True)
+        if each is largest or (p >= _LEVEL and _is_physical(task, each.state))
+    )
+    chosen = _without_outliers(task, compared) if loss == "tukey" else compared
+    alternatives = tuple(
+        _alternative(task, each, p, chosen.state)
+        for each, p in zip(candidates, p_values, strict=True)
+        if each is not compared
+    )
+    return _result(task, chosen, alternatives)
+
+
+def _prepared(
+    views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]],
+    image_size: tuple[int, int],
+    focal_length: float | None,
+    centre: tuple[float, float] | None,
+    loss: LossName,
+    sigma: float | None,
+    free_aspect: bool,
+) -> _Task:
+    """Check and pack what was given, and fit the homographies."""
     packed, masks = pack(views)
     size = (int(image_size[0]), int(image_size[1]))
-    middle = 0.5 * (np.array(size) - 1.0)
+    known = None if centre is None else numbers(centre, (2,), "centre (column, row)")
+    origin = 0.5 * (np.array(size) - 1.0) if known is None else np.array(known)
     radius = 0.5 * math.hypot(*size)
-    known_f = None if focal_length is None else _positive(focal_length, "focal_length")
-    known_centre = None if centre is None else numbers(centre, (2,), "centre (column, row)")
-    flat = flatten(packed, middle if known_centre is None else np.array(known_centre), radius, robust=loss != "linear")
-    task = _Task(
+    flat = flatten(packed, origin, radius, robust=loss != "linear")
+    return _Task(
         views=packed,
         masks=masks,
         size=size,
         flat=flat,
-        middle=middle if known_centre is None else np.array(known_centre),
+        origin=origin,
         radius=radius,
         # Tukey's loss has many minima, Huber's one near the start: models are searched and compared under that.
         loss=Loss("linear" if loss == "linear" else "huber", flat.noise if sigma is None else sigma),
-        scale_is_given=sigma is not None,
+        sigma=sigma,
         aspect=free_aspect,
-        focal_length=known_f,
-        centre=known_centre,
+        focal_length=None if focal_length is None else _positive(focal_length, "focal_length"),
+        centre_is_known=known is not None,
     )
-    models = _check_enough(task, models)
-    largest = _searched(task, models[-1])
-    candidates = [_refined(task, each, largest) for each in models[:-1]] + [largest]
-    return _result(task, candidates, sigma, redescend=loss == "tukey")
 
 
 def _positive(value: float, what: str) -> float:
@@ -212,11 +236,11 @@ def _starts(task: _Task, chart: Chart) -> Iterator[State]:
 
 
 def _start(task: _Task, chart: Chart, f: float, aspect: float, v: Floats) -> State:
-    """Return the state of a virtual camera, in units of the image's radius about its middle."""
+    """Return the state of a virtual camera, in units of the image's radius about its middle or the known centre."""
     rotations, translations = poses(task.flat.homographies, f, aspect, v)
     square = f * f + float(v @ v)
     values = np.zeros(11)
-    values[:6] = [f * task.radius, aspect, *(v * task.radius + task.middle), *task.middle]
+    values[:6] = [f * task.radius, aspect, *(v * task.radius + task.origin), *task.origin]
     if not chart.tilt and chart.centre:
         values[4:6] = values[2:4]
         square = f * f
@@ -247,7 +271,7 @@ def _searched(task: _Task, model: str) -> _Candidate:
 def _fitted(task: _Task, candidate: _Candidate) -> _Candidate:
     """Minimise the loss; a robust one at the scale that its own residuals have."""
     state, loss = candidate.state, candidate.loss
-    for _ in range(1 if loss.kind == "linear" or task.scale_is_given else _RESCALINGS):
+    for _ in range(1 if loss.kind == "linear" or task.sigma is not None else _RESCALINGS):
         used = loss
         state = adjust(task.views, candidate.chart, state, used)
         if not np.isfinite(state.cost) or loss.kind == "linear":
@@ -295,19 +319,11 @@ def _refined(task: _Task, model: str, largest: _Candidate) -> _Candidate:
     return _Candidate(model, chart, state, largest.loss)
 
 
-def _result(task: _Task, candidates: Sequence[_Candidate], sigma: float | None, redescend: bool) -> CameraFit:
-    """Choose the smallest sufficient model and describe it."""
-    largest = candidates[-1]
-    p_values = [_p_value(task, each, largest) for each in candidates]
-    compared = next(
-        each
-        for each, p in zip(candidates, p_values, strict=True)
-        if each is largest or (p >= _LEVEL and _is_physical(task, each.state))
-    )
-    chosen = _without_outliers(task, compared) if redescend else compared
+def _result(task: _Task, chosen: _Candidate, alternatives: tuple[Alternative, ...]) -> CameraFit:
+    """Describe a fit, with what its data leave open."""
     state, chart = chosen.state, chosen.chart
     noise = noise_of(task.views, chart, state, chosen.loss)
-    covariance, pose_covariance, focus = covariances(task.views, chart, state, chosen.loss, sigma)
+    covariance, pose_covariance, focus = covariances(task.views, chart, state, chosen.loss, task.sigma)
     errors = residuals(task.views, state)
     fit = CameraFit(
         camera=camera_of(state.numbers),
@@ -317,28 +333,26 @@ def _result(task: _Task, candidates: Sequence[_Candidate], sigma: float | None, 
         covariance=covariance,
         pose_covariance=pose_covariance,
         rms_px=_rms(task, state),
-        sigma=noise if sigma is None else sigma,
+        sigma=noise if task.sigma is None else task.sigma,
         residuals=_unpacked(task, errors),
         iterations=state.steps,
-        alternatives=tuple(
-            _alternative(task, each, p, state)
-            for each, p in zip(candidates, p_values, strict=True)
-            if each is not compared
-        ),
+        alternatives=alternatives,
     )
     if not fixes_focus(fit, focus, settled=state.settled):
         raise ValueError(
             "the views do not fix the focal length: views at other angles to the camera, or focal_length=, are needed"
         )
-    length = np.linalg.norm(errors, axis=1)
-    doubtful = int(np.sum(length > _OUTLIER * robust_scale(task.views, state))) if chosen.loss.kind == "linear" else 0
-    mirrored = bool((np.linalg.det(task.flat.homographies) < 0.0).all())
-    return replace(
+    doubtful = np.linalg.norm(errors, axis=1) > _OUTLIER * robust_scale(task.views, state)
+    warnings = diagnose(
         fit,
-        warnings=diagnose(
-            fit, task.size, focus=focus, settled=state.settled, noise=noise, outliers=doubtful, mirrored=mirrored
-        ),
+        task.size,
+        focus=focus,
+        settled=state.settled,
+        noise=noise,
+        outliers=int(doubtful.sum()) if chosen.loss.kind == "linear" else 0,
+        mirrored=bool((np.linalg.det(task.flat.homographies) < 0.0).all()),
     )
+    return replace(fit, warnings=warnings)
 
 
 def _rms(task: _Task, state: State) -> float:

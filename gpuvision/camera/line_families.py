@@ -18,7 +18,7 @@ LineFamilies = Sequence[Sequence[npt.ArrayLike]]
 
 _FEWEST = 3
 """Points of a line that say something about its straightness."""
-_SPREAD = 1e-9
+_SPREAD = 1e-7
 """Half-diagonals below which points of a line lie on one place."""
 
 
@@ -105,7 +105,9 @@ class PackedLines:
     starts, counts
         First point of each line, and how many it has (lines,).
     family
-        Index of each line's family (lines,).
+        Index of each line's family (lines,); lines of a family lie side by side.
+    family_starts
+        First line of each family that has any.
     families
         How many there are.
     origin, unit
@@ -122,6 +124,7 @@ class PackedLines:
     starts: Index
     counts: Index
     family: Index
+    family_starts: Index
     families: int
     origin: Float64
     unit: float
@@ -131,10 +134,6 @@ class PackedLines:
     def sums(self, values: Float64) -> Float64:
         """Sum of values (..., n) over each line, shape (..., lines)."""
         return np.asarray(np.add.reduceat(values, self.starts, axis=-1))
-
-    def family_sums(self, values: Float64) -> Float64:
-        """Sum of values (lines, ...) over the lines of each family that has any."""
-        return np.asarray(np.add.reduceat(values, np.flatnonzero(np.diff(self.family, prepend=-1)), axis=0))
 
 
 def pack(given: LineFamilies) -> PackedLines:
@@ -175,16 +174,18 @@ def pack(given: LineFamilies) -> PackedLines:
 def _normalised(
     places: Float64, line: Index, counts: Index, family: Index, families: int, used: npt.NDArray[np.bool_]
 ) -> PackedLines:
-    low, high = places.min(axis=0), places.max(axis=0)
+    x, y = places.T.copy()
+    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
     unit = 0.5 * float(np.hypot(*(high - low)))
     origin = 0.5 * (low + high)
     if not unit > 0.0:
         raise ValueError("all points lie on one place; expected lines across the image")
-    x, y = np.ascontiguousarray(((places - origin) / unit).T)
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    packed = PackedLines(x, y, line, starts, counts, family, families, origin, unit, 0.5 * (high - low) / unit, used)
-    both = np.stack([x, y])
-    widths = np.max(np.maximum.reduceat(both, starts, axis=1) - np.minimum.reduceat(both, starts, axis=1), axis=0)
-    if widths.min() < _SPREAD:
-        raise ValueError(f"all points of line {int(np.argmin(widths))} lie on one place; expected points along it")
+    x, y = (x - origin[0]) / unit, (y - origin[1]) / unit
+    starts = np.cumsum(counts) - counts
+    family_starts = np.flatnonzero(np.diff(family, prepend=-1))
+    corner = 0.5 * (high - low) / unit
+    packed = PackedLines(x, y, line, starts, counts, family, family_starts, families, origin, unit, corner, used)
+    spread = packed.sums(x * x + y * y) / counts - (packed.sums(x) / counts) ** 2 - (packed.sums(y) / counts) ** 2
+    if spread.min() < _SPREAD**2:
+        raise ValueError(f"all points of line {int(np.argmin(spread))} lie on one place; expected points along it")
     return packed

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import scipy.special
 
 from gpuvision.camera.line_families import Float64, PackedLines
-from gpuvision.camera.straightness import Parameters, bound_lines, projected_columns
+from gpuvision.camera.straightness import Parameters, bound_lines, inner, projected_columns
 from gpuvision.camera.variable_projection import Minimum, linear_start, minimise
 
 Loss = Literal["squared", "huber", "tukey"]
@@ -36,8 +36,7 @@ def same_points(packed: PackedLines) -> npt.NDArray[np.intp]:
 def line_parameters(packed: PackedLines, at: Parameters) -> int:
     """How many numbers say where the lines and their vanishing points are."""
     bound = bound_lines(packed, at)
-    points = len(np.unique(packed.family[bound]))
-    return 2 * len(bound) - int(np.count_nonzero(bound)) + 2 * points
+    return 2 * len(bound) - int(np.count_nonzero(bound)) + 2 * len(set(packed.family[bound].tolist()))
 
 
 def noise_dimensions(owner: npt.NDArray[np.intp]) -> int:
@@ -91,7 +90,7 @@ def covariance(
     normals *= found.here.inverse
     return (
         _sandwich(
-            columns @ columns.T,
+            inner(columns, columns),
             [_per_point(columns * normal, owner) for normal in normals],
             len(found.at.k),
             keep_centre,
@@ -117,7 +116,7 @@ def robust_covariance(
     slope = influence_slope(found.here.distance / scale, loss)
     spread = _per_point(columns * found.here.residual, owner)
     enlarged = len(weight) / max(len(weight) - line_parameters(packed, found.at) - len(columns), 1)
-    return enlarged * _sandwich((bread * slope) @ bread.T, [spread], len(found.at.k), keep_centre)
+    return enlarged * _sandwich(inner(bread * slope, bread), [spread], len(found.at.k), keep_centre)
 
 
 def _per_point(values: Float64, owner: npt.NDArray[np.intp]) -> Float64:
@@ -127,19 +126,19 @@ def _per_point(values: Float64, owner: npt.NDArray[np.intp]) -> Float64:
 
 def _sandwich(bread: Float64, spreads: list[Float64], order: int, keep_centre: bool) -> Float64:
     """Return bread^-1 (sum of spread spread') bread^-1; infinite for what the data do not fix, 0 for what is known."""
-    meat = sum((each @ each.T for each in spreads), np.zeros_like(bread))
+    meat = sum((inner(each, each) for each in spreads), np.zeros_like(bread))
     kept = np.flatnonzero(bread.diagonal() > 0.0)
     if keep_centre:
         kept = kept[(kept < order) | (kept >= order + 2)]
-    inner = np.ix_(kept, kept)
+    fixed = np.ix_(kept, kept)
     scale = 1.0 / np.sqrt(bread.diagonal()[kept])
-    values, vectors = np.linalg.eigh(bread[inner] * np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(bread[fixed] * np.outer(scale, scale))
     seen = values > _SINGULAR
     turned = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T * np.outer(scale, scale)
     found = np.diag(np.full(len(bread), np.inf))
     if keep_centre and order:
         found[[order, order + 1], [order, order + 1]] = 0.0
-    found[inner] = turned @ meat[inner] @ turned
+    found[fixed] = turned @ meat[fixed] @ turned
     lost = kept[np.any(np.abs(vectors[:, ~seen]) > math.sqrt(_SINGULAR), axis=1)]
     found[lost, lost] = np.inf
     return found
@@ -168,8 +167,8 @@ def robust_start(packed: PackedLines, centre: Float64 | None) -> tuple[Parameter
     weight = np.ones(len(packed.x))
     for _ in range(_ROUNDS):
         start = linear_start(packed, centre, weight)
-        scale = _NORMAL_MAD * float(np.median(np.abs(start.distance)))
-        weight = weights(start.distance, max(scale, _ROUNDING), "huber")
+        distance = start.distances(packed, weight)
+        weight = weights(distance, max(_NORMAL_MAD * float(np.median(np.abs(distance))), _ROUNDING), "huber")
     return start.at, weight
 
 

@@ -103,6 +103,16 @@ class Evaluation:
     cost: float
 
 
+def inner(first: Float64, second: Float64) -> Float64:
+    """Sum products over the last axis, of each with each: ``first @ second.T``.
+
+    Not by BLAS, whose threads wait for each other longer than the sums take, above all beside an OpenCL runtime's.
+    """
+    if first.ndim == 1:
+        return np.asarray(np.einsum("n,n->", first, second))
+    return np.asarray(np.einsum("in,jn->ij", first, second))
+
+
 def undistort(packed: PackedLines, k: Float64, centre: Float64) -> Undistorted:
     """Undo a lens of at most k1 and k2."""
     k1, k2 = (*k.tolist(), 0.0, 0.0)[:2]
@@ -220,7 +230,9 @@ def evaluate(
         root = np.sqrt(weight)
         inverse *= root
         residual = distance * root
-    return Evaluation(points, lines, nx, ny, along, spread, inverse, distance, residual, float(residual @ residual))
+    return Evaluation(
+        points, lines, nx, ny, along, spread, inverse, distance, residual, float(inner(residual, residual))
+    )
 
 
 def best_lines(packed: PackedLines, at: Parameters, moments: Float64) -> LineSet:
@@ -332,16 +344,18 @@ class NormalEquations(NamedTuple):
 
 def normal_equations(packed: PackedLines, at: Parameters, here: Evaluation, slopes: Columns) -> NormalEquations:
     """Return the normal equations of what is sought, the lines' columns projected out."""
-    cross = np.stack([packed.sums(line * slopes.lens) for line in slopes.line])
-    own = np.stack([packed.sums(slopes.line[i] * slopes.line[j]) for i, j in ((0, 0), (0, 1), (1, 1))])
-    taken = np.stack([own[2] * cross[0] - own[1] * cross[1], own[0] * cross[1] - own[1] * cross[0]])
+    cross = np.array([packed.sums(line * slopes.lens) for line in slopes.line])
+    own = packed.sums(np.array([slopes.line[i] * slopes.line[j] for i, j in ((0, 0), (0, 1), (1, 1))]))
+    taken = np.empty_like(cross)
+    np.subtract(own[2] * cross[0], own[1] * cross[1], out=taken[0])
+    np.subtract(own[0] * cross[1], own[1] * cross[0], out=taken[1])
     taken /= own[0] * own[2] - own[1] ** 2
     bound = bound_lines(packed, at)
     sideways = None
     if at.vanishing is not None and bound.any():
         sideways = _pencils(packed, at.vanishing, here.lines, own, cross, bound)
         taken[..., bound] = sideways.taken
-    product = slopes.lens @ slopes.lens.T - np.tensordot(taken, cross, axes=((0, 2), (0, 2)))
+    product = inner(slopes.lens, slopes.lens) - sum(inner(a, b) for a, b in zip(taken, cross, strict=True))
     if at.vanishing is None:
         return NormalEquations(product[:-1, :-1], product[:-1, -1], taken)
     lens, tangents = len(product) - 1, 2 * packed.families

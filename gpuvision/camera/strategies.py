@@ -21,6 +21,7 @@ from gpuvision.camera.straightness import (
     best_lines,
     columns,
     evaluate,
+    inner,
     moments,
     normal_equations,
     undistort,
@@ -67,7 +68,7 @@ class _Objective:
     def cost(self, lens: Float64, points: Float64) -> float:
         """Sum of squares."""
         distance = self.distances(lens, points)[2]
-        return float(distance @ distance)
+        return float(inner(distance, distance))
 
     def slopes(self, lens: Float64, points: Float64) -> tuple[Float64, Float64]:
         """Distances (n,) and their derivatives (parameters, n) by the lens, the lines where they are."""
@@ -99,7 +100,7 @@ def _steepest_descent(objective: _Objective, lens: Float64, points: Float64) -> 
     reach = 1e-3
     for _ in range(_DESCENTS):
         distance, slopes = objective.slopes(lens, points)
-        gradient, here = slopes @ distance, float(distance @ distance)
+        gradient, here = inner(slopes, distance[None])[:, 0], float(inner(distance, distance))
         length = float(np.linalg.norm(gradient))
         if length == 0.0:
             break
@@ -115,8 +116,10 @@ def _steepest_descent(objective: _Objective, lens: Float64, points: Float64) -> 
 
 def _gauss_newton(objective: _Objective, lens: Float64, points: Float64) -> Float64:
     distance, slopes = objective.slopes(lens, points)
-    here = float(distance @ distance)
-    step = np.linalg.lstsq(slopes.T, -distance, rcond=1e-10)[0]
+    here = float(inner(distance, distance))
+    scale = 1.0 / np.sqrt(np.maximum(np.einsum("in,in->i", slopes, slopes), 1e-30))
+    matrix, gradient = inner(slopes * scale[:, None], slopes * scale[:, None]), inner(slopes, distance[None])[:, 0]
+    step = -scale * np.linalg.lstsq(matrix, scale * gradient, rcond=1e-12)[0]
     for _ in range(30):
         if objective.cost(lens + step, points) < here:
             return np.asarray(lens + step)

@@ -27,8 +27,8 @@ _FARTHEST = 4.0
 """Half-diagonals that the centre may lie off the middle: without a bound the data pull it away (k1 -> 0)."""
 _LEAST_SLOPE = 1e-3
 """Of r (1 + k1 r^2 + ...) over the data, in parts of that at the centre."""
-_NEGLIGIBLE = 1e-3
-"""What another step would still gain, in variances, at the end: 0.03 standard deviations of the parameters."""
+_NEGLIGIBLE = 5e-3
+"""What another step would still gain, in variances, at the end: 0.07 standard deviations of the parameters."""
 _ROUNDING = 64.0 * float(np.finfo(np.float64).eps) ** 2
 _FLAT = 1e-8
 """Mean square of a bend, in half-diagonals, below which the lines do not have it."""
@@ -164,14 +164,22 @@ class LinearStart(NamedTuple):
         How many ways the lines could bend: 3 fix k1 and the centre; 1 fixes k1 about a known centre.
     gain
         By how much the sum of squares falls from that without a lens.
-    distance
-        Distances (n,) that are left.
+    slopes, taken, mixed
+        Columns, what of the lines is in them, and how much of each is in the distances that are left.
     """
 
     at: Parameters
     rank: int
     gain: float
-    distance: Float64
+    slopes: Columns
+    taken: Float64
+    mixed: Float64
+
+    def distances(self, packed: PackedLines, weight: Float64) -> Float64:
+        """Distances (n,) that are left."""
+        own = np.einsum("k,ikl->il", self.mixed, self.taken)[:, packed.line]
+        left = np.einsum("k,kn->n", self.mixed, self.slopes.lens) - np.sum(own * self.slopes.line, axis=0)
+        return np.asarray(left / np.sqrt(weight))
 
 
 def linear_start(packed: PackedLines, centre: Float64 | None = None, weight: Float64 | None = None) -> LinearStart:
@@ -196,29 +204,28 @@ def linear_start(packed: PackedLines, centre: Float64 | None = None, weight: Flo
     vectors = vectors[:, seen]
     step = -vectors @ (vectors.T @ normal.gradient / values[seen])
     k1, *moved = step.tolist()
-    mixed = np.append(step, 1.0)
-    own = np.tensordot(mixed, normal.taken, axes=(0, 1))[:, packed.line]
-    left = (mixed @ slopes.lens - own[0] * slopes.line[0] - own[1] * slopes.line[1]) / here.inverse
     if centre is None and math.hypot(*moved) < abs(k1):
         known = np.array(moved) / k1
     k = np.array([k1])
     while not monotone(k, reach(packed, known), least=_LEAST_SLOPE):
         k *= 0.7
+    gain = -float(step @ normal.gradient)
     return LinearStart(
-        Parameters(k, known, None), int(np.count_nonzero(seen)), -float(step @ normal.gradient), np.asarray(left)
+        Parameters(k, known, None), int(np.count_nonzero(seen)), gain, slopes, normal.taken, np.append(step, 1.0)
     )
 
 
 def vanishing_start(packed: PackedLines, lines: LineSet) -> Float64:
     """Return the point nearest to each family's lines, as unit vectors (families, 3)."""
-    rows = np.stack(lines, axis=-1)
-    present = np.unique(packed.family)
+    rows = np.stack(lines)
+    outer = rows[:, None] * rows
+    present = packed.family[packed.family_starts]
     found = np.tile([0.0, 0.0, 1.0], (packed.families, 1))
-    weight = np.ones(len(rows))
+    weight = 1.0
     for _ in range(2):
-        scatter = packed.family_sums(rows[:, :, None] * rows[:, None, :] * weight[:, None, None])
-        found[present] = np.linalg.eigh(scatter)[1][:, :, 0]
+        scatter = np.add.reduceat(outer * weight, packed.family_starts, axis=-1)
+        found[present] = np.linalg.eigh(scatter.transpose(2, 0, 1))[1][:, :, 0]
         # Of far points the lines' directions alone say little, so each line is weighed by its error at the point.
-        point = found[packed.family]
-        weight = 1.0 / ((rows[:, 0] * point[:, 1] - rows[:, 1] * point[:, 0]) ** 2 + point[:, 2] ** 2)
+        x, y, w = found[packed.family].T
+        weight = 1.0 / ((rows[0] * y - rows[1] * x) ** 2 + w * w)
     return found

@@ -68,11 +68,24 @@ def test_strategies_minimise_what_the_thesis_says(points: np.ndarray, strategy: 
     assert found.evaluations > found.minimum.steps == 3
 
 
+def test_fit_by_a_strategy(points: np.ndarray) -> None:
+    """A fit says what the strategy reached, in its own rounds; ours is never worse."""
+    families = grid_lines(points)
+    ours, theirs = (
+        fit_lens(families, model="k1", lines="vanishing", strategy=each)
+        for each in ("variable_projection", "gauss_newton")
+    )
+    assert theirs.rms_px > ours.rms_px * (1.0 - 1e-6)
+    assert theirs.iterations > ours.iterations
+
+
+@pytest.mark.slow
 def test_the_simplex_ends_where_ours_does(points: np.ndarray) -> None:
     families = grid_lines(points)
     ours = fit_lens(families, model="k1", lines="vanishing")
     theirs = fit_lens(families, model="k1", lines="vanishing", strategy="nelder_mead")
-    assert theirs.iterations > ours.iterations
     # The thesis' distances shrink with the lens, which pulls it off by less than its uncertainty.
-    assert np.all(np.abs(theirs.values - ours.values)[:3] < 0.5 * np.sqrt(np.diag(ours.covariance))[:3])
-    assert theirs.covariance == pytest.approx(ours.covariance, rel=0.1, abs=0.02 * np.max(ours.covariance))
+    sigma = np.sqrt(np.diag(ours.covariance))
+    assert np.all(np.abs(theirs.values - ours.values)[:3] < 0.5 * sigma[:3])
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(theirs.covariance / scale, ours.covariance / scale, atol=0.1)

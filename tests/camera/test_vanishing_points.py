@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
+from gpuvision.camera.dots import find_dots
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.line_families import grid_lines
+from gpuvision.camera.line_pattern import find_lines
 from gpuvision.camera.vanishing_points import LensFit, fit_lens, straightness_px
 from reference.straight_lines import bound, plane_grid, radial_lens, straightness
 
@@ -372,3 +377,24 @@ def test_a_family_of_one_line_is_free(rng: np.random.Generator) -> None:
     assert np.all(np.isnan(fit.vanishing_points[1:]))
     assert np.all(np.abs(errors(fit, lens)) < 5.0)
     assert any("families [1, 2] have fewer than two lines" in each for each in fit.warnings)
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "raw", "best", "centre"),
+    [
+        ("dot_pattern_01", 3.3, 0.079, (1257.0, 1020.0)),
+        ("dot_pattern_02", 0.94, 0.695, None),
+        ("line_pattern_01", 0.6, 0.117, None),
+    ],
+)
+def test_real_targets(data: Path, name: str, raw: float, best: float, centre: tuple[float, float] | None) -> None:
+    """As straight as the best known, and nearly as well with the model chosen from the data."""
+    image = cv2.imread(str(data / "calibration" / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
+    families = find_lines(image) if name.startswith("line") else grid_lines(find_dots(image).points)
+    assert straightness_px(families) == pytest.approx(raw, rel=0.2)
+    for lines, model in (("free", "k1,k2"), ("auto", "auto")):
+        fit = fit_lens(families, lines=lines, model=model)
+        assert straightness_px(families, fit.lens) <= best
+        if centre is not None:
+            assert np.hypot(*np.subtract(fit.lens.centre, centre)) < 3.0

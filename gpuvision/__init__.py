@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from gpuvision.camera.chessboard import find_chessboard
     from gpuvision.camera.dots import find_dots
     from gpuvision.camera.lens import Lens
+    from gpuvision.camera.lens_fit import LensFit
     from gpuvision.camera.lens_known import fit_tilt
+    from gpuvision.camera.line_families import grid_lines
     from gpuvision.camera.line_pattern import find_lines
     from gpuvision.camera.pattern import PatternGrid
     from gpuvision.camera.planar_views import fit_camera
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from gpuvision.camera.target_views import view_of
     from gpuvision.camera.tsai import fit_tsai
     from gpuvision.camera.undistort_points import UndistortedPoints, UndistortPoints
+    from gpuvision.camera.vanishing_points import fit_lens, straightness_px
     from gpuvision.host import Device, GpuVisionError, Pipeline, Step, host_view, open_recording
     from gpuvision.ranging.line import LineReading, LineReadout
     from gpuvision.ranging.psd import PsdNoise, PsdReading, PsdReadout
@@ -47,6 +50,7 @@ _PLACES = {
     "Grid": "gpuvision.ranging.regrid",
     "HeightMap": "gpuvision.ranging.regrid",
     "Lens": "gpuvision.camera.lens",
+    "LensFit": "gpuvision.camera.lens_fit",
     "LineReading": "gpuvision.ranging.line",
     "LineReadout": "gpuvision.ranging.line",
     "PatternGrid": "gpuvision.camera.pattern",
@@ -72,10 +76,13 @@ _PLACES = {
     "find_dots": "gpuvision.camera.dots",
     "find_lines": "gpuvision.camera.line_pattern",
     "fit_camera": "gpuvision.camera.planar_views",
+    "fit_lens": "gpuvision.camera.vanishing_points",
     "fit_tilt": "gpuvision.camera.lens_known",
     "fit_tsai": "gpuvision.camera.tsai",
+    "grid_lines": "gpuvision.camera.line_families",
     "host_view": "gpuvision.host",
     "open_recording": "gpuvision.host",
+    "straightness_px": "gpuvision.camera.vanishing_points",
     "view_of": "gpuvision.camera.target_views",
 }
 
@@ -87,6 +94,7 @@ __all__ = [
     "Grid",
     "HeightMap",
     "Lens",
+    "LensFit",
     "LineReading",
     "LineReadout",
     "PatternGrid",
@@ -112,10 +120,13 @@ __all__ = [
     "find_dots",
     "find_lines",
     "fit_camera",
+    "fit_lens",
     "fit_tilt",
     "fit_tsai",
+    "grid_lines",
     "host_view",
     "open_recording",
+    "straightness_px",
     "view_of",
 ]
 

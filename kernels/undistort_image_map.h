@@ -5,9 +5,9 @@
 
 // Heads: column and row that the run's places count from; what to do, the number of bands, and where the windows of
 // three vectors begin, in bits; a number.
-#define HEAD_WHAT(head) ((head).z & 15)
-#define HEAD_BANDS(head) ((head).z >> 4 & 255)
-#define HEAD_STARTS(head) (((head).zzz >> (int3)(12, 18, 24)) & 63)
+#define HEAD_WHAT(head) ((head).z & 255)
+#define HEAD_BANDS(head) ((head).z >> 8 & 31)
+#define HEAD_STARTS(head) (((head).zzz >> (int3)(13, 19, 25)) & 63)
 #define RUN_POINTS 0  // each pixel by itself: the head's number says which 16 of the points are its places
 #define RUN_BLANK 1   // no source: the head's number is the status
 #define RUN_WINDOW 2

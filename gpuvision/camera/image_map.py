@@ -22,7 +22,7 @@ RUN = 16
 _POINTS, _BLANK, _WINDOW = 0, 1, 2
 _WIDE, _BANDED = 1, 2
 _NARROW_SPAN, _LOADED = 16, 32
-_SHIFTS = (4, 12, 18, 24)  # of the number of bands, and of the places where the windows of the thirds begin
+_SHIFTS = (8, 13, 19, 25)  # of the number of bands, and of the places where the windows of the thirds begin
 _MOST_BANDS = 16
 # How far a cubic may miss a place [px]: below what a float of a coordinate beyond 256 rounds away.
 _CUBIC_TOLERANCE = 1e-5

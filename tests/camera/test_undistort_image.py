@@ -120,7 +120,7 @@ def test_every_window(device: Device, name: str, channels: int, interpolation: A
     places = map_of((80, 80), source, **options)
     taps = Taps(1, 2) if interpolation == "bicubic" else Taps(0, 1)
     heads = Packer(source, taps, channels, Status.HOLE, Status.HOLE, (0.5, 0.5)).pack(places).heads
-    found = set(np.unique(heads[..., 2] & 15))
+    found = set(np.unique(heads[..., 2] & 255))
     # Three channels need three times the width.
     assert found & {what, what | (channels == 3 and what > 0)}
     op = UndistortImage(model=places, interpolation=interpolation, channels=channels, walk="strip")
@@ -178,12 +178,12 @@ def test_no_window_reads_outside_the_image(
     packed = Packer(source, taps, channels, Status.HOLE, None, (0.5, 0.5)).pack(
         map_of((40, 48), source, turn=turn, scale=scale) + shift
     )
-    what = packed.heads[..., 2] & 15
+    what = packed.heads[..., 2] & 255
     column, row, bits, _ = np.moveaxis(packed.heads[what >= 2], -1, 0)
-    starts = [bits >> shift & 63 for shift in ((12, 18, 24) if channels == 3 else (30,))]
+    starts = [bits >> shift & 63 for shift in ((13, 19, 25) if channels == 3 else (31,))]
     loaded = np.where(what[what >= 2] & 1, 32, 16)
     lowest = ((row - taps.before) * source[1] + column - taps.before) * channels
-    last_row = row + (bits >> 4 & 255) - 1 + taps.after
+    last_row = row + (bits >> 8 & 31) - 1 + taps.after
     highest = (last_row * source[1] + column + np.max(starts, axis=0) + taps.after) * channels + loaded
     assert (lowest >= 0).all()
     assert (highest <= source[0] * source[1] * channels).all()

@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import legendre
+from scipy.ndimage import maximum_filter
 
 from gpuvision.camera.pattern import Float64, nan_median
 
 _DEGREE = 4
 # Points for every coefficient, so that one that is off does not bend it much.
 _POINTS_PER_TERM = 2
+# Rounds that look for points that are off, and how far a point bears on others.
+_ROUNDS = 5
+_REACH = 7
 
 
 class GridPolynomial:
@@ -64,12 +68,21 @@ def on_grid(points: Float64, usual: float, least: float) -> npt.NDArray[np.bool_
     if not np.isfinite(points).any():
         return np.zeros(points.shape[:2], dtype=np.bool_)
     bent = GridPolynomial(points)
-    off = np.linalg.norm(_off_neighbours(points - bent.derivative(0, 0)), axis=-1)
     cell = np.abs(cross(bent.derivative(1, 0), bent.derivative(0, 1)))
     limit = least * float(np.sqrt(np.median(cell)))
-    if np.isfinite(off).any():
-        limit = max(limit, usual * float(np.nanmedian(off)))
-    return ~(off > limit)
+    rest = points - bent.derivative(0, 0)
+    good = np.ones(points.shape[:2], dtype=np.bool_)
+    for last in (*[False] * (_ROUNDS - 1), True):
+        off = np.nan_to_num(_off_neighbours(rest))
+        if off.any():
+            limit = max(limit, usual * float(np.median(off[off > 0.0])))
+        # A point that is off makes its neighbours look so: the worst goes first.
+        worst = (off > limit) & (last | (off == maximum_filter(off, _REACH)))
+        good &= ~worst
+        rest[worst] = np.nan
+        if not worst.any():
+            break
+    return good
 
 
 def cross(a: Float64, b: Float64) -> Float64:
@@ -78,14 +91,14 @@ def cross(a: Float64, b: Float64) -> Float64:
 
 
 def _off_neighbours(points: Float64) -> Float64:
-    """How far every point of a grid lies from where its neighbours in its row and in its column would have it.
+    """How far (rows, columns) every point lies from where its neighbours in its row and its column would have it.
 
-    A cubic through two neighbours on either side, a line through one on either side, and parabolas through three on
-    one side each predict the point; the median counts, so that a neighbour that is off itself does no harm.
+    A cubic through two neighbours on either side, or a line through one, predicts the point. At a border there are
+    only parabolas through three neighbours on one side, with more noise: what they tell counts half.
     """
     rows, columns = points.shape[:2]
     padded = np.pad(points, ((3, 3), (3, 3), (0, 0)), constant_values=np.nan)
-    predictions = []
+    amid, beyond = [], []
     for down, right in ((0, 1), (1, 0)):
         at = {
             k: padded[3 + k * down : 3 + k * down + rows, 3 + k * right : 3 + k * right + columns]
@@ -93,6 +106,7 @@ def _off_neighbours(points: Float64) -> Float64:
         }
         line = 0.5 * (at[-1] + at[1])
         cubic = (4.0 * (at[-1] + at[1]) - at[-2] - at[2]) / 6.0
-        predictions += [np.where(np.isfinite(cubic), cubic, line)]
-        predictions += [3.0 * (at[k] - at[2 * k]) + at[3 * k] for k in (-1, 1)]
-    return points - nan_median(np.stack(predictions))
+        amid.append(np.where(np.isfinite(cubic), cubic, line))
+        beyond += [3.0 * (at[k] - at[2 * k]) + at[3 * k] for k in (-1, 1)]
+    off, off_beyond = (np.linalg.norm(points - nan_median(np.stack(each)), axis=-1) for each in (amid, beyond))
+    return np.where(np.isfinite(off), off, 0.5 * off_beyond)

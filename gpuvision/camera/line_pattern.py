@@ -31,7 +31,7 @@ _GROUND = 0.2
 # always; in contrast.
 _OFF_USUAL = 7.0
 _OFF_STEP = 0.003
-_OFF_WIDTH = 0.15
+_OFF_WIDTH = 0.1
 _LEAST_CONTRAST = 0.4
 _CHUNK_SAMPLES = 1 << 18
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from gpuvision.camera.camera_fit import CameraFit
     from gpuvision.camera.chessboard import find_chessboard
     from gpuvision.camera.dots import find_dots
+    from gpuvision.camera.image_map import PixelMap
     from gpuvision.camera.lens import Lens
     from gpuvision.camera.lens_fit import LensFit
     from gpuvision.camera.lens_known import fit_tilt
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from gpuvision.camera.scheimpflug import TiltedSensor
     from gpuvision.camera.target_views import view_of
     from gpuvision.camera.tsai import fit_tsai
+    from gpuvision.camera.undistort_image import UndistortedImage, UndistortImage
     from gpuvision.camera.undistort_points import UndistortedPoints, UndistortPoints
     from gpuvision.camera.vanishing_points import fit_lens, straightness_px
     from gpuvision.host import Device, GpuVisionError, Pipeline, Step, host_view, open_recording
@@ -55,6 +57,7 @@ _PLACES = {
     "LineReadout": "gpuvision.ranging.line",
     "PatternGrid": "gpuvision.camera.pattern",
     "Pipeline": "gpuvision.host",
+    "PixelMap": "gpuvision.camera.image_map",
     "PlanePolynomial": "gpuvision.camera.polynomial",
     "PsdNoise": "gpuvision.ranging.psd",
     "PsdReading": "gpuvision.ranging.psd",
@@ -70,7 +73,9 @@ _PLACES = {
     "StraightTransport": "gpuvision.ranging.range_image",
     "TiltedSensor": "gpuvision.camera.scheimpflug",
     "Triangulation": "gpuvision.ranging.triangulation",
+    "UndistortImage": "gpuvision.camera.undistort_image",
     "UndistortPoints": "gpuvision.camera.undistort_points",
+    "UndistortedImage": "gpuvision.camera.undistort_image",
     "UndistortedPoints": "gpuvision.camera.undistort_points",
     "find_chessboard": "gpuvision.camera.chessboard",
     "find_dots": "gpuvision.camera.dots",
@@ -99,6 +104,7 @@ __all__ = [
     "LineReadout",
     "PatternGrid",
     "Pipeline",
+    "PixelMap",
     "PlanePolynomial",
     "PsdNoise",
     "PsdReading",
@@ -114,7 +120,9 @@ __all__ = [
     "StraightTransport",
     "TiltedSensor",
     "Triangulation",
+    "UndistortImage",
     "UndistortPoints",
+    "UndistortedImage",
     "UndistortedPoints",
     "find_chessboard",
     "find_dots",

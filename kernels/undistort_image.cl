@@ -1,7 +1,6 @@
 // Images as an ideal camera would show them: each output pixel is interpolated at its place in the measured image.
 // CODE is the pixels' type, LARGEST its largest value where it is a whole number, CHANNELS of them lie side by side.
-// BICUBIC or bilinear; BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT; MISSING is the status of a
-// pixel that has no place at all.
+// BICUBIC or bilinear; BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT.
 //
 // Places come from a map in runs of 16 pixels (image_map.py), or under COMPUTED from the camera model.
 #include "camera.h"

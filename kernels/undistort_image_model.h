@@ -58,7 +58,7 @@ inline void computed_run(global const CODE *image, global CODE *made, global uch
 inline uchar computed_pixel(global const CODE *image, global CODE *made, int column, int row, constant real *model,
                             constant int *size, float fill) {
     real x = column + size[FIRST_COLUMN], y = row + size[FIRST_ROW];
-    if (measured(&x, &y, model)) return blank(MISSING, fill, made);
+    if (measured(&x, &y, model)) return blank(size[MISSING], fill, made);
     const int left = pixel_before(x), top = pixel_before(y);
     return sample(image, left, top, (float)(x - left), (float)(y - top), size, fill, made);
 }

@@ -2,13 +2,14 @@
 #ifndef UNDISTORT_IMAGE_PIXEL_H
 #define UNDISTORT_IMAGE_PIXEL_H
 
-// Sizes, as UndistortImage packs them.
+// Whole numbers, as UndistortImage packs them.
 #define SOURCE_COLUMNS 0
 #define SOURCE_ROWS 1
 #define MADE_COLUMNS 2
 #define MADE_ROWS 3
 #define FIRST_COLUMN 4  // of the output, in the ideal image
 #define FIRST_ROW 5
+#define MISSING 6  // status of a pixel that has no place at all
 
 // Places farther away than this are moved to it: a whole number that a float holds.
 #define FARTHEST 16777216.0f
@@ -115,7 +116,7 @@ inline int whole_below(float place) {
 inline uchar sample(global const CODE *image, int column, int row, float x, float y, constant int *size, float fill,
                     global CODE *made) {
     if ((as_int(x) & 0x7f800000) == 0x7f800000 || (as_int(y) & 0x7f800000) == 0x7f800000)
-        return blank(MISSING, fill, made);
+        return blank(size[MISSING], fill, made);
     const int columns = size[SOURCE_COLUMNS], rows = size[SOURCE_ROWS];
     const uchar status = x < -0.5f - column || x > columns - 0.5f - column || y < -0.5f - row || y > rows - 0.5f - row
                              ? STATUS_HOLE

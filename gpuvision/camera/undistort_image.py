@@ -211,7 +211,7 @@ class UndistortImage(Operation[UndistortedImage]):
             defines=real_defines(device, real) | self._defines(dtype, strip) | past_caches,
             arguments=(
                 *tables,
-                np.array([columns, rows, made_columns, made_rows, *region[:2]], np.int32),
+                np.array([columns, rows, made_columns, made_rows, *region[:2], self._missing], np.int32),
                 np.float32(fill),
             ),
             global_size=(made_rows, frames) if strip else (made_columns, made_rows, frames),
@@ -256,7 +256,7 @@ class UndistortImage(Operation[UndistortedImage]):
 
     def _defines(self, dtype: np.dtype[Any], strip: bool) -> dict[str, Any]:
         code = _CODES[dtype.name]
-        defines: dict[str, Any] = {"CODE": code, "CHANNELS": self.channels, "MISSING": int(self._missing)}
+        defines: dict[str, Any] = {"CODE": code, "CHANNELS": self.channels}
         if dtype.kind == "u":
             defines["LARGEST"] = f"{np.iinfo(dtype).max}.0f"
         if strip:

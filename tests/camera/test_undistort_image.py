@@ -88,7 +88,8 @@ def test_a_batch_against_the_oracle(
     device: Device, dtype: Any, interpolation: Any, channels: int, walk: Any, rng: np.random.Generator
 ) -> None:
     lens = Lens(k1=4e-6, k2=1e-11, centre=(60.0, 41.0))
-    for border in BORDERS:
+    # Borders are the same code for every type.
+    for border in BORDERS if dtype == np.float32 else ["mask", "constant"]:
         op = UndistortImage(
             model=lens, interpolation=interpolation, channels=channels, border=border, value=0.75, walk=walk
         )

@@ -10,7 +10,8 @@ import numpy as np
 from gpuvision.camera.chart import Chart, internal_of
 from gpuvision.camera.tilted_projection import COLUMNS, INTERNAL, Floats, project, rotation_of
 
-_STEPS = 100
+# The fewer views, the more bent is the valley that the target's pose and the camera share, and the cheaper a step.
+_FEWEST_STEPS, _STEPS_OF_A_VIEW = 100, 1000
 # The last step moved the numbers by less than this many of their standard deviations ...
 _SETTLED = 1e-4
 _STUCK = 1e16
@@ -190,7 +191,7 @@ def moved(chart: Chart, state: State, camera: Floats, poses: Floats) -> State:
     )
 
 
-def adjust(views: Views, chart: Chart, start: State, loss: Loss, steps: int = _STEPS) -> State:
+def adjust(views: Views, chart: Chart, start: State, loss: Loss) -> State:
     """Move camera and poses to the nearest minimum of the loss.
 
     Levenberg-Marquardt with Nielsen's damping. It ends when a step would move nothing by more than 1e-4 of its
@@ -202,7 +203,7 @@ def adjust(views: Views, chart: Chart, start: State, loss: Loss, steps: int = _S
         return state
     state = replace(state, cost=system.cost)
     damping, growth, polished = 1e-4, 2.0, False
-    for count in range(1, steps + 1):
+    for count in range(1, max(_FEWEST_STEPS, _STEPS_OF_A_VIEW // len(views.seen)) + 1):
         camera, poses, _ = solve(system, damping)
         tried = moved(chart, state, camera, poses)
         next_system = linearise(views, chart, tried, loss)

@@ -22,7 +22,7 @@ from gpuvision.camera.bundle import Loss, State, Views, adjust
 from gpuvision.camera.camera_fit import Pose, covariances, deviation_of_alpha, lens_poses, noise_of
 from gpuvision.camera.chart import Chart
 from gpuvision.camera.lens import Lens
-from gpuvision.camera.planar_start import flatten
+from gpuvision.camera.planar_start import closed_form_of_tilt, flatten
 from gpuvision.camera.scheimpflug import TiltedSensor
 from gpuvision.camera.target_views import pack
 from gpuvision.camera.tilted_projection import Floats
@@ -96,10 +96,12 @@ def fit_tilt(
     centre = np.array(lens.centre)
     radius = float(np.sqrt(np.max(np.sum((packed.seen - centre[:, None]) ** 2, axis=1))))
     homographies = flatten(packed, centre, radius, straight=True).homographies
-    f_prime, aside = _closed_form(homographies, direction, None if focal_length is None else focal_length / radius)
-    f = radius * math.sqrt(f_prime - float(aside @ aside))
+    closed = closed_form_of_tilt(homographies, direction, None if focal_length is None else focal_length / radius)
+    if closed is None:
+        raise ValueError("no tilt and f' explain these views: are lens and direction right, and the target oblique?")
+    f = radius * closed[0]
     values = np.zeros(11)
-    values[:6] = [f, 1.0, *(centre - radius * aside), *centre]
+    values[:6] = [f, 1.0, *(centre + radius * closed[1]), *centre]
     chart = Chart(coefficients=(), tilt=True, centre=False, direction=direction, focal_length=focal_length)
     poses = [
         fit_tsai(target, seen, (values[2], values[3]), focal_length=f, distorted=False).pose
@@ -109,32 +111,6 @@ def fit_tilt(
     state = State(values, np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
     state = adjust(packed, chart, state, Loss())
     return _described(packed, chart, state, lens)
-
-
-def _closed_form(homographies: Floats, direction: float | None, focal_length: float | None) -> tuple[float, Floats]:
-    """Return f'^2 and the way from v to the centre, in the homographies' units about the centre.
-
-    The image of the absolute conic, v = -e: every view gives two equations linear in e and f'^2 = f^2 + e^2.
-    """
-    h1, h2 = homographies[:, :, 0], homographies[:, :, 1]
-    scale = 1.0 / np.sqrt(np.sum(h1**2, axis=1) * np.sum(h2**2, axis=1))
-    constant = np.concatenate([np.sum((h1 * h2)[:, :2], axis=1), 0.5 * np.sum((h1**2 - h2**2)[:, :2], axis=1)])
-    by_aside = np.concatenate(
-        [h1[:, :2] * h2[:, 2:] + h2[:, :2] * h1[:, 2:], h1[:, :2] * h1[:, 2:] - h2[:, :2] * h2[:, 2:]]
-    )
-    by_square = np.concatenate([h1[:, 2] * h2[:, 2], 0.5 * (h1[:, 2] ** 2 - h2[:, 2] ** 2)])
-    basis = np.eye(2) if direction is None else np.array([[math.cos(direction)], [math.sin(direction)]])
-    weight = np.concatenate([scale, scale])
-    along, by_square, side = (by_aside @ basis) * weight[:, None], by_square * weight, -constant * weight
-    if focal_length is None:
-        found = np.linalg.lstsq(np.column_stack([along, by_square]), side, rcond=None)[0]
-        square, aside = float(found[-1]), basis @ found[:-1]
-    else:
-        square = focal_length**2
-        aside = basis @ np.linalg.lstsq(along, side - by_square * square, rcond=None)[0]
-    if not square > float(aside @ aside):
-        raise ValueError("no tilt and f' explain these views: are lens and direction right, and the target oblique?")
-    return square, aside
 
 
 def _described(views: Views, chart: Chart, state: State, lens: Lens) -> TiltFit:

@@ -181,6 +181,42 @@ def _conic_row(a: Floats, b: Floats) -> Floats:
     )
 
 
+def closed_form_of_tilt(
+    homographies: Floats, direction: float | None, focal_length: float | None
+) -> tuple[float, Floats] | None:
+    """Return f and v in closed form where the centre is known, in the homographies' units about it, or None.
+
+    Every view gives two equations on the image of the absolute conic, linear in v and f'^2 = f^2 + v^2.
+
+    Parameters
+    ----------
+    homographies
+        Of one view or more, about the centre.
+    direction
+        In which v lies from the centre (or opposite), where that is known, radians.
+    focal_length
+        f' where it is known. One view fixes two numbers of f' and v.
+    """
+    h1, h2 = homographies[:, :, 0], homographies[:, :, 1]
+    scale = 1.0 / np.sqrt(np.sum(h1**2, axis=1) * np.sum(h2**2, axis=1))
+    constant = np.concatenate([np.sum((h1 * h2)[:, :2], axis=1), 0.5 * np.sum((h1**2 - h2**2)[:, :2], axis=1)])
+    by_v = np.concatenate(
+        [-h1[:, :2] * h2[:, 2:] - h2[:, :2] * h1[:, 2:], h2[:, :2] * h2[:, 2:] - h1[:, :2] * h1[:, 2:]]
+    )
+    by_square = np.concatenate([h1[:, 2] * h2[:, 2], 0.5 * (h1[:, 2] ** 2 - h2[:, 2] ** 2)])
+    basis = np.eye(2) if direction is None else np.array([[math.cos(direction)], [math.sin(direction)]])
+    weight = np.concatenate([scale, scale])
+    along, by_square, side = (by_v @ basis) * weight[:, None], by_square * weight, -constant * weight
+    if focal_length is None:
+        found = np.linalg.lstsq(np.column_stack([along, by_square]), side, rcond=None)[0]
+        square, v = float(found[-1]), basis @ found[:-1]
+    else:
+        square = focal_length**2
+        v = basis @ np.linalg.lstsq(along, side - by_square * square, rcond=None)[0]
+    f2 = square - float(v @ v)
+    return (math.sqrt(f2), v) if f2 > 0.0 else None
+
+
 def poses(homographies: Floats, f: float, aspect: float, v: Floats) -> tuple[Floats, Floats]:
     """Rotations and translations of planes whose homographies a pinhole camera saw."""
     inverse = np.array([[1.0 / f, 0.0, -v[0] / f], [0.0, 1.0 / (aspect * f), -v[1] / (aspect * f)], [0.0, 0.0, 1.0]])

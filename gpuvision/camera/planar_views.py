@@ -23,7 +23,7 @@ from gpuvision.camera.camera_fit import (
 )
 from gpuvision.camera.chart import COEFFICIENTS, Chart, internal_of
 from gpuvision.camera.diagnosis import diagnose, fixes_focus
-from gpuvision.camera.planar_start import Flat, closed_form, flatten, poses
+from gpuvision.camera.planar_start import Flat, closed_form, closed_form_of_tilt, flatten, poses
 from gpuvision.camera.target_views import Mask, pack
 from gpuvision.camera.tilted_projection import Floats, tilt_matrix
 from gpuvision.tables import finite, numbers
@@ -223,6 +223,10 @@ def _check_enough(task: _Task, models: Sequence[str]) -> list[str]:
 def _starts(task: _Task, chart: Chart) -> Iterator[State]:
     """Cameras to start from, the most likely first."""
     flat = task.flat
+    if chart.tilt and task.focal_length is not None:
+        oblique = closed_form_of_tilt(flat.homographies, None, task.focal_length / task.radius)
+        if oblique is not None:
+            yield _start(task, chart, oblique[0], 1.0, oblique[1])
     closed = closed_form(flat.homographies, task.aspect) if len(task.masks) > 1 else None
     if closed is not None:
         yield _start(task, chart, *closed)
@@ -324,6 +328,8 @@ def _result(task: _Task, chosen: _Candidate, alternatives: tuple[Alternative, ..
     state, chart = chosen.state, chosen.chart
     noise = noise_of(task.views, chart, state, chosen.loss)
     covariance, pose_covariance, focus = covariances(task.views, chart, state, chosen.loss, task.sigma)
+    if task.focal_length is not None:
+        focus = 0.0
     errors = residuals(task.views, state)
     fit = CameraFit(
         camera=camera_of(state.numbers),

@@ -19,7 +19,9 @@
 inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant real *table, reals *back_x, reals *back_y) {
     const reals own_x = zero_where(~wanted, x), own_y = zero_where(~wanted, y), square = own_x * own_x + own_y * own_y;
     reals at_x = -own_x, at_y = -own_y, left = square, ahead = square;
-    reals step_x = own_x + zero_where(~wanted, *back_x), step_y = own_y + zero_where(~wanted, *back_y);
+    // A guess may be no number, where it comes from a search that did not settle.
+    const masks guessed = wanted & mask_of(*back_x * *back_x + *back_y * *back_y < square);
+    reals step_x = own_x + zero_where(~guessed, *back_x), step_y = own_y + zero_where(~guessed, *back_y);
     masks open = wanted;
     for (int k = 0; k < NEWTON_STEPS && any_lane(open); k++) {
         reals next_x, next_y, next_left;

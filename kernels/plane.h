@@ -19,7 +19,9 @@
 #define PLANE_BACK 12    // its inverse
 #define PLANE_A 16
 #define PLANE_B 23
+// The region's edge, given and found.
 #define PLANE_EDGE ((real)(1 + 4 * REAL_EPSILON))
+#define PLANE_FOUND_EDGE ((real)(1 + 64 * REAL_EPSILON))
 // How far out of the region a Newton step may look.
 #define PLANE_OUTSKIRTS ((real)1.25)
 // No bending takes a place in the region as far as that.
@@ -79,7 +81,7 @@ inline masks LANED(plane_show)(reals *g, reals *h, constant real *plane) {
     reals back_x = 0, back_y = 0;
     masks unseen = ~LANED(plane_within)(x, y, PLANE_FARTHEST);
     unseen |= LANED(newton_back)(x, y, ~unseen, plane, &back_x, &back_y);
-    unseen |= ~LANED(plane_within)(x + back_x, y + back_y, PLANE_EDGE);
+    unseen |= ~LANED(plane_within)(x + back_x, y + back_y, PLANE_FOUND_EDGE);
     *g = plane[PLANE_ORIGIN] + plane[PLANE_PER_SCALE] * (x + back_x);
     *h = plane[PLANE_ORIGIN + 1] + plane[PLANE_PER_SCALE + 1] * (y + back_y);
     return unseen;

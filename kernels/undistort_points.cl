@@ -72,12 +72,12 @@ kernel void undistort_points(global const INPUT *restrict points, global real *r
         const reals given_x = x, given_y = y;
         masks flags = LANED(moved)(&x, &y, model);
         // Flags are rare.
-        const masks bad = mask_of(flags != 0) | LANED(not_finite)(x) | LANED(not_finite)(y);
+        const masks bad = mask_of(flags != 0) | mask_of(LANED(not_finite)(x)) | mask_of(LANED(not_finite)(y));
         if (any_lane(bad)) {
-            const masks lost = LANED(not_finite)(given_x) | LANED(not_finite)(given_y) | mask_of(flags == 0);
+            const masks good = ~mask_of(LANED(not_finite)(given_x)) & ~mask_of(LANED(not_finite)(given_y));
             x = nan_where(bad, x);
             y = nan_where(bad, y);
-            flags = lost & bad ? (masks)STATUS_NOT_FINITE : flags;
+            flags = bad & ~(good & mask_of(flags != 0)) ? (masks)STATUS_NOT_FINITE : flags;
         }
         store_points(x, y, moved_points, i);
         store_bytes(convert_bytes(flags), status + i);

@@ -38,7 +38,7 @@ def one_to_one(radial: Sequence[float], tangential: Sequence[float], prism: Sequ
     terms = np.array([*radial, *tangential, *prism])
     with np.errstate(divide="ignore", over="ignore"):
         radii = np.abs(terms) ** (-1.0 / _ORDERS)
-    # Terms too weak to matter anywhere would only spoil the numbers. The unit is where the first of the others reaches 1.
+    # Terms too weak to matter anywhere would only spoil the numbers. The unit: where the first of the others reaches 1.
     terms = np.where(radii < _FARTHEST, terms, 0.0)
     unit = min(float(radii.min()), _FARTHEST)
     k, p, s = np.split(terms * unit**_ORDERS, [6, 8])

@@ -124,7 +124,7 @@ class Guess:
         """How much is left of a first step, for most places."""
         sizes, rests = self._steps
         with np.errstate(all="ignore"):
-            ratios = np.sqrt(rests[0] / sizes[0])
+            ratios = np.sqrt(rests[0] / np.maximum(sizes[0], np.finfo(np.float64).tiny))
         return float(np.clip(np.nanquantile(ratios, _MOST_PLACES), 1e-4, 1.0))
 
 

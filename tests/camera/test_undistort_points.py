@@ -1,0 +1,410 @@
+"""UndistortPoints on devices: as the models on the host say, in both directions, to half a float's spacing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import gpuvision as gv
+from canary import Guarded
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.lens import Lens
+from gpuvision.camera.polynomial import PlanePolynomial
+from gpuvision.camera.undistort_points import UndistortedPoints, UndistortPoints
+from gpuvision.host import Device
+from gpuvision.status import Status
+from reference import camera as reference
+
+ON_DEVICES = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+MATRIX = ((1700.0, 0.0, 642.5), (0.0, 1650.0, 509.25), (0.0, 0.0, 1.0))
+ANOTHER = ((1500.0, 0.0, 600.0), (0.0, 1480.0, 500.0), (0.0, 0.0, 1.0))
+FULL = (-0.12, 0.08, 1e-3, -2e-3, 0.01, 0.02, 0.03, 0.001, 1e-3, 2e-3, -1e-3, 3e-3)
+WALKS = ("strip", "item")
+# Every model in these two; all four where it is not the model that is tested.
+TWO_WAYS = pytest.mark.parametrize(("walk", "dtype"), [("strip", np.float32), ("item", np.float64)])
+
+
+def camera(*coefficients: float, tilt: tuple[float, float] = (0.0, 0.0), matrix: Any = MATRIX) -> Camera:
+    distortion = (*coefficients, *(0.0,) * (12 - len(coefficients)), *np.radians(tilt))
+    return Camera(matrix=matrix, distortion=distortion)
+
+
+CAMERAS = {
+    "pinhole": camera(),
+    "k1": camera(-0.25),
+    "k1 k2 k3": camera(-0.28, 0.11, 0.0, 0.0, -0.02),
+    "tangential": camera(-0.28, 0.11, 5e-4, -3e-4, -0.02),
+    "k4": camera(0.0, 0.0, 0.0, 0.0, 0.0, 0.1),
+    "rational": camera(*FULL[:8]),
+    "prism s1 s3": camera(-0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.0, -0.02, 0.0),
+    "tilt": camera(tilt=(20.0, -10.0)),
+    "tilt 45": camera(-0.12, 0.08, tilt=(45.0, 0.0)),
+    "all": camera(*FULL, tilt=(-25.0, 20.0)),
+}
+LENSES = {
+    "lens k1": Lens(k1=-2e-7, centre=(650.0, 500.0)),
+    "lens k1 k2": Lens(k1=-2e-7, k2=5e-14, centre=(650.0, 500.0)),
+    "lens out": Lens(k1=3e-7, k2=1e-13, centre=(650.0, 500.0)),
+    "lens k2": Lens(k1=0.0, k2=-1e-13, centre=(650.0, 500.0)),
+}
+MODELS = CAMERAS | LENSES
+
+
+@pytest.fixture(params=MODELS.values(), ids=MODELS)
+def model(request: pytest.FixtureRequest) -> Camera | Lens:
+    """Each of them."""
+    return request.param
+
+
+def image_points(rng: np.random.Generator, count: int = 5003) -> np.ndarray:
+    return rng.uniform(0.0, 1.0, (count, 2)) * [1279.0, 1023.0]
+
+
+def expected_of(operation: UndistortPoints, points: np.ndarray) -> np.ndarray:
+    """What the model on the host says, which its own tests hold to its equations."""
+    function = operation.model.distort if operation.inverse else operation.model.undistort
+    more = {} if operation.matrix is None else {"matrix": operation.matrix}
+    return function(points.astype(np.float64), **more)
+
+
+def half_spacing(values: np.ndarray) -> np.ndarray:
+    """What a float's own rounding may do."""
+    return 0.5 * np.spacing(np.abs(values).astype(np.float32))
+
+
+def tolerance(given_: np.ndarray, expected: np.ndarray, real: Any) -> np.ndarray:
+    """Ten half-roundings of what moves the point, and the result's own one; in double the host's as well."""
+    eps = float(np.finfo(real).eps)
+    with np.errstate(invalid="ignore"):
+        moved = np.abs(expected - given_).max(axis=-1, keepdims=True)
+    own = half_spacing(expected) if real == np.float32 else 4e-12
+    return own + 5.0 * eps * (moved + 10.0)
+
+
+def assert_as_expected(operation: UndistortPoints, result: UndistortedPoints, points: np.ndarray) -> np.ndarray:
+    expected = expected_of(operation, points)
+    real = result.points.dtype
+    good = np.isfinite(expected[..., 0])
+    np.testing.assert_array_equal(result.status == 0, good)
+    np.testing.assert_array_equal(np.isfinite(result.points), np.broadcast_to(good[..., None], expected.shape))
+    error = np.abs(result.points - expected)[good]
+    assert np.all(error <= tolerance(points, expected, real)[good]), f"off by {error.max(initial=0.0)}"
+    return good
+
+
+@TWO_WAYS
+@pytest.mark.parametrize("inverse", [False, True], ids=["undistort", "distort"])
+def test_as_the_host_says(
+    device: Device, model: Any, dtype: Any, walk: Any, inverse: bool, rng: np.random.Generator
+) -> None:
+    operation = UndistortPoints(model=model, walk=walk, inverse=inverse)
+    points = image_points(rng).astype(dtype)
+    result = operation(points, device=device)
+    assert result.points.dtype == dtype
+    assert assert_as_expected(operation, result, points).mean() > 0.9
+
+
+@pytest.mark.parametrize("name", ["all", "lens k1 k2"])
+@pytest.mark.parametrize("inverse", [False, True], ids=["undistort", "distort"])
+def test_the_other_two_ways(device: Device, name: str, inverse: bool, rng: np.random.Generator) -> None:
+    for walk, dtype in (("strip", np.float64), ("item", np.float32)):
+        operation = UndistortPoints(model=MODELS[name], walk=walk, inverse=inverse)
+        points = image_points(rng).astype(dtype)
+        assert assert_as_expected(operation, operation(points, device=device), points).mean() > 0.9
+
+
+@pytest.mark.parametrize("name", ["tilt", "all"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("inverse", [False, True], ids=["undistort", "distort"])
+def test_another_matrix(device: Device, name: str, dtype: Any, inverse: bool, rng: np.random.Generator) -> None:
+    operation = UndistortPoints(model=CAMERAS[name], matrix=ANOTHER, inverse=inverse)
+    points = image_points(rng).astype(dtype)
+    assert assert_as_expected(operation, operation(points, device=device), points).mean() > 0.9
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_double_arithmetic_on_single_points(device: Device, walk: Any, rng: np.random.Generator) -> None:
+    operation = UndistortPoints(model=CAMERAS["all"], precision="double", walk=walk)
+    points = image_points(rng).astype(np.float32)
+    result = operation(points, device=device)
+    assert result.points.dtype == np.float64
+    assert_as_expected(operation, result, points)
+    with pytest.raises(TypeError, match="single"):
+        UndistortPoints(model=CAMERAS["all"], precision="single")(points.astype(float), device=device)
+
+
+@pytest.mark.parametrize("name", ["k1 k2 k3", "tangential", "tilt 45", "all"])
+def test_round_trip_in_double(device: Device, name: str, rng: np.random.Generator) -> None:
+    points = image_points(rng)
+    ideal = UndistortPoints(model=CAMERAS[name])(points, device=device)
+    good = ideal.status == 0
+    back = UndistortPoints(model=CAMERAS[name], inverse=True)(np.ascontiguousarray(ideal.points[good]), device=device)
+    np.testing.assert_allclose(back.points, points[good], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("inverse", [False, True], ids=["undistort", "distort"])
+def test_a_sensor_of_8000_pixels_in_single(device: Device, walk: Any, inverse: bool, rng: np.random.Generator) -> None:
+    """The correction is good to 1e-4 px; the result's own rounding, up to 2.4e-4 px, comes on top."""
+    matrix = ((9000.0, 0.0, 4012.3), (0.0, 9000.0, 2987.7), (0.0, 0.0, 1.0))
+    big = camera(-0.1, 0.05, 2e-4, -3e-4, 0.01, tilt=(5.0, -2.0), matrix=matrix)
+    points = (rng.uniform(0.0, 1.0, (20_001, 2)) * [7999.0, 5999.0]).astype(np.float32)
+    operation = UndistortPoints(model=big, walk=walk, inverse=inverse)
+    result, expected = operation(points, device=device), expected_of(operation, points)
+    assert np.all(result.status == 0)
+    assert np.abs(expected - points).max() > 200.0
+    assert np.all(np.abs(result.points - expected) <= half_spacing(expected) + 1e-4)
+    lens = UndistortPoints(model=Lens(k1=-2e-9, k2=1e-17, centre=(4012.3, 2987.7)), walk=walk, inverse=inverse)
+    result, expected = lens(points, device=device), expected_of(lens, points)
+    assert np.all(np.abs(result.points - expected) <= half_spacing(expected) + 1e-4)
+
+
+# ---- the fold ------------------------------------------------------------------------------------------------
+
+
+@TWO_WAYS
+@pytest.mark.parametrize(
+    "coefficients",
+    [(-0.4,), (-0.5, 0.1), (-0.3, 0.02, 0.02, -0.03), (0.1, 0.0, 0.01, 0.02, 0.0, 0.5, 0.1, 0.05)],
+    ids=["k1", "k1 k2", "tangential", "rational decentred"],
+)
+def test_at_the_fold(device: Device, coefficients: tuple[float, ...], walk: Any, dtype: Any) -> None:
+    """Rays from the centre through the fold: ideal points behind it are flagged, and so is what lies past its image."""
+    wide = camera(*coefficients, matrix=((800.0, 0.0, 640.0), (0.0, 800.0, 512.0), (0.0, 0.0, 1.0)))
+    rays = []
+    for angle in np.linspace(0.1, 6.3, 23):
+        fold = min(reference.fold_radius(angle, wide.distortion, 5.0, 4000), 3.0)
+        parts = np.array([0.0, 0.3, 0.8, 0.95, 0.98, 1.02, 1.1, 1.5, 2.0])
+        rays.append(fold * parts[:, None] * [math.cos(angle), math.sin(angle)])
+    ideal = (np.concatenate(rays) * 800.0 + [640.0, 512.0]).astype(dtype)
+    distort = UndistortPoints(model=wide, inverse=True, walk=walk)
+    shown = distort(ideal, device=device)
+    np.testing.assert_array_equal(shown.status == 0, np.isfinite(wide.distort(ideal)[:, 0]))
+    assert set(shown.status.tolist()) == {0, Status.FOLDED}
+    measured = np.concatenate([wide.distort(ideal), [[640.0 + 3000.0, 512.0], [640.0, -2000.0]]]).astype(dtype)
+    known = np.isfinite(measured[:, 0])
+    result = UndistortPoints(model=wide, walk=walk)(measured, device=device)
+    np.testing.assert_array_equal(result.status[~known], Status.NOT_FINITE)
+    exact = wide.undistort(measured)
+    np.testing.assert_array_equal(result.status[known] == 0, np.isfinite(exact[known, 0]))
+    good = known & np.isfinite(exact[:, 0])
+    # The inverse magnifies the measured point's rounding and the correction's.
+    magnified = np.linalg.norm(wide.jacobian(measured[good]), 2, axis=(-2, -1))[:, None]
+    error = np.abs(result.points[good] - exact[good])
+    # Three roundings of up to 2700 pixels.
+    assert np.all(error <= 8e3 * np.finfo(dtype).eps * magnified)
+
+
+def test_lens_at_its_fold(device: Device) -> None:
+    lens = Lens(k1=-4e-7, k2=1e-14, centre=(640.0, 512.0))
+    radius = lens.fold_radius * np.array([0.0, 0.5, 0.99, 0.9999, 1.0001, 1.5, 3.0])
+    points = np.stack([640.0 + radius, np.full(7, 512.0)], -1)
+    flags = [0, 0, 0, 0] + 3 * [Status.FOLDED]
+    straight = UndistortPoints(model=lens)(np.tile(points, (3, 1)), device=device)
+    np.testing.assert_array_equal(straight.status, 3 * flags)
+    furthest = lens.undistort(points[3:4])[0, 0] - 640.0
+    ideal = np.stack([640.0 + furthest * np.array([0.0, 0.5, 0.99, 0.9999, 1.0001, 1.5, 3.0]), np.full(7, 512.0)], -1)
+    back = UndistortPoints(model=lens, inverse=True)(np.tile(ideal, (3, 1)), device=device)
+    np.testing.assert_array_equal(back.status, 3 * flags)
+    np.testing.assert_allclose(back.points[:3], lens.distort(ideal[:3]), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_wild_cameras_agree_with_the_host(device: Device, seed: int) -> None:
+    """Folds anywhere, from random coefficients: the same points are flagged, the others are where the host has them."""
+    rng = np.random.default_rng(seed)
+    for _ in range(3):
+        radial, decentred = rng.normal(0.0, 0.3, 6), rng.normal(0.0, 0.02, 6)
+        wild = camera(*radial[:2], *decentred[:2], *radial[2:], *decentred[2:], tilt=tuple(rng.uniform(-30.0, 30.0, 2)))
+        points = rng.uniform(-1.0, 2.0, (4000, 2)) * [1279.0, 1023.0]
+        for inverse in (False, True):
+            operation = UndistortPoints(model=wild, inverse=inverse)
+            result, expected = operation(points, device=device), expected_of(operation, points)
+            good = np.isfinite(expected[:, 0])
+            # A point within rounding of the fold is on either side of it.
+            assert np.mean((result.status == 0) == good) > 0.999
+            both = good & (result.status == 0)
+            ideal = points[both] if inverse else expected[both]
+            magnified = np.linalg.norm(wild.jacobian(wild.distort(ideal)), 2, axis=(-2, -1))
+            magnified = np.maximum(magnified, 1.0 / magnified)
+            error = np.abs(result.points[both] - expected[both]).max(axis=1)
+            assert np.all(error <= 1e-10 * np.maximum(magnified, 1.0) ** 2)
+
+
+# ---- what comes in -------------------------------------------------------------------------------------------
+
+
+@ON_DEVICES
+@given(
+    shape=st.lists(st.integers(1, 40), max_size=3).map(lambda batch: (*batch, 2)),
+    walk=st.sampled_from(WALKS),
+    name=st.sampled_from(["tangential", "lens k1 k2"]),
+    inverse=st.booleans(),
+    seed=st.integers(0, 9),
+)
+def test_any_shape(device: Device, shape: tuple[int, ...], walk: Any, name: str, inverse: bool, seed: int) -> None:
+    points = (np.random.default_rng(seed).uniform(0.0, 1.0, shape) * [1279.0, 1023.0]).astype(np.float32)
+    operation = UndistortPoints(model=MODELS[name], walk=walk, inverse=inverse)
+    result = operation(points, device=device)
+    assert result.points.shape == shape
+    assert result.status.shape == shape[:-1]
+    assert_as_expected(operation, result, points)
+
+
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 31, 255, 256, 257, 1023, 1025, 5000, 300_001])
+@pytest.mark.parametrize("walk", WALKS)
+def test_sizes_around_the_groups_and_canaries(device: Device, count: int, walk: Any, rng: np.random.Generator) -> None:
+    operation = UndistortPoints(model=CAMERAS["k1"], walk=walk)
+    points = image_points(rng, count).astype(np.float32)
+    guarded = Guarded(UndistortedPoints(np.empty((count, 2), np.float32), np.empty(count, np.uint8)))
+    assert operation(points, device=device, out=guarded.out) is guarded.out
+    guarded.assert_intact()
+    assert_as_expected(operation, guarded.out, points)
+
+
+@pytest.mark.parametrize("shift", [1, 3])
+def test_arrays_anywhere(device: Device, shift: int, rng: np.random.Generator) -> None:
+    """Aligned to their elements only."""
+    points = image_points(rng, 1000).astype(np.float32)
+    given_, moved = (np.zeros(2000 + 16, np.float32)[shift:][:2000].reshape(1000, 2) for _ in range(2))
+    given_[...] = points
+    out = UndistortedPoints(moved, np.zeros(1016, np.uint8)[shift:][:1000])
+    operation = UndistortPoints(model=CAMERAS["tangential"])
+    assert_as_expected(operation, operation(given_, device=device, out=out), points)
+
+
+@TWO_WAYS
+@pytest.mark.parametrize("inverse", [False, True], ids=["undistort", "distort"])
+def test_not_finite(device: Device, model: Any, dtype: Any, walk: Any, inverse: bool) -> None:
+    inf, nan = math.inf, math.nan
+    bad = [(nan, 5.0), (5.0, nan), (inf, 5.0), (5.0, -inf), (nan, inf), (inf, -inf), (300.0, 200.0), (650.0, 500.0)]
+    operation = UndistortPoints(model=model, walk=walk, inverse=inverse)
+    result = operation(np.tile(np.array(bad, dtype), (5, 1)), device=device)
+    np.testing.assert_array_equal(result.status, 5 * (6 * [Status.NOT_FINITE] + [0, 0]))
+    np.testing.assert_array_equal(np.isnan(result.points).all(axis=1), result.status != 0)
+
+
+@TWO_WAYS
+@pytest.mark.parametrize("inverse", [False, True], ids=["undistort", "distort"])
+def test_far_points_are_flagged_or_finite(device: Device, model: Any, walk: Any, dtype: Any, inverse: bool) -> None:
+    far = np.geomspace(1e4, 1e38 if dtype == np.float32 else 1e300, 64)
+    points = np.concatenate([np.stack(each, -1) for each in ((far, far), (-far, 0 * far), (0 * far, far))])
+    operation = UndistortPoints(model=model, inverse=inverse, walk=walk)
+    result = operation(points.astype(dtype), device=device)
+    np.testing.assert_array_equal(np.isfinite(result.points).all(axis=1), result.status == 0)
+    np.testing.assert_array_equal(np.isnan(result.points).all(axis=1), result.status != 0)
+
+
+def test_behind_a_tilted_sensor(device: Device) -> None:
+    given_ = camera(tilt=(45.0, 0.0))
+    points = np.tile([[642.5, 509.25 + 1650.0 * 0.99], [642.5, 509.25 + 1650.0 * 1.01]], (10, 1))
+    result = UndistortPoints(model=given_, inverse=True)(points, device=device)
+    np.testing.assert_array_equal(result.status, 10 * [0, Status.FOLDED])
+
+
+def test_bound_and_device_arrays_say_the_same(device: Device, rng: np.random.Generator) -> None:
+    operation = UndistortPoints(model=CAMERAS["all"])
+    points = image_points(rng, 777).astype(np.float32)
+    expected = operation(points, device=device)
+    on_device = cl.array.to_device(device.queue, points)
+    result = operation(on_device)
+    assert isinstance(result.points, cl.array.Array)
+    np.testing.assert_array_equal(result.points.get(), expected.points)
+    bound = operation.bind(device, points.shape, points.dtype)
+    bound(on_device).wait()
+    np.testing.assert_array_equal(bound.outputs.points.get(), expected.points)
+    np.testing.assert_array_equal(bound.outputs.status.get(), expected.status)
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_neighbours_do_not_matter(device: Device, walk: Any, rng: np.random.Generator) -> None:
+    """A point's result is the same to the bit beside points that need the careful search, and beside none."""
+    wide = camera(-0.28, 0.11, 5e-4, -3e-4, -0.02)
+    points = image_points(rng, 160).astype(np.float32)
+    alone = UndistortPoints(model=wide, walk=walk)(points, device=device)
+    points[::5] = (1e5, 1e5)
+    among = UndistortPoints(model=wide, walk=walk)(points, device=device)
+    others = np.arange(160) % 5 != 0
+    np.testing.assert_array_equal(among.points[others], alone.points[others])
+
+
+# ---- the plane -----------------------------------------------------------------------------------------------
+
+
+@TWO_WAYS
+def test_plane_polynomial(device: Device, dtype: Any, walk: Any, rng: np.random.Generator) -> None:
+    p = (-0.064, 1.02e-4, -1.7e-6, 4e-9, 3e-9, -1e-9, 4e-12, 4e-12)
+    q = (-0.051, 1.01e-4, 1.8e-6, -2e-9, 5e-9, 1e-9, 4e-12, 4e-12)
+    polynomial = PlanePolynomial(p=p, q=q, region=((0.0, 1279.0), (0.0, 1023.0)))
+    points = (image_points(rng) * 1.1).astype(dtype)
+    outside = (points > [1279.0, 1023.0]).any(axis=1)
+    points[17] = math.nan
+    status = np.where(outside, Status.OUT_OF_RANGE, 0)
+    status[17] = Status.NOT_FINITE
+    result = UndistortPoints(model=polynomial, walk=walk)(points, device=device)
+    np.testing.assert_array_equal(result.status, status)
+    # Ten roundings of 0.1 m.
+    eps = float(np.finfo(dtype).eps)
+    np.testing.assert_allclose(result.points, polynomial.to_plane(points), rtol=0, atol=eps)
+    inner = result.points[(status == 0) & (points < [1278.0, 1022.0]).all(axis=1) & (points > 1.0).all(axis=1)]
+    back = UndistortPoints(model=polynomial, inverse=True, walk=walk)(np.ascontiguousarray(inner), device=device)
+    assert np.all(back.status == 0)
+    np.testing.assert_allclose(back.points, polynomial.to_sensor(inner), rtol=0, atol=1e4 * eps)
+    far = np.tile(np.array([[0.2, 0.0], [0.0, -0.2], [1e20, 0.0], [0.0, 0.0]], dtype), (5, 1))
+    lost = UndistortPoints(model=polynomial, inverse=True, walk=walk)(far, device=device)
+    np.testing.assert_array_equal(lost.status, 5 * (3 * [Status.OUT_OF_RANGE] + [0]))
+
+
+# ---- what is refused -----------------------------------------------------------------------------------------
+
+
+def test_wrong_inputs(device: Device) -> None:
+    operation = UndistortPoints(model=CAMERAS["k1"])
+    with pytest.raises(TypeError, match="float32 or float64 points, got int64"):
+        operation(np.zeros((4, 2), np.int64), device=device)
+    with pytest.raises(ValueError, match=r"takes points \(\.\.\., 2\), got shape \(4, 3\)"):
+        operation(np.zeros((4, 3)), device=device)
+    with pytest.raises(ValueError, match="contiguous"):
+        operation(np.zeros((8, 4))[:, ::2], device=device)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"model": 3}, TypeError, "expected a Camera, a Lens or a PlanePolynomial"),
+        ({"model": LENSES["lens k1"], "matrix": ANOTHER}, ValueError, "goes with a Camera only"),
+        ({"model": CAMERAS["k1"], "matrix": np.eye(2)}, ValueError, r"matrix has shape \(2, 2\)"),
+        ({"model": CAMERAS["k1"], "matrix": np.zeros((3, 3))}, ValueError, "focal lengths 0 and 0"),
+    ],
+)
+def test_wrong_parameters(options: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        UndistortPoints(**options)
+
+
+def test_against_a_converged_opencv(device: Device, rng: np.random.Generator) -> None:
+    given_ = CAMERAS["all"]
+    points = image_points(rng)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
+    matrix, coefficients = given_.to_opencv()
+    theirs = cv2.undistortPoints(points[:, None], matrix, coefficients, P=matrix, criteria=stop)[:, 0]
+    ours = UndistortPoints(model=given_)(points, device=device)
+    good = ours.status == 0
+    assert good.mean() > 0.9
+    np.testing.assert_allclose(ours.points[good], theirs[good], rtol=0, atol=1e-8)
+
+
+def test_the_public_names() -> None:
+    assert gv.UndistortPoints is UndistortPoints
+    assert gv.Camera is Camera
+    assert gv.PlanePolynomial is PlanePolynomial
+    assert replace(UndistortPoints(model=CAMERAS["k1"]), inverse=True).inverse

@@ -115,15 +115,20 @@ def _steepest_descent(objective: _Objective, lens: Float64, points: Float64) -> 
 
 
 def _gauss_newton(objective: _Objective, lens: Float64, points: Float64) -> Float64:
-    distance, slopes = objective.slopes(lens, points)
-    here = float(inner(distance, distance))
-    scale = 1.0 / np.sqrt(np.maximum(np.einsum("in,in->i", slopes, slopes), 1e-30))
-    matrix, gradient = inner(slopes * scale[:, None], slopes * scale[:, None]), inner(slopes, distance[None])[:, 0]
-    step = -scale * np.linalg.lstsq(matrix, scale * gradient, rcond=1e-12)[0]
-    for _ in range(30):
-        if objective.cost(lens + step, points) < here:
-            return np.asarray(lens + step)
-        step = 0.5 * step
+    """Take linear steps, halved until they gain; lines are fitted again after each."""
+    for _ in range(_DESCENTS):
+        distance, slopes = objective.slopes(lens, points)
+        here = float(inner(distance, distance))
+        scale = 1.0 / np.sqrt(np.maximum(np.einsum("in,in->i", slopes, slopes), 1e-30))
+        slopes *= scale[:, None]
+        step = -scale * np.linalg.lstsq(inner(slopes, slopes), inner(slopes, distance[None])[:, 0], rcond=1e-12)[0]
+        after = objective.cost(lens + step, points)
+        while after >= here and np.max(np.abs(step)) > 1e-12:
+            step = 0.5 * step
+            after = objective.cost(lens + step, points)
+        if here - after <= _SETTLED * here:
+            break
+        lens = lens + step
     return lens
 
 

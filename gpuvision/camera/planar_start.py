@@ -63,7 +63,8 @@ def flatten(views: Views, centre: Floats, radius: float, *, robust: bool = False
         by_radial *= not straight
         if robust:
             length = np.linalg.norm(residual, axis=1)
-            middle = np.median(length[views.weight > 0.0])
+            # Of each view: one that is all wrong shall not lose all its points here.
+            middle = np.nanmedian(np.where(views.weight > 0.0, length, np.nan), axis=1)[:, None]
             weight = views.weight / np.maximum(length, 0.3 * middle + 1e-12) * middle
             if round_ > _ROBUST_ROUNDS - 4:  # beyond doubt an outlier by now
                 weight *= length < 6.0 * middle + 1e-12

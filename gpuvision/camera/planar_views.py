@@ -37,7 +37,8 @@ _LEVEL = 0.001
 _SUFFICIENT = 1.3
 _RESCALINGS = 10
 _SAME_SCALE = 0.01
-_FEWEST_GOOD = 4
+# Share of a view's points that must fit before the others count as outliers.
+_FEWEST_GOOD = 0.25
 # One of 1e5 points at normal noise.
 _OUTLIER = 5.0
 # Residuals below are rounding: of no use to tell models apart.
@@ -291,11 +292,10 @@ def _without_outliers(task: _Task, candidate: _Candidate) -> _Candidate:
     """Go on from Huber's minimum to the nearest of Tukey's, in which outliers have no weight."""
     loss = candidate.loss._replace(kind="tukey")
     length = np.linalg.norm(residuals(task.views, candidate.state), axis=1)
-    lost = np.flatnonzero(np.sum(task.views.weight * (loss.weight(length) > 0.0), axis=1) < _FEWEST_GOOD)
+    weight = task.views.weight
+    lost = np.flatnonzero(np.sum(weight * (loss.weight(length) > 0.0), axis=1) < _FEWEST_GOOD * np.sum(weight, axis=1))
     if len(lost):
-        raise ValueError(
-            f"views {lost.tolist()} have no points that fit the others: leave them out or take loss='huber'"
-        )
+        raise ValueError(f"views {lost.tolist()} do not fit the others: leave them out, or take loss='huber'")
     return _fitted(task, replace(candidate, loss=loss))
 
 

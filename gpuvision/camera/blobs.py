@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from gpuvision.camera.lattice import local_bases
-from gpuvision.camera.pattern import Float64
+from gpuvision.camera.pattern import Float32, Float64, boxed, shrunk
 
 # Cells of the map of thresholds in a window.
 _CELLS = 16
@@ -68,13 +68,13 @@ class Scale(NamedTuple):
     bright: bool
     pitch: float
     """Usual distance to the nearest neighbours, in pixels."""
-    count: int
+    number: int
 
 
-def find_pattern_blobs(grey: npt.NDArray[np.float32]) -> PatternBlobs:
+def find_pattern_blobs(grey: Float32) -> PatternBlobs:
     """Find the blobs that a regular pattern is made of, of any size and brightness; maybe none."""
     scale = find_scale(grey)
-    if scale.count == 0:
+    if scale.number == 0:
         return PatternBlobs(np.empty((0, 2)), np.empty((0, 2)), False, math.nan)
     smoothing = 2 * round(_SMOOTHED * scale.pitch) + 1
     blobs = find_blobs(grey, _WINDOW_PITCHES * scale.pitch, scale.bright, smoothing)
@@ -83,7 +83,7 @@ def find_pattern_blobs(grey: npt.NDArray[np.float32]) -> PatternBlobs:
     return PatternBlobs(blobs.points[kept], blobs.size[kept], scale.bright, cover)
 
 
-def find_blobs(grey: npt.NDArray[np.float32], window: float, bright: bool, smoothing: int) -> Blobs:
+def find_blobs(grey: Float32, window: float, bright: bool, smoothing: int) -> Blobs:
     """Find regions brighter (darker) than the middle between the lightest and the darkest within a window.
 
     Those that touch the border, and those that fill their bounding box as no ellipse does, are left out.
@@ -99,7 +99,7 @@ def find_blobs(grey: npt.NDArray[np.float32], window: float, bright: bool, smoot
     smoothing
         Side in pixels, odd, of a box that the image is smoothed with.
     """
-    grey = cv2.blur(grey, (smoothing, smoothing)) if smoothing > 1 else grey
+    grey = boxed(grey, smoothing)
     level, usable = _threshold(grey, window)
     mask = cv2.compare(grey, level, cv2.CMP_GT if bright else cv2.CMP_LT)
     cv2.bitwise_and(mask, usable, dst=mask)
@@ -115,23 +115,23 @@ def find_blobs(grey: npt.NDArray[np.float32], window: float, bright: bool, smoot
     return Blobs(centroids[1:][kept], area[kept].astype(np.float64), box[kept].astype(np.float64))
 
 
-def _threshold(grey: npt.NDArray[np.float32], window: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
+def _threshold(grey: Float32, window: float) -> tuple[Float32, npt.NDArray[np.uint8]]:
     """Middle of the local extremes, and where they lie far enough apart (255)."""
     rows, columns = grey.shape
     step = max(1, math.floor(window / _CELLS))
-    small = cv2.resize(grey, (-(-columns // step), -(-rows // step)), interpolation=cv2.INTER_AREA)
+    small = shrunk(grey, step)
     side = 2 * round(0.5 * window / step) + 1
     kernel = np.ones((side, side), np.uint8)
-    high, low = (cv2.blur(each, (side, side)) for each in (cv2.dilate(small, kernel), cv2.erode(small, kernel)))
+    extremes = (cv2.dilate(small, kernel), cv2.erode(small, kernel))
+    high, low = (boxed(np.asarray(each, dtype=np.float32), side) for each in extremes)
     span = high - low
     least = max(_CONTRAST * float(np.percentile(span, 90)), _ABOVE_NOISE * _noise(small))
-    usable = (span > least).astype(np.uint8) * 255
-    full = (columns, rows)
-    middle = cv2.resize(0.5 * (high + low), full, interpolation=cv2.INTER_LINEAR)
-    return middle, cv2.resize(usable, full, interpolation=cv2.INTER_NEAREST)
+    middle = cv2.resize(0.5 * (high + low), (columns, rows), interpolation=cv2.INTER_LINEAR)
+    usable = cv2.resize((span > least).astype(np.uint8) * 255, (columns, rows), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(middle, dtype=np.float32), np.asarray(usable, dtype=np.uint8)
 
 
-def _noise(image: npt.NDArray[np.float32]) -> float:
+def _noise(image: Float32) -> float:
     """Sigma of an image's noise, from the quarter of its second differences that is smallest: there are no edges."""
     step = np.abs(image[:, 2:] - 2.0 * image[:, 1:-1] + image[:, :-2])
     return float(np.percentile(step, 25)) / (0.3186 * math.sqrt(6.0)) if step.size else 0.0
@@ -143,21 +143,21 @@ def alike(area: Float64) -> npt.NDArray[np.bool_]:
     return (area > _AREAS[0] * usual) & (area < _AREAS[1] * usual)
 
 
-def find_scale(grey: npt.NDArray[np.float32]) -> Scale:
+def find_scale(grey: Float32) -> Scale:
     """Try windows and both kinds of contrast; most blobs that lie amid symmetric neighbours win."""
     shrink = math.ceil(math.sqrt(grey.size / _TRIAL_PIXELS))
     best = Scale(False, math.nan, 0)
     for factor in sorted({shrink, 1}, reverse=True):
-        small = cv2.resize(grey, None, fx=1 / factor, fy=1 / factor, interpolation=cv2.INTER_AREA)
+        small = shrunk(grey, factor)
         for part in _WINDOWS:
             for bright in (False, True):
                 blobs = find_blobs(small, part * min(small.shape), bright, _TRIAL_SMOOTHING)
                 trial = _judge(blobs, bright)
-                if trial.count > best.count:
+                if trial.number > best.number:
                     best = trial._replace(pitch=trial.pitch * factor)
-                if trial.count > max(_CLEAR_COUNT, _CLEAR_SHARE * len(blobs.area)):
+                if trial.number > max(_CLEAR_COUNT, _CLEAR_SHARE * len(blobs.area)):
                     return best
-        if best.count > _CLEAR_COUNT:
+        if best.number > _CLEAR_COUNT:
             break
     return best
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, uniform_filter
 
 from gpuvision.camera.grid_polynomial import GridPolynomial, cross
-from gpuvision.camera.pattern import Float64
+from gpuvision.camera.pattern import Float32, Float64, boxed, nan_mean
 
 # Pixels with less of a dot than this count as ground: noise on the ground stays out, and the weight is 0 where the
 # window ends.
@@ -49,29 +48,27 @@ def lattice_steps(values: Float64) -> Float64:
         forward = np.diff(values, axis=axis)
         none = np.full_like(np.take(values, [0], axis), np.nan)
         pair = np.stack([np.concatenate([forward, none], axis), np.concatenate([none, forward], axis)])
-        known = np.isfinite(pair)
-        count = known.sum(axis=0)
-        mean = np.where(known, pair, 0.0).sum(axis=0) / np.where(count, count, np.nan)
-        steps.append(filled(mean))
+        steps.append(_filled(nan_mean(pair)))
     return np.stack(steps, axis=2)
 
 
-def filled(values: Float64) -> Float64:
-    """Fill what is NaN with the mean of what is known nearby; (rows, columns, channels)."""
+def _filled(values: Float64) -> Float64:
+    """Fill what is NaN with the mean of what is known nearby; (rows, columns, channels), NaN if nothing is known."""
     values = values.copy()
-    known = np.isfinite(values).all(axis=-1)
+    known = np.asarray(np.isfinite(values).all(axis=-1))
     reach = 1
-    while not known.all():
+    while known.any() and not known.all():
         reach = 2 * reach + 1
-        weight = cv2.blur(known.astype(np.float64), (reach, reach), borderType=cv2.BORDER_CONSTANT)
-        total = cv2.blur(np.where(known[..., None], values, 0.0), (reach, reach), borderType=cv2.BORDER_CONSTANT)
-        reached = ~known & (weight > 0.5 / reach**2)
-        values[reached] = total.reshape(values.shape)[reached] / weight[reached, None]
+        box = (reach, reach, 1)
+        weight = uniform_filter(known[..., None].astype(np.float64), box, mode="constant")
+        total = uniform_filter(np.where(known[..., None], values, 0.0), box, mode="constant")
+        reached = np.asarray(~known & (weight[..., 0] > 0.5 / reach**2))
+        values[reached] = total[reached] / weight[reached]
         known |= reached
     return values
 
 
-def measure_dots(grey: npt.NDArray[np.float32], points: Float64, size: Float64) -> Centroids:
+def measure_dots(grey: Float32, points: Float64, size: Float64) -> Centroids:
     """Measure the centres of gravity of dots.
 
     The ground is a plane through the corners of the dot's cell, the contrast grows as it does from dot to dot. A
@@ -117,40 +114,31 @@ def _laid_out(values: Float64, nodes: npt.NDArray[np.bool_]) -> Float64:
     return whole
 
 
-def _smoothed(grey: npt.NDArray[np.float32], sides: Float64) -> npt.NDArray[np.float32]:
+def _smoothed(grey: Float32, sides: Float64) -> Float32:
     """Smooth with a box of one of the smaller ones of these sides."""
-    side = 2 * int(0.5 * np.percentile(sides, 10)) + 1
-    return np.asarray(cv2.blur(grey, (side, side)), dtype=np.float32)
+    return boxed(grey, 2 * int(0.5 * np.percentile(sides, 10)) + 1)
 
 
-def sampled(image: npt.NDArray[np.float32], at: Float64) -> Float64:
+def sampled(image: Float32, at: Float64) -> Float64:
     """Bilinear samples at (..., 2); NaN outside of the image."""
     where = at[..., ::-1].transpose(at.ndim - 1, *range(at.ndim - 1))
     return np.asarray(map_coordinates(image, where, np.float64, order=1, mode="constant", cval=np.nan))
 
 
-def _ground(smooth: npt.NDArray[np.float32], at: Float64, steps: Float64) -> tuple[Float64, Float64, Float64]:
+def _ground(smooth: Float32, at: Float64, steps: Float64) -> tuple[Float64, Float64, Float64]:
     """Plane through the corners of the cells: level at the dot, slope per pixel, and what is left of four corners."""
     u, v = 0.5 * steps[:, 0], 0.5 * steps[:, 1]
     low, right, left, high = (sampled(smooth, at + each) for each in (-u - v, u - v, v - u, u + v))
     pairs = np.stack([0.5 * (low + high), 0.5 * (left + right)])
-    level = _mean(pairs)
-    level = np.where(np.isfinite(level), level, _mean(np.stack([low, right, left, high])))
-    along = np.stack([_mean(np.stack([right - low, high - left])), _mean(np.stack([left - low, high - right]))], axis=1)
+    level = nan_mean(pairs)
+    level = np.where(np.isfinite(level), level, nan_mean(np.stack([low, right, left, high])))
+    along = [nan_mean(np.stack(each)) for each in ((right - low, high - left), (left - low, high - right))]
     # along = steps @ slope
-    slope = np.linalg.solve(steps, np.nan_to_num(along)[..., None])[..., 0]
-    return level, slope, np.nan_to_num(pairs[0] - pairs[1])
+    slope = np.linalg.solve(steps, np.nan_to_num(np.stack(along, axis=1))[..., None])[..., 0]
+    return level, np.asarray(slope, dtype=np.float64), np.nan_to_num(pairs[0] - pairs[1])
 
 
-def _mean(values: Float64) -> Float64:
-    """Mean over the first axis of what is finite; NaN where nothing is."""
-    known = np.isfinite(values)
-    count = known.sum(axis=0)
-    mean: Float64 = np.where(known, values, 0.0).sum(axis=0) / np.where(count, count, np.nan)
-    return mean
-
-
-def _moments(grey: npt.NDArray[np.float32], at: Float64, half: Float64, planes: list[Float64], reach: int) -> Float64:
+def _moments(grey: Float32, at: Float64, half: Float64, planes: list[Float64], reach: int) -> Float64:
     """Sum of the weights, and of the weights times x, y, x^2, y^2 from the nearest pixel, (n, 5).
 
     ``planes`` are ground and contrast: level at the dot and slopes along x and y, (n, 3).

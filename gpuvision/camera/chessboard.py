@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,9 +13,16 @@ from scipy.ndimage import label
 from gpuvision.camera.centroids import lattice_steps, sampled
 from gpuvision.camera.grid_polynomial import on_grid
 from gpuvision.camera.lattice import as_grid, charts, joined
-from gpuvision.camera.pattern import Float64, PatternGrid, grey_image, localisation_noise, trimmed
-
-Float32 = npt.NDArray[np.float32]
+from gpuvision.camera.pattern import (
+    Float32,
+    Float64,
+    PatternGrid,
+    boxed,
+    grey_image,
+    localisation_noise,
+    shrunk,
+    trimmed,
+)
 
 _FEWEST = 6
 # Blur that corners are looked for with, in pixels of the image and of its half and its quarter.
@@ -47,7 +55,7 @@ _SETTLED = 1e-4
 _CHUNK_PIXELS = 1 << 17
 
 
-def find_chessboard(image: npt.NDArray[np.generic], inner: tuple[int, int] | None = None) -> PatternGrid:
+def find_chessboard(image: npt.NDArray[Any], inner: tuple[int, int] | None = None) -> PatternGrid:
     """Find the inner corners of a chessboard.
 
     Corners are saddles of the grey levels, indexed by walking from neighbour to neighbour and kept where the four
@@ -99,21 +107,19 @@ def _known(points: Float64) -> int:
 
 def _board(grey: Float32, level: int) -> Float64:
     """Corners (rows, columns, 2) of the board as it shows in the image, halved so many times; to about a pixel."""
-    factor = 2**level
-    size = (max(1, grey.shape[1] // factor), max(1, grey.shape[0] // factor))
-    places, turning = _saddles(cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if level else grey)
+    small = shrunk(grey, 2**level)
+    places, turning = _saddles(small)
     pieces = charts(places, _FEWEST, turning)
     if not pieces:
         return np.empty((0, 0, 2))
     # Pixel (0, 0) of a halved image is the middle of four.
-    scale = np.array([grey.shape[1] / size[0], grey.shape[0] / size[1]])
+    scale = np.array([grey.shape[1] / small.shape[1], grey.shape[0] / small.shape[0]])
     places = (places + 0.5) * scale - 0.5
     index = as_grid(joined(pieces, places)[0], places)
     corners = np.where(index[..., None] < 0, np.nan, places[index])
     corners[~_chequered(grey, corners)] = np.nan
     parts, _ = label(np.isfinite(corners[..., 0]))
-    small = np.flatnonzero(np.bincount(parts.ravel()) < _FEWEST)
-    corners[np.isin(parts, small)] = np.nan
+    corners[np.isin(parts, np.flatnonzero(np.bincount(parts.ravel()) < _FEWEST))] = np.nan
     return trimmed(corners)
 
 
@@ -121,7 +127,7 @@ def _chequered(grey: Float32, corners: Float64) -> npt.NDArray[np.bool_]:
     """Where two opposite squares about a corner are darker than the two others, by about as much as elsewhere."""
     steps = lattice_steps(corners)
     u, v = _SQUARES * steps[:, :, 0], _SQUARES * steps[:, :, 1]
-    smooth = cv2.blur(grey, (3, 3))
+    smooth = boxed(grey, 3)
     a, b, c, d = (sampled(smooth, corners + each) for each in (u + v, u - v, -u - v, v - u))
     parity = np.where(np.indices(corners.shape[:2]).sum(axis=0) % 2, 1.0, -1.0)
     low, high = np.minimum(a, c) - np.maximum(b, d), np.minimum(b, d) - np.maximum(a, c)
@@ -135,13 +141,16 @@ def _chequered(grey: Float32, corners: Float64) -> npt.NDArray[np.bool_]:
 def _measured(grey: Float32, corners: Float64) -> Float64:
     """Move corners to where the gradients around them lead past."""
     known = np.isfinite(corners[..., 0])
-    if not known.any():
-        return corners
-    steps = lattice_steps(corners)[known]
-    to_steps = np.linalg.inv(steps).transpose(0, 2, 1)  # (x, y) to steps, from the left
+    # Rows that nothing joins have no steps from one to the other.
+    if min(known.shape) < 2 or not np.isfinite(steps := lattice_steps(corners)[known]).all():
+        return np.full_like(corners, np.nan)
+    # (x, y) to steps, from the left
+    to_steps = np.asarray(np.linalg.inv(steps).transpose(0, 2, 1), dtype=np.float64)
     step = float(np.median(np.linalg.norm(steps, axis=-1)))
     smooth = cv2.GaussianBlur(grey, (0, 0), max(_LEAST_BLUR, _MEASURED_BLUR * step)) / _white(grey, step)
-    slope = [cv2.Scharr(smooth, cv2.CV_32F, *order, scale=1 / 32) for order in ((1, 0), (0, 1))]
+    slope = [
+        np.asarray(cv2.Scharr(smooth, cv2.CV_32F, *order, scale=1 / 32), dtype=np.float32) for order in ((1, 0), (0, 1))
+    ]
     at, rest = corners[known], np.empty(len(steps))
     reach = math.ceil(_WINDOW * float(np.abs(steps).sum(axis=1).max())) + 1
     chunk = max(1, _CHUNK_PIXELS // (2 * reach + 1) ** 2)
@@ -158,9 +167,8 @@ def _measured(grey: Float32, corners: Float64) -> Float64:
 def _white(grey: Float32, step: float) -> Float32:
     """Grey level of light squares, everywhere: a slope of the illumination would turn the gradients."""
     factor = max(1, int(step / _WHITE_CELLS))
-    small = cv2.resize(grey, (-(-grey.shape[1] // factor), -(-grey.shape[0] // factor)), interpolation=cv2.INTER_AREA)
     side = 2 * math.ceil(step / factor) + 1
-    high = cv2.blur(cv2.dilate(small, np.ones((side, side), np.uint8)), (side, side))
+    high = boxed(np.asarray(cv2.dilate(shrunk(grey, factor), np.ones((side, side), np.uint8)), dtype=np.float32), side)
     white = cv2.resize(high, grey.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(np.maximum(white, 1e-3 * white.max()), dtype=np.float32)
 

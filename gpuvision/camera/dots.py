@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -25,7 +27,7 @@ _LEAST_CONTRAST = 0.25
 _UNEVEN = 0.5
 
 
-def find_dots(image: npt.NDArray[np.generic]) -> PatternGrid:
+def find_dots(image: npt.NDArray[Any]) -> PatternGrid:
     """Find the dots of a regular grid, dark on light or light on dark.
 
     Dots are told from the ground by a threshold that follows the illumination, indexed by walking from neighbour to

@@ -109,4 +109,4 @@ def _off_neighbours(points: Float64) -> Float64:
         amid.append(np.where(np.isfinite(cubic), cubic, line))
         beyond += [3.0 * (at[k] - at[2 * k]) + at[3 * k] for k in (-1, 1)]
     off, off_beyond = (np.linalg.norm(points - nan_median(np.stack(each)), axis=-1) for each in (amid, beyond))
-    return np.where(np.isfinite(off), off, 0.5 * off_beyond)
+    return np.asarray(np.where(np.isfinite(off), off, 0.5 * off_beyond))

@@ -36,7 +36,7 @@ class Chart(NamedTuple):
     """Points of one lattice: their numbers and their (column, row), any origin."""
 
     members: Int64
-    index: Int64
+    nodes: Int64
 
 
 def local_bases(points: Float64, tree: cKDTree, turning: Float64 | None = None) -> Float64:
@@ -103,7 +103,7 @@ class _Walk:
         key = target[:, 0] * _SIDE + target[:, 1]
         for names in (key, found):
             order = order[np.sort(np.unique(names[order], return_index=True)[1])]
-        new = found[order]
+        new: Int64 = found[order]
         self.bases[new] = self.bases[parent[order]]
         self._place(new, target[order])
         self._measure(new)
@@ -157,7 +157,7 @@ def charts(points: Float64, fewest: int, turning: Float64 | None = None) -> list
         chart = _walked(points, tree, seed, bases[seed], turning)
         left[chart.members] = False
         left[seed] = False
-        if len(chart.members) >= fewest and np.ptp(chart.index, axis=0).all():
+        if len(chart.members) >= fewest and np.ptp(chart.nodes, axis=0).all():
             pieces.append(chart)
     return _without_overlap(pieces, fewest)
 
@@ -181,7 +181,7 @@ def _without_overlap(pieces: list[Chart], fewest: int) -> list[Chart]:
     for piece in sorted(pieces, key=lambda each: len(each.members), reverse=True):
         own = ~np.isin(piece.members, taken)
         if np.count_nonzero(own) >= fewest:
-            kept.append(Chart(piece.members[own], piece.index[own]))
+            kept.append(Chart(piece.members[own], piece.nodes[own]))
             taken = np.concatenate([taken, piece.members[own]])
     return kept
 
@@ -196,7 +196,7 @@ def as_grid(chart: Chart, points: Float64) -> Int64:
     numpy.ndarray
         (rows, columns): numbers of points, -1 where there is none.
     """
-    index = chart.index
+    index = chart.nodes
     place = points[chart.members]
     for _ in range(2):  # the first turn is found on oblique axes where the shortest steps are others
         steps = _mean_steps(index, place)
@@ -248,7 +248,7 @@ def joined(pieces: list[Chart], points: Float64) -> tuple[Chart, list[Chart]]:
         for piece in apart:
             index = _continued(whole, piece, points)
             if index is not None:
-                whole = Chart(np.concatenate([whole.members, piece.members]), np.concatenate([whole.index, index]))
+                whole = Chart(np.concatenate([whole.members, piece.members]), np.concatenate([whole.nodes, index]))
                 apart = [each for each in apart if each is not piece]
                 break
         else:
@@ -268,8 +268,8 @@ def _continued(whole: Chart, piece: Chart, points: Float64) -> Int64 | None:
     ends = np.argsort(np.linalg.norm(other - anchor, axis=1))[: _JOINT // 4]
     scale = np.ptp(place[near])
     design, there = (_quadratic((each - anchor) / scale) for each in (place[near], other[ends]))
-    guess = there @ np.linalg.lstsq(design, whole.index[near].astype(np.float64), rcond=None)[0]
-    own = piece.index[ends].astype(np.float64)
+    guess = there @ np.linalg.lstsq(design, whole.nodes[near].astype(np.float64), rcond=None)[0]
+    own = piece.nodes[ends].astype(np.float64)
     turn = np.rint(np.linalg.lstsq(own - own.mean(axis=0), guess - guess.mean(axis=0), rcond=None)[0]).astype(np.int64)
     if abs(round(float(np.linalg.det(turn)))) != 1:
         return None
@@ -277,8 +277,8 @@ def _continued(whole: Chart, piece: Chart, points: Float64) -> Int64 | None:
     shift = np.rint(np.median(offset, axis=0)).astype(np.int64)
     if np.median(np.abs(offset - shift)) > _FITS or np.max(np.abs(np.median(offset, axis=0) - shift)) > 2.0 * _FITS:
         return None
-    index = piece.index @ turn + shift
-    taken = {tuple(each) for each in whole.index.tolist()}
+    index = piece.nodes @ turn + shift
+    taken = {tuple(each) for each in whole.nodes.tolist()}
     return None if any(tuple(each) in taken for each in index.tolist()) else index
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,7 @@ from gpuvision.camera.blobs import find_pattern_blobs
 from gpuvision.camera.centroids import lattice_steps, sampled
 from gpuvision.camera.grid_polynomial import on_grid
 from gpuvision.camera.lattice import whole_grid
-from gpuvision.camera.pattern import Float64, LineFamilies, grey_image, nan_median
+from gpuvision.camera.pattern import Float32, Float64, LineFamilies, grey_image, nan_median
 
 _FEWEST_CELLS = 9
 _FEWEST_POINTS = 3
@@ -36,7 +37,7 @@ _LEAST_CONTRAST = 0.4
 _CHUNK_SAMPLES = 1 << 18
 
 
-def find_lines(image: npt.NDArray[np.generic]) -> LineFamilies:
+def find_lines(image: npt.NDArray[Any]) -> LineFamilies:
     """Find the lines of a grid of crossing lines, dark on light or light on dark.
 
     The cells between the lines are found and indexed as dots are; between two neighbouring cells lies a line, and
@@ -76,7 +77,7 @@ def find_lines(image: npt.NDArray[np.generic]) -> LineFamilies:
     return _family(rows), _family(columns)
 
 
-def _between_columns(grey: npt.NDArray[np.float32], cells: Float64, bright: bool) -> Float64:
+def _between_columns(grey: Float32, cells: Float64, bright: bool) -> Float64:
     """Measure the lines before, between and after columns of cells: (columns + 1, rows, 2), NaN where there is none."""
     steps = lattice_steps(cells)
     across, along = (np.concatenate([each, each[:, -1:]], axis=1) for each in (steps[:, :, 0], steps[:, :, 1]))
@@ -92,9 +93,7 @@ def _between_columns(grey: npt.NDArray[np.float32], cells: Float64, bright: bool
     return points.swapaxes(0, 1)
 
 
-def _measured(
-    grey: npt.NDArray[np.float32], centre: Float64, across: Float64, along: Float64, bright_cells: bool
-) -> Float64:
+def _measured(grey: Float32, centre: Float64, across: Float64, along: Float64, bright_cells: bool) -> Float64:
     """Centres of gravity (n, 2) of profiles across lines; NaN where there is no line like the others."""
     long = (float(np.linalg.norm(each, axis=1).max()) for each in (across, along))
     u = np.linspace(-_REACH, _REACH, 2 * math.ceil(_REACH * _ACROSS * next(long)) + 1)
@@ -116,7 +115,7 @@ def _measured(
     alike = (contrast > _LEAST_CONTRAST * np.nanmedian(contrast)) & (
         change < max(_OFF_WIDTH, _OFF_USUAL * float(np.nanmedian(change)))
     )
-    points = centre + across * (weight @ u / width)[:, None]
+    points: Float64 = centre + across * (weight @ u / width)[:, None]
     points[~alike] = np.nan
     return points
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 Float64: TypeAlias = npt.NDArray[np.float64]
+Float32: TypeAlias = npt.NDArray[np.float32]
 
 LineFamilies: TypeAlias = tuple[tuple[Float64, ...], ...]
 """Families of lines that are parallel in the world; a line is an array (n, 2) of measured (column, row), in order."""
@@ -33,7 +34,7 @@ class PatternGrid(NamedTuple):
     """Noise of one coordinate in pixels, as `localisation_noise` estimates it from the points."""
 
 
-def grey_image(image: npt.NDArray[np.generic]) -> npt.NDArray[np.float32]:
+def grey_image(image: npt.NDArray[Any]) -> Float32:
     """Return an image as float32 grey levels.
 
     Parameters
@@ -54,9 +55,8 @@ def grey_image(image: npt.NDArray[np.generic]) -> npt.NDArray[np.float32]:
         raise TypeError(f"image is {what}, expected an array of uint8, uint16 or float32")
     if image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)) or 0 in image.shape:
         raise ValueError(f"image has the shape {image.shape}, expected (height, width) or (height, width, 3)")
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    grey = image.astype(np.float32)
+    single = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+    grey = single.astype(np.float32)
     if image.dtype == np.float32 and not np.isfinite(grey).all():
         raise ValueError(f"image has {np.count_nonzero(~np.isfinite(grey))} pixels that are no finite numbers")
     return grey
@@ -88,6 +88,25 @@ def localisation_noise(points: npt.ArrayLike) -> float:
         if known.size >= _FEWEST_DIFFERENCES:
             estimates.append(float(np.median(known)) * _SIGMA_OF_MAD / math.sqrt(math.comb(2 * order, order)))
     return float(np.fmin.reduce(estimates))
+
+
+def shrunk(grey: Float32, step: int) -> Float32:
+    """Mean over cells of so many pixels, the last ones stretched to fit."""
+    rows, columns = grey.shape
+    size = (-(-columns // step), -(-rows // step))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def boxed(grey: Float32, side: int) -> Float32:
+    """Mean over a box about every pixel; the side is odd."""
+    return np.asarray(cv2.blur(grey, (side, side)) if side > 1 else grey, dtype=np.float32)
+
+
+def nan_mean(values: Float64) -> Float64:
+    """Mean over the first axis of what is finite; NaN where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=0)
+    return np.asarray(np.where(known, values, 0.0).sum(axis=0) / np.where(count, count, np.nan))
 
 
 def nan_median(values: Float64) -> Float64:

@@ -130,6 +130,11 @@ def test_the_number_of_corners_in_any_order(inner: tuple[int, int], rng: np.rand
     assert find_chessboard(photo(chessboard(VIEWS["plain"], INNER), rng), inner).points.shape == (6, 9, 2)
 
 
+def test_a_single_row_of_corners_is_none(rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match="corners of a chessboard found, expected at least 6"):
+        find_chessboard(photo(chessboard(view(SIZE, 1, 10, 40.0), (10, 1)), rng))
+
+
 def test_another_number_of_corners_is_told(rng: np.random.Generator) -> None:
     with pytest.raises(ValueError, match="chessboard of 9 x 6 inner corners found, expected 8 x 6"):
         find_chessboard(photo(chessboard(VIEWS["plain"], INNER), rng), (8, 6))

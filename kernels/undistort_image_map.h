@@ -14,18 +14,30 @@
 #define RUN_WIDE_WINDOW 3
 #define RUN_BANDED_WINDOW 4
 #define RUN_WIDE_BANDED_WINDOW 5
+#define RUN_SCATTERED 6  // as RUN_POINTS, where all taps lie within the image
 
 // Column and row of the other runs are cubics over the run.
 #define RUN_MIDDLE 7.5f
 #define CUBIC(curve, t) ((curve).s0 + (t) * ((curve).s1 + (t) * ((curve).s2 + (t) * (curve).s3)))
 
 #ifdef STRIP
-INLINED void in_window(const int wide, const int flat, global const CODE *image, global CODE *made, int4 head,
+INLINED void in_window(const int spread, const int flat, global const CODE *image, global CODE *made, int4 head,
                        float8 curve, constant int *size) {
     const float16 t = (float16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) - RUN_MIDDLE;
     const size_t pitch = (size_t)size[SOURCE_COLUMNS] * CHANNELS;
-    window(wide, flat, image + head.y * pitch + head.x * CHANNELS, pitch, CUBIC(curve.lo, t), CUBIC(curve.hi, t),
+    window(spread, flat, image + head.y * pitch + head.x * CHANNELS, pitch, CUBIC(curve.lo, t), CUBIC(curve.hi, t),
            HEAD_BANDS(head), HEAD_STARTS(head), made);
+}
+
+inline void at_points(global const CODE *image, global CODE *made, global uchar *status, int4 head, int lanes,
+                      global const float2 *points, constant int *size, float fill) {
+    global const float16 *places = (global const float16 *)(points + (size_t)RUN * head.w);
+    const float16 x = (float16)(places[0].even, places[1].even), y = (float16)(places[0].odd, places[1].odd);
+    const size_t pitch = (size_t)size[SOURCE_COLUMNS] * CHANNELS;
+    if (HEAD_WHAT(head) == RUN_SCATTERED)
+        window(SCATTERED, 1, image + head.y * pitch + head.x * CHANNELS, pitch, x, y, 0, 0, made);
+    else
+        each_pixel(image, made, status, head.x, head.y, lanes, x, y, size, fill);
 }
 
 // Does a row's runs.
@@ -37,21 +49,18 @@ inline void mapped_row(global const CODE *image, global CODE *made, global uchar
         const int start = RUN_START(run, columns);
         global CODE *to = made + start * CHANNELS;
         switch (HEAD_WHAT(head)) {
-        case RUN_WINDOW: in_window(0, 1, image, to, head, curves[run], size); break;
-        case RUN_WIDE_WINDOW: in_window(1, 1, image, to, head, curves[run], size); break;
-        case RUN_BANDED_WINDOW: in_window(0, 0, image, to, head, curves[run], size); break;
-        case RUN_WIDE_BANDED_WINDOW: in_window(1, 0, image, to, head, curves[run], size); break;
+        case RUN_WINDOW: in_window(NARROW, 1, image, to, head, curves[run], size); break;
+        case RUN_WIDE_WINDOW: in_window(WIDE, 1, image, to, head, curves[run], size); break;
+        case RUN_BANDED_WINDOW: in_window(NARROW, 0, image, to, head, curves[run], size); break;
+        case RUN_WIDE_BANDED_WINDOW: in_window(WIDE, 0, image, to, head, curves[run], size); break;
         case RUN_BLANK:
             for (int lane = 0; lane < lanes; lane++) {
                 blank(head.w, fill, to + lane * CHANNELS);
                 if (status) status[start + lane] = head.w;
             }
             break;
-        default: {
-            global const float16 *places = (global const float16 *)(points + (size_t)RUN * head.w);
-            each_pixel(image, to, status ? status + start : 0, head.x, head.y, lanes,
-                       (float16)(places[0].even, places[1].even), (float16)(places[0].odd, places[1].odd), size, fill);
-        }
+        default:
+            at_points(image, to, status ? status + start : 0, head, lanes, points, size, fill);
         }
     }
 }
@@ -63,7 +72,7 @@ inline uchar mapped_pixel(global const CODE *image, global CODE *made, int colum
     const int4 head = heads[index];
     if (HEAD_WHAT(head) == RUN_BLANK) return blank(head.w, fill, made);
     float2 place;
-    if (HEAD_WHAT(head) == RUN_POINTS) {
+    if (HEAD_WHAT(head) == RUN_POINTS || HEAD_WHAT(head) == RUN_SCATTERED) {
         place = points[(size_t)RUN * head.w + lane];
     } else {
         const float8 curve = curves[index];

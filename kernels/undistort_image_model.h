@@ -50,9 +50,9 @@ inline void computed_run(global const CODE *image, global CODE *made, global uch
         each_pixel(image, made, status ? status + start : 0, left, top, min(columns, RUN),
                    convert_float16(nan_where(folded, x)), convert_float16(nan_where(folded, y)), size, fill);
     else if (wide)
-        window(1, 0, from, pitch, along, across, bands, starts, made);
+        window(WIDE, 0, from, pitch, along, across, bands, starts, made);
     else
-        window(0, 0, from, pitch, along, across, bands, starts, made);
+        window(NARROW, 0, from, pitch, along, across, bands, starts, made);
 }
 #else
 inline uchar computed_pixel(global const CODE *image, global CODE *made, int column, int row, constant real *model,

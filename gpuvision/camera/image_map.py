@@ -19,11 +19,11 @@ Bools = npt.NDArray[np.bool_]
 
 # As in undistort_image_run.h and undistort_image_window.h.
 RUN = 16
-_POINTS, _BLANK, _WINDOW = 0, 1, 2
+_POINTS, _BLANK, _WINDOW, _SCATTERED = 0, 1, 2, 6
 _WIDE, _BANDED = 1, 2
 _NARROW_SPAN, _LOADED = 16, 32
 _SHIFTS = (8, 13, 19, 25)  # of the number of bands, and of the places where the windows of the thirds begin
-_MOST_BANDS = 16
+_MOST_BANDS = 5
 # How far a cubic may miss a place [px]: below what a float of a coordinate beyond 256 rounds away.
 _CUBIC_TOLERANCE = 1e-5
 # Places this near before a whole pixel count as on it [px]; interpolation is continuous there.
@@ -126,13 +126,13 @@ class Packer:
         base = self._bases(runs, finite)
         offsets = runs - base[:, :, None]
         curves, fits = _cubics(offsets)
-        what, bits = self._windows(base, offsets)
-        what = np.where(fits & finite.all(-1) & (places.shape[1] >= RUN), what, _POINTS)
+        what, bits = self._windows(base, offsets, fits)
+        what = np.where(finite.all(-1) & (places.shape[1] >= RUN), what, _POINTS)
         what, number = self._blanks(runs, finite, what)
         heads = np.empty((*what.shape, 4), np.int32)
         heads[..., :2] = base
         heads[..., 2] = what | bits
-        listed = what == _POINTS
+        listed = (what == _POINTS) | (what == _SCATTERED)
         heads[..., 3] = np.where(listed, points_before + np.cumsum(listed).reshape(listed.shape) - 1, number)
         points = np.where(finite[..., None], offsets, np.nan)[listed]
         return PackedMap(heads, curves.astype(np.float32), points.astype(np.float32))
@@ -145,7 +145,7 @@ class Packer:
         last = np.array(self.source[::-1]) - 1
         return np.asarray(np.where((base == last) & (last > 0), base - 1, base))
 
-    def _windows(self, base: Float64, offsets: Float64) -> tuple[Ints, Ints]:
+    def _windows(self, base: Float64, offsets: Float64, fits: Bools) -> tuple[Ints, Ints]:
         """Which window serves each run, if any, and what the kernel has to know of it, as bits of the head."""
         before, after = self.taps
         rows, columns = self.source
@@ -155,13 +155,15 @@ class Packer:
         inside &= (column + gaps_x - 1 + after < columns) & (row + gaps_y - 1 + after < rows)
         starts, spans = self._parts(offsets[..., 0])
         wide = self.channels * spans > _NARROW_SPAN
-        inside &= (self.channels * spans <= _LOADED - self.channels + 1) & (gaps_y <= _MOST_BANDS)
+        window = fits & inside & (self.channels * spans <= _LOADED - self.channels + 1) & (gaps_y <= _MOST_BANDS)
         last = (row + gaps_y - 1 + after) * columns + column + starts.max(axis=0) + after
-        inside &= self.channels * last + np.where(wide, _LOADED, _NARROW_SPAN) <= self.channels * rows * columns
-        what = np.where(inside, _WINDOW + _WIDE * wide + _BANDED * (gaps_y > 1), _POINTS)
+        window &= self.channels * last + np.where(wide, _LOADED, _NARROW_SPAN) <= self.channels * rows * columns
+        # Single precision may round an offset up to the next pixel; in a window that is held back.
+        roomy = inside & (column + gaps_x + after < columns) & (row + gaps_y + after < rows)
+        what = np.where(window, _WINDOW + _WIDE * wide + _BANDED * (gaps_y > 1), np.where(roomy, _SCATTERED, _POINTS))
         bits = np.zeros_like(what)
         for number, shift in zip((gaps_y, *starts), _SHIFTS, strict=False):
-            bits |= np.where(inside, number, 0) << shift
+            bits |= np.where(window, number, 0) << shift
         return what, bits
 
     def _parts(self, x: Float64) -> tuple[Ints, Ints]:

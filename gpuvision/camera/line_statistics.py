@@ -20,6 +20,7 @@ _ROUNDS = 20
 _SINGULAR = 1e-13
 _SETTLED = 1e-3
 _NORMAL_MAD = 1.4826
+_LEAST_ROOT = 1e-4
 # Residuals below this part of the image are rounding; to test them against each other would be noise.
 _ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 
@@ -111,8 +112,7 @@ def robust_covariance(
 ) -> Float64:
     """Covariance of an M-estimate, in the order of `covariance`, from the spread of its own equations."""
     columns = projected_columns(packed, found.at, found.here, found.slopes, found.normal.taken)
-    root = np.sqrt(weight)
-    bread = np.divide(columns, root, out=np.zeros_like(columns), where=root > 0.0)
+    bread = columns / np.sqrt(weight)
     slope = influence_slope(found.here.distance / scale, loss)
     spread = _per_point(columns * found.here.residual, owner)
     enlarged = len(weight) / max(len(weight) - line_parameters(packed, found.at) - len(columns), 1)
@@ -159,7 +159,8 @@ def weights(residual: Float64, scale: float, loss: Loss) -> Float64:
     limit = _TUNING[loss] * scale
     if loss == "huber":
         return np.asarray(limit / np.maximum(np.abs(residual), limit))
-    return np.maximum(1.0 - (residual / limit) ** 2, 0.0) ** 2
+    # Not quite 0: a line of outliers alone is still a line.
+    return np.maximum(1.0 - (residual / limit) ** 2, _LEAST_ROOT) ** 2
 
 
 def robust_start(packed: PackedLines, centre: Float64 | None) -> tuple[Parameters, Float64]:

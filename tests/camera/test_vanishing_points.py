@@ -308,6 +308,17 @@ def test_outliers(loss: str) -> None:
     assert 0.6 < np.sqrt(np.mean(squares)) < 1.5
 
 
+@pytest.mark.parametrize("loss", ["huber", "tukey"])
+def test_a_line_of_outliers(rng: np.random.Generator, loss: str) -> None:
+    """A row that belongs to something else: it is a line, but no straight one."""
+    points, lens = seen(rng, 20.0, 20.0, 0.1)
+    rows, columns = grid_lines(points)
+    zigzag = rows[5] + np.where(np.arange(len(rows[5])) % 2, 30.0, -30.0)[:, None] * [0.0, 1.0]
+    fit = fit_lens([(*rows[:5], zigzag, *rows[6:]), columns], model="k1,k2", lines="free", loss=loss)
+    assert np.all(np.abs(errors(fit, lens)) < 5.0)
+    assert fit.rms_px < (5.0 if loss == "huber" else 0.15)
+
+
 def test_loss_without_outliers_costs_little(rng: np.random.Generator) -> None:
     points, lens = seen(rng, 20.0, 20.0, 0.1)
     plain = fit_lens(grid_lines(points), model="k1,k2", lines="vanishing")

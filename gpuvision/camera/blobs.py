@@ -32,6 +32,7 @@ _SMOOTHED = 0.04
 _WINDOWS = (1 / 3, 1 / 6, 1 / 12, 1 / 24, 1 / 48)
 _TRIAL_SMOOTHING = 3
 _TRIAL_PIXELS = 3e6
+_FEWEST_BLOBS = 5
 _MOST_BLOBS = 60_000
 # So many blobs amid symmetric neighbours, and such a share of all, need no further trial.
 _CLEAR_COUNT = 50
@@ -67,8 +68,11 @@ class Scale(NamedTuple):
 
     bright: bool
     pitch: float
-    """Usual distance to the nearest neighbours, in pixels."""
+    """Usual distance of neighbours along the longer one of the two steps, in pixels."""
+    cell: float
+    """Usual area that the two steps span, in square pixels."""
     number: int
+    """Blobs that lie amid symmetric neighbours."""
 
 
 def find_pattern_blobs(grey: Float32) -> PatternBlobs:
@@ -79,7 +83,7 @@ def find_pattern_blobs(grey: Float32) -> PatternBlobs:
     smoothing = 2 * round(_SMOOTHED * scale.pitch) + 1
     blobs = find_blobs(grey, _WINDOW_PITCHES * scale.pitch, scale.bright, smoothing)
     kept = alike(blobs.area)
-    cover = float(np.median(blobs.area[kept])) / scale.pitch**2 if kept.any() else math.nan
+    cover = float(np.median(blobs.area[kept])) / scale.cell if kept.any() else math.nan
     return PatternBlobs(blobs.points[kept], blobs.size[kept], scale.bright, cover)
 
 
@@ -146,7 +150,7 @@ def alike(area: Float64) -> npt.NDArray[np.bool_]:
 def find_scale(grey: Float32) -> Scale:
     """Try windows and both kinds of contrast; most blobs that lie amid symmetric neighbours win."""
     shrink = math.ceil(math.sqrt(grey.size / _TRIAL_PIXELS))
-    best = Scale(False, math.nan, 0)
+    best = Scale(False, math.nan, math.nan, 0)
     for factor in sorted({shrink, 1}, reverse=True):
         small = shrunk(grey, factor)
         for part in _WINDOWS:
@@ -154,7 +158,7 @@ def find_scale(grey: Float32) -> Scale:
                 blobs = find_blobs(small, part * min(small.shape), bright, _TRIAL_SMOOTHING)
                 trial = _judge(blobs, bright)
                 if trial.number > best.number:
-                    best = trial._replace(pitch=trial.pitch * factor)
+                    best = trial._replace(pitch=trial.pitch * factor, cell=trial.cell * factor**2)
                 if trial.number > max(_CLEAR_COUNT, _CLEAR_SHARE * len(blobs.area)):
                     return best
         if best.number > _CLEAR_COUNT:
@@ -163,12 +167,13 @@ def find_scale(grey: Float32) -> Scale:
 
 
 def _judge(blobs: Blobs, bright: bool) -> Scale:
+    """Tell what is usual about those blobs that lie amid symmetric neighbours."""
     points = blobs.points[alike(blobs.area)]
-    if not 5 <= len(points) <= _MOST_BLOBS:
-        return Scale(bright, math.nan, 0)
+    if not _FEWEST_BLOBS <= len(points) <= _MOST_BLOBS:
+        return Scale(bright, math.nan, math.nan, 0)
     bases = local_bases(points, cKDTree(points))
+    bases = bases[np.isfinite(bases[:, 0, 0])]
+    if len(bases) == 0:
+        return Scale(bright, math.nan, math.nan, 0)
     length = np.linalg.norm(bases, axis=-1).max(axis=1)
-    known = np.isfinite(length)
-    if not known.any():
-        return Scale(bright, math.nan, 0)
-    return Scale(bright, float(np.median(length[known])), int(np.count_nonzero(known)))
+    return Scale(bright, float(np.median(length)), float(np.median(np.abs(np.linalg.det(bases)))), len(bases))

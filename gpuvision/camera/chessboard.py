@@ -52,6 +52,7 @@ _AWAY = 0.3
 _OTHER_EDGES = 4.0
 _ITERATIONS = 20
 _SETTLED = 1e-4
+_SINGULAR = 1e-9
 _CHUNK_PIXELS = 1 << 17
 
 
@@ -191,6 +192,8 @@ def _settled(slope: list[Float32], start: Float64, to_steps: Float64, reach: int
         s, t = (to_steps[:, k, 0, None, None] * dx + to_steps[:, k, 1, None, None] * dy for k in (0, 1))
         window = np.maximum(1.0 - (s / _WINDOW) ** 2, 0.0) * np.maximum(1.0 - (t / _WINDOW) ** 2, 0.0)
         normal = _sums(window * xx, window * xy, window * xy, window * yy).reshape(-1, 2, 2)
+        # Where all edges run one way, or there are none, the point stays.
+        normal += (_SINGULAR * np.trace(normal, axis1=1, axis2=2) + np.finfo(float).tiny)[:, None, None] * np.eye(2)
         right = _sums(window * (xx * dx + xy * dy), window * (xy * dx + yy * dy))
         move = np.linalg.solve(normal, right[..., None])[..., 0]
         at += move

@@ -78,6 +78,13 @@ def test_error_follows_the_noise(noise: float, limit: float, width: float, rng: 
     assert abs(errors.mean()) < 4.0 * limit / np.sqrt(len(errors)) + 5e-4
 
 
+def test_wide_lines_seen_askew(rng: np.random.Generator) -> None:
+    camera = view(SIZE, ROWS, COLUMNS, 40.0, turn=10.0, tilt=50.0, focal=2.0)
+    rows, columns, errors = _checked(find_lines(photo(line_grid(camera, ROWS, COLUMNS, 0.25), rng)), camera)
+    assert (rows, columns) == (list(range(ROWS)), list(range(COLUMNS)))
+    assert _rms(errors) < 0.02
+
+
 def test_mirrored(rng: np.random.Generator) -> None:
     camera = view(SIZE, ROWS, COLUMNS, 40.0, turn=4.0, mirrored=True)
     rows, columns, errors = _checked(find_lines(photo(line_grid(camera, ROWS, COLUMNS), rng)), camera)

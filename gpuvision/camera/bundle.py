@@ -12,12 +12,12 @@ from gpuvision.camera.tilted_projection import COLUMNS, INTERNAL, Floats, projec
 
 # The fewer views, the more bent is the valley that the target's pose and the camera share, and the cheaper a step.
 _FEWEST_STEPS, _STEPS_OF_A_VIEW = 100, 1000
-# The last step moved the numbers by less than this many of their standard deviations ...
+# A fit ends where a step moves the numbers by less than this many of their standard deviations ...
 _SETTLED = 1e-4
-_STUCK = 1e16
-_UNDAMPED = 1e-11
 # ... or the residual is down to the rounding of pixel coordinates.
 _EXACT_PX = 1e-9
+# Damping that holds back nothing, and damping at which no step leads down.
+_UNDAMPED, _STUCK = 1e-11, 1e16
 MEDIAN_OF_NORM = 1.1774  # of two normal deviates
 # 95 % efficiency for normal noise on two coordinates.
 _HUBER, _TUKEY = 1.5, 5.123

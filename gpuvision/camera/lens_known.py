@@ -92,7 +92,7 @@ def fit_tilt(
     if len(views) == 1 and direction is None and focal_length is None:
         raise ValueError("one view fixes two numbers of alpha, its direction and f': give direction=, or focal_length=")
     straight = [(target, lens.undistort(np.asarray(image).reshape(-1, 2))) for target, image in views]
-    packed, masks = pack(straight)
+    packed, _ = pack(straight)
     centre = np.array(lens.centre)
     radius = float(np.sqrt(np.max(np.sum((packed.seen - centre[:, None]) ** 2, axis=1))))
     homographies = flatten(packed, centre, radius, straight=True).homographies
@@ -105,8 +105,7 @@ def fit_tilt(
     chart = Chart(coefficients=(), tilt=True, centre=False, direction=direction, focal_length=focal_length)
     poses = [
         fit_tsai(target, seen, (values[2], values[3]), focal_length=f, distorted=False).pose
-        for (target, seen), mask in zip(straight, masks, strict=True)
-        if mask.any()
+        for target, seen in straight
     ]
     state = State(values, np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
     state = adjust(packed, chart, state, Loss())

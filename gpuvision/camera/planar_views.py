@@ -39,6 +39,8 @@ _RESCALINGS = 10
 _SAME_SCALE = 0.01
 # Share of a view's points that must fit before the others count as outliers.
 _FEWEST_GOOD = 0.25
+# Outliers may lie anywhere, but not so many of them.
+_MOST_OUTSIDE = 0.05
 # One of 1e5 points at normal noise.
 _OUTLIER = 5.0
 # Residuals below are rounding: of no use to tell models apart.
@@ -161,6 +163,7 @@ def _prepared(
     """Check and pack what was given, and fit the homographies."""
     packed, masks = pack(views)
     size = (int(image_size[0]), int(image_size[1]))
+    _check_inside(packed, size)
     known = None if centre is None else numbers(centre, (2,), "centre (column, row)")
     origin = 0.5 * (np.array(size) - 1.0) if known is None else np.array(known)
     radius = 0.5 * math.hypot(*size)
@@ -179,6 +182,14 @@ def _prepared(
         focal_length=None if focal_length is None else _positive(focal_length, "focal_length"),
         centre_is_known=known is not None,
     )
+
+
+def _check_inside(views: Views, size: tuple[int, int]) -> None:
+    outside = ((views.seen < -0.5) | (views.seen > np.array(size)[:, None] - 0.5)).any(axis=1) & (views.weight > 0.0)
+    if np.sum(outside) > _MOST_OUTSIDE * np.sum(views.weight):
+        raise ValueError(
+            f"{np.sum(outside)} points lie outside an image of {size[0]} columns and {size[1]} rows: expected them within"
+        )
 
 
 def _positive(value: float, what: str) -> float:

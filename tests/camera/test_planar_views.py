@@ -369,6 +369,12 @@ def test_options_out_of_bounds(options, message, rng):
         fit_camera(made.views(rng, 0.1), made.size, **options)
 
 
+def test_an_image_size_in_the_wrong_order(rng):
+    made = scene(rng, "grid", 10, views=3)
+    with pytest.raises(ValueError, match="outside an image of 512 columns and 1280 rows"):
+        fit_camera(made.views(rng, 0.1), (512, 1280))
+
+
 def test_a_view_of_a_grid():
     points = np.arange(24.0).reshape(3, 4, 2)
     points[1, 2] = np.nan

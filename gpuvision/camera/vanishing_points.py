@@ -214,6 +214,8 @@ class _Search:
             self.linear = self.linear._replace(at=start)
         start, here = self._beginning(order, meet)
         found = minimise(self.packed, start, here, weight=self.weight, keep_centre=self.keep_centre)
+        if order and not self.keep_centre and np.hypot(*found.at.centre) > 1.0:
+            found = self._from_the_middle(found, order, meet)
         if robust:
             found, self.weight, self.scale = reweighted(
                 self.packed, found, self.loss, self.sigma, keep_centre=self.keep_centre
@@ -221,6 +223,16 @@ class _Search:
             # Sums of squares compare under the same weights only.
             self.fits.clear()
         return found
+
+    def _from_the_middle(self, found: Minimum, order: int, meet: bool) -> Minimum:
+        """Look for a better minimum than one whose centre left the data: there are others far out, with k1 near 0."""
+        about = linear_start(self.packed, np.zeros(2), self.weight).at
+        start = about._replace(k=np.append(about.k, np.zeros(order - 1)))
+        if meet:
+            lines = evaluate(self.packed, start, weight=self.weight).lines
+            start = start._replace(vanishing=vanishing_start(self.packed, lines))
+        other = minimise(self.packed, start, weight=self.weight)
+        return min(found, other, key=lambda each: each.here.cost)
 
     def _beginning(self, order: int, meet: bool) -> tuple[Parameters, Evaluation | None]:
         if meet:

@@ -206,6 +206,9 @@ def linear_start(packed: PackedLines, centre: Float64 | None = None, weight: Flo
     k1, *moved = step.tolist()
     if centre is None and math.hypot(*moved) < abs(k1):
         known = np.array(moved) / k1
+    elif seen.any():
+        # A centre outside the image is noise, and so is k1 beside it: k1 about the middle.
+        k1 = -float(normal.gradient[0] / normal.matrix[0, 0])
     k = np.array([k1])
     while not monotone(k, reach(packed, known), least=_LEAST_SLOPE):
         k *= 0.7

@@ -186,9 +186,10 @@ def _prepared(
 
 def _check_inside(views: Views, size: tuple[int, int]) -> None:
     outside = ((views.seen < -0.5) | (views.seen > np.array(size)[:, None] - 0.5)).any(axis=1) & (views.weight > 0.0)
-    if np.sum(outside) > _MOST_OUTSIDE * np.sum(views.weight):
+    count = np.count_nonzero(outside)
+    if count > _MOST_OUTSIDE * np.sum(views.weight):
         raise ValueError(
-            f"{np.sum(outside)} points lie outside an image of {size[0]} columns and {size[1]} rows: expected them within"
+            f"{count} points lie outside an image of {size[0]} columns and {size[1]} rows: is image_size right?"
         )
 
 

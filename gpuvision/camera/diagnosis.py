@@ -18,6 +18,8 @@ _LEVEL = 0.001
 _TOO_NOISY = 1.2
 _SIGNIFICANT = 3.0
 _BORDER_POINTS = 17
+# Lenses are assembled no better, and sensors not tilted by so little on purpose.
+_ASSEMBLY_DEGREES = 1.0
 
 
 def diagnose(
@@ -145,7 +147,10 @@ def _small_tilt(fit: CameraFit) -> str:
     block = fit.covariance[-2:, -2:]
     tau = np.array(fit.camera.distortion[12:])
     if tau @ np.linalg.solve(block, tau) > _SIGNIFICANT**2:
-        return ""
+        alpha = math.degrees(math.hypot(*tau))
+        if alpha > _ASSEMBLY_DEGREES:
+            return ""
+        return f"a tilt of {alpha:.2g} degrees is no proof of a tilted sensor: decentred lenses (p1, p2) look the same"
     return (
         f"the tilt found, {math.degrees(math.hypot(*tau)):.2g} degrees, is within its own uncertainty: "
         "an untilted sensor fits as well"

@@ -26,6 +26,10 @@ _AS_WELL = 1.01
 _VAGUE = 0.1
 """Standard deviation of the centre, in half-diagonals, from which the data are said not to fix it."""
 
+_NORMAL_MAD = 1.4826
+_ROUNDING = 1e-9
+_TAILED = 2.0
+"""Ratio of rms to what half of the points suggest, from which errors are not normal."""
 _FAINT = 100.0
 """Variances that bends have to explain for linear uncertainties of k1 beside k2 to hold."""
 
@@ -197,15 +201,13 @@ def residuals_px(packed: PackedLines, found: Minimum, families: LineFamilies) ->
     return tuple(sorted_out)
 
 
-def warnings_of(fit: LensFit, packed: PackedLines, at_bound: str, straight: float, bends: float) -> Iterator[str]:
+def warnings_of(fit: LensFit, packed: PackedLines, found: Minimum, straight: float, bends: float) -> Iterator[str]:
     """Say what the data cannot fix.
 
     Parameters
     ----------
-    fit, packed
-        The fit, and its points.
-    at_bound
-        As in `Minimum`.
+    fit, packed, found
+        The fit, its points, and the minimum that it is.
     straight
         Probability of such bends of the lines without any lens.
     bends
@@ -214,11 +216,17 @@ def warnings_of(fit: LensFit, packed: PackedLines, at_bound: str, straight: floa
     single = np.bincount(packed.family, minlength=packed.families) < 2
     if fit.lines == "vanishing" and single.any():
         yield f"families {np.flatnonzero(single).tolist()} have fewer than two lines, hence no vanishing point"
+    usual = _NORMAL_MAD * packed.unit * float(np.median(np.abs(found.here.distance)))
+    if fit.rms_px > max(_TAILED * usual, _ROUNDING * packed.unit):
+        yield (
+            f"half of the points lie within {usual / _NORMAL_MAD:.3g} pixels, but the rms is {fit.rms_px:.3g}: "
+            "there are outliers; use loss='tukey'"
+        )
     if fit.lens is None:
         return
-    if at_bound == "fold":
+    if found.at_bound == "fold":
         yield "the best lens would fold the image inside the data; it was kept just from that: the model does not suit"
-    if at_bound == "centre":
+    if found.at_bound == "centre":
         yield "the data pull the centre out of sight: there is too little distortion to find it"
     if straight > REJECTED:
         yield f"the lines are as straight without a lens (p = {straight:.2g}): its parameters are noise"

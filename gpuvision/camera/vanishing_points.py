@@ -309,7 +309,7 @@ def _report(search: _Search, order: int, meet: bool, families: LineFamilies) -> 
     residuals = (len(packed.x), search.independent)
     straight = chance(search.linear.gain, 0.0, search.sought(1), residuals, 0, sigma**2)
     bends = search.linear.gain / sigma**2 * residuals[1] / residuals[0]
-    return replace(fit, warnings=tuple(warnings_of(fit, packed, found.at_bound, straight, bends)))
+    return replace(fit, warnings=tuple(warnings_of(fit, packed, found, straight, bends)))
 
 
 def _alternatives(search: _Search, order: int, meet: bool) -> tuple[LensAlternative, ...]:

@@ -40,6 +40,7 @@ def test_exact_lines_give_the_lens(rng: np.random.Generator, border: float, tilt
     # Rounding of the points, 1e-13 pixels, over the distortion they see: 1e-12 of it at the smallest.
     np.testing.assert_allclose(fit.values[:4], [lens.k1, lens.k2, *lens.centre], rtol=1e-9)
     assert fit.rms_px < 1e-12
+    assert fit.warnings == ()
     assert fit.names[:4] == NAMES
     ideal = lens.undistort(points)
     for number, line in ((0, ideal[0]), (1, ideal[:, 0])):
@@ -306,6 +307,16 @@ def test_outliers(loss: str) -> None:
         squares.append(errors(fit_lens(grid_lines(points), model="k1,k2", lines="free", loss=loss), lens) ** 2)
     # Rows and columns of an outlier are down-weighted each for itself: predicted errors hold to about a third.
     assert 0.6 < np.sqrt(np.mean(squares)) < 1.5
+
+
+def test_outliers_are_pointed_out(rng: np.random.Generator) -> None:
+    points, _ = seen(rng, 20.0, 20.0, 0.1)
+    assert fit_lens(grid_lines(points)).warnings == ()
+    points[5, 7] += [15.0, 0.0]
+    points[10, 20] -= [0.0, 40.0]
+    (said,) = (each for each in fit_lens(grid_lines(points)).warnings if "outliers" in each)
+    assert said.endswith("there are outliers; use loss='tukey'")
+    assert not any("outliers" in each for each in fit_lens(grid_lines(points), loss="tukey").warnings)
 
 
 @pytest.mark.parametrize("loss", ["huber", "tukey"])

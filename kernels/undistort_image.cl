@@ -18,10 +18,12 @@
 #endif
 
 #ifdef STRIP
-// One work-item per row of a frame: its runs may overlap.
-kernel __attribute__((vec_type_hint(float16))) __attribute__((reqd_work_group_size(1, 1, 1))) void undistort(global const CODE *image, global CODE *made, global uchar *status, global const int4 *heads,
-                      global const float8 *curves, global const float2 *points, constant real *model,
-                      constant int *size, const float fill) {
+// One work-item per row of a frame: its runs may overlap. The hint keeps compilers from looking for more vectors, which
+// takes them half a minute.
+kernel __attribute__((vec_type_hint(float16))) __attribute__((reqd_work_group_size(1, 1, 1)))
+void undistort(global const CODE *image, global CODE *made, global uchar *status, global const int4 *heads,
+               global const float8 *curves, global const float2 *points, constant real *model, constant int *size,
+               const float fill) {
     const int row = get_global_id(0), columns = size[MADE_COLUMNS];
     const size_t frame = get_global_id(1);
     image += frame * size[SOURCE_ROWS] * size[SOURCE_COLUMNS] * CHANNELS;
@@ -43,6 +45,7 @@ kernel void undistort(global const CODE *image, global CODE *made, global uchar 
                       constant int *size, const float fill) {
     const int column = get_global_id(0), row = get_global_id(1), columns = size[MADE_COLUMNS];
     const size_t frame = get_global_id(2), pixel = (size_t)row * columns + column;
+    if (column >= columns || row >= size[MADE_ROWS]) return;
     image += frame * size[SOURCE_ROWS] * size[SOURCE_COLUMNS] * CHANNELS;
     made += (frame * size[MADE_ROWS] * columns + pixel) * CHANNELS;
 #ifdef COMPUTED

@@ -12,13 +12,6 @@ inline masks measured(reals *column, reals *row, constant real *model) {
 #endif
 }
 
-// The pixel that a place counts from: within what a float holds, also where the place is none.
-inline int pixel_before(real place) {
-    const real held = fmin(fmax(place, (real)-FARTHEST), (real)FARTHEST);
-    const int whole = (int)held;
-    return whole - (held < whole);
-}
-
 #ifdef STRIP
 // How far a window's pixels may lie apart, and how many gaps between rows they may fall into.
 #define STEEPEST (CHANNELS == 3 ? (real)1.6 : (real)2)
@@ -40,19 +33,19 @@ inline void computed_run(global const CODE *image, global CODE *made, global uch
     const int3 starts = (int3)(0, pixel_before(x.s5), pixel_before(x.sa)) * (CHANNELS / 3);
     const int wide = gaps * CHANNELS > 16;
     const size_t pitch = (size_t)size[SOURCE_COLUMNS] * CHANNELS;
-    const size_t loaded = (top + bands - 1 + TAPS_AFTER) * pitch + (left + starts.z + TAPS_AFTER) * CHANNELS + 16 + 16 * wide;
-    const int inside = left >= TAPS_BEFORE && top >= TAPS_BEFORE && left + gaps - 1 + TAPS_AFTER < size[SOURCE_COLUMNS] &&
-                       top + bands - 1 + TAPS_AFTER < size[SOURCE_ROWS] && loaded <= pitch * size[SOURCE_ROWS];
-    const float16 along = convert_float16(x), across = convert_float16(y);
-    global const CODE *from = image + top * pitch + left * CHANNELS;
+    const int right = left + gaps - 1 + TAPS_AFTER, bottom = top + bands - 1 + TAPS_AFTER;
+    const size_t loaded = bottom * pitch + (left + starts.z + TAPS_AFTER) * CHANNELS + (wide ? 32 : 16);
+    const int inside = left >= TAPS_BEFORE && top >= TAPS_BEFORE && right < size[SOURCE_COLUMNS] &&
+                       bottom < size[SOURCE_ROWS] && loaded <= pitch * size[SOURCE_ROWS];
     made += start * CHANNELS;
-    if (columns < RUN || !inside || bands > MOST_BANDS || any_lane(folded | ~steady))
+    if (columns < RUN || !inside || bands > MOST_BANDS || any_lane(folded | ~steady)) {
         each_pixel(image, made, status ? status + start : 0, left, top, min(columns, RUN),
                    convert_float16(nan_where(folded, x)), convert_float16(nan_where(folded, y)), size, fill);
-    else if (wide)
-        window(WIDE, 0, from, pitch, along, across, bands, starts, made);
-    else
-        window(NARROW, 0, from, pitch, along, across, bands, starts, made);
+        return;
+    }
+    image += top * pitch + left * CHANNELS;
+    if (wide) window(WIDE, 0, image, pitch, convert_float16(x), convert_float16(y), bands, starts, made);
+    else window(NARROW, 0, image, pitch, convert_float16(x), convert_float16(y), bands, starts, made);
 }
 #else
 inline uchar computed_pixel(global const CODE *image, global CODE *made, int column, int row, constant real *model,

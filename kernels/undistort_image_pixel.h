@@ -17,20 +17,20 @@
 #ifdef BICUBIC
 #define TAPS_BEFORE 1
 #define TAPS_AFTER 2
-// OpenCV's cubic kernel: the slope at 1 is A.
-#define A (-0.75f)
-#define DEFINE_CUBIC(Weights, floats, weights_of)                       \
-    typedef struct {                                                    \
-        floats before, at, after, last;                                 \
-    } Weights;                                                          \
-    inline Weights weights_of(floats part) {                            \
-        const floats rest = 1 - part;                                   \
-        Weights w;                                                      \
-        w.before = A * part * rest * rest;                              \
-        w.at = 1 + part * part * ((A + 2) * part - (A + 3));            \
-        w.last = A * rest * part * part;                                \
-        w.after = 1 - w.before - w.at - w.last;                         \
-        return w;                                                       \
+// OpenCV's cubic kernel, by its slope at 1.
+#define SLOPE (-0.75f)
+#define DEFINE_CUBIC(Weights, floats, weights_of)                    \
+    typedef struct {                                                 \
+        floats before, at, after, last;                              \
+    } Weights;                                                       \
+    inline Weights weights_of(floats part) {                         \
+        const floats rest = 1 - part;                                \
+        Weights w;                                                   \
+        w.before = SLOPE * part * rest * rest;                       \
+        w.at = 1 + part * part * ((SLOPE + 2) * part - (SLOPE + 3)); \
+        w.last = SLOPE * rest * part * part;                         \
+        w.after = 1 - w.before - w.at - w.last;                      \
+        return w;                                                    \
     }
 DEFINE_CUBIC(CubicWeights, float, cubic_weights)
 #else
@@ -104,9 +104,10 @@ inline uchar blank(uchar status, float fill, global CODE *made) {
 // Whether no tap lies in the image.
 inline int beyond(int place, int size) { return place + TAPS_AFTER < 0 || place - TAPS_BEFORE >= size; }
 
-// The whole part of a place, within what a float holds. (PoCL takes floor() of a scalar apart.)
-inline int whole_below(float place) {
-    const float held = clamp(place, -FARTHEST, FARTHEST);
+// The pixel that a place counts from: within what a float holds, also where the place is none. (PoCL takes floor() of
+// a scalar apart.)
+inline int pixel_before(real place) {
+    const real held = fmin(fmax(place, (real)-FARTHEST), (real)FARTHEST);
     const int whole = (int)held;
     return whole - (held < whole);
 }
@@ -124,7 +125,7 @@ inline uchar sample(global const CODE *image, int column, int row, float x, floa
 #ifdef BORDER_MASK
     if (status) return blank(status, fill, made);
 #endif
-    const int whole_x = whole_below(x), whole_y = whole_below(y);
+    const int whole_x = pixel_before(x), whole_y = pixel_before(y);
     column += whole_x;
     row += whole_y;
 #ifdef BORDER_CONSTANT

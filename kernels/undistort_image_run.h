@@ -8,8 +8,8 @@
 
 #ifdef STRIP
 // The pixels of a run one by one, at places (x, y) from the source pixel (column, row) on.
-inline void each_pixel(global const CODE *image, global CODE *made, global uchar *status, int column, int row, int lanes,
-                       float16 x, float16 y, constant int *size, float fill) {
+inline void each_pixel(global const CODE *image, global CODE *made, global uchar *status, int column, int row,
+                       int lanes, float16 x, float16 y, constant int *size, float fill) {
     float along[RUN], across[RUN];
     vstore16(x, 0, along);
     vstore16(y, 0, across);

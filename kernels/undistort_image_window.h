@@ -120,12 +120,11 @@ INLINED void window(const int spread, const int flat, global const CODE *from, s
     const int16 lanes = (int16)(0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0);
     const int16 later = (int16)(1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1);
     const int16 latest = (int16)(2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2);
-    sixteen(spread, flat, from + 3 * starts.x, pitch, x.s0001112223334445 - starts.x, y.s0001112223334445, bands, lanes,
-            to);
-    sixteen(spread, flat, from + 3 * starts.y, pitch, x.s55666777888999aa - starts.y, y.s55666777888999aa, bands, later,
-            to + 16);
-    sixteen(spread, flat, from + 3 * starts.z, pitch, x.sabbbcccdddeeefff - starts.z, y.sabbbcccdddeeefff, bands, latest,
-            to + 32);
+    const float16 first = x.s0001112223334445 - starts.x, second = x.s55666777888999aa - starts.y;
+    const float16 third = x.sabbbcccdddeeefff - starts.z;
+    sixteen(spread, flat, from + 3 * starts.x, pitch, first, y.s0001112223334445, bands, lanes, to);
+    sixteen(spread, flat, from + 3 * starts.y, pitch, second, y.s55666777888999aa, bands, later, to + 16);
+    sixteen(spread, flat, from + 3 * starts.z, pitch, third, y.sabbbcccdddeeefff, bands, latest, to + 32);
 #else
     sixteen(spread, flat, from, pitch, x, y, bands, 0, to);
 #endif

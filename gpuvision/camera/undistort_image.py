@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -14,7 +15,7 @@ from gpuvision.camera.image_map import Packer, PixelMap, Taps
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines
 from gpuvision.status import Status
-from gpuvision.tables import finite
+from gpuvision.tables import finite, numbers
 
 Interpolation = Literal["bilinear", "bicubic"]
 Border = Literal["mask", "constant", "replicate", "reflect"]
@@ -32,6 +33,8 @@ _CODES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 _LARGEST_FRAME = 2**30
 # What a model computes at once stays in the caches.
 _ROWS_AT_ONCE = 32
+# Columns and rows of a work-group with an item per pixel.
+_GROUP = (32, 4)
 
 
 @runtime_checkable
@@ -131,11 +134,12 @@ class UndistortImage(Operation[UndistortedImage]):
             given = getattr(self, name)
             if given is None:
                 continue
-            object.__setattr__(self, name, tuple(map(int, given)))
+            object.__setattr__(self, name, tuple(map(operator.index, given)))
             if len(given) != length or min(given[-2:]) < 1:
                 raise ValueError(f"UndistortImage.{name} is {given}, expected {length} whole numbers, sizes above 0")
         if self.matrix is not None:
-            object.__setattr__(self, "matrix", tuple(tuple(map(float, row)) for row in self.matrix))
+            object.__setattr__(self, "matrix", numbers(self.matrix, (3, 3), "UndistortImage.matrix"))
+            self.model.defines(self.matrix)
 
     def _check_choices(self) -> None:
         choices: dict[str, tuple[Any, ...]] = {
@@ -214,8 +218,8 @@ class UndistortImage(Operation[UndistortedImage]):
                 np.array([columns, rows, made_columns, made_rows, *region[:2], self._missing], np.int32),
                 np.float32(fill),
             ),
-            global_size=(made_rows, frames) if strip else (made_columns, made_rows, frames),
-            local_size=(1, 1) if strip else None,
+            global_size=(made_rows, frames) if strip else (*_whole_groups(made_columns, made_rows), frames),
+            local_size=(1, 1) if strip else (*_GROUP, 1),
         )
 
     def _checked(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
@@ -268,3 +272,8 @@ class UndistortImage(Operation[UndistortedImage]):
             model = self.model.defines if isinstance(self.model, Lens) else self.model.defines(self.matrix)
             defines |= {"COMPUTED": None} | model
         return defines
+
+
+def _whole_groups(columns: int, rows: int) -> tuple[int, ...]:
+    """Return numbers of work-items, whole groups of them, that cover an image."""
+    return tuple(-(-size // group) * group for size, group in zip((columns, rows), _GROUP, strict=True))

@@ -377,6 +377,7 @@ def test_wrong_arguments(device: Device) -> None:
         ({"region": (0, 0, 0, 5)}, "region"),
         ({"size": (0, 5)}, "size"),
         ({"value": math.nan}, "value"),
+        ({"model": CAMERA, "matrix": np.zeros((3, 3))}, "focal"),
         ({"precision": "double"}, "precision"),
         ({"model": np.zeros((4, 4))}, "map"),
         ({"model": np.zeros((4, 4, 2)), "size": (4, 4)}, "size"),
@@ -386,6 +387,7 @@ def test_wrong_arguments(device: Device) -> None:
     for options, words in (
         ({"model": 3}, "distort"),
         ({"matrix": OTHER}, "Camera"),
+        ({"size": (4.5, 4)}, "integer"),
         ({"model": np.zeros((4, 4, 2)), "coordinates": "computed"}, "map"),
     ):
         with pytest.raises(TypeError, match=words):

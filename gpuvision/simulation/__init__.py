@@ -1,0 +1,1 @@
+"""Prediction of what a sensor will measure, and where it will be wrong."""

@@ -81,7 +81,8 @@ inline reals LANED(lens_find)(reals square, masks wanted, constant real *lens, r
         step = better ? next_step : step / 2;
         open = mask_of(left > (real)REAL_EPSILON) & mask_of(fabs(step) > (real)REAL_EPSILON / 4);
     }
-    return wanted ? e : found;
+    // The last step is still to come, or next to nothing.
+    return wanted ? e + step : found;
 }
 
 // Moves the undistorted (x, y) to its measured place; returns where there is none, past the fold's image.

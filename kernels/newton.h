@@ -38,8 +38,9 @@ inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant real *t
         open = mask_of(left > NEWTON_ROUNDING * square) & mask_of(ahead > NEWTON_ROUNDING * square) &
                mask_of(size > NEWTON_STUCK * square);
     }
-    *back_x = wanted ? at_x : *back_x;
-    *back_y = wanted ? at_y : *back_y;
+    // The last step is still to come, or next to nothing.
+    *back_x = wanted ? at_x + step_x : *back_x;
+    *back_y = wanted ? at_y + step_y : *back_y;
     return wanted & mask_of(left > NEWTON_ROUNDING * square) & mask_of(ahead > NEWTON_ROUNDING * square);
 }
 

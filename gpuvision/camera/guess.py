@@ -46,8 +46,9 @@ class Guess:
         self._reach = _BEYOND**2 * farthest or 1.0
         if math.isfinite(fold):
             edge = np.array([[math.sqrt(fold), 0.0]])
-            bent = edge + (radial or lens)(edge)[0]
-            self._reach = min(self._reach, float(np.sum(bent**2)) * _SHORT**2)
+            with np.errstate(all="ignore"):
+                bent = np.sum((edge + (radial or lens)(edge)[0]) ** 2)
+            self._reach = min(self._reach, float(bent) * _SHORT**2) if np.isfinite(bent) else self._reach
         # Chebyshev's nodes in the squared radius.
         z = 0.5 - 0.5 * np.cos((np.arange(_RADII) + 0.5) * (math.pi / _RADII))
         angles = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)

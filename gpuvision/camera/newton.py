@@ -49,7 +49,8 @@ def undo(displacement: Displacement, moved: Float64) -> Float64:
             least = np.minimum(left[going], ahead[going])
             going = going[(least > _ROUNDING * square[going]) & (sizes > _STUCK * square[going])]
         found = np.minimum(left, ahead) <= _ROUNDING * square
-    return np.asarray(np.where(found[:, None], wanted + back, np.nan).reshape(moved.shape))
+    # The last step is still to come, or next to nothing.
+    return np.asarray(np.where(found[:, None], wanted + (back + step), np.nan).reshape(moved.shape))
 
 
 def determinant(jacobian: Float64) -> Float64:

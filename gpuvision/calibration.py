@@ -128,7 +128,7 @@ class Calibration:
     def parameters(self) -> dict[str, tuple[float, float]]:
         """Value and standard deviation of every parameter of the camera, by its name."""
         if isinstance(self.fit, LensFit):
-            errors, values = self.fit.standard_errors, dict(zip(self.fit.names, self.fit.values, strict=True))
+            errors, values = self.fit.uncertainties, dict(zip(self.fit.names, self.fit.values, strict=True))
             return {name: (float(values[name]), error) for name, error in errors.items() if not name.startswith("v")}
         camera = self.fit.camera
         (fx, _, cx), (_, fy, cy), _ = camera.matrix

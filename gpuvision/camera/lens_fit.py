@@ -117,7 +117,7 @@ class LensFit:
     warnings: tuple[str, ...]
 
     @property
-    def standard_errors(self) -> dict[str, float]:
+    def uncertainties(self) -> dict[str, float]:
         """Standard deviation of each parameter by its name."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 

@@ -76,13 +76,14 @@ def _case(device: Device, name: str, camera: Camera, dtype: str, size: int, **op
     peer()
     exact, inner = _exact(image, places, interpolation)
     ours, theirs = (np.abs(each[inner] - exact[inner]) for each in (bound.outputs.image.get(), made))
-    facts = {
-        "rms": float(np.sqrt(np.mean(ours**2))),
-        "peer_error": float(theirs.max()),
-        "peer_rms": float(np.sqrt(np.mean(theirs**2))),
-    }
+    numbers = {"rms": _rms(ours), "peer_error": theirs.max(), "peer_rms": _rms(theirs)}
+    facts = {name: float(f"{number:.5g}") for name, number in numbers.items()}
     traffic = (image.nbytes, image.nbytes + bound.outputs.status.nbytes)
     return Case("undistort", name, bound.run, {"opencv": peer}, float(ours.max()), traffic, facts=facts)
+
+
+def _rms(values: Float64) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _peer(

@@ -8,8 +8,9 @@
 //     measured = H bent                                      the sensor's tilt, a homography that keeps the centre
 //
 // Only terms that are not zero are compiled: CAMERA_RADIAL and CAMERA_RATIONAL (0 to 3: how many of k1.. and k4..),
-// CAMERA_DECENTRED (p and s), CAMERA_PRISM (s2 and s4), CAMERA_TILTED, CAMERA_MATRICES (ideal pixels other than the camera's own). The host
-// computes the displacements' constants in double; a point keeps its digits, since what moves it is small beside it.
+// CAMERA_DECENTRED (p and s), CAMERA_PRISM (s2 and s4), CAMERA_TILTED, CAMERA_MATRICES (ideal pixels other than the
+// camera's own). The host computes the constants in double; a point keeps its digits, since what moves it is small
+// beside it.
 // The tables are Camera.packed in camera.py, one for either direction; camera_undistort needs CAMERA_STEPS as well,
 // how many steps serve most places (Camera.steps).
 #ifndef CAMERA_H
@@ -215,8 +216,10 @@ inline masks LANED(camera_newton)(reals x, reals y, reals back_x, reals back_y, 
 //     back = m (z g(z) + v(z).m) + q w(z)                    v and w, which have a direction, for a decentred lens
 //
 // Their Jacobian is about the inverse of the lens' own: it turns what is left into a step, without a division. Returns
-// the places that a few steps do not settle.
-__attribute__((always_inline)) inline masks LANED(camera_approach)(reals x, reals y, constant real *camera, reals *back_x, reals *back_y) {
+// the places that a few steps do not settle. (PoCL neither inlines what is so long nor unrolls, unless it is told to:
+// it is half as fast then.)
+__attribute__((always_inline)) inline masks LANED(camera_approach)(reals x, reals y, constant real *camera,
+                                                                   reals *back_x, reals *back_y) {
     constant real *c = camera + CAMERA_GUESS;
     const real per = camera[CAMERA_PER_REACH];
     const reals q = x * x + y * y, z = q * per;
@@ -268,7 +271,8 @@ __attribute__((always_inline)) inline masks LANED(camera_approach)(reals x, real
 
 // Moves the measured pixel (column, row) to its ideal one; returns where there is none, being past the fold's image, a
 // million focal lengths away, or no pixel at all.
-__attribute__((always_inline)) inline masks LANED(camera_undistort)(reals *column, reals *row, constant real *camera) {
+__attribute__((always_inline)) inline masks LANED(camera_undistort)(reals *column, reals *row,
+                                                                    constant real *camera) {
     reals x = (*column - camera[CAMERA_CENTRE_X]) * camera[CAMERA_PER_X];
     reals y = (*row - camera[CAMERA_CENTRE_Y]) * camera[CAMERA_PER_Y];
     reals back_x, back_y;

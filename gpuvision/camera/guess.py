@@ -68,7 +68,8 @@ class Guess:
         left, noise = _LEFT[np.dtype(real)]
         sizes = self._steps[0]
         before = np.concatenate([np.full_like(sizes[:1], left / self._shrinkage**4), sizes[:-1]]) + noise
-        settled = np.sum(sizes**2 <= left * before, axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            settled = np.sum(sizes**2 <= left * before, axis=1)
         return 1 + int(np.argmax(settled >= _MOST_PLACES * settled.max()))
 
     def _fit(self, is_decentred: bool) -> Float64:

@@ -44,8 +44,8 @@
 #define CAMERA_GUESS 33
 #define CAMERA_GUESS_TERMS 8
 
-// Steps shrink evenly: one of size s after one of size t leaves about s^2 / t. Relative squares: of what may be left, and
-// of a step that is rounding.
+// Steps shrink evenly: one of size s after one of size t leaves about s^2 / t. Relative squares: of what may be left,
+// and of a step that is rounding.
 #ifdef REAL_IS_DOUBLE
 #define CAMERA_LEFT 1e-31
 #define CAMERA_NOISE 1e-28

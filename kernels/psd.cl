@@ -21,7 +21,6 @@
 #define COMMON 10      // variance of the place times the sum: a spot of finitely many electrons [m^2]
 
 #ifdef STRIP
-#define SAMPLES_PER_STRIP 4096
 #define BLOCK 8  // vectors that are judged together
 typedef CODE16 codes_at __attribute__((aligned(sizeof(CODE))));
 #ifdef REAL_IS_DOUBLE
@@ -106,12 +105,28 @@ inline masks reasons(reals left, reals right, masks saturated, reals sum, reals 
     return flags;
 }
 
-// Reads the sample(s) at `sample`, writes what is asked for there, and says which are not good. Unless it is told to
-// be careful it writes as if all were good: the caller comes again where some are not.
-inline masks read_out(const int careful, int sample, global const CODE *currents, global real *position,
-                      global real *total, global uchar *status, global real *sigma, global real *g, global real *h,
-                      constant real *p, int samples, global const real *table, int strips, int knots,
-                      constant real *sheet) {
+// What is known of a block's samples so far: enough to tell whether all are good.
+#ifdef SIGNED
+typedef masks Verdict;
+#define UNBLEMISHED 0
+inline int is_blemished(Verdict bad, constant real *p) { return any_lane(bad); }
+#else
+// Of codes, which are numbers, the extremes suffice: in vectors they cost less than masks.
+typedef struct {
+    reals least_sum, largest_code;
+} Verdict;
+#define UNBLEMISHED {MAXFLOAT, 0}
+inline int is_blemished(Verdict worst, constant real *p) {
+    return any_lane(mask_of(worst.least_sum <= p[MINIMUM]) | mask_of(worst.largest_code >= p[SATURATION]));
+}
+#endif
+
+// Reads the sample(s) at `sample`, writes what is asked for there, and adds to the verdict. Unless it is told to be
+// careful it writes as if all were good: the caller comes again where some are not.
+inline void read_out(const int careful, int sample, Verdict *verdict, global const CODE *currents,
+                     global real *position, global real *total, global uchar *status, global real *sigma,
+                     global real *g, global real *h, constant real *p, int samples, global const real *table,
+                     int strips, int knots, constant real *sheet) {
     reals left, right;
     load_pair(currents, sample, samples, &left, &right);
     const reals larger = left > right ? left : right;
@@ -133,6 +148,10 @@ inline masks read_out(const int careful, int sample, global const CODE *currents
     good &= mask_of(sum > p[MINIMUM]);
 #ifdef SIGNED
     good &= mask_of(fabs(difference) <= p[LIMIT] * sum);
+    *verdict |= ~good;
+#else
+    verdict->least_sum = sum < verdict->least_sum ? sum : verdict->least_sum;
+    verdict->largest_code = larger > verdict->largest_code ? larger : verdict->largest_code;
 #endif
     const reals balance = difference / sum;
     reals u = p[HALF_LENGTH] * balance;
@@ -164,27 +183,39 @@ inline masks read_out(const int careful, int sample, global const CODE *currents
 #ifdef WITH_STATUS
     store_bytes(convert_bytes(flags), status + sample);
 #endif
-    return ~good;
 }
 
 kernel void psd_readout(global const CODE *currents, global real *position, global real *total, global uchar *status,
-                        global real *sigma, global real *g, global real *h, constant real *p, int samples,
+                        global real *sigma, global real *g, global real *h, constant real *p, int samples, int each,
                         global const real *table, int strips, int knots, constant real *sheet) {
+    Verdict verdict = UNBLEMISHED;
 #define READ_OUT(careful, sample)                                                                                      \
-    read_out(careful, sample, currents, position, total, status, sigma, g, h, p, samples, table, strips, knots, sheet)
+    read_out(careful, sample, &verdict, currents, position, total, status, sigma, g, h, p, samples, table, strips,     \
+             knots, sheet)
 #ifdef STRIP
     // The last strip takes the remainder too, and its last vector overlaps the one before: no sample is left over,
     // and no other work-item writes there.
-    int sample = get_global_id(0) * SAMPLES_PER_STRIP;
-    const int end = get_global_id(0) + 1 == get_global_size(0) ? samples : sample + SAMPLES_PER_STRIP;
-    int trouble = 0;  // which comes in runs: what was so before is expected again
-    for (; sample + BLOCK * LANES <= end; sample += BLOCK * LANES) {
-        masks bad = 0;
-        if (!trouble)
-            for (int k = 0; k < BLOCK; k++) bad |= READ_OUT(0, sample + k * LANES);
-        if (trouble || any_lane(bad))
-            for (int k = 0; k < BLOCK; k++) bad |= READ_OUT(1, sample + k * LANES);
-        trouble = any_lane(bad);
+    int sample = get_global_id(0) * each;
+    const int end = get_global_id(0) + 1 == get_global_size(0) ? samples : sample + each;
+    int all_troubled = 0;
+    while (sample + BLOCK * LANES <= end) {
+        // Blocks with bad samples come in runs and are few: they are noted, and written again with care.
+        const int blocks = min((end - sample) / (BLOCK * LANES), 32);
+        const uint all = ~0u >> (32 - blocks);
+        uint troubled = all_troubled ? all : 0, found = 0;
+        for (int block = 0; block < blocks && !all_troubled; block++) {
+            verdict = (Verdict)UNBLEMISHED;
+            for (int k = 0; k < BLOCK; k++) READ_OUT(0, sample + (block * BLOCK + k) * LANES);
+            troubled |= (uint)is_blemished(verdict, p) << block;
+        }
+        for (; troubled; troubled &= troubled - 1) {
+            const int block = 31 - clz(troubled & -troubled);
+            verdict = (Verdict)UNBLEMISHED;
+            for (int k = 0; k < BLOCK; k++) READ_OUT(1, sample + (block * BLOCK + k) * LANES);
+            found |= (uint)is_blemished(verdict, p) << block;
+        }
+        all_troubled = found == all;
+        sample += blocks * BLOCK * LANES;
     }
     for (; sample < end; sample += LANES) READ_OUT(1, min(sample, end - LANES));
 #else

@@ -18,7 +18,8 @@ from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.tables import finite
 
 ELECTRON = 1.602176634e-19  # C
-_SAMPLES_PER_STRIP = 4096  # as in psd.cl
+# Samples of a strip: long where enough strips remain to share among the cores, a multiple of 16 always.
+_SHORT_STRIP, _LONG_STRIP, _STRIPS_PER_CORE = 4096, 16384, 8
 _LANES = 16
 _CODES = {"float32": "float", "float64": "double", "uint16": "ushort"}
 
@@ -215,7 +216,9 @@ class PsdReadout(Operation[PsdReading]):
             raise ValueError(f"PsdReadout takes fewer than 2**30 samples at once, got {samples}; split the batch")
         real = real_of(self.precision, dtype)
         strip = in_strips(self.walk, device) and samples >= _LANES
-        items = max(samples // _SAMPLES_PER_STRIP, 1) if strip else samples
+        many = samples >= _STRIPS_PER_CORE * _LONG_STRIP * device.handle.max_compute_units
+        each = _LONG_STRIP if many else _SHORT_STRIP
+        items = max(samples // each, 1) if strip else samples
         sheet = self.triangulation
         table = None if self.linearity is None else np.array(self.linearity, real)
         outputs = self._outputs(batch, real)
@@ -232,6 +235,7 @@ class PsdReadout(Operation[PsdReading]):
             arguments=[
                 self._packed(real, dtype),
                 np.int32(samples),
+                np.int32(each),
                 table,
                 np.int32(strips),
                 np.int32(0 if table is None else table.shape[1]),

@@ -17,24 +17,24 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gpuvision.camera.camera import Camera
-    from gpuvision.camera.camera_fit import CameraFit
-    from gpuvision.camera.chessboard import find_chessboard
-    from gpuvision.camera.dots import find_dots
     from gpuvision.camera.image_map import PixelMap
     from gpuvision.camera.lens import Lens
-    from gpuvision.camera.lens_fit import LensFit
     from gpuvision.camera.lens_known import fit_tilt
-    from gpuvision.camera.line_families import grid_lines
-    from gpuvision.camera.line_pattern import find_lines
-    from gpuvision.camera.pattern import PatternGrid
+    from gpuvision.camera.lines.lens_fit import LensFit
+    from gpuvision.camera.lines.line_families import grid_lines
+    from gpuvision.camera.patterns.chessboard import find_chessboard
+    from gpuvision.camera.patterns.dots import find_dots
+    from gpuvision.camera.patterns.line_pattern import find_lines
+    from gpuvision.camera.patterns.pattern import PatternGrid
     from gpuvision.camera.planar_views import fit_camera
     from gpuvision.camera.polynomial import PlanePolynomial
     from gpuvision.camera.scheimpflug import TiltedSensor
-    from gpuvision.camera.target_views import view_of
     from gpuvision.camera.tsai import fit_tsai
     from gpuvision.camera.undistort_image import UndistortedImage, UndistortImage
     from gpuvision.camera.undistort_points import UndistortedPoints, UndistortPoints
     from gpuvision.camera.vanishing_points import fit_lens, straightness_px
+    from gpuvision.camera.views.camera_fit import CameraFit
+    from gpuvision.camera.views.target_views import view_of
     from gpuvision.host import Device, GpuVisionError, Pipeline, Step, host_view, open_recording
     from gpuvision.ranging.line import LineReading, LineReadout
     from gpuvision.ranging.psd import PsdNoise, PsdReading, PsdReadout
@@ -46,16 +46,16 @@ if TYPE_CHECKING:
 # Names come with their first use: the command is there at once, and an interrupt while it loads is not a stack trace.
 _PLACES = {
     "Camera": "gpuvision.camera.camera",
-    "CameraFit": "gpuvision.camera.camera_fit",
+    "CameraFit": "gpuvision.camera.views.camera_fit",
     "Device": "gpuvision.host",
     "GpuVisionError": "gpuvision.host",
     "Grid": "gpuvision.ranging.regrid",
     "HeightMap": "gpuvision.ranging.regrid",
     "Lens": "gpuvision.camera.lens",
-    "LensFit": "gpuvision.camera.lens_fit",
+    "LensFit": "gpuvision.camera.lines.lens_fit",
     "LineReading": "gpuvision.ranging.line",
     "LineReadout": "gpuvision.ranging.line",
-    "PatternGrid": "gpuvision.camera.pattern",
+    "PatternGrid": "gpuvision.camera.patterns.pattern",
     "Pipeline": "gpuvision.host",
     "PixelMap": "gpuvision.camera.image_map",
     "PlanePolynomial": "gpuvision.camera.polynomial",
@@ -77,18 +77,18 @@ _PLACES = {
     "UndistortPoints": "gpuvision.camera.undistort_points",
     "UndistortedImage": "gpuvision.camera.undistort_image",
     "UndistortedPoints": "gpuvision.camera.undistort_points",
-    "find_chessboard": "gpuvision.camera.chessboard",
-    "find_dots": "gpuvision.camera.dots",
-    "find_lines": "gpuvision.camera.line_pattern",
+    "find_chessboard": "gpuvision.camera.patterns.chessboard",
+    "find_dots": "gpuvision.camera.patterns.dots",
+    "find_lines": "gpuvision.camera.patterns.line_pattern",
     "fit_camera": "gpuvision.camera.planar_views",
     "fit_lens": "gpuvision.camera.vanishing_points",
     "fit_tilt": "gpuvision.camera.lens_known",
     "fit_tsai": "gpuvision.camera.tsai",
-    "grid_lines": "gpuvision.camera.line_families",
+    "grid_lines": "gpuvision.camera.lines.line_families",
     "host_view": "gpuvision.host",
     "open_recording": "gpuvision.host",
     "straightness_px": "gpuvision.camera.vanishing_points",
-    "view_of": "gpuvision.camera.target_views",
+    "view_of": "gpuvision.camera.views.target_views",
 }
 
 __all__ = [

@@ -16,18 +16,18 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.camera import NAMES, Camera
-from gpuvision.camera.camera_fit import CameraFit
-from gpuvision.camera.chessboard import find_chessboard
-from gpuvision.camera.dots import find_dots
 from gpuvision.camera.lens import Lens
-from gpuvision.camera.lens_fit import LensFit
-from gpuvision.camera.line_families import grid_lines
-from gpuvision.camera.line_pattern import find_lines
-from gpuvision.camera.line_statistics import Loss
-from gpuvision.camera.pattern import LineFamilies
+from gpuvision.camera.lines.lens_fit import LensFit
+from gpuvision.camera.lines.line_families import grid_lines
+from gpuvision.camera.lines.line_statistics import Loss
+from gpuvision.camera.patterns.chessboard import find_chessboard
+from gpuvision.camera.patterns.dots import find_dots
+from gpuvision.camera.patterns.line_pattern import find_lines
+from gpuvision.camera.patterns.pattern import LineFamilies
 from gpuvision.camera.planar_views import LossName, fit_camera
-from gpuvision.camera.target_views import view_of
 from gpuvision.camera.vanishing_points import fit_lens, straightness_px
+from gpuvision.camera.views.camera_fit import CameraFit
+from gpuvision.camera.views.target_views import view_of
 from gpuvision.host.files import write_whole
 from gpuvision.host.recordings import RecordingError, read_image
 from gpuvision.lens_file import write_lens

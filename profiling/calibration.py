@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.camera.dots import find_dots
 from gpuvision.camera.lens import Lens
-from gpuvision.camera.line_families import grid_lines
-from gpuvision.camera.line_pattern import find_lines
+from gpuvision.camera.lines.line_families import grid_lines
+from gpuvision.camera.patterns.dots import find_dots
+from gpuvision.camera.patterns.line_pattern import find_lines
 from gpuvision.camera.vanishing_points import fit_lens, straightness_px
 from gpuvision.host import Device
 from gpuvision.profiling.harness import Case

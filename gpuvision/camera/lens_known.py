@@ -18,15 +18,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.bundle import Loss, State, Views, adjust
-from gpuvision.camera.camera_fit import Pose, covariances, deviation_of_alpha, lens_poses, noise_of
-from gpuvision.camera.chart import Chart
 from gpuvision.camera.lens import Lens
-from gpuvision.camera.planar_start import closed_form_of_tilt, flatten
 from gpuvision.camera.scheimpflug import TiltedSensor
-from gpuvision.camera.target_views import pack
-from gpuvision.camera.tilted_projection import Floats
 from gpuvision.camera.tsai import fit_tsai
+from gpuvision.camera.views.bundle import Loss, State, Views, adjust
+from gpuvision.camera.views.camera_fit import Pose, covariances, deviation_of_alpha, lens_poses, noise_of
+from gpuvision.camera.views.chart import Chart
+from gpuvision.camera.views.planar_start import closed_form_of_tilt, flatten
+from gpuvision.camera.views.target_views import pack
+from gpuvision.camera.views.tilted_projection import Floats
 
 _NO_FOCUS = 0.3
 _BEST_NOISE_PX = 0.01

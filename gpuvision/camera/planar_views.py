@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import fdtrc
 
-from gpuvision.camera.bundle import Loss, State, Views, adjust, residuals, robust_scale
-from gpuvision.camera.camera_fit import (
+from gpuvision.camera.views.bundle import Loss, State, Views, adjust, residuals, robust_scale
+from gpuvision.camera.views.camera_fit import (
     Alternative,
     CameraFit,
     camera_of,
@@ -21,11 +21,11 @@ from gpuvision.camera.camera_fit import (
     noise_of,
     variance_of,
 )
-from gpuvision.camera.chart import COEFFICIENTS, Chart, internal_of
-from gpuvision.camera.diagnosis import diagnose, fixes_focus
-from gpuvision.camera.planar_start import Flat, closed_form, closed_form_of_tilt, flatten, poses
-from gpuvision.camera.target_views import Mask, pack
-from gpuvision.camera.tilted_projection import Floats, tilt_matrix
+from gpuvision.camera.views.chart import COEFFICIENTS, Chart, internal_of
+from gpuvision.camera.views.diagnosis import diagnose, fixes_focus
+from gpuvision.camera.views.planar_start import Flat, closed_form, closed_form_of_tilt, flatten, poses
+from gpuvision.camera.views.target_views import Mask, pack
+from gpuvision.camera.views.tilted_projection import Floats, tilt_matrix
 from gpuvision.tables import finite, numbers
 
 LossName = Literal["linear", "huber", "tukey"]

@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.camera_fit import Pose
 from gpuvision.camera.lens import Lens
-from gpuvision.camera.tilted_projection import Floats
+from gpuvision.camera.views.camera_fit import Pose
+from gpuvision.camera.views.tilted_projection import Floats
 from gpuvision.tables import numbers
 
 _FEWEST_POINTS = 5

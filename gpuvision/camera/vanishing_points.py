@@ -2,9 +2,9 @@
 
 Straight lines stay straight in any pinhole image, tilted sensor or not, so what bends them is the lens alone
 (F. de Jong, 3.3.5-3.3.6). The thesis asks parallel lines to meet in one vanishing point as well and alternates
-between vanishing points and lens (`gpuvision.camera.strategies`). Here all is minimised at once: the lines are
+between vanishing points and lens (`gpuvision.camera.lines.strategies`). Here all is minimised at once: the lines are
 eliminated in closed form, vanishing points are unit vectors, so that one at infinity is a point like any other, and
-distances are those in the measured image (`gpuvision.camera.straightness`).
+distances are those in the measured image (`gpuvision.camera.lines.straightness`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpuvision.camera.lens import Lens
-from gpuvision.camera.lens_fit import (
+from gpuvision.camera.lines.lens_fit import (
     MODELS,
     REJECTED,
     LensAlternative,
@@ -30,8 +30,8 @@ from gpuvision.camera.lens_fit import (
     rms_px,
     warnings_of,
 )
-from gpuvision.camera.line_families import Float64, LineFamilies, PackedLines, pack
-from gpuvision.camera.line_statistics import (
+from gpuvision.camera.lines.line_families import Float64, LineFamilies, PackedLines, pack
+from gpuvision.camera.lines.line_statistics import (
     Loss,
     chance,
     covariance,
@@ -42,9 +42,9 @@ from gpuvision.camera.line_statistics import (
     robust_start,
     same_points,
 )
-from gpuvision.camera.straightness import Evaluation, Parameters, evaluate
-from gpuvision.camera.strategies import STRATEGIES, alternate
-from gpuvision.camera.variable_projection import Minimum, linear_start, minimise, vanishing_start
+from gpuvision.camera.lines.straightness import Evaluation, Parameters, evaluate
+from gpuvision.camera.lines.strategies import STRATEGIES, alternate
+from gpuvision.camera.lines.variable_projection import Minimum, linear_start, minimise, vanishing_start
 from gpuvision.tables import finite, numbers
 
 Strategy = Literal["variable_projection", "nelder_mead", "steepest_descent", "gauss_newton"]
@@ -90,7 +90,7 @@ def fit_lens(
     ----------
     families
         Families of lines that are parallel in the scene, each line an array (points, 2) of (column, row) in pixels,
-        in any image that the lens took: `gpuvision.camera.line_families.grid_lines` makes them from a grid. NaN
+        in any image that the lens took: `gpuvision.camera.lines.line_families.grid_lines` makes them from a grid. NaN
         points and lines of fewer than three points are left out.
     model
         Distortion coefficients; "auto": the smallest model that an F test does not reject against the largest.

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from gpuvision.camera.pattern import PatternGrid
+from gpuvision.camera.patterns.pattern import PatternGrid
 from gpuvision.camera.planar_views import fit_camera
-from gpuvision.camera.target_views import view_of
+from gpuvision.camera.views.target_views import view_of
 from reference.tilted_camera import (
     KINDS,
     TILTED,

@@ -1,0 +1,1 @@
+"""What the lens calibration from straight lines is made of."""

@@ -1,0 +1,1 @@
+"""Dot grids, chessboards and line grids in images, found sub-pixel."""

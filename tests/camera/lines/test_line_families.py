@@ -1,0 +1,88 @@
+"""Families of lines from grids and labels, and what is packed of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gpuvision.camera.lines.line_families import families, grid_lines, pack
+
+
+def numbered(rows: int, columns: int) -> np.ndarray:
+    """Grid whose points tell their index."""
+    return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(np.float64)
+
+
+def test_rows_and_columns() -> None:
+    rows, columns = grid_lines(numbered(4, 6))
+    assert [len(line) for line in rows] == [6] * 4
+    assert [len(line) for line in columns] == [4] * 6
+    np.testing.assert_array_equal(rows[2][:, 1], 2.0)
+    np.testing.assert_array_equal(columns[5][:, 0], 5.0)
+
+
+@given(rows=st.integers(1, 7), columns=st.integers(1, 7))
+def test_diagonals(rows: int, columns: int) -> None:
+    grid = numbered(rows, columns)
+    *_, falling, rising = grid_lines(grid, diagonals=True)
+    for family, sign in ((falling, -1.0), (rising, 1.0)):
+        for line in family:
+            assert len(np.unique(line[:, 0] + sign * line[:, 1])) == 1
+            np.testing.assert_array_equal(np.abs(np.diff(line, axis=0)), 1.0)
+        lengths = [min(rows, columns, each + 1, rows + columns - 1 - each) for each in range(rows + columns - 1)]
+        assert sorted(len(line) for line in family) == sorted(each for each in lengths if each >= 3)
+
+
+def test_missing_points_are_left_out() -> None:
+    grid = numbered(4, 6)
+    grid[1, 2:] = np.nan
+    grid[0, 0, 1] = np.inf
+    rows, columns = grid_lines(grid)
+    assert [len(line) for line in rows] == [5, 6, 6]
+    assert [len(line) for line in columns] == [3, 4, 3, 3, 3, 3]
+
+
+def test_labels_make_families(rng: np.random.Generator) -> None:
+    points = rng.normal(size=(12, 2))
+    found = families(points, [7] * 6 + [3] * 6, [0, 0, 0, 1, 1, 1] * 2)
+    np.testing.assert_array_equal(found[0][1], points[9:])
+    np.testing.assert_array_equal(found[1][0], points[:3])
+    with pytest.raises(ValueError, match=r"points have shape \(12, 2\) and labels \(11,\)"):
+        families(points, [0] * 11, [0] * 11)
+
+
+def test_packed_lines_keep_what_is_finite(rng: np.random.Generator) -> None:
+    lines = [rng.normal(500.0, 200.0, (count, 2)) for count in (5, 2, 4, 6)]
+    lines[2][:2] = np.nan
+    lines[3][4, 0] = np.nan
+    packed = pack([lines[:2], [], lines[2:]])
+    np.testing.assert_array_equal(packed.counts, [5, 5])
+    np.testing.assert_array_equal(packed.family, [0, 2])
+    assert packed.families == 3
+    wanted = np.concatenate([lines[0], lines[3][[0, 1, 2, 3, 5]]])
+    found = np.stack([packed.x, packed.y], axis=-1) * packed.unit + packed.origin
+    np.testing.assert_allclose(found, wanted, rtol=1e-14)
+    np.testing.assert_array_equal(np.concatenate(lines)[packed.used], wanted)
+    assert np.max(np.hypot(packed.x, packed.y)) <= 1.0
+    np.testing.assert_allclose(packed.sums(packed.x), [packed.x[:5].sum(), packed.x[5:].sum()], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ([], "there are no lines"),
+        ([[]], "there are no lines"),
+        ([[np.zeros((4, 3))]], r"a line has shape \(4, 3\), expected \(points, 2\)"),
+        ([[np.arange(4.0).reshape(2, 2)]], "no line has three finite points"),
+        ([[np.full((4, 2), np.nan)]], "no line has three finite points"),
+        ([[np.ones((4, 2))]], "all points lie on one place"),
+        ([[np.ones((4, 2)), np.arange(8.0).reshape(4, 2)]], "all points of line 0 lie on one place"),
+    ],
+)
+def test_what_says_nothing_is_refused(lines: list[list[np.ndarray]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        pack(lines)
+    with pytest.raises(ValueError, match=r"grid points have shape \(3, 2\)"):
+        grid_lines(np.zeros((3, 2)))

@@ -1,0 +1,139 @@
+"""Distances from straight lines: their slopes, the lines taken out of them, pencils at infinity."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gpuvision.camera import straightness
+from gpuvision.camera.lines.line_families import PackedLines, grid_lines, pack
+from gpuvision.camera.lines.straightness import LineSet, Parameters
+from gpuvision.camera.lines.variable_projection import reach, stepped
+from reference.straight_lines import plane_grid, radial_lens
+
+STEP = 1e-6
+# Central differences of functions of about 1: their own error is about STEP^2, and rounding over STEP.
+CLOSE = 1e-8
+
+
+@pytest.fixture
+def packed(rng: np.random.Generator) -> PackedLines:
+    """Lines bent by 20 pixels, with errors as large, so that no term is too small to be tested."""
+    points = radial_lens(20.0).distort(plane_grid(rng, 30.0, rows=7, columns=9))
+    return pack(grid_lines(points + rng.normal(0.0, 15.0, points.shape), diagonals=True))
+
+
+@pytest.fixture
+def anywhere(rng: np.random.Generator) -> Parameters:
+    """A lens and vanishing points that are the best for nothing; one point is at infinity."""
+    points = rng.normal(size=(4, 3)) * [1.0, 1.0, 0.4]
+    points[2, 2] = 0.0
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return Parameters(np.array([0.1, -0.05]), np.array([0.1, -0.2]), points)
+
+
+def distances(packed: PackedLines, k: np.ndarray, centre: np.ndarray, lines: LineSet) -> np.ndarray:
+    """(n.u + rho)/|J'n| with J by the chain rule as it is written on paper."""
+    d = np.stack([packed.x, packed.y], axis=-1) - centre
+    s = np.sum(d**2, axis=-1)
+    growth, slope = 1.0 + s * (k[0] + k[1] * s), k[0] + 2.0 * k[1] * s
+    jacobian = growth[:, None, None] * np.eye(2) + 2.0 * slope[:, None, None] * d[:, :, None] * d[:, None, :]
+    normal = np.stack([lines.nx, lines.ny], axis=-1)[packed.line]
+    value = np.sum(normal * (centre + d * growth[:, None]), axis=-1) + lines.offset[packed.line]
+    return value / np.linalg.norm(np.einsum("nij,ni->nj", jacobian, normal), axis=-1)
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_slopes_are_those_of_the_distances(packed: PackedLines, anywhere: Parameters, free: bool) -> None:
+    at = anywhere._replace(vanishing=None) if free else anywhere
+    here = straightness.evaluate(packed, at)
+    slopes = straightness.columns(2, here)
+    np.testing.assert_allclose(here.residual, distances(packed, at.k, at.centre, here.lines), atol=1e-14)
+    turn = np.arctan2(here.lines.ny, here.lines.nx)
+
+    def moved(change: np.ndarray) -> np.ndarray:
+        lines = LineSet(np.cos(turn + change[5]), np.sin(turn + change[5]), here.lines.offset + change[4])
+        return distances(packed, at.k + change[:2], at.centre + change[2:4], lines)
+
+    for number, column in enumerate([*slopes.lens[:4], *slopes.line]):
+        change = STEP * np.eye(6)[number]
+        np.testing.assert_allclose(column, (moved(change) - moved(-change)) / (2.0 * STEP), atol=CLOSE)
+
+
+def test_lines_move_with_their_points(packed: PackedLines, anywhere: Parameters) -> None:
+    """A line's slopes by the vanishing point's tangents are those of a line that stays in the point's pencil."""
+    lines = straightness.evaluate(packed, anywhere).lines
+    change = straightness.pencil_changes(anywhere.vanishing, packed.family, lines)
+    for axis in (0, 1):
+        step = np.zeros(2 + 2 + 8)
+        step[4 + axis :: 2] = STEP
+        there, _ = stepped(packed, anywhere, step)
+        point = there.vanishing[packed.family]
+        offset, turn = change[:, 1 + axis] * STEP
+        nx, ny = lines.nx - turn * lines.ny, lines.ny + turn * lines.nx
+        missed = nx * point[:, 0] + ny * point[:, 1] + (lines.offset + offset) * point[:, 2]
+        np.testing.assert_allclose(missed, 0.0, atol=10.0 * STEP**2)
+    on_point = np.sum(np.stack(lines, axis=-1) * anywhere.vanishing[packed.family], axis=-1)
+    np.testing.assert_allclose(on_point, 0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_lines_are_projected_out(packed: PackedLines, anywhere: Parameters, free: bool) -> None:
+    """The small normal equations are those of the whole Jacobian, a column for each line's own parameters."""
+    at = anywhere._replace(vanishing=None) if free else anywhere
+    here = straightness.evaluate(packed, at)
+    slopes = straightness.columns(2, here)
+    normal = straightness.normal_equations(packed, at, here, slopes)
+    sought, own = list(slopes.lens[:4]), []
+    change = np.zeros((2, 3, len(packed.counts)))
+    if not free:
+        change = straightness.pencil_changes(at.vanishing, packed.family, here.lines)
+        for family in range(4):
+            inside = packed.family[packed.line] == family
+            for axis in (1, 2):
+                sought.append(inside * np.sum(slopes.line * change[:, axis, packed.line], axis=0))
+    for line in range(len(packed.counts)):
+        inside = packed.line == line
+        columns = slopes.line if free else [np.sum(slopes.line * change[:, 0, packed.line], axis=0)]
+        own += [inside * column for column in columns]
+    basis = np.linalg.qr(np.array(own).T)[0]
+    wanted = np.array(sought).T
+    wanted = wanted - basis @ (basis.T @ wanted)
+    scale = np.max(np.abs(normal.matrix))
+    np.testing.assert_allclose(normal.matrix, wanted.T @ wanted, atol=1e-13 * scale)
+    np.testing.assert_allclose(normal.gradient, wanted.T @ here.residual, atol=1e-13 * scale)
+    columns = straightness.projected_columns(packed, at, here, slopes, normal.taken)
+    np.testing.assert_allclose(columns, wanted.T, atol=1e-12 * np.sqrt(scale))
+
+
+def test_pencil_lines_are_the_best(packed: PackedLines, anywhere: Parameters) -> None:
+    """No line through the vanishing point, at infinity or not, has a smaller sum of squares."""
+    lines = straightness.evaluate(packed, anywhere._replace(k=np.empty(0))).lines
+    change = straightness.pencil_changes(anywhere.vanishing, packed.family, lines)
+
+    def cost(turn: float) -> np.ndarray:
+        angle = np.arctan2(lines.ny, lines.nx) + change[1, 0] * turn
+        offset = lines.offset + change[0, 0] * turn
+        each = np.cos(angle)[packed.line] * packed.x + np.sin(angle)[packed.line] * packed.y + offset[packed.line]
+        return packed.sums(each**2)
+
+    # The first-order turn leaves the pencil by 1e-8, which changes no sum of squares by 1e-10 of it.
+    assert np.all(cost(0.0) < cost(1e-4) * (1.0 + 1e-10))
+    assert np.all(cost(0.0) < cost(-1e-4) * (1.0 + 1e-10))
+
+
+@pytest.mark.parametrize(
+    ("k", "square", "holds"),
+    [((-0.3,), 1.0, True), ((-0.3,), 1.2, False), ((-1.0, 1.0), 1.0, True), ((-1.5, 0.9), 1.0, False), ((), 9.0, True)],
+)
+def test_monotone(k: tuple[float, ...], square: float, holds: bool) -> None:
+    radius = np.linspace(0.0, np.sqrt(square), 2001)
+    powers = sum(each * radius ** (2 * power) for power, each in enumerate(k, 1))
+    assert bool(np.all(np.diff(radius * (1.0 + powers)) > 0.0)) is holds
+    assert straightness.monotone(np.array(k), square) is holds
+
+
+def test_reach_covers_every_point(packed: PackedLines) -> None:
+    for centre in np.array([[0.0, 0.0], [0.7, -0.2], [-3.0, 1.0]]):
+        farthest = np.max((packed.x - centre[0]) ** 2 + (packed.y - centre[1]) ** 2)
+        assert farthest <= reach(packed, centre) * (1.0 + 1e-12)

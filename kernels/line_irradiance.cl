@@ -1,6 +1,6 @@
-// Irradiance of receivers (position, normal) from all lit segments, unoccluded. CPU runtimes take strips of 16 receivers,
-// GPUs an item per receiver. Places are subtracted and turned into each segment's frame in `place`, double wherever the
-// device has it: 1e-6 of a segment's length away from it, single would have no digit left.
+// Irradiance of receivers (position, normal) from all lit segments, unoccluded. CPU runtimes take strips of 16
+// receivers, GPUs an item per receiver. Places are subtracted and turned into each segment's frame in `place`, double
+// wherever the device has it: 1e-6 of a segment's length away from it, single would have no digit left.
 #include "line_irradiance.h"
 #include "status.h"
 
@@ -30,21 +30,23 @@ typedef float places;
 #define narrow convert_real
 #endif
 
-// A row: start, direction, normal, across (3 places each), length; and in real the last four again, exitance / pi.
+// A row: start, direction, normal, across (3 places each), length; and in real the last four again, exitance / 2 pi.
 #define PLACES 13
 #define REALS 11
 
 inline places load_places(global const INPUT *receivers, int column) {
 #ifdef STRIP
     global const INPUT *at = receivers + column;
-    return (places)(at[0], at[6], at[12], at[18], at[24], at[30], at[36], at[42], at[48], at[54], at[60], at[66], at[72],
-                    at[78], at[84], at[90]);
+    return (places)(at[0], at[6], at[12], at[18], at[24], at[30], at[36], at[42],
+                    at[48], at[54], at[60], at[66], at[72], at[78], at[84], at[90]);
 #else
     return receivers[column];
 #endif
 }
 
-inline places dot3(places x, places y, places z, global const place *row) { return x * row[0] + y * row[1] + z * row[2]; }
+inline places dot3(places x, places y, places z, global const place *row) {
+    return x * row[0] + y * row[1] + z * row[2];
+}
 inline reals turned(reals x, reals y, reals z, global const real *row) { return x * row[0] + y * row[1] + z * row[2]; }
 
 kernel void line_irradiance(global const INPUT *restrict receivers, global real *restrict irradiance,

@@ -42,46 +42,36 @@ __attribute__((always_inline)) inline reals LANED(arc_rest)(reals w) {
 #endif
 }
 
-// One end of the segment at tau.
-typedef struct {
-    masks steep;  // |tau| > rho
-    reals ratio;  // tau / rho, or where steep rho / tau: in [-1, 1]
-    reals fall;   // 1 / (1 + ratio^2)
-    reals part;   // integral of dy / (1 + y^2)^2 from 0 to tau / rho, or where steep from there to infinity
-} LANED(LineEnd);
-
-__attribute__((always_inline)) inline LANED(LineEnd) LANED(line_end)(reals tau, reals rho) {
-    LANED(LineEnd) end;
-    end.steep = mask_of(fabs(tau) > rho);
-    end.ratio = (end.steep ? rho : tau) / (end.steep ? tau : rho);
-    const reals w = end.ratio * end.ratio, rest = LANED(arc_rest)(w);
-    end.fall = (real)1 / ((real)1 + w);
-    // Where steep both terms of the usual form are ratio / 2 but for the third order, which is what counts there.
-    const reals cube = end.ratio * w;
-    end.part = (real)0.5 * (end.steep ? cube * (end.fall - rest) : end.ratio - cube * rest + end.ratio * end.fall);
-    return end;
+// Twice the integral of (offset + slope y) / (1 + y^2)^2 dy, y from y1 to y2; `step` is y2 - y1, and they are not both
+// more than 1 or both less than -1: the usual form, of differences that do not cancel.
+__attribute__((always_inline)) inline reals LANED(line_closed_form)(reals y1, reals y2, reals step, reals offset,
+                                                                   reals slope) {
+    const reals product = y1 * y2, cosine = (real)1 + product, size = fabs(cosine);
+    const reals weight = step / (((real)1 + y1 * y1) * ((real)1 + y2 * y2));
+    // atan(y2) - atan(y1)
+    const masks steep = mask_of(step > size);
+    const reals ratio = (steep ? size : step) / (steep ? step : size), square = ratio * ratio;
+    const reals low = ratio - ratio * square * LANED(arc_rest)(square);
+    const reals half_turn = steep ? (reals)(real)1.57079632679489661923 - low : low;
+    const reals turn = cosine < (reals)(real)0 ? (reals)(real)3.14159265358979323846 - half_turn : half_turn;
+    return offset * (((real)1 - product) * weight + turn) + slope * ((y1 + y2) * weight);
 }
 
-// Integral of (offset + slope y) / (1 + y^2)^2 dy, y from tau1 / rho to tau2 / rho; `length` is tau2 - tau1.
-__attribute__((always_inline)) inline reals LANED(line_closed_form)(reals tau1, reals tau2, reals length, reals rho,
-                                                                   reals offset, reals slope) {
-    const LANED(LineEnd) one = LANED(line_end)(tau1, rho), two = LANED(line_end)(tau2, rho);
-    const real quarter_turn = (real)0.78539816339744830962;
-    const reals zero = (reals)0;
-    const reals to_one = one.steep ? (tau1 < zero ? (reals)-quarter_turn : (reals)quarter_turn) : zero;
-    const reals to_two = two.steep ? (tau2 < zero ? (reals)-quarter_turn : (reals)quarter_turn) : zero;
-    // The quarters cancel exactly where both ends are steep on one side.
-    const reals level = (to_two - to_one) + ((two.steep ? -two.part : two.part) - (one.steep ? -one.part : one.part));
-    const reals fall_one = one.steep ? one.ratio * one.ratio * one.fall : one.fall;
-    const reals fall_two = two.steep ? two.ratio * two.ratio * two.fall : two.fall;
-    const reals tilt = (real)0.5 * ((length / rho) * fall_one) * (((tau1 + tau2) / rho) * fall_two);
-    return offset * level + slope * tilt;
+// The same where both are more than 1 in size, on one side, and that form loses its digits: in z = 1 / y its terms are
+// equal but for the third order, which is what counts.
+__attribute__((always_inline)) inline reals LANED(line_end_on)(reals y1, reals y2, reals step, reals offset,
+                                                              reals slope) {
+    const reals inverse = (real)1 / (y1 * y2), z1 = y2 * inverse, z2 = y1 * inverse;
+    const reals square1 = z1 * z1, square2 = z2 * z2, sum1 = (real)1 + square1, sum2 = (real)1 + square2;
+    const reals both = (real)1 / (sum1 * sum2);
+    const reals level = z1 * square1 * (sum2 * both - LANED(arc_rest)(square1)) -
+                        z2 * square2 * (sum1 * both - LANED(arc_rest)(square2));
+    return offset * level + slope * (step * square1) * ((y1 + y2) * square2) * both;
 }
 
 // The same by Gauss and Legendre, for pieces that are short beside their distance, where the closed form cancels;
-// `first` is offset + slope tau1 / rho, exactly zero at a horizon.
-__attribute__((always_inline)) inline reals LANED(line_quadrature)(reals tau1, reals length, reals rho, reals first,
-                                                                  reals slope) {
+// `first` is offset + slope y1, exactly zero at a horizon.
+__attribute__((always_inline)) inline reals LANED(line_quadrature)(reals start, reals step, reals first, reals slope) {
 #ifdef REAL_IS_DOUBLE
 #define LINE_NODES 6
     const real nodes[LINE_NODES] = {0.033765242898423986, 0.16939530676686774, 0.38069040695840155,
@@ -95,25 +85,20 @@ __attribute__((always_inline)) inline reals LANED(line_quadrature)(reals tau1, r
     const real weights[LINE_NODES] = {0.17392742256872693f, 0.32607257743127307f, 0.32607257743127307f,
                                       0.17392742256872693f};
 #endif
-    const reals start = tau1 / rho, step = length / rho;
     reals sum = (reals)0;
 #pragma unroll
     for (int k = 0; k < LINE_NODES; k++) {
         const reals on = step * nodes[k], y = start + on, fall = (real)1 / ((real)1 + y * y);
         sum += weights[k] * (first + slope * on) * fall * fall;
     }
-    return step * sum;
+    return (real)2 * step * sum;
 }
 
-// From how many times its length on a piece is short beside its distance; squared. Either form is good to a few
-// roundings there: 4 nodes leave 4e-7 at 2 lengths, 6 nodes 3e-14 at 4, and the closed form loses a factor of 3 or 6.
-#ifdef REAL_IS_DOUBLE
+// From four times its length on a piece is short beside its distance. Either form is good there: 4 nodes leave 2e-9, 6
+// nodes 3e-14, and the closed form loses a factor of 12 at most.
 #define LINE_FAR ((real)16)
-#else
-#define LINE_FAR ((real)4)
-#endif
 
-// Irradiance over exitance, times pi. `along` is where the receiver stands along the line, `height` above the lit
+// Irradiance over exitance, times 2 pi. `along` is where the receiver stands along the line, `height` above the lit
 // surface, `aside` across it; (by_u, by_n, by_w) its normal in that frame.
 __attribute__((always_inline)) inline reals LANED(line_factor)(reals along, reals height, reals aside, reals end,
                                                               reals whole, reals by_u, reals by_n, reals by_w) {
@@ -129,18 +114,25 @@ __attribute__((always_inline)) inline reals LANED(line_factor)(reals along, real
     if (!any_lane(lit)) return zero;
     if (any_lane(lit & (cut_first | cut_last))) {
         // The cut from the foot, where both are near; what is left from the end, where it is little.
-        const reals cut = -foot / by_u, left = min((cut_first ? last : first) / fabs(by_u), length);
+        const reals steps = (real)1 / by_u, cut = -foot * steps;
+        const reals left = min((cut_first ? last : first) * fabs(steps), length);
         length = cut_first | cut_last ? left : length;
         tau1 = cut_first ? cut : tau1;
         tau2 = cut_last ? cut : tau2;
         first = cut_first ? zero : first;
     }
-    const reals beyond = max(max(tau1, -tau2), zero);
-    const masks far = mask_of(rho * rho + beyond * beyond >= LINE_FAR * length * length);
+    const reals y1 = tau1 * per, y2 = tau2 * per, step = length * per;
+    const reals beyond = max(max(y1, -y2), zero);
+    const masks far = lit & mask_of((real)1 + beyond * beyond >= LINE_FAR * step * step);
+    const masks end_on = lit & ~far & mask_of(beyond > (reals)(real)1);
     reals integral = zero;
-    if (any_lane(lit & ~far)) integral = LANED(line_closed_form)(tau1, tau2, length, rho, foot * per, by_u);
-    if (any_lane(lit & far)) {
-        const reals few = LANED(line_quadrature)(tau1, length, rho, first * per, by_u);
+    if (any_lane(lit & ~far & ~end_on)) integral = LANED(line_closed_form)(y1, y2, step, foot * per, by_u);
+    if (any_lane(end_on)) {
+        const reals beside = LANED(line_end_on)(y1, y2, step, foot * per, by_u);
+        integral = end_on ? beside : integral;
+    }
+    if (any_lane(far)) {
+        const reals few = LANED(line_quadrature)(y1, step, first * per, by_u);
         integral = far ? few : integral;
     }
     // Rounding may leave less than nothing at the horizon.

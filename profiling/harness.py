@@ -23,7 +23,18 @@ from gpuvision.host import Device
 from gpuvision.host.files import write_whole
 from gpuvision.profiling import ceiling
 
-OPERATIONS = ("psd", "line", "triangulation", "range_image", "undistort", "points", "calibration", "launch", "stream")
+OPERATIONS = (
+    "psd",
+    "line",
+    "triangulation",
+    "range_image",
+    "undistort",
+    "points",
+    "calibration",
+    "reflections",
+    "launch",
+    "stream",
+)
 _ROUND_LIMITS = (7, 101)
 _WARM_UP = 1e-3  # s
 _CALLS_PER_TURN = 3

@@ -68,7 +68,7 @@ class LitSegments:
         frame = np.concatenate([along, self.normals, np.cross(along, self.normals)], axis=1)
         emits = (length > 0.0) & (self.exitance > 0.0)
         places = np.column_stack([start, frame, length])[emits]
-        reals = np.column_stack([frame, length, self.exitance / math.pi])[emits]
+        reals = np.column_stack([frame, length, self.exitance / math.tau])[emits]
         # A runtime takes no table without rows.
         rows = max(len(places), 1)
         whole = [
@@ -173,7 +173,7 @@ class LineIrradiance(Operation[Irradiance]):
 def _strip_of(count: int, segments: int, device: Device) -> int:
     share = -(-count // (_STRIPS_PER_CORE * _LANES * device.handle.max_compute_units)) * _LANES
     worth = -(-_PAIRS_PER_STRIP // (max(segments, 1) * _LANES)) * _LANES
-    return max(share, worth)
+    return int(max(share, worth))
 
 
 def _real_of(precision: Precision, dtype: np.dtype[Any]) -> np.dtype[Any]:
@@ -197,7 +197,7 @@ def _checked(values: Any, shape: tuple[int, ...], what: str) -> npt.NDArray[np.f
     return array
 
 
-def _refuse(wrong: npt.NDArray[np.bool_], what: str) -> None:
+def _refuse(wrong: Any, what: str) -> None:
     if wrong.any():
         raise ValueError(f"LitSegments: segment {int(np.argmax(wrong))} {what}")
 

@@ -1,0 +1,132 @@
+"""Light from lit lines on surfaces, all pairs and no occlusion, against the same closed form in Numba.
+
+The peer is branch-free and vectorised by LLVM over receivers, with a polynomial arc tangent, in single throughout; its
+error, like ours over the largest irradiance of the case and NaN on a device without double, stands in the column
+``peer_error``. ``wall``: lines that run into a wall, all pairs face each other. ``board``: patches of boxes on a board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from gpuvision.host import Device
+from gpuvision.profiling.harness import Case
+from gpuvision.simulation.line_irradiance import LineIrradiance, LitSegments
+
+_BLOCK = 512
+F = np.float32
+ZERO, HALF, ONE, QUARTER, TURN, TINY = F(0.0), F(0.5), F(1.0), F(np.pi / 2.0), F(np.pi), F(1e-24)
+# Minimax for atan(z) / z on [0, 1] in z^2, to 1.6e-8.
+A0, A1, A2, A3, A4 = F(-0.333333317), F(0.199997393), F(-0.142785687), F(0.110337641), F(-0.086568804)
+A5, A6, A7, A8 = F(0.062501694), F(-0.035871539), F(0.013507771), F(-0.002386997)
+
+
+@numba.njit(parallel=True, error_model="numpy")
+def _numba(receivers, table, out):  # type: ignore[no-untyped-def]
+    """Sum over segments for blocks of receivers, each block turned into columns first; written out, for LLVM."""
+    count = receivers.shape[0]
+    for block in numba.prange((count + _BLOCK - 1) // _BLOCK):
+        begin = block * _BLOCK
+        n = min(_BLOCK, count - begin)
+        own = np.empty((6, _BLOCK), np.float32)
+        sums = np.zeros(_BLOCK, np.float32)
+        for i in range(n):
+            for k in range(6):
+                own[k, i] = receivers[begin + i, k]
+        xs, ys, zs, us, vs, ws = own[0], own[1], own[2], own[3], own[4], own[5]
+        for m in range(table.shape[0]):
+            px, py, pz, ux, uy, uz = table[m, 0], table[m, 1], table[m, 2], table[m, 3], table[m, 4], table[m, 5]
+            lx, ly, lz, length, power = table[m, 6], table[m, 7], table[m, 8], table[m, 9], table[m, 10]
+            for i in range(n):
+                dx, dy, dz = xs[i] - px, ys[i] - py, zs[i] - pz
+                along = dx * ux + dy * uy + dz * uz
+                height = dx * lx + dy * ly + dz * lz
+                rx, ry, rz = along * ux - dx, along * uy - dy, along * uz - dz
+                square = rx * rx + ry * ry + rz * rz + TINY
+                a, b = us[i] * rx + vs[i] * ry + ws[i] * rz, us[i] * ux + vs[i] * uy + ws[i] * uz
+                cut = -a / b
+                low, high = -along, length - along
+                low = cut if (b > ZERO) & (cut > low) else low
+                high = cut if (b < ZERO) & (cut < high) else high
+                step = high - low
+                per = ONE / ((low * low + square) * (high * high + square))
+                rho = np.sqrt(square)
+                sine, cosine = step * rho, square + low * high
+                size = -cosine if cosine < ZERO else cosine
+                ratio = (size if sine > size else sine) / (sine if sine > size else size)
+                w = ratio * ratio
+                arc = A0 + w * (A1 + w * (A2 + w * (A3 + w * (A4 + w * (A5 + w * (A6 + w * (A7 + w * A8)))))))
+                arc = ratio + ratio * w * arc
+                arc = QUARTER - arc if sine > size else arc
+                arc = TURN - arc if cosine < ZERO else arc
+                value = a * (step * (square - low * high) * per + arc / rho) / square + b * step * (low + high) * per
+                seen = (height > ZERO) & (step > ZERO) & ((a > ZERO) | (b != ZERO))
+                sums[i] += HALF * height * power * value if seen else ZERO
+        out[begin : begin + n] = sums[:n]
+
+
+def cases(device: Device) -> Iterator[Case]:
+    """Yield a wall over many lines and over few, and a board with boxes."""
+    yield _case(device, *_wall(64, 20_000), "closed-form/wall/64x20000")
+    yield _case(device, *_wall(16, 100_000), "closed-form/wall/16x1e5")
+    yield _case(device, *_board(20_000), "closed-form/board/64x20000")
+
+
+def _case(device: Device, segments: LitSegments, receivers: NDArray[np.float32], name: str) -> Case:
+    bound = LineIrradiance(segments=segments).bind(device, receivers.shape, receivers.dtype)
+    bound.inputs[0].set(receivers)
+    ours = bound.run().irradiance.get()
+    table, out = _peer_table(segments), np.empty(len(receivers), np.float32)
+    _numba(receivers, table, out)
+    exact = LineIrradiance(segments=segments, precision="double")
+    truth = exact(receivers, device=device).irradiance if device.has_double else np.full(len(out), np.nan)
+    pairs = len(segments.exitance) * len(receivers)
+    facts = {"pairs": pairs, "peer_error": _error(out, truth)}
+    peers = {"numba": lambda: _numba(receivers, table, out)}
+    return Case("reflections", name, bound.run, peers, _error(ours, truth), facts=facts)
+
+
+def _error(values: NDArray[Any], truth: NDArray[np.float64]) -> float:
+    return float(np.max(np.abs(values - truth)) / np.max(truth))
+
+
+def _peer_table(segments: LitSegments) -> NDArray[np.float32]:
+    start = segments.ends[:, 0]
+    along = segments.ends[:, 1] - start
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    columns = [start, along / length, segments.normals, length, segments.exitance / np.pi]
+    return np.column_stack(columns).astype(np.float32)
+
+
+def _wall(segments: int, receivers: int) -> tuple[LitSegments, NDArray[np.float32]]:
+    """Return lines on a floor that end at a wall, and receivers on the wall."""
+    rng = np.random.default_rng(1)
+    ends = np.zeros((segments, 2, 3))
+    ends[:, :, 1] = rng.uniform(-0.1, 0.1, segments)[:, None]
+    ends[:, 1, 0] = rng.uniform(0.02, 0.2, segments)
+    places = np.zeros((receivers, 6), np.float32)
+    places[:, 1], places[:, 2] = rng.uniform(-0.1, 0.1, receivers), rng.uniform(1e-3, 0.1, receivers)
+    places[:, 3] = 1.0
+    return LitSegments(ends, np.tile([0.0, 0.0, 1.0], (segments, 1)), np.ones(segments)), places
+
+
+def _board(receivers: int) -> tuple[LitSegments, NDArray[np.float32]]:
+    """Return lines over boxes and the board between them, and patches on sides and tops of boxes, face by face."""
+    rng = np.random.default_rng(2)
+    at = np.linspace(-0.1, 0.1, 33)[:-1]
+    ends = np.zeros((64, 2, 3))
+    ends[::2, 0, 0], ends[1::2, 0, 0] = at, at + 0.003
+    ends[:, 1, 0] = ends[:, 0, 0] + 0.003
+    ends[::2, :, 2] = rng.uniform(0.001, 0.01, 32)[:, None]
+    normals = np.tile([0.0, 0.0, 1.0], (64, 1))
+    faces = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    side = np.repeat(np.arange(receivers // 50 + 1), 50)[:receivers]
+    centres = rng.uniform(-0.1, 0.1, (side[-1] + 1, 3)) * [1.0, 0.3, 0.0] + [0.0, 0.0, 0.005]
+    facing = faces[side % 5]
+    spread = rng.uniform(-0.004, 0.004, (receivers, 3)) * (facing == 0.0)
+    return LitSegments(ends, normals, np.ones(64)), np.hstack([centres[side] + spread, facing]).astype(np.float32)

@@ -1,0 +1,234 @@
+"""A tree of boxes over triangles with 16 children a node, built with NumPy, and rays through it on devices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Reals = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+WIDTH = 16
+_BINS = 16
+# From here on halves by number, so that the tree stays shallow whatever the triangles.
+_DEEP = 48
+_UNITS_IN_LAST_PLACE = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Bvh:
+    """The tree of kernels/bvh.h over some triangles; compared by identity.
+
+    Attributes
+    ----------
+    corners
+        float64 (n, 3, 3), metres: the triangles, from the scene's `middle`.
+    middle
+        float64 (3,), metres.
+    numbers
+        int64 (n,): what they are called.
+    members
+        int64 (m, 16): the triangles of each leaf by their place in `corners`, -1 where it has fewer.
+    children
+        int32 (k, 16): a node, or ~leaf; -1 behind the last (`boxes` says that nothing is there).
+    axes
+        int32 (k,): along which a node's children lie in order.
+    boxes
+        float64 (k, 6, 16): low corners, then high ones; of no child: low is infinity, high minus infinity.
+    depth
+        How many nodes lie above each other at most.
+    """
+
+    corners: Reals
+    middle: Reals
+    numbers: Integers
+    members: Integers
+    children: npt.NDArray[np.int32]
+    axes: npt.NDArray[np.int32]
+    boxes: Reals
+    depth: int
+
+    @classmethod
+    def build(cls, corners: npt.NDArray[Any], wanted: npt.NDArray[np.bool_] | None = None) -> Bvh:
+        """Build the tree over triangles (n, 3, 3), finite, those that are ``wanted`` (n,); there may be none.
+
+        Binary splits by the surface-area heuristic in 16 bins along the widest axis of the centroids, a level at a
+        time for all nodes (Wald 2007), to leaves of at most 16; then the largest nodes are opened until 16 children
+        stand side by side.
+        """
+        if corners.ndim != 3 or corners.shape[1:] != (3, 3):
+            raise ValueError(f"Bvh.build takes triangles (n, 3, 3), got shape {corners.shape}")
+        numbers = np.arange(len(corners)) if wanted is None else np.flatnonzero(wanted)
+        if not len(numbers):
+            return cls._empty()
+        corners = corners[numbers]
+        middle = 0.5 * (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))).astype(np.float64)
+        moved = corners.astype(np.float64) - middle
+        extents = np.concatenate([moved.min(axis=1).T, -moved.max(axis=1).T])
+        binary = _binary_tree(extents)
+        children, depth = _opened(binary)
+        boxes = binary.extents.T[children].transpose(0, 2, 1)
+        boxes[:, 3:] *= -1.0
+        # In order along the widest axis of what each node holds.
+        boxes = np.where(children[:, None] < 0, np.repeat([np.inf, -np.inf], 3)[:, None], boxes)
+        axes = np.argmax(boxes[:, 3:].max(axis=2) - boxes[:, :3].min(axis=2), axis=1)
+        rows = np.arange(len(children))
+        with np.errstate(invalid="ignore"):
+            centres = boxes[rows, axes] + boxes[rows, 3 + axes]
+        order = np.argsort(np.where(children < 0, np.inf, centres), axis=1, kind="stable")
+        children = np.take_along_axis(children, order, axis=1)
+        boxes = np.take_along_axis(boxes, order[:, None], axis=2)
+        leaf = (children >= 0) & (binary.left[children] < 0)
+        starts, counts = binary.start[children[leaf]], binary.count[children[leaf]]
+        places = starts[:, None] + np.arange(WIDTH)
+        members = binary.order[np.minimum(places, len(corners) - 1)]
+        members[np.arange(WIDTH) >= counts[:, None]] = -1
+        inner = np.flatnonzero((children >= 0) & ~leaf)
+        links = np.full(children.size, -1, np.int32)
+        # Nodes were numbered as they were opened: level by level, in the order of their parents' lanes before sorting.
+        links[inner] = binary.number[children.flat[inner]]
+        links[np.flatnonzero(leaf)] = ~np.arange(len(members), dtype=np.int32)
+        return cls(moved, middle, numbers, members, links.reshape(children.shape), axes.astype(np.int32), boxes, depth)
+
+    @classmethod
+    def _empty(cls) -> Bvh:
+        boxes = np.tile(np.repeat([np.inf, -np.inf], 3)[:, None], (1, 1, WIDTH)).astype(np.float64)
+        nowhere = np.full((1, WIDTH), -1)
+        return cls(
+            np.zeros((0, 3, 3)),
+            np.zeros(3),
+            nowhere[0, :0],
+            nowhere,
+            nowhere.astype(np.int32),
+            np.zeros(1, np.int32),
+            boxes,
+            1,
+        )
+
+    def tables(self, real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
+        """Return nodes, children, axes, leaves, triangles as kernels/bvh.h takes them."""
+        reach = float(np.abs(self.corners).max(initial=0.0))
+        pad = _UNITS_IN_LAST_PLACE * float(np.finfo(real).eps) * reach
+        nodes = self.boxes.copy()
+        nodes[:, :3] -= pad
+        nodes[:, 3:] += pad
+        whole = np.concatenate([self.corners, np.zeros((1, 3, 3))])
+        leaves = whole[self.members].transpose(0, 2, 3, 1)
+        return (
+            nodes.astype(real),
+            self.children,
+            self.axes,
+            np.ascontiguousarray(leaves, real),
+            np.append(self.numbers, -1)[self.members].astype(np.int32),
+        )
+
+
+class _Binary:
+    """The binary tree while it grows: arrays over its nodes; ``left`` is -1 for a leaf, the right child is left + 1."""
+
+    def __init__(self, extents: Reals) -> None:
+        count = extents.shape[1]
+        self.order: Integers = np.arange(count)
+        self.start: Integers = np.zeros(1, np.int64)
+        self.count: Integers = np.full(1, count)
+        self.left: Integers = np.full(1, -1)
+        self.extents: Reals = extents.min(axis=1, keepdims=True)
+        self.number: Integers = np.zeros(0, np.int64)
+
+    def split(self, nodes: Integers, on_the_left: Integers, extents: Reals) -> Integers:
+        """Give nodes their two children, extents (6, 2 len(nodes)) left and right by turns; return the new ones."""
+        first = len(self.start)
+        fresh = first + np.arange(2 * len(nodes))
+        self.left[nodes] = fresh[::2]
+        begin, number = self.start[nodes], self.count[nodes]
+        self.start = np.append(self.start, np.column_stack([begin, begin + on_the_left]))
+        self.count = np.append(self.count, np.column_stack([on_the_left, number - on_the_left]))
+        self.left = np.append(self.left, np.full(len(fresh), -1))
+        self.extents = np.concatenate([self.extents, extents], axis=1)
+        return fresh
+
+
+def _binary_tree(extents: Reals) -> _Binary:
+    tree = _Binary(extents)
+    extents32 = extents.astype(np.float32)
+    active = np.zeros(1, np.int64)
+    for level in range(200):
+        active = active[tree.count[active] > WIDTH]
+        if not len(active):
+            break
+        active = _split_level(tree, active, extents, extents32, level >= _DEEP)
+    return tree
+
+
+def _split_level(tree: _Binary, active: Integers, extents: Reals, extents32: npt.NDArray[Any], halve: bool) -> Integers:
+    """Split each active node once and put the triangles in order; return the children."""
+    start, count = tree.start[active], tree.count[active]
+    owner = np.repeat(np.arange(len(active)), count)
+    first = np.cumsum(count) - count
+    places = np.arange(len(owner)) + np.repeat(start - first, count)
+    members = tree.order[places]
+    centre = extents32[:3, members] - extents32[3:, members]
+    low, high = np.minimum.reduceat(centre, first, axis=1), np.maximum.reduceat(centre, first, axis=1)
+    axis = np.argmax(high - low, axis=0)
+    each = np.arange(len(active))
+    bottom, span = low[axis, each], (high - low)[axis, each]
+    scale = np.where(span > 0.0, _BINS * (1.0 - 1e-6) / np.maximum(span, 1e-37), 0.0).astype(np.float32)
+    value = centre[axis[owner], np.arange(len(owner))]
+    bins = np.clip(((value - bottom[owner]) * scale[owner]).astype(np.int64), 0, _BINS - 1)
+    # Sorting by node and bin also puts the two sides of every cut side by side.
+    key = np.sort(((owner * _BINS + bins) << 32) | members)
+    members, key = key & 0xFFFFFFFF, key >> 32
+    tree.order[places] = members
+    cuts = np.flatnonzero(np.diff(key, prepend=-1))
+    grid = np.full((6, len(active) * _BINS), np.inf, np.float32)
+    grid[:, key[cuts]] = np.minimum.reduceat(extents32[:, members], cuts, axis=1)
+    filled = np.bincount(key, minlength=len(active) * _BINS).reshape(-1, _BINS)
+    on_the_left = _best_cuts(grid.reshape(6, -1, _BINS), filled)
+    on_the_left = np.where((on_the_left <= 0) | (on_the_left >= count) | halve, count // 2, on_the_left)
+    sides = np.column_stack([first, first + on_the_left]).ravel()
+    return tree.split(active, on_the_left, np.minimum.reduceat(extents[:, members], sides, axis=1))
+
+
+def _best_cuts(grid: npt.NDArray[Any], filled: Integers) -> Integers:
+    """Return how many triangles go to the left of the best cut between bins: extents (6, n, bins), counts (n, bins)."""
+    left = _areas(np.minimum.accumulate(grid, axis=2))[:, :-1]
+    right = _areas(np.minimum.accumulate(grid[:, :, ::-1], axis=2))[:, ::-1][:, 1:]
+    below = np.cumsum(filled, axis=1)[:, :-1]
+    above = filled.sum(axis=1, keepdims=True) - below
+    cost = np.where((below > 0) & (above > 0), left * below + right * above, np.inf)
+    best: Integers = below[np.arange(len(below)), np.argmin(cost, axis=1)]
+    return best
+
+
+def _areas(extents: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    with np.errstate(invalid="ignore"):
+        x, y, z = np.where(np.isinf(extents[:3]), 0.0, -extents[3:] - extents[:3])
+    return np.asarray(x * y + y * z + z * x)
+
+
+def _opened(tree: _Binary) -> tuple[Integers, int]:
+    """Return the 16 children of every wide node, as binary nodes (-1: none), and the depth; sets ``tree.number``."""
+    area = np.where(tree.left >= 0, _areas(tree.extents), -1.0)
+    tree.number = np.full(len(tree.start), -1)
+    roots, levels, numbered, depth = np.zeros(1, np.int64), [], 0, 0
+    while len(roots):
+        tree.number[roots] = numbered + np.arange(len(roots))
+        numbered += len(roots)
+        depth += 1
+        children = np.full((len(roots), WIDTH), -1)
+        children[:, 0] = roots
+        rows = np.arange(len(roots))
+        for column in range(1, WIDTH):
+            largest = np.argmax(np.where(children >= 0, area[children], -1.0), axis=1)
+            chosen = children[rows, largest]
+            able = rows[area[chosen] >= 0.0]
+            opened = tree.left[chosen[able]]
+            children[able, largest[able]] = opened
+            children[able, column] = opened + 1
+        levels.append(children)
+        inside = children[children >= 0]
+        roots = inside[tree.left[inside] >= 0]
+    return np.concatenate(levels), depth

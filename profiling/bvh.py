@@ -1,0 +1,107 @@
+"""Segments against a board with parts: AnyHit against Embree, and the build of the tree.
+
+From points all over the board's surfaces to a line of light on it, the shadow rays of a simulation. Embree runs its
+occlusion query in one big call per core, which it serves best. The column `error` of these cases is the part of the
+segments on which the two disagree (silhouettes, by rounding).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
+
+from gpuvision.host import Device
+from gpuvision.profiling.harness import Case
+from gpuvision.simulation.bvh import Bvh
+from gpuvision.simulation.rays import AnyHit
+from gpuvision.simulation.scene import Scene
+
+_PARTS, _RECEIVERS, _SAMPLES = 40, 4000, 64
+_LIFT = 1e-5  # metres, off the surface that a segment starts on
+
+
+def cases(device: Device) -> Iterator[Case]:
+    """Yield segments in order and shuffled, finer boards of the same shape, and builds."""
+    for name, finer, shuffled in (("board", 0, False), ("board-shuffled", 0, True), ("board-fine", 3, False)):
+        yield _any_hit(device, name, board(finer), shuffled)
+    yield _build(board(3), "1e5")
+
+
+def board(finer: int) -> Any:
+    """Return a board of 100 mm x 80 mm with boxes and cylinders, each triangle cut into four so often."""
+    rng = np.random.default_rng(1)
+    plate = trimesh.creation.box((0.1, 0.08, 0.0016)).subdivide().subdivide().subdivide()
+    parts = [plate.apply_translation((0.0, 0.0, -0.0008))]
+    for number in range(_PARTS):
+        size = rng.uniform((2e-3, 2e-3, 1e-3), (12e-3, 12e-3, 6e-3))
+        part = trimesh.creation.cylinder(3e-3, 5e-3, sections=12) if number % 3 == 0 else trimesh.creation.box(size)
+        place = (*rng.uniform((-0.045, -0.035), (0.045, 0.035)), 0.5 * part.extents[2])
+        parts.append(part.apply_translation(place))
+    mesh: Any = trimesh.util.concatenate(parts)
+    for _ in range(finer):
+        mesh = mesh.subdivide()
+    return mesh
+
+
+def shadow_segments(mesh: Any, shuffled: bool) -> NDArray[np.float32]:
+    """Return segments from points on the mesh to samples of a line across the board."""
+    points, faces = trimesh.sample.sample_surface(mesh, _RECEIVERS, seed=3)
+    points = points + _LIFT * mesh.face_normals[faces]
+    along = np.linspace(-0.04, 0.04, _SAMPLES)
+    line = np.column_stack([along, np.full(_SAMPLES, 1e-3), np.full(_SAMPLES, 4e-3)])
+    segments = np.hstack([np.repeat(points, _SAMPLES, axis=0), np.tile(line, (len(points), 1))]).astype(np.float32)
+    if shuffled:
+        np.random.default_rng(4).shuffle(segments)
+    return segments
+
+
+def _any_hit(device: Device, name: str, mesh: Any, shuffled: bool) -> Case:
+    segments, scene = shadow_segments(mesh, shuffled), Scene.of(mesh)
+    bound = AnyHit(scene=scene).bind(device, segments.shape, segments.dtype)
+    bound.inputs[0].set(segments)
+    theirs = _embree(scene.corners)
+    queries = [
+        (np.ascontiguousarray(some[:, :3]), some[:, 3:] - some[:, :3], np.ones(len(some), np.float32))
+        for some in np.array_split(segments, os.cpu_count() or 1)
+    ]
+    pool = ThreadPoolExecutor(len(queries))
+
+    def query(given: tuple[NDArray[Any], ...]) -> NDArray[Any]:
+        return np.asarray(theirs.run(given[0], given[1], dists=given[2], query="OCCLUDED"))
+
+    def embree() -> list[NDArray[Any]]:
+        return list(pool.map(query, queries))
+
+    bound.run()
+    disagree = float(np.mean((np.concatenate(embree()) == 0) != (bound.outputs.occluded.get() != 0)))
+    facts = {"triangles": len(mesh.faces), "segments": len(segments)}
+    return Case("bvh", f"any-hit/{name}", bound.run, {"embreex": embree}, disagree, facts=facts)
+
+
+def _build(mesh: Any, size: str) -> Case:
+    corners = np.asarray(mesh.triangles)
+    facts = {"triangles": len(corners)}
+    return Case(
+        "bvh",
+        f"build/{size}",
+        lambda: Bvh.build(corners),
+        {"embreex": lambda: _embree(corners)},
+        0.0,
+        facts=facts,
+    )
+
+
+def _embree(corners: NDArray[Any]) -> Any:
+    """Return Embree's scene; it builds at the first query."""
+    scene = EmbreeScene()
+    TriangleMesh(scene, corners.astype(np.float32))
+    scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), query="OCCLUDED")
+    return scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gpuvision.camera import straightness
+from gpuvision.camera.lines import straightness
 from gpuvision.camera.lines.line_families import PackedLines, grid_lines, pack
 from gpuvision.camera.lines.straightness import LineSet, Parameters
 from gpuvision.camera.lines.variable_projection import reach, stepped

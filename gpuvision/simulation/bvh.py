@@ -65,9 +65,12 @@ class Bvh:
         if not len(numbers):
             return cls._empty()
         corners = corners[numbers]
-        middle = 0.5 * (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))).astype(np.float64)
-        moved = corners.astype(np.float64) - middle
-        extents = np.concatenate([moved.min(axis=1).T, -moved.max(axis=1).T])
+        # Numbers side by side: NumPy is slow along short axes.
+        rows = np.ascontiguousarray(corners.reshape(-1, 9).T, np.float64).reshape(3, 3, -1)
+        middle = 0.5 * (rows.min(axis=2).min(axis=0) + rows.max(axis=2).max(axis=0))
+        rows -= middle[:, None]
+        extents = np.concatenate([rows.min(axis=0), -rows.max(axis=0)])
+        moved = rows.reshape(9, -1).T.reshape(-1, 3, 3)
         binary = _binary_tree(extents)
         children, depth = _opened(binary)
         boxes = binary.extents.T[children].transpose(0, 2, 1)
@@ -75,9 +78,9 @@ class Bvh:
         # In order along the widest axis of what each node holds.
         boxes = np.where(children[:, None] < 0, np.repeat([np.inf, -np.inf], 3)[:, None], boxes)
         axes = np.argmax(boxes[:, 3:].max(axis=2) - boxes[:, :3].min(axis=2), axis=1)
-        rows = np.arange(len(children))
+        each = np.arange(len(children))
         with np.errstate(invalid="ignore"):
-            centres = boxes[rows, axes] + boxes[rows, 3 + axes]
+            centres = boxes[each, axes] + boxes[each, 3 + axes]
         order = np.argsort(np.where(children < 0, np.inf, centres), axis=1, kind="stable")
         children = np.take_along_axis(children, order, axis=1)
         boxes = np.take_along_axis(boxes, order[:, None], axis=2)
@@ -129,17 +132,16 @@ class Bvh:
 class _Binary:
     """The binary tree while it grows: arrays over its nodes; ``left`` is -1 for a leaf, the right child is left + 1."""
 
-    def __init__(self, extents: Reals) -> None:
-        count = extents.shape[1]
+    def __init__(self, count: int) -> None:
         self.order: Integers = np.arange(count)
         self.start: Integers = np.zeros(1, np.int64)
         self.count: Integers = np.full(1, count)
         self.left: Integers = np.full(1, -1)
-        self.extents: Reals = extents.min(axis=1, keepdims=True)
+        self.extents: Reals = np.zeros((6, 0))
         self.number: Integers = np.zeros(0, np.int64)
 
-    def split(self, nodes: Integers, on_the_left: Integers, extents: Reals) -> Integers:
-        """Give nodes their two children, extents (6, 2 len(nodes)) left and right by turns; return the new ones."""
+    def split(self, nodes: Integers, on_the_left: Integers) -> Integers:
+        """Give nodes their two children, the first with so many triangles; return the new ones."""
         first = len(self.start)
         fresh = first + np.arange(2 * len(nodes))
         self.left[nodes] = fresh[::2]
@@ -147,30 +149,39 @@ class _Binary:
         self.start = np.append(self.start, np.column_stack([begin, begin + on_the_left]))
         self.count = np.append(self.count, np.column_stack([on_the_left, number - on_the_left]))
         self.left = np.append(self.left, np.full(len(fresh), -1))
-        self.extents = np.concatenate([self.extents, extents], axis=1)
         return fresh
+
+    def measure(self, extents: Reals, levels: list[Integers]) -> None:
+        """Set the nodes' extents from their triangles', the leaves first and then what was split, level by level."""
+        leaves = np.flatnonzero(self.left < 0)
+        leaves = leaves[np.argsort(self.start[leaves])]
+        self.extents = np.empty((6, len(self.start)))
+        self.extents[:, leaves] = np.minimum.reduceat(extents[:, self.order], self.start[leaves], axis=1)
+        for nodes in reversed(levels):
+            left = self.left[nodes]
+            self.extents[:, nodes] = np.minimum(self.extents[:, left], self.extents[:, left + 1])
 
 
 def _binary_tree(extents: Reals) -> _Binary:
-    tree = _Binary(extents)
-    extents32 = extents.astype(np.float32)
-    active = np.zeros(1, np.int64)
-    for level in range(200):
-        active = active[tree.count[active] > WIDTH]
-        if not len(active):
-            break
-        active = _split_level(tree, active, extents, extents32, level >= _DEEP)
+    tree, levels = _Binary(extents.shape[1]), []
+    rough = extents.astype(np.float32)
+    active = np.flatnonzero(tree.count > WIDTH)
+    while len(active):
+        levels.append(active)
+        fresh = _split_level(tree, active, rough, halve=len(levels) > _DEEP)
+        active = fresh[tree.count[fresh] > WIDTH]
+    tree.measure(extents, levels)
     return tree
 
 
-def _split_level(tree: _Binary, active: Integers, extents: Reals, extents32: npt.NDArray[Any], halve: bool) -> Integers:
+def _split_level(tree: _Binary, active: Integers, extents: npt.NDArray[Any], *, halve: bool) -> Integers:
     """Split each active node once and put the triangles in order; return the children."""
     start, count = tree.start[active], tree.count[active]
     owner = np.repeat(np.arange(len(active)), count)
     first = np.cumsum(count) - count
     places = np.arange(len(owner)) + np.repeat(start - first, count)
     members = tree.order[places]
-    centre = extents32[:3, members] - extents32[3:, members]
+    centre = extents[:3, members] - extents[3:, members]
     low, high = np.minimum.reduceat(centre, first, axis=1), np.maximum.reduceat(centre, first, axis=1)
     axis = np.argmax(high - low, axis=0)
     each = np.arange(len(active))
@@ -184,12 +195,11 @@ def _split_level(tree: _Binary, active: Integers, extents: Reals, extents32: npt
     tree.order[places] = members
     cuts = np.flatnonzero(np.diff(key, prepend=-1))
     grid = np.full((6, len(active) * _BINS), np.inf, np.float32)
-    grid[:, key[cuts]] = np.minimum.reduceat(extents32[:, members], cuts, axis=1)
+    grid[:, key[cuts]] = np.minimum.reduceat(extents[:, members], cuts, axis=1)
     filled = np.bincount(key, minlength=len(active) * _BINS).reshape(-1, _BINS)
     on_the_left = _best_cuts(grid.reshape(6, -1, _BINS), filled)
     on_the_left = np.where((on_the_left <= 0) | (on_the_left >= count) | halve, count // 2, on_the_left)
-    sides = np.column_stack([first, first + on_the_left]).ravel()
-    return tree.split(active, on_the_left, np.minimum.reduceat(extents[:, members], sides, axis=1))
+    return tree.split(active, on_the_left)
 
 
 def _best_cuts(grid: npt.NDArray[Any], filled: Integers) -> Integers:

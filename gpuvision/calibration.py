@@ -28,8 +28,9 @@ from gpuvision.camera.planar_views import LossName, fit_camera
 from gpuvision.camera.vanishing_points import fit_lens, straightness_px
 from gpuvision.camera.views.camera_fit import CameraFit
 from gpuvision.camera.views.target_views import view_of
+from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import write_whole
-from gpuvision.host.recordings import RecordingError, read_image
+from gpuvision.host.recordings import read_image
 from gpuvision.lens_file import write_lens
 
 Pattern = Literal["dots", "chessboard", "lines"]
@@ -85,7 +86,7 @@ class Seen(NamedTuple):
     families: LineFamilies
 
     @property
-    def count(self) -> int:
+    def points(self) -> int:
         """Number of points."""
         if self.grid is None:
             return sum(len(line) for family in self.families for line in family)
@@ -170,7 +171,7 @@ class Calibration:
 
     def summary(self) -> str:
         """Return a line: what was found, how well."""
-        points = sum(each.count for each in self.seen)
+        points = sum(each.points for each in self.seen)
         before, after = self.straightness_px
         return (
             f"{self.pattern} in {len(self.seen)} of {len(self.seen) + len(self.passed_over)} images, {points} points; "

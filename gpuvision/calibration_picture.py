@@ -44,7 +44,7 @@ def _draw_residuals(axes: Axes, calibration: Calibration) -> None:
     size = np.abs(off) if off.ndim == 1 else np.hypot(off[:, 0], off[:, 1])
     known = np.flatnonzero(np.isfinite(size))
     known = known[:: max(len(known) // _MOST_POINTS, 1)]
-    usual = max(float(np.percentile(size[known], 98)), np.finfo(np.float32).tiny)
+    usual = max(float(np.percentile(size[known], 98)), float(np.finfo(np.float32).tiny))
     # The largest last, on top.
     known = known[np.argsort(size[known])]
     x, y = points[known].T

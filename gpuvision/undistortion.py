@@ -16,7 +16,8 @@ from gpuvision.camera.lens import Lens
 from gpuvision.camera.undistort_image import Border, Interpolation, UndistortImage
 from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.host import Device
-from gpuvision.host.recordings import RecordingError, read_image
+from gpuvision.host.errors import RecordingError
+from gpuvision.host.recordings import read_image
 from gpuvision.scan import whole_folder
 
 Progress = Callable[[int, int | None], object]

@@ -21,7 +21,7 @@
 #define COMMON 10      // variance of the place times the sum: a spot of finitely many electrons [m^2]
 
 #ifdef STRIP
-#define BLOCK 8  // vectors that are judged together
+#define BLOCK 16  // vectors that are judged together
 typedef CODE16 codes_at __attribute__((aligned(sizeof(CODE))));
 #ifdef REAL_IS_DOUBLE
 #define to_reals convert_double16

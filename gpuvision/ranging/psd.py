@@ -19,7 +19,7 @@ from gpuvision.tables import finite
 
 ELECTRON = 1.602176634e-19  # C
 # Samples of a strip: long where enough strips remain to share among the cores, a multiple of 16 always.
-_SHORT_STRIP, _LONG_STRIP, _STRIPS_PER_CORE = 4096, 16384, 8
+_SHORT_STRIP, _LONG_STRIP, _STRIPS_PER_CORE = 4096, 65536, 4
 _LANES = 16
 _CODES = {"float32": "float", "float64": "double", "uint16": "ushort"}
 

@@ -12,7 +12,7 @@ import operator
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
 import pyopencl as cl
@@ -193,15 +193,16 @@ def _kept_bound() -> Any:
     return _thread.bound
 
 
-class _Site(NamedTuple):
-    """Where a bound operation runs: a queue, and the kernel as compiled for its device."""
+@dataclass(slots=True, eq=False)
+class _Site:
+    """Where a bound operation runs: a queue, the kernel as compiled for its device, and the arrays set in that.
+
+    The runtime may abort the process on a freed buffer: what the kernel was given stays referenced.
+    """
 
     queue: Any
     kernel: Any
-
-
-def _kernel(device: Device, launch: Launch, handle: Any) -> Any:
-    return cl.Kernel(build(device, launch.stem, launch.defines, handle=handle), launch.kernel)
+    given: tuple[Any, ...]
 
 
 class Bound(Generic[R]):
@@ -223,26 +224,27 @@ class Bound(Generic[R]):
         self.queue = device.queue if queue is None else queue
         self._launch = launch
         self._computed_specs = {name: spec for name, spec in launch.outputs.items() if spec is not None}
-        self._workers = _Site(self.queue, _kernel(device, launch, device.handle))
-        self._here: _Site | None = None
-        if device.callers_thread is not None and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
-            own = cl.CommandQueue(device.context, device.callers_thread, properties=self.queue.properties)
-            self._here = _Site(own, _kernel(device, launch, device.callers_thread))
         self._global, self._local = launch.global_size, launch.local_size
         self._empty = not all(launch.global_size)
         self.inputs = tuple(device.empty(shape, dtype, self.queue) for shape, dtype in launch.inputs)
         self.outputs = self.allocate()
-        # The runtime may abort the process on a freed buffer: whatever the kernel was given stays referenced.
         self._tables = [self._upload(each) for each in launch.arguments if isinstance(each, np.ndarray)]
         self._in_flight: collections.deque[tuple[Any, Any]] = collections.deque()
+        after_inputs = enumerate(launch.outputs.values(), len(launch.inputs))
+        # Of the arrays that calls bind, among the kernel's arguments.
+        self._places = [*range(len(launch.inputs)), *(place for place, spec in after_inputs if spec is not None)]
         self._own = (*self.inputs, *self._computed(self.outputs))
-        self._given: tuple[Any, ...] = (None,) * len(self._own)
-        self._places = self._set_constants()
+        self._workers = self._site_on(device.handle, self.queue)
+        self._here: _Site | None = None
+        if device.callers_thread is not None and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
+            own = cl.CommandQueue(device.context, device.callers_thread, properties=self.queue.properties)
+            self._here = self._site_on(device.callers_thread, own)
         for array in self.inputs:
             self._clear(array)
         self().wait()
         if self._here is not None and not self._empty:
-            cl.enqueue_nd_range_kernel(*self._workers, self._global, self._local).wait()
+            self._set_arrays(self._workers, self._own)
+            cl.enqueue_nd_range_kernel(self.queue, self._workers.kernel, self._global, self._local).wait()
 
     def allocate(self) -> R:
         """Return fresh device arrays for the outputs."""
@@ -277,14 +279,14 @@ class Bound(Generic[R]):
             if out is not None and out is not self.outputs:
                 self._check_fields(out)
             given = (*(frames or self.inputs), *self._computed(self.outputs if out is None else out))
-        if given is not self._given:
-            self._set_arrays(given)
+        site = self._site(wait_for)
+        if given is not site.given:
+            self._set_arrays(site, given)
         if self._empty:
             return cl.enqueue_marker(self.queue, wait_for=wait_for)
-        site = self._site(wait_for)
         if site is self._here:
-            return cl.enqueue_nd_range_kernel(*site, self._global, self._local)
-        event = cl.enqueue_nd_range_kernel(*site, self._global, self._local, wait_for=wait_for)
+            return cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
+        event = cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local, wait_for=wait_for)
         self._hold(event, given)
         return event
 
@@ -328,11 +330,11 @@ class Bound(Generic[R]):
         flags, context = cl.mem_flags, self.device.context
         read = [cl.Buffer(context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in frames]
         write = [cl.Buffer(context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in targets]
-        self._given = (None,) * len(self._own)
-        for index, memory in zip(self._places, (*read, *write), strict=True):
-            self._set_arg(index, memory)
         site = self._site()
-        cl.enqueue_nd_range_kernel(*site, self._global, self._local)
+        site.given = (None,) * len(self._own)
+        for index, memory in zip(self._places, (*read, *write), strict=True):
+            site.kernel.set_arg(index, memory)
+        cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
         for memory, array in zip(write, targets, strict=True):
             # The map is what makes the kernel's writes visible to the host; the address stays the same.
             mapped, _ = cl.enqueue_map_buffer(
@@ -341,7 +343,7 @@ class Bound(Generic[R]):
             mapped.base.release(site.queue)
         site.queue.finish()
         # The next call binds others before these go away: a preset argument must never dangle.
-        self._set_arrays(self._own)
+        self._set_arrays(site, self._own)
 
     def _run_with_copies(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
         for array, frame in zip(self.inputs, frames, strict=True):
@@ -358,21 +360,21 @@ class Bound(Generic[R]):
         result: R = self.operation.Result(**{name: arrays.get(name) for name in self.operation.Result._fields})
         return result
 
-    def _set_arrays(self, given: tuple[Any, ...]) -> None:
+    def _set_arrays(self, site: _Site, given: tuple[Any, ...]) -> None:
         specs = (*self._launch.inputs, *self._computed_specs.values())
         if len(given) != len(specs):
             raise TypeError(
                 f"expected {len(self.inputs)} input arrays, got {len(given) - len(specs) + len(self.inputs)}"
             )
-        for array, before, spec in zip(given, self._given, specs, strict=True):
+        for array, before, spec in zip(given, site.given, specs, strict=True):
             if array is not before:
                 self._check(array, *spec)
         inputs = len(self.inputs)
         _check_apart(given[:inputs], given[inputs:], lambda a, b: a.base_data is b.base_data)
-        for place, array, before in zip(self._places, given, self._given, strict=True):
+        for place, array, before in zip(self._places, given, site.given, strict=True):
             if array is not before:
-                self._set_arg(place, memory_of(array))
-        self._given = given
+                site.kernel.set_arg(place, memory_of(array))
+        site.given = given
 
     def _check_fields(self, out: R) -> None:
         for name, array in zip(self.operation.Result._fields, out, strict=True):
@@ -396,26 +398,19 @@ class Bound(Generic[R]):
         elif array.nbytes:
             cl.enqueue_fill_buffer(self.queue, memory_of(array), np.zeros(1, np.uint8), 0, array.nbytes)
 
-    def _set_constants(self) -> list[int]:
-        """Set what no call changes; return the places of the arrays that calls bind."""
+    def _site_on(self, handle: Any, queue: Any) -> _Site:
+        """Compile the kernel for a device of the context and set what no call changes."""
         launch = self._launch
+        kernel = cl.Kernel(build(self.device, launch.stem, launch.defines, handle=handle), launch.kernel)
         after_inputs = len(launch.inputs)
         after_outputs = after_inputs + len(launch.outputs)
-        places = list(range(after_inputs))
         for place, spec in enumerate(launch.outputs.values(), after_inputs):
             if spec is None:
-                self._set_arg(place, None)
-            else:
-                places.append(place)
+                kernel.set_arg(place, None)
         tables = iter(self._tables)
         for place, value in enumerate(launch.arguments, after_outputs):
-            self._set_arg(place, next(tables) if isinstance(value, np.ndarray) else value)
-        return places
-
-    def _set_arg(self, place: int, value: Any) -> None:
-        self._workers.kernel.set_arg(place, value)
-        if self._here is not None:
-            self._here.kernel.set_arg(place, value)
+            kernel.set_arg(place, next(tables) if isinstance(value, np.ndarray) else value)
+        return _Site(queue, kernel, (None,) * len(self._own))
 
     def _upload(self, table: HostArray) -> Any:
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR

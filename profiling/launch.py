@@ -23,7 +23,8 @@ def cases(device: Device) -> Iterator[Case]:
     for frame in frames:
         frame.set(np.ones((16, 2), np.float32))
     # A bound instance's own kernel and sizes, launched without it.
-    (queue, kernel), sizes = bound._site(), (bound._global, bound._local)
+    site, sizes = bound._site(), (bound._global, bound._local)
+    queue, kernel = site.queue, site.kernel
 
     def plain() -> None:
         for _ in range(_LAUNCHES):

@@ -26,7 +26,7 @@ def paper(monkeypatch: pytest.MonkeyPatch) -> Paper:
         listed = []
         for label, reason in reasons.items():
             handle = FakePlatform(f"Platform of {label}", devices=[FakeDevice(f"Name of {label}")]).devices[0]
-            listed.append(discovery.Candidate(label, label, 0, 0, handle, "", reason))
+            listed.append(discovery.Candidate(label, label, 0, 0, handle, "", None, reason))
         asked: list[bool] = []
 
         def candidates(*, probe_again: bool = False) -> tuple[discovery.Candidate, ...]:

@@ -180,9 +180,9 @@ class Triangulation(Operation[SheetPoints]):
         start = first + pitch * origin
         terms = self._displacement(start, pitch / scale)
         lens = np.zeros(5)
-        if self._lens is not None:
+        if self.sensor_lens is not None:
             # The two scales differ by a rounding only, which moves a distorted point by less than a rounding.
-            lens = self._lens.packed(start, 1.0 / half[0])
+            lens = self.sensor_lens.packed(start, 1.0 / half[0])
         g0, gx, gy, h0, hx, hy, dx, dy = terms
         head = [origin[0], scale[0], origin[1], scale[1], self.horizon, dx, dy, g0, gx, gy, h0, hx, hy]
         with np.errstate(over="ignore"):
@@ -263,7 +263,7 @@ class Triangulation(Operation[SheetPoints]):
         middle = inverse @ matrix[:, 2]
         lifted[lifted[..., 2] * middle[2] <= 0.0] = np.nan
         straight: Float64 = origin + unit * lifted[..., :2] / lifted[..., 2:]
-        return straight if self._lens is None else self._lens.distort(straight)
+        return straight if self.sensor_lens is None else self.sensor_lens.distort(straight)
 
     def covariance_at(self, points: npt.ArrayLike) -> Float64:
         """Covariance of (G, H) at measured points (u, v): (..., 2) to (..., 2, 2); NaN beyond the horizon.
@@ -279,14 +279,14 @@ class Triangulation(Operation[SheetPoints]):
             raise ValueError("Triangulation knows neither sigma nor covariance; give it one of them")
         points = np.asarray(points, dtype=np.float64)
         origin, unit = self._middle_and_half()
-        x = ((points if self._lens is None else self._lens.undistort(points)) - origin) / unit
+        x = ((points if self.sensor_lens is None else self.sensor_lens.undistort(points)) - origin) / unit
         _, gx, gy, _, hx, hy, dx, dy = self.conditioned()
         w = 1.0 + x @ np.array([dx, dy])
         w = np.where(w > self.horizon, w, np.nan)
         p = x / w[..., None]
         values = p @ np.array([[gx, hx], [gy, hy]])
         slopes = np.array([[gx, gy], [hx, hy]]) - values[..., None] * np.array([dx, dy])
-        bend = np.eye(2) if self._lens is None else self._lens.jacobian(points)
+        bend = np.eye(2) if self.sensor_lens is None else self.sensor_lens.jacobian(points)
         slopes = (slopes / w[..., None, None]) @ bend / unit
         spread = slopes * np.array(self.sigma or (0.0, 0.0))
         total: Float64 = spread @ np.swapaxes(spread, -1, -2)
@@ -301,8 +301,8 @@ class Triangulation(Operation[SheetPoints]):
         return total
 
     @property
-    def _lens(self) -> Lens | None:
-        """The lens for points in (u, v) order."""
+    def sensor_lens(self) -> Lens | None:
+        """The lens for points in (u, v) order; None without one."""
         return _in_sensor_order(self.lens, self.along)
 
     # ---- where one comes from ------------------------------------------------------------------------------

@@ -77,6 +77,19 @@ class Section:
         self._known.append(key)
         return self.section(key) if key in self else None
 
+    def sections(self, key: str) -> tuple[Section, ...]:
+        """Return the tables of an array of tables ``[[key]]``, named with their numbers; none where it is missing.
+
+        Raises
+        ------
+        DescriptionError
+            It is no array of tables.
+        """
+        tables = self._value(key, "tables", [])
+        if not isinstance(tables, list) or not all(isinstance(each, dict) for each in tables):
+            raise self._wrong(key, tables, "", f"tables [[{self.dotted(key)}]]")
+        return tuple(Section(each, self._source, f"{self.dotted(key)}[{n}]") for n, each in enumerate(tables))
+
     @overload
     def number(self, key: str, unit: str, default: float = ..., **limits: float) -> float: ...
     @overload

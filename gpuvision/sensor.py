@@ -16,6 +16,7 @@ Tables of the file (the ones in ``gpuvision/sensors`` are commented examples):
                       (`Triangulation.from_constants`); or ``points``: calibration points (u, v, G, H) to fit
 ``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`
 ``[output]``          see `Output`
+``[light]``           what ``gpuvision simulate`` must know beside: see `gpuvision.light`
 ====================  ==================================================================================================
 """
 
@@ -34,6 +35,7 @@ from gpuvision.camera.lens import Lens
 from gpuvision.description import DescriptionError, Section, read
 from gpuvision.host.recordings import CHANNELS, Channel
 from gpuvision.lens_file import radial_lens
+from gpuvision.light import Light, read_light
 from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.range_image import Limits, RotatingSheet, StraightTransport, Vector
@@ -103,6 +105,8 @@ class Sensor:
         Shape that a frame must have, where the file says: (rows, columns), or (strips, 2).
     recording, output
         See there.
+    light
+        Where the file says: what a simulation needs.
     """
 
     name: str
@@ -111,6 +115,7 @@ class Sensor:
     output: Output
     recording: Recording = Recording()
     frame: tuple[int, int] | None = None
+    light: Light | None = None
 
     @classmethod
     def load(cls, path: str | Path) -> Sensor:
@@ -172,6 +177,7 @@ class Sensor:
             region = _region(kind, top, frame, along, axes, readout)
             sheet = _triangulation(top.section("triangulation"), {"region": region, "along": along, "lens": lens})
         output = _output(top.section("output"))
+        light = _light(top, transport)
         top.finish()
         return cls(
             name=name,
@@ -180,6 +186,7 @@ class Sensor:
             output=output,
             recording=recording,
             frame=frame,
+            light=light,
         )
 
     @property
@@ -396,6 +403,23 @@ def _rotating(table: Section, lens: Lens | None, along: Along) -> RotatingSheet:
     )
     table.finish()
     return sheet
+
+
+def _light(top: Section, transport: StraightTransport | RotatingSheet) -> Light | None:
+    table = top.optional_section("light")
+    if table is None:
+        return None
+    light = read_light(table)
+    if light.lens is not None:
+        return light
+    setup = top.section("triangulation")
+    if "baseline" not in setup or not isinstance(transport, StraightTransport):
+        raise top.error("the key 'light.lens' is missing, expected where the pinhole is: a list of 3 numbers [m]")
+    up = np.array(transport.h_axis) / np.linalg.norm(transport.h_axis)
+    beside = np.cross(transport.g_axis, transport.h_axis)
+    beside *= np.sign(beside @ np.array(transport.direction)) / np.linalg.norm(beside)
+    place = np.array(transport.origin) + setup.number("baseline", "m") * beside + setup.number("stand_off", "m") * up
+    return replace(light, lens=(float(place[0]), float(place[1]), float(place[2])))
 
 
 def _output(table: Section) -> Output:

@@ -256,3 +256,45 @@ def test_frames_of_another_sensor_are_refused() -> None:
         camera.check_frame((480, 64), "here")
     with pytest.raises(ValueError, match=r"expects \(strips, 2\) = \(96, 2\)"):
         psd.check_frame((96,), "here")
+
+
+LIGHT = """
+[light]
+aperture = 8e-3
+power = 0.5
+thickness = 40e-6
+source = [0.0, 0.3]
+width = [-0.02, 0.02]
+profile = [[-0.02, 0.5], [0.0, 1.0], [0.02, 0.5]]
+nodes = [2, 1]
+modulated = "yes"
+"""
+
+
+def test_a_setup_in_metres_says_where_the_lens_is(tmp_path):
+    path = tmp_path / "sensor.toml"
+    brought = resources.files("gpuvision").joinpath("sensors", "psd_line.toml").read_text(encoding="utf-8")
+    path.write_text(brought.split("[light]")[0] + LIGHT)
+    light = Sensor.load(path).light
+    assert light is not None
+    assert light.lens == (0.0, 0.08, 0.15)
+    assert (light.aperture, light.power, light.thickness, light.source) == (8e-3, 0.5, 40e-6, (0.0, 0.3))
+    assert (light.width, light.nodes, light.modulated, light.bins) == ((-0.02, 0.02), (2, 1), True, 64)
+    assert light.profile == ((-0.02, 0.5), (0.0, 1.0), (0.02, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[light]\npower = 1.0", "light.aperture' is missing"),
+        ("[light]\naperture = 1.0\npower = 0.0", "light.power is 0.0 W/m, expected a number .W/m. above 0"),
+        ("[light]\naperture = 1.0\npower = 1.0\nnodes = [1.5, 1]", "two whole numbers"),
+        ("[light]\naperture = 1.0\npower = 1.0\nsigma = 1", "unknown key 'light.sigma'"),
+    ],
+)
+def test_what_a_light_cannot_be(tmp_path, text, words):
+    path = tmp_path / "sensor.toml"
+    brought = resources.files("gpuvision").joinpath("sensors", "psd_line.toml").read_text(encoding="utf-8")
+    path.write_text(brought.split("[light]")[0] + text)
+    with pytest.raises(DescriptionError, match=words):
+        Sensor.load(path)

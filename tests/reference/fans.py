@@ -1,0 +1,45 @@
+"""What of a segment is visible from an apex, by the ends of all hidden intervals, in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def visible(corners: np.ndarray, fan: np.ndarray, least: float = 1e-9) -> np.ndarray:
+    """Return the visible parts (k, 2) of one fan (11,): a triangle's cut is clipped by the fan in its plane."""
+    apex, one, two = fan[:3], fan[3:6] - fan[:3], fan[6:9] - fan[:3]
+    per = 1.0 / np.maximum(fan[9:], 1e-12)
+    basis = np.linalg.pinv(np.stack([one, two], axis=1))
+    normal = np.cross(one, two) / np.linalg.norm(np.cross(one, two))
+    hidden = []
+    for triangle in corners - apex:
+        above = triangle @ normal
+        cuts = []
+        for n in range(3):
+            m = (n + 1) % 3
+            if (above[n] < 0.0) != (above[m] < 0.0):
+                share = above[n] / (above[n] - above[m])
+                cuts.append(basis @ (triangle[n] + share * (triangle[m] - triangle[n])))
+        if len(cuts) != 2:
+            continue
+        start, end = cuts
+        low, high = 0.0, 1.0
+        for weights, offset in (((1, 0), 0), ((0, 1), 0), ((-1, -1), 1 - least), (per, -1 - least)):
+            a, b = np.dot(weights, start) + offset, np.dot(weights, end) + offset
+            if a < 0 and b < 0:
+                low, high = 1.0, 0.0
+            elif a < 0:
+                low = max(low, a / (a - b))
+            elif b < 0:
+                high = min(high, a / (a - b))
+        if high > low:
+            ends = [start + share * (end - start) for share in (low, high)]
+            hidden.append(sorted(each[1] / each.sum() for each in ends))
+    shown, at = [], 0.0
+    for begin, finish in sorted(hidden):
+        if begin > at + least:
+            shown.append((at, begin))
+        at = max(at, finish)
+    if at < 1.0 - least:
+        shown.append((at, 1.0))
+    return np.array(shown).reshape(-1, 2)

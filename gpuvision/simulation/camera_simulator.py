@@ -1,0 +1,195 @@
+"""Camera columns under simulated light: frames with their noise, and what is read.
+
+Takes the same light as `gpuvision.simulation.psd_simulator`; a bin along u is a pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.psd import ELECTRON
+from gpuvision.simulation.masks import Mask, light_behind
+from gpuvision.simulation.readings import (
+    Reading,
+    check_not_negative,
+    check_samples,
+    height_secant,
+    lit_by,
+    profile_generators,
+    with_ambient,
+)
+from gpuvision.simulation.sight import Exposure, Sight
+
+Float64 = npt.NDArray[np.float64]
+_SAME = 1e-6  # pixel
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraSimulator:
+    """A camera beside a sheet of light: every sample of its sight is a profile of the frame, every bin a pixel.
+
+    Parameters
+    ----------
+    sight
+        Its bins along u are the pixels of a profile.
+    readout
+        How the line is read. Without a triangulation it takes the sight's.
+    exposure_time
+        [s].
+    responsivity
+        Of the pixels [A/W]: electrons are charge over the electron's.
+    gain
+        Grey levels per electron.
+    offset
+        Grey levels without light.
+    read_noise
+        Standard deviation of a pixel without light [electrons].
+    full_well
+        Electrons that a pixel holds; infinite: only the highest code limits it.
+    bits
+        Of a grey level; from 8 on frames are uint16.
+    ambient
+        Other light on every profile, even along it [W].
+    mask
+        In front of the pixels: a region of interest that follows the line, or glass.
+
+    Raises
+    ------
+    ValueError
+        A number is out of its range, or the sight is not one of the readout's pixels.
+    """
+
+    sight: Sight
+    readout: LineReadout
+    exposure_time: float = 1e-3
+    responsivity: float = 0.4
+    gain: float = 0.01
+    offset: float = 0.0
+    read_noise: float = 0.0
+    full_well: float = np.inf
+    bits: Literal[8, 10, 12, 14, 16] = 8
+    ambient: float = 0.0
+    mask: Mask | None = None
+
+    def __post_init__(self) -> None:
+        check_not_negative(self, "exposure_time", "responsivity", "gain", "offset", "read_noise", "ambient")
+        if not self.full_well > 0.0 or self.gain == 0.0:
+            raise ValueError("CameraSimulator.full_well and gain: expected numbers > 0")
+        if self.bits not in (8, 10, 12, 14, 16):
+            raise ValueError(f"CameraSimulator.bits is {self.bits}, expected 8, 10, 12, 14 or 16")
+        given = self.readout
+        readout = replace(
+            given,
+            triangulation=given.triangulation or self.sight.triangulation,
+            saturation=self._highest if given.saturation is None else given.saturation,
+            outputs=None,
+        )
+        object.__setattr__(self, "readout", readout)
+        axes = readout.axes
+        pixels = axes.position_origin + axes.position_pitch * (np.arange(self.sight.bins + 1) - 0.5)
+        if np.any(np.abs(self.sight.u_edges - pixels) > _SAME * abs(axes.position_pitch)):
+            raise ValueError(
+                f"CameraSimulator: the sight's bins are {self.sight.u_edges[0]:g} ... {self.sight.u_edges[-1]:g}, the "
+                f"readout's pixels {pixels[0]:g} ... {pixels[-1]:g}; expected a bin for every pixel"
+            )
+        check_samples(self.sight, axes.sample_origin, axes.sample_pitch)
+
+    @property
+    def _highest(self) -> float:
+        return min(float(2**self.bits - 1), self.offset + self.gain * self.full_well)
+
+    def light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
+        """Return the light behind the mask by path, ambient light among it."""
+        return light_behind(self.mask, self.sight, with_ambient(self.sight, exposures, self.ambient))
+
+    def electrons(self, exposures: Mapping[str, Exposure]) -> Float64:
+        """Return how many electrons are expected in every pixel, (..., samples, bins), however many it holds."""
+        power = lit_by(self.light(exposures)).power
+        return np.asarray(power * (self.responsivity * self.exposure_time / ELECTRON))
+
+    def frames(self, exposures: Mapping[str, Exposure], *, seed: int | None = None, first: int = 0) -> npt.NDArray[Any]:
+        """Return frames as the readout takes them, (..., rows, columns).
+
+        Parameters
+        ----------
+        exposures
+            Light by path, as it comes from the lens.
+        seed
+            Of the noise of photons and electronics: codes of uint8 or uint16. None: what is expected, float32.
+        first
+            Number of the block's first profile.
+        """
+        electrons = self.electrons(exposures)
+        highest = float(2**self.bits - 1)
+        if seed is None:
+            grey = self.offset + self.gain * np.minimum(electrons, self.full_well)
+            return self._as_frames(np.minimum(grey, highest).astype(np.float32))
+        flat = electrons.reshape(-1, *electrons.shape[-2:])
+        codes = np.empty(flat.shape, np.uint8 if self.bits == 8 else np.uint16)
+        for each, generator in enumerate(profile_generators(seed, first, electrons.shape[:-2])):
+            # A Poisson number beyond 1e9 is a normal one, and beyond 9e18 none.
+            held = np.minimum(generator.poisson(np.minimum(flat[each], 1e15)), self.full_well)
+            grey = self.offset + self.gain * (held + self.read_noise * generator.standard_normal(held.shape))
+            codes[each] = np.clip(np.rint(grey), 0.0, highest)
+        return self._as_frames(codes.reshape(electrons.shape))
+
+    def read(
+        self,
+        exposures: Mapping[str, Exposure],
+        *,
+        seed: int | None = None,
+        first: int = 0,
+        device: Device | None = None,
+    ) -> Reading:
+        """Read a block of profiles: `frames`, then the readout on a device.
+
+        Sigma is that of a centre of gravity over the readout's window about the reading (over all light, for method
+        "whole"), of photon, read and rounding noise, where the threshold lies below the noise of dark pixels or far
+        above it; other methods' differ from it. Without a seed the frames are those without noise.
+        """
+        said = self.readout(self.frames(exposures, seed=seed, first=first), device=device)
+        axes = self.readout.axes
+        position = np.asarray(said.position, np.float64)
+        u = axes.position_origin + axes.position_pitch * position
+        slope = np.abs(height_secant(self.sight.triangulation, u, u, self.sight.v_middles))
+        return Reading(
+            position=u,
+            g=np.asarray(said.g, np.float64),
+            h=np.asarray(said.h, np.float64),
+            sigma=slope * abs(axes.position_pitch) * self._sigma(exposures, position),
+            strength=np.asarray(said.total, np.float64),
+            width=np.asarray(said.width, np.float64),
+            status=np.asarray(said.status),
+        )
+
+    def _as_frames(self, profiles: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        turned = profiles if self.readout.along == "rows" else profiles.swapaxes(-1, -2)
+        return np.ascontiguousarray(turned)
+
+    def _sigma(self, exposures: Mapping[str, Exposure], position: Float64) -> Float64:
+        """Return the standard deviation of a centre of gravity about positions [pixel]."""
+        electrons = np.minimum(self.electrons(exposures), self.full_well)
+        signal = np.maximum(electrons + (self.offset - self.readout.threshold) / self.gain, 0.0)
+        variance = electrons + self.read_noise**2 + 1.0 / 12.0 / self.gain**2
+        known = np.isfinite(position)
+        middle = np.where(known, position, 0.0)
+        if self.readout.method == "whole":
+            at = np.broadcast_to(np.arange(self.sight.bins), electrons.shape)
+        else:
+            reach = np.arange(-self.readout.window, self.readout.window + 1)
+            at = np.rint(middle)[..., None].astype(np.intp) + reach
+            inside = (at >= 0) & (at < self.sight.bins)
+            clipped = np.clip(at, 0, self.sight.bins - 1)
+            signal = np.where(inside, np.take_along_axis(signal, clipped, axis=-1), 0.0)
+            variance = np.where(inside, np.take_along_axis(variance, clipped, axis=-1), 0.0)
+        # Samples that the threshold takes away have no say.
+        weighed = np.sum(np.where(signal > 0.0, variance, 0.0) * (at - middle[..., None]) ** 2, axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(known, np.sqrt(weighed) / np.sum(signal, axis=-1), np.nan)

@@ -1,0 +1,204 @@
+"""PSD strips under simulated light: their currents with noise, and what is read.
+
+Takes the same light as `gpuvision.simulation.camera_simulator`: `Exposure` by path, (samples, bins) of a profile or
+(profiles, samples, bins) of a block. Noise is drawn anew for every profile from the seed and the profile's number, so
+that a block simulated twice, or in other blocks, is the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device
+from gpuvision.ranging.psd import ELECTRON, PsdNoise, PsdReadout
+from gpuvision.simulation.masks import Mask, light_behind
+from gpuvision.simulation.readings import (
+    AMBIENT,
+    Reading,
+    check_not_negative,
+    check_samples,
+    height_secant,
+    lit_by,
+    profile_generators,
+    with_ambient,
+)
+from gpuvision.simulation.sight import Exposure, Sight
+
+Float64 = npt.NDArray[np.float64]
+_HIGHEST_CODE = 65535
+_SAME = 1e-6  # of half a strip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PsdSimulator:
+    """A row of PSD strips behind a lens.
+
+    Parameters
+    ----------
+    sight
+        Its samples are the strips; its first and last edge along u are the strips' electrodes. Light beyond them does
+        not count.
+    readout
+        How the currents are read, with the electronics' dark level, gain, load, linearity and noise, all of which are
+        put into the currents. Without a triangulation it takes the sight's. Its layout is "pairs".
+    responsivity
+        Of the strips [A/W].
+    ambient
+        Other light on every strip, even along it [W].
+    modulated
+        The light is modulated and demodulated: ambient light adds its shot noise only.
+    mask
+        In front of the strips.
+    codes
+        The currents come as uint16 codes of `readout.ampere` each, as from a converter; False: in ampere.
+
+    Raises
+    ------
+    ValueError
+        A number is out of its range, or the sight is not one of the readout's strips.
+    """
+
+    sight: Sight
+    readout: PsdReadout
+    responsivity: float = 0.4
+    ambient: float = 0.0
+    modulated: bool = False
+    mask: Mask | None = None
+    codes: bool = False
+
+    def __post_init__(self) -> None:
+        check_not_negative(self, "responsivity", "ambient")
+        if self.readout.layout != "pairs":
+            raise ValueError("PsdSimulator.readout has layout 'planar', expected 'pairs'")
+        sheet = self.readout.triangulation or self.sight.triangulation
+        noise = self.readout.noise or PsdNoise()
+        object.__setattr__(self, "readout", replace(self.readout, triangulation=sheet, noise=noise, outputs=None))
+        axes, edges = self.readout.axes, self.sight.u_edges
+        half = 0.5 * abs(axes.position_pitch) * self.readout.strip_length
+        ends = np.array([axes.position_origin - half, axes.position_origin + half])
+        if np.any(np.abs(edges[[0, -1]] - ends) > _SAME * half):
+            raise ValueError(
+                f"PsdSimulator: the sight's light ends at u = {edges[0]:g} and {edges[-1]:g}, the readout's strips at "
+                f"{ends[0]:g} and {ends[1]:g}; expected the same"
+            )
+        check_samples(self.sight, axes.sample_origin, axes.sample_pitch)
+
+    def light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
+        """Return the light behind the mask by path, ambient light among it."""
+        return light_behind(self.mask, self.sight, with_ambient(self.sight, exposures, self.ambient))
+
+    def currents(
+        self, exposures: Mapping[str, Exposure], *, seed: int | None = None, first: int = 0
+    ) -> npt.NDArray[Any]:
+        """Return the strips' currents (left, right), (..., samples, 2): float64 [A], or uint16 codes.
+
+        Parameters
+        ----------
+        exposures
+            Light by path, as it comes from the lens.
+        seed
+            Of the noise; None: none.
+        first
+            Number of the block's first profile.
+        """
+        light = self.light(exposures)
+        lit = lit_by(light, without=(AMBIENT,) if self.modulated else ())
+        total = self.responsivity * lit.total()
+        with np.errstate(invalid="ignore", divide="ignore"):
+            place = np.where(total > 0.0, self.responsivity * lit.first_moment(self.sight.u_edges) / total, 0.0)
+        if seed is None:
+            return self._recorded(self._divided(total, place))
+        generators = profile_generators(seed, first, total.shape[:-1])
+        draws = np.reshape(
+            [each.standard_normal((5, self.sight.samples)) for each in generators], (*total.shape[:-1], 5, -1)
+        )
+        kinds = self.readout.noise or PsdNoise()
+        pair = self._divided(*self._with_shot_noise(light, total, place, draws))
+        pair += kinds.independent * draws[..., 2:4, :].swapaxes(-1, -2)
+        pair += kinds.opposed * draws[..., 4, :, None] * (1.0, -1.0)
+        return self._recorded(pair)
+
+    def read(
+        self,
+        exposures: Mapping[str, Exposure],
+        *,
+        seed: int | None = None,
+        first: int = 0,
+        device: Device | None = None,
+    ) -> Reading:
+        """Read a block of profiles: `currents`, then the readout on a device.
+
+        Without a seed the reading is the one of the currents without noise; its sigma says what noise would do. A
+        strip without any light is DARK.
+        """
+        said = self.readout(self.currents(exposures, seed=seed, first=first), device=device)
+        axes = self.readout.axes
+        u = axes.position_origin + axes.position_pitch * np.asarray(said.position, np.float64)
+        slope = np.abs(height_secant(self.sight.triangulation, u, u, self.sight.v_middles))
+        return Reading(
+            position=u,
+            g=np.asarray(said.g, np.float64),
+            h=np.asarray(said.h, np.float64),
+            sigma=slope * abs(axes.position_pitch) * np.asarray(said.sigma, np.float64),
+            strength=np.asarray(said.total, np.float64),
+            width=np.full(u.shape, np.nan),
+            status=np.asarray(said.status),
+        )
+
+    # ---- from light to currents ----------------------------------------------------------------------------
+
+    def _with_shot_noise(
+        self, light: Mapping[str, Exposure], total: Float64, place: Float64, noise: Float64
+    ) -> tuple[Float64, Float64]:
+        """Every electron divides at its own place: their number, and the mean of their places, have noise.
+
+        Ambient electrons add theirs, even where the mean of ambient light is demodulated away.
+        """
+        bandwidth = (self.readout.noise or PsdNoise()).bandwidth
+        everything = lit_by(light)
+        about = _second_moment(everything, self.sight.u_edges, place)
+        variance = 2.0 * ELECTRON * bandwidth * self.responsivity * everything.total()
+        spread = np.sqrt(2.0 * ELECTRON * bandwidth * self.responsivity * about)
+        noisy = total + np.sqrt(variance) * noise[..., 0, :]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shift = np.where(total > 0.0, spread * noise[..., 1, :] / total, 0.0)
+        return noisy, place + shift
+
+    def _divided(self, total: Float64, u: Float64) -> Float64:
+        """Return what arrives at the electrodes, (..., 2) [A], without dark level and gain."""
+        readout = self.readout
+        position = (u - readout.axes.position_origin) / readout.axes.position_pitch
+        half = 0.5 * readout.strip_length
+        if readout.linearity is not None:
+            knots = np.linspace(-half, half, len(readout.linearity[0]))
+            for strip, corrections in enumerate(readout.linearity):
+                # What is read at a knot is the knot; the light is where the correction takes it.
+                position[..., strip] = np.interp(position[..., strip], knots + np.array(corrections), knots)
+        balance = position / half
+        if readout.interelectrode_resistance:
+            balance /= 1.0 + 2.0 * readout.load_resistance / readout.interelectrode_resistance
+        return 0.5 * total[..., None] * np.stack([1.0 - balance, 1.0 + balance], axis=-1)
+
+    def _recorded(self, pair: Float64) -> npt.NDArray[Any]:
+        readout = self.readout
+        raw = pair * (1.0, readout.right_gain) + readout.dark
+        if readout.saturation is not None:
+            raw = np.minimum(raw, readout.saturation)
+        if not self.codes:
+            return raw
+        return np.clip(np.rint(raw / readout.ampere), 0, _HIGHEST_CODE).astype(np.uint16)
+
+
+def _second_moment(light: Exposure, edges: Float64, place: Float64) -> Float64:
+    """Return the sum of power times squared distance from a place; light is even about its centre in every bin."""
+    middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        centre = np.where(light.power > 0.0, light.moment / light.power, 0.0)
+    reach = half - np.minimum(np.abs(centre), half)
+    square = (middle + centre - place[..., None]) ** 2 + reach**2 / 3.0
+    return np.asarray(np.sum(light.power * square, axis=-1))

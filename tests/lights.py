@@ -1,0 +1,83 @@
+"""Light on simulated sensors whose power and moments are known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import ndtr
+
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.psd import PsdReadout
+from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.simulation.camera_simulator import CameraSimulator
+from gpuvision.simulation.psd_simulator import PsdSimulator
+from gpuvision.simulation.sight import Exposure, Sight
+
+LENGTH, PITCH, STRIPS = 6e-3, 1e-4, 5
+
+
+def psd_sight(bins: int = 60, strips: int = STRIPS) -> Sight:
+    """Return strips of 6 mm beside a sheet that shines straight down."""
+    half, v = 0.5 * LENGTH, PITCH * (np.arange(strips + 1) - 0.5 * strips)
+    triangulation = Triangulation.from_stand_off(
+        baseline=0.08, stand_off=0.15, focal_distance=0.04, region=((-half, half), (v[0], v[-1]))
+    )
+    edges = np.linspace(-half, half, bins + 1)
+    return Sight(
+        triangulation=triangulation, transport=StraightTransport(), lens=(0.0, 0.08, 0.15), u_edges=edges, v_edges=v
+    )
+
+
+def strip_axes(sight: Sight) -> SampleAxes:
+    return SampleAxes(sample_origin=float(sight.v_middles[0]), sample_pitch=PITCH)
+
+
+def psd(sight: Sight | None = None, *, readout: dict | None = None, **more) -> PsdSimulator:
+    sight = psd_sight() if sight is None else sight
+    return PsdSimulator(
+        sight=sight, readout=PsdReadout(strip_length=LENGTH, axes=strip_axes(sight), **(readout or {})), **more
+    )
+
+
+def camera_sight(rows: int = 64, columns: int = 8) -> Sight:
+    """Return a camera's columns beside the same sheet, 10 um pixels."""
+    axes = [10e-6 * (np.arange(count + 1) - 0.5 * count) for count in (rows, columns)]
+    triangulation = Triangulation.from_stand_off(
+        baseline=0.08,
+        stand_off=0.15,
+        focal_distance=0.04,
+        region=((axes[0][0], axes[0][-1]), (axes[1][0], axes[1][-1])),
+    )
+    return Sight(
+        triangulation=triangulation,
+        transport=StraightTransport(),
+        lens=(0.0, 0.08, 0.15),
+        u_edges=axes[0],
+        v_edges=axes[1],
+    )
+
+
+def pixel_axes(sight: Sight) -> SampleAxes:
+    return SampleAxes(
+        position_origin=float(sight.u_middles[0]),
+        position_pitch=10e-6,
+        sample_origin=float(sight.v_middles[0]),
+        sample_pitch=10e-6,
+    )
+
+
+def camera(sight: Sight | None = None, *, readout: dict | None = None, **more) -> CameraSimulator:
+    sight = camera_sight() if sight is None else sight
+    return CameraSimulator(sight=sight, readout=LineReadout(**{"axes": pixel_axes(sight), **(readout or {})}), **more)
+
+
+def gaussian(sight: Sight, u, power, sigma: float) -> Exposure:
+    """Return spots of a Gaussian profile, exact in every bin: u and power broadcast to (..., samples)."""
+    u, power = np.broadcast_arrays(np.asarray(u, float), np.asarray(power, float))
+    u, power = (np.array(np.broadcast_to(each, (*u.shape[:-1], sight.samples)))[..., None] for each in (u, power))
+    x = (sight.u_edges - u) / sigma
+    share = np.diff(ndtr(x), axis=-1)
+    # The far side's differences of shares near 1 would cancel.
+    share = np.where(x[..., :-1] > 0.0, -np.diff(ndtr(-x), axis=-1), share)
+    first = -sigma * np.diff(np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), axis=-1)
+    return Exposure(power * share, power * (first + (u - sight.u_middles) * share))

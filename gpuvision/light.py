@@ -1,7 +1,7 @@
 """The light of a sensor: what ``gpuvision simulate`` must know beside what a scan needs, table ``[light]`` of its file.
 
 ==============  ======================================================================================================
-``lens``        where the pinhole is [m]; a triangulation given by baseline and stand-off says it itself
+``lens``        where the pinhole is, in the scene [m]; needless beside a triangulation from baseline and stand-off
 ``aperture``    diameter of the lens' opening [m]
 ``power``       of the sheet of light, per metre of G [W/m]
 ``thickness``   standard deviation of the light across the sheet [m]; 0: thin

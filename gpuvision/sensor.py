@@ -410,11 +410,10 @@ def _light(top: Section, transport: StraightTransport | RotatingSheet) -> Light 
     if table is None:
         return None
     light = read_light(table)
-    if light.lens is not None:
+    setup = top.optional_section("triangulation")
+    if light.lens is not None or setup is None or "baseline" not in setup:
         return light
-    setup = top.section("triangulation")
-    if "baseline" not in setup or not isinstance(transport, StraightTransport):
-        raise top.error("the key 'light.lens' is missing, expected where the pinhole is: a list of 3 numbers [m]")
+    assert isinstance(transport, StraightTransport)  # the others have no triangulation
     up = np.array(transport.h_axis) / np.linalg.norm(transport.h_axis)
     beside = np.cross(transport.g_axis, transport.h_axis)
     beside *= np.sign(beside @ np.array(transport.direction)) / np.linalg.norm(beside)

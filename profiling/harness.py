@@ -63,6 +63,9 @@ class Case:
         How often every call does the work back to back; a row's times are for one.
     facts
         More columns for the row (latencies, rates).
+    factors
+        What the measured time of a peer, by name, is multiplied with, where all of its work would take too long; the
+        facts say how the factor was found.
     """
 
     operation: str
@@ -73,6 +76,7 @@ class Case:
     traffic: tuple[int, int] | None = None
     repeats: int = 1
     facts: Mapping[str, Any] = field(default_factory=dict)
+    factors: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -116,7 +120,8 @@ def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
     calls: dict[str, Callable[[], object]] = {"": case.ours, **case.peers}
     if case.traffic is not None:
         calls["ceiling"] = ceiling.move(device, *case.traffic, case.repeats)
-    times = {name: np.array(taken) / case.repeats for name, taken in _take_turns(calls, seconds).items()}
+    taken = _take_turns(calls, seconds)
+    times = {name: np.array(each) * (case.factors.get(name, 1.0) / case.repeats) for name, each in taken.items()}
     ours = times.pop("")
     limit = times.pop("ceiling", None)
     fraction = None if limit is None else float(np.median(limit / ours))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 import types
 
 import numpy as np
@@ -41,6 +42,16 @@ def test_facts_stand_beside_the_columns(device):
     (row,) = harness.measure(case(facts={"p50_us": 12.0}), device, seconds=0.01)
     assert row.to_dict()["p50_us"] == 12.0
     assert "facts" not in row.to_dict()
+
+
+def test_a_part_of_a_peers_work_stands_for_all_of_it(device):
+    (part,), (whole,) = (
+        harness.measure(case(peers={"numpy": lambda: time.sleep(2e-3)}, factors=factors), device, seconds=0.01)
+        for factors in ({}, {"numpy": 1e3})
+    )
+    assert part.peer_seconds == pytest.approx(2e-3, rel=0.9)
+    assert whole.peer_seconds == pytest.approx(2.0, rel=0.9)
+    assert whole.ratio > 100.0 * part.ratio
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ def strip_axes(sight: Sight) -> SampleAxes:
 def psd(sight: Sight | None = None, *, readout: dict | None = None, **more) -> PsdSimulator:
     sight = psd_sight() if sight is None else sight
     return PsdSimulator(
-        sight=sight, readout=PsdReadout(strip_length=LENGTH, axes=strip_axes(sight), **(readout or {})), **more
+        sight=sight, readout=PsdReadout(strip_length=LENGTH, **{"axes": strip_axes(sight), **(readout or {})}), **more
     )
 
 

@@ -20,9 +20,9 @@ from gpuvision.simulation.readings import (
     Reading,
     check_not_negative,
     check_samples,
-    height_secant,
     lit_by,
     profile_generators,
+    reading_of,
     with_ambient,
 )
 from gpuvision.simulation.sight import Exposure, Sight
@@ -94,7 +94,7 @@ class CameraSimulator:
         object.__setattr__(self, "readout", readout)
         axes = readout.axes
         pixels = axes.position_origin + axes.position_pitch * (np.arange(self.sight.bins + 1) - 0.5)
-        if np.any(np.abs(self.sight.u_edges - pixels) > _SAME * abs(axes.position_pitch)):
+        if np.any(np.abs(self.sight.u_edges - np.sort(pixels)) > _SAME * abs(axes.position_pitch)):
             raise ValueError(
                 f"CameraSimulator: the sight's bins are {self.sight.u_edges[0]:g} ... {self.sight.u_edges[-1]:g}, the "
                 f"readout's pixels {pixels[0]:g} ... {pixels[-1]:g}; expected a bin for every pixel"
@@ -158,24 +158,22 @@ class CameraSimulator:
         axes = self.readout.axes
         position = np.asarray(said.position, np.float64)
         u = axes.position_origin + axes.position_pitch * position
-        slope = np.abs(height_secant(self.sight.triangulation, u, u, self.sight.v_middles))
-        return Reading(
-            position=u,
-            g=np.asarray(said.g, np.float64),
-            h=np.asarray(said.h, np.float64),
-            sigma=slope * abs(axes.position_pitch) * self._sigma(exposures, position),
-            strength=np.asarray(said.total, np.float64),
-            width=np.asarray(said.width, np.float64),
-            status=np.asarray(said.status),
-        )
+        sigma = abs(axes.position_pitch) * self._sigma(exposures, position)
+        return reading_of(self.sight, said, u, sigma, backward=axes.sample_pitch < 0.0)
+
+    def _in_order(self, profiles: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return (..., samples, bins) with samples and bins as the readout counts them."""
+        axes = self.readout.axes
+        return profiles[..., :: -1 if axes.sample_pitch < 0.0 else 1, :: -1 if axes.position_pitch < 0.0 else 1]
 
     def _as_frames(self, profiles: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        profiles = self._in_order(profiles)
         turned = profiles if self.readout.along == "rows" else profiles.swapaxes(-1, -2)
         return np.ascontiguousarray(turned)
 
     def _sigma(self, exposures: Mapping[str, Exposure], position: Float64) -> Float64:
         """Return the standard deviation of a centre of gravity about positions [pixel]."""
-        electrons = np.minimum(self.electrons(exposures), self.full_well)
+        electrons = self._in_order(np.minimum(self.electrons(exposures), self.full_well))
         signal = np.maximum(electrons + (self.offset - self.readout.threshold) / self.gain, 0.0)
         variance = electrons + self.read_noise**2 + 1.0 / 12.0 / self.gain**2
         known = np.isfinite(position)

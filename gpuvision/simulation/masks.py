@@ -290,7 +290,10 @@ class _Groups(NamedTuple):
         return cls(power, moment, true_u, slope, low.min(axis=1), high.max(axis=1))
 
     def part(self, first: int, last: int) -> _Groups:
-        return self._make(each[first:last] for each in self)
+        some = slice(first, last)
+        return _Groups(
+            self.power[some], self.moment[some], self.true_u[some], self.slope[some], self.low[some], self.high[some]
+        )
 
     def best(self, objective: str) -> tuple[Index, Index]:
         """Return the best ends of every group's window."""

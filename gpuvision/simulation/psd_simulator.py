@@ -22,9 +22,9 @@ from gpuvision.simulation.readings import (
     Reading,
     check_not_negative,
     check_samples,
-    height_secant,
     lit_by,
     profile_generators,
+    reading_of,
     with_ambient,
 )
 from gpuvision.simulation.sight import Exposure, Sight
@@ -55,7 +55,7 @@ class PsdSimulator:
     mask
         In front of the strips.
     codes
-        The currents come as uint16 codes of `readout.ampere` each, as from a converter; False: in ampere.
+        A converter makes uint16 codes of the currents, of `readout.ampere` each.
 
     Raises
     ------
@@ -77,7 +77,10 @@ class PsdSimulator:
             raise ValueError("PsdSimulator.readout has layout 'planar', expected 'pairs'")
         sheet = self.readout.triangulation or self.sight.triangulation
         noise = self.readout.noise or PsdNoise()
-        object.__setattr__(self, "readout", replace(self.readout, triangulation=sheet, noise=noise, outputs=None))
+        limits = [self.readout.saturation, _HIGHEST_CODE * self.readout.ampere if self.codes else None]
+        saturation = min((each for each in limits if each is not None), default=None)
+        readout = replace(self.readout, triangulation=sheet, noise=noise, saturation=saturation, outputs=None)
+        object.__setattr__(self, "readout", readout)
         axes, edges = self.readout.axes, self.sight.u_edges
         half = 0.5 * abs(axes.position_pitch) * self.readout.strip_length
         ends = np.array([axes.position_origin - half, axes.position_origin + half])
@@ -95,18 +98,20 @@ class PsdSimulator:
     def currents(
         self, exposures: Mapping[str, Exposure], *, seed: int | None = None, first: int = 0
     ) -> npt.NDArray[Any]:
-        """Return the strips' currents (left, right), (..., samples, 2): float64 [A], or uint16 codes.
+        """Return the strips' currents (left, right), (..., strips, 2), in units of `readout.ampere`.
+
+        In the readout's order of the strips, which runs against the sight's where its axes' pitch is negative.
 
         Parameters
         ----------
         exposures
             Light by path, as it comes from the lens.
         seed
-            Of the noise; None: none.
+            Of the noise, of which the rounding to codes is a part. None: the currents that are expected, float64.
         first
             Number of the block's first profile.
         """
-        light = self.light(exposures)
+        light = self._in_order(self.light(exposures))
         lit = lit_by(light, without=(AMBIENT,) if self.modulated else ())
         total = self.responsivity * lit.total()
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -121,7 +126,10 @@ class PsdSimulator:
         pair = self._divided(*self._with_shot_noise(light, total, place, draws))
         pair += kinds.independent * draws[..., 2:4, :].swapaxes(-1, -2)
         pair += kinds.opposed * draws[..., 4, :, None] * (1.0, -1.0)
-        return self._recorded(pair)
+        recorded = self._recorded(pair)
+        if not self.codes:
+            return recorded
+        return np.clip(np.rint(recorded), 0, _HIGHEST_CODE).astype(np.uint16)
 
     def read(
         self,
@@ -134,21 +142,21 @@ class PsdSimulator:
         """Read a block of profiles: `currents`, then the readout on a device.
 
         Without a seed the reading is the one of the currents without noise; its sigma says what noise would do. A
-        strip without any light is DARK.
+        strip without any light is DARK. Samples are in the sight's order.
         """
-        said = self.readout(self.currents(exposures, seed=seed, first=first), device=device)
+        device = Device.best() if device is None else device
+        currents = self.currents(exposures, seed=seed, first=first)
+        if currents.dtype == np.float64 and not device.has_double:
+            currents = currents.astype(np.float32)
+        said = self.readout(currents, device=device)
         axes = self.readout.axes
         u = axes.position_origin + axes.position_pitch * np.asarray(said.position, np.float64)
-        slope = np.abs(height_secant(self.sight.triangulation, u, u, self.sight.v_middles))
-        return Reading(
-            position=u,
-            g=np.asarray(said.g, np.float64),
-            h=np.asarray(said.h, np.float64),
-            sigma=slope * abs(axes.position_pitch) * np.asarray(said.sigma, np.float64),
-            strength=np.asarray(said.total, np.float64),
-            width=np.full(u.shape, np.nan),
-            status=np.asarray(said.status),
-        )
+        sigma = abs(axes.position_pitch) * np.asarray(said.sigma, np.float64)
+        return reading_of(self.sight, said, u, sigma, backward=axes.sample_pitch < 0.0)
+
+    def _in_order(self, light: Mapping[str, Exposure]) -> dict[str, Exposure]:
+        step = -1 if self.readout.axes.sample_pitch < 0.0 else 1
+        return {name: Exposure(*(part[..., ::step, :] for part in each)) for name, each in light.items()}
 
     # ---- from light to currents ----------------------------------------------------------------------------
 
@@ -184,14 +192,12 @@ class PsdSimulator:
             balance /= 1.0 + 2.0 * readout.load_resistance / readout.interelectrode_resistance
         return 0.5 * total[..., None] * np.stack([1.0 - balance, 1.0 + balance], axis=-1)
 
-    def _recorded(self, pair: Float64) -> npt.NDArray[Any]:
+    def _recorded(self, pair: Float64) -> Float64:
         readout = self.readout
-        raw = pair * (1.0, readout.right_gain) + readout.dark
+        raw: Float64 = pair * (1.0, readout.right_gain) + readout.dark
         if readout.saturation is not None:
             raw = np.minimum(raw, readout.saturation)
-        if not self.codes:
-            return raw
-        return np.clip(np.rint(raw / readout.ampere), 0, _HIGHEST_CODE).astype(np.uint16)
+        return raw / readout.ampere
 
 
 def _second_moment(light: Exposure, edges: Float64, place: Float64) -> Float64:

@@ -197,12 +197,34 @@ def check_samples(sight: Sight, origin: float, pitch: float) -> None:
     ValueError
         They do not.
     """
-    expected = origin + pitch * np.arange(sight.samples)
+    expected = np.sort(origin + pitch * np.arange(sight.samples))
     if np.any(np.abs(sight.v_middles - expected) > _SAME * abs(pitch)):
         raise ValueError(
             f"the sight's samples lie about v = {sight.v_middles[0]:g} ... {sight.v_middles[-1]:g}, the readout's axes "
-            f"place them at {expected[0]:g} ... {expected[-1]:g}; expected the same, in the same order"
+            f"place them at {expected[0]:g} ... {expected[-1]:g}; expected the same"
         )
+
+
+def reading_of(sight: Sight, said: Any, u: Float64, sigma_u: Float64, *, backward: bool) -> Reading:
+    """Return what a readout says as a simulator's reading.
+
+    Parameters
+    ----------
+    sight
+        Of the sensor.
+    said
+        `PsdReading` or `LineReading`.
+    u, sigma_u
+        Its position and the standard deviation of that [sensor unit].
+    backward
+        The readout's samples run against the sight's.
+    """
+    step = -1 if backward else 1
+    width = getattr(said, "width", np.full(u.shape, np.nan))
+    numbers = (u, said.g, said.h, sigma_u, said.total, width)
+    u, g, h, sigma_u, strength, width = (np.asarray(each, np.float64)[..., ::step] for each in numbers)
+    slope = height_secant(sight.triangulation, u, u, sight.v_middles)
+    return Reading(u, g, h, np.abs(slope) * sigma_u, strength, width, np.asarray(said.status)[..., ::step])
 
 
 def sheet_point(triangulation: Triangulation, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Float64, Float64]:

@@ -7,11 +7,12 @@ import pytest
 
 from gpuvision.host import Device
 from gpuvision.ranging.psd import ELECTRON
+from gpuvision.ranging.triangulation import SampleAxes
 from gpuvision.simulation.masks import Mask
 from gpuvision.simulation.readings import height_secant, sheet_point, stack
 from gpuvision.simulation.sight import Exposure
 from gpuvision.status import Status
-from lights import camera, camera_sight, gaussian
+from lights import camera, camera_sight, gaussian, pixel_axes
 
 PIXEL = 10e-6
 
@@ -108,6 +109,25 @@ def test_mask_is_a_region_of_interest(device: Device) -> None:
     for given, pixel in ((None, 50.0), (mask, 20.0)):
         reading = camera(sight, mask=given, gain=1e-3).read(light, device=device)
         np.testing.assert_allclose(reading.position, first + pixel * PIXEL, atol=1e-4 * PIXEL)
+
+
+def test_axes_that_run_backwards(device: Device) -> None:
+    """A frame whose rows and columns count against the sensor's coordinates says the same, in the sight's order."""
+    sight = camera_sight()
+    light = line(sight, 30.0 + np.arange(sight.samples) * 0.37)
+    axes = pixel_axes(sight)
+    turned = SampleAxes(
+        position_origin=float(sight.u_middles[-1]),
+        position_pitch=-axes.position_pitch,
+        sample_origin=float(sight.v_middles[-1]),
+        sample_pitch=-axes.sample_pitch,
+    )
+    method = {"method": "windowed", "window": 6}
+    ahead, back = (
+        camera(sight, readout=method | {"axes": each}, gain=1e-3).read(light, device=device) for each in (axes, turned)
+    )
+    for one, other in zip(ahead, back, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-9)
 
 
 def test_dark_profiles(device: Device) -> None:

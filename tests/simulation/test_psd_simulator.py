@@ -10,12 +10,13 @@ from scipy.special import ndtr
 
 from gpuvision.host import Device
 from gpuvision.ranging.psd import ELECTRON, PsdNoise
+from gpuvision.ranging.triangulation import SampleAxes
 from gpuvision.simulation.masks import Mask
 from gpuvision.simulation.psd_simulator import PsdSimulator
 from gpuvision.simulation.readings import height_secant, sheet_point, stack
 from gpuvision.simulation.sight import Exposure
 from gpuvision.status import Status
-from lights import LENGTH, gaussian, psd, psd_sight
+from lights import LENGTH, PITCH, gaussian, psd, psd_sight
 
 
 def moments(simulator: PsdSimulator, light: dict[str, Exposure]) -> tuple[np.ndarray, np.ndarray]:
@@ -122,12 +123,14 @@ def test_codes(device: Device) -> None:
     sight = psd_sight()
     light = {"direct": sight.deposit([1e-3] * 3, sight.v_middles[:3], [1e-6, 1e-7, 1e-2])}
     coded = psd(sight, readout={"ampere": 1e-11, "dark": (1e-9, 1e-9)}, codes=True)
-    codes = coded.currents(light)
+    codes = coded.currents(light, seed=0)
     assert codes.dtype == np.uint16
     exact = psd(sight, readout={"dark": (1e-9, 1e-9)}).currents(light)
+    np.testing.assert_allclose(coded.currents(light)[:2], exact[:2] / 1e-11, rtol=1e-14)
     np.testing.assert_allclose(1e-11 * codes[:2].astype(float), exact[:2], atol=0.5e-11 * (1.0 + 1e-9))
-    reading = coded.read(light, device=device)
+    reading = coded.read(light, seed=0, device=device)
     assert reading.status[2] == Status.SATURATED
+    assert coded.read(light, device=device).status[2] == Status.SATURATED
     # Half a step of either current.
     assert abs(reading.position[0] - 1e-3) < 0.5e-11 / 0.4e-6 * LENGTH
     saturating = psd(sight, readout={"saturation": 1e-6}).read(light, device=device)
@@ -173,6 +176,18 @@ def test_ambient_light_has_shot_noise_also_where_its_mean_is_gone() -> None:
     )
     growth = loud.sum(axis=-1).std() / quiet.sum(axis=-1).std()
     assert growth == pytest.approx(10.0, rel=0.1)
+
+
+def test_axes_that_run_backwards(device: Device) -> None:
+    """A readout whose axes point against the sensor's coordinates says the same of the light, in the sight's order."""
+    sight = psd_sight()
+    axes = SampleAxes(sample_origin=float(sight.v_middles[-1]), sample_pitch=-PITCH, position_pitch=-1.0)
+    table = tuple(tuple(1e-6 * np.arange(3) * strip) for strip in range(sight.samples))
+    light = {"direct": gaussian(sight, np.linspace(-2e-3, 2e-3, 5), [1e-6, 2e-6, 3e-6, 4e-6, 5e-6], 5e-5)}
+    ahead = psd(sight, readout={"linearity": table[::-1]}).read(light, device=device)
+    back = psd(sight, readout={"axes": axes, "linearity": table}).read(light, device=device)
+    for one, other in zip(ahead, back, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_what_is_refused() -> None:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr
 
 from gpuvision.ranging.range_image import StraightTransport, Vector
 from gpuvision.ranging.triangulation import Triangulation
@@ -224,6 +225,25 @@ class Sight:
         total = np.bincount(at, weights, minlength=size)
         moment = np.bincount(at, weights * (u[on] - self.u_middles[place[on]]), minlength=size)
         return Exposure(total.reshape(self.samples, -1), moment.reshape(self.samples, -1))
+
+    def blurred(self, exposure: Exposure, sigma: float) -> Exposure:
+        """Return the exposure behind a lens that images a point as a Gaussian along u, sigma in sensor units.
+
+        Power and moment are moved from bin to bin by the spot of a light in the middle of each, and by its derivative:
+        exact for light at the middle, off by the square of its distance from there over sigma otherwise, at most
+        (bin / sigma)^2 / 50 of the light. What comes to lie beyond the sensor's ends is lost.
+        """
+        if sigma == 0.0:
+            return exposure
+        edges = (self.u_edges[None, :] - self.u_middles[:, None]) / sigma
+        below, bell = ndtr(edges), np.exp(-0.5 * edges**2) / math.sqrt(math.tau)
+        # From a bin (row) to a bin (column): share of the power, and its first moment about the row's middle.
+        share, place = np.diff(below, axis=1), -sigma * np.diff(bell, axis=1)
+        share_slope, place_slope = -np.diff(bell, axis=1) / sigma, share - np.diff(edges * bell, axis=1)
+        apart = self.u_middles[None, :] - self.u_middles[:, None]
+        power = exposure.power @ share + exposure.moment @ share_slope
+        moment = exposure.power @ (place - apart * share) + exposure.moment @ (place_slope - apart * share_slope)
+        return Exposure(power, moment)
 
     # ---- what follows from the parameters ------------------------------------------------------------------
 

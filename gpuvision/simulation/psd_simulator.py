@@ -92,8 +92,9 @@ class PsdSimulator:
         check_samples(self.sight, axes.sample_origin, axes.sample_pitch)
 
     def light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
-        """Return the light behind the mask by path, ambient light among it."""
-        return light_behind(self.mask, self.sight, with_ambient(self.sight, exposures, self.ambient))
+        """Return the light behind the mask by path, ambient light among it unless it is demodulated away."""
+        light = self._arriving(exposures)
+        return {name: each for name, each in light.items() if not (self.modulated and name == AMBIENT)}
 
     def currents(
         self, exposures: Mapping[str, Exposure], *, seed: int | None = None, first: int = 0
@@ -111,8 +112,7 @@ class PsdSimulator:
         first
             Number of the block's first profile.
         """
-        light = self._in_order(self.light(exposures))
-        lit = lit_by(light, without=(AMBIENT,) if self.modulated else ())
+        lit = self._in_order(lit_by(self.light(exposures)))
         total = self.responsivity * lit.total()
         with np.errstate(invalid="ignore", divide="ignore"):
             place = np.where(total > 0.0, self.responsivity * lit.first_moment(self.sight.u_edges) / total, 0.0)
@@ -123,7 +123,8 @@ class PsdSimulator:
             [each.standard_normal((5, self.sight.samples)) for each in generators], (*total.shape[:-1], 5, -1)
         )
         kinds = self.readout.noise or PsdNoise()
-        pair = self._divided(*self._with_shot_noise(light, total, place, draws))
+        arriving = self._in_order(lit_by(self._arriving(exposures)))
+        pair = self._divided(*self._with_shot_noise(arriving, total, place, draws))
         pair += kinds.independent * draws[..., 2:4, :].swapaxes(-1, -2)
         pair += kinds.opposed * draws[..., 4, :, None] * (1.0, -1.0)
         recorded = self._recorded(pair)
@@ -154,23 +155,25 @@ class PsdSimulator:
         sigma = abs(axes.position_pitch) * np.asarray(said.sigma, np.float64)
         return reading_of(self.sight, said, u, sigma, backward=axes.sample_pitch < 0.0)
 
-    def _in_order(self, light: Mapping[str, Exposure]) -> dict[str, Exposure]:
+    def _arriving(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
+        return light_behind(self.mask, self.sight, with_ambient(self.sight, exposures, self.ambient))
+
+    def _in_order(self, light: Exposure) -> Exposure:
         step = -1 if self.readout.axes.sample_pitch < 0.0 else 1
-        return {name: Exposure(*(part[..., ::step, :] for part in each)) for name, each in light.items()}
+        return Exposure(light.power[..., ::step, :], light.moment[..., ::step, :])
 
     # ---- from light to currents ----------------------------------------------------------------------------
 
     def _with_shot_noise(
-        self, light: Mapping[str, Exposure], total: Float64, place: Float64, noise: Float64
+        self, light: Exposure, total: Float64, place: Float64, noise: Float64
     ) -> tuple[Float64, Float64]:
         """Every electron divides at its own place: their number, and the mean of their places, have noise.
 
         Ambient electrons add theirs, even where the mean of ambient light is demodulated away.
         """
         bandwidth = (self.readout.noise or PsdNoise()).bandwidth
-        everything = lit_by(light)
-        about = _second_moment(everything, self.sight.u_edges, place)
-        variance = 2.0 * ELECTRON * bandwidth * self.responsivity * everything.total()
+        about = _second_moment(light, self.sight.u_edges, place)
+        variance = 2.0 * ELECTRON * bandwidth * self.responsivity * light.total()
         spread = np.sqrt(2.0 * ELECTRON * bandwidth * self.responsivity * about)
         noisy = total + np.sqrt(variance) * noise[..., 0, :]
         with np.errstate(invalid="ignore", divide="ignore"):

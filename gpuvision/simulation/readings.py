@@ -126,8 +126,8 @@ def dark_exposure(exposures: Mapping[str, Exposure]) -> Exposure:
     return Exposure(np.zeros_like(like.power), np.zeros_like(like.power))
 
 
-def lit_by(exposures: Mapping[str, Exposure], without: Sequence[str] = ()) -> Exposure:
-    """Return the light of all paths and what is ambient together, apart from those left out.
+def lit_by(exposures: Mapping[str, Exposure]) -> Exposure:
+    """Return the light of all paths and what is ambient together.
 
     Raises
     ------
@@ -141,7 +141,7 @@ def lit_by(exposures: Mapping[str, Exposure], without: Sequence[str] = ()) -> Ex
         raise ValueError("the paths' light has different shapes, expected one (..., samples, bins)")
     total = dark_exposure(exposures)
     for name in _LIT:
-        if name in exposures and name not in without:
+        if name in exposures:
             total = total + exposures[name]
     return total
 

@@ -1,0 +1,201 @@
+"""Where curved mirrors show points, and how concentrated their light arrives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.simulation.scene import Scene
+
+Float64 = npt.NDArray[np.float64]
+_ROW, _GROUP, _LANES = 26, 64, 16
+_CREASE = math.radians(40.0)
+
+
+def smooth_normals(scene: Scene, crease: float = _CREASE) -> Float64:
+    """Return a unit normal for every corner of every triangle, (n, 3, 3), as if the surface were smooth.
+
+    At a corner the normals of all triangles that share it are joined, but for those that lean more than the crease
+    from the triangle's own: an edge stays an edge. With Max's weights (Weights for computing vertex normals, 1999)
+    the normals of a sphere are exact; of other smooth surfaces they are off by the square of the triangles' size.
+
+    Parameters
+    ----------
+    scene
+        Triangles that touch share corners, to the last digit. Of one without area the normals are zero.
+    crease
+        Radians.
+    """
+    corners = scene.corners
+    ahead, back = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    across = np.cross(ahead, back)
+    squares = np.sum(ahead * ahead, axis=2) * np.sum(back * back, axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weighted = across / squares[..., None]
+        flat = across[:, 0] / np.linalg.norm(across[:, 0], axis=1, keepdims=True)
+    bad = ~(np.isfinite(weighted).all(axis=(1, 2)) & np.isfinite(flat).all(axis=1))
+    weighted[bad], flat[bad] = 0.0, 0.0
+    # All pairs of corners in one place.
+    points = np.where(np.isfinite(corners), corners, 0.0).reshape(-1, 3) + 0.0
+    place = np.unique(points, axis=0, return_inverse=True)[1].ravel()
+    order = np.argsort(place, kind="stable")
+    counts = np.bincount(place)
+    first = np.cumsum(counts) - counts
+    own = np.repeat(order, counts[place[order]])
+    within = np.arange(len(own)) - np.repeat(
+        np.cumsum(counts[place[order]]) - counts[place[order]], counts[place[order]]
+    )
+    other = order[first[place[own]] + within]
+    smooth = np.sum(flat[own // 3] * flat[other // 3], axis=1) > math.cos(crease)
+    total = np.zeros((3 * len(corners), 3))
+    np.add.at(total, own[smooth], weighted.reshape(-1, 3)[other[smooth]])
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    lonely = length[:, 0] == 0.0
+    total[lonely], length[lonely] = np.repeat(flat, 3, axis=0)[lonely], 1.0
+    return np.asarray((total / length).reshape(-1, 3, 3))
+
+
+class MirroredPoints(NamedTuple):
+    """Images of points in curved mirrors.
+
+    Attributes
+    ----------
+    place
+        (..., kept, 3), metres: where on the mirrors they are seen.
+    move
+        (..., kept, 3): how these places move with the points' steps.
+    density
+        (..., kept), 1/m^2: the lens' solid angle per area across the rays at the point, or the point's per area at
+        the lens: 1 / (way to the mirror + way on) ** 2 where the mirror is flat.
+    triangle
+        int32 (..., kept): number in the scene, -1 behind the last.
+    count
+        uint8 (...,): how many there are.
+    status
+        uint8 `Status` flags, (...,): NOT_FINITE (a number is not), AMBIGUOUS (there are more images than are kept).
+    """
+
+    place: Any
+    move: Any
+    density: Any
+    triangle: Any
+    count: Any
+    status: Any
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MirrorPoints(Operation[MirroredPoints]):
+    """Where a lens sees points in curved mirrors: ``op(points, lens) -> MirroredPoints``; compared by identity.
+
+    Points are float32 or float64 (..., 6): a place and a step, any vector, in metres. The lens is a place, (3,). On
+    each triangle the place is found by Newton's method at which the direction half way between lens and point is along
+    the normal, interpolated from the corners; the place is lifted off the flat triangle as the normals say it bulges.
+    Nothing is in the way.
+
+    Parameters
+    ----------
+    corners, normals
+        (m, 3, 3): the mirrors' triangles [m], and the normals at their corners.
+    numbers
+        (m,): what the triangles are called.
+    kept
+        At most so many images of a point.
+    precision
+        Of the arithmetic and the outputs but places; None follows the input.
+    walk
+        "strip" (16 points in a vector, for CPU runtimes), "item" (for GPUs), "auto".
+
+    Raises
+    ------
+    ValueError
+        A parameter is not what is said here.
+
+    Notes
+    -----
+    Normal and surface are exact to the second degree, so images are off by the third power of the triangles' size over
+    the radius of curvature, their density by its first. One image per triangle is found: triangles must be small
+    beside the distances and radii, at least a few across each image. Near a caustic the density is unbounded.
+    """
+
+    Result: ClassVar[type[Any]] = MirroredPoints
+
+    corners: Float64
+    normals: Float64
+    numbers: npt.NDArray[np.int32]
+    kept: int = 8
+    precision: Precision = None
+    walk: Walk = "auto"
+
+    def __post_init__(self) -> None:
+        for name in ("corners", "normals"):
+            array = np.asarray(getattr(self, name), np.float64)
+            if array.ndim != 3 or array.shape[1:] != (3, 3) or not np.isfinite(array).all():
+                raise ValueError(f"MirrorPoints.{name} has shape {array.shape}, expected finite numbers (m, 3, 3)")
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "numbers", np.asarray(self.numbers, np.int32))
+        if not len(self.corners) == len(self.normals) == len(self.numbers) or self.numbers.ndim != 1:
+            raise ValueError("MirrorPoints: corners, normals and numbers differ in length, expected one per triangle")
+        if not 1 <= self.kept <= 255:
+            raise ValueError(f"MirrorPoints.kept is {self.kept}, expected 1 to 255")
+
+    def _table(self, middle: Float64) -> Float64:
+        """Return rows of kernels/mirrors.cl, at least one."""
+        corners, normals = self.corners - middle, self.normals
+        first, one, two = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        columns = [
+            first,
+            one,
+            two,
+            normals.reshape(-1, 9),
+            np.einsum("mk,mnk->mn", one, normals),
+            np.einsum("mk,mnk->mn", two, normals),
+            -np.sum(one * normals[:, 1], axis=1, keepdims=True),
+            -np.sum(two * normals[:, 2], axis=1, keepdims=True),
+        ]
+        return np.hstack(columns) if len(corners) else np.zeros((1, _ROW))
+
+    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        if dtype not in (np.float32, np.float64):
+            raise TypeError(f"MirrorPoints takes float32 or float64, got {dtype}")
+        if not shape or shape[-1] != 6:
+            raise ValueError(f"MirrorPoints takes points (..., 6), place and step, got shape {shape}")
+        real = real_of(self.precision, dtype)
+        strip, where = in_strips(self.walk, device), shape[:-1]
+        count = math.prod(where)
+        items = -(-count // _LANES) if strip else -(-count // _GROUP) * _GROUP
+        middle = 0.5 * (self.corners.min((0, 1)) + self.corners.max((0, 1))) if len(self.corners) else np.zeros(3)
+        # The kernel subtracts the middle as its input's type holds it.
+        middle = middle.astype(dtype)
+        return Launch(
+            stem="mirrors",
+            kernel="mirror_points",
+            defines={
+                **real_defines(device, real),
+                **({"STRIP": None} if strip else {}),
+                "INPUT": "float" if dtype == np.float32 else "double",
+            },
+            inputs=[(shape, dtype), ((3,), dtype)],
+            outputs={
+                "place": ((*where, self.kept, 3), dtype),
+                "move": ((*where, self.kept, 3), real),
+                "density": ((*where, self.kept), real),
+                "triangle": ((*where, self.kept), np.dtype(np.int32)),
+                "count": (where, np.dtype(np.uint8)),
+                "status": (where, np.dtype(np.uint8)),
+            },
+            arguments=[
+                self._table(middle.astype(np.float64)).astype(real),
+                np.append(self.numbers, -1).astype(np.int32),
+                middle,
+                np.uint32(len(self.corners)),
+                np.uint32(self.kept),
+                np.uint64(count),
+            ],
+            global_size=(items,),
+            local_size=(1,) if strip else (_GROUP,),
+        )

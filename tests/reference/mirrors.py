@@ -1,0 +1,58 @@
+"""Images in a unit sphere and an ellipsoid about the origin, in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import brentq
+
+
+def in_sphere(point: np.ndarray, lens: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return where the outside of the sphere shows a point (Alhazen's problem), and how concentrated its light is.
+
+    That is one over the product of the ways apart of rays in the plane of incidence and across it, d and e being the
+    distances and i the angle of incidence: (d + e + 2 d e / cos i) (d + e + 2 d e cos i).
+    """
+    one = lens / np.linalg.norm(lens)
+    two = point - (point @ one) * one
+    two /= np.linalg.norm(two)
+
+    def parts(angle: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        normal = np.cos(angle) * one + np.sin(angle) * two
+        return normal, lens - normal, point - normal
+
+    def lean(angle: float) -> float:
+        _, to_lens, to_point = parts(angle)
+        aside = np.cos(angle) * two - np.sin(angle) * one
+        return float(aside @ (to_lens / np.linalg.norm(to_lens) + to_point / np.linalg.norm(to_point)))
+
+    angle = brentq(lean, 0.0, np.arctan2(point @ two, point @ one), xtol=1e-15)
+    normal, to_lens, to_point = parts(angle)
+    d, e = np.linalg.norm(to_lens), np.linalg.norm(to_point)
+    cosine = to_lens @ normal / d
+    return normal, float(1.0 / ((d + e + 2.0 * d * e / cosine) * (d + e + 2.0 * d * e * cosine)))
+
+
+def past_ellipsoid(
+    shape: tuple[float, ...], lens: np.ndarray, place: np.ndarray, point: np.ndarray, apart: float = 1e-5
+) -> tuple[float, float]:
+    """Return how far a ray to a place passes a point, after an ellipsoid, and the area of a bundle there per angle."""
+    middle = place - lens
+    middle /= np.linalg.norm(middle)
+    one = np.cross(middle, [0.0, 0.0, 1.0])
+    one /= np.linalg.norm(one)
+    two = np.cross(middle, one)
+    found = []
+    for a, b in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+        towards = middle + apart * (a * one + b * two)
+        start, way = lens / shape, towards / shape
+        half, square = start @ way, way @ way
+        t = (-half - np.sqrt(half**2 - square * (start @ start - 1.0))) / square
+        spot = lens + t * towards
+        normal = spot / np.square(shape)
+        normal /= np.linalg.norm(normal)
+        on = towards - 2.0 * (towards @ normal) * normal
+        found.append((spot, on / np.linalg.norm(on)))
+    spot, on = found[0]
+    beside = [each + ((point - each) @ on) / (ray @ on) * ray - point for each, ray in found]
+    across = np.cross(beside[1] - beside[2], beside[3] - beside[4]) / (2.0 * apart) ** 2
+    return float(np.linalg.norm(beside[0])), float(np.linalg.norm(across))

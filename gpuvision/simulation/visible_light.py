@@ -1,0 +1,337 @@
+"""Light of lit segments on receivers as far as they see each other, and what is visible of segments from points."""
+
+from __future__ import annotations
+
+import math
+import operator
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines
+from gpuvision.simulation.line_irradiance import LitSegments
+from gpuvision.simulation.scene import Scene
+
+Spec = tuple[tuple[int, ...], np.dtype[Any]]
+Visibility = Literal["intervals", "rays", "none"]
+
+PICK_BLOCK = 16
+"""Receivers of a strip that share a list of picked segments."""
+
+_GROUP = 64
+_ROWS_PER_STRIP = 64
+# Small scenes share a build.
+_LEAST_DEPTH = 4
+# Of the scene's size: within this of a surface, rounding decides what lies before it.
+_CLEARANCE_IN_LAST_PLACE = 32.0
+_CLEARANCE_ALONG_RAYS = 1024.0
+
+
+class ReceivedLight(NamedTuple):
+    """Light that strips' receivers get.
+
+    Attributes
+    ----------
+    irradiance
+        (strips, n), W/m^2; NaN where the status says so.
+    left, right
+        (strips,): sums of irradiance times weight; NaN if one of the irradiances is that is to be added.
+    status
+        uint8 `Status` flags, (strips, n): HOLE (no receiver: its normal is zero; adds nothing), NOT_FINITE (a number of
+        the receiver, or of any segment that it was to see, is not), OUT_OF_RANGE (a pick is no segment, or stands
+        beyond the list's end), AMBIGUOUS (too many things hide parts of one segment: light is missing or too much by
+        less than 1e-4 of that segment's; with a value).
+    """
+
+    irradiance: Any
+    left: Any
+    right: Any
+    status: Any
+
+
+class Visibles(NamedTuple):
+    """What is seen of segments.
+
+    Attributes
+    ----------
+    intervals
+        (..., most, 2): from and to, 0 at the segment's start and 1 at its end, in order; NaN behind the last.
+    count
+        int32 (...,): how many there are; more than `most` if the status is AMBIGUOUS.
+    status
+        uint8 `Status` flags, (...,): NOT_FINITE, HORIZON (point and segment lie on a line, or the segment has no
+        length: nothing is given), AMBIGUOUS (the first intervals are given, there are more).
+    """
+
+    intervals: Any
+    count: Any
+    status: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class VisibleLight(Operation[ReceivedLight]):
+    """Diffuse light of lit segments on strips of receivers: ``op(receivers, weights, segments) -> ReceivedLight``.
+
+    All inputs are float32 or float64, alike, and change from call to call: one bound instance serves all profiles.
+
+    receivers (strips, n, 6)
+        Place in metres, normal of any length; a normal of zero: no receiver.
+    weights (strips, n, 2)
+        What a unit of irradiance adds to `left` and `right`.
+    segments (segments, 10)
+        Start, end, normal of the lit surface on the side that emits, exitance in W/m (`segment_rows`). An exitance of
+        zero or less: no segment.
+    starts (strips * ceil(n / 16) + 1,), picks (picks,), int32
+        With ``picks`` only: `starts` says where in `picks` the segments of each block of 16 receivers begin, block by
+        block and strip by strip, the end of the last one behind them; a pick is a segment's number, or ~number for one
+        that is taken without looking whether anything is in the way.
+
+    Parameters
+    ----------
+    scene
+        What may lie between; both sides of a triangle hide. In the frame of receivers and segments.
+    segments
+        Rows of `segments`.
+    picks
+        Room in `picks`; None: every receiver gets light from all segments.
+    visibility
+        "intervals" (exact: what each triangle hides of a segment is projected on it from the receiver, in one walk
+        through the tree), "rays" (shadow rays to the middles of ``samples`` parts of each segment: an independent,
+        slower way, of first order in the length of a part), "none" (nothing hides).
+    samples
+        Parts of a segment for "rays".
+    clearance
+        Metres: what is less high above the lit surface, or above the receiver's own plane, hides nothing: the surfaces
+        on which both lie, as far as they are flat. None: 32 roundings of the scene's size.
+    precision
+        Of the arithmetic and the outputs; None follows the input. "single" takes float64 places, too: they are
+        subtracted before they are rounded.
+    walk
+        "strip" (a work-item per strip, 16 boxes at once, for CPU runtimes), "item" (a work-group per strip, an item
+        per receiver, for GPUs), or "auto".
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter is not what is said here.
+
+    Notes
+    -----
+    Light of the visible parts by the closed form, with the errors of `LineIrradiance`. An edge of a shadow is right to
+    some roundings of places (relative to the scene's size, 1e-7 or 2e-16) seen from the receiver over the edge's
+    distance from it: it moves along a segment by e D / d, if the place of an edge at distance d is off by e and the
+    segment is D away.
+    """
+
+    Result: ClassVar[type[Any]] = ReceivedLight
+
+    scene: Scene
+    segments: int
+    picks: int | None = None
+    visibility: Visibility = "intervals"
+    samples: int = 64
+    clearance: float | None = None
+    precision: Precision = None
+    walk: Walk = "auto"
+
+    def __post_init__(self) -> None:
+        _check_scene("VisibleLight", self.scene, self.clearance)
+        _check_count("VisibleLight.segments", self.segments, 1)
+        _check_count("VisibleLight.samples", self.samples, 1)
+        if self.picks is not None:
+            _check_count("VisibleLight.picks", self.picks, 1)
+        if self.visibility not in ("intervals", "rays", "none"):
+            raise ValueError(f"VisibleLight.visibility is {self.visibility!r}, expected 'intervals', 'rays' or 'none'")
+
+    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        if len(shape) != 3 or shape[-1] != 6 or not shape[1]:
+            raise ValueError(f"VisibleLight takes receivers (strips, n, 6), n at least 1, got shape {shape}")
+        real = _real_of("VisibleLight", device, dtype, self.precision)
+        strips, each = shape[:2]
+        strip, place, tree = in_strips(self.walk, device), _place(device), self.scene.bvh
+        present = {
+            "STRIP": strip,
+            "WIDE_PLACES": device.has_double,
+            "INTERVALS": self.visibility == "intervals",
+            "RAYS": self.visibility == "rays",
+            "PICKED": self.picks is not None,
+        }
+        inputs: list[Spec] = [(shape, dtype), ((strips, each, 2), dtype), ((self.segments, 10), dtype)]
+        if self.picks is not None:
+            integers = np.dtype(np.int32)
+            inputs += [((strips * -(-each // PICK_BLOCK) + 1,), integers), ((self.picks,), integers)]
+        return Launch(
+            stem="visible_light",
+            kernel="visible_light",
+            defines={
+                **real_defines(device, real),
+                **{name: None for name, is_present in present.items() if is_present},
+                "INPUT": "float" if dtype == np.float32 else "double",
+                "BVH_DEPTH": max(tree.depth, _LEAST_DEPTH),
+                **({} if strip else {"GROUP": _GROUP}),
+            },
+            inputs=inputs,
+            outputs={
+                "irradiance": ((strips, each), real),
+                "left": ((strips,), real),
+                "right": ((strips,), real),
+                "status": ((strips, each), np.dtype(np.uint8)),
+            },
+            arguments=[
+                *tree.tables(real),
+                tree.middle.astype(place),
+                _clearance(self.clearance, self.scene, real, _CLEARANCE_IN_LAST_PLACE),
+                np.uint32(self.samples),
+                np.uint32(each),
+                np.uint32(self.segments),
+                np.uint32(self.picks or 0),
+            ],
+            global_size=(strips if strip else strips * _GROUP,),
+            local_size=(1 if strip else _GROUP,),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class VisibleIntervals(Operation[Visibles]):
+    """Which parts of segments are seen from points: ``op(rows) -> Visibles``, rows float32 or float64 (..., 9).
+
+    A row is a point and the two ends of a segment, in metres.
+
+    Parameters
+    ----------
+    scene
+        What may lie between; both sides of a triangle hide, one in whose plane point and segment lie does not.
+    most
+        How many intervals are given for a segment.
+    clearance
+        Metres from the point, and from the segment, within which nothing hides: along the ray to the segment's nearest
+        place, and in proportion along longer rays; at most a quarter of each ray. None: 1024 roundings of the scene's
+        size. A surface that holds the segment, but for an error e, and is seen at an angle to it, wants
+        e / sin(angle).
+    precision
+        Of the arithmetic and the outputs; None follows the input. "single" takes float64 rows, too.
+    walk
+        "strip" (16 boxes at once, for CPU runtimes), "item" (a work-item per row, for GPUs), or "auto".
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter is not what is said here.
+
+    Notes
+    -----
+    Error of an end: as of a shadow's edge in `VisibleLight`, over the segment's length.
+    """
+
+    Result: ClassVar[type[Any]] = Visibles
+
+    scene: Scene
+    most: int = 8
+    clearance: float | None = None
+    precision: Precision = None
+    walk: Walk = "auto"
+
+    def __post_init__(self) -> None:
+        _check_scene("VisibleIntervals", self.scene, self.clearance)
+        _check_count("VisibleIntervals.most", self.most, 1)
+
+    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        if not shape or shape[-1] != 9:
+            raise ValueError(f"VisibleIntervals takes rows (..., 9), a point and two ends, got shape {shape}")
+        real = _real_of("VisibleIntervals", device, dtype, self.precision)
+        where, tree = shape[:-1], self.scene.bvh
+        count = math.prod(where)
+        strip = in_strips(self.walk, device)
+        each = _ROWS_PER_STRIP if strip else 1
+        items = -(-count // each)
+        present = {"STRIP": strip, "WIDE_PLACES": device.has_double}
+        return Launch(
+            stem="visible_intervals",
+            kernel="visible_intervals",
+            defines={
+                **real_defines(device, real),
+                **{name: None for name, is_present in present.items() if is_present},
+                "INPUT": "float" if dtype == np.float32 else "double",
+                "BVH_DEPTH": max(tree.depth, _LEAST_DEPTH),
+            },
+            inputs=[(shape, dtype)],
+            outputs={
+                "intervals": ((*where, self.most, 2), real),
+                "count": (where, np.dtype(np.int32)),
+                "status": (where, np.dtype(np.uint8)),
+            },
+            arguments=[
+                *tree.tables(real),
+                tree.middle.astype(_place(device)),
+                _clearance(self.clearance, self.scene, real, _CLEARANCE_ALONG_RAYS),
+                np.int32(self.most),
+                np.uint64(count),
+                np.uint64(each),
+            ],
+            global_size=(items,) if strip else (-(-items // _GROUP) * _GROUP,),
+            local_size=(1,) if strip else (_GROUP,),
+        )
+
+
+def segment_rows(segments: LitSegments, room: int | None = None) -> npt.NDArray[np.float64]:
+    """Return segments as `VisibleLight` takes them, (room, 10); rows of no exitance behind them.
+
+    Parameters
+    ----------
+    segments
+        What is lit.
+    room
+        How many rows; None: as many as there are segments.
+
+    Raises
+    ------
+    ValueError
+        There are more segments than that.
+    """
+    count = len(segments.exitance)
+    rows = np.zeros((count if room is None else room, 10))
+    if count > len(rows):
+        raise ValueError(f"{count} segments do not fit into {len(rows)} rows")
+    rows[:count] = np.column_stack([segments.ends.reshape(count, 6), segments.normals, segments.exitance])
+    return rows
+
+
+def _check_scene(name: str, scene: object, clearance: float | None) -> None:
+    if not isinstance(scene, Scene):
+        raise TypeError(f"{name}.scene is {scene!r}, expected a Scene")
+    if clearance is not None and not (math.isfinite(clearance) and clearance >= 0.0):
+        raise ValueError(f"{name}.clearance is {clearance!r}, expected metres, 0 or more, or None")
+
+
+def _check_count(what: str, value: object, least: int) -> None:
+    try:
+        number = operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise TypeError(f"{what} is {value!r}, expected an integer") from None
+    if not least <= number < 2**31:
+        raise ValueError(f"{what} is {number}, expected {least} or more, below 2^31")
+
+
+def _real_of(name: str, device: Device, dtype: np.dtype[Any], precision: Precision) -> np.dtype[Any]:
+    if dtype not in (np.float32, np.float64):
+        raise TypeError(f"{name} takes float32 or float64, got {dtype}")
+    if precision not in ("single", "double", None):
+        raise ValueError(f"precision must be 'single', 'double' or None, got {precision!r}")
+    if dtype == np.float64 and not device.has_double:
+        raise ValueError(f"device {device.label} has no double precision; give float32")
+    if precision is None:
+        return dtype
+    return np.dtype(np.float64 if precision == "double" else np.float32)
+
+
+def _place(device: Device) -> np.dtype[Any]:
+    return np.dtype(np.float64 if device.has_double else np.float32)
+
+
+def _clearance(given: float | None, scene: Scene, real: np.dtype[Any], in_last_place: float) -> Any:
+    if given is None:
+        reach = float(np.abs(scene.bvh.corners).max(initial=0.0))
+        given = in_last_place * float(np.finfo(real).eps) * reach
+    return real.type(given)

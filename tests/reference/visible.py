@@ -1,0 +1,100 @@
+"""What is visible of a segment from a point: all places where that can change, and a ray into each part between."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from reference import line_irradiance, rays
+
+
+def intervals(corners: np.ndarray, ray_of: object, points: tuple[np.ndarray, ...], planes: list[tuple]) -> np.ndarray:
+    """Return visible (k, 2), from 0 to 1, of the segment from ``points[1]`` to ``points[2]`` seen from ``points[0]``.
+
+    ``ray_of(t)`` gives the ends (n, 3) of rays to places t within which triangles hide; ``planes`` (place, normal) are
+    those at which that begins or ends.
+    """
+    point, start, stop = points
+    along = stop - start
+    edges = np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 3) - point
+    off = np.cross(edges[:, 0], edges[:, 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        critical = [off @ (point - start) / (off @ along)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        critical.append(np.sum(normals * (corners[:, 0] - start), axis=1) / (normals @ along))
+    view = np.cross(start - point, along)
+    for place, normal in planes:
+        for at, facing in zip(corners[:, 0], normals, strict=True):
+            system = np.stack([facing, view, normal])
+            if np.linalg.matrix_rank(system) < 3:
+                continue
+            met = np.linalg.solve(system, [facing @ at, view @ point, normal @ place])
+            across = np.cross(view, met - point)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                critical.append(np.atleast_1d(across @ (point - start) / (across @ along)))
+    cuts = np.concatenate(critical)
+    cuts = np.unique([*np.clip(cuts[np.isfinite(cuts)], 0.0, 1.0), 0.0, 1.0])
+    origins, ends = ray_of(0.5 * (cuts[1:] + cuts[:-1]))  # type: ignore[operator]
+    seen = ~rays.occluded(corners, np.hstack([origins, ends])) if len(corners) else np.ones(len(cuts) - 1, bool)
+    found: list[list[float]] = []
+    for low, high, is_seen in zip(cuts[:-1], cuts[1:], seen, strict=True):
+        if is_seen and found and found[-1][1] == low:
+            found[-1][1] = high
+        elif is_seen:
+            found.append([low, high])
+    return np.array(found).reshape(-1, 2)
+
+
+def from_point(corners: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Return the visible intervals of a row (9,): a point, and a segment's ends; only what is in either is left out."""
+    point, start, stop = row.astype(float).reshape(3, 3)
+
+    def ray_of(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ends = start + t[:, None] * (stop - start)
+        return point + 1e-9 * (ends - point), point + (1.0 - 1e-9) * (ends - point)
+
+    return intervals(corners, ray_of, (point, start, stop), [])
+
+
+def from_receiver(corners: np.ndarray, receiver: np.ndarray, segment: np.ndarray, clearance: float) -> np.ndarray:
+    """Return the visible intervals of a segment (10,) from a receiver (6,): what is above both their planes hides."""
+    point, facing = receiver[:3].astype(float), receiver[3:].astype(float)
+    start, stop, lit = segment[:9].astype(float).reshape(3, 3)
+    along = (stop - start) / np.linalg.norm(stop - start)
+    lit = lit - (lit @ along) * along
+    facing, lit = facing / np.linalg.norm(facing), lit / np.linalg.norm(lit)
+
+    def ray_of(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        toward = start + t[:, None] * (stop - start) - point
+        height, above = -(toward @ lit), toward @ facing
+        near = np.clip(clearance / np.where(above > 0.0, above, np.inf), 0.0, 0.5)[:, None]
+        return point + near * toward, point + (1.0 - clearance / height[:, None]) * toward
+
+    planes = [(point + clearance * facing, facing), (start + clearance * lit, lit)]
+    return intervals(corners, ray_of, (point, start, stop), planes)
+
+
+def light(corners: np.ndarray, receivers: np.ndarray, segments: np.ndarray, clearance: float) -> tuple:
+    """Return irradiance (n,) of receivers (n, 6) and the sum of E0 of what faces them, from segments (m, 10)."""
+    total, largest = np.zeros(len(receivers)), np.zeros(len(receivers))
+    for number, receiver in enumerate(receivers):
+        for segment in segments:
+            ends, lit = segment[:6].reshape(2, 3), segment[6:9]
+            if (receiver[:3] - ends[0]) @ lit <= 0.0 or ((ends - receiver[:3]) @ receiver[3:]).max() <= 0.0:
+                continue
+            one = receiver[None]
+            largest[number] += line_irradiance.irradiance(one, ends[None], lit[None], segment[9:])[1][0]
+            for low, high in from_receiver(corners, receiver, segment, clearance):
+                part = ends[0] + np.array([[low], [high]]) * (ends[1] - ends[0])
+                total[number] += line_irradiance.irradiance(one, part[None], lit[None], segment[9:])[0][0]
+    return total, largest
+
+
+def difference(some: np.ndarray, others: np.ndarray) -> float:
+    """Return the length of what is in one of two sets of intervals only."""
+    edges = np.unique(np.concatenate([some.ravel(), others.ravel(), [0.0, 1.0]]))
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    inside = [
+        ((middles[:, None] > each[:, 0]) & (middles[:, None] < each[:, 1])).any(axis=1) for each in (some, others)
+    ]
+    return float(np.sum((edges[1:] - edges[:-1])[inside[0] != inside[1]]))

@@ -1,0 +1,474 @@
+"""VisibleLight and VisibleIntervals on devices: as a ray into every part says, in float64; extremes; what comes in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from canary import Guarded
+from gpuvision.host import Device
+from gpuvision.simulation.line_irradiance import LineIrradiance, LitSegments
+from gpuvision.simulation.scene import Scene
+from gpuvision.simulation.visible_light import (
+    PICK_BLOCK,
+    ReceivedLight,
+    VisibleIntervals,
+    VisibleLight,
+    Visibles,
+    segment_rows,
+)
+from gpuvision.status import Status
+from reference import visible as reference
+
+ON_DEVICES = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+# Builds are what takes time: each walk in one of the two types here, hypothesis and the rest in the device's own.
+WAYS = pytest.mark.parametrize(("walk", "dtype"), [("strip", np.float32), ("strip", np.float64), ("item", np.float32)])
+FLOOR = np.array([-0.5, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0])
+NO_TRIANGLES = np.zeros((0, 3, 3))
+
+
+def single(values: Any) -> np.ndarray:
+    """Numbers that a float holds exactly, so that both precisions see the same scene."""
+    return np.asarray(values).astype(np.float32).astype(np.float64)
+
+
+def soup(rng: np.random.Generator, count: int, size: float = 0.2) -> np.ndarray:
+    return single(rng.uniform(-1.0, 1.0, (count, 1, 3)) + rng.normal(0.0, size, (count, 3, 3)))
+
+
+def segments_of(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Segments anywhere in the cube, each with a normal square to it and an exitance of its own."""
+    ends = single(rng.uniform(-1.0, 1.0, (count, 6)))
+    normals = np.cross(ends[:, 3:] - ends[:, :3], rng.normal(size=(count, 3)))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.hstack([ends, single(normals), single(rng.uniform(0.5, 2.0, (count, 1)))])
+
+
+def receivers_of(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return single(np.concatenate([rng.uniform(-1.0, 1.0, (*shape, 3)), rng.normal(size=(*shape, 3))], axis=-1))
+
+
+def light_of(
+    corners: np.ndarray, receivers: Any, segments: Any, device: Device, weights: Any = None, **how: Any
+) -> Any:
+    """What VisibleLight says of receivers (strips, n, 6), in their type."""
+    dtype = receivers.dtype
+    operation = VisibleLight(scene=Scene(corners), segments=len(segments), **how)
+    if weights is None:
+        weights = np.ones((*receivers.shape[:2], 2))
+    return operation(receivers, weights.astype(dtype), np.ascontiguousarray(segments, dtype), device=device)
+
+
+def subdivided(mesh: Any, times: int) -> Any:
+    for _ in range(times):
+        mesh = mesh.subdivide()
+    return mesh
+
+
+# ---- intervals -------------------------------------------------------------------------------------------------
+
+
+def assert_intervals(corners: np.ndarray, rows: np.ndarray, result: Any, tolerance: float, rare: float) -> None:
+    """A share of ``rare`` rows may have an edge that is so near the point that rounding moves it by more."""
+    assert not result.status.any()
+    far = 0
+    for row, found, count in zip(rows, result.intervals, result.count, strict=True):
+        assert np.isnan(found[count:]).all()
+        flat = found[:count].ravel()
+        assert (np.diff(flat) > 0.0).all()
+        assert ((flat >= 0.0) & (flat <= 1.0)).all()
+        far += reference.difference(found[:count], reference.from_point(corners, row)) > tolerance
+    assert far <= rare * len(rows)
+
+
+@WAYS
+@pytest.mark.parametrize("count", [1, 17, 400])
+def test_intervals_as_rays_say(device: Device, walk: Any, dtype: Any, count: int, rng: np.random.Generator) -> None:
+    corners = soup(rng, count, 0.6 if count < 20 else 0.08)
+    rows = single(rng.uniform(-1.0, 1.0, (100, 9))).astype(dtype)
+    result = VisibleIntervals(scene=Scene(corners), walk=walk, most=16, clearance=0.0)(rows, device=device)
+    assert result.intervals.dtype == dtype
+    assert_intervals(corners, rows, result, *((2e-5, 0.05) if dtype == np.float32 else (1e-9, 0.0)))
+    if count == 400:
+        assert result.count.max() > 3
+        assert (result.count == 0).any()
+
+
+@ON_DEVICES
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 40), size=st.sampled_from([1e-2, 0.3, 3.0]))
+def test_intervals_of_any_soup(device: Device, seed: int, count: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    corners, rows = soup(rng, count, size), rng.uniform(-1.0, 1.0, (7, 9))
+    result = VisibleIntervals(scene=Scene(corners), most=16, clearance=0.0)(rows, device=device)
+    assert_intervals(corners, rows, result, 1e-8, 0.0)
+
+
+@WAYS
+def test_shadow_of_a_box(device: Device, walk: Any, dtype: Any) -> None:
+    scene = Scene.of(trimesh.creation.box((0.01, 0.01, 0.01)).apply_translation((0.0, 0.0, 0.03)))
+    rows = np.array([[0.0, 0.0, 0.1, -0.05, 0.0, 0.0, 0.05, 0.0, 0.0], [0.1, 0, 0, -0.05, 0.1, 0, 0.05, 0.1, 0]], dtype)
+    result = VisibleIntervals(scene=scene, walk=walk)(rows, device=device)
+    edge = 0.005 / 0.065  # the top's edge
+    tolerance = 16 * float(np.finfo(dtype).eps)
+    np.testing.assert_allclose(result.intervals[0, :2], [[0.0, 0.5 - edge], [0.5 + edge, 1.0]], atol=tolerance, rtol=0)
+    np.testing.assert_array_equal(result.intervals[1, :1], [[0.0, 1.0]])
+    np.testing.assert_array_equal(result.count, [2, 1])
+
+
+@WAYS
+def test_nothing_is_seen_through_an_edge(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
+    """From within a closed surface: planes through its corners, along its edges."""
+    mesh = trimesh.creation.icosphere(2)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [0.1, 0.7, 0.3]))
+    corners = single(mesh.vertices)[mesh.faces]
+    points = single(rng.uniform(-0.3, 0.3, (len(corners), 3)))
+    points[::2] = 0.0
+    rows = np.hstack([points, 2.0 * corners[:, 0], 2.0 * corners[:, 1]]).astype(dtype)
+    result = VisibleIntervals(scene=Scene(corners), walk=walk)(rows, device=device)
+    np.testing.assert_array_equal(result.count, 0)
+    np.testing.assert_array_equal(result.status, 0)
+
+
+def comb(teeth: int) -> np.ndarray:
+    """Thin triangles side by side, and how much of a unit segment each hides from twice their distance: a half."""
+    at = (np.arange(teeth) + 0.25) / teeth - 0.5
+    x = 0.5 * np.stack([at, at + 0.5 / teeth, at], axis=1)
+    x[:, 2] = x[:, :2].mean(axis=1)
+    y = np.tile([-1.0, -1.0, 2.0e3], (teeth, 1))
+    return np.stack([x, y, np.full_like(x, 0.5)], axis=-1)
+
+
+@WAYS
+def test_more_than_fits(device: Device, walk: Any, dtype: Any) -> None:
+    teeth = 100
+    row = np.array([[0.0, 0.0, 1.0, -0.5, 0.0, 0.0, 0.5, 0.0, 0.0]], dtype)
+    scene = Scene(comb(teeth))
+    many = VisibleIntervals(scene=scene, walk=walk, most=120)(row, device=device)
+    assert (many.count[0], many.status[0]) == (teeth + 1, Status.OK)
+    assert np.nansum(many.intervals[0, :, 1] - many.intervals[0, :, 0]) == pytest.approx(0.5, abs=1e-3)
+    few = VisibleIntervals(scene=scene, walk=walk)(row, device=device)
+    assert (few.count[0], few.status[0]) == (teeth + 1, Status.AMBIGUOUS)
+    np.testing.assert_array_equal(few.intervals[0], many.intervals[0, :8])
+
+
+@WAYS
+def test_clearance(device: Device, walk: Any, dtype: Any) -> None:
+    """A wall 1 mm before the segment hides it, unless that is within the clearance; so does one before the point."""
+    wall = np.array([[[-1.0, -1.0, 1e-3], [1.0, -1.0, 1e-3], [0.0, 3.0, 1e-3]]])
+    up, down = [0.1, 0.0, 1.0, -0.5, 0.0, 0.0, 0.5, 0.0, 0.0], [0.1, 0.0, 0.0, -0.5, 0.0, 1.0, 0.5, 0.0, 1.0]
+    rows = np.array([up, down], dtype)
+    for clearance, count in ((None, 0), (0.9e-3, 0), (1.2e-3, 1)):
+        result = VisibleIntervals(scene=Scene(wall), walk=walk, clearance=clearance)(rows, device=device)
+        np.testing.assert_array_equal(result.count, count)
+
+
+@WAYS
+def test_rows_that_have_no_plane(device: Device, walk: Any, dtype: Any) -> None:
+    rows = np.array([np.arange(9.0)] * 4 + [[0, 0, 0, 1, 0, 0, 2, 0, 0], [0, 0, 1, 1, 0, 0, 1, 0, 0]], dtype)
+    rows[:, 3] += 0.5
+    rows[1, 2], rows[2, 4], rows[3, 8] = np.nan, np.inf, -np.inf
+    rows[4:, 3] -= 0.5
+    result = VisibleIntervals(scene=Scene(NO_TRIANGLES), walk=walk)(rows, device=device)
+    np.testing.assert_array_equal(result.status, [0, 8, 8, 8, Status.HORIZON, Status.HORIZON])
+    np.testing.assert_array_equal(result.count, [1, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(np.isnan(result.intervals[1:]), True)
+
+
+@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 200])
+@pytest.mark.parametrize("walk", ["strip", "item"])
+def test_intervals_sizes_and_canaries(device: Device, walk: Any, count: int, rng: np.random.Generator) -> None:
+    corners, rows = soup(rng, 300), single(rng.uniform(-1.0, 1.0, (count, 9))).astype(np.float32)
+    operation = VisibleIntervals(scene=Scene(corners), walk=walk, most=2)
+    like = Visibles(np.empty((count, 2, 2), np.float32), np.empty(count, np.int32), np.empty(count, np.uint8))
+    guarded = Guarded(like)
+    operation(rows, device=device, out=guarded.out)
+    guarded.assert_intact()
+    alone = VisibleIntervals(scene=Scene(corners), walk=walk, most=2)(np.repeat(rows, 2, axis=0), device=device)
+    for name in Visibles._fields:
+        np.testing.assert_array_equal(getattr(guarded.out, name), getattr(alone, name)[::2])
+
+
+# ---- light -----------------------------------------------------------------------------------------------------
+
+
+@WAYS
+@pytest.mark.parametrize("count", [3, 60])
+def test_light_as_rays_say(device: Device, walk: Any, dtype: Any, count: int, rng: np.random.Generator) -> None:
+    corners = soup(rng, count, 0.6 if count < 20 else 0.3)
+    segments, receivers = segments_of(rng, 5), receivers_of(rng, 3, 23)
+    result = light_of(corners, receivers.astype(dtype), segments, device, walk=walk, clearance=1e-5)
+    assert result.irradiance.dtype == dtype
+    assert not result.status.any()
+    value, most = reference.light(corners, receivers.reshape(-1, 6), segments, 1e-5)
+    error = np.abs(result.irradiance.ravel() - value) / np.where(most > 0.0, most, 1.0)
+    if dtype == np.float64:
+        assert error.max() <= 1e-9
+    else:
+        # Of the few receivers that are near an edge of a triangle, rounding moves shadows more.
+        assert np.quantile(error, 0.95) <= 5e-6
+        assert error.max() <= 2e-3
+    free = light_of(NO_TRIANGLES, receivers.astype(dtype), segments, device, walk=walk).irradiance
+    assert np.mean(np.abs(result.irradiance - free) > 0.01 * free) > 0.2
+
+
+@ON_DEVICES
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 30), size=st.sampled_from([0.1, 0.3, 3.0]))
+def test_light_in_any_soup(device: Device, seed: int, count: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    corners, segments, receivers = soup(rng, count, size), segments_of(rng, 2), receivers_of(rng, 1, 5)
+    result = light_of(corners, receivers, segments, device, clearance=1e-7)
+    value, most = reference.light(corners, receivers[0], segments, 1e-7)
+    assert np.all(np.abs(result.irradiance[0] - value) <= 1e-8 * most)
+
+
+def room(kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A convex surface seen from within, receivers on it, and lit segments on it: nothing hides anything."""
+    rng = np.random.default_rng(5)
+    mesh = trimesh.creation.icosphere(3) if kind == "sphere" else subdivided(trimesh.creation.box((1.0, 0.8, 0.6)), 3)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [0.1, 0.7, 0.3]))
+    weights = rng.dirichlet(np.ones(3), len(mesh.faces))
+    places = np.einsum("nk,nkd->nd", weights, mesh.triangles)
+    receivers = np.hstack([places, -mesh.face_normals])[rng.permutation(len(places))[:96]].reshape(2, 48, 6)
+    lit = rng.permutation(len(mesh.faces))[:6]
+    ends = mesh.triangles[lit, :2].copy()
+    ends[3:, 0] = mesh.triangles[lit[3:], 2] * 0.3 + ends[3:, 1] * 0.7
+    rows = np.hstack([ends.reshape(-1, 6), -mesh.face_normals[lit], np.ones((6, 1))])
+    return np.asarray(mesh.triangles), receivers, rows
+
+
+@WAYS
+@pytest.mark.parametrize("kind", ["box", "sphere"])
+def test_the_surfaces_that_they_lie_on_hide_nothing(device: Device, walk: Any, dtype: Any, kind: str) -> None:
+    corners, receivers, segments = room(kind)
+    seen = light_of(corners, receivers.astype(dtype), segments, device, walk=walk)
+    free = light_of(corners, receivers.astype(dtype), segments, device, walk=walk, visibility="none")
+    # But for rounding, where a segment ends in another face.
+    np.testing.assert_allclose(seen.irradiance, free.irradiance, rtol=64 * float(np.finfo(dtype).eps))
+    assert np.mean(seen.irradiance > 0.0) > 0.7
+
+
+@WAYS
+def test_at_the_foot_of_a_wall(device: Device, walk: Any, dtype: Any) -> None:
+    """A line that runs into a wall, receivers on it from 1e-9 of the line's length: the closed form, nothing hides."""
+    floor, wall = trimesh.creation.box((2.0, 2.0, 0.2)), trimesh.creation.box((0.2, 2.0, 2.0))
+    meshes = [floor.apply_translation((0.0, 0.0, -0.1)), wall.apply_translation((-0.1, 0.0, 0.0))]
+    corners = np.concatenate([subdivided(each, 2).triangles for each in meshes])
+    height = np.array([1e-9, 1e-7, 1e-5, 1e-3, 0.1, 0.5])
+    receivers = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0], (1, 6, 1))
+    receivers[0, :, 2] = height
+    segments = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]])
+    result = light_of(corners, receivers.astype(dtype), segments, device, walk=walk)
+    expected = 1.0 / (2.0 * np.pi * height * (height**2 + 1.0))
+    np.testing.assert_allclose(result.irradiance[0], expected, rtol=5e-6 if dtype == np.float32 else 1e-12)
+
+
+@WAYS
+def test_a_wall_between_is_dark(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
+    """Beside a closed surface that is cut everywhere, at its edges too: not a glimmer."""
+    corners = single(trimesh.creation.icosphere(3).triangles * 0.4)
+    receivers = np.zeros((1, 40, 6))
+    receivers[0, :, :2], receivers[0, :, 2] = rng.uniform(-0.01, 0.01, (40, 2)), 0.45
+    receivers[0, ::2, :2] = 0.0
+    receivers[0, :, 5] = -1.0
+    segments = np.array([[-0.3, 0.0, -0.45, 0.3, 0.0, -0.45, 0.0, 0.0, 1.0, 1.0]])
+    result = light_of(corners, receivers.astype(dtype), segments, device, walk=walk)
+    np.testing.assert_array_equal(result.irradiance, 0.0)
+    np.testing.assert_array_equal(result.status, 0)
+
+
+@WAYS
+def test_light_through_a_comb(device: Device, walk: Any, dtype: Any) -> None:
+    """More shadows than are kept at a time: the segment is taken in parts."""
+    teeth = 300
+    at = (np.arange(teeth) + 0.25) / teeth - 0.5
+    visible = np.sort(np.concatenate([[-0.5, 0.5], at, at + 0.5 / teeth])).reshape(-1, 2)
+    receivers = np.array([[[0.0, 0.0, 1.0, 0.0, 0.0, -1.0]]], dtype)
+    parts = np.tile(FLOOR, (len(visible), 1))
+    parts[:, 0], parts[:, 3] = visible.T
+    corners = comb(teeth)
+    corners[..., 1] *= np.where(corners[..., 1] > 0.0, 1e3, 1.0)
+    result = light_of(corners, receivers, FLOOR[None], device, walk=walk)
+    expected = light_of(NO_TRIANGLES, receivers.astype(np.float64), parts, device, visibility="none")
+    assert result.status[0, 0] == Status.OK
+    np.testing.assert_allclose(result.irradiance, expected.irradiance, rtol=1e-4 if dtype == np.float32 else 2e-6)
+
+
+@pytest.mark.parametrize("walk", ["strip", "item"])
+def test_rays_come_to_the_same_in_first_order(device: Device, walk: Any, rng: np.random.Generator) -> None:
+    corners, segments, receivers = soup(rng, 60, 0.3), segments_of(rng, 5), receivers_of(rng, 4, 64)
+    exact = light_of(corners, receivers, segments, device).irradiance
+    errors = []
+    for samples in (16, 256, 4096):
+        sampled = light_of(corners, receivers, segments, device, walk=walk, visibility="rays", samples=samples)
+        errors.append(np.mean(np.abs(sampled.irradiance - exact)) / np.mean(exact))
+    assert errors[2] < 2e-4
+    assert errors[1] < 0.15 * errors[0]
+    assert errors[2] < 0.15 * errors[1]
+
+
+@WAYS
+def test_without_visibility_as_line_irradiance(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
+    receivers, rows = receivers_of(rng, 3, 37), segments_of(rng, 19)
+    segments = LitSegments(rows[:, :6].reshape(-1, 2, 3), rows[:, 6:9], rows[:, 9])
+    np.testing.assert_array_equal(segment_rows(segments)[:, 9], rows[:, 9])
+    room = segment_rows(segments, 24)
+    result = light_of(soup(rng, 20), receivers.astype(dtype), room, device, walk=walk, visibility="none")
+    expected = LineIrradiance(segments=segments)(receivers, device=device).irradiance
+    tolerance = 4e-6 if dtype == np.float32 else 1e-13
+    np.testing.assert_allclose(result.irradiance, expected, rtol=0, atol=tolerance * expected.max())
+
+
+@WAYS
+def test_currents(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
+    receivers, segments, weights = receivers_of(rng, 5, 70), segments_of(rng, 3), rng.normal(size=(5, 70, 2))
+    result = light_of(soup(rng, 20), receivers.astype(dtype), segments, device, weights=weights, walk=walk)
+    sums = np.einsum("sn,snk->ks", result.irradiance.astype(float), weights)
+    sizes = np.einsum("sn,snk->ks", result.irradiance.astype(float), np.abs(weights))
+    for current, expected, size in zip((result.left, result.right), sums, sizes, strict=True):
+        assert np.all(np.abs(current - expected) <= 4.0 * np.finfo(dtype).eps * size)
+
+
+# ---- picks -----------------------------------------------------------------------------------------------------
+
+
+def picked(corners: Any, receivers: Any, segments: Any, lists: Any, device: Device, walk: Any, room: int = 0) -> Any:
+    starts = np.cumsum([0, *map(len, lists)]).astype(np.int32)
+    picks = np.concatenate([*lists, np.zeros(room)]).astype(np.int32)
+    operation = VisibleLight(scene=Scene(corners), segments=len(segments), picks=len(picks), walk=walk)
+    dtype = receivers.dtype
+    weights = np.ones((*receivers.shape[:2], 2), dtype)
+    return operation(receivers, weights, segments.astype(dtype), starts, picks, device=device)
+
+
+@pytest.mark.parametrize("walk", ["strip", "item"])
+def test_picks(device: Device, walk: Any, rng: np.random.Generator) -> None:
+    """Each block gets its own: some seen, some taken as they are, some left out."""
+    corners, segments, receivers = soup(rng, 40, 0.3), segments_of(rng, 6), receivers_of(rng, 2, 37).astype(np.float32)
+    seen = [light_of(corners, receivers, segments[[k]], device, walk=walk).irradiance for k in range(6)]
+    free = [
+        light_of(corners, receivers, segments[[k]], device, walk=walk, visibility="none").irradiance for k in range(6)
+    ]
+    lists = [rng.permutation(6)[: rng.integers(0, 7)] for _ in range(6)]
+    lists = [np.where(rng.random(len(some)) < 0.3, ~some, some) for some in lists]
+    result = picked(corners, receivers, segments, lists, device, walk, room=5)
+    for number, some in enumerate(lists):
+        strip, block = divmod(number, 3)
+        part = np.s_[strip, PICK_BLOCK * block : PICK_BLOCK * (block + 1)]
+        expected = sum((seen[k][part] if k >= 0 else free[~k][part] for k in some), np.zeros_like(seen[0][part]))
+        np.testing.assert_allclose(result.irradiance[part], expected, rtol=1e-5, atol=1e-9)
+    assert not result.status.any()
+
+
+@pytest.mark.parametrize("walk", ["strip", "item"])
+def test_picks_that_are_no_segments(device: Device, walk: Any, rng: np.random.Generator) -> None:
+    segments, receivers = segments_of(rng, 3), receivers_of(rng, 1, 64).astype(np.float32)
+    lists = [[0, 1], [2, 3], [~5], [2]]
+    result = picked(soup(rng, 3), receivers, segments, lists, device, walk)
+    np.testing.assert_array_equal(result.status[0], np.repeat([0, Status.OUT_OF_RANGE, Status.OUT_OF_RANGE, 0], 16))
+    np.testing.assert_array_equal(np.isnan(result.irradiance), result.status != 0)
+    operation = VisibleLight(scene=Scene(NO_TRIANGLES), segments=3, picks=1, walk=walk)
+    weights, starts = np.ones((1, 64, 2), np.float32), np.array([-1, 1, 1, 1, 7], np.int32)
+    beyond = operation(receivers, weights, segments.astype(np.float32), starts, np.zeros(1, np.int32), device=device)
+    np.testing.assert_array_equal(beyond.status[0] != 0, np.repeat([True, False, False, True], 16))
+
+
+# ---- what comes in ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("walk", ["strip", "item"])
+def test_what_is_not_finite(device: Device, walk: Any, rng: np.random.Generator) -> None:
+    corners, segments, receivers = soup(rng, 20, 0.3), segments_of(rng, 2), receivers_of(rng, 2, 40).astype(np.float32)
+    good = light_of(corners, receivers, segments, device, walk=walk)
+    wrong = receivers.copy()
+    wrong[0, np.arange(6), np.arange(6)] = np.nan
+    wrong[0, 6 + np.arange(6), np.arange(6)] = np.inf
+    wrong[0, 20, 3:] = 0.0
+    wrong[1, 39, 3:] = 0.0
+    result = light_of(corners, wrong, segments, device, walk=walk)
+    np.testing.assert_array_equal(result.status[0, :12], Status.NOT_FINITE)
+    assert result.status[0, 20] == result.status[1, 39] == Status.HOLE
+    np.testing.assert_array_equal(np.isnan(result.irradiance), result.status != 0)
+    fine = result.status == 0
+    np.testing.assert_array_equal(result.irradiance[fine], good.irradiance[fine])
+    assert np.isnan(result.left[0])
+    assert result.left[1] == pytest.approx(good.irradiance[1, :39].sum(), rel=1e-6)
+    for row, column in ((0, 2), (1, 7), (0, 9)):
+        broken = segments.copy()
+        broken[row, column] = np.nan
+        result = light_of(corners, receivers, broken, device, walk=walk)
+        np.testing.assert_array_equal(result.status, Status.NOT_FINITE)
+        assert np.isnan(result.irradiance).all()
+
+
+@pytest.mark.parametrize("walk", ["strip", "item"])
+@pytest.mark.parametrize(("strips", "each"), [(0, 5), (1, 1), (2, 15), (2, 17), (3, 64), (1, 130)])
+def test_sizes_and_canaries(device: Device, walk: Any, strips: int, each: int, rng: np.random.Generator) -> None:
+    """Also: a receiver's light is the same whatever its neighbours are."""
+    corners, segments = soup(rng, 60, 0.3), segments_of(rng, 3).astype(np.float32)
+    receivers, weights = receivers_of(rng, strips, each).astype(np.float32), np.ones((strips, each, 2), np.float32)
+    operation = VisibleLight(scene=Scene(corners), segments=3, walk=walk)
+    size = np.zeros((strips, each), np.float32)
+    like = ReceivedLight(size, np.empty(strips, np.float32), np.empty(strips, np.float32), size.astype(np.uint8))
+    guarded = Guarded(like)
+    operation(receivers, weights, segments, device=device, out=guarded.out)
+    guarded.assert_intact()
+    alone = operation(receivers.reshape(-1, 1, 6), weights.reshape(-1, 1, 2), segments, device=device).irradiance
+    np.testing.assert_allclose(guarded.out.irradiance.ravel(), alone.ravel(), rtol=1e-6)
+    np.testing.assert_allclose(guarded.out.left, guarded.out.irradiance.sum(axis=1), rtol=1e-6)
+
+
+def test_no_light_and_no_triangles(device: Device, rng: np.random.Generator) -> None:
+    receivers, dark = receivers_of(rng, 1, 20), segments_of(rng, 4)
+    dark[0, 9], dark[1, 9], dark[2, 3:6], dark[3] = 0.0, -1.0, dark[2, :3], 0.0
+    result = light_of(NO_TRIANGLES, receivers, dark, device)
+    np.testing.assert_array_equal(result.irradiance, 0.0)
+    np.testing.assert_array_equal(result.status, 0)
+
+
+def test_one_bound_instance_for_all_profiles(device: Device, rng: np.random.Generator) -> None:
+    corners, receivers = soup(rng, 60, 0.3), receivers_of(rng, 2, 20).astype(np.float32)
+    operation = VisibleLight(scene=Scene(corners), segments=3)
+    bound = operation.bind(device, receivers.shape, receivers.dtype)
+    bound.inputs[0].set(receivers)
+    bound.inputs[1].set(np.ones((2, 20, 2), np.float32))
+    for _ in range(3):
+        segments = segments_of(rng, 3).astype(np.float32)
+        bound.inputs[2].set(segments)
+        there = bound.run()
+        expected = operation(receivers, np.ones((2, 20, 2), np.float32), segments, device=device)
+        np.testing.assert_array_equal(there.irradiance.get(), expected.irradiance)
+    given = [cl.array.to_device(device.queue, each) for each in (receivers, np.ones((2, 20, 2), np.float32), segments)]
+    np.testing.assert_array_equal(operation(*given).left.get(), expected.left)
+
+
+def test_wrong_parameters(device: Device) -> None:
+    scene = Scene(NO_TRIANGLES)
+    with pytest.raises(TypeError, match=r"VisibleLight\.scene is None, expected a Scene"):
+        VisibleLight(scene=None, segments=1)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"segments is 1\.5, expected an integer"):
+        VisibleLight(scene=scene, segments=1.5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="samples is 0, expected 1 or more"):
+        VisibleLight(scene=scene, segments=1, samples=0)
+    with pytest.raises(ValueError, match="visibility is 'some'"):
+        VisibleLight(scene=scene, segments=1, visibility="some")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"clearance is -1\.0"):
+        VisibleIntervals(scene=scene, clearance=-1.0)
+    with pytest.raises(ValueError, match="most is 0, expected 1 or more"):
+        VisibleIntervals(scene=scene, most=0)
+    with pytest.raises(ValueError, match=r"rows \(\.\.\., 9\), a point and two ends, got shape \(3, 6\)"):
+        VisibleIntervals(scene=scene)(np.zeros((3, 6)), device=device)
+    with pytest.raises(ValueError, match=r"receivers \(strips, n, 6\), n at least 1, got shape \(4, 6\)"):
+        light_of(NO_TRIANGLES, np.zeros((4, 6)), np.zeros((1, 10)), device, weights=np.zeros((4, 2)))
+    with pytest.raises(TypeError, match="takes float32 or float64, got int64"):
+        light_of(NO_TRIANGLES, np.zeros((1, 4, 6), np.int64), np.zeros((1, 10)), device)
+    with pytest.raises(ValueError, match="precision must be"):
+        light_of(NO_TRIANGLES, np.zeros((1, 4, 6)), np.zeros((1, 10)), device, precision="half")
+    with pytest.raises(ValueError, match="2 segments do not fit into 1 rows"):
+        segment_rows(LitSegments([FLOOR[:6].reshape(2, 3)] * 2, [[0, 0, 1]] * 2, [1.0, 1.0]), 1)

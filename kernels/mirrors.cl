@@ -243,7 +243,12 @@ kernel void mirror_points(global const INPUT *restrict points, global const INPU
     real wrong[LANES];
     unpacked(as_reals(bad), wrong);
     for (int n = 0; n <= last; n++) {
-        for (uint m = found[n]; m < kept; m++) triangles[(i + n) * kept + m] = -1;
+        for (uint m = found[n]; m < kept; m++) {
+            const size_t slot = (i + n) * kept + m;
+            triangles[slot] = -1;
+            densities[slot] = REAL_NAN;
+            for (int k = 0; k < 3; k++) places[3 * slot + k] = moves[3 * slot + k] = REAL_NAN;
+        }
         counts[i + n] = (uchar)min(found[n], kept);
         status[i + n] = as_bits(wrong[n]) ? STATUS_NOT_FINITE : found[n] > kept ? STATUS_AMBIGUOUS : STATUS_OK;
     }

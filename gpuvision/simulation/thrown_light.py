@@ -22,7 +22,7 @@ Integers = npt.NDArray[np.int64]
 # Corners that are looked at in one go.
 _CORNERS = 4_000_000
 # What is as near to the mirror, in distances of the source or sizes of the scene, lies on it.
-_ON_IT = 1e-9
+_ON_IT = 1e-12
 _HALVINGS = 12
 
 

@@ -1,0 +1,47 @@
+"""A sensor beside a sheet of light, and mirrors before it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gpuvision.host import Device
+from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.triangulation import Triangulation
+from gpuvision.simulation.material import Material
+from gpuvision.simulation.mirrors import Mirrors
+from gpuvision.simulation.scene import Scene
+from gpuvision.simulation.sight import Sight
+
+LENS = (0.0, 0.08, 0.15)
+
+
+def sight(samples: int = 120, bins: int = 240) -> Sight:
+    """Return a sensor of 12 mm x 12 mm that sees some 50 mm of the sheet, from 80 mm beside it and 150 mm above."""
+    geometry = Triangulation.from_stand_off(
+        baseline=LENS[1],
+        stand_off=LENS[2],
+        focal_distance=0.04,
+        tilt=0.0,
+        region=((-6e-3, 6e-3), (-6e-3, 6e-3)),
+    )
+    return Sight(
+        triangulation=geometry,
+        transport=StraightTransport(step=1e-4),
+        lens=LENS,
+        u_edges=np.linspace(-6e-3, 6e-3, bins + 1),
+        v_edges=np.linspace(-6e-3, 6e-3, samples + 1),
+    )
+
+
+def mirrors_of(scene: Scene, materials: Sequence[Material], device: Device, **more: Any) -> Mirrors:
+    """Return the mirrors of a scene before that sensor."""
+    return Mirrors(sight=more.pop("sight", sight()), scene=scene, materials=materials, device=device, **more)
+
+
+def quad(*corners: Sequence[float]) -> list[list[Sequence[float]]]:
+    """Return the two triangles of four corners."""
+    a, b, c, d = corners
+    return [[a, b, c], [a, c, d]]

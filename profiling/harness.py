@@ -33,6 +33,7 @@ OPERATIONS = (
     "calibration",
     "reflections",
     "bvh",
+    "mitsuba",
     "launch",
     "stream",
 )

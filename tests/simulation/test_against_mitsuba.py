@@ -1,0 +1,80 @@
+"""Light of lit strips against Mitsuba, a path tracer with which nothing here is shared: within its own noise."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from gpuvision.host import Device
+
+pytest.importorskip("mitsuba", reason="the extra 'profile' is not installed")
+pytest.importorskip("numba", reason="the extra 'profile' is not installed")
+
+from gpuvision.profiling.mitsuba_scenes import LitScene, Picture, by_closed_form, by_mitsuba, groove
+
+pytestmark = pytest.mark.slow
+
+SEEDS = 16
+
+
+class Agreement(NamedTuple):
+    """Of pictures by several seeds and one that is expected; the pixels' own spread over the seeds is the noise."""
+
+    chi_square: float  # per pixel; 1 if noise is all there is
+    chi_sigma: float
+    bias: float  # of the mean of ratios
+    bias_sigma: float
+    pixels: int
+
+
+def compare(pictures: Picture, expected: Picture, kept: np.ndarray) -> Agreement:
+    made, expected = pictures[:, kept], expected[kept]
+    student = (made.mean(axis=0) - expected) / (made.std(axis=0, ddof=1) / np.sqrt(len(made)))
+    normal = stats.norm.ppf(stats.t.cdf(student, len(made) - 1))
+    ratio = (made / expected).mean(axis=1) - 1.0
+    return Agreement(
+        float(np.mean(normal**2)),
+        float(np.sqrt(2.0 / kept.sum())),
+        float(ratio.mean()),
+        float(ratio.std(ddof=1) / np.sqrt(len(made))),
+        int(kept.sum()),
+    )
+
+
+def render(lit: LitScene, samples: int) -> Picture:
+    picture = by_mitsuba(lit, "scalar_rgb")
+    return np.array([picture(samples, seed) for seed in range(SEEDS)])
+
+
+@pytest.fixture(scope="module", params=[90.0, 60.0], ids=["corner", "groove"])
+def glowing(request):
+    """The angle in degrees, Mitsuba's pictures, and ours."""
+    lit = groove(np.radians(request.param))
+    return request.param, render(lit, 256), *expect(lit)
+
+
+def expect(lit: LitScene, *, occluding: bool = False) -> tuple[Picture, np.ndarray]:
+    receivers = lit.receivers()
+    return by_closed_form(lit, receivers, Device.best(), occluding=occluding), receivers.whole
+
+
+def test_a_wall_gets_the_light_that_the_closed_form_says(glowing):
+    _, pictures, expected, kept = glowing
+    found = compare(pictures, expected, kept)
+    assert found.pixels > 4000
+    assert abs(found.chi_square - 1.0) < 4.0 * found.chi_sigma
+    assert abs(found.bias) < 3.0 * found.bias_sigma
+    assert found.bias_sigma < 2e-4
+
+
+def test_the_comparison_sees_a_thousandth_and_a_degree(glowing):
+    angle, pictures, expected, kept = glowing
+    brighter = compare(pictures, 1.001 * expected, kept)
+    assert abs(brighter.bias) > 3.0 * brighter.bias_sigma
+    # A wall that leans by one degree more, with the same light in all.
+    other, _ = expect(groove(np.radians(angle + 1.0)))
+    leaning = compare(pictures, other * (expected[kept].sum() / other[kept].sum()), kept)
+    assert abs(leaning.chi_square - 1.0) > 4.0 * leaning.chi_sigma

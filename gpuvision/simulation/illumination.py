@@ -138,6 +138,16 @@ class LightSheet:
         line = LitLine(ends, self._normals(scene, triangle, ends), triangle, arriving[good] / length[good])
         return line, np.searchsorted(sheet, np.arange(len(places) + 1))
 
+    def towards(self, points: npt.ArrayLike) -> Float64:
+        """Return unit vectors from points towards the light, (..., 3); of a fan, the source in each point's sheet."""
+        points, move = np.asarray(points, np.float64), self.transport
+        axes = np.array([move.g_axis, move.h_axis, move.direction])
+        if self.source is None:
+            return np.broadcast_to(axes[1] / np.linalg.norm(axes[1]), points.shape)
+        away = np.array([*self.source, 0.0]) - (points - move.origin) @ np.linalg.inv(axes)
+        towards = away[..., :2] @ axes[:2]
+        return np.asarray(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+
     # ---- the sheet's own coordinates: x, which does not change along a ray, and a height towards the light ------
 
     def _in_light(self, cuts: Cuts) -> tuple[Cuts, Float64, Float64]:
@@ -242,15 +252,7 @@ class LightSheet:
         # Of whatever size: the cross product of micrometres is not to vanish.
         normal = np.cross(one, two / np.abs(two).max(axis=1, keepdims=True))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        if self.source is None:
-            towards: Float64 = np.array(self.transport.h_axis)
-        else:
-            move = self.transport
-            sheet = np.array(move.origin) + np.array(self.source) @ np.array([move.g_axis, move.h_axis])
-            middle = ends.mean(axis=1) - sheet
-            normal_of_sheet = np.cross(move.g_axis, move.h_axis)
-            moved = (middle @ normal_of_sheet) / (np.array(move.direction) @ normal_of_sheet)
-            towards = moved[:, None] * np.array(move.direction) - middle
+        towards = self.towards(0.5 * (ends[:, 0] + ends[:, 1]))
         side = np.sum(normal * towards, axis=1, keepdims=True)
         return np.where(side < 0.0, -normal, normal)
 

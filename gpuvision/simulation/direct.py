@@ -1,0 +1,333 @@
+"""The direct light: from the sheet to a surface to the lens. What a sensor is meant to see, and the truth about it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr
+
+from gpuvision.host import Device
+from gpuvision.simulation.illumination import LightSheet, LitLine
+from gpuvision.simulation.line_parts import LineOfSight, Parts, in_view, split_at, where_imaged
+from gpuvision.simulation.material import Material
+from gpuvision.simulation.readings import EVEN, EVEN_OPEN, OPEN, Truth
+from gpuvision.simulation.reflectance import Brdf, Ggx, Lambert, Phong, Ward
+from gpuvision.simulation.scene import Scene
+from gpuvision.simulation.sheet_cut import ranges
+from gpuvision.simulation.sight import Exposure, Sight
+from gpuvision.simulation.sight_lines import check_materials
+from gpuvision.status import Status
+
+Float64 = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+# Gauss and Legendre's two nodes on [0, 1].
+_NODES = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
+# How far a lobe's half way vector may turn within a part, in widths of the lobe, and into how many parts at most.
+_TURN, _TURNS = 0.5, 256
+# A Gaussian's light beyond so many sigmas, 1e-12, is not sought.
+_BEYOND = 7.0
+# Of the largest coordinate: nearer than that, two lit places are one.
+_SAME = 1e-9
+
+
+class Slabs(NamedTuple):
+    """Slabs of a sheet with a Gaussian across, in its sigmas.
+
+    Attributes
+    ----------
+    low, high
+        (n,): where each begins and ends; the first and the last have no end.
+    share
+        (n,): of the light.
+    middle
+        (n,): where the light of a slab lies in the mean.
+    """
+
+    low: Float64
+    high: Float64
+    share: Float64
+    middle: Float64
+
+    @classmethod
+    def between(cls, cuts: npt.ArrayLike) -> Slabs:
+        """Return the slabs that ascending cuts make, one more than there are cuts."""
+        cuts = np.asarray(cuts, np.float64)
+        low, high = np.append(-np.inf, cuts), np.append(cuts, np.inf)
+        share = _between(low, high)
+        return cls(low, high, share, (_bell(low) - _bell(high)) / share)
+
+    @classmethod
+    def of(cls, count: int) -> Slabs:
+        """Return so many slabs, all but the outer ones of one width."""
+        # What the outer ones hold falls with their number as an inner one's width does.
+        reach = math.sqrt(2.0 * math.log(count)) if count > 2 else 0.0
+        return cls.between(np.linspace(-reach, reach, count - 1))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DirectLight:
+    """Light of a sheet that comes to a sensor straight from what it lights; compared by identity.
+
+    Parameters
+    ----------
+    sight
+        The sensor.
+    scene, materials
+        What is lit; a material for every number in `Scene.material`.
+    sheet
+        The light.
+    sub_sheets
+        A thick sheet is taken as so many slabs; or the places in its sigmas at which it is cut into slabs. A thin sheet
+        has one.
+    device
+        Where visibility is found; None: `Device.best`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter is not what is said here; a triangle's material is missing.
+
+    Notes
+    -----
+    What is lit, and what of it the lens sees, is exact but for rounding; so is the division of light among samples and
+    bins. Within a part of a line that falls into one bin, two Gauss nodes are taken.
+
+    A slab's light is where the slab's mean is, and is spread over the bins as the surface there, thought plane, spreads
+    it. So a plane gives a Gaussian, exactly, whatever the number of slabs; where the surface, its material or its
+    shadow change within a slab, the error falls as one over the number of slabs.
+
+    The x axis of an anisotropic lobe is the scene's x axis laid onto the surface (y, on one that x stands on).
+    """
+
+    sight: Sight
+    scene: Scene
+    materials: Sequence[Material]
+    sheet: LightSheet
+    sub_sheets: int | Sequence[float] = 9
+    device: Device | None = None
+    slabs: Slabs = field(init=False, repr=False)
+    _line_of_sight: LineOfSight = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        check_materials(self.scene, self.materials)
+        if self.sheet.transport != self.sight.transport:
+            raise ValueError("DirectLight: sheet and sight have different transports, expected the same one")
+        object.__setattr__(self, "slabs", _slabs(self.sub_sheets if self.sheet.sigma > 0.0 else 1))
+        device = Device.best() if self.device is None else self.device
+        object.__setattr__(self, "_line_of_sight", LineOfSight(scene=self.scene, device=device))
+
+    def exposures(self, L: float, *, causes: bool = False) -> dict[str, Exposure]:
+        """Return the light at a transport L [m]: "direct" off the surfaces' diffuse parts, "specular" off their lobes.
+
+        With ``causes``, also what the direct light would be if all surfaces were white ones of Lambert (`EVEN`), if
+        nothing were in the way to the lens (`OPEN`), and both (`EVEN_OPEN`).
+        """
+        slabs, sight = self.slabs, self.sight
+        line, first = self.sheet.lit_lines(self.scene, L + self.sheet.sigma * slabs.middle)
+        slab = np.repeat(np.arange(len(slabs.share)), np.diff(first))
+        line, kept = self._facing(line, L)
+        slab = slab[kept]
+        parts = in_view(self._line_of_sight.parts(line, sight.lens_at(L), hidden=causes), line, sight, L)
+        parts = self._split(parts, line, L)
+        # Both nodes of all parts.
+        arriving = (line.power * line.lengths * slabs.share[slab])[parts.segment] * (parts.end - parts.start)
+        nodes = parts.at(line, _NODES[:, None]).reshape(-1, 3)
+        segment, seen = np.tile(parts.segment, 2), np.tile(parts.seen, 2)
+        sent = self._sent(line, segment, nodes, np.tile(0.5 * arriving, 2), L)
+        wanted = {"direct": sent["diffuse"] * seen, "specular": sent["gloss"] * seen}
+        if causes:
+            wanted |= {EVEN: sent["even"] * seen, OPEN: sent["diffuse"], EVEN_OPEN: sent["even"]}
+        spread = self._spread(line, segment, nodes, L)
+        return _deposits(sight, sight.project(nodes, L), spread, slabs, slab[segment], wanted)
+
+    def truth(self, L: float) -> Truth:
+        """Return where the middle of the sheet truly is at a transport L [m], at the middle of each sample.
+
+        What is lit and visible there and imaged on the sensor. Status: DARK, there is none; OUT_OF_RANGE, it is
+        imaged beyond the sensor's ends in u, and not given; AMBIGUOUS, there are several: the one with the most light
+        is given.
+        """
+        sight = self.sight
+        line, _ = self._facing(self.sheet.lit(self.scene, L), L)
+        parts = in_view(self._line_of_sight.parts(line, sight.lens_at(L)), line, sight, L)
+        v = sight.project(parts.ends(line), L)[..., 1]
+        low, high = v.min(axis=1), v.max(axis=1)
+        # Half open, so that of two parts that touch one has the sample.
+        first = np.searchsorted(sight.v_middles, low, side="left")
+        count = np.maximum(np.searchsorted(sight.v_middles, high, side="left") - first, 0)
+        owner, sample = np.repeat(np.arange(len(count)), count), ranges(first, count)
+        mine = parts.those(owner)
+        share = where_imaged(mine, line, sight, sight.v_middles[sample], 1, L)
+        points = Parts(mine.segment, share, share, mine.seen).ends(line)[:, 0]
+        u = sight.project(points, L)[..., 0]
+        on = (u >= sight.u_edges[0]) & (u <= sight.u_edges[-1])
+        light = (line.power * line.lengths)[mine.segment] * (mine.end - mine.start) / (high - low)[owner]
+        return _chosen(sight.samples, sample, sight.sheet_coordinates(points, L), on, light)
+
+    def _facing(self, line: LitLine, L: float) -> tuple[LitLine, Integers]:
+        """Return the segments whose lit side the lens can see, in samples that there are, and which those are."""
+        kept = np.sum(line.normals * (self.sight.lens_at(L) - line.ends[:, 0]), axis=1) > 0.0
+        v = self.sight.project(line.ends, L)[..., 1]
+        known = np.isfinite(v)
+        low = np.where(known, v, -np.inf).min(axis=1)
+        high = np.where(known, v, np.inf).max(axis=1)
+        kept &= known.any(axis=1) & (high >= self.sight.v_edges[0]) & (low <= self.sight.v_edges[-1])
+        which = np.flatnonzero(kept)
+        return LitLine(line.ends[which], line.normals[which], line.triangle[which], line.power[which]), which
+
+    def _split(self, parts: Parts, line: LitLine, L: float) -> Parts:
+        """Split parts at the edges of samples and bins, and where a lobe changes much."""
+        u_edges = self.sight.u_edges
+        if self.sheet.sigma > 0.0:
+            # Light is spread onto the sensor from beyond its ends.
+            u_edges = np.concatenate([[-np.inf], u_edges, [np.inf]])
+        parts = split_at(parts, line, self.sight, self.sight.v_edges, 1, L)
+        return self._split_lobes(split_at(parts, line, self.sight, u_edges, 0, L), line, L)
+
+    def _split_lobes(self, parts: Parts, line: LitLine, L: float) -> Parts:
+        """Split parts on glossy surfaces until the half way vector turns little within each."""
+        widths = np.array([math.inf if each.gloss is None else _width(each.gloss) for each in self.materials])
+        if np.isinf(widths).all():
+            return parts
+        width = widths[self._material(line)][parts.segment]
+        ends = parts.ends(line)
+        half_way = _unit(self.sheet.towards(ends) + _unit(self.sight.lens_at(L) - ends))
+        turn = np.linalg.norm(half_way[:, 1] - half_way[:, 0], axis=1) / width
+        count = np.clip(np.ceil(turn / _TURN), 1, _TURNS).astype(np.int64)
+        owner, number = np.repeat(np.arange(len(count)), count), ranges(np.zeros_like(count), count)
+        size = ((parts.end - parts.start) / count)[owner]
+        start = parts.start[owner] + number * size
+        return parts.those(owner)._replace(start=start, end=start + size)
+
+    def _material(self, line: LitLine) -> npt.NDArray[np.int32]:
+        assert self.scene.material is not None  # set by Scene itself
+        return self.scene.material[line.triangle]
+
+    def _sent(
+        self, line: LitLine, segment: Integers, points: Float64, arriving: Float64, L: float
+    ) -> dict[str, Float64]:
+        """Return power on the sensor [W] of light that arrives at points [W], by kind of reflection."""
+        normal = line.normals[segment]
+        eye = _unit(self.sight.lens_at(L) - points)
+        arriving = arriving * np.maximum(np.sum(normal * eye, axis=1), 0.0) * self.sight.received(points, L)
+        sent = {"even": arriving / math.pi, "diffuse": np.zeros(len(points)), "gloss": np.zeros(len(points))}
+        material = self._material(line)[segment]
+        for number in np.unique(material):
+            mine, made_of = np.flatnonzero(material == number), self.materials[number]
+            if isinstance(made_of.diffuse, Lambert):
+                sent["diffuse"][mine] = made_of.albedo * sent["even"][mine]
+                if made_of.gloss is None:
+                    continue
+            directions = _in_frames(normal[mine], self.sheet.towards(points[mine]), eye[mine])
+            if not isinstance(made_of.diffuse, Lambert):
+                sent["diffuse"][mine] = arriving[mine] * made_of.diffuse.value(directions)
+            if made_of.gloss is not None:
+                sent["gloss"][mine] = arriving[mine] * made_of.gloss.value(directions)
+        return sent
+
+    def _spread(self, line: LitLine, segment: Integers, points: Float64, L: float) -> Float64:
+        """Return how far an image moves along u as the sheet moves by one sigma over the surface, thought plane."""
+        sigma = self.sheet.sigma
+        if sigma == 0.0:
+            return np.zeros(len(points))
+        direction, normal = np.array(self.sheet.transport.direction), line.normals[segment]
+        light = self.sheet.towards(points)
+        slope = np.sum(normal * light, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moved = 0.5 * sigma * (direction - light * ((normal @ direction) / slope)[:, None])
+            ahead, behind = self.sight.project(np.stack([points + moved, points - moved]), L)[..., 0]
+        return np.asarray(np.nan_to_num(ahead - behind))
+
+
+def _slabs(given: int | Sequence[float]) -> Slabs:
+    if isinstance(given, int):
+        if given < 1:
+            raise ValueError(f"DirectLight.sub_sheets is {given}, expected 1 or more")
+        return Slabs.of(given)
+    cuts = np.asarray(given, np.float64)
+    if cuts.ndim != 1 or not np.isfinite(cuts).all() or np.any(np.diff(cuts) <= 0.0):
+        raise ValueError("DirectLight.sub_sheets: expected a number of slabs, or ascending places in sigmas")
+    return Slabs.between(cuts)
+
+
+def _deposits(
+    sight: Sight, uv: Float64, spread: Float64, slabs: Slabs, slab: Integers, lights: Mapping[str, Float64]
+) -> dict[str, Exposure]:
+    """Return exposures by spots of slabs' light: their means at (u, v), spread by so much along u a sigma."""
+    sample = sight.sample_of(uv[:, 1])
+    on = np.flatnonzero(sample >= 0)
+    sample, u, slab = sample[on], uv[on, 0], slab[on]
+    least = 1e-9 * float(np.diff(sight.u_edges).min())
+    spread = np.where(np.abs(spread[on]) < least, least, spread[on])
+    low, high, middle = slabs.low[slab], slabs.high[slab], slabs.middle[slab]
+    reach = u + spread * (np.clip([low, high], -_BEYOND, _BEYOND) - middle)
+    first = np.maximum(np.searchsorted(sight.u_edges, reach.min(axis=0), side="right") - 1, 0)
+    last = np.minimum(np.searchsorted(sight.u_edges, reach.max(axis=0), side="left"), sight.bins)
+    count = np.maximum(last - first, 0)
+    of, place = np.repeat(np.arange(len(u)), count), ranges(first, count)
+    # The edges of the bins in sigmas of the sheet.
+    ends = middle[of] + (np.stack([sight.u_edges[place], sight.u_edges[place + 1]]) - u[of]) / spread[of]
+    ends = np.clip(np.sort(ends, axis=0), low[of], high[of])
+    share = _between(*ends)
+    moment = (u - spread * middle)[of] - sight.u_middles[place]
+    moment = moment * share + spread[of] * (_bell(ends[0]) - _bell(ends[1]))
+    at, per = sample[of] * sight.bins + place, 1.0 / slabs.share[slab[of]]
+    size = sight.samples * sight.bins
+    made = {}
+    for name, power in lights.items():
+        here = power[on][of] * per
+        sums = [np.asarray(np.bincount(at, here * each, minlength=size), np.float64) for each in (share, moment)]
+        made[name] = Exposure(*(each.reshape(sight.samples, sight.bins) for each in sums))
+    return made
+
+
+def _chosen(samples: int, sample: Integers, places: Float64, on: npt.NDArray[np.bool_], light: Float64) -> Truth:
+    """Return of the places (G, H) of each sample the one on the sensor with the most light."""
+    order = np.lexsort((-light, ~on, sample))
+    sample, places, on = sample[order], places[order], on[order]
+    best = np.flatnonzero(np.diff(sample, prepend=-1))
+    own = np.repeat(best, np.diff(best, append=len(sample)))
+    other = on & (np.abs(places - places[own]).max(axis=1, initial=0.0) > _SAME * np.abs(places).max(initial=0.0))
+    g, h = np.full(samples, np.nan), np.full(samples, np.nan)
+    status = np.full(samples, Status.DARK, np.uint8)
+    status[sample[best]] = np.where(on[best], Status.OK, Status.OUT_OF_RANGE)
+    status[sample[other]] |= np.uint8(Status.AMBIGUOUS)
+    given = best[on[best]]
+    g[sample[given]], h[sample[given]] = places[given].T
+    return Truth(g, h, status)
+
+
+def _width(lobe: Brdf) -> float:
+    """Return about how wide a lobe is, as an angle of the half way vector [rad]."""
+    if isinstance(lobe, Ggx):
+        return lobe.alpha
+    if isinstance(lobe, Ward):
+        return min(lobe.alpha_x, lobe.alpha_y)
+    return 0.5 / math.sqrt(lobe.exponent + 1.0) if isinstance(lobe, Phong) else math.inf
+
+
+def _in_frames(normal: Float64, light: Float64, eye: Float64) -> Float64:
+    """Return directions (n, 6) to the light and to the eye in frames whose z is the normal."""
+    axis = np.where((np.abs(normal[:, 0]) < 0.9)[:, None], (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    x = _unit(axis - np.sum(axis * normal, axis=1, keepdims=True) * normal)
+    frame = np.stack([x, np.cross(normal, x), normal], axis=1)
+    return np.concatenate([np.einsum("nij,nj->ni", frame, each) for each in (light, eye)], axis=1)
+
+
+def _unit(vectors: Float64) -> Float64:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def _bell(x: Float64) -> Float64:
+    return np.asarray(np.exp(-0.5 * x * x) / math.sqrt(math.tau))
+
+
+def _between(low: Float64, high: Float64) -> Float64:
+    """Return a Gaussian's share between two places, to its own digits in either tail."""
+    return np.asarray(np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low)))

@@ -1,0 +1,436 @@
+"""DirectLight: the thesis' closed forms of steps, corners and occlusion; rays against every triangle; the truth."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.optimize import minimize_scalar
+from scipy.special import ndtr
+
+from gpuvision.camera.lens import Lens
+from gpuvision.host import Device
+from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.ranging.triangulation import Triangulation
+from gpuvision.simulation.direct import DirectLight, Slabs
+from gpuvision.simulation.illumination import LightSheet
+from gpuvision.simulation.material import Material
+from gpuvision.simulation.rays import AnyHit
+from gpuvision.simulation.readings import EVEN, EVEN_OPEN, OPEN
+from gpuvision.simulation.reflectance import Ggx, Lambert, OrenNayar, Phong, Ward
+from gpuvision.simulation.scene import Scene
+from gpuvision.simulation.sight import Exposure, Sight
+from gpuvision.status import Status
+from reference.rays import occluded
+
+TRANSPORT = StraightTransport(step=1e-4)
+GREY = Material(diffuse=Lambert(albedo=0.5))
+
+
+def sight(*, scale: float = 1.0, bins: int = 12, samples: int = 8, lens: Lens | None = None, **more: Any) -> Sight:
+    """A lens beside the sheet, 0.15 m up; ``scale`` takes it farther, its focal distance along: the image stays."""
+    baseline, stand_off, focal = 0.08 * scale, 0.15 * scale, 0.04 * scale
+    geometry = Triangulation.from_stand_off(
+        baseline=baseline, stand_off=stand_off, focal_distance=focal, region=((-3e-3, 3e-3), (-6e-3, 6e-3)), lens=lens
+    )
+    values = {
+        "triangulation": geometry,
+        "transport": TRANSPORT,
+        "lens": (0.0, baseline, stand_off),
+        "u_edges": np.linspace(-3e-3, 3e-3, bins + 1),
+        "v_edges": np.linspace(-6e-3, 6e-3, samples + 1),
+    }
+    return Sight(**(values | more))
+
+
+def light_of(corners: Any, materials: Any = (GREY,), *, seen_by: Sight | None = None, **more: Any) -> DirectLight:
+    values = {key: more.pop(key) for key in ("sub_sheets", "device") if key in more}
+    scene = corners if isinstance(corners, Scene) else Scene(corners)
+    sheet = LightSheet(transport=TRANSPORT, **more)
+    return DirectLight(sight=seen_by or sight(), scene=scene, materials=materials, sheet=sheet, **values)
+
+
+def quad(a: Any, b: Any, c: Any, d: Any) -> np.ndarray:
+    return np.array([[a, b, c], [a, c, d]], float)
+
+
+def plate(x: float = 1.0, y: float = 1.0, z: float = 0.0) -> np.ndarray:
+    return quad((-x, -y, z), (x, -y, z), (x, y, z), (-x, y, z))
+
+
+def u_of(exposure: Exposure, seen_by: Sight) -> np.ndarray:
+    return exposure.first_moment(seen_by.u_edges) / exposure.total()
+
+
+# ---- the closed forms: a lens so far away that its image is a parallel one ---------------------------------
+
+FAR, SIGMA = 1e4, 1e-4
+
+
+def far_sight() -> Sight:
+    return sight(scale=FAR, bins=3, samples=1)
+
+
+def u_per_metre(seen_by: Sight, towards: Any) -> float:
+    """How far the image of a point moves along u as the point does."""
+    ends = seen_by.project(0.5 * SIGMA * np.array([towards, towards]) * [[1.0], [-1.0]])
+    return float(ends[0, 0] - ends[1, 0]) / SIGMA
+
+
+def bell(x: float) -> float:
+    return math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)
+
+
+def step_shift(k: float, x: float) -> float:
+    return (k - 1.0) * bell(x) / (float(ndtr(x)) + k * float(ndtr(-x)))
+
+
+def two_plates(before: float, behind: float) -> tuple[Scene, tuple[Material, ...]]:
+    """A plate whose albedo changes at y = 0."""
+    corners = np.concatenate([plate(1.0, 0.5) + np.array([0.0, y, 0.0]) for y in (-0.5, 0.5)])
+    made_of = tuple(Material(diffuse=Lambert(albedo=each)) for each in (before, behind))
+    return Scene(corners, np.array([0, 0, 1, 1])), made_of
+
+
+# domain.md E: the largest shift in sigmas of the beam, by the ratio of reflectances; it is its own offset.
+STEPS = [(1.5, 0.162), (2.0, 0.276), (5.0, 0.636), (10.0, 0.902), (50.0, 1.485), (100.0, 1.721), (1000.0, 2.436)]
+
+
+@pytest.mark.parametrize(("k", "largest"), STEPS)
+def test_step_of_reflectivity(k: float, largest: float) -> None:
+    found = minimize_scalar(lambda x: -step_shift(k, x), bounds=(0.0, 4.0), method="bounded", options={"xatol": 1e-12})
+    assert found.x == pytest.approx(largest, abs=6e-4)
+    assert -found.fun == pytest.approx(found.x, abs=1e-7)
+    seen_by = far_sight()
+    scene, materials = two_plates(1.0 / 1024.0, k / 1024.0)
+    per_sigma = SIGMA * u_per_metre(seen_by, (0.0, 1.0, 0.0))
+    for x in (found.x, -0.7, 2.5):
+        light = light_of(scene, materials, seen_by=seen_by, sigma=SIGMA, sub_sheets=[x])
+        direct = light.exposures(-x * SIGMA)["direct"]
+        middle = seen_by.project([0.0, -x * SIGMA, 0.0], -x * SIGMA)[0]
+        shift = (u_of(direct, seen_by)[0] - middle) / per_sigma
+        assert shift == pytest.approx(step_shift(k, x), rel=1e-6)
+
+
+@pytest.mark.parametrize("x", [-2.0, -1.0, 0.0, 0.5, 2.0])
+def test_half_of_the_beam_hidden(device: Device, x: float) -> None:
+    """A screen in the way to the lens hides what lies beyond x sigmas: the shift is that of a step to 0."""
+    seen_by = far_sight()
+    lens, height = np.array(seen_by.lens), 0.01
+    edge = x * SIGMA + (lens[1] - x * SIGMA) * height / lens[2]
+    screen = quad((-1, edge, height), (1, edge, height), (1, 1, height), (-1, 1, height))
+    scene = Scene(np.concatenate([plate(), screen]))
+    light = light_of(scene, seen_by=seen_by, sigma=SIGMA, sub_sheets=[x], device=device)
+    shown = light.exposures(0.0, causes=True)
+    shift = u_of(shown["direct"], seen_by)[0] / (SIGMA * u_per_metre(seen_by, (0.0, 1.0, 0.0)))
+    assert shift == pytest.approx(-bell(x) / float(ndtr(x)), rel=1e-6)
+    share = shown["direct"].total()[0] / shown[OPEN].total()[0]
+    assert share == pytest.approx(float(ndtr(x)), rel=1e-6)
+    assert u_of(shown[OPEN], seen_by)[0] == pytest.approx(0.0, abs=1e-11)
+
+
+@pytest.mark.parametrize(("one", "two"), [(0.0, 0.6), (0.5, -0.5), (-0.3, 0.7), (-0.6, 0.2)])
+@pytest.mark.parametrize("x", [-1.0, 0.0, 0.4])
+def test_corner_between_slopes(one: float, two: float, x: float) -> None:
+    """Either side of a ridge or valley sends its part of the Gaussian, as it is turned to the lens."""
+    seen_by = far_sight()
+    before = quad((-1, -1, -one), (1, -1, -one), (1, 0, 0), (-1, 0, 0))
+    behind = quad((-1, 0, 0), (1, 0, 0), (1, 1, two), (-1, 1, two))
+    scene, at = Scene(np.concatenate([before, behind])), -x * SIGMA
+    light = light_of(scene, seen_by=seen_by, sigma=SIGMA, sub_sheets=[x])
+    u = u_of(light.exposures(at)["direct"], seen_by)[0] - seen_by.project([0.0, 0.0, 0.0], at)[0]
+    lens = np.array(seen_by.lens) / np.linalg.norm(seen_by.lens)
+    weights = [(lens[2] - slope * lens[1]) / math.hypot(1.0, slope) for slope in (one, two)]
+    moves = [SIGMA * u_per_metre(seen_by, (0.0, 1.0, slope)) for slope in (one, two)]
+    parts = [float(ndtr(x)), float(ndtr(-x))]
+    means = [-bell(x) - x * parts[0], bell(x) - x * parts[1]]
+    expected = np.dot(np.multiply(weights, moves), means) / np.dot(weights, parts)
+    assert u == pytest.approx(expected, rel=2e-6)
+
+
+def test_order_of_convergence_in_slabs() -> None:
+    """First order where a step lies within a slab; second on a surface that bends."""
+    seen_by = far_sight()
+    scene, materials = two_plates(0.1, 0.5)
+    counts = np.array([8, 16, 32, 64, 128])
+    errors = []
+    for count in counts:
+        shifts = []
+        for x in np.linspace(-0.61, 0.67, 7):
+            light = light_of(scene, materials, seen_by=seen_by, sigma=SIGMA, sub_sheets=int(count))
+            direct = light.exposures(-x * SIGMA)["direct"]
+            u = u_of(direct, seen_by)[0] - seen_by.project([0.0, -x * SIGMA, 0.0], -x * SIGMA)[0]
+            shifts.append(u / (SIGMA * u_per_metre(seen_by, (0.0, 1.0, 0.0))) - step_shift(5.0, float(x)))
+        errors.append(np.sqrt(np.mean(np.square(shifts))))
+    order = -np.polyfit(np.log(counts), np.log(errors), 1)[0]
+    assert 0.7 < order < 1.6
+    assert errors[0] < 0.2
+    turn = np.linspace(-0.3, 0.3, 20001)
+    y, z = 0.01 * np.sin(turn), 0.01 * np.cos(turn)
+    rows = [quad((-1, a, c), (1, a, c), (1, b, d), (-1, b, d)) for a, b, c, d in zip(y, y[1:], z, z[1:], strict=False)]
+    bent = Scene(np.concatenate(rows))
+    values = [
+        u_of(light_of(bent, seen_by=seen_by, sigma=5e-4, sub_sheets=n).exposures(0.0)["direct"], seen_by)[0]
+        for n in (8, 16, 32, 1000)
+    ]
+    errors = np.abs(np.array(values[:-1]) - values[-1])
+    assert np.all(errors[:-1] / errors[1:] > 2.2)
+
+
+def test_slabs() -> None:
+    for slabs in (Slabs.of(1), Slabs.of(2), Slabs.of(9), Slabs.between([-1.0, 3.0, 9.0])):
+        assert slabs.share.sum() == pytest.approx(1.0, rel=1e-15)
+        assert slabs.share @ slabs.middle == pytest.approx(0.0, abs=1e-15)
+        assert np.all((slabs.low < slabs.middle) & (slabs.middle < slabs.high))
+    assert len(Slabs.of(9).share) == 9
+
+
+# ---- power, bins, samples ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lens", [None, Lens(k1=-900.0, centre=(1e-4, -2e-4))])
+@pytest.mark.parametrize("sigma", [0.0, 1e-4])
+def test_power_of_a_plate(device: Device, lens: Lens | None, sigma: float) -> None:
+    """Each sample gets what its part of the line sends into the lens; the place is that of the line."""
+    seen_by = sight(lens=lens, samples=16)
+    light = light_of(plate(z=3e-3), seen_by=seen_by, power=2.0, sigma=sigma, sub_sheets=5, device=device)
+    direct = light.exposures(0.02)["direct"]
+    node, weight = np.polynomial.legendre.leggauss(40)
+    G = np.linspace(-0.05, 0.05, 200_001)
+    uv = seen_by.project(np.stack([G, np.full_like(G, 0.02), np.full_like(G, 3e-3)], axis=-1), 0.02)
+    for sample, (low, high) in enumerate(zip(seen_by.v_edges, seen_by.v_edges[1:], strict=False)):
+        start, end = np.interp([low, high], uv[:, 1], G)
+        at = 0.5 * (start + end) + 0.5 * (end - start) * node
+        points = np.stack([at, np.full_like(at, 0.02), np.full_like(at, 3e-3)], axis=-1)
+        eye = seen_by.lens_at(0.02) - points
+        sent = 2.0 * 0.5 / math.pi * eye[:, 2] / np.linalg.norm(eye, axis=1) * seen_by.received(points, 0.02)
+        sent *= 0.5 * (end - start) * weight
+        # The reference's own interpolation is good to 1e-8; a Gaussian is a curve in perspective.
+        rough = 1e-7 if sigma == 0.0 else 1e-5
+        assert direct.total()[sample] == pytest.approx(sent.sum(), rel=rough)
+        place = sent @ seen_by.project(points, 0.02)[:, 0] / sent.sum()
+        assert u_of(direct, seen_by)[sample] == pytest.approx(place, abs=1e-9 if sigma == 0.0 else 2e-7)
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_a_plate_gives_a_gaussian(count: int) -> None:
+    """Whatever the number of slabs: in every bin the light that falls into it. Rounding is that of 1.7 km."""
+    seen_by = sight(scale=FAR, bins=400, samples=1)
+    light = light_of(plate(z=1e-3), seen_by=seen_by, sigma=SIGMA, sub_sheets=count)
+    direct = light.exposures(0.0)["direct"]
+    middle = seen_by.project([0.0, 0.0, 1e-3])[0]
+    width = SIGMA * u_per_metre(seen_by, (0.0, 1.0, 0.0))
+    edges = (seen_by.u_edges - middle) / abs(width)
+    np.testing.assert_allclose(direct.power[0] / direct.total()[0], np.diff(ndtr(edges)), atol=3e-7)
+    spots = -np.diff(np.exp(-0.5 * edges**2)) / math.sqrt(2 * math.pi) * abs(width)
+    beside = spots + (middle - seen_by.u_middles) * np.diff(ndtr(edges))
+    np.testing.assert_allclose(direct.moment[0] / direct.total()[0], beside, atol=3e-7 * abs(width))
+
+
+def test_light_that_falls_beside_the_sensor_is_lost() -> None:
+    """Half of the spot over the end of the strips: half of the power, and the bias of domain.md A."""
+    whole = sight(scale=FAR, bins=4, samples=1)
+    middle = whole.project([0.0, 0.0, 1e-3])[0]
+    cut = sight(scale=FAR, samples=1, u_edges=np.array([-3e-3, 0.0, middle]))
+    powers, places = [], []
+    for seen_by in (whole, cut):
+        direct = light_of(plate(z=1e-3), seen_by=seen_by, sigma=SIGMA).exposures(0.0)["direct"]
+        powers.append(direct.total()[0])
+        places.append(u_of(direct, seen_by)[0])
+    width = abs(SIGMA * u_per_metre(whole, (0.0, 1.0, 0.0)))
+    assert powers[1] / powers[0] == pytest.approx(0.5, rel=1e-6)
+    assert (places[1] - places[0]) / width == pytest.approx(-0.7979, abs=1e-4)
+
+
+def test_finer_bins_and_samples_add_up(rng: np.random.Generator) -> None:
+    """A steep and broken surface: what a sample gets does not hang on how it is divided."""
+    mesh = trimesh.creation.icosphere(3, 0.012)
+    mesh.vertices *= 1.0 + 0.05 * rng.normal(size=(len(mesh.vertices), 1))
+    gloss = Material(diffuse=OrenNayar(albedo=0.4, roughness=0.5), gloss=Phong(albedo=0.3, exponent=20.0))
+    sums = []
+    for bins, samples in ((1, 4), (40, 4), (7, 64)):
+        light = light_of(Scene.of(mesh), (gloss,), seen_by=sight(bins=bins, samples=samples), sigma=1e-5, sub_sheets=3)
+        found = light.exposures(2e-3)
+        assert set(found) == {"direct", "specular"}
+        sums.append([found[name].total().reshape(4, -1).sum(axis=1) for name in ("direct", "specular")])
+        moments = found["direct"].first_moment(light.sight.u_edges).reshape(4, -1).sum(axis=1)
+        sums[-1].append(moments / 1e-3)
+    np.testing.assert_allclose(sums[1], sums[2], rtol=2e-4, atol=1e-14)
+    np.testing.assert_allclose(sums[0], sums[1], rtol=2e-2, atol=1e-14)
+
+
+# ---- what is seen: rays against every triangle -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("source", [None, (0.005, 0.3)])
+@pytest.mark.parametrize("lens", [None, Lens(k1=-900.0, centre=(1e-4, -2e-4))])
+def test_as_rays_to_the_lens_say(device: Device, source: Any, lens: Lens | None, rng: np.random.Generator) -> None:
+    """Light of points on the lit line, each with a ray to the lens; truths lie on the line and are seen."""
+    tips = rng.uniform(-0.02, 0.02, (150, 1, 3)) + rng.normal(0.0, 4e-3, (150, 3, 3))
+    scene, seen_by, L = Scene(np.concatenate([tips, plate(0.03, 0.03, -0.02)])), sight(lens=lens, bins=6), 1e-3
+    light = light_of(scene, seen_by=seen_by, source=source, device=device)
+    line = light.sheet.lit(scene, L)
+    count = 2000
+    share = (np.arange(count) + 0.5) / count
+    points = line.ends[:, :1] + share[:, None] * (line.ends[:, 1:] - line.ends[:, :1])
+    eye = seen_by.lens_at(L) - points
+    cosine = np.sum(line.normals[:, None] * eye, axis=-1) / np.linalg.norm(eye, axis=-1)
+    power = (line.power * line.lengths / count)[:, None] * 0.5 / math.pi * seen_by.received(points, L)
+    power = power * np.maximum(cosine, 0.0)
+    rays = np.concatenate([points, np.broadcast_to(seen_by.lens_at(L), points.shape)], axis=-1).reshape(-1, 6)
+    hidden = AnyHit(scene=scene, clearance=1e-10)(rays, device=device).occluded != 0
+    uv = seen_by.project(points, L).reshape(-1, 2)
+    for name, weight in (("direct", ~hidden), (OPEN, 1.0)):
+        expected = seen_by.deposit(uv[:, 0], uv[:, 1], power.ravel() * weight)
+        found = light.exposures(L, causes=True)[name]
+        np.testing.assert_allclose(found.power, expected.power, atol=1e-3 * expected.power.max())
+        np.testing.assert_allclose(found.moment, expected.moment, atol=1e-6 * expected.power.max())
+    truth = light.truth(L)
+    known = np.isfinite(truth.h)
+    assert known.sum() >= 4
+    np.testing.assert_array_equal(truth.status[~known] & (Status.DARK | Status.OUT_OF_RANGE) != 0, True)
+    place = np.stack([truth.g, np.full(len(known), L), truth.h], axis=-1)[known]
+    np.testing.assert_allclose(seen_by.project(place, L)[:, 1], seen_by.v_middles[known], atol=1e-12)
+    near = np.linalg.norm(place[:, None, None] - points, axis=-1).min(axis=(1, 2))
+    assert near.max() < 1e-5
+    to_lens = np.concatenate([place, np.broadcast_to(seen_by.lens_at(L), place.shape)], axis=-1)
+    assert not occluded(scene.corners, to_lens, 1e-7).any()
+
+
+def test_very_many_gaps() -> None:
+    """A comb in the way to the lens, of more teeth than the kernel keeps: halves are looked at."""
+    teeth = np.linspace(-0.01, 0.01, 201)
+    screen = np.concatenate(
+        [
+            quad((a, 5e-3, 0.01), (b, 5e-3, 0.01), (b, 9e-3, 0.01), (a, 9e-3, 0.01))
+            for a, b in zip(teeth[::2], teeth[1::2], strict=False)
+        ]
+    )
+    light = light_of(np.concatenate([plate(), screen]), seen_by=sight(samples=1))
+    found = light.exposures(0.0, causes=True)
+    assert 0.3 < found["direct"].total()[0] / found[OPEN].total()[0] < 0.9
+    parts = light._line_of_sight.parts(light.sheet.lit(light.scene, 0.0), light.sight.lens_at(0.0), hidden=True)
+    assert parts.seen.sum() >= 100
+    assert np.sum(parts.end - parts.start) == pytest.approx(parts.segment.max() + 1, rel=1e-12)
+    # The plate is 2 m wide, and the lit line is two segments of 1 m; the shadows are the teeth's, from the lens.
+    hidden = np.sum((parts.end - parts.start)[~parts.seen])
+    assert hidden == pytest.approx(100 * (teeth[1] - teeth[0]) * 0.15 / 0.14, rel=1e-9)
+
+
+# ---- the truth ---------------------------------------------------------------------------------------------
+
+
+def test_truth_at_a_step() -> None:
+    """A narrow strip of tape over a plate: the higher surface is magnified.
+
+    Where it ends right of the middle, samples see it and the plate: ambiguous; on the left they see neither.
+    """
+    for at, flag in ((8e-3, Status.AMBIGUOUS), (-8e-3, Status.DARK)):
+        seen_by = sight(samples=2000)
+        tape = quad((-1, -2e-4, 5e-3), (at, -2e-4, 5e-3), (at, 2e-4, 5e-3), (-1, 2e-4, 5e-3))
+        light = light_of(np.concatenate([plate(), tape]), seen_by=seen_by)
+        truth = light.truth(0.0)
+        ends = np.sort(seen_by.project([[at, 0.0, 5e-3], [at, 0.0, 0.0]])[:, 1])
+        between = (seen_by.v_middles > ends[0]) & (seen_by.v_middles < ends[1])
+        assert between.sum() > 3
+        np.testing.assert_array_equal(truth.status, np.where(between, flag, 0))
+        expected = np.where(truth.g < at, 5e-3, 0.0)
+        np.testing.assert_allclose(truth.h[~between], expected[~between], atol=1e-15)
+        assert np.isfinite(truth.h[between]).all() == (flag == Status.AMBIGUOUS)
+
+
+def test_truth_follows_the_transport(rng: np.random.Generator) -> None:
+    ball = trimesh.creation.icosphere(6, 0.02)
+    light = light_of(
+        Scene.of(ball),
+        seen_by=sight(samples=64, lens=Lens(k1=-900.0, centre=(1e-4, -2e-4)), bins=1, u_edges=np.array([-9e-3, 9e-3])),
+    )
+    for L in rng.uniform(-5e-3, 5e-3, 4):
+        truth = light.truth(float(L))
+        seen = np.isfinite(truth.h)
+        assert seen.sum() > 30
+        radius = np.sqrt(truth.g**2 + L**2 + truth.h**2)[seen]
+        np.testing.assert_allclose(radius, 0.02, atol=0.02 * 4e-4)
+
+
+def test_beside_the_sensor() -> None:
+    """What is imaged beyond the ends of the strips is out of range, also if a lid hides a part; nothing is dark."""
+    for corners in (np.concatenate([plate(0.02, 0.02), plate(0.03, 0.03, 0.03)]), plate(z=-0.2)):
+        light = light_of(corners)
+        truth = light.truth(0.0)
+        np.testing.assert_array_equal(truth.status, Status.OUT_OF_RANGE)
+        assert np.isnan(truth.h).all()
+        assert light.exposures(0.0)["direct"].total().sum() == 0.0
+    away = light_of(plate(0.01, 0.01))
+    np.testing.assert_array_equal(away.truth(5.0).status, Status.DARK)
+    assert away.exposures(5.0)["direct"].power.shape == (8, 12)
+
+
+def test_in_a_slit_is_dark() -> None:
+    """A part wholly in a deep slit, lit from above: the lens sees the walls' upper edges alone."""
+    walls = [quad((-1, y, -0.05), (1, y, -0.05), (1, y, 0.0), (-1, y, 0.0)) for y in (-2e-3, 2e-3)]
+    scene = np.concatenate([plate(1.0, 2e-3, -0.05), *walls])
+    truth = light_of(scene, seen_by=sight(bins=1, u_edges=np.array([-0.1, 0.1]))).truth(0.0)
+    np.testing.assert_array_equal(truth.status, Status.DARK)
+    assert np.isnan(truth.g).all()
+
+
+# ---- materials and causes ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "lobe",
+    [Phong(albedo=0.4, exponent=2000.0), Ggx(alpha=0.02, facing=0.5), Ward(albedo=0.4, alpha_x=0.02, alpha_y=0.3)],
+)
+def test_lobes_are_resolved(lobe: Any) -> None:
+    """A lobe narrower than a sample: as a sum over a million points of the line."""
+    tilt = 0.25
+    fall = math.tan(tilt)
+    slope = quad((-1, -1, fall), (1, -1, fall), (1, 1, -fall), (-1, 1, -fall))
+    made_of = Material(diffuse=Lambert(albedo=0.2), gloss=lobe)
+    seen_by = sight(samples=2, bins=1)
+    light = light_of(slope, (made_of,), seen_by=seen_by)
+    found = light.exposures(0.0)
+    G = np.linspace(-0.03, 0.03, 1_000_001)
+    points = np.stack([G, 0.0 * G, 0.0 * G], axis=-1)
+    eye = seen_by.lens_at(0.0) - points
+    eye /= np.linalg.norm(eye, axis=1, keepdims=True)
+    normal, across = np.array([0.0, math.sin(tilt), math.cos(tilt)]), np.array([0.0, math.cos(tilt), -math.sin(tilt)])
+    local = np.stack([eye[:, 0], eye @ across, eye @ normal], axis=-1)
+    towards = np.broadcast_to([0.0, across[2], normal[2]], local.shape)
+    sent = lobe.value(np.concatenate([towards, local], axis=-1)) * local[:, 2] * seen_by.received(points)
+    uv = seen_by.project(points)
+    expected = seen_by.deposit(uv[:, 0], uv[:, 1], sent * (G[1] - G[0]))
+    np.testing.assert_allclose(found["specular"].total(), expected.total(), rtol=1e-4)
+    assert expected.total().min() > 0.0
+
+
+def test_causes() -> None:
+    """Even surfaces, and nothing in the way: without a screen and with white surfaces nothing changes."""
+    scene, materials = two_plates(0.2, 0.8)
+    light = light_of(scene, materials, seen_by=sight(), sigma=1e-4, sub_sheets=[0.0])
+    found = light.exposures(0.0, causes=True)
+    assert set(found) == {"direct", "specular", EVEN, OPEN, EVEN_OPEN}
+    np.testing.assert_array_equal(found[OPEN].power, found["direct"].power)
+    np.testing.assert_array_equal(found[EVEN].power, found[EVEN_OPEN].power)
+    ratio = found["direct"].total() / found[EVEN].total()
+    np.testing.assert_allclose(ratio, 0.5, rtol=1e-3)
+    assert not found["specular"].power.any()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"sub_sheets": 0}, "DirectLight.sub_sheets is 0"), ({"sub_sheets": [1.0, 0.0]}, "ascending places in sigmas")],
+)
+def test_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        light_of(plate(), sigma=1e-4, **wrong)
+    with pytest.raises(ValueError, match="expected one for each"):
+        light_of(plate(), ())
+    with pytest.raises(ValueError, match="different transports"):
+        DirectLight(
+            sight=sight(), scene=Scene(plate()), materials=(GREY,), sheet=LightSheet(transport=StraightTransport())
+        )

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.simulation.readings import Truth, dark_exposure, height_slope, lit_by
+from gpuvision.simulation.readings import Truth, dark_exposure, height_secant, height_slope, lit_by
 from gpuvision.simulation.sight import Exposure, Sight
 from gpuvision.tables import finite
 
@@ -24,6 +24,7 @@ Index = npt.NDArray[np.intp]
 
 _CHOICES = 16  # ends of a window that are tried at once
 _PAIRS_AT_ONCE = 4_000_000
+_ROUNDS = 30  # to the end of a window; each closes in by the share that the slope changes on the way
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,6 +64,37 @@ class Mask:
             if shares.ndim < 2 or not np.all((shares >= 0.0) & (shares <= 1.0)):
                 raise ValueError("Mask.transmission: expected (..., samples, bins) shares from 0 to 1")
             object.__setattr__(self, "transmission", shares)
+
+    @classmethod
+    def about(cls, sight: Sight, truth: Truth, reach: float) -> Mask:
+        """Return the mask that follows an expected profile: windows up to so much above and below it.
+
+        Parameters
+        ----------
+        sight
+            Of the sensor.
+        truth
+            Expected points, (samples,) or (profiles, samples). Where there is none the mask is closed.
+        reach
+            In height [m]; a window ends with the sensor at the latest.
+
+        Raises
+        ------
+        ValueError
+            The reach is not positive.
+        """
+        if not finite(reach, "reach") > 0.0:
+            raise ValueError(f"reach is {reach:g} m, expected a number > 0")
+        u, _ = height_slope(sight, truth)
+        low, high = sight.u_edges[0], sight.u_edges[-1]
+        ends = np.stack([u, u], axis=-1)
+        rise = np.array([-reach, reach])
+        for _ in range(_ROUNDS):
+            slope = height_secant(sight.triangulation, u[..., None], ends, sight.v_middles[:, None])
+            with np.errstate(invalid="ignore", divide="ignore"):
+                ends = np.clip(u[..., None] + rise / slope, low, high)
+        ends.sort(axis=-1)
+        return cls(windows=np.where(np.isnan(ends), low, ends))
 
     def apply(self, exposure: Exposure, u_edges: npt.ArrayLike) -> Exposure:
         """Return the light that passes.

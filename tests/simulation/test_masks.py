@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gpuvision.camera.lens import Lens
 from gpuvision.simulation.masks import Mask, optimise_mask
 from gpuvision.simulation.readings import Truth, height_secant, sheet_point
 from gpuvision.simulation.sight import Exposure
@@ -119,6 +121,24 @@ def test_what_is_refused() -> None:
         Mask(transmission=[[1.5]])
     with pytest.raises(ValueError, match="does not fit"):
         Mask(windows=[[0.0, 1.0]] * 3).apply(psd_sight().dark(), psd_sight().u_edges)
+
+
+@pytest.mark.parametrize("lens", [None, Lens(k1=-4000.0)])
+def test_mask_about_an_expected_profile(lens: Lens | None) -> None:
+    """Its ends are seen at the heights asked for, above and below; it is closed where nothing is expected."""
+    sight = psd_sight()
+    sight = replace(sight, triangulation=replace(sight.triangulation, lens=lens))
+    u = np.array([-2e-3, -1e-3, np.nan, 1e-3, 2.9e-3])
+    truth = Truth(*sheet_point(sight.triangulation, u, sight.v_middles), np.zeros(5, np.uint8))
+    windows = Mask.about(sight, truth, 2e-3).windows
+    assert windows[2, 0] == windows[2, 1]
+    assert windows[4, 1] == 0.5 * LENGTH
+    seen = [0, 1, 3]
+    for end, rise in ((0, -2e-3), (1, 2e-3)):
+        _, h = sheet_point(sight.triangulation, windows[:, end], sight.v_middles)
+        np.testing.assert_allclose(h[seen], truth.h[seen] + rise, atol=1e-12)
+    with pytest.raises(ValueError, match="reach is 0"):
+        Mask.about(sight, truth, 0.0)
 
 
 # ---- the best mask -------------------------------------------------------------------------------------------

@@ -116,6 +116,19 @@ class Artifacts:
         wrong = true & ~(np.abs(self.error) <= limit)
         return np.asarray(wrong.sum() / max(int(true.sum()), 1))
 
+    def without(self, flags: Status) -> Artifacts:
+        """Return them as if what has any of the flags were not read."""
+        dropped = (self.reading.status & flags) != 0
+        values = {name: np.where(dropped, np.nan, getattr(self.reading, name)) for name in ("position", "g", "h")}
+        reading = self.reading._replace(**values)
+        return replace(
+            self,
+            reading=reading,
+            error=np.where(dropped, np.nan, self.error),
+            causes={name: np.where(dropped, np.nan, part) for name, part in self.causes.items()},
+            verdict=verdict_of(reading.h, self.truth),
+        )
+
     def summary(self, limit: float) -> dict[str, Any]:
         """Return the numbers of a report; errors in metres, None where there is no reading at all.
 
@@ -224,12 +237,13 @@ def explain(
         error=error,
         causes=causes,
         light={name: _light_of(name, behind, detail) for name in causes},
-        verdict=_verdict(reading, truth),
+        verdict=verdict_of(reading.h, truth),
     )
 
 
-def _verdict(reading: Reading, truth: Truth) -> npt.NDArray[np.uint8]:
-    true, read = np.isfinite(truth.h), np.isfinite(reading.h)
+def verdict_of(h: Float64, truth: Truth) -> npt.NDArray[np.uint8]:
+    """Return uint8 `Verdict` flags of heights read, NaN where there is none, beside the truth."""
+    true, read = np.isfinite(truth.h), np.isfinite(h)
     several = (np.asarray(truth.status) & Status.AMBIGUOUS) != 0
     verdict = np.select([true & ~read, read & ~true, ~read & ~true], [Verdict.MISSING, Verdict.FALSE, Verdict.NOTHING])
     verdict = np.where(several & ~true, 0, verdict)

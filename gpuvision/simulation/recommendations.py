@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from gpuvision.host import Device
 from gpuvision.ranging.line import Choice
-from gpuvision.simulation.artifacts import Artifacts, Verdict, explain
+from gpuvision.simulation.artifacts import Artifacts, Verdict, explain, verdict_of
 from gpuvision.simulation.camera_simulator import CameraSimulator
 from gpuvision.simulation.readings import Reading, Truth
 from gpuvision.simulation.sight import Exposure
@@ -122,6 +122,8 @@ class Joined(NamedTuple):
         The point in the sheet of light [m]; NaN where neither can be trusted.
     sigma
         Standard deviation of h by the sensors' noise [m].
+    share
+        Of the first sensor in g and h, 0 to 1; NaN where there is no value.
     source
         int8: 0 none, 1 the first sensor, 2 the second, 3 both.
     status
@@ -132,6 +134,7 @@ class Joined(NamedTuple):
     g: Float64
     h: Float64
     sigma: Float64
+    share: Float64
     source: npt.NDArray[np.int8]
     status: npt.NDArray[np.uint8]
 
@@ -259,6 +262,57 @@ class DualSensor:
         return np.where(sure, np.array([FIRST, SECOND, BOTH])[best], NONE)
 
 
+def join_artifacts(first: Artifacts, second: Artifacts, rule: DualSensor, *, gap: float) -> Artifacts:
+    """Return what two sensors over one sheet make of a part together: for `rank`, beside each of them alone.
+
+    Parameters
+    ----------
+    first, second
+        What `explain` found for each, of the same profiles. The result lies where the first one's samples do.
+    rule
+        "predicted" takes their errors without noise for what a simulation predicts.
+    gap
+        As for `resampled` [m].
+
+    Returns
+    -------
+    Artifacts
+        Causes have the sensors' shares of the reading; what the second sensor's samples miss of the surface in between
+        is added to "shape". The position along u is NaN.
+
+    Raises
+    ------
+    ValueError
+        As `DualSensor.join`.
+    """
+    truth = first.truth
+    places = np.where(np.isfinite(first.reading.g), first.reading.g, truth.g)
+    other = resampled(second.reading, places, gap=gap)
+    parts = {
+        name: resampled(second.reading._replace(h=np.where(np.isfinite(second.error), part, np.nan)), places, gap=gap).h
+        for name, part in second.causes.items()
+    }
+    error = other.h - truth.h
+    parts["shape"] = parts["shape"] + (error - np.sum(list(parts.values()), axis=0))
+    joined = rule.join(first.reading, other, (first.error - first.causes["noise"], error - parts["noise"]))
+    total = joined.h - truth.h
+    causes = {}
+    for name in (name for name in first.causes if name in parts):
+        mean = joined.share * first.causes[name] + (1.0 - joined.share) * parts[name]
+        one = np.where(joined.share == 1.0, first.causes[name], np.where(joined.share == 0.0, parts[name], mean))
+        causes[name] = np.where(np.isfinite(total), one, np.nan)
+    nothing = np.full(joined.h.shape, np.nan)
+    strength = np.where(joined.share >= 0.5, first.reading.strength, other.strength)
+    return Artifacts(
+        reading=Reading(nothing, joined.g, joined.h, joined.sigma, strength, nothing, joined.status),
+        truth=truth,
+        error=total,
+        causes=causes,
+        light={name: first.light[name] for name in causes},
+        verdict=verdict_of(joined.h, truth),
+    )
+
+
 def resampled(reading: Reading, g: npt.ArrayLike, *, gap: float) -> Reading:
     """Return a profile at other places along the sheet: straight lines between its points.
 
@@ -321,12 +375,13 @@ def _taken(
     weights: tuple[Float64, Float64],
     both: npt.NDArray[np.bool_],
 ) -> Joined:
+    def chosen(one: Float64, other: Float64, mean: Float64) -> Float64:
+        return np.choose(source, [np.full(source.shape, np.nan), one, other, mean])
+
     def of(one: Float64, other: Float64) -> Float64:
-        mean = weights[0] * one + weights[1] * other
-        return np.choose(source, [np.full(one.shape, np.nan), one, other, mean])
+        return chosen(one, other, weights[0] * one + weights[1] * other)
 
     spread = np.hypot(weights[0] * first.sigma, weights[1] * second.sigma)
-    sigma = np.choose(source, [np.full(spread.shape, np.nan), first.sigma, second.sigma, spread])
     either = first.status | second.status
     own = np.choose(source, [np.where(both, int(Status.AMBIGUOUS), either), first.status, second.status, either])
     # A lone value that is not taken is no value: its flags do not say so.
@@ -334,7 +389,8 @@ def _taken(
     return Joined(
         g=of(first.g, second.g),
         h=of(first.h, second.h),
-        sigma=sigma,
+        sigma=chosen(first.sigma, second.sigma, spread),
+        share=chosen(np.ones(source.shape), np.zeros(source.shape), weights[0]),
         source=source.astype(np.int8),
         status=own.astype(np.uint8),
     )

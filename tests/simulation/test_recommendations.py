@@ -11,7 +11,17 @@ from gpuvision.ranging.psd import PsdNoise
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.simulation.artifacts import explain
 from gpuvision.simulation.readings import Reading, Truth, sheet_point
-from gpuvision.simulation.recommendations import BOTH, FIRST, NONE, SECOND, DualSensor, compare_peaks, rank, resampled
+from gpuvision.simulation.recommendations import (
+    BOTH,
+    FIRST,
+    NONE,
+    SECOND,
+    DualSensor,
+    compare_peaks,
+    join_artifacts,
+    rank,
+    resampled,
+)
 from gpuvision.simulation.sight import Exposure, Sight
 from gpuvision.status import Status
 from lights import camera, camera_sight, gaussian, psd, psd_sight
@@ -110,6 +120,32 @@ def test_half_a_beam_hidden_from_one(level: Truth, device: Device) -> None:
         assert (turned.source == SECOND).all()
     mean = DualSensor(rule="mean").join(whole, half)
     np.testing.assert_allclose(np.abs(mean.h), 0.5 * error, rtol=5e-3)
+
+
+def test_a_part_seen_by_two(level: Truth, device: Device) -> None:
+    """A pair is ranked beside either sensor alone: half of a beam is hidden from one here, from the other there."""
+    sight = psd_sight()
+    hidden = (ACROSS < X * SIGMA).astype(float)
+    found = []
+    for each, from_here in ((sight, [0, 1]), (facing(sight), [3, 4])):
+        whole, half = (thick_line(each, SIGMA, factor, ACROSS) for factor in (np.ones_like(ACROSS), hidden))
+        seen = np.isin(np.arange(5), from_here)[:, None]
+        light = Exposure(*(np.where(seen, one, other) for one, other in zip(half, whole, strict=True)))
+        variants = {"direct": light, "direct, even": light, "direct, open": whole, "direct, even, open": whole}
+        found.append(explain(psd(each), variants, level, device=device))
+    joined = join_artifacts(*found, DualSensor(rule="predicted"), gap=1.0)
+    assert joined.reading.h.shape == (5,)
+    candidates = {"first": found[0], "second": found[1], "pair": joined}
+    order = rank(candidates, 1e-6)
+    assert order[0].name == "pair"
+    assert [each.unread for each in order] == [0.0, 0.4, 0.4]
+    for each in candidates.values():
+        np.testing.assert_allclose(np.sum(list(each.causes.values()), axis=0), each.error, atol=1e-12)
+    flagged = join_artifacts(*found, DualSensor(tolerance=1e-6), gap=1.0)
+    assert np.isfinite(flagged.error).tolist() == [False, False, True, False, False]
+    assert flagged.summary(1e-6)["missing"] == 4
+    mean = join_artifacts(*found, DualSensor(rule="mean"), gap=1.0)
+    np.testing.assert_allclose(mean.causes["occlusion"][:2], 0.5 * found[0].causes["occlusion"][:2], rtol=1e-6)
 
 
 # ---- the rules -------------------------------------------------------------------------------------------------

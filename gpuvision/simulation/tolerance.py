@@ -1,0 +1,408 @@
+"""Model only what the scene requires: what may be left out of secondary light, to a proven error of the range."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device, Launch, Operation, Walk, in_strips, real_defines
+from gpuvision.simulation.clusters import COLUMNS, Clusters
+from gpuvision.simulation.range_error import StripReading
+from gpuvision.simulation.scene import Scene
+
+Reals = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int32]
+
+BLOCK = 16
+# Of a row of placed segments in kernels/tolerance.cl.
+_PLACED = 10
+_GROUP, _STRIPS_PER_CORE = 64, 8
+_CLEAR = 1 << 30
+# Picks of a block for which there is room at first; what needs more is planned again.
+_ROOM = 64
+# Twos by which the errors of picks are told apart when some of them are left out.
+_STEPS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class LightPlan:
+    """What of the light from lit segments is to be modelled; compared by identity.
+
+    Attributes
+    ----------
+    segments
+        float64 (m + clusters, 10): those given, and one for each cluster that stands for its parts somewhere.
+    starts
+        int32 (blocks + 1,): where the picks of each block of 16 receivers begin, block by block and strip by strip.
+    picks
+        int32: the segments that each needs, as `gpuvision.simulation.visible_light.VisibleLight` takes them: a number,
+        or ~number of one that nothing can hide.
+    tolerance
+        Metres, as asked for.
+    bound
+        (strips,), metres: what the plan may be off by in range, proven; 0 where nothing is left out.
+    worst
+        (strips,), metres: what leaving out all of it may be off by.
+    counts
+        "segments", as given; "pairs" of receiver and segment, all, and by what becomes of them: "exact", "clear" (those
+        of them that nothing can hide), "clustered", "left out"; "work": pairs that are left to compute.
+    """
+
+    segments: Reals
+    starts: Integers
+    picks: Integers
+    tolerance: float
+    bound: Reals
+    worst: Reals
+    counts: Mapping[str, int]
+
+    @property
+    def modelled(self) -> bool:
+        """Whether anything is left to compute."""
+        return bool(len(self.picks))
+
+    def tables(self, dtype: npt.DTypeLike, segments: int = 0, picks: int = 0) -> tuple[Any, Integers, Integers]:
+        """Return segments, starts and picks with room for so many, and up to a power of two, at least.
+
+        What is added has no exitance, and is picked by none: instances bound to few shapes serve many plans.
+        """
+        rows = np.zeros((_room(max(segments, len(self.segments))), 10), dtype)
+        rows[: len(self.segments)] = self.segments
+        rows[len(self.segments) :, 8] = 1.0
+        filled = np.zeros(_room(max(picks, len(self.picks))), np.int32)
+        filled[: len(self.picks)] = self.picks
+        return rows, self.starts, filled
+
+    def report(self) -> dict[str, Any]:
+        """Return what was modelled and what was left out, with which bound, as JSON takes it; no bound is None."""
+        return {
+            "modelled": self.modelled,
+            "tolerance": self.tolerance,
+            "bound": _largest(self.bound),
+            "bound if left out": _largest(self.worst),
+            "clusters": len(self.segments) - self.counts["segments"],
+            **self.counts,
+        }
+
+
+def _room(count: int) -> int:
+    return 1 << max(count - 1, 0).bit_length()
+
+
+def _largest(values: Reals) -> float | None:
+    largest = float(values.max(initial=0.0))
+    return largest if math.isfinite(largest) else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightPlanner:
+    """Leaves out of the light between surfaces what stays under a tolerance: ``planner(segments, ...) -> LightPlan``.
+
+    Parameters
+    ----------
+    tolerance
+        Metres of range; 0 leaves out only what is zero.
+    scene
+        What may stand between; None: nothing does.
+    clearance
+        Metres: what rises less above a receiver's or a lit surface does not hide anything.
+    clusters
+        Whether one segment may stand for several.
+    walk
+        "strip" (16 boxes at a time, for CPU runtimes), "item" (a work-item per block, for GPUs), or "auto".
+
+    Raises
+    ------
+    ValueError
+        The tolerance or the clearance is negative or no number.
+
+    Notes
+    -----
+    A receiver's irradiance from a segment is at most W cos cos / (pi r^2), W its power, with the largest cosines and
+    the least distance of any two points, and never more than W / (L r) of length L. The error of a segment that stands
+    for a cluster is in `gpuvision.simulation.clusters`. Visibility is between 0 and 1, and a cluster stands only where
+    nothing can hide any of it, so all this holds with occlusion. Each pair's share of the tolerance is as large as its
+    share of power times cost; what the shares leave over is then spent on the pairs with the least bounds. The kernels'
+    rounding comes on top.
+    """
+
+    tolerance: float
+    scene: Scene | None = None
+    clearance: float = 0.0
+    clusters: bool = True
+    walk: Walk = "auto"
+
+    def __post_init__(self) -> None:
+        for name in ("tolerance", "clearance"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"LightPlanner.{name} is {value!r}, expected metres, 0 or more")
+
+    def __call__(
+        self,
+        segments: npt.NDArray[Any],
+        receivers: npt.NDArray[Any],
+        weights: npt.NDArray[Any],
+        direct: StripReading,
+        *,
+        device: Device | None = None,
+    ) -> LightPlan:
+        """Plan a profile.
+
+        Parameters
+        ----------
+        segments
+            (m, 10): start, end [m], normal, exitance [W/m]; without exitance: none.
+        receivers
+            (strips, n, 6), float32 or float64: place and normal. Those without weight have no part in it.
+        weights
+            (strips, n, 2): W, and W times sensor unit about u = 0, by 1 W/m^2.
+        direct
+            What else falls on the strips.
+        device
+            Where to plan; `Device.best` if left out.
+        """
+        segments = np.asarray(segments, np.float64)
+        if receivers.ndim != 3 or receivers.shape[2] != 6 or weights.shape != (*receivers.shape[:2], 2):
+            raise ValueError(
+                f"expected receivers (strips, n, 6) and weights (strips, n, 2), got {receivers.shape}, {weights.shape}"
+            )
+        tree = Clusters.build(segments)
+        costs = direct.costs(weights)
+        return _planned(self, tree, segments, np.ascontiguousarray(receivers), costs, direct, device or Device.best())
+
+
+class _Found(NamedTuple):
+    """As kernels/tolerance.cl writes it."""
+
+    picks: Any
+    errors: Any
+    counts: Any
+    spent: Any
+    tallies: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PlanLight(Operation[_Found]):
+    """Traverses the clusters for every block of receivers (strips, n, 6)."""
+
+    Result: ClassVar[type[Any]] = _Found
+
+    nodes: int
+    segments: int
+    room: int
+    scene: Scene | None
+    clearance: float
+    clusters: bool
+    walk: Walk
+
+    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        if dtype not in (np.float32, np.float64):
+            raise TypeError(f"LightPlanner takes float32 or float64 receivers, got {dtype}")
+        if dtype == np.float64 and not device.has_double:
+            raise ValueError(f"device {device.label} has no double precision; give receivers as float32")
+        real = np.dtype(np.float64 if device.has_double else np.float32)
+        strips, count, _ = shape
+        of_strip = -(-count // BLOCK)
+        blocks = strips * of_strip
+        strip = in_strips(self.walk, device)
+        each = -(-blocks // (_STRIPS_PER_CORE * device.handle.max_compute_units)) if strip else 1
+        items = -(-blocks // max(each, 1))
+        whole = np.dtype(np.int32)
+        tables: list[Any] = [None] * 5
+        depth = 1
+        if self.scene is not None:
+            tables, depth = list(self.scene.bvh.tables(real)), self.scene.bvh.depth
+        present = {"STRIP": strip, "OCCLUDERS": self.scene is not None, "CLUSTERS": self.clusters}
+        margin = max(self.clearance, _rounding(self.scene, real))
+        return Launch(
+            stem="tolerance",
+            kernel="plan_light",
+            defines={
+                **real_defines(device, real),
+                **{name: None for name, is_present in present.items() if is_present},
+                "INPUT": "float" if dtype == np.float32 else "double",
+                "BVH_DEPTH": depth,
+                "BLOCK": BLOCK,
+            },
+            inputs=[
+                (shape, dtype),
+                ((strips, count), real),
+                ((strips,), real),
+                ((self.nodes, COLUMNS), real),
+                ((self.nodes, 2), whole),
+                ((self.segments, _PLACED), real),
+            ],
+            outputs={
+                "picks": ((blocks, self.room), whole),
+                "errors": ((blocks, self.room), np.dtype(np.float32)),
+                "counts": ((blocks,), whole),
+                "spent": ((blocks, 2), real),
+                "tallies": ((blocks, 2), whole),
+            },
+            arguments=[
+                *tables,
+                _middle(self.scene).astype(dtype),
+                real.type(margin),
+                *(np.uint32(value) for value in (self.room, blocks, of_strip, count, each)),
+            ],
+            global_size=(items,) if strip else (-(-items // _GROUP) * _GROUP,),
+            local_size=(1,) if strip else (_GROUP,),
+        )
+
+
+def _middle(scene: Scene | None) -> Reals:
+    return np.zeros(3) if scene is None else scene.bvh.middle
+
+
+def _largest_of(real: np.dtype[Any]) -> float:
+    return float(np.finfo(real).max)
+
+
+def _rounding(scene: Scene | None, real: np.dtype[Any]) -> float:
+    reach = 0.0 if scene is None else float(np.abs(scene.bvh.corners).max(initial=0.0))
+    return 64.0 * float(np.finfo(real).eps) * reach
+
+
+def _planned(
+    planner: LightPlanner,
+    tree: Clusters,
+    segments: Reals,
+    receivers: npt.NDArray[Any],
+    costs: Reals,
+    direct: StripReading,
+    device: Device,
+) -> LightPlan:
+    strips = len(costs)
+    of_strip = -(-receivers.shape[1] // BLOCK)
+    found = _traversed(planner, tree, segments, receivers, costs, device)
+    owner = np.repeat(np.arange(strips), of_strip)
+    spent = np.add.reduceat(found.spent, np.arange(strips) * of_strip) if of_strip else np.zeros((strips, 2))
+    held = np.arange(found.picks.shape[1]) < found.counts[:, None]
+    picks, errors = found.picks[held], found.errors[held].astype(np.float64)
+    block = np.repeat(np.arange(len(found.counts)), found.counts)
+    receivers_of = np.minimum(BLOCK, receivers.shape[1] - BLOCK * (np.arange(len(found.counts)) % max(of_strip, 1)))
+    worst = np.minimum(spent[:, 1], direct.widest())
+    kept, lost = _kept(picks, errors, owner[block], spent, worst, planner.tolerance)
+    bound = np.minimum(np.where(lost > 0.0, lost, 0.0), worst)
+    return _assembled(planner, tree, segments, picks[kept], block[kept], bound, worst, receivers_of)
+
+
+def _kept(
+    picks: Integers, errors: Reals, strip: npt.NDArray[np.int64], spent: Reals, worst: Reals, tolerance: float
+) -> tuple[npt.NDArray[np.bool_], Reals]:
+    """Return which picks stay when what is left of the tolerance is spent on the least, and all that is lost."""
+    strips = len(spent)
+    out = worst <= tolerance
+    single = picks >= 0
+    # Errors in steps of two below the tolerance; a step is left out whole.
+    with np.errstate(divide="ignore"):
+        below = np.floor(np.log2(tolerance) - np.log2(errors)) if tolerance > 0.0 else np.full(len(errors), -1.0)
+    step = np.clip(below, -1.0, _STEPS - 1.0).astype(np.int64)
+    able = single & (step >= 0)
+    sums = np.bincount(strip[able] * _STEPS + step[able], errors[able], strips * _STEPS).reshape(strips, _STEPS)
+    # The smallest are in the last step.
+    running = np.cumsum(sums[:, ::-1], axis=1)[:, ::-1]
+    fits = running <= (tolerance - spent[:, 0])[:, None]
+    cut = np.where(fits.any(axis=1), np.argmax(fits, axis=1), _STEPS)
+    dropped = np.where(cut < _STEPS, running[np.arange(strips), np.minimum(cut, _STEPS - 1)], 0.0)
+    kept = ~out[strip] & ~(able & (step >= cut[strip]))
+    return kept, np.where(out, worst, spent[:, 0] + dropped)
+
+
+def _assembled(
+    planner: LightPlanner,
+    tree: Clusters,
+    segments: Reals,
+    picks: Integers,
+    block: npt.NDArray[np.int64],
+    bound: Reals,
+    worst: Reals,
+    receivers_of: npt.NDArray[np.int64],
+) -> LightPlan:
+    """Turn picks of the kernel, by places in the tree and by nodes, into numbers of segments."""
+    cluster = picks < 0
+    clear = cluster | (picks >= _CLEAR)
+    numbers = np.zeros(len(picks), np.int64)
+    numbers[~cluster] = tree.order[picks[~cluster] & (_CLEAR - 1)] if len(segments) else 0
+    nodes, place = np.unique(~picks[cluster], return_inverse=True)
+    numbers[cluster] = len(segments) + place
+    starts = np.zeros(len(receivers_of) + 1, np.int32)
+    np.cumsum(np.bincount(block, minlength=len(receivers_of)), out=starts[1:])
+    each = receivers_of[block]
+    pairs = int(receivers_of.sum()) * len(segments)
+    exact = int(each[~cluster].sum())
+    clustered = int((each[cluster] * tree.spans[~picks[cluster], 1]).sum())
+    counts = {
+        "segments": len(segments),
+        "pairs": pairs,
+        "exact": exact,
+        "clear": int(each[~cluster & clear].sum()),
+        "clustered": clustered,
+        "left out": pairs - exact - clustered,
+        "work": int(each.sum()),
+    }
+    return LightPlan(
+        np.concatenate([segments, tree.aggregates[nodes]]),
+        starts,
+        np.where(clear, ~numbers, numbers).astype(np.int32),
+        planner.tolerance,
+        bound,
+        worst,
+        counts,
+    )
+
+
+def _traversed(
+    planner: LightPlanner,
+    tree: Clusters,
+    segments: Reals,
+    receivers: npt.NDArray[Any],
+    costs: Reals,
+    device: Device,
+) -> _Found:
+    real = np.dtype(np.float64 if device.has_double else np.float32)
+    middle = _middle(planner.scene)
+    rows = tree.rows.copy()
+    rows[:, :9] -= np.tile(middle, 3)
+    placed = np.zeros((len(tree.spans) // 2, _PLACED))
+    placed[: len(segments)] = _placed(segments[tree.order], middle)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = planner.tolerance / (costs.sum(axis=1) * tree.power)
+    shares = np.where(np.isnan(shares), 0.0, np.minimum(shares, _largest_of(real)))
+    room = min(_ROOM, max(2 * len(segments), 1))
+    while True:
+        operation = _PlanLight(
+            nodes=len(tree.spans),
+            segments=len(placed),
+            room=room,
+            scene=planner.scene,
+            clearance=planner.clearance,
+            clusters=planner.clusters,
+            walk=planner.walk,
+        )
+        found = operation(
+            receivers,
+            costs.astype(real),
+            shares.astype(real),
+            rows.astype(real),
+            tree.spans,
+            placed.astype(real),
+            device=device,
+        )
+        most = int(found.counts.max(initial=0))
+        if most <= room:
+            return found
+        room = _room(most)
+
+
+def _placed(segments: Reals, middle: Reals) -> Reals:
+    """Return (m, 10): normal, the height of its plane, start and end, from the middle."""
+    normal = segments[:, 6:9] / np.linalg.norm(segments[:, 6:9], axis=1, keepdims=True)
+    start, end = segments[:, :3] - middle, segments[:, 3:6] - middle
+    return np.column_stack([normal, np.sum(normal * start, axis=1), start, end])

@@ -1,0 +1,80 @@
+"""Light between pairs of segments and receivers by quadrature, and readings of strips, in NumPy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+_PANELS = 24
+
+
+def pair_irradiance(receivers: NDArray[Any], segments: NDArray[Any]) -> NDArray[np.float64]:
+    """Return (n, m): what each receiver (n, 6) gets from each segment (m, 10), nothing between them.
+
+    Gauss and Legendre on panels even in asinh of the distance along the line from its foot over that from the line.
+    """
+    place, normal = receivers[:, None, :3].astype(float), receivers[:, None, 3:].astype(float)
+    normal = normal / np.linalg.norm(normal, axis=2, keepdims=True)
+    start, end, lit = segments[None, :, :3], segments[None, :, 3:6], segments[None, :, 6:9]
+    lit = lit / np.linalg.norm(lit, axis=2, keepdims=True)
+    length = np.linalg.norm(end - start, axis=2)
+    along = (end - start) / length[..., None]
+    foot = np.sum((place - start) * along, axis=2)
+    rho = np.maximum(np.linalg.norm(place - start - foot[..., None] * along, axis=2), 1e-12)
+    height = np.sum((place - start) * lit, axis=2)
+    above, slope = -np.sum((place - start - foot[..., None] * along) * normal, axis=2), np.sum(along * normal, axis=2)
+    first, last = np.arcsinh(-foot / rho), np.arcsinh((length - foot) / rho)
+    total = np.zeros_like(rho)
+    for panel in range(_PANELS):
+        for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+            x = first + (last - first) * (panel + 0.5 + 0.5 * node) / _PANELS
+            cosine = np.maximum(above + slope * rho * np.sinh(x), 0.0)
+            total += weight * cosine / (rho * np.cosh(x)) ** 3
+    factor = np.maximum(height, 0.0) * segments[None, :, 9] / np.pi
+    return factor * total * (last - first) * 0.5 / _PANELS
+
+
+def hidden(origins: NDArray[Any], targets: NDArray[Any], triangles: NDArray[Any], clearance: float) -> NDArray[Any]:
+    """Return (k,): whether any triangle (t, 3, 3) lies between points (k, 3), ends excluded (Moeller, Trumbore)."""
+    way = targets - origins
+    length = np.linalg.norm(way, axis=1)
+    one, two = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    p = np.cross(way[:, None], two[None])
+    det = np.sum(p * one, axis=2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = origins[:, None] - triangles[None, :, 0]
+        u = np.sum(s * p, axis=2) / det
+        q = np.cross(s, one[None])
+        v = np.sum(way[:, None] * q, axis=2) / det
+        t = np.sum(two * q, axis=2) / det
+        margin = (clearance / length)[:, None]
+        met = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > margin) & (t < 1 - margin)
+    return np.asarray(np.any(met, axis=1))
+
+
+def visibility(
+    receivers: NDArray[Any], segments: NDArray[Any], triangles: NDArray[Any], points: int = 16
+) -> NDArray[np.float64]:
+    """Return (n, m): which part of each segment is not hidden, by rays to the middles of its parts.
+
+    What lies under the receiver's plane is not hidden: it sends no light anyway.
+    """
+    n, m = len(receivers), len(segments)
+    at = (np.arange(points) + 0.5) / points
+    on = segments[:, None, :3] + at[:, None] * (segments[:, None, 3:6] - segments[:, None, :3])
+    to = np.broadcast_to(on.reshape(1, -1, 3), (n, m * points, 3)).reshape(-1, 3)
+    origin = np.repeat(receivers[:, :3].astype(float), m * points, axis=0)
+    seen = np.concatenate(
+        [~hidden(origin[k : k + 20000], to[k : k + 20000], triangles, 1e-7) for k in range(0, len(origin), 20000)]
+    )
+    under = np.einsum("kx,kx->k", np.repeat(receivers[:, 3:], m * points, axis=0), to - origin) <= 0.0
+    return (seen | under).reshape(n, m, points).mean(axis=2)
+
+
+def reading(power: Any, moment: Any, weights: NDArray[Any], irradiance: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the mean u of strips: their direct light, and what receivers (strips, n) add."""
+    more = np.sum(weights * irradiance[..., None], axis=1)
+    return np.asarray((moment + more[:, 1]) / (power + more[:, 0]))

@@ -1,6 +1,7 @@
 // Irradiance of receivers (position, normal) from all lit segments, unoccluded. CPU runtimes take strips of 16
-// receivers, GPUs an item per receiver. Places are subtracted and turned into each segment's frame in `place`, double
-// wherever the device has it: 1e-6 of a segment's length away from it, single would have no digit left.
+// receivers, GPUs an item per receiver. Segments that lie alike, along one direction in surfaces of one normal, share a
+// frame: receivers are turned into it once, and a segment's start is subtracted there, both in `place`, double wherever
+// the device has it: 1e-6 of a segment's length away from it, single would have no digit left.
 #include "line_irradiance.h"
 #include "status.h"
 
@@ -30,29 +31,70 @@ typedef float places;
 #define narrow convert_real
 #endif
 
-// A row: start, direction, normal, across (3 places each), length; and in real the last four again, exitance / 2 pi.
-#define PLACES 13
-#define REALS 11
-
-inline places load_places(global const INPUT *receivers, int column) {
-#ifdef STRIP
-    global const INPUT *at = receivers + column;
-    return (places)(at[0], at[6], at[12], at[18], at[24], at[30], at[36], at[42],
-                    at[48], at[54], at[60], at[66], at[72], at[78], at[84], at[90]);
-#else
-    return receivers[column];
-#endif
+// Places and normals of 16 receivers, six numbers each, as columns. (From single numbers the compilers make gathers.)
+#if defined(STRIP) && __has_builtin(__builtin_shufflevector)
+typedef INPUT inputs __attribute__((ext_vector_type(16)));
+typedef inputs inputs_at __attribute__((aligned(sizeof(INPUT))));
+#define PART(a, b, first)                                                                                              \
+    __builtin_shufflevector(a, b, first, first + 2, first + 4, first + 6, first + 8, first + 10, first + 12,           \
+                            first + 14, first + 16, first + 18, first + 20, first + 22, first + 24, first + 26,        \
+                            first + 28, first + 30)
+// Of 48 numbers in three vectors, the 16 from `first` on, each third.
+__attribute__((always_inline)) inline places third(inputs a, inputs b, inputs c, int first) {
+    if (first == 0) {
+        const inputs two = __builtin_shufflevector(a, b, 0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0);
+        return convert_places(
+            __builtin_shufflevector(two, c, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29));
+    }
+    if (first == 1) {
+        const inputs two = __builtin_shufflevector(a, b, 1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0);
+        return convert_places(
+            __builtin_shufflevector(two, c, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30));
+    }
+    const inputs two = __builtin_shufflevector(a, b, 2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0);
+    return convert_places(__builtin_shufflevector(two, c, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31));
 }
+inline void load_columns(global const INPUT *at, places *columns) {
+    global const inputs_at *from = (global const inputs_at *)at;
+    const inputs a = from[0], b = from[1], c = from[2], d = from[3], e = from[4], f = from[5];
+#pragma unroll
+    for (int parity = 0; parity < 2; parity++) {
+        const inputs one = parity ? PART(a, b, 1) : PART(a, b, 0);
+        const inputs two = parity ? PART(c, d, 1) : PART(c, d, 0);
+        const inputs three = parity ? PART(e, f, 1) : PART(e, f, 0);
+#pragma unroll
+        for (int n = 0; n < 3; n++) columns[2 * n + parity] = third(one, two, three, n);
+    }
+}
+#elif defined(STRIP)
+inline void load_columns(global const INPUT *from, places *columns) {
+    for (int n = 0; n < 6; n++) {
+        global const INPUT *at = from + n;
+        columns[n] = (places)(at[0], at[6], at[12], at[18], at[24], at[30], at[36], at[42],
+                              at[48], at[54], at[60], at[66], at[72], at[78], at[84], at[90]);
+    }
+}
+#else
+inline void load_columns(global const INPUT *from, places *columns) {
+    for (int n = 0; n < 6; n++) columns[n] = from[n];
+}
+#endif
 
 inline places dot3(places x, places y, places z, global const place *row) {
     return x * row[0] + y * row[1] + z * row[2];
 }
-inline reals turned(reals x, reals y, reals z, global const real *row) { return x * row[0] + y * row[1] + z * row[2]; }
+inline reals turned(reals x, reals y, reals z, global const place *row) {
+    return x * (real)row[0] + y * (real)row[1] + z * (real)row[2];
+}
 
+// `middle`: what is subtracted from places first. frames: direction, normal, across (3 each); `firsts`: where the
+// segments of each frame begin, and the end of the last. starts: along, height, aside of a segment's start in its
+// frame, its length; lines: its length, exitance / 2 pi.
 kernel void line_irradiance(global const INPUT *restrict receivers, global real *restrict irradiance,
-                            global uchar *restrict status, global const place *restrict segment_places,
-                            global const real *restrict segment_reals, const uint segments, const ulong count,
-                            const ulong each) {
+                            global uchar *restrict status, constant place *restrict middle,
+                            global const place *restrict frames, global const uint *restrict firsts,
+                            global const place *restrict starts, global const real *restrict lines, const uint alike,
+                            const ulong count, const ulong each) {
     // The last vector, or work-group, moves back to end with the last receiver.
 #ifdef STRIP
     const ulong begin = get_global_id(0) * each, end = min(begin + each, count);
@@ -62,32 +104,39 @@ kernel void line_irradiance(global const INPUT *restrict receivers, global real 
     {
         const ulong i = min(get_group_id(0) * each, count - each) + get_local_id(0);
 #endif
-        global const INPUT *at = receivers + 6 * i;
-        const places x = load_places(at, 0), y = load_places(at, 1), z = load_places(at, 2);
-        places nx = load_places(at, 3), ny = load_places(at, 4), nz = load_places(at, 5);
-        const places longest = fmax(fmax(fabs(nx), fabs(ny)), fabs(nz));
-        nx /= longest;
-        ny /= longest;
-        nz /= longest;
-        const places per = (place)1 / sqrt(nx * nx + ny * ny + nz * nz);
-        const reals normal_x = narrow(nx * per), normal_y = narrow(ny * per), normal_z = narrow(nz * per);
+        places columns[6];
+        load_columns(receivers + 6 * i, columns);
+        const places x = columns[0] - middle[0], y = columns[1] - middle[1], z = columns[2] - middle[2];
+        // Normals may be of any length.
+        const places ax = fabs(columns[3]), ay = fabs(columns[4]), az = fabs(columns[5]);
+        const places two = ax > ay ? ax : ay, scale = (place)1 / (two > az ? two : az);
+        const reals nx = narrow(columns[3] * scale), ny = narrow(columns[4] * scale), nz = narrow(columns[5] * scale);
+        const reals per = (real)1 / sqrt(nx * nx + ny * ny + nz * nz);
+        const reals normal_x = nx * per, normal_y = ny * per, normal_z = nz * per;
         places sum = (place)0;
-        for (uint k = 0; k < segments; k++) {
-            global const place *row = segment_places + k * PLACES;
-            global const real *more = segment_reals + k * REALS;
-            const places dx = x - row[0], dy = y - row[1], dz = z - row[2];
-            const reals height = narrow(dot3(dx, dy, dz, row + 6));
-            // Most pairs do not face each other.
-            if (!any_lane(mask_of(height > (reals)0))) continue;
-            const places along = dot3(dx, dy, dz, row + 3);
-            const reals by_u = turned(normal_x, normal_y, normal_z, more);
-            const reals by_n = turned(normal_x, normal_y, normal_z, more + 3);
-            const reals by_w = turned(normal_x, normal_y, normal_z, more + 6);
-            const reals aside = narrow(dot3(dx, dy, dz, row + 9));
-            // The far end, too, may be near.
-            const reals past = narrow(row[12] - along);
-            sum += convert_places(more[10] * LANED(line_factor)(narrow(along), height, aside, past, (reals)more[9],
-                                                               by_u, by_n, by_w));
+        for (uint frame = 0; frame < alike; frame++) {
+            global const place *row = frames + frame * 9;
+            const places along = dot3(x, y, z, row), height = dot3(x, y, z, row + 3), aside = dot3(x, y, z, row + 6);
+            const reals by_u = turned(normal_x, normal_y, normal_z, row);
+            const reals by_n = turned(normal_x, normal_y, normal_z, row + 3);
+            const reals by_w = turned(normal_x, normal_y, normal_z, row + 6);
+            const uint last = firsts[frame + 1];
+            for (uint k = firsts[frame]; k < last;) {
+                // Few are summed in `real`.
+                reals few = (reals)0;
+                for (const uint to = min(k + 16, last); k < to; k++) {
+                    global const place *start = starts + 4 * k;
+                    const reals above = narrow(height - start[1]);
+                    // Most pairs do not face each other.
+                    if (!any_lane(mask_of(above > (reals)0))) continue;
+                    const places from = along - start[0];
+                    // The far end, too, may be near.
+                    few += lines[2 * k + 1] * LANED(line_factor)(narrow(from), above, narrow(aside - start[2]),
+                                                                narrow(start[3] - from), (reals)lines[2 * k], by_u,
+                                                                by_n, by_w);
+                }
+                sum += convert_places(few);
+            }
         }
         reals result = narrow(sum);
         const masks bad = mask_of(LANED(not_finite)(narrow(x))) | mask_of(LANED(not_finite)(narrow(y))) |

@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 from gpuvision.host import Device
 from gpuvision.simulation.illumination import LightSheet, LitLine
-from gpuvision.simulation.line_parts import LineOfSight, Parts, in_view, split_at, where_imaged
+from gpuvision.simulation.line_parts import Images, LineImages, LineOfSight, Parts, along
 from gpuvision.simulation.material import Material
 from gpuvision.simulation.readings import EVEN, EVEN_OPEN, OPEN, Truth
 from gpuvision.simulation.reflectance import Brdf, Ggx, Lambert, Phong, Ward
@@ -113,12 +113,14 @@ class DirectLight:
     device: Device | None = None
     slabs: Slabs = field(init=False, repr=False)
     _line_of_sight: LineOfSight = field(init=False, repr=False)
+    _images: Images = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         check_materials(self.scene, self.materials)
         if self.sheet.transport != self.sight.transport:
             raise ValueError("DirectLight: sheet and sight have different transports, expected the same one")
         object.__setattr__(self, "slabs", _slabs(self.sub_sheets if self.sheet.sigma > 0.0 else 1))
+        object.__setattr__(self, "_images", Images(self.sight))
         device = Device.best() if self.device is None else self.device
         object.__setattr__(self, "_line_of_sight", LineOfSight(scene=self.scene, device=device))
 
@@ -132,19 +134,23 @@ class DirectLight:
         line, first = self.sheet.lit_lines(self.scene, L + self.sheet.sigma * slabs.middle)
         slab = np.repeat(np.arange(len(slabs.share)), np.diff(first))
         line, kept = self._facing(line, L)
-        slab = slab[kept]
-        parts = in_view(self._line_of_sight.parts(line, sight.lens_at(L), hidden=causes), line, sight, L)
-        parts = self._split(parts, line, L)
+        images, slab = self._images.of(line.ends, L), slab[kept]
+        parts = images.in_view(self._line_of_sight.parts(line, sight.lens_at(L), hidden=causes))
+        parts = self._split(parts, images, line, L)
         # Both nodes of all parts.
         arriving = (line.power * line.lengths * slabs.share[slab])[parts.segment] * (parts.end - parts.start)
-        nodes = parts.at(line, _NODES[:, None]).reshape(-1, 3)
+        share = (parts.start + _NODES[:, None] * (parts.end - parts.start)).ravel()
         segment, seen = np.tile(parts.segment, 2), np.tile(parts.seen, 2)
-        sent = self._sent(line, segment, nodes, np.tile(0.5 * arriving, 2), L)
+        points = along(line.ends[segment], share)
+        sent = self._sent(line, segment, points, np.tile(0.5 * arriving, 2), L)
         wanted = {"direct": sent["diffuse"] * seen, "specular": sent["gloss"] * seen}
         if causes:
             wanted |= {EVEN: sent["even"] * seen, OPEN: sent["diffuse"], EVEN_OPEN: sent["even"]}
-        spread = self._spread(line, segment, nodes, L)
-        return _deposits(sight, sight.project(nodes, L), spread, slabs, slab[segment], wanted)
+        uv = images.at(segment, share)
+        spread = np.zeros(len(share))
+        if self.sheet.sigma > 0.0:
+            spread = images.speed(segment, share, uv, self._moved(line.normals[segment], points))
+        return _deposits(sight, uv, spread, slabs, slab[segment], wanted)
 
     def truth(self, L: float) -> Truth:
         """Return where the middle of the sheet truly is at a transport L [m], at the middle of each sample.
@@ -155,40 +161,36 @@ class DirectLight:
         """
         sight = self.sight
         line, _ = self._facing(self.sheet.lit(self.scene, L), L)
-        parts = in_view(self._line_of_sight.parts(line, sight.lens_at(L)), line, sight, L)
-        v = sight.project(parts.ends(line), L)[..., 1]
-        low, high = v.min(axis=1), v.max(axis=1)
+        images = self._images.of(line.ends, L)
+        parts = images.in_view(self._line_of_sight.parts(line, sight.lens_at(L)))
+        v = images.at(parts.segment, np.stack([parts.start, parts.end]))[..., 1]
+        low, high = v.min(axis=0), v.max(axis=0)
         # Half open, so that of two parts that touch one has the sample.
         first = np.searchsorted(sight.v_middles, low, side="left")
         count = np.maximum(np.searchsorted(sight.v_middles, high, side="left") - first, 0)
         owner, sample = np.repeat(np.arange(len(count)), count), ranges(first, count)
         mine = parts.those(owner)
-        share = where_imaged(mine, line, sight, sight.v_middles[sample], 1, L)
-        points = Parts(mine.segment, share, share, mine.seen).ends(line)[:, 0]
-        u = sight.project(points, L)[..., 0]
+        share = images.where(mine, sight.v_middles[sample], 1)
+        points = along(line.ends[mine.segment], share)
+        u = images.at(mine.segment, share)[:, 0]
         on = (u >= sight.u_edges[0]) & (u <= sight.u_edges[-1])
         light = (line.power * line.lengths)[mine.segment] * (mine.end - mine.start) / (high - low)[owner]
         return _chosen(sight.samples, sample, sight.sheet_coordinates(points, L), on, light)
 
     def _facing(self, line: LitLine, L: float) -> tuple[LitLine, Integers]:
-        """Return the segments whose lit side the lens can see, in samples that there are, and which those are."""
+        """Return the segments whose lit side the lens can see, and which those are."""
         kept = np.sum(line.normals * (self.sight.lens_at(L) - line.ends[:, 0]), axis=1) > 0.0
-        v = self.sight.project(line.ends, L)[..., 1]
-        known = np.isfinite(v)
-        low = np.where(known, v, -np.inf).min(axis=1)
-        high = np.where(known, v, np.inf).max(axis=1)
-        kept &= known.any(axis=1) & (high >= self.sight.v_edges[0]) & (low <= self.sight.v_edges[-1])
         which = np.flatnonzero(kept)
         return LitLine(line.ends[which], line.normals[which], line.triangle[which], line.power[which]), which
 
-    def _split(self, parts: Parts, line: LitLine, L: float) -> Parts:
+    def _split(self, parts: Parts, images: LineImages, line: LitLine, L: float) -> Parts:
         """Split parts at the edges of samples and bins, and where a lobe changes much."""
         u_edges = self.sight.u_edges
         if self.sheet.sigma > 0.0:
             # Light is spread onto the sensor from beyond its ends.
             u_edges = np.concatenate([[-np.inf], u_edges, [np.inf]])
-        parts = split_at(parts, line, self.sight, self.sight.v_edges, 1, L)
-        return self._split_lobes(split_at(parts, line, self.sight, u_edges, 0, L), line, L)
+        parts = images.split(images.split(parts, self.sight.v_edges, 1), u_edges, 0)
+        return self._split_lobes(parts, line, L)
 
     def _split_lobes(self, parts: Parts, line: LitLine, L: float) -> Parts:
         """Split parts on glossy surfaces until the half way vector turns little within each."""
@@ -231,18 +233,11 @@ class DirectLight:
                 sent["gloss"][mine] = arriving[mine] * made_of.gloss.value(directions)
         return sent
 
-    def _spread(self, line: LitLine, segment: Integers, points: Float64, L: float) -> Float64:
-        """Return how far an image moves along u as the sheet moves by one sigma over the surface, thought plane."""
-        sigma = self.sheet.sigma
-        if sigma == 0.0:
-            return np.zeros(len(points))
-        direction, normal = np.array(self.sheet.transport.direction), line.normals[segment]
-        light = self.sheet.towards(points)
-        slope = np.sum(normal * light, axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            moved = 0.5 * sigma * (direction - light * ((normal @ direction) / slope)[:, None])
-            ahead, behind = self.sight.project(np.stack([points + moved, points - moved]), L)[..., 0]
-        return np.asarray(np.nan_to_num(ahead - behind))
+    def _moved(self, normal: Float64, points: Float64) -> Float64:
+        """Return how lit points move over their planes as the sheet moves by one sigma."""
+        direction, light = np.array(self.sheet.transport.direction), self.sheet.towards(points)
+        slope = (normal @ direction) / np.sum(normal * light, axis=1)
+        return np.asarray(self.sheet.sigma * (direction - light * slope[:, None]))
 
 
 def _slabs(given: int | Sequence[float]) -> Slabs:

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.simulation.illumination import LitLine
-from gpuvision.simulation.line_parts import Parts, in_view, split_at
+from gpuvision.simulation.line_parts import Images, Parts
 from gpuvision.simulation.sight import Exposure, Sight
 
 Float64 = npt.NDArray[np.float64]
@@ -40,14 +39,12 @@ def line_exposure(sight: Sight, L: float, ends: Float64, strength: Strength) -> 
     Legendre's rule of 3 nodes integrates power and moment.
     """
     count = len(ends)
-    line = LitLine(ends, np.zeros((count, 3)), np.zeros(count, np.int64), np.zeros(count))
-    parts = Parts(np.arange(count), np.zeros(count), np.ones(count), np.ones(count, bool))
-    parts = in_view(parts, line, sight, L)
-    for axis, edges in ((1, sight.v_edges), (0, sight.u_edges)):
-        parts = split_at(parts, line, sight, edges, axis, L)
+    images = Images(sight).of(ends, L)
+    parts = images.in_view(Parts(np.arange(count), np.zeros(count), np.ones(count), np.ones(count, bool)))
+    parts = images.split(images.split(parts, sight.v_edges, 1), sight.u_edges, 0)
     width = parts.end - parts.start
     at = parts.start + _NODES[:, None] * width
     which = np.broadcast_to(parts.segment, at.shape)
     power = _WEIGHTS[:, None] * width * strength(which.ravel(), at.ravel()).reshape(at.shape)
-    places = sight.project(parts.at(line, np.broadcast_to(_NODES[:, None], at.shape)), L)
+    places = images.at(which, at)
     return sight.deposit(places[..., 0], places[..., 1], power)

@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
+from gpuvision.host.arrays import host_view
 from gpuvision.simulation.fans import FanIntervals
 from gpuvision.simulation.illumination import LitLine
 from gpuvision.simulation.scene import Scene
@@ -21,8 +23,11 @@ Integers = npt.NDArray[np.int64]
 
 # Parts that a segment is seen in; of one that has more, its halves are looked at.
 _KEPT, _HALVINGS = 8, 20
-_FEWEST_FANS = 256
-_BISECTIONS = 50
+# Fans in one go: one kernel, and one copy of the tree on the device, whatever the number of segments.
+_FANS = 1024
+# What lies this near to a limit of the view, in shares of the farther end's distance, is beyond it.
+_LEAST = 1e-9
+_BISECTIONS, _STEPS = 50, 3
 
 
 class Parts(NamedTuple):
@@ -52,10 +57,6 @@ class Parts(NamedTuple):
         at = np.stack([self.start, self.end], axis=1)
         return along(line.ends[self.segment][:, None], at)
 
-    def at(self, line: LitLine, share: Float64) -> Float64:
-        """Return places at shares of the parts' own lengths, (..., n) to (..., n, 3)."""
-        return along(line.ends[self.segment], self.start + share * (self.end - self.start))
-
 
 def along(ends: Float64, share: Float64) -> Float64:
     """Return places on segments (..., 2, 3) at shares of their lengths, exact at both ends."""
@@ -79,7 +80,12 @@ class LineOfSight:
 
     scene: Scene
     device: Device
-    _bound: dict[int, Any] = field(init=False, repr=False, default_factory=dict)
+    _bound: Any = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        real = np.dtype(np.float64 if self.device.has_double else np.float32)
+        fans = FanIntervals(scene=self.scene, kept=_KEPT)
+        object.__setattr__(self, "_bound", fans.bind(self.device, (_FANS, 11), real))
 
     def parts(self, line: LitLine, lens: Float64, *, hidden: bool = False) -> Parts:
         """Return the parts of segments that a lens (3,) sees, and those it does not if ``hidden``."""
@@ -98,26 +104,33 @@ class LineOfSight:
     def _seen(self, line: LitLine, parts: Parts, lens: Float64) -> tuple[Parts, npt.NDArray[np.bool_]]:
         """Return the visible parts of parts, and which had too many of them."""
         count = len(parts.segment)
-        bound = self._fans(count)
-        fans = np.full(bound.inputs[0].shape, np.nan, bound.inputs[0].dtype)
-        fans[:count, :3], fans[:count, 3:9], fans[:count, 9:] = lens, parts.ends(line).reshape(-1, 6), 0.0
-        bound.inputs[0].set(fans)
-        result = bound.run()
-        shown = result.intervals.get()[:count].astype(np.float64)
-        owner, which = np.nonzero(np.isfinite(shown[..., 0]))
-        low, high = shown[owner, which].T
-        start, size = parts.start[owner], (parts.end - parts.start)[owner]
-        end = np.where(high == 1.0, parts.end[owner], start + high * size)
-        visible = Parts(parts.segment[owner], start + low * size, end, np.ones(len(owner), bool))
-        return visible, (result.status.get()[:count] & Status.AMBIGUOUS) != 0
+        fans = np.zeros((count, 11))
+        fans[:, :3], fans[:, 3:9] = lens, parts.ends(line).reshape(-1, 6)
+        many = np.zeros(count, bool)
+        found = [parts.those(np.zeros(0, np.int64))]
+        for first in range(0, count, _FANS):
+            intervals, status = self._intervals(fans[first : first + _FANS])
+            many[first : first + _FANS] = (status & Status.AMBIGUOUS) != 0
+            owner, which = np.nonzero(np.isfinite(intervals[..., 0]))
+            low, high = intervals[owner, which].T.astype(np.float64)
+            owner += first
+            start, size = parts.start[owner], (parts.end - parts.start)[owner]
+            end = np.where(high == 1.0, parts.end[owner], start + high * size)
+            found.append(Parts(parts.segment[owner], start + low * size, end, np.ones(len(owner), bool)))
+        return together(found), many
 
-    def _fans(self, count: int) -> Any:
-        """Return a bound operation for that many fans or more."""
-        size = max(_FEWEST_FANS, 1 << (count - 1).bit_length())
-        if size not in self._bound:
-            real = np.dtype(np.float64 if self.device.has_double else np.float32)
-            self._bound[size] = FanIntervals(scene=self.scene, kept=_KEPT).bind(self.device, (size, 11), real)
-        return self._bound[size]
+    def _intervals(self, fans: Float64) -> tuple[npt.NDArray[Any], npt.NDArray[np.uint8]]:
+        """Return visible intervals of up to so many fans, and status flags."""
+        count, bound = len(fans), self._bound
+        given = np.full(bound.inputs[0].shape, np.nan, bound.inputs[0].dtype)
+        given[:count] = fans
+        if self.device.shares_memory:
+            host_view(bound.inputs[0])[:] = given
+            result = bound.run()
+            return host_view(result.intervals)[:count].copy(), host_view(result.status)[:count].copy()
+        bound.inputs[0].set(given)
+        result = bound.run()
+        return result.intervals.get()[:count], result.status.get()[:count]
 
 
 def together(parts: list[Parts]) -> Parts:
@@ -141,38 +154,147 @@ def _between(shown: Parts, count: int) -> Parts:
     return rest.those(rest.start < rest.end)
 
 
-def in_view(parts: Parts, line: LitLine, sight: Sight, L: float) -> Parts:
-    """Cut parts down to what lies in front of the lens and this side of the sheet's horizon."""
-    known = np.isfinite(sight.project(parts.ends(line), L)).all(axis=-1)
-    if known.all():
-        return parts
-    parts, known = parts.those(known.any(axis=1)), known[known.any(axis=1)]
-    start, end = parts.start.copy(), parts.end.copy()
-    cut = np.flatnonzero(~known.all(axis=1))
-    from_start = known[cut, 0]
-    good, bad = np.where(from_start, start[cut], end[cut]), np.where(from_start, end[cut], start[cut])
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (good + bad)
-        fine = np.isfinite(sight.project(along(line.ends[parts.segment[cut]], middle), L)).all(axis=-1)
-        good, bad = np.where(fine, middle, good), np.where(fine, bad, middle)
-    start[cut], end[cut] = np.where(from_start, start[cut], good), np.where(from_start, good, end[cut])
-    return parts._replace(start=start, end=end)
+class Images:
+    """Where a sensor images places on straight segments.
+
+    Without distortion (u, v) is a ratio of two functions that are straight along a segment, so that it is known where
+    the image of a segment crosses an edge.
+
+    Parameters
+    ----------
+    sight
+        The sensor.
+    """
+
+    def __init__(self, sight: Sight) -> None:
+        move = sight.transport
+        axes = np.array([move.g_axis, move.h_axis])
+        normal, to_sheet = np.cross(*axes), np.array(move.origin) - np.array(sight.lens)
+        off = float(to_sheet @ normal)
+        # From a ray to the sheet's (G, H, 1), and on to the sensor's (u, v, 1), but for factors.
+        in_sheet = (off * np.eye(3) - np.outer(normal, to_sheet)) @ np.linalg.pinv(axes)
+        homography = np.array(sight.triangulation.homography)
+        middle = np.append(np.mean(np.array(sight.triangulation.region), axis=1), 1.0)
+        in_front = np.sign(off) * np.sign(homography[2] @ middle)
+        lifting = in_front * np.column_stack([in_sheet, normal]) @ np.linalg.inv(homography).T
+        self._sight, self._lens = sight, sight.triangulation.sensor_lens
+        self._lifting = lifting
+        # In front of the lens, towards the sheet, this side of its horizon: all are positive.
+        self._limits = np.column_stack([np.array(sight.axis), np.sign(off) * normal, lifting[:, 2]])
+
+    def of(self, ends: Float64, L: float) -> LineImages:
+        """Return the images of segments (m, 2, 3) at a transport [m]."""
+        rays = ends - self._sight.lens_at(L)
+        lifted = rays @ self._lifting
+        return LineImages(self._lens, self._lifting, rays @ self._limits, lifted[:, 0], lifted[:, 1] - lifted[:, 0])
 
 
-def split_at(parts: Parts, line: LitLine, sight: Sight, edges: Float64, axis: int, L: float) -> Parts:
-    """Split parts where their images cross edges in u (axis 0) or v (axis 1); drop what lies beyond the outer ones."""
-    place = sight.project(parts.ends(line), L)[..., axis]
-    low, high = place.min(axis=1), place.max(axis=1)
-    on = (high >= edges[0]) & (low <= edges[-1])
-    parts, place, low, high = parts.those(on), place[on], low[on], high[on]
-    first = np.searchsorted(edges, low, side="right")
-    count = np.maximum(np.searchsorted(edges, high, side="left") - first, 0)
-    if count.any():
-        owner, edge = np.repeat(np.arange(len(count)), count), ranges(first, count)
-        cuts = where_imaged(parts.those(owner), line, sight, edges[edge], axis, L)
-        parts = _cut(parts, count, cuts, place[:, 1] < place[:, 0])
-    middle = sight.project(parts.at(line, np.full(len(parts.start), 0.5)), L)[..., axis]
-    return parts.those((middle >= edges[0]) & (middle <= edges[-1]) & (parts.start < parts.end))
+@dataclass(frozen=True, eq=False)
+class LineImages:
+    """Images of lit segments; `Images` makes them.
+
+    Attributes
+    ----------
+    lens
+        The sensor's distortion.
+    lifting
+        (3, 3): from metres to (u, v, 1) but for a factor.
+    limits
+        (m, 2, 3): of both ends of the segments; what is imaged has positive ones.
+    start, way
+        (m, 3): the lifted start of a segment, and from there to its end.
+    """
+
+    lens: Lens | None
+    lifting: Float64
+    limits: Float64
+    start: Float64
+    way: Float64
+
+    def at(self, segment: Integers, share: Float64) -> Float64:
+        """Return (u, v) of places on segments, (..., 2); NaN where the distortion folds."""
+        lifted = self.start[segment] + share[..., None] * self.way[segment]
+        straight = np.asarray(lifted[..., :2] / lifted[..., 2:])
+        return straight if self.lens is None else self.lens.distort(straight)
+
+    def speed(self, segment: Integers, share: Float64, uv: Float64, moved: Float64) -> Float64:
+        """Return how fast u of places imaged at (u, v) changes as they move, in metres, (n, 3)."""
+        lifted = self.start[segment] + share[:, None] * self.way[segment]
+        straight, per = lifted[:, :2] / lifted[:, 2:], 1.0 / lifted[:, 2]
+        change = moved @ self.lifting
+        u, v = ((change[:, :2] - straight * change[:, 2:]) * per[:, None]).T
+        if self.lens is None:
+            return np.asarray(u)
+        (a, b), (c, d) = np.moveaxis(self.lens.jacobian(uv), 0, -1)
+        return np.asarray((d * u - b * v) / (a * d - b * c))
+
+    def in_view(self, parts: Parts) -> Parts:
+        """Cut parts down to what lies in front of the lens, this side of the horizon, and before the lens' fold."""
+        for start, end in np.moveaxis(self.limits, -1, 0).transpose(0, 2, 1):
+            if min(start.min(initial=1.0), end.min(initial=1.0)) > 0.0:
+                continue
+            least = _LEAST * np.maximum(np.abs(start), np.abs(end))
+            share = np.divide(least - start, end - start, out=np.zeros_like(start), where=start != end)
+            low = np.where(start > least, 0.0, np.where(end > least, share, 1.0))[parts.segment]
+            high = np.where(end > least, 1.0, np.where(start > least, share, 0.0))[parts.segment]
+            parts = parts._replace(start=np.maximum(parts.start, low), end=np.minimum(parts.end, high))
+        parts = parts.those(parts.start < parts.end)
+        return parts if self.lens is None else self._before_the_fold(parts)
+
+    def _before_the_fold(self, parts: Parts) -> Parts:
+        shares = np.stack([parts.start, parts.end])
+        known: npt.NDArray[np.bool_] = np.isfinite(self.at(parts.segment, shares).sum(axis=-1))
+        if known.all():
+            return parts
+        kept = np.flatnonzero(known.any(axis=0))
+        parts, known = parts.those(kept), known[:, kept]
+        good = np.where(known[0], parts.start, parts.end)
+        bad = np.where(known[0], parts.end, parts.start)
+        bad = np.where(known.all(axis=0), good, bad)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (good + bad)
+            fine = np.isfinite(self.at(parts.segment, middle)).all(axis=-1)
+            good, bad = np.where(fine, middle, good), np.where(fine, bad, middle)
+        start = np.where(known[0], parts.start, good)
+        return parts._replace(start=start, end=np.where(known[1], parts.end, good))
+
+    def split(self, parts: Parts, edges: Float64, axis: int) -> Parts:
+        """Split parts where they cross edges in u (axis 0) or v (axis 1); drop what lies beyond the outer ones."""
+        first, last = self.at(parts.segment, np.stack([parts.start, parts.end]))[..., axis]
+        low, high = np.minimum(first, last), np.maximum(first, last)
+        begin = np.searchsorted(edges, low, side="right")
+        count = np.maximum(np.searchsorted(edges, high, side="left") - begin, 0)
+        if count.any():
+            owner, edge = np.repeat(np.arange(len(count)), count), ranges(begin, count)
+            cuts = self.where(parts.those(owner), edges[edge], axis)
+            parts = _cut(parts, count, cuts, last < first)
+        middle = self.at(parts.segment, 0.5 * (parts.start + parts.end))[:, axis]
+        return parts.those((middle >= edges[0]) & (middle <= edges[-1]) & (parts.start < parts.end))
+
+    def where(self, parts: Parts, value: Float64, axis: int) -> Float64:
+        """Return where on its segment each part has a coordinate u (axis 0) or v (1), which it has within the part.
+
+        With distortion, Newton's steps from where it would be if the other coordinate were that of the part's middle.
+        """
+        straight = value
+        if self.lens is not None:
+            middle = self.at(parts.segment, 0.5 * (parts.start + parts.end))
+            middle[:, axis] = value
+            straight = self.lens.undistort(middle)[:, axis]
+        start, way = self.start[parts.segment], self.way[parts.segment]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = (straight * start[:, 2] - start[:, axis]) / (way[:, axis] - straight * way[:, 2])
+        found = self._within(parts, found)
+        for _ in range(0 if self.lens is None else _STEPS):
+            step = np.where(2.0 * found < parts.start + parts.end, 1e-4, -1e-4) * (parts.end - parts.start)
+            here, there = self.at(parts.segment, np.stack([found, found + step]))[..., axis]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                found = self._within(parts, found + (value - here) * step / (there - here))
+        return found
+
+    def _within(self, parts: Parts, share: Float64) -> Float64:
+        middle = 0.5 * (parts.start + parts.end)
+        return np.clip(np.where(np.isfinite(share), share, middle), parts.start, parts.end)
 
 
 def _cut(parts: Parts, count: Integers, cuts: Float64, reverse: npt.NDArray[np.bool_]) -> Parts:
@@ -186,26 +308,3 @@ def _cut(parts: Parts, count: Integers, cuts: Float64, reverse: npt.NDArray[np.b
     start = np.where(number == 0, parts.start[owner], cuts[np.clip(left, 0, most)])
     end = np.where(number == last, parts.end[owner], cuts[np.clip(right, 0, most)])
     return parts.those(owner)._replace(start=start, end=end)
-
-
-def where_imaged(parts: Parts, line: LitLine, sight: Sight, value: Float64, axis: int, L: float) -> Float64:
-    """Return where on its segment each part's image has a coordinate u (axis 0) or v (1), which it has within the part.
-
-    Exact without distortion, where the image of a straight line is a ratio of straight lines; with it, two secants
-    from there.
-    """
-    place = sight.project(parts.at(line, np.array([[0.0], [0.5], [1.0]])), L)[..., axis]
-    one, two = place[1] - place[0], place[2] - place[1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        lean = np.where(one * two > 0.0, one / two, 1.0)
-        low, high = value - place[0], lean * (place[2] - value)
-        share = np.where(low + high != 0.0, low / (low + high), 0.5)
-    share = np.clip(share, 0.0, 1.0)
-    if sight.triangulation.sensor_lens is not None:
-        for step in (1e-3, 1e-5):
-            beside = np.where(share < 0.5, share + step, share - step)
-            here, there = sight.project(parts.at(line, np.stack([share, beside])), L)[..., axis]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                better = share + (value - here) * (beside - share) / (there - here)
-            share = np.where(np.isfinite(better), np.clip(better, 0.0, 1.0), share)
-    return np.asarray(parts.start + share * (parts.end - parts.start))

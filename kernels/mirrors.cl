@@ -15,14 +15,19 @@
 // A row: first corner; two edges; three normals; both edges on each normal; first corner from the other two on their
 // normals.
 #define ROW 26
+// Of a block of triangles: middle, radius; axis of its normals, cosine and sine of twice their cone.
+#define BLOCK 9
 #define STEPS 16
+#define TANGENTS 4
 // How far out of the triangle, in its own size, the linear guess may lie.
 #define MARGIN ((real)0.5)
 #ifdef REAL_IS_DOUBLE
 #define NEAR_ENOUGH ((real)1e-7)
+#define SLACK ((real)1e-12)
 #define GRAZING ((real)1e-9)
 #else
 #define NEAR_ENOUGH ((real)1e-3)
+#define SLACK ((real)1e-5)
 #define GRAZING ((real)1e-4)
 #endif
 
@@ -136,6 +141,25 @@ INLINE masks guessed(Vector point, Fixed lens, global const real *row, reals *x,
     return facing & mask_of(a * per > least) & mask_of(*x > least) & mask_of(*y > least);
 }
 
+// Whether a block of triangles may show a point. Reflection turns a direction by twice what it turns the normal, so the
+// point lies within a cone: about the way of the lens' ray off the block's middle, as wide as twice the cone of the
+// normals and what the block spans as seen from the lens and from the point.
+INLINE masks may_show(Vector point, Fixed lens, global const real *block) {
+    const Fixed middle = fixed_at(block), axis = fixed_at(block + 4);
+    const real radius = block[3], cx = lens.x - middle.x, cy = lens.y - middle.y, cz = lens.z - middle.z;
+    const real square = cx * cx + cy * cy + cz * cz, per = (real)1 / sqrt(square);
+    const real sine = radius * per, cosine = sqrt(max((real)1 - sine * sine, (real)0));
+    const real cos_all = block[7] * cosine - block[8] * sine, sin_all = block[8] * cosine + block[7] * sine;
+    const Vector q = moved(point, middle, -1);
+    const reals far = dot_of(q, q), room = far - radius * radius, zero = (real)0;
+    // Too wide to say: both cosines say whether the sum is beyond a right angle.
+    if (!(sine < (real)1 && block[7] > (real)0 && cos_all > (real)0)) return mask_of(far >= zero);
+    const real up = (real)2 * per * (cx * axis.x + cy * axis.y + cz * axis.z);
+    const Fixed on = {up * axis.x - cx * per, up * axis.y - cy * per, up * axis.z - cz * per};
+    const reals least = cos_all * sqrt(room > zero ? room : zero) - (reals)(sin_all * radius);
+    return mask_of(room <= zero) | mask_of(dot_fixed(q, on) >= least - SLACK * sqrt(far));
+}
+
 INLINE reals within(reals value, real limit) {
     const reals high = limit, low = -limit;
     value = value > high ? high : value;
@@ -194,7 +218,8 @@ kernel void mirror_points(global const INPUT *restrict points, global const INPU
                           global INPUT *restrict places, global real *restrict moves, global real *restrict densities,
                           global int *restrict triangles, global uchar *restrict counts, global uchar *restrict status,
                           global const real *restrict table, global const int *restrict numbers,
-                          constant INPUT *middle, const uint rows, const uint kept, const ulong count) {
+                          global const real *restrict block_table, global const int *restrict starts,
+                          constant INPUT *middle, const uint blocks, const uint kept, const ulong count) {
     const ulong i = get_global_id(0) * LANES;
     if (i >= count) return;
     const int last = (int)min(count - i, (ulong)LANES) - 1;
@@ -209,35 +234,39 @@ kernel void mirror_points(global const INPUT *restrict points, global const INPU
                       mask_of(LANED(not_finite)(step.x + step.y + step.z));
     uint found[LANES];
     for (int n = 0; n < LANES; n++) found[n] = 0;
-    for (uint k = 0; k < rows; k++) {
-        global const real *row = table + (size_t)k * ROW;
-        reals x, y;
-        const masks near = guessed(point, lens, row, &x, &y) & ~bad;
-        if (!any_lane(near)) continue;
-        x = zero_where(~near, x);
-        y = zero_where(~near, y);
-        Reflection it;
-        const masks met = near & solved(point, lens_wide, row, &x, &y, &it);
-        if (!any_lane(met)) continue;
-        const Vector move = place_moves(&it, step);
-        real values[7][LANES];
-        bits shown[LANES];
-        unpacked(it.place.x, values[0]), unpacked(it.place.y, values[1]), unpacked(it.place.z, values[2]);
-        unpacked(move.x, values[3]), unpacked(move.y, values[4]), unpacked(move.z, values[5]);
-        unpacked(concentration(&it), values[6]);
-        unpacked(as_reals(met), (real *)shown);
-        for (int n = 0; n <= last; n++) {
-            if (!shown[n]) continue;
-            if (found[n] < kept) {
-                const size_t slot = (i + n) * kept + found[n];
-                for (int m = 0; m < 3; m++) {
-                    places[3 * slot + m] = (INPUT)values[m][n] + middle[m];
-                    moves[3 * slot + m] = values[3 + m][n];
+    for (uint b = 0; b < blocks; b++) {
+        const masks may = may_show(point, lens, block_table + (size_t)b * BLOCK) & ~bad;
+        if (!any_lane(may)) continue;
+        for (uint k = starts[b]; k < (uint)starts[b + 1]; k++) {
+            global const real *row = table + (size_t)k * ROW;
+            reals x, y;
+            const masks near = guessed(point, lens, row, &x, &y) & may;
+            if (!any_lane(near)) continue;
+            x = zero_where(~near, x);
+            y = zero_where(~near, y);
+            Reflection it;
+            const masks met = near & solved(point, lens_wide, row, &x, &y, &it);
+            if (!any_lane(met)) continue;
+            const Vector move = place_moves(&it, step);
+            real values[7][LANES];
+            bits shown[LANES];
+            unpacked(it.place.x, values[0]), unpacked(it.place.y, values[1]), unpacked(it.place.z, values[2]);
+            unpacked(move.x, values[3]), unpacked(move.y, values[4]), unpacked(move.z, values[5]);
+            unpacked(concentration(&it), values[6]);
+            unpacked(as_reals(met), (real *)shown);
+            for (int n = 0; n <= last; n++) {
+                if (!shown[n]) continue;
+                if (found[n] < kept) {
+                    const size_t slot = (i + n) * kept + found[n];
+                    for (int m = 0; m < 3; m++) {
+                        places[3 * slot + m] = (INPUT)values[m][n] + middle[m];
+                        moves[3 * slot + m] = values[3 + m][n];
+                    }
+                    densities[slot] = values[6][n];
+                    triangles[slot] = numbers[k];
                 }
-                densities[slot] = values[6][n];
-                triangles[slot] = numbers[k];
+                found[n]++;
             }
-            found[n]++;
         }
     }
     real wrong[LANES];
@@ -251,5 +280,67 @@ kernel void mirror_points(global const INPUT *restrict points, global const INPU
         }
         counts[i + n] = (uchar)min(found[n], kept);
         status[i + n] = as_bits(wrong[n]) ? STATUS_NOT_FINITE : found[n] > kept ? STATUS_AMBIGUOUS : STATUS_OK;
+    }
+}
+
+// Of y = start + t way, how far it is inside a cone: y axis - cosine |y|, which bends downwards; its slope.
+INLINE reals inside_cone(Vector start, Vector way, reals t, Fixed axis, real cosine, reals *slope) {
+    const Vector y = sum_of(start, scaled(way, t));
+    const reals length = sqrt(dot_of(y, y));
+    *slope = dot_fixed(way, axis) - cosine * (dot_of(y, way) / length);
+    return dot_fixed(y, axis) - cosine * length;
+}
+
+// Whether a lens may see a part of a line in a block of mirrors: the cone of `may_show` about a ball lies in one with
+// its tip before the ball, and tangents say how deep in that the line may get.
+INLINE masks may_show_part(Vector start, Vector way, Fixed lens, global const real *block) {
+    const Fixed middle = fixed_at(block), axis = fixed_at(block + 4);
+    const real radius = block[3], cx = lens.x - middle.x, cy = lens.y - middle.y, cz = lens.z - middle.z;
+    const real square = cx * cx + cy * cy + cz * cz, per = (real)1 / sqrt(square);
+    const real sine = radius * per, cosine = sqrt(max((real)1 - sine * sine, (real)0));
+    const real cos_all = block[7] * cosine - block[8] * sine, sin_all = block[8] * cosine + block[7] * sine;
+    const reals zero = (real)0, one = (real)1;
+    if (!(sine < (real)1 && block[7] > (real)0 && cos_all > (real)0)) return mask_of(way.x - way.x <= zero);
+    const real up = (real)2 * per * (cx * axis.x + cy * axis.y + cz * axis.z), back = radius / sin_all;
+    const Fixed on = {up * axis.x - cx * per, up * axis.y - cy * per, up * axis.z - cz * per};
+    const Vector from = {start.x - (middle.x - back * on.x), start.y - (middle.y - back * on.y),
+                         start.z - (middle.z - back * on.z)};
+    reals low = zero, high = one, low_slope, high_slope, slope;
+    reals at_low = inside_cone(from, way, low, on, cos_all, &low_slope);
+    reals at_high = inside_cone(from, way, high, on, cos_all, &high_slope);
+    const reals slack = SLACK * ((reals)back + sqrt(dot_of(from, from)) + sqrt(dot_of(way, way)));
+    masks seen = mask_of(at_low >= -slack) | mask_of(at_high >= -slack);
+    masks open = ~seen & mask_of(low_slope > zero) & mask_of(high_slope < zero);
+    for (int n = 0; n < TANGENTS && any_lane(open); n++) {
+        const reals place = (at_high - at_low + low_slope * low - high_slope * high) / (low_slope - high_slope);
+        open &= mask_of(at_low + low_slope * (place - low) >= -slack);
+        const reals value = inside_cone(from, way, place, on, cos_all, &slope);
+        seen |= open & mask_of(value >= -slack);
+        open &= ~seen;
+        const masks rising = mask_of(slope > zero);
+        low = rising ? place : low, at_low = rising ? value : at_low, low_slope = rising ? slope : low_slope;
+        high = rising ? high : place, at_high = rising ? at_high : value, high_slope = rising ? high_slope : slope;
+    }
+    return seen | open;
+}
+
+// Which lines (both ends) a lens may see in which blocks of mirrors.
+kernel void mirror_facets(global const INPUT *restrict lines, global const INPUT *restrict lens_place,
+                          global uchar *restrict near, global const real *restrict block_table, constant INPUT *middle,
+                          const uint blocks, const ulong count) {
+    const ulong i = get_global_id(0) * LANES;
+    if (i >= count) return;
+    const int last = (int)min(count - i, (ulong)LANES) - 1;
+    global const INPUT *at = lines + 6 * i;
+    const Vector start = {loaded(at, 0, middle[0], last), loaded(at, 1, middle[1], last),
+                          loaded(at, 2, middle[2], last)};
+    const Vector end = {loaded(at, 3, middle[0], last), loaded(at, 4, middle[1], last), loaded(at, 5, middle[2], last)};
+    const Fixed lens = {(real)(lens_place[0] - middle[0]), (real)(lens_place[1] - middle[1]),
+                        (real)(lens_place[2] - middle[2])};
+    const Vector way = minus(end, start);
+    for (uint b = 0; b < blocks; b++) {
+        real seen[LANES];
+        unpacked(as_reals(may_show_part(start, way, lens, block_table + (size_t)b * BLOCK)), seen);
+        for (int lane = 0; lane <= last; lane++) near[(i + lane) * blocks + b] = as_bits(seen[lane]) != 0;
     }
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -10,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.simulation.bvh import Bvh
 from gpuvision.simulation.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
-_ROW, _GROUP, _LANES = 26, 64, 16
+_ROW, _BLOCK, _GROUP, _LANES = 26, 9, 64, 16
 _CREASE = math.radians(40.0)
 
 
@@ -88,6 +90,73 @@ class MirroredPoints(NamedTuple):
     status: Any
 
 
+class Blocks(NamedTuple):
+    """Triangles by the leaves of a tree, and what holds each leaf's: a ball, and a cone of normals.
+
+    Attributes
+    ----------
+    order
+        (m,): the triangles.
+    start
+        (b + 1,): where blocks begin in it, and the end of the last.
+    middle, radius
+        (b, 3), (b,): a ball about the triangles, as they bulge.
+    axis, cone
+        (b, 3), (b,): unit vector, and the angle to it within which all normals lie [rad].
+    """
+
+    order: npt.NDArray[np.int64]
+    start: npt.NDArray[np.int64]
+    middle: Float64
+    radius: Float64
+    axis: Float64
+    cone: Float64
+
+    @classmethod
+    def of(cls, corners: Float64, normals: Float64, sorted_by: Float64 | None = None) -> Blocks:
+        """Return the blocks of triangles and the normals at their corners, each (m, 3, 3).
+
+        They are sorted as if they stood where ``sorted_by`` says, (m, 3, 3); None: where they do.
+        """
+        if not len(corners):
+            none = np.zeros(0)
+            return cls(none.astype(int), np.zeros(1, int), none.reshape(0, 3), none, none.reshape(0, 3), none)
+        members = Bvh.build(corners if sorted_by is None else sorted_by).members
+        order, count = members[members >= 0], (members >= 0).sum(axis=1)
+        start = np.append(0, np.cumsum(count))
+        each = np.repeat(np.arange(len(count)), count)
+        points, directions = corners[order], normals[order]
+        low, high = (f.reduceat(g(points, axis=1), start[:-1]) for f, g in ((np.minimum, np.min), (np.maximum, np.max)))
+        middle = 0.5 * (low + high)
+        away = np.linalg.norm(points - middle[each][:, None], axis=2).max(axis=1) + bulge_of(points, directions)
+        axis = np.add.reduceat(directions.sum(axis=1), start[:-1])
+        length = np.linalg.norm(axis, axis=1, keepdims=True)
+        # Where all cancel, any will do: the cone is wide.
+        axis = np.where(length > 0.0, axis / np.where(length > 0.0, length, 1.0), (0.0, 0.0, 1.0))
+        lean = np.arctan2(
+            np.linalg.norm(np.cross(directions, axis[each][:, None]), axis=2),
+            np.sum(directions * axis[each][:, None], axis=2),
+        )
+        radius = np.maximum.reduceat(away, start[:-1])
+        return cls(order, start, middle, radius, axis, np.maximum.reduceat(lean.max(axis=1), start[:-1]))
+
+    def table(self, middle: Float64) -> Float64:
+        """Return rows of kernels/mirrors.cl, at least one; balls and cones hold what rounding moves."""
+        if not len(self.radius):
+            return np.zeros((1, _BLOCK))
+        twice = np.minimum(2.0 * self.cone * (1.0 + 1e-5) + 1e-6, math.pi)
+        radius = self.radius * (1.0 + 1e-5)
+        return np.column_stack([self.middle - middle, radius, self.axis, np.cos(twice), np.sin(twice)])
+
+
+def bulge_of(corners: Float64, normals: Float64) -> Float64:
+    """Return how far smooth surfaces leave their triangles at most, (m, 3, 3) each to (m,) [m]."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    rise = np.abs(np.sum(edges * normals, axis=2)) + np.abs(np.sum(edges * np.roll(normals, -1, axis=1), axis=2))
+    # Half the sum over pairs of corners of b_i b_j times what they rise above each other's tangents; b_i b_j <= 1 / 3.
+    return np.asarray(rise.max(axis=1, initial=0.0) / 6.0)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MirrorPoints(Operation[MirroredPoints]):
     """Where a lens sees points in curved mirrors: ``op(points, lens) -> MirroredPoints``; compared by identity.
@@ -145,7 +214,7 @@ class MirrorPoints(Operation[MirroredPoints]):
 
     def _table(self, middle: Float64) -> Float64:
         """Return rows of kernels/mirrors.cl, at least one."""
-        corners, normals = self.corners - middle, self.normals
+        corners, normals = (self.corners - middle)[self._blocks.order], self.normals[self._blocks.order]
         first, one, two = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         columns = [
             first,
@@ -158,6 +227,10 @@ class MirrorPoints(Operation[MirroredPoints]):
             -np.sum(two * normals[:, 2], axis=1, keepdims=True),
         ]
         return np.hstack(columns) if len(corners) else np.zeros((1, _ROW))
+
+    @functools.cached_property
+    def _blocks(self) -> Blocks:
+        return Blocks.of(self.corners, self.normals)
 
     def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         if dtype not in (np.float32, np.float64):
@@ -190,9 +263,11 @@ class MirrorPoints(Operation[MirroredPoints]):
             },
             arguments=[
                 self._table(middle.astype(np.float64)).astype(real),
-                np.append(self.numbers, -1).astype(np.int32),
+                np.append(self.numbers[self._blocks.order], -1).astype(np.int32),
+                self._blocks.table(middle.astype(np.float64)).astype(real),
+                self._blocks.start.astype(np.int32),
                 middle,
-                np.uint32(len(self.corners)),
+                np.uint32(len(self._blocks.radius)),
                 np.uint32(self.kept),
                 np.uint64(count),
             ],

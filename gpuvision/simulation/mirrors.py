@@ -16,14 +16,16 @@ from gpuvision.simulation.fans import FanIntervals
 from gpuvision.simulation.illumination import LightSheet, LitLine
 from gpuvision.simulation.line_exposure import line_exposure
 from gpuvision.simulation.material import Material
-from gpuvision.simulation.mirror_points import MirrorPoints, smooth_normals
+from gpuvision.simulation.mirror_facets import MirrorFacets
+from gpuvision.simulation.mirror_points import MirrorPoints, bulge_of, smooth_normals
 from gpuvision.simulation.padded import run_padded
 from gpuvision.simulation.plane_mirrors import heights, mirrored, planes_of, windows
 from gpuvision.simulation.rays import AnyHit
 from gpuvision.simulation.scene import Scene
+from gpuvision.simulation.sheet_cut import ranges
 from gpuvision.simulation.sight import Exposure, Sight
 from gpuvision.simulation.sight_lines import check_materials
-from gpuvision.simulation.thrown_light import ThrownLight
+from gpuvision.simulation.thrown_light import ThrownLight, lines_of
 
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -127,7 +129,7 @@ class Mirrors:
         """Return what the sensor sees of lit lines in mirrors, as they are diffuse."""
         exitance = self._exitance(lit)
         shining = np.flatnonzero(exitance > 0.0)
-        lit, exitance = LitLine(*(each[shining] for each in lit)), exitance[shining]
+        lit, exitance = lines_of(lit, shining), exitance[shining]
         if not len(exitance):
             return self.sight.dark()
         return self._in_planes(lit, exitance, L) + self._in_curves(lit, exitance, L)
@@ -136,7 +138,7 @@ class Mirrors:
         """Return what the sensor sees of lit lines without a mirror, as they are diffuse."""
         exitance = self._exitance(lit)
         shining = np.flatnonzero(exitance > 0.0)
-        lit, exitance = LitLine(*(each[shining] for each in lit)), exitance[shining]
+        lit, exitance = lines_of(lit, shining), exitance[shining]
         if not len(exitance):
             return self.sight.dark()
         lens = self.sight.lens_at(L)
@@ -168,6 +170,8 @@ class Mirrors:
     # ---- plane mirrors ---------------------------------------------------------------------------------------
 
     def _in_planes(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
+        if not len(self._flat):
+            return self.sight.dark()
         seen = self._through_windows(lit, L)
         if not len(seen.line):
             return self.sight.dark()
@@ -180,8 +184,7 @@ class Mirrors:
     def _through_windows(self, lit: LitLine, L: float) -> _Seen:
         """Return the parts of lines that the lens sees in plane mirrors, nothing in the way before or behind them."""
         lens = self.sight.lens_at(L)
-        found = windows(lens, lit.ends, self.scene.corners[self._flat])
-        line, mirror, share = found
+        line, mirror, share = windows(lens, lit.ends, self._facets.corners, self._planes, *self._pairs(lit, lens))
         # The side that the light comes from faces the mirror image of the lens.
         apex = mirrored(lens, self._planes[mirror])
         facing = np.sum((apex - lit.ends[line].mean(axis=1)) * lit.normals[line], axis=1) > 0.0
@@ -205,6 +208,13 @@ class Mirrors:
         weight = np.stack([1.0 - before, before], axis=-1) * near[:, None, :]
         before = weight[..., 1] / weight.sum(axis=-1)
         return _Seen(line[row], mirror[row], share[:, :1] + np.diff(share) * before)
+
+    def _pairs(self, lit: LitLine, lens: Float64) -> tuple[Integers, Integers]:
+        """Return which lines may be seen in which plane mirrors."""
+        blocks = self._facets.blocks
+        line, block = np.nonzero(self._run(self._facets, lit.ends.reshape(-1, 6), lens).near)
+        count = np.diff(blocks.start)[block]
+        return np.repeat(line, count), blocks.order[ranges(blocks.start[block], count)]
 
     def _visible(self, apex: Float64, ends: Float64, near: Float64, share: Float64) -> tuple[Integers, Float64]:
         """Return visible parts of segments (k, 2, 3): which segment, from where to where."""
@@ -349,15 +359,11 @@ class Mirrors:
 
     @functools.cached_property
     def _planes(self) -> Float64:
-        return planes_of(self.scene.corners[self._flat])
+        return planes_of(self._facets.corners)
 
     @functools.cached_property
     def _bulge(self) -> Float64:
-        """Return how far the smooth surface leaves its triangle at most, about, (n,) [m]."""
-        corners, normals = self.scene.corners, self._normals
-        edges = np.roll(corners, -1, axis=1) - corners
-        rise = np.abs(np.sum(edges * normals, axis=2)) + np.abs(np.sum(edges * np.roll(normals, -1, axis=1), axis=2))
-        return np.asarray(0.25 * rise.max(axis=1, initial=0.0))
+        return bulge_of(self.scene.corners, self._normals)
 
     @functools.cached_property
     def _clearance(self) -> float:
@@ -382,6 +388,10 @@ class Mirrors:
     @functools.cached_property
     def _fans(self) -> FanIntervals:
         return FanIntervals(scene=self.scene)
+
+    @functools.cached_property
+    def _facets(self) -> MirrorFacets:
+        return MirrorFacets(corners=self.scene.corners[self._flat])
 
     @functools.cached_property
     def _any_hit(self) -> AnyHit:

@@ -10,8 +10,6 @@ import numpy.typing as npt
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Pairs of a line and a triangle that are looked at in one go.
-_PAIRS = 1_000_000
 # What is as near to a mirror, in distances of the lens, lies in it.
 _IN_IT = 1e-12
 
@@ -49,7 +47,9 @@ def mirrored(points: Float64, planes: Float64) -> Float64:
     return np.asarray(points - 2.0 * heights(points, planes)[..., None] * planes[..., :3])
 
 
-def windows(lens: Float64, ends: Float64, corners: Float64) -> Windows:
+def windows(
+    lens: Float64, ends: Float64, corners: Float64, planes: Float64, line: Integers, mirror: Integers
+) -> Windows:
     """Return which parts of lines are seen in triangles: where the ray from the lens to the mirror image meets it.
 
     Line and lens lie on one side of the mirror; either side reflects. Exact to rounding.
@@ -60,42 +60,33 @@ def windows(lens: Float64, ends: Float64, corners: Float64) -> Windows:
         (3,), metres.
     ends
         (k, 2, 3), metres: the lines.
-    corners
-        (m, 3, 3), metres: the mirrors, each with an area.
+    corners, planes
+        (m, 3, 3), metres: the mirrors, each with an area; and `planes_of` them.
+    line, mirror
+        (n,): the pairs that are looked at.
     """
-    found, each = [], max(_PAIRS // max(2 * len(ends), 1), 1)
-    for first in range(0, len(corners), each):
-        part = _windows(lens, ends, corners[first : first + each])
-        found.append(part._replace(mirror=part.mirror + first))
-    if not found:
-        return Windows(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
-    return Windows(*(np.concatenate(column) for column in zip(*found, strict=True)))
-
-
-def _windows(lens: Float64, ends: Float64, corners: Float64) -> Windows:
-    from_lens, planes = corners - lens, planes_of(corners)
+    from_lens, planes = corners[mirror] - lens, planes[mirror]
     lens_height = heights(lens, planes)
     usable = np.abs(lens_height) > _IN_IT * np.linalg.norm(from_lens[:, 0], axis=1)
     # Mirrors are taken with the lens above them; edges so that the triangle lies on their positive side.
-    planes[:, :3] *= np.sign(lens_height)[:, None]
-    lens_height = np.abs(lens_height)
+    normal, lens_height = planes[:, :3] * np.sign(lens_height)[:, None], np.abs(lens_height)
     sides = np.cross(from_lens, np.roll(from_lens, -1, axis=1))
     sides *= np.sign(np.sum(sides * np.roll(from_lens, 1, axis=1), axis=2))[..., None]
-    points = (ends - lens).reshape(-1, 3)
-    height = points @ planes[:, :3].T + lens_height
-    low, high = np.zeros((len(ends), len(corners))), np.ones((len(ends), len(corners)))
-    _cut(low, high, height - _IN_IT * lens_height)
+    points = ends[line] - lens
+    height = np.einsum("nek,nk->ne", points, normal) + lens_height[:, None]
+    low, high = np.zeros(len(line)), np.ones(len(line))
+    _cut(low, high, height - _IN_IT * lens_height[:, None])
+    # Of the mirror image: the point, less twice its height along the normal.
+    image = points - 2.0 * height[..., None] * normal[:, None]
     for n in range(3):
-        side = sides[:, n]
-        # Of the mirror image: the point, less twice its height along the normal.
-        _cut(low, high, points @ side.T - 2.0 * height * np.sum(side * planes[:, :3], axis=1))
-    line, mirror = np.nonzero((low < high) & usable)
-    return Windows(line, mirror, np.stack([low[line, mirror], high[line, mirror]], axis=1))
+        _cut(low, high, np.einsum("nek,nk->ne", image, sides[:, n]))
+    kept = (low < high) & usable
+    return Windows(line[kept], mirror[kept], np.stack([low, high], axis=1)[kept])
 
 
 def _cut(low: Float64, high: Float64, value: Float64) -> None:
-    """Keep where a function, linear on each line, is positive; its values at starts and ends of lines, (2 k, m)."""
-    start, end = value[::2], value[1::2]
+    """Keep where a function, linear on each line, is positive; its values at starts and ends of lines, (n, 2)."""
+    start, end = value.T
     with np.errstate(divide="ignore", invalid="ignore"):
         place = start / (start - end)
     np.maximum(low, place, out=low, where=start < 0.0)

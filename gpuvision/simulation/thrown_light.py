@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -315,7 +315,7 @@ def _cut(fans: _Fans, some: Integers, corners: Float64, numbers: Integers) -> _C
 def _beyond(p: Float64, depth: Float64, least: Float64) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:
     """Cut segments to where their depth is beyond the least; the last says which there are."""
     under = depth < least[:, None]
-    kept = ~under.all(axis=1)
+    kept = np.asarray(~under.all(axis=1))
     p, depth, least, under = p[kept].copy(), depth[kept].copy(), least[kept], under[kept]
     rows, near = np.nonzero(under)
     share = (least[rows] - depth[rows, near]) / (depth[rows, 1 - near] - depth[rows, near])
@@ -353,8 +353,13 @@ def _no_line() -> LitLine:
     return LitLine(np.zeros((0, 2, 3)), np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0))
 
 
-def _those(beam: _Beam, which: npt.NDArray[np.generic]) -> _Beam:
-    return _Beam(LitLine(*(each[which] for each in beam.line)), beam.light[which])
+def lines_of(line: LitLine, which: npt.NDArray[Any]) -> LitLine:
+    """Return some of the lines."""
+    return LitLine(line.ends[which], line.normals[which], line.triangle[which], line.power[which])
+
+
+def _those(beam: _Beam, which: npt.NDArray[Any]) -> _Beam:
+    return _Beam(lines_of(beam.line, which), beam.light[which])
 
 
 def _joined(beams: list[_Beam]) -> _Beam:

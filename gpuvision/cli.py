@@ -28,6 +28,7 @@ def application() -> typer.Typer:
     from gpuvision.commands.devices import devices
     from gpuvision.commands.profile import profile
     from gpuvision.commands.scan import scan
+    from gpuvision.commands.simulate import simulate
     from gpuvision.commands.undistort import undistort
 
     app = typer.Typer(
@@ -37,7 +38,7 @@ def application() -> typer.Typer:
         add_completion=False,
         pretty_exceptions_enable=False,
     )
-    for command in (scan, calibrate, undistort, demo, devices, profile):
+    for command in (scan, simulate, calibrate, undistort, demo, devices, profile):
         app.command()(command)
     return app
 

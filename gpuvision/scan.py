@@ -12,7 +12,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -239,12 +239,15 @@ def scan(
     parts, numbers = _streamed(stream, source.length, progress)
     fields = {key: np.concatenate([getattr(each, key) for each in parts]) for key in readout.outputs or ()}
     start = time.perf_counter()
-    points, intensity = _assembled(sensor, fields, numbers, stream.device)
-    assembled = time.perf_counter()
-    heights, grid = _resampled(sensor, points, intensity, stream.device)
+    place = [fields[name] for name in ("position", "g", "h") if name in fields]
+    transports = sensor.transport.transport(int(numbers[-1]) + 1)[numbers]
+    points = assembled(sensor, place, transports, fields["status"], stream.device)
+    intensity = fields["peak" if sensor.kind == "camera" else "total"]
+    middle = time.perf_counter()
+    heights, grid = resampled(sensor, points, intensity, stream.device)
     if timeline is not None:
         timeline.write_now()
-    seconds = {"assemble": assembled - start, "resample": time.perf_counter() - assembled}
+    seconds = {"assemble": middle - start, "resample": time.perf_counter() - middle}
     return Scan(
         sensor=sensor,
         points=points,
@@ -305,21 +308,40 @@ def _streamed(stream: Pipeline[Any], length: int | None, progress: Progress) -> 
     return parts, np.concatenate(numbers)
 
 
-def _assembled(sensor: Sensor, fields: dict[str, Array], numbers: Array, device: Device) -> tuple[RangePoints, Array]:
-    status = fields["status"]
-    light = fields["peak" if sensor.kind == "camera" else "total"]
-    place = [fields[name] for name in ("position", "g", "h") if name in fields]
-    moved = sensor.transport.transport(int(numbers[-1]) + 1)[numbers].astype(place[0].dtype)
+def assembled(sensor: Sensor, place: Sequence[Array], transports: Array, status: Array, device: Device) -> RangePoints:
+    """Return the organised range image of what a sensor reads.
+
+    Parameters
+    ----------
+    sensor
+        Says how the sheet moves, what lies in the scene, and whether doubtful points stay.
+    place
+        g and h, (profiles, samples) each, or the position for a sheet that turns.
+    transports
+        (profiles,).
+    status
+        (profiles, samples) flags.
+    device
+        Where it is done.
+    """
+    moved = transports.astype(place[0].dtype)
     assemble = RangeImage(geometry=sensor.transport, limits=sensor.output.limits)
     points: RangePoints = assemble(*place, moved, status, device=device)
     if sensor.output.ambiguous == "drop":
         doubtful = (points.status & Status.AMBIGUOUS) != 0
         for array in points[:3]:
             array[doubtful] = np.nan
-    return points, light
+    return points
 
 
-def _resampled(sensor: Sensor, points: RangePoints, light: Array, device: Device) -> tuple[HeightMap, Grid]:
+def resampled(sensor: Sensor, points: RangePoints, light: Array, device: Device) -> tuple[HeightMap, Grid]:
+    """Return the height map of organised points, over the cells that the sensor's file asks for.
+
+    Raises
+    ------
+    ValueError
+        No point is valid, or they span too many cells.
+    """
     if not np.any(np.isfinite(points.z)):
         flags = ", ".join(flag.name or "" for flag in Status if flag and np.any(points.status & flag))
         raise ValueError(

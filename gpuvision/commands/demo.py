@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,40 +21,45 @@ def demo(
 ) -> None:
     """Record a part with a camera and with PSD strips, scan both recordings, and compare with the truth.
 
-    The sensors are simulated: direct light, noise, quantisation. The scans are what `gpuvision scan` does.
+    The recordings are simulated, the scans are what `gpuvision scan` does. The part's corners glow, which moves the
+    PSD's readings; a mask made for the part helps.
     """
     import numpy as np
 
-    from gpuvision.demo import SENSORS, part, record
-    from gpuvision.demo_errors import compare, draw_errors
+    from gpuvision.commands.scan import progress_bar
+    from gpuvision.demo import SENSORS, part, scanned_part
     from gpuvision.host import Device
-    from gpuvision.scan import check_folder, whole_folder
-    from gpuvision.scan import scan as run
-    from gpuvision.sensor import Sensor
+    from gpuvision.scan import check_folder, scan, whole_folder
+    from gpuvision.simulate import recorded, simulate
 
     check_folder(out)
     chosen = Device.best() if device is None else Device.named(device)
     typer.echo(f"device {chosen.label}: {chosen.name}")
-    mesh = part()
     results: dict[str, Any] = {}
-    with whole_folder(out) as inside:
-        mesh.export(inside / "part.ply")
+    with whole_folder(out) as inside, tempfile.TemporaryDirectory() as light:
+        part().export(inside / "part.ply")
         for name in SENSORS:
-            recording = record(name, mesh, seed)
-            done = run(recording, Sensor.load(name), device=chosen)
-            errors = compare(done, mesh)
+            task = scanned_part(name)
+            with progress_bar(f"{name}: simulating") as progress:
+                known = simulate(task, light, seed=seed, device=chosen, progress=progress)
+            recording = recorded(task, light, seed=seed, device=chosen)
+            done = scan(recording, task.sensor, device=chosen)
+            known.write(inside / name)
             done.write(inside / name)
             np.save(inside / name / "recording.npy", recording)
-            draw_errors(inside / name / "errors.png", errors, done.sensor.name)
-            results[name] = {"errors": errors.to_dict(), **done.report()}
-            typer.echo(f"{name}: {done.summary()}\n{'':>{len(name)}}  {errors.summary()}")
+            results[name] = {"predicted": known.report(), **done.report()}
+            typer.echo(f"{name}: {done.summary()}\n  {known.summary()}")
+        masked = simulate(task, light, seed=seed, mask="best", device=chosen)
+        masked.write(inside / f"{name}_masked")
+        results[f"{name}_masked"] = {"predicted": masked.report()}
         (inside / "report.json").write_text(json.dumps(results, indent=1) + "\n")
+    typer.echo(f"{name} behind a mask made for the part: {masked.summary()}")
     camera = out / "camera_line"
     typer.echo(
         f"scan one yourself: gpuvision scan {camera / 'recording.npy'} --sensor camera_line --out {out / 'again'}"
     )
-    worst = max(each["errors"]["rms"] for each in results.values())
     typer.echo(
-        f"Two scans of a part with a known shape, off by {1e6 * worst:.0f} µm rms or less away from its edges: "
-        f"look at {camera / 'picture.png'}, and at errors.png beside it."
+        f"A part as it is measured: look at {camera / 'picture.png'}. How its glowing corners pull the readings of PSD "
+        f"strips: {out / name / 'errors.png'} and causes.png beside it; with a mask: "
+        f"{out / f'{name}_masked' / 'errors.png'}."
     )

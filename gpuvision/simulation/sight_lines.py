@@ -25,7 +25,8 @@ class SeenSurface(NamedTuple):
     Attributes
     ----------
     receivers
-        (samples, n, 6): places on the surface [m] and its unit normals, on the side that the lens sees.
+        (samples, n, 6): places on the surface [m] and its unit normals, on the side that the lens sees; zero where
+        nothing is seen.
     weights
         (samples, n): power on the sensor [W] per irradiance [W/m^2] of the element; 0 where nothing is seen.
     triangle
@@ -110,6 +111,7 @@ class SightLines:
         way = np.sum(normal * (corner - origin), axis=-1) / np.where(seen, slope, 1.0)
         places = origin + np.where(seen, way, 0.0)[..., None] * towards
         receivers = np.concatenate([places, np.where(slope[..., None] > 0.0, -normal, normal)], axis=-1)
+        receivers = np.where((seen & (self._weights > 0.0))[..., None], receivers, 0.0)
         return SeenSurface(receivers, np.where(seen, self._weights * albedo, 0.0), triangle)
 
     def exposure(self, seen: SeenSurface, irradiance: Float64) -> Exposure:

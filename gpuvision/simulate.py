@@ -1,0 +1,418 @@
+"""A part and the description of a sensor become the range image that the sensor will make, its errors and their causes.
+
+The light of every profile is simulated once and kept (`gpuvision.simulation_blocks`); what the electronics make of it,
+behind which mask, is computed from there.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device
+from gpuvision.ranging.export import write_npz, write_ply, write_png16, write_tiff
+from gpuvision.ranging.picture import draw_height_map
+from gpuvision.ranging.range_image import RangePoints, StraightTransport
+from gpuvision.ranging.regrid import Grid, HeightMap
+from gpuvision.scan import assembled, resampled, whole_folder
+from gpuvision.sensor import Sensor
+from gpuvision.simulated_sensor import light_of, sight_of, simulator_of
+from gpuvision.simulation.artifacts import Artifacts, explain
+from gpuvision.simulation.masks import Mask, MaskPlan, optimise_mask
+from gpuvision.simulation.material import Material
+from gpuvision.simulation.psd_simulator import PsdSimulator
+from gpuvision.simulation.readings import PATHS, Reading, Truth
+from gpuvision.simulation.reflectance import Lambert
+from gpuvision.simulation.scene import Scene
+from gpuvision.simulation.sight import Exposure
+from gpuvision.simulation_blocks import Block, BlockStore, Progress, Task, compute_missing
+from gpuvision.simulation_picture import draw_causes, draw_errors
+from gpuvision.status import Status
+
+USUAL_PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse")
+_SIGMAS = 5.0
+_MOST_FOR_A_MASK = 1 << 26  # bins of all profiles that a mask is made from
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """What a sensor will make of a part.
+
+    Attributes
+    ----------
+    task
+        What was simulated.
+    artifacts
+        Readings, truth, errors and causes, (profiles, samples).
+    points
+        The range image that the sensor makes.
+    heights, grid
+        Its height map over regular cells, and where they lie.
+    limit
+        Error from which on a sample counts as wrong [m].
+    mask
+        What was found for it, where one was asked for.
+    account
+        What was modelled, summed over the profiles.
+    device
+        Where readings were made.
+    seconds
+        Time of the steps, by name.
+    computed
+        Blocks of profiles that were not there yet.
+    """
+
+    task: Task
+    artifacts: Artifacts
+    points: RangePoints
+    heights: HeightMap
+    grid: Grid
+    limit: float
+    mask: MaskPlan | None
+    account: dict[str, float]
+    device: Device
+    seconds: dict[str, float]
+    computed: int
+
+    def summary(self) -> str:
+        """Return what came out, in a line or two."""
+        told = self.artifacts.summary(self.limit)
+        worst = max(told["causes"], key=lambda name: told["causes"][name]["dominant"])
+        um = 1e6
+        text = (
+            f"{len(self.task.transports)} profiles, {told['read']} of {told['surface']} samples read, errors "
+            f"{um * (told['median'] or 0.0):.1f} µm median, {um * (told['p95'] or 0.0):.0f} µm p95, "
+            f"{told['beyond_limit']} beyond {um * self.limit:.1f} µm (mostly {worst}), {told['false']} false"
+        )
+        if self.mask is None:
+            return text
+        before, after = (float(np.nanmax(np.abs(each))) for each in (self.mask.before, self.mask.after))
+        return (
+            f"{text}\nmask: worst error of the light's centre {um * before:.0f} µm without, {um * after:.0f} µm with it"
+        )
+
+    def report(self) -> dict[str, Any]:
+        """Return what `write` puts into ``report.json``; lengths in metres, times in seconds."""
+        task = self.task
+        return {
+            "gpuvision": version("gpuvision"),
+            "sensor": task.sensor.name,
+            "kind": task.sensor.kind,
+            "profiles": len(task.transports),
+            "triangles": len(task.part.corners),
+            "defects": {each.name: len(getattr(task.part.defects, each.name)) for each in fields(task.part.defects)},
+            "paths": list(task.paths),
+            "tolerance": task.tolerance,
+            "errors": self.artifacts.summary(self.limit),
+            "mask": None if self.mask is None else _told_mask(self.mask),
+            "modelled": self.account,
+            "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
+            "light": task.fingerprint,
+            "computed_blocks": self.computed,
+            "seconds": self.seconds,
+        }
+
+    def write(self, folder: str | Path) -> None:
+        """Write the range image, pictures and the report into a folder, all or nothing.
+
+        ``range_image.tiff``, ``.png`` (16 bit) and ``picture.png`` show the height map as it will be measured,
+        ``range_image.ply`` the organised points, ``errors.png`` and ``causes.png`` how far off they are and why;
+        ``simulation.npz`` holds the arrays.
+
+        Raises
+        ------
+        OSError
+            The folder cannot be written.
+        """
+        told = self.artifacts
+        title = self.task.sensor.name or "Simulation"
+        with whole_folder(folder) as inside:
+            write_tiff(inside / "range_image.tiff", self.heights.z, self.grid)
+            write_png16(inside / "range_image.png", self.heights.z, self.grid)
+            write_ply(inside / "range_image.ply", *self.points[:3], _strength(told.reading), self.points.status)
+            write_npz(inside / "simulation.npz", *self._arrays())
+            draw_height_map(inside / "picture.png", self.heights, self.grid, title=f"{title}: as measured")
+            draw_errors(inside / "errors.png", told.error, f"{title}: errors")
+            draw_causes(
+                inside / "causes.png",
+                self._pictured_causes(),
+                list(told.causes),
+                f"{title}: what most of each error comes from",
+                good=f"within {1e6 * self.limit:.1f} µm",
+            )
+            if self.mask is not None:
+                self.mask.mask.save(inside / "mask.txt")
+            (inside / "report.json").write_text(json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
+
+    def _pictured_causes(self) -> Array:
+        dominant = self.artifacts.dominant(self.limit).astype(int)
+        nothing = ~np.isfinite(self.artifacts.error) & (dominant < 0)
+        return np.where(nothing, -2, dominant)
+
+    def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
+        told = self.artifacts
+        held: dict[str, tuple[Any, str]] = {
+            **{name: (getattr(self.points, name), "m") for name in ("x", "y", "z")},
+            "status": (self.points.status, "flags"),
+            "true_g": (told.truth.g, "m"),
+            "true_h": (told.truth.h, "m"),
+            "error": (told.error, "m"),
+            "verdict": (told.verdict, "flags"),
+            **{f"cause_{name}": (part, "m") for name, part in told.causes.items()},
+            "sigma": (told.reading.sigma, "m"),
+            "transport": (self.task.transports, "m"),
+        }
+        return {name: array for name, (array, _) in held.items()}, {name: unit for name, (_, unit) in held.items()}
+
+
+def prepare(
+    part: Scene,
+    materials: Sequence[Material],
+    sensor: Sensor,
+    *,
+    paths: Sequence[str] = USUAL_PATHS,
+    tolerance: float = 0.0,
+    profiles: int | None = None,
+) -> Task:
+    """Return the task of scanning a part from end to end.
+
+    Parameters
+    ----------
+    part, materials
+        The scene, in the sensor's coordinates, and a material for every number in `Scene.material`.
+    sensor
+        With a light and a straight transport of even steps.
+    paths
+        Out of `gpuvision.simulation.readings.PATHS`.
+    tolerance
+        Range error that may come from what is left out [m]; 0: nothing is left out.
+    profiles
+        How many, about the middle; None: all that meet the part.
+
+    Raises
+    ------
+    ValueError
+        The sensor cannot be simulated, or no profile meets the part.
+    """
+    light_of(sensor)
+    transport = sensor.transport
+    assert isinstance(transport, StraightTransport)  # light_of looked
+    if transport.step is None:
+        raise ValueError("a simulation needs [transport] step: metres per profile")
+    if not (np.isfinite(tolerance) and tolerance >= 0.0):
+        raise ValueError(f"the tolerance is {tolerance}, expected metres, 0 or more")
+    for path in paths:
+        if path not in PATHS:
+            raise ValueError(f"unknown path '{path}', expected some of {', '.join(PATHS)}")
+    if "direct" not in paths:
+        raise ValueError("the paths lack 'direct': without it there is nothing to read")
+    corners = part.corners.reshape(-1, 3)
+    corners = corners[np.isfinite(corners).all(axis=1)]
+    if not len(corners):
+        raise ValueError("the part has no triangle")
+    axes = np.array([transport.g_axis, transport.h_axis, transport.direction])
+    places = (corners - transport.origin) @ np.linalg.inv(axes)[:, 2]
+    steps = (np.array([places.min(), places.max()]) - transport.start) / transport.step
+    first, last = int(np.ceil(steps.min() + 1e-9)), int(np.floor(steps.max() - 1e-9))
+    if profiles is not None and profiles < last + 1 - first:
+        first = (first + last + 1 - profiles) // 2
+        last = first + profiles - 1
+    if last < first:
+        raise ValueError("no profile meets the part: it is shorter than a step of the transport")
+    moved = (
+        transport.transport(last + 1 - first, first)
+        if first >= 0
+        else transport.start + transport.step * np.arange(first, last + 1, dtype=np.float64)
+    )
+    return Task(
+        part=part,
+        materials=tuple(materials),
+        sensor=sensor,
+        transports=moved,
+        paths=tuple(dict.fromkeys(paths)),
+        tolerance=float(tolerance),
+    )
+
+
+def simulate(
+    task: Task,
+    folder: str | Path,
+    *,
+    mask: Mask | str | None = None,
+    seed: int | None = 1,
+    limit: float | None = None,
+    device: Device | None = None,
+    scheduler: str | None = None,
+    progress: Progress = lambda done, of: None,
+) -> Simulation:
+    """Simulate a scan; what a folder already holds of its light is not computed again.
+
+    Parameters
+    ----------
+    task
+        From `prepare`.
+    folder
+        Where the light of the profiles is kept, in ``light``.
+    mask
+        Before the sensor; "best": a window for every sample, made for this part.
+    seed
+        Of the noise; None: there is none.
+    limit
+        Error from which on a sample counts as wrong [m]; None: five times the median of the predicted standard
+        deviation, or the task's tolerance if that is more.
+    device
+        None: `Device.best`.
+    scheduler
+        Address of a Dask scheduler whose workers compute the light.
+    progress
+        Called with the profiles done, and of how many.
+
+    Raises
+    ------
+    ValueError
+        The mask is not one for this sensor, or nothing can be read.
+    OSError
+        The folder cannot be written.
+    """
+    device = Device.best() if device is None else device
+    store = BlockStore(Path(folder), task)
+    start = time.perf_counter()
+    computed = compute_missing(store, device=device, scheduler=scheduler, progress=progress)
+    lit = time.perf_counter()
+    sight = sight_of(task.sensor)
+    found = optimise_mask(sight, *_whole_light(store, sight.samples * sight.bins)) if mask == "best" else None
+    before = found.mask if found is not None else mask if isinstance(mask, Mask) else None
+    simulator = simulator_of(task.sensor, sight, before)
+    parts, account, first = [], {}, 0
+    for block in store:
+        parts.append(explain(simulator, block.exposures, block.truth, seed=seed, first=first, device=device))
+        account = _added(account, block)
+        first += len(block.truth.h)
+    artifacts = _joined(parts)
+    reading = artifacts.reading
+    place = [np.ascontiguousarray(each, np.float32) for each in (reading.g, reading.h)]
+    points = assembled(task.sensor, place, task.transports, reading.status, device)
+    if task.sensor.output.ambiguous == "drop":
+        artifacts = artifacts.without(Status.AMBIGUOUS)
+    heights, grid = resampled(task.sensor, points, _strength(artifacts.reading), device)
+    sigma = artifacts.reading.sigma[np.isfinite(artifacts.reading.sigma)]
+    usual = _SIGMAS * float(np.median(sigma)) if sigma.size else 0.0
+    return Simulation(
+        task=task,
+        artifacts=artifacts,
+        points=points,
+        heights=heights,
+        grid=grid,
+        limit=max(usual, task.tolerance) if limit is None else limit,
+        mask=found,
+        account=account,
+        device=device,
+        seconds={"light": lit - start, "readings": time.perf_counter() - lit},
+        computed=computed,
+    )
+
+
+def recorded(
+    task: Task, folder: str | Path, *, mask: Mask | None = None, seed: int | None = 1, device: Device | None = None
+) -> Array:
+    """Return what the sensor records, as `gpuvision.scan.scan` takes it; light that `folder` has is not computed again.
+
+    Parameters
+    ----------
+    task, folder, mask, seed, device
+        As for `simulate`.
+
+    Returns
+    -------
+    numpy.ndarray
+        (profiles, rows, columns) grey levels of a camera, (profiles, strips, 2) currents or codes of a PSD.
+    """
+    store = BlockStore(Path(folder), task)
+    compute_missing(store, device=device)
+    simulator = simulator_of(task.sensor, sight_of(task.sensor), mask)
+    record = simulator.currents if isinstance(simulator, PsdSimulator) else simulator.frames
+    parts, first = [], 0
+    for block in store:
+        parts.append(record(block.exposures, seed=seed, first=first))
+        first += len(parts[-1])
+    return np.concatenate(parts)
+
+
+def part_of(
+    path: str | Path, metres: float, materials: Sequence[Material] | None, albedo: float
+) -> tuple[Scene, tuple[Material, ...]]:
+    """Read a part, and give it its materials, or one of an albedo.
+
+    Raises
+    ------
+    OSError, ValueError
+        As `Scene.load`; or there are fewer materials than the file has meshes.
+    """
+    scene = Scene.load(path, metres=metres)
+    assert scene.material is not None  # set by Scene itself
+    count = int(scene.material.max(initial=-1)) + 1
+    if materials is None:
+        return scene, (Material(diffuse=Lambert(albedo=albedo)),) * count
+    if len(materials) < count:
+        raise ValueError(f"{path} has {count} meshes, {len(materials)} materials are given; expected one for each")
+    return scene, tuple(materials)
+
+
+def _whole_light(store: BlockStore, bins: int) -> tuple[dict[str, Exposure], Truth]:
+    """Return the light of all profiles by path, or of every second, third, ... where that is much."""
+    every = -(-len(store.task.transports) * bins // _MOST_FOR_A_MASK)
+    light: dict[str, list[Exposure]] = {}
+    truths = []
+    for block, profiles in zip(store, store.task.blocks(), strict=True):
+        chosen = [k - profiles.start for k in profiles if k % every == 0]
+        for name in set(PATHS) & set(block.exposures):
+            light.setdefault(name, []).append(Exposure(*(each[chosen] for each in block.exposures[name])))
+        truths.append(Truth(*(each[chosen] for each in block.truth)))
+    whole = {
+        name: Exposure(*(np.concatenate(each) for each in zip(*parts, strict=True))) for name, parts in light.items()
+    }
+    return whole, Truth(*(np.concatenate(each) for each in zip(*truths, strict=True)))
+
+
+def _added(account: Mapping[str, float], block: Block) -> dict[str, float]:
+    return {name: account.get(name, 0.0) + float(np.sum(each)) for name, each in block.account.items()}
+
+
+def _joined(parts: Sequence[Artifacts]) -> Artifacts:
+    """Return the artifacts of all blocks as one."""
+
+    def joined(values: Sequence[Any]) -> Any:
+        if isinstance(values[0], dict):
+            return {name: joined([each[name] for each in values]) for name in values[0]}
+        if isinstance(values[0], tuple):
+            return type(values[0])(*(joined(each) for each in zip(*values, strict=True)))
+        return np.concatenate(values)
+
+    return Artifacts(**{each.name: joined([getattr(part, each.name) for part in parts]) for each in fields(Artifacts)})
+
+
+def _strength(reading: Reading) -> Array:
+    return np.nan_to_num(reading.strength).astype(np.float32)
+
+
+def _told_mask(plan: MaskPlan) -> dict[str, Any]:
+    def worst(values: Array) -> float | None:
+        known = np.abs(values[np.isfinite(values)])
+        return float(known.max()) if known.size else None
+
+    kept = plan.kept[np.isfinite(plan.kept)]
+    return {
+        "worst_without": worst(plan.before),
+        "worst_with": worst(plan.after),
+        "light_kept": float(kept.min()) if kept.size else None,
+    }

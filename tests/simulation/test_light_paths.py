@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+from gpuvision.simulation.illumination import LightSheet
+from gpuvision.simulation.light_paths import LightPaths
+from gpuvision.simulation.material import Material
+from gpuvision.simulation.reflectance import Lambert
+from gpuvision.simulation.scene import Scene
+from simulation.test_sight import sight
+
+GREY = Material(diffuse=Lambert(albedo=0.5))
+PATHS = ("direct", "diffuse-diffuse")
+
+
+def corner(moved: float = 0.0) -> Scene:
+    """A floor and a wall across the sheet's end: the line on the floor runs into the wall x = 20 mm."""
+    floor = np.array([[-0.1, -0.1, 0.0], [0.02, -0.1, 0.0], [0.02, 0.1, 0.0], [-0.1, 0.1, 0.0]])
+    wall = np.array([[0.02, -0.1, 0.0], [0.02, 0.1, 0.0], [0.02, 0.1, 0.05], [0.02, -0.1, 0.05]])
+    corners = np.concatenate([floor, wall])
+    corners[:, 1] += moved
+    return Scene.of(trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], process=False))
+
+
+def paths(scene, device, **more):
+    one = sight()
+    sheet = LightSheet(transport=one.transport, power=3.0, g_limits=(-0.02, 0.05))
+    values = {"sight": one, "sheet": sheet, "scene": scene, "materials": [GREY], "paths": PATHS, "device": device}
+    return LightPaths(**(values | more))
+
+
+def glow(places, normal, length, power, x0):
+    """Irradiance from a line on the floor, from x0 - length to x0, y = 0: points of 1 um, in double."""
+    t = x0 - (np.arange(round(length / 1e-6)) + 0.5) * 1e-6
+    line = np.stack([t, np.zeros_like(t), np.zeros_like(t)], axis=-1)
+    got = []
+    for place in places:
+        way = line - place
+        square = np.sum(way * way, axis=1)
+        arrive = np.maximum(way @ normal, 0.0) * np.maximum(-way[:, 2], 0.0)
+        got.append(np.sum(0.5 * power / math.pi * arrive / square**2) * 1e-6)
+    return np.array(got)
+
+
+def test_a_wall_glows_as_the_line_before_it_says(device):
+    model = paths(corner(), device)
+    lines = model._lines
+    seen = lines.surface(0.0)
+    wall = np.argwhere((seen.triangle >= 2) & (seen.receivers[..., 2] > 1e-3))
+    assert len(wall) >= 3
+    light = model.profile(0.0).exposures["diffuse-diffuse"]
+    chosen = wall[:: max(len(wall) // 8, 1)]
+    at = tuple(chosen.T)
+    expected = glow(seen.receivers[at][:, :3], np.array([-1.0, 0.0, 0.0]), 0.04, 3.0, 0.02)
+    # One node a bin: the power of a bin is its element's.
+    np.testing.assert_allclose(light.power[at], expected * seen.weights[at], rtol=2e-5)
+    floor = np.argwhere(seen.triangle[..., :] < 2)
+    assert not light.power[tuple(floor.T)].any()
+
+
+def test_scene_and_sensor_may_move_together(device):
+    one, other = paths(corner(), device).profile(0.0), paths(corner(0.03), device).profile(0.03)
+    for name in PATHS:
+        np.testing.assert_allclose(one.exposures[name].power, other.exposures[name].power, rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(one.truth.h, other.truth.h, atol=1e-12)
+
+
+def test_light_is_proportional_to_power_and_albedo(device):
+    one = paths(corner(), device).profile(0.0).exposures
+    sheet = LightSheet(transport=sight().transport, power=6.0, g_limits=(-0.02, 0.05))
+    white = Material(diffuse=Lambert(albedo=1.0))
+    more = paths(corner(), device, sheet=sheet, materials=[white]).profile(0.0).exposures
+    np.testing.assert_allclose(more["direct"].power, 4.0 * one["direct"].power, rtol=1e-12)
+    # Diffused twice.
+    np.testing.assert_allclose(more["diffuse-diffuse"].power, 8.0 * one["diffuse-diffuse"].power, rtol=1e-5)
+
+
+def test_further_bounces_come_on_top(device):
+    model = paths(corner(), device, paths=(*PATHS, "bounces"), patch=0.02)
+    light = model.profile(0.0).exposures
+    first, further = light["diffuse-diffuse"].power.sum(), light["bounces"].power.sum()
+    # The wall throws light back onto the floor, and so on; each bounce loses half and what leaves the corner.
+    assert 0.05 * first < further < first
+
+
+def test_nothing_lit_is_dark_and_not_zero(device):
+    model = paths(corner(), device)
+    # Far beyond the part: the sheet meets nothing.
+    profile = model.profile(0.5)
+    assert np.isnan(profile.truth.h).all()
+    assert (profile.truth.status != 0).all()
+    assert not any(each.power.any() for each in profile.exposures.values())
+    assert profile.account["segments"] == 0.0
+
+
+def test_what_was_not_asked_for_is_not_there(device):
+    assert "diffuse-diffuse" not in paths(corner(), device, paths=("direct",)).profile(0.0).exposures
+    with pytest.raises(ValueError, match="unknown path 'defuse'"):
+        paths(corner(), device, paths=("defuse",))

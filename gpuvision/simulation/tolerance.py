@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -25,6 +25,8 @@ _GROUP, _STRIPS_PER_CORE = 64, 8
 _CLEAR = 1 << 30
 # Picks of a block for which there is room at first; what needs more is planned again.
 _ROOM = 64
+# Bounds of zero leave most shares unspent: the others get so many times theirs, as long as the sum allows it.
+_GENEROSITY = 3.0
 # Twos by which the errors of picks are told apart when some of them are left out.
 _STEPS = 64
 
@@ -126,8 +128,8 @@ class LightPlanner:
     A receiver's irradiance from a segment is at most W cos cos / (pi r^2), W its power, with the largest cosines and
     the least distance of any two points, and never more than W / (L r) of length L. The error of a segment that stands
     for a cluster is in `gpuvision.simulation.clusters`. Visibility is between 0 and 1, and a cluster stands only where
-    nothing can hide any of it, so all this holds with occlusion. Each pair's share of the tolerance is as large as its
-    share of power times cost; what the shares leave over is then spent on the pairs with the least bounds. The kernels'
+    nothing can hide any of it, so all this holds with occlusion. The tolerance is shared among
+    pairs by power times cost; what the shares leave over is then spent on the pairs with the least bounds. The kernels'
     rounding comes on top.
     """
 
@@ -136,6 +138,8 @@ class LightPlanner:
     clearance: float = 0.0
     clusters: bool = True
     walk: Walk = "auto"
+    # The room that the last profiles needed.
+    _room: list[int] = field(init=False, repr=False, compare=False, default_factory=lambda: [_ROOM])
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "clearance"):
@@ -168,7 +172,12 @@ class LightPlanner:
             Where to plan; `Device.best` if left out.
         """
         segments = np.asarray(segments, np.float64)
-        if receivers.ndim != 3 or receivers.shape[2] != 6 or weights.shape != (*receivers.shape[:2], 2):
+        if (
+            receivers.ndim != 3
+            or receivers.shape[2] != 6
+            or not receivers.size
+            or weights.shape != (*receivers.shape[:2], 2)
+        ):
             raise ValueError(
                 f"expected receivers (strips, n, 6) and weights (strips, n, 2), got {receivers.shape}, {weights.shape}"
             )
@@ -280,13 +289,12 @@ def _planned(
 ) -> LightPlan:
     strips = len(costs)
     of_strip = -(-receivers.shape[1] // BLOCK)
-    found = _traversed(planner, tree, segments, receivers, costs, device)
+    found, spent = _traversed(planner, tree, segments, receivers, costs, device)
     owner = np.repeat(np.arange(strips), of_strip)
-    spent = np.add.reduceat(found.spent, np.arange(strips) * of_strip) if of_strip else np.zeros((strips, 2))
     held = np.arange(found.picks.shape[1]) < found.counts[:, None]
     picks, errors = found.picks[held], found.errors[held].astype(np.float64)
     block = np.repeat(np.arange(len(found.counts)), found.counts)
-    receivers_of = np.minimum(BLOCK, receivers.shape[1] - BLOCK * (np.arange(len(found.counts)) % max(of_strip, 1)))
+    receivers_of = np.minimum(BLOCK, receivers.shape[1] - BLOCK * (np.arange(len(found.counts)) % of_strip))
     worst = np.minimum(spent[:, 1], direct.widest())
     kept, lost = _kept(picks, errors, owner[block], spent, worst, planner.tolerance)
     bound = np.minimum(np.where(lost > 0.0, lost, 0.0), worst)
@@ -365,7 +373,8 @@ def _traversed(
     receivers: npt.NDArray[Any],
     costs: Reals,
     device: Device,
-) -> _Found:
+) -> tuple[_Found, Reals]:
+    """Return what the kernel found, and what each strip has lost by it, and would lose by all of it, metres."""
     real = np.dtype(np.float64 if device.has_double else np.float32)
     middle = _middle(planner.scene)
     rows = tree.rows.copy()
@@ -375,30 +384,43 @@ def _traversed(
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = planner.tolerance / (costs.sum(axis=1) * tree.power)
     shares = np.where(np.isnan(shares), 0.0, np.minimum(shares, _largest_of(real)))
-    room = min(_ROOM, max(2 * len(segments), 1))
+    given = costs.astype(real), rows.astype(real), placed.astype(real)
+    of_strip = -(-receivers.shape[1] // BLOCK)
+    generosity = np.full(len(costs), _GENEROSITY)
+    while True:
+        found = _run(planner, receivers, (shares * generosity).astype(real), tree.spans, *given, device=device)
+        spent = np.add.reduceat(found.spent, np.arange(len(costs)) * of_strip, axis=0)
+        over = (spent[:, 0] > planner.tolerance) & (generosity > 1.0)
+        if not over.any():
+            return found, spent
+        generosity[over] = 1.0
+
+
+def _run(
+    planner: LightPlanner,
+    receivers: npt.NDArray[Any],
+    shares: npt.NDArray[Any],
+    spans: Integers,
+    costs: npt.NDArray[Any],
+    rows: npt.NDArray[Any],
+    placed: npt.NDArray[Any],
+    device: Device,
+) -> _Found:
     while True:
         operation = _PlanLight(
-            nodes=len(tree.spans),
+            nodes=len(spans),
             segments=len(placed),
-            room=room,
+            room=planner._room[0],
             scene=planner.scene,
             clearance=planner.clearance,
             clusters=planner.clusters,
             walk=planner.walk,
         )
-        found = operation(
-            receivers,
-            costs.astype(real),
-            shares.astype(real),
-            rows.astype(real),
-            tree.spans,
-            placed.astype(real),
-            device=device,
-        )
+        found = operation(receivers, costs, shares, rows, spans, placed, device=device)
         most = int(found.counts.max(initial=0))
-        if most <= room:
+        if most <= planner._room[0]:
             return found
-        room = _room(most)
+        planner._room[0] = _room(most)
 
 
 def _placed(segments: Reals, middle: Reals) -> Reals:

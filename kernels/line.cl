@@ -45,8 +45,12 @@ inline void store_reading(const Outputs *to, ulong first, int sample, reals posi
     const reals samples = to_reals((ints)sample + lane_numbers);
     const ints sheet_flags = to_ints(LANED(sheet_point)(position, samples, to->sheet, &g, &h));
     flags |= sheet_flags & ~lost;
+#ifdef WITH_G
     store_reals(g, to->g + first);
+#endif
+#ifdef WITH_H
     store_reals(h, to->h + first);
+#endif
 #endif
 #ifdef WITH_POSITION
     store_reals(position, to->position + first);

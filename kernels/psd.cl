@@ -177,8 +177,12 @@ inline void read_out(const int careful, int sample, Verdict *verdict, global con
     const bytes lost = LANED(sheet_point)(u, strip_numbers(sample, strips), sheet, &at_g, &at_h);
     // The sheet sees NaN where the reading was bad: the reason is the reading's own.
     flags |= LANED(convert_bits)(lost) & good;
+#ifdef WITH_G
     store_reals(at_g, g + sample);
+#endif
+#ifdef WITH_H
     store_reals(at_h, h + sample);
+#endif
 #endif
 #ifdef WITH_STATUS
     store_bytes(convert_bytes(flags), status + sample);

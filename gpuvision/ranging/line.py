@@ -306,7 +306,7 @@ class LineReadout(Operation[LineReading]):
         if self.method == "fir":
             defines["REACH"] = self.window + self.fir_length // 2
         chosen = self.outputs or ()
-        defines |= {f"WITH_{name.upper()}": None for name in LineReading._fields[:5] if name in chosen}
+        defines |= {f"WITH_{name.upper()}": None for name in LineReading._fields if name in chosen}
         if self.triangulation is not None:
             defines |= {"WITH_SHEET": None} | self.triangulation.defines
         present = {

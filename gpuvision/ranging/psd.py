@@ -254,7 +254,7 @@ class PsdReadout(Operation[PsdReading]):
         defines: dict[str, Any] = real_defines(device, real)
         code = _CODES[dtype.name]
         defines |= {"CODE": code, "CODE16": f"{code}16"}
-        defines |= {f"WITH_{name.upper()}": None for name in ("position", "total", "status", "sigma") if name in chosen}
+        defines |= {f"WITH_{name.upper()}": None for name in PsdReading._fields if name in chosen}
         if self.triangulation is not None:
             defines |= {"WITH_SHEET": None} | self.triangulation.defines
         present = {

@@ -466,6 +466,16 @@ def test_triangulation_flags_its_own(device):
     np.testing.assert_array_equal(np.isnan(reading.h), np.repeat([False, True], 32))
 
 
+@pytest.mark.parametrize("name", ["g", "h", "position"])
+def test_one_output_of_the_sheet(device, rng, name):
+    """What is not asked for is not written, with a triangulation too."""
+    frames = line_frames(rng, "uint8", (2, 99, 130), "columns")
+    readout = LineReadout(threshold=20, triangulation=SHEET)
+    whole, alone = (each(frames, device=device) for each in (readout, replace(readout, outputs=(name,))))
+    np.testing.assert_array_equal(getattr(alone, name), getattr(whole, name))
+    assert sum(each is not None for each in alone) == 1
+
+
 def test_triangulation_of_another_axis():
     with pytest.raises(ValueError, match="along"):
         LineReadout(along="rows", triangulation=SHEET)

@@ -270,6 +270,17 @@ def test_outputs_are_chosen(device, rng):
     assert (reading.status == 0).all()
 
 
+@pytest.mark.parametrize("name", ["g", "h", "position"])
+def test_one_output_of_the_sheet(device, rng, name):
+    """What is not asked for is not written, with a triangulation too."""
+    sheet = Triangulation(homography=((1, 0, 0), (0, 1, 0), (5.0, 0, 1)), region=((-3e-3, 3e-3), (-4e-3, 4e-3)))
+    pairs = currents(rng, (40, 2))
+    whole = PsdReadout(strip_length=LENGTH, triangulation=sheet)(pairs, device=device)
+    alone = PsdReadout(strip_length=LENGTH, triangulation=sheet, outputs=(name,))(pairs, device=device)
+    np.testing.assert_array_equal(getattr(alone, name), getattr(whole, name))
+    assert sum(each is not None for each in alone) == 1
+
+
 def test_an_empty_batch_is_no_error(device):
     reading = PsdReadout(strip_length=LENGTH)(np.zeros((0, 4, 2), np.float32), device=device)
     assert reading.position.shape == (0, 4)

@@ -35,11 +35,12 @@ from gpuvision.simulation.readings import (
     OPEN,
     PATHS,
     Reading,
+    Simulator,
     Truth,
+    dark_exposure,
     height_secant,
     height_slope,
     lit_by,
-    with_ambient,
 )
 from gpuvision.simulation.sight import Exposure, Sight
 from gpuvision.status import Status
@@ -216,19 +217,18 @@ def explain(
     chosen = split or ("moments" if isinstance(simulator, PsdSimulator) else "removal")
     if chosen == "moments" and not isinstance(simulator, PsdSimulator):
         raise ValueError("split 'moments' is for PSDs, whose reading is a centre of gravity; cameras take 'removal'")
-    clean = simulator.read(exposures, device=device)
-    if np.shape(truth.h) != clean.h.shape:
-        raise ValueError(f"the truth has shape {np.shape(truth.h)}, the reading {clean.h.shape}; expected the same")
+    reading = simulator.read(exposures, seed=seed, first=first, device=device)
+    if np.shape(truth.h) != reading.h.shape:
+        raise ValueError(f"the truth has shape {np.shape(truth.h)}, the reading {reading.h.shape}; expected the same")
     behind = simulator.light(exposures)
     if chosen == "moments":
+        clean = reading if seed is None else simulator.read(exposures, device=device)
         causes = _by_moments(simulator.sight, behind, truth, clean, detail)
     else:
-        causes = _by_removal(simulator, exposures, truth, detail, device)
-    reading = clean if seed is None else simulator.read(exposures, seed=seed, first=first, device=device)
+        causes = _by_removal(simulator, behind, truth, detail, device)
     error = reading.h - truth.h
-    explained = np.sum(list(causes.values()), axis=0)
     # Rounding, and what cannot be read without its noise.
-    causes["noise"] = np.where(np.isnan(clean.h), error, error - np.nan_to_num(explained))
+    causes["noise"] = error - np.nan_to_num(np.sum(list(causes.values()), axis=0))
     known = np.isfinite(error)
     causes = {name: np.where(known, np.nan_to_num(part), np.nan) for name, part in causes.items()}
     return Artifacts(
@@ -326,40 +326,43 @@ def _direct_causes(sight: Sight, light: Mapping[str, Exposure], weight: Float64)
 
 
 def _by_removal(
-    simulator: PsdSimulator | CameraSimulator,
-    exposures: Mapping[str, Exposure],
-    truth: Truth,
-    detail: bool,
-    device: Device | None,
+    simulator: Simulator, light: Mapping[str, Exposure], truth: Truth, detail: bool, device: Device | None
 ) -> dict[str, Float64]:
-    light = with_ambient(simulator.sight, exposures, simulator.ambient)
-    still = replace(simulator, ambient=0.0)
     beside = _beside_direct(light, detail)
-    variants = _has_variants(light)
-    toggles = ["occlusion", "reflectivity"] if variants else []
-    present = [name for name in beside if np.any(_light_of(name, light, detail) > 0.0)]
-    players = toggles + present
+    direct = _direct_signals(simulator, light)
+    signals = {}
+    for name in beside:
+        if np.any(_light_of(name, light, detail) > 0.0):
+            signals[name] = simulator.signal(
+                lit_by({path: light[path] for path in _paths_of(name, detail) if path in light})
+            )
+    toggles = ["occlusion", "reflectivity"] if len(direct) > 1 else []
+    players = toggles + list(signals)
     errors: dict[frozenset[str], Float64] = {}
     for count in range(len(players) + 1):
         for group in itertools.combinations(players, count):
-            seen = _lit_by_group(light, set(group), variants, detail)
-            errors[frozenset(group)] = np.nan_to_num(still.read(seen, device=device).h - truth.h)
+            total = sum(
+                (signals[name] for name in group if name in signals), start=direct[frozenset(group) & {*toggles}]
+            )
+            errors[frozenset(group)] = np.nan_to_num(simulator.heights(total, device) - truth.h)
     causes = {"shape": errors[frozenset()]}
     for name in toggles + beside:
         causes[name] = _shapley(name, players, errors) if name in players else np.zeros(np.shape(truth.h))
     return causes
 
 
-def _lit_by_group(light: Mapping[str, Exposure], causes: set[str], variants: bool, detail: bool) -> dict[str, Exposure]:
-    """Return the light if only some causes were at work."""
-    seen = {path: light[path] for cause in causes for path in _paths_of(cause, detail) if path in light}
-    if variants:
-        real, even = ("direct", EVEN) if "occlusion" in causes else (OPEN, EVEN_OPEN)
-        seen["direct"] = light[real] if "reflectivity" in causes else _as_bright(light[even], light[real])
-    elif "direct" in light:
-        seen["direct"] = light["direct"]
-    dark = next(iter(light.values()))
-    return seen if "direct" in seen else seen | {"direct": Exposure(0.0 * dark.power, 0.0 * dark.moment)}
+def _direct_signals(simulator: Simulator, light: Mapping[str, Exposure]) -> dict[frozenset[str], npt.NDArray[Any]]:
+    """Return the signal of the direct light for every set of its two causes; the real one's, if it alone is known."""
+    real = light["direct"] if "direct" in light else dark_exposure(light)
+    if not _has_variants(light):
+        return {frozenset(): simulator.signal(real)}
+    kinds = {
+        frozenset({"occlusion", "reflectivity"}): real,
+        frozenset({"reflectivity"}): light[OPEN],
+        frozenset({"occlusion"}): _as_bright(light[EVEN], real),
+        frozenset(): _as_bright(light[EVEN_OPEN], light[OPEN]),
+    }
+    return {name: simulator.signal(each) for name, each in kinds.items()}
 
 
 def _as_bright(light: Exposure, like: Exposure) -> Exposure:

@@ -29,6 +29,7 @@ from gpuvision.simulation.sight import Exposure, Sight
 
 Float64 = npt.NDArray[np.float64]
 _SAME = 1e-6  # pixel
+_MOST_ELECTRONS = 1e15
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,19 +127,20 @@ class CameraSimulator:
         first
             Number of the block's first profile.
         """
-        electrons = self.electrons(exposures)
-        highest = float(2**self.bits - 1)
         if seed is None:
-            grey = self.offset + self.gain * np.minimum(electrons, self.full_well)
-            return self._as_frames(np.minimum(grey, highest).astype(np.float32))
-        flat = electrons.reshape(-1, *electrons.shape[-2:])
-        codes = np.empty(flat.shape, np.uint8 if self.bits == 8 else np.uint16)
-        for each, generator in enumerate(profile_generators(seed, first, electrons.shape[:-2])):
-            # A Poisson number beyond 1e9 is a normal one, and beyond 9e18 none.
-            held = np.minimum(generator.poisson(np.minimum(flat[each], 1e15)), self.full_well)
-            grey = self.offset + self.gain * (held + self.read_noise * generator.standard_normal(held.shape))
-            codes[each] = np.clip(np.rint(grey), 0.0, highest)
-        return self._as_frames(codes.reshape(electrons.shape))
+            return self._expected(self.signal(lit_by(self.light(exposures))))
+        return self._noisy(self.electrons(exposures), seed, first)
+
+    def signal(self, light: Exposure) -> npt.NDArray[np.float32]:
+        """Return what light behind the mask adds to the grey levels, float32 as the readout takes frames."""
+        levels = self.gain * self.responsivity * self.exposure_time / ELECTRON
+        return self._as_frames((levels * light.power).astype(np.float32))
+
+    def heights(self, signal: npt.NDArray[np.float32], device: Device | None = None) -> Float64:
+        """Read a signal without noise: heights [m], (..., samples), in the sight's order."""
+        said = replace(self.readout, outputs=("h",))(self._expected(signal), device=device)
+        step = -1 if self.readout.axes.sample_pitch < 0.0 else 1
+        return np.asarray(said.h, np.float64)[..., ::step]
 
     def read(
         self,
@@ -152,14 +154,31 @@ class CameraSimulator:
 
         Sigma is that of a centre of gravity over the readout's window about the reading (over all light, for method
         "whole"), of photon, read and rounding noise, where the threshold lies below the noise of dark pixels or far
-        above it; other methods' differ from it. Without a seed the frames are those without noise.
+        above it; other methods' differ from it. Without a seed the frames are those without noise. Samples are in the
+        sight's order.
         """
-        said = self.readout(self.frames(exposures, seed=seed, first=first), device=device)
+        light = lit_by(self.light(exposures))
+        electrons = light.power * (self.responsivity * self.exposure_time / ELECTRON)
+        frames = self._expected(self.signal(light)) if seed is None else self._noisy(electrons, seed, first)
+        said = self.readout(frames, device=device)
         axes = self.readout.axes
         position = np.asarray(said.position, np.float64)
         u = axes.position_origin + axes.position_pitch * position
-        sigma = abs(axes.position_pitch) * self._sigma(exposures, position)
+        sigma = abs(axes.position_pitch) * self._sigma(self._in_order(electrons), position)
         return reading_of(self.sight, said, u, sigma, backward=axes.sample_pitch < 0.0)
+
+    def _expected(self, signal: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        return np.asarray(np.minimum(signal + np.float32(self.offset), np.float32(self._highest)))
+
+    def _noisy(self, electrons: Float64, seed: int, first: int) -> npt.NDArray[Any]:
+        flat = electrons.reshape(-1, *electrons.shape[-2:])
+        codes = np.empty(flat.shape, np.uint8 if self.bits == 8 else np.uint16)
+        for each, generator in enumerate(profile_generators(seed, first, electrons.shape[:-2])):
+            # More than any well holds is no Poisson number that can be drawn.
+            held = np.minimum(generator.poisson(np.clip(flat[each], 0.0, _MOST_ELECTRONS)), self.full_well)
+            grey = self.offset + self.gain * (held + self.read_noise * generator.standard_normal(held.shape))
+            codes[each] = np.clip(np.rint(grey), 0.0, 2.0**self.bits - 1.0)
+        return self._as_frames(codes.reshape(electrons.shape))
 
     def _in_order(self, profiles: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Return (..., samples, bins) with samples and bins as the readout counts them."""
@@ -171,23 +190,22 @@ class CameraSimulator:
         turned = profiles if self.readout.along == "rows" else profiles.swapaxes(-1, -2)
         return np.ascontiguousarray(turned)
 
-    def _sigma(self, exposures: Mapping[str, Exposure], position: Float64) -> Float64:
+    def _sigma(self, electrons: Float64, position: Float64) -> Float64:
         """Return the standard deviation of a centre of gravity about positions [pixel]."""
-        electrons = self._in_order(np.minimum(self.electrons(exposures), self.full_well))
-        signal = np.maximum(electrons + (self.offset - self.readout.threshold) / self.gain, 0.0)
-        variance = electrons + self.read_noise**2 + 1.0 / 12.0 / self.gain**2
         known = np.isfinite(position)
         middle = np.where(known, position, 0.0)
         if self.readout.method == "whole":
             at = np.broadcast_to(np.arange(self.sight.bins), electrons.shape)
+            inside = np.ones(electrons.shape, bool)
         else:
             reach = np.arange(-self.readout.window, self.readout.window + 1)
             at = np.rint(middle)[..., None].astype(np.intp) + reach
             inside = (at >= 0) & (at < self.sight.bins)
-            clipped = np.clip(at, 0, self.sight.bins - 1)
-            signal = np.where(inside, np.take_along_axis(signal, clipped, axis=-1), 0.0)
-            variance = np.where(inside, np.take_along_axis(variance, clipped, axis=-1), 0.0)
+            electrons = np.take_along_axis(electrons, np.clip(at, 0, self.sight.bins - 1), axis=-1)
+        held = np.minimum(electrons, self.full_well)
+        signal = np.where(inside, np.maximum(held + (self.offset - self.readout.threshold) / self.gain, 0.0), 0.0)
         # Samples that the threshold takes away have no say.
-        weighed = np.sum(np.where(signal > 0.0, variance, 0.0) * (at - middle[..., None]) ** 2, axis=-1)
+        variance = np.where(signal > 0.0, held + self.read_noise**2 + 1.0 / 12.0 / self.gain**2, 0.0)
+        weighed = np.sum(variance * (at - middle[..., None]) ** 2, axis=-1)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(known, np.sqrt(weighed) / np.sum(signal, axis=-1), np.nan)

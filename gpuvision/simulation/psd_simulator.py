@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.ranging.psd import ELECTRON, PsdNoise, PsdReadout
+from gpuvision.ranging.psd import ELECTRON, PsdNoise, PsdReading, PsdReadout
 from gpuvision.simulation.masks import Mask, light_behind
 from gpuvision.simulation.readings import (
     AMBIENT,
@@ -112,12 +112,10 @@ class PsdSimulator:
         first
             Number of the block's first profile.
         """
-        lit = self._in_order(lit_by(self.light(exposures)))
-        total = self.responsivity * lit.total()
-        with np.errstate(invalid="ignore", divide="ignore"):
-            place = np.where(total > 0.0, self.responsivity * lit.first_moment(self.sight.u_edges) / total, 0.0)
+        signal = self.signal(lit_by(self.light(exposures)))
         if seed is None:
-            return self._recorded(self._divided(total, place))
+            return self._expected(signal)
+        total, place = self._centre(signal)
         generators = profile_generators(seed, first, total.shape[:-1])
         draws = np.reshape(
             [each.standard_normal((5, self.sight.samples)) for each in generators], (*total.shape[:-1], 5, -1)
@@ -145,15 +143,37 @@ class PsdSimulator:
         Without a seed the reading is the one of the currents without noise; its sigma says what noise would do. A
         strip without any light is DARK. Samples are in the sight's order.
         """
-        device = Device.best() if device is None else device
-        currents = self.currents(exposures, seed=seed, first=first)
-        if currents.dtype == np.float64 and not device.has_double:
-            currents = currents.astype(np.float32)
-        said = self.readout(currents, device=device)
+        said = self._said(self.currents(exposures, seed=seed, first=first), device)
         axes = self.readout.axes
         u = axes.position_origin + axes.position_pitch * np.asarray(said.position, np.float64)
         sigma = abs(axes.position_pitch) * np.asarray(said.sigma, np.float64)
         return reading_of(self.sight, said, u, sigma, backward=axes.sample_pitch < 0.0)
+
+    def signal(self, light: Exposure) -> Float64:
+        """Return what light behind the mask adds to the strips' currents: their sum, and it times u, (..., strips, 2).
+
+        In the readout's order of the strips.
+        """
+        light = self._in_order(light)
+        return self.responsivity * np.stack([light.total(), light.first_moment(self.sight.u_edges)], axis=-1)
+
+    def heights(self, signal: Float64, device: Device | None = None) -> Float64:
+        """Read a signal without noise: heights [m], (..., samples), in the sight's order."""
+        step = -1 if self.readout.axes.sample_pitch < 0.0 else 1
+        return np.asarray(self._said(self._expected(signal), device).h, np.float64)[..., ::step]
+
+    def _said(self, currents: npt.NDArray[Any], device: Device | None) -> PsdReading:
+        device = Device.best() if device is None else device
+        if currents.dtype == np.float64 and not device.has_double:
+            currents = currents.astype(np.float32)
+        return self.readout(currents, device=device)
+
+    def _expected(self, signal: Float64) -> Float64:
+        return self._recorded(self._divided(*self._centre(signal)))
+
+    def _centre(self, signal: Float64) -> tuple[Float64, Float64]:
+        total = signal[..., 0]
+        return total, np.divide(signal[..., 1], total, out=np.zeros_like(total), where=total > 0.0)
 
     def _arriving(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
         return light_behind(self.mask, self.sight, with_ambient(self.sight, exposures, self.ambient))

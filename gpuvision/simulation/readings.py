@@ -79,6 +79,18 @@ class Simulator(Protocol):
         """What it sees."""
         ...
 
+    def light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
+        """Return the light by path that moves a reading: behind the mask, ambient light among it."""
+        ...
+
+    def signal(self, light: Exposure) -> npt.NDArray[Any]:
+        """Return what light behind the mask adds to what is read; signals add."""
+        ...
+
+    def heights(self, signal: npt.NDArray[Any], device: Device | None = None) -> Float64:
+        """Read a signal without noise: heights [m], (..., samples)."""
+        ...
+
     def read(
         self,
         exposures: Mapping[str, Exposure],
@@ -139,10 +151,14 @@ def lit_by(exposures: Mapping[str, Exposure]) -> Exposure:
             raise ValueError(f"unknown path {name!r}, expected some of {', '.join(_KNOWN)}")
     if len({each.power.shape for each in exposures.values()}) > 1:
         raise ValueError("the paths' light has different shapes, expected one (..., samples, bins)")
-    total = dark_exposure(exposures)
-    for name in _LIT:
-        if name in exposures:
-            total = total + exposures[name]
+    lit = [exposures[name] for name in _LIT if name in exposures] or [dark_exposure(exposures)]
+    return Exposure(_sum([each.power for each in lit]), _sum([each.moment for each in lit]))
+
+
+def _sum(parts: Sequence[Float64]) -> Float64:
+    total = parts[0] if len(parts) == 1 else parts[0] + parts[1]
+    for each in parts[2:]:
+        total += each
     return total
 
 

@@ -12,15 +12,19 @@ import numpy.typing as npt
 from gpuvision.host import Device
 from gpuvision.simulation.envelope import upper_envelope
 from gpuvision.simulation.illumination import LightSheet, LitLine
+from gpuvision.simulation.mirror_points import Blocks
 from gpuvision.simulation.padded import run_padded
 from gpuvision.simulation.rays import ClosestHit
 from gpuvision.simulation.scene import Scene
+from gpuvision.simulation.sheet_cut import ranges
 
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Corners that are looked at in one go.
-_CORNERS = 4_000_000
+# Pairs of a sheet and a block of triangles that are looked at in one go.
+_PAIRS = 2_000_000
+# Mirrored sheets that agree to so many digits, in sizes of the scene, are one.
+_DIGITS = 11
 # What is as near to the mirror, in distances of the source or sizes of the scene, lies on it.
 _ON_IT = 1e-12
 _HALVINGS = 12
@@ -81,11 +85,10 @@ class ThrownLight:
     # ---- plane mirrors: the mirrored sheet cuts the scene ------------------------------------------------------
 
     def _by_planes(self, beam: _Beam, uniformity: float) -> _Beam:
-        """Throw on what falls on plane mirrors, mirror by mirror and direction by direction."""
+        """Throw on what falls on plane mirrors: together what falls on one plane in one sheet from one place."""
         if not len(beam.light):
             return beam
-        key = np.column_stack([beam.line.triangle, beam.light])
-        group = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+        group = np.unique(self._keys(beam), axis=0, return_inverse=True)[1].ravel()
         order = np.argsort(group, kind="stable")
         beam, group = _those(beam, order), group[order]
         first = np.flatnonzero(np.diff(group, prepend=-1))
@@ -138,13 +141,32 @@ class ThrownLight:
         triangle = cuts.triangle[member][good]
         return _Beam(_lit(self._planes, ends[good], triangle, (arriving[good] / length[good]), light), light)
 
+    def _keys(self, beam: _Beam) -> Float64:
+        """Return rows that are equal for lines which one mirrored sheet stands for."""
+        line, light = beam.line, beam.light.copy()
+        start, mirror = line.ends[:, 0], self._planes[line.triangle]
+        across = np.cross(line.ends[:, 1] - start, light[:, :3] - light[:, 3:] * start)
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        planes = []
+        for normal in (mirror, across):
+            largest = np.take_along_axis(normal, np.abs(normal).argmax(axis=1)[:, None], axis=1)
+            normal = normal * np.sign(largest)
+            planes += [normal, np.sum(normal * start, axis=1, keepdims=True) / self._reach]
+        light[:, :3] /= np.where(light[:, 3:] != 0.0, self._reach, 1.0)
+        return np.round(np.hstack([*planes, light]), _DIGITS) + 0.0
+
     def _cuts(self, fans: _Fans) -> _Cuts:
         """Return where mirrored sheets cut the scene's triangles beyond their mirrors."""
-        there = self.scene.bvh.numbers
-        corners = self.scene.corners[there]
-        found, each = [], max(_CORNERS // max(3 * len(corners), 1), 1)
-        for first in range(0, len(fans.length), each):
-            found.append(_cut(fans, np.arange(first, min(first + each, len(fans.length))), corners, there))
+        blocks, found = self._blocks, []
+        step = max(_PAIRS // max(len(blocks.radius), 1), 1)
+        for first in range(0, len(fans.length), step):
+            some = slice(first, first + step)
+            off = fans.across[some] @ blocks.middle.T - np.sum(fans.across * fans.start, axis=1)[some, None]
+            fan, block = np.nonzero(np.abs(off) <= blocks.radius * (1.0 + 1e-9) + _ON_IT * self._reach)
+            fan, block = fans.reached(fan + first, block, blocks)
+            count = np.diff(blocks.start)[block]
+            triangle = blocks.order[ranges(blocks.start[block], count)]
+            found.append(_cut(fans, np.repeat(fan, count), self.scene.corners, triangle, self._reach))
         return _Cuts(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
     # ---- curved mirrors: rays ----------------------------------------------------------------------------------
@@ -215,6 +237,17 @@ class ThrownLight:
         return flat + lift, normal / np.linalg.norm(normal, axis=-1, keepdims=True), np.linalg.norm(lift, axis=-1)
 
     @functools.cached_property
+    def _reach(self) -> float:
+        return float(np.abs(self.scene.corners[self.scene.bvh.numbers]).max(initial=0.0)) or 1.0
+
+    @functools.cached_property
+    def _blocks(self) -> Blocks:
+        there = self.scene.bvh.numbers
+        corners = self.scene.corners[there]
+        blocks = Blocks.of(corners, np.broadcast_to((0.0, 0.0, 1.0), corners.shape))
+        return blocks._replace(order=there[blocks.order])
+
+    @functools.cached_property
     def _planes(self) -> Float64:
         corners = self.scene.corners
         with np.errstate(all="ignore"):
@@ -229,6 +262,33 @@ class _Fans(NamedTuple):
     along: Float64  # (f, 3): to the other end
     light: Float64  # (f, 4): where the light seems to come from
     length: Float64  # (f,) of the lit line
+
+    @property
+    def back(self) -> Float64:
+        """From the start towards the light, (f, 3)."""
+        return np.asarray(self.light[:, :3] - self.light[:, 3:] * self.start)
+
+    @property
+    def basis(self) -> Float64:
+        """What turns a place from the start into multiples of along and back, (f, 2, 3)."""
+        return np.linalg.pinv(np.stack([self.along, self.back], axis=2))
+
+    def reached(self, fan: Integers, block: Integers, blocks: Blocks) -> tuple[Integers, Integers]:
+        """Return those pairs of a sheet and a block, cut by its plane, that the light may reach."""
+        p, q = np.moveaxis(self.basis[fan], 1, 0)
+        away, radius = blocks.middle[block] - self.start[fan], blocks.radius[block] * (1.0 + 1e-9)
+        spread = np.where(self.is_point[fan], 1.0, 0.0)[:, None]
+        # The way beyond the mirror, x from 0, and x to 1, each positive there and linear in the place.
+        inside = np.ones(len(fan), bool)
+        for offset, slope in ((0.0, -q), (0.0, p), (1.0, -p - spread * q)):
+            inside &= offset + np.sum(slope * away, axis=1) >= -radius * np.linalg.norm(slope, axis=1)
+        return fan[inside], block[inside]
+
+    @property
+    def across(self) -> Float64:
+        """Unit normals of the sheets, (f, 3)."""
+        normal = np.cross(self.along, self.back)
+        return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
     @property
     def is_point(self) -> npt.NDArray[np.bool_]:
@@ -268,48 +328,38 @@ def _fans_of(beam: _Beam, first: Integers, group: Integers, planes: Float64) -> 
     return _Fans(start, along * length[:, None], light, length), (at - low[group][:, None]) / length[group][:, None]
 
 
-def _cut(fans: _Fans, some: Integers, corners: Float64, numbers: Integers) -> _Cuts:
-    """Cut all triangles with some sheets, and keep what lies beyond the mirror and within the light."""
-    start, along, light = fans.start[some], fans.along[some], fans.light[some]
-    # From the source, or from the line's start along the light: place = a along + b back.
-    back = light[:, :3] - light[:, 3:] * start
-    across = np.cross(along, back)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    off = corners @ across.T - np.sum(start * across, axis=1)
+def _cut(fans: _Fans, fan: Integers, corners: Float64, triangle: Integers, reach: float) -> _Cuts:
+    """Cut triangles with sheets, pair by pair, and keep what lies beyond the mirror and within the light."""
+    points = corners[triangle] - fans.start[fan][:, None]
+    across = fans.across[fan][:, None]
+    # Each product by itself: neighbours find the same for the corner that they share.
+    off = points[..., 0] * across[..., 0] + points[..., 1] * across[..., 1] + points[..., 2] * across[..., 2]
     below = off < 0.0
     crossing = below.any(axis=1) & ~below.all(axis=1)
-    which, fan = np.nonzero(crossing)
-    if not len(which):
-        return _Cuts(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
+    fan, triangle, points, off, below = (each[crossing] for each in (fan, triangle, points, off, below))
     # Of each triangle the corner alone on its side, and the other two.
-    sides = below[which, :, fan]
-    lone = np.where(sides.sum(axis=1) == 1, np.argmax(sides, axis=1), np.argmin(sides, axis=1))
-    ends = []
+    lone = np.where(below.sum(axis=1) == 1, np.argmax(below, axis=1), np.argmin(below, axis=1))
+    row, ends = np.arange(len(fan)), []
     for step in (1, 2):
         other = (lone + step) % 3
-        one, two = off[which, lone, fan], off[which, other, fan]
-        # Neighbours cut the edge that they share in one place: from below upwards.
-        swap = one > two
+        # The edge that two share is cut in one place: from below upwards.
+        swap = off[row, lone] > off[row, other]
         low, high = np.where(swap, other, lone), np.where(swap, lone, other)
-        one, two = np.minimum(one, two), np.maximum(one, two)
-        share = (one / (one - two))[:, None]
-        ends.append(corners[which, low] + share * (corners[which, high] - corners[which, low]))
-    place = np.stack(ends, axis=1) - start[fan][:, None]
+        share = (off[row, low] / (off[row, low] - off[row, high]))[:, None]
+        ends.append(points[row, low] + share * (points[row, high] - points[row, low]))
+    place, light = np.stack(ends, axis=1), fans.light[fan]
     # place = p along + q back, in the plane of the two.
-    basis = np.stack([along, back], axis=2)
-    p, q = np.moveaxis(np.einsum("fij,fpj->fpi", np.linalg.pinv(basis)[fan], place), -1, 0)
-    is_point = (light[fan, 3] != 0.0)[:, None]
+    p, q = np.moveaxis(np.einsum("fij,fpj->fpi", fans.basis[fan], place), -1, 0)
     # Beyond the mirror q is negative; rays from a source are 1 - q times as far apart as there.
-    is_point = light[fan, 3] != 0.0
-    least = _ON_IT * np.where(is_point, 1.0, np.abs(corners).max(initial=0.0))
-    p, depth, kept = _beyond(p, -q, least)
-    fan, triangle, is_point = fan[kept], numbers[which[kept]], is_point[kept, None]
+    is_point = light[:, 3] != 0.0
+    p, depth, kept = _beyond(p, -q, _ON_IT * np.where(is_point, 1.0, reach))
+    fan, triangle, is_point = fan[kept], triangle[kept], is_point[kept, None]
     wide = np.where(is_point, 1.0 + depth, 1.0)
     x, height = p / wide, np.where(is_point, 1.0 / wide, -depth)
     order = np.argsort(x, axis=1, kind="stable")
     x, height = np.take_along_axis(x, order, axis=1), np.take_along_axis(height, order, axis=1)
     inside = (x[:, 1] > 0.0) & (x[:, 0] < 1.0)
-    return _Cuts(some[fan[inside]], triangle[inside], x[inside], height[inside])
+    return _Cuts(fan[inside], triangle[inside], x[inside], height[inside])
 
 
 def _beyond(p: Float64, depth: Float64, least: Float64) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:

@@ -28,16 +28,17 @@ typedef struct {
 
 PATCH_INLINE real dot_of(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-inline int is_free(const bvh_tree *tree, const real *place, const real *way, real clearance) {
-    const real margin = clearance > 0 ? clearance / sqrt(dot_of(way, way)) : 0;
-    if (!(margin < (real)0.5)) return 1;
-    const bvh_ray ray = bvh_ray_of(place[0], place[1], place[2], way[0], way[1], way[2], margin, (real)1 - margin);
+// Metres at either end do not count: the surfaces that the ends lie on.
+inline int is_free(const bvh_tree *tree, const real *place, const real *way, real after, real before) {
+    const real per = after + before > 0 ? (real)1 / sqrt(dot_of(way, way)) : 0, start = after * per, end = 1 - before * per;
+    if (!(start < end)) return 1;
+    const bvh_ray ray = bvh_ray_of(place[0], place[1], place[2], way[0], way[1], way[2], start, end);
     return !bvh_any(tree, &ray);
 }
 
 // The part of a polygon's light that gets through, by rays to the middles of side x side fields of it, each for what it
 // would send if it were small.
-inline real free_part(const bvh_tree *tree, const view *own, int side, real clearance) {
+__attribute__((noinline)) real free_part(const bvh_tree *tree, const view *own, int side, real after, real before) {
     real through = 0, whole = 0;
     for (int field = 0; field < side * side; field++) {
         const real s = (field % side + (real)0.5) / side, t = (field / side + (real)0.5) / side;
@@ -53,7 +54,7 @@ inline real free_part(const bvh_tree *tree, const view *own, int side, real clea
         const real square = dot_of(way, way);
         const real sent = fabs(dot_of(way, front) * dot_of(way, own->normal)) / (square * square);
         whole += sent;
-        if (is_free(tree, own->place, way, clearance)) through += sent;
+        if (is_free(tree, own->place, way, after, before)) through += sent;
     }
     return whole > 0 ? through / whole : 0;
 }
@@ -69,7 +70,7 @@ PATCH_INLINE void spread(real (*to)[LANES], vector from) {
 
 // A factor without what is hidden.
 PATCH_INLINE reals seen_part(const bvh_tree *tree, reals factor, vector place, vector normal, const polygon *shape,
-                             real rays, real clearance) {
+                             real rays, real after, real before) {
 #ifdef STRIP
     real factors[LANES], all[18][LANES];
     *(reals_at *)factors = factor;
@@ -81,7 +82,7 @@ PATCH_INLINE reals seen_part(const bvh_tree *tree, reals factor, vector place, v
         view own;
         for (int n = 0; n < 3; n++) own.place[n] = all[n][lane], own.normal[n] = all[3 + n][lane];
         for (int n = 0; n < 12; n++) own.corner[n / 3][n % 3] = all[6 + n][lane];
-        factors[lane] *= free_part(tree, &own, side_of(factors[lane], rays), clearance);
+        factors[lane] *= free_part(tree, &own, side_of(factors[lane], rays), after, before);
     }
     return *(reals_at *)factors;
 #else
@@ -90,7 +91,7 @@ PATCH_INLINE reals seen_part(const bvh_tree *tree, reals factor, vector place, v
     for (int n = 0; n < 4; n++)
         own.corner[n][0] = shape->corner[n].x, own.corner[n][1] = shape->corner[n].y,
         own.corner[n][2] = shape->corner[n].z;
-    return factor * free_part(tree, &own, side_of(factor, rays), clearance);
+    return factor * free_part(tree, &own, side_of(factor, rays), after, before);
 #endif
 }
 #endif
@@ -102,8 +103,9 @@ kernel void patch_light(global const INPUT *restrict receivers, global const rea
                         global real *restrict irradiance,
 #endif
                          global uchar *restrict status, global const real *restrict triangles,
-                         global const int *restrict starts, global const real *nodes, global const int *children,
-                         global const int *axes, global const real *leaves, global const int *numbers,
+                         global const int *restrict starts, global const real *restrict slacks,
+                         global const real *nodes, global const int *children, global const int *axes,
+                         global const real *leaves, global const int *numbers,
                          constant PLACE *middle, const real shallow, const real clearance, const real rays,
                          const uint patches, const ulong count, const ulong each) {
 #ifdef OCCLUSION
@@ -151,7 +153,8 @@ kernel void patch_light(global const INPUT *restrict receivers, global const rea
                 const polygon shape = patch_cut(corner, edge, height);
                 reals factor = zero_where(~(facing & above), patch_factor(&shape, normal));
 #ifdef OCCLUSION
-                factor = seen_part(&tree, factor, place, normal, &shape, rays, clearance);
+                factor = seen_part(&tree, factor, place, normal, &shape, rays, clearance,
+                                   max(clearance, slacks[patch]));
 #endif
                 whole += factor;
             }

@@ -86,7 +86,7 @@ class Bounces:
         *,
         size: float,
         grades: int = 0,
-        both_sides: bool = False,
+        both_sides: bool | None = None,
         device: Device | None = None,
         dense: int = 4096,
     ) -> Bounces:
@@ -134,11 +134,19 @@ class Bounces:
             raise ValueError(f"Bounces.exitance takes finite irradiances ({self.patches.count},), got {first.shape}")
         return self._solved(self.albedo * first)
 
-    def light(self, receivers: npt.NDArray[Any], exitance: npt.NDArray[Any]) -> Irradiance:
-        """Return what receivers (..., 6), float32 or float64, get from patches of such exitances, by `PatchLight`."""
+    def light(self, receivers: npt.NDArray[Any], exitance: npt.NDArray[Any], *, leave_out: float = 0.0) -> Irradiance:
+        """Return what receivers (..., 6), float32 or float64, get from patches of such exitances, by `PatchLight`.
+
+        Parameters
+        ----------
+        leave_out
+            Patches of less exitance are left out [W/m^2]. No receiver gets less by more than that: form factors add to
+            1 at most.
+        """
         operation = PatchLight(patches=self.patches, scene=self.scene)
         real = np.float64 if receivers.dtype == np.float64 else np.float32
-        return operation(receivers, np.ascontiguousarray(exitance, real), device=self.device)
+        strong = np.where(exitance >= leave_out, exitance, 0.0).astype(real)
+        return operation(receivers, strong, device=self.device)
 
     @functools.cached_property
     def factors(self) -> Reals:

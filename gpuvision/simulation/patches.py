@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines
 from gpuvision.simulation.line_irradiance import Irradiance
+from gpuvision.simulation.patch_making import cut, in_two
 from gpuvision.simulation.scene import Scene
 
 Reals = npt.NDArray[np.float64]
@@ -37,6 +38,12 @@ class Patches:
         (m,) integers, ascending from 0 without a gap: which patch each triangle belongs to; each its own if left out.
     origin
         (m,) integers: which triangle of a scene each is a part of; the triangles themselves if left out.
+    slack
+        (count,), metres: how far before a patch nothing occludes it, because it stands for a surface there; 0 if left
+        out.
+    looked_at
+        Receivers (r, 6), their patches, and their weights (r,), 1 together for a patch: where to look at what arrives
+        on some patches, instead of on their own triangles (`points`).
 
     Raises
     ------
@@ -47,6 +54,8 @@ class Patches:
     corners: Reals
     patch: npt.NDArray[Any] | None = None
     origin: npt.NDArray[Any] | None = None
+    slack: npt.NDArray[Any] | None = None
+    looked_at: tuple[Reals, Integers, Reals] | None = None
 
     def __post_init__(self) -> None:
         corners = np.array(self.corners, np.float64)
@@ -68,17 +77,22 @@ class Patches:
         object.__setattr__(self, "corners", corners)
         object.__setattr__(self, "patch", patch.astype(np.int64))
         object.__setattr__(self, "origin", origin.astype(np.int64))
+        slack = np.zeros(self.count) if self.slack is None else np.array(self.slack, np.float64)
+        if slack.shape != (self.count,) or not np.all(slack >= 0.0):
+            raise ValueError(f"Patches.slack has shape {slack.shape}, expected ({self.count},): metres, 0 or more")
+        object.__setattr__(self, "slack", slack)
         flat = self._areas == 0.0
         if flat.any():
             raise ValueError(f"Patches: triangle {int(np.argmax(flat))} has no area")
 
     @classmethod
-    def of(cls, scene: Scene, *, size: float, both_sides: bool = False) -> Patches:
+    def of(cls, scene: Scene, *, size: float, both_sides: bool | None = None) -> Patches:
         """Cut a scene's triangles until no edge is longer than ``size``, and join small ones.
 
-        Triangles are halved at their longest edge, so that long thin ones give few patches. Triangles of less than
-        half the size become one patch where they have their material, their cell of that size, and roughly their
-        direction in common.
+        Triangles are halved at their longest edge, so that long thin ones give few patches. What is less than half the
+        size is joined where it hangs together, of one material, in one cell of that size, and faces roughly one way.
+        More than eight triangles so joined, if they are nearly flat, are replaced by an octagon of their area, so that
+        a fine mesh costs no more than a coarse one; light on it is still looked at on the triangles themselves.
 
         Parameters
         ----------
@@ -87,26 +101,13 @@ class Patches:
         size
             Metres.
         both_sides
-            Whether the back of every triangle is a surface, too; the outside of a closed part needs no back.
+            Whether the back of every triangle is a surface, too. None: where surfaces are not closed.
         """
         if not (math.isfinite(size) and size > 0.0):
             raise ValueError(f"Patches.of: size is {size!r}, expected metres, more than 0")
-        numbers = scene.bvh.numbers
-        if not len(numbers):
+        if not len(scene.bvh.numbers):
             raise ValueError("Patches.of: the scene has no triangles")
-        corners = scene.corners[numbers]
-        if both_sides:
-            corners, numbers = np.concatenate([corners, corners[:, ::-1]]), np.concatenate([numbers, numbers])
-        small = _longest(corners)[0] < 0.5 * size
-        groups = _cells(corners[small], scene, numbers[small], size)
-        large, origin = _halved(corners[~small], numbers[~small], size)
-        order = np.argsort(groups, kind="stable")
-        first = int(groups.max(initial=-1)) + 1
-        return cls(
-            np.concatenate([corners[small][order], large]),
-            np.concatenate([groups[order], first + np.arange(len(large))]),
-            np.concatenate([numbers[small][order], origin]),
-        )
+        return cls(*cut(scene, size, both_sides))
 
     @property
     def count(self) -> int:
@@ -122,20 +123,24 @@ class Patches:
     def points(self) -> tuple[Reals, Integers, Reals]:
         """Where the light that arrives on patches is looked at: receivers (r, 6), their patches, their weights (r,).
 
-        Three points of each triangle, by Gauss; of patches of more than three triangles, the centroids of the largest.
+        As given; else three points of each triangle, by Gauss, or of patches of more than three triangles the centroids
+        of the largest.
         """
+        given = (np.zeros((0, 6)), np.zeros(0, np.int64), np.zeros(0)) if self.looked_at is None else self.looked_at
+        has_own = np.isin(self._patch, given[1])
         order = np.lexsort((-self._areas, self._patch))
         rank = np.arange(len(order)) - np.searchsorted(self._patch, self._patch)
-        order = order[rank < _TRIANGLES_PER_PATCH]
+        order = order[(rank < _TRIANGLES_PER_PATCH) & ~has_own[order]]
         few = (np.bincount(self._patch) < _TRIANGLES_PER_PATCH)[self._patch[order]]
         inside = np.einsum("pk,mkd->mpd", _THREE_POINTS, self.corners[order[few]]).reshape(-1, 3)
         places = np.concatenate([self.corners[order[~few]].mean(axis=1), inside])
         chosen = np.concatenate([order[~few], np.repeat(order[few], 3)])
-        by_patch = np.argsort(self._patch[chosen], kind="stable")
-        places, chosen = places[by_patch], chosen[by_patch]
-        owner = self._patch[chosen]
-        weight = self._areas[chosen] / np.bincount(owner, self._areas[chosen])[owner]
-        return np.concatenate([places, self.normals[chosen]], axis=1), owner, weight
+        share = self._areas[chosen]
+        weight = share / np.bincount(self._patch[chosen], share, self.count)[self._patch[chosen]]
+        receivers = np.concatenate([given[0], np.concatenate([places, self.normals[chosen]], axis=1)])
+        owner = np.concatenate([given[1], self._patch[chosen]])
+        by_patch = np.argsort(owner, kind="stable")
+        return receivers[by_patch], owner[by_patch], np.concatenate([given[2], weight])[by_patch]
 
     @functools.cached_property
     def normals(self) -> Reals:
@@ -143,17 +148,26 @@ class Patches:
         return self._area_vectors / (2.0 * self._areas[:, None])
 
     def halved(self, wanted: npt.NDArray[np.bool_]) -> Patches:
-        """Cut the triangles of some patches (count,) in two at their longest edge, each half a patch of its own."""
+        """Cut the triangles of some patches (count,) in two at their longest edge, each half a patch of its own.
+
+        Patches that stand for others' triangles (`looked_at`) stay as they are.
+        """
         if np.shape(wanted) != (self.count,):
             raise ValueError(f"Patches.halved takes which patches, ({self.count},), got shape {np.shape(wanted)}")
-        cut = np.asarray(wanted, bool)[self._patch]
-        halves = _in_two(self.corners[cut])
-        kept = np.unique(self._patch[~cut], return_inverse=True)[1]
-        first = int(kept.max(initial=-1)) + 1
+        apart = np.array(wanted, bool)
+        if self.looked_at is not None:
+            apart[self.looked_at[1]] = False
+        cut_up = apart[self._patch]
+        halves = in_two(self.corners[cut_up])
+        number = np.cumsum(~apart) - 1
+        first = int(np.count_nonzero(~apart))
+        looked_at = self.looked_at
         return Patches(
-            np.concatenate([self.corners[~cut], halves]),
-            np.concatenate([kept, first + np.arange(len(halves))]),
-            np.concatenate([self._origin[~cut], np.tile(self._origin[cut], 2)]),
+            np.concatenate([self.corners[~cut_up], halves]),
+            np.concatenate([number[self._patch[~cut_up]], first + np.arange(len(halves))]),
+            np.concatenate([self._origin[~cut_up], np.tile(self._origin[cut_up], 2)]),
+            np.concatenate([self._slack[~apart], np.repeat(self._slack[self._patch[cut_up]], 2)]),
+            None if looked_at is None else (looked_at[0], number[looked_at[1]], looked_at[2]),
         )
 
     @property
@@ -164,6 +178,10 @@ class Patches:
     def _origin(self) -> Integers:
         return np.asarray(self.origin)
 
+    @property
+    def _slack(self) -> Reals:
+        return np.asarray(self.slack)
+
     @functools.cached_property
     def _area_vectors(self) -> Reals:
         return np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
@@ -172,49 +190,12 @@ class Patches:
     def _areas(self) -> Reals:
         return np.asarray(0.5 * np.linalg.norm(self._area_vectors, axis=1))
 
-    def tables(self, middle: Reals, real: np.dtype[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[np.int32]]:
-        """Return the triangles and the patches' starts as kernels/patches.cl takes them."""
+    def tables(self, middle: Reals, real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
+        """Return the triangles, the patches' starts and slacks as kernels/patches.cl takes them."""
         edges = np.diff(self.corners, axis=1).reshape(-1, 6)
         rows = np.concatenate([self.corners[:, 0] - middle, edges, self.normals], axis=1)
         starts = np.searchsorted(self._patch, np.arange(self.count + 1))
-        return rows.astype(real), starts.astype(np.int32)
-
-
-def _longest(corners: Reals) -> tuple[Reals, Integers]:
-    """Return the longest edge's length, and at which corner it starts."""
-    lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    return lengths.max(axis=1, initial=0.0), lengths.argmax(axis=1)
-
-
-def _in_two(corners: Reals) -> Reals:
-    """Return the first halves of triangles (n, 3, 3), then the second ones."""
-    turn = (_longest(corners)[1][:, None] + np.arange(3)) % 3
-    a, b, c = np.moveaxis(np.take_along_axis(corners, turn[:, :, None], axis=1), 1, 0)
-    between = 0.5 * (a + b)
-    return np.concatenate([np.stack([a, between, c], axis=1), np.stack([between, b, c], axis=1)])
-
-
-def _halved(corners: Reals, numbers: Integers, size: float) -> tuple[Reals, Integers]:
-    """Halve triangles until no edge is longer; return the pieces and the numbers of what they are of."""
-    done, of = [corners[:0]], [numbers[:0]]
-    while len(corners):
-        fits = _longest(corners)[0] <= size
-        done.append(corners[fits])
-        of.append(numbers[fits])
-        corners, numbers = _in_two(corners[~fits]), np.tile(numbers[~fits], 2)
-    return np.concatenate(done), np.concatenate(of)
-
-
-def _cells(corners: Reals, scene: Scene, numbers: Integers, size: float) -> Integers:
-    """Return the same number for triangles of one material, cell, and set of signs of the normal's larger parts."""
-    if not len(corners):
-        return np.zeros(0, np.int64)
-    cells = np.floor(corners.mean(axis=1) / size)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    directions = np.rint(1.5 * normals / np.linalg.norm(normals, axis=1, keepdims=True))
-    material = np.asarray(scene.material)[numbers]
-    keys = np.column_stack([material, cells, directions])
-    return np.asarray(np.unique(keys, axis=0, return_inverse=True)[1]).reshape(-1)
+        return rows.astype(real), starts.astype(np.int32), self._slack.astype(real)
 
 
 class Factors(NamedTuple):

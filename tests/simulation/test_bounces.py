@@ -157,6 +157,10 @@ def test_materials_and_receivers(device: Device) -> None:
     assert twice.irradiance[0] != twice.irradiance[1]
     np.testing.assert_allclose(single.irradiance, twice.irradiance, rtol=1e-4)
     assert single.irradiance.dtype == np.float32
+    least = 0.5 * float(exitance.max())
+    some = box.light(receivers, exitance, leave_out=least)
+    assert np.all(some.irradiance < twice.irradiance)
+    assert np.all(some.irradiance > twice.irradiance - least)
 
 
 def test_no_light_at_all(device: Device) -> None:

@@ -21,6 +21,9 @@
 #define ARM 22
 #define LENGTH 23
 
+// Of a lit segment: its normal, the height of its plane, start, end.
+#define PLACED 10
+
 #define PER_PI ((real)0.31830988618379067)
 #define PI ((real)3.14159265358979324)
 // Of a pick: a segment that nothing can hide; else without it. A cluster is ~node.
@@ -42,7 +45,7 @@
 typedef struct {
     real centre[3], low[3], high[3], normal[3];
     real radius, spread, most_height, least_height, slab, cost;
-    real places[3 * BLOCK], normals[3 * BLOCK], heights[BLOCK]; // of the planes in which receivers lie
+    real places[3 * BLOCK], normals[3 * BLOCK], costs[BLOCK];
     int count;
 } receivers_block;
 
@@ -71,7 +74,7 @@ inline receivers_block block_of(global const INPUT *receivers, global const real
         real size = 0;
         for (int k = 0; k < 3; k++) size += (real)receivers[6 * i + 3 + k] * (real)receivers[6 * i + 3 + k];
         if (!(costs[i] > 0 && size > 0)) continue;
-        block.cost += costs[i];
+        block.costs[kept] = costs[i], block.cost += costs[i];
         real *place = block.places + 3 * kept, *normal = block.normals + 3 * kept;
         for (int k = 0; k < 3; k++) {
             place[k] = (real)(receivers[6 * i + k] - middle[k]);
@@ -99,7 +102,6 @@ inline receivers_block block_of(global const INPUT *receivers, global const real
             off[k] = block.normals[3 * i + k] - block.normal[k];
         }
         const real height = -dot3(block.normals + 3 * i, from);
-        block.heights[i] = dot3(block.normals + 3 * i, block.places + 3 * i);
         block.radius = fmax(block.radius, length3(from));
         block.spread = fmax(block.spread, length3(off));
         block.slab = fmax(block.slab, fabs(dot3(block.normal, from)));
@@ -167,10 +169,33 @@ inline real error_of(const receivers_block *block, global const real *row) {
     return per * per * per * (row[FIRST_ORDER] + per * beyond) * PER_PI * UP;
 }
 
-#ifdef OCCLUDERS
-// Of a lit segment: its normal, the height of its plane, start, end.
-#define PLACED 10
+// What a segment costs at most, each receiver for itself: so that it stays finite where a block touches what is lit.
+inline real most_of_segment(const receivers_block *block, global const real *lit, real length, real power) {
+    real sum = 0;
+    for (int i = 0; i < block->count; i++) {
+        const real *place = block->places + 3 * i, *normal = block->normals + 3 * i;
+        real up = 0, in_front = 0, beyond = 0, along = 0, square = 0;
+        for (int k = 0; k < 3; k++) {
+            const real from = place[k] - lit[4 + k];
+            up += lit[k] * from;
+            in_front -= normal[k] * from;
+            beyond += normal[k] * (lit[7 + k] - place[k]);
+            along += from * (lit[7 + k] - lit[4 + k]);
+        }
+        const real part = clamp(along / (length * length), (real)0, (real)1);
+        for (int k = 0; k < 3; k++) {
+            const real off = place[k] - lit[4 + k] - part * (lit[7 + k] - lit[4 + k]);
+            square += off * off;
+        }
+        const real ahead = fmax(in_front, beyond);
+        if (!(up > 0 && ahead > 0)) continue;
+        const real per = UP / sqrt(square), cosines = fmin(up * per, (real)1) * fmin(ahead * per, (real)1);
+        sum += block->costs[i] * cosines * fmin(per * per, PI * per / length);
+    }
+    return sum * power * PER_PI * UP;
+}
 
+#ifdef OCCLUDERS
 typedef struct {
     bvh_reals x, y, z;
 } vectors;
@@ -404,8 +429,12 @@ kernel void plan_light(global const INPUT *restrict receivers, global const real
             }
             const meeting met = meeting_of(&block, row, count == 1);
             // A bound of zero may meet a cost that is infinite.
-            const real most = met.bound > 0 ? met.bound * row[POWER] * block.cost : 0;
-            if (met.bound <= share) {
+            real most = met.bound > 0 ? met.bound * row[POWER] * block.cost : 0;
+            if (count == 1 && met.bound > share) {
+                const real each_for_itself = most_of_segment(&block, placed + PLACED * place, row[LENGTH], row[POWER]);
+                most = fmin(most, each_for_itself);
+            }
+            if (met.bound <= share || most <= share * row[POWER] * block.cost) {
                 out += count;
                 lost += most, whole += most;
                 node = next;

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.simulation.sight import Exposure, Sight
+
 Reals = npt.NDArray[np.float64]
 
 
@@ -59,6 +61,34 @@ class StripReading:
         if np.any(power < 0.0) or np.any(low >= high):
             raise ValueError("StripReading: expected power >= 0 and limits (u_low, u_high) with u_low < u_high")
         object.__setattr__(self, "limits", (low, high))
+
+    @classmethod
+    def of(
+        cls, sight: Sight, exposure: Exposure, *, floor: float = 0.0, shift: npt.ArrayLike = math.inf
+    ) -> StripReading:
+        """Return what the direct light of a profile makes of a sensor's strips.
+
+        The slope is the largest of the height H over u anywhere on a strip, from bin to bin; what
+        looks over the horizon does not count.
+        """
+        power = exposure.total()
+        u, v = np.broadcast_arrays(sight.u_edges, sight.v_middles[:, None])
+        height = sight.sheet_coordinates(sight.points_in_sheet(u, v))[..., 1]
+        slope = np.abs(np.diff(height, axis=1) / np.diff(sight.u_edges))
+        return cls(
+            power=power,
+            moment=exposure.first_moment(sight.u_edges),
+            slope=np.where(np.isfinite(slope), slope, 0.0).max(axis=1),
+            limits=(sight.u_edges[0], sight.u_edges[-1]),
+            floor=floor,
+            shift=shift,
+        )
+
+    def weights(self, seen: npt.NDArray[Any], u: npt.NDArray[Any]) -> Reals:
+        """Return weights for `costs` and `LightPlanner`: W by 1 W/m^2 of receivers (strips, n) that are seen at u."""
+        low, high = (np.asarray(each)[:, None] for each in self.limits)
+        power = np.where((u >= low) & (u <= high), seen, 0.0)
+        return np.stack([power, power * u], axis=-1)
 
     @property
     def position(self) -> Reals:

@@ -425,6 +425,7 @@ def _run(
 
 def _placed(segments: Reals, middle: Reals) -> Reals:
     """Return (m, 10): normal, the height of its plane, start and end, from the middle."""
-    normal = segments[:, 6:9] / np.linalg.norm(segments[:, 6:9], axis=1, keepdims=True)
+    size = np.linalg.norm(segments[:, 6:9], axis=1, keepdims=True)
+    normal = segments[:, 6:9] / np.where(size > 0.0, size, 1.0)
     start, end = segments[:, :3] - middle, segments[:, 3:6] - middle
     return np.column_stack([normal, np.sum(normal * start, axis=1), start, end])

@@ -434,7 +434,7 @@ kernel void plan_light(global const INPUT *restrict receivers, global const real
                 const real each_for_itself = most_of_segment(&block, placed + PLACED * place, row[LENGTH], row[POWER]);
                 most = fmin(most, each_for_itself);
             }
-            if (met.bound <= share || most <= share * row[POWER] * block.cost) {
+            if (most == 0 || met.bound <= share || most <= share * row[POWER] * block.cost) {
                 out += count;
                 lost += most, whole += most;
                 node = next;

@@ -128,9 +128,9 @@ class LightPlanner:
     A receiver's irradiance from a segment is at most W cos cos / (pi r^2), W its power, with the largest cosines and
     the least distance of any two points, and never more than W / (L r) of length L. The error of a segment that stands
     for a cluster is in `gpuvision.simulation.clusters`. Visibility is between 0 and 1, and a cluster stands only where
-    nothing can hide any of it, so all this holds with occlusion. The tolerance is shared among
-    pairs by power times cost; what the shares leave over is then spent on the pairs with the least bounds. The kernels'
-    rounding comes on top.
+    nothing can hide any of it, so all this holds with occlusion. The tolerance is shared among pairs by power times
+    cost; what the shares leave over is then spent on the pairs with the least bounds. The kernels' rounding comes on
+    top.
     """
 
     tolerance: float

@@ -224,6 +224,33 @@ def test_summary_counts_causes(device: Device) -> None:
     assert "occlusion" not in said["causes"]
 
 
+def test_what_flags_take_out(device: Device) -> None:
+    """A reading that is dropped for a flag is a missing one."""
+    sight = psd_sight()
+    u = np.zeros(sight.samples)
+    light = {"direct": gaussian(sight, u, [1e-6, 1e-6, 2e-5, 1e-6, 1e-6], 4e-5)}
+    found = explain(psd(sight, ambient=1e-8), light, truth_at(sight, u), device=device)
+    found.reading.status[2] = Status.AMBIGUOUS
+    kept = found.without(Status.AMBIGUOUS)
+    assert np.isnan(kept.error).tolist() == [False, False, True, False, False]
+    assert kept.verdict.tolist() == [0, 0, Verdict.MISSING, 0, 0]
+    assert np.isfinite(found.error).all()
+    assert kept.summary(1.0)["read"] == 4
+
+
+def test_signals_add_up_to_the_reading(device: Device) -> None:
+    """What is split by removal is what is read."""
+    for simulator in (psd(ambient=1e-7), camera(gain=1e-4, offset=3.0, ambient=1e-12, readout={"threshold": 1.0})):
+        sight = simulator.sight
+        u = np.broadcast_to(sight.u_middles[sight.bins // 3], sight.samples)
+        light = {"direct": gaussian(sight, u, 1e-9, 2.0 * np.diff(sight.u_edges)[0])}
+        light["bounces"] = gaussian(sight, u + 3.0 * np.diff(sight.u_edges)[0], 1e-10, np.diff(sight.u_edges)[0])
+        signals = [simulator.signal(each) for each in simulator.light(light).values()]
+        assert len(signals) == 3
+        heights = simulator.heights(sum(signals[1:], start=signals[0]), device)
+        np.testing.assert_allclose(heights, simulator.read(light, device=device).h, rtol=1e-5, atol=1e-8)
+
+
 def test_a_part_in_shadow_says_nothing(device: Device) -> None:
     """No light at all: flagged, not zero, and a report can still be made."""
     sight = psd_sight()

@@ -30,7 +30,8 @@ PATCH_INLINE real dot_of(const real *a, const real *b) { return a[0] * b[0] + a[
 
 // Metres at either end do not count: the surfaces that the ends lie on.
 inline int is_free(const bvh_tree *tree, const real *place, const real *way, real after, real before) {
-    const real per = after + before > 0 ? (real)1 / sqrt(dot_of(way, way)) : 0, start = after * per, end = 1 - before * per;
+    const real per = after + before > 0 ? (real)1 / sqrt(dot_of(way, way)) : 0;
+    const real start = after * per, end = 1 - before * per;
     if (!(start < end)) return 1;
     const bvh_ray ray = bvh_ray_of(place[0], place[1], place[2], way[0], way[1], way[2], start, end);
     return !bvh_any(tree, &ray);

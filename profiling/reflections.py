@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
+from gpuvision.profiling import bounces
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.line_irradiance import LineIrradiance, LitSegments
 
@@ -71,10 +72,11 @@ def _numba(receivers, table, out):  # type: ignore[no-untyped-def]
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a wall over many lines and over few, and a board with boxes."""
+    """Yield a wall over many lines and over few, a board with boxes, and light from patches."""
     yield _case(device, *_wall(64, 20_000), "closed-form/wall/64x20000")
     yield _case(device, *_wall(16, 100_000), "closed-form/wall/16x1e5")
     yield _case(device, *_board(20_000), "closed-form/board/64x20000")
+    yield from bounces.cases(device)
 
 
 def _case(device: Device, segments: LitSegments, receivers: NDArray[np.float32], name: str) -> Case:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from scipy.special import ndtr
 
 from gpuvision.host import Device
+from gpuvision.simulation.glints import glints
 from gpuvision.simulation.illumination import LightSheet, LitLine
 from gpuvision.simulation.line_parts import Images, LineImages, LineOfSight, Parts, along
 from gpuvision.simulation.material import Material
@@ -25,6 +26,8 @@ from gpuvision.status import Status
 
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
+# Power on the sensor [W] by kind of reflection, of light that arrives at points of segments [W].
+Sender = Callable[[LitLine, Integers, Float64, Float64, float], dict[str, Float64]]
 
 # Gauss and Legendre's two nodes on [0, 1].
 _NODES = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
@@ -102,6 +105,9 @@ class DirectLight:
     it. So a plane gives a Gaussian, exactly, whatever the number of slabs; where the surface, its material or its
     shadow change within a slab, the error falls as one over the number of slabs.
 
+    Of a mirror, the lens takes the rays that meet its opening; a slab's light goes where its middle goes. Triangles are
+    plane mirrors.
+
     The x axis of an anisotropic lobe is the scene's x axis laid onto the surface (y, on one that x stands on).
     """
 
@@ -125,24 +131,35 @@ class DirectLight:
         object.__setattr__(self, "_line_of_sight", LineOfSight(scene=self.scene, device=device))
 
     def exposures(self, L: float, *, causes: bool = False) -> dict[str, Exposure]:
-        """Return the light at a transport L [m]: "direct" off the surfaces' diffuse parts, "specular" off their lobes.
+        """Return the light at a transport L [m]: "direct" and "specular".
 
-        With ``causes``, also what the direct light would be if all surfaces were white ones of Lambert (`EVEN`), if
-        nothing were in the way to the lens (`OPEN`), and both (`EVEN_OPEN`).
+        Direct light comes off the surfaces' diffuse parts, specular light off their lobes, and off mirrors right into
+        the lens. With ``causes``, also what the direct light would be if all surfaces were white ones of Lambert
+        (`EVEN`), if nothing were in the way to the lens (`OPEN`), and both (`EVEN_OPEN`).
         """
-        slabs, sight = self.slabs, self.sight
+        slabs, lens = self.slabs, self.sight.lens_at(L)
         line, first = self.sheet.lit_lines(self.scene, L + self.sheet.sigma * slabs.middle)
         slab = np.repeat(np.arange(len(slabs.share)), np.diff(first))
         line, kept = self._facing(line, L)
-        images, slab = self._images.of(line.ends, L), slab[kept]
-        parts = images.in_view(self._line_of_sight.parts(line, sight.lens_at(L), hidden=causes))
-        parts = self._split(parts, images, line, L)
+        line = line._replace(power=line.power * slabs.share[slab[kept]])
+        parts = self._line_of_sight.parts(line, lens, hidden=causes)
+        found = self._exposed(line, slab[kept], parts, L, self._sent, causes=causes)
+        if any(each.mirror > 0.0 for each in self.materials):
+            found["specular"] += self._mirrored(line, slab[kept], L)
+        return found
+
+    def _exposed(
+        self, line: LitLine, slab: Integers, parts: Parts, L: float, sent_by: Sender, *, causes: bool = False
+    ) -> dict[str, Exposure]:
+        """Return the exposures by parts of segments, each of a slab."""
+        images = self._images.of(line.ends, L)
+        parts = self._split(images.in_view(parts), images, line, L)
         # Both nodes of all parts.
-        arriving = (line.power * line.lengths * slabs.share[slab])[parts.segment] * (parts.end - parts.start)
+        arriving = (line.power * line.lengths)[parts.segment] * (parts.end - parts.start)
         share = (parts.start + _NODES[:, None] * (parts.end - parts.start)).ravel()
         segment, seen = np.tile(parts.segment, 2), np.tile(parts.seen, 2)
         points = along(line.ends[segment], share)
-        sent = self._sent(line, segment, points, np.tile(0.5 * arriving, 2), L)
+        sent = sent_by(line, segment, points, np.tile(0.5 * arriving, 2), L)
         wanted = {"direct": sent["diffuse"] * seen, "specular": sent["gloss"] * seen}
         if causes:
             wanted |= {EVEN: sent["even"] * seen, OPEN: sent["diffuse"], EVEN_OPEN: sent["even"]}
@@ -150,7 +167,17 @@ class DirectLight:
         spread = np.zeros(len(share))
         if self.sheet.sigma > 0.0:
             spread = images.speed(segment, share, uv, self._moved(line.normals[segment], points))
-        return _deposits(sight, uv, spread, slabs, slab[segment], wanted)
+        return _deposits(self.sight, uv, spread, self.slabs, slab[segment], wanted)
+
+    def _mirrored(self, line: LitLine, slab: Integers, L: float) -> Exposure:
+        """Return what mirrors throw right into the lens."""
+        shares = np.array([each.mirror for each in self.materials])[self._material(line)]
+        parts = glints(line, self.sheet, self.sight, L)
+        parts = parts.those(shares[parts.segment] > 0.0)
+        of = parts.segment
+        line = LitLine(parts.ends(line), line.normals[of], line.triangle[of], line.power[of] * shares[of])
+        seen = self._line_of_sight.parts(line, self.sight.lens_at(L))
+        return self._exposed(line, slab[of], seen, L, _all_of_it)["specular"]
 
     def truth(self, L: float) -> Truth:
         """Return where the middle of the sheet truly is at a transport L [m], at the middle of each sample.
@@ -238,6 +265,10 @@ class DirectLight:
         direction, light = np.array(self.sheet.transport.direction), self.sheet.towards(points)
         slope = (normal @ direction) / np.sum(normal * light, axis=1)
         return np.asarray(self.sheet.sigma * (direction - light * slope[:, None]))
+
+
+def _all_of_it(line: LitLine, segment: Integers, points: Float64, arriving: Float64, L: float) -> dict[str, Float64]:
+    return {"diffuse": np.zeros(len(arriving)), "gloss": arriving}
 
 
 def _slabs(given: int | Sequence[float]) -> Slabs:

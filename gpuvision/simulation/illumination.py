@@ -140,13 +140,27 @@ class LightSheet:
 
     def towards(self, points: npt.ArrayLike) -> Float64:
         """Return unit vectors from points towards the light, (..., 3); of a fan, the source in each point's sheet."""
+        points = np.asarray(points, np.float64)
+        if self.source is None:
+            up = np.array(self.transport.h_axis)
+            return np.broadcast_to(up / np.linalg.norm(up), points.shape)
+        towards = self.source_of(points) - points
+        return np.asarray(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+
+    def source_of(self, points: npt.ArrayLike) -> Float64:
+        """Return where a fan comes from, (..., 3), in the sheets that points lie in.
+
+        Raises
+        ------
+        ValueError
+            The light is parallel.
+        """
+        if self.source is None:
+            raise ValueError("LightSheet.source is None: parallel light comes from nowhere; use `towards`")
         points, move = np.asarray(points, np.float64), self.transport
         axes = np.array([move.g_axis, move.h_axis, move.direction])
-        if self.source is None:
-            return np.broadcast_to(axes[1] / np.linalg.norm(axes[1]), points.shape)
         away = np.array([*self.source, 0.0]) - (points - move.origin) @ np.linalg.inv(axes)
-        towards = away[..., :2] @ axes[:2]
-        return np.asarray(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+        return np.asarray(points + away[..., :2] @ axes[:2])
 
     # ---- the sheet's own coordinates: x, which does not change along a ray, and a height towards the light ------
 

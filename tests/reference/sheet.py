@@ -19,7 +19,7 @@ def first_met(sheet: Any, corners: np.ndarray, L: float, x: np.ndarray) -> tuple
     place = np.array(move.origin) + L * np.array(move.direction)
     foot = place + x[:, None] * g_axis
     if sheet.source is None:
-        start, way = foot + 10.0 * h_axis, np.broadcast_to(-h_axis, foot.shape)
+        start, way = foot + 100.0 * h_axis, np.broadcast_to(-h_axis, foot.shape)
     else:
         start = np.broadcast_to(place + sheet.source[0] * g_axis + sheet.source[1] * h_axis, foot.shape)
         way = foot - start

@@ -16,6 +16,7 @@ from gpuvision.host import Device
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.simulation.direct import DirectLight, Slabs
+from gpuvision.simulation.glints import glints
 from gpuvision.simulation.illumination import LightSheet
 from gpuvision.simulation.material import Material
 from gpuvision.simulation.rays import AnyHit
@@ -406,6 +407,81 @@ def test_lobes_are_resolved(lobe: Any) -> None:
     expected = seen_by.deposit(uv[:, 0], uv[:, 1], sent * (G[1] - G[0]))
     np.testing.assert_allclose(found["specular"].total(), expected.total(), rtol=1e-4)
     assert expected.total().min() > 0.0
+
+
+def mirror_to_the_lens(turn: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """A plane through the origin that mirrors light from above to the lens, but for a turn; and its normal."""
+    lens = np.array([0.0, 0.08, 0.15])
+    half_way = lens / np.linalg.norm(lens) + (0.0, math.sin(turn), math.cos(turn))
+    normal = half_way / np.linalg.norm(half_way)
+    fall = normal[1] / normal[2]
+    return quad((-1, -1, fall), (1, -1, fall), (1, 1, -fall), (-1, 1, -fall)), normal
+
+
+def test_a_mirror_throws_the_light_into_the_lens(device: Device) -> None:
+    """Of parallel light the width of the opening, dimmed by the mirror; a degree off, nothing."""
+    made_of = Material(diffuse=Lambert(albedo=0.0), mirror=0.7)
+    seen_by = sight(samples=9)
+    corners, _ = mirror_to_the_lens()
+    glint = light_of(corners, (made_of,), seen_by=seen_by, power=3.0, device=device).exposures(0.0)
+    np.testing.assert_allclose(glint["specular"].total()[4], 3.0 * 0.7 * seen_by.aperture, rtol=1e-9)
+    assert glint["specular"].total().sum() == pytest.approx(glint["specular"].total()[4], rel=1e-15)
+    np.testing.assert_allclose(u_of(glint["specular"], seen_by)[4], 0.0, atol=1e-9)
+    assert not glint["direct"].power.any()
+    away, _ = mirror_to_the_lens(math.radians(2.0))
+    assert not light_of(away, (made_of,), seen_by=seen_by).exposures(0.0)["specular"].power.any()
+    screen = quad((-0.1, 0.04, 0.06), (0.1, 0.04, 0.06), (0.1, 0.04, 0.09), (-0.1, 0.04, 0.09))
+    hidden = light_of(np.concatenate([corners, screen]), (made_of,), seen_by=seen_by)
+    assert not hidden.exposures(0.0)["specular"].power.any()
+
+
+def test_a_thick_sheet_in_a_mirror() -> None:
+    """The beam is wider than the opening: what goes in is the integral of its density over a disc."""
+    made_of = Material(diffuse=Lambert(albedo=0.0), mirror=1.0)
+    seen_by, sigma = sight(samples=9, aperture=2e-4), 1e-4
+    corners, normal = mirror_to_the_lens()
+    light = light_of(corners, (made_of,), seen_by=seen_by, sigma=sigma, sub_sheets=400)
+    off = np.linspace(-1e-4, 1e-4, 20001)
+    # A mirrored beam is as wide as before; across the axis, seen from the lens, no distance changes.
+    chord = 2.0 * np.sqrt(np.maximum(1e-8 - off**2, 0.0))
+    through = np.trapezoid(chord * np.exp(-0.5 * (off / sigma) ** 2), off) / (sigma * math.sqrt(2.0 * math.pi))
+    assert light.exposures(0.0)["specular"].total().sum() == pytest.approx(through, rel=2e-3)
+    assert normal[2] > 0.9
+
+
+@pytest.mark.parametrize("source", [None, (0.01, 0.2), (-0.02, 0.1)])
+def test_glints_as_rays_say(source: Any, rng: np.random.Generator) -> None:
+    """Facets that lean any way by some degrees: of a thousand rays on each, those that meet the opening."""
+    seen_by = sight(aperture=0.02)
+    turns = rng.normal(0.0, 0.1, (300, 2))
+    made_of = Material(diffuse=Lambert(albedo=0.0), mirror=1.0)
+    facets, G = [], np.linspace(-0.02, 0.02, 301)
+    for (a, b), left, right in zip(turns, G, G[1:], strict=False):
+        fall = 0.245 + b
+        rise = a * (right - left)
+        facets.append(
+            quad(
+                (left, -0.01, 0.01 * fall),
+                (right, -0.01, 0.01 * fall + rise),
+                (right, 0.01, -0.01 * fall + rise),
+                (left, 0.01, -0.01 * fall),
+            )
+        )
+    light = light_of(np.concatenate(facets), (made_of,), seen_by=seen_by, source=source)
+    line = light.sheet.lit(light.scene, 0.0)
+    parts = glints(line, light.sheet, seen_by, 0.0)
+    share = np.bincount(parts.segment, parts.end - parts.start, minlength=len(line.power))
+    at = (np.arange(2000) + 0.5) / 2000
+    points = line.ends[:, :1] + at[:, None] * (line.ends[:, 1:] - line.ends[:, :1])
+    arrives = -light.sheet.towards(points)
+    normal = line.normals[:, None]
+    goes = arrives - 2.0 * np.sum(arrives * normal, axis=-1, keepdims=True) * normal
+    to_lens, axis = np.array(seen_by.lens) - points, np.array(seen_by.axis)
+    way = (to_lens @ axis) / (goes @ axis)
+    miss = np.linalg.norm(to_lens - way[..., None] * goes, axis=-1)
+    inside = (way > 0.0) & (miss < 0.5 * seen_by.aperture)
+    np.testing.assert_allclose(share, inside.mean(axis=1), atol=1.1e-3)
+    assert 3 < (share > 0.0).sum() < 200
 
 
 def test_causes() -> None:

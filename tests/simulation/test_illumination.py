@@ -298,6 +298,21 @@ def test_nothing_there() -> None:
         np.testing.assert_array_equal(first, [0, 0, 0])
 
 
+def test_where_a_fan_comes_from() -> None:
+    sheet = SHEETS["tilted fan"]
+    move = sheet.transport
+    place = np.array(move.origin) + 0.3 * np.array(move.direction)
+    axes = np.array([move.g_axis, move.h_axis])
+    source = place + np.array(sheet.source) @ axes
+    point = place + np.array([0.2, -0.1]) @ axes
+    np.testing.assert_allclose(sheet.source_of(point), source, atol=1e-14)
+    np.testing.assert_allclose(sheet.towards(point), (source - point) / np.linalg.norm(source - point), atol=1e-14)
+    upright = SHEETS["tilted"]
+    np.testing.assert_allclose(np.cross(upright.towards(np.zeros((4, 3))), move.h_axis), 0.0, atol=1e-15)
+    with pytest.raises(ValueError, match=r"parallel light comes from nowhere"):
+        upright.source_of(point)
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

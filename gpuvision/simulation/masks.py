@@ -214,7 +214,7 @@ def optimise_mask(
     truth: Truth,
     *,
     fixed: bool = True,
-    objective: Literal["worst", "rms"] = "worst",
+    objective: Literal["worst", "rms"] = "rms",
     keep: float = 0.999,
     margin: float = 0.0,
 ) -> MaskPlan:
@@ -234,7 +234,8 @@ def optimise_mask(
     fixed
         One window a sample for all profiles; False: another one for every profile, a mask that follows the part.
     objective
-        The worst error of a sample's profiles counts, or their root mean square.
+        What of the errors of a sample's profiles counts: the worst, which may be one that no mask can help and then
+        leaves the others as they are, or their root mean square.
     keep
         Share of the valid light that must pass, in every profile; at most half of the rest is cut at either end.
     margin

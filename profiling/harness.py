@@ -33,6 +33,7 @@ OPERATIONS = (
     "calibration",
     "reflections",
     "bvh",
+    "simulate",
     "mitsuba",
     "launch",
     "stream",
@@ -181,7 +182,7 @@ def _turn(call: Callable[[], object]) -> float:
 def peer_version(peer: str) -> str:
     """Return the version of the package a peer's name stands for."""
     packages = {"opencv": "opencv-contrib-python-headless"}
-    return version(packages.get(peer, peer)) if peer else ""
+    return " + ".join(version(packages.get(each, each)) for each in peer.split("+") if each)
 
 
 def profile(

@@ -73,6 +73,11 @@ class LightPaths:
     ------
     ValueError
         A path is unknown, or a material missing.
+
+    Attributes
+    ----------
+    lines
+        What the sensor sees of the scene.
     """
 
     sight: Sight
@@ -88,7 +93,7 @@ class LightPaths:
     device: Device | None = None
     _direct: DirectLight = field(init=False, repr=False)
     _mirrors: Mirrors = field(init=False, repr=False)
-    _lines: SightLines = field(init=False, repr=False)
+    lines: SightLines = field(init=False, repr=False)
     _bounces: Bounces | None = field(init=False, repr=False)
     _bound: dict[int, Bound[Any]] = field(init=False, repr=False, default_factory=dict)
 
@@ -112,7 +117,7 @@ class LightPaths:
         mirrors = Mirrors(sight=self.sight, scene=self.scene, materials=self.materials, device=device)
         object.__setattr__(self, "_direct", direct)
         object.__setattr__(self, "_mirrors", mirrors)
-        object.__setattr__(self, "_lines", lines)
+        object.__setattr__(self, "lines", lines)
         object.__setattr__(self, "_bounces", self._between_patches() if "bounces" in self.paths else None)
 
     def profile(self, L: float) -> Profile:
@@ -136,17 +141,18 @@ class LightPaths:
 
     def _by_detours(self, lit: LitLine, L: float) -> dict[str, Exposure]:
         exposures: dict[str, Exposure] = {}
-        seen = self._lines.surface(L)
+        seen = self.lines.surface(L)
         segments = self._diffuse(lit)
         if "diffuse-diffuse" in self.paths:
-            exposures["diffuse-diffuse"] = self._lines.exposure(seen, self._irradiance(seen, segments))
+            exposures["diffuse-diffuse"] = self.lines.exposure(seen, self.irradiance(seen, segments))
         if self._bounces is not None:
             exitance = self._bounces.exitance(self._bounces.arrival(segments))
             light = self._bounces.light(seen.receivers, exitance)
-            exposures["bounces"] = self._lines.exposure(seen, light.irradiance)
+            exposures["bounces"] = self.lines.exposure(seen, light.irradiance)
         return exposures
 
-    def _irradiance(self, seen: SeenSurface, segments: LitSegments) -> Float64:
+    def irradiance(self, seen: SeenSurface, segments: LitSegments) -> Float64:
+        """Return the irradiance [W/m^2] of what the sensor sees from lit segments, (samples, n)."""
         room = max(_LEAST_ROOM, 1 << max(len(segments.exitance) - 1, 0).bit_length())
         if room not in self._bound:
             shape = seen.receivers.shape

@@ -48,7 +48,7 @@ def glow(places, normal, length, power, x0):
 
 def test_a_wall_glows_as_the_line_before_it_says(device):
     model = paths(corner(), device)
-    lines = model._lines
+    lines = model.lines
     seen = lines.surface(0.0)
     wall = np.argwhere((seen.triangle >= 2) & (seen.receivers[..., 2] > 1e-3))
     assert len(wall) >= 3

@@ -1,0 +1,65 @@
+"""A whole profile of a simulated scan, against what NumPy and Embree need for its secondary light alone.
+
+Ours: lit segments, shadows, what the lens sees of them, the causes of errors, what every bin sees, secondary light with
+exact visibility, truth. The peer: 256 samples of the line, rays to the same elements of the surface (`visible_light`).
+The errors are those of the secondary light, medians relative to the same in double.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+
+import numpy as np
+
+from gpuvision.demo import scanned_part
+from gpuvision.host import Device
+from gpuvision.profiling.harness import Case
+from gpuvision.profiling.visible_light import Board, embree_of, error_of, irradiance_by_samples
+from gpuvision.simulated_sensor import light_of, sheet_of, sight_of
+from gpuvision.simulation.light_paths import LightPaths
+from gpuvision.simulation.line_irradiance import LitSegments
+from gpuvision.simulation.visible_light import VisibleLight, segment_rows
+
+_SAMPLES = 256
+_AT = 0.006  # m: over the cylinder's rim, the box and the ball
+
+
+def cases(device: Device) -> Iterator[Case]:
+    """Yield a profile of PSD strips and one of a camera."""
+    for name in ("psd_line", "camera_line"):
+        yield _case(device, name)
+
+
+def _case(device: Device, name: str) -> Case:
+    task = scanned_part(name)
+    light = light_of(task.sensor)
+    model = LightPaths(
+        sight=sight_of(task.sensor),
+        sheet=sheet_of(task.sensor),
+        scene=task.part,
+        materials=task.materials,
+        paths=task.paths,
+        sub_sheets=light.sub_sheets,
+        blur=light.blur,
+        device=device,
+    )
+    seen = model.lines.surface(_AT)
+    lit = model.sheet.lit(task.part, _AT)
+    segments = LitSegments(lit.ends, lit.normals, task.materials[0].albedo * lit.power)
+    board = Board(task.part, segments, seen.receivers.astype(np.float32))
+    ours, truth = model.irradiance(seen, segments), np.full(seen.weights.shape, np.nan)
+    if device.has_double:
+        rows = segment_rows(segments)
+        exact = VisibleLight(scene=task.part, segments=len(rows), precision="double")
+        truth = exact(seen.receivers, np.zeros((*seen.weights.shape, 2)), rows, device=device).irradiance
+    peer = functools.partial(irradiance_by_samples, board, _SAMPLES, embree_of(task.part))
+    seen_at_all = seen.weights > 0.0
+    facts = {
+        "receivers": int(seen_at_all.sum()),
+        "segments": len(segments.exitance),
+        "peer_error": error_of(peer().reshape(truth.shape)[seen_at_all], truth[seen_at_all]),
+    }
+    run = functools.partial(model.profile, _AT)
+    error = error_of(ours[seen_at_all], truth[seen_at_all])
+    return Case("simulate", f"profile/{name}", run, {"numpy+embreex": peer}, error, facts=facts)

@@ -13,10 +13,11 @@
 #include "status.h"
 
 // A row: first corner; two edges; three normals; both edges on each normal; first corner from the other two on their
-// normals.
-#define ROW 26
-// Of a block of triangles: middle, radius; axis of its normals, cosine and sine of twice their cone.
-#define BLOCK 9
+// normals; whether only the side of the normals reflects.
+#define ROW 27
+// Of a block of triangles: middle, radius; axis of its normals, cosine and sine of twice their cone; whether only that
+// side of all of them reflects, and the sine of their cone.
+#define BLOCK 11
 #define STEPS 16
 #define TANGENTS 4
 // How far out of the triangle, in its own size, the linear guess may lie.
@@ -150,11 +151,13 @@ INLINE masks may_show(Vector point, Fixed lens, global const real *block) {
     const real square = cx * cx + cy * cy + cz * cz, per = (real)1 / sqrt(square);
     const real sine = radius * per, cosine = sqrt(max((real)1 - sine * sine, (real)0));
     const real cos_all = block[7] * cosine - block[8] * sine, sin_all = block[8] * cosine + block[7] * sine;
+    const real facing = per * (cx * axis.x + cy * axis.y + cz * axis.z);
+    if (block[9] > 0 && facing < -(block[10] + sine + SLACK)) return mask_of((reals)(real)0 > (reals)(real)0);
     const Vector q = moved(point, middle, -1);
     const reals far = dot_of(q, q), room = far - radius * radius, zero = (real)0;
     // Too wide to say: both cosines say whether the sum is beyond a right angle.
     if (!(sine < (real)1 && block[7] > (real)0 && cos_all > (real)0)) return mask_of(far >= zero);
-    const real up = (real)2 * per * (cx * axis.x + cy * axis.y + cz * axis.z);
+    const real up = (real)2 * facing;
     const Fixed on = {up * axis.x - cx * per, up * axis.y - cy * per, up * axis.z - cz * per};
     const reals least = cos_all * sqrt(room > zero ? room : zero) - (reals)(sin_all * radius);
     return mask_of(room <= zero) | mask_of(dot_fixed(q, on) >= least - SLACK * sqrt(far));
@@ -182,10 +185,11 @@ INLINE masks solved(Vector point, Vector lens, global const real *row, reals *x,
     *it = reflection_at(*x, *y, point, lens, row);
     const reals zero = (real)0;
     const masks inside = mask_of(*x >= zero) & mask_of(*y >= zero) & mask_of(*x + *y <= (real)1);
+    const masks outside = mask_of(it->up_lens > zero) | mask_of((reals)row[26] == zero);
     // R is zero, too, where the surface is seen edge on from both.
     const reals ways = sqrt(dot_of(it->to_lens, it->to_lens) * dot_of(it->to_point, it->to_point));
     const masks sides = positive(it->up_lens * it->up_point - GRAZING * GRAZING * ways);
-    return inside & sides & mask_of(step <= NEAR_ENOUGH);
+    return inside & sides & outside & mask_of(step <= NEAR_ENOUGH);
 }
 
 // The solid angle of the lens' rays per area across them at the point.

@@ -15,7 +15,7 @@ from gpuvision.simulation.bvh import Bvh
 from gpuvision.simulation.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
-_ROW, _BLOCK, _GROUP, _LANES = 26, 9, 64, 16
+_ROW, _BLOCK, _GROUP, _LANES = 27, 11, 64, 16
 _CREASE = math.radians(40.0)
 
 
@@ -103,6 +103,8 @@ class Blocks(NamedTuple):
         (b, 3), (b,): a ball about the triangles, as they bulge.
     axis, cone
         (b, 3), (b,): unit vector, and the angle to it within which all normals lie [rad].
+    outside
+        (b,): whether all reflect only on the side of their normals.
     """
 
     order: npt.NDArray[np.int64]
@@ -111,16 +113,25 @@ class Blocks(NamedTuple):
     radius: Float64
     axis: Float64
     cone: Float64
+    outside: npt.NDArray[np.bool_]
 
     @classmethod
-    def of(cls, corners: Float64, normals: Float64, sorted_by: Float64 | None = None) -> Blocks:
+    def of(
+        cls,
+        corners: Float64,
+        normals: Float64,
+        sorted_by: Float64 | None = None,
+        outside: npt.NDArray[np.bool_] | None = None,
+    ) -> Blocks:
         """Return the blocks of triangles and the normals at their corners, each (m, 3, 3).
 
         They are sorted as if they stood where ``sorted_by`` says, (m, 3, 3); None: where they do.
         """
         if not len(corners):
             none = np.zeros(0)
-            return cls(none.astype(int), np.zeros(1, int), none.reshape(0, 3), none, none.reshape(0, 3), none)
+            return cls(
+                none.astype(int), np.zeros(1, int), none.reshape(0, 3), none, none.reshape(0, 3), none, none > 0.0
+            )
         members = Bvh.build(corners if sorted_by is None else sorted_by).members
         order, count = members[members >= 0], (members >= 0).sum(axis=1)
         start = np.append(0, np.cumsum(count))
@@ -137,8 +148,9 @@ class Blocks(NamedTuple):
             np.linalg.norm(np.cross(directions, axis[each][:, None]), axis=2),
             np.sum(directions * axis[each][:, None], axis=2),
         )
-        radius = np.maximum.reduceat(away, start[:-1])
-        return cls(order, start, middle, radius, axis, np.maximum.reduceat(lean.max(axis=1), start[:-1]))
+        radius, cone = (np.maximum.reduceat(value, start[:-1]) for value in (away, lean.max(axis=1)))
+        one_sided = np.zeros(len(order), bool) if outside is None else outside[order]
+        return cls(order, start, middle, radius, axis, cone, np.logical_and.reduceat(one_sided, start[:-1]))
 
     def table(self, middle: Float64) -> Float64:
         """Return rows of kernels/mirrors.cl, at least one; balls and cones hold what rounding moves."""
@@ -146,7 +158,17 @@ class Blocks(NamedTuple):
             return np.zeros((1, _BLOCK))
         twice = np.minimum(2.0 * self.cone * (1.0 + 1e-5) + 1e-6, math.pi)
         radius = self.radius * (1.0 + 1e-5)
-        return np.column_stack([self.middle - middle, radius, self.axis, np.cos(twice), np.sin(twice)])
+        one_sided = self.outside & (twice < 0.5 * math.pi)
+        columns = [
+            self.middle - middle,
+            radius,
+            self.axis,
+            np.cos(twice),
+            np.sin(twice),
+            one_sided,
+            np.sin(0.5 * twice),
+        ]
+        return np.column_stack(columns)
 
 
 def bulge_of(corners: Float64, normals: Float64) -> Float64:
@@ -172,6 +194,8 @@ class MirrorPoints(Operation[MirroredPoints]):
         (m, 3, 3): the mirrors' triangles [m], and the normals at their corners.
     numbers
         (m,): what the triangles are called.
+    outside
+        (m,) bool: which reflect only on the side that their normals point to; None: all do on both.
     kept
         At most so many images of a point.
     precision
@@ -196,6 +220,7 @@ class MirrorPoints(Operation[MirroredPoints]):
     corners: Float64
     normals: Float64
     numbers: npt.NDArray[np.int32]
+    outside: npt.NDArray[np.bool_] | None = None
     kept: int = 8
     precision: Precision = None
     walk: Walk = "auto"
@@ -207,8 +232,10 @@ class MirrorPoints(Operation[MirroredPoints]):
                 raise ValueError(f"MirrorPoints.{name} has shape {array.shape}, expected finite numbers (m, 3, 3)")
             object.__setattr__(self, name, array)
         object.__setattr__(self, "numbers", np.asarray(self.numbers, np.int32))
-        if not len(self.corners) == len(self.normals) == len(self.numbers) or self.numbers.ndim != 1:
-            raise ValueError("MirrorPoints: corners, normals and numbers differ in length, expected one per triangle")
+        outside = np.zeros(len(self.corners), bool) if self.outside is None else np.asarray(self.outside, bool)
+        object.__setattr__(self, "outside", outside)
+        if not len(self.normals) == len(self.numbers) == len(outside) == len(self.corners) or self.numbers.ndim != 1:
+            raise ValueError("MirrorPoints: corners, normals, numbers and outside differ in length, expected one each")
         if not 1 <= self.kept <= 255:
             raise ValueError(f"MirrorPoints.kept is {self.kept}, expected 1 to 255")
 
@@ -225,12 +252,13 @@ class MirrorPoints(Operation[MirroredPoints]):
             np.einsum("mk,mnk->mn", two, normals),
             -np.sum(one * normals[:, 1], axis=1, keepdims=True),
             -np.sum(two * normals[:, 2], axis=1, keepdims=True),
+            np.asarray(self.outside, np.float64)[self._blocks.order, None],
         ]
         return np.hstack(columns) if len(corners) else np.zeros((1, _ROW))
 
     @functools.cached_property
     def _blocks(self) -> Blocks:
-        return Blocks.of(self.corners, self.normals)
+        return Blocks.of(self.corners, self.normals, outside=self.outside)
 
     def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         if dtype not in (np.float32, np.float64):

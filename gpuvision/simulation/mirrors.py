@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
+from gpuvision.simulation.closed_surfaces import outward
 from gpuvision.simulation.fans import FanIntervals
 from gpuvision.simulation.illumination import LightSheet, LitLine
 from gpuvision.simulation.line_exposure import line_exposure
@@ -26,6 +27,7 @@ from gpuvision.simulation.sheet_cut import ranges
 from gpuvision.simulation.sight import Exposure, Sight
 from gpuvision.simulation.sight_lines import check_materials
 from gpuvision.simulation.thrown_light import ThrownLight, lines_of
+from gpuvision.status import Status
 
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -34,6 +36,8 @@ Integers = npt.NDArray[np.int64]
 _FLAT = 1e-6
 # Windows of which more parts are visible than are kept are halved so often.
 _HALVINGS = 12
+# Images of a point in curved mirrors that there is room for, at first and at last.
+_KEPT, _MOST_KEPT = 32, 255
 # Clearance of rays between surfaces, in sizes of the scene.
 _CLEARANCE = 1e-7
 
@@ -85,7 +89,7 @@ class Mirrors:
     scene: Scene
     materials: Sequence[Material]
     normals: Float64 | None = None
-    per_sample: float = 4.0
+    per_sample: float = 2.0
     throws: int = 2
     device: Device | None = None
 
@@ -214,7 +218,9 @@ class Mirrors:
         blocks = self._facets.blocks
         line, block = np.nonzero(self._run(self._facets, lit.ends.reshape(-1, 6), lens).near)
         count = np.diff(blocks.start)[block]
-        return np.repeat(line, count), blocks.order[ranges(blocks.start[block], count)]
+        line, mirror = np.repeat(line, count), blocks.order[ranges(blocks.start[block], count)]
+        seen = heights(lens, self._planes) * self._sides[self._flat] >= 0.0
+        return line[seen[mirror]], mirror[seen[mirror]]
 
     def _visible(self, apex: Float64, ends: Float64, near: Float64, share: Float64) -> tuple[Integers, Float64]:
         """Return visible parts of segments (k, 2, 3): which segment, from where to where."""
@@ -246,24 +252,37 @@ class Mirrors:
         place = _between(lit.ends[line], share)
         move, middle = place[:, 1] - place[:, 0], place.mean(axis=1)
         lens = self.sight.lens_at(L)
-        images = self._run(self._points, np.hstack([middle, move]), lens)
-        point, slot = np.nonzero(images.triangle >= 0)
-        spot, triangle = images.place[point, slot], images.triangle[point, slot]
+        point, spot, spot_move, density, triangle = self._images(np.hstack([middle, move]), lens)
         origin = middle[point]
         towards = spot - origin
         way = np.linalg.norm(towards, axis=1)
         cosine = np.sum(towards * lit.normals[line[point]], axis=1) / way
-        good = (cosine > 0.0) & np.isfinite(images.density[point, slot])
+        good = (cosine > 0.0) & np.isfinite(density)
         good[good] = self._free(origin[good], spot[good], lens, triangle[good])
-        point, slot, spot, triangle, cosine = (each[good] for each in (point, slot, spot, triangle, cosine))
+        point, spot, spot_move, density, triangle, cosine = (
+            each[good] for each in (point, spot, spot_move, density, triangle, cosine)
+        )
         source = line[point]
         intensity = exitance[source] / math.pi * cosine * np.linalg.norm(move[point], axis=1)
         # Aperture and cosine at the lens are those of the spot; the solid angle is the mirror's doing.
-        square = np.sum((spot - lens) ** 2, axis=1) * images.density[point, slot]
+        square = np.sum((spot - lens) ** 2, axis=1) * density
         power = intensity * self._share_of(triangle) * self.sight.received(spot, L) * square
-        half_move = 0.5 * images.move[point, slot]
-        ends = np.stack([spot - half_move, spot + half_move], axis=1)
+        ends = np.stack([spot - 0.5 * spot_move, spot + 0.5 * spot_move], axis=1)
         return line_exposure(self.sight, L, ends, lambda line, at: power[line])
+
+    def _images(self, points: Float64, lens: Float64) -> tuple[Integers, Float64, Float64, Float64, Integers]:
+        """Return images of points: of which point, where, how they move, their density, on which triangle."""
+        found: list[tuple[Any, ...]] = []
+        row, kept = np.arange(len(points)), _KEPT
+        while len(row):
+            images = self._run(self._points(kept), points[row], lens)
+            # Where there may be more, all are sought again.
+            more = (images.status & Status.AMBIGUOUS != 0) & (kept < _MOST_KEPT)
+            which, slot = np.nonzero((images.triangle >= 0) & ~more[:, None])
+            found.append((row[which], *(each[which, slot] for each in images[:4])))
+            row, kept = row[more], min(4 * kept, _MOST_KEPT)
+        point, spot, move, density, triangle = (np.concatenate(each) for each in zip(*found, strict=True))
+        return point, spot, move, density, triangle
 
     def _free(self, origin: Float64, spot: Float64, lens: Float64, triangle: Integers) -> npt.NDArray[np.bool_]:
         """Return whether nothing is in the way from points to spots on curved mirrors and on to the lens.
@@ -330,14 +349,22 @@ class Mirrors:
 
     @functools.cached_property
     def _normals(self) -> Float64:
-        """Return normals at the corners; those of what does not reflect are not used."""
+        """Return normals at the corners, of closed surfaces outwards; those of what does not reflect are not used."""
         if self.normals is not None:
-            return np.asarray(self.normals, np.float64)
-        found = np.zeros(self.scene.corners.shape)
-        some = np.flatnonzero(self._reflects)
-        if len(some):
-            found[some] = smooth_normals(Scene(self.scene.corners[some]))
+            found = np.array(self.normals, np.float64)
+        else:
+            found = np.zeros(self.scene.corners.shape)
+            some = np.flatnonzero(self._reflects)
+            if len(some):
+                found[some] = smooth_normals(Scene(self.scene.corners[some]))
+        with np.errstate(invalid="ignore"):
+            inward = np.sum(found.sum(axis=1) * self._normal_of, axis=1) * self._sides < 0.0
+        found[inward] *= -1.0
         return found
+
+    @functools.cached_property
+    def _sides(self) -> npt.NDArray[np.int8]:
+        return outward(self.scene, self.sight.lens, self.sight.transport.direction)
 
     @functools.cached_property
     def _is_curved(self) -> npt.NDArray[np.bool_]:
@@ -397,12 +424,21 @@ class Mirrors:
     def _any_hit(self) -> AnyHit:
         return AnyHit(scene=self.scene, clearance=self._clearance)
 
+    def _points(self, kept: int) -> MirrorPoints:
+        if kept not in self._by_kept:
+            some = self._curved
+            self._by_kept[kept] = MirrorPoints(
+                corners=self.scene.corners[some],
+                normals=self._normals[some],
+                numbers=some.astype(np.int32),
+                outside=self._sides[some] != 0,
+                kept=kept,
+            )
+        return self._by_kept[kept]
+
     @functools.cached_property
-    def _points(self) -> MirrorPoints:
-        some = self._curved
-        return MirrorPoints(
-            corners=self.scene.corners[some], normals=self._normals[some], numbers=some.astype(np.int32)
-        )
+    def _by_kept(self) -> dict[int, MirrorPoints]:
+        return {}
 
     def _run(self, operation: Any, rows: Float64, *more: Float64) -> Any:
         return run_padded(operation, self._device, rows, *more)

@@ -110,6 +110,16 @@ def test_images_move_as_points_do(device: Device, walk: Any, dtype: Any, rng: np
 
 
 @WAYS
+def test_the_inside_of_a_ball_may_be_left_out(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
+    points, lens = some_points(rng).astype(dtype), LENS.astype(dtype)
+    both = mirrors(3, walk=walk)(points, lens, device=device)
+    one = mirrors(3, walk=walk, outside=np.ones(1280, bool))(points, lens, device=device)
+    np.testing.assert_array_equal(both.count, 2)
+    np.testing.assert_array_equal(one.count, 1)
+    np.testing.assert_array_equal(one.place[:, 0], outside(both)[0])
+
+
+@WAYS
 def test_a_flat_mirror_shows_the_mirror_image(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
     corners = np.array([[[-1.0, -1, 0.5], [3, -1, 0.5], [-1, 3, 0.5]]])
     op = MirrorPoints(corners=corners, normals=np.tile([0.0, 0, 1], (1, 3, 1)), numbers=[3], walk=walk)

@@ -201,6 +201,17 @@ def test_what_stands_before_a_curved_mirror_hides_its_image(device: Device) -> N
         assert mirrors_of(hidden, MATERIALS, device).seen(lit, 0.0).power.sum() < 1e-3 * whole
 
 
+def test_more_images_than_there_is_room_for_are_sought_again(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    balls = [np.array(trimesh.creation.icosphere(2).triangles) * 1e-3 + [x, -0.007, 2e-3] for x in np.arange(9) * 3e-3]
+    corners = np.concatenate([FLOOR, *balls])
+    scene = Scene(corners, np.r_[0, 0, np.ones(len(corners) - 2, int)])
+    lit = sheet(g_limits=(-0.005, 0.03)).lit(scene, 0.0)
+    plenty = mirrors_of(scene, MATERIALS, device).seen(lit, 0.0)
+    monkeypatch.setattr("gpuvision.simulation.mirrors._KEPT", 2)
+    np.testing.assert_allclose(mirrors_of(scene, MATERIALS, device).seen(lit, 0.0).power, plenty.power, rtol=1e-12)
+    assert plenty.power.sum() > 0.0
+
+
 def test_light_that_meets_a_mirror_head_on_comes_back_and_is_lost(device: Device) -> None:
     """The thrown light runs into the sheet itself; there is nothing on its way, and no number that is none."""
     mirror = quad([-0.1, -0.05, 0], [0.1, -0.05, 0], [0.1, 0.05, 0], [-0.1, 0.05, 0])

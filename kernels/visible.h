@@ -11,7 +11,17 @@
 
 #include "bvh.h"
 
+#ifdef STRIP
+// Of a kernel: its vectors are the code's own, a compiler need not look for more across work-items (Intel's does, for
+// seconds).
+#define AS_IT_IS __attribute__((vec_type_hint(real16)))
+#else
+#define AS_IT_IS
+#endif
+
 #define VIEW_HALVES 6
+// A node, where a leaf is to be.
+#define NO_HINT 0
 #define HIDDEN_MOST 32
 // What separates two hidden intervals at least: less is rounding.
 #define HIDDEN_SLIT ((real)4 * (real)REAL_EPSILON)
@@ -29,6 +39,7 @@ typedef struct {
     real along_x, along_y, along_z;    // of the length that makes `along` what it is
     real near, far;                    // in `deep`: what hides lies between
     real lift_deep, lift_along, lift;  // and where lift_deep deep + lift_along along > lift
+    real from, to;                     // the window
     view_half halves[VIEW_HALVES];     // it lies in all of these: window's start and end, both sides of the plane, ...
 } view;
 
@@ -54,6 +65,7 @@ BVH_INLINE view_half view_half_of(const view *view, real x, real y, real z, real
 
 // Sets the first two halves: what is seen between two places of the segment.
 BVH_INLINE void view_set_window(view *view, real from, real to) {
+    view->from = from, view->to = to;
     view->halves[0] = view_half_of(view, view->along_x - from * view->deep_x, view->along_y - from * view->deep_y,
                                    view->along_z - from * view->deep_z, 0);
     view->halves[1] = view_half_of(view, to * view->deep_x - view->along_x, to * view->deep_y - view->along_y,
@@ -66,17 +78,21 @@ BVH_INLINE void view_set_plane(view *view) {
     view->halves[3] = view_half_of(view, -view->across_x, -view->across_y, -view->across_z, 0);
 }
 
-// Which boxes reach into all halves.
+// How far a box reaches into a half.
+BVH_INLINE bvh_reals view_reach(const view_half *half_space, global const real *node) {
+    const bvh_reals x = half_space->x, y = half_space->y, z = half_space->z;
+    return bvh_fma(x, BVH_LOAD(node + half_space->at_x),
+                   bvh_fma(y, BVH_LOAD(node + half_space->at_y),
+                           bvh_fma(z, BVH_LOAD(node + half_space->at_z), -(bvh_reals)half_space->least)));
+}
+
+// Which boxes reach into all halves; no child does, as its box is inside out.
 BVH_INLINE bvh_masks view_boxes(const view *view, global const real *node) {
-    bvh_masks met = BVH_MASK(BVH_LOAD(node) <= BVH_LOAD(node + 3 * WIDTH));
-#pragma unroll
-    for (int n = 0; n < VIEW_HALVES; n++) {
-        const view_half *each = view->halves + n;
-        met &= BVH_MASK(BVH_LOAD(node + each->at_x) * each->x + BVH_LOAD(node + each->at_y) * each->y +
-                            BVH_LOAD(node + each->at_z) * each->z >=
-                        (bvh_reals)each->least);
-    }
-    return met;
+    const view_half *all = view->halves;
+    const bvh_reals window = bvh_min(view_reach(all, node), view_reach(all + 1, node));
+    const bvh_reals plane = bvh_min(view_reach(all + 2, node), view_reach(all + 3, node));
+    const bvh_reals beyond = bvh_min(view_reach(all + 4, node), view_reach(all + 5, node));
+    return BVH_MASK(bvh_min(bvh_min(window, plane), beyond) >= (bvh_reals)0);
 }
 
 BVH_INLINE uint view_met(const view *view, global const real *node) {
@@ -89,22 +105,21 @@ BVH_INLINE uint view_met(const view *view, global const real *node) {
 #endif
 }
 
-#ifdef STRIP
-BVH_INLINE int view_any(bvh_masks mask) { return bvh_lanes(mask) != 0; }
-#else
+// Whether any lane is set. (An or over comparisons is one instruction, where the compiler sees that it is one.)
+#if !defined(STRIP)
 BVH_INLINE int view_any(bvh_masks mask) { return mask != 0; }
+#elif __has_builtin(__builtin_reduce_or)
+BVH_INLINE int view_any(bvh_masks mask) { return __builtin_reduce_or(mask) != 0; }
+#else
+BVH_INLINE int view_any(bvh_masks mask) { return bvh_lanes(mask) != 0; }
 #endif
 
-// Cuts what lies between two places down to where a linear function is not negative; its values there are v1 and v2.
-BVH_INLINE bvh_masks view_cut(bvh_reals v1, bvh_reals v2, bvh_reals *enter, bvh_reals *leave) {
-    const bvh_reals zero = (bvh_reals)0;
-    const bvh_masks out1 = BVH_MASK(v1 < zero), out2 = BVH_MASK(v2 < zero);
-    if (view_any(out1 ^ out2)) {
-        const bvh_reals cut = v1 / (v1 - v2);
-        *enter = out1 ? bvh_max(*enter, cut) : *enter;
-        *leave = out2 ? bvh_min(*leave, cut) : *leave;
-    }
-    return ~(out1 & out2);
+// Where a linear function is negative at both of two places nothing is left of what lies between; else it begins, or
+// ends, where the function is zero.
+BVH_INLINE void view_cut(bvh_reals v1, bvh_reals v2, bvh_reals *enter, bvh_reals *leave) {
+    const bvh_reals cut = v1 / (v1 - v2);
+    *enter = v1 < (bvh_reals)0 ? bvh_max(*enter, cut) : *enter;
+    *leave = v2 < (bvh_reals)0 ? bvh_min(*leave, cut) : *leave;
 }
 
 // Which triangles hide something, and from where to where on the segment.
@@ -146,13 +161,27 @@ BVH_INLINE bvh_masks view_triangles(const view *view, global const real *leaf, b
     const bvh_reals deep2 = bvh_fma(share_3, step_deep_3, before ? deep_1 : deep_3);
     const bvh_reals along1 = bvh_fma(share_2, step_along_2, before ? along_1 : along_2);
     const bvh_reals along2 = bvh_fma(share_3, step_along_3, before ? along_1 : along_3);
-    bvh_reals enter = zero, leave = (bvh_reals)1;
-    bvh_masks hides = apart & view_cut(view->far - deep1, view->far - deep2, &enter, &leave);
-    hides &= view_cut(deep1 - view->near, deep2 - view->near, &enter, &leave);
-    hides &= view_cut(view->lift_deep * deep1 + view->lift_along * along1 - view->lift,
-                      view->lift_deep * deep2 + view->lift_along * along2 - view->lift, &enter, &leave);
-    hides &= BVH_MASK(enter < leave);
+    // Whether what lies between is in the window, before the segment's surface, before the point, above its surface.
+    const bvh_reals far1 = view->far - deep1, far2 = view->far - deep2;
+    const bvh_reals near1 = deep1 - view->near, near2 = deep2 - view->near;
+    const bvh_reals lift1 = view->lift_deep * deep1 + view->lift_along * along1 - view->lift;
+    const bvh_reals lift2 = view->lift_deep * deep2 + view->lift_along * along2 - view->lift;
+#define VIEW_OUT(name) const bvh_masks out_##name##1 = BVH_MASK(name##1 < zero), out_##name##2 = BVH_MASK(name##2 < zero)
+    VIEW_OUT(far);
+    VIEW_OUT(near);
+    VIEW_OUT(lift);
+#undef VIEW_OUT
+    bvh_masks hides = apart & ~((out_far1 & out_far2) | (out_near1 & out_near2) | (out_lift1 & out_lift2));
+    hides &= BVH_MASK(along1 >= view->from * deep1) | BVH_MASK(along2 >= view->from * deep2);
+    hides &= BVH_MASK(along1 <= view->to * deep1) | BVH_MASK(along2 <= view->to * deep2);
     if (!view_any(hides)) return hides;
+    bvh_reals enter = zero, leave = (bvh_reals)1;
+    if (view_any(hides & (out_far1 | out_far2 | out_near1 | out_near2 | out_lift1 | out_lift2))) {
+        view_cut(far1, far2, &enter, &leave);
+        view_cut(near1, near2, &enter, &leave);
+        view_cut(lift1, lift2, &enter, &leave);
+        hides &= BVH_MASK(enter < leave);
+    }
     const bvh_masks is_cut1 = BVH_MASK(enter > zero), is_cut2 = BVH_MASK(leave < (bvh_reals)1);
     const bvh_reals step_deep = deep2 - deep1, step_along = along2 - along1;
     // By rounding a cut may come out nearer than the nearest.
@@ -222,33 +251,44 @@ BVH_INLINE void view_leaf(const view *view, global const real *leaf, hidden *all
 #endif
 }
 
-// Finds what is hidden; stops when all is, or when more than can be kept is.
-BVH_INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all) {
+// Finds what is hidden; stops when all is, or when more than can be kept is. Looks first into the leaf that hid all from
+// the last point: it often does again.
+BVH_INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all, int *hint) {
     int nodes[BVH_DEPTH];
     uint left[BVH_DEPTH];
-    int node = 0, depth = 0;
-    view_set_window(view, all->from, all->to);
-    uint met = view_met(view, tree->nodes);
+    int node = 0, depth = 0, is_begun = 0, child = *hint;
+    uint met = 0;
+    view->from = all->from, view->to = all->to;
     while (true) {
-        if (!met) {
-            if (!depth) return;
-            node = nodes[--depth];
-            met = left[depth];
-        }
-        const int lane = bvh_lowest(met);
-        met &= met - 1;
-        const int child = tree->children[node * WIDTH + lane];
         if (child < 0) {
             view_leaf(view, tree->leaves + (size_t)~child * (9 * WIDTH), all);
-            if (all->is_full || all->from >= all->to) return;
-            continue;
+            if (all->is_full || all->from >= all->to) {
+                *hint = child;
+                return;
+            }
+        } else if (is_begun) {
+            node = child;
+            met = view_met(view, tree->nodes + (size_t)node * (6 * WIDTH));
         }
-        if (met) {
+        if (!met) {
+            if (depth) {
+                node = nodes[--depth];
+                met = left[depth];
+            } else {
+                if (is_begun) return;
+                is_begun = 1;
+                view_set_window(view, all->from, all->to);
+                child = 0;
+                continue;
+            }
+        }
+        child = tree->children[node * WIDTH + bvh_lowest(met)];
+        met &= met - 1;
+        if (child >= 0 && met) {
             nodes[depth] = node;
             left[depth++] = met;
+            met = 0;
         }
-        node = child;
-        met = view_met(view, tree->nodes + (size_t)node * (6 * WIDTH));
     }
 }
 

@@ -58,13 +58,14 @@ inline int keep(global real *restrict to, int count, int most, real *last, real 
     return count;
 }
 
-kernel void visible_intervals(global const INPUT *restrict rows, global real *restrict intervals,
+AS_IT_IS kernel void visible_intervals(global const INPUT *restrict rows, global real *restrict intervals,
                               global int *restrict counts, global uchar *restrict status, global const real *nodes,
                               global const int *children, global const int *axes, global const real *leaves,
                               global const int *triangles, constant place *middle, const real clearance, const int most,
                               const ulong total, const ulong each) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong begin = get_global_id(0) * each, stop = min(begin + each, total);
+    int hint = NO_HINT;
     for (ulong i = begin; i < stop; i++) {
         global real *to = intervals + i * 2 * most;
         for (int n = 0; n < 2 * most; n++) to[n] = REAL_NAN;
@@ -75,7 +76,7 @@ kernel void visible_intervals(global const INPUT *restrict rows, global real *re
         real last = -1, from = 0, until = has_plane ? 1 : 0;
         while (from < 1 && has_plane) {
             hidden dark = hidden_none(from, until);
-            view_trace(&tree, &v, &dark);
+            view_trace(&tree, &v, &dark, &hint);
             if (dark.is_full && until - from > LEAST_WINDOW) {
                 until = (real)0.5 * (from + until);
                 continue;

@@ -53,27 +53,38 @@ typedef struct {
 
 inline int has_no_number(place value) { return not_finite((real)value); }
 
+
+// A segment's start, and not yet of unit length: along it, and off it its normal.
 lit lit_of(global const INPUT *row, constant place *middle) {
     lit one;
-    const place x = (place)row[3] - (place)row[0], y = (place)row[4] - (place)row[1], z = (place)row[5] - (place)row[2];
     one.x = (place)row[0] - middle[0], one.y = (place)row[1] - middle[1], one.z = (place)row[2] - middle[2];
-    one.length = sqrt(x * x + y * y + z * z);
-    const place per = one.length > 0 ? (place)1 / one.length : 0;
-    one.along_x = x * per, one.along_y = y * per, one.along_z = z * per;
+    one.along_x = (place)row[3] - (place)row[0], one.along_y = (place)row[4] - (place)row[1];
+    one.along_z = (place)row[5] - (place)row[2];
     const place nx = row[6], ny = row[7], nz = row[8];
+    const place square = one.along_x * one.along_x + one.along_y * one.along_y + one.along_z * one.along_z;
     const place lean = one.along_x * nx + one.along_y * ny + one.along_z * nz;
-    one.off_x = nx - lean * one.along_x, one.off_y = ny - lean * one.along_y, one.off_z = nz - lean * one.along_z;
-    const place size = sqrt(one.off_x * one.off_x + one.off_y * one.off_y + one.off_z * one.off_z);
-    one.off_x /= size, one.off_y /= size, one.off_z /= size;
-    one.across_x = one.along_y * one.off_z - one.along_z * one.off_y;
-    one.across_y = one.along_z * one.off_x - one.along_x * one.off_z;
-    one.across_z = one.along_x * one.off_y - one.along_y * one.off_x;
+    one.off_x = square * nx - lean * one.along_x, one.off_y = square * ny - lean * one.along_y;
+    one.off_z = square * nz - lean * one.along_z;
     one.exitance = (real)(row[9] * (INPUT)0.15915494309189533577);
-    const int is_bad = has_no_number(one.x + one.y + one.z) | has_no_number(one.length) | not_finite(one.exitance) |
-                       has_no_number(one.length > 0 && row[9] > 0 ? size + one.off_x + one.off_y + one.off_z : 0);
-    one.is_good = !is_bad;
-    one.is_lit = !is_bad && one.length > 0 && one.exitance > 0;
+    const place size = fabs(one.off_x) + fabs(one.off_y) + fabs(one.off_z);
+    const int emits = one.exitance > 0 && square > 0;
+    one.is_good = !(has_no_number(one.x + one.y + one.z) | has_no_number(square + size) | not_finite(one.exitance)) &&
+                  !(emits && size == 0);
+    one.is_lit = one.is_good && emits;
     return one;
+}
+
+// Completes a segment that a receiver faces.
+void finish_lit(lit *one) {
+    one->length = sqrt(one->along_x * one->along_x + one->along_y * one->along_y + one->along_z * one->along_z);
+    const place per = (place)1 / one->length;
+    one->along_x *= per, one->along_y *= per, one->along_z *= per;
+    const place size = sqrt(one->off_x * one->off_x + one->off_y * one->off_y + one->off_z * one->off_z);
+    const place per_size = (place)1 / size;
+    one->off_x *= per_size, one->off_y *= per_size, one->off_z *= per_size;
+    one->across_x = one->along_y * one->off_z - one->along_z * one->off_y;
+    one->across_y = one->along_z * one->off_x - one->along_x * one->off_z;
+    one->across_z = one->along_x * one->off_y - one->along_y * one->off_x;
 }
 
 // The closed form for what waits.
@@ -90,7 +101,7 @@ __attribute__((noinline)) void finish(pieces *waiting, place *sums) {
 }
 
 // A lane's receiver sees the segment from `start` to `stop` of its length.
-void add_piece(const lit *one, const facing *all, int lane, real start, real stop, pieces *waiting, place *sums) {
+__attribute__((noinline)) void add_piece(const lit *one, const facing *all, int lane, real start, real stop, pieces *waiting, place *sums) {
     if (!(start < stop)) return;
     const int n = waiting->count++;
     const real length = (real)one->length;
@@ -136,8 +147,8 @@ view view_from(const lit *one, const facing *all, int lane, real x, real y, real
 }
 
 // Returns whether all is found: it is, unless there is more to keep than fits even in a small part of the segment.
-int add_visible(const bvh_tree *tree, const lit *one, const facing *all, int lane, view *v, pieces *waiting,
-                place *sums) {
+int add_visible(const bvh_tree *tree, const lit *one, const facing *all, int lane, view *v, int *hint,
+                pieces *waiting, place *sums) {
     // What is above the receiver's plane; the closed form cuts it exactly.
     const real toward = all->toward[lane], toward_end = all->toward_end[lane], slack = (real)8 * (real)REAL_EPSILON;
     const real horizon = toward / (toward - toward_end);
@@ -147,7 +158,7 @@ int add_visible(const bvh_tree *tree, const lit *one, const facing *all, int lan
     real from = begin, to = end;
     while (from < end) {
         hidden dark = hidden_none(from, to);
-        view_trace(tree, v, &dark);
+        view_trace(tree, v, &dark, hint);
         if (dark.is_full && to - from > LEAST_WINDOW) {
             to = (real)0.5 * (from + to);
             continue;
@@ -194,7 +205,7 @@ void add_sampled(const bvh_tree *tree, const lit *one, const facing *all, int la
 }
 #endif
 
-kernel void visible_light(global const INPUT *restrict receivers, global const INPUT *restrict weights,
+AS_IT_IS kernel void visible_light(global const INPUT *restrict receivers, global const INPUT *restrict weights,
                           global const INPUT *restrict segments,
 #ifdef PICKED
                           global const int *restrict starts, global const int *restrict picks,
@@ -206,6 +217,7 @@ kernel void visible_light(global const INPUT *restrict receivers, global const I
                           const uint segment_count, const uint pick_count) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong strip = get_group_id(0);
+    int hint = NO_HINT;
     place to_left = 0, to_right = 0;
     for (uint first = get_local_id(0) * LANES; first < each; first += get_local_size(0) * LANES) {
         // Receivers by columns; the last ones again where there are fewer.
@@ -246,12 +258,19 @@ kernel void visible_light(global const INPUT *restrict receivers, global const I
         for (uint number = 0; number < segment_count; number++) {
             const int unseen = 0;
 #endif
-            const lit one = lit_of(segments + 10 * (ulong)number, middle);
+            lit one = lit_of(segments + 10 * (ulong)number, middle);
             if (!one.is_good) flag = STATUS_NOT_FINITE;
             if (!one.is_lit) continue;
             const places dx = x - one.x, dy = y - one.y, dz = z - one.z;
+            // Before the segment's frame: whether any receiver is above its surface, and it above the receiver's.
+            const places above = dx * one.off_x + dy * one.off_y + dz * one.off_z;
+            const places near_end = -(dx * nx + dy * ny + dz * nz);
+            const places step = one.along_x * nx + one.along_y * ny + one.along_z * nz;
+            const masks may_face = mask_of(narrow(above) > (reals)0) &
+                                   (mask_of(narrow(near_end) > (reals)0) | mask_of(narrow(near_end + step) > (reals)0));
+            if (!any_lane(may_face)) continue;
+            finish_lit(&one);
             const reals height = narrow(dx * one.off_x + dy * one.off_y + dz * one.off_z);
-            if (!any_lane(mask_of(height > (reals)0))) continue;
             const places along = dx * one.along_x + dy * one.along_y + dz * one.along_z;
             const reals aside = narrow(dx * one.across_x + dy * one.across_y + dz * one.across_z);
             const reals by_u = normal_x * (real)one.along_x + normal_y * (real)one.along_y + normal_z * (real)one.along_z;
@@ -280,7 +299,7 @@ kernel void visible_light(global const INPUT *restrict receivers, global const I
 #if defined(INTERVALS)
                 view v = view_from(&one, &all, lane, at[0][lane], at[1][lane], at[2][lane], at[3][lane], at[4][lane],
                                    at[5][lane], clearance);
-                if (!add_visible(&tree, &one, &all, lane, &v, &waiting, sums)) flags[lane] = STATUS_AMBIGUOUS;
+                if (!add_visible(&tree, &one, &all, lane, &v, &hint, &waiting, sums)) flags[lane] = STATUS_AMBIGUOUS;
 #elif defined(RAYS)
                 const real over = fmin(clearance, LEAST_SHARE * all.height[lane]);
                 const real lift = fmin(clearance, LEAST_SHARE * fmax(all.toward[lane], all.toward_end[lane]));

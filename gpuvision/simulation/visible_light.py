@@ -24,9 +24,9 @@ _GROUP = 64
 _ROWS_PER_STRIP = 64
 # Small scenes share a build.
 _LEAST_DEPTH = 4
-# Of the scene's size: within this of a surface, rounding decides what lies before it.
-_CLEARANCE_IN_LAST_PLACE = 32.0
-_CLEARANCE_ALONG_RAYS = 1024.0
+# Of the scene's size: within this of a surface rounding, the caller's too, decides what lies before it.
+_CLEARANCE = {4: 4e-6, 8: 1e-12}
+_CLEARANCE_ALONG_RAYS = {4: 1e-4, 8: 1e-10}
 
 
 class ReceivedLight(NamedTuple):
@@ -104,7 +104,8 @@ class VisibleLight(Operation[ReceivedLight]):
         Parts of a segment for "rays".
     clearance
         Metres: what is less high above the lit surface, or above the receiver's own plane, hides nothing: the surfaces
-        on which both lie, as far as they are flat. None: 32 roundings of the scene's size.
+        on which both lie, as far as they are flat. None: 4e-6 of the scene's reach from the origin where places are in
+        single, 1e-12 in double.
     precision
         Of the arithmetic and the outputs; None follows the input. "single" takes float64 places, too: they are
         subtracted before they are rounded.
@@ -182,7 +183,7 @@ class VisibleLight(Operation[ReceivedLight]):
             arguments=[
                 *tree.tables(real),
                 tree.middle.astype(place),
-                _clearance(self.clearance, self.scene, real, _CLEARANCE_IN_LAST_PLACE),
+                _clearance(self.clearance, self.scene, real, dtype, _CLEARANCE),
                 np.uint32(self.samples),
                 np.uint32(each),
                 np.uint32(self.segments),
@@ -207,8 +208,8 @@ class VisibleIntervals(Operation[Visibles]):
         How many intervals are given for a segment.
     clearance
         Metres from the point, and from the segment, within which nothing hides: along the ray to the segment's nearest
-        place, and in proportion along longer rays; at most a quarter of each ray. None: 1024 roundings of the scene's
-        size. A surface that holds the segment, but for an error e, and is seen at an angle to it, wants
+        place, and in proportion along longer rays; at most a quarter of each ray. None: 1e-4 of the scene's reach from
+        the origin where places are in single, 1e-10 in double. A surface that holds the segment, but for an error e, and is seen at an angle to it, wants
         e / sin(angle).
     precision
         Of the arithmetic and the outputs; None follows the input. "single" takes float64 rows, too.
@@ -265,7 +266,7 @@ class VisibleIntervals(Operation[Visibles]):
             arguments=[
                 *tree.tables(real),
                 tree.middle.astype(_place(device)),
-                _clearance(self.clearance, self.scene, real, _CLEARANCE_ALONG_RAYS),
+                _clearance(self.clearance, self.scene, real, dtype, _CLEARANCE_ALONG_RAYS),
                 np.int32(self.most),
                 np.uint64(count),
                 np.uint64(each),
@@ -330,8 +331,10 @@ def _place(device: Device) -> np.dtype[Any]:
     return np.dtype(np.float64 if device.has_double else np.float32)
 
 
-def _clearance(given: float | None, scene: Scene, real: np.dtype[Any], in_last_place: float) -> Any:
+def _clearance(
+    given: float | None, scene: Scene, real: np.dtype[Any], dtype: np.dtype[Any], shares: dict[int, float]
+) -> Any:
     if given is None:
-        reach = float(np.abs(scene.bvh.corners).max(initial=0.0))
-        given = in_last_place * float(np.finfo(real).eps) * reach
+        reach = float(np.abs(scene.bvh.corners).max(initial=0.0) + np.abs(scene.bvh.middle).max())
+        given = shares[min(real.itemsize, dtype.itemsize)] * reach
     return real.type(given)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,7 @@ def assert_intervals(corners: np.ndarray, rows: np.ndarray, result: Any, toleran
 @pytest.mark.parametrize("count", [1, 17, 400])
 def test_intervals_as_rays_say(device: Device, walk: Any, dtype: Any, count: int, rng: np.random.Generator) -> None:
     corners = soup(rng, count, 0.6 if count < 20 else 0.08)
-    rows = single(rng.uniform(-1.0, 1.0, (100, 9))).astype(dtype)
+    rows = single(rng.uniform(-1.0, 1.0, (100 if count < 20 else 30, 9))).astype(dtype)
     result = VisibleIntervals(scene=Scene(corners), walk=walk, most=16, clearance=0.0)(rows, device=device)
     assert result.intervals.dtype == dtype
     assert_intervals(corners, rows, result, *((2e-5, 0.05) if dtype == np.float32 else (1e-9, 0.0)))
@@ -198,15 +199,22 @@ def test_intervals_sizes_and_canaries(device: Device, walk: Any, count: int, rng
 # ---- light -----------------------------------------------------------------------------------------------------
 
 
-@WAYS
-@pytest.mark.parametrize("count", [3, 60])
-def test_light_as_rays_say(device: Device, walk: Any, dtype: Any, count: int, rng: np.random.Generator) -> None:
+@functools.cache
+def lit_soup(count: int) -> tuple[np.ndarray, ...]:
+    """Triangles, segments, receivers, and their light by rays."""
+    rng = np.random.default_rng(count)
     corners = soup(rng, count, 0.6 if count < 20 else 0.3)
     segments, receivers = segments_of(rng, 5), receivers_of(rng, 3, 23)
+    return corners, segments, receivers, *reference.light(corners, receivers.reshape(-1, 6), segments, 1e-5)
+
+
+@WAYS
+@pytest.mark.parametrize("count", [3, 60])
+def test_light_as_rays_say(device: Device, walk: Any, dtype: Any, count: int) -> None:
+    corners, segments, receivers, value, most = lit_soup(count)
     result = light_of(corners, receivers.astype(dtype), segments, device, walk=walk, clearance=1e-5)
     assert result.irradiance.dtype == dtype
     assert not result.status.any()
-    value, most = reference.light(corners, receivers.reshape(-1, 6), segments, 1e-5)
     error = np.abs(result.irradiance.ravel() - value) / np.where(most > 0.0, most, 1.0)
     if dtype == np.float64:
         assert error.max() <= 1e-9

@@ -134,4 +134,4 @@ class _PointByPoint:
             start.astype(np.float32), (end - start).astype(np.float32), dists=reach, query="OCCLUDED"
         )
         share = self._powers[patch] * (at * out / square**2)[receiver, patch] * (np.asarray(free) != 0)
-        return np.bincount(receiver, share, len(points))
+        return np.asarray(np.bincount(receiver, share, len(points)), np.float64)

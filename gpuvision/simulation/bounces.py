@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,14 +14,18 @@ import numpy.typing as npt
 from gpuvision.host import Device
 from gpuvision.simulation.line_irradiance import Irradiance, LitSegments
 from gpuvision.simulation.patches import FormFactors, Patches, PatchLight
+from gpuvision.simulation.rays import ClosestHit
 from gpuvision.simulation.scene import Scene
 
 Reals = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
 # Receivers whose rows of the matrix stand in memory at a time; quadratures come in multiples of the smaller number, so
 # that few shapes are bound.
 _ROWS, _ROUND = 2048, 128
 _NODES_PER_SEGMENT, _NODES_PER_PATCH = 8, 2.0
 _TOLERANCE, _ROUNDS = 1e-10, 400
+# Roundings of the scene's extent around a place within which nothing covers it, and which part of a view is none.
+_CLEARANCE, _NOTHING = 64.0, 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -119,7 +123,8 @@ class Bounces:
         got = np.zeros(self.patches.count)
         for rows, begin in self._rows(receivers):
             got += power[begin : begin + len(rows)] @ rows
-        return got / self.patches.area
+        area = self._surface.area
+        return np.where(area > 0.0, got / np.where(area > 0.0, area, 1.0), 0.0)
 
     def exitance(self, arrival: npt.ArrayLike) -> Reals:
         """Return (count,) W/m^2: what leaves each patch of the light that arrives first as ``arrival``, all bounces.
@@ -151,7 +156,7 @@ class Bounces:
     @functools.cached_property
     def factors(self) -> Reals:
         """(count, count): which part of each column's exitance arrives on the row's patch."""
-        points, owner, weight = self.patches.points
+        points, owner, weight, _ = self._surface
         matrix = np.zeros((self.patches.count, self.patches.count))
         for rows, begin in self._rows(points):
             own, share = owner[begin : begin + len(rows)], weight[begin : begin + len(rows), None]
@@ -166,6 +171,30 @@ class Bounces:
             some = receivers[begin : begin + _ROWS]
             padded = np.resize(some, (-(-len(some) // _ROUND) * _ROUND, 6)).astype(real)
             yield operation(padded, device=self.device).factors[: len(some)].astype(np.float64), begin
+
+    @functools.cached_property
+    def _surface(self) -> _Surface:
+        """What of the patches can be lit: not where a body stands on them."""
+        points, owner, weight = self.patches.points
+        if self.scene is None:
+            return _Surface(points, owner, weight, self.patches.area)
+        covered = self._is_covered(self.scene, points)
+        points, owner, weight = points[~covered], owner[~covered], weight[~covered]
+        part = np.bincount(owner, weight, self.patches.count)
+        return _Surface(points, owner, weight / part[owner], self.patches.area * part)
+
+    def _is_covered(self, scene: Scene, points: Reals) -> npt.NDArray[np.bool_]:
+        """Whether all that places see is backs of surfaces: they are inside of something."""
+        clearance = _CLEARANCE * float(np.finfo(self._real).eps) * float(np.ptp(scene.bvh.corners, axis=(0, 1)).max())
+        hit = ClosestHit(scene=scene, clearance=clearance)(points.astype(self._real), device=self.device).triangle
+        a, b, c = np.moveaxis(scene.corners[hit], 1, 0)
+        behind = np.flatnonzero((hit >= 0) & (np.sum(np.cross(b - a, c - a) * points[:, 3:], axis=1) > 0.0))
+        everything = np.ones(self.patches.count, self._real)
+        light = PatchLight(patches=self.patches, scene=scene)
+        seen = light(np.ascontiguousarray(points[behind], self._real), everything, device=self.device).irradiance
+        covered = np.zeros(len(points), bool)
+        covered[behind] = seen < _NOTHING
+        return covered
 
     @property
     def _real(self) -> Any:
@@ -195,22 +224,31 @@ class Bounces:
     def _iterated(self, emitted: Reals) -> Reals:
         from scipy.sparse.linalg import LinearOperator, gmres
 
-        points, owner, weight = self.patches.points
+        size = self.patches.count
+        points, owner, weight, _ = self._surface
         bound = PatchLight(patches=self.patches, scene=self.scene).bind(self.device, points.shape, self._real)
         bound.inputs[0].set(points.astype(self._real))
 
         def without_bounced(exitance: Reals) -> Reals:
             bound.inputs[1].set(exitance.astype(self._real))
-            arrived = np.bincount(owner, weight * bound.run().irradiance.get())
+            arrived = np.bincount(owner, weight * bound.run().irradiance.get(), size)
             return np.asarray(exitance - self.albedo * arrived)
 
-        size = self.patches.count
         operator = LinearOperator((size, size), without_bounced, dtype=np.float64)
         tolerance = max(_TOLERANCE, 10.0 * float(np.finfo(self._real).eps))
         solution, failed = gmres(operator, emitted, rtol=tolerance, restart=_ROUNDS, maxiter=1)
         if failed:
             raise ValueError(_NO_WAY_OUT)
         return np.asarray(solution)
+
+
+class _Surface(NamedTuple):
+    """Receivers on patches, whose they are, their weights, and the patches' free areas (count,)."""
+
+    points: Reals
+    owner: Integers
+    weight: Reals
+    area: Reals
 
 
 _NO_WAY_OUT = (

@@ -130,6 +130,20 @@ def test_light_beside_a_screen(device: Device) -> None:
     assert exitance[left].max() < 1e-6 * exitance[right].max()
 
 
+def test_what_a_body_stands_on_is_not_lit(device: Device) -> None:
+    """Patches that it covers in part neither lose nor make light: all of it is absorbed by what is free."""
+    part = trimesh.creation.box((0.3, 0.3, 0.3)).apply_translation((0.05, -0.1, -0.15))
+    scene = Scene(np.concatenate([room(1.0, 0.8, 0.6).corners, part.triangles]))
+    albedo = 0.9
+    box = Bounces.of(scene, [albedo], size=0.2, device=device)
+    arrival = box.arrival(stripe())
+    free = box._surface.area
+    assert arrival @ free == pytest.approx(1.0, rel=3e-3)
+    absorbed = box.exitance(arrival) @ free * (1.0 - albedo) / albedo
+    assert absorbed == pytest.approx(1.0, rel=1e-2)
+    assert box.patches.area.sum() - free.sum() == pytest.approx(0.3 * 0.3, rel=0.3)
+
+
 def test_patches_in_corners_are_graded(device: Device) -> None:
     patches = Patches.of(room(1.0, 0.8, 0.6), size=0.5)
     finer = graded(patches, 3, device=device)

@@ -385,7 +385,13 @@ def _whole_light(store: BlockStore, bins: int) -> tuple[dict[str, Exposure], Tru
 
 
 def _added(account: Mapping[str, float], block: Block) -> dict[str, float]:
-    return {name: account.get(name, 0.0) + float(np.sum(each)) for name, each in block.account.items()}
+    """Return sums, and of bounds the largest."""
+    added = {}
+    for name, each in block.account.items():
+        before = account.get(name, 0.0)
+        largest = name.startswith("bound")
+        added[name] = max(before, float(np.max(each))) if largest else before + float(np.sum(each))
+    return added
 
 
 def _joined(parts: Sequence[Artifacts]) -> Artifacts:

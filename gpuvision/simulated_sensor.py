@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from gpuvision.light import Light
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.psd import PsdReadout
+from gpuvision.ranging.psd import ELECTRON, PsdReadout
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.sensor import Sensor
@@ -86,6 +86,18 @@ def sight_of(sensor: Sensor) -> Sight:
         v_edges=_ascending(axes.sample_origin + axes.sample_pitch * (np.arange(samples + 1) - 0.5)),
         aperture=light.aperture,
     )
+
+
+def floor_of(sensor: Sensor) -> float:
+    """Return the power of a sample below which it is not read, W.
+
+    Of a PSD, what makes the least total current; of a camera, what makes the least peak, or the threshold.
+    """
+    light, readout = light_of(sensor), sensor.readout
+    if isinstance(readout, PsdReadout):
+        return readout.minimum_total / light.responsivity
+    grey = max(readout.minimum_peak or 0.0, readout.threshold)
+    return grey * light.full_well / _CODES * ELECTRON / (light.responsivity * light.exposure)
 
 
 def simulator_of(sensor: Sensor, sight: Sight, mask: Mask | None = None) -> PsdSimulator | CameraSimulator:

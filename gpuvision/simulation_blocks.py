@@ -23,7 +23,7 @@ from gpuvision.host import Device
 from gpuvision.host.files import replacing
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor import Sensor
-from gpuvision.simulated_sensor import light_of, sheet_of, sight_of
+from gpuvision.simulated_sensor import floor_of, light_of, sheet_of, sight_of
 from gpuvision.simulation.light_paths import LightPaths
 from gpuvision.simulation.material import Material
 from gpuvision.simulation.readings import Truth
@@ -82,7 +82,9 @@ class Task:
         length = readout.strip_length if isinstance(readout, PsdReadout) else readout.along
         optics = [readout.triangulation, readout.axes, length, sensor.transport, sensor.frame]
         light = [getattr(sensor.light, name) for name in _OPTICAL]
-        words = repr([version("gpuvision"), self.materials, optics, light, self.paths, self.tolerance])
+        words = repr(
+            [floor_of(sensor), version("gpuvision"), self.materials, optics, light, self.paths, self.tolerance]
+        )
         digest = hashlib.sha256(words.encode())
         for array in (self.part.corners, self.part.material, self.transports):
             digest.update(np.ascontiguousarray(array).tobytes())
@@ -268,6 +270,7 @@ def _bench(task: Task, device: Device | None) -> LightPaths:
             blur=light.blur,
             nodes=light.nodes,
             tolerance=task.tolerance,
+            floor=floor_of(task.sensor),
             device=chosen,
         )
     return _BENCH[key]

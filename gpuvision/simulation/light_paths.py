@@ -16,6 +16,8 @@ from gpuvision.simulation.illumination import LightSheet, LitLine
 from gpuvision.simulation.line_irradiance import LitSegments
 from gpuvision.simulation.material import Material
 from gpuvision.simulation.mirrors import Mirrors
+from gpuvision.simulation.planned_light import PlannedLight
+from gpuvision.simulation.range_error import StripReading, bounce_power, choose_paths
 from gpuvision.simulation.readings import PATHS, Truth
 from gpuvision.simulation.scene import Scene
 from gpuvision.simulation.sight import Exposure, Sight
@@ -66,6 +68,11 @@ class LightPaths:
         Of `SightLines`.
     patch
         Size of the patches between which light bounces on [m]; None: a sixteenth of the scene.
+    tolerance
+        Range error that may come from secondary light that is left out [m], as a centre of gravity reads it; 0:
+        nothing is left out.
+    floor
+        Power of a sample below which it is not read [W].
     device
         None: `Device.best`.
 
@@ -90,12 +97,14 @@ class LightPaths:
     nodes: tuple[int, int] = (1, 1)
     patch: float | None = None
     tolerance: float = 0.0
+    floor: float = 0.0
     device: Device | None = None
     _direct: DirectLight = field(init=False, repr=False)
     _mirrors: Mirrors = field(init=False, repr=False)
     lines: SightLines = field(init=False, repr=False)
     _bounces: Bounces | None = field(init=False, repr=False)
     _bound: dict[int, Bound[Any]] = field(init=False, repr=False, default_factory=dict)
+    _planned: dict[float, PlannedLight] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         for path in self.paths:
@@ -128,7 +137,19 @@ class LightPaths:
         if "diffuse-specular" in self.paths and self._mirrors.there_are_any:
             exposures["diffuse-specular"] = self._mirrors.exposure(lit, L, self.sheet)
         if {"diffuse-diffuse", "bounces"} & set(self.paths):
-            exposures |= self._by_detours(lit, L)
+            seen, segments = self.lines.surface(L), self._diffuse(lit)
+            reading = StripReading.of(self.sight, exposures["direct"], floor=self.floor)
+            remaining = self.tolerance
+            if self._bounces is not None:
+                choice = choose_paths({"bounces": reading.worst(self._most_by_bounces(segments))}, self.tolerance)
+                remaining = choice.remaining
+                if "bounces" in choice.modelled:
+                    exposures["bounces"] = self._bounced(seen, segments)
+                account |= {"bound of bounces left out [m]": sum(choice.left_out.values())}
+            if "diffuse-diffuse" in self.paths:
+                irradiance, told = self._secondary(seen, segments, reading, remaining)
+                exposures["diffuse-diffuse"] = self.lines.exposure(seen, irradiance)
+                account |= told
         return Profile(exposures, self._direct.truth(L), account)
 
     def _straight(self, L: float) -> dict[str, Exposure]:
@@ -139,17 +160,41 @@ class LightPaths:
             if name in self.paths or name not in PATHS
         }
 
-    def _by_detours(self, lit: LitLine, L: float) -> dict[str, Exposure]:
-        exposures: dict[str, Exposure] = {}
-        seen = self.lines.surface(L)
-        segments = self._diffuse(lit)
-        if "diffuse-diffuse" in self.paths:
-            exposures["diffuse-diffuse"] = self.lines.exposure(seen, self.irradiance(seen, segments))
-        if self._bounces is not None:
-            exitance = self._bounces.exitance(self._bounces.arrival(segments))
-            light = self._bounces.light(seen.receivers, exitance)
-            exposures["bounces"] = self.lines.exposure(seen, light.irradiance)
-        return exposures
+    # ---- light by detours ------------------------------------------------------------------------------------
+
+    def _bounced(self, seen: SeenSurface, segments: LitSegments) -> Exposure:
+        assert self._bounces is not None  # asked for
+        exitance = self._bounces.exitance(self._bounces.arrival(segments))
+        return self.lines.exposure(seen, self._bounces.light(seen.receivers, exitance).irradiance)
+
+    def _most_by_bounces(self, segments: LitSegments) -> float:
+        """Return the most power that the sensor can get of light that went between surfaces more than once."""
+        sent = float(segments.exitance @ np.linalg.norm(segments.ends[:, 1] - segments.ends[:, 0], axis=1))
+        corners = self.scene.corners.reshape(-1, 3)
+        lens = self.sight.lens_at(0.0)
+        # The nearest that the part can come to the lens, wherever the sheet stands on it.
+        across = corners - lens
+        across -= np.outer(across @ np.array(self.sight.transport.direction), self.sight.transport.direction)
+        nearest = float(np.linalg.norm(across, axis=1).min(initial=np.inf))
+        opening = 0.25 * np.pi * self.sight.aperture**2
+        solid_angle = min(opening / nearest**2, 2.0 * np.pi) if nearest > 0.0 else 2.0 * np.pi
+        return bounce_power(sent, max((each.albedo for each in self.materials), default=0.0), solid_angle)
+
+    def _secondary(
+        self, seen: SeenSurface, segments: LitSegments, reading: StripReading, tolerance: float
+    ) -> tuple[Float64, dict[str, float]]:
+        """Return the irradiance by lit segments, and what of it was modelled."""
+        if tolerance == 0.0:
+            pairs = float(len(segments.exitance) * np.count_nonzero(seen.weights))
+            return self.irradiance(seen, segments), {"pairs": pairs, "pairs exact": pairs}
+        if tolerance not in self._planned:
+            self._planned[tolerance] = PlannedLight(scene=self.scene, tolerance=tolerance, device=self.device)
+        weights = reading.weights(seen.weights, self.lines.u)
+        light, plan = self._planned[tolerance](segment_rows(segments), seen.receivers, weights, reading)
+        told = {"pairs": plan.counts["pairs"]}
+        told |= {f"pairs {name}": plan.counts[name] for name in ("exact", "clustered", "left out")}
+        told |= {"bound of pairs left out [m]": float(plan.bound.max(initial=0.0))}
+        return light, {name: float(each) for name, each in told.items()}
 
     def irradiance(self, seen: SeenSurface, segments: LitSegments) -> Float64:
         """Return the irradiance [W/m^2] of what the sensor sees from lit segments, (samples, n)."""

@@ -9,6 +9,7 @@ import trimesh
 from gpuvision.simulation.illumination import LightSheet
 from gpuvision.simulation.light_paths import LightPaths
 from gpuvision.simulation.material import Material
+from gpuvision.simulation.range_error import StripReading
 from gpuvision.simulation.reflectance import Lambert
 from gpuvision.simulation.scene import Scene
 from simulation.test_sight import sight
@@ -101,3 +102,29 @@ def test_what_was_not_asked_for_is_not_there(device):
     assert "diffuse-diffuse" not in paths(corner(), device, paths=("direct",)).profile(0.0).exposures
     with pytest.raises(ValueError, match="unknown path 'defuse'"):
         paths(corner(), device, paths=("defuse",))
+
+
+@pytest.mark.parametrize("tolerance", [1e-7, 1e-5, 1e-3])
+def test_a_tolerance_is_kept(device, tolerance):
+    exact = paths(corner(), device).profile(0.0)
+    about = paths(corner(), device, tolerance=tolerance).profile(0.0)
+    one = sight()
+    slope = StripReading.of(one, exact.exposures["direct"]).slope
+
+    def place(profile):
+        total = profile.exposures["direct"] + profile.exposures["diffuse-diffuse"]
+        return total.first_moment(one.u_edges) / total.total()
+
+    lit = exact.exposures["direct"].total() > 0.0
+    error = np.abs(place(about) - place(exact))[lit] * slope[lit]
+    assert error.max() <= about.account["bound of pairs left out [m]"] * (1.0 + 1e-6) + 1e-12
+    assert about.account["bound of pairs left out [m]"] <= tolerance
+    assert about.account["pairs left out"] > 0.0
+
+
+def test_bounces_are_left_out_where_they_cannot_matter(device):
+    dim = Material(diffuse=Lambert(albedo=1e-3))
+    model = paths(corner(), device, paths=(*PATHS, "bounces"), materials=[dim], patch=0.05, tolerance=1e-3)
+    profile = model.profile(0.0)
+    assert "bounces" not in profile.exposures
+    assert 0.0 < profile.account["bound of bounces left out [m]"] <= 0.5e-3

@@ -209,8 +209,8 @@ class VisibleIntervals(Operation[Visibles]):
     clearance
         Metres from the point, and from the segment, within which nothing hides: along the ray to the segment's nearest
         place, and in proportion along longer rays; at most a quarter of each ray. None: 1e-4 of the scene's reach from
-        the origin where places are in single, 1e-10 in double. A surface that holds the segment, but for an error e, and is seen at an angle to it, wants
-        e / sin(angle).
+        the origin where places are in single, 1e-10 in double. A surface that holds the segment, but for an error e,
+        and is seen at an angle to it, wants e / sin(angle).
     precision
         Of the arithmetic and the outputs; None follows the input. "single" takes float64 rows, too.
     walk

@@ -262,59 +262,104 @@ class DualSensor:
         return np.where(sure, np.array([FIRST, SECOND, BOTH])[best], NONE)
 
 
-def join_artifacts(first: Artifacts, second: Artifacts, rule: DualSensor, *, gap: float) -> Artifacts:
-    """Return what two sensors over one sheet make of a part together: for `rank`, beside each of them alone.
+def pair_artifacts(
+    first: Artifacts, second: Artifacts, rule: DualSensor, *, gap: float, g: npt.ArrayLike | None = None
+) -> dict[str, Artifacts]:
+    """Return what two sensors over one sheet make of a part: "first", "second" and "both", for `rank`.
+
+    All three lie at the same places along the sheet and are judged by the surfaces that either sensor sees: what is
+    hidden from one of them is missing there.
 
     Parameters
     ----------
     first, second
-        What `explain` found for each, of the same profiles. The result lies where the first one's samples do.
+        What `explain` found for each, (profiles, samples) of the same profiles.
     rule
         "predicted" takes their errors without noise for what a simulation predicts.
     gap
         As for `resampled` [m].
+    g
+        (k,) the places [m]; None: where the first one's samples see the part, in the median over the profiles.
 
     Returns
     -------
-    Artifacts
-        Causes have the sensors' shares of the reading; what the second sensor's samples miss of the surface in between
-        is added to "shape". The position along u is NaN.
+    dict
+        Causes of "both" have the sensors' shares of the reading; what lies between samples is added to "shape". Places
+        along u are NaN.
 
     Raises
     ------
     ValueError
-        As `DualSensor.join`.
+        As `DualSensor.join`; or the first sensor sees no surface and ``g`` is not given.
     """
-    truth = first.truth
-    places = np.where(np.isfinite(first.reading.g), first.reading.g, truth.g)
-    other = resampled(second.reading, places, gap=gap)
-    parts = {
-        name: resampled(second.reading._replace(h=np.where(np.isfinite(second.error), part, np.nan)), places, gap=gap).h
-        for name, part in second.causes.items()
-    }
-    error = other.h - truth.h
-    parts["shape"] = parts["shape"] + (error - np.sum(list(parts.values()), axis=0))
-    joined = rule.join(first.reading, other, (first.error - first.causes["noise"], error - parts["noise"]))
-    total = joined.h - truth.h
+    places = _usual_places(first) if g is None else np.asarray(g, np.float64)
+    truths = [_on_places(each.reading, each.truth.g, each.truth.h, places, gap) for each in (first, second)]
+    h = np.where(np.isfinite(truths[0]), truths[0], truths[1])
+    at = np.broadcast_to(places, h.shape)
+    truth = Truth(np.where(np.isfinite(h), at, np.nan), h, np.where(np.isfinite(h), 0, int(Status.DARK)))
+    alone = [_resampled_artifacts(each, truth, places, gap) for each in (first, second)]
+    expected = [each.error - each.causes["noise"] for each in alone]
+    joined = rule.join(alone[0].reading, alone[1].reading, (expected[0], expected[1]))
+    error = joined.h - h
     causes = {}
-    for name in (name for name in first.causes if name in parts):
-        mean = joined.share * first.causes[name] + (1.0 - joined.share) * parts[name]
-        one = np.where(joined.share == 1.0, first.causes[name], np.where(joined.share == 0.0, parts[name], mean))
-        causes[name] = np.where(np.isfinite(total), one, np.nan)
-    nothing = np.full(joined.h.shape, np.nan)
-    strength = np.where(joined.share >= 0.5, first.reading.strength, other.strength)
-    return Artifacts(
+    for name in (name for name in alone[0].causes if name in alone[1].causes):
+        one, other = (each.causes[name] for each in alone)
+        mean = joined.share * one + (1.0 - joined.share) * other
+        part = np.where(joined.share == 1.0, one, np.where(joined.share == 0.0, other, mean))
+        causes[name] = np.where(np.isfinite(error), part, np.nan)
+    nothing = np.full(h.shape, np.nan)
+    strength = np.where(joined.share >= 0.5, alone[0].reading.strength, alone[1].reading.strength)
+    both = Artifacts(
         reading=Reading(nothing, joined.g, joined.h, joined.sigma, strength, nothing, joined.status),
         truth=truth,
-        error=total,
+        error=error,
         causes=causes,
-        light={name: first.light[name] for name in causes},
+        light={name: alone[0].light[name] + alone[1].light[name] for name in causes},
         verdict=verdict_of(joined.h, truth),
+    )
+    return {"first": alone[0], "second": alone[1], "both": both}
+
+
+def _usual_places(found: Artifacts) -> Float64:
+    g = np.asarray(found.truth.g, np.float64).reshape(-1, np.shape(found.truth.g)[-1])
+    known = np.isfinite(g).any(axis=0)
+    if not known.any():
+        raise ValueError("the first sensor sees no surface; give the places along the sheet, g=")
+    at = np.flatnonzero(known)
+    return np.interp(np.arange(g.shape[1]), at, np.nanmedian(g[:, at], axis=0))
+
+
+def _on_places(reading: Reading, g: Float64, values: Float64, places: Float64, gap: float) -> Float64:
+    """Return any values of samples that lie at g as straight lines at other places; NaN where there are none."""
+    return resampled(reading._replace(g=g, h=values), places, gap=gap).h
+
+
+def _resampled_artifacts(found: Artifacts, truth: Truth, places: Float64, gap: float) -> Artifacts:
+    """Return readings at other places beside a truth of those places."""
+    reading = resampled(found.reading, places, gap=gap)
+    error = reading.h - truth.h
+    known = np.isfinite(found.reading.h)
+
+    def moved(values: Float64) -> Float64:
+        return _on_places(found.reading, found.reading.g, np.where(known, values, np.nan), places, gap)
+
+    # Where the sample had no truth beside it, the other sensor's says how wrong it is, and "shape" has it all.
+    causes = {name: moved(np.nan_to_num(part)) for name, part in found.causes.items()}
+    causes["shape"] = causes["shape"] + (error - np.sum(list(causes.values()), axis=0))
+    return Artifacts(
+        reading=reading,
+        truth=truth,
+        error=error,
+        causes={name: np.where(np.isfinite(error), part, np.nan) for name, part in causes.items()},
+        light={name: np.nan_to_num(moved(part)) for name, part in found.light.items()},
+        verdict=verdict_of(reading.h, truth),
     )
 
 
 def resampled(reading: Reading, g: npt.ArrayLike, *, gap: float) -> Reading:
     """Return a profile at other places along the sheet: straight lines between its points.
+
+    Beside a hole and at either end a point stands for what is up to half a usual distance of points away.
 
     Parameters
     ----------
@@ -340,23 +385,29 @@ def resampled(reading: Reading, g: npt.ArrayLike, *, gap: float) -> Reading:
         return Reading._make(np.reshape(part, places.shape) for part in zip(*rows, strict=True))
     at = np.asarray(g, np.float64)
     known = np.flatnonzero(np.isfinite(reading.g) & np.isfinite(reading.h))
-    if known.size < 2:
+    if not known.size:
         nothing = np.full(at.shape, np.nan)
         return Reading._make([*[nothing] * 6, np.full(at.shape, int(Status.HOLE), np.uint8)])
     order = known[np.argsort(reading.g[known], kind="stable")]
     x = reading.g[order]
-    right = np.clip(np.searchsorted(x, at, side="left"), 1, len(x) - 1)
-    left = right - 1
+    right = np.clip(np.searchsorted(x, at, side="left"), min(1, len(x) - 1), len(x) - 1)
+    left = np.maximum(right - 1, 0)
     width = x[right] - x[left]
+    usual = min(float(np.median(np.diff(x))), gap) if len(x) > 1 else gap
     with np.errstate(invalid="ignore", divide="ignore"):
-        t = np.where(width > 0.0, (at - x[left]) / width, 0.5)
-        inside = (t >= 0.0) & (t <= 1.0) & (width <= gap)
+        t = np.where(width > 0.0, (at - x[left]) / width, np.nan)
+        between = (t >= 0.0) & (t <= 1.0) & (width <= gap)
+        nearer = np.where(np.abs(at - x[left]) <= np.abs(at - x[right]), 0.0, 1.0)
+        beside = np.abs(at - np.where(nearer == 0.0, x[left], x[right])) <= 0.5 * usual
+    t = np.where(between, t, nearer)
+    inside = between | beside
     # On a point itself the other end does not matter.
     flags = np.where(t < 1.0, reading.status[order[left]], 0) | np.where(t > 0.0, reading.status[order[right]], 0)
     lines = [
         np.where(inside, (1.0 - t) * part[order[left]] + t * part[order[right]], np.nan)
-        for part in (reading.position, reading.g, reading.h, reading.sigma, reading.strength, reading.width)
+        for part in (reading.position, reading.h, reading.sigma, reading.strength, reading.width)
     ]
+    lines.insert(1, np.where(inside, at, np.nan))
     return Reading._make([*lines, np.where(inside, flags, int(Status.HOLE)).astype(np.uint8)])
 
 

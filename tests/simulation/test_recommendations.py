@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -18,13 +20,13 @@ from gpuvision.simulation.recommendations import (
     SECOND,
     DualSensor,
     compare_peaks,
-    join_artifacts,
+    pair_artifacts,
     rank,
     resampled,
 )
 from gpuvision.simulation.sight import Exposure, Sight
 from gpuvision.status import Status
-from lights import camera, camera_sight, gaussian, psd, psd_sight
+from lights import PITCH, camera, camera_sight, gaussian, psd, psd_sight
 
 PIXEL = 10e-6
 
@@ -64,6 +66,8 @@ def thick_line(sight: Sight, sigma: float, factor: np.ndarray, across: np.ndarra
 
 
 SIGMA, X = 5e-5, 0.4
+# Where strips see the plane H = 0: 0.1 mm times 170 mm over 40 mm.
+PLACES = np.arange(-2, 3) * PITCH * 0.17 / 0.04
 ACROSS = (np.arange(-4000, 4000) + 0.5) * (6.0 * SIGMA / 4000)
 
 
@@ -132,20 +136,36 @@ def test_a_part_seen_by_two(level: Truth, device: Device) -> None:
         seen = np.isin(np.arange(5), from_here)[:, None]
         light = Exposure(*(np.where(seen, one, other) for one, other in zip(half, whole, strict=True)))
         variants = {"direct": light, "direct, even": light, "direct, open": whole, "direct, even, open": whole}
-        found.append(explain(psd(each), variants, level, device=device))
-    joined = join_artifacts(*found, DualSensor(rule="predicted"), gap=1.0)
-    assert joined.reading.h.shape == (5,)
-    candidates = {"first": found[0], "second": found[1], "pair": joined}
+        found.append(explain(psd(each), variants, level._replace(g=PLACES), device=device))
+    candidates = pair_artifacts(*found, DualSensor(rule="predicted"), gap=1.0, g=PLACES)
     order = rank(candidates, 1e-6)
-    assert order[0].name == "pair"
+    assert order[0].name == "both"
     assert [each.unread for each in order] == [0.0, 0.4, 0.4]
     for each in candidates.values():
         np.testing.assert_allclose(np.sum(list(each.causes.values()), axis=0), each.error, atol=1e-12)
-    flagged = join_artifacts(*found, DualSensor(tolerance=1e-6), gap=1.0)
+    flagged = pair_artifacts(*found, DualSensor(tolerance=1e-6), gap=1.0, g=PLACES)["both"]
     assert np.isfinite(flagged.error).tolist() == [False, False, True, False, False]
     assert flagged.summary(1e-6)["missing"] == 4
-    mean = join_artifacts(*found, DualSensor(rule="mean"), gap=1.0)
-    np.testing.assert_allclose(mean.causes["occlusion"][:2], 0.5 * found[0].causes["occlusion"][:2], rtol=1e-6)
+    mean = pair_artifacts(*found, DualSensor(rule="mean"), gap=1.0, g=PLACES)["both"]
+    np.testing.assert_allclose(mean.causes["occlusion"][:2], 0.5 * found[0].causes["occlusion"][:2], rtol=1e-3)
+
+
+def test_what_one_does_not_see_the_other_does(device: Device) -> None:
+    """Surfaces that are hidden from the first sensor count for it as missing, and the second one fills them."""
+    sight = psd_sight()
+    u = np.zeros(5)
+    truth = Truth(*sheet_point(sight.triangulation, u, sight.v_middles), np.zeros(5, np.uint8))
+    found = []
+    for each, hidden in ((sight, [0, 1]), (facing(sight), [4])):
+        lost = np.isin(np.arange(5), hidden)
+        seen = Truth(truth.g, np.where(lost, np.nan, truth.h), np.where(lost, Status.DARK, 0).astype(np.uint8))
+        found.append(explain(psd(each), {"direct": gaussian(each, u, ~lost * 1e-6, 5e-5)}, seen, device=device))
+    pair = pair_artifacts(*found, DualSensor(tolerance=1e-6), gap=1.0)
+    assert [pair[name].unread(1e-6) for name in ("first", "second", "both")] == [0.4, 0.2, 0.0]
+    blind = found[0].without(Status.DARK)
+    nothing = Truth(np.full(5, np.nan), np.full(5, np.nan), np.full(5, Status.DARK))
+    with pytest.raises(ValueError, match="give the places"):
+        pair_artifacts(replace(blind, truth=nothing), found[1], DualSensor(), gap=1.0)
 
 
 # ---- the rules -------------------------------------------------------------------------------------------------
@@ -208,21 +228,25 @@ def test_what_joining_refuses() -> None:
 
 
 def test_resampling() -> None:
-    """A straight profile stays one, between its points and on them; holes stay holes."""
+    """A straight profile stays one, between its points and on them; holes stay holes but for half a sample."""
     g = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 7.0]) * 1e-4
     h = 2.0 * g + 1e-3
     h[3] = np.nan
     given = reading(h, g=g, status=[0, 0, 0, 0, Status.SATURATED, 0])
-    at = np.array([-0.1, 0.0, 0.25, 1.0, 2.0, 2.5, 4.0, 5.0, 7.0, np.nan]) * 1e-4
+    at = np.array([0.0, 0.25, 1.0, 2.0, 2.5, 4.0, 7.0]) * 1e-4
     said = resampled(given, at, gap=2.5e-4)
-    lost = np.array([True, False, False, False, False, False, False, True, True, True])
-    np.testing.assert_allclose(said.h, np.where(lost, np.nan, 2.0 * at + 1e-3), rtol=1e-12)
-    np.testing.assert_allclose(said.g, np.where(lost, np.nan, at), atol=1e-18)
-    assert (said.status[lost] == Status.HOLE).all()
-    assert said.status[~lost].tolist() == [0, 0, 0, 0, Status.SATURATED, Status.SATURATED]
+    np.testing.assert_allclose(said.h, 2.0 * at + 1e-3, rtol=1e-12)
+    np.testing.assert_array_equal(said.g, at)
+    assert said.status.tolist() == [0, 0, 0, 0, Status.SATURATED, Status.SATURATED, 0]
+    # Points are 0.15 mm apart in the median.
+    beside = resampled(given, np.array([-0.7, -0.8, 4.7, 4.8, 6.3, 7.8, np.nan]) * 1e-4, gap=2.5e-4)
+    np.testing.assert_array_equal(beside.h, [h[0], np.nan, h[4], np.nan, h[5], np.nan, np.nan])
+    assert beside.status.tolist() == [0, Status.HOLE, Status.SATURATED, Status.HOLE, 0, Status.HOLE, Status.HOLE]
     block = resampled(Reading(*(np.stack([each, each]) for each in given)), at, gap=2.5e-4)
     np.testing.assert_array_equal(block.h, np.stack([said.h, said.h]))
-    assert (resampled(reading([np.nan, 1e-3]), at, gap=1.0).status == Status.HOLE).all()
+    alone = resampled(reading([np.nan, 1e-3]), np.array([0.0, 1e-3, 1.2e-3]), gap=3e-4)
+    np.testing.assert_array_equal(alone.h, [np.nan, 1e-3, np.nan])
+    assert (resampled(reading([np.nan, np.nan]), at, gap=1.0).status == Status.HOLE).all()
 
 
 # ---- reflections -----------------------------------------------------------------------------------------------

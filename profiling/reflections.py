@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
-from gpuvision.profiling import bounces
+from gpuvision.profiling import bounces, visible_light
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.line_irradiance import LineIrradiance, LitSegments
 
@@ -72,11 +72,12 @@ def _numba(receivers, table, out):  # type: ignore[no-untyped-def]
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a wall over many lines and over few, a board with boxes, and light from patches."""
+    """Yield a wall over many lines and over few, a board with boxes, light from patches, and visible light."""
     yield _case(device, *_wall(64, 20_000), "closed-form/wall/64x20000")
     yield _case(device, *_wall(16, 100_000), "closed-form/wall/16x1e5")
     yield _case(device, *_board(20_000), "closed-form/board/64x20000")
     yield from bounces.cases(device)
+    yield from visible_light.cases(device)
 
 
 def _case(device: Device, segments: LitSegments, receivers: NDArray[np.float32], name: str) -> Case:

@@ -82,9 +82,9 @@ class Task:
         length = readout.strip_length if isinstance(readout, PsdReadout) else readout.along
         optics = [readout.triangulation, readout.axes, length, sensor.transport, sensor.frame]
         light = [getattr(sensor.light, name) for name in _OPTICAL]
-        words = repr(
-            [floor_of(sensor), version("gpuvision"), self.materials, optics, light, self.paths, self.tolerance]
-        )
+        # What is read depends on the electronics, and so does what may be left out.
+        least = floor_of(sensor) if self.tolerance > 0.0 else None
+        words = repr([version("gpuvision"), self.materials, optics, light, self.paths, self.tolerance, least])
         digest = hashlib.sha256(words.encode())
         for array in (self.part.corners, self.part.material, self.transports):
             digest.update(np.ascontiguousarray(array).tobytes())

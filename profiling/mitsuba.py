@@ -2,9 +2,9 @@
 
 Mitsuba runs as fast as it does on this machine (LLVM where it works, else scalar) with next-event estimation, which
 suits it best. Its time is that of ``samples`` per pixel times (its median error / 1 %)^2: its error falls as one over
-the root of the number of samples. Ours is the time for the centres of all pixels, in single. Errors are relative to
-the closed form in double, averaged over each pixel; ``error`` is our median, as ``peer_error`` is Mitsuba's, both over
-the pixels that see one plane.
+the root of the number of samples. Ours is the time for the centres of all pixels and strips as lines, in single.
+Errors are relative to the closed form in double with strips 0.1 mm wide, averaged over each pixel; ``error`` is our
+median, as ``peer_error`` is Mitsuba's, both over the pixels that see one plane, and light.
 """
 
 from __future__ import annotations
@@ -20,47 +20,47 @@ from gpuvision.profiling.harness import Case
 from gpuvision.profiling.mitsuba_scenes import (
     LitScene,
     best_variant,
+    board,
     bound_closed_form,
     by_closed_form,
     by_mitsuba,
     groove,
 )
 
-_PIXELS = (256, 256)
-_SAMPLES = 16
 _ASKED = 0.01
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a corner of 90 degrees and a groove of 60; nothing, and a line that says so, without Mitsuba."""
+    """Yield a corner of 90 degrees, a groove of 60, and a board with parts; without Mitsuba nothing, and say so."""
     if importlib.util.find_spec("mitsuba") is None:
         print("mitsuba is left out: the package is missing; install it: pip install mitsuba", file=sys.stderr)
         return
     variant = best_variant()
-    yield _case(device, groove(np.radians(90.0), _PIXELS), "corner/90", variant, occluding=False)
-    yield _case(device, groove(np.radians(60.0), _PIXELS), "groove/60", variant, occluding=False)
+    yield _case(device, groove(np.radians(90.0), (256, 256)), "corner/90", variant, samples=16)
+    yield _case(device, groove(np.radians(60.0), (256, 256)), "groove/60", variant, samples=16)
+    yield _case(device, board((56, 256)), "board", variant, samples=256, occluding=True)
 
 
-def _case(device: Device, lit: LitScene, name: str, variant: str, *, occluding: bool) -> Case:
+def _case(device: Device, lit: LitScene, name: str, variant: str, *, samples: int, occluding: bool = False) -> Case:
     receivers, centres = lit.receivers(nodes=4), lit.receivers(nodes=1)
     exact = by_closed_form(lit, receivers, device, occluding=occluding)
-    bound = bound_closed_form(lit, centres, device, occluding=occluding)
+    bound = bound_closed_form(lit, centres, device, occluding=occluding, across=1)
     lights = receivers.whole & (exact > 1e-3 * np.max(exact[receivers.whole]))
     picture = by_mitsuba(lit, variant)
 
     def median_error(made: np.ndarray) -> float:
         return float(np.median(np.abs(made[lights] / exact[lights] - 1.0)))
 
-    theirs = median_error(picture(_SAMPLES, 1))
+    theirs = median_error(picture(samples, 1))
     ours = median_error(bound.run().irradiance.get().reshape(lit.pixels).astype(np.float64))
     facts = {
         "variant": variant,
         "pixels": int(np.prod(lit.pixels)),
-        "samples": _SAMPLES,
+        "samples": samples,
         "peer_error": theirs,
         "its_time_is_for": f"{_ASKED:g}, extrapolated by 1/sqrt(samples)",
     }
     factors = {"mitsuba": (theirs / _ASKED) ** 2}
     return Case(
-        "mitsuba", name, bound.run, {"mitsuba": lambda: picture(_SAMPLES, 2)}, ours, facts=facts, factors=factors
+        "mitsuba", name, bound.run, {"mitsuba": lambda: picture(samples, 2)}, ours, facts=facts, factors=factors
     )

@@ -23,6 +23,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from gpuvision.host import Device, Precision
+from gpuvision.profiling.visible_light import Board
 from gpuvision.ranging.range_image import Vector
 from gpuvision.simulation.line_irradiance import LineIrradiance, LitSegments
 from gpuvision.simulation.rays import ClosestHit
@@ -164,6 +165,21 @@ def groove(angle: float, pixels: tuple[int, int] = (64, 64)) -> LitScene:
     )
 
 
+def board(pixels: tuple[int, int] = (40, 184)) -> LitScene:
+    """Return a board with parts and a line of strips over all; seen: the parts' sides that face it, at 45 degrees."""
+    of = Board.of()
+    slope = math.sqrt(0.5)
+    return LitScene(
+        scene=of.scene,
+        segments=of.segments,
+        width=1e-4,
+        middle=(0.0, 0.011, 0.003),
+        right=(0.046, 0.0, 0.0),
+        up=(0.0, 0.01 * slope, 0.01 * slope),
+        pixels=pixels,
+    )
+
+
 def by_closed_form(
     lit: LitScene, receivers: Receivers, device: Device, *, occluding: bool, precision: Precision = "double"
 ) -> Picture:
@@ -173,10 +189,16 @@ def by_closed_form(
 
 
 def bound_closed_form(
-    lit: LitScene, receivers: Receivers, device: Device, *, occluding: bool, precision: Precision = "single"
+    lit: LitScene,
+    receivers: Receivers,
+    device: Device,
+    *,
+    occluding: bool,
+    precision: Precision = "single",
+    across: int = _ACROSS,
 ) -> Any:
-    """Return what computes the irradiance of all receivers, the strips as lines, ready to run on a device."""
-    lines = lit.lines()
+    """Return what computes the irradiance of all receivers, a strip as so many lines, ready to run on a device."""
+    lines = lit.lines(across)
     places = receivers.rows.reshape(lit.pixels[0], -1, 6)
     light: Any = LineIrradiance(segments=lines, precision=precision)
     if occluding:
@@ -206,7 +228,10 @@ def by_mitsuba(lit: LitScene, variant: str = "scalar_rgb") -> Callable[[int, int
     transform = mi.ScalarTransform4f
     white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
     emission = float(lit.segments.exitance[0]) / (math.pi * lit.width)
-    half = [float(np.linalg.norm(each)) / _MILLI for each in (lit.right, lit.up)]
+    # A film is [-1, 1] wide, and as high as its pixels are square.
+    half = [
+        float(np.linalg.norm(each)) / _MILLI * times for each, times in ((lit.right, 1.0), (lit.up, columns / rows))
+    ]
     looks = transform().look_at(
         (lit.before / _MILLI).tolist(), ((lit.before + lit.towards) / _MILLI).tolist(), list(lit.up)
     )

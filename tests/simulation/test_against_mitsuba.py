@@ -13,7 +13,7 @@ from gpuvision.host import Device
 pytest.importorskip("mitsuba", reason="the extra 'profile' is not installed")
 pytest.importorskip("numba", reason="the extra 'profile' is not installed")
 
-from gpuvision.profiling.mitsuba_scenes import LitScene, Picture, by_closed_form, by_mitsuba, groove
+from gpuvision.profiling.mitsuba_scenes import LitScene, Picture, board, by_closed_form, by_mitsuba, groove
 
 pytestmark = pytest.mark.slow
 
@@ -78,3 +78,31 @@ def test_the_comparison_sees_a_thousandth_and_a_degree(glowing):
     other, _ = expect(groove(np.radians(angle + 1.0)))
     leaning = compare(pictures, other * (expected[kept].sum() / other[kept].sum()), kept)
     assert abs(leaning.chi_square - 1.0) > 4.0 * leaning.chi_sigma
+
+
+@pytest.fixture(scope="module")
+def busy():
+    """Mitsuba's pictures of a board with parts, which hide parts of the line from each other."""
+    lit = board()
+    return lit, render(lit, 512)
+
+
+def test_a_board_gets_the_light_of_what_it_sees(busy):
+    lit, pictures = busy
+    expected, whole = expect(lit, occluding=True)
+    dark = whole & (expected == 0.0)
+    assert dark.sum() > 3000
+    assert np.all(pictures[:, dark] == 0.0)
+    found = compare(pictures, expected, whole & (expected > 1e-3 * expected[whole].max()))
+    assert found.pixels > 200
+    assert abs(found.chi_square - 1.0) < 4.0 * found.chi_sigma
+    assert abs(found.bias) < 3.0 * found.bias_sigma
+    assert found.bias_sigma < 4e-3
+
+
+def test_a_board_through_which_light_goes_is_another_one(busy):
+    lit, pictures = busy
+    expected, whole = expect(lit, occluding=False)
+    found = compare(pictures, expected, whole & (expected > 0.0) & (np.ptp(pictures, axis=0) > 0.0))
+    assert found.chi_square > 2.0
+    assert abs(found.bias) > 10.0 * found.bias_sigma

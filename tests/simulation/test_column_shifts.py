@@ -20,6 +20,8 @@ from gpuvision.ranging.psd import ELECTRON, PsdReadout
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.simulation.camera_simulator import CameraSimulator
+from gpuvision.simulation.direct import DirectLight
+from gpuvision.simulation.illumination import LightSheet
 from gpuvision.simulation.line_irradiance import LineIrradiance, LitSegments
 from gpuvision.simulation.material import Material
 from gpuvision.simulation.psd_simulator import PsdSimulator
@@ -27,6 +29,7 @@ from gpuvision.simulation.reflectance import Lambert
 from gpuvision.simulation.scene import Scene
 from gpuvision.simulation.sight import Exposure, Sight
 from gpuvision.simulation.sight_lines import SightLines
+from gpuvision.simulation.visible_light import VisibleLight, segment_rows
 
 PIXEL, PIXELS = 1e-5, 1024
 HALF = 0.5 * PIXELS * PIXEL
@@ -130,11 +133,37 @@ def direct(one: Sight, lit: LitSegments) -> tuple[Exposure, np.ndarray]:
     return Exposure(power[:, None] * share, power[:, None] * moment), whole
 
 
-def shifts(degrees: float, columns: int = PIXELS) -> Shifts:
+def of_groove(degrees: float, columns: int = PIXELS) -> Shifts:
     one = sight(columns)
     scene, lit = groove(math.radians(degrees))
     line, whole = direct(one, lit)
-    glow = secondary(one, scene, lit)
+    return shifts(one, line, secondary(one, scene, lit), whole)
+
+
+def of_board(columns: int = PIXELS) -> Shifts:
+    """Of a board with parts, which hide light from each other."""
+    from gpuvision.profiling.visible_light import Board
+
+    one, of = sight(columns), Board.of()
+    at = float(of.segments.ends[0, 0, 1])
+    materials = [Material(diffuse=Lambert(albedo=ALBEDO))]
+    sheet = LightSheet(transport=one.transport, power=1.0, sigma=FWHM / 2.3548)
+    line = DirectLight(sight=one, scene=of.scene, materials=materials, sheet=sheet).exposures(at)["direct"]
+    lines = SightLines(sight=one, scene=of.scene, materials=materials)
+    seen = lines.surface(at)
+    receivers = np.where((seen.triangle >= 0)[..., None], seen.receivers, 0.0)
+    lit = sheet.lit(of.scene, at)
+    rows = segment_rows(LitSegments(lit.ends, lit.normals, ALBEDO * lit.power))
+    light = VisibleLight(scene=of.scene, segments=len(rows), precision="single")
+    irradiance = light(receivers, np.zeros((*receivers.shape[:2], 2)), rows).irradiance
+    # A column in which the line can be read has a good part of what others have.
+    total = line.total()
+    whole = total > 0.1 * np.median(total[total > 0.0])
+    return shifts(one, line, lines.exposure(seen, np.nan_to_num(irradiance)), whole)
+
+
+def shifts(one: Sight, line: Exposure, glow: Exposure, whole: np.ndarray) -> Shifts:
+    """Read the line with and without the other light on it."""
     alone, together = {"direct": line}, {"direct": line, "diffuse-diffuse": glow}
     electrons = (line.power + glow.power)[whole].max() * 0.4 * EXPOSED / ELECTRON
     axes = SampleAxes(
@@ -175,7 +204,7 @@ def told(values: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module", params=[90, 60], ids=["V 90", "V 60"])
 def found(request):
-    return request.param, shifts(request.param, 256)
+    return request.param, of_groove(request.param, 256)
 
 
 def test_columns_of_a_camera_move_as_they_do_elsewhere(found):
@@ -217,3 +246,36 @@ def test_the_direct_line_is_read_where_it_is():
     u = line.first_moment(one.u_edges) / line.total()
     place = one.points_in_sheet(u, one.v_middles)
     np.testing.assert_allclose(place[whole, 2], np.abs(place[whole, 0]), atol=1e-6)
+
+
+def test_parts_on_a_board_move_few_columns():
+    pytest.importorskip("embreex.rtcore_scene", reason="the extra 'profile' is not installed")
+    pytest.importorskip("numba", reason="the extra 'profile' is not installed")
+    made = of_board(256)
+    # Elsewhere, with other parts: 0.125, 2.2, 11 pixels of the whole column, 0, 0.32, 3.3 in a window of 16.
+    median, high, most = told(made.camera["whole column"])
+    assert 0.03 < median < 0.4
+    assert 0.7 < high < 7.0
+    assert 3.0 < most < 30.0
+    median, high, most = told(made.camera["window 16"])
+    assert median < 1e-3
+    assert high < 1.0
+    assert 0.5 < most < 10.0
+    assert told(made.camera["threshold 5 %"])[1] == 0.0
+    assert np.median(made.secondary_over_direct) == pytest.approx(1e-3, rel=2.0)
+    assert np.median(made.peak_ratio) == pytest.approx(2e-4, rel=0.5)
+    np.testing.assert_allclose(made.psd, made.camera["whole column"], atol=0.02)
+
+
+def test_the_closed_line_is_the_simulators():
+    one = sight(64)
+    scene, lit = groove(math.radians(90.0))
+    line, whole = direct(one, lit)
+    sheet = LightSheet(transport=one.transport, power=1.0, sigma=FWHM / 2.3548)
+    light = DirectLight(sight=one, scene=scene, materials=[Material(diffuse=Lambert(albedo=ALBEDO))], sheet=sheet)
+    made = light.exposures(0.0)["direct"]
+    # A column 16 pixels wide against its middle, where the line is straight: all but the two at the edge.
+    whole &= np.abs(np.arange(64) - 31.5) > 1.0
+    np.testing.assert_allclose(made.total()[whole], line.total()[whole], rtol=2e-3)
+    middles = [each.first_moment(one.u_edges)[whole] / each.total()[whole] for each in (made, line)]
+    np.testing.assert_allclose(middles[0], middles[1], atol=0.05 * PIXEL)

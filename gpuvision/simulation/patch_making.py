@@ -93,17 +93,21 @@ def halved_to(corners: Reals, numbers: Integers, size: float) -> tuple[Reals, In
     return np.concatenate(done), np.concatenate(of)
 
 
-def _edges(corners: Reals) -> tuple[Integers, Integers]:
-    """Return a number for each edge (3 n,), the same where two triangles share it, and whose it is."""
-    points = corners.reshape(-1, 3) + 0.0
-    order = np.lexsort(points.T)
-    fresh = np.diff(points[order], axis=0, prepend=np.nan).any(axis=1)
-    names = np.empty(len(points), np.int64)
-    names[order] = np.cumsum(fresh)
-    tail = names.reshape(-1, 3)
-    head = np.roll(tail, -1, axis=1)
-    number = np.minimum(tail, head) * (len(points) + 1) + np.maximum(tail, head)
-    return number.ravel(), np.repeat(np.arange(len(corners)), 3)
+def _mixed(values: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """Return numbers that look random, the same for the same input (splitmix64)."""
+    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return values ^ (values >> np.uint64(31))
+
+
+def _edges(corners: Reals) -> tuple[npt.NDArray[np.uint64], Integers]:
+    """Return a number for each edge (3 n,), the same where two triangles share it, and whose it is.
+
+    Two that are not the same have the same number with a chance of 1e-19.
+    """
+    bits = (corners + 0.0).view(np.uint64)
+    named = _mixed(bits[:, :, 0] + _mixed(bits[:, :, 1] + _mixed(bits[:, :, 2] + np.uint64(1))))
+    return (named + np.roll(named, -1, axis=1)).ravel(), np.repeat(np.arange(len(corners)), 3)
 
 
 def _linked(count: int, one: Integers, other: Integers) -> Integers:
@@ -120,7 +124,7 @@ def _is_open(corners: Reals) -> Flags:
     edge, face = _edges(corners)
     order = np.argsort(edge, kind="stable")
     edge, face = edge[order], face[order]
-    first = np.diff(edge, prepend=-1) > 0
+    first = np.append(True, edge[1:] != edge[:-1])
     uses = np.bincount(np.cumsum(first) - 1)[np.cumsum(first) - 1]
     again = np.flatnonzero(~first)
     label = _linked(len(corners), face[again - 1], face[again])
@@ -136,14 +140,14 @@ def _pieces(corners: Reals, material: npt.NDArray[np.int32], size: float) -> Int
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     directions = np.rint(1.5 * normals / np.linalg.norm(normals, axis=1, keepdims=True))
     cells = np.floor(corners.mean(axis=1) / size)
-    keys = np.column_stack([material, cells, directions])
-    order = np.lexsort(keys.T)
-    key = np.empty(len(keys), np.int64)
-    key[order] = np.cumsum(np.diff(keys[order], axis=0, prepend=np.nan).any(axis=1))
+    key = _mixed(material.astype(np.uint64) + np.uint64(1))
+    for column in (*cells.T, *directions.T):
+        key = _mixed(key + column.astype(np.int64).view(np.uint64))
     edge, face = _edges(corners)
-    order = np.lexsort((key[face], edge))
+    edge = edge + key[face]
+    order = np.argsort(edge, kind="stable")
     edge, face = edge[order], face[order]
-    same = np.flatnonzero((np.diff(edge) == 0) & (np.diff(key[face]) == 0))
+    same = np.flatnonzero(edge[1:] == edge[:-1])
     return _linked(len(corners), face[same], face[same + 1])
 
 

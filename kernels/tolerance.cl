@@ -31,9 +31,9 @@
 // Clusters between which and a block something may stand are looked at from so many segments down to so many: a look
 // takes about as long as to compute that few with their visibility.
 #define MOST_LOOKED_AT 16
-#define LEAST_LOOKED_AT 4
+#define LEAST_LOOKED_AT 2
 // A block looks so often in vain, and some times more for each time that it did not.
-#define PATIENCE 6
+#define PATIENCE 256
 #define PATIENCE_WON 3
 // Rounding of the bounds themselves.
 #define UP ((real)1 + (real)256 * (real)REAL_EPSILON)

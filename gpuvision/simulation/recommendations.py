@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -293,11 +293,14 @@ def pair_artifacts(
         As `DualSensor.join`; or the first sensor sees no surface and ``g`` is not given.
     """
     places = _usual_places(first) if g is None else np.asarray(g, np.float64)
-    truths = [_on_places(each.reading, each.truth.g, each.truth.h, places, gap) for each in (first, second)]
+    at = np.broadcast_to(places, (*first.error.shape[:-1], *places.shape))
+    truths = [
+        _Lines.through(each.truth.g, np.isfinite(each.truth.h), at, gap).values(each.truth.h)
+        for each in (first, second)
+    ]
     h = np.where(np.isfinite(truths[0]), truths[0], truths[1])
-    at = np.broadcast_to(places, h.shape)
     truth = Truth(np.where(np.isfinite(h), at, np.nan), h, np.where(np.isfinite(h), 0, int(Status.DARK)))
-    alone = [_resampled_artifacts(each, truth, places, gap) for each in (first, second)]
+    alone = [_resampled_artifacts(each, truth, at, gap) for each in (first, second)]
     expected = [each.error - each.causes["noise"] for each in alone]
     joined = rule.join(alone[0].reading, alone[1].reading, (expected[0], expected[1]))
     error = joined.h - h
@@ -329,29 +332,20 @@ def _usual_places(found: Artifacts) -> Float64:
     return np.interp(np.arange(g.shape[1]), at, np.nanmedian(g[:, at], axis=0))
 
 
-def _on_places(reading: Reading, g: Float64, values: Float64, places: Float64, gap: float) -> Float64:
-    """Return any values of samples that lie at g as straight lines at other places; NaN where there are none."""
-    return resampled(reading._replace(g=g, h=values), places, gap=gap).h
-
-
 def _resampled_artifacts(found: Artifacts, truth: Truth, places: Float64, gap: float) -> Artifacts:
     """Return readings at other places beside a truth of those places."""
     reading = resampled(found.reading, places, gap=gap)
     error = reading.h - truth.h
-    known = np.isfinite(found.reading.h)
-
-    def moved(values: Float64) -> Float64:
-        return _on_places(found.reading, found.reading.g, np.where(known, values, np.nan), places, gap)
-
+    lines = _Lines.through(found.reading.g, np.isfinite(found.reading.h), places, gap)
     # Where the sample had no truth beside it, the other sensor's says how wrong it is, and "shape" has it all.
-    causes = {name: moved(np.nan_to_num(part)) for name, part in found.causes.items()}
+    causes = {name: lines.values(np.nan_to_num(part)) for name, part in found.causes.items()}
     causes["shape"] = causes["shape"] + (error - np.sum(list(causes.values()), axis=0))
     return Artifacts(
         reading=reading,
         truth=truth,
         error=error,
         causes={name: np.where(np.isfinite(error), part, np.nan) for name, part in causes.items()},
-        light={name: np.nan_to_num(moved(part)) for name, part in found.light.items()},
+        light={name: np.nan_to_num(lines.values(part)) for name, part in found.light.items()},
         verdict=verdict_of(reading.h, truth),
     )
 
@@ -376,20 +370,55 @@ def resampled(reading: Reading, g: npt.ArrayLike, *, gap: float) -> Reading:
     Reading
         Of shape (..., k). Flags of either end go with the line; its sigma, strength and width are lines too.
     """
-    if reading.h.ndim > 1:
-        batch = reading.h.shape[:-1]
-        places = np.broadcast_to(np.asarray(g, np.float64), (*batch, np.shape(g)[-1]))
-        rows = [
-            resampled(Reading._make(part[row] for part in reading), places[row], gap=gap) for row in np.ndindex(batch)
-        ]
-        return Reading._make(np.reshape(part, places.shape) for part in zip(*rows, strict=True))
-    at = np.asarray(g, np.float64)
-    known = np.flatnonzero(np.isfinite(reading.g) & np.isfinite(reading.h))
-    if not known.size:
-        nothing = np.full(at.shape, np.nan)
-        return Reading._make([*[nothing] * 6, np.full(at.shape, int(Status.HOLE), np.uint8)])
-    order = known[np.argsort(reading.g[known], kind="stable")]
-    x = reading.g[order]
+    at = np.broadcast_to(np.asarray(g, np.float64), (*reading.h.shape[:-1], np.shape(g)[-1]))
+    lines = _Lines.through(reading.g, np.isfinite(reading.h), at, gap)
+    position, h, sigma, strength, width = (
+        lines.values(part) for part in (reading.position, reading.h, reading.sigma, reading.strength, reading.width)
+    )
+    return Reading(position, np.where(lines.inside, at, np.nan), h, sigma, strength, width, lines.flags(reading.status))
+
+
+class _Lines(NamedTuple):
+    """Which two samples each place lies between, how far from the one to the other, and whether it does; (..., k)."""
+
+    left: npt.NDArray[np.intp]
+    right: npt.NDArray[np.intp]
+    t: Float64
+    inside: npt.NDArray[np.bool_]
+
+    @classmethod
+    def through(cls, g: Float64, known: npt.NDArray[np.bool_], places: Float64, gap: float) -> _Lines:
+        lines = cls(
+            np.zeros(places.shape, np.intp),
+            np.zeros(places.shape, np.intp),
+            np.zeros(places.shape),
+            np.zeros(places.shape, bool),
+        )
+        known = known & np.isfinite(g)
+        for row in np.ndindex(places.shape[:-1]):
+            samples = np.flatnonzero(known[row])
+            if samples.size:
+                samples = samples[np.argsort(g[row][samples], kind="stable")]
+                left, right, t, inside = _spans(g[row][samples], places[row], gap)
+                lines.left[row], lines.right[row] = samples[left], samples[right]
+                lines.t[row], lines.inside[row] = t, inside
+        return lines
+
+    def values(self, of: npt.NDArray[Any]) -> Float64:
+        left, right = (np.take_along_axis(of, ends, axis=-1) for ends in (self.left, self.right))
+        # On a point itself the other end does not matter.
+        with np.errstate(invalid="ignore"):
+            line = np.where(self.t == 0.0, left, np.where(self.t == 1.0, right, (1.0 - self.t) * left + self.t * right))
+        return np.where(self.inside, line, np.nan)
+
+    def flags(self, of: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        left, right = (np.take_along_axis(of, ends, axis=-1) for ends in (self.left, self.right))
+        either = np.where(self.t < 1.0, left, 0) | np.where(self.t > 0.0, right, 0)
+        return np.where(self.inside, either, int(Status.HOLE)).astype(np.uint8)
+
+
+def _spans(x: Float64, at: Float64, gap: float) -> tuple[Any, ...]:
+    """Return left and right neighbours among ascending x, the share of the way between them, and whether it counts."""
     right = np.clip(np.searchsorted(x, at, side="left"), min(1, len(x) - 1), len(x) - 1)
     left = np.maximum(right - 1, 0)
     width = x[right] - x[left]
@@ -399,16 +428,7 @@ def resampled(reading: Reading, g: npt.ArrayLike, *, gap: float) -> Reading:
         between = (t >= 0.0) & (t <= 1.0) & (width <= gap)
         nearer = np.where(np.abs(at - x[left]) <= np.abs(at - x[right]), 0.0, 1.0)
         beside = np.abs(at - np.where(nearer == 0.0, x[left], x[right])) <= 0.5 * usual
-    t = np.where(between, t, nearer)
-    inside = between | beside
-    # On a point itself the other end does not matter.
-    flags = np.where(t < 1.0, reading.status[order[left]], 0) | np.where(t > 0.0, reading.status[order[right]], 0)
-    lines = [
-        np.where(inside, (1.0 - t) * part[order[left]] + t * part[order[right]], np.nan)
-        for part in (reading.position, reading.h, reading.sigma, reading.strength, reading.width)
-    ]
-    lines.insert(1, np.where(inside, at, np.nan))
-    return Reading._make([*lines, np.where(inside, flags, int(Status.HOLE)).astype(np.uint8)])
+    return left, right, np.where(between, t, nearer), between | beside
 
 
 def _weights(first: Float64, second: Float64) -> tuple[Float64, Float64]:

@@ -142,22 +142,11 @@ class Simulation:
             write_ply(inside / "range_image.ply", *self.points[:3], _strength(told.reading), self.points.status)
             write_npz(inside / "simulation.npz", *self._arrays())
             draw_height_map(inside / "picture.png", self.heights, self.grid, title=f"{title}: as measured")
-            draw_errors(inside / "errors.png", told.error, f"{title}: errors")
-            draw_causes(
-                inside / "causes.png",
-                self._pictured_causes(),
-                list(told.causes),
-                f"{title}: what most of each error comes from",
-                good=f"within {1e6 * self.limit:.1f} µm",
-            )
+            draw_errors(inside / "errors.png", told, title)
+            draw_causes(inside / "causes.png", told, self.limit, title)
             if self.mask is not None:
                 self.mask.mask.save(inside / "mask.txt")
             (inside / "report.json").write_text(json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
-
-    def _pictured_causes(self) -> Array:
-        dominant = self.artifacts.dominant(self.limit).astype(int)
-        nothing = ~np.isfinite(self.artifacts.error) & (dominant < 0)
-        return np.where(nothing, -2, dominant)
 
     def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
         told = self.artifacts
@@ -183,6 +172,7 @@ def prepare(
     paths: Sequence[str] = USUAL_PATHS,
     tolerance: float = 0.0,
     profiles: int | None = None,
+    transports: npt.ArrayLike | None = None,
 ) -> Task:
     """Return the task of scanning a part from end to end.
 
@@ -198,6 +188,8 @@ def prepare(
         Range error that may come from what is left out [m]; 0: nothing is left out.
     profiles
         How many, about the middle; None: all that meet the part.
+    transports
+        Where the sheet is to stand instead [m]: for a second sensor beside a first one.
 
     Raises
     ------
@@ -207,8 +199,6 @@ def prepare(
     light_of(sensor)
     transport = sensor.transport
     assert isinstance(transport, StraightTransport)  # light_of looked
-    if transport.step is None:
-        raise ValueError("a simulation needs [transport] step: metres per profile")
     if not (np.isfinite(tolerance) and tolerance >= 0.0):
         raise ValueError(f"the tolerance is {tolerance}, expected metres, 0 or more")
     for path in paths:
@@ -216,29 +206,11 @@ def prepare(
             raise ValueError(f"unknown path '{path}', expected some of {', '.join(PATHS)}")
     if "direct" not in paths:
         raise ValueError("the paths lack 'direct': without it there is nothing to read")
-    corners = part.corners.reshape(-1, 3)
-    corners = corners[np.isfinite(corners).all(axis=1)]
-    if not len(corners):
-        raise ValueError("the part has no triangle")
-    axes = np.array([transport.g_axis, transport.h_axis, transport.direction])
-    places = (corners - transport.origin) @ np.linalg.inv(axes)[:, 2]
-    steps = (np.array([places.min(), places.max()]) - transport.start) / transport.step
-    first, last = int(np.ceil(steps.min() + 1e-9)), int(np.floor(steps.max() - 1e-9))
-    if profiles is not None and profiles < last + 1 - first:
-        first = (first + last + 1 - profiles) // 2
-        last = first + profiles - 1
-    if last < first:
-        raise ValueError("no profile meets the part: it is shorter than a step of the transport")
-    moved = (
-        transport.transport(last + 1 - first, first)
-        if first >= 0
-        else transport.start + transport.step * np.arange(first, last + 1, dtype=np.float64)
-    )
     return Task(
         part=part,
         materials=tuple(materials),
         sensor=sensor,
-        transports=moved,
+        transports=_over(part, transport, profiles) if transports is None else np.asarray(transports, np.float64),
         paths=tuple(dict.fromkeys(paths)),
         tolerance=float(tolerance),
     )
@@ -366,6 +338,26 @@ def part_of(
     if len(materials) < count:
         raise ValueError(f"{path} has {count} meshes, {len(materials)} materials are given; expected one for each")
     return scene, tuple(materials)
+
+
+def _over(part: Scene, transport: StraightTransport, profiles: int | None) -> Array:
+    """Return where the sheet stands while it moves over a part."""
+    if transport.step is None:
+        raise ValueError("a simulation needs [transport] step: metres per profile")
+    corners = part.corners.reshape(-1, 3)
+    corners = corners[np.isfinite(corners).all(axis=1)]
+    if not len(corners):
+        raise ValueError("the part has no triangle")
+    axes = np.array([transport.g_axis, transport.h_axis, transport.direction])
+    places = (corners - transport.origin) @ np.linalg.inv(axes)[:, 2]
+    steps = (np.array([places.min(), places.max()]) - transport.start) / transport.step
+    first, last = int(np.ceil(steps.min() + 1e-9)), int(np.floor(steps.max() - 1e-9))
+    if profiles is not None and profiles < last + 1 - first:
+        first = (first + last + 1 - profiles) // 2
+        last = first + profiles - 1
+    if last < first:
+        raise ValueError("no profile meets the part: it is shorter than a step of the transport")
+    return transport.start + transport.step * np.arange(first, last + 1, dtype=np.float64)
 
 
 def _whole_light(store: BlockStore, bins: int) -> tuple[dict[str, Exposure], Truth]:

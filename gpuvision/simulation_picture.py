@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from matplotlib.patches import Patch
 
 from gpuvision.host.files import replacing
 from gpuvision.ranging.picture import length_unit, round_length
+from gpuvision.simulation.artifacts import Artifacts
 
 Array = npt.NDArray[Any]
 
@@ -24,17 +24,17 @@ _NO_READING, _GOOD = "#4b5563", "#e5e7eb"
 _COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#d55e00", "#009e73", "#56b4e9", "#f0e442", "#000000")
 
 
-def draw_errors(path: Path, error: Array, title: str) -> None:
-    """Draw how far readings are off, (profiles, samples) [m], as PNG; NaN, where nothing is read or true, is dark.
+def draw_errors(path: Path, told: Artifacts, title: str) -> None:
+    """Draw how far readings are off as PNG; where nothing is read, or nothing is true, it is dark.
 
-    The scale ends at a round length that leaves 2 % of the samples beyond.
+    The scale ends at a round length that leaves about 2 % of the samples beyond.
     """
-    figure, axes = _page(title)
-    known = np.abs(error[np.isfinite(error)])
+    figure, axes = _page(f"{title}: errors")
+    known = np.abs(told.error[np.isfinite(told.error)])
     reach = round_length(2.0 * max(float(np.percentile(known, 98)) if known.size else 0.0, 1e-9))
     unit, name = length_unit(reach)
     shown = axes.imshow(
-        error / unit,
+        told.error / unit,
         cmap="RdBu_r",
         vmin=-reach / unit,
         vmax=reach / unit,
@@ -47,45 +47,23 @@ def draw_errors(path: Path, error: Array, title: str) -> None:
     _write(figure, path)
 
 
-def draw_causes(path: Path, cause: Array, names: Sequence[str], title: str, *, good: str) -> None:
-    """Draw which cause is to blame for most of every sample's error, as PNG.
-
-    Parameters
-    ----------
-    path
-        Where to.
-    cause
-        (profiles, samples): numbers of names; -1 where the sample is good; -2 where there is no reading.
-    names
-        Of the causes.
-    title
-        Over the picture.
-    good
-        What a good sample is.
-    """
-    figure, axes = _page(title)
+def draw_causes(path: Path, told: Artifacts, limit: float, title: str) -> None:
+    """Draw which cause is to blame for most of every error beyond a limit [m], as PNG."""
+    figure, axes = _page(f"{title}: what most of each error comes from")
+    names = list(told.causes)
+    cause = told.dominant(limit).astype(int)
+    cause = np.where(~np.isfinite(told.error) & (cause < 0), -2, cause)
     colours = [_NO_READING, _GOOD, *_COLOURS[: len(names)]]
-    entries = ["no reading, or no truth", good, *names]
-    picture = ListedColormap([to_rgb(each) for each in colours])(np.asarray(cause) + 2)
+    entries = ["no reading, or no truth", f"within {1e6 * limit:.1f} µm", *names]
+    picture = ListedColormap([to_rgb(each) for each in colours])(cause + 2)
     axes.imshow(picture, aspect="auto", origin="lower", interpolation="nearest")
-    parts = [float(np.mean(np.asarray(cause) == number - 2)) for number in range(len(entries))]
+    parts = [float(np.mean(cause == number - 2)) for number in range(len(entries))]
     handles = [
         Patch(facecolor=colour, edgecolor="#6b7280", label=f"{entry} ({100 * part:.1f} %)")
         for colour, entry, part in zip(colours, entries, parts, strict=True)
         if part > 0.0
     ]
     figure.legend(handles=handles, loc="outside lower left", ncols=3, fontsize=8, frameon=False)
-    _write(figure, path)
-
-
-def draw_growth(path: Path, rows: Mapping[str, tuple[Array, Array]], title: str, axis: str) -> None:
-    """Draw how times [s] grow with sizes: a line for each name, on logarithmic scales, as PNG."""
-    figure, axes = _page(title)
-    for colour, (name, (size, seconds)) in zip(_COLOURS, rows.items(), strict=False):
-        axes.loglog(size, seconds, "o-", color=colour, label=name, markersize=4)
-    axes.set(xlabel=axis, ylabel="s")
-    axes.grid(which="both", alpha=0.2)
-    axes.legend(fontsize=8, frameon=False)
     _write(figure, path)
 
 

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -231,3 +232,20 @@ def test_a_cluster_loses_a_worker_and_nothing_else(part_file: Path, tmp_path: Pa
     assert there.computed == len(task.blocks())
     assert seen[-1] == len(task.transports)
     np.testing.assert_array_equal(there.artifacts.error, here.artifacts.error)
+
+
+def test_a_second_sensor_sees_what_is_hidden_from_the_first(
+    part_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = resources.files("gpuvision").joinpath("sensors", "camera_line.toml").read_text(encoding="utf-8")
+    across = tmp_path / "across.toml"
+    across.write_text(text.replace("[light]", "[light]\nlens = [0.0, -0.08, 0.15]"))
+    words = [str(part_file), "--sensor", "camera_line", "--second", str(across), "--out", str(tmp_path)]
+    assert command(monkeypatch, *words, "--profiles", "48", "--paths", "direct") == 0
+    assert "surfaces read within" in capsys.readouterr().out
+    report = json.loads((tmp_path / "both" / "report.json").read_text())
+    ranked = {each["name"]: each["unread"] for each in report["ranked"]}
+    assert report["ranked"][0]["name"] == "both"
+    # Behind the block each one alone misses as much as the other.
+    assert ranked["both"] < 0.5 * min(ranked["first"], ranked["second"])
+    assert (tmp_path / "second" / "errors.png").stat().st_size > 1000

@@ -21,6 +21,16 @@ class Unit(StrEnum):
     inch = "inch"
 
 
+class Rule(StrEnum):
+    """What ``--rule`` takes."""
+
+    flag = "flag"
+    mean = "mean"
+    stronger = "stronger"
+    narrower = "narrower"
+    predicted = "predicted"
+
+
 _METRES = {Unit.metre: 1.0, Unit.millimetre: 1e-3, Unit.micrometre: 1e-6, Unit.inch: 25.4e-3}
 
 
@@ -54,6 +64,10 @@ def simulate(
     mask: Annotated[
         str, typer.Option(help="Before the sensor: none, best (a window per sample, made for the part), or a file.")
     ] = "none",
+    second: Annotated[
+        str | None, typer.Option(metavar="SENSOR", help="A second sensor over the same sheet; the two become one.")
+    ] = None,
+    rule: Annotated[Rule, typer.Option(help="Which of two sensors is right where they disagree.")] = Rule.stronger,
     limit: Annotated[
         float | None, typer.Option(min=0.0, help="Error from which on a sample counts as wrong [m].")
     ] = None,
@@ -77,9 +91,11 @@ def simulate(
     from gpuvision.materials_file import read_materials
     from gpuvision.scan import check_folder
     from gpuvision.sensor import Sensor
+    from gpuvision.sensor_pair import SensorPair
     from gpuvision.simulate import part_of, prepare
     from gpuvision.simulate import simulate as run
     from gpuvision.simulation.masks import Mask
+    from gpuvision.simulation.recommendations import DualSensor
 
     described = Sensor.load(sensor)
     check_folder(out)
@@ -91,16 +107,16 @@ def simulate(
     names = tuple(each.strip() for each in paths.split(",") if each.strip())
     task = prepare(scene, made_of, described, paths=names, tolerance=tolerance, profiles=profiles)
     chosen = None if device is None else Device.named(device)
+    made = {"mask": before, "seed": seed if noise else None, "limit": limit, "device": chosen, "scheduler": scheduler}
     with progress_bar(f"simulating {part.name}") as progress:
-        done = run(
-            task,
-            out,
-            mask=before,
-            seed=seed if noise else None,
-            limit=limit,
-            device=chosen,
-            scheduler=scheduler,
-            progress=progress,
-        )
+        done = run(task, out, progress=progress, **made)
+    told = done.summary()
+    if second is not None:
+        beside = Sensor.load(second)
+        other = prepare(scene, made_of, beside, paths=names, tolerance=tolerance, transports=task.transports)
+        with progress_bar(f"simulating {part.name}, second sensor") as progress:
+            pair = SensorPair.of(done, run(other, out, progress=progress, **made), DualSensor(rule=rule.value))
+        pair.write(out)
+        told += f"\n{pair.summary()}"
     done.write(out)
-    typer.echo(f"{done.summary()}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}")
+    typer.echo(f"{told}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}")

@@ -55,7 +55,7 @@ class CameraSimulator:
     full_well
         Electrons that a pixel holds; infinite: only the highest code limits it.
     bits
-        Of a grey level; from 8 on frames are uint16.
+        Of a grey level; frames of more than 8 are uint16.
     ambient
         Other light on every profile, even along it [W].
     mask

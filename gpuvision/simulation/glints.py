@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import numpy.typing as npt
 
 from gpuvision.simulation.illumination import LightSheet, LitLine
-from gpuvision.simulation.line_parts import Parts, together
+from gpuvision.simulation.line_parts import Parts, within_reach
 from gpuvision.simulation.sight import Sight
 
 Float64 = npt.NDArray[np.float64]
@@ -22,27 +20,7 @@ def glints(line: LitLine, sheet: LightSheet, sight: Sight, L: float) -> Parts:
     not asked.
     """
     plane, weight = _crossings(line, sheet, sight, L)
-    radius = 0.5 * sight.aperture
-    start, end = plane[:, 0], plane[:, 1]
-    low, high = radius * weight[:, 0], radius * weight[:, 1]
-    # Inside: |start + t (end - start)| < low + t (high - low), a quadratic in t.
-    way, growth = end - start, high - low
-    square = np.sum(way * way, axis=1) - growth**2
-    half = np.sum(start * way, axis=1) - low * growth
-    rest = np.sum(start * start, axis=1) - low**2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        root = np.sqrt(half * half - square * rest)
-        # Without cancellation.
-        sum_ = -(half + np.copysign(root, half))
-        places = np.sort(np.clip(np.nan_to_num(np.stack([sum_ / square, rest / sum_]), nan=0.0), 0.0, 1.0), axis=0)
-    knots = np.concatenate([np.zeros((1, len(low))), places, np.ones((1, len(low)))])
-    each, found = np.arange(len(low)), []
-    for first, last in itertools.pairwise(knots):
-        middle = 0.5 * (first + last)
-        reach = low + middle * growth
-        inside = (np.linalg.norm(start + middle[:, None] * way, axis=1) < reach) & (first < last)
-        found.append(Parts(each, first, last, np.ones(len(each), bool)).those(inside))
-    return together(found)
+    return within_reach(plane[:, 0], plane[:, 1], *(0.5 * sight.aperture * weight.T))
 
 
 def _crossings(line: LitLine, sheet: LightSheet, sight: Sight, L: float) -> tuple[Float64, Float64]:

@@ -63,7 +63,8 @@ class LightSheet:
     power
         Power in a metre of the sheet, W per metre of G; of a fan, where it meets H = 0.
     sigma
-        Standard deviation of the light across the sheet, metres along the transport; 0 is a thin sheet.
+        Standard deviation of the light across the sheet, metres along the transport; 0 is a thin sheet. The light of a
+        thick one stays in sheets side by side.
     source
         (G, H) of the point that a fan comes from, H > 0: it lights what lies below. None: parallel light.
     g_limits

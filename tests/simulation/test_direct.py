@@ -63,7 +63,8 @@ def plate(x: float = 1.0, y: float = 1.0, z: float = 0.0) -> np.ndarray:
 
 
 def u_of(exposure: Exposure, seen_by: Sight) -> np.ndarray:
-    return exposure.first_moment(seen_by.u_edges) / exposure.total()
+    with np.errstate(invalid="ignore"):
+        return exposure.first_moment(seen_by.u_edges) / exposure.total()
 
 
 # ---- the closed forms: a lens so far away that its image is a parallel one ---------------------------------
@@ -319,6 +320,70 @@ def test_very_many_gaps() -> None:
     # The plate is 2 m wide, and the lit line is two segments of 1 m; the shadows are the teeth's, from the lens.
     hidden = np.sum((parts.end - parts.start)[~parts.seen])
     assert hidden == pytest.approx(100 * (teeth[1] - teeth[0]) * 0.15 / 0.14, rel=1e-9)
+
+
+def test_coincident_faces_are_one() -> None:
+    """A face upon another, in other triangles, takes nothing and hides nothing; the first one's material counts."""
+    over = np.array([[(-0.1, -0.1, 0), (0.1, -0.1, 0), (0.0, 0.15, 0)]], float)
+    once, twice = Scene(plate()), Scene(np.concatenate([plate(), over]), np.array([0, 0, 1]))
+    other = Material(diffuse=Lambert(albedo=0.1))
+    found = [light_of(each, (GREY, other)).exposures(1e-3)["direct"] for each in (once, twice)]
+    np.testing.assert_allclose(found[1].power, found[0].power, rtol=1e-12)
+    truth = light_of(twice, (GREY, other)).truth(1e-3)
+    assert not truth.status.any()
+    np.testing.assert_array_equal(truth.h, 0.0)
+
+
+@pytest.mark.parametrize("lean", [80.0, 89.0, 89.99])
+def test_grazing_light(lean: float) -> None:
+    """Along a wall that nearly stands upright: the power that meets it, spread over its height, as the lens sees it."""
+    tangent = math.tan(math.radians(lean))
+    low, high = -2e-3 / tangent, 2e-3 / tangent
+    wall = quad((low, -1, -2e-3), (high, -1, 2e-3), (high, 1, 2e-3), (low, 1, -2e-3))
+    seen_by = sight(samples=1, bins=1, lens=None)
+    light = light_of(wall, seen_by=seen_by)
+    assert light.sheet.lit(light.scene, 0.0).total() == pytest.approx(high - low, rel=1e-12)
+    share = np.polynomial.legendre.leggauss(30)
+    points = np.stack([0.5 * (high - low) * share[0], 0.0 * share[0], 2e-3 * share[0]], axis=-1)
+    eye = seen_by.lens_at(0.0) - points
+    normal = np.array([-math.sin(math.radians(lean)), 0.0, math.cos(math.radians(lean))])
+    cosine = np.maximum(eye @ normal, 0.0) / np.linalg.norm(eye, axis=1)
+    expected = 0.5 / math.pi * (high - low) * 0.5 * share[1] @ (cosine * seen_by.received(points))
+    assert light.exposures(0.0)["direct"].total()[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_metres_and_micrometres() -> None:
+    """A step of a micrometre on a slab of 20 m, 100 m down the transport: the truth is good to the place's digits."""
+    L, fine = 100.0, 1e-6
+    ground = plate(10.0, 10.0) + np.array([0.0, L, 0.0])
+    tile = plate(5e-6, 1e-5, fine) + np.array([2e-3, L, 0.0])
+    seen_by = sight(samples=20001)
+    light = light_of(np.concatenate([ground, tile]), seen_by=seen_by)
+    truth = light.truth(L)
+    on_tile = np.abs(truth.g - 2e-3) < 4.9e-6
+    assert on_tile.sum() >= 3
+    np.testing.assert_allclose(truth.h[on_tile], fine, atol=1e-13)
+    np.testing.assert_allclose(truth.h[np.abs(truth.g - 2e-3) > 5.1e-6], 0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("lens", [None, Lens(k1=-900.0, centre=(1e-4, -2e-4)), Lens(k1=-4e3)])
+def test_out_of_view_behind_the_lens_and_beyond_the_fold(lens: Lens | None) -> None:
+    """A ramp from below the sensor's range up to far above the lens: what has an image counts, and nothing else."""
+    ramp = quad((-0.03, -1, -0.05), (0.5, -1, 1.0), (0.5, 1, 1.0), (-0.03, 1, -0.05))
+    seen_by = sight(lens=lens, bins=30, u_edges=np.linspace(-9e-3, 9e-3, 31), v_edges=np.linspace(-9e-3, 9e-3, 10))
+    found = light_of(ramp, seen_by=seen_by).exposures(0.0)["direct"]
+    line = LightSheet(transport=TRANSPORT).lit(Scene(ramp), 0.0)
+    share = (np.arange(200_000) + 0.5) / 200_000
+    points = (line.ends[:, :1] + share[:, None] * (line.ends[:, 1:] - line.ends[:, :1])).reshape(-1, 3)
+    eye = seen_by.lens_at(0.0) - points
+    cosine = np.maximum(eye @ line.normals[0], 0.0) / np.linalg.norm(eye, axis=1)
+    sent = 0.5 / math.pi * cosine * seen_by.received(points) * np.repeat(line.power * line.lengths, 200_000) / 200_000
+    uv = seen_by.project(points)
+    assert 0.01 < np.isfinite(uv[:, 0]).mean() < 0.9
+    expected = seen_by.deposit(uv[:, 0], uv[:, 1], sent)
+    assert expected.power.max() > 0.0
+    # A bin holds 1000 points.
+    np.testing.assert_allclose(found.power, expected.power, atol=2e-3 * expected.power.max())
 
 
 # ---- the truth ---------------------------------------------------------------------------------------------

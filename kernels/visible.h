@@ -39,7 +39,10 @@ typedef struct {
     real along_x, along_y, along_z;    // of the length that makes `along` what it is
     real near, far;                    // in `deep`: what hides lies between
     real lift_deep, lift_along, lift;  // and where lift_deep deep + lift_along along > lift
+    real start_x, start_y, start_z;    // of the segment
+    real step_x, step_y, step_z;       // from there to its end
     real from, to;                     // the window
+    real low_x, low_y, low_z, high_x, high_y, high_z; // around the point and the window
     view_half halves[VIEW_HALVES];     // it lies in all of these: window's start and end, both sides of the plane, ...
 } view;
 
@@ -63,13 +66,22 @@ BVH_INLINE view_half view_half_of(const view *view, real x, real y, real z, real
     return half_space;
 }
 
-// Sets the first two halves: what is seen between two places of the segment.
+// Sets the first two halves: what is seen between two places of the segment. And what is around it.
 BVH_INLINE void view_set_window(view *view, real from, real to) {
     view->from = from, view->to = to;
     view->halves[0] = view_half_of(view, view->along_x - from * view->deep_x, view->along_y - from * view->deep_y,
                                    view->along_z - from * view->deep_z, 0);
     view->halves[1] = view_half_of(view, to * view->deep_x - view->along_x, to * view->deep_y - view->along_y,
                                    to * view->deep_z - view->along_z, 0);
+#define VIEW_AROUND(x)                                                                                                 \
+    const real first_##x = view->start_##x + from * view->step_##x, last_##x = view->start_##x + to * view->step_##x;  \
+    const real slack_##x = (real)4 * (real)REAL_EPSILON * (fabs(first_##x) + fabs(last_##x) + fabs(view->x));         \
+    view->low_##x = fmin(view->x, fmin(first_##x, last_##x)) - slack_##x;                                              \
+    view->high_##x = fmax(view->x, fmax(first_##x, last_##x)) + slack_##x
+    VIEW_AROUND(x);
+    VIEW_AROUND(y);
+    VIEW_AROUND(z);
+#undef VIEW_AROUND
 }
 
 // Sets the next two: both sides of the plane.
@@ -92,7 +104,11 @@ BVH_INLINE bvh_masks view_boxes(const view *view, global const real *node) {
     const bvh_reals window = bvh_min(view_reach(all, node), view_reach(all + 1, node));
     const bvh_reals plane = bvh_min(view_reach(all + 2, node), view_reach(all + 3, node));
     const bvh_reals beyond = bvh_min(view_reach(all + 4, node), view_reach(all + 5, node));
-    return BVH_MASK(bvh_min(bvh_min(window, plane), beyond) >= (bvh_reals)0);
+    const bvh_masks around =
+        BVH_MASK(BVH_LOAD(node) <= view->high_x) & BVH_MASK(BVH_LOAD(node + WIDTH) <= view->high_y) &
+        BVH_MASK(BVH_LOAD(node + 2 * WIDTH) <= view->high_z) & BVH_MASK(BVH_LOAD(node + 3 * WIDTH) >= view->low_x) &
+        BVH_MASK(BVH_LOAD(node + 4 * WIDTH) >= view->low_y) & BVH_MASK(BVH_LOAD(node + 5 * WIDTH) >= view->low_z);
+    return around & BVH_MASK(bvh_min(bvh_min(window, plane), beyond) >= (bvh_reals)0);
 }
 
 BVH_INLINE uint view_met(const view *view, global const real *node) {

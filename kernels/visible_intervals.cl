@@ -25,6 +25,9 @@ inline int view_of(view *v, global const INPUT *row, constant place *middle, rea
     const place away = start > 0 ? start : end < 0 ? -end : 0;
     const real nearest = (real)sqrt(depth * depth + away * away * square);
     v->x = (real)(x - middle[0]), v->y = (real)(y - middle[1]), v->z = (real)(z - middle[2]);
+    v->start_x = (real)(row[3] - middle[0]), v->start_y = (real)(row[4] - middle[1]);
+    v->start_z = (real)(row[5] - middle[2]);
+    v->step_x = (real)sx, v->step_y = (real)sy, v->step_z = (real)sz;
     v->deep_x = (real)dx, v->deep_y = (real)dy, v->deep_z = (real)dz;
     v->across_x = (real)((sy * dz - sz * dy) / size), v->across_y = (real)((sz * dx - sx * dz) / size);
     v->across_z = (real)((sx * dy - sy * dx) / size);

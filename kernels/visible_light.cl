@@ -129,6 +129,8 @@ view view_from(const lit *one, const facing *all, int lane, real x, real y, real
     const real ex = (real)one->off_x, ey = (real)one->off_y, ez = (real)one->off_z;
     const real wx = (real)one->across_x, wy = (real)one->across_y, wz = (real)one->across_z;
     v.x = x, v.y = y, v.z = z;
+    v.start_x = (real)one->x, v.start_y = (real)one->y, v.start_z = (real)one->z;
+    v.step_x = (real)one->length * ux, v.step_y = (real)one->length * uy, v.step_z = (real)one->length * uz;
     v.deep_x = up * ex + side * wx, v.deep_y = up * ey + side * wy, v.deep_z = up * ez + side * wz;
     v.across_x = up * wx - side * ex, v.across_y = up * wy - side * ey, v.across_z = up * wz - side * ez;
     v.along_x = (depth * ux + along * v.deep_x) * per_length;

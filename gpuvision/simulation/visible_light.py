@@ -21,7 +21,7 @@ PICK_BLOCK = 16
 """Receivers of a strip that share a list of picked segments."""
 
 _GROUP = 64
-_ROWS_PER_STRIP = 64
+_ROWS_PER_STRIP = 16
 # Small scenes share a build.
 _LEAST_DEPTH = 4
 # Of the scene's size: within this of a surface rounding, the caller's too, decides what lies before it.

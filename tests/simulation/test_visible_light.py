@@ -182,7 +182,7 @@ def test_rows_that_have_no_plane(device: Device, walk: Any, dtype: Any) -> None:
     np.testing.assert_array_equal(np.isnan(result.intervals[1:]), True)
 
 
-@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 200])
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 65, 200])
 @pytest.mark.parametrize("walk", ["strip", "item"])
 def test_intervals_sizes_and_canaries(device: Device, walk: Any, count: int, rng: np.random.Generator) -> None:
     corners, rows = soup(rng, 300), single(rng.uniform(-1.0, 1.0, (count, 9))).astype(np.float32)

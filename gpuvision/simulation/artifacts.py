@@ -111,11 +111,11 @@ class Artifacts:
         """Return where a flag is set; for READ, where none is."""
         return np.asarray(self.verdict == 0 if verdict == Verdict.READ else (self.verdict & verdict) != 0)
 
-    def unread(self, limit: float) -> Float64:
+    def unread(self, limit: float) -> float:
         """Return the share of the lit surfaces' samples that are missing or off by more than a limit [m]."""
         true = np.isfinite(self.truth.h)
         wrong = true & ~(np.abs(self.error) <= limit)
-        return np.asarray(wrong.sum() / max(int(true.sum()), 1))
+        return int(wrong.sum()) / max(int(true.sum()), 1)
 
     def without(self, flags: Status) -> Artifacts:
         """Return them as if what has any of the flags were not read."""
@@ -160,7 +160,7 @@ class Artifacts:
             "ambiguous": int(self.is_(Verdict.AMBIGUOUS).sum()),
             "limit": limit,
             "beyond_limit": int(wrong.sum()),
-            "unread_share": float(self.unread(limit)),
+            "unread_share": self.unread(limit),
             "rms": _rms(error),
             "median": levels[0],
             "p95": levels[1],

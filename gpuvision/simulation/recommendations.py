@@ -78,7 +78,7 @@ def rank(candidates: Mapping[str, Artifacts], limit: float) -> list[Ranked]:
         good = found.error[np.abs(found.error) <= limit]
         rms = float(np.sqrt(np.mean(good**2))) if good.size else float("nan")
         false = float(np.mean(found.is_(Verdict.FALSE)))
-        ranked.append(Ranked(name, float(found.unread(limit)), false, rms))
+        ranked.append(Ranked(name, found.unread(limit), false, rms))
     return sorted(ranked, key=lambda each: (each.unread + each.false, np.nan_to_num(each.rms, nan=np.inf)))
 
 

@@ -34,6 +34,7 @@ OPERATIONS = (
     "reflections",
     "bvh",
     "simulate",
+    "tolerance",
     "mitsuba",
     "launch",
     "stream",

@@ -18,6 +18,8 @@ Reals = npt.NDArray[np.float64]
 
 # Shapes go by powers of two, from these on, so that few of them are ever bound.
 _LEAST_SEGMENTS, _LEAST_PICKS = 64, 4096
+# Of fewer pairs nothing is planned.
+_LEAST_PAIRS = 1 << 15
 
 
 class PlannedIrradiance(NamedTuple):
@@ -45,40 +47,53 @@ class PlannedLight:
         What may lie between.
     tolerance
         Metres of range; 0 leaves out only what is zero.
+    clearance
+        As of `VisibleLight`.
     device
         None: `Device.best`.
+
+    Notes
+    -----
+    So few pairs that a plan takes longer than they do are all computed, whatever the tolerance.
     """
 
     scene: Scene
     tolerance: float
+    clearance: float | None = None
     device: Device | None = None
     _planner: LightPlanner = field(init=False, repr=False)
     _bound: dict[Any, Bound[Any]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "device", Device.best() if self.device is None else self.device)
-        object.__setattr__(self, "_planner", LightPlanner(tolerance=self.tolerance, scene=self.scene))
+        object.__setattr__(self, "_planner", self._new_planner())
 
     def __call__(
         self, segments: npt.NDArray[Any], receivers: npt.NDArray[Any], weights: npt.NDArray[Any], reading: StripReading
     ) -> PlannedIrradiance:
         """Return the light of a profile; arguments as of `LightPlanner`."""
-        plan = self._planner(segments, receivers, weights, reading, device=self.device)
+        if len(segments) * receivers.shape[0] * receivers.shape[1] < _LEAST_PAIRS:
+            plan = LightPlan.of_all(segments, receivers, self.tolerance)
+        else:
+            plan = self._planner(segments, receivers, weights, reading, device=self.device)
         if not plan.modelled:
             return PlannedIrradiance(np.zeros(receivers.shape[:2]), plan)
-        tables = plan.tables(self._real, _LEAST_SEGMENTS, _LEAST_PICKS)
-        bound = self._bound_for(receivers.shape, len(tables[0]), len(tables[2]))
-        places, _, *given = bound.inputs
-        places.set(np.ascontiguousarray(receivers, self._real))
-        for slot, table in zip(given, tables, strict=True):
-            slot.set(table)
-        # What would be summed up behind the receivers is not needed: the weights stay zero.
-        return PlannedIrradiance(np.asarray(bound.run().irradiance.get(), np.float64), plan)
+        rows, starts, picks = plan.tables(self._real, _LEAST_SEGMENTS, _LEAST_PICKS)
+        bound = self._bound_for(receivers.shape, len(rows), len(picks))
+        # What would be summed up behind the receivers is not needed.
+        nothing = np.zeros((*receivers.shape[:2], 2), self._real)
+        light = bound.on_host([np.ascontiguousarray(receivers, self._real), nothing, rows, starts, picks])
+        return PlannedIrradiance(np.asarray(light.irradiance, np.float64), plan)
+
+    def _new_planner(self) -> LightPlanner:
+        return LightPlanner(tolerance=self.tolerance, scene=self.scene, clearance=self.clearance or 0.0)
 
     def _bound_for(self, shape: tuple[int, ...], segments: int, picks: int) -> Bound[Any]:
         key = (shape, segments, picks)
         if key not in self._bound:
-            operation = VisibleLight(scene=self.scene, segments=segments, picks=picks, precision="single")
+            operation = VisibleLight(
+                scene=self.scene, segments=segments, picks=picks, clearance=self.clearance, precision="single"
+            )
             self._bound[key] = operation.bind(self.device, shape, self._real)
         return self._bound[key]
 

@@ -265,7 +265,9 @@ def simulate(
     found = optimise_mask(sight, *_whole_light(store, sight.samples * sight.bins)) if mask == "best" else None
     before = found.mask if found is not None else mask if isinstance(mask, Mask) else None
     simulator = simulator_of(task.sensor, sight, before)
-    parts, account, first = [], {}, 0
+    parts: list[Artifacts] = []
+    account: dict[str, float] = {}
+    first = 0
     for block in store:
         parts.append(explain(simulator, block.exposures, block.truth, seed=seed, first=first, device=device))
         account = _added(account, block)

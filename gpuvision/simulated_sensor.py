@@ -74,10 +74,10 @@ def sight_of(sensor: Sensor) -> Sight:
     if isinstance(readout, PsdReadout):
         samples = sensor.frame[0]
         half = 0.5 * readout.strip_length
-        positions = np.linspace(-half, half, light.bins + 1)
+        positions: npt.NDArray[np.float64] = np.linspace(-half, half, light.bins + 1)
     else:
         length, samples = sensor.frame if readout.along == "columns" else sensor.frame[::-1]
-        positions = np.arange(length + 1) - 0.5
+        positions = np.arange(length + 1, dtype=np.float64) - 0.5
     return Sight(
         triangulation=_triangulation(readout),
         transport=_transport(sensor),

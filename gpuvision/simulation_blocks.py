@@ -235,17 +235,18 @@ def _here(task: Task, numbers: list[int], device: Device | None) -> Iterator[tup
 
 def _by_dask(task: Task, numbers: list[int], address: str) -> Iterator[tuple[int, bytes]]:
     try:
-        from distributed import Client, as_completed
+        import distributed
     except ImportError:
         raise ImportError("a scheduler needs Dask: pip install 'gpuvision[cluster]'") from None
-    with Client(address, timeout="10s", set_as_default=False) as client, client.as_current():
+    dask: Any = distributed
+    with dask.Client(address, timeout="10s", set_as_default=False) as client, client.as_current():
         everywhere = client.scatter(task, broadcast=True)
         # Not pure: the same block asked for twice is computed twice, and written over itself.
         futures = {
             client.submit(compute_block, everywhere, number, key=f"{task.fingerprint}-{number}"): number
             for number in numbers
         }
-        for future, content in as_completed(futures, with_results=True):
+        for future, content in dask.as_completed(futures, with_results=True):
             yield futures[future], content
 
 

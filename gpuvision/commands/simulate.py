@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -107,7 +107,13 @@ def simulate(
     names = tuple(each.strip() for each in paths.split(",") if each.strip())
     task = prepare(scene, made_of, described, paths=names, tolerance=tolerance, profiles=profiles)
     chosen = None if device is None else Device.named(device)
-    made = {"mask": before, "seed": seed if noise else None, "limit": limit, "device": chosen, "scheduler": scheduler}
+    made: dict[str, Any] = {
+        "mask": before,
+        "seed": seed if noise else None,
+        "limit": limit,
+        "device": chosen,
+        "scheduler": scheduler,
+    }
     with progress_bar(f"simulating {part.name}") as progress:
         done = run(task, out, progress=progress, **made)
     told = done.summary()

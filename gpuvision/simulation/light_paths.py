@@ -191,10 +191,9 @@ class LightPaths:
             self._planned[tolerance] = PlannedLight(scene=self.scene, tolerance=tolerance, device=self.device)
         weights = reading.weights(seen.weights, self.lines.u)
         light, plan = self._planned[tolerance](segment_rows(segments), seen.receivers, weights, reading)
-        told = {"pairs": plan.counts["pairs"]}
-        told |= {f"pairs {name}": plan.counts[name] for name in ("exact", "clustered", "left out")}
-        told |= {"bound of pairs left out [m]": float(plan.bound.max(initial=0.0))}
-        return light, {name: float(each) for name, each in told.items()}
+        told = {f"pairs {name}": float(plan.counts[name]) for name in ("exact", "clustered", "left out")}
+        bound = {"bound of pairs left out [m]": float(plan.bound.max(initial=0.0))}
+        return light, {"pairs": float(plan.counts["pairs"])} | told | bound
 
     def irradiance(self, seen: SeenSurface, segments: LitSegments) -> Float64:
         """Return the irradiance [W/m^2] of what the sensor sees from lit segments, (samples, n)."""

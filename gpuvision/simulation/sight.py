@@ -226,7 +226,8 @@ class Sight:
         weights = np.asarray(power, np.float64)[on]
         total = np.bincount(at, weights, minlength=size)
         moment = np.bincount(at, weights * (u[on] - self.u_middles[place[on]]), minlength=size)
-        return Exposure(total.reshape(self.samples, -1), moment.reshape(self.samples, -1))
+        shape = (self.samples, self.bins)
+        return Exposure(np.asarray(total.reshape(shape), np.float64), np.asarray(moment.reshape(shape), np.float64))
 
     def blurred(self, exposure: Exposure, sigma: float) -> Exposure:
         """Return the exposure behind a lens that images a point as a Gaussian along u, sigma in sensor units.
@@ -250,10 +251,9 @@ class Sight:
         first_moment = -sigma * light[:, None] * np.diff(bell, axis=1)
         moment = first_moment + (at[:, None] - self.u_middles[bins]) * power
         slot = (sample[:, None] * self.bins + bins).ravel()
-        size = self.samples * self.bins
-        return Exposure(
-            *(np.bincount(slot, each.ravel(), minlength=size).reshape(-1, self.bins) for each in (power, moment))
-        )
+        shape, size = (self.samples, self.bins), self.samples * self.bins
+        whole = (np.bincount(slot, each.ravel(), minlength=size).reshape(shape) for each in (power, moment))
+        return Exposure(*(np.asarray(each, np.float64) for each in whole))
 
     # ---- what follows from the parameters ------------------------------------------------------------------
 

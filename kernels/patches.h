@@ -23,6 +23,7 @@ PATCH_INLINE vector patch_choose(masks which, vector a, vector b) {
 // Corners, and the edges that leave them: exact, where differences of corners that are far away would not be.
 typedef struct {
     vector corner[4], edge[4];
+    int is_whole; // the third edge is nothing
 } polygon;
 
 // What is left of a triangle above the receiver's plane, in the same sense; `height` is that of its corners.
@@ -30,7 +31,7 @@ PATCH_INLINE polygon patch_cut(const vector *corner, const vector *edge, const r
     const masks in0 = mask_of(height[0] > (reals)0), in1 = mask_of(height[1] > (reals)0);
     const masks in2 = mask_of(height[2] > (reals)0), all = in0 & in1 & in2;
     const vector none = {(reals)0, (reals)0, (reals)0};
-    const polygon whole = {{corner[0], corner[1], corner[2], corner[2]}, {edge[0], edge[1], none, edge[2]}};
+    const polygon whole = {{corner[0], corner[1], corner[2], corner[2]}, {edge[0], edge[1], none, edge[2]}, 1};
     if (!any_lane(~all)) return whole;
     // Turned, so that the one corner on its side of the plane comes first.
     const masks second = (in0 ^ in1) & ~(in0 ^ in2), third = (in0 ^ in2) & ~(in0 ^ in1);
@@ -50,6 +51,7 @@ PATCH_INLINE polygon patch_cut(const vector *corner, const vector *edge, const r
     const vector on_ab = patch_sum(a, step_b), on_ca = patch_sum(a, patch_times((reals)-1, step_c));
     const vector across = patch_sum(step_b, step_c);
     polygon cut;
+    cut.is_whole = 0;
     // a, ab, ca where a is the only corner above; else ab, b, c, ca.
     cut.corner[0] = patch_choose(lone, a, on_ab);
     cut.corner[1] = patch_choose(lone, on_ab, b);
@@ -68,13 +70,17 @@ PATCH_INLINE polygon patch_cut(const vector *corner, const vector *edge, const r
 
 // The form factor of a polygon above the plane of a receiver with this unit normal; it turns left seen from there.
 PATCH_INLINE reals patch_factor(const polygon *shape, vector normal) {
-    reals size[4], weight[4], angle_per_sine[4], excess[4];
+    reals size[4], weight[4], excess[4];
     masks near_by = (masks)0;
 #pragma unroll
     for (int n = 0; n < 4; n++) size[n] = sqrt(patch_dot(shape->corner[n], shape->corner[n]));
     reals sum = (reals)0;
 #pragma unroll
     for (int n = 0; n < 4; n++) {
+        if (n == 2 && shape->is_whole) {
+            weight[n] = excess[n] = (reals)0;
+            continue;
+        }
         const vector turn = patch_cross(shape->edge[n], shape->corner[n]);
         const reals cosine = size[n] * size[n] + patch_dot(shape->corner[n], shape->edge[n]);
         const reals sine = sqrt(patch_dot(turn, turn)), positive = fabs(cosine);

@@ -23,6 +23,8 @@ Integers = npt.NDArray[np.int64]
 # that few shapes are bound.
 _ROWS, _ROUND = 2048, 128
 _NODES_PER_SEGMENT, _NODES_PER_PATCH = 8, 2.0
+# Of patches: segments below that are points, and points within that are one.
+_SHORT = 0.0625
 _TOLERANCE, _ROUNDS = 1e-10, 400
 # Roundings of the scene's extent around a place within which nothing covers it, and which part of a view is none.
 _CLEARANCE, _NOTHING = 64.0, 0.01
@@ -117,7 +119,7 @@ class Bounces:
         """Return (count,) W/m^2: the mean irradiance of each patch, straight from lit segments.
 
         What a patch gets from a point of a line is the point's form factor with the patch, so the mean over the patch
-        needs no samples on it: only along the line, by Gauss and Legendre, closer to each other towards the ends.
+        needs no samples on it: only along the line.
         """
         receivers, power = _samples(lit, math.sqrt(float(np.median(self.patches.area))))
         got = np.zeros(self.patches.count)
@@ -235,7 +237,7 @@ class Bounces:
             return np.asarray(exitance - self.albedo * arrived)
 
         operator = LinearOperator((size, size), without_bounced, dtype=np.float64)
-        tolerance = max(_TOLERANCE, 10.0 * float(np.finfo(self._real).eps))
+        tolerance = max(_TOLERANCE, 100.0 * float(np.finfo(self._real).eps))
         solution, failed = gmres(operator, emitted, rtol=tolerance, restart=_ROUNDS, maxiter=1)
         if failed:
             raise ValueError(_NO_WAY_OUT)
@@ -272,17 +274,27 @@ def graded(patches: Patches, times: int, scene: Scene | None = None, *, device: 
 
 
 def _samples(lit: LitSegments, size: float) -> tuple[Reals, Reals]:
-    """Return points along segments as receivers (n, 6), and the power in W that each stands for."""
-    places, powers = [np.zeros((0, 6))], [np.zeros(0)]
-    for (start, stop), normal, exitance in zip(lit.ends, lit.normals, lit.exitance, strict=True):
-        length = float(np.linalg.norm(stop - start))
-        if not (length > 0.0 and exitance > 0.0):
-            continue
-        nodes, weights = np.polynomial.legendre.leggauss(
-            _NODES_PER_SEGMENT + math.ceil(_NODES_PER_PATCH * length / size)
-        )
+    """Return points along segments as receivers (n, 6), and the power in W that each stands for.
+
+    Long segments get the nodes of Gauss and Legendre, closer to each other towards the ends. Of those that are short
+    beside the patches, one stands for all in its neighbourhood that face roughly the same way.
+    """
+    length = np.linalg.norm(lit.ends[:, 1] - lit.ends[:, 0], axis=1)
+    power = lit.exitance * length
+    short = (length < _SHORT * size) & (power > 0.0)
+    middles = lit.ends[short].mean(axis=1)
+    keys = np.column_stack([np.floor(middles / (_SHORT * size)), np.rint(1.5 * lit.normals[short])])
+    group = np.asarray(np.unique(keys, axis=0, return_inverse=True)[1]).reshape(-1)
+    powers = [np.bincount(group, power[short])]
+    mean = np.column_stack([np.bincount(group, power[short] * each) for each in middles.T]) / powers[0][:, None]
+    order = np.lexsort((np.sum((middles - mean[group]) ** 2, axis=1), group))
+    chosen = order[np.diff(group[order], prepend=-1) > 0]
+    places = [np.column_stack([middles[chosen], lit.normals[short][chosen]])]
+    for k in np.flatnonzero(~short & (power > 0.0)):
+        (start, stop), count = lit.ends[k], _NODES_PER_SEGMENT + math.ceil(_NODES_PER_PATCH * length[k] / size)
+        nodes, weights = np.polynomial.legendre.leggauss(count)
         s = 0.5 + 0.5 * nodes
         along = s * s * (3.0 - 2.0 * s)
-        places.append(np.column_stack([start + along[:, None] * (stop - start), np.tile(normal, (len(s), 1))]))
-        powers.append(exitance * length * 0.5 * weights * 6.0 * s * (1.0 - s))
+        places.append(np.column_stack([start + along[:, None] * (stop - start), np.tile(lit.normals[k], (count, 1))]))
+        powers.append(power[k] * 0.5 * weights * 6.0 * s * (1.0 - s))
     return np.concatenate(places), np.concatenate(powers)

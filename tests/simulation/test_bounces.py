@@ -105,6 +105,32 @@ def test_arrival_is_the_mean_over_patches(device: Device) -> None:
     np.testing.assert_allclose(arrival[beside], mean[beside], rtol=0.05, atol=1e-4)
 
 
+def test_many_short_segments_are_as_one(device: Device) -> None:
+    """A line cut into 2000 pieces, as by a fine mesh, sends as much to every patch."""
+    box = solved(0.3, [0.5], device)
+    cuts = np.linspace(-0.5, 0.5, 2001)
+    ends = np.zeros((2000, 2, 3))
+    ends[:, 0, 0], ends[:, 1, 0], ends[:, :, 1], ends[:, :, 2] = cuts[:-1], cuts[1:], 0.1, -0.3
+    pieces = LitSegments(ends, np.tile([0.0, 0.0, 1.0], (2000, 1)), np.ones(2000))
+    whole, arrived = box.arrival(stripe()), box.arrival(pieces)
+    assert arrived @ box.patches.area == pytest.approx(1.0, rel=1e-12)
+    np.testing.assert_allclose(arrived, whole, atol=0.02 * whole.max())
+
+
+def test_single_precision_serves_where_there_is_no_double(device: Device) -> None:
+    class Single(Bounces):
+        _real = np.float32
+
+    double = solved(0.3, [0.9], device)
+    single = Single(patches=double.patches, albedo=double.albedo, device=device)
+    iterated = Single(patches=double.patches, albedo=double.albedo, device=device, dense=0)
+    arrival = double.arrival(stripe())
+    np.testing.assert_allclose(single.arrival(stripe()), arrival, atol=1e-5 * arrival.max())
+    exact = double.exitance(arrival)
+    np.testing.assert_allclose(single.exitance(arrival), exact, rtol=1e-4)
+    np.testing.assert_allclose(iterated.exitance(arrival), exact, rtol=1e-4)
+
+
 def _owners(corners: np.ndarray, places: np.ndarray) -> np.ndarray:
     a, one, two = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(one, two)

@@ -19,7 +19,7 @@ from gpuvision.simulation.material import Material
 from gpuvision.simulation.readings import EVEN, EVEN_OPEN, OPEN, Truth
 from gpuvision.simulation.reflectance import Brdf, Ggx, Lambert, Phong, Ward
 from gpuvision.simulation.scene import Scene
-from gpuvision.simulation.sheet_cut import ranges
+from gpuvision.simulation.sheet_cut import SheetIndex, ranges
 from gpuvision.simulation.sight import Exposure, Sight
 from gpuvision.simulation.sight_lines import check_materials
 from gpuvision.status import Status
@@ -35,6 +35,8 @@ _NODES = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
 _TURN, _TURNS = 0.5, 256
 # A Gaussian's light beyond so many sigmas, 1e-12, is not sought.
 _BEYOND = 7.0
+# Edges in the sheet, within so many sigmas, cut it; the longest so many; those so many sigmas apart.
+_REACH, _STEPS, _APART = 4.0, 16, 1e-4
 # Of the largest coordinate: nearer than that, two lit places are one.
 _SAME = 1e-9
 
@@ -63,7 +65,7 @@ class Slabs(NamedTuple):
         cuts = np.asarray(cuts, np.float64)
         low, high = np.append(-np.inf, cuts), np.append(cuts, np.inf)
         share = _between(low, high)
-        return cls(low, high, share, (_bell(low) - _bell(high)) / share)
+        return cls(low, high, share, np.clip((_bell(low) - _bell(high)) / share, low, high))
 
     @classmethod
     def of(cls, count: int) -> Slabs:
@@ -86,8 +88,9 @@ class DirectLight:
     sheet
         The light.
     sub_sheets
-        A thick sheet is taken as so many slabs; or the places in its sigmas at which it is cut into slabs. A thin sheet
-        has one.
+        A thick sheet is taken as so many slabs, and is cut also where an edge of the surface lies in it from end to
+        end: there what it lights changes at once. Or the places in sigmas at which it is cut, and no others. A thin
+        sheet has one.
     device
         Where visibility is found; None: `Device.best`.
 
@@ -102,8 +105,9 @@ class DirectLight:
     bins. Within a part of a line that falls into one bin, two Gauss nodes are taken.
 
     A slab's light is where the slab's mean is, and is spread over the bins as the surface there, thought plane, spreads
-    it. So a plane gives a Gaussian, exactly, whatever the number of slabs; where the surface, its material or its
-    shadow change within a slab, the error falls as one over the number of slabs.
+    it. So planes that end at edges along the sheet are exact whatever the number of slabs; where the surface, its
+    material or its shadow change within a slab, across it or hidden from the lens, the error falls as one over the
+    number of slabs.
 
     Of a mirror, the lens takes the rays that meet its opening; a slab's light goes where its middle goes. Triangles are
     plane mirrors.
@@ -117,7 +121,7 @@ class DirectLight:
     sheet: LightSheet
     sub_sheets: int | Sequence[float] = 9
     device: Device | None = None
-    slabs: Slabs = field(init=False, repr=False)
+    _slabs: Slabs = field(init=False, repr=False)
     _line_of_sight: LineOfSight = field(init=False, repr=False)
     _images: Images = field(init=False, repr=False)
 
@@ -125,7 +129,7 @@ class DirectLight:
         check_materials(self.scene, self.materials)
         if self.sheet.transport != self.sight.transport:
             raise ValueError("DirectLight: sheet and sight have different transports, expected the same one")
-        object.__setattr__(self, "slabs", _slabs(self.sub_sheets if self.sheet.sigma > 0.0 else 1))
+        object.__setattr__(self, "_slabs", _slabs(self.sub_sheets if self.sheet.sigma > 0.0 else 1))
         object.__setattr__(self, "_images", Images(self.sight))
         device = Device.best() if self.device is None else self.device
         object.__setattr__(self, "_line_of_sight", LineOfSight(scene=self.scene, device=device))
@@ -137,19 +141,27 @@ class DirectLight:
         the lens. With ``causes``, also what the direct light would be if all surfaces were white ones of Lambert
         (`EVEN`), if nothing were in the way to the lens (`OPEN`), and both (`EVEN_OPEN`).
         """
-        slabs, lens = self.slabs, self.sight.lens_at(L)
+        slabs, lens = self.slabs(L), self.sight.lens_at(L)
         line, first = self.sheet.lit_lines(self.scene, L + self.sheet.sigma * slabs.middle)
         slab = np.repeat(np.arange(len(slabs.share)), np.diff(first))
         line, kept = self._facing(line, L)
         line = line._replace(power=line.power * slabs.share[slab[kept]])
         parts = self._line_of_sight.parts(line, lens, hidden=causes)
-        found = self._exposed(line, slab[kept], parts, L, self._sent, causes=causes)
+        found = self._exposed(line, slab[kept], slabs, parts, L, self._sent, causes=causes)
         if any(each.mirror > 0.0 for each in self.materials):
-            found["specular"] += self._mirrored(line, slab[kept], L)
+            found["specular"] += self._mirrored(line, slab[kept], slabs, L)
         return found
 
     def _exposed(
-        self, line: LitLine, slab: Integers, parts: Parts, L: float, sent_by: Sender, *, causes: bool = False
+        self,
+        line: LitLine,
+        slab: Integers,
+        slabs: Slabs,
+        parts: Parts,
+        L: float,
+        sent_by: Sender,
+        *,
+        causes: bool = False,
     ) -> dict[str, Exposure]:
         """Return the exposures by parts of segments, each of a slab."""
         images = self._images.of(line.ends, L)
@@ -167,9 +179,9 @@ class DirectLight:
         spread = np.zeros(len(share))
         if self.sheet.sigma > 0.0:
             spread = images.speed(segment, share, uv, self._moved(line.normals[segment], points))
-        return _deposits(self.sight, uv, spread, self.slabs, slab[segment], wanted)
+        return _deposits(self.sight, uv, spread, slabs, slab[segment], wanted)
 
-    def _mirrored(self, line: LitLine, slab: Integers, L: float) -> Exposure:
+    def _mirrored(self, line: LitLine, slab: Integers, slabs: Slabs, L: float) -> Exposure:
         """Return what mirrors throw right into the lens."""
         shares = np.array([each.mirror for each in self.materials])[self._material(line)]
         parts = glints(line, self.sheet, self.sight, L)
@@ -177,7 +189,23 @@ class DirectLight:
         of = parts.segment
         line = LitLine(parts.ends(line), line.normals[of], line.triangle[of], line.power[of] * shares[of])
         seen = self._line_of_sight.parts(line, self.sight.lens_at(L))
-        return self._exposed(line, slab[of], seen, L, _all_of_it)["specular"]
+        return self._exposed(line, slab[of], slabs, seen, L, _all_of_it)["specular"]
+
+    def slabs(self, L: float) -> Slabs:
+        """Return the slabs of the sheet at a transport L [m]."""
+        sigma = self.sheet.sigma
+        if sigma == 0.0 or not isinstance(self.sub_sheets, int):
+            return self._slabs
+        places, lengths = SheetIndex.of(self.scene, self.sheet.transport).steps
+        near = slice(*np.searchsorted(places, [L - _REACH * sigma, L + _REACH * sigma]))
+        longest = np.argsort(-lengths[near], kind="stable")[:_STEPS]
+        steps = np.sort((places[near][longest] - L) / sigma)
+        if not len(steps):
+            return self._slabs
+        cuts = self._slabs.high[:-1]
+        far = np.abs(cuts[:, None] - steps).min(axis=1) > _APART
+        steps = steps[np.diff(steps, prepend=-np.inf) > _APART]
+        return Slabs.between(np.sort(np.append(cuts[far], steps)))
 
     def truth(self, L: float) -> Truth:
         """Return where the middle of the sheet truly is at a transport L [m], at the middle of each sample.

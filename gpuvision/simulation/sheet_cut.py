@@ -6,7 +6,9 @@ is a plane of constant L, and what it cuts are segments in (G, H).
 
 from __future__ import annotations
 
+import functools
 import itertools
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
@@ -22,6 +24,8 @@ Integers = npt.NDArray[np.int64]
 
 # Triangles as long as 2^-n of the longest one are sought together; the shortest with all that are shorter.
 _LEVELS = 24
+# Edges that lean out of a sheet by no more lie in it; a surface that turns by less than 0.2 rad does not end.
+_PARALLEL, _SMOOTH = 1e-9, math.cos(0.2)
 _known: WeakKeyDictionary[Scene, dict[tuple[object, ...], SheetIndex]] = WeakKeyDictionary()
 
 
@@ -62,6 +66,8 @@ class SheetIndex:
         (levels + 1,): where each level begins.
     length
         (levels,): how long the triangles of a level are along the transport at most.
+    material
+        (n,): of the triangles.
     """
 
     triangle: Integers
@@ -69,6 +75,7 @@ class SheetIndex:
     start: Float64
     levels: Integers
     length: Float64
+    material: npt.NDArray[np.int32]
 
     @classmethod
     def of(cls, scene: Scene, transport: StraightTransport) -> SheetIndex:
@@ -96,7 +103,49 @@ class SheetIndex:
         chosen, level = chosen[order], level[order]
         bounds = np.searchsorted(level, np.arange(_LEVELS + 1))
         longest_of = [float(length[chosen[a:b]].max(initial=0.0)) for a, b in itertools.pairwise(bounds)]
-        return cls(chosen, corners[chosen], start[chosen], bounds, np.array(longest_of))
+        assert scene.material is not None  # set by Scene itself
+        material = scene.material[chosen]
+        return cls(chosen, corners[chosen], start[chosen], bounds, np.array(longest_of), material)
+
+    @functools.cached_property
+    def steps(self) -> tuple[Float64, Float64]:
+        """Transports at which what a sheet lights changes at once, ascending, and how long the edges there are [m].
+
+        Edges that lie in a sheet from end to end, where a surface ends, turns sharply, or changes its material.
+        """
+        edges, rows = self._in_a_sheet()
+        order = np.lexsort(edges.reshape(-1, 6).T)
+        edges, rows = edges[order], rows[order]
+        new = np.ones(len(edges), bool)
+        new[1:] = (edges[1:] != edges[:-1]).any(axis=(1, 2))
+        first = np.flatnonzero(new)
+        uses = np.diff(first, append=len(edges))
+        one, two = rows[first], rows[first + (uses > 1)]
+        corners = self.corners[np.stack([one, two])]
+        normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        smooth = (uses == 2) & (np.sum(normal[0] * normal[1], axis=-1) > _SMOOTH)
+        sharp = edges[first[~smooth | (self.material[one] != self.material[two])]]
+        places, lengths = sharp[:, 0, 2], np.linalg.norm(sharp[:, 1] - sharp[:, 0], axis=1)
+        order = np.argsort(places, kind="stable")
+        places, lengths = places[order], lengths[order]
+        apart = np.diff(places, prepend=-np.inf) > _PARALLEL * np.abs(self.corners[..., 2]).max(initial=0.0)
+        begin = np.flatnonzero(apart)
+        return places[begin], np.add.reduceat(lengths, begin) if len(begin) else lengths
+
+    def _in_a_sheet(self) -> tuple[Float64, Integers]:
+        """Return edges that lie in a sheet, (k, 2, 3), each as often as it is used and always alike, and the rows."""
+        edges, rows = [], []
+        for n in range(3):
+            both = self.corners[:, [n, (n + 1) % 3]]
+            way = np.abs(both[:, 1] - both[:, 0])
+            found = np.flatnonzero(way[:, 2] <= _PARALLEL * np.maximum(way[:, 0], way[:, 1]))
+            edges.append(both[found])
+            rows.append(found)
+        whole = np.concatenate(edges)
+        way = whole[:, 1, :2] - whole[:, 0, :2]
+        backward = (way[:, 0] < 0.0) | ((way[:, 0] == 0.0) & (way[:, 1] < 0.0))
+        return np.where(backward[:, None, None], whole[:, ::-1], whole), np.concatenate(rows)
 
     def cuts(self, places: npt.ArrayLike) -> Cuts:
         """Return what the sheets at some transports (k,) [m] cut, in the order of the sheets."""

@@ -23,6 +23,7 @@ from gpuvision.simulation.rays import AnyHit
 from gpuvision.simulation.readings import EVEN, EVEN_OPEN, OPEN
 from gpuvision.simulation.reflectance import Ggx, Lambert, OrenNayar, Phong, Ward
 from gpuvision.simulation.scene import Scene
+from gpuvision.simulation.sheet_cut import SheetIndex
 from gpuvision.simulation.sight import Exposure, Sight
 from gpuvision.status import Status
 from reference.rays import occluded
@@ -110,7 +111,7 @@ def test_step_of_reflectivity(k: float, largest: float) -> None:
     scene, materials = two_plates(1.0 / 1024.0, k / 1024.0)
     per_sigma = SIGMA * u_per_metre(seen_by, (0.0, 1.0, 0.0))
     for x in (found.x, -0.7, 2.5):
-        light = light_of(scene, materials, seen_by=seen_by, sigma=SIGMA, sub_sheets=[x])
+        light = light_of(scene, materials, seen_by=seen_by, sigma=SIGMA, sub_sheets=1)
         direct = light.exposures(-x * SIGMA)["direct"]
         middle = seen_by.project([0.0, -x * SIGMA, 0.0], -x * SIGMA)[0]
         shift = (u_of(direct, seen_by)[0] - middle) / per_sigma
@@ -142,7 +143,7 @@ def test_corner_between_slopes(one: float, two: float, x: float) -> None:
     before = quad((-1, -1, -one), (1, -1, -one), (1, 0, 0), (-1, 0, 0))
     behind = quad((-1, 0, 0), (1, 0, 0), (1, 1, two), (-1, 1, two))
     scene, at = Scene(np.concatenate([before, behind])), -x * SIGMA
-    light = light_of(scene, seen_by=seen_by, sigma=SIGMA, sub_sheets=[x])
+    light = light_of(scene, seen_by=seen_by, sigma=SIGMA, sub_sheets=2)
     u = u_of(light.exposures(at)["direct"], seen_by)[0] - seen_by.project([0.0, 0.0, 0.0], at)[0]
     lens = np.array(seen_by.lens) / np.linalg.norm(seen_by.lens)
     weights = [(lens[2] - slope * lens[1]) / math.hypot(1.0, slope) for slope in (one, two)]
@@ -162,7 +163,8 @@ def test_order_of_convergence_in_slabs() -> None:
     for count in counts:
         shifts = []
         for x in np.linspace(-0.61, 0.67, 7):
-            light = light_of(scene, materials, seen_by=seen_by, sigma=SIGMA, sub_sheets=int(count))
+            cuts = Slabs.of(int(count)).low[1:]
+            light = light_of(scene, materials, seen_by=seen_by, sigma=SIGMA, sub_sheets=cuts)
             direct = light.exposures(-x * SIGMA)["direct"]
             u = u_of(direct, seen_by)[0] - seen_by.project([0.0, -x * SIGMA, 0.0], -x * SIGMA)[0]
             shifts.append(u / (SIGMA * u_per_metre(seen_by, (0.0, 1.0, 0.0))) - step_shift(5.0, float(x)))
@@ -180,6 +182,29 @@ def test_order_of_convergence_in_slabs() -> None:
     ]
     errors = np.abs(np.array(values[:-1]) - values[-1])
     assert np.all(errors[:-1] / errors[1:] > 2.2)
+
+
+def test_slabs_end_where_edges_lie_in_the_sheet() -> None:
+    """A turn and a change of material cut it; a diagonal, an edge in a plane, and one askew do not."""
+    corners = np.concatenate(
+        [
+            plate(1.0, 0.5) + np.array([0.0, -0.5, 0.0]),
+            plate(1.0, 0.5) + np.array([0.0, 0.5, 0.0]),
+            quad((-1, 1, 0), (1, 1, 0), (1, 2, 1), (-1, 2, 1)),
+            quad((-1, 2, 1), (1, 2, 1), (1, 3.0, 1.5), (-1, 3.1, 1.5)),
+        ]
+    )
+    light = light_of(Scene(corners), sigma=0.05, sub_sheets=1)
+    np.testing.assert_allclose(SheetIndex.of(light.scene, TRANSPORT).steps, [[-1.0, 1.0, 2.0], [2.0, 2.0, 2.0]])
+    assert len(light.slabs(0.0).share) == 1
+    np.testing.assert_allclose(light.slabs(1.02).high, [-0.4, np.inf])
+    painted = light_of(Scene(corners, np.repeat([0, 1, 1, 1], 2)), (GREY, GREY), sigma=0.05, sub_sheets=2)
+    np.testing.assert_allclose(painted.slabs(-0.01).high, [0.0, 0.2, np.inf])
+    np.testing.assert_allclose(painted.slabs(0.5).high, [0.0, np.inf])
+    by_hand = light_of(Scene(corners), sigma=0.05, sub_sheets=[0.5])
+    np.testing.assert_allclose(by_hand.slabs(1.02).high, [0.5, np.inf])
+    nothing = light_of(np.zeros((0, 3, 3)), sigma=0.05)
+    assert len(nothing.slabs(0.0).share) == 9
 
 
 def test_slabs() -> None:

@@ -279,7 +279,7 @@ class Sight:
 
     @property
     def _to_sheet(self) -> Float64:
-        return np.array(self.transport.origin) - np.array(self.lens)
+        return np.asarray(np.array(self.transport.origin) - np.array(self.lens))
 
     @property
     def _off_sheet(self) -> float:

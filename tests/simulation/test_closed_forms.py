@@ -155,6 +155,28 @@ def test_perpendicular_rectangle(device: Device, precision: Any) -> None:
             assert got[0, 0] == pytest.approx(0.05573420, abs=5e-9 if precision == "double" else 5e-8)
 
 
+def test_squares_that_face_each_other_and_that_meet(device: Device) -> None:
+    """From square to square: Gauss and Legendre over one of them. Where they meet, the light there has an edge."""
+    square = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 0.0, 1.0]])
+    wall = np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
+    both = FormFactors(patches=Patches(np.concatenate([square, wall])[[[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]]))
+    root, angle = math.sqrt(2.0), math.atan(1.0 / math.sqrt(2.0))
+    facing = 2.0 / math.pi * (0.5 * math.log(4.0 / 3.0) + 2.0 * root * angle - 2.0 * math.atan(1.0))
+    meeting = (2.0 * math.atan(1.0) - root * angle + 0.25 * math.log(3.0 / 4.0)) / math.pi
+    assert facing == pytest.approx(0.199825, abs=5e-7)
+    assert meeting == pytest.approx(0.200044, abs=5e-7)
+    errors = []
+    for nodes in (4, 8, 16):
+        x, w = np.polynomial.legendre.leggauss(nodes)
+        u, v = (each.ravel() for each in np.meshgrid(0.5 + 0.5 * x, 0.5 + 0.5 * x))
+        floor = np.column_stack([u, v, 0.0 * u, 0.0 * u, 0.0 * u, 1.0 + 0.0 * u])
+        means = (0.25 * np.outer(w, w).ravel()) @ both(floor, device=device).factors
+        errors.append((abs(means[:2].sum() / facing - 1.0), abs(means[2:].sum() / meeting - 1.0)))
+    assert errors[2][0] < 1e-11
+    assert errors[2][1] < 1e-4
+    assert errors[1][1] < 0.3 * errors[0][1]
+
+
 def between_walls(edges: np.ndarray, walls: Any, first: np.ndarray, albedo: float, length: float, device: Any) -> Any:
     """Solve two walls (across, front, from) in strips; the first light arrives on the second one."""
     triangles = [reference.strips(edges, across, front, length) + np.asarray(start) for across, front, start in walls]

@@ -31,7 +31,11 @@ def draws() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Receivers, triangles of very different size, their factors, and the bound that is stated, in roundings."""
     rng = np.random.default_rng(7)
     triangles = np.concatenate([rng.normal(size=(5, 3, 3)) * size for size in SIZES]).astype(np.float32)
+    # A sliver, and one that is seen at a grazing angle by a receiver that is nearly in its plane.
+    triangles[3] = [[0.0, 0.0, 0.0], [3.0, 1.0, 0.0], [1.5, 0.5001, 0.0]]
+    triangles[8] = [[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [0.0, 1.0, -1.0]]
     receivers = rng.normal(size=(RECEIVERS, 6)).astype(np.float32)
+    receivers[5] = [-0.5, -0.5, -0.9998, 1.0, 1.0, 1e-4]
     values, bounds = np.zeros((2, RECEIVERS, len(triangles)))
     for i, receiver in enumerate(receivers):
         for k, corners in enumerate(triangles.astype(float)):
@@ -71,6 +75,19 @@ def test_factors_are_exact_at_any_distance(device: Device, walk: Any, precision:
     eps = float(np.finfo(result.factors.dtype).eps)
     assert np.all(np.abs(result.factors - values) <= bounds * eps)
     np.testing.assert_array_equal(result.factors[bounds == 0.0], 0.0)
+
+
+def test_micrometres_stand_in_metres(device: Device) -> None:
+    """A corner of ten micrometres, far from the middle of a scene of metres, is as bright as one at the origin."""
+    corner = 1e-5 * np.array([[[0, 0, 0], [0, 1, 0], [0, 1, 1]], [[0, 0, 0], [0, 1, 1], [0, 0, 1]]])
+    far = np.array([[[-2.0, -1.0, -3.0], [2.0, -1.0, -3.0], [0.0, 1.0, -3.0]]])
+    shift = np.array([1.0, 0.5, 0.25])
+    receivers = np.array([[1e-6, 5e-6, 0.0, 0, 0, 1], [1e-5, 5e-6, 1e-6, -1, 0, 1], [1e-7, 5e-6, 0.0, 0, 0, 1]])
+    at_home = FormFactors(patches=Patches(corner))(receivers, device=device).factors
+    assert np.all(at_home.sum(axis=1) > 0.1)
+    receivers[:, :3] += shift
+    away = FormFactors(patches=Patches(np.concatenate([corner + shift, far])))(receivers, device=device).factors
+    np.testing.assert_allclose(away[:, :2], at_home, atol=1e-8)
 
 
 def test_pieces_add_up_to_the_whole(device: Device) -> None:

@@ -105,7 +105,8 @@ class VisibleLight(Operation[ReceivedLight]):
     clearance
         Metres: what is less high above the lit surface, or above the receiver's own plane, hides nothing: the surfaces
         on which both lie, as far as they are flat. None: 4e-6 of the scene's reach from the origin where places are in
-        single, 1e-12 in double.
+        single, 1e-12 in double; with less than that, surfaces may hide what lies on them. So a scene of metres with
+        details of micrometres wants double.
     precision
         Of the arithmetic and the outputs; None follows the input. "single" takes float64 places, too: they are
         subtracted before they are rounded.

@@ -343,6 +343,59 @@ def test_currents(device: Device, walk: Any, dtype: Any, rng: np.random.Generato
         assert np.all(np.abs(current - expected) <= 4.0 * np.finfo(dtype).eps * size)
 
 
+@WAYS
+def test_metres_and_micrometres(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
+    """A scene a millionth as large gets the same light, a million times as much on a square metre; to the bit."""
+    corners, receivers = soup(rng, 60, 0.3), receivers_of(rng, 2, 40).astype(dtype)
+    segments, small = segments_of(rng, 4), 2.0**-20
+    result = light_of(corners, receivers, segments, device, walk=walk)
+    receivers[..., :3] *= small
+    segments[:, :6] *= small
+    tiny = light_of(corners * small, receivers, segments, device, walk=walk)
+    np.testing.assert_array_equal(tiny.irradiance * dtype(small), result.irradiance)
+    assert np.count_nonzero(result.irradiance) > 10
+
+
+@pytest.mark.parametrize("walk", ["strip", "item"])
+def test_a_part_of_micrometres_in_a_room_of_metres(device: Device, walk: Any) -> None:
+    """A box of 20 um on the floor hides what it hides in a scene of its own; in double, single knows no such place."""
+    part = trimesh.creation.box((2e-5, 2e-5, 2e-5)).apply_translation((3e-5, 0.0, 1e-5)).triangles
+    room = trimesh.creation.box((8.0, 6.0, 4.0)).apply_translation((0.0, 0.0, 2.0)).triangles
+    receivers = np.zeros((1, 32, 6))
+    receivers[0, :, 0], receivers[0, :, 2], receivers[0, :, 3] = 1e-4, np.linspace(1e-6, 1e-4, 32), -1.0
+    segments = np.array([[-2e-4, 0.0, 0.0, 1.5e-5, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]])
+    alone = light_of(part, receivers, segments, device, walk=walk, clearance=1e-9).irradiance
+    both = light_of(np.concatenate([part, room]), receivers, segments, device, walk=walk, clearance=1e-9).irradiance
+    free = light_of(room, receivers, segments, device, walk=walk, clearance=1e-9).irradiance
+    np.testing.assert_allclose(both, alone, rtol=0, atol=1e-7 * free.max())
+    assert alone.max() > 0.05 * free.max()
+    assert np.mean(alone < 0.5 * free) > 0.3
+
+
+@WAYS
+def test_faces_that_coincide(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
+    corners, receivers, segments = soup(rng, 60, 0.3), receivers_of(rng, 2, 40).astype(dtype), segments_of(rng, 4)
+    once = light_of(corners, receivers, segments, device, walk=walk)
+    twice = light_of(np.repeat(corners, 3, axis=0)[:, ::-1], receivers, segments, device, walk=walk)
+    np.testing.assert_allclose(twice.irradiance, once.irradiance, rtol=64 * float(np.finfo(dtype).eps), atol=1e-7)
+
+
+@WAYS
+@pytest.mark.parametrize("angle", [1e-2, 1.7e-4, 1e-6])
+def test_grazing(device: Device, walk: Any, dtype: Any, angle: float) -> None:
+    """A wall that stands on the floor hides half the line from a receiver low over it; 89.99 degrees is 1.7e-4."""
+    wall = trimesh.creation.box((0.01, 1.0, 0.2)).apply_translation((0.5, 0.5, 0.1)).triangles
+    floor = trimesh.creation.box((2.0, 2.0, 0.1)).apply_translation((0.0, 0.0, -0.05)).triangles
+    receivers = np.array([[[1.0, 0.0, angle, -1.0, 0.0, 0.0]]], dtype)
+    segments = np.array([[0.0, -0.5, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0, 1.0]])
+    half = segments.copy()
+    half[0, 4] = 0.0
+    corners = np.concatenate([wall, floor])
+    seen = light_of(corners, receivers, segments, device, walk=walk, clearance=1e-7).irradiance[0, 0]
+    free = light_of(NO_TRIANGLES, receivers, half, device, visibility="none").irradiance[0, 0]
+    assert seen == pytest.approx(free, rel=1e-5 if dtype == np.float32 else 1e-12)
+
+
 # ---- picks -----------------------------------------------------------------------------------------------------
 
 

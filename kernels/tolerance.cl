@@ -54,6 +54,10 @@ typedef struct {
     int faces;  // whether all of one face all of the other
 } meeting;
 
+// A runtime may call a function for fmin and fmax. A second number that is NaN does not count.
+inline real lower(real a, real b) { return b < a ? b : a; }
+inline real higher(real a, real b) { return b > a ? b : a; }
+
 inline real dot3(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 inline real length3(const real *a) { return sqrt(dot3(a, a)); }
 
@@ -79,8 +83,8 @@ inline receivers_block block_of(global const INPUT *receivers, global const real
         for (int k = 0; k < 3; k++) {
             place[k] = (real)(receivers[6 * i + k] - middle[k]);
             normal[k] = (real)receivers[6 * i + 3 + k];
-            block.low[k] = fmin(block.low[k], place[k]);
-            block.high[k] = fmax(block.high[k], place[k]);
+            block.low[k] = lower(block.low[k], place[k]);
+            block.high[k] = higher(block.high[k], place[k]);
         }
         const real per = (real)1 / sqrt(size);
         for (int k = 0; k < 3; k++) block.normal[k] += normal[k] *= per;
@@ -102,11 +106,11 @@ inline receivers_block block_of(global const INPUT *receivers, global const real
             off[k] = block.normals[3 * i + k] - block.normal[k];
         }
         const real height = -dot3(block.normals + 3 * i, from);
-        block.radius = fmax(block.radius, length3(from));
-        block.spread = fmax(block.spread, length3(off));
-        block.slab = fmax(block.slab, fabs(dot3(block.normal, from)));
-        block.most_height = fmax(block.most_height, height);
-        block.least_height = fmin(block.least_height, height);
+        block.radius = higher(block.radius, length3(from));
+        block.spread = higher(block.spread, length3(off));
+        block.slab = higher(block.slab, fabs(dot3(block.normal, from)));
+        block.most_height = higher(block.most_height, height);
+        block.least_height = lower(block.least_height, height);
     }
     return block;
 }
@@ -120,15 +124,15 @@ inline meeting meeting_of(const receivers_block *block, global const real *row, 
         reach += fabs(normal[k]) * side[k];
         const real low = block->normal[k] * (row[LOW + k] - row[CENTRE + k]);
         const real high = block->normal[k] * (row[HIGH + k] - row[CENTRE + k]);
-        front += fmax(low, high), back -= fmin(low, high);
+        front += higher(low, high), back -= lower(low, high);
     }
     // Points of a box reach no further along a normal than its sides, those of a disc no further than that.
     real across[3];
     cross3(normal, block->normal, across);
     const real sine = length3(across), cosine = fabs(dot3(normal, block->normal));
     const real between = length3(to), wide = row[RADIUS], lit_disc = cosine * row[SLAB] + sine * wide;
-    reach = fmin(reach, cosine * block->slab + sine * block->radius);
-    front = fmin(front, lit_disc), back = fmin(back, lit_disc);
+    reach = lower(reach, cosine * block->slab + sine * block->radius);
+    front = lower(front, lit_disc), back = lower(back, lit_disc);
     // How high receivers stand above the lit surfaces, and the lit above the receivers' planes.
     const real lit_turn = row[SPREAD] * (between + block->radius), got_turn = block->spread * (between + wide);
     const real lit = dot3(normal, to), got = -dot3(block->normal, to);
@@ -139,18 +143,18 @@ inline meeting meeting_of(const receivers_block *block, global const real *row, 
     met.faces = lit - lit_turn + row[LEAST_HEIGHT] - reach > 0 && got - got_turn + block->least_height - back > 0;
     real gap = 0;
     for (int k = 0; k < 3; k++) {
-        const real apart = fmax(fmax(block->low[k] - row[HIGH + k], row[LOW + k] - block->high[k]), (real)0);
+        const real apart = higher(higher(block->low[k] - row[HIGH + k], row[LOW + k] - block->high[k]), (real)0);
         gap += apart * apart;
     }
-    const real distance = fmax(sqrt(gap), between - block->radius - wide);
+    const real distance = higher(sqrt(gap), between - block->radius - wide);
     if (!(distance > 0)) {
         met.bound = INFINITY;
         return met;
     }
-    const real per = UP / distance, cosines = fmin(lit_most * per, (real)1) * fmin(got_most * per, (real)1);
+    const real per = UP / distance, cosines = lower(lit_most * per, (real)1) * lower(got_most * per, (real)1);
     // The integral of dt / r^2 over a line is pi / r at most.
     const real spread = single ? PI * per / row[LENGTH] : (real)INFINITY;
-    met.bound = cosines * fmin(per * per, spread) * PER_PI * UP;
+    met.bound = cosines * lower(per * per, spread) * PER_PI * UP;
     return met;
 }
 
@@ -159,7 +163,7 @@ inline real error_of(const receivers_block *block, global const real *row) {
     real gap = 0;
     for (int k = 0; k < 3; k++) {
         const real apart =
-            fmax(fmax(block->low[k] - row[CENTRE + k], row[CENTRE + k] - block->high[k]), (real)0);
+            higher(higher(block->low[k] - row[CENTRE + k], row[CENTRE + k] - block->high[k]), (real)0);
         gap += apart * apart;
     }
     const real per = UP / sqrt(gap), q = row[RADIUS] * per, arm = row[ARM] * per;
@@ -182,15 +186,15 @@ inline real most_of_segment(const receivers_block *block, global const real *lit
             beyond += normal[k] * (lit[7 + k] - place[k]);
             along += from * (lit[7 + k] - lit[4 + k]);
         }
-        const real part = clamp(along / (length * length), (real)0, (real)1);
+        const real part = lower(higher((real)0, along / (length * length)), (real)1);
         for (int k = 0; k < 3; k++) {
             const real off = place[k] - lit[4 + k] - part * (lit[7 + k] - lit[4 + k]);
             square += off * off;
         }
-        const real ahead = fmax(in_front, beyond);
+        const real ahead = higher(in_front, beyond);
         if (!(up > 0 && ahead > 0)) continue;
-        const real per = UP / sqrt(square), cosines = fmin(up * per, (real)1) * fmin(ahead * per, (real)1);
-        sum += block->costs[i] * cosines * fmin(per * per, PI * per / length);
+        const real per = UP / sqrt(square), cosines = lower(up * per, (real)1) * lower(ahead * per, (real)1);
+        sum += block->costs[i] * cosines * lower(per * per, PI * per / length);
     }
     return sum * power * PER_PI * UP;
 }
@@ -432,7 +436,7 @@ kernel void plan_light(global const INPUT *restrict receivers, global const real
             real most = met.bound > 0 ? met.bound * row[POWER] * block.cost : 0;
             if (count == 1 && met.bound > share) {
                 const real each_for_itself = most_of_segment(&block, placed + PLACED * place, row[LENGTH], row[POWER]);
-                most = fmin(most, each_for_itself);
+                most = lower(most, each_for_itself);
             }
             if (most == 0 || met.bound <= share || most <= share * row[POWER] * block.cost) {
                 out += count;

@@ -69,13 +69,19 @@ class PlannedLight:
         object.__setattr__(self, "_planner", self._new_planner())
 
     def __call__(
-        self, segments: npt.NDArray[Any], receivers: npt.NDArray[Any], weights: npt.NDArray[Any], reading: StripReading
+        self,
+        segments: npt.NDArray[Any],
+        receivers: npt.NDArray[Any],
+        weights: npt.NDArray[Any],
+        reading: StripReading,
+        *,
+        tolerance: float | None = None,
     ) -> PlannedIrradiance:
         """Return the light of a profile; arguments as of `LightPlanner`."""
         if len(segments) * receivers.shape[0] * receivers.shape[1] < _LEAST_PAIRS:
-            plan = LightPlan.of_all(segments, receivers, self.tolerance)
+            plan = LightPlan.of_all(segments, receivers, self.tolerance if tolerance is None else tolerance)
         else:
-            plan = self._planner(segments, receivers, weights, reading, device=self.device)
+            plan = self._planner(segments, receivers, weights, reading, tolerance=tolerance, device=self.device)
         if not plan.modelled:
             return PlannedIrradiance(np.zeros(receivers.shape[:2]), plan)
         rows, starts, picks = plan.tables(self._real, _LEAST_SEGMENTS, _LEAST_PICKS)

@@ -161,9 +161,7 @@ class LightPlanner:
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "clearance"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"LightPlanner.{name} is {value!r}, expected metres, 0 or more")
+            _check_metres(getattr(self, name), f"LightPlanner.{name}")
 
     def __call__(
         self,
@@ -172,6 +170,7 @@ class LightPlanner:
         weights: npt.NDArray[Any],
         direct: StripReading,
         *,
+        tolerance: float | None = None,
         device: Device | None = None,
     ) -> LightPlan:
         """Plan a profile.
@@ -186,9 +185,13 @@ class LightPlanner:
             (strips, n, 2): W, and W times sensor unit about u = 0, by 1 W/m^2.
         direct
             What else falls on the strips.
+        tolerance
+            Of this profile, if another one.
         device
             Where to plan; `Device.best` if left out.
         """
+        asked = self.tolerance if tolerance is None else tolerance
+        _check_metres(asked, "LightPlanner.tolerance")
         segments = np.asarray(segments, np.float64)
         if (
             receivers.ndim != 3
@@ -201,7 +204,13 @@ class LightPlanner:
             )
         tree = Clusters.build(segments)
         costs = direct.costs(weights)
-        return _planned(self, tree, segments, np.ascontiguousarray(receivers), costs, direct, device or Device.best())
+        places = np.ascontiguousarray(receivers)
+        return _planned(self, asked, tree, segments, places, costs, direct, device or Device.best())
+
+
+def _check_metres(value: float, what: str) -> None:
+    if not (math.isfinite(value) and value >= 0.0):
+        raise ValueError(f"{what} is {value!r}, expected metres, 0 or more")
 
 
 class _Found(NamedTuple):
@@ -298,6 +307,7 @@ def _rounding(scene: Scene | None, real: np.dtype[Any]) -> float:
 
 def _planned(
     planner: LightPlanner,
+    tolerance: float,
     tree: Clusters,
     segments: Reals,
     receivers: npt.NDArray[Any],
@@ -307,16 +317,16 @@ def _planned(
 ) -> LightPlan:
     strips = len(costs)
     of_strip = -(-receivers.shape[1] // BLOCK)
-    found, spent = _traversed(planner, tree, segments, receivers, costs, device)
+    found, spent = _traversed(planner, tolerance, tree, segments, receivers, costs, device)
     owner = np.repeat(np.arange(strips), of_strip)
     held = np.arange(found.picks.shape[1]) < found.counts[:, None]
     picks, errors = found.picks[held], found.errors[held].astype(np.float64)
     block = np.repeat(np.arange(len(found.counts)), found.counts)
     receivers_of = np.minimum(BLOCK, receivers.shape[1] - BLOCK * (np.arange(len(found.counts)) % of_strip))
     worst = np.minimum(spent[:, 1], direct.widest())
-    kept, lost = _kept(picks, errors, owner[block], spent, worst, planner.tolerance)
+    kept, lost = _kept(picks, errors, owner[block], spent, worst, tolerance)
     bound = np.minimum(np.where(lost > 0.0, lost, 0.0), worst)
-    return _assembled(planner, tree, segments, picks[kept], block[kept], bound, worst, receivers_of)
+    return _assembled(tolerance, tree, segments, picks[kept], block[kept], bound, worst, receivers_of)
 
 
 def _kept(
@@ -342,7 +352,7 @@ def _kept(
 
 
 def _assembled(
-    planner: LightPlanner,
+    tolerance: float,
     tree: Clusters,
     segments: Reals,
     picks: Integers,
@@ -377,7 +387,7 @@ def _assembled(
         np.concatenate([segments, tree.aggregates[nodes]]),
         starts,
         np.where(clear, ~numbers, numbers).astype(np.int32),
-        planner.tolerance,
+        tolerance,
         bound,
         worst,
         counts,
@@ -386,6 +396,7 @@ def _assembled(
 
 def _traversed(
     planner: LightPlanner,
+    tolerance: float,
     tree: Clusters,
     segments: Reals,
     receivers: npt.NDArray[Any],
@@ -400,7 +411,7 @@ def _traversed(
     placed = np.zeros((len(tree.spans) // 2, _PLACED))
     placed[: len(segments)] = _placed(segments[tree.order], middle)
     with np.errstate(divide="ignore", invalid="ignore"):
-        shares = planner.tolerance / (costs.sum(axis=1) * tree.power)
+        shares = tolerance / (costs.sum(axis=1) * tree.power)
     shares = np.where(np.isnan(shares), 0.0, np.minimum(shares, _largest_of(real)))
     given = costs.astype(real), rows.astype(real), placed.astype(real)
     of_strip = -(-receivers.shape[1] // BLOCK)
@@ -408,7 +419,7 @@ def _traversed(
     while True:
         found = _run(planner, receivers, (shares * generosity).astype(real), tree.spans, *given, device=device)
         spent = np.add.reduceat(found.spent, np.arange(len(costs)) * of_strip, axis=0)
-        over = (spent[:, 0] > planner.tolerance) & (generosity > 1.0)
+        over = (spent[:, 0] > tolerance) & (generosity > 1.0)
         if not over.any():
             return found, spent
         generosity[over] = 1.0

@@ -185,13 +185,13 @@ def planes(*, wall: bool = False) -> Scene:
 @TWO_WAYS
 def test_work_falls_as_the_tolerance_rises(device: Device, walk: Any) -> None:
     segments, receivers, weights, reading = valley(64, 8, 64)
-    works = []
+    planner, works = LightPlanner(tolerance=1.0, scene=planes(), walk=walk), []
     for tolerance in (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 0.1):
-        planner = LightPlanner(tolerance=tolerance, scene=planes(), walk=walk)
-        plan = planner(segments, receivers, weights, reading, device=device)
+        plan = planner(segments, receivers, weights, reading, tolerance=tolerance, device=device)
         works.append(plan.counts["work"])
         assert np.all(plan.bound <= tolerance)
         assert plan.counts["exact"] + plan.counts["clustered"] + plan.counts["left out"] == plan.counts["pairs"]
+        assert plan.tolerance == tolerance
     assert works == sorted(works, reverse=True)
     assert works[0] > 4 * works[3]
     assert works[-1] == 0

@@ -113,6 +113,12 @@ class Bvh:
             1,
         )
 
+    @property
+    def radius(self) -> float:
+        """Of a sphere about the middle that the triangles lie well within, metres."""
+        low, high = self.boxes[0, :3].min(axis=1), self.boxes[0, 3:].max(axis=1)
+        return 1.01 * float(np.linalg.norm(np.maximum(high, -low))) if len(self.corners) else 0.0
+
     def tables(self, real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
         """Return nodes, children, axes, leaves, triangles as kernels/bvh.h takes them."""
         reach = float(np.abs(self.corners).max(initial=0.0))

@@ -84,7 +84,8 @@ class _Rays(Operation[R]):
         each = _RAYS_PER_STRIP if strip else 1
         items = -(-count // each)
         tree = self.scene.bvh
-        present = {"STRIP": strip, "SEGMENTS": kernel == "any_hit"}
+        place = np.dtype(np.float64 if device.has_double else np.float32)
+        present = {"STRIP": strip, "SEGMENTS": kernel == "any_hit", "WIDE_PLACES": device.has_double}
         return Launch(
             stem="rays",
             kernel=kernel,
@@ -98,7 +99,8 @@ class _Rays(Operation[R]):
             outputs=outputs,
             arguments=[
                 *tree.tables(real),
-                tree.middle.astype(dtype),
+                tree.middle.astype(place),
+                place.type(tree.radius),
                 real.type(self.clearance),
                 np.uint64(count),
                 np.uint64(each),
@@ -123,7 +125,7 @@ class ClosestHit(_Rays[Hits]):
         Metres from the origin within which nothing counts; what lies in the origin never does.
     precision
         Of the arithmetic and the outputs; None follows the input. "single" takes float64 rays too: the scene's middle
-        is subtracted in double.
+        is subtracted in double, and of a ray from afar only the part about the scene is traced.
     walk
         "strip" (a ray against 16 boxes in a vector, for CPU runtimes), "item" (a work-item per ray, for GPUs), "auto".
 
@@ -135,7 +137,8 @@ class ClosestHit(_Rays[Hits]):
     Notes
     -----
     Error: places are rounded to the real type once, relative to the scene's middle, so the distance is off by some
-    roundings of the scene's size and of the distance, over the cosine of incidence.
+    roundings of the scene's size and of the distance, over the cosine of incidence; however far the origin is, on
+    devices with double.
     """
 
     Result: ClassVar[type[Any]] = Hits

@@ -11,7 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.simulation.bvh import Bvh
+from gpuvision.simulation.bvh import Bvh, sorted_by
+
+# An odd number of 64 bits that looks like noise (of the golden ratio).
+_MIXER = 0x9E3779B97F4A7C15
 
 Integers = npt.NDArray[np.int64]
 
@@ -166,7 +169,7 @@ def _defects(corners: npt.NDArray[np.float64]) -> Defects:
     good = np.flatnonzero(finite & ~flat)
     if not len(good):
         return Defects(_numbers(np.flatnonzero(~finite)), _numbers(np.flatnonzero(flat)), (), ())
-    points = np.unique(safe[good].reshape(-1, 3) + 0.0, axis=0, return_inverse=True)[1].reshape(-1, 3)
+    points = _numbered(safe[good].reshape(-1, 3)).reshape(-1, 3)
     crowded, inverted = _winding(points)
     return Defects(
         _numbers(np.flatnonzero(~finite)),
@@ -188,6 +191,24 @@ def _is_flat(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     return np.asarray(area <= rounding)
 
 
+def _numbered(points: npt.NDArray[np.float64]) -> Integers:
+    """Return a number for each point (n, 3), the same for the same."""
+    columns = np.ascontiguousarray(points.T) + 0.0
+    mixed = np.zeros(len(points), np.uint64)
+    for column in columns.view(np.uint64):
+        mixed = (mixed ^ column) * np.uint64(_MIXER)
+        mixed ^= mixed >> np.uint64(32)
+    # A number of 63 bits for each; the places say whether two have the same one by chance.
+    order = sorted_by((mixed >> np.uint64(1)).astype(np.int64))
+    mixed, columns = mixed[order] >> np.uint64(1), columns[:, order]
+    is_new = np.append(True, mixed[1:] != mixed[:-1])
+    if np.any((columns[:, 1:] != columns[:, :-1]).any(axis=0) & ~is_new[1:]):
+        return np.asarray(np.unique(points + 0.0, axis=0, return_inverse=True)[1]).reshape(-1)
+    numbers = np.empty(len(points), np.int64)
+    numbers[order] = np.cumsum(is_new) - 1
+    return numbers
+
+
 def _winding(points: Integers) -> tuple[Integers, Integers]:
     """Return which triangles hang on a crowded edge (or cannot be wound), and which are wound against the most."""
     from scipy.sparse import coo_array
@@ -197,13 +218,15 @@ def _winding(points: Integers) -> tuple[Integers, Integers]:
     tail, head = points.ravel(), np.roll(points, -1, axis=1).ravel()
     face = np.repeat(np.arange(count), 3)
     edge = np.minimum(tail, head) * (points.max() + 1) + np.maximum(tail, head)
-    order = np.argsort(edge, kind="stable")
+    order = sorted_by(edge)
     edge, face, forward = edge[order], face[order], (tail < head)[order]
-    first = np.flatnonzero(np.diff(edge, prepend=-1))
+    first = np.append(0, np.flatnonzero(edge[1:] != edge[:-1]) + 1)
     uses = np.diff(first, append=len(edge))
     crowded = np.unique(face[np.repeat(uses > 2, uses)])
     one = first[uses == 2]
     against = forward[one] == forward[one + 1]
+    if not against.any():
+        return crowded, np.zeros(0, np.int64)
     # Every triangle twice, as it is and turned: neighbours join the sheets in which they are wound alike.
     a, b = face[one], face[one + 1]
     rows, columns = np.concatenate([a, a + count]), np.concatenate([b + count * against, b + count * ~against])

@@ -240,6 +240,35 @@ def test_far_from_the_origin_in_single(device: Device, rng: np.random.Generator)
 
 
 @WAYS
+def test_rays_from_afar(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
+    """From a million times the scene's size they meet it, in single, as from nearby."""
+    corners, away = soup(rng, 200), np.array([3e6, -1e6, 2e6])
+    far = np.hstack([rng.normal(0.0, 1e6, (400, 3)) + away, np.zeros((400, 3))]).astype(dtype)
+    targets = np.round(rng.uniform(-1.0, 1.0, (400, 3)) * 256.0) / 256.0
+    rays = far.astype(np.float64)
+    rays[:, 3:] = targets - rays[:, :3]
+    sure = far_from_edges(corners, rays, 1e-4)
+    assert sure.mean() > 0.9
+    triangle, distance, u, v = reference.closest(corners, rays)
+    hits = ClosestHit(scene=Scene(corners), walk=walk, precision="single")(rays, device=device)
+    np.testing.assert_array_equal(hits.triangle[sure], triangle[sure])
+    met = sure & (triangle >= 0)
+    assert 0.3 < met.mean() < 0.99
+    np.testing.assert_allclose(hits.barycentric[met], np.column_stack([u, v])[met], atol=1e-4)
+    np.testing.assert_allclose(hits.distance[met], distance[met], rtol=4 * eps_of(np.float32))
+    segments = np.hstack([far[:, :3], targets.astype(dtype)])
+    exact = segments.astype(np.float64)
+    sure &= reference.occluded(corners, exact, -1e-9) == reference.occluded(corners, exact, 1e-9)
+    result = AnyHit(scene=Scene(corners), walk=walk)(segments, device=device)
+    np.testing.assert_array_equal(result.occluded[sure], reference.occluded(corners, exact)[sure])
+    # Those that point away, and those that end before it, meet nothing.
+    rays[:, 3:] *= -1.0
+    assert (ClosestHit(scene=Scene(corners), walk=walk)(rays.astype(dtype), device=device).triangle == -1).all()
+    segments[:, 3:] = segments[:, :3] * dtype(0.5)
+    assert not AnyHit(scene=Scene(corners), walk=walk)(segments, device=device).occluded.any()
+
+
+@WAYS
 def test_writes_only_its_outputs(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
     scene = Scene(soup(rng, 100))
     for operation in (ClosestHit(scene=scene, walk=walk), AnyHit(scene=scene, walk=walk)):

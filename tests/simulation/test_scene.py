@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from gpuvision.simulation.scene import Scene
+from gpuvision.host import Device
+from gpuvision.simulation.rays import ClosestHit
+from gpuvision.simulation.scene import Scene, _numbered
 
 
 @pytest.fixture
@@ -87,6 +89,36 @@ def test_three_on_an_edge(box: np.ndarray) -> None:
     defects = Scene(np.concatenate([box, fin])).defects
     assert {0, 12} <= set(defects.non_manifold)
     assert len(defects.non_manifold) == 3
+
+
+def test_the_same_points_have_the_same_number(rng: np.random.Generator) -> None:
+    """Whatever the sign of a zero, and though they differ in the last bit only."""
+    some = np.array([0.0, -0.0, 1.0, -1.0, np.nextafter(1.0, 2.0), 5e-324, 1e300])
+    points = rng.choice(some, (3000, 3))
+    numbers = _numbered(points)
+    _, first, expected = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
+    np.testing.assert_array_equal(numbers, numbers[first][expected])
+    assert len(np.unique(numbers)) == len(first)
+
+
+@pytest.mark.slow
+def test_a_million_triangles(device: Device, rng: np.random.Generator) -> None:
+    """A sphere of 1.3 million: each triangle once in the tree, the turned ones found, and rays that meet it."""
+    mesh = trimesh.creation.icosphere(8)
+    corners = np.array(mesh.triangles)
+    wrong = rng.choice(len(corners), 1000, replace=False)
+    corners[wrong] = corners[wrong][:, ::-1]
+    scene = Scene(corners)
+    assert scene.defects.inverted == tuple(sorted(wrong))
+    members = scene.bvh.members
+    np.testing.assert_array_equal(np.sort(members[members >= 0]), np.arange(len(corners)))
+    directions = rng.normal(size=(20_000, 3))
+    hits = ClosestHit(scene=scene)(np.hstack([np.zeros((20_000, 3)), directions]), device=device)
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    met = scene.corners[hits.triangle]
+    weights = np.column_stack([1.0 - hits.barycentric.sum(axis=1), hits.barycentric])
+    np.testing.assert_allclose(np.einsum("nc,ncx->nx", weights, met), unit * hits.distance[:, None], atol=1e-12)
+    assert not hits.status.any()
 
 
 def test_a_moebius_strip_has_no_winding() -> None:

@@ -39,7 +39,7 @@ def cases(device: Device) -> Iterator[Case]:
 def _room(device: Device, receivers: int) -> Case:
     box = trimesh.creation.box((1.0, 0.8, 0.6))
     box.invert()
-    patches = Patches.of(Scene.of(box), size=0.1)
+    patches = Patches.of(Scene.of(box), size=0.1, both_sides=False)
     points = patches.points[0]
     chosen = np.linspace(0, len(points) - 1, receivers).astype(int)
     points = points[chosen]

@@ -43,7 +43,7 @@ def cut(scene: Scene, size: float, both_sides: bool | None) -> Cut:
     numbers = scene.bvh.numbers
     corners = scene.corners[numbers]
     if both_sides is None or both_sides:
-        back = _is_open(corners) if both_sides is None else np.ones(len(corners), bool)
+        back = ~_is_outside(corners) if both_sides is None else np.ones(len(corners), bool)
         corners = np.concatenate([corners, corners[back][:, ::-1]])
         numbers = np.concatenate([numbers, numbers[back]])
     small = longest(corners)[0] < 0.5 * size
@@ -119,8 +119,8 @@ def _linked(count: int, one: Integers, other: Integers) -> Integers:
     return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
 
-def _is_open(corners: Reals) -> Flags:
-    """Whether triangles hang together with an edge that is not shared by two: their backs can be seen."""
+def _is_outside(corners: Reals) -> Flags:
+    """Whether triangles are of closed surfaces with their front outside: nobody outside sees their backs."""
     edge, face = _edges(corners)
     order = np.argsort(edge, kind="stable")
     edge, face = edge[order], face[order]
@@ -128,9 +128,10 @@ def _is_open(corners: Reals) -> Flags:
     uses = np.bincount(np.cumsum(first) - 1)[np.cumsum(first) - 1]
     again = np.flatnonzero(~first)
     label = _linked(len(corners), face[again - 1], face[again])
-    is_open = np.zeros(int(label.max(initial=-1)) + 1, bool)
-    is_open[label[face[uses != 2]]] = True
-    return np.asarray(is_open[label])
+    a, b, c = np.moveaxis(corners - corners.mean(axis=(0, 1)), 1, 0)
+    outside = np.bincount(label, np.sum(a * np.cross(b, c), axis=1)) > 0.0
+    outside[label[face[uses != 2]]] = False
+    return np.asarray(outside[label])
 
 
 def _pieces(corners: Reals, material: npt.NDArray[np.int32], size: float) -> Integers:

@@ -101,7 +101,8 @@ class Patches:
         size
             Metres.
         both_sides
-            Whether the back of every triangle is a surface, too. None: where surfaces are not closed.
+            Whether the back of every triangle is a surface, too. None: but for closed surfaces that have their front
+            outside, seen from outside.
         """
         if not (math.isfinite(size) and size > 0.0):
             raise ValueError(f"Patches.of: size is {size!r}, expected metres, more than 0")

@@ -31,7 +31,7 @@ def stripe(*, power: float = 1.0) -> LitSegments:
 
 def solved(size: float, albedo: Any, device: Device, *, lid: bool = False) -> Bounces:
     scene = room(1.0, 0.8, 0.6, lid=lid)
-    whole = Bounces.of(scene, albedo, size=size, device=device)
+    whole = Bounces.of(scene, albedo, size=size, both_sides=False, device=device)
     return Bounces(patches=whole.patches, albedo=whole.albedo, device=device)
 
 
@@ -161,7 +161,7 @@ def test_what_a_body_stands_on_is_not_lit(device: Device) -> None:
     part = trimesh.creation.box((0.3, 0.3, 0.3)).apply_translation((0.05, -0.1, -0.15))
     scene = Scene(np.concatenate([room(1.0, 0.8, 0.6).corners, part.triangles]))
     albedo = 0.9
-    box = Bounces.of(scene, [albedo], size=0.2, device=device)
+    box = Bounces.of(scene, [albedo], size=0.2, both_sides=False, device=device)
     arrival = box.arrival(stripe())
     free = box._surface.area
     assert arrival @ free == pytest.approx(1.0, rel=3e-3)
@@ -171,7 +171,7 @@ def test_what_a_body_stands_on_is_not_lit(device: Device) -> None:
 
 
 def test_patches_in_corners_are_graded(device: Device) -> None:
-    patches = Patches.of(room(1.0, 0.8, 0.6), size=0.5)
+    patches = Patches.of(room(1.0, 0.8, 0.6), size=0.5, both_sides=False)
     finer = graded(patches, 3, device=device)
     assert finer.area.sum() == pytest.approx(patches.area.sum(), rel=1e-12)
     assert patches.count < finer.count < 8 * patches.count
@@ -210,7 +210,7 @@ def test_no_light_at_all(device: Device) -> None:
 
 
 def test_what_is_refused() -> None:
-    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0)
+    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
     with pytest.raises(TypeError, match="expected Patches"):
         Bounces(patches=None, albedo=[0.5])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"expected \(\d+,\)"):

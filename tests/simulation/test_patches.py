@@ -109,7 +109,7 @@ def test_a_closed_room_fills_the_view(device: Device, seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = 10.0 ** (rng.uniform(-6.0, 3.0) + rng.uniform(-1.0, 1.0, 3))
     scene = room(*size)
-    patches = Patches.of(scene, size=float(size.max()))
+    patches = Patches.of(scene, size=float(size.max()), both_sides=False)
     receivers = np.concatenate([rng.uniform(-0.5, 0.5, (16, 3)) * size, rng.normal(size=(16, 3))], axis=1)
     factors = FormFactors(patches=patches)(receivers, device=device).factors
     np.testing.assert_allclose(factors.sum(axis=1), 1.0, rtol=1e-12)
@@ -149,7 +149,7 @@ def test_at_an_edge_the_factor_is_that_of_the_angle(device: Device) -> None:
 @TWO_WAYS
 def test_light_is_the_sum_of_factors(device: Device, walk: Any) -> None:
     rng = np.random.default_rng(11)
-    patches = Patches.of(room(1.0, 2.0, 3.0), size=1.0)
+    patches = Patches.of(room(1.0, 2.0, 3.0), size=1.0, both_sides=False)
     receivers = np.concatenate([rng.uniform(-0.5, 0.5, (3, 7, 3)), rng.normal(size=(3, 7, 3))], axis=2)
     exitance = rng.uniform(0.0, 2.0, patches.count)
     exitance[::3] = 0.0
@@ -212,7 +212,7 @@ def test_one_ray_agrees_with_any_hit(device: Device, rng: np.random.Generator) -
 
 @TWO_WAYS
 def test_receivers_that_are_not_finite_are_flagged(device: Device, walk: Any) -> None:
-    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0)
+    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
     receivers = np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 1.0], (RECEIVERS, 1)).astype(np.float32)
     receivers[3, 0], receivers[5, 4], receivers[7, 3:] = np.nan, np.inf, 0.0
     wrong = np.isin(np.arange(RECEIVERS), (3, 5, 7))
@@ -224,7 +224,7 @@ def test_receivers_that_are_not_finite_are_flagged(device: Device, walk: Any) ->
 
 
 def test_it_writes_nothing_but_its_outputs(device: Device) -> None:
-    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0)
+    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
     receivers = np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 1.0], (RECEIVERS, 1)).astype(np.float32)
     operation = FormFactors(patches=patches)
     plain = operation(receivers, device=device)
@@ -300,6 +300,7 @@ def test_backs_of_open_surfaces() -> None:
     assert Patches.of(scene, size=2.0).count == 14
     assert Patches.of(scene, size=2.0, both_sides=True).count == 26
     assert Patches.of(Scene(box[1:]), size=2.0).count == 22
+    assert Patches.of(Scene(box[:, ::-1]), size=2.0).count == 24
     fine = trimesh.creation.icosphere(4, 0.1)
     both = Patches.of(Scene(np.asarray(fine.triangles)), size=0.05, both_sides=True)
     assert both.area.sum() == pytest.approx(2.0 * fine.area, rel=1e-12)
@@ -324,7 +325,7 @@ def test_a_fine_mesh_shines_as_a_coarse_one(device: Device) -> None:
 
 
 def test_halving_leaves_the_rest_alone() -> None:
-    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0)
+    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
     wanted = np.zeros(patches.count, bool)
     wanted[[1, 4]] = True
     finer = patches.halved(wanted)

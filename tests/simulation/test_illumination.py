@@ -330,3 +330,21 @@ def test_refused(wrong: dict[str, Any], message: str) -> None:
         LightSheet(transport=UPRIGHT, **wrong)
     with pytest.raises(TypeError, match="expected a StraightTransport"):
         LightSheet(transport="upright")  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_a_million_triangles() -> None:
+    """A rough field of heights without a gap: every profile gets all the light of its width."""
+    x = np.linspace(-0.05, 0.05, 708)
+    X, Y = np.meshgrid(x, x)
+    Z = 2e-3 * np.sin(200.0 * X) * np.cos(170.0 * Y) + 2e-5 * np.random.default_rng(1).normal(size=X.shape)
+    field = np.stack([X, Y, Z], axis=-1)
+    a, b, c, d = field[:-1, :-1], field[:-1, 1:], field[1:, 1:], field[1:, :-1]
+    halves = [np.stack(each, axis=-2).reshape(-1, 3, 3) for each in ((a, b, c), (a, c, d))]
+    scene, sheet = Scene(np.concatenate(halves)), LightSheet(transport=UPRIGHT)
+    places = np.linspace(-0.0499, 0.0499, 1000)
+    for L in places:
+        lit = sheet.lit(scene, float(L))
+        assert lit.total() == pytest.approx(0.1, rel=1e-12)
+        assert len(lit.power) >= 1414
+    assert len(scene.corners) > 999_000

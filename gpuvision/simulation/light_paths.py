@@ -104,7 +104,7 @@ class LightPaths:
     lines: SightLines = field(init=False, repr=False)
     _bounces: Bounces | None = field(init=False, repr=False)
     _bound: dict[int, Bound[Any]] = field(init=False, repr=False, default_factory=dict)
-    _planned: dict[float, PlannedLight] = field(init=False, repr=False, default_factory=dict)
+    _planned: PlannedLight = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for path in self.paths:
@@ -124,6 +124,8 @@ class LightPaths:
             device=device,
         )
         mirrors = Mirrors(sight=self.sight, scene=self.scene, materials=self.materials, device=device)
+        planned = PlannedLight(scene=self.scene, tolerance=self.tolerance, device=device)
+        object.__setattr__(self, "_planned", planned)
         object.__setattr__(self, "_direct", direct)
         object.__setattr__(self, "_mirrors", mirrors)
         object.__setattr__(self, "lines", lines)
@@ -187,10 +189,9 @@ class LightPaths:
         if tolerance == 0.0:
             pairs = float(len(segments.exitance) * np.count_nonzero(seen.weights))
             return self.irradiance(seen, segments), {"pairs": pairs, "pairs exact": pairs}
-        if tolerance not in self._planned:
-            self._planned[tolerance] = PlannedLight(scene=self.scene, tolerance=tolerance, device=self.device)
         weights = reading.weights(seen.weights, self.lines.u)
-        light, plan = self._planned[tolerance](segment_rows(segments), seen.receivers, weights, reading)
+        rows = segment_rows(segments)
+        light, plan = self._planned(rows, seen.receivers, weights, reading, tolerance=tolerance)
         told = {f"pairs {name}": float(plan.counts[name]) for name in ("exact", "clustered", "left out")}
         bound = {"bound of pairs left out [m]": float(plan.bound.max(initial=0.0))}
         return light, {"pairs": float(plan.counts["pairs"])} | told | bound

@@ -18,8 +18,6 @@ Reals = npt.NDArray[np.float64]
 
 # Shapes go by powers of two, from these on, so that few of them are ever bound.
 _LEAST_SEGMENTS, _LEAST_PICKS = 64, 4096
-# Of fewer pairs nothing is planned.
-_LEAST_PAIRS = 1 << 15
 
 
 class PlannedIrradiance(NamedTuple):
@@ -51,10 +49,6 @@ class PlannedLight:
         As of `VisibleLight`.
     device
         None: `Device.best`.
-
-    Notes
-    -----
-    So few pairs that a plan takes longer than they do are all computed, whatever the tolerance.
     """
 
     scene: Scene
@@ -78,10 +72,7 @@ class PlannedLight:
         tolerance: float | None = None,
     ) -> PlannedIrradiance:
         """Return the light of a profile; arguments as of `LightPlanner`."""
-        if len(segments) * receivers.shape[0] * receivers.shape[1] < _LEAST_PAIRS:
-            plan = LightPlan.of_all(segments, receivers, self.tolerance if tolerance is None else tolerance)
-        else:
-            plan = self._planner(segments, receivers, weights, reading, tolerance=tolerance, device=self.device)
+        plan = self._planner(segments, receivers, weights, reading, tolerance=tolerance, device=self.device)
         if not plan.modelled:
             return PlannedIrradiance(np.zeros(receivers.shape[:2]), plan)
         rows, starts, picks = plan.tables(self._real, _LEAST_SEGMENTS, _LEAST_PICKS)

@@ -63,24 +63,6 @@ class LightPlan:
     worst: Reals
     counts: Mapping[str, int]
 
-    @classmethod
-    def of_all(cls, segments: npt.NDArray[Any], receivers: npt.NDArray[Any], tolerance: float) -> LightPlan:
-        """Return the plan that leaves out nothing, whatever the tolerance; what that would do is not known."""
-        strips, each, _ = receivers.shape
-        blocks, pairs = strips * -(-each // BLOCK), strips * each * len(segments)
-        picks = np.tile(np.arange(len(segments), dtype=np.int32), blocks)
-        starts = np.arange(blocks + 1, dtype=np.int32) * np.int32(len(segments))
-        counts = {"segments": len(segments), "pairs": pairs, "exact": pairs, "clear": 0, "clustered": 0, "left out": 0}
-        return cls(
-            np.asarray(segments, np.float64),
-            starts,
-            picks,
-            tolerance,
-            np.zeros(strips),
-            np.full(strips, np.inf),
-            {**counts, "work": pairs},
-        )
-
     @property
     def modelled(self) -> bool:
         """Whether anything is left to compute."""

@@ -9,7 +9,6 @@ import pytest
 
 from gpuvision.host import Device
 from gpuvision.ranging.range_image import StraightTransport
-from gpuvision.simulation import planned_light
 from gpuvision.simulation.planned_light import PlannedLight
 from gpuvision.simulation.range_error import StripReading
 from gpuvision.simulation.scene import Scene
@@ -50,13 +49,6 @@ def strips(triangles: Any, count: int, each: int) -> Any:
     return np.concatenate([place, np.where(normal[number][..., 2:] < -0.5, -1.0, 1.0) * normal[number]], axis=2)
 
 
-@pytest.fixture
-def planned(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However few the pairs are."""
-    monkeypatch.setattr(planned_light, "_LEAST_PAIRS", 0)
-
-
-@pytest.mark.usefixtures("planned")
 @pytest.mark.parametrize("tolerance", [0.0, 1e-6, 1e-5, 1e-4])
 def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
     triangles, segments = boxes(np.random.default_rng(0), 12)
@@ -79,7 +71,6 @@ def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
         np.testing.assert_allclose(ours.irradiance, exact, rtol=2e-5, atol=1e-6 * exact.max())
 
 
-@pytest.mark.usefixtures("planned")
 def test_what_is_not_modelled_is_dark(device: Device) -> None:
     triangles, segments = boxes(np.random.default_rng(0), 3)
     receivers = strips(triangles, 2, 16)
@@ -88,21 +79,6 @@ def test_what_is_not_modelled_is_dark(device: Device) -> None:
     result = PlannedLight(scene=Scene(triangles), tolerance=1e-3, device=device)(segments, receivers, weights, reading)
     assert not result.plan.modelled
     assert not result.irradiance.any()
-
-
-def test_few_pairs_are_all_computed(device: Device) -> None:
-    triangles, segments = boxes(np.random.default_rng(0), 4)
-    receivers = strips(triangles, 2, 20)
-    weights = np.full((2, 20, 2), 1e-4)
-    reading = StripReading(power=np.ones(2), moment=np.zeros(2), slope=np.ones(2), limits=(-0.03, 0.03))
-    scene = Scene(triangles)
-    result = PlannedLight(scene=scene, tolerance=1e-3, device=device)(segments, receivers, weights, reading)
-    exact = VisibleLight(scene=scene, segments=len(segments), precision="single")(
-        receivers, 0.0 * weights, segments, device=device
-    ).irradiance
-    np.testing.assert_allclose(result.irradiance, exact, rtol=1e-5, atol=1e-6 * exact.max())
-    assert result.plan.counts["exact"] == result.plan.counts["pairs"]
-    assert result.plan.report()["bound if left out"] is None
 
 
 def test_a_sensor_says_how_its_readings_follow_light() -> None:

@@ -20,6 +20,8 @@ Integers = npt.NDArray[np.int64]
 
 # A fan's rays reach no farther from the source than a thousand times its height, on the level H = 0.
 _FLATTEST = 1e-3
+# What counts as one place, beside its coordinates, and as one direction or power.
+_TOUCHING, _EVEN = 1e-14, 1e-9
 
 
 class LitLine(NamedTuple):
@@ -50,6 +52,25 @@ class LitLine(NamedTuple):
     def total(self) -> float:
         """Return the power that arrives on all segments, W."""
         return float(self.lengths @ self.power)
+
+    def joined(self, kind: npt.ArrayLike) -> LitLine:
+        """Return fewer segments: those that touch, one after another, in one plane, of one power and kind, as one.
+
+        Parameters
+        ----------
+        kind
+            (m,) integers, such as the materials of the segments' triangles. A joined segment keeps the first triangle.
+        """
+        kind = np.asarray(kind)
+        gap = np.abs(self.ends[1:, 0] - self.ends[:-1, 1]).max(axis=1, initial=0.0)
+        size = np.abs(self.ends[1:, 0]).max(axis=1, initial=0.0)
+        turn = np.abs(np.diff(self.normals, axis=0)).max(axis=1, initial=0.0)
+        alike = (gap <= _TOUCHING * size) & (turn <= _EVEN) & (np.diff(kind) == 0)
+        alike &= np.abs(np.diff(self.power)) <= _EVEN * self.power[1:]
+        first = np.flatnonzero(np.append(True, ~alike)[: len(self.power)])
+        last = np.append(first[1:], len(self.power))[: len(first)] - 1
+        ends = np.stack([self.ends[first, 0], self.ends[last, 1]], axis=1)
+        return LitLine(ends, self.normals[first], self.triangle[first], self.power[first])
 
 
 @dataclass(frozen=True, kw_only=True)

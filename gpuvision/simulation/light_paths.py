@@ -212,6 +212,7 @@ class LightPaths:
 
     def _diffuse(self, lit: LitLine) -> LitSegments:
         assert self.scene.material is not None  # set by Scene itself
+        lit = lit.joined(self.scene.material[lit.triangle])
         albedo = np.array([each.albedo for each in self.materials])[self.scene.material[lit.triangle]]
         return LitSegments(lit.ends, lit.normals, albedo * lit.power)
 

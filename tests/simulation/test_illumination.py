@@ -232,6 +232,29 @@ def test_uniformity_of_a_fan() -> None:
     assert 40 < len(lit.power) < 90
 
 
+def test_joined(rng: np.random.Generator) -> None:
+    """A finely divided box on a plate in a fine mesh: joined, as many segments as there are faces and materials."""
+    ground, box = trimesh.creation.box((2.0, 2.0, 0.2)), trimesh.creation.box((0.5, 0.5, 0.5))
+    for _ in range(4):
+        ground, box = ground.subdivide(), box.subdivide()
+    scene = Scene.of([ground, box])
+    lit = LightSheet(transport=TILTED).lit(scene, 0.013)
+    joined = lit.joined(scene.material[lit.triangle])
+    assert len(lit.power) > 40
+    assert 3 <= len(joined.power) <= 6
+    assert joined.total() == pytest.approx(lit.total(), rel=1e-13)
+    lengths, at = np.cumsum(lit.lengths), np.cumsum(joined.lengths)
+    np.testing.assert_allclose(np.abs(lengths[:, None] - at).min(axis=0), 0.0, atol=1e-12)
+    apart = lit.joined(np.arange(len(lit.power)))
+    for both, alone in zip(apart, lit, strict=True):
+        np.testing.assert_array_equal(both, alone)
+    nothing = LightSheet(transport=UPRIGHT).lit(scene, 9.0).joined(np.zeros(0, int))
+    assert nothing.ends.shape == (0, 2, 3)
+    bent = Scene.of(trimesh.creation.icosphere(3, 0.5))
+    curve = LightSheet(transport=UPRIGHT).lit(bent, 0.1)
+    assert len(curve.joined(np.zeros(len(curve.power), int)).power) == len(curve.power)
+
+
 def test_coincident_faces_share_nothing() -> None:
     """Of two faces in one place the first one gets all the light."""
     lit = LightSheet(transport=UPRIGHT).lit(Scene(np.concatenate([plate(1.0, 1.0), plate(1.0, 1.0)])), 0.3)

@@ -26,6 +26,10 @@ def profile(
     as_json: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", parser=named_path, help="Write the rows there.")
     ] = None,
+    plots: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", parser=named_path, help="Draw how times grow, and what accuracy costs, there."),
+    ] = None,
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
 
@@ -49,6 +53,11 @@ def profile(
     )
     if as_json is not None:
         run.write(as_json)
+    if plots is not None:
+        from gpuvision.profiling.plots import draw_plots
+
+        plots.mkdir(parents=True, exist_ok=True)
+        draw_plots(plots, run.rows)
     _show(list(run.rows))
     if not run.valid:
         typer.echo("not valid: the machine changed its speed while it was measured; run it again", err=True)

@@ -1,0 +1,77 @@
+"""Pictures of a run: how time grows with the work, and what accuracy costs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from gpuvision.host.files import replacing
+from gpuvision.profiling.harness import Row
+
+_SIZE, _DPI = (8.0, 3.6), 150
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+_GROWTH = re.compile(r"^growth/(?:(\w+)-)?x(\d+)$")
+
+
+def draw_plots(folder: str | Path, rows: Sequence[Row]) -> list[str]:
+    """Draw what the rows hold into a folder, as PNG; return the names of the files.
+
+    ``growth.png``: times over the work, of all cases ``growth/...``; ``tolerance.png``: times and errors over the
+    tolerance asked for, of the cases that have one.
+    """
+    drawn = []
+    for name, draw, chosen in (
+        ("growth.png", _growth, [row for row in rows if _GROWTH.match(row.case)]),
+        ("tolerance.png", _tolerance, [row for row in rows if "tolerance" in row.facts and "/" in row.case]),
+    ):
+        some = [row for row in chosen if name == "growth.png" or not row.case.startswith("growth/")]
+        if some:
+            _draw(Path(folder) / name, draw, some)
+            drawn.append(name)
+    return drawn
+
+
+def _draw(path: Path, draw: Callable[[Any, Sequence[Row]], None], rows: Sequence[Row]) -> None:
+    devices = list(dict.fromkeys(row.device for row in rows))
+    figure = Figure(figsize=_SIZE, dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, device in zip(figure.subplots(1, len(devices), squeeze=False, sharey=True)[0], devices, strict=True):
+        axes.set_title(device, fontsize=9, loc="left")
+        draw(axes, [row for row in rows if row.device == device])
+        axes.grid(which="both", alpha=0.2)
+        axes.legend(fontsize=6.5, frameon=False)
+    with replacing(path) as file:
+        figure.savefig(file, format="png")
+
+
+def _growth(axes: Any, rows: Sequence[Row]) -> None:
+    lines: dict[str, dict[int, float]] = {}
+    for row in rows:
+        what, times = _GROWTH.match(row.case).groups()  # type: ignore[union-attr]
+        lines.setdefault(what or "all, within a tolerance", {})[int(times)] = row.seconds
+        if row.peer == "gpuvision":
+            lines.setdefault("all, all pairs", {})[int(times)] = row.peer_seconds
+    for colour, (name, line) in zip(_COLOURS, lines.items(), strict=False):
+        times = sorted(line)
+        axes.loglog(times, [1e3 * line[each] for each in times], "o-", color=colour, label=name, markersize=3)
+    axes.set(xlabel="times as many", ylabel="ms")
+
+
+def _tolerance(axes: Any, rows: Sequence[Row]) -> None:
+    lines: dict[str, list[Row]] = {}
+    for row in rows:
+        lines.setdefault(row.case.split("/")[0], []).append(row)
+    for colour, (name, line) in zip(_COLOURS, lines.items(), strict=False):
+        asked = sorted((row for row in line if row.facts["tolerance"] > 0.0), key=lambda row: row.facts["tolerance"])
+        x = [1e6 * row.facts["tolerance"] for row in asked]
+        axes.loglog(x, [1e3 * row.seconds for row in asked], "o-", color=colour, label=f"{name}: time", markersize=3)
+        off = [1e6 * max(row.error, 1e-12) for row in asked]
+        axes.loglog(x, off, "s--", color=colour, label=f"{name}: largest error", markersize=3)
+    if lines:
+        axes.loglog(x, x, ":", color="0.4", label="as asked")
+    axes.set(xlabel="tolerance [µm]", ylabel="ms, µm")

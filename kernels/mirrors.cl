@@ -21,7 +21,7 @@
 #define STEPS 16
 #define TANGENTS 4
 // How far out of the triangle, in its own size, the linear guess may lie.
-#define MARGIN ((real)0.5)
+#define MARGIN ((real)1.5)
 #ifdef REAL_IS_DOUBLE
 #define NEAR_ENOUGH ((real)1e-7)
 #define SLACK ((real)1e-12)
@@ -113,8 +113,10 @@ INLINE Reflection reflection_at(reals x, reals y, Vector point, Vector lens, glo
     return it;
 }
 
-// The equation at a corner, and whether lens and point lie on one side there.
-INLINE masks at_corner(Vector point, Fixed lens, global const real *row, int corner, reals *r1, reals *r2) {
+// The equation at a corner; on which sides of the surface there lens and point lie is added to `lens_sides` (1: above,
+// 2: below), `above` and `below`.
+INLINE void at_corner(Vector point, Fixed lens, global const real *row, int corner, reals *r1, reals *r2,
+                      int *lens_sides, masks *above, masks *below) {
     global const real *edge = corner == 0 ? row : row + 3 * corner;
     const Fixed n = fixed_at(row + 9 + 3 * corner);
     Fixed place = fixed_at(row);
@@ -126,15 +128,21 @@ INLINE masks at_corner(Vector point, Fixed lens, global const real *row, int cor
     const reals up = dot_fixed(q, n);
     *r1 = (cx * e1.x + cy * e1.y + cz * e1.z - twice * row[18 + corner]) * up + c * dot_fixed(q, e1);
     *r2 = (cx * e2.x + cy * e2.y + cz * e2.z - twice * row[21 + corner]) * up + c * dot_fixed(q, e2);
-    return positive(up * c);
+    *lens_sides |= c > 0 ? 1 : 2;
+    *above |= positive(up);
+    *below |= positive(-up);
 }
 
 // Whether the linear guess lies in the triangle or near it, and the guess.
 INLINE masks guessed(Vector point, Fixed lens, global const real *row, reals *x, reals *y) {
     reals u0, v0, u1, v1, u2, v2;
-    masks facing = at_corner(point, lens, row, 0, &u0, &v0);
-    facing |= at_corner(point, lens, row, 1, &u1, &v1);
-    facing |= at_corner(point, lens, row, 2, &u2, &v2);
+    int lens_sides = 0;
+    masks above = 0, below = 0;
+    at_corner(point, lens, row, 0, &u0, &v0, &lens_sides, &above, &below);
+    at_corner(point, lens, row, 1, &u1, &v1, &lens_sides, &above, &below);
+    at_corner(point, lens, row, 2, &u2, &v2, &lens_sides, &above, &below);
+    // At a silhouette they may be on one side only in between.
+    const masks facing = (lens_sides & 1 ? above : (masks)0) | (lens_sides & 2 && row[26] == 0 ? below : (masks)0);
     const reals a = u1 * v2 - u2 * v1, b = u2 * v0 - u0 * v2, c = u0 * v1 - u1 * v0, whole = a + b + c;
     const reals per = (real)1 / whole, least = -MARGIN;
     *x = b * per;
@@ -167,6 +175,14 @@ INLINE reals within(reals value, real limit) {
     const reals high = limit, low = -limit;
     value = value > high ? high : value;
     return value < low ? low : value;
+}
+
+// A start in the triangle or next to it.
+INLINE reals within_triangle(reals value, masks near) {
+    const reals low = (real)-0.1, high = (real)1.1;
+    value = zero_where(~near, value);
+    value = value < low ? low : value;
+    return value > high ? high : value;
 }
 
 // Newton's method from the guess; which lanes came to rest in the triangle, lens and point on one side of it.
@@ -246,8 +262,8 @@ kernel void mirror_points(global const INPUT *restrict points, global const INPU
             reals x, y;
             const masks near = guessed(point, lens, row, &x, &y) & may;
             if (!any_lane(near)) continue;
-            x = zero_where(~near, x);
-            y = zero_where(~near, y);
+            x = within_triangle(x, near);
+            y = within_triangle(y, near);
             Reflection it;
             const masks met = near & solved(point, lens_wide, row, &x, &y, &it);
             if (!any_lane(met)) continue;

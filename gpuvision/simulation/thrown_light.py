@@ -336,7 +336,8 @@ def _cut(fans: _Fans, fan: Integers, corners: Float64, triangle: Integers, reach
     off = points[..., 0] * across[..., 0] + points[..., 1] * across[..., 1] + points[..., 2] * across[..., 2]
     below = off < 0.0
     crossing = below.any(axis=1) & ~below.all(axis=1)
-    fan, triangle, points, off, below = (each[crossing] for each in (fan, triangle, points, off, below))
+    fan, triangle, below = fan[crossing], triangle[crossing], below[crossing]
+    points, off = points[crossing], off[crossing]
     # Of each triangle the corner alone on its side, and the other two.
     lone = np.where(below.sum(axis=1) == 1, np.argmax(below, axis=1), np.argmin(below, axis=1))
     row, ends = np.arange(len(fan)), []

@@ -109,6 +109,23 @@ def test_images_move_as_points_do(device: Device, walk: Any, dtype: Any, rng: np
     np.testing.assert_allclose(((end - start) / step)[same], move[same], atol=within)
 
 
+def test_a_ball_shows_all_that_it_does_not_hide(device: Device, rng: np.random.Generator) -> None:
+    """To the silhouette: a point has an image on the outside where the ball is not between it and the lens."""
+    ways = rng.normal(0.0, 1.0, (3000, 3))
+    points = np.zeros((3000, 6))
+    points[:, :3] = rng.uniform(1.05, 4.0, (3000, 1)) * ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    towards = LENS - points[:, :3]
+    share = np.clip(-np.sum(points[:, :3] * towards, axis=1) / np.sum(towards * towards, axis=1), 0.0, 1.0)
+    near = np.linalg.norm(points[:, :3] + share[:, None] * towards, axis=1)
+    result = mirrors(3, outside=np.ones(1280, bool))(points, LENS, device=device)
+    # Within the bulge of a triangle of the silhouette, rounding of the surface says whether.
+    sure = np.abs(near - 1.0) > 3e-3
+    missed = sure & (result.count != (near > 1.0))
+    assert missed.mean() < 5e-3
+    assert np.all(near[missed] < 1.2)
+    assert sure.mean() > 0.98
+
+
 @WAYS
 def test_the_inside_of_a_ball_may_be_left_out(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
     points, lens = some_points(rng).astype(dtype), LENS.astype(dtype)

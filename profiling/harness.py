@@ -32,6 +32,7 @@ OPERATIONS = (
     "points",
     "calibration",
     "reflections",
+    "mirrors",
     "bvh",
     "simulate",
     "tolerance",

@@ -58,7 +58,7 @@ def _balls(device: Device) -> Case:
     op = MirrorPoints(
         corners=corners,
         normals=normals,
-        numbers=np.arange(len(corners)),
+        numbers=np.arange(len(corners), dtype=np.int32),
         outside=np.ones(len(corners), bool),
         kept=2 * _BALLS,
     )
@@ -213,9 +213,7 @@ def _box_scene() -> tuple[Scene, Sight, LitLine]:
     parts = [floor]
     for _ in range(_BOXES):
         size = rng.uniform((2e-3, 2e-3, 1e-3), (6e-3, 6e-3, 6e-3))
-        box = trimesh.creation.box(size).apply_transform(
-            trimesh.transformations.rotation_matrix(rng.random(), (0, 0, 1))
-        )
+        box = trimesh.creation.box(size).apply_transform(_turned(rng.random()))
         place = (*rng.uniform((-0.02, -0.015), (0.02, 0.005)), 0.5 * size[2])
         parts.append(np.add(box.triangles, place))
     corners = np.concatenate(parts)
@@ -229,6 +227,13 @@ def _box_scene() -> tuple[Scene, Sight, LitLine]:
     sight = Sight(triangulation=geometry, transport=transport, lens=lens, u_edges=edges, v_edges=edges)
     scene = Scene(corners, upright.astype(np.int32))
     return scene, sight, LightSheet(transport=transport, g_limits=(-0.025, 0.025)).lit(scene, 0.0)
+
+
+def _turned(angle: float) -> Array:
+    """Return the transformation that turns about z."""
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return turn
 
 
 def _by_samples(scene: Scene, sight: Sight, lit: LitLine, embree: Any, samples: int) -> Exposure:

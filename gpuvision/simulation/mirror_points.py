@@ -12,7 +12,9 @@ import numpy.typing as npt
 
 from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
 from gpuvision.simulation.bvh import Bvh
+from gpuvision.simulation.closed_surfaces import places_of
 from gpuvision.simulation.scene import Scene
+from gpuvision.simulation.sheet_cut import ranges
 
 Float64 = npt.NDArray[np.float64]
 _ROW, _BLOCK, _GROUP, _LANES = 27, 11, 64, 16
@@ -43,19 +45,14 @@ def smooth_normals(scene: Scene, crease: float = _CREASE) -> Float64:
     bad = ~(np.isfinite(weighted).all(axis=(1, 2)) & np.isfinite(flat).all(axis=1))
     weighted[bad], flat[bad] = 0.0, 0.0
     # All pairs of corners in one place.
-    points = np.where(np.isfinite(corners), corners, 0.0).reshape(-1, 3) + 0.0
-    place = np.unique(points, axis=0, return_inverse=True)[1].ravel()
-    order = np.argsort(place, kind="stable")
-    counts = np.bincount(place)
-    first = np.cumsum(counts) - counts
-    own = np.repeat(order, counts[place[order]])
-    within = np.arange(len(own)) - np.repeat(
-        np.cumsum(counts[place[order]]) - counts[place[order]], counts[place[order]]
-    )
-    other = order[first[place[own]] + within]
+    place = places_of(np.where(np.isfinite(corners), corners, 0.0)).ravel()
+    order, counts = np.argsort(place, kind="stable"), np.bincount(place)
+    partners = counts[place]
+    own = np.repeat(np.arange(len(place)), partners)
+    other = order[ranges((np.cumsum(counts) - counts)[place], partners)]
     smooth = np.sum(flat[own // 3] * flat[other // 3], axis=1) > math.cos(crease)
-    total = np.zeros((3 * len(corners), 3))
-    np.add.at(total, own[smooth], weighted.reshape(-1, 3)[other[smooth]])
+    own, share = own[smooth], weighted.reshape(-1, 3)[other[smooth]]
+    total = np.stack([np.bincount(own, column, minlength=len(place)) for column in share.T], axis=1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     lonely = length[:, 0] == 0.0
     total[lonely], length[lonely] = np.repeat(flat, 3, axis=0)[lonely], 1.0

@@ -125,7 +125,7 @@ class Mirrors:
     @functools.cached_property
     def there_are_any(self) -> bool:
         """Whether any triangle reflects."""
-        return bool(len(self._flat) or len(self._curved))
+        return bool(self._reflects.any())
 
     # ---- diffuse lines ---------------------------------------------------------------------------------------
 

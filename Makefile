@@ -10,7 +10,7 @@ demo: .venv/ready
 	.venv/bin/gpuvision demo
 
 test: .venv/ready-tests
-	.venv/bin/python -m pytest $(PYTEST_ARGS)
+	.venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
 
 # Type checkers follow neither setuptools' package-dir nor its hook for editable installs. The package is laid out
 # for them in links, as a wheel would install it: no build, no network, and messages lead to the real file.

@@ -41,33 +41,68 @@ if TYPE_CHECKING:
     from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
     from gpuvision.ranging.regrid import Grid, HeightMap, Regrid
     from gpuvision.ranging.triangulation import SampleAxes, SheetPoints, Triangulation
+    from gpuvision.simulation.artifacts import Artifacts, explain
+    from gpuvision.simulation.bounces import Bounces
+    from gpuvision.simulation.camera_simulator import CameraSimulator
+    from gpuvision.simulation.illumination import LightSheet
+    from gpuvision.simulation.light_paths import LightPaths
+    from gpuvision.simulation.line_irradiance import LineIrradiance, LitSegments
+    from gpuvision.simulation.masks import Mask, optimise_mask
+    from gpuvision.simulation.material import Material
+    from gpuvision.simulation.psd_simulator import PsdSimulator
+    from gpuvision.simulation.rays import AnyHit, ClosestHit
+    from gpuvision.simulation.recommendations import DualSensor
+    from gpuvision.simulation.reflectance import Ggx, Lambert, OrenNayar, Phong, Reflectance, Ward
+    from gpuvision.simulation.scene import Scene
+    from gpuvision.simulation.sight import Sight
+    from gpuvision.simulation.visible_light import VisibleLight
     from gpuvision.status import Status
 
 # Names come with their first use: the command is there at once, and an interrupt while it loads is not a stack trace.
 _PLACES = {
+    "AnyHit": "gpuvision.simulation.rays",
+    "Artifacts": "gpuvision.simulation.artifacts",
+    "Bounces": "gpuvision.simulation.bounces",
     "Camera": "gpuvision.camera.camera",
     "CameraFit": "gpuvision.camera.views.camera_fit",
+    "CameraSimulator": "gpuvision.simulation.camera_simulator",
+    "ClosestHit": "gpuvision.simulation.rays",
     "Device": "gpuvision.host",
+    "DualSensor": "gpuvision.simulation.recommendations",
+    "Ggx": "gpuvision.simulation.reflectance",
     "GpuVisionError": "gpuvision.host",
     "Grid": "gpuvision.ranging.regrid",
     "HeightMap": "gpuvision.ranging.regrid",
+    "Lambert": "gpuvision.simulation.reflectance",
     "Lens": "gpuvision.camera.lens",
     "LensFit": "gpuvision.camera.lines.lens_fit",
+    "LightPaths": "gpuvision.simulation.light_paths",
+    "LightSheet": "gpuvision.simulation.illumination",
+    "LineIrradiance": "gpuvision.simulation.line_irradiance",
     "LineReading": "gpuvision.ranging.line",
     "LineReadout": "gpuvision.ranging.line",
+    "LitSegments": "gpuvision.simulation.line_irradiance",
+    "Mask": "gpuvision.simulation.masks",
+    "Material": "gpuvision.simulation.material",
+    "OrenNayar": "gpuvision.simulation.reflectance",
     "PatternGrid": "gpuvision.camera.patterns.pattern",
+    "Phong": "gpuvision.simulation.reflectance",
     "Pipeline": "gpuvision.host",
     "PixelMap": "gpuvision.camera.image_map",
     "PlanePolynomial": "gpuvision.camera.polynomial",
     "PsdNoise": "gpuvision.ranging.psd",
     "PsdReading": "gpuvision.ranging.psd",
     "PsdReadout": "gpuvision.ranging.psd",
+    "PsdSimulator": "gpuvision.simulation.psd_simulator",
     "RangeImage": "gpuvision.ranging.range_image",
     "RangePoints": "gpuvision.ranging.range_image",
+    "Reflectance": "gpuvision.simulation.reflectance",
     "Regrid": "gpuvision.ranging.regrid",
     "RotatingSheet": "gpuvision.ranging.range_image",
     "SampleAxes": "gpuvision.ranging.triangulation",
+    "Scene": "gpuvision.simulation.scene",
     "SheetPoints": "gpuvision.ranging.triangulation",
+    "Sight": "gpuvision.simulation.sight",
     "Status": "gpuvision.status",
     "Step": "gpuvision.host",
     "StraightTransport": "gpuvision.ranging.range_image",
@@ -77,6 +112,9 @@ _PLACES = {
     "UndistortPoints": "gpuvision.camera.undistort_points",
     "UndistortedImage": "gpuvision.camera.undistort_image",
     "UndistortedPoints": "gpuvision.camera.undistort_points",
+    "VisibleLight": "gpuvision.simulation.visible_light",
+    "Ward": "gpuvision.simulation.reflectance",
+    "explain": "gpuvision.simulation.artifacts",
     "find_chessboard": "gpuvision.camera.patterns.chessboard",
     "find_dots": "gpuvision.camera.patterns.dots",
     "find_lines": "gpuvision.camera.patterns.line_pattern",
@@ -87,34 +125,55 @@ _PLACES = {
     "grid_lines": "gpuvision.camera.lines.line_families",
     "host_view": "gpuvision.host",
     "open_recording": "gpuvision.host",
+    "optimise_mask": "gpuvision.simulation.masks",
     "straightness_px": "gpuvision.camera.vanishing_points",
     "view_of": "gpuvision.camera.views.target_views",
 }
 
 __all__ = [
+    "AnyHit",
+    "Artifacts",
+    "Bounces",
     "Camera",
     "CameraFit",
+    "CameraSimulator",
+    "ClosestHit",
     "Device",
+    "DualSensor",
+    "Ggx",
     "GpuVisionError",
     "Grid",
     "HeightMap",
+    "Lambert",
     "Lens",
     "LensFit",
+    "LightPaths",
+    "LightSheet",
+    "LineIrradiance",
     "LineReading",
     "LineReadout",
+    "LitSegments",
+    "Mask",
+    "Material",
+    "OrenNayar",
     "PatternGrid",
+    "Phong",
     "Pipeline",
     "PixelMap",
     "PlanePolynomial",
     "PsdNoise",
     "PsdReading",
     "PsdReadout",
+    "PsdSimulator",
     "RangeImage",
     "RangePoints",
+    "Reflectance",
     "Regrid",
     "RotatingSheet",
     "SampleAxes",
+    "Scene",
     "SheetPoints",
+    "Sight",
     "Status",
     "Step",
     "StraightTransport",
@@ -124,6 +183,9 @@ __all__ = [
     "UndistortPoints",
     "UndistortedImage",
     "UndistortedPoints",
+    "VisibleLight",
+    "Ward",
+    "explain",
     "find_chessboard",
     "find_dots",
     "find_lines",
@@ -134,6 +196,7 @@ __all__ = [
     "grid_lines",
     "host_view",
     "open_recording",
+    "optimise_mask",
     "straightness_px",
     "view_of",
 ]

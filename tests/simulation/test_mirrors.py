@@ -75,6 +75,54 @@ def test_a_plane_mirror_shows_a_second_line_at_twice_its_distance(device: Device
     assert np.abs(read - u).min() > 1e-4
 
 
+def test_a_mirror_of_micrometres_in_a_scene_of_metres(device: Device) -> None:
+    """20 um of mirror show the part of the line that the way to them and on says."""
+    sensor, distance, low, high = sight(), 0.004, 3e-3, 3.02e-3
+    wall = quad([low, -distance, 0], [high, -distance, 0], [high, -distance, 0.1], [low, -distance, 0.1])
+    scene = Scene(np.concatenate([10.0 * np.array(FLOOR), wall]), np.array([0, 0, 1, 1]))
+    lit = sheet(g_limits=(-0.05, 0.05)).lit(scene, 0.0)
+    lens = np.array(sensor.lens)
+    share = (lens[1] + distance) / (lens[1] + 2.0 * distance)
+
+    def density(x: float) -> float:
+        image = np.array([x, -2.0 * distance, 0.0])
+        cosine = lens[2] / np.linalg.norm(lens - image)
+        return SHARE * ALBEDO * 3.0 / np.pi * cosine * float(sensor.received(image))
+
+    expected = integral(density, low / share, high / share)[0]
+    seen = mirrors_of(scene, MATERIALS, device, sight=sensor).seen(lit, 0.0)
+    # The corners are rounded in units of 1 m where there is single only.
+    assert seen.power.sum() == pytest.approx(expected, rel=1e-9 if device.has_double else 0.05)
+
+
+def test_a_mirror_seen_at_89_99_degrees(device: Device) -> None:
+    """A mirror 30 um under the line, which lens and line nearly lie in."""
+    sensor, height = sight(12, 480), 3e-5
+    lens, point = np.array(sensor.lens), np.zeros(3)
+    along = (lens - point) / np.linalg.norm(lens - point)
+    up = np.cross([1.0, 0.0, 0.0], along)
+    up *= np.sign(up[2])
+    below = point - height * up
+    one, two = np.array([1.0, 0.0, 0.0]), along
+    mirror = [below + a * one + b * two for a, b in ((-0.3, 0.001), (0.3, 0.001), (0.3, 0.16), (-0.3, 0.16))]
+    scene = Scene(np.array(quad(*mirror)), np.array([1, 1]))
+    line = LitLine(np.array([[[-5e-3, 0.0, 0.0], [5e-3, 0.0, 0.0]]]), up[None], np.zeros(1, int), np.array([3.0]))
+    normal = (up + along) / np.sqrt(2.0)
+    line = line._replace(normals=normal[None])
+    materials = (MATERIALS[0], Material(diffuse=Lambert(albedo=ALBEDO), mirror=SHARE / 2.0))
+
+    def density(x: float) -> float:
+        place = np.array([x, 0.0, 0.0])
+        image = place - 2.0 * height * up
+        spot = lens + 0.5 * (image - lens)
+        cosine = normal @ (spot - place) / np.linalg.norm(spot - place)
+        return SHARE / 2.0 * ALBEDO * 3.0 / np.pi * cosine * float(sensor.received(image))
+
+    seen = mirrors_of(scene, materials, device, sight=sensor).seen(line, 0.0)
+    assert height / np.linalg.norm(lens - point) < 2e-4
+    assert seen.power.sum() == pytest.approx(integral(density, -5e-3, 5e-3)[0], rel=1e-8 if device.has_double else 1e-2)
+
+
 def test_direct_light_is_what_the_direct_path_says(device: Device, rng: np.random.Generator) -> None:
     heap = trimesh.util.concatenate(
         [

@@ -28,13 +28,13 @@
 #define PI ((real)3.14159265358979324)
 // Of a pick: a segment that nothing can hide; else without it. A cluster is ~node.
 #define CLEAR (1 << 30)
-// Clusters between which and a block something may stand are looked at from so many segments down to so many: a look
-// takes about as long as to compute that few with their visibility.
+// Whether anything may stand between is looked at for so many segments at once, and fewer. A block looks so often in
+// vain, and some times more for each time that it did not: a look at one segment takes about a third of the time that
+// its visibility does.
 #define MOST_LOOKED_AT 16
-#define LEAST_LOOKED_AT 2
-// A block looks so often in vain, and some times more for each time that it did not.
 #define PATIENCE 256
-#define PATIENCE_WON 3
+#define PATIENCE_ALONE 10
+#define PATIENCE_WON 2
 // Rounding of the bounds themselves.
 #define UP ((real)1 + (real)256 * (real)REAL_EPSILON)
 // Of a block's tallies.
@@ -69,7 +69,7 @@ inline void cross3(const real *a, const real *b, real *c) {
 
 // Those without cost have no part in the reading; a normal of zero is no receiver.
 inline receivers_block block_of(global const INPUT *receivers, global const real *costs, int count,
-                                constant INPUT *middle) {
+                                global const INPUT *middle) {
     receivers_block block;
     int kept = 0;
     block.cost = 0;
@@ -115,7 +115,7 @@ inline receivers_block block_of(global const INPUT *receivers, global const real
     return block;
 }
 
-inline meeting meeting_of(const receivers_block *block, global const real *row, int single) {
+inline meeting meeting_of(const receivers_block *block, global const real *row, int single, real rounding) {
     real to[3], side[3], reach = 0, back = 0, front = 0;
     const real normal[3] = {row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]};
     for (int k = 0; k < 3; k++) {
@@ -140,41 +140,45 @@ inline meeting meeting_of(const receivers_block *block, global const real *row, 
     const real got_most = got + got_turn + block->most_height + front;
     meeting met = {0, 0};
     if (!(lit_most > 0 && got_most > 0)) return met;
-    met.faces = lit - lit_turn + row[LEAST_HEIGHT] - reach > 0 && got - got_turn + block->least_height - back > 0;
+    met.faces = lit - lit_turn + row[LEAST_HEIGHT] - reach > rounding &&
+                got - got_turn + block->least_height - back > rounding;
     real gap = 0;
     for (int k = 0; k < 3; k++) {
         const real apart = higher(higher(block->low[k] - row[HIGH + k], row[LOW + k] - block->high[k]), (real)0);
         gap += apart * apart;
     }
-    const real distance = higher(sqrt(gap), between - block->radius - wide);
+    const real distance = higher(sqrt(gap), between - block->radius - wide) - rounding;
     if (!(distance > 0)) {
         met.bound = INFINITY;
         return met;
     }
-    const real per = UP / distance, cosines = lower(lit_most * per, (real)1) * lower(got_most * per, (real)1);
+    const real per = UP / distance;
+    const real cosines = lower((lit_most + rounding) * per, (real)1) * lower((got_most + rounding) * per, (real)1);
     // The integral of dt / r^2 over a line is pi / r at most.
     const real spread = single ? PI * per / row[LENGTH] : (real)INFINITY;
     met.bound = cosines * lower(per * per, spread) * PER_PI * UP;
     return met;
 }
 
-// What the cluster's own segment is off by at most, over pi, as irradiance.
-inline real error_of(const receivers_block *block, global const real *row) {
+// What the cluster's own segment is off by at most, as irradiance by a watt.
+inline real error_of(const receivers_block *block, global const real *row, real rounding) {
     real gap = 0;
     for (int k = 0; k < 3; k++) {
         const real apart =
             higher(higher(block->low[k] - row[CENTRE + k], row[CENTRE + k] - block->high[k]), (real)0);
         gap += apart * apart;
     }
-    const real per = UP / sqrt(gap), q = row[RADIUS] * per, arm = row[ARM] * per;
-    if (!(q < 1 && arm < 1)) return INFINITY;
+    const real distance = sqrt(gap) - rounding, per = UP / distance;
+    const real q = row[RADIUS] * per, arm = row[ARM] * per;
+    if (!(distance > 0 && q < 1 && arm < 1)) return INFINITY;
     const real third = ((real)4 - 3 * q) / ((1 - q) * (1 - q)), fourth = ((real)5 - 4 * arm) / ((1 - arm) * (1 - arm));
     const real beyond = row[SECOND_ORDER] + per * (row[THIRD_MOMENT] * third + per * row[FOURTH_MOMENT] * fourth);
     return per * per * per * (row[FIRST_ORDER] + per * beyond) * PER_PI * UP;
 }
 
 // What a segment costs at most, each receiver for itself: so that it stays finite where a block touches what is lit.
-inline real most_of_segment(const receivers_block *block, global const real *lit, real length, real power) {
+inline real most_of_segment(const receivers_block *block, global const real *lit, real length, real power,
+                            real rounding) {
     real sum = 0;
     for (int i = 0; i < block->count; i++) {
         const real *place = block->places + 3 * i, *normal = block->normals + 3 * i;
@@ -193,7 +197,10 @@ inline real most_of_segment(const receivers_block *block, global const real *lit
         }
         const real ahead = higher(in_front, beyond);
         if (!(up > 0 && ahead > 0)) continue;
-        const real per = UP / sqrt(square), cosines = lower(up * per, (real)1) * lower(ahead * per, (real)1);
+        const real distance = sqrt(square) - rounding;
+        if (!(distance > 0)) return INFINITY;
+        const real per = UP / distance;
+        const real cosines = lower((up + rounding) * per, (real)1) * lower((ahead + rounding) * per, (real)1);
         sum += block->costs[i] * cosines * lower(per * per, PI * per / length);
     }
     return sum * power * PER_PI * UP;
@@ -399,25 +406,28 @@ inline uint after(uint node) {
 kernel void plan_light(global const INPUT *restrict receivers, global const real *restrict costs,
                        global const real *restrict shares, global const real *restrict rows,
                        global const int *restrict spans, global const real *restrict placed,
+                       global const INPUT *restrict frame,
                        global int *restrict picks, global float *restrict errors, global int *restrict counts,
                        global real *restrict spent, global int *restrict tallies, global const real *nodes,
                        global const int *children, global const int *axes, global const real *leaves,
-                       global const int *triangles, constant INPUT *middle, const real margin, const uint capacity,
+                       global const int *triangles, const real margin, const uint capacity,
                        const uint blocks, const uint blocks_of_strip, const uint of_strip, const uint each) {
 #ifdef OCCLUDERS
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
 #endif
+    // Places are from the frame's middle; behind it stands by how much they may be rounded.
+    const real rounding = (real)frame[3];
     const uint begin = get_global_id(0) * each, end = min(begin + each, blocks);
     for (uint b = begin; b < end; b++) {
         const uint strip = b / blocks_of_strip, first = (b % blocks_of_strip) * BLOCK;
         const size_t at = (size_t)strip * of_strip + first;
         const receivers_block block =
-            block_of(receivers + 6 * at, costs + at, (int)min((uint)BLOCK, of_strip - first), middle);
+            block_of(receivers + 6 * at, costs + at, (int)min((uint)BLOCK, of_strip - first), frame);
         const real share = shares[strip];
         global int *pick = picks + (size_t)b * capacity;
         global float *error = errors + (size_t)b * capacity;
         uint found = 0;
-        int out = 0, together = 0, culprit = -1, patience = PATIENCE;
+        int out = 0, together = 0, culprit = -1, for_many = PATIENCE, for_one = PATIENCE_ALONE;
         // The level of the cluster that nothing can hide, whose parts are being looked at; else below all levels.
         int open_level = OPEN_LEVEL;
         real lost = 0, whole = 0;
@@ -431,12 +441,12 @@ kernel void plan_light(global const INPUT *restrict receivers, global const real
                 node = next;
                 continue;
             }
-            const meeting met = meeting_of(&block, row, count == 1);
+            const meeting met = meeting_of(&block, row, count == 1, rounding);
             // A bound of zero may meet a cost that is infinite.
             real most = met.bound > 0 ? met.bound * row[POWER] * block.cost : 0;
             if (count == 1 && met.bound > share) {
-                const real each_for_itself = most_of_segment(&block, placed + PLACED * place, row[LENGTH], row[POWER]);
-                most = lower(most, each_for_itself);
+                global const real *lit = placed + PLACED * place;
+                most = lower(most, most_of_segment(&block, lit, row[LENGTH], row[POWER], rounding));
             }
             if (most == 0 || met.bound <= share || most <= share * row[POWER] * block.cost) {
                 out += count;
@@ -446,16 +456,17 @@ kernel void plan_light(global const INPUT *restrict receivers, global const real
             }
             real wrong = count > 1 ? (real)INFINITY : (real)0;
 #ifdef CLUSTERS
-            if (count > 1 && met.faces) wrong = error_of(&block, row);
+            if (count > 1 && met.faces) wrong = error_of(&block, row, rounding);
 #endif
-            const int close = wrong <= share * row[POWER];
+            const int close = wrong <= share;
 #ifdef OCCLUDERS
-            // Looked at where that may spare something: many at once, or few that one could stand for.
-            if (level < open_level && patience > 0 && count <= MOST_LOOKED_AT &&
-                (2 * count > MOST_LOOKED_AT || (close && count >= LEAST_LOOKED_AT))) {
+            // Looked at where that may spare something: many at once, or few that one could stand for, or one.
+            int *patience = count > 1 ? &for_many : &for_one;
+            const int worth = count <= MOST_LOOKED_AT && (2 * count > MOST_LOOKED_AT || close);
+            if (level < open_level && *patience > 0 && worth) {
                 const int clear = is_clear(&tree, &block, row, placed + PLACED * place, count, margin, &culprit);
                 if (clear) open_level = level;
-                patience += clear ? PATIENCE_WON : -1;
+                *patience += clear ? PATIENCE_WON : -1;
             }
 #endif
             const int open = level >= open_level;
@@ -463,7 +474,7 @@ kernel void plan_light(global const INPUT *restrict receivers, global const real
                 node = 2 * node;
                 continue;
             }
-            if (count > 1) together += count, lost += wrong * block.cost;
+            if (count > 1) together += count, lost += wrong * row[POWER] * block.cost;
             whole += most;
             if (found < capacity) {
                 pick[found] = count > 1 ? ~(int)node : open ? place | CLEAR : place;
@@ -473,7 +484,7 @@ kernel void plan_light(global const INPUT *restrict receivers, global const real
             node = next;
         }
         counts[b] = (int)found;
-        spent[2 * b] = lost, spent[2 * b + 1] = whole;
+        spent[2 * b] = lost * UP, spent[2 * b + 1] = whole * UP;
         tallies[TALLIES * b + OUT] = out;
         tallies[TALLIES * b + TOGETHER] = together;
     }

@@ -38,7 +38,7 @@ class Clusters:
     spans
         int32 (nodes, 2): the first place in `order`, and how many; none where a node is empty.
     rows
-        float64 (nodes, 24): what kernels/tolerance.cl knows of each.
+        float64 (nodes, 24): what kernels/tolerance.cl knows of each; bounds of errors are by a watt.
     aggregates
         float64 (nodes, 10): the segment that stands for each: start, end, normal, exitance.
     power
@@ -145,7 +145,7 @@ def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows:
     slab = np.maximum.reduceat(np.max(np.abs(np.sum(ends * facing[owner], axis=2)), axis=0), begin)
     low = np.minimum.reduceat(np.minimum(ends[0], ends[1]), begin)
     high = np.maximum.reduceat(np.maximum(ends[0], ends[1]), begin)
-    scale = np.where(total > 0.0, total / mass, 0.0)
+    scale, each = np.where(total > 0.0, total / mass, 0.0), np.where(total > 0.0, 1.0 / mass, 0.0)
     table = np.column_stack(
         [
             centre,
@@ -158,10 +158,10 @@ def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows:
             np.minimum.reduceat(height, begin),
             slab,
             total,
-            2.0 * np.sqrt(3.0) * np.linalg.norm(skew, axis=(1, 2)) * scale,
-            3.0 * (rest + sums(weight * tilt * square)) * scale,
-            sums(weight * np.sqrt(square * fourth)) * scale,
-            0.2 * effective * arm_size**4 * scale,
+            2.0 * np.sqrt(3.0) * np.linalg.norm(skew, axis=(1, 2)) * each,
+            3.0 * (rest + sums(weight * tilt * square)) * each,
+            sums(weight * np.sqrt(square * fourth)) * each,
+            0.2 * effective * arm_size**4 * each,
             np.where(lean > _MOST_LEAN, arm_size, np.inf),
             2.0 * np.linalg.norm(half, axis=1)[begin],
         ]

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Walk, in_strips, real_defines
+from gpuvision.host import Device, Launch, Operation, Walk, in_strips
 from gpuvision.simulation.clusters import COLUMNS, Clusters
 from gpuvision.simulation.range_error import StripReading
 from gpuvision.simulation.scene import Scene
@@ -19,6 +19,10 @@ Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int32]
 
 BLOCK = 16
+# The kernel's reals, and of the scene's reach: what a place may be off by in them, and what rises less than it hides
+# nothing.
+_REAL = np.dtype(np.float32)
+_ROUNDING, _MARGIN = 4.0 * 2.0**-23, 32.0 * 2.0**-23
 # Of a row of placed segments in kernels/tolerance.cl.
 _PLACED = 10
 _GROUP, _STRIPS_PER_CORE = 64, 8
@@ -112,7 +116,8 @@ class LightPlanner:
     scene
         What may stand between; None: nothing does.
     clearance
-        Metres: what rises less above a receiver's or a lit surface does not hide anything.
+        Metres: what rises less above a receiver's or a lit surface does not hide anything; at least 4e-6 of the
+        scene's reach from its middle.
     clusters
         Whether one segment may stand for several.
     walk
@@ -129,8 +134,11 @@ class LightPlanner:
     the least distance of any two points, and never more than W / (L r) of length L. The error of a segment that stands
     for a cluster is in `gpuvision.simulation.clusters`. Visibility is between 0 and 1, and a cluster stands only where
     nothing can hide any of it, so all this holds with occlusion. The tolerance is shared among pairs by power times
-    cost; what the shares leave over is then spent on the pairs with the least bounds. The kernels' rounding comes on
-    top.
+    cost; what the shares leave over is then spent on the pairs with the least bounds.
+
+    Places are rounded to single about the scene's middle, and the bounds take that into account, by 5e-7 of its reach;
+    only what lies in, or under, a surface's own plane to that is taken to get nothing from it. The rounding of the
+    kernel that computes the rest comes on top.
     """
 
     tolerance: float
@@ -224,7 +232,6 @@ class _PlanLight(Operation[_Found]):
             raise TypeError(f"LightPlanner takes float32 or float64 receivers, got {dtype}")
         if dtype == np.float64 and not device.has_double:
             raise ValueError(f"device {device.label} has no double precision; give receivers as float32")
-        real = np.dtype(np.float64 if device.has_double else np.float32)
         strips, count, _ = shape
         of_strip = -(-count // BLOCK)
         blocks = strips * of_strip
@@ -235,14 +242,14 @@ class _PlanLight(Operation[_Found]):
         tables: list[Any] = [None] * 5
         depth = 1
         if self.scene is not None:
-            tables, depth = list(self.scene.bvh.tables(real)), self.scene.bvh.depth
+            tables, depth = list(self.scene.bvh.tables(_REAL)), self.scene.bvh.depth
         present = {"STRIP": strip, "OCCLUDERS": self.scene is not None, "CLUSTERS": self.clusters}
-        margin = max(self.clearance, _rounding(self.scene, real))
+        reach = 0.0 if self.scene is None else _reach(self.scene, dtype)
+        margin = max(self.clearance, _MARGIN * reach)
         return Launch(
             stem="tolerance",
             kernel="plan_light",
             defines={
-                **real_defines(device, real),
                 **{name: None for name, is_present in present.items() if is_present},
                 "INPUT": "float" if dtype == np.float32 else "double",
                 "BVH_DEPTH": depth,
@@ -250,23 +257,23 @@ class _PlanLight(Operation[_Found]):
             },
             inputs=[
                 (shape, dtype),
-                ((strips, count), real),
-                ((strips,), real),
-                ((self.nodes, COLUMNS), real),
+                ((strips, count), _REAL),
+                ((strips,), _REAL),
+                ((self.nodes, COLUMNS), _REAL),
                 ((self.nodes, 2), whole),
-                ((self.segments, _PLACED), real),
+                ((self.segments, _PLACED), _REAL),
+                ((4,), dtype),
             ],
             outputs={
                 "picks": ((blocks, self.room), whole),
                 "errors": ((blocks, self.room), np.dtype(np.float32)),
                 "counts": ((blocks,), whole),
-                "spent": ((blocks, 2), real),
+                "spent": ((blocks, 2), _REAL),
                 "tallies": ((blocks, 2), whole),
             },
             arguments=[
                 *tables,
-                _middle(self.scene).astype(dtype),
-                real.type(margin),
+                _REAL.type(margin),
                 *(np.uint32(value) for value in (self.room, blocks, of_strip, count, each)),
             ],
             global_size=(items,) if strip else (-(-items // _GROUP) * _GROUP,),
@@ -274,17 +281,25 @@ class _PlanLight(Operation[_Found]):
         )
 
 
-def _middle(scene: Scene | None) -> Reals:
-    return np.zeros(3) if scene is None else scene.bvh.middle
+def _frame(scene: Scene | None, segments: Reals, receivers: npt.NDArray[Any]) -> Reals:
+    """Return the middle of all places, and by how much they may be rounded in single, metres."""
+    if scene is not None:
+        middle, reach = scene.bvh.middle, _reach(scene, receivers.dtype)
+    else:
+        places = np.concatenate([segments[:, :6].reshape(-1, 3), receivers[..., :3].reshape(-1, 3)])
+        places = places[np.isfinite(places).all(axis=1)]
+        if not len(places):
+            return np.zeros(4)
+        low, high = places.min(axis=0), places.max(axis=0)
+        middle = (0.5 * (low + high)).astype(receivers.dtype)
+        reach = float(np.abs(places).max()) if receivers.dtype == np.float32 else 0.5 * float((high - low).max())
+    return np.append(middle, _ROUNDING * reach)
 
 
-def _largest_of(real: np.dtype[Any]) -> float:
-    return float(np.finfo(real).max)
-
-
-def _rounding(scene: Scene | None, real: np.dtype[Any]) -> float:
-    reach = 0.0 if scene is None else float(np.abs(scene.bvh.corners).max(initial=0.0))
-    return 64.0 * float(np.finfo(real).eps) * reach
+def _reach(scene: Scene, dtype: np.dtype[Any]) -> float:
+    """Return how far from its middle a scene goes; from the origin, where places come in single."""
+    reach = float(np.abs(scene.bvh.corners).max(initial=0.0))
+    return reach + (float(np.abs(scene.bvh.middle).max()) if dtype == np.float32 else 0.0)
 
 
 def _planned(
@@ -386,21 +401,28 @@ def _traversed(
     device: Device,
 ) -> tuple[_Found, Reals]:
     """Return what the kernel found, and what each strip has lost by it, and would lose by all of it, metres."""
-    real = np.dtype(np.float64 if device.has_double else np.float32)
-    middle = _middle(planner.scene)
+    frame = _frame(planner.scene, segments, receivers)
+    middle = frame[:3]
     rows = tree.rows.copy()
     rows[:, :9] -= np.tile(middle, 3)
     placed = np.zeros((len(tree.spans) // 2, _PLACED))
     placed[: len(segments)] = _placed(segments[tree.order], middle)
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = tolerance / (costs.sum(axis=1) * tree.power)
-    shares = np.where(np.isnan(shares), 0.0, np.minimum(shares, _largest_of(real)))
-    given = costs.astype(real), rows.astype(real), placed.astype(real)
+    shares = np.where(np.isnan(shares), 0.0, np.minimum(shares, float(np.finfo(np.float32).max)))
+    given = costs.astype(_REAL), rows.astype(_REAL), placed.astype(_REAL), frame.astype(receivers.dtype)
     of_strip = -(-receivers.shape[1] // BLOCK)
     generosity = np.full(len(costs), _GENEROSITY)
     while True:
-        found = _run(planner, receivers, (shares * generosity).astype(real), tree.spans, *given, device=device)
-        spent = np.add.reduceat(found.spent, np.arange(len(costs)) * of_strip, axis=0)
+        found = _run(
+            planner,
+            receivers,
+            np.minimum(shares * generosity, np.finfo(np.float32).max).astype(_REAL),
+            tree.spans,
+            *given,
+            device=device,
+        )
+        spent = np.add.reduceat(found.spent.astype(np.float64), np.arange(len(costs)) * of_strip, axis=0)
         over = (spent[:, 0] > tolerance) & (generosity > 1.0)
         if not over.any():
             return found, spent
@@ -415,6 +437,7 @@ def _run(
     costs: npt.NDArray[Any],
     rows: npt.NDArray[Any],
     placed: npt.NDArray[Any],
+    frame: npt.NDArray[Any],
     device: Device,
 ) -> _Found:
     while True:
@@ -427,7 +450,7 @@ def _run(
             clusters=planner.clusters,
             walk=planner.walk,
         )
-        found = operation(receivers, costs, shares, rows, spans, placed, device=device)
+        found = operation(receivers, costs, shares, rows, spans, placed, frame, device=device)
         most = int(found.counts.max(initial=0))
         if most <= planner._room[0]:
             return found

@@ -125,7 +125,7 @@ def test_a_cluster_is_off_by_its_bound_at_most(rng: Any, count: int, distance: f
     q, arm = row[12] / far, row[22] / far
     with np.errstate(all="ignore"):
         bound = row[18] / far**3 + row[19] / far**4 + row[20] * (4 - 3 * q) / (1 - q) ** 2 / far**5
-        bound = (bound + row[21] * (5 - 4 * arm) / (1 - arm) ** 2 / far**6) / np.pi
+        bound = row[17] * (bound + row[21] * (5 - 4 * arm) / (1 - arm) ** 2 / far**6) / np.pi
     light = reference.pair_irradiance(receivers, segments).sum(axis=1)
     error = np.abs(light - reference.pair_irradiance(receivers, aggregate)[:, 0])
     good = facing & (q < 1.0) & (arm < 1.0)
@@ -196,6 +196,29 @@ def test_work_falls_as_the_tolerance_rises(device: Device, walk: Any) -> None:
     assert works[0] > 4 * works[3]
     assert works[-1] == 0
     assert not plan.modelled
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("with_scene", [False, True])
+def test_bounds_hold_far_from_the_origin(device: Device, dtype: Any, with_scene: bool) -> None:
+    """Places are rounded about the middle of what there is; micrometres stand beside metres."""
+    rng = np.random.default_rng(8)
+    segments, receivers, weights, reading = (
+        random_segments(rng, 20),
+        random_strips(rng),
+        weights_of(rng),
+        reading_of(rng),
+    )
+    segments[:10, 3:6] = segments[:10, :3] + 1e-3 * (segments[:10, 3:6] - segments[:10, :3])
+    segments[:, :6] += 7.0
+    receivers[..., :3] += 7.0
+    # Far below all: it hides nothing.
+    scene = Scene(np.array([[[0.0, 0.0, 0.0], [14.0, 0.0, 0.0], [14.0, 14.0, 0.0]]])) if with_scene else None
+    given = receivers.astype(dtype)
+    plan = LightPlanner(tolerance=1e-6, scene=scene)(segments, given, weights, reading, device=device)
+    assert 0 < plan.counts["work"] < plan.counts["pairs"]
+    assert np.all(plan.bound <= 1e-6)
+    assert np.all(off_by(plan, given.astype(float), weights, reading, segments) <= plan.bound + 1e-12)
 
 
 @TWO_WAYS

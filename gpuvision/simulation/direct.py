@@ -27,7 +27,7 @@ from gpuvision.status import Status
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 # Power on the sensor [W] by kind of reflection, of light that arrives at points of segments [W].
-Sender = Callable[[LitLine, Integers, Float64, Float64, float], dict[str, Float64]]
+Sender = Callable[[LitLine, Integers, Float64, Float64], dict[str, Float64]]
 
 # Gauss and Legendre's two nodes on [0, 1].
 _NODES = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
@@ -37,6 +37,8 @@ _TURN, _TURNS = 0.5, 256
 _BEYOND = 7.0
 # Edges in the sheet, within so many sigmas, cut it; the longest so many; those so many sigmas apart.
 _REACH, _STEPS, _APART = 4.0, 16, 1e-4
+# Sheets that are looked at in one go.
+_SHEETS = 64
 # Of the largest coordinate: nearer than that, two lit places are one.
 _SAME = 1e-9
 
@@ -73,6 +75,53 @@ class Slabs(NamedTuple):
         # What the outer ones hold falls with their number as an inner one's width does.
         reach = math.sqrt(2.0 * math.log(count)) if count > 2 else 0.0
         return cls.between(np.linspace(-reach, reach, count - 1))
+
+
+class _Lit(NamedTuple):
+    """Lit segments moved to before the sensor at transport 0, the sheets they are in, and how far they lie."""
+
+    line: LitLine
+    sheet: Integers
+    moved: Float64
+
+
+class _Image(NamedTuple):
+    """Where light is deposited: slabs, each of one of so many profiles."""
+
+    sight: Sight
+    slabs: Slabs
+    profile: Integers
+    profiles: int
+
+    def of(self, uv: Float64, spread: Float64, slab: Integers, lights: Mapping[str, Float64]) -> dict[str, Exposure]:
+        """Return exposures by spots of slabs' light: their means at (u, v), spread by so much along u a sigma."""
+        sight, slabs = self.sight, self.slabs
+        sample = sight.sample_of(uv[:, 1])
+        on = np.flatnonzero(sample >= 0)
+        sample, u, slab = sample[on], uv[on, 0], slab[on]
+        least = 1e-9 * float(np.diff(sight.u_edges).min())
+        spread = np.where(np.abs(spread[on]) < least, least, spread[on])
+        low, high, middle = slabs.low[slab], slabs.high[slab], slabs.middle[slab]
+        reach = u + spread * (np.clip([low, high], -_BEYOND, _BEYOND) - middle)
+        first = np.maximum(np.searchsorted(sight.u_edges, reach.min(axis=0), side="right") - 1, 0)
+        last = np.minimum(np.searchsorted(sight.u_edges, reach.max(axis=0), side="left"), sight.bins)
+        count = np.maximum(last - first, 0)
+        of, place = np.repeat(np.arange(len(u)), count), ranges(first, count)
+        # The edges of the bins in sigmas of the sheet.
+        ends = middle[of] + (np.stack([sight.u_edges[place], sight.u_edges[place + 1]]) - u[of]) / spread[of]
+        ends = np.clip(np.sort(ends, axis=0), low[of], high[of])
+        share = _between(*ends)
+        moment = (u - spread * middle)[of] - sight.u_middles[place]
+        moment = moment * share + spread[of] * (_bell(ends[0]) - _bell(ends[1]))
+        row = self.profile[slab] * sight.samples + sample
+        at, per = row[of] * sight.bins + place, 1.0 / slabs.share[slab[of]]
+        shape = (self.profiles, sight.samples, sight.bins)
+        made = {}
+        for name, power in lights.items():
+            here = power[on][of] * per
+            sums = [np.bincount(at, here * each, minlength=math.prod(shape)) for each in (share, moment)]
+            made[name] = Exposure(*(np.asarray(each, np.float64).reshape(shape) for each in sums))
+        return made
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,37 +190,43 @@ class DirectLight:
         the lens. With ``causes``, also what the direct light would be if all surfaces were white ones of Lambert
         (`EVEN`), if nothing were in the way to the lens (`OPEN`), and both (`EVEN_OPEN`).
         """
-        slabs, lens = self.slabs(L), self.sight.lens_at(L)
-        line, first = self.sheet.lit_lines(self.scene, L + self.sheet.sigma * slabs.middle)
-        slab = np.repeat(np.arange(len(slabs.share)), np.diff(first))
-        line, kept = self._facing(line, L)
-        line = line._replace(power=line.power * slabs.share[slab[kept]])
-        parts = self._line_of_sight.parts(line, lens, hidden=causes)
-        found = self._exposed(line, slab[kept], slabs, parts, L, self._sent, causes=causes)
+        found = self.exposures_along([L], causes=causes)
+        return {name: Exposure(each.power[0], each.moment[0]) for name, each in found.items()}
+
+    def exposures_along(self, transports: npt.ArrayLike, *, causes: bool = False) -> dict[str, Exposure]:
+        """Return `exposures` of several profiles, (profiles, samples, bins) each: faster than one by one."""
+        places = np.atleast_1d(np.asarray(transports, np.float64))
+        each = max(_SHEETS // len(self._slabs.share), 1)
+        parts = [self._some_exposures(places[k : k + each], causes) for k in range(0, max(len(places), 1), each)]
+        return {
+            name: Exposure(*(np.concatenate([part[name][n] for part in parts]) for n in (0, 1))) for name in parts[0]
+        }
+
+    def _some_exposures(self, places: Float64, causes: bool) -> dict[str, Exposure]:
+        by_profile = [self.slabs(float(L)) for L in places]
+        profile = np.repeat(np.arange(len(places)), [len(each.share) for each in by_profile])
+        columns = zip(*by_profile, strict=True) if by_profile else ([], [], [], [])
+        slabs = Slabs(*(np.concatenate([*each, np.zeros(0)]) for each in columns))
+        lit = self._lit(places[profile] + self.sheet.sigma * slabs.middle, places[profile])
+        lit = lit._replace(line=lit.line._replace(power=lit.line.power * slabs.share[lit.sheet]))
+        image = _Image(self.sight, slabs, profile, len(places))
+        found = self._exposed(lit, image, self._visible(lit, hidden=causes), self._sent, causes=causes)
         if any(each.mirror > 0.0 for each in self.materials):
-            found["specular"] += self._mirrored(line, slab[kept], slabs, L)
+            found["specular"] += self._mirrored(lit, image)
         return found
 
     def _exposed(
-        self,
-        line: LitLine,
-        slab: Integers,
-        slabs: Slabs,
-        parts: Parts,
-        L: float,
-        sent_by: Sender,
-        *,
-        causes: bool = False,
+        self, lit: _Lit, image: _Image, parts: Parts, sent_by: Sender, *, causes: bool = False
     ) -> dict[str, Exposure]:
-        """Return the exposures by parts of segments, each of a slab."""
-        images = self._images.of(line.ends, L)
-        parts = self._split(images.in_view(parts), images, line, L)
+        """Return the exposures by parts of segments."""
+        line, images = lit.line, self._images.of(lit.line.ends, 0.0)
+        parts = self._split(images.in_view(parts), images, line)
         # Both nodes of all parts.
         arriving = (line.power * line.lengths)[parts.segment] * (parts.end - parts.start)
         share = (parts.start + _NODES[:, None] * (parts.end - parts.start)).ravel()
         segment, seen = np.tile(parts.segment, 2), np.tile(parts.seen, 2)
         points = along(line.ends[segment], share)
-        sent = sent_by(line, segment, points, np.tile(0.5 * arriving, 2), L)
+        sent = sent_by(line, segment, points, np.tile(0.5 * arriving, 2))
         wanted = {"direct": sent["diffuse"] * seen, "specular": sent["gloss"] * seen}
         if causes:
             wanted |= {EVEN: sent["even"] * seen, OPEN: sent["diffuse"], EVEN_OPEN: sent["even"]}
@@ -179,17 +234,18 @@ class DirectLight:
         spread = np.zeros(len(share))
         if self.sheet.sigma > 0.0:
             spread = images.speed(segment, share, uv, self._moved(line.normals[segment], points))
-        return _deposits(self.sight, uv, spread, slabs, slab[segment], wanted)
+        return image.of(uv, spread, lit.sheet[segment], wanted)
 
-    def _mirrored(self, line: LitLine, slab: Integers, slabs: Slabs, L: float) -> Exposure:
+    def _mirrored(self, lit: _Lit, image: _Image) -> Exposure:
         """Return what mirrors throw right into the lens."""
+        line = lit.line
         shares = np.array([each.mirror for each in self.materials])[self._material(line)]
-        parts = glints(line, self.sheet, self.sight, L)
+        parts = glints(line, self.sheet, self.sight, 0.0)
         parts = parts.those(shares[parts.segment] > 0.0)
         of = parts.segment
         line = LitLine(parts.ends(line), line.normals[of], line.triangle[of], line.power[of] * shares[of])
-        seen = self._line_of_sight.parts(line, self.sight.lens_at(L))
-        return self._exposed(line, slab[of], slabs, seen, L, _all_of_it)["specular"]
+        lit = _Lit(line, lit.sheet[of], lit.moved[of])
+        return self._exposed(lit, image, self._visible(lit), _all_of_it)["specular"]
 
     def slabs(self, L: float) -> Slabs:
         """Return the slabs of the sheet at a transport L [m]."""
@@ -214,10 +270,15 @@ class DirectLight:
         imaged beyond the sensor's ends in u, and not given; AMBIGUOUS, there are several: the one with the most light
         is given.
         """
-        sight = self.sight
-        line, _ = self._facing(self.sheet.lit(self.scene, L), L)
-        images = self._images.of(line.ends, L)
-        parts = images.in_view(self._line_of_sight.parts(line, sight.lens_at(L)))
+        found = self.truths_along([L])
+        return Truth(found.g[0], found.h[0], found.status[0])
+
+    def truths_along(self, transports: npt.ArrayLike) -> Truth:
+        """Return `truth` of several profiles, (profiles, samples): faster than one by one."""
+        sight, places = self.sight, np.atleast_1d(np.asarray(transports, np.float64))
+        lit = self._lit(places, places)
+        line, images = lit.line, self._images.of(lit.line.ends, 0.0)
+        parts = images.in_view(self._visible(lit))
         v = images.at(parts.segment, np.stack([parts.start, parts.end]))[..., 1]
         low, high = v.min(axis=0), v.max(axis=0)
         # Half open, so that of two parts that touch one has the sample.
@@ -230,31 +291,42 @@ class DirectLight:
         u = images.at(mine.segment, share)[:, 0]
         on = (u >= sight.u_edges[0]) & (u <= sight.u_edges[-1])
         light = (line.power * line.lengths)[mine.segment] * (mine.end - mine.start) / (high - low)[owner]
-        return _chosen(sight.samples, sample, sight.sheet_coordinates(points, L), on, light)
+        slot = lit.sheet[mine.segment] * sight.samples + sample
+        found = _chosen(len(places) * sight.samples, slot, sight.sheet_coordinates(points), on, light)
+        return Truth(*(each.reshape(len(places), sight.samples) for each in found))
 
-    def _facing(self, line: LitLine, L: float) -> tuple[LitLine, Integers]:
-        """Return the segments whose lit side the lens can see, and which those are."""
-        kept = np.sum(line.normals * (self.sight.lens_at(L) - line.ends[:, 0]), axis=1) > 0.0
-        which = np.flatnonzero(kept)
-        return LitLine(line.ends[which], line.normals[which], line.triangle[which], line.power[which]), which
+    def _lit(self, sheets: Float64, transports: Float64) -> _Lit:
+        """Return what sheets light on the side that the lens can see, each in a profile at a transport."""
+        line, first = self.sheet.lit_lines(self.scene, sheets)
+        sheet = np.repeat(np.arange(len(sheets)), np.diff(first))
+        moved = transports[sheet, None] * np.array(self.sheet.transport.direction)
+        ends = line.ends - moved[:, None]
+        towards = np.array(self.sight.lens) - ends[:, 0]
+        which = np.flatnonzero(np.sum(line.normals * towards, axis=1) > 0.0)
+        line = LitLine(ends[which], line.normals[which], line.triangle[which], line.power[which])
+        return _Lit(line, sheet[which], moved[which])
 
-    def _split(self, parts: Parts, images: LineImages, line: LitLine, L: float) -> Parts:
+    def _visible(self, lit: _Lit, *, hidden: bool = False) -> Parts:
+        line = lit.line._replace(ends=lit.line.ends + lit.moved[:, None])
+        return self._line_of_sight.parts(line, np.array(self.sight.lens) + lit.moved, hidden=hidden)
+
+    def _split(self, parts: Parts, images: LineImages, line: LitLine) -> Parts:
         """Split parts at the edges of samples and bins, and where a lobe changes much."""
         u_edges = self.sight.u_edges
         if self.sheet.sigma > 0.0:
             # Light is spread onto the sensor from beyond its ends.
             u_edges = np.concatenate([[-np.inf], u_edges, [np.inf]])
         parts = images.split(images.split(parts, self.sight.v_edges, 1), u_edges, 0)
-        return self._split_lobes(parts, line, L)
+        return self._split_lobes(parts, line)
 
-    def _split_lobes(self, parts: Parts, line: LitLine, L: float) -> Parts:
+    def _split_lobes(self, parts: Parts, line: LitLine) -> Parts:
         """Split parts on glossy surfaces until the half way vector turns little within each."""
         widths = np.array([math.inf if each.gloss is None else _width(each.gloss) for each in self.materials])
         if np.isinf(widths).all():
             return parts
         width = widths[self._material(line)][parts.segment]
         ends = parts.ends(line)
-        half_way = _unit(self.sheet.towards(ends) + _unit(self.sight.lens_at(L) - ends))
+        half_way = _unit(self.sheet.towards(ends) + _unit(np.array(self.sight.lens) - ends))
         turn = np.linalg.norm(half_way[:, 1] - half_way[:, 0], axis=1) / width
         count = np.clip(np.ceil(turn / _TURN), 1, _TURNS).astype(np.int64)
         owner, number = np.repeat(np.arange(len(count)), count), ranges(np.zeros_like(count), count)
@@ -266,13 +338,11 @@ class DirectLight:
         assert self.scene.material is not None  # set by Scene itself
         return self.scene.material[line.triangle]
 
-    def _sent(
-        self, line: LitLine, segment: Integers, points: Float64, arriving: Float64, L: float
-    ) -> dict[str, Float64]:
+    def _sent(self, line: LitLine, segment: Integers, points: Float64, arriving: Float64) -> dict[str, Float64]:
         """Return power on the sensor [W] of light that arrives at points [W], by kind of reflection."""
         normal = line.normals[segment]
-        eye = _unit(self.sight.lens_at(L) - points)
-        arriving = arriving * np.maximum(np.sum(normal * eye, axis=1), 0.0) * self.sight.received(points, L)
+        eye = _unit(np.array(self.sight.lens) - points)
+        arriving = arriving * np.maximum(np.sum(normal * eye, axis=1), 0.0) * self.sight.received(points)
         sent = {"even": arriving / math.pi, "diffuse": np.zeros(len(points)), "gloss": np.zeros(len(points))}
         material = self._material(line)[segment]
         for number in np.unique(material):
@@ -295,7 +365,7 @@ class DirectLight:
         return np.asarray(self.sheet.sigma * (direction - light * slope[:, None]))
 
 
-def _all_of_it(line: LitLine, segment: Integers, points: Float64, arriving: Float64, L: float) -> dict[str, Float64]:
+def _all_of_it(line: LitLine, segment: Integers, points: Float64, arriving: Float64) -> dict[str, Float64]:
     return {"diffuse": np.zeros(len(arriving)), "gloss": arriving}
 
 
@@ -308,37 +378,6 @@ def _slabs(given: int | Sequence[float]) -> Slabs:
     if cuts.ndim != 1 or not np.isfinite(cuts).all() or np.any(np.diff(cuts) <= 0.0):
         raise ValueError("DirectLight.sub_sheets: expected a number of slabs, or ascending places in sigmas")
     return Slabs.between(cuts)
-
-
-def _deposits(
-    sight: Sight, uv: Float64, spread: Float64, slabs: Slabs, slab: Integers, lights: Mapping[str, Float64]
-) -> dict[str, Exposure]:
-    """Return exposures by spots of slabs' light: their means at (u, v), spread by so much along u a sigma."""
-    sample = sight.sample_of(uv[:, 1])
-    on = np.flatnonzero(sample >= 0)
-    sample, u, slab = sample[on], uv[on, 0], slab[on]
-    least = 1e-9 * float(np.diff(sight.u_edges).min())
-    spread = np.where(np.abs(spread[on]) < least, least, spread[on])
-    low, high, middle = slabs.low[slab], slabs.high[slab], slabs.middle[slab]
-    reach = u + spread * (np.clip([low, high], -_BEYOND, _BEYOND) - middle)
-    first = np.maximum(np.searchsorted(sight.u_edges, reach.min(axis=0), side="right") - 1, 0)
-    last = np.minimum(np.searchsorted(sight.u_edges, reach.max(axis=0), side="left"), sight.bins)
-    count = np.maximum(last - first, 0)
-    of, place = np.repeat(np.arange(len(u)), count), ranges(first, count)
-    # The edges of the bins in sigmas of the sheet.
-    ends = middle[of] + (np.stack([sight.u_edges[place], sight.u_edges[place + 1]]) - u[of]) / spread[of]
-    ends = np.clip(np.sort(ends, axis=0), low[of], high[of])
-    share = _between(*ends)
-    moment = (u - spread * middle)[of] - sight.u_middles[place]
-    moment = moment * share + spread[of] * (_bell(ends[0]) - _bell(ends[1]))
-    at, per = sample[of] * sight.bins + place, 1.0 / slabs.share[slab[of]]
-    size = sight.samples * sight.bins
-    made = {}
-    for name, power in lights.items():
-        here = power[on][of] * per
-        sums = [np.asarray(np.bincount(at, here * each, minlength=size), np.float64) for each in (share, moment)]
-        made[name] = Exposure(*(each.reshape(sight.samples, sight.bins) for each in sums))
-    return made
 
 
 def _chosen(samples: int, sample: Integers, places: Float64, on: npt.NDArray[np.bool_], light: Float64) -> Truth:

@@ -96,8 +96,12 @@ class LineOfSight:
         object.__setattr__(self, "_bound", fans.bind(self.device, (_FANS, 11), real))
 
     def parts(self, line: LitLine, lens: Float64, *, hidden: bool = False) -> Parts:
-        """Return the parts of segments that a lens (3,) sees, and those it does not if ``hidden``."""
+        """Return the parts of segments that a lens sees, and those it does not if ``hidden``.
+
+        The lens is one for all, (3,), or each segment has its own, (m, 3).
+        """
         count = len(line.power)
+        lens = np.broadcast_to(lens, (count, 3))
         todo = Parts(np.arange(count), np.zeros(count), np.ones(count), np.ones(count, bool))
         found = [todo.those(np.zeros(0, np.int64))]
         for _ in range(_HALVINGS):
@@ -113,7 +117,7 @@ class LineOfSight:
         """Return the visible parts of parts, and which had too many of them."""
         count = len(parts.segment)
         fans = np.zeros((count, 11))
-        fans[:, :3], fans[:, 3:9] = lens, parts.ends(line).reshape(-1, 6)
+        fans[:, :3], fans[:, 3:9] = lens[parts.segment], parts.ends(line).reshape(-1, 6)
         many = np.zeros(count, bool)
         found = [parts.those(np.zeros(0, np.int64))]
         for first in range(0, count, _FANS):

@@ -460,6 +460,26 @@ def test_beside_the_sensor() -> None:
     assert away.exposures(5.0)["direct"].power.shape == (8, 12)
 
 
+@pytest.mark.parametrize("sigma", [0.0, 2e-4])
+def test_several_profiles_at_once(device: Device, sigma: float) -> None:
+    """As one by one, in any order, some beside the part; shining mirrors and lobes among them."""
+    ball = trimesh.creation.icosphere(3, 0.02)
+    made_of = Material(diffuse=Lambert(albedo=0.2), gloss=Phong(albedo=0.2, exponent=30.0), mirror=0.3)
+    seen_by = sight(bins=5, aperture=0.02)
+    light = light_of(Scene.of(ball), (made_of,), seen_by=seen_by, sigma=sigma, source=(0.01, 0.2), device=device)
+    places = np.array([3e-3, -0.5, 1e-2, *np.linspace(-4e-3, 4e-3, 9), 0.0])
+    together, truths = light.exposures_along(places, causes=True), light.truths_along(places)
+    for k, L in enumerate(places):
+        for name, alone in light.exposures(float(L), causes=True).items():
+            np.testing.assert_allclose(together[name].power[k], alone.power, rtol=1e-9, atol=1e-20)
+            np.testing.assert_allclose(together[name].moment[k], alone.moment, rtol=1e-9, atol=1e-20)
+        for both, one in zip(truths, light.truth(float(L)), strict=True):
+            np.testing.assert_array_equal(both[k], one)
+    assert (together["specular"].total().sum(axis=1) > 0.0).sum() > 5
+    assert light.exposures_along([])["direct"].power.shape == (0, 8, 5)
+    assert light.truths_along([]).h.shape == (0, 8)
+
+
 def test_in_a_slit_is_dark() -> None:
     """A part wholly in a deep slit, lit from above: the lens sees the walls' upper edges alone."""
     walls = [quad((-1, y, -0.05), (1, y, -0.05), (1, y, 0.0), (-1, y, 0.0)) for y in (-2e-3, 2e-3)]

@@ -15,6 +15,10 @@ def intervals(corners: np.ndarray, ray_of: object, points: tuple[np.ndarray, ...
     """
     point, start, stop = points
     along = stop - start
+    view = np.cross(start - point, along)
+    sides = (corners - point) @ view
+    slack = 1e-9 * np.abs(sides).max(initial=0.0)
+    corners = corners[(sides.min(axis=1) <= slack) & (sides.max(axis=1) >= -slack)]
     edges = np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 3) - point
     off = np.cross(edges[:, 0], edges[:, 1])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -22,16 +26,15 @@ def intervals(corners: np.ndarray, ray_of: object, points: tuple[np.ndarray, ...
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         critical.append(np.sum(normals * (corners[:, 0] - start), axis=1) / (normals @ along))
-    view = np.cross(start - point, along)
     for place, normal in planes:
-        for at, facing in zip(corners[:, 0], normals, strict=True):
-            system = np.stack([facing, view, normal])
-            if np.linalg.matrix_rank(system) < 3:
-                continue
-            met = np.linalg.solve(system, [facing @ at, view @ point, normal @ place])
-            across = np.cross(view, met - point)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                critical.append(np.atleast_1d(across @ (point - start) / (across @ along)))
+        systems = np.stack([normals, np.tile(view, (len(normals), 1)), np.tile(normal, (len(normals), 1))], axis=1)
+        meets = np.linalg.matrix_rank(systems) == 3
+        right = np.column_stack(
+            [np.sum(normals * corners[:, 0], axis=1), np.tile([view @ point, normal @ place], (len(normals), 1))]
+        )
+        across = np.cross(view, np.linalg.solve(systems[meets], right[meets][..., None])[..., 0] - point)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            critical.append(across @ (point - start) / (across @ along))
     cuts = np.concatenate(critical)
     cuts = np.unique([*np.clip(cuts[np.isfinite(cuts)], 0.0, 1.0), 0.0, 1.0])
     origins, ends = ray_of(0.5 * (cuts[1:] + cuts[:-1]))  # type: ignore[operator]
@@ -67,8 +70,9 @@ def from_receiver(corners: np.ndarray, receiver: np.ndarray, segment: np.ndarray
     def ray_of(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         toward = start + t[:, None] * (stop - start) - point
         height, above = -(toward @ lit), toward @ facing
-        near = np.clip(clearance / np.where(above > 0.0, above, np.inf), 0.0, 0.5)[:, None]
-        return point + near * toward, point + (1.0 - clearance / height[:, None]) * toward
+        end = 1.0 - clearance / height[:, None]
+        near = np.minimum(clearance / np.where(above > 0.0, above, np.inf)[:, None], end)
+        return point + near * toward, point + end * toward
 
     planes = [(point + clearance * facing, facing), (start + clearance * lit, lit)]
     return intervals(corners, ray_of, (point, start, stop), planes)

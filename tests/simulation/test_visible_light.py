@@ -226,6 +226,33 @@ def test_light_as_rays_say(device: Device, walk: Any, dtype: Any, count: int) ->
     assert np.mean(np.abs(result.irradiance - free) > 0.01 * free) > 0.2
 
 
+@functools.cache
+def lit_board() -> tuple[np.ndarray, ...]:
+    """The board of the benchmarks: receivers (1, 24, 6) that face it, segments, corners, and the light by rays."""
+    pytest.importorskip("embreex", reason="the extra 'test' is not installed")
+    from gpuvision.profiling.visible_light import Board
+
+    board = Board.of()
+    everywhere = board.receivers.astype(float).reshape(-1, 6)
+    segments = segment_rows(board.segments)
+    facing = [
+        np.any(((each[:3] - segments[:, :3]) * segments[:, 6:9]).sum(axis=1) > 1e-4)
+        and np.any((segments[:, :6].reshape(-1, 2, 3) - each[:3]) @ each[3:] > 1e-4)
+        for each in everywhere
+    ]
+    receivers = everywhere[facing][::20][:24]
+    value, most = reference.light(board.scene.corners, receivers, segments, 1e-6)
+    return board.scene.corners, receivers[None], segments, value, most
+
+
+@WAYS
+def test_light_on_a_board_as_rays_say(device: Device, walk: Any, dtype: Any) -> None:
+    corners, receivers, segments, value, most = lit_board()
+    result = light_of(corners, receivers.astype(dtype), segments, device, walk=walk, clearance=1e-6).irradiance[0]
+    assert np.all(np.abs(result - value) <= (2e-5 if dtype == np.float32 else 1e-10) * most)
+    assert 0.2 < np.mean(value > 0.0) < 0.9
+
+
 @ON_DEVICES
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 30), size=st.sampled_from([0.1, 0.3, 3.0]))
 def test_light_in_any_soup(device: Device, seed: int, count: int, size: float) -> None:

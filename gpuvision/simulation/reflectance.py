@@ -108,12 +108,28 @@ class OrenNayar(Brdf):
     """Rough and diffuse: Oren and Nayar's model in Fujii's form, which reflects no more than the albedo.
 
     (The usual form with A and B of sigma^2 returns over 1 % more than arrives at grazing incidence.)
-    A roughness of 0 is `Lambert`; 1 is the roughest.
+    A roughness of 0 is `Lambert`; 1 is the roughest. `of_slopes` takes a measured sigma.
     """
 
     kind: ClassVar[str] = "BRDF_OREN_NAYAR"
     albedo: float
     roughness: float
+
+    @classmethod
+    def of_slopes(cls, *, albedo: float, sigma: float) -> OrenNayar:
+        """Take sigma, the standard deviation of the slope angles of the surface's facets, radians, 0 to pi / 2.
+
+        The roughness is B / A of Oren and Nayar's qualitative model (1994): over its value at normal incidence and
+        view, the reflectance is theirs wherever light and eye stand on one side of the normal. On opposite sides
+        theirs stays level and this one falls, which is what keeps it within the albedo. Sigma of pi / 2 is a
+        roughness of 0.776.
+        """
+        angle = finite(sigma, "OrenNayar.of_slopes: sigma")
+        if not 0.0 <= angle <= math.pi / 2.0:
+            raise ValueError(f"OrenNayar.of_slopes: sigma is {angle:g}, expected radians, 0 to pi / 2")
+        square = angle**2
+        level, slope = 1.0 - 0.5 * square / (square + 0.33), 0.45 * square / (square + 0.09)
+        return cls(albedo=albedo, roughness=slope / level)
 
     def __post_init__(self) -> None:
         _keep(self, "albedo", 0.0, 1.0)

@@ -99,6 +99,27 @@ def test_limits_to_lambert(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(OrenNayar(albedo=0.8, roughness=0.0).value(pairs), diffuse.value(pairs), rtol=1e-15)
 
 
+@pytest.mark.parametrize("sigma", [0.0, 0.1, 0.5, math.pi / 2.0])
+def test_slopes_as_oren_and_nayar_say(sigma: float, rng: np.random.Generator) -> None:
+    """Their A + B cos(phi) sin(alpha) tan(beta) over A, where light and eye stand on one side."""
+    polar, azimuth = rng.uniform(0.0, 1.5, (2, 500)), rng.uniform(-1.5, 1.5, 500)
+    light = np.stack([np.sin(polar[0]), 0.0 * azimuth, np.cos(polar[0])], axis=1)
+    eye = np.stack([np.sin(polar[1]) * np.cos(azimuth), np.sin(polar[1]) * np.sin(azimuth), np.cos(polar[1])], axis=1)
+    level = 1.0 - 0.5 * sigma**2 / (sigma**2 + 0.33)
+    slope = 0.45 * sigma**2 / (sigma**2 + 0.09)
+    expected = 1.0 + slope / level * np.cos(azimuth) * np.sin(polar.max(axis=0)) * np.tan(polar.min(axis=0))
+    model = OrenNayar.of_slopes(albedo=0.7, sigma=sigma)
+    normal = model.value([0.0, 0.0, 1.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(model.value(np.hstack([light, eye])) / normal, expected, rtol=1e-12)
+    assert albedo(model, 0.5) <= 0.7 * (1.0 + 1e-9)
+
+
+def test_slopes_out_of_range() -> None:
+    for sigma in (-0.1, 2.0):
+        with pytest.raises(ValueError, match="expected radians"):
+            OrenNayar.of_slopes(albedo=0.5, sigma=sigma)
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.5, 1.0, 1.3])
 def test_limits_to_the_mirror(angle: float) -> None:
     """All light goes into the mirror direction, and a little aside there is none."""

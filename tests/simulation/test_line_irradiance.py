@@ -183,6 +183,23 @@ def test_many_pairs_against_the_quadrature(device: Device, walk: Any, rng: np.ra
         assert np.all(np.abs(result.irradiance - value) <= tolerance * most)
 
 
+@TWO_WAYS
+@PRECISIONS
+def test_segments_that_lie_alike(device: Device, walk: Any, precision: Any, rng: np.random.Generator) -> None:
+    """On two surfaces, in directions that are one but for rounding, turned and shifted; each near some receivers."""
+    start = np.column_stack([rng.uniform(-0.1, 0.1, (41, 2)), np.zeros(41)])
+    ends = np.stack([start, start + rng.uniform(0.01, 0.1, (41, 1)) * [1.0, 0.0, 0.0]], axis=1)
+    normals = np.tile([0.0, 0.0, 1.0], (41, 1))
+    ends[::3], normals[::3] = ends[::3][:, :, [0, 2, 1]], [0.0, 1.0, 0.0]
+    rotation = turned(rng)
+    segments = LitSegments(ends @ rotation + 0.3, normals @ rotation, np.ones(41))
+    places = ends[:, 0] + rng.uniform(1e-4, 1e-2, (41, 3)) * normals + [1e-3, 1e-3, 1e-3]
+    receivers = np.hstack([places @ rotation + 0.3, rng.normal(size=(41, 3))])
+    frames = segments.tables(np.dtype(np.float64), np.dtype(np.float32))[1]
+    assert len(frames) < 8
+    assert_exact(receivers[:8], segments, device, walk, precision)
+
+
 # ---- extremes --------------------------------------------------------------------------------------------------
 
 FLOOR = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))

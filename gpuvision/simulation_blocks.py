@@ -217,7 +217,7 @@ def compute_block(task: Task, number: int, device: Device | None = None) -> byte
     """Compute a block; the bytes of its file."""
     with _BENCH_LOCK:
         paths = _bench(task, device)
-        profiles = [paths.profile(task.transports[k]) for k in task.blocks()[number]]
+        profiles = paths.profiles(task.transports[list(task.blocks()[number])])
     names = profiles[0].exposures
     exposures = {
         name: Exposure(*(np.stack(each) for each in zip(*(p.exposures[name] for p in profiles), strict=True)))

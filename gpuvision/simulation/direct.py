@@ -303,8 +303,7 @@ class DirectLight:
         ends = line.ends - moved[:, None]
         towards = np.array(self.sight.lens) - ends[:, 0]
         which = np.flatnonzero(np.sum(line.normals * towards, axis=1) > 0.0)
-        line = LitLine(ends[which], line.normals[which], line.triangle[which], line.power[which])
-        return _Lit(line, sheet[which], moved[which])
+        return _Lit(line._replace(ends=ends).those(which), sheet[which], moved[which])
 
     def _visible(self, lit: _Lit, *, hidden: bool = False) -> Parts:
         line = lit.line._replace(ends=lit.line.ends + lit.moved[:, None])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -52,6 +52,10 @@ class LitLine(NamedTuple):
     def total(self) -> float:
         """Return the power that arrives on all segments, W."""
         return float(self.lengths @ self.power)
+
+    def those(self, which: npt.NDArray[Any] | slice) -> LitLine:
+        """Return some of the segments."""
+        return LitLine(self.ends[which], self.normals[which], self.triangle[which], self.power[which])
 
     def joined(self, kind: npt.ArrayLike) -> LitLine:
         """Return fewer segments: those that touch, one after another, in one plane, of one power and kind, as one.

@@ -133,8 +133,26 @@ class LightPaths:
 
     def profile(self, L: float) -> Profile:
         """Return the light at a transport [m]."""
-        lit = self.sheet.lit(self.scene, L)
-        exposures = self._straight(L)
+        return self.profiles([L])[0]
+
+    def profiles(self, transports: npt.ArrayLike) -> list[Profile]:
+        """Return the light at several transports [m]: faster than one by one."""
+        places = np.atleast_1d(np.asarray(transports, np.float64))
+        straight, truths = self._direct.exposures_along(places, causes=True), self._direct.truths_along(places)
+        lit, first = self.sheet.lit_lines(self.scene, places)
+        found = []
+        for k, L in enumerate(places):
+            exposures = {
+                name: self.sight.blurred(Exposure(each.power[k], each.moment[k]), self.blur)
+                for name, each in straight.items()
+                if name in self.paths or name not in PATHS
+            }
+            truth = Truth(truths.g[k], truths.h[k], truths.status[k])
+            found.append(self._profile(float(L), lit.those(slice(first[k], first[k + 1])), exposures, truth))
+        return found
+
+    def _profile(self, L: float, lit: LitLine, exposures: dict[str, Exposure], truth: Truth) -> Profile:
+        """Return the direct light of a profile with the light by detours."""
         account = {"segments": float(len(lit.power)), "power": lit.total()}
         if "diffuse-specular" in self.paths and self._mirrors.there_are_any:
             exposures["diffuse-specular"] = self._mirrors.exposure(lit, L, self.sheet)
@@ -152,15 +170,7 @@ class LightPaths:
                 irradiance, told = self._secondary(seen, segments, reading, remaining)
                 exposures["diffuse-diffuse"] = self.lines.exposure(seen, irradiance)
                 account |= told
-        return Profile(exposures, self._direct.truth(L), account)
-
-    def _straight(self, L: float) -> dict[str, Exposure]:
-        light = self._direct.exposures(L, causes=True)
-        return {
-            name: self.sight.blurred(each, self.blur)
-            for name, each in light.items()
-            if name in self.paths or name not in PATHS
-        }
+        return Profile(exposures, truth, account)
 
     # ---- light by detours ------------------------------------------------------------------------------------
 

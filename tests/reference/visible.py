@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from reference import line_irradiance, rays
@@ -102,3 +104,22 @@ def difference(some: np.ndarray, others: np.ndarray) -> float:
         ((middles[:, None] > each[:, 0]) & (middles[:, None] < each[:, 1])).any(axis=1) for each in (some, others)
     ]
     return float(np.sum((edges[1:] - edges[:-1])[inside[0] != inside[1]]))
+
+
+def single(values: Any) -> np.ndarray:
+    """Numbers that a float holds exactly, so that both precisions see the same scene."""
+    return np.asarray(values).astype(np.float32).astype(np.float64)
+
+
+def soup(rng: np.random.Generator, count: int, size: float = 0.2) -> np.ndarray:
+    """Triangles anywhere in a cube."""
+    return single(rng.uniform(-1.0, 1.0, (count, 1, 3)) + rng.normal(0.0, size, (count, 3, 3)))
+
+
+def comb(teeth: int) -> np.ndarray:
+    """Thin triangles side by side, and how much of a unit segment each hides from twice their distance: a half."""
+    at = (np.arange(teeth) + 0.25) / teeth - 0.5
+    x = 0.5 * np.stack([at, at + 0.5 / teeth, at], axis=1)
+    x[:, 2] = x[:, :2].mean(axis=1)
+    y = np.tile([-1.0, -1.0, 2.0e3], (teeth, 1))
+    return np.stack([x, y, np.full_like(x, 0.5)], axis=-1)

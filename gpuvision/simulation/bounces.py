@@ -25,7 +25,7 @@ _ROWS, _ROUND = 2048, 128
 _NODES_PER_SEGMENT, _NODES_PER_PATCH = 8, 2.0
 # Of patches: segments below that are points, and points within that are one.
 _SHORT = 0.0625
-_TOLERANCE, _ROUNDS = 1e-10, 400
+_TOLERANCE, _ROUNDS = 3e-6, 400
 # Roundings of the scene's extent around a place within which nothing covers it, and which part of a view is none.
 _CLEARANCE, _NOTHING = 64.0, 0.01
 
@@ -48,8 +48,8 @@ class Bounces:
     device
         Where form factors are computed, in double where it can; None takes `Device.best`.
     dense
-        Up to so many patches the matrix is kept and factored, once for all lights; beyond, it is computed anew in each
-        round of an iteration (GMRES to 1e-10).
+        Up to so many patches the matrix is kept in double and factored, once for all lights; beyond, in single, four
+        bytes for a pair of patches, and each light is solved for by iteration (GMRES, to 3e-6).
 
     Raises
     ------
@@ -158,8 +158,11 @@ class Bounces:
     @functools.cached_property
     def factors(self) -> Reals:
         """(count, count): which part of each column's exitance arrives on the row's patch."""
+        return self._matrix(np.float64)
+
+    def _matrix(self, kind: Any) -> npt.NDArray[Any]:
         points, owner, weight, _ = self._surface
-        matrix = np.zeros((self.patches.count, self.patches.count))
+        matrix = np.zeros((self.patches.count, self.patches.count), kind)
         for rows, begin in self._rows(points):
             own, share = owner[begin : begin + len(rows)], weight[begin : begin + len(rows), None]
             starts = np.flatnonzero(np.diff(own, prepend=-1))
@@ -223,22 +226,21 @@ class Bounces:
         factored = lu_factor(matrix, overwrite_a=True, check_finite=False)
         return factored, float(lapack.dgecon(factored[0], norm)[0])
 
+    @functools.cached_property
+    def _compact(self) -> npt.NDArray[np.float32]:
+        """The factors in single precision: half of the memory, for scenes of many patches."""
+        return self._matrix(np.float32)
+
     def _iterated(self, emitted: Reals) -> Reals:
         from scipy.sparse.linalg import LinearOperator, gmres
 
-        size = self.patches.count
-        points, owner, weight, _ = self._surface
-        bound = PatchLight(patches=self.patches, scene=self.scene).bind(self.device, points.shape, self._real)
-        bound.inputs[0].set(points.astype(self._real))
+        size, factors = self.patches.count, self._compact
 
         def without_bounced(exitance: Reals) -> Reals:
-            bound.inputs[1].set(exitance.astype(self._real))
-            arrived = np.bincount(owner, weight * bound.run().irradiance.get(), size)
-            return np.asarray(exitance - self.albedo * arrived)
+            return np.asarray(exitance - self.albedo * (factors @ exitance.astype(np.float32)))
 
         operator = LinearOperator((size, size), without_bounced, dtype=np.float64)
-        tolerance = max(_TOLERANCE, 100.0 * float(np.finfo(self._real).eps))
-        solution, failed = gmres(operator, emitted, rtol=tolerance, restart=_ROUNDS, maxiter=1)
+        solution, failed = gmres(operator, emitted, rtol=_TOLERANCE, restart=_ROUNDS, maxiter=1)
         if failed:
             raise ValueError(_NO_WAY_OUT)
         return np.asarray(solution)

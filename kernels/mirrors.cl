@@ -26,10 +26,12 @@
 #define NEAR_ENOUGH ((real)1e-7)
 #define SLACK ((real)1e-12)
 #define GRAZING ((real)1e-9)
+#define EDGE ((real)1e-10)
 #else
 #define NEAR_ENOUGH ((real)1e-3)
 #define SLACK ((real)1e-5)
 #define GRAZING ((real)1e-4)
+#define EDGE ((real)1e-5)
 #endif
 
 #define INLINE __attribute__((always_inline)) inline
@@ -200,7 +202,9 @@ INLINE masks solved(Vector point, Vector lens, global const real *row, reals *x,
     }
     *it = reflection_at(*x, *y, point, lens, row);
     const reals zero = (real)0;
-    const masks inside = mask_of(*x >= zero) & mask_of(*y >= zero) & mask_of(*x + *y <= (real)1);
+    // What lies on the edge of two is to be in one at least.
+    const reals least = -EDGE, most = (real)1 + EDGE;
+    const masks inside = mask_of(*x >= least) & mask_of(*y >= least) & mask_of(*x + *y <= most);
     const masks outside = mask_of(it->up_lens > zero) | mask_of((reals)row[26] == zero);
     // R is zero, too, where the surface is seen edge on from both.
     const reals ways = sqrt(dot_of(it->to_lens, it->to_lens) * dot_of(it->to_point, it->to_point));

@@ -282,7 +282,11 @@ class Mirrors:
             found.append((row[which], *(each[which, slot] for each in images[:4])))
             row, kept = row[more], min(4 * kept, _MOST_KEPT)
         point, spot, move, density, triangle = (np.concatenate(each) for each in zip(*found, strict=True))
-        return point, spot, move, density, triangle
+        # One on the edge of two triangles is found on both.
+        order = np.lexsort((*spot.T, point))
+        near = np.abs(np.diff(spot[order], axis=0)).max(axis=1, initial=0.0) <= self._clearance
+        once = order[np.append(True, ~near | (np.diff(point[order]) != 0))[: len(order)]]
+        return point[once], spot[once], move[once], density[once], triangle[once]
 
     def _free(self, origin: Float64, spot: Float64, lens: Float64, triangle: Integers) -> npt.NDArray[np.bool_]:
         """Return whether nothing is in the way from points to spots on curved mirrors and on to the lens.

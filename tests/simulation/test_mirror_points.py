@@ -91,6 +91,28 @@ def test_an_ellipsoid_shows_points_as_rays_that_it_reflects(device: Device, rng:
         assert abs(density[n] * area_per_angle - 1.0) < 5e-3
 
 
+@pytest.mark.parametrize("point_height", [0.012, 0.03, 0.06, 0.2])
+def test_a_hollow_mirror_concentrates_as_its_focal_length_says(device: Device, point_height: float) -> None:
+    """On the axis of a sphere of radius R: (d + e - 2 d e / R)^2 square metres per steradian; more beyond the focus."""
+    radius, lens_height = 0.08, 0.3
+    corners, normals = ball(4)
+    turn = trimesh.transformations.random_rotation_matrix(np.array([0.31, 0.77, 0.23]))[:3, :3]
+    corners, normals = radius * corners @ turn + [0.0, 0.0, radius], -normals @ turn
+    # Further out there is a ring of images, a caustic.
+    bottom = corners[..., 2].max(axis=1) < 0.1 * radius
+    op = MirrorPoints(corners=corners[bottom], normals=normals[bottom], numbers=np.flatnonzero(bottom))
+    points = np.array([[0.0, 0.0, point_height, 1.0, 0.0, 0.0]])
+    result = op(points, np.array([0.0, 0.0, lens_height]), device=device)
+    axial = np.linalg.norm(result.place[0, : result.count[0], :2], axis=1) < 1e-5
+    assert axial.sum() == 1
+    spread = lens_height + point_height - 2.0 * lens_height * point_height / radius
+    assert np.abs(result.place[0, : result.count[0], 2][axial]) < 1e-6
+    assert result.density[0, : result.count[0]][axial] == pytest.approx(spread**-2, rel=2e-2)
+    move = result.move[0, : result.count[0], 0][axial]
+    # Of the place as the point moves aside: the lens is at e / (e - f) times its image's way.
+    assert move == pytest.approx(lens_height / spread, rel=1e-2)
+
+
 @WAYS
 def test_images_move_as_points_do(device: Device, walk: Any, dtype: Any, rng: np.random.Generator) -> None:
     points = some_points(rng)

@@ -237,6 +237,23 @@ def test_a_curved_mirror_in_steps_converges_to_the_second_order(device: Device) 
     assert abs(totals[1] / totals[2] - 1.0) < 1e-3
 
 
+def test_a_hollow_mirror_does_not_hide_itself(device: Device) -> None:
+    """A line over a bowl: facets stand out of the smooth surface; that costs no light, however coarse they are."""
+    radius, totals = 0.08, []
+    for fineness in (3, 5):
+        ball = np.array(trimesh.creation.icosphere(fineness).triangles)
+        bowl = radius * ball / np.linalg.norm(ball, axis=2, keepdims=True) + [0.0, 0.0, radius]
+        bowl = bowl[bowl[..., 2].max(axis=1) < 0.008]
+        plate = [[[-6e-3, -1e-5, 0.012], [6e-3, -1e-5, 0.012], [0.0, 1e-5, 0.012]]]
+        normals = np.concatenate([np.zeros((1, 3, 3)), ([0.0, 0.0, radius] - bowl) / radius])
+        scene = Scene(np.concatenate([plate, bowl]), np.r_[0, np.ones(len(bowl), int)])
+        ends = np.array([[[-5e-3, 0.0, 0.012], [5e-3, 0.0, 0.012]]])
+        line = LitLine(ends, np.array([[0.0, 0.0, -1.0]]), np.zeros(1, int), np.array([3.0]))
+        totals.append(mirrors_of(scene, MATERIALS, device, normals=normals).seen(line, 0.0).power.sum())
+    assert totals[0] == pytest.approx(totals[1], rel=2e-3)
+    assert totals[0] > 0.0
+
+
 def test_what_stands_before_a_curved_mirror_hides_its_image(device: Device) -> None:
     scene = ball_scene(3, 5e-3, np.array([0.0, -0.007, 5.0e-3]))
     lit = sheet(g_limits=(-0.015, 0.015)).lit(scene, 0.0)
@@ -247,6 +264,30 @@ def test_what_stands_before_a_curved_mirror_hides_its_image(device: Device) -> N
     ):
         hidden = Scene(np.concatenate([scene.corners, screen]), np.append(scene.material, [0, 0]))
         assert mirrors_of(hidden, MATERIALS, device).seen(lit, 0.0).power.sum() < 1e-3 * whole
+
+
+def test_an_image_on_an_edge_counts_once(device: Device) -> None:
+    """A cylinder along x whose edge shows a line: lens, edge and line lie in one plane."""
+    sensor = sight(24, 24)
+    lens, middle = np.array(sensor.lens), np.array([0.0, -0.01, 0.005])
+    back = (lens - middle) * [0.0, 1.0, 1.0] / np.linalg.norm((lens - middle)[1:])
+    turns, sideways = np.linspace(-0.6, 0.6, 5), np.cross([1.0, 0.0, 0.0], back)
+    ring = np.cos(turns)[:, None] * back + np.sin(turns)[:, None] * sideways
+    rows, normals = [], []
+    for a, b in itertools.pairwise(range(5)):
+        left, right = ([middle + [x, 0, 0] + 5e-3 * ring[n] for n in (a, b)] for x in (-0.05, 0.05))
+        rows += quad(left[0], right[0], right[1], left[1])
+        normals += quad(ring[a], ring[a], ring[b], ring[b])
+    scene = Scene(np.array(rows), np.ones(8, int))
+    images = mirrors_of(scene, MATERIALS, device, sight=sensor, normals=np.array(normals))
+    points = np.tile(middle + 0.05 * back, (40, 1))
+    points[:, 0] = np.linspace(-0.02, 0.02, 40)
+    points = np.hstack([points, np.tile([1e-4, 0.0, 0.0], (40, 1))])
+    row, spot, *_ = images._images(points, lens)
+    np.testing.assert_array_equal(row, np.arange(40))
+    np.testing.assert_allclose((spot - middle) @ back, 5e-3, rtol=1e-6)
+    raw = images._points(8)(points, lens, device=device) if device.has_double else None
+    assert raw is None or np.all(raw.count == 2)
 
 
 def test_more_images_than_there_is_room_for_are_sought_again(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

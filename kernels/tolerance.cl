@@ -1,31 +1,9 @@
 // Which lit segments each block of receivers needs, to a tolerance: the tree of gpuvision/simulation/clusters.py from
 // its root, a block at a time. A cluster is left out where the light that it could send at most is under its share;
 // replaced by one segment where that is close enough and nothing can stand between; else opened.
+#include "light_bounds.h"
 #include "shaft.h"
 
-#define COLUMNS 24
-#define CENTRE 0
-#define LOW 3
-#define HIGH 6
-#define NORMAL 9
-#define RADIUS 12
-#define SPREAD 13
-#define MOST_HEIGHT 14
-#define LEAST_HEIGHT 15
-#define SLAB 16
-#define POWER 17
-#define FIRST_ORDER 18
-#define SECOND_ORDER 19
-#define THIRD_MOMENT 20
-#define FOURTH_MOMENT 21
-#define ARM 22
-#define LENGTH 23
-
-// Of a lit segment: its normal, the height of its plane, start, end.
-#define PLACED 10
-
-#define PER_PI ((real)0.31830988618379067)
-#define PI ((real)3.14159265358979324)
 // Of a pick: a segment that nothing can hide; else without it. A cluster is ~node.
 #define CLEAR (1 << 30)
 // Whether anything may stand between is looked at for so many segments at once, and fewer. A block looks so often in
@@ -35,176 +13,10 @@
 #define PATIENCE 256
 #define PATIENCE_ALONE 10
 #define PATIENCE_WON 2
-// Rounding of the bounds themselves.
-#define UP ((real)1 + (real)256 * (real)REAL_EPSILON)
 // Of a block's tallies.
 #define OUT 0
 #define TOGETHER 1
 #define TALLIES 2
-
-typedef struct {
-    real centre[3], low[3], high[3], normal[3];
-    real radius, spread, most_height, least_height, slab, cost;
-    real places[3 * BLOCK], normals[3 * BLOCK], costs[BLOCK];
-    int count;
-} receivers_block;
-
-typedef struct {
-    real bound; // the largest cos cos / (pi r^2) of any two points
-    int faces;  // whether all of one face all of the other
-} meeting;
-
-// A runtime may call a function for fmin and fmax. A second number that is NaN does not count.
-inline real lower(real a, real b) { return b < a ? b : a; }
-inline real higher(real a, real b) { return b > a ? b : a; }
-
-inline real dot3(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-inline real length3(const real *a) { return sqrt(dot3(a, a)); }
-
-inline void cross3(const real *a, const real *b, real *c) {
-    c[0] = a[1] * b[2] - a[2] * b[1];
-    c[1] = a[2] * b[0] - a[0] * b[2];
-    c[2] = a[0] * b[1] - a[1] * b[0];
-}
-
-// Those without cost have no part in the reading; a normal of zero is no receiver.
-inline receivers_block block_of(global const INPUT *receivers, global const real *costs, int count,
-                                global const INPUT *middle) {
-    receivers_block block;
-    int kept = 0;
-    block.cost = 0;
-    for (int k = 0; k < 3; k++) block.low[k] = INFINITY, block.high[k] = -INFINITY, block.normal[k] = 0;
-    for (int i = 0; i < count; i++) {
-        real size = 0;
-        for (int k = 0; k < 3; k++) size += (real)receivers[6 * i + 3 + k] * (real)receivers[6 * i + 3 + k];
-        if (!(costs[i] > 0 && size > 0)) continue;
-        block.costs[kept] = costs[i], block.cost += costs[i];
-        real *place = block.places + 3 * kept, *normal = block.normals + 3 * kept;
-        for (int k = 0; k < 3; k++) {
-            place[k] = (real)(receivers[6 * i + k] - middle[k]);
-            normal[k] = (real)receivers[6 * i + 3 + k];
-            block.low[k] = lower(block.low[k], place[k]);
-            block.high[k] = higher(block.high[k], place[k]);
-        }
-        const real per = (real)1 / sqrt(size);
-        for (int k = 0; k < 3; k++) block.normal[k] += normal[k] *= per;
-        kept++;
-    }
-    block.count = kept;
-    if (!kept) return block;
-    const real size = length3(block.normal);
-    for (int k = 0; k < 3; k++) {
-        block.centre[k] = (real)0.5 * (block.low[k] + block.high[k]);
-        block.normal[k] = size > 0 ? block.normal[k] / size : block.normals[k];
-    }
-    block.radius = block.spread = block.slab = 0;
-    block.most_height = -INFINITY, block.least_height = INFINITY;
-    for (int i = 0; i < kept; i++) {
-        real from[3], off[3];
-        for (int k = 0; k < 3; k++) {
-            from[k] = block.places[3 * i + k] - block.centre[k];
-            off[k] = block.normals[3 * i + k] - block.normal[k];
-        }
-        const real height = -dot3(block.normals + 3 * i, from);
-        block.radius = higher(block.radius, length3(from));
-        block.spread = higher(block.spread, length3(off));
-        block.slab = higher(block.slab, fabs(dot3(block.normal, from)));
-        block.most_height = higher(block.most_height, height);
-        block.least_height = lower(block.least_height, height);
-    }
-    return block;
-}
-
-inline meeting meeting_of(const receivers_block *block, global const real *row, int single, real rounding) {
-    real to[3], side[3], reach = 0, back = 0, front = 0;
-    const real normal[3] = {row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]};
-    for (int k = 0; k < 3; k++) {
-        to[k] = block->centre[k] - row[CENTRE + k];
-        side[k] = (real)0.5 * (block->high[k] - block->low[k]);
-        reach += fabs(normal[k]) * side[k];
-        const real low = block->normal[k] * (row[LOW + k] - row[CENTRE + k]);
-        const real high = block->normal[k] * (row[HIGH + k] - row[CENTRE + k]);
-        front += higher(low, high), back -= lower(low, high);
-    }
-    // Points of a box reach no further along a normal than its sides, those of a disc no further than that.
-    real across[3];
-    cross3(normal, block->normal, across);
-    const real sine = length3(across), cosine = fabs(dot3(normal, block->normal));
-    const real between = length3(to), wide = row[RADIUS], lit_disc = cosine * row[SLAB] + sine * wide;
-    reach = lower(reach, cosine * block->slab + sine * block->radius);
-    front = lower(front, lit_disc), back = lower(back, lit_disc);
-    // How high receivers stand above the lit surfaces, and the lit above the receivers' planes.
-    const real lit_turn = row[SPREAD] * (between + block->radius), got_turn = block->spread * (between + wide);
-    const real lit = dot3(normal, to), got = -dot3(block->normal, to);
-    const real lit_most = lit + lit_turn + row[MOST_HEIGHT] + reach;
-    const real got_most = got + got_turn + block->most_height + front;
-    meeting met = {0, 0};
-    if (!(lit_most > 0 && got_most > 0)) return met;
-    met.faces = lit - lit_turn + row[LEAST_HEIGHT] - reach > rounding &&
-                got - got_turn + block->least_height - back > rounding;
-    real gap = 0;
-    for (int k = 0; k < 3; k++) {
-        const real apart = higher(higher(block->low[k] - row[HIGH + k], row[LOW + k] - block->high[k]), (real)0);
-        gap += apart * apart;
-    }
-    const real distance = higher(sqrt(gap), between - block->radius - wide) - rounding;
-    if (!(distance > 0)) {
-        met.bound = INFINITY;
-        return met;
-    }
-    const real per = UP / distance;
-    const real cosines = lower((lit_most + rounding) * per, (real)1) * lower((got_most + rounding) * per, (real)1);
-    // The integral of dt / r^2 over a line is pi / r at most.
-    const real spread = single ? PI * per / row[LENGTH] : (real)INFINITY;
-    met.bound = cosines * lower(per * per, spread) * PER_PI * UP;
-    return met;
-}
-
-// What the cluster's own segment is off by at most, as irradiance by a watt.
-inline real error_of(const receivers_block *block, global const real *row, real rounding) {
-    real gap = 0;
-    for (int k = 0; k < 3; k++) {
-        const real apart =
-            higher(higher(block->low[k] - row[CENTRE + k], row[CENTRE + k] - block->high[k]), (real)0);
-        gap += apart * apart;
-    }
-    const real distance = sqrt(gap) - rounding, per = UP / distance;
-    const real q = row[RADIUS] * per, arm = row[ARM] * per;
-    if (!(distance > 0 && q < 1 && arm < 1)) return INFINITY;
-    const real third = ((real)4 - 3 * q) / ((1 - q) * (1 - q)), fourth = ((real)5 - 4 * arm) / ((1 - arm) * (1 - arm));
-    const real beyond = row[SECOND_ORDER] + per * (row[THIRD_MOMENT] * third + per * row[FOURTH_MOMENT] * fourth);
-    return per * per * per * (row[FIRST_ORDER] + per * beyond) * PER_PI * UP;
-}
-
-// What a segment costs at most, each receiver for itself: so that it stays finite where a block touches what is lit.
-inline real most_of_segment(const receivers_block *block, global const real *lit, real length, real power,
-                            real rounding) {
-    real sum = 0;
-    for (int i = 0; i < block->count; i++) {
-        const real *place = block->places + 3 * i, *normal = block->normals + 3 * i;
-        real up = 0, in_front = 0, beyond = 0, along = 0, square = 0;
-        for (int k = 0; k < 3; k++) {
-            const real from = place[k] - lit[4 + k];
-            up += lit[k] * from;
-            in_front -= normal[k] * from;
-            beyond += normal[k] * (lit[7 + k] - place[k]);
-            along += from * (lit[7 + k] - lit[4 + k]);
-        }
-        const real part = lower(higher((real)0, along / (length * length)), (real)1);
-        for (int k = 0; k < 3; k++) {
-            const real off = place[k] - lit[4 + k] - part * (lit[7 + k] - lit[4 + k]);
-            square += off * off;
-        }
-        const real ahead = higher(in_front, beyond);
-        if (!(up > 0 && ahead > 0)) continue;
-        const real distance = sqrt(square) - rounding;
-        if (!(distance > 0)) return INFINITY;
-        const real per = UP / distance;
-        const real cosines = lower((up + rounding) * per, (real)1) * lower((ahead + rounding) * per, (real)1);
-        sum += block->costs[i] * cosines * lower(per * per, PI * per / length);
-    }
-    return sum * power * PER_PI * UP;
-}
 
 #ifdef OCCLUDERS
 typedef struct {

@@ -30,7 +30,7 @@ _CLEAR = 1 << 30
 # Picks of a block for which there is room at first; what needs more is planned again.
 _ROOM = 64
 # Bounds of zero leave most shares unspent: the others get so many times theirs, as long as the sum allows it.
-_GENEROSITY = 3.0
+_GENEROSITY = 2.0
 # Twos by which the errors of picks are told apart when some of them are left out.
 _STEPS = 64
 

@@ -83,18 +83,17 @@ inline void load_columns(global const INPUT *from, places *columns) {
 inline places dot3(places x, places y, places z, global const place *row) {
     return x * row[0] + y * row[1] + z * row[2];
 }
-inline reals turned(reals x, reals y, reals z, global const place *row) {
-    return x * (real)row[0] + y * (real)row[1] + z * (real)row[2];
-}
+inline reals turned(reals x, reals y, reals z, global const real *row) { return x * row[0] + y * row[1] + z * row[2]; }
 
-// `middle`: what is subtracted from places first. frames: direction, normal, across (3 each); `firsts`: where the
-// segments of each frame begin, and the end of the last. starts: along, height, aside of a segment's start in its
-// frame, its length; lines: its length, exitance / 2 pi.
+// `middle`: what is subtracted from places first. frames, and axes, the same for normals: direction, normal, across (3
+// each); `firsts`: where the segments of each frame begin, and the end of the last. starts: along, height, aside of a
+// segment's start in its frame, its length; lines: its length, exitance / 2 pi.
 kernel void line_irradiance(global const INPUT *restrict receivers, global real *restrict irradiance,
                             global uchar *restrict status, constant place *restrict middle,
-                            global const place *restrict frames, global const uint *restrict firsts,
-                            global const place *restrict starts, global const real *restrict lines, const uint alike,
-                            const ulong count, const ulong each) {
+                            global const place *restrict frames, global const real *restrict axes,
+                            global const uint *restrict firsts, global const place *restrict starts,
+                            global const real *restrict lines, const uint alike, const ulong count,
+                            const ulong each) {
     // The last vector, or work-group, moves back to end with the last receiver.
 #ifdef STRIP
     const ulong begin = get_global_id(0) * each, end = min(begin + each, count);
@@ -117,9 +116,10 @@ kernel void line_irradiance(global const INPUT *restrict receivers, global real 
         for (uint frame = 0; frame < alike; frame++) {
             global const place *row = frames + frame * 9;
             const places along = dot3(x, y, z, row), height = dot3(x, y, z, row + 3), aside = dot3(x, y, z, row + 6);
-            const reals by_u = turned(normal_x, normal_y, normal_z, row);
-            const reals by_n = turned(normal_x, normal_y, normal_z, row + 3);
-            const reals by_w = turned(normal_x, normal_y, normal_z, row + 6);
+            global const real *axis = axes + frame * 9;
+            const reals by_u = turned(normal_x, normal_y, normal_z, axis);
+            const reals by_n = turned(normal_x, normal_y, normal_z, axis + 3);
+            const reals by_w = turned(normal_x, normal_y, normal_z, axis + 6);
             const uint last = firsts[frame + 1];
             for (uint k = firsts[frame]; k < last;) {
                 // Few are summed in `real`.

@@ -3,6 +3,8 @@
 The peer is branch-free and vectorised by LLVM over receivers, with a polynomial arc tangent, in single throughout; its
 error, like ours over the largest irradiance of the case and NaN on a device without double, stands in the column
 ``peer_error``. ``wall``: lines that run into a wall, all pairs face each other. ``board``: patches of boxes on a board.
+In these, segments lie alike, as on flat faces, and we make use of it; ``closed-form-slopes`` has none that does, each
+line on a slope of its own, which is our worst case and nothing to the peer.
 """
 
 from __future__ import annotations
@@ -76,6 +78,7 @@ def cases(device: Device) -> Iterator[Case]:
     yield _case(device, *_wall(64, 20_000), "closed-form/wall/64x20000")
     yield _case(device, *_wall(16, 100_000), "closed-form/wall/16x1e5")
     yield _case(device, *_board(20_000), "closed-form/board/64x20000")
+    yield _case(device, *_slopes(64, 20_000), "closed-form-slopes/64x20000")
     yield from bounces.cases(device)
     yield from visible_light.cases(device)
 
@@ -116,6 +119,18 @@ def _wall(segments: int, receivers: int) -> tuple[LitSegments, NDArray[np.float3
     places[:, 1], places[:, 2] = rng.uniform(-0.1, 0.1, receivers), rng.uniform(1e-3, 0.1, receivers)
     places[:, 3] = 1.0
     return LitSegments(ends, np.tile([0.0, 0.0, 1.0], (segments, 1)), np.ones(segments)), places
+
+
+def _slopes(segments: int, receivers: int) -> tuple[LitSegments, NDArray[np.float32]]:
+    """Return lines on slopes that face a wall, no two alike, and receivers on the wall."""
+    rng = np.random.default_rng(7)
+    start = np.column_stack(
+        [rng.uniform(0.01, 0.1, segments), rng.uniform(-0.1, 0.1, segments), np.full(segments, -0.05)]
+    )
+    across = rng.uniform((0.02, -0.02, -0.02), (0.1, 0.02, 0.02), (segments, 3))
+    normals = np.cross(across, np.cross([-0.5, 0.0, 1.0], across))
+    ends = np.stack([start, start + across], axis=1)
+    return LitSegments(ends, normals, np.ones(segments)), _wall(segments, receivers)[1]
 
 
 def _board(receivers: int) -> tuple[LitSegments, NDArray[np.float32]]:

@@ -62,14 +62,15 @@ class LitSegments:
             array.flags.writeable = False
 
     def tables(self, place: np.dtype[Any], real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
-        """Return middle, frames, firsts, starts and lines as kernels/line_irradiance.cl takes them: what emits."""
+        """Return middle, frames, axes, firsts, starts, lines as kernels/line_irradiance.cl takes them: what emits."""
         across = self.ends[:, 1] - self.ends[:, 0]
         length = np.linalg.norm(across, axis=1)
         emits = np.flatnonzero((length > 0.0) & (self.exitance > 0.0))
         if not len(emits):
             # A runtime takes no table without rows.
-            empty = np.zeros(2, np.uint32)
-            return np.zeros(3, place), np.zeros((1, 9), place), empty, np.zeros((1, 4), place), np.zeros((1, 2), real)
+            frame, firsts = np.zeros((1, 9)), np.zeros(2, np.uint32)
+            start, line = np.zeros((1, 4), place), np.zeros((1, 2), real)
+            return np.zeros(3, place), frame.astype(place), frame.astype(real), firsts, start, line
         along, normals = _unit(across[emits]), self.normals[emits]
         frames = np.stack([along, normals, np.cross(along, normals)], axis=1)
         # In single, what lies alike but for rounding is alike.
@@ -81,10 +82,10 @@ class LitSegments:
         frames = frames[example]
         middle = self.ends[emits, 0].mean(axis=0)
         places = np.einsum("nij,nj->ni", frames[group], self.ends[emits, 0] - middle)
-        starts = np.column_stack([places, length[emits]])
-        lines = np.column_stack([length[emits], self.exitance[emits] / math.tau])
-        rows = np.ascontiguousarray(frames.reshape(-1, 9), place)
-        return middle.astype(place), rows, firsts.astype(np.uint32), starts.astype(place), lines.astype(real)
+        starts = np.column_stack([places, length[emits]]).astype(place)
+        lines = np.column_stack([length[emits], self.exitance[emits] / math.tau]).astype(real)
+        rows, firsts = frames.reshape(-1, 9), firsts.astype(np.uint32)
+        return middle.astype(place), rows.astype(place), rows.astype(real), firsts, starts, lines
 
 
 class Irradiance(NamedTuple):
@@ -160,7 +161,7 @@ class LineIrradiance(Operation[Irradiance]):
             raise ValueError(f"device {device.label} has no double precision; give receivers as float32")
         real = _real_of(self.precision, dtype)
         place = np.dtype(np.float64 if device.has_double else np.float32)
-        middle, frames, firsts, starts, lines = self.segments.tables(place, real)
+        middle, frames, axes, firsts, starts, lines = self.segments.tables(place, real)
         count = math.prod(shape[:-1])
         strip = in_strips(self.walk, device) and count >= _LANES
         each = _strip_of(count, int(firsts[-1]), device) if strip else max(min(count, _GROUP), 1)
@@ -179,6 +180,7 @@ class LineIrradiance(Operation[Irradiance]):
             arguments=[
                 middle,
                 frames,
+                axes,
                 firsts,
                 starts,
                 lines,

@@ -38,7 +38,7 @@ _BEYOND = 7.0
 # Edges in the sheet, within so many sigmas, cut it; the longest so many; those so many sigmas apart.
 _REACH, _STEPS, _APART = 4.0, 16, 1e-4
 # Sheets that are looked at in one go.
-_SHEETS = 64
+_SHEETS = 36
 # Of the largest coordinate: nearer than that, two lit places are one.
 _SAME = 1e-9
 

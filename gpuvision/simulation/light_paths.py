@@ -232,7 +232,7 @@ class LightPaths:
             corners = self.scene.corners.reshape(-1, 3)
             size = float(np.linalg.norm(np.ptp(corners, axis=0))) / 16.0
         albedo = [each.albedo for each in self.materials]
-        return Bounces.of(self.scene, albedo, size=size, both_sides=True, device=self.device)
+        return Bounces.of(self.scene, albedo, size=size, device=self.device)
 
     @property
     def _real(self) -> np.dtype[Any]:

@@ -19,14 +19,6 @@ typedef long places;
 #define LANE_NUMBERS 0L
 #endif
 
-#ifdef STRIP
-#define LANE(values, lane) ((private const real *)&(values))[lane]
-#define LANE_BITS(values, lane) ((private const bits *)&(values))[lane]
-#else
-#define LANE(values, lane) (values)
-#define LANE_BITS(values, lane) (values)
-#endif
-
 kernel void line_fit_sets(global const INPUT *restrict points,
 #ifdef WITH_SIGMA
                           global const INPUT *restrict sigma,

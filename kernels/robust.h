@@ -20,6 +20,15 @@
 #endif
 #define MAD_TO_SIGMA (real)1.4826022185056018
 
+// A value of one lane.
+#ifdef STRIP
+#define LANE(values, lane) (((private const real *)&(values))[lane])
+#define LANE_BITS(values, lane) (((private const bits *)&(values))[lane])
+#else
+#define LANE(values, lane) (values)
+#define LANE_BITS(values, lane) (values)
+#endif
+
 inline reals kept_where(masks mask, reals value) { return as_reals(as_masks(value) & mask); }
 
 // What a residual weighs in the next step of least squares.

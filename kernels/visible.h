@@ -1,6 +1,6 @@
 // What of a segment is seen from a point: exactly, by intervals. The plane through both cuts every triangle in its way
-// along a line, and what lies behind that line, seen from the point, is hidden. One walk through the tree of bvh.h finds
-// them all, 16 boxes or 16 triangles at once.
+// along a line, and what lies behind that line, seen from the point, is hidden. One walk through the tree of bvh.h
+// finds them all, 16 boxes or 16 triangles at once.
 //
 // In the plane a place has two coordinates, from the point: `deep`, towards the segment's line, and `along`, such that
 // along / deep is where on the segment (0 at its start, 1 at its end) the place is seen. A cut between two corners is
@@ -23,6 +23,8 @@
 // A node, where a leaf is to be.
 #define NO_HINT 0
 #define HIDDEN_MOST 32
+// Where more than that hides parts of a segment, it is taken by halves; down to this much of it.
+#define LEAST_WINDOW ((real)0.0001)
 // What separates two hidden intervals at least: less is rounding.
 #define HIDDEN_SLIT ((real)4 * (real)REAL_EPSILON)
 
@@ -138,8 +140,8 @@ BVH_INLINE void view_cut(bvh_reals v1, bvh_reals v2, bvh_reals *enter, bvh_reals
     *leave = v2 < (bvh_reals)0 ? bvh_min(*leave, cut) : *leave;
 }
 
-// Which triangles hide something, and from where to where on the segment.
-BVH_INLINE bvh_masks view_triangles(const view *view, global const real *leaf, bvh_reals *low, bvh_reals *high) {
+// The two ends of the line along which the plane cuts a triangle; returns which triangles it cuts.
+BVH_INLINE bvh_masks view_lines(const view *view, global const real *leaf, bvh_reals *deep, bvh_reals *along) {
     const bvh_reals zero = (bvh_reals)0;
     const bvh_reals x = view->x, y = view->y, z = view->z;
     const bvh_reals ax = BVH_LOAD(leaf) - x, ay = BVH_LOAD(leaf + WIDTH) - y, az = BVH_LOAD(leaf + 2 * WIDTH) - z;
@@ -173,21 +175,32 @@ BVH_INLINE bvh_masks view_triangles(const view *view, global const real *leaf, b
     const bvh_reals step_deep_3 = before ? deep_3 - deep_1 : deep_1 - deep_3;
     const bvh_reals step_along_2 = before ? along_2 - along_1 : along_1 - along_2;
     const bvh_reals step_along_3 = before ? along_3 - along_1 : along_1 - along_3;
-    const bvh_reals deep1 = bvh_fma(share_2, step_deep_2, before ? deep_1 : deep_2);
-    const bvh_reals deep2 = bvh_fma(share_3, step_deep_3, before ? deep_1 : deep_3);
-    const bvh_reals along1 = bvh_fma(share_2, step_along_2, before ? along_1 : along_2);
-    const bvh_reals along2 = bvh_fma(share_3, step_along_3, before ? along_1 : along_3);
+    deep[0] = bvh_fma(share_2, step_deep_2, before ? deep_1 : deep_2);
+    deep[1] = bvh_fma(share_3, step_deep_3, before ? deep_1 : deep_3);
+    along[0] = bvh_fma(share_2, step_along_2, before ? along_1 : along_2);
+    along[1] = bvh_fma(share_3, step_along_3, before ? along_1 : along_3);
+    return apart;
+}
+
+// Which triangles hide something, and from where to where on the segment.
+BVH_INLINE bvh_masks view_triangles(const view *view, global const real *leaf, bvh_reals *low, bvh_reals *high) {
+    bvh_reals deep[2], along[2];
+    const bvh_masks cut = view_lines(view, leaf, deep, along);
+    if (!view_any(cut)) return cut;
+    const bvh_reals zero = (bvh_reals)0;
+    const bvh_reals deep1 = deep[0], deep2 = deep[1], along1 = along[0], along2 = along[1];
     // Whether what lies between is in the window, before the segment's surface, before the point, above its surface.
     const bvh_reals far1 = view->far - deep1, far2 = view->far - deep2;
     const bvh_reals near1 = deep1 - view->near, near2 = deep2 - view->near;
     const bvh_reals lift1 = view->lift_deep * deep1 + view->lift_along * along1 - view->lift;
     const bvh_reals lift2 = view->lift_deep * deep2 + view->lift_along * along2 - view->lift;
-#define VIEW_OUT(name) const bvh_masks out_##name##1 = BVH_MASK(name##1 < zero), out_##name##2 = BVH_MASK(name##2 < zero)
+#define VIEW_OUT(name)                                                                                                 \
+    const bvh_masks out_##name##1 = BVH_MASK(name##1 < zero), out_##name##2 = BVH_MASK(name##2 < zero)
     VIEW_OUT(far);
     VIEW_OUT(near);
     VIEW_OUT(lift);
 #undef VIEW_OUT
-    bvh_masks hides = apart & ~((out_far1 & out_far2) | (out_near1 & out_near2) | (out_lift1 & out_lift2));
+    bvh_masks hides = cut & ~((out_far1 & out_far2) | (out_near1 & out_near2) | (out_lift1 & out_lift2));
     hides &= BVH_MASK(along1 >= view->from * deep1) | BVH_MASK(along2 >= view->from * deep2);
     hides &= BVH_MASK(along1 <= view->to * deep1) | BVH_MASK(along2 <= view->to * deep2);
     if (!view_any(hides)) return hides;
@@ -267,8 +280,8 @@ BVH_INLINE void view_leaf(const view *view, global const real *leaf, hidden *all
 #endif
 }
 
-// Finds what is hidden; stops when all is, or when more than can be kept is. Looks first into the leaf that hid all from
-// the last point: it often does again.
+// Finds what is hidden; stops when all is, or when more than can be kept is. Looks first into the leaf that hid all
+// from the last point: it often does again.
 BVH_INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all, int *hint) {
     int nodes[BVH_DEPTH];
     uint left[BVH_DEPTH];

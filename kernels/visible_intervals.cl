@@ -3,9 +3,8 @@
 #include "status.h"
 #include "visible.h"
 
-// Beyond this a window is not cut any more.
-#define LEAST_WINDOW ((real)0.0001)
-#define LEAST_SHARE ((real)0.5)
+// Of the ray to the nearest place of the segment: a clearance takes no more of it.
+#define MOST_CLEARANCE ((real)0.25)
 
 // The plane through both; nothing of it where they lie on a line.
 inline int view_of(view *v, global const INPUT *row, constant place *middle, real clearance) {
@@ -33,7 +32,7 @@ inline int view_of(view *v, global const INPUT *row, constant place *middle, rea
     v->across_z = (real)((sx * dy - sy * dx) / size);
     v->along_x = (real)(depth * sx * per - start * dx), v->along_y = (real)(depth * sy * per - start * dy);
     v->along_z = (real)(depth * sz * per - start * dz);
-    const real share_of_it = fmin(clearance / nearest, (real)0.25), deep = (real)depth;
+    const real share_of_it = fmin(clearance / nearest, MOST_CLEARANCE), deep = (real)depth;
     v->far = deep - share_of_it * deep;
     v->near = fmax(share_of_it, (real)1e-12) * deep;
     v->lift_deep = 1, v->lift_along = 0, v->lift = v->near;

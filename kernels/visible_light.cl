@@ -11,28 +11,24 @@
 
 // Receivers that share a list of picked segments.
 #define PICK_BLOCK 16
-// Beyond this a window is not cut any more.
-#define LEAST_WINDOW ((real)0.0001)
-// A receiver gets nothing from segments in its own plane.
+// Of how high either stands above the other's surface: a clearance takes no more of it.
 #define LEAST_SHARE ((real)0.5)
 
 #ifdef STRIP
 #define LOAD_PLACES(from) (*(const places_at *)(from))
 #define narrow convert_real16
-#define widen convert_place16
 #define STORE_LANES(value, to) (*(reals_at *)(to) = (value))
 #define LOAD_LANES(from) (*(const reals_at *)(from))
 #else
 #define LOAD_PLACES(from) (*(from))
 #define narrow convert_real
-#define widen convert_place
 #define STORE_LANES(value, to) (*(to) = (value))
 #define LOAD_LANES(from) (*(from))
 #endif
 
+// A lit segment: its start and its frame, `off` being the normal of its surface.
 typedef struct {
-    place x, y, z;                                                                           // its start
-    place along_x, along_y, along_z, off_x, off_y, off_z, across_x, across_y, across_z; // its frame: off is the normal
+    place x, y, z, along_x, along_y, along_z, off_x, off_y, off_z, across_x, across_y, across_z;
     place length;
     real exitance; // over 2 pi
     int is_lit, is_good;
@@ -44,6 +40,7 @@ typedef struct {
     real toward[LANES], toward_end[LANES]; // how far above the receiver's plane the segment's ends are
 } facing;
 
+// What waits for the closed form: visible parts of segments, each with its lane's receiver.
 typedef struct {
     real along[LANES], height[LANES], aside[LANES], past[LANES], length[LANES], by_u[LANES], by_n[LANES], by_w[LANES];
     real exitance[LANES];
@@ -52,7 +49,6 @@ typedef struct {
 } pieces;
 
 inline int has_no_number(place value) { return not_finite((real)value); }
-
 
 // A segment's start, and not yet of unit length: along it, and off it its normal.
 lit lit_of(global const INPUT *row, constant place *middle) {
@@ -101,7 +97,8 @@ __attribute__((noinline)) void finish(pieces *waiting, place *sums) {
 }
 
 // A lane's receiver sees the segment from `start` to `stop` of its length.
-__attribute__((noinline)) void add_piece(const lit *one, const facing *all, int lane, real start, real stop, pieces *waiting, place *sums) {
+__attribute__((noinline)) void add_piece(const lit *one, const facing *all, int lane, real start, real stop,
+                                         pieces *waiting, place *sums) {
     if (!(start < stop)) return;
     const int n = waiting->count++;
     const real length = (real)one->length;
@@ -191,9 +188,9 @@ void add_sampled(const bvh_tree *tree, const lit *one, const facing *all, int la
         int hit = 1;
         if (n < samples) {
             const real t = ((real)n + (real)0.5) * per;
-            const bvh_ray ray =
-                bvh_ray_of(origin[0], origin[1], origin[2], start[0] + t * ux - origin[0], start[1] + t * uy - origin[1],
-                           start[2] + t * uz - origin[2], 0, 1);
+            const real dx = start[0] + t * ux - origin[0], dy = start[1] + t * uy - origin[1];
+            const real dz = start[2] + t * uz - origin[2];
+            const bvh_ray ray = bvh_ray_of(origin[0], origin[1], origin[2], dx, dy, dz, 0, 1);
             hit = bvh_any(tree, &ray);
         }
         if (!hit) {
@@ -207,53 +204,129 @@ void add_sampled(const bvh_tree *tree, const lit *one, const facing *all, int la
 }
 #endif
 
-AS_IT_IS kernel void visible_light(global const INPUT *restrict receivers, global const INPUT *restrict weights,
-                          global const INPUT *restrict segments,
-#ifdef PICKED
-                          global const int *restrict starts, global const int *restrict picks,
+// Receivers of a strip that are taken together, by columns: places from the scene's middle and normals of about unit
+// length, and both in real, the normals of unit length.
+typedef struct {
+    place wide[6][LANES];
+    real at[6][LANES];
+    place sums[LANES];
+    uchar flags[LANES], is_none[LANES];
+    uint count;
+} block;
+
+// The last receiver again where there are fewer than lanes.
+void load_block(global const INPUT *receivers, constant place *middle, uint count, block *here) {
+    here->count = count;
+    for (int lane = 0; lane < LANES; lane++) {
+        global const INPUT *row = receivers + 6 * min((uint)lane, count - 1);
+        for (int k = 0; k < 3; k++) here->wide[k][lane] = (place)row[k] - middle[k];
+        for (int k = 3; k < 6; k++) here->wide[k][lane] = (place)row[k];
+        here->is_none[lane] = row[3] == 0 && row[4] == 0 && row[5] == 0;
+        here->sums[lane] = 0, here->flags[lane] = STATUS_OK;
+    }
+    places nx = LOAD_PLACES(here->wide[3]), ny = LOAD_PLACES(here->wide[4]), nz = LOAD_PLACES(here->wide[5]);
+    const places longest = fmax(fmax(fabs(nx), fabs(ny)), fabs(nz));
+    nx /= longest, ny /= longest, nz /= longest;
+    const places per = (place)1 / sqrt(nx * nx + ny * ny + nz * nz);
+    *(places_at *)here->wide[3] = nx, *(places_at *)here->wide[4] = ny, *(places_at *)here->wide[5] = nz;
+    for (int k = 0; k < 3; k++) STORE_LANES(narrow(LOAD_PLACES(here->wide[k])), here->at[k]);
+    STORE_LANES(narrow(nx * per), here->at[3]);
+    STORE_LANES(narrow(ny * per), here->at[4]);
+    STORE_LANES(narrow(nz * per), here->at[5]);
+}
+
+// Which receivers and the segment face each other; completes the segment if any may.
+masks face(const block *here, lit *one, facing *all) {
+    const places dx = LOAD_PLACES(here->wide[0]) - one->x, dy = LOAD_PLACES(here->wide[1]) - one->y;
+    const places dz = LOAD_PLACES(here->wide[2]) - one->z;
+    const places wide_x = LOAD_PLACES(here->wide[3]), wide_y = LOAD_PLACES(here->wide[4]);
+    const places wide_z = LOAD_PLACES(here->wide[5]);
+    // Before the segment's frame: whether any receiver is above its surface, and it above the receiver's.
+    const places above = dx * one->off_x + dy * one->off_y + dz * one->off_z;
+    const places start = -(dx * wide_x + dy * wide_y + dz * wide_z);
+    const places end = start + one->along_x * wide_x + one->along_y * wide_y + one->along_z * wide_z;
+    const reals zero = (reals)0;
+    const masks may = mask_of(narrow(above) > zero) & (mask_of(narrow(start) > zero) | mask_of(narrow(end) > zero));
+    if (!any_lane(may)) return may;
+    finish_lit(one);
+    const reals nx = LOAD_LANES(here->at[3]), ny = LOAD_LANES(here->at[4]), nz = LOAD_LANES(here->at[5]);
+    const reals height = narrow(dx * one->off_x + dy * one->off_y + dz * one->off_z);
+    const places along = dx * one->along_x + dy * one->along_y + dz * one->along_z;
+    const reals aside = narrow(dx * one->across_x + dy * one->across_y + dz * one->across_z);
+    const reals by_u = nx * (real)one->along_x + ny * (real)one->along_y + nz * (real)one->along_z;
+    const reals by_n = nx * (real)one->off_x + ny * (real)one->off_y + nz * (real)one->off_z;
+    const reals by_w = nx * (real)one->across_x + ny * (real)one->across_y + nz * (real)one->across_z;
+    const reals past = narrow(one->length - along), foot = -(by_n * height + by_w * aside);
+    const reals toward = foot - by_u * narrow(along), toward_end = foot + by_u * past;
+    STORE_LANES(narrow(along), all->along), STORE_LANES(height, all->height), STORE_LANES(aside, all->aside);
+    STORE_LANES(past, all->past), STORE_LANES(by_u, all->by_u), STORE_LANES(by_n, all->by_n);
+    STORE_LANES(by_w, all->by_w), STORE_LANES(toward, all->toward), STORE_LANES(toward_end, all->toward_end);
+    return mask_of(height > zero) & (mask_of(toward > zero) | mask_of(toward_end > zero));
+}
+
+// What a lane's receiver gets from a segment that it faces.
+void add_light(const bvh_tree *tree, const lit *one, const facing *all, int lane, real clearance, uint samples,
+               int *hint, block *here, pieces *waiting) {
+#if defined(INTERVALS)
+    view v = view_from(one, all, lane, here->at[0][lane], here->at[1][lane], here->at[2][lane], here->at[3][lane],
+                       here->at[4][lane], here->at[5][lane], clearance);
+    if (!add_visible(tree, one, all, lane, &v, hint, waiting, here->sums)) here->flags[lane] = STATUS_AMBIGUOUS;
+#elif defined(RAYS)
+    const real over = fmin(clearance, LEAST_SHARE * all->height[lane]);
+    const real lift = fmin(clearance, LEAST_SHARE * fmax(all->toward[lane], all->toward_end[lane]));
+    const real origin[3] = {here->at[0][lane] + lift * here->at[3][lane], here->at[1][lane] + lift * here->at[4][lane],
+                            here->at[2][lane] + lift * here->at[5][lane]};
+    const real start[3] = {(real)one->x + over * (real)one->off_x, (real)one->y + over * (real)one->off_y,
+                           (real)one->z + over * (real)one->off_z};
+    add_sampled(tree, one, all, lane, origin, start, samples, waiting, here->sums);
+#else
+    add_piece(one, all, lane, 0, 1, waiting, here->sums);
 #endif
-                          global real *restrict irradiance, global real *restrict left, global real *restrict right,
-                          global uchar *restrict status, global const real *nodes, global const int *children,
-                          global const int *axes, global const real *leaves, global const int *triangles,
-                          constant place *middle, const real clearance, const uint samples, const uint each,
-                          const uint segment_count, const uint pick_count) {
+}
+
+// A receiver's result; returns what is to be added to the currents for a unit of weight.
+place result_of(const block *here, int lane, uchar flag, global real *irradiance, global uchar *status) {
+    int is_bad = 0;
+    for (int k = 0; k < 6; k++) is_bad |= not_finite(here->at[k][lane]) && !(k >= 3 && here->is_none[lane]);
+    const uchar wrong = flag | (is_bad || has_no_number(here->sums[lane]) ? STATUS_NOT_FINITE : 0);
+    const int is_none = here->is_none[lane];
+    const place light = wrong ? (place)REAL_NAN : here->sums[lane];
+    *irradiance = is_none ? REAL_NAN : (real)light;
+    *status = is_none ? STATUS_HOLE : wrong | here->flags[lane];
+    return is_none ? 0 : light;
+}
+
+AS_IT_IS kernel void visible_light(global const INPUT *restrict receivers, global const INPUT *restrict weights,
+                                   global const INPUT *restrict segments,
+#ifdef PICKED
+                                   global const int *restrict starts, global const int *restrict picks,
+#endif
+                                   global real *restrict irradiance, global real *restrict left,
+                                   global real *restrict right, global uchar *restrict status,
+                                   global const real *nodes, global const int *children, global const int *axes,
+                                   global const real *leaves, global const int *triangles, constant place *middle,
+                                   const real clearance, const uint samples, const uint each,
+                                   const uint segment_count, const uint pick_count) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong strip = get_group_id(0);
     int hint = NO_HINT;
     place to_left = 0, to_right = 0;
     for (uint first = get_local_id(0) * LANES; first < each; first += get_local_size(0) * LANES) {
-        // Receivers by columns; the last ones again where there are fewer.
-        const uint here = min((uint)LANES, each - first);
-        place own[6][LANES];
-        for (int lane = 0; lane < LANES; lane++) {
-            const ulong at = 6 * (strip * each + first + min((uint)lane, here - 1));
-            for (int k = 0; k < 6; k++) own[k][lane] = (place)receivers[at + k];
-        }
-        const places x = LOAD_PLACES(own[0]) - middle[0], y = LOAD_PLACES(own[1]) - middle[1];
-        const places z = LOAD_PLACES(own[2]) - middle[2];
-        places nx = LOAD_PLACES(own[3]), ny = LOAD_PLACES(own[4]), nz = LOAD_PLACES(own[5]);
-        const places longest = fmax(fmax(fabs(nx), fabs(ny)), fabs(nz));
-        nx /= longest, ny /= longest, nz /= longest;
-        const places per = (place)1 / sqrt(nx * nx + ny * ny + nz * nz);
-        const reals normal_x = narrow(nx * per), normal_y = narrow(ny * per), normal_z = narrow(nz * per);
-        real at[6][LANES];
-        STORE_LANES(narrow(x), at[0]), STORE_LANES(narrow(y), at[1]), STORE_LANES(narrow(z), at[2]);
-        STORE_LANES(normal_x, at[3]), STORE_LANES(normal_y, at[4]), STORE_LANES(normal_z, at[5]);
-        place sums[LANES];
-        uchar flags[LANES];
-        for (int lane = 0; lane < LANES; lane++) sums[lane] = 0, flags[lane] = STATUS_OK;
+        const ulong row = strip * each + first;
+        block here;
+        load_block(receivers + 6 * row, middle, min((uint)LANES, each - first), &here);
         uchar flag = STATUS_OK;
         pieces waiting;
         waiting.count = 0;
 #ifdef PICKED
         const ulong list = strip * ((each + PICK_BLOCK - 1) / PICK_BLOCK) + first / PICK_BLOCK;
         const int begin = starts[list], end = starts[list + 1];
-        if (begin < 0 || end > (int)pick_count) flag = STATUS_OUT_OF_RANGE;
+        if (begin < 0 || end > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;
         for (int k = max(begin, 0); k < min(end, (int)pick_count); k++) {
             const int unseen = picks[k] < 0;
             const uint number = unseen ? ~picks[k] : picks[k];
             if (number >= segment_count) {
-                flag = STATUS_OUT_OF_RANGE;
+                flag |= STATUS_OUT_OF_RANGE;
                 continue;
             }
 #else
@@ -261,71 +334,26 @@ AS_IT_IS kernel void visible_light(global const INPUT *restrict receivers, globa
             const int unseen = 0;
 #endif
             lit one = lit_of(segments + 10 * (ulong)number, middle);
-            if (!one.is_good) flag = STATUS_NOT_FINITE;
+            if (!one.is_good) flag |= STATUS_NOT_FINITE;
             if (!one.is_lit) continue;
-            const places dx = x - one.x, dy = y - one.y, dz = z - one.z;
-            // Before the segment's frame: whether any receiver is above its surface, and it above the receiver's.
-            const places above = dx * one.off_x + dy * one.off_y + dz * one.off_z;
-            const places near_end = -(dx * nx + dy * ny + dz * nz);
-            const places step = one.along_x * nx + one.along_y * ny + one.along_z * nz;
-            const masks may_face = mask_of(narrow(above) > (reals)0) &
-                                   (mask_of(narrow(near_end) > (reals)0) | mask_of(narrow(near_end + step) > (reals)0));
-            if (!any_lane(may_face)) continue;
-            finish_lit(&one);
-            const reals height = narrow(dx * one.off_x + dy * one.off_y + dz * one.off_z);
-            const places along = dx * one.along_x + dy * one.along_y + dz * one.along_z;
-            const reals aside = narrow(dx * one.across_x + dy * one.across_y + dz * one.across_z);
-            const reals by_u = normal_x * (real)one.along_x + normal_y * (real)one.along_y + normal_z * (real)one.along_z;
-            const reals by_n = normal_x * (real)one.off_x + normal_y * (real)one.off_y + normal_z * (real)one.off_z;
-            const reals by_w =
-                normal_x * (real)one.across_x + normal_y * (real)one.across_y + normal_z * (real)one.across_z;
-            const reals past = narrow(one.length - along), foot = -(by_n * height + by_w * aside);
-            const reals toward = foot - by_u * narrow(along), toward_end = foot + by_u * past;
-            const masks faces = mask_of(height > (reals)0) & (mask_of(toward > (reals)0) | mask_of(toward_end > (reals)0));
-            if (!any_lane(faces)) continue;
             facing all;
-            STORE_LANES(narrow(along), all.along), STORE_LANES(height, all.height), STORE_LANES(aside, all.aside);
-            STORE_LANES(past, all.past), STORE_LANES(by_u, all.by_u), STORE_LANES(by_n, all.by_n);
-            STORE_LANES(by_w, all.by_w), STORE_LANES(toward, all.toward), STORE_LANES(toward_end, all.toward_end);
+            const masks faces = face(&here, &one, &all);
 #ifdef STRIP
-            uint left_lanes = bvh_lanes(faces) & (here < LANES ? (1u << here) - 1 : 0xffff);
+            uint lanes = bvh_lanes(faces) & ((1u << here.count) - 1);
 #else
-            uint left_lanes = 1;
+            uint lanes = faces ? 1 : 0;
 #endif
-            for (; left_lanes; left_lanes &= left_lanes - 1) {
-                const int lane = bvh_lowest(left_lanes);
-                if (unseen) {
-                    add_piece(&one, &all, lane, 0, 1, &waiting, sums);
-                    continue;
-                }
-#if defined(INTERVALS)
-                view v = view_from(&one, &all, lane, at[0][lane], at[1][lane], at[2][lane], at[3][lane], at[4][lane],
-                                   at[5][lane], clearance);
-                if (!add_visible(&tree, &one, &all, lane, &v, &hint, &waiting, sums)) flags[lane] = STATUS_AMBIGUOUS;
-#elif defined(RAYS)
-                const real over = fmin(clearance, LEAST_SHARE * all.height[lane]);
-                const real lift = fmin(clearance, LEAST_SHARE * fmax(all.toward[lane], all.toward_end[lane]));
-                const real origin[3] = {at[0][lane] + lift * at[3][lane], at[1][lane] + lift * at[4][lane],
-                                        at[2][lane] + lift * at[5][lane]};
-                const real start[3] = {(real)one.x + over * (real)one.off_x, (real)one.y + over * (real)one.off_y,
-                                       (real)one.z + over * (real)one.off_z};
-                add_sampled(&tree, &one, &all, lane, origin, start, samples, &waiting, sums);
-#else
-                add_piece(&one, &all, lane, 0, 1, &waiting, sums);
-#endif
+            for (; lanes; lanes &= lanes - 1) {
+                const int lane = bvh_lowest(lanes);
+                if (unseen) add_piece(&one, &all, lane, 0, 1, &waiting, here.sums);
+                else add_light(&tree, &one, &all, lane, clearance, samples, &hint, &here, &waiting);
             }
         }
-        finish(&waiting, sums);
-        for (uint lane = 0; lane < here; lane++) {
-            const ulong i = strip * each + first + lane;
-            const int is_none = own[3][lane] == 0 && own[4][lane] == 0 && own[5][lane] == 0;
-            const int is_bad = (!is_none && (not_finite(at[3][lane]) | not_finite(at[4][lane]) | not_finite(at[5][lane]))) |
-                               not_finite(at[0][lane]) | not_finite(at[1][lane]) | not_finite(at[2][lane]);
-            const uchar wrong = flag | (is_bad || has_no_number(is_none ? 0 : sums[lane]) ? STATUS_NOT_FINITE : 0);
-            const place light = wrong ? (place)REAL_NAN : sums[lane];
-            irradiance[i] = is_none ? REAL_NAN : (real)light;
-            status[i] = is_none ? STATUS_HOLE : wrong | flags[lane];
-            if (is_none) continue;
+        finish(&waiting, here.sums);
+        for (uint lane = 0; lane < here.count; lane++) {
+            const ulong i = row + lane;
+            const place light = result_of(&here, lane, flag, irradiance + i, status + i);
+            if (here.is_none[lane]) continue;
             to_left += light * (place)weights[2 * i], to_right += light * (place)weights[2 * i + 1];
         }
     }

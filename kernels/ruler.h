@@ -50,63 +50,12 @@ typedef struct {
     uint status;
 } ruler_edge;
 
-#ifdef STRIP
-#define RULER_EACH(load) \
-    load(0), load(1), load(2), load(3), load(4), load(5), load(6), load(7), load(8), load(9), load(a), load(b), \
-        load(c), load(d), load(e), load(f)
-#endif
-// Two neighbours in a row, of every lane.
-#if defined(STRIP) && !defined(CODE_float)
-#ifdef CODE_uchar
-typedef ushort16 ruler_pairs;
-#define RULER_PAIR(k) as_ushort(vload2(0, from + at.s##k))
-#define RULER_BITS 8
-#else
-typedef uint16 ruler_pairs;
-#define RULER_PAIR(k) as_uint(vload2(0, from + at.s##k))
-#define RULER_BITS 16
-#endif
-inline void ruler_pixels(global const CODE *from, masks at, reals *left, reals *right) {
-    const int16 pairs = convert_int16((ruler_pairs)(RULER_EACH(RULER_PAIR)));
-    *left = convert_real16(pairs & ((1 << RULER_BITS) - 1));
-    *right = convert_real16(as_int16(as_uint16(pairs) >> RULER_BITS));
-}
-#elif defined(STRIP)
-#define RULER_LEFT(k) from[at.s##k]
-#define RULER_RIGHT(k) from[at.s##k + 1]
-inline void ruler_pixels(global const CODE *from, masks at, reals *left, reals *right) {
-    *left = (reals)(RULER_EACH(RULER_LEFT));
-    *right = (reals)(RULER_EACH(RULER_RIGHT));
-}
-#else
-inline void ruler_pixels(global const CODE *from, masks at, reals *left, reals *right) {
-    *left = from[at];
-    *right = from[at + 1];
-}
-#endif
-
 // Where a ruler lies: the first sample of its first line, relative to a pixel near it, which keeps the digits.
 typedef struct {
     global const CODE *pixel;
     real x, y, cosine, sine;
     int last_column, last_row;  // that have a neighbour, from the pixel on
 } ruler_place;
-
-// Bilinear samples at (x, y) from the place's pixel.
-inline reals ruler_sample(const ruler_place *place, int pitch, reals x, reals y) {
-    masks column = LANED(convert_bits)(x), row = LANED(convert_bits)(y);
-    column = column > (masks)place->last_column ? (masks)place->last_column : column;
-    row = row > (masks)place->last_row ? (masks)place->last_row : row;
-    x -= LANED(convert_real)(column);
-    y -= LANED(convert_real)(row);
-    const masks at = row * pitch + column;
-    reals a, b, c, d;
-    ruler_pixels(place->pixel, at, &a, &b);
-    ruler_pixels(place->pixel + pitch, at, &c, &d);
-    a += x * (b - a);
-    c += x * (d - c);
-    return a + y * (c - a);
-}
 
 inline uint ruler_lay(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
                       ruler_place *place) {
@@ -154,34 +103,45 @@ inline masks ruler_distort(reals *x, reals *y, const ruler_place *place, constan
 }
 #endif
 
-// Sums over the lines at the samples `index`, and what is wrong with them.
-__attribute__((always_inline)) inline reals ruler_sum(const ruler_place *place, int pitch, reals index,
-                                                      constant real *table, constant real *model, masks *flags) {
-    const reals along_x = place->x + index * place->cosine, along_y = place->y + index * place->sine;
-    const real per_step = 1 / table[RULER_STEP];
-    const real across_x = -place->sine * per_step, across_y = place->cosine * per_step;
-    reals sum = 0;
-#ifdef SATURATION
-    reals top = 0;
-#endif
-    for (int line = 0; line < WIDTH; line++) {
-        reals x = along_x + line * across_x, y = along_y + line * across_y;
+// Splits (x, y) from the place's pixel into a pixel that has neighbours, and what is left.
+inline masks ruler_split(const ruler_place *place, int pitch, reals *x, reals *y) {
+    masks column = LANED(convert_bits)(*x), row = LANED(convert_bits)(*y);
+    column = column > (masks)place->last_column ? (masks)place->last_column : column;
+    row = row > (masks)place->last_row ? (masks)place->last_row : row;
+    *x -= LANED(convert_real)(column);
+    *y -= LANED(convert_real)(row);
+    return row * pitch + column;
+}
+
+inline reals ruler_between(reals a, reals b, reals c, reals d, reals x, reals y) {
+    a += x * (b - a);
+    c += x * (d - c);
+    return a + y * (c - a);
+}
+
+// Where sample `index` of a line lies; returns what is wrong with it.
+inline masks ruler_at(const ruler_place *place, reals index, int line, constant real *table, constant real *model,
+                      reals *x, reals *y) {
+    const real across = line / table[RULER_STEP];
+    *x = place->x - across * place->sine + index * place->cosine;
+    *y = place->y + across * place->cosine + index * place->sine;
 #if defined(LENS) || defined(CAMERA)
-        *flags |= ruler_distort(&x, &y, place, model);
+    return ruler_distort(x, y, place, model);
+#else
+    return 0;
 #endif
-        const reals sample = ruler_sample(place, pitch, x, y);
-        sum += sample;
+}
+
+// What is wrong with a sample itself.
+inline masks ruler_judge(reals sample, constant real *table) {
+    masks flags = 0;
 #ifdef SATURATION
-        top = sample > top ? sample : top;
-#endif
-    }
-#ifdef SATURATION
-    *flags |= mask_of(top >= table[RULER_SATURATION]) & STATUS_SATURATED;
+    flags |= mask_of(sample >= table[RULER_SATURATION]) & STATUS_SATURATED;
 #endif
 #ifdef CODE_float
-    *flags |= mask_of(LANED(not_finite)(sum)) & STATUS_NOT_FINITE;
+    flags |= mask_of(LANED(not_finite)(sample)) & STATUS_NOT_FINITE;
 #endif
-    return sum;
+    return flags;
 }
 
 inline reals ruler_slope(RULER_SPACE const real *profile, constant real *table) {
@@ -341,40 +301,122 @@ inline uint ruler_any(masks flags) {
     return quarter.x | quarter.y | quarter.z | quarter.w;
 }
 
+// The four pixels about a sample, fetched one sample after the other and unpacked 16 at a time: a vector made of single
+// loads takes longer.
+#define RULER_SAMPLES (16 * RULER_VECTORS)
+#ifdef CODE_uchar
+typedef uint ruler_part;
+#define RULER_PARTS 1
+inline void ruler_fetch(global const CODE *pixel, int pitch, private ruler_part *to) {
+    to[0] = as_ushort(vload2(0, pixel)) | (uint)as_ushort(vload2(0, pixel + pitch)) << 16;
+}
+inline void ruler_unpack(private const ruler_part *from, reals *a, reals *b, reals *c, reals *d) {
+    const uint16 four = *(private const uint16 *)from;
+    *a = convert_real16(as_int16(four & 0xff));
+    *b = convert_real16(as_int16(four >> 8 & 0xff));
+    *c = convert_real16(as_int16(four >> 16 & 0xff));
+    *d = convert_real16(as_int16(four >> 24));
+}
+#elif defined(CODE_ushort)
+typedef uint ruler_part;
+#define RULER_PARTS 2
+inline void ruler_fetch(global const CODE *pixel, int pitch, private ruler_part *to) {
+    to[0] = as_uint(vload2(0, pixel));
+    to[RULER_SAMPLES] = as_uint(vload2(0, pixel + pitch));
+}
+inline void ruler_unpack(private const ruler_part *from, reals *a, reals *b, reals *c, reals *d) {
+    const uint16 above = *(private const uint16 *)from, below = *(private const uint16 *)(from + RULER_SAMPLES);
+    *a = convert_real16(as_int16(above & 0xffff));
+    *b = convert_real16(as_int16(above >> 16));
+    *c = convert_real16(as_int16(below & 0xffff));
+    *d = convert_real16(as_int16(below >> 16));
+}
+#else
+typedef float ruler_part;
+#define RULER_PARTS 4
+inline void ruler_fetch(global const CODE *pixel, int pitch, private ruler_part *to) {
+    to[0] = pixel[0];
+    to[RULER_SAMPLES] = pixel[1];
+    to[2 * RULER_SAMPLES] = pixel[pitch];
+    to[3 * RULER_SAMPLES] = pixel[pitch + 1];
+}
+inline void ruler_unpack(private const ruler_part *from, reals *a, reals *b, reals *c, reals *d) {
+    *a = *(private const reals *)from;
+    *b = *(private const reals *)(from + RULER_SAMPLES);
+    *c = *(private const reals *)(from + 2 * RULER_SAMPLES);
+    *d = *(private const reals *)(from + 3 * RULER_SAMPLES);
+}
+#endif
+
+// Adds a line to the profile; returns what is wrong with it.
+__attribute__((always_inline)) inline masks ruler_add(const ruler_place *place, int pitch, int line,
+                                                      constant real *table, constant real *model,
+                                                      private reals *profile) {
+    const reals lanes = (reals)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    uint16 pixels[RULER_VECTORS], parts[RULER_VECTORS * RULER_PARTS];
+    reals x[RULER_VECTORS], y[RULER_VECTORS];
+    masks flags = 0;
+    for (int v = 0; v < RULER_VECTORS; v++) {
+        reals index = lanes + 16 * v;
+#if LENGTH % 16
+        index = index > (real)(LENGTH - 1) ? (reals)(LENGTH - 1) : index;
+#endif
+        flags |= ruler_at(place, index, line, table, model, x + v, y + v);
+        pixels[v] = as_uint16(ruler_split(place, pitch, x + v, y + v));
+    }
+#pragma clang loop vectorize(disable) unroll_count(4)
+    for (int i = 0; i < RULER_SAMPLES; i++)
+        ruler_fetch(place->pixel + ((private const uint *)pixels)[i], pitch, (private ruler_part *)parts + i);
+    for (int v = 0; v < RULER_VECTORS; v++) {
+        reals a, b, c, d;
+        ruler_unpack((private const ruler_part *)(parts + v), &a, &b, &c, &d);
+        const reals sample = ruler_between(a, b, c, d, x[v], y[v]);
+        flags |= ruler_judge(sample, table);
+        profile[v] += sample;
+    }
+    return flags;
+}
+
 // Whole rulers: fills edges[MOST].
 inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
                           constant real *model, private ruler_edge *edges) {
     ruler_place place;
     uint status = ruler_lay(image, rows, columns, ruler, table, &place);
-    real profile[RULER_PADDED], slopes[16 * RULER_CHUNKS];
+    reals profile[RULER_PADDED / 16], slopes[RULER_CHUNKS];
     uint chunks = 0;
     if (!status) {
-        const reals lanes = (reals)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
         masks flags = 0;
-        for (int v = 0; v < RULER_VECTORS; v++) {
-            reals index = lanes + 16 * v;
-#if LENGTH % 16
-            index = index > (real)(LENGTH - 1) ? (reals)(LENGTH - 1) : index;
-#endif
-            *(private reals_at *)(profile + 16 * v) = ruler_sum(&place, columns, index, table, model, &flags);
-        }
-        for (int i = 16 * RULER_VECTORS; i < RULER_PADDED; i += 16) *(private reals_at *)(profile + i) = 0;
+        for (int v = 0; v < RULER_PADDED / 16; v++) profile[v] = 0;
+        for (int line = 0; line < WIDTH; line++) flags |= ruler_add(&place, columns, line, table, model, profile);
 #if defined(SATURATION) || defined(CODE_float) || defined(LENS) || defined(CAMERA)
         status = ruler_any(flags);
 #endif
         for (int chunk = 0; chunk < RULER_CHUNKS; chunk++) {
-            const reals slope = ruler_slope(profile + 16 * chunk, table);
-            *(private reals_at *)(slopes + 16 * chunk) = slope;
-            chunks |= (uint)any_lane(RULER_STRENGTH(slope) >= table[RULER_THRESHOLD]) << chunk;
+            slopes[chunk] = ruler_slope((private const real *)(profile + chunk), table);
+            chunks |= (uint)any_lane(RULER_STRENGTH(slopes[chunk]) >= table[RULER_THRESHOLD]) << chunk;
         }
     }
     if (status & RULER_USELESS) {
         for (int k = 0; k < MOST; k++) edges[k] = ruler_nothing(status);
     } else {
-        ruler_find(slopes, chunks, status, table, edges);
+        ruler_find((private const real *)slopes, chunks, status, table, edges);
     }
 }
 #else
+inline real ruler_sum(const ruler_place *place, int pitch, int i, constant real *table, constant real *model,
+                      int *flags) {
+    real sum = 0;
+    for (int line = 0; line < WIDTH; line++) {
+        real x, y;
+        *flags |= ruler_at(place, i, line, table, model, &x, &y);
+        global const CODE *pixel = place->pixel + ruler_split(place, pitch, &x, &y);
+        const real sample = ruler_between(pixel[0], pixel[1], pixel[pitch], pixel[pitch + 1], x, y);
+        *flags |= ruler_judge(sample, table);
+        sum += sample;
+    }
+    return sum;
+}
+
 // The same by a work-group, in arrays of its own; edges[MOST] are for its first item.
 inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
                           constant real *model, local real *profile, local real *slopes, local uint *bits,

@@ -78,13 +78,13 @@ class LitSegments:
         _, example, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
         order = np.argsort(group, kind="stable")
         emits, group = emits[order], group[order]
-        firsts = np.searchsorted(group, np.arange(len(example) + 1))
+        firsts = np.searchsorted(group, np.arange(len(example) + 1)).astype(np.uint32)
         frames = frames[example]
         middle = self.ends[emits, 0].mean(axis=0)
         places = np.einsum("nij,nj->ni", frames[group], self.ends[emits, 0] - middle)
         starts = np.column_stack([places, length[emits]]).astype(place)
         lines = np.column_stack([length[emits], self.exitance[emits] / math.tau]).astype(real)
-        rows, firsts = frames.reshape(-1, 9), firsts.astype(np.uint32)
+        rows = frames.reshape(-1, 9)
         return middle.astype(place), rows.astype(place), rows.astype(real), firsts, starts, lines
 
 

@@ -1,4 +1,4 @@
-"""Light of lit segments on receivers as far as they see each other, and what is visible of segments from points."""
+"""Light of lit segments on receivers, as far as they see each other."""
 
 from __future__ import annotations
 
@@ -21,12 +21,10 @@ PICK_BLOCK = 16
 """Receivers of a strip that share a list of picked segments."""
 
 _GROUP = 64
-_ROWS_PER_STRIP = 16
 # Small scenes share a build.
 _LEAST_DEPTH = 4
 # Of the scene's size: within this of a surface rounding, the caller's too, decides what lies before it.
 _CLEARANCE = {4: 4e-6, 8: 1e-12}
-_CLEARANCE_ALONG_RAYS = {4: 1e-4, 8: 1e-10}
 
 
 class ReceivedLight(NamedTuple):
@@ -48,25 +46,6 @@ class ReceivedLight(NamedTuple):
     irradiance: Any
     left: Any
     right: Any
-    status: Any
-
-
-class Visibles(NamedTuple):
-    """What is seen of segments.
-
-    Attributes
-    ----------
-    intervals
-        (..., most, 2): from and to, 0 at the segment's start and 1 at its end, in order; NaN behind the last.
-    count
-        int32 (...,): how many there are; more than `most` if the status is AMBIGUOUS.
-    status
-        uint8 `Status` flags, (...,): NOT_FINITE, HORIZON (point and segment lie on a line, or the segment has no
-        length: nothing is given), AMBIGUOUS (the first intervals are given, there are more).
-    """
-
-    intervals: Any
-    count: Any
     status: Any
 
 
@@ -139,7 +118,7 @@ class VisibleLight(Operation[ReceivedLight]):
     walk: Walk = "auto"
 
     def __post_init__(self) -> None:
-        _check_scene("VisibleLight", self.scene, self.clearance)
+        _check_scene(self.scene, self.clearance)
         _check_count("VisibleLight.segments", self.segments, 1)
         _check_count("VisibleLight.samples", self.samples, 1)
         if self.picks is not None:
@@ -150,7 +129,7 @@ class VisibleLight(Operation[ReceivedLight]):
     def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         if len(shape) != 3 or shape[-1] != 6 or not shape[1]:
             raise ValueError(f"VisibleLight takes receivers (strips, n, 6), n at least 1, got shape {shape}")
-        real = _real_of("VisibleLight", device, dtype, self.precision)
+        real = _real_of(device, dtype, self.precision)
         strips, each = shape[:2]
         strip, place, tree = in_strips(self.walk, device), _place(device), self.scene.bvh
         present = {
@@ -184,7 +163,7 @@ class VisibleLight(Operation[ReceivedLight]):
             arguments=[
                 *tree.tables(real),
                 tree.middle.astype(place),
-                _clearance(self.clearance, self.scene, real, dtype, _CLEARANCE),
+                _clearance(self.clearance, self.scene, real, dtype),
                 np.uint32(self.samples),
                 np.uint32(each),
                 np.uint32(self.segments),
@@ -192,88 +171,6 @@ class VisibleLight(Operation[ReceivedLight]):
             ],
             global_size=(strips if strip else strips * _GROUP,),
             local_size=(1 if strip else _GROUP,),
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class VisibleIntervals(Operation[Visibles]):
-    """Which parts of segments are seen from points: ``op(rows) -> Visibles``, rows float32 or float64 (..., 9).
-
-    A row is a point and the two ends of a segment, in metres.
-
-    Parameters
-    ----------
-    scene
-        What may lie between; both sides of a triangle hide, one in whose plane point and segment lie does not.
-    most
-        How many intervals are given for a segment.
-    clearance
-        Metres from the point, and from the segment, within which nothing hides: along the ray to the segment's nearest
-        place, and in proportion along longer rays; at most a quarter of each ray. None: 1e-4 of the scene's reach from
-        the origin where places are in single, 1e-10 in double. A surface that holds the segment, but for an error e,
-        and is seen at an angle to it, wants e / sin(angle).
-    precision
-        Of the arithmetic and the outputs; None follows the input. "single" takes float64 rows, too.
-    walk
-        "strip" (16 boxes at once, for CPU runtimes), "item" (a work-item per row, for GPUs), or "auto".
-
-    Raises
-    ------
-    TypeError, ValueError
-        A parameter is not what is said here.
-
-    Notes
-    -----
-    Error of an end: as of a shadow's edge in `VisibleLight`, over the segment's length.
-    """
-
-    Result: ClassVar[type[Any]] = Visibles
-
-    scene: Scene
-    most: int = 8
-    clearance: float | None = None
-    precision: Precision = None
-    walk: Walk = "auto"
-
-    def __post_init__(self) -> None:
-        _check_scene("VisibleIntervals", self.scene, self.clearance)
-        _check_count("VisibleIntervals.most", self.most, 1)
-
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
-        if not shape or shape[-1] != 9:
-            raise ValueError(f"VisibleIntervals takes rows (..., 9), a point and two ends, got shape {shape}")
-        real = _real_of("VisibleIntervals", device, dtype, self.precision)
-        where, tree = shape[:-1], self.scene.bvh
-        count = math.prod(where)
-        strip = in_strips(self.walk, device)
-        each = _ROWS_PER_STRIP if strip else 1
-        items = -(-count // each)
-        present = {"STRIP": strip, "WIDE_PLACES": device.has_double}
-        return Launch(
-            stem="visible_intervals",
-            kernel="visible_intervals",
-            defines={
-                **real_defines(device, real),
-                **{name: None for name, is_present in present.items() if is_present},
-                "INPUT": "float" if dtype == np.float32 else "double",
-                "BVH_DEPTH": max(tree.depth, _LEAST_DEPTH),
-            },
-            inputs=[(shape, dtype)],
-            outputs={
-                "intervals": ((*where, self.most, 2), real),
-                "count": (where, np.dtype(np.int32)),
-                "status": (where, np.dtype(np.uint8)),
-            },
-            arguments=[
-                *tree.tables(real),
-                tree.middle.astype(_place(device)),
-                _clearance(self.clearance, self.scene, real, dtype, _CLEARANCE_ALONG_RAYS),
-                np.int32(self.most),
-                np.uint64(count),
-                np.uint64(each),
-            ],
-            global_size=(items,) if strip else (-(-items // _GROUP) * _GROUP,),
-            local_size=(1,) if strip else (_GROUP,),
         )
 
 
@@ -300,11 +197,11 @@ def segment_rows(segments: LitSegments, room: int | None = None) -> npt.NDArray[
     return rows
 
 
-def _check_scene(name: str, scene: object, clearance: float | None) -> None:
+def _check_scene(scene: object, clearance: float | None) -> None:
     if not isinstance(scene, Scene):
-        raise TypeError(f"{name}.scene is {scene!r}, expected a Scene")
+        raise TypeError(f"VisibleLight.scene is {scene!r}, expected a Scene")
     if clearance is not None and not (math.isfinite(clearance) and clearance >= 0.0):
-        raise ValueError(f"{name}.clearance is {clearance!r}, expected metres, 0 or more, or None")
+        raise ValueError(f"VisibleLight.clearance is {clearance!r}, expected metres, 0 or more, or None")
 
 
 def _check_count(what: str, value: object, least: int) -> None:
@@ -316,9 +213,9 @@ def _check_count(what: str, value: object, least: int) -> None:
         raise ValueError(f"{what} is {number}, expected {least} or more, below 2^31")
 
 
-def _real_of(name: str, device: Device, dtype: np.dtype[Any], precision: Precision) -> np.dtype[Any]:
+def _real_of(device: Device, dtype: np.dtype[Any], precision: Precision) -> np.dtype[Any]:
     if dtype not in (np.float32, np.float64):
-        raise TypeError(f"{name} takes float32 or float64, got {dtype}")
+        raise TypeError(f"VisibleLight takes float32 or float64, got {dtype}")
     if precision not in ("single", "double", None):
         raise ValueError(f"precision must be 'single', 'double' or None, got {precision!r}")
     if dtype == np.float64 and not device.has_double:
@@ -332,10 +229,8 @@ def _place(device: Device) -> np.dtype[Any]:
     return np.dtype(np.float64 if device.has_double else np.float32)
 
 
-def _clearance(
-    given: float | None, scene: Scene, real: np.dtype[Any], dtype: np.dtype[Any], shares: dict[int, float]
-) -> Any:
+def _clearance(given: float | None, scene: Scene, real: np.dtype[Any], dtype: np.dtype[Any]) -> Any:
     if given is None:
         reach = float(np.abs(scene.bvh.corners).max(initial=0.0) + np.abs(scene.bvh.middle).max())
-        given = shares[min(real.itemsize, dtype.itemsize)] * reach
+        given = _CLEARANCE[min(real.itemsize, dtype.itemsize)] * reach
     return real.type(given)

@@ -50,17 +50,6 @@ def intervals(corners: np.ndarray, ray_of: object, points: tuple[np.ndarray, ...
     return np.array(found).reshape(-1, 2)
 
 
-def from_point(corners: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """Return the visible intervals of a row (9,): a point, and a segment's ends; only what is in either is left out."""
-    point, start, stop = row.astype(float).reshape(3, 3)
-
-    def ray_of(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        ends = start + t[:, None] * (stop - start)
-        return point + 1e-9 * (ends - point), point + (1.0 - 1e-9) * (ends - point)
-
-    return intervals(corners, ray_of, (point, start, stop), [])
-
-
 def from_receiver(corners: np.ndarray, receiver: np.ndarray, segment: np.ndarray, clearance: float) -> np.ndarray:
     """Return the visible intervals of a segment (10,) from a receiver (6,): what is above both their planes hides."""
     point, facing = receiver[:3].astype(float), receiver[3:].astype(float)

@@ -37,6 +37,7 @@
 // Of the arrays: what the last chunk of gradients reads.
 #define RULER_PADDED (16 * RULER_VECTORS + 16 * ((2 * TAPS + 15) / 16))
 #define RULER_MIDDLE ((real)0.5f * (LENGTH - 1))
+#define RULER_LARGEST 1e37f  // of sums over lines: gradients of them are numbers
 #define RULER_ROOT_TWO_PI 2.5066282746310002f
 
 #ifdef STRIP
@@ -132,16 +133,21 @@ inline masks ruler_at(const ruler_place *place, reals index, int line, constant 
 #endif
 }
 
-// What is wrong with a sample itself.
+// What is wrong with a sample itself, and with a sum of them.
 inline masks ruler_judge(reals sample, constant real *table) {
-    masks flags = 0;
 #ifdef SATURATION
-    flags |= mask_of(sample >= table[RULER_SATURATION]) & STATUS_SATURATED;
+    return mask_of(sample >= table[RULER_SATURATION]) & STATUS_SATURATED;
+#else
+    return 0;
 #endif
+}
+
+inline masks ruler_judge_sum(reals sum) {
 #ifdef CODE_float
-    flags |= mask_of(LANED(not_finite)(sample)) & STATUS_NOT_FINITE;
+    return mask_of((LANED(not_finite)(sum) | (fabs(sum) > (real)RULER_LARGEST)) != 0) & STATUS_NOT_FINITE;
+#else
+    return 0;
 #endif
-    return flags;
 }
 
 inline reals ruler_slope(RULER_SPACE const real *profile, constant real *table) {
@@ -388,6 +394,9 @@ inline void ruler_measure(global const CODE *image, int rows, int columns, real4
         masks flags = 0;
         for (int v = 0; v < RULER_PADDED / 16; v++) profile[v] = 0;
         for (int line = 0; line < WIDTH; line++) flags |= ruler_add(&place, columns, line, table, model, profile);
+#ifdef CODE_float
+        for (int v = 0; v < RULER_VECTORS; v++) flags |= ruler_judge_sum(profile[v]);
+#endif
 #if defined(SATURATION) || defined(CODE_float) || defined(LENS) || defined(CAMERA)
         status = ruler_any(flags);
 #endif
@@ -414,6 +423,7 @@ inline real ruler_sum(const ruler_place *place, int pitch, int i, constant real 
         *flags |= ruler_judge(sample, table);
         sum += sample;
     }
+    *flags |= ruler_judge_sum(sum);
     return sum;
 }
 

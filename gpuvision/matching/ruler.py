@@ -52,7 +52,7 @@ class Edges(NamedTuple):
         Predicted standard deviation of the position [px], from the noise that the operation was given.
     status
         uint8 `Status` flags. DARK: no edge over the threshold. OUT_OF_RANGE: the ruler leaves the image. NOT_FINITE:
-        a number of the ruler or a pixel under it is not, or its edge is beyond the largest number. FOLDED: the lens
+        a number of the ruler or a pixel under it is not, or grey levels times lines are beyond 1e37. FOLDED: the lens
         has no such point. With a value: SATURATED (a sample of the ruler reached the saturation, the edge may be
         displaced), AMBIGUOUS (a second edge is comparable; for ``choice="all"`` in the last place: there are more).
     spacing
@@ -187,9 +187,7 @@ class RulerEdges(Operation[Edges]):
     def _check_choices(self) -> None:
         for name, allowed in (("polarity", POLARITIES), ("choice", CHOICES)):
             if getattr(self, name) not in allowed:
-                raise ValueError(
-                    f"RulerEdges.{name} is {getattr(self, name)!r}, expected one of {', '.join(allowed)}"
-                )
+                raise ValueError(f"RulerEdges.{name} is {getattr(self, name)!r}, expected one of {', '.join(allowed)}")
         if self.ambiguity is not None:
             if not 0.0 < finite(self.ambiguity, "RulerEdges.ambiguity") <= 1.0:
                 raise ValueError(f"RulerEdges.ambiguity is {self.ambiguity}, expected a share, 0 < share <= 1")

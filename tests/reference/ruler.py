@@ -1,0 +1,121 @@
+"""Edges along one ruler in float64, sample by sample as the docstring of `RulerEdges` says it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+Float64 = NDArray[np.float64]
+
+
+def straight(points: Float64) -> Float64:
+    """No lens."""
+    return points
+
+
+def profile(
+    image: NDArray[Any],
+    ruler: NDArray[Any],
+    length: int,
+    width: int,
+    step: float = 1.0,
+    distort: Callable[[Float64], Float64] = straight,
+) -> tuple[Float64, Float64]:
+    """Return the grey levels averaged over the lines, and all samples (width, length); NaN out of the image."""
+    x, y, cosine, sine = np.asarray(ruler, np.float64)
+    along = (np.arange(length) - 0.5 * (length - 1)) * step
+    across = (np.arange(width) - 0.5 * (width - 1))[:, None]
+    points = distort(np.stack([x + along * cosine - across * sine, y + along * sine + across * cosine], axis=-1))
+    inside = np.all((points >= 0) & (points <= np.array(image.shape[::-1]) - 1), axis=-1)
+    at = np.where(inside[..., None], points, 0.0)
+    samples = map_coordinates(image.astype(np.float64), [at[..., 1], at[..., 0]], order=1)
+    samples = np.where(inside, samples, np.nan)
+    return samples.mean(axis=0), samples
+
+
+def taps(smoothing: float, step: float = 1.0) -> Float64:
+    """Derivative of a Gaussian at whole samples to 3 sigma, as `numpy.correlate` takes it; 1 for a ramp of 1."""
+    reach = math.ceil(3.0 * smoothing / step)
+    k = np.arange(-reach, reach + 1)
+    values = k * np.exp(-0.5 * (k * step / smoothing) ** 2)
+    return values / np.sum(k * values)
+
+
+def smoothing_variance(filter_: Float64) -> float:
+    """Of the smoothing that goes with a derivative filter [samples^2]: a third of its third moment."""
+    k = np.arange(filter_.size) - filter_.size // 2
+    return float(np.sum(filter_ * k**3)) / 3.0
+
+
+def edges(grey: Float64, smoothing: float, threshold: float, step: float = 1.0) -> list[dict[str, float]]:
+    """Return every edge over the threshold in order: position [px], amplitude, width [px], gradient."""
+    filter_ = taps(smoothing, step)
+    reach, variance = filter_.size // 2, smoothing_variance(filter_)
+    slopes = np.correlate(grey, filter_, "valid")
+    least = threshold / math.sqrt(2.0 * math.pi * variance)
+    found = []
+    for i in range(1, slopes.size - 1):
+        before, here, after = np.abs(slopes[i - 1 : i + 2])
+        if here < least or not (here > before and here >= after):
+            continue
+        sign = np.sign(slopes[i])
+        found.append(_refined(slopes[i - 1 : i + 2] * sign, sign, variance, step))
+        found[-1]["position"] += (i + reach - 0.5 * (grey.size - 1)) * step
+    return found
+
+
+def _refined(three: Float64, sign: float, smoothing: float, step: float) -> dict[str, float]:
+    left, middle, right = np.log(np.maximum(three, 1e-6 * three[1]))
+    curvature = left - 2.0 * middle + right
+    shift = 0.5 * (left - right) / curvature
+    variance = -1.0 / curvature
+    peak = math.exp(middle - 0.25 * (left - right) * shift)
+    return {
+        "position": shift * step,
+        "amplitude": sign * peak * math.sqrt(2.0 * math.pi * variance),
+        "width": math.sqrt(max(variance - smoothing, 0.0)) * step,
+        "gradient": sign * three[1],
+        "variance": variance,
+    }
+
+
+def step_image(
+    shape: tuple[int, int], angle: float, distance: float, blur: float, low: float = 50.0, high: float = 150.0
+) -> Float64:
+    """Grey levels of a straight edge, blurred: high where x cos + y sin is beyond the distance."""
+    from scipy.special import ndtr
+
+    row, column = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+    return low + (high - low) * ndtr((column * math.cos(angle) + row * math.sin(angle) - distance) / blur)
+
+
+def stripe_image(
+    shape: tuple[int, int], angle: float, distance: float, spacing: float, blur: float, high: float = 150.0
+) -> Float64:
+    """Grey levels of a bright stripe about the distance."""
+    first = step_image(shape, angle, distance - 0.5 * spacing, blur, 50.0, high)
+    return first - step_image(shape, angle, distance + 0.5 * spacing, blur, 0.0, high - 50.0)
+
+
+def disc_image(shape: tuple[int, int], centre: tuple[float, float], radius: float, blur: float) -> Float64:
+    """Grey levels of a dark disc, by 15 x 15 points of each pixel, blurred."""
+    from scipy.ndimage import gaussian_filter
+
+    fine = 15
+    row, column = ((np.arange(n * fine) + 0.5) / fine - 0.5 for n in shape)
+    inside = np.hypot(row[:, None] - centre[1], column - centre[0]) < radius
+    coarse = inside.reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3))
+    return 150.0 - 100.0 * gaussian_filter(coarse, math.sqrt(blur**2 - 1.0 / 12.0), truncate=6.0)
+
+
+def across(angle: float, distance: float, count: int, rng: np.random.Generator, middle: tuple[float, float]) -> Float64:
+    """Return rulers at right angles to an edge, about the middle of an image, up to 8 px beside the edge."""
+    direction, along = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+    foot = np.array(middle) + (distance - np.array(middle) @ direction) * direction
+    centres = foot + rng.uniform(-20, 20, (count, 1)) * along + rng.uniform(-8, 8, (count, 1)) * direction
+    return np.concatenate([centres, np.tile(direction, (count, 1))], axis=1).astype(np.float32)

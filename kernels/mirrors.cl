@@ -19,9 +19,10 @@
 // side of all of them reflects, and the sine of their cone.
 #define BLOCK 11
 #define STEPS 16
+#define ASTRAY ((real)5)
 #define TANGENTS 4
 // How far out of the triangle, in its own size, the linear guess may lie.
-#define MARGIN ((real)1.5)
+#define MARGIN ((real)0.5)
 #ifdef REAL_IS_DOUBLE
 #define NEAR_ENOUGH ((real)1e-7)
 #define SLACK ((real)1e-12)
@@ -188,7 +189,8 @@ INLINE reals within_triangle(reals value, masks near) {
 }
 
 // Newton's method from the guess; which lanes came to rest in the triangle, lens and point on one side of it.
-INLINE masks solved(Vector point, Vector lens, global const real *row, reals *x, reals *y, Reflection *it) {
+INLINE masks solved(masks near, Vector point, Vector lens, global const real *row, reals *x, reals *y,
+                    Reflection *it) {
     reals step = (real)1;
     for (int n = 0; n < STEPS; n++) {
         *it = reflection_at(*x, *y, point, lens, row);
@@ -198,7 +200,9 @@ INLINE masks solved(Vector point, Vector lens, global const real *row, reals *x,
         *x -= dx;
         *y -= dy;
         step = fabs(dx) + fabs(dy);
-        if (!any_lane(mask_of(step > NEAR_ENOUGH))) break;
+        // What has gone astray does not come back.
+        near &= mask_of(fabs(*x) + fabs(*y) < ASTRAY);
+        if (!any_lane(near & mask_of(step > NEAR_ENOUGH))) break;
     }
     *it = reflection_at(*x, *y, point, lens, row);
     const reals zero = (real)0;
@@ -209,7 +213,7 @@ INLINE masks solved(Vector point, Vector lens, global const real *row, reals *x,
     // R is zero, too, where the surface is seen edge on from both.
     const reals ways = sqrt(dot_of(it->to_lens, it->to_lens) * dot_of(it->to_point, it->to_point));
     const masks sides = positive(it->up_lens * it->up_point - GRAZING * GRAZING * ways);
-    return inside & sides & outside & mask_of(step <= NEAR_ENOUGH);
+    return near & inside & sides & outside & mask_of(step <= NEAR_ENOUGH);
 }
 
 // The solid angle of the lens' rays per area across them at the point.
@@ -269,7 +273,7 @@ kernel void mirror_points(global const INPUT *restrict points, global const INPU
             x = within_triangle(x, near);
             y = within_triangle(y, near);
             Reflection it;
-            const masks met = near & solved(point, lens_wide, row, &x, &y, &it);
+            const masks met = solved(near, point, lens_wide, row, &x, &y, &it);
             if (!any_lane(met)) continue;
             const Vector move = place_moves(&it, step);
             real values[7][LANES];

@@ -211,7 +211,7 @@ class MirrorPoints(Operation[MirroredPoints]):
     the radius of curvature, their density by its first. One image per triangle is found: triangles must be small
     beside the distances and radii, at least a few across each image. An image on the edge of two triangles is found on
     both. At grazing incidence, within about what a triangle turns, an image may be missed (of a sphere of 1280
-    triangles, of 1 point in 500). Near a caustic the density is unbounded.
+    triangles, of 1 point in 300). Near a caustic the density is unbounded.
     """
 
     Result: ClassVar[type[Any]] = MirroredPoints

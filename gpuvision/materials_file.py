@@ -4,6 +4,7 @@
 ``name``       for reports
 ``albedo``     share of the light that the surface throws back diffusely
 ``roughness``  0 (Lambert) to 1, see `OrenNayar`
+``slopes``     instead: standard deviation of the slopes of the surface's facets [rad], see `OrenNayar.of_slopes`
 ``mirror``     share that it throws on as an ideal mirror
 ``gloss``      a table: ``model = "phong"`` with ``albedo``, ``exponent``; ``"ggx"`` with ``alpha``, ``facing``; or
                ``"ward"`` with ``albedo``, ``alpha_x``, ``alpha_y``
@@ -12,6 +13,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,12 +43,19 @@ def read_materials(path: str | Path) -> tuple[Material, ...]:
 def _material(table: Section, top: Section) -> Material:
     name = table.text("name", "")
     albedo = table.number("albedo", "", at_least=0.0, at_most=1.0)
-    roughness = table.number("roughness", "", 0.0, at_least=0.0, at_most=1.0)
+    roughness = table.number("roughness", "", None, at_least=0.0, at_most=1.0)
+    slopes = table.number("slopes", "rad", None, at_least=0.0, at_most=0.5 * math.pi)
+    if roughness is not None and slopes is not None:
+        raise top.error(f"{table.name} has roughness and slopes at once, expected one of them")
     mirror = table.number("mirror", "", 0.0, at_least=0.0, at_most=1.0)
     lobe = table.optional_section("gloss")
     gloss = None if lobe is None else _gloss(lobe)
     table.finish()
-    diffuse = OrenNayar(albedo=albedo, roughness=roughness) if roughness else Lambert(albedo=albedo)
+    diffuse: Lambert | OrenNayar = Lambert(albedo=albedo)
+    if slopes:
+        diffuse = OrenNayar.of_slopes(albedo=albedo, sigma=slopes)
+    elif roughness:
+        diffuse = OrenNayar(albedo=albedo, roughness=roughness)
     try:
         return Material(diffuse=diffuse, gloss=gloss, mirror=mirror, name=name)
     except ValueError as error:

@@ -273,6 +273,11 @@ def simulate(
         account = _added(account, block)
         first += len(block.truth.h)
     artifacts = _joined(parts)
+    if not np.isfinite(artifacts.truth.h).any():
+        raise ValueError(
+            f"the sensor sees nothing lit in any of {len(artifacts.truth.h)} profiles: {_place(task.part)}; "
+            "is that where sheet and sensor are, and the unit right?"
+        )
     reading = artifacts.reading
     place = [np.ascontiguousarray(each, np.float32) for each in (reading.g, reading.h)]
     points = assembled(task.sensor, place, task.transports, reading.status, device)
@@ -399,6 +404,15 @@ def _joined(parts: Sequence[Artifacts]) -> Artifacts:
         return np.concatenate(values)
 
     return Artifacts(**{each.name: joined([getattr(part, each.name) for part in parts]) for each in fields(Artifacts)})
+
+
+def _place(part: Scene) -> str:
+    """Say where a part lies."""
+    corners = part.corners.reshape(-1, 3)
+    low, high = (1e3 * bound(corners[np.isfinite(corners).all(axis=1)], axis=0) for bound in (np.min, np.max))
+    return "the part lies at " + ", ".join(
+        f"{name} {a:.4g} to {b:.4g} mm" for name, a, b in zip("xyz", low, high, strict=True)
+    )
 
 
 def _strength(reading: Reading) -> Array:

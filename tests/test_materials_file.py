@@ -18,6 +18,10 @@ albedo = 0.5
 roughness = 0.4
 
 [[material]]
+albedo = 0.5
+slopes = 0.3
+
+[[material]]
 name = "pad"
 albedo = 0.1
 mirror = 0.6
@@ -41,6 +45,7 @@ def test_materials_come_in_the_order_of_the_file(tmp_path):
     assert read(tmp_path, GOOD) == (
         Material(diffuse=Lambert(albedo=0.3), gloss=Phong(albedo=0.1, exponent=40.0), name="solder mask"),
         Material(diffuse=OrenNayar(albedo=0.5, roughness=0.4)),
+        Material(diffuse=OrenNayar.of_slopes(albedo=0.5, sigma=0.3)),
         Material(diffuse=Lambert(albedo=0.1), mirror=0.6, name="pad"),
         Material(diffuse=Lambert(albedo=0.0), gloss=Ggx(alpha=0.1, facing=0.9)),
     )
@@ -54,6 +59,7 @@ def test_materials_come_in_the_order_of_the_file(tmp_path):
         ("[[material]]\nalbedo = 1.5", r"material\[0\].albedo is 1.5"),
         ("[[material]]\nalbedo = 0.5\nmirror = 0.7", r"material\[0\]: Material throws back 1.20"),
         ("[[material]]\nalbedo = 0.5\n[[material]]\nname = 'x'", r"material\[1\].albedo' is missing"),
+        ("[[material]]\nalbedo = 0.5\nroughness = 0.1\nslopes = 0.1", "roughness and slopes at once"),
         ("[[material]]\nalbedo = 0.5\ngloss = {model = 'fong'}", "did you mean"),
         ("[[material]]\nalbedo = 0.5\ngloss = {model = 'ggx', alpha = 0, facing = 1}", "Ggx.alpha is 0"),
         ("[[material]]\nalbedo = 0.5\nmiror = 0.1", r"unknown key 'material\[0\].miror'"),

@@ -169,6 +169,14 @@ def test_what_cannot_be_simulated(part_file: Path, change: dict[str, Any], words
         task_of(part_file, **change)
 
 
+def test_a_part_beside_the_sensor_is_told_where_it_is(tmp_path: Path) -> None:
+    aside = mesh()
+    aside.apply_translation((1.0, 0.0, 0.0))
+    aside.export(tmp_path / "aside.stl")
+    with pytest.raises(ValueError, match="sees nothing lit in any of 8 profiles: the part lies at x 980 to 1020 mm"):
+        simulate(task_of(tmp_path / "aside.stl", profiles=8), tmp_path)
+
+
 def test_a_mesh_needs_its_materials(tmp_path: Path) -> None:
     scene = trimesh.Scene([mesh(), trimesh.creation.box((MM, MM, MM))])
     scene.export(tmp_path / "two.glb")
@@ -204,6 +212,7 @@ def test_the_command(
     for wrong, line in [
         (["--paths", "direct,sideways"], "unknown path 'sideways'"),
         (["--mask", str(tmp_path / "none.txt")], "none.txt"),
+        (["--mask", str(tmp_path / "mm.stl")], "mm.stl: expected two numbers a line"),
         (["--materials", str(tmp_path / "none.toml")], "none.toml"),
         (["--scheduler", "tcp://127.0.0.1:1", "--profiles", "7"], "127.0.0.1:1"),
     ]:

@@ -63,7 +63,7 @@ class LightPaths:
         Thin sheets that stand for a thick one, on the direct path. Secondary light comes from the middle one: it sees
         the sheet from further away than the sheet is thick.
     blur
-        Standard deviation of a point's image along u [sensor unit].
+        Standard deviation of a point's image along u [sensor unit]; light by diffuse detours is even enough without.
     nodes
         Of `SightLines`.
     patch
@@ -155,7 +155,8 @@ class LightPaths:
         """Return the direct light of a profile with the light by detours."""
         account = {"segments": float(len(lit.power)), "power": lit.total()}
         if "diffuse-specular" in self.paths and self._mirrors.there_are_any:
-            exposures["diffuse-specular"] = self._mirrors.exposure(lit, L, self.sheet)
+            mirrored = self._mirrors.exposure(lit, L, self.sheet)
+            exposures["diffuse-specular"] = self.sight.blurred(mirrored, self.blur)
         if {"diffuse-diffuse", "bounces"} & set(self.paths):
             seen, segments = self.lines.surface(L), self._diffuse(lit)
             reading = StripReading.of(self.sight, exposures["direct"], floor=self.floor)

@@ -152,9 +152,13 @@ class Mask:
         ValueError
             The file holds anything else.
         """
-        windows = np.loadtxt(path, delimiter=",", ndmin=2)
+        expected = f"{path}: expected two numbers a line, the lower and the upper end of a sample's window"
+        try:
+            windows = np.loadtxt(path, delimiter=",", ndmin=2)
+        except ValueError:
+            raise ValueError(expected) from None
         if windows.shape[1:] != (2,):
-            raise ValueError(f"{path}: expected two numbers a line, the lower and the upper end of a sample's window")
+            raise ValueError(expected)
         return cls(windows=windows)
 
 

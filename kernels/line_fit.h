@@ -42,12 +42,12 @@ inline void line_distances(laned_line line, laned_points all) {
     }
 }
 
-// How badly a line does: the median (to a percent) of the distances, or the loss, which bends at a known scale.
+// How badly a line does: the loss at the scale that is known, or the median of the distances to a percent.
 inline reals line_score(laned_line line, laned_points all, masks rank) {
-#ifdef LOSS_CUT
+#ifdef SCALE
     reals sum = 0;
     for (int i = 0; i < all.count; i++)
-        sum += loss_of(line_distance(line, all.x[i], all.y[i]) * all.certainty[i] * (reals)(1 / SCALE));
+        sum += loss_of(line_distance(line, all.x[i], all.y[i]) * all.certainty[i] * (reals)((real)1 / SCALE));
     return sum;
 #else
     line_distances(line, all);
@@ -55,9 +55,20 @@ inline reals line_score(laned_line line, laned_points all, masks rank) {
 #endif
 }
 
+// The weighted middle of all points, and any direction.
+inline laned_line line_middle(laned_points all) {
+    reals sum = 0, sum_x = 0, sum_y = 0;
+    for (int i = 0; i < all.count; i++) {
+        const reals w = all.certainty[i] * all.certainty[i];
+        sum += w, sum_x += w * all.x[i], sum_y += w * all.y[i];
+    }
+    const reals per = (reals)1 / (sum > (reals)0 ? sum : (reals)1);
+    return (laned_line){sum_x * per, sum_y * per, 1, 0};
+}
+
 // Of the lines through pairs of points the one that does best.
 inline laned_line line_start(laned_points all, constant const int *pairs, int trials, masks rank) {
-    laned_line best = {0, 0, 1, 0};
+    laned_line best = line_middle(all);
     reals least = INFINITY;
     for (int trial = 0; trial < trials; trial++) {
         const int i = pairs[2 * trial], j = pairs[2 * trial + 1];
@@ -76,17 +87,6 @@ inline laned_line line_start(laned_points all, constant const int *pairs, int tr
         best.s = better ? tried.s : best.s;
     }
     return best;
-}
-
-// The weighted middle of all points, and any direction.
-inline laned_line line_middle(laned_points all) {
-    reals sum = 0, sum_x = 0, sum_y = 0;
-    for (int i = 0; i < all.count; i++) {
-        const reals w = all.certainty[i] * all.certainty[i];
-        sum += w, sum_x += w * all.x[i], sum_y += w * all.y[i];
-    }
-    const reals per = (reals)1 / (sum > (reals)0 ? sum : (reals)1);
-    return (laned_line){sum_x * per, sum_y * per, 1, 0};
 }
 
 // One step of weighted total least squares. The line is turned from where it is: half its angle needs no arctangent.
@@ -120,15 +120,17 @@ inline laned_line line_step(laned_line line, laned_points all, reals per_scale, 
     return next;
 }
 
-inline reals line_scale(laned_line line, laned_points all, masks points, masks rank, reals smallest) {
+// By the median of the distances; of those only within `reach`, once a scale is known: outliers raise the median too.
+inline reals line_scale(laned_line line, laned_points all, reals reach, real few, reals smallest) {
 #ifdef SCALE
     return (reals)SCALE;
 #else
     line_distances(line, all);
-    const reals middle = ranked_of(all.distances, all.count, rank, 0);
-    const reals free = LANED(convert_real)(points) - (reals)2;
-    // A few points' median is too small: the line followed them (Rousseeuw and Leroy, 1987).
-    const reals scale = (reals)MAD_TO_SIGMA * ((reals)1 + (reals)5 / (free > (reals)1 ? free : (reals)1)) * middle;
+    masks within = 0;
+    for (int i = 0; i < all.count; i++) within -= mask_of(all.distances[i] <= reach) & mask_of(all.certainty[i] > (reals)0);
+    const reals middle = ranked_of(all.distances, all.count, (within >> 1) + 1, 0);
+    const reals free = LANED(convert_real)(within) - (reals)2;
+    const reals scale = (reals)MAD_TO_SIGMA * ((reals)1 + (reals)few / (free > (reals)1 ? free : (reals)1)) * middle;
     return scale > smallest ? scale : smallest;
 #endif
 }
@@ -165,18 +167,18 @@ inline void line_variances(laned_fit *fit, laned_points all) {
 inline laned_fit line_fit(laned_points all, constant const int *pairs, int trials, int steps, reals smallest) {
     laned_fit fit = {line_middle(all), smallest, 0, 0, 0, 0, 0};
     for (int i = 0; i < all.count; i++) fit.points -= mask_of(all.certainty[i] > (reals)0);
-    const masks rank = (fit.points >> 1) + 1;
-#if defined(LOSS_HUBER) || defined(LOSS_TUKEY) || defined(LOSS_CUT)
-    fit.line = line_start(all, pairs, trials, rank);
+#ifdef ROBUST
+    fit.line = line_start(all, pairs, trials, (fit.points >> 1) + 1);
+    fit.scale = line_scale(fit.line, all, (reals)INFINITY, FEW_TRIED, smallest);
 #endif
-    fit.scale = line_scale(fit.line, all, fit.points, rank, smallest);
     for (int step = 0; step < steps; step++) {
         // About a line that all its points have moved, the median says more than about one through two of them.
-        if (step == 2) fit.scale = line_scale(fit.line, all, fit.points, rank, smallest);
+        if (RESCALED_AT(step))
+            fit.scale = line_scale(fit.line, all, (reals)2.5f * fit.scale, FEW_FITTED, smallest);
         fit.line = line_step(fit.line, all, (reals)1 / fit.scale, &fit.coincide);
     }
-#if !defined(LOSS_HUBER) && !defined(LOSS_TUKEY) && !defined(LOSS_CUT)
-    fit.scale = line_scale(fit.line, all, fit.points, rank, smallest);
+#ifndef ROBUST
+    fit.scale = line_scale(fit.line, all, (reals)INFINITY, FEW_FITTED, smallest);
 #endif
     line_variances(&fit, all);
     return fit;

@@ -158,7 +158,7 @@ inline reals pose_score(laned_pose pose, pose_rows all, private reals *distances
         const laned_row at = row_for_all(all, i);
         const reals z = residual_of(pose, at) * at.certainty;
 #ifdef GIVEN_SCALE
-        loss += loss_of(z * (reals)(1 / (real)(GIVEN_SCALE)));
+        loss += loss_of(z * (reals)((real)1 / (real)(GIVEN_SCALE)));
     }
     return loss;
 #else
@@ -206,26 +206,31 @@ inline laned_pose pose_start(laned_pose near, pose_rows all, constant const int 
     return best;
 }
 
-// The scale of the residuals in sigmas: as it is known, or by their median.
-inline real pose_scale(laned_pose pose, pose_rows all, private reals *room, int present, real smallest) {
+// The scale of the residuals in sigmas: as it is known, or by their median; of those only within `reach`, once a scale
+// is known: outliers raise the median too.
+inline real pose_scale(laned_pose pose, pose_rows all, private reals *room, real reach, real few, real smallest) {
 #ifdef GIVEN_SCALE
     return (real)(GIVEN_SCALE);
 #else
     private real *distances = (private real *)room;
+    masks inside = 0;
     for (int i = 0; i < all.count; i += LANES) {
         const laned_row at = row_of(all, i);
         const reals z = FABS(residual_of(pose, at) * at.certainty);
-        *(private reals_at *)(distances + i) = at.certainty > (reals)0 ? z : (reals)INFINITY;
+        const masks there = mask_of(at.certainty > (reals)0);
+        inside -= there & mask_of(z <= (reals)reach);
+        *(private reals_at *)(distances + i) = there ? z : (reals)INFINITY;
     }
+    const int within = (int)sum_of(LANED(convert_real)(inside));
     bits found = 0;
     for (int bit = BITS_BELOW_SIGN - 1; bit >= BITS_TO_ONE_PERCENT; bit--) {
         const bits next = found | ((bits)1 << bit);
         masks below = 0;
         for (int i = 0; i < all.count; i += LANES) below -= mask_of(as_masks(READ(distances, i)) < (masks)next);
-        found = (int)sum_of(LANED(convert_real)(below)) > present / 2 ? found : next;
+        found = (int)sum_of(LANED(convert_real)(below)) > within / 2 ? found : next;
     }
-    const real free = max((real)(present - FREEDOMS), (real)1);
-    return max(smallest, MAD_TO_SIGMA * (1 + 5 / free) * as_real(found));
+    const real free = max((real)(within - FREEDOMS), (real)1);
+    return max(smallest, MAD_TO_SIGMA * (1 + few / free) * as_real(found));
 #endif
 }
 
@@ -327,18 +332,22 @@ inline solved_pose pose_solved(laned_pose near, pose_rows all, constant const in
     fit.present = (int)present;
     fit.pose = near;
     pose_sums sums;
-#if defined(LOSS_HUBER) || defined(LOSS_TUKEY) || defined(LOSS_CUT)
+    fit.scale = smallest;
+#ifdef ROBUST
     fit.pose = pose_start(near, all, subsets, trials, room, fit.present);
+    fit.scale = pose_scale(fit.pose, all, room, INFINITY, FEW_TRIED, smallest);
 #endif
-    fit.scale = pose_scale(fit.pose, all, room, fit.present, smallest);
     for (int step = 0; step < steps; step++) {
-        if (step == 2) fit.scale = pose_scale(fit.pose, all, room, fit.present, smallest);
+        if (RESCALED_AT(step)) fit.scale = pose_scale(fit.pose, all, room, (real)2.5f * fit.scale, FEW_FITTED, smallest);
         reals change[FREEDOMS];
         pose_summed(fit.pose, all, 1 / fit.scale, 0, &sums);
         if (any_lane(factored(sums.matrix))) break;
         solved(sums.matrix, sums.right, change);
         fit.pose = pose_after(fit.pose, change);
     }
+#ifndef ROBUST
+    fit.scale = pose_scale(fit.pose, all, room, INFINITY, FEW_FITTED, smallest);
+#endif
     pose_summed(fit.pose, all, 1 / fit.scale, 1, &sums);
     fit.inliers = sums.inliers;
     real least, largest;

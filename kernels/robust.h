@@ -5,6 +5,13 @@
 
 #include "lanes.h"
 
+#if defined(LOSS_HUBER) || defined(LOSS_TUKEY) || defined(LOSS_CUT)
+#define ROBUST
+// The step before which the scale is taken anew.
+#define RESCALED_AT(step) ((step) == 2)
+#else
+#define RESCALED_AT(step) 0
+#endif
 #ifdef LOSS_BEND
 #define TUNING ((real)(LOSS_BEND))
 #endif
@@ -19,6 +26,10 @@
 #define BITS_TO_ONE_PERCENT 16
 #endif
 #define MAD_TO_SIGMA (real)1.4826022185056018
+// How much too small the median is for few points: much where the fit is the best of many through two or three of them
+// (Rousseeuw and Leroy, 1987), a little where all took part.
+#define FEW_TRIED (real)5
+#define FEW_FITTED (real)1
 
 // A value of one lane.
 #ifdef STRIP

@@ -58,8 +58,8 @@ class FitLines(Operation[LineFits]):
     A point with a coordinate that is not finite is missing. With ``weighted`` there is a second input of shape
     (..., points): each point's standard deviation; a point for which it is not positive or not finite is missing.
 
-    The fit starts at the line through two of the points that has the least median of distances (``"ransac"``: the
-    least loss) and iterates reweighted total least squares from there.
+    The fit starts at the line through two of the points that has the least loss (where the scale is None: the least
+    median of distances) and iterates reweighted total least squares from there.
 
     Parameters
     ----------
@@ -70,7 +70,8 @@ class FitLines(Operation[LineFits]):
         Where the loss bends, in scales; None: 4.685 for Tukey, 1.345 for Huber (95 % efficiency), 3 for RANSAC.
     scale
         Standard deviation of a good point's distance in the points' unit; with ``weighted`` in sigmas: 1 trusts them.
-        None: 1.4826 of the median of the absolute distances, raised by 1 + 5 / (points - 2) for few points.
+        None: 1.4826 of the median of the absolute distances, raised by 1 + 5 / (points - 2) for few points;
+        then of those within 2.5 of it.
     smallest_scale
         The scale is not taken to be less (in its unit): points that lie on a line exactly leave none.
     trials

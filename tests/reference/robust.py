@@ -1,0 +1,65 @@
+"""Robust fits by a general minimiser in double: the loss itself, whose minimum the kernels iterate to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares, minimize
+
+
+def loss(z: np.ndarray, name: str, bend: float) -> np.ndarray:
+    """Of residuals in units of their scale."""
+    if name == "huber":
+        return np.where(np.abs(z) <= bend, 0.5 * z**2, bend * (np.abs(z) - 0.5 * bend))
+    if name == "tukey":
+        return bend**2 / 6.0 * (1.0 - np.clip(1.0 - (z / bend) ** 2, 0.0, None) ** 3)
+    if name == "ransac":
+        return 0.5 * np.minimum(z**2, bend**2)
+    return 0.5 * z**2
+
+
+def fit_line(
+    points: np.ndarray, sigma: np.ndarray, scale: float, name: str, bend: float, start: tuple[float, float]
+) -> tuple[float, float]:
+    """Return angle and distance from the origin (along (-sin, cos)) of the line of least loss near a start."""
+
+    def total(parameters: np.ndarray) -> float:
+        angle, distance = parameters
+        across = points @ [-np.sin(angle), np.cos(angle)] - distance
+        return float(np.sum(loss(across / (sigma * scale), name, bend)))
+
+    found = minimize(total, start, method="Nelder-Mead", options={"xatol": 1e-11, "fatol": 1e-14, "maxiter": 4000})
+    return float(found.x[0]), float(found.x[1])
+
+
+def moved(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return matrix and shift of x, y, theta and the scales and shear that follow."""
+    x, y, theta = parameters[:3]
+    deformation = np.eye(2)
+    if len(parameters) == 4:
+        deformation = deformation * (1.0 + parameters[3])
+    if len(parameters) == 6:
+        deformation = np.array([[1.0 + parameters[3], parameters[5]], [0.0, 1.0 + parameters[4]]])
+    turned = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+    return turned @ deformation, np.array([x, y])
+
+
+def residuals(parameters: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Of every row along its normal in the artwork, at a pose."""
+    matrix, shift = moved(parameters)
+    seen = rows[:, 2:4] + rows[:, 4:6]
+    artwork = np.linalg.solve(matrix, (seen - shift).T).T
+    return np.sum(rows[:, :2] * (artwork - rows[:, 2:4]), axis=-1)
+
+
+def solve_pose(rows: np.ndarray, freedoms: int, scale: float, name: str, bend: float, start: np.ndarray) -> np.ndarray:
+    """Return the parameters of least loss near a start: least squares of the loss' square roots."""
+    size = np.array([1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 1e-2])[:freedoms]
+
+    def roots(scaled: np.ndarray) -> np.ndarray:
+        z = residuals(scaled * size, rows) / (rows[:, 6] * scale)
+        return np.sqrt(2.0 * loss(z, name, bend))
+
+    found: Any = least_squares(roots, start / size, xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=2000)
+    return np.asarray(found.x) * size

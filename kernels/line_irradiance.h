@@ -83,7 +83,7 @@ __attribute__((always_inline)) inline reals LANED(line_factor)(reals along, real
         // The cut from the foot, where both are near; what is left from the end, where it is little.
         const reals steps = one / by_u, cut = -foot * steps, left = most * fabs(steps);
         const masks cut_first = mask_of(first < zero), cut_last = mask_of(last < zero);
-        length = mask_of(least < zero) & mask_of(left < length) ? left : length;
+        length = (mask_of(least < zero) & mask_of(left < length)) ? left : length;
         tau1 = cut_first ? cut : tau1;
         tau2 = cut_last ? cut : tau2;
     }

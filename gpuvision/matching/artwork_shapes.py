@@ -1,0 +1,276 @@
+"""Drawn layers of a board as polygons [m], and what of a straight line they cover."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gerbonara import graphic_objects, graphic_primitives
+from gerbonara.apertures import ApertureMacroInstance, CircleAperture, ExcellonTool
+from gerbonara.utils import MM
+
+Float64 = npt.NDArray[np.float64]
+Crossings = list[tuple[bool, Float64]]
+
+SAGITTA = 0.5e-6
+"""How far [m] a chord of a polygon may lie inside the arc that it stands for."""
+_METRE = 1e-3  # gerbonara is asked for millimetres
+_BROKEN_MACROS = {6: "moiré", 7: "thermal"}  # gerbonara 1.5 reads them and cannot draw them
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One area of a layer, later ones drawn over earlier ones.
+
+    Attributes
+    ----------
+    outline
+        (n, 2) corners [m], closed from the last to the first; inside is what an odd number of turns goes round.
+    dark
+        True where the layer's material (copper, ink, the mask's opening) is laid, False where it is taken away.
+    """
+
+    outline: Float64
+    dark: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """One object of a layer: what it is drawn as, and what the file says it is for.
+
+    Attributes
+    ----------
+    kind
+        ``"flash"``, ``"stroke"`` or ``"region"``.
+    shapes
+        Its areas.
+    ends
+        (2, 2) of a straight stroke's middle [m], None of anything else.
+    width
+        Of a stroke with a round aperture [m], otherwise NaN.
+    function
+        ``.AperFunction`` of Gerber X2, ``""`` where the file does not say it.
+    net, part, pin
+        ``.N``, and ``.P`` of Gerber X2, ``""`` where the file does not say them.
+    """
+
+    kind: str
+    shapes: tuple[Shape, ...]
+    ends: Float64 | None = None
+    width: float = math.nan
+    function: str = ""
+    net: str = ""
+    part: str = ""
+    pin: str = ""
+
+    @cached_property
+    def bounds(self) -> Float64:
+        """(2, 2): the least and the greatest x, y [m] of what is laid (of everything, where nothing is)."""
+        dark = [each.outline for each in self.shapes if each.dark] or [each.outline for each in self.shapes]
+        points = np.concatenate(dark)
+        return np.stack([points.min(axis=0), points.max(axis=0)])
+
+    @property
+    def centre(self) -> Float64:
+        """(2,) middle of the bounds [m]."""
+        return np.asarray(self.bounds.mean(axis=0))
+
+
+class Layer:
+    """Shapes of one layer, ordered, for asking what lies along a line.
+
+    Parameters
+    ----------
+    shapes
+        In the order of drawing.
+    """
+
+    def __init__(self, shapes: tuple[Shape, ...]) -> None:
+        self.shapes = shapes
+        counts = np.array([len(each.outline) for each in shapes], dtype=np.int64)
+        self._stop = np.cumsum(counts)
+        self._start = self._stop - counts
+        outlines = [each.outline for each in shapes] or [np.empty((0, 2))]
+        self._from = np.concatenate(outlines)
+        self._to = np.concatenate([np.roll(each, -1, axis=0) for each in outlines])
+        self._low = np.array([each.outline.min(axis=0) for each in shapes]).reshape(-1, 2)
+        self._high = np.array([each.outline.max(axis=0) for each in shapes]).reshape(-1, 2)
+
+    def crossings(self, start: Float64, end: Float64) -> Crossings:
+        """Shapes that the bounds of a line meet, in order: whether dark, and where the endless line crosses them.
+
+        Parameters
+        ----------
+        start, end
+            (2,) [m]; 0 and 1 are where the line starts and ends.
+        """
+        low, high = np.minimum(start, end), np.maximum(start, end)
+        near = np.flatnonzero(np.all((self._low <= high) & (self._high >= low), axis=1))
+        found = []
+        along = end - start
+        for index in near:
+            span = slice(self._start[index], self._stop[index])
+            a, b = self._from[span] - start, self._to[span] - start
+            side_a = along[0] * a[:, 1] - along[1] * a[:, 0]
+            side_b = along[0] * b[:, 1] - along[1] * b[:, 0]
+            crossing = (side_a > 0) != (side_b > 0)
+            share = side_a[crossing] / (side_a[crossing] - side_b[crossing])
+            points = a[crossing] + share[:, None] * (b[crossing] - a[crossing])
+            found.append((self.shapes[index].dark, np.sort(points @ along / (along @ along))))
+        return found
+
+
+def covered(crossings: Crossings, at: Float64) -> npt.NDArray[np.bool_]:
+    """Whether a layer's material lies at places along a line; see :meth:`Layer.crossings`."""
+    laid = np.zeros(len(at), dtype=np.bool_)
+    for dark, where in crossings:
+        laid[np.searchsorted(where, at) % 2 == 1] = dark
+    return laid
+
+
+def drawn_objects(layer: Any) -> tuple[Drawn, ...]:
+    """Objects of a Gerber layer as gerbonara reads it; strokes without an area are left out.
+
+    Raises
+    ------
+    ValueError
+        An aperture macro with a moiré or a thermal: they are obsolete or of inner layers, and are not read.
+    """
+    return tuple(each for item in layer.objects if (each := _drawn(item)) is not None)
+
+
+def _drawn(item: Any) -> Drawn | None:
+    if isinstance(item, graphic_objects.Region):
+        (primitive,) = item.to_primitives(MM)
+        return Drawn("region", (Shape(_outline(primitive), bool(item.polarity_dark)),))
+    says = _attributes(item)
+    if isinstance(item, graphic_objects.Flash):
+        place = np.array([MM(item.x, item.unit), MM(item.y, item.unit)]) * _METRE
+        return Drawn("flash", tuple(_flashed(item.aperture, place, bool(item.polarity_dark))), **says)
+    lines = [item] if isinstance(item, graphic_objects.Line) else item.approximate(SAGITTA / _METRE, MM)
+    ends = [np.array([[MM(x, item.unit), MM(y, item.unit)] for x, y in (each.p1, each.p2)]) * _METRE for each in lines]
+    shapes = tuple(shape for each in ends for shape in _swept(item.aperture, each, bool(item.polarity_dark)))
+    if not shapes:
+        return None
+    straight = len(ends) == 1 and math.dist(*ends[0]) > 0
+    return Drawn("stroke", shapes, ends[0] if straight else None, _round_width(item.aperture), **says)
+
+
+def _attributes(item: Any) -> dict[str, Any]:
+    function = dict(item.aperture.attrs or ()).get(".AperFunction", ("",)) if item.aperture is not None else ("",)
+    net, place = item.attrs.get(".N", ("",)), item.attrs.get(".P", ("", ""))
+    return {"function": function[0], "net": net[0], "part": place[0], "pin": place[1] if len(place) > 1 else ""}
+
+
+def _round_width(aperture: Any) -> float:
+    if isinstance(aperture, CircleAperture | ExcellonTool):
+        return float(aperture.equivalent_width(MM)) * _METRE
+    return math.nan
+
+
+def _flashed(aperture: Any, place: Float64, dark: bool) -> Iterator[Shape]:
+    if isinstance(aperture, ApertureMacroInstance):
+        for primitive in aperture.macro.primitives:
+            if name := _BROKEN_MACROS.get(getattr(primitive, "code", 0)):
+                raise ValueError(f"aperture macro {aperture.macro.name}: a {name} is not read; draw it as regions")
+    # At the origin, and moved afterwards: gerbonara 1.5 forgets the place of a macro's regular polygons.
+    for primitive in aperture.flash(0.0, 0.0, MM, dark):
+        yield Shape(_outline(primitive) + place, bool(primitive.polarity_dark))
+
+
+def _swept(aperture: Any, ends: Float64, dark: bool) -> Iterator[Shape]:
+    width = _round_width(aperture)
+    if not math.isnan(width):
+        if width > 0:
+            yield Shape(capsule(ends[0], ends[1], width / 2), dark)
+        return
+    if aperture is None:
+        return
+    for primitive in aperture.flash(0.0, 0.0, MM, dark):
+        outline = _outline(primitive)
+        yield Shape(hull(np.concatenate([outline + ends[0], outline + ends[1]])), dark)
+
+
+def _outline(primitive: Any) -> Float64:
+    """Polygon [m] of what gerbonara draws, in millimetres; its own polygons of turned rectangles are not right."""
+    if isinstance(primitive, graphic_primitives.Circle):
+        return disk(np.array([primitive.x, primitive.y]) * _METRE, primitive.r * _METRE)
+    if isinstance(primitive, graphic_primitives.Rectangle):
+        cos, sin = math.cos(primitive.rotation), math.sin(primitive.rotation)
+        half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array([primitive.w, primitive.h]) / 2
+        return np.asarray((half @ np.array([[cos, sin], [-sin, cos]]) + (primitive.x, primitive.y)) * _METRE)
+    if isinstance(primitive, graphic_primitives.Line):
+        start, end = np.array([[primitive.x1, primitive.y1], [primitive.x2, primitive.y2]]) * _METRE
+        return capsule(start, end, primitive.width / 2 * _METRE)
+    corners: list[Float64] = []
+    for start, end, (clockwise, centre) in primitive.segments:
+        first, last = np.array(start) * _METRE, np.array(end) * _METRE
+        bent = clockwise is not None
+        corners.append(_arc(first, last, np.array(centre) * _METRE, bool(clockwise)) if bent else first[None])
+    return np.concatenate(corners)
+
+
+def disk(centre: Float64, radius: float) -> Float64:
+    """Regular polygon with the circle's area; (n, 2) corners within ``SAGITTA`` of it."""
+    count = _chords(radius, 2 * math.pi)
+    angle = np.arange(count) * (2 * math.pi / count)
+    step = 2 * math.pi / count
+    radius *= math.sqrt(step / math.sin(step))
+    return np.asarray(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+
+
+def capsule(start: Float64, end: Float64, radius: float) -> Float64:
+    """Polygon that a disk of a radius [m] sweeps along a line: straight sides, chords round the ends."""
+    along = end - start
+    if not along.any():
+        return disk(start, radius)
+    angle = math.atan2(along[1], along[0]) + np.linspace(-math.pi / 2, math.pi / 2, _chords(radius, math.pi) + 1)
+    cap = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([end + cap, start - cap])
+
+
+def hull(points: Float64) -> Float64:
+    """Corners of the convex hull, counter-clockwise (monotone chain)."""
+    order = sorted(set(map(tuple, points.tolist())))
+
+    def half(sequence: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
+        chain: list[tuple[float, ...]] = []
+        for x, y in sequence:
+            while len(chain) > 1:
+                (ax, ay), (bx, by) = chain[-2:]
+                if (bx - ax) * (y - by) - (by - ay) * (x - bx) > 0:
+                    break
+                chain.pop()
+            chain.append((x, y))
+        return chain[:-1]
+
+    return np.array(half(order) + half(order[::-1]))
+
+
+def area(outline: Float64) -> float:
+    """Area [m^2] inside an outline, positive where it runs counter-clockwise."""
+    x, y = (outline - outline[0]).T
+    return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2)
+
+
+def _chords(radius: float, angle: float) -> int:
+    """How many chords an arc needs."""
+    return max(math.ceil(angle / (2 * math.acos(1 - min(SAGITTA / max(radius, SAGITTA), 0.05)))), 1)
+
+
+def _arc(start: Float64, end: Float64, centre: Float64, clockwise: bool) -> Float64:
+    """Corners of an arc from its start, without its end; from a point to itself it is a whole circle."""
+    a, b = start - centre, end - centre
+    sweep = (math.atan2(b[1], b[0]) - math.atan2(a[1], a[0])) % (2 * math.pi)
+    sweep = sweep - 2 * math.pi if clockwise and sweep > 0 else sweep
+    if np.allclose(start, end, rtol=0, atol=1e-9):
+        sweep = -2 * math.pi if clockwise else 2 * math.pi
+    radius = math.hypot(*a)
+    count = _chords(radius, abs(sweep))
+    angle = math.atan2(a[1], a[0]) + np.arange(count) * (sweep / count)
+    return np.asarray(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))

@@ -1,18 +1,24 @@
-// Edges along rulers (ruler.h). On CPU runtimes an item takes `each` rulers one after the other, on GPUs a group of
-// RULER_GROUP items takes one.
+// Edges along rulers (ruler.h). On CPU runtimes an item takes `each` rulers, 16 at a time, on GPUs a group of RULER_GROUP
+// items takes one.
 #include "ruler.h"
 
-inline void store_edge(ruler_edge edge, ulong i, global real *position, global real *amplitude, global real *width,
-                       global real *sigma, global real *spacing, global uchar *status) {
-    // NaN unless there is an edge: SATURATED and AMBIGUOUS come with one.
-    position[i] = edge.position;
-    amplitude[i] = edge.amplitude;
-    width[i] = edge.width;
-    sigma[i] = edge.sigma;
+// Under STRIP of the 16 rulers from `ruler` on, as far as there are any.
+inline void store_edges(private const ruler_edge *edges, uint ruler, uint count, global real *position,
+                        global real *amplitude, global real *width, global real *sigma, global real *spacing,
+                        global uchar *status) {
+    for (int k = 0; k < MOST; k++) {
+        for (uint lane = 0; lane < LANES && ruler + lane < count; lane++) {
+            const ulong i = ((ulong)ruler + lane) * MOST + k;
+            position[i] = ((private const real *)&edges[k].position)[lane];
+            amplitude[i] = ((private const real *)&edges[k].amplitude)[lane];
+            width[i] = ((private const real *)&edges[k].width)[lane];
+            sigma[i] = ((private const real *)&edges[k].sigma)[lane];
 #ifdef PAIRS
-    spacing[i] = edge.spacing;
+            spacing[i] = ((private const real *)&edges[k].spacing)[lane];
 #endif
-    status[i] = edge.status;
+            status[i] = ((private const bits *)&edges[k].status)[lane];
+        }
+    }
 }
 
 kernel void ruler_edges(global const CODE *restrict image, global const real *restrict rulers,
@@ -23,19 +29,16 @@ kernel void ruler_edges(global const CODE *restrict image, global const real *re
     ruler_edge edges[MOST];
 #ifdef STRIP
     const uint first = get_global_id(0) * each, end = min(first + each, count);
-    for (uint ruler = first; ruler < end; ruler++) {
-        ruler_measure(image, rows, columns, vload4(ruler, rulers), table, model, edges);
-        for (int k = 0; k < MOST; k++)
-            store_edge(edges[k], (ulong)ruler * MOST + k, position, amplitude, width, sigma, spacing, status);
+    for (uint ruler = first; ruler < end; ruler += LANES) {
+        ruler_measure(image, rows, columns, rulers + 4 * (ulong)ruler, 4, count - ruler, table, model, edges);
+        store_edges(edges, ruler, count, position, amplitude, width, sigma, spacing, status);
     }
 #else
     local real profile[LENGTH], slopes[RULER_SLOPES];
-    local uint bits[2];
+    local int flags;
     const uint ruler = get_group_id(0);
-    ruler_measure(image, rows, columns, vload4(ruler, rulers), table, model, profile, slopes, bits, edges);
-    if (get_local_id(0) == 0) {
-        for (int k = 0; k < MOST; k++)
-            store_edge(edges[k], (ulong)ruler * MOST + k, position, amplitude, width, sigma, spacing, status);
-    }
+    ruler_measure(image, rows, columns, vload4(ruler, rulers), table, model, profile, slopes, &flags, edges);
+    if (get_local_id(0) == 0)
+        store_edges(edges, ruler, count, position, amplitude, width, sigma, spacing, status);
 #endif
 }

@@ -2,7 +2,7 @@
 // samples along its direction, each the sum over WIDTH lines a pixel apart, bilinear between pixels. Its gradient is
 // taken with the derivative of a Gaussian (TAPS either side), an edge is a peak of that.
 //
-//     STRIP      one work-item takes a ruler, 16 samples at a time (for CPU runtimes)
+//     STRIP      one work-item takes 16 rulers at a time, one in each lane (for CPU runtimes)
 //     else       a work-group of RULER_GROUP items takes a ruler, its arrays are local
 //     CODE       type of the pixels, CODE_uchar, CODE_ushort or CODE_float
 //     RISING, FALLING     what edges count, of pairs the first one; neither: both
@@ -32,60 +32,55 @@
 #define RULER_TAPS 11
 
 #define RULER_SLOPES (LENGTH - 2 * TAPS)
-#define RULER_CHUNKS ((RULER_SLOPES + 15) / 16)
-#define RULER_VECTORS ((LENGTH + 15) / 16)
-// Of the arrays: what the last chunk of gradients reads.
-#define RULER_PADDED (16 * RULER_VECTORS + 16 * ((2 * TAPS + 15) / 16))
 #define RULER_MIDDLE ((real)0.5f * (LENGTH - 1))
 #define RULER_LARGEST 1e37f  // of sums over lines: gradients of them are numbers
 #define RULER_ROOT_TWO_PI 2.5066282746310002f
-
-#ifdef STRIP
-#define RULER_SPACE private
-#else
-#define RULER_SPACE local
-#endif
+// What leaves no edge to look for.
+#define RULER_USELESS (STATUS_NOT_FINITE | STATUS_OUT_OF_RANGE | STATUS_FOLDED)
 
 typedef struct {
-    real position, amplitude, width, sigma, spacing;
-    uint status;
+    reals position, amplitude, width, sigma, spacing;
+    masks status;
 } ruler_edge;
 
 // Where a ruler lies: the first sample of its first line, relative to a pixel near it, which keeps the digits.
 typedef struct {
-    global const CODE *pixel;
-    real x, y, cosine, sine;
-    int last_column, last_row;  // that have a neighbour, from the pixel on
+    masks pixel;
+    reals x, y, along_x, along_y, across_x, across_y;  // of the next sample, and of the next line
+    masks last_column, last_row;                       // that have a neighbour, from the pixel on
 } ruler_place;
 
-inline uint ruler_lay(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
-                      ruler_place *place) {
-    const real step = table[RULER_STEP], half_length = RULER_MIDDLE * step, half_width = (real)0.5f * (WIDTH - 1);
-    const real cosine = ruler.z, sine = ruler.w;
-    const real along_x = half_length * cosine, along_y = half_length * sine;
-    const real across_x = -half_width * sine, across_y = half_width * cosine;
-    place->cosine = cosine * step;
-    place->sine = sine * step;
-    if (not_finite(ruler.x) | not_finite(ruler.y) | not_finite(cosine) | not_finite(sine)) return STATUS_NOT_FINITE;
+// Lays rulers out; returns what is wrong with them. Those get a place all the same, where there is something to read.
+inline masks ruler_lay(int rows, int columns, reals x, reals y, reals cosine, reals sine, constant real *table,
+                       ruler_place *place) {
+    const masks bad = mask_of((LANED(not_finite)(x) | LANED(not_finite)(y) | LANED(not_finite)(cosine) |
+                               LANED(not_finite)(sine)) != 0);
+    const real half_length = RULER_MIDDLE * table[RULER_STEP], half_width = (real)0.5f * (WIDTH - 1);
+    const reals start_x = half_length * cosine - half_width * sine;
+    const reals start_y = half_length * sine + half_width * cosine;
 #if defined(LENS) || defined(CAMERA)
-    place->pixel = image;
-    place->x = ruler.x - along_x - across_x;
-    place->y = ruler.y - along_y - across_y;
-    place->last_column = columns - 2;
-    place->last_row = rows - 2;
+    const masks away = bad;
+    const masks column = 0, row = 0;
 #else
-    const real reach_x = fabs(along_x) + fabs(across_x), reach_y = fabs(along_y) + fabs(across_y);
-    const real low_x = ruler.x - reach_x, low_y = ruler.y - reach_y;
-    if (!(low_x >= 0 & low_y >= 0 & ruler.x + reach_x <= columns - 1 & ruler.y + reach_y <= rows - 1))
-        return STATUS_OUT_OF_RANGE;
-    const int column = min((int)low_x, columns - 2), row = min((int)low_y, rows - 2);
-    place->pixel = image + ((long)row * columns + column);
-    place->x = ruler.x - column - along_x - across_x;
-    place->y = ruler.y - row - along_y - across_y;
-    place->last_column = columns - 2 - column;
-    place->last_row = rows - 2 - row;
+    const reals reach_x = half_length * fabs(cosine) + half_width * fabs(sine);
+    const reals reach_y = half_length * fabs(sine) + half_width * fabs(cosine);
+    const reals low_x = x - reach_x, low_y = y - reach_y;
+    const masks away = bad | ~(mask_of(low_x >= 0) & mask_of(low_y >= 0) & mask_of(x + reach_x <= (real)(columns - 1)) &
+                               mask_of(y + reach_y <= (real)(rows - 1)));
+    masks column = LANED(convert_bits)(zero_where(away, low_x)), row = LANED(convert_bits)(zero_where(away, low_y));
+    column = column > (masks)(columns - 2) ? (masks)(columns - 2) : column;
+    row = row > (masks)(rows - 2) ? (masks)(rows - 2) : row;
 #endif
-    return 0;
+    place->pixel = row * columns + column;
+    place->x = zero_where(away, x - LANED(convert_real)(column) - start_x);
+    place->y = zero_where(away, y - LANED(convert_real)(row) - start_y);
+    place->along_x = zero_where(away, cosine * table[RULER_STEP]);
+    place->along_y = zero_where(away, sine * table[RULER_STEP]);
+    place->across_x = zero_where(away, -sine);
+    place->across_y = zero_where(away, cosine);
+    place->last_column = (columns - 2) - column;
+    place->last_row = (rows - 2) - row;
+    return bad ? (masks)STATUS_NOT_FINITE : away & STATUS_OUT_OF_RANGE;
 }
 
 // Takes (x, y) to the measured image; returns the flags of lanes that have no place in it, which it leaves at 0, 0.
@@ -96,8 +91,8 @@ inline masks ruler_distort(reals *x, reals *y, const ruler_place *place, constan
 #else
     const masks folded = LANED(lens_distort)(x, y, model);
 #endif
-    const masks inside = mask_of(*x >= 0) & mask_of(*y >= 0) & mask_of(*x <= (real)(place->last_column + 1)) &
-                         mask_of(*y <= (real)(place->last_row + 1));
+    const masks inside = mask_of(*x >= 0) & mask_of(*y >= 0) & mask_of(*x <= LANED(convert_real)(place->last_column + 1)) &
+                         mask_of(*y <= LANED(convert_real)(place->last_row + 1));
     *x = zero_where(~inside, *x);
     *y = zero_where(~inside, *y);
     return (folded & STATUS_FOLDED) | (~inside & STATUS_OUT_OF_RANGE);
@@ -107,30 +102,17 @@ inline masks ruler_distort(reals *x, reals *y, const ruler_place *place, constan
 // Splits (x, y) from the place's pixel into a pixel that has neighbours, and what is left.
 inline masks ruler_split(const ruler_place *place, int pitch, reals *x, reals *y) {
     masks column = LANED(convert_bits)(*x), row = LANED(convert_bits)(*y);
-    column = column > (masks)place->last_column ? (masks)place->last_column : column;
-    row = row > (masks)place->last_row ? (masks)place->last_row : row;
+    column = column < place->last_column ? column : place->last_column;
+    row = row < place->last_row ? row : place->last_row;
     *x -= LANED(convert_real)(column);
     *y -= LANED(convert_real)(row);
-    return row * pitch + column;
+    return place->pixel + row * pitch + column;
 }
 
 inline reals ruler_between(reals a, reals b, reals c, reals d, reals x, reals y) {
     a += x * (b - a);
     c += x * (d - c);
     return a + y * (c - a);
-}
-
-// Where sample `index` of a line lies; returns what is wrong with it.
-inline masks ruler_at(const ruler_place *place, reals index, int line, constant real *table, constant real *model,
-                      reals *x, reals *y) {
-    const real across = line / table[RULER_STEP];
-    *x = place->x - across * place->sine + index * place->cosine;
-    *y = place->y + across * place->cosine + index * place->sine;
-#if defined(LENS) || defined(CAMERA)
-    return ruler_distort(x, y, place, model);
-#else
-    return 0;
-#endif
 }
 
 // What is wrong with a sample itself, and with a sum of them.
@@ -144,20 +126,10 @@ inline masks ruler_judge(reals sample, constant real *table) {
 
 inline masks ruler_judge_sum(reals sum) {
 #ifdef CODE_float
-    return mask_of((LANED(not_finite)(sum) | (fabs(sum) > (real)RULER_LARGEST)) != 0) & STATUS_NOT_FINITE;
+    return mask_of((LANED(not_finite)(sum) | mask_of(fabs(sum) > (real)RULER_LARGEST)) != 0) & STATUS_NOT_FINITE;
 #else
     return 0;
 #endif
-}
-
-inline reals ruler_slope(RULER_SPACE const real *profile, constant real *table) {
-    reals slope = 0;
-    for (int k = 1; k <= TAPS; k++) {
-        const reals ahead = *(RULER_SPACE const reals_at *)(profile + TAPS + k);
-        const reals behind = *(RULER_SPACE const reals_at *)(profile + TAPS - k);
-        slope += table[RULER_TAPS + k - 1] * (ahead - behind);
-    }
-    return slope;
 }
 
 // How much of an edge of the wanted polarity a gradient is; of pairs the polarity is looked at later.
@@ -169,40 +141,43 @@ inline reals ruler_slope(RULER_SPACE const real *profile, constant real *table) 
 #define RULER_STRENGTH(slope) fabs(slope)
 #endif
 
-// The edge at the peak i of the gradient: a parabola through the logarithms of the gradients there, which is exact
-// for a Gaussian. Positions are in samples from the first gradient.
-inline ruler_edge ruler_refine(RULER_SPACE const real *slopes, int i, constant real *table) {
-    const real sign = slopes[i] < 0 ? -1 : 1, here = fabs(slopes[i]), per = sign / here;
-    // A neighbour of other sign is far below the peak: noise.
-    const real before = log(fmax(slopes[i - 1] * per, (real)1e-6f));
-    const real after = log(fmax(slopes[i + 1] * per, (real)1e-6f));
-    const real curvature = -(before + after), tilt = (real)0.5f * (after - before), shift = tilt / curvature;
-    const real variance = 1 / curvature;
-    ruler_edge edge;
-    edge.position = i + shift;
-    edge.amplitude = sign * here * exp((real)0.5f * tilt * shift) * (real)RULER_ROOT_TWO_PI * sqrt(variance) *
-                     table[RULER_PER_LINE];
-    edge.width = sqrt(fmax(variance - table[RULER_SMOOTHING], (real)0)) * table[RULER_STEP];
-    edge.sigma = table[RULER_NOISE] * variance / here * table[RULER_STEP];
-    edge.spacing = REAL_NAN;
-    edge.status = 0;
-    return edge;
+// A peak of the gradient, and its neighbours.
+typedef struct {
+    reals at, before, here, after;
+} ruler_peak;
+
+inline ruler_peak ruler_either(masks first, ruler_peak one, ruler_peak other) {
+    const ruler_peak either = {first ? one.at : other.at, first ? one.before : other.before,
+                               first ? one.here : other.here, first ? one.after : other.after};
+    return either;
 }
 
-// In pixels from the middle; an edge that bends about a point ahead is seen ahead of where it is, by the variances
-// of the blur and of the lines over twice the radius.
-inline ruler_edge ruler_edge_at(RULER_SPACE const real *slopes, int i, constant real *table) {
-    ruler_edge edge = ruler_refine(slopes, i, table);
-    edge.position = (edge.position + TAPS - RULER_MIDDLE) * table[RULER_STEP];
+// The edge at a peak: a parabola through the logarithms of the gradients there, which is exact for a Gaussian. An edge
+// that bends about a point ahead is seen ahead of where it is, by the variances of the blur and of the lines over twice
+// the radius.
+inline ruler_edge ruler_refine(ruler_peak peak, constant real *table) {
+    const reals size = fabs(peak.here), sign = peak.here < 0 ? (reals)-1 : (reals)1, per = 1 / peak.here;
+    // A neighbour of other sign is far below the peak: noise.
+    const reals before = log(fmax(peak.before * per, (reals)1e-6f));
+    const reals after = log(fmax(peak.after * per, (reals)1e-6f));
+    const reals variance = -1 / (before + after), tilt = (real)0.5f * (after - before), shift = tilt * variance;
+    ruler_edge edge;
+    edge.position = (peak.at + shift + (TAPS - RULER_MIDDLE)) * table[RULER_STEP];
+    edge.amplitude = peak.here * exp((real)0.5f * tilt * shift) *
+                     ((real)RULER_ROOT_TWO_PI * table[RULER_PER_LINE]) * sqrt(variance);
+    edge.width = sqrt(fmax(variance - table[RULER_SMOOTHING], (reals)0)) * table[RULER_STEP];
+    edge.sigma = table[RULER_NOISE] * table[RULER_STEP] * variance / size;
+    edge.spacing = REAL_NAN;
+    edge.status = 0;
 #ifdef CURVED
     edge.position -= table[RULER_BEND] * (edge.width * edge.width + table[RULER_ACROSS]);
 #endif
     return edge;
 }
 
-inline ruler_edge ruler_pair_at(RULER_SPACE const real *slopes, int first, int second, constant real *table) {
-    ruler_edge edge = ruler_edge_at(slopes, first, table);
-    const ruler_edge other = ruler_edge_at(slopes, second, table);
+inline ruler_edge ruler_pair(ruler_peak first, ruler_peak second, constant real *table) {
+    ruler_edge edge = ruler_refine(first, table);
+    const ruler_edge other = ruler_refine(second, table);
     edge.spacing = other.position - edge.position;
     edge.position = (real)0.5f * (edge.position + other.position);
     edge.amplitude = (real)0.5f * (edge.amplitude - other.amplitude);
@@ -211,113 +186,151 @@ inline ruler_edge ruler_pair_at(RULER_SPACE const real *slopes, int first, int s
     return edge;
 }
 
-inline ruler_edge ruler_nothing(uint status) {
-    const ruler_edge edge = {REAL_NAN, REAL_NAN, REAL_NAN, REAL_NAN, REAL_NAN, status};
+#ifdef PAIRS
+#define RULER_TAKEN(first, second) ruler_pair(first, second, table)
+#else
+#define RULER_TAKEN(first, second) ruler_refine(second, table)
+#endif
+
+// Puts what is not known yet, or wrong, into an edge.
+inline ruler_edge ruler_marked(ruler_edge edge, masks there, masks flags) {
+    const masks broken = there & mask_of(LANED(not_finite)(edge.position + edge.amplitude + edge.sigma) != 0);
+    const masks useless = mask_of((flags & RULER_USELESS) != 0);
+    const masks none = ~there | broken | useless;
+    edge.position = nan_where(none, edge.position);
+    edge.amplitude = nan_where(none, edge.amplitude);
+    edge.width = nan_where(none, edge.width);
+    edge.sigma = nan_where(none, edge.sigma);
+    edge.spacing = nan_where(none, edge.spacing);
+    const masks found = flags | (there ? edge.status : (masks)STATUS_DARK) | (broken & STATUS_NOT_FINITE);
+    edge.status = useless ? flags : found;
     return edge;
 }
 
-#ifdef PAIRS
-#define RULER_TAKEN(first, second) ruler_pair_at(slopes, first, second, table)
+#ifdef STRIP
+inline reals ruler_slope(private const reals *profile, int i, constant real *table) {
+    reals slope = 0;
+    for (int k = 1; k <= TAPS; k++)
+        slope += table[RULER_TAPS + k - 1] * (profile[i + TAPS + k] - profile[i + TAPS - k]);
+    return slope;
+}
+#define RULER_SPACE private
+#define RULER_SLOPE(i) ruler_slope(values, i, table)
 #else
-#define RULER_TAKEN(first, second) ruler_edge_at(slopes, first, table)
+inline real ruler_slope(local const real *profile, int i, constant real *table) {
+    real slope = 0;
+    for (int k = 1; k <= TAPS; k++)
+        slope += table[RULER_TAPS + k - 1] * (profile[i + TAPS + k] - profile[i + TAPS - k]);
+    return slope;
+}
+#define RULER_SPACE local
+#define RULER_SLOPE(i) values[i]
 #endif
 
-// The edges among the gradients; bits of `chunks` say which 16 hold one over the threshold.
-inline void ruler_find(RULER_SPACE const real *slopes, uint chunks, uint flags, constant real *table,
-                       private ruler_edge *edges) {
+// The edges along profiles (in lanes) or gradients (of one ruler); what is wrong with the rulers themselves is in
+// `flags`.
+inline void ruler_find(RULER_SPACE const reals *values, masks flags, constant real *table, private ruler_edge *edges) {
     const real threshold = table[RULER_THRESHOLD];
-    for (int k = 0; k < MOST; k++) edges[k] = ruler_nothing(flags | STATUS_DARK);
-    int found = 0, first = 0, second = 0;
-    real best = 0, rival = 0;
-#ifdef PAIRS
-    int other = -1;
+    masks found = 0, wins;
+    reals best = 0, rival = 0;
+    ruler_peak peak = {0, 0, 1, 0};
+    ruler_peak first = peak, second = peak;
+#ifdef CHOOSE_ALL
+    masks count = 0;
+    for (int k = 0; k < MOST; k++) edges[k] = RULER_TAKEN(peak, peak);
 #endif
-    for (int chunk = 0; chunk < RULER_CHUNKS; chunk++) {
-        if (!(chunks >> chunk & 1)) continue;
-        const int end = min(16 * chunk + 16, RULER_SLOPES - 1);
-        for (int i = max(16 * chunk, 1); i < end; i++) {
-            real strength = RULER_STRENGTH(slopes[i]);
-            if (!(strength >= threshold)) continue;
-            if (!(strength > RULER_STRENGTH(slopes[i - 1]) & strength >= RULER_STRENGTH(slopes[i + 1]))) continue;
-            int from = i;
 #ifdef PAIRS
-            from = other;
-            other = i;
-            if (from < 0) continue;
-            const real gap = i - from;
-            const int rises = slopes[from] > 0;
+    ruler_peak other = peak;
+    masks has_other = 0;
+#endif
+    peak.before = RULER_SLOPE(0);
+    peak.here = RULER_SLOPE(1);
+    for (int i = 1; i < RULER_SLOPES - 1; i++) {
+        peak.after = RULER_SLOPE(i + 1);
+        peak.at = i;
+        reals strength = RULER_STRENGTH(peak.here);
+        const masks is_peak = mask_of(strength >= threshold) & mask_of(strength > RULER_STRENGTH(peak.before)) &
+                              mask_of(strength >= RULER_STRENGTH(peak.after));
+        if (any_lane(is_peak)) {
+            masks candidate = is_peak;
+#ifdef PAIRS
+            const reals gap = peak.at - other.at;
+            candidate &= has_other & (mask_of(other.here > 0) ^ mask_of(peak.here > 0)) &
+                         mask_of(gap >= table[RULER_NEAREST]) & mask_of(gap <= table[RULER_FARTHEST]);
 #if defined(RISING)
-            if (!rises) continue;
+            candidate &= mask_of(other.here > 0);
 #elif defined(FALLING)
-            if (rises) continue;
+            candidate &= mask_of(other.here < 0);
 #endif
-            if (rises == (slopes[i] > 0) | gap < table[RULER_NEAREST] | gap > table[RULER_FARTHEST]) continue;
-            strength = fmin(strength, fabs(slopes[from]));
-#endif
-#if defined(CHOOSE_ALL)
-            if (found < MOST) {
-                edges[found] = RULER_TAKEN(from, i);
-                edges[found].status |= flags;
-            } else {
-                edges[MOST - 1].status |= STATUS_AMBIGUOUS;
-            }
-#elif defined(CHOOSE_FIRST)
-            if (!found) {
-                first = from;
-                second = i;
-            }
-#elif defined(CHOOSE_LAST)
-            first = from;
-            second = i;
+            const reals weaker = fabs(other.here);
+            strength = strength < weaker ? strength : weaker;
+            const ruler_peak from = other;
+            other = ruler_either(is_peak, peak, other);
+            has_other |= is_peak;
 #else
-            if (strength > best) {
-                rival = best;
-                best = strength;
-                first = from;
-                second = i;
-            } else {
-                rival = fmax(rival, strength);
-            }
+            const ruler_peak from = peak;
 #endif
-            found++;
-        }
-    }
-#ifndef CHOOSE_ALL
-    if (found) {
-        edges[0] = RULER_TAKEN(first, second);
-        edges[0].status |= flags;
-    }
+#ifdef CHOOSE_ALL
+            const ruler_edge edge = RULER_TAKEN(from, peak);
+            for (int k = 0; k < MOST; k++) {
+                wins = candidate & mask_of(count == k);
+                edges[k].position = wins ? edge.position : edges[k].position;
+                edges[k].amplitude = wins ? edge.amplitude : edges[k].amplitude;
+                edges[k].width = wins ? edge.width : edges[k].width;
+                edges[k].sigma = wins ? edge.sigma : edges[k].sigma;
+                edges[k].spacing = wins ? edge.spacing : edges[k].spacing;
+            }
+            count -= candidate;
+            edges[MOST - 1].status |= mask_of(count > MOST) & STATUS_AMBIGUOUS;
+#else
+#if defined(CHOOSE_FIRST)
+            wins = candidate & ~found;
+#elif defined(CHOOSE_LAST)
+            wins = candidate;
+#else
+            wins = candidate & mask_of(strength > best);
 #endif
 #ifdef AMBIGUITY
-    if (found && rival >= table[RULER_AMBIGUITY] * best) edges[0].status |= STATUS_AMBIGUOUS;
+            rival = wins ? best : (candidate & mask_of(strength > rival) ? strength : rival);
 #endif
-    for (int k = 0; k < MOST; k++) {
-        if (k < found && not_finite(edges[k].position + edges[k].amplitude + edges[k].sigma))
-            edges[k] = ruler_nothing(flags | STATUS_NOT_FINITE);
+            best = wins ? strength : best;
+            first = ruler_either(wins, from, first);
+            second = ruler_either(wins, peak, second);
+#endif
+            found |= candidate;
+        }
+        peak.before = peak.here;
+        peak.here = peak.after;
     }
+#ifdef CHOOSE_ALL
+    for (int k = 0; k < MOST; k++) edges[k] = ruler_marked(edges[k], mask_of(count > k), flags);
+#else
+    edges[0] = RULER_TAKEN(first, second);
+#ifdef AMBIGUITY
+    edges[0].status |= mask_of(rival >= table[RULER_AMBIGUITY] * best) & STATUS_AMBIGUOUS;
+#endif
+    edges[0] = ruler_marked(edges[0], found, flags);
+#endif
 }
-
-// What leaves no edge to look for.
-#define RULER_USELESS (STATUS_NOT_FINITE | STATUS_OUT_OF_RANGE | STATUS_FOLDED)
 
 #ifdef STRIP
-inline uint ruler_any(masks flags) {
-    const int8 half_of_it = flags.lo | flags.hi;
-    const int4 quarter = half_of_it.lo | half_of_it.hi;
-    return quarter.x | quarter.y | quarter.z | quarter.w;
-}
-
-// The four pixels about a sample, fetched one sample after the other and unpacked 16 at a time: a vector made of single
-// loads takes longer.
-#define RULER_SAMPLES (16 * RULER_VECTORS)
+// The four pixels about a sample, fetched one after the other and unpacked 16 at a time: a vector made of single loads
+// takes longer, and so does one that is read right after its parts were written, so several samples go at once.
+#if WIDTH < 8
+#define RULER_LINES WIDTH
+#else
+#define RULER_LINES 8
+#endif
+#define RULER_STRIDE 4  // samples
+#define RULER_BATCH (RULER_STRIDE * RULER_LINES)
 #ifdef CODE_uchar
 typedef uint ruler_part;
 #define RULER_PARTS 1
-inline void ruler_fetch(global const CODE *pixel, int pitch, private ruler_part *to) {
-    to[0] = as_ushort(vload2(0, pixel)) | (uint)as_ushort(vload2(0, pixel + pitch)) << 16;
+inline void ruler_fetch(global const CODE *above, global const CODE *below, private ruler_part *to) {
+    to[0] = as_ushort(vload2(0, above)) | (uint)as_ushort(vload2(0, below)) << 16;
 }
-inline void ruler_unpack(private const ruler_part *from, reals *a, reals *b, reals *c, reals *d) {
-    const uint16 four = *(private const uint16 *)from;
+inline void ruler_unpack(private const uint16 *from, reals *a, reals *b, reals *c, reals *d) {
+    const uint16 four = from[0];
     *a = convert_real16(as_int16(four & 0xff));
     *b = convert_real16(as_int16(four >> 8 & 0xff));
     *c = convert_real16(as_int16(four >> 16 & 0xff));
@@ -326,12 +339,12 @@ inline void ruler_unpack(private const ruler_part *from, reals *a, reals *b, rea
 #elif defined(CODE_ushort)
 typedef uint ruler_part;
 #define RULER_PARTS 2
-inline void ruler_fetch(global const CODE *pixel, int pitch, private ruler_part *to) {
-    to[0] = as_uint(vload2(0, pixel));
-    to[RULER_SAMPLES] = as_uint(vload2(0, pixel + pitch));
+inline void ruler_fetch(global const CODE *above, global const CODE *below, private ruler_part *to) {
+    to[0] = as_uint(vload2(0, above));
+    to[16 * RULER_BATCH] = as_uint(vload2(0, below));
 }
-inline void ruler_unpack(private const ruler_part *from, reals *a, reals *b, reals *c, reals *d) {
-    const uint16 above = *(private const uint16 *)from, below = *(private const uint16 *)(from + RULER_SAMPLES);
+inline void ruler_unpack(private const uint16 *from, reals *a, reals *b, reals *c, reals *d) {
+    const uint16 above = from[0], below = from[RULER_BATCH];
     *a = convert_real16(as_int16(above & 0xffff));
     *b = convert_real16(as_int16(above >> 16));
     *c = convert_real16(as_int16(below & 0xffff));
@@ -340,85 +353,102 @@ inline void ruler_unpack(private const ruler_part *from, reals *a, reals *b, rea
 #else
 typedef float ruler_part;
 #define RULER_PARTS 4
-inline void ruler_fetch(global const CODE *pixel, int pitch, private ruler_part *to) {
-    to[0] = pixel[0];
-    to[RULER_SAMPLES] = pixel[1];
-    to[2 * RULER_SAMPLES] = pixel[pitch];
-    to[3 * RULER_SAMPLES] = pixel[pitch + 1];
+inline void ruler_fetch(global const CODE *above, global const CODE *below, private ruler_part *to) {
+    to[0] = above[0];
+    to[16 * RULER_BATCH] = above[1];
+    to[32 * RULER_BATCH] = below[0];
+    to[48 * RULER_BATCH] = below[1];
 }
-inline void ruler_unpack(private const ruler_part *from, reals *a, reals *b, reals *c, reals *d) {
-    *a = *(private const reals *)from;
-    *b = *(private const reals *)(from + RULER_SAMPLES);
-    *c = *(private const reals *)(from + 2 * RULER_SAMPLES);
-    *d = *(private const reals *)(from + 3 * RULER_SAMPLES);
+inline void ruler_unpack(private const uint16 *from, reals *a, reals *b, reals *c, reals *d) {
+    *a = as_reals(from[0]);
+    *b = as_reals(from[RULER_BATCH]);
+    *c = as_reals(from[2 * RULER_BATCH]);
+    *d = as_reals(from[3 * RULER_BATCH]);
 }
 #endif
 
-// Adds a line to the profile; returns what is wrong with it.
-__attribute__((always_inline)) inline masks ruler_add(const ruler_place *place, int pitch, int line,
-                                                      constant real *table, constant real *model,
-                                                      private reals *profile) {
-    const reals lanes = (reals)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-    uint16 pixels[RULER_VECTORS], parts[RULER_VECTORS * RULER_PARTS];
-    reals x[RULER_VECTORS], y[RULER_VECTORS];
+// Adds RULER_LINES lines (or what is left of them) of RULER_STRIDE samples to the profile; returns what is wrong.
+__attribute__((always_inline)) inline masks ruler_add(global const CODE *image, const ruler_place *place, int pitch,
+                                                      int sample, int line, constant real *table,
+                                                      constant real *model, private reals *profile) {
+    const int lines = WIDTH % RULER_LINES ? min(RULER_LINES, WIDTH - line) : RULER_LINES;
+    uint16 pixels[RULER_BATCH], parts[RULER_BATCH * RULER_PARTS];
+    reals x[RULER_BATCH], y[RULER_BATCH];
     masks flags = 0;
-    for (int v = 0; v < RULER_VECTORS; v++) {
-        reals index = lanes + 16 * v;
-#if LENGTH % 16
-        index = index > (real)(LENGTH - 1) ? (reals)(LENGTH - 1) : index;
+    int count = 0;
+    for (int k = 0; k < RULER_STRIDE; k++) {
+        const real index = min(sample + k, LENGTH - 1);
+        reals next_x = place->x + index * place->along_x + line * place->across_x;
+        reals next_y = place->y + index * place->along_y + line * place->across_y;
+        for (int j = 0; j < lines; j++, count++) {
+            x[count] = next_x;
+            y[count] = next_y;
+            next_x += place->across_x;
+            next_y += place->across_y;
+#if defined(LENS) || defined(CAMERA)
+            flags |= ruler_distort(x + count, y + count, place, model);
 #endif
-        flags |= ruler_at(place, index, line, table, model, x + v, y + v);
-        pixels[v] = as_uint16(ruler_split(place, pitch, x + v, y + v));
+            pixels[count] = as_uint16(ruler_split(place, pitch, x + count, y + count));
+        }
     }
-#pragma clang loop vectorize(disable) unroll_count(4)
-    for (int i = 0; i < RULER_SAMPLES; i++)
-        ruler_fetch(place->pixel + ((private const uint *)pixels)[i], pitch, (private ruler_part *)parts + i);
-    for (int v = 0; v < RULER_VECTORS; v++) {
-        reals a, b, c, d;
-        ruler_unpack((private const ruler_part *)(parts + v), &a, &b, &c, &d);
-        const reals sample = ruler_between(a, b, c, d, x[v], y[v]);
-        flags |= ruler_judge(sample, table);
-        profile[v] += sample;
+    global const CODE *below = image + pitch;
+#pragma clang loop vectorize(disable) unroll_count(8)
+    for (int i = 0; i < 16 * count; i++) {
+        const uint pixel = ((private const uint *)pixels)[i];
+        ruler_fetch(image + pixel, below + pixel, (private ruler_part *)parts + i);
+    }
+    count = 0;
+    for (int k = 0; k < RULER_STRIDE; k++) {
+        reals sum = profile[sample + k];
+        for (int j = 0; j < lines; j++, count++) {
+            reals a, b, c, d;
+            ruler_unpack(parts + count, &a, &b, &c, &d);
+            const reals value = ruler_between(a, b, c, d, x[count], y[count]);
+            flags |= ruler_judge(value, table);
+            sum += value;
+        }
+        profile[sample + k] = sum;
     }
     return flags;
 }
 
-// Whole rulers: fills edges[MOST].
-inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
-                          constant real *model, private ruler_edge *edges) {
+// 16 rulers from the one given on, `stride` numbers apart, one in each lane: fills edges[MOST]. There are `count`; lanes
+// past them do the last one again.
+inline void ruler_measure(global const CODE *image, int rows, int columns, global const real *rulers, uint stride,
+                          uint count, constant real *table, constant real *model, private ruler_edge *edges) {
+    real given[4][LANES];
+    for (uint lane = 0; lane < LANES; lane++) {
+        const real4 one = vload4(0, rulers + stride * (ulong)min(lane, count - 1));
+        given[0][lane] = one.x;
+        given[1][lane] = one.y;
+        given[2][lane] = one.z;
+        given[3][lane] = one.w;
+    }
     ruler_place place;
-    uint status = ruler_lay(image, rows, columns, ruler, table, &place);
-    reals profile[RULER_PADDED / 16], slopes[RULER_CHUNKS];
-    uint chunks = 0;
-    if (!status) {
-        masks flags = 0;
-        for (int v = 0; v < RULER_PADDED / 16; v++) profile[v] = 0;
-        for (int line = 0; line < WIDTH; line++) flags |= ruler_add(&place, columns, line, table, model, profile);
+    masks flags = ruler_lay(rows, columns, vload16(0, given[0]), vload16(0, given[1]), vload16(0, given[2]),
+                            vload16(0, given[3]), table, &place);
+    reals profile[LENGTH + RULER_STRIDE];
+    for (int i = 0; i < LENGTH; i += RULER_STRIDE) {
+        for (int k = 0; k < RULER_STRIDE; k++) profile[i + k] = 0;
+        for (int line = 0; line < WIDTH; line += RULER_LINES)
+            flags |= ruler_add(image, &place, columns, i, line, table, model, profile);
+    }
 #ifdef CODE_float
-        for (int v = 0; v < RULER_VECTORS; v++) flags |= ruler_judge_sum(profile[v]);
+    for (int i = 0; i < LENGTH; i++) flags |= ruler_judge_sum(profile[i]);
 #endif
-#if defined(SATURATION) || defined(CODE_float) || defined(LENS) || defined(CAMERA)
-        status = ruler_any(flags);
-#endif
-        for (int chunk = 0; chunk < RULER_CHUNKS; chunk++) {
-            slopes[chunk] = ruler_slope((private const real *)(profile + chunk), table);
-            chunks |= (uint)any_lane(RULER_STRENGTH(slopes[chunk]) >= table[RULER_THRESHOLD]) << chunk;
-        }
-    }
-    if (status & RULER_USELESS) {
-        for (int k = 0; k < MOST; k++) edges[k] = ruler_nothing(status);
-    } else {
-        ruler_find((private const real *)slopes, chunks, status, table, edges);
-    }
+    ruler_find(profile, flags, table, edges);
 }
 #else
-inline real ruler_sum(const ruler_place *place, int pitch, int i, constant real *table, constant real *model,
-                      int *flags) {
+inline real ruler_sum(global const CODE *image, const ruler_place *place, int pitch, int i, constant real *table,
+                      constant real *model, int *flags) {
     real sum = 0;
     for (int line = 0; line < WIDTH; line++) {
-        real x, y;
-        *flags |= ruler_at(place, i, line, table, model, &x, &y);
-        global const CODE *pixel = place->pixel + ruler_split(place, pitch, &x, &y);
+        real x = place->x + i * place->along_x + line * place->across_x;
+        real y = place->y + i * place->along_y + line * place->across_y;
+#if defined(LENS) || defined(CAMERA)
+        *flags |= ruler_distort(&x, &y, place, model);
+#endif
+        global const CODE *pixel = image + ruler_split(place, pitch, &x, &y);
         const real sample = ruler_between(pixel[0], pixel[1], pixel[pitch], pixel[pitch + 1], x, y);
         *flags |= ruler_judge(sample, table);
         sum += sample;
@@ -427,38 +457,22 @@ inline real ruler_sum(const ruler_place *place, int pitch, int i, constant real 
     return sum;
 }
 
-// The same by a work-group, in arrays of its own; edges[MOST] are for its first item.
+// One ruler by a work-group, in arrays of its own; edges[MOST] are for its first item.
 inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
-                          constant real *model, local real *profile, local real *slopes, local uint *bits,
+                          constant real *model, local real *profile, local real *slopes, local int *shared_flags,
                           private ruler_edge *edges) {
     const int item = get_local_id(0);
     ruler_place place;
-    const uint wrong = ruler_lay(image, rows, columns, ruler, table, &place);
-    if (item == 0) {
-        bits[0] = wrong;
-        bits[1] = 0;
-    }
+    int flags = ruler_lay(rows, columns, ruler.x, ruler.y, ruler.z, ruler.w, table, &place);
+    if (item == 0) *shared_flags = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (!wrong) {
-        int flags = 0;
-        for (int i = item; i < LENGTH; i += RULER_GROUP)
-            profile[i] = ruler_sum(&place, columns, i, table, model, &flags);
-        if (flags) atomic_or(bits, (uint)flags);
-    }
+    for (int i = item; i < LENGTH; i += RULER_GROUP)
+        profile[i] = ruler_sum(image, &place, columns, i, table, model, &flags);
+    if (flags) atomic_or(shared_flags, flags);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (!wrong) {
-        for (int i = item; i < RULER_SLOPES; i += RULER_GROUP) {
-            slopes[i] = ruler_slope(profile + i, table);
-            if (RULER_STRENGTH(slopes[i]) >= table[RULER_THRESHOLD]) atomic_or(bits + 1, 1u << (i / 16));
-        }
-    }
+    for (int i = item; i < RULER_SLOPES; i += RULER_GROUP) slopes[i] = ruler_slope(profile, i, table);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item) return;
-    if (bits[0] & RULER_USELESS) {
-        for (int k = 0; k < MOST; k++) edges[k] = ruler_nothing(bits[0]);
-    } else {
-        ruler_find(slopes, bits[1], bits[0], table, edges);
-    }
+    if (item == 0) ruler_find(slopes, *shared_flags, table, edges);
 }
 #endif
 #endif

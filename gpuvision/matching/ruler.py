@@ -29,9 +29,9 @@ LONGEST = 512  # samples: a bit of 32 for each 16 gradients
 WIDEST = 255
 MOST_EDGES = 64
 _CODES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
-_GROUP = 64
+_LANES, _GROUP = 16, 64
 _SHARES_PER_CORE = 4  # keep the cores even
-_ALONE = 100  # rulers that the caller's thread does sooner than it wakes another
+_ALONE = 64  # rulers that the caller's thread does sooner than it wakes another
 _REAL = np.dtype(np.float32)
 
 
@@ -227,7 +227,8 @@ class RulerEdges(Operation[Edges]):
         if self.count is None:
             raise ValueError("RulerEdges.count is None; to bind it say how many rulers there will be")
         strip = in_strips(self.walk, device)
-        each = max(-(-self.count // (_SHARES_PER_CORE * device.handle.max_compute_units)), 1)
+        share = -(-self.count // (_SHARES_PER_CORE * device.handle.max_compute_units * _LANES))
+        each = max(share, 1) * _LANES
         spec = ((self.count, self.most) if self.choice == "all" else (self.count,), _REAL)
         return Launch(
             stem="ruler",

@@ -17,16 +17,22 @@
 #define SHARED local
 #endif
 
-// Edge to place and certainty in the line's frame.
-inline void edge_place(ruler_edge edge, global const real *ruler, real *u, real *v, real *certainty) {
-    const real s = edge.position, per = 1 / (1 + s * ruler[8]);
-    const real at_u = (ruler[4] + s * ruler[6]) * per, at_v = (ruler[5] + s * ruler[7]) * per;
+// What rulers found, one after the other: places in their line's frame, and certainties.
+typedef struct {
+    SHARED real *u;
+    SHARED real *v;
+    SHARED real *certainty;
+} fix_places;
+
+inline void put_edge(real position, real sigma, global const real *ruler, int i, fix_places to) {
+    const real per = 1 / (1 + position * ruler[8]);
+    const real at_u = (ruler[4] + position * ruler[6]) * per, at_v = (ruler[5] + position * ruler[7]) * per;
     // Along the ruler a pixel moves the place across the line by so much.
-    const real across = fabs(ruler[7] - at_v * ruler[8]) * per * edge.sigma;
+    const real across = fabs(ruler[7] - at_v * ruler[8]) * per * sigma;
     const int good = !not_finite(at_u) & !not_finite(at_v) & !not_finite(across) & across > 0;
-    *u = good ? at_u : 0;
-    *v = good ? at_v : 0;
-    *certainty = good ? 1 / across : 0;
+    to.u[i] = good ? at_u : 0;
+    to.v[i] = good ? at_v : 0;
+    to.certainty[i] = good ? 1 / across : 0;
 }
 
 typedef struct {
@@ -98,49 +104,48 @@ kernel void local_fix(global const CODE *restrict image, global const real *rest
     SHARED real row[7][CAPACITY];
     const fix_rows lined = {row[0], row[1], row[2], row[3], row[4], row[5], row[6]};
     ruler_edge edge[MOST];
+    SHARED real place[3][ROOM];
+    const fix_places places_of = {place[0], place[1], place[2]};
 #ifdef STRIP
-    for (int first = 0; first < lines; first += LANES) {
-        reals x[EACH], y[EACH], certainty[EACH], distances[EACH];
-        for (int k = 0; k < each; k++) x[k] = y[k] = certainty[k] = 0;
-        for (int lane = 0; lane < LANES && first + lane < lines; lane++)
-            for (int k = 0; k < each; k++) {
-                const int i = (first + lane) * each + k;
-                ruler_measure(image, rows, columns, vload4(0, rulers + i * RULER), table, model, edge);
-                edge_place(edge[0], rulers + i * RULER, (real *)(x + k) + lane, (real *)(y + k) + lane,
-                           (real *)(certainty + k) + lane);
-                edges[i] = edge[0].position;
-                edge_status[i] = edge[0].status;
-            }
-        const laned_points all = {x, y, certainty, distances, each};
-        fit_lines(all, first, lines, line, pairs, pair_trials, steps, lined, edge_weights);
+    const int item = 0, items = LANES;
+    for (int first = 0; first < lines * each; first += LANES) {
+        ruler_measure(image, rows, columns, rulers + first * RULER, RULER, lines * each - first, table, model, edge);
+        for (int lane = 0; lane < LANES && first + lane < lines * each; lane++) {
+            const int i = first + lane;
+            put_edge(LANE(edge[0].position, lane), LANE(edge[0].sigma, lane), rulers + i * RULER, i, places_of);
+            edges[i] = LANE(edge[0].position, lane);
+            edge_status[i] = (uchar)LANE_BITS(edge[0].status, lane);
+        }
     }
 #else
-    local real profile[LENGTH], slopes[RULER_SLOPES], place[3][LINES * EACH];
-    local uint bits[2];
-    const int item = get_local_id(0);
+    local real profile[LENGTH], slopes[RULER_SLOPES];
+    local int flags;
+    const int item = get_local_id(0), items = RULER_GROUP;
     for (int i = 0; i < lines * each; i++) {
-        ruler_measure(image, rows, columns, vload4(0, rulers + i * RULER), table, model, profile, slopes, bits, edge);
+        ruler_measure(image, rows, columns, vload4(0, rulers + i * RULER), table, model, profile, slopes, &flags, edge);
         if (item == 0) {
-            real u, v, certainty;
-            edge_place(edge[0], rulers + i * RULER, &u, &v, &certainty);
-            place[0][i] = u;
-            place[1][i] = v;
-            place[2][i] = certainty;
+            put_edge(edge[0].position, edge[0].sigma, rulers + i * RULER, i, places_of);
             edges[i] = edge[0].position;
-            edge_status[i] = edge[0].status;
+            edge_status[i] = (uchar)edge[0].status;
         }
         barrier(CLK_LOCAL_MEM_FENCE);
     }
-    for (int first = item; first < lines; first += RULER_GROUP) {
+#endif
+    for (int first = item; first < lines; first += items) {
         reals x[EACH], y[EACH], certainty[EACH], distances[EACH];
         for (int k = 0; k < each; k++) {
-            x[k] = place[0][first * each + k];
-            y[k] = place[1][first * each + k];
-            certainty[k] = place[2][first * each + k];
+            x[k] = y[k] = certainty[k] = 0;
+            for (int lane = 0; lane < LANES && first + lane < lines; lane++) {
+                const int i = (first + lane) * each + k;
+                LANE(x[k], lane) = place[0][i];
+                LANE(y[k], lane) = place[1][i];
+                LANE(certainty[k], lane) = place[2][i];
+            }
         }
         const laned_points all = {x, y, certainty, distances, each};
         fit_lines(all, first, lines, line, pairs, pair_trials, steps, lined, edge_weights);
     }
+#ifndef STRIP
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item) return;
 #endif

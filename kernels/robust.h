@@ -33,7 +33,7 @@
 
 // A value of one lane.
 #ifdef STRIP
-#define LANE(values, lane) (((private const real *)&(values))[lane])
+#define LANE(values, lane) (((private real *)&(values))[lane])
 #define LANE_BITS(values, lane) (((private const bits *)&(values))[lane])
 #else
 #define LANE(values, lane) (values)

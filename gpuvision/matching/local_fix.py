@@ -20,7 +20,7 @@ from gpuvision.matching.ruler import RulerEdges
 Float64 = npt.NDArray[np.float64]
 RULER = ("x_px", "y_px", "cosine", "sine", "u", "v", "u_per_px", "v_per_px", "bend")
 LINE = ("normal_x", "normal_y", "x", "y", "sigma")
-_GROUP, _LANES = 64, 16
+_GROUP, _MOST_RULERS = 64, 2048
 _REAL = np.dtype(np.float32)
 
 
@@ -156,6 +156,10 @@ class LocalFix(Operation[Fix]):
         for name, least, most in (("lines", 2, 512), ("each", 1, 256)):
             if not isinstance(getattr(self, name), int) or not least <= getattr(self, name) <= most:
                 raise ValueError(f"LocalFix.{name} is {getattr(self, name)!r}, expected {least} to {most}")
+        if self.lines * self.each > _MOST_RULERS:
+            raise ValueError(
+                f"LocalFix: {self.lines} lines of {self.each} rulers, expected {_MOST_RULERS} or fewer in all"
+            )
         if 2 * self.lines < FREEDOMS[self.solver.freedom]:
             raise ValueError(f"LocalFix.lines is {self.lines}: too few for the freedom '{self.solver.freedom}'")
 
@@ -172,7 +176,7 @@ class LocalFix(Operation[Fix]):
         return Launch(
             stem="local_fix",
             kernel="local_fix",
-            defines=dict(edges.defines) | solver.defines(count, strip) | self._capacities(strip),
+            defines=dict(edges.defines) | solver.defines(count, strip) | self._capacities(),
             inputs=[(shape, dtype), ((*found, len(RULER)), _REAL), ((self.lines, len(LINE)), _REAL)],
             outputs={
                 **{name: (size, _REAL) for name, size in sizes.items()},
@@ -202,7 +206,6 @@ class LocalFix(Operation[Fix]):
         """Return what the rulers alone would launch: their table, model and defines."""
         return replace(self.ruler, count=self.lines * self.each)._launch(device, shape, dtype)
 
-    def _capacities(self, strip: bool) -> dict[str, int]:
+    def _capacities(self) -> dict[str, int]:
         """Return the sizes of the arrays; powers of two, so that there are few builds."""
-        each = 1 << (self.each - 1).bit_length()
-        return {"EACH": each} | ({} if strip else {"LINES": 1 << (self.lines - 1).bit_length()})
+        return {"EACH": 1 << (self.each - 1).bit_length(), "ROOM": 1 << (self.lines * self.each - 1).bit_length()}

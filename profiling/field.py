@@ -1,0 +1,273 @@
+"""Finding a robot on its field against NumPy, Numba and SciPy.
+
+``global`` is a known robot's full search: 44 226 positions (243 x 182 at 1 cm), 64 rays, the heading from a compass.
+Every candidate gives the score of all poses and the least of each 64. Numba has our own form, the strongest there is:
+for one heading a ray is a shift of the map, whose rows are added in 16 bits, so that it vectorises. NumPy looks every
+pose and ray up in the map. ``global-shifts`` has NumPy add shifted maps, and Numba look every pose and ray up, as one
+writes it for any set of poses. ``turns`` is a whole field of 22 m with 72 headings, Numba as in ``global``. ``local``
+is one pose to the least cost; SciPy has exact distances and slopes as we do, in double.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from gpuvision.field_file import read_field
+from gpuvision.host import Device
+from gpuvision.matching.field import RefinePoses, SearchField
+from gpuvision.matching.field_map import LEVELS, FieldMap
+from gpuvision.profiling.harness import Case
+
+_BLOCK, _RAYS = 64, 64
+
+
+def cases(device: Device) -> Iterator[Case]:
+    """Yield the global search, with one heading and with 72, and the local one."""
+    junior = FieldMap(field=read_field("robocup_junior"), cell=0.01, scale=0.05, reach=1.5, device=device)
+    large = FieldMap(field=read_field("robocup_msl"), cell=0.1, scale=0.25, reach=6.0, device=device)
+    pose = (0.213, -0.177, 0.4)
+    yield from _global(device, junior, pose)
+    yield _turns(device, large, (3.1, -2.2, 0.7))
+    yield _local(device, large, (3.1, -2.2, 0.7))
+
+
+def _points(field_map: FieldMap, pose: tuple[float, ...], sigma: float) -> NDArray[np.float32]:
+    """As many points as rays, on lines within the reach, as seen from a pose."""
+    rng = np.random.default_rng(5)
+    spread: list[NDArray[np.float64]] = []
+    for x0, y0, x1, y1 in field_map.field.lines:
+        part = np.linspace(0.0, 1.0, int(np.hypot(x1 - x0, y1 - y0) / field_map.cell) + 2)[:, None]
+        spread.append(np.array([x0, y0]) * (1.0 - part) + np.array([x1, y1]) * part)
+    x, y, heading = pose
+    turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+    points = (np.concatenate(spread) - [x, y]) @ turn
+    points = points[np.hypot(*points.T) < 0.95 * field_map.reach]
+    points = points[rng.choice(len(points), _RAYS, replace=False)]
+    return np.asarray(points + rng.normal(0.0, sigma, points.shape), np.float32)
+
+
+# ---- global --------------------------------------------------------------------------------------------------
+
+
+@numba.njit(error_model="numpy")
+def _shifts(points, headings, per_cell, border):  # type: ignore[no-untyped-def]
+    columns = np.empty((headings.shape[0], points.shape[0]), np.int64)
+    rows = np.empty((headings.shape[0], points.shape[0]), np.int64)
+    for turn in range(headings.shape[0]):
+        c, s = np.float32(np.cos(headings[turn])), np.float32(np.sin(headings[turn]))
+        for i in range(points.shape[0]):
+            x, y = points[i, 0], points[i, 1]
+            columns[turn, i] = np.int64(np.rint((c * x - s * y) * per_cell)) + border
+            rows[turn, i] = np.int64(np.rint((s * x + c * y) * per_cell)) + border
+    return columns, rows
+
+
+@numba.njit(parallel=True, error_model="numpy")
+def _numba_shifts(level, columns, rows, scores, sums, least, where):  # type: ignore[no-untyped-def]
+    """Add rows of the map in 16 bits, a row of positions for one heading a task."""
+    turns, height, width = scores.shape
+    scale = np.float32(1.0 / (1023.0 * columns.shape[1]))
+    for task in numba.prange(turns * height):
+        turn, row = task // height, task % height
+        total, out = sums[task], scores[turn, row]
+        total[:] = 0
+        for i in range(columns.shape[1]):
+            first = columns[turn, i]
+            source = level[row + rows[turn, i], first : first + width]
+            for x in range(width):
+                total[x] += source[x]
+        for x in range(width):
+            out[x] = np.float32(total[x]) * scale
+        for block in range(least.shape[2]):
+            at = min(block * 64, width - 64)
+            low = total[at]
+            for x in range(at, at + 64):
+                low = min(low, total[x])
+            while total[at] != low:
+                at += 1
+            least[turn, row, block] = np.float32(low) * scale
+            where[turn, row, block] = at
+
+
+@numba.njit(parallel=True, error_model="numpy")
+def _numba_poses(level, columns, rows, scores, least, where):  # type: ignore[no-untyped-def]
+    """Look up every ray of every pose."""
+    _, height, width = scores.shape
+    scale = np.float32(1.0 / (1023.0 * columns.shape[1]))
+    for row in numba.prange(height):
+        for x in range(width):
+            total = np.int32(0)
+            for i in range(columns.shape[1]):
+                total += level[row + rows[0, i], x + columns[0, i]]
+            scores[0, row, x] = np.float32(total) * scale
+        for block in range(least.shape[2]):
+            at = min(block * 64, width - 64)
+            at += np.argmin(scores[0, row, at : at + 64])
+            least[0, row, block] = scores[0, row, at]
+            where[0, row, block] = at
+
+
+def _numpy_least(scores: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    first = [min(at, scores.shape[2] - _BLOCK) for at in range(0, scores.shape[2], _BLOCK)]
+    blocks = np.stack([scores[:, :, at : at + _BLOCK] for at in first], axis=2)
+    return blocks.min(axis=-1), blocks.argmin(axis=-1) + first
+
+
+class _Search:
+    """Our call on one map with its points, and the peers' arrays."""
+
+    def __init__(self, device: Device, field_map: FieldMap, points: NDArray[Any], headings: tuple[float, ...]) -> None:
+        self.map, self.points, self.headings = field_map, points, np.array(headings)
+        self.bound = SearchField(map=field_map, headings=headings, with_scores=True).bind(device, points.shape, "f4")
+        self.bound.inputs[0].set(points)
+        self.ours = self.bound.run()
+        self.scores = np.empty(self.ours.scores.shape, np.float32)
+        self.sums = np.empty((len(headings) * self.scores.shape[1], self.scores.shape[2]), np.uint16)
+        self.least = np.empty(self.ours.least.shape, np.float32)
+        self.where = np.empty(self.ours.column.shape, np.int64)
+        self.float_level = field_map.cells.level.astype(np.float32)
+
+    @property
+    def traffic(self) -> tuple[int, int]:
+        """The map's cells that are seen, and what is written."""
+        return self.map.cells.level.nbytes, self.scores.nbytes + 2 * self.least.nbytes
+
+    def shifts(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Where each ray lies for each heading."""
+        result: tuple[NDArray[Any], NDArray[Any]] = _shifts(
+            self.points, self.headings, np.float32(1.0 / self.map.cell), self.map.border
+        )
+        return result
+
+    def numba_shifts(self) -> None:
+        """In our form."""
+        _numba_shifts(self.map.cells.level, *self.shifts(), self.scores, self.sums, self.least, self.where)
+
+    def numba_poses(self) -> None:
+        """As one writes it."""
+        _numba_poses(self.map.cells.level, *self.shifts(), self.scores, self.least, self.where)
+
+    def numpy_poses(self) -> None:
+        """Look up every ray of every pose."""
+        columns, rows = (each[0] for each in self.shifts())
+        _, height, width = self.scores.shape
+        at = (np.arange(height)[:, None, None] + rows, np.arange(width)[:, None] + columns)
+        self.scores[0] = self.float_level[at].sum(axis=-1) * np.float32(1.0 / (LEVELS * _RAYS))
+        self.least[:], self.where[:] = _numpy_least(self.scores)
+
+    def numpy_shifts(self) -> None:
+        """Add shifted maps."""
+        _, height, width = self.scores.shape
+        total = np.zeros((height, width), np.float32)
+        for column, row in zip(*(each[0] for each in self.shifts()), strict=True):
+            total += self.float_level[row : row + height, column : column + width]
+        self.scores[0] = total * np.float32(1.0 / (LEVELS * _RAYS))
+        self.least[:], self.where[:] = _numpy_least(self.scores)
+
+    def check(self, *peers: Callable[[], None]) -> None:
+        """Check that the peers find the same."""
+        ours = self.ours.scores.get(), self.ours.least.get(), self.ours.column.get()
+        for peer in peers:
+            peer()
+            theirs = self.scores, self.least, self.where
+            if not all(np.allclose(each, other, atol=1e-6) for each, other in zip(theirs, ours, strict=True)):
+                raise AssertionError("the peer's scores are others than ours: it does other work")
+
+    @property
+    def error(self) -> float:
+        """Our scores' largest error against exact distances, in double, at some of the poses."""
+        turn, row, column = (each[:: max(each.size // 200, 1)] for each in np.indices(self.scores.shape).reshape(3, -1))
+        x0, y0 = self.map.first_position
+        c, s = np.cos(self.headings[turn])[:, None], np.sin(self.headings[turn])[:, None]
+        px, py = self.points.astype(np.float64).T
+        x = x0 + self.map.cell * column[:, None] + c * px - s * py
+        y = y0 + self.map.cell * row[:, None] + s * px + c * py
+        shapes = self.map.field.shapes
+        away = [np.abs(_offsets(shapes, np.full(x.shape, each), x, y)[0]) for each in range(len(shapes))]
+        square = np.min(away, axis=0) ** 2
+        exact = np.mean(square / (self.map.scale**2 + square), axis=1)
+        return float(np.max(np.abs(self.ours.scores.get()[turn, row, column] - exact)))
+
+
+def _global(device: Device, field_map: FieldMap, pose: tuple[float, ...]) -> Iterator[Case]:
+    search = _Search(device, field_map, _points(field_map, pose, 0.003), (pose[2],))
+    height, width = field_map.positions
+    facts = {"poses": height * width, "rays": _RAYS}
+    search.check(search.numba_shifts, search.numpy_poses, search.numba_poses, search.numpy_shifts)
+    peers: dict[str, Callable[[], object]] = {"numba": search.numba_shifts, "numpy": search.numpy_poses}
+    yield Case("field", "global", search.bound.run, peers, search.error, search.traffic, facts=facts)
+    peers = {"numba": search.numba_poses, "numpy": search.numpy_shifts}
+    yield Case("field", "global-shifts", search.bound.run, peers, search.error, search.traffic, facts=facts)
+
+
+def _turns(device: Device, field_map: FieldMap, pose: tuple[float, ...]) -> Case:
+    headings = tuple(np.arange(72) * (np.pi / 36.0))
+    search = _Search(device, field_map, _points(field_map, pose, 0.02), headings)
+    search.check(search.numba_shifts)
+    facts = {"poses": search.scores.size, "rays": _RAYS}
+    peers = {"numba": search.numba_shifts}
+    return Case("field", "turns", search.bound.run, peers, search.error, search.traffic, facts=facts)
+
+
+# ---- local ---------------------------------------------------------------------------------------------------
+
+
+def _offsets(shapes: NDArray[Any], which: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> tuple[Any, Any, Any]:
+    """Signed distances to given straight lines, full circles and quarters, and their slopes."""
+    sx, sy, c, s, half, end, radius = np.moveaxis(shapes[which], -1, 0)
+    dx, dy = x - sx, y - sy
+    along, across = c * dx + s * dy, c * dy - s * dx
+    far = np.hypot(dx, dy)
+    over = np.where(radius > 0.0, 0.0, np.copysign(np.maximum(np.abs(along) - half, 0.0), along))
+    beside = (radius > 0.0) & (along < far * half)
+    ox = np.where(beside, along - radius * half, np.where(radius > 0.0, along, over))
+    oy = np.where(beside, across - np.copysign(radius * end, across), across)
+    length = np.hypot(ox, oy) + 1e-300
+    straight = (radius == 0.0) & (over == 0.0)
+    away = np.where(straight, across, np.where((radius > 0.0) & ~beside, far - radius, length))
+    nx, ny = np.where(straight, 0.0, ox / length), np.where(straight, 1.0, oy / length)
+    return away, c * nx - s * ny, s * nx + c * ny
+
+
+def _local(device: Device, field_map: FieldMap, pose: tuple[float, ...]) -> Case:
+    points = _points(field_map, pose, 0.02)
+    start = np.add(pose, [0.06, -0.05, 0.06])
+    bound = RefinePoses(map=field_map, count=1).bind(device, points.shape, "f4")
+    bound.inputs[0].set(points)
+    bound.inputs[1].set(start[None].astype(np.float32))
+    ours = bound.run()
+    shapes, nearest, scale = field_map.field.shapes, field_map.cells.nearest, field_map.scale
+    x0, y0 = field_map.first
+    px, py = points.astype(np.float64).T
+
+    def rows(at: NDArray[Any]) -> tuple[Any, ...]:
+        c, s = np.cos(at[2]), np.sin(at[2])
+        dx, dy = c * px - s * py, s * px + c * py
+        x, y = at[0] + dx, at[1] + dy
+        row = np.clip(np.rint((y - y0) / field_map.cell).astype(int), 0, nearest.shape[0] - 1)
+        column = np.clip(np.rint((x - x0) / field_map.cell).astype(int), 0, nearest.shape[1] - 1)
+        may = _offsets(shapes, nearest[row, column].T, x, y)
+        least = np.argmin(np.abs(may[0]), axis=0)
+        return (*(each[least, np.arange(_RAYS)] for each in may), dx, dy)
+
+    def residuals(at: NDArray[Any]) -> NDArray[Any]:
+        away = rows(at)[0]
+        return np.array(away / np.sqrt(scale**2 + away**2))
+
+    def slopes(at: NDArray[Any]) -> NDArray[Any]:
+        away, nx, ny, dx, dy = rows(at)
+        steep = scale**2 / (scale**2 + away**2) ** 1.5
+        return np.array(np.stack([nx, ny, ny * dx - nx * dy], axis=-1) * steep[:, None])
+
+    def scipy() -> Any:
+        fit = least_squares(residuals, start, slopes, method="lm", xtol=1e-6, ftol=1e-9)
+        return fit.x, np.linalg.inv(fit.jac.T @ fit.jac)
+
+    error = float(np.max(np.abs(ours.poses.get()[0] - scipy()[0])))
+    return Case("field", "local", bound.run, {"scipy": scipy}, error, facts={"rays": _RAYS})

@@ -1,5 +1,8 @@
 """Rulers against Numba on all cores, OpenCV's remap of all rulers in one call, and NumPy.
 
+Numba sums the lines of a sample in a register, for LLVM to vectorise over samples. Cases named ``flat`` put it up in a
+form that LLVM likes better still: places of 32 bits in a flat image.
+
 Rulers of 64 samples and 5 lines, smoothing 1 px, across the border of a disc in an 8-bit frame of 640 x 480: one edge
 each, at any angle. All return position, amplitude, width, predicted deviation and status of the strongest edge.
 """
@@ -7,7 +10,7 @@ each, at any angle. All return position, amplitude, width, predicted deviation a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import cv2
@@ -29,59 +32,80 @@ _VARIANCE = float(np.sum(2.0 * _TAPS * np.arange(1, _REACH + 1) ** 3)) / 3.0
 _LEAST = THRESHOLD / math.sqrt(2.0 * math.pi * _VARIANCE)
 
 
-@numba.njit(parallel=True, error_model="numpy", fastmath={"contract"})
-def _numba(image, rulers, taps, numbers, edges, status):  # type: ignore[no-untyped-def]
-    """Sum the lines of a sample in a register, for LLVM to vectorise over samples; edges are (4, n)."""
-    columns = np.uint32(image.shape[1])
-    pixels = image.reshape(-1)
-    half, one = np.float32(0.5), np.float32(1.0)
-    least, smoothing, noise = numbers[0], numbers[1], numbers[2]
-    first, second, third = taps[0], taps[1], taps[2]
-    for r in numba.prange(rulers.shape[0]):
-        profile, slopes = np.zeros(LENGTH, np.float32), np.zeros(LENGTH, np.float32)
-        cosine, sine = rulers[r, 2], rulers[r, 3]
-        middle = half * np.float32(LENGTH - 1)
-        first_x = rulers[r, 0] - middle * cosine + half * np.float32(WIDTH - 1) * sine
-        first_y = rulers[r, 1] - middle * sine - half * np.float32(WIDTH - 1) * cosine
-        for i in range(LENGTH):
-            along_x, along_y = first_x + np.float32(i) * cosine, first_y + np.float32(i) * sine
-            total = np.float32(0.0)
-            for line in range(WIDTH):
-                x, y = along_x - np.float32(line) * sine, along_y + np.float32(line) * cosine
-                column, row = np.int32(x), np.int32(y)
-                dx, dy = x - np.float32(column), y - np.float32(row)
-                at = np.uint32(row) * columns + np.uint32(column)
-                a, b = np.float32(pixels[at]), np.float32(pixels[at + np.uint32(1)])
-                c = np.float32(pixels[at + columns])
-                d = np.float32(pixels[at + columns + np.uint32(1)])
-                a += dx * (b - a)
-                c += dx * (d - c)
-                total += a + dy * (c - a)
-            profile[i] = total
-        for i in range(3, LENGTH - 3):
-            slopes[i] = (
-                first * (profile[i + 1] - profile[i - 1])
-                + second * (profile[i + 2] - profile[i - 2])
-                + third * (profile[i + 3] - profile[i - 3])
-            )
-        best, at_best = np.float32(0.0), 4
-        for i in range(4, LENGTH - 4):
-            strength = abs(slopes[i])
-            if strength > best:
-                best, at_best = strength, i
-        found = best >= least
-        sign = np.float32(np.sign(slopes[at_best]))
-        before = np.log(max(sign * slopes[at_best - 1] / best, np.float32(1e-6)))
-        after = np.log(max(sign * slopes[at_best + 1] / best, np.float32(1e-6)))
-        variance, tilt = -one / (before + after), half * (after - before)
-        shift = tilt * variance
-        nan = np.float32(np.nan)
-        edges[0, r] = np.float32(at_best) + shift - middle if found else nan
-        height = sign * best * np.exp(half * tilt * shift) * np.sqrt(np.float32(2.0 * np.pi) * variance)
-        edges[1, r] = height / np.float32(WIDTH) if found else nan
-        edges[2, r] = np.sqrt(max(variance - smoothing, np.float32(0.0))) if found else nan
-        edges[3, r] = noise * variance / best if found else nan
-        status[r] = np.uint8(not found)
+@numba.njit(error_model="numpy", fastmath={"contract"})
+def _sample(image, pixels, pitch, x, y):  # type: ignore[no-untyped-def]
+    """Return a bilinear sample; unsigned places, which need no test for being below 0."""
+    column, row = np.int32(x), np.int32(y)
+    dx, dy = x - np.float32(column), y - np.float32(row)
+    u, v, one = np.uint64(row), np.uint64(column), np.uint64(1)
+    a, b = np.float32(image[u, v]), np.float32(image[u, v + one])
+    c, d = np.float32(image[u + one, v]), np.float32(image[u + one, v + one])
+    a += dx * (b - a)
+    c += dx * (d - c)
+    return a + dy * (c - a)
+
+
+@numba.njit(error_model="numpy", fastmath={"contract"})
+def _sample_flat(image, pixels, pitch, x, y):  # type: ignore[no-untyped-def]
+    """Return the same from places of 32 bits in a flat image."""
+    column, row = np.int32(x), np.int32(y)
+    dx, dy = x - np.float32(column), y - np.float32(row)
+    one, at = np.uint32(1), np.uint32(row) * pitch + np.uint32(column)
+    a, b = np.float32(pixels[at]), np.float32(pixels[at + one])
+    c, d = np.float32(pixels[at + pitch]), np.float32(pixels[at + pitch + one])
+    a += dx * (b - a)
+    c += dx * (d - c)
+    return a + dy * (c - a)
+
+
+def _compiled(sample: Any) -> Any:
+    """Return Numba's rulers, ``(image, rulers, taps, numbers, edges, status)`` with edges of (4, n)."""
+
+    @numba.njit(parallel=True, error_model="numpy", fastmath={"contract"})
+    def measure(image, rulers, taps, numbers, edges, status):  # type: ignore[no-untyped-def]
+        pixels, pitch = image.reshape(-1), np.uint32(image.shape[1])
+        half, one = np.float32(0.5), np.float32(1.0)
+        least, smoothing, noise = numbers[0], numbers[1], numbers[2]
+        first, second, third = taps[0], taps[1], taps[2]
+        for r in numba.prange(rulers.shape[0]):
+            profile, slopes = np.zeros(LENGTH, np.float32), np.zeros(LENGTH, np.float32)
+            cosine, sine = rulers[r, 2], rulers[r, 3]
+            middle = half * np.float32(LENGTH - 1)
+            first_x = rulers[r, 0] - middle * cosine + half * np.float32(WIDTH - 1) * sine
+            first_y = rulers[r, 1] - middle * sine - half * np.float32(WIDTH - 1) * cosine
+            for i in range(LENGTH):
+                along_x, along_y = first_x + np.float32(i) * cosine, first_y + np.float32(i) * sine
+                total = np.float32(0.0)
+                for line in range(WIDTH):
+                    x, y = along_x - np.float32(line) * sine, along_y + np.float32(line) * cosine
+                    total += sample(image, pixels, pitch, x, y)
+                profile[i] = total
+            for i in range(3, LENGTH - 3):
+                slopes[i] = (
+                    first * (profile[i + 1] - profile[i - 1])
+                    + second * (profile[i + 2] - profile[i - 2])
+                    + third * (profile[i + 3] - profile[i - 3])
+                )
+            best, at_best = np.float32(0.0), 4
+            for i in range(4, LENGTH - 4):
+                strength = abs(slopes[i])
+                if strength > best:
+                    best, at_best = strength, i
+            found = best >= least
+            sign = np.float32(np.sign(slopes[at_best]))
+            before = np.log(max(sign * slopes[at_best - 1] / best, np.float32(1e-6)))
+            after = np.log(max(sign * slopes[at_best + 1] / best, np.float32(1e-6)))
+            variance, tilt = -one / (before + after), half * (after - before)
+            shift = tilt * variance
+            nan = np.float32(np.nan)
+            edges[0, r] = np.float32(at_best) + shift - middle if found else nan
+            height = sign * best * np.exp(half * tilt * shift) * np.sqrt(np.float32(2.0 * np.pi) * variance)
+            edges[1, r] = height / np.float32(WIDTH) if found else nan
+            edges[2, r] = np.sqrt(max(variance - smoothing, np.float32(0.0))) if found else nan
+            edges[3, r] = noise * variance / best if found else nan
+            status[r] = np.uint8(not found)
+
+    return measure
 
 
 def _gradient_matrix(dtype: Any) -> NDArray[Any]:
@@ -152,11 +176,13 @@ def scene(count: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
 
 def cases(device: Device) -> Iterator[Case]:
     """Yield 16, 100, 1000 and 10 000 rulers."""
+    plain, flat = _compiled(_sample), _compiled(_sample_flat)
     for count in (16, 100, 1000, 10_000):
-        yield _case(device, count)
+        yield _case(device, count, str(count), plain)
+        yield _case(device, count, f"{count}/flat", flat, alone=True)
 
 
-def _case(device: Device, count: int) -> Case:
+def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool = False) -> Case:
     image, rulers = scene(count)
     operation = RulerEdges(threshold=THRESHOLD, length=LENGTH, width=WIDTH, smoothing_px=SMOOTHING, count=count)
     bound = operation.bind(device, image.shape, image.dtype)
@@ -169,17 +195,13 @@ def _case(device: Device, count: int) -> Case:
     exact, *_, dark = _numpy(image, rulers.astype(np.float64), _gradient_matrix(np.float64))
     if np.any(bound.outputs.status.get()) or np.any(dark):
         raise AssertionError("a ruler across an edge found none")
-    _numba(image, rulers, taps, numbers, edges, status)
+    compiled(image, rulers, taps, numbers, edges, status)
     facts = {"peer_error": float(np.max(np.abs(edges[0] - exact))), "rulers": count}
-    return Case(
-        "ruler",
-        str(count),
-        bound.run,
-        {
-            "numba": lambda: _numba(image, rulers, taps, numbers, edges, status),
-            "opencv": lambda: _opencv(image, rulers, matrix),
-            "numpy": lambda: _numpy(image, rulers, matrix),
-        },
-        float(np.max(np.abs(bound.outputs.position.get() - exact))),
-        facts=facts,
-    )
+    peers: dict[str, Callable[[], object]] = {
+        "numba": lambda: compiled(image, rulers, taps, numbers, edges, status),
+    }
+    if not alone:
+        peers["opencv"] = lambda: _opencv(image, rulers, matrix)
+        peers["numpy"] = lambda: _numpy(image, rulers, matrix)
+    error = float(np.max(np.abs(bound.outputs.position.get() - exact)))
+    return Case("ruler", name, bound.run, peers, error, facts=facts)

@@ -31,7 +31,7 @@ MOST_EDGES = 64
 _CODES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 _LANES, _GROUP = 16, 64
 _SHARES_PER_CORE = 4  # keep the cores even
-_ALONE = 64  # rulers that the caller's thread does sooner than it wakes another
+_ALONE = 128  # rulers that the caller's thread does sooner than it wakes another
 _REAL = np.dtype(np.float32)
 
 

@@ -36,6 +36,7 @@ OPERATIONS = (
     "bvh",
     "simulate",
     "tolerance",
+    "field",
     "mitsuba",
     "launch",
     "stream",

@@ -79,7 +79,7 @@ BVH_INLINE void cut(bvh_reals start, bvh_reals end, bvh_reals *low, bvh_reals *h
     const bvh_reals zero = (real)0, place = start / (start - end);
     *low = start < zero ? bvh_max(*low, place) : *low;
     *high = end < zero ? bvh_min(*high, place) : *high;
-    *high = (start < zero) & (end < zero) ? (bvh_reals)(real)-1 : *high;
+    *high = ((start < zero) & (end < zero)) ? (bvh_reals)(real)-1 : *high;
 }
 
 // Which triangles hide something; from where to where.

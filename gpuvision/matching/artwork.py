@@ -73,7 +73,7 @@ class Land:
     outline
         (n, 2) corners, counter-clockwise [m]; the convex hull where several areas make one spot.
     hole
-        Diameter of the round hole in it [m]; 0 without one.
+        Diameter of the hole in it, or width of the slot [m]; 0 without one.
     opening
         How far the mask's opening reaches beyond the copper [m], the least of four sides: negative where the mask
         lies on the copper, NaN where there is no opening about the same centre (a covered via).
@@ -202,7 +202,7 @@ def read_artwork(
     via_drill
         Where a file does not say what a land is for: a round one with a plated hole up to this wide [m] is a via. One
         without a hole, without paste, in an opening of the mask of 1.5 diameters or more is a fiducial. The others are
-        pads; so are areas (regions) whose place the mask opens.
+        pads; so are areas (regions) whose place the mask opens, of which gerbonara does not hand on attributes.
 
     Raises
     ------

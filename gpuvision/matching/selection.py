@@ -1,0 +1,374 @@
+"""Where to put rulers on a board, chosen before it is seen: the few that fix its pose best.
+
+An edge with the unit normal n through p, measured with the standard deviation sigma along n, says one thing of the
+board's shift t and turn theta about the placement point: n . t + n . J p theta + e, p from that point and J a quarter
+turn. e is how much wider than drawn all copper was etched on each side, one unknown for the whole board: an edge
+measures it along with the pose, a ruler across both edges of a trace does not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.matching.artwork import Artwork
+from gpuvision.matching.artwork_shapes import Float64, Layer, covered
+
+_WORST_CONDITION = 1e4  # worst standard deviation over best: beyond it a pose is refused
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imaging:
+    """What the camera makes of an edge, and how far the board may be from where it is looked for.
+
+    Parameters
+    ----------
+    pixel
+        On the board [m].
+    blur_px
+        Standard deviation of the edges' blur [px].
+    contrast_bare, contrast_masked
+        Step at an edge over the noise of a pixel, of bare copper and of copper under the mask.
+    width_px
+        Lines that a ruler averages.
+    etch
+        Standard deviation of how far copper was etched beside its drawn edge, the same all over the board [m].
+    shift, angle
+        Greatest distance [m], along x and along y, and greatest angle [rad] from where the board is looked for.
+
+    Raises
+    ------
+    ValueError
+        A parameter that is not finite, or not positive (``etch`` and ``angle`` may be 0).
+    """
+
+    pixel: float
+    blur_px: float = 1.0
+    contrast_bare: float = 40.0
+    contrast_masked: float = 15.0
+    width_px: int = 5
+    etch: float = 10e-6
+    shift: float = 100e-6
+    angle: float = 5e-3
+
+    def __post_init__(self) -> None:
+        positive = (self.pixel, self.blur_px, self.contrast_bare, self.contrast_masked, self.width_px, self.shift)
+        if not all(math.isfinite(each) and each > 0 for each in positive):
+            raise ValueError("pixel, blur, contrasts, width and shift must be positive and finite")
+        if not all(math.isfinite(each) and each >= 0 for each in (self.etch, self.angle)):
+            raise ValueError("etch and angle must be finite and not negative")
+
+    def sigma(self, bare: npt.ArrayLike) -> Float64:
+        """Return the standard deviation [m] of an isolated edge, at the smoothing that is best for it.
+
+        1.883 sqrt(blur) / (contrast sqrt(width)) pixels is the bound for Gaussian edges in white noise; a gradient's
+        peak at the best smoothing, sqrt(5) blurs, reaches 1.2 times that.
+        """
+        contrast = np.where(bare, self.contrast_bare, self.contrast_masked)
+        bound = math.sqrt(2 * math.sqrt(math.pi) * self.blur_px / self.width_px) / contrast
+        return np.asarray(math.sqrt(3 / 8 * 6**3 / math.sqrt(5) ** 5) * bound * self.pixel)
+
+
+class Candidates(NamedTuple):
+    """Rulers that could be laid.
+
+    Attributes
+    ----------
+    point
+        (n, 2) middle on the board [m]: on the edge, or between the two edges of a trace.
+    normal
+        (n, 2) unit, along which the ruler looks; out of the copper at a single edge.
+    sigma
+        (n,) of the measured place along the normal [m].
+    pair
+        (n,) bool: across both edges of a trace.
+    length
+        (n,) [m] so that the edge lies on it wherever the board is.
+    ambiguity
+        (n,) how likely another edge of the same sense is nearer to the ruler's middle, for shifts along the normal
+        that are all equally likely; 0 where none is in reach.
+    source
+        (n,) the same number for rulers on one trace, or on one side of a land.
+    placement
+        (2,) [m] the point whose pose counts.
+    """
+
+    point: Float64
+    normal: Float64
+    sigma: Float64
+    pair: npt.NDArray[np.bool_]
+    length: Float64
+    ambiguity: Float64
+    source: npt.NDArray[np.int64]
+    placement: Float64
+
+    def pixels(self, imaging: Imaging) -> Float64:
+        """(n,) how many pixels each ruler samples: a cost for :func:`select`."""
+        return np.asarray(np.ceil(self.length / imaging.pixel) * imaging.width_px)
+
+
+class Selection(NamedTuple):
+    """What was chosen, and what it promises.
+
+    Attributes
+    ----------
+    chosen
+        (k,) indices of the candidates, in the order in which they were chosen.
+    covariance
+        (3, 3) of the placement point's x, y [m] and theta [rad].
+    cost
+        Sum of the chosen costs.
+    condition
+        Worst standard deviation over best, the angle's at the mean distance of the chosen points.
+    region
+        (2, 2) least and greatest x, y [m] that the rulers sample: what the camera must read.
+    """
+
+    chosen: npt.NDArray[np.int64]
+    covariance: Float64
+    cost: float
+    condition: float
+    region: Float64
+
+    @property
+    def sigmas(self) -> Float64:
+        """(3,) standard deviations of x, y [m] and theta [rad] at the placement point."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def candidates(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike, imaging: Imaging) -> Candidates:
+    """Rulers across every edge of a region, side by side, and across both edges of traces where both can be seen.
+
+    A ruler lies so that its whole width stays on the edge wherever the board is within ``imaging.shift``; edges cut by
+    the mask, by silk or by other copper are cut already (:func:`~gpuvision.matching.artwork.read_artwork`).
+
+    Parameters
+    ----------
+    artwork
+        From :func:`~gpuvision.matching.artwork.read_artwork`.
+    region
+        (2, 2) least and greatest x, y [m]: the middles lie in it.
+    placement
+        (2,) [m] the point whose pose counts.
+    imaging
+        The camera.
+
+    Raises
+    ------
+    ValueError
+        A region without extent, or a placement that is not finite.
+    """
+    box, place = np.asarray(region, dtype=np.float64), np.asarray(placement, dtype=np.float64)
+    if box.shape != (2, 2) or not np.all(np.isfinite(box)) or not np.all(box[1] > box[0]):
+        raise ValueError("region must be finite ((x, y), (x, y)), the least first and the greatest second")
+    if place.shape != (2,) or not np.all(np.isfinite(place)):
+        raise ValueError("placement must be a finite x, y")
+    copper = Layer(artwork.copper)
+    rows = [
+        row
+        for row in [*_single_rows(artwork, imaging), *_pair_rows(artwork, imaging)]
+        if np.all((row[0] >= box[0]) & (row[0] <= box[1]))
+    ]
+    point = np.array([row[0] for row in rows]).reshape(-1, 2)
+    normal = np.array([row[1] for row in rows]).reshape(-1, 2)
+    pair = np.array([row[2] > 0 for row in rows], dtype=np.bool_)
+    across = np.array([row[2] for row in rows], dtype=np.float64)
+    sigma = imaging.sigma(np.array([row[3] for row in rows], dtype=np.bool_)) / np.where(pair, math.sqrt(2.0), 1.0)
+    reach = imaging.shift * np.abs(normal).sum(axis=1) + imaging.angle * np.abs(_lever(point - place, normal))
+    tails = 4 * imaging.blur_px * math.sqrt(6) * imaging.pixel  # blurred and smoothed: sqrt(1 + 5) blurs
+    ambiguity = [
+        _ambiguity(copper, *each) for each in zip(point + normal * across[:, None] / 2, normal, reach, strict=True)
+    ]
+    source = np.array([row[4] for row in rows], dtype=np.int64)
+    length = 2 * (reach + tails) + across
+    return Candidates(point, normal, sigma, pair, length, np.array(ambiguity, dtype=np.float64), source, place)
+
+
+_Row = tuple[Float64, Float64, float, bool, int]
+
+
+def _single_rows(artwork: Artwork, imaging: Imaging) -> list[_Row]:
+    edges = artwork.edges
+    rows: list[_Row] = []
+    for index in range(len(edges.width)):
+        source = int(edges.trace[index]) if edges.trace[index] >= 0 else -1 - index
+        for point in _along(edges.start[index], edges.end[index], imaging):
+            rows.append((point, edges.normal[index], 0.0, bool(edges.bare[index]), source))
+    return rows
+
+
+def _pair_rows(artwork: Artwork, imaging: Imaging) -> list[_Row]:
+    """Across both edges of a trace, where they can be seen side by side and are alike."""
+    edges = artwork.edges
+    rows: list[_Row] = []
+    for first in np.flatnonzero(edges.trace >= 0):
+        normal, origin = edges.normal[first], edges.start[first]
+        axis = np.array([-normal[1], normal[0]])
+        opposite = (edges.trace == edges.trace[first]) & (edges.normal @ normal < 0) & (edges.bare == edges.bare[first])
+        span = np.sort([0.0, float((edges.end[first] - origin) @ axis)])
+        if normal[0] < 0 or (normal[0] == 0 and normal[1] < 0):
+            continue  # its opposite edge comes with the other normal
+        for second in np.flatnonzero(opposite):
+            ends = np.sort([(edges.start[second] - origin) @ axis, (edges.end[second] - origin) @ axis])
+            low, high = max(span[0], ends[0]), min(span[1], ends[1])
+            width = float(edges.width[first])
+            middle = origin - normal * (width / 2)
+            if high > low:
+                for point in _along(middle + low * axis, middle + high * axis, imaging):
+                    rows.append((point, normal, width, bool(edges.bare[first]), int(edges.trace[first])))
+    return rows
+
+
+def _along(start: Float64, end: Float64, imaging: Imaging) -> Float64:
+    """(k, 2) middles of rulers side by side that stay on an edge wherever the board is."""
+    length = math.dist(start, end)
+    width = imaging.width_px * imaging.pixel
+    free = length - width - 2 * imaging.shift
+    if free < 0:
+        return np.empty((0, 2))
+    count = math.floor(free / width) + 1
+    offset = (length - (count - 1) * width) / 2 + np.arange(count) * width
+    return np.asarray(start + offset[:, None] * ((end - start) / length))
+
+
+def _lever(point: Float64, normal: Float64) -> Float64:
+    return np.asarray(point[:, 0] * normal[:, 1] - point[:, 1] * normal[:, 0])
+
+
+def _ambiguity(copper: Layer, point: Float64, normal: Float64, reach: float) -> float:
+    """Chance that another edge out of copper along the normal is nearer to the middle than the edge itself.
+
+    An edge at a distance a from it is nearer where the board is shifted by more than a / 2 the other way.
+    """
+    ends = point - 2 * reach * normal, point + 2 * reach * normal
+    found = copper.crossings(*ends)
+    cuts = np.unique(np.concatenate([np.array([0.0, 1.0]), *(where for _, where in found)]))
+    cuts = cuts[(cuts >= 0) & (cuts <= 1)]
+    laid = covered(found, (cuts[1:] + cuts[:-1]) / 2)
+    away = (cuts[1:-1][laid[:-1] & ~laid[1:]] - 0.5) * 4 * reach
+    away = np.abs(away[np.abs(away) > 2e-6])  # the edge itself is there, to a chord's sagitta
+    return float(min(1.0, np.sum((reach - away / 2) / (2 * reach))))
+
+
+def select(
+    rulers: Candidates,
+    imaging: Imaging,
+    budget: float,
+    *,
+    costs: Any = None,
+    criterion: Literal["determinant", "placement"] = "determinant",
+    per_source: int = 4,
+    missing: float = 0.0,
+) -> Selection:
+    """Choose rulers one after the other, each time the one that gains most for its cost.
+
+    The gain in the logarithm of the determinant is at least 1 - 1/e of the greatest possible one where all costs are
+    equal, every source has room and ``imaging.etch`` is 0; otherwise, and for the variance, no such bound is known.
+
+    Parameters
+    ----------
+    rulers
+        From :func:`candidates`.
+    imaging
+        The camera; what is known before is its ``shift`` and ``angle``, equally likely throughout. It steers the first
+        choices and does not count in what is promised.
+    budget
+        Sum of the costs that may be spent.
+    costs
+        (n,) positive, of each candidate: 1 (the budget is a number of rulers) by default, ``rulers.pixels(imaging)``,
+        or microseconds as they were measured.
+    criterion
+        ``"determinant"`` of the pose's information, or ``"placement"``: the variance of the placement point's x and y.
+    per_source
+        Most rulers on one trace or side: what is missing or wrong there cannot take the others along.
+    missing
+        Share of the rulers that will find nothing, anywhere: counts in what is promised.
+
+    Raises
+    ------
+    ValueError
+        What was chosen does not fix x, y and theta: traces all parallel, too small a budget, too few edges.
+    """
+    price = np.ones(len(rulers.sigma)) if costs is None else np.asarray(costs, dtype=np.float64)
+    if price.shape != rulers.sigma.shape or not np.all(price > 0):
+        raise ValueError(f"costs must be {len(rulers.sigma)} positive numbers, one for each candidate")
+    if not (0 <= missing < 1 and per_source >= 1):
+        raise ValueError("missing must be in [0, 1), per_source 1 or more")
+    if criterion not in ("determinant", "placement"):
+        raise ValueError(f"criterion must be 'determinant' or 'placement', not {criterion!r}")
+    rows = _rows(rulers)
+    weight = (1 - missing) * (1 - rulers.ambiguity) / rulers.sigma**2
+    chosen = _greedy(rows, weight, price, rulers, imaging, (budget, criterion, per_source))
+    covariance, condition = _promised(rows[chosen], weight[chosen], rulers, chosen, imaging)
+    return Selection(chosen, covariance, float(price[chosen].sum()), condition, _region(rulers, chosen, imaging))
+
+
+def _rows(rulers: Candidates) -> Float64:
+    """(n, 4): what each ruler says of x, y, theta and the etching."""
+    lever = _lever(rulers.point - rulers.placement, rulers.normal)
+    return np.concatenate([rulers.normal, lever[:, None], np.where(rulers.pair, 0.0, 1.0)[:, None]], axis=1)
+
+
+def _greedy(
+    rows: Float64,
+    weight: Float64,
+    price: Float64,
+    rulers: Candidates,
+    imaging: Imaging,
+    limits: tuple[float, str, int],
+) -> npt.NDArray[np.int64]:
+    budget, criterion, per_source = limits
+    # Variances of what is equally likely within limits; of nothing, where no angle or etching is expected.
+    prior = np.array([imaging.shift**2 / 3, imaging.shift**2 / 3, imaging.angle**2 / 3, imaging.etch**2])
+    covariance, of_etch = np.diag(np.maximum(prior, 1e-18)), 1 / max(prior[3], 1e-18)
+    used: dict[int, int] = {}
+    free = weight > 0
+    chosen: list[int] = []
+    while True:
+        free &= price <= budget
+        if not free.any():
+            return np.array(chosen, dtype=np.int64)
+        seen = rows @ covariance
+        total = 1 + weight * np.einsum("ij,ij->i", seen, rows)
+        if criterion == "determinant":
+            # Of the pose alone: what is learnt of the etching is none of its information.
+            gain = np.log(total) - np.log1p(weight * rows[:, 3] ** 2 / of_etch)
+        else:
+            gain = weight * np.sum(seen[:, :2] ** 2, axis=1) / total
+        best = int(np.argmax(np.where(free, gain / price, -np.inf)))
+        chosen.append(best)
+        covariance -= weight[best] / total[best] * np.outer(seen[best], seen[best])
+        of_etch += weight[best] * rows[best, 3] ** 2
+        budget -= price[best]
+        free[best] = False
+        source = int(rulers.source[best])
+        used[source] = used.get(source, 0) + 1
+        if used[source] >= per_source:
+            free &= rulers.source != source
+
+
+def _promised(
+    rows: Float64, weight: Float64, rulers: Candidates, chosen: npt.NDArray[np.int64], imaging: Imaging
+) -> tuple[Float64, float]:
+    """Covariance without what was known before, and its condition; the etching is taken out."""
+    if len(chosen) < 3:
+        raise ValueError(f"{len(chosen)} rulers do not fix x, y and theta: give a larger budget or region")
+    information = (rows * weight[:, None]).T @ rows
+    information[3, 3] += 1 / max(imaging.etch, 1e-9) ** 2
+    pose = information[:3, :3] - np.outer(information[:3, 3], information[3, :3]) / information[3, 3]
+    distance = max(float(np.hypot(*(rulers.point[chosen] - rulers.placement).T).mean()), imaging.pixel)
+    metres = np.array([1.0, 1.0, 1 / distance])
+    values = np.linalg.eigvalsh(pose * metres * metres[:, None])
+    if not values[0] * _WORST_CONDITION**2 > values[2]:
+        raise ValueError("these edges do not fix x, y and theta (all parallel, or all through one point)")
+    return np.linalg.inv(pose), math.sqrt(values[2] / values[0])
+
+
+def _region(rulers: Candidates, chosen: npt.NDArray[np.int64], imaging: Imaging) -> Float64:
+    normal = np.abs(rulers.normal[chosen])
+    half = normal * rulers.length[chosen, None] / 2 + normal[:, ::-1] * (imaging.width_px * imaging.pixel / 2)
+    return np.stack([(rulers.point[chosen] - half).min(axis=0), (rulers.point[chosen] + half).max(axis=0)])

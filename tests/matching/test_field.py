@@ -206,18 +206,31 @@ def test_kidnapped_robots_are_found(device: Device, rng: np.random.Generator) ->
 
 
 def test_clutter_of_70_percent(device: Device, rng: np.random.Generator) -> None:
-    """Most points are on lines painted in the hall, people, and the ball."""
+    """Most points are on lines painted in the hall, people, and the ball; no robot is taken for elsewhere."""
     field_map = large(device)
-    points = view(field_map, POSE, rng, 200, reach=5.5)
-    angle, far = rng.uniform(-np.pi, np.pi, 140), 5.5 * np.sqrt(rng.uniform(0.0, 1.0, 140))
-    points[:140] = np.stack([far * np.cos(angle), far * np.sin(angle)], axis=-1)
-    assert_found(field_map, POSE, points, device)
+    for _ in range(40):
+        pose = rng.uniform([-10.5, -6.5, -np.pi], [10.5, 6.5, np.pi])
+        points = view(field_map, pose, rng, 200, reach=6.0)
+        angle, far = rng.uniform(-np.pi, np.pi, 140), 6.0 * np.sqrt(rng.uniform(0.0, 1.0, 140))
+        points[:140] = np.stack([far * np.cos(angle), far * np.sin(angle)], axis=-1)
+        first = locate(field_map, points, device=device)[0]
+        assert min(np.abs(off(each, pose)[:2]).max() for each in (first.pose, twin_of(first.pose))) < 0.3
 
 
 def test_a_robot_outside_the_field(device: Device, rng: np.random.Generator) -> None:
     field_map = large(device)
     pose = np.array([4.0, 7.8, -1.2])
     assert_found(field_map, pose, view(field_map, pose, rng, 128, reach=6.0), device)
+
+
+def test_a_compass_tells_twins_apart(device: Device, rng: np.random.Generator) -> None:
+    field_map = FieldMap(field=read_field("robocup_junior"), cell=0.02, scale=0.05, reach=1.5, device=device)
+    pose = np.array([0.31, -0.22, 0.7])
+    points = view(field_map, pose, rng, sigma=0.005, reach=1.2)
+    first, *others = locate(field_map, points, headings=(0.6,), device=device)
+    assert first.twin is None
+    assert np.abs(off(first.pose, pose)).max() < 0.02
+    assert all(each.score > first.score + 0.05 for each in others)
 
 
 def test_points_twice_are_the_same_pose(device: Device, rng: np.random.Generator) -> None:

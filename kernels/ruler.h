@@ -166,7 +166,8 @@ inline ruler_edge ruler_refine(ruler_peak peak, constant real *table) {
     edge.amplitude = peak.here * exp((real)0.5f * tilt * shift) *
                      ((real)RULER_ROOT_TWO_PI * table[RULER_PER_LINE]) * sqrt(variance);
     edge.width = sqrt(fmax(variance - table[RULER_SMOOTHING], (reals)0)) * table[RULER_STEP];
-    edge.sigma = table[RULER_NOISE] * table[RULER_STEP] * variance / size;
+    // The logarithms beside the peak have the noise over the gradients there, which are smaller.
+    edge.sigma = table[RULER_NOISE] * table[RULER_STEP] * variance * exp((real)0.5f / variance) / size;
     edge.spacing = REAL_NAN;
     edge.status = 0;
 #ifdef CURVED
@@ -392,7 +393,7 @@ __attribute__((always_inline)) inline masks ruler_add(global const CODE *image, 
         }
     }
     global const CODE *below = image + pitch;
-#pragma clang loop vectorize(disable) unroll_count(8)
+#pragma clang loop vectorize(disable) unroll_count(16)
     for (int i = 0; i < 16 * count; i++) {
         const uint pixel = ((private const uint *)pixels)[i];
         ruler_fetch(image + pixel, below + pixel, (private ruler_part *)parts + i);

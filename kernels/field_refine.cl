@@ -34,15 +34,16 @@ inline field_row row_of(float2 point, float3 pose, float2 turn, constant float *
     return result;
 }
 
-inline int point_counts(float2 point, float reach) { return point.x * point.x + point.y * point.y <= reach * reach; }
+// Whether it is finite and within the reach, by squares.
+inline int point_counts(float2 point, float farthest) { return point.x * point.x + point.y * point.y <= farthest; }
 
 inline normal_equations equations_at(global const float *points, int count, float3 pose, constant float *shapes,
-                                     global const uchar *nearest, field_grid grid, float square, float reach) {
+                                     global const uchar *nearest, field_grid grid, float square, float farthest) {
     const float2 turn = (float2)(cos(pose.z), sin(pose.z));
     normal_equations sum = {0};
     for (int i = 0; i < count; i++) {
         const float2 point = (float2)(points[2 * i], points[2 * i + 1]);
-        if (!point_counts(point, reach)) continue;
+        if (!point_counts(point, farthest)) continue;
         const field_row at = row_of(point, pose, turn, shapes, nearest, grid);
         const float share = square / (square + at.r * at.r), weight = share * share, pull = weight * at.r;
         sum.cost += 1.0f - share;
@@ -102,26 +103,26 @@ kernel void field_refine(global const float *restrict points, global const float
                          global float *restrict scale, global float *restrict share, global uchar *restrict status,
                          constant float *shapes, global const uchar *restrict nearest, const int count,
                          const int rows, const int columns, const float first_x, const float first_y,
-                         const float cell, const float square, const float reach, const int steps) {
+                         const float cell, const float square, const float farthest, const int steps) {
     const size_t i = get_global_id(0);
     const field_grid grid = {first_x, first_y, 1.0f / cell, rows, columns};
     float3 pose = (float3)(starts[3 * i], starts[3 * i + 1], starts[3 * i + 2]);
     float levers = 0, used = 0;
     for (int k = 0; k < count; k++) {
         const float2 point = (float2)(points[2 * k], points[2 * k + 1]);
-        if (!point_counts(point, reach)) continue;
+        if (!point_counts(point, farthest)) continue;
         levers += point.x * point.x + point.y * point.y;
         used += 1;
     }
     const int finite = fabs(pose.x) + fabs(pose.y) + fabs(pose.z) < 1e6f;
     const float lever = 1.0f / sqrt(levers / fmax(used, 1.0f) + 1e-12f);
     normal_equations here = {0};
-    if (finite) here = equations_at(points, count, pose, shapes, nearest, grid, square, reach);
+    if (finite) here = equations_at(points, count, pose, shapes, nearest, grid, square, farthest);
     float damping = 1e-4f;
     for (int step = 0; finite && step < steps && damping < 1e6f; step++) {
         const float3 by = damped_step(here, damping, lever);
         const float3 next = pose + by;
-        const normal_equations there = equations_at(points, count, next, shapes, nearest, grid, square, reach);
+        const normal_equations there = equations_at(points, count, next, shapes, nearest, grid, square, farthest);
         // As good as the sum's rounding can tell: near the least cost the step says more than the cost.
         const int better = there.cost <= here.cost * 1.000004f;
         damping = better ? fmax(0.1f * damping, 1e-7f) : 10.0f * damping;
@@ -135,7 +136,7 @@ kernel void field_refine(global const float *restrict points, global const float
     float bends = 0, pulls = 0, close = 0;
     for (int k = 0; finite && k < count; k++) {
         const float2 point = (float2)(points[2 * k], points[2 * k + 1]);
-        if (!point_counts(point, reach)) continue;
+        if (!point_counts(point, farthest)) continue;
         const field_row at = row_of(point, pose, turn, shapes, nearest, grid);
         const float part = square / (square + at.r * at.r), weight = part * part;
         const float bend = fmax(weight * (4.0f * part - 3.0f), 0.0f);

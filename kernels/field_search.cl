@@ -9,13 +9,12 @@
 // Where a block begins: the last one moves back, so as to be whole, and does some positions twice.
 inline int block_from(int block, int columns) { return min(block * BLOCK, max(columns - BLOCK, 0)); }
 
-// The shift of a point for a heading; negative where it has none: not finite, or beyond the map's border.
-inline int shift_of(float2 point, float2 heading, float per_cell, int border, int stride) {
+// The shift of a point for a heading; negative where it has none: not finite, or further than the reach.
+inline int shift_of(float2 point, float2 heading, float per_cell, float square, int border, int stride) {
+    // False for NaN, too.
+    if (!(point.x * point.x + point.y * point.y <= square)) return -1;
     const float x = (heading.x * point.x - heading.y * point.y) * per_cell;
     const float y = (heading.y * point.x + heading.x * point.y) * per_cell;
-    const float limit = (float)border;
-    // False for NaN, too.
-    if (!(fabs(x) <= limit && fabs(y) <= limit)) return -1;
     return ((int)rint(y) + border) * stride + (int)rint(x) + border;
 }
 
@@ -45,12 +44,12 @@ kernel void field_search(global const float *restrict points, global float *rest
                          global float *restrict least, global int *restrict column, global int *restrict seen,
                          global const ushort *restrict level, constant float *headings, const int count,
                          const int rows, const int columns, const int border, const int stride, const float per_cell,
-                         const int each) {
+                         const float square, const int each) {
     const int turn = (int)get_global_id(1), first = (int)get_global_id(0) * each, end = min(first + each, rows);
     const float2 heading = (float2)(headings[2 * turn], headings[2 * turn + 1]);
     int shifts[CAPACITY], used = 0;
     for (int i = 0; i < count; i++) {
-        const int shift = shift_of((float2)(points[2 * i], points[2 * i + 1]), heading, per_cell, border, stride);
+        const int shift = shift_of((float2)(points[2 * i], points[2 * i + 1]), heading, per_cell, square, border, stride);
         shifts[used] = shift;
         used += shift >= 0;
     }
@@ -113,7 +112,7 @@ kernel void field_search(global const float *restrict points, global float *rest
                          global float *restrict least, global int *restrict column, global int *restrict seen,
                          global const ushort *restrict level, constant float *headings, const int count,
                          const int rows, const int columns, const int border, const int stride, const float per_cell,
-                         const int each) {
+                         const float square, const int each) {
     const int item = (int)get_local_id(0), block = (int)get_group_id(0), row = (int)get_group_id(1),
               turn = (int)get_group_id(2), blocks = (int)get_num_groups(0);
     local int shifts[CAPACITY], used;
@@ -125,7 +124,8 @@ kernel void field_search(global const float *restrict points, global float *rest
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int i = item; i < count; i += BLOCK) {
         const int shift = shift_of((float2)(points[2 * i], points[2 * i + 1]),
-                                   (float2)(headings[2 * turn], headings[2 * turn + 1]), per_cell, border, stride);
+                                   (float2)(headings[2 * turn], headings[2 * turn + 1]), per_cell, square, border,
+                                   stride);
         if (shift >= 0) shifts[atomic_inc(&used)] = shift;
     }
     barrier(CLK_LOCAL_MEM_FENCE);

@@ -124,13 +124,14 @@ class SearchField(Operation[PoseCosts]):
                 np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32),
                 *map(np.int32, (count, rows, columns, self.map.border, self.map.cells.level.shape[1])),
                 np.float32(1.0 / self.map.cell),
+                np.float32(self.map.reach**2),
                 np.int32(each),
             ],
             global_size=(-(-rows // each), len(angles)) if strip else (blocks * _BLOCK, rows, len(angles)),
             local_size=(1, 1) if strip else (_BLOCK, 1, 1),
         )
 
-    def best(self, costs: PoseCosts, most: int = 8, *, apart: tuple[float, float] = (0.5, 0.35)) -> RoughPoses:
+    def best(self, costs: PoseCosts, most: int = 8, *, apart: tuple[float, float] | None = None) -> RoughPoses:
         """Return the best poses that are ``apart`` (m or rad) from each better one, best first.
 
         Parameters
@@ -140,8 +141,10 @@ class SearchField(Operation[PoseCosts]):
         most
             How many at most.
         apart
-            Poses that are nearer than this to a better one, in place (m) and in heading (rad), are the same.
+            Poses that are nearer than this to a better one, in place (m) and in heading (rad), are the same. None:
+            twice the map's scale, and 20 degrees.
         """
+        far, turned = (2.0 * self.map.scale, math.radians(20.0)) if apart is None else apart
         least = costs.least.ravel().copy()
         least[~np.isfinite(least)] = np.inf
         turn, row, _ = np.unravel_index(np.arange(least.size), costs.least.shape)
@@ -154,8 +157,8 @@ class SearchField(Operation[PoseCosts]):
             if not np.isfinite(least[number]):
                 break
             chosen.append(number)
-            near = np.flatnonzero((x - x[number]) ** 2 + (y - y[number]) ** 2 < apart[0] ** 2)
-            least[near[np.abs(_wrapped(angles[near] - angles[number])) < apart[1]]] = np.inf
+            near = np.flatnonzero((x - x[number]) ** 2 + (y - y[number]) ** 2 < far**2)
+            least[near[np.abs(_wrapped(angles[near] - angles[number])) < turned]] = np.inf
             least[number] = np.inf
         poses = np.stack([x[chosen], y[chosen], angles[chosen]], axis=-1)
         return RoughPoses(poses, costs.least.ravel()[chosen])
@@ -264,7 +267,7 @@ class RefinePoses(Operation[FieldPoses]):
                 self.map.field.shapes.astype(np.float32).ravel(),
                 cells,
                 *map(np.int32, (points, *cells.shape[:2])),
-                *map(np.float32, (*self.map.first, self.map.cell, self.map.scale**2, self.map.reach)),
+                *map(np.float32, (*self.map.first, self.map.cell, self.map.scale**2, self.map.reach**2)),
                 np.int32(self.steps),
             ],
             global_size=(self.count,),

@@ -109,18 +109,14 @@ def expected_scores(search: SearchField, points: np.ndarray) -> np.ndarray:
     """From the map, point by point, in whole numbers."""
     field_map, (rows, columns) = search.map, search.map.positions
     result = np.zeros((len(search.angles), rows, columns))
-    good = np.all(np.abs(points) < 1e6, axis=1)
-    for turn, heading in enumerate(search.angles.astype(np.float32)):
+    for turn, heading in enumerate(search.angles):
         c, s = np.float32(np.cos(heading)), np.float32(np.sin(heading))
-        x, y = points[good, 0], points[good, 1]
+        x, y = points.T
         per = np.float32(1.0 / field_map.cell)
-        right, up = (c * x - s * y) * per, (s * x + c * y) * per
-        near = (np.abs(right) <= field_map.border) & (np.abs(up) <= field_map.border)
-        at = np.rint(np.stack([up, right], axis=-1)[near]).astype(int) + field_map.border
+        at = np.rint(np.stack([s * x + c * y, c * x - s * y], axis=-1) * per).astype(int) + field_map.border
         for row, column in at:
             result[turn] += field_map.cells.level[row : row + rows, column : column + columns]
-        result[turn] /= 1023.0 * len(at)
-    return result
+    return result / (1023.0 * len(points))
 
 
 @WALKS
@@ -155,9 +151,10 @@ def test_outputs_stay_within_theirs(device: Device, walk: Any, rng: np.random.Ge
 def test_points_that_are_none_do_not_count(device: Device, walk: Any, rng: np.random.Generator) -> None:
     search = SearchField(map=small(device), headings=(0.3, -2.0, 1.1), with_scores=True, walk=walk)
     points = rng.uniform(-1.0, 1.0, (63, 2)).astype(np.float32)
-    worse = np.concatenate([points, points[:2]])
-    worse[7], worse[64] = (np.nan, 0.0), (1e30, np.inf)
-    alike = np.delete(worse, [7, 64], axis=0)
+    worse = np.concatenate([points, points[:3]])
+    # The last one is beyond the reach by less than a cell.
+    worse[7], worse[64], worse[65] = (np.nan, 0.0), (1e30, np.inf), (2.01, 0.0)
+    alike = np.delete(worse, [7, 64, 65], axis=0)
     costs, expected = search(worse, device=device), search(alike, device=device)
     assert (costs.seen == 63).all()
     np.testing.assert_array_equal(costs.scores, expected.scores)

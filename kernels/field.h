@@ -2,9 +2,9 @@
 #ifndef FIELD_H
 #define FIELD_H
 
-// A shape is seven numbers: a straight line is its middle (x, y), its direction (c, s), half its length and 0, 0; an arc
-// is its centre, the direction of its own middle, the cosine and the sine of half its opening (a whole circle: -2, 0),
-// and its radius.
+// A shape is seven numbers: a straight line is its middle (x, y), its direction (c, s), half its length and 0, 0; an
+// arc is its centre, the direction of its own middle, the cosine and the sine of half its opening (a whole circle: -2,
+// 0), and its radius.
 #define SHAPE 7
 
 // How far (x, y) is from the line, signed, and the direction in which that grows.

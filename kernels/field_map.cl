@@ -1,5 +1,5 @@
-// For every cell of a grid over a field: how far the nearest line is, which ones may be the nearest within the cell, and
-// what a point in its middle costs, d^2 / (c^2 + d^2), in FIELD_LEVELS steps. One cell a work-item.
+// For every cell of a grid over a field: how far the nearest line is, which ones may be the nearest within the cell,
+// and what a point in its middle costs, d^2 / (c^2 + d^2), in FIELD_LEVELS steps. One cell a work-item.
 #include "field.h"
 
 kernel void field_map(global const float *restrict at_x, global float *restrict distance,

@@ -49,7 +49,8 @@ kernel void field_search(global const float *restrict points, global float *rest
     const float2 heading = (float2)(headings[2 * turn], headings[2 * turn + 1]);
     int shifts[CAPACITY], used = 0;
     for (int i = 0; i < count; i++) {
-        const int shift = shift_of((float2)(points[2 * i], points[2 * i + 1]), heading, per_cell, square, border, stride);
+        const float2 point = (float2)(points[2 * i], points[2 * i + 1]);
+        const int shift = shift_of(point, heading, per_cell, square, border, stride);
         shifts[used] = shift;
         used += shift >= 0;
     }

@@ -38,9 +38,7 @@ def simulate(
     part: Annotated[
         Path, typer.Argument(metavar="PART", parser=named_path, help="Mesh of the part: STL, PLY, OBJ or GLB.")
     ],
-    sensor: Annotated[
-        str, typer.Option(help="The sensor's TOML file, with a table [light]; or camera_line, psd_line.")
-    ],
+    sensor: Annotated[str, typer.Option(help="The sensor's TOML file, with its light; or camera_line, psd_line.")],
     out: Annotated[
         Path, typer.Option(metavar="DIR", parser=named_path, help="Folder for pictures, range image and report.json.")
     ],
@@ -48,7 +46,9 @@ def simulate(
     materials: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", parser=named_path, help="TOML file with a [[material]] for each mesh of the part."
+            metavar="FILE",
+            parser=named_path,
+            help="TOML file with a material for each mesh of the part, see gpuvision/materials_file.py.",
         ),
     ] = None,
     albedo: Annotated[float, typer.Option(min=0.0, max=1.0, help="Of all surfaces, without --materials.")] = 0.5,
@@ -59,7 +59,7 @@ def simulate(
         ),
     ] = "direct,specular,diffuse-specular,diffuse-diffuse",
     tolerance: Annotated[
-        float, typer.Option(min=0.0, help="Range error that may come from what is left out [m]; 0: nothing is.")
+        float, typer.Option(min=0.0, help="Range error that may come from what is left out, in metres; 0: nothing is.")
     ] = 0.0,
     mask: Annotated[
         str, typer.Option(help="Before the sensor: none, best (a window per sample, made for the part), or a file.")
@@ -69,7 +69,7 @@ def simulate(
     ] = None,
     rule: Annotated[Rule, typer.Option(help="Which of two sensors is right where they disagree.")] = Rule.stronger,
     limit: Annotated[
-        float | None, typer.Option(min=0.0, help="Error from which on a sample counts as wrong [m].")
+        float | None, typer.Option(min=0.0, help="Error from which on a sample counts as wrong, in metres.")
     ] = None,
     profiles: Annotated[
         int | None, typer.Option(min=1, help="How many; otherwise as many as the part is long.")
@@ -79,7 +79,7 @@ def simulate(
     device: Annotated[str | None, typer.Option(help="Label of an OpenCL device, see `gpuvision devices`.")] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers compute; needs gpuvision[cluster]."),
+        typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers compute; needs the extra cluster."),
     ] = None,
 ) -> None:
     """Predict the range image that a sensor makes of a PART, its errors, and their causes.

@@ -48,7 +48,7 @@ def simulate(
         typer.Option(
             metavar="FILE",
             parser=named_path,
-            help="TOML file with a material for each mesh of the part, see gpuvision/materials_file.py.",
+            help="TOML file with a material for each mesh of the part.",
         ),
     ] = None,
     albedo: Annotated[float, typer.Option(min=0.0, max=1.0, help="Of all surfaces, without --materials.")] = 0.5,

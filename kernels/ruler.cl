@@ -1,5 +1,5 @@
-// Edges along rulers (ruler.h). On CPU runtimes an item takes `each` rulers, 16 at a time, on GPUs a group of RULER_GROUP
-// items takes one.
+// Edges along rulers (ruler.h). On CPU runtimes an item takes `each` rulers, 16 at a time, on GPUs a group of
+// RULER_GROUP items takes one.
 #include "ruler.h"
 
 // Under STRIP of the 16 rulers from `ruler` on, as far as there are any.

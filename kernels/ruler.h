@@ -91,8 +91,8 @@ inline masks ruler_distort(reals *x, reals *y, const ruler_place *place, constan
 #else
     const masks folded = LANED(lens_distort)(x, y, model);
 #endif
-    const masks inside = mask_of(*x >= 0) & mask_of(*y >= 0) & mask_of(*x <= LANED(convert_real)(place->last_column + 1)) &
-                         mask_of(*y <= LANED(convert_real)(place->last_row + 1));
+    const reals right = LANED(convert_real)(place->last_column + 1), bottom = LANED(convert_real)(place->last_row + 1);
+    const masks inside = mask_of(*x >= 0) & mask_of(*y >= 0) & mask_of(*x <= right) & mask_of(*y <= bottom);
     *x = zero_where(~inside, *x);
     *y = zero_where(~inside, *y);
     return (folded & STATUS_FOLDED) | (~inside & STATUS_OUT_OF_RANGE);
@@ -413,8 +413,8 @@ __attribute__((always_inline)) inline masks ruler_add(global const CODE *image, 
     return flags;
 }
 
-// 16 rulers from the one given on, `stride` numbers apart, one in each lane: fills edges[MOST]. There are `count`; lanes
-// past them do the last one again.
+// 16 rulers from the one given on, `stride` numbers apart, one in each lane: fills edges[MOST]. There are `count`;
+// lanes past them do the last one again.
 inline void ruler_measure(global const CODE *image, int rows, int columns, global const real *rulers, uint stride,
                           uint count, constant real *table, constant real *model, private ruler_edge *edges) {
     real given[4][LANES];

@@ -37,6 +37,7 @@ OPERATIONS = (
     "simulate",
     "tolerance",
     "field",
+    "ruler",
     "mitsuba",
     "launch",
     "stream",

@@ -186,8 +186,8 @@ def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool =
     image, rulers = scene(count)
     operation = RulerEdges(threshold=THRESHOLD, length=LENGTH, width=WIDTH, smoothing_px=SMOOTHING, count=count)
     bound = operation.bind(device, image.shape, image.dtype)
-    for array, values in zip(bound.inputs, (image, rulers), strict=True):
-        array.set(values)
+    bound.inputs[0].set(image)
+    bound.inputs[1].set(rulers)
     bound.run()
     taps, matrix = _TAPS.astype(np.float32), _gradient_matrix(np.float32)
     numbers = np.array([_LEAST * WIDTH, _VARIANCE, 1.0], np.float32)

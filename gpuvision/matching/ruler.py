@@ -141,8 +141,9 @@ class RulerEdges(Operation[Edges]):
     given. With a model the samples have that rounding. The sampled peak of a noise-free Gaussian edge is off by up to
     0.01 px for a smoothing of 1 px and a blur over 0.7 px, less for more of either (the interpolation's error).
 
-    ``sigma`` is the gradient noise at the peak over the curvature there, for white noise and rulers at random
-    places; one that lies on the pixels' grid has up to 10 % more.
+    ``sigma`` is the gradient noise at the peak over the curvature there, for white noise and rulers at random places:
+    within 5 % of what is measured from noise 2 at a step of 100 on. Below it lacks the interpolation's error; a ruler
+    on the pixels' grid has up to 10 % more. At `best_smoothing` both are 1.2 times the Cramer-Rao bound.
     """
 
     Result: ClassVar[type[Any]] = Edges
@@ -329,7 +330,7 @@ def _cubic_spline(distance: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     """Return the cubic B-spline: what two triangles that far apart have in common."""
     far = np.abs(distance).astype(np.float64)
     near = 2.0 / 3.0 - far**2 + 0.5 * far**3
-    return np.where(far < 1.0, near, np.maximum(2.0 - far, 0.0) ** 3 / 6.0)
+    return np.asarray(np.where(far < 1.0, near, np.maximum(2.0 - far, 0.0) ** 3 / 6.0))
 
 
 def _whole(value: Any, what: str, least: int, most: int) -> int:

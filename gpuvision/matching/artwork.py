@@ -21,7 +21,7 @@ from gerbonara.graphic_objects import Flash, Line
 from gerbonara.utils import MM
 from scipy.spatial import cKDTree
 
-from gpuvision.matching.artwork_edges import Edges, board_edges
+from gpuvision.matching.artwork_edges import BoardEdges, board_edges
 from gpuvision.matching.artwork_shapes import Drawn, Float64, Layer, Shape, area, drawn_objects, hull
 
 Side = Literal["top", "bottom"]
@@ -111,7 +111,7 @@ class Artwork:
     lands
         Vias, pads and fiducials.
     edges
-        :class:`~gpuvision.matching.artwork_edges.Edges`: straight edges of traces and pads that can be seen.
+        :class:`~gpuvision.matching.artwork_edges.BoardEdges`: straight edges of traces and pads that can be seen.
     bounds
         (2, 2): least and greatest x, y [m] of the board's outline; of the copper where there is no file of it.
     """
@@ -122,7 +122,7 @@ class Artwork:
     silk: tuple[Shape, ...]
     holes: Holes
     lands: tuple[Land, ...]
-    edges: Edges
+    edges: BoardEdges
     bounds: Float64
 
     @property

@@ -18,7 +18,7 @@ _CLOSE = 2 * SAGITTA
 _SHORTEST = 100e-6  # [m] of an edge, what a ruler of five pixels needs at 20 um each
 
 
-class Edges(NamedTuple):
+class BoardEdges(NamedTuple):
     """Straight edges between copper and what lies beside it.
 
     Attributes
@@ -68,8 +68,8 @@ def board_edges(
     mask: Layer | None,
     silk: Layer,
     clearance: float,
-) -> Edges:
-    """Edges of strokes with a round aperture and of the straight sides of lands.
+) -> BoardEdges:
+    """BoardEdges of strokes with a round aperture and of the straight sides of lands.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def board_edges(
             along = each.end - each.start
             rows.append((each.start + low * along, each.start + high * along, each.normal, each.width, bare, *each[4:]))
     columns: list[Any] = list(zip(*rows, strict=True)) if rows else [[]] * 7
-    return Edges(
+    return BoardEdges(
         np.array(columns[0], dtype=np.float64).reshape(-1, 2),
         np.array(columns[1], dtype=np.float64).reshape(-1, 2),
         np.array(columns[2], dtype=np.float64).reshape(-1, 2),

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from gpuvision.matching.artwork import Artwork
 from gpuvision.matching.artwork_shapes import Float64, Layer, covered
 
+_ITSELF = 2e-6  # [m] within which a step is the edge that is looked for, to the chords of arcs
 _WORST_CONDITION = 1e4  # worst standard deviation over best: beyond it a pose is refused
 
 
@@ -144,7 +145,9 @@ def candidates(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike
     """Rulers across every edge of a region, side by side, and across both edges of traces where both can be seen.
 
     A ruler lies so that its whole width stays on the edge wherever the board is within ``imaging.shift``; edges cut by
-    the mask, by silk or by other copper are cut already (:func:`~gpuvision.matching.artwork.read_artwork`).
+    the mask, by silk or by other copper are cut already (:func:`~gpuvision.matching.artwork.read_artwork`). Edges with
+    copper's, ink's or an opening's next border nearer than 3 times the best smoothing, sqrt(5) blurs, are left out:
+    it would pull at them.
 
     Parameters
     ----------
@@ -168,10 +171,11 @@ def candidates(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike
     if place.shape != (2,) or not np.all(np.isfinite(place)):
         raise ValueError("placement must be a finite x, y")
     copper = Layer(artwork.copper)
+    layers = (copper, Layer(artwork.mask), Layer(artwork.silk))
     rows = [
         row
         for row in [*_single_rows(artwork, imaging), *_pair_rows(artwork, imaging)]
-        if np.all((row[0] >= box[0]) & (row[0] <= box[1]))
+        if np.all((row[0] >= box[0]) & (row[0] <= box[1])) and _is_isolated(layers, row, imaging)
     ]
     point = np.array([row[0] for row in rows]).reshape(-1, 2)
     normal = np.array([row[1] for row in rows]).reshape(-1, 2)
@@ -239,18 +243,34 @@ def _lever(point: Float64, normal: Float64) -> Float64:
     return np.asarray(point[:, 0] * normal[:, 1] - point[:, 1] * normal[:, 0])
 
 
+def _steps(layer: Layer, point: Float64, normal: Float64, reach: float) -> tuple[Float64, npt.NDArray[np.bool_]]:
+    """Where a layer begins and ends along a normal, as far as a reach [m] either way, and whether it ends there."""
+    found = layer.crossings(point - reach * normal, point + reach * normal)
+    cuts = np.unique(np.concatenate([np.array([0.0, 1.0]), *(where for _, where in found)]))
+    cuts = cuts[(cuts >= 0) & (cuts <= 1)]
+    laid = covered(found, (cuts[1:] + cuts[:-1]) / 2)
+    step = laid[:-1] != laid[1:]
+    return (cuts[1:-1][step] - 0.5) * 2 * reach, laid[:-1][step]
+
+
+def _is_isolated(layers: tuple[Layer, ...], row: _Row, imaging: Imaging) -> bool:
+    """Whether no other step of any layer is so near to an edge as to pull it (see `RulerEdges.smoothing_px`)."""
+    point, normal, across, _, _ = row
+    reach = 3 * math.sqrt(5.0) * imaging.blur_px * imaging.pixel
+    if 0 < across < reach:
+        return False
+    edges = (point,) if not across else (point - normal * across / 2, point + normal * across / 2)
+    places = np.concatenate([_steps(layer, edge, normal, reach)[0] for layer in layers for edge in edges])
+    return not np.any(np.abs(places) > _ITSELF)
+
+
 def _ambiguity(copper: Layer, point: Float64, normal: Float64, reach: float) -> float:
     """Chance that another edge out of copper along the normal is nearer to the middle than the edge itself.
 
     An edge at a distance a from it is nearer where the board is shifted by more than a / 2 the other way.
     """
-    ends = point - 2 * reach * normal, point + 2 * reach * normal
-    found = copper.crossings(*ends)
-    cuts = np.unique(np.concatenate([np.array([0.0, 1.0]), *(where for _, where in found)]))
-    cuts = cuts[(cuts >= 0) & (cuts <= 1)]
-    laid = covered(found, (cuts[1:] + cuts[:-1]) / 2)
-    away = (cuts[1:-1][laid[:-1] & ~laid[1:]] - 0.5) * 4 * reach
-    away = np.abs(away[np.abs(away) > 2e-6])  # the edge itself is there, to a chord's sagitta
+    place, outwards = _steps(copper, point, normal, 2 * reach)
+    away = np.abs(place[outwards & (np.abs(place) > _ITSELF)])
     return float(min(1.0, np.sum((reach - away / 2) / (2 * reach))))
 
 

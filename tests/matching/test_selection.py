@@ -171,6 +171,15 @@ def test_repeated_edges_within_reach_are_ambiguous(tmp_path: Path, rng: np.rando
     assert not rulers.ambiguity[chosen].any()
 
 
+def test_edges_that_pull_at_each_other_are_left_out(tmp_path: Path) -> None:
+    artwork = board(tmp_path, (2, 10, 18, 10), (2, 10.5, 18, 10.5))
+    # 0.3 mm wide and 0.2 mm apart; 3 sqrt(5) blurs are 0.134 mm at 20 um, 0.268 mm at 40 um and 0.335 mm at 50 um.
+    fine, coarse, coarsest = (rulers_of(artwork, replace(IMAGING, pixel=each)) for each in (20e-6, 40e-6, 50e-6))
+    assert sorted(set(np.round(fine.point[:, 1] * 1e3, 6))) == pytest.approx([9.85, 10, 10.15, 10.35, 10.5, 10.65])
+    assert sorted(set(np.round(coarse.point[:, 1] * 1e3, 6))) == pytest.approx([9.85, 10.65])
+    assert len(coarsest.sigma) == 0
+
+
 def test_rulers_stay_on_their_edges_and_in_the_region_to_read(tmp_path: Path, rng: np.random.Generator) -> None:
     artwork = board(tmp_path, *CROSS, flashes=((5, 15), (15, 5)))
     rulers = rulers_of(artwork)
@@ -246,7 +255,7 @@ def test_refuses_what_makes_no_sense(tmp_path: Path) -> None:
 def test_finds_rulers_on_the_boards_of_three_tools(data: Path, name: str, rng: np.random.Generator) -> None:
     artwork = read_artwork(data / "gerber" / name)
     middle = artwork.bounds.mean(axis=0)
-    rulers = candidates(artwork, (middle - 12e-3, middle + 12e-3), middle, IMAGING)
+    rulers = candidates(artwork, (middle - 8e-3, middle + 8e-3), middle, IMAGING)
     found: Selection = select(rulers, IMAGING, 30)
     others = [
         np.sqrt(np.diag(covariance_of(rulers, rng.choice(len(rulers.sigma), 30, replace=False), IMAGING)))

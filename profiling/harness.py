@@ -38,6 +38,7 @@ OPERATIONS = (
     "tolerance",
     "field",
     "ruler",
+    "pose",
     "mitsuba",
     "launch",
     "stream",

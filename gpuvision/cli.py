@@ -56,6 +56,8 @@ def one_line(error: Exception) -> str:
 
 def main() -> None:
     """Run the command line; what goes wrong becomes a line on stderr and an exit code."""
+    # Threads of NumPy's BLAS wait for more work in a loop, for some 20 ms, on cores that kernels then lack.
+    os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
     before = signal.signal(signal.SIGTERM, _terminated)
     try:
         _run()

@@ -118,7 +118,9 @@ class DepthFromFocus:
         enough = known & (np.count_nonzero(lit, axis=-1) >= 3)
         safe = np.where(lit, light, 1.0)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            peak, curvature, spread = self._peak(np.log(safe), self._weights(safe, lit), lit, safe)
+            # Relative to the brightest: a common level would only add roundings, which small weights magnify.
+            log = np.log(safe / np.max(np.where(lit, light, 0.0), axis=-1, keepdims=True))
+            peak, curvature, spread = self._peak(log, self._weights(safe, lit), lit, safe)
             # In units of the spacing, from the middle of the pinholes.
             image = self.first + self.spacing * (peak + 0.5 * (count - 1))
             width = self.spacing * np.sqrt(-0.5 / curvature)

@@ -3,7 +3,7 @@
 The peer is branch-free and vectorised by LLVM over receivers, with a polynomial arc tangent, in single throughout; its
 error, like ours over the largest irradiance of the case and NaN on a device without double, stands in the column
 ``peer_error``. ``wall``: lines that run into a wall, all pairs face each other. ``board``: patches of boxes on a board.
-In these, segments lie alike, as on flat faces, and we make use of it; ``slopes`` has none that does, each
+In these, segments lie alike, as on flat faces, and we make use of it; ``closed-form-slopes`` has none that does, each
 line on a slope of its own, which is our worst case and nothing to the peer.
 """
 
@@ -78,7 +78,7 @@ def cases(device: Device) -> Iterator[Case]:
     yield _case(device, *_wall(64, 20_000), "closed-form/wall/64x20000")
     yield _case(device, *_wall(16, 100_000), "closed-form/wall/16x1e5")
     yield _case(device, *_board(20_000), "closed-form/board/64x20000")
-    yield _case(device, *_slopes(64, 20_000), "slopes/64x20000")
+    yield _case(device, *_slopes(64, 20_000), "closed-form-slopes/64x20000")
     yield from bounces.cases(device)
     yield from visible_light.cases(device)
 

@@ -303,9 +303,10 @@ def whole_grid(points: Float64, fewest: int, what: str) -> Int64:
     advice = f"expected at least {fewest} {what} on an even ground: check focus, exposure and what is in the picture"
     if len(points) < fewest:
         raise ValueError(f"{len(points) or 'no'} {what} found; {advice}")
+    no_grid = f"{len(points)} {what} found, but they lie on no grid; {advice}"
     pieces = charts(points, fewest)
     if not pieces:
-        raise ValueError(f"{len(points)} {what} found, but they lie on no grid; {advice}")
+        raise ValueError(no_grid)
     whole, apart = joined(pieces, points)
     large = [each for each in apart if len(each.members) > _WORTH_JOINING * len(whole.members)]
     if large:
@@ -314,4 +315,9 @@ def whole_grid(points: Float64, fewest: int, what: str) -> Int64:
             f"the grid broke into {len(large) + 1} parts of {counts} {what} with too wide a gap between them; "
             "uncover what lies between them, or crop the image to one part"
         )
-    return as_grid(whole, points)
+    grid = as_grid(whole, points)
+    known = grid >= 0
+    # A row of points is no grid: a step of each direction must have been seen somewhere.
+    if not ((known[1:] & known[:-1]).any() and (known[:, 1:] & known[:, :-1]).any()):
+        raise ValueError(no_grid)
+    return grid

@@ -25,6 +25,7 @@ from gpuvision.tables import finite
 Float64 = npt.NDArray[np.float64]
 
 _STEPS = 80
+_ROUNDINGS = 4.0 * np.finfo(np.float64).eps
 _HALF_ROOT = math.sqrt(0.5)
 
 
@@ -95,7 +96,10 @@ class PolygonMirror:
         x = np.asarray(position, dtype=np.float64)
         bounds = self.limits
         first, last = self._position(np.array(bounds))
-        reachable = (x >= first) & (x <= last)
+        # Where x folds it hardly changes with phi: `position` of a rotation inside may round to less than at the limit.
+        below, above = (_ROUNDINGS * (abs(end) + self.apothem) for end in (first, last))
+        reachable = (x >= first - below) & (x <= last + above)
+        x = np.clip(x, first, last)
         low, high = np.full_like(x, bounds[0]), np.full_like(x, bounds[1])
         # Without the polygon's own term this is the answer.
         phi = np.where(reachable, np.clip(0.5 * np.arctan(x / self.drop), *bounds), np.nan)
@@ -103,7 +107,8 @@ class PolygonMirror:
             excess = self._position(phi) - x
             high = np.where(excess > 0.0, phi, high)
             low = np.where(excess < 0.0, phi, low)
-            step = phi - excess / self.slope(phi)
+            with np.errstate(divide="ignore"):  # at a fold the slope is 0: such a step is not inside
+                step = phi - np.divide(excess, self.slope(phi), out=np.zeros_like(x), where=excess != 0.0)
             inside = (step >= low) & (step <= high)
             better = np.where(inside | ~reachable, step, 0.5 * (low + high))
             if np.array_equal(better, phi, equal_nan=True):

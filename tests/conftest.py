@@ -12,7 +12,7 @@ import pytest
 from gpuvision.host import Device
 from gpuvision.host.discovery import INSTALL_HINT
 
-# New draws in every run, without a clock, for a busy machine is no fault of the code; what fails prints how to repeat it.
+# New draws in every run; what fails prints how to repeat it. Without a clock: a busy machine is no fault of the code.
 hypothesis.settings.register_profile("unhurried", deadline=None, print_blob=True)
 hypothesis.settings.load_profile("unhurried")
 

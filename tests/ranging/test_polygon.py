@@ -72,7 +72,10 @@ def test_round_trip(ratio: float, facets: int, part: float, apothem: float) -> N
 
 
 def test_out_of_reach_has_no_rotation() -> None:
-    for mirror in (PolygonMirror(apothem=0.03, facets=12, height=0.2), PolygonMirror(apothem=1.0, facets=11, height=0.72)):
+    for mirror in (
+        PolygonMirror(apothem=0.03, facets=12, height=0.2),
+        PolygonMirror(apothem=1.0, facets=11, height=0.72),
+    ):
         low, high = mirror.position(mirror.limits)
         assert np.isnan(mirror.rotation([low - 1e-12, high + 1e-12])).all()
 

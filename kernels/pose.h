@@ -7,6 +7,7 @@
 #ifndef POSE_H
 #define POSE_H
 
+#include "least_squares.h"
 #include "robust.h"
 
 // FREEDOMS: 3, the board is rigid; 4, with a scale; 6, with scales along both axes and a shear.
@@ -34,8 +35,6 @@ typedef struct {
 typedef struct {
     reals row[FREEDOMS], residual;
 } pose_equation;
-
-#define READ(from, i) (*(private const reals_at *)((from) + (i)))
 
 inline laned_row row_of(pose_rows all, int i) {
     return (laned_row){READ(all.nx, i), READ(all.ny, i), READ(all.px, i),       READ(all.py, i),
@@ -90,10 +89,6 @@ inline laned_pose pose_after(laned_pose pose, private const reals *step) {
     return next;
 }
 
-// Triangles of a symmetric matrix, row by row: (0, 0), (1, 0), (1, 1), ...
-#define TRIANGLE (FREEDOMS * (FREEDOMS + 1) / 2)
-#define CELL(row, column) ((row) * ((row) + 1) / 2 + (column))
-
 inline void add_equation(pose_equation equation, reals weight, private reals *matrix, private reals *right) {
     for (int i = 0; i < FREEDOMS; i++) {
         const reals weighted = weight * equation.row[i];
@@ -102,53 +97,13 @@ inline void add_equation(pose_equation equation, reals weight, private reals *ma
     }
 }
 
-// Cholesky: the matrix becomes its factor, with the diagonal's inverse on the diagonal. Returns where it has none.
-inline masks factored(private reals *matrix) {
-    masks bad = 0;
-    for (int i = 0; i < FREEDOMS; i++) {
-        const reals diagonal = matrix[CELL(i, i)];
-        for (int j = 0; j <= i; j++) {
-            reals sum = matrix[CELL(i, j)];
-            for (int k = 0; k < j; k++) sum -= matrix[CELL(i, k)] * matrix[CELL(j, k)];
-            if (j < i) matrix[CELL(i, j)] = sum * matrix[CELL(j, j)];
-            else {
-                const masks none = mask_of(!(sum > diagonal * (reals)(8 * REAL_EPSILON)));
-                bad |= none;
-                matrix[CELL(i, i)] = (reals)1 / sqrt(none ? (reals)1 : sum);
-            }
-        }
-    }
-    return bad;
-}
-
-inline void solved(private const reals *factor, private const reals *right, private reals *solution) {
-    for (int i = 0; i < FREEDOMS; i++) {
-        reals sum = right[i];
-        for (int k = 0; k < i; k++) sum -= factor[CELL(i, k)] * solution[k];
-        solution[i] = sum * factor[CELL(i, i)];
-    }
-    for (int i = FREEDOMS - 1; i >= 0; i--) {
-        reals sum = solution[i];
-        for (int k = i + 1; k < FREEDOMS; k++) sum -= factor[CELL(k, i)] * solution[k];
-        solution[i] = sum * factor[CELL(i, i)];
-    }
-}
-
 #ifdef STRIP
 #define GATHERED(from, at)                                                                                             \
     (reals)((from)[(at)[0]], (from)[(at)[1]], (from)[(at)[2]], (from)[(at)[3]], (from)[(at)[4]], (from)[(at)[5]],        \
             (from)[(at)[6]], (from)[(at)[7]], (from)[(at)[8]], (from)[(at)[9]], (from)[(at)[10]], (from)[(at)[11]],      \
             (from)[(at)[12]], (from)[(at)[13]], (from)[(at)[14]], (from)[(at)[15]])
-inline real sum_of(reals value) {
-    const real8 a = value.lo + value.hi;
-    const real4 b = a.lo + a.hi;
-    return (b.x + b.y) + (b.z + b.w);
-}
-#define FIRST(value) (value).s0
 #else
 #define GATHERED(from, at) ((from)[(at)[0]])
-inline real sum_of(reals value) { return value; }
-#define FIRST(value) (value)
 #endif
 
 // How badly each lane's pose does: the loss at the scale that is known, or the median of the residuals to a percent.

@@ -413,21 +413,11 @@ __attribute__((always_inline)) inline masks ruler_add(global const CODE *image, 
     return flags;
 }
 
-// 16 rulers from the one given on, `stride` numbers apart, one in each lane: fills edges[MOST]. There are `count`;
-// lanes past them do the last one again.
-inline void ruler_measure(global const CODE *image, int rows, int columns, global const real *rulers, uint stride,
-                          uint count, constant real *table, constant real *model, private ruler_edge *edges) {
-    real given[4][LANES];
-    for (uint lane = 0; lane < LANES; lane++) {
-        const real4 one = vload4(0, rulers + stride * (ulong)min(lane, count - 1));
-        given[0][lane] = one.x;
-        given[1][lane] = one.y;
-        given[2][lane] = one.z;
-        given[3][lane] = one.w;
-    }
+// 16 rulers, one in each lane: fills edges[MOST].
+inline void ruler_measure_lanes(global const CODE *image, int rows, int columns, reals x, reals y, reals cosine,
+                                reals sine, constant real *table, constant real *model, private ruler_edge *edges) {
     ruler_place place;
-    masks flags = ruler_lay(rows, columns, vload16(0, given[0]), vload16(0, given[1]), vload16(0, given[2]),
-                            vload16(0, given[3]), table, &place);
+    masks flags = ruler_lay(rows, columns, x, y, cosine, sine, table, &place);
     reals profile[LENGTH + RULER_STRIDE];
     for (int i = 0; i < LENGTH; i += RULER_STRIDE) {
         for (int k = 0; k < RULER_STRIDE; k++) profile[i + k] = 0;
@@ -438,6 +428,21 @@ inline void ruler_measure(global const CODE *image, int rows, int columns, globa
     for (int i = 0; i < LENGTH; i++) flags |= ruler_judge_sum(profile[i]);
 #endif
     ruler_find(profile, flags, table, edges);
+}
+
+// 16 rulers from the one given on, `stride` numbers apart. There are `count`; lanes past them do the last one again.
+inline void ruler_measure(global const CODE *image, int rows, int columns, global const real *rulers, uint stride,
+                          uint count, constant real *table, constant real *model, private ruler_edge *edges) {
+    real given[4][LANES];
+    for (uint lane = 0; lane < LANES; lane++) {
+        const real4 one = vload4(0, rulers + stride * (ulong)min(lane, count - 1));
+        given[0][lane] = one.x;
+        given[1][lane] = one.y;
+        given[2][lane] = one.z;
+        given[3][lane] = one.w;
+    }
+    ruler_measure_lanes(image, rows, columns, vload16(0, given[0]), vload16(0, given[1]), vload16(0, given[2]),
+                        vload16(0, given[3]), table, model, edges);
 }
 #else
 inline real ruler_sum(global const CODE *image, const ruler_place *place, int pitch, int i, constant real *table,

@@ -20,6 +20,7 @@ from gpuvision.ranging.export import read_npz
 from gpuvision.sensor import Sensor
 from gpuvision.simulate import part_of, prepare, simulate
 from gpuvision.simulation.masks import Mask
+from gpuvision.simulation.readings import PATHS
 from gpuvision.simulation_blocks import PROFILES_PER_BLOCK, BlockStore, compute_missing
 
 MM = 1e-3
@@ -211,6 +212,7 @@ def test_the_command(
     capsys.readouterr()
     for wrong, line in [
         (["--paths", "direct,sideways"], "unknown path 'sideways'"),
+        (["--paths", ""], "lack 'direct'"),
         (["--mask", str(tmp_path / "none.txt")], "none.txt"),
         (["--mask", str(tmp_path / "mm.stl")], "mm.stl: expected two numbers a line"),
         (["--materials", str(tmp_path / "none.toml")], "none.toml"),
@@ -258,3 +260,19 @@ def test_a_second_sensor_sees_what_is_hidden_from_the_first(
     # Behind the block each one alone misses as much as the other.
     assert ranked["both"] < 0.5 * min(ranked["first"], ranked["second"])
     assert (tmp_path / "second" / "errors.png").stat().st_size > 1000
+
+
+def test_a_wrong_second_sensor_costs_no_light(
+    part_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(part_file), "--sensor", "psd_line", "--out", str(tmp_path), "--profiles", "1"]
+    for second, line in [("nowhere.toml", "nowhere.toml"), ("corner_scene", "straight transport")]:
+        assert command(monkeypatch, *words, "--second", second) == 1
+        assert line in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_all_paths_by_one_word(part_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = [str(part_file), "--sensor", "psd_line", "--out", str(tmp_path), "--profiles", "1"]
+    assert command(monkeypatch, *words, "--paths", "all") == 0
+    assert json.loads((tmp_path / "report.json").read_text())["paths"] == list(PATHS)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import typer
+
+DeviceLabel = Annotated[str | None, typer.Option(help="Label of an OpenCL device, see `gpuvision devices`.")]
 
 
 def named_path(text: str | Path) -> Path:

@@ -44,47 +44,52 @@ class Outliers(StrEnum):
     tukey = "tukey"
 
 
+Images = Annotated[
+    list[Path], typer.Argument(metavar="IMAGES...", parser=named_path, help="From one camera, all of one size.")
+]
+LensFile = Annotated[
+    Path,
+    typer.Option(
+        metavar="FILE.toml",
+        parser=named_path,
+        help="The lens file; its report (.json) and picture (.png) beside it.",
+    ),
+]
+Pattern = Annotated[Seen, typer.Option(help="What the images show: a grid of dots, a chessboard, or crossing lines.")]
+Method = Annotated[
+    Way,
+    typer.Option(
+        help="lines: the lens alone, from what should be straight, from one image on. views: focal length, centre, "
+        "lens and tilt of the sensor. auto: views where three images show a grid or --focal-length is given."
+    ),
+]
+Model = Annotated[
+    str,
+    typer.Option(
+        help="auto: the smallest model that the data do not refuse. lines: none, k1 or k1,k2. "
+        "views: names out of k1,k2,p1,p2,k3,tilt."
+    ),
+]
+Inner = Annotated[
+    str | None, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the chessboard, such as 9x6.")
+]
+Pitch = Annotated[float, typer.Option(min=1e-9, help="Distance of neighbours on the pattern in metres, for the poses.")]
+FocalLength = Annotated[
+    float | None, typer.Option(help="Focal length in pixels, where it is known: one view then suffices.")
+]
+Loss = Annotated[Outliers, typer.Option(help="huber and tukey give points that lie far off less weight, or none.")]
+
+
 def calibrate(
-    images: Annotated[
-        list[Path], typer.Argument(metavar="IMAGES...", parser=named_path, help="From one camera, all of one size.")
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="FILE.toml",
-            parser=named_path,
-            help="The lens file; its report (.json) and picture (.png) beside it.",
-        ),
-    ],
-    pattern: Annotated[
-        Seen, typer.Option(help="What the images show: a grid of dots, a chessboard, or crossing lines.")
-    ] = (Seen.dots),
-    method: Annotated[
-        Way,
-        typer.Option(
-            help="lines: the lens alone, from what should be straight, from one image on. views: focal length, centre, "
-            "lens and tilt of the sensor. auto: views where three images show a grid or --focal-length is given."
-        ),
-    ] = Way.auto,
-    model: Annotated[
-        str,
-        typer.Option(
-            help="auto: the smallest model that the data do not refuse. lines: none, k1 or k1,k2. "
-            "views: names out of k1,k2,p1,p2,k3,tilt."
-        ),
-    ] = "auto",
-    inner: Annotated[
-        str | None, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the chessboard, such as 9x6.")
-    ] = None,
-    pitch: Annotated[
-        float, typer.Option(min=1e-9, help="Distance of neighbours on the pattern in metres, for the poses.")
-    ] = 1.0,
-    focal_length: Annotated[
-        float | None, typer.Option(help="Focal length in pixels, where it is known: one view then suffices.")
-    ] = None,
-    loss: Annotated[
-        Outliers, typer.Option(help="huber and tukey give points that lie far off less weight, or none.")
-    ] = Outliers.squared,
+    images: Images,
+    out: LensFile,
+    pattern: Pattern = Seen.dots,
+    method: Method = Way.auto,
+    model: Model = "auto",
+    inner: Inner = None,
+    pitch: Pitch = 1.0,
+    focal_length: FocalLength = None,
+    loss: Loss = Outliers.squared,
 ) -> None:
     """Calibrate a lens, or a camera with a tilted sensor, from images of a flat pattern.
 

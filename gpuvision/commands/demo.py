@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gpuvision.commands.arguments import named_path
+from gpuvision.commands.arguments import DeviceLabel, named_path
 
 
 def demo(
@@ -17,7 +17,7 @@ def demo(
         Path, typer.Option(metavar="DIR", parser=named_path, help="Folder for recordings, range images and pictures.")
     ] = Path("out/demo"),
     seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 1,
-    device: Annotated[str | None, typer.Option(help="Label of an OpenCL device, see `gpuvision devices`.")] = None,
+    device: DeviceLabel = None,
 ) -> None:
     """Record a part with a camera and with PSD strips, scan both recordings, and compare with the truth.
 

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.commands.arguments import named_path
+from gpuvision.commands.arguments import DeviceLabel, named_path
 
 
 class Arithmetic(StrEnum):
@@ -29,42 +29,44 @@ class NoRoom(StrEnum):
     stop = "raise"
 
 
+Recording = Annotated[
+    Path,
+    typer.Argument(
+        metavar="INPUT",
+        parser=named_path,
+        help="Of a camera: a video, a TIFF stack, a folder of images, an NPY array (frames, rows, columns). "
+        "Of a PSD: an NPY array (frames, strips, 2).",
+    ),
+]
+SensorFile = Annotated[
+    str, typer.Option(help="The sensor's TOML file, or one that comes along: camera_line, corner_scene, psd_line.")
+]
+Results = Annotated[
+    Path,
+    typer.Option(metavar="DIR", parser=named_path, help="Folder for the range image, the pictures and report.json."),
+]
+Rate = Annotated[float | None, typer.Option(help="Replay at so many frames per second, as a sensor would send them.")]
+RoomPolicy = Annotated[
+    NoRoom | None,
+    typer.Option(help="Where no room is left for a frame: it waits; the oldest is given up (so with --rate); stop."),
+]
+TraceFile = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", parser=named_path, help="Timeline for chrome://tracing or ui.perfetto.dev."),
+]
+
+
 def scan(
-    recording: Annotated[
-        Path,
-        typer.Argument(
-            metavar="INPUT",
-            parser=named_path,
-            help="Of a camera: a video, a TIFF stack, a folder of images, an NPY array (frames, rows, columns). "
-            "Of a PSD: an NPY array (frames, strips, 2).",
-        ),
-    ],
-    sensor: Annotated[
-        str, typer.Option(help="The sensor's TOML file, or one that comes along: camera_line, corner_scene, psd_line.")
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="DIR", parser=named_path, help="Folder for the range image, the pictures and report.json."
-        ),
-    ],
-    device: Annotated[str | None, typer.Option(help="Label of an OpenCL device, see `gpuvision devices`.")] = None,
+    recording: Recording,
+    sensor: SensorFile,
+    out: Results,
+    device: DeviceLabel = None,
     precision: Annotated[
         Arithmetic | None, typer.Option(help="Of the arithmetic; otherwise as the recording has it.")
     ] = None,
-    rate: Annotated[
-        float | None, typer.Option(help="Replay at so many frames per second, as a sensor would send them.")
-    ] = None,
-    policy: Annotated[
-        NoRoom | None,
-        typer.Option(
-            help="Where no room is left for a frame: it waits; the oldest is given up (so with --rate); stop."
-        ),
-    ] = None,
-    trace: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", parser=named_path, help="Timeline for chrome://tracing or ui.perfetto.dev."),
-    ] = None,
+    rate: Rate = None,
+    policy: RoomPolicy = None,
+    trace: TraceFile = None,
 ) -> None:
     """Scan a recording: range image, pictures and a report in DIR.
 

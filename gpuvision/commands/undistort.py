@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.commands.arguments import named_path
+from gpuvision.commands.arguments import DeviceLabel, named_path
 from gpuvision.commands.scan import progress_bar
 
 
@@ -51,7 +51,7 @@ def undistort(
         str | None,
         typer.Option(metavar="COLUMN,ROW,COLUMNS,ROWS", help="The part of the ideal images to make; else all."),
     ] = None,
-    device: Annotated[str | None, typer.Option(help="Label of an OpenCL device, see `gpuvision devices`.")] = None,
+    device: DeviceLabel = None,
 ) -> None:
     """Undo a lens in images and in points.
 

@@ -1,0 +1,334 @@
+"""Marks located to a fraction of a pixel: vias, fiducials and pads near places where they are expected.
+
+Rulers lie across the contour of the expected mark, each finds an edge, and a robust fit of the shape through the edges
+gives the mark's centre, size and angle with their covariance:
+
+    operation = FindBlobs(threshold=20.0, shape="circle", polarity="bright", search_px=6.0)
+    blobs = operation(image, places)  # places: float32 (n, 3): x, y, radius [px]
+    good = blobs.status == 0
+    centres = np.stack([blobs.x, blobs.y], axis=-1)[good]
+    covariances = blobs.covariance[good, :2, :2]
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device, Launch, Operation, Walk, in_strips
+from gpuvision.matching.losses import efficiency, loss_defines
+from gpuvision.matching.ruler import RulerEdges
+from gpuvision.tables import finite
+
+Shape = Literal["circle", "ring", "square", "cross"]
+Contrast = Literal["bright", "dark", "either"]
+
+SHAPES = ("circle", "ring", "square", "cross")
+CONTRASTS = ("bright", "dark", "either")
+BEND = 6.0  # of Tukey's loss [sigma]: 98 % efficient
+MOST_SPOKES = 256
+_LANES, _GROUP = 16, 64
+_SHARES_PER_CORE = 4  # keep the cores even
+_ALONE = 8  # marks that the caller's thread does sooner than it wakes another
+_REAL = np.dtype(np.float32)
+# Of rulers across a mark's edge: polarity along the ruler, which leaves the mark's area.
+_POLARITIES: dict[str, Literal["falling", "rising", "any"]] = {"bright": "falling", "dark": "rising", "either": "any"}
+
+
+class Blobs(NamedTuple):
+    """What was found at each place, arrays of shape (n,) unless said otherwise; all are NaN unless the mark is trusted.
+
+    Attributes
+    ----------
+    x, y
+        Centre [px].
+    shift
+        (n, 2) the centre relative to the nominal place [px]: the same, with more digits.
+    size
+        Radius of a circle, outer radius of a ring, half of a square's side or of a cross's length [px].
+    angle
+        Of squares and crosses [rad], from x towards y, near the nominal one; None for round marks.
+    covariance
+        (n, 3, 3) of x, y, size; of squares and crosses (n, 4, 4) with the angle [px, rad]. The noise of the edges as
+        it is predicted, or as they differ from the shape, whichever is more.
+    residual
+        Root mean square distance of the edges from the shape [px], as they weigh in the fit.
+    inliers
+        int32, how many edges the fit has; 0 where there is none.
+    symmetry
+        How well opposite edges agree, 0 to 1: the mean over all rulers of the root of the weights of an edge and the
+        one opposite, times the ratio of their heights. 1 for an undisturbed mark, lower by the share that is hidden.
+    gravity_x, gravity_y
+        Centre of gravity of what differs from the background, a second estimate [px]: of the grey levels within the
+        found contour and its blur, less their mean in a ring of 2 px about that. NaN also where the ring leaves the
+        image.
+    distance
+        From the nominal place [px].
+    contrast
+        Grey levels of the mark above its background.
+    blur
+        Standard deviation of the edges' blur [px], that of the bilinear samples (0.4 px on average) included.
+    status
+        uint8 `Status` flags. DARK: too few rulers found an edge over the threshold, of the polarity, within the search
+        radius. OUT_OF_RANGE: too many rulers leave the image, or the mark lies further than the search radius from its
+        nominal place. NOT_FINITE: a place or radius is not finite, the radius not above 0, or too many pixels are not
+        finite. AMBIGUOUS: too few of the edges agree on one shape. With a value: SATURATED (a ruler of the fit has
+        reached the saturation).
+    """
+
+    x: Any
+    y: Any
+    shift: Any
+    size: Any
+    angle: Any
+    covariance: Any
+    residual: Any
+    inliers: Any
+    symmetry: Any
+    gravity_x: Any
+    gravity_y: Any
+    distance: Any
+    contrast: Any
+    blur: Any
+    status: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class FindBlobs(Operation[Blobs]):
+    """Marks near their nominal places: ``op(image, places) -> Blobs``.
+
+    Takes a uint8, uint16 or float32 image (rows, columns), 16 columns or more, and float32 places: (n, 3) x, y and
+    radius of circles and rings, (n, 4) x, y, half side or half length, and angle [rad] of squares and crosses [px].
+
+    Parameters
+    ----------
+    threshold
+        Least height of an edge [grey levels]: that of a sharp step of the same greatest gradient.
+    shape
+        ``"circle"``, ``"ring"`` (two concentric edges), ``"square"``, ``"cross"`` (two bars of equal length and width).
+    ratio
+        Of a ring: inner radius to outer radius; of a cross: width to length of a bar.
+    polarity
+        Whether marks are ``"bright"``, ``"dark"``, or ``"either"``, each for itself.
+    search_px
+        How far from its nominal place a mark may be, and an edge from the nominal contour.
+    spokes
+        Rulers of a mark, a multiple of 4 (of a ring 8), evenly over its contour.
+    width
+        Lines averaged by a ruler, a pixel apart. All of the contour is used where spokes times width is as long as it
+        is; more than a third of the radius blurs the edge.
+    smoothing_px
+        Of the edges; `best_smoothing` of the blur is the optimum where the mark is wide enough: less than half its
+        radius (of rings and crosses half the width of the bar).
+    passes
+        How often rulers are laid, at most: again where the mark was found more than 0.1 px from where they were.
+    agreement
+        Share of the rulers whose edges must agree on the shape.
+    saturation
+        Level at which a sample is saturated; None does not look.
+    noise
+        Standard deviation of a pixel [grey levels]; the rounding of integer images comes on top of it.
+    count
+        Marks, n. None follows the places of a call; `bind` needs it.
+    walk
+        "strip" (16 rulers at a time, for CPU runtimes), "item" (a work-group per mark, for GPUs), or "auto".
+
+    Raises
+    ------
+    TypeError
+        A parameter is no number, or a count no whole one.
+    ValueError
+        A parameter is out of its range.
+
+    Notes
+    -----
+    The fit starts at the nominal place with a reach of twice the search radius and halves it from step to step
+    (Gauss-Newton, Tukey's weights), down to a pixel; the last steps have the scale of the residuals, from their median.
+    Whatever place a later pass starts from, edges further than the search radius from the *nominal* contour are left
+    out: it cannot walk away to another mark.
+
+    A blurred edge of radius R is seen at sqrt(R^2 - v) to second order, v the variance of the blur and of the averaged
+    lines: the mean of sqrt(R^2 - u^2) over u across the ruler. The radius is corrected for that, with the mean blur of
+    the mark's own edges.
+    """
+
+    Result: ClassVar[type[Any]] = Blobs
+
+    threshold: float
+    shape: Shape = "circle"
+    ratio: float = 0.5
+    polarity: Contrast = "bright"
+    search_px: float = 6.0
+    spokes: int = 32
+    width: int = 3
+    smoothing_px: float = 1.5
+    passes: int = 2
+    agreement: float = 0.5
+    saturation: float | None = None
+    noise: float = 1.0
+    count: int | None = None
+    walk: Walk = "auto"
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("shape", SHAPES), ("polarity", CONTRASTS)):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"FindBlobs.{name} is {getattr(self, name)!r}, expected one of {', '.join(allowed)}")
+        for name, low, high in (("ratio", 0.0, 1.0), ("agreement", 0.0, 1.0), ("search_px", 0.0, 200.0)):
+            if not low < finite(getattr(self, name), f"FindBlobs.{name}") < high:
+                raise ValueError(f"FindBlobs.{name} is {getattr(self, name)}, expected a number in ({low:g}, {high:g})")
+        multiple = 8 if self.shape == "ring" else 4
+        for name, least, most, of in (("spokes", 8, MOST_SPOKES, multiple), ("passes", 1, 10, 1)):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool):
+                raise TypeError(f"FindBlobs.{name} must be a whole number, got {value!r}")
+            if not least <= value <= most or value % of:
+                raise ValueError(f"FindBlobs.{name} is {value}, expected {least} to {most}, a multiple of {of}")
+        self._ruler()
+
+    def _ruler(self) -> RulerEdges:
+        """Return what finds the edges; it checks the other parameters."""
+        ruler = RulerEdges(
+            threshold=self.threshold,
+            length=511,
+            width=self.width,
+            smoothing_px=self.smoothing_px,
+            polarity=_POLARITIES[self.polarity],
+            saturation=self.saturation,
+            noise=self.noise,
+            walk=self.walk,
+            count=self.count,
+        )
+        return replace(ruler, length=2 * (math.ceil(self.search_px) + math.ceil(3.0 * self.smoothing_px)) + 3)
+
+    def __call__(self, *inputs: Any, device: Device | None = None, out: Blobs | None = None) -> Blobs:
+        """Run once, as every `Operation`; with ``count=None`` for as many marks as there are places."""
+        if self.count is None and len(inputs) == 2 and getattr(inputs[1], "ndim", 0) == 2:
+            return replace(self, count=len(inputs[1]))(*inputs, device=device, out=out)
+        return super().__call__(*inputs, device=device, out=out)
+
+    @property
+    def _round(self) -> bool:
+        return self.shape in ("circle", "ring")
+
+    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        if self.count is None:
+            raise ValueError("FindBlobs.count is None; to bind it say how many marks there will be")
+        edges = self._ruler()._launch(device, shape, dtype)
+        if shape[1] < _LANES:
+            raise ValueError(f"FindBlobs takes images of {_LANES} columns or more, got shape {shape}")
+        strip = in_strips(self.walk, device)
+        each = max(-(-self.count // (_SHARES_PER_CORE * device.handle.max_compute_units)), 1)
+        freedoms = 3 if self._round else 4
+        one, layout = ((self.count,), _REAL), self._layout()
+        fields = dict.fromkeys(Blobs._fields, one) | {
+            "shift": ((self.count, 2), _REAL),
+            "angle": None if self._round else one,
+            "covariance": ((self.count, freedoms, freedoms), _REAL),
+            "inliers": ((self.count,), np.dtype(np.int32)),
+            "status": ((self.count,), np.dtype(np.uint8)),
+        }
+        numbers = ((self.width**2 - 1) / 12.0, self._overlap(layout), self._extent())
+        least = max(math.ceil(self.agreement * self.spokes), freedoms + 1)
+        return Launch(
+            stem="blob",
+            kernel="find_blobs",
+            defines=dict(edges.defines) | self._defines(freedoms),
+            inputs=[(shape, dtype), ((self.count, freedoms), _REAL)],
+            outputs=fields,
+            arguments=[
+                edges.arguments[0],
+                layout.astype(_REAL),
+                *map(np.int32, shape),
+                np.uint32(self.count),
+                np.uint32(each),
+                np.float32(self.search_px),
+                np.int32(least),
+                *map(np.float32, numbers),
+            ],
+            global_size=(-(-self.count // each),) if strip else (self.count * _GROUP,),
+            local_size=(1,) if strip else (_GROUP,),
+            passes_once=strip and self.count <= _ALONE,
+        )
+
+    def _defines(self, freedoms: int) -> dict[str, Any]:
+        defines: dict[str, Any] = dict(loss_defines("tukey", BEND)) | {"EFFICIENCY": efficiency("tukey", BEND)}
+        defines |= {"FREEDOMS": freedoms, "SPOKES": self.spokes, "ROOM": -(-self.spokes // _LANES) * _LANES}
+        defines |= {"PASSES": self.passes}
+        present = {"ROUND": self._round, "EITHER": self.polarity == "either"}
+        return defines | {name: None for name, is_present in present.items() if is_present}
+
+    def _layout(self) -> npt.NDArray[np.float64]:
+        """Return the table of ``blob.cl``: six rows; rulers k and k + spokes / 2 are opposite."""
+        half = _half_layout(self.shape, self.ratio, self.spokes // 2)
+        base, normal = (np.concatenate([each, -each]) for each in half)
+        height = np.abs(np.sum(base * normal, axis=-1))
+        rows = np.concatenate([base.T, normal.T, [height, np.ones(self.spokes)]])
+        fill = -self.spokes % _LANES
+        padded = np.pad(rows, ((0, 0), (0, fill)), mode="edge")
+        padded[-1, self.spokes :] = 0.0
+        return padded
+
+    def _overlap(self, layout: npt.NDArray[np.float64]) -> float:
+        """Return the size of a mark below which neighbouring rulers see the same noise."""
+        length = {"circle": 2.0 * math.pi, "ring": 2.0 * math.pi * (1.0 + self.ratio)}.get(self.shape)
+        if length is None:
+            length = 4.0 * 2.0 * _SIDE if self.shape == "square" else 4.0 * self._arm_length()
+        # Lines share noise with their neighbours: of the average of so many, 1/variance in pixels.
+        lines = self.width**2 / (self.width - 1.0 / 3.0)
+        return self.spokes * lines / length
+
+    def _arm_length(self) -> float:
+        return _END * 2.0 * self.ratio + 2.0 * _FLANK * (1.0 - self.ratio)
+
+    def _extent(self) -> float:
+        """Return the farthest point of a mark of size 1."""
+        return {"square": math.sqrt(2.0), "cross": math.hypot(1.0, self.ratio)}.get(self.shape, 1.0)
+
+
+# Which part of a straight edge has rulers: corners bend what is near them.
+_SIDE, _END, _FLANK = 0.7, 0.5, 0.5
+
+
+def _spread(count: int) -> npt.NDArray[np.float64]:
+    """Return so many places evenly over -1 to 1."""
+    return (2.0 * np.arange(count) + 1.0) / count - 1.0
+
+
+def _half_layout(shape: str, ratio: float, count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return centres and directions of the rulers of half a mark of size 1."""
+    if shape == "circle":
+        directions = _circle(np.arange(count) * math.pi / count)
+        return directions, directions
+    if shape == "ring":
+        outer, inner = (
+            _circle(np.arange(count // 2) * 2.0 * math.pi / count),
+            _circle((np.arange(count // 2) + 0.5) * 2.0 * math.pi / count),
+        )
+        return np.concatenate([outer, ratio * inner]), np.concatenate([outer, -inner])
+    arm = _side(count // 2) if shape == "square" else _arm(ratio, count // 2)
+    turned = [np.stack([-each[:, 1], each[:, 0]], axis=-1) for each in arm]
+    return np.concatenate([arm[0], turned[0]]), np.concatenate([arm[1], turned[1]])
+
+
+def _circle(angle: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _side(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    along = _SIDE * _spread(count)
+    return np.stack([np.ones(count), along], axis=-1), np.tile([1.0, 0.0], (count, 1))
+
+
+def _arm(ratio: float, count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return rulers across the end and the two flanks of the arm along x."""
+    flank = max(round(0.375 * count), 0 if count < 3 else 1)
+    end = count - 2 * flank
+    out = 0.5 * (1.0 + ratio) + 0.5 * (1.0 - ratio) * _FLANK * _spread(flank)
+    base = [(1.0, each) for each in ratio * _END * _spread(end)]
+    base += [(each, side * ratio) for side in (1.0, -1.0) for each in out]
+    normal = [(1.0, 0.0)] * end + [(0.0, 1.0)] * flank + [(0.0, -1.0)] * flank
+    return np.array(base), np.array(normal)

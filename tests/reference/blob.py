@@ -1,0 +1,55 @@
+"""Images of marks in float64, by the exact profile of a blurred disc and by products of blurred edges."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import i1e, ndtr
+
+Float64 = NDArray[np.float64]
+
+
+def disc_profile(radius: float, blur: float) -> tuple[Float64, Float64]:
+    """Return distances from the centre and the levels there, of a disc of 1 on 0 blurred by a Gaussian.
+
+    Its slope is (R / s^2) exp(-(r^2 + R^2) / (2 s^2)) I1(r R / s^2); the levels are the sum of it from outside.
+    """
+    r = np.linspace(0.0, radius + 8.0 * blur + 1.0, 20001)
+    slope = radius / blur**2 * np.exp(-((r - radius) ** 2) / (2.0 * blur**2)) * i1e(r * radius / blur**2)
+    parts = 0.5 * (slope[1:] + slope[:-1]) * np.diff(r)
+    return r, np.concatenate([np.cumsum(parts[::-1])[::-1], [0.0]])
+
+
+def disc(shape: tuple[int, int], x: float, y: float, radius: float, blur: float) -> Float64:
+    """Return levels 0 to 1 of a blurred disc."""
+    row, column = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+    r, level = disc_profile(radius, blur)
+    return np.interp(np.hypot(column - x, row - y), r, level, right=0.0)
+
+
+def ring(shape: tuple[int, int], x: float, y: float, radius: float, ratio: float, blur: float) -> Float64:
+    """Return levels of a blurred ring."""
+    return disc(shape, x, y, radius, blur) - disc(shape, x, y, ratio * radius, blur)
+
+
+def bar(shape: tuple[int, int], x: float, y: float, angle: float, long: float, wide: float, blur: float) -> Float64:
+    """Return levels of a blurred rectangle, ``long`` and ``wide`` to either side of its centre."""
+    row, column = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    u, v = (column - x) * cosine + (row - y) * sine, (row - y) * cosine - (column - x) * sine
+    along = ndtr((u + long) / blur) - ndtr((u - long) / blur)
+    return np.asarray(along * (ndtr((v + wide) / blur) - ndtr((v - wide) / blur)))
+
+
+def square(shape: tuple[int, int], x: float, y: float, half: float, angle: float, blur: float) -> Float64:
+    """Return levels of a blurred square."""
+    return bar(shape, x, y, angle, half, half, blur)
+
+
+def cross(shape: tuple[int, int], x: float, y: float, half: float, angle: float, ratio: float, blur: float) -> Float64:
+    """Return levels of a blurred cross: two bars less what both have."""
+    wide = ratio * half
+    bars = bar(shape, x, y, angle, half, wide, blur) + bar(shape, x, y, angle, wide, half, blur)
+    return bars - bar(shape, x, y, angle, wide, wide, blur)

@@ -274,7 +274,17 @@ def test_poses_are_of_least_cost(device: Device, rng: np.random.Generator) -> No
         start = (pose + rng.uniform(-1.0, 1.0, 3) * [0.1, 0.1, 0.05]).astype(np.float32)
         fit = RefinePoses(map=field_map)(points, start[None], device=device)
         expected = reference.refined(field_map.field, start, points.astype(np.float64), field_map.scale)
-        np.testing.assert_allclose(off(fit.poses[0], expected), 0.0, atol=3e-5)
+        # Where two lines are as near as one another the cost has an edge, at which SciPy stops now and then: then it
+        # may not be better, and finds nothing better from the pose that was found.
+        least, other = (
+            reference.cost(field_map.field, each, points.astype(np.float64), field_map.scale)
+            for each in (fit.poses[0], expected)
+        )
+        assert least <= other + 1e-8
+        if other < least + 1e-6:
+            np.testing.assert_allclose(off(fit.poses[0], expected), 0.0, atol=3e-5)
+        again = reference.refined(field_map.field, fit.poses[0], points.astype(np.float64), field_map.scale)
+        np.testing.assert_allclose(off(fit.poses[0], again), 0.0, atol=3e-5)
         exact = reference.cost(field_map.field, expected, points.astype(np.float64), field_map.scale)
         assert fit.score[0] == pytest.approx(exact, abs=2e-6)
 

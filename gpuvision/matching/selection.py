@@ -94,6 +94,8 @@ class Candidates(NamedTuple):
         that are all equally likely; 0 where none is in reach.
     source
         (n,) the same number for rulers on one trace, or on one side of a land.
+    spacing
+        (n,) of the two edges of a pair, as drawn [m]; 0 at a single edge.
     placement
         (2,) [m] the point whose pose counts.
     """
@@ -105,6 +107,7 @@ class Candidates(NamedTuple):
     length: Float64
     ambiguity: Float64
     source: npt.NDArray[np.int64]
+    spacing: Float64
     placement: Float64
 
     def pixels(self, imaging: Imaging) -> Float64:
@@ -189,7 +192,7 @@ def candidates(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike
     ]
     source = np.array([row[4] for row in rows], dtype=np.int64)
     length = 2 * (reach + tails) + across
-    return Candidates(point, normal, sigma, pair, length, np.array(ambiguity, dtype=np.float64), source, place)
+    return Candidates(point, normal, sigma, pair, length, np.array(ambiguity, dtype=np.float64), source, across, place)
 
 
 _Row = tuple[Float64, Float64, float, bool, int]

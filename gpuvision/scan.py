@@ -8,12 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import secrets
-import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -23,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device, Operation, Precision
+from gpuvision.host.files import check_file, whole_folder
 from gpuvision.host.pipeline import Pipeline, Policy
 from gpuvision.host.plan import plan
 from gpuvision.host.recordings import open_recording
@@ -221,27 +218,16 @@ def scan(
     OSError
         The timeline cannot be written there.
     """
-    if trace is not None:
-        check_file(trace)
+    timeline = None if trace is None else _Timeline(trace)
     source, name = _opened(recording, sensor)
     sensor.check_frame(source.shape, name)
     readout = _asking_for(sensor, precision)
-    operation: Operation[Any] = readout
     device = Device.best() if device is None else device
-    setup: dict[str, Any] = {"policy": policy or "block"}
-    paced = source
-    if rate is not None:
-        paced = PacedSource(source, rate)
-        fitting = plan(paced, operation, device=device)
-        setup = {"policy": policy or "drop_oldest", "batch": fitting.batch, "ring": fitting.ring}
-    timeline = None if trace is None else _Timeline(trace)
-    stream = Pipeline(paced, operation, device=device, profile=True, trace=timeline, **setup)
+    paced, stream = _pipeline(source, readout, device, rate, policy, timeline)
     parts, numbers = _streamed(stream, source.length, progress)
     fields = {key: np.concatenate([getattr(each, key) for each in parts]) for key in readout.outputs or ()}
     start = time.perf_counter()
-    place = [fields[name] for name in ("position", "g", "h") if name in fields]
-    transports = sensor.transport.transport(int(numbers[-1]) + 1)[numbers]
-    points = assembled(sensor, place, transports, fields["status"], stream.device)
+    points = _points(sensor, fields, numbers, stream.device)
     intensity = fields["peak" if sensor.kind == "camera" else "total"]
     middle = time.perf_counter()
     heights, grid = resampled(sensor, points, intensity, stream.device)
@@ -258,19 +244,16 @@ def scan(
         device=stream.device,
         stream=stream.report(),
         seconds=seconds,
-        facts={
-            "recording": name,
-            "sensor": sensor.name,
-            "kind": sensor.kind,
-            "sensor_rate": sensor.recording.rate,
-            "rate": rate,
-            "late": paced.late * 1e-9 if isinstance(paced, PacedSource) else None,
-        },
+        facts=_facts(name, sensor, rate, paced),
     )
 
 
 class _Timeline(Trace):
-    """A trace that waits for the end of the scan: bad input leaves no file."""
+    """A trace that waits for the end of the scan: bad input leaves no file, and one that cannot be is told first."""
+
+    def __init__(self, path: str | Path) -> None:
+        check_file(path)
+        super().__init__(path)
 
     def write(self) -> None:
         """Do nothing at the end of the stream."""
@@ -288,11 +271,41 @@ def _opened(recording: str | Path | Source | Array, sensor: Sensor) -> tuple[Sou
     return open_recording(recording, channel=sensor.recording.channel, key=sensor.recording.key), str(recording)
 
 
+def _facts(name: str, sensor: Sensor, rate: float | None, source: Source) -> dict[str, Any]:
+    """Return what the report says of the recording and of how it was asked for; seconds and frames per second."""
+    return {
+        "recording": name,
+        "sensor": sensor.name,
+        "kind": sensor.kind,
+        "sensor_rate": sensor.recording.rate,
+        "rate": rate,
+        "late": source.late * 1e-9 if isinstance(source, PacedSource) else None,
+    }
+
+
 def _asking_for(sensor: Sensor, precision: Precision) -> LineReadout | PsdReadout:
     """Return the readout with just the outputs that a range image needs."""
     place = ("position",) if isinstance(sensor.transport, RotatingSheet) else ("g", "h")
     light = "peak" if sensor.kind == "camera" else "total"
     return dataclasses.replace(sensor.readout, outputs=(*place, light, "status"), precision=precision)
+
+
+def _pipeline(
+    source: Source,
+    operation: Operation[Any],
+    device: Device,
+    rate: float | None,
+    policy: Policy | None,
+    timeline: Trace | None,
+) -> tuple[Source, Pipeline[Any]]:
+    """Return the source, held back to a rate if one is given, and the stream of its frames."""
+    if rate is None:
+        stream = Pipeline(source, operation, device=device, profile=True, trace=timeline, policy=policy or "block")
+        return source, stream
+    paced = PacedSource(source, rate)
+    fitting = plan(paced, operation, device=device)
+    setup: dict[str, Any] = {"policy": policy or "drop_oldest", "batch": fitting.batch, "ring": fitting.ring}
+    return paced, Pipeline(paced, operation, device=device, profile=True, trace=timeline, **setup)
 
 
 def _streamed(stream: Pipeline[Any], length: int | None, progress: Progress) -> tuple[list[Any], Array]:
@@ -306,6 +319,13 @@ def _streamed(stream: Pipeline[Any], length: int | None, progress: Progress) -> 
     if not parts:
         raise ValueError("the recording has no frame; expected at least one")
     return parts, np.concatenate(numbers)
+
+
+def _points(sensor: Sensor, fields: dict[str, Array], numbers: Array, device: Device) -> RangePoints:
+    """Return the organised range image of the fields that a readout gave for the frames of these numbers."""
+    place = [fields[name] for name in ("position", "g", "h") if name in fields]
+    transports = sensor.transport.transport(int(numbers[-1]) + 1)[numbers]
+    return assembled(sensor, place, transports, fields["status"], device)
 
 
 def assembled(sensor: Sensor, place: Sequence[Array], transports: Array, status: Array, device: Device) -> RangePoints:
@@ -380,99 +400,3 @@ def _directions(points: RangePoints) -> tuple[Direction, Direction]:
     on_samples, on_profiles = (0, 1) if samples_on_x else (1, 0)
     names: tuple[tuple[Direction, Direction], tuple[Direction, Direction]] = (("x", "-x"), ("y", "-y"))
     return names[on_samples][int(steps[on_samples, 1] < 0)], names[on_profiles][int(steps[on_profiles, 0] < 0)]
-
-
-def check_folder(folder: str | Path) -> None:
-    """Check that a folder is there to write into, or can be made.
-
-    Raises
-    ------
-    ValueError
-        The name is empty.
-    OSError
-        There is a file of that name, or one in its place on the way there; or nothing can be written there.
-    """
-    if not os.fspath(folder):
-        raise ValueError("the name of the folder to write into is empty; give one, or . for this folder")
-    path = Path(folder).absolute()
-    for each in (path, *path.parents):
-        if os.path.lexists(each) and not each.is_dir():
-            raise NotADirectoryError(f"cannot write into {folder}: {each} is a file, expected a folder")
-    place = next(each for each in (path, *path.parents) if each.is_dir())
-    # Rights do not tell: who may do everything still cannot write into a read-only or a virtual file system.
-    trial = _beside(place)
-    try:
-        trial.mkdir()
-        trial.rmdir()
-    except OSError as error:
-        raise type(error)(f"cannot write into {folder}: {place}: {error.strerror}; give another folder") from error
-
-
-def check_file(file: str | Path) -> None:
-    """Check that a file can be written there.
-
-    Raises
-    ------
-    ValueError
-        The name is empty.
-    OSError
-        There is a folder of that name, or its folder cannot be written.
-    """
-    if not os.fspath(file):
-        raise ValueError("the name of the file to write is empty; give one")
-    if Path(file).is_dir():
-        raise IsADirectoryError(f"cannot write {file}: it is a folder, expected a file")
-    check_folder(Path(file).parent)
-
-
-@contextmanager
-def whole_folder(folder: str | Path) -> Iterator[Path]:
-    """Give a folder to write into whose files appear in `folder` when the block ends well, and vanish if not.
-
-    Raises
-    ------
-    ValueError, OSError
-        See `check_folder`; or something in the folder is in the way of a file.
-    """
-    check_folder(folder)
-    folder = Path(folder).absolute()
-    made = [each for each in (folder.parent, *folder.parent.parents) if not each.exists()]
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    # Within a folder that is there: it may be a mounted one, and the one above not ours.
-    inside = _beside(folder if folder.is_dir() else folder.parent)
-    try:
-        inside.mkdir()
-        yield inside
-        _check_room(inside, folder)
-        _move(inside, folder)
-        made = []
-    finally:
-        shutil.rmtree(inside, ignore_errors=True)
-        for each in made:
-            each.rmdir()
-
-
-def _beside(place: Path) -> Path:
-    return place / f".gpuvision.{secrets.token_hex(4)}.part"
-
-
-def _check_room(inside: Path, folder: Path) -> None:
-    """Check that nothing stands in the way of a file, before the first one is moved."""
-    for each in sorted(inside.rglob("*")):
-        target = folder / each.relative_to(inside)
-        if each.is_dir() and target.exists() and not target.is_dir():
-            raise NotADirectoryError(f"cannot write into {target}: it is a file, expected a folder; move it away")
-        if not each.is_dir() and target.is_dir():
-            raise IsADirectoryError(f"cannot write {target}: it is a folder, expected a file; move it away")
-        if target.is_dir():
-            check_folder(target)
-
-
-def _move(inside: Path, folder: Path) -> None:
-    """Move files over those of the same name, and leave the others."""
-    folder.mkdir(exist_ok=True)
-    for each in list(inside.iterdir()):
-        if each.is_dir():
-            _move(each, folder / each.name)
-        else:
-            os.replace(each, folder / each.name)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gpuvision.scan import whole_folder
+from gpuvision.host.files import whole_folder
 from gpuvision.simulate import Simulation
 from gpuvision.simulation.artifacts import Artifacts
 from gpuvision.simulation.recommendations import DualSensor, pair_artifacts, rank

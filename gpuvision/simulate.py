@@ -18,14 +18,16 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
+from gpuvision.host.files import whole_folder
 from gpuvision.ranging.export import write_npz, write_ply, write_png16, write_tiff
 from gpuvision.ranging.picture import draw_height_map
 from gpuvision.ranging.range_image import RangePoints, StraightTransport
 from gpuvision.ranging.regrid import Grid, HeightMap
-from gpuvision.scan import assembled, resampled, whole_folder
+from gpuvision.scan import assembled, resampled
 from gpuvision.sensor import Sensor
 from gpuvision.simulated_sensor import light_of, sight_of, simulator_of
 from gpuvision.simulation.artifacts import Artifacts, explain
+from gpuvision.simulation.camera_simulator import CameraSimulator
 from gpuvision.simulation.masks import Mask, MaskPlan, optimise_mask
 from gpuvision.simulation.material import Material
 from gpuvision.simulation.psd_simulator import PsdSimulator
@@ -264,35 +266,18 @@ def simulate(
     sight = sight_of(task.sensor)
     found = optimise_mask(sight, *_whole_light(store, sight.samples * sight.bins)) if mask == "best" else None
     before = found.mask if found is not None else mask if isinstance(mask, Mask) else None
-    simulator = simulator_of(task.sensor, sight, before)
-    parts: list[Artifacts] = []
-    account: dict[str, float] = {}
-    first = 0
-    for block in store:
-        parts.append(explain(simulator, block.exposures, block.truth, seed=seed, first=first, device=device))
-        account = _added(account, block)
-        first += len(block.truth.h)
-    artifacts = _joined(parts)
-    if not np.isfinite(artifacts.truth.h).any():
-        raise ValueError(
-            f"the sensor sees nothing lit in any of {len(artifacts.truth.h)} profiles: {_place(task.part)}; "
-            "is that where sheet and sensor are, and the unit right?"
-        )
-    reading = artifacts.reading
-    place = [np.ascontiguousarray(each, np.float32) for each in (reading.g, reading.h)]
-    points = assembled(task.sensor, place, task.transports, reading.status, device)
+    artifacts, account = _explained(store, simulator_of(task.sensor, sight, before), seed, device)
+    points = _points(task, artifacts.reading, device)
     if task.sensor.output.ambiguous == "drop":
         artifacts = artifacts.without(Status.AMBIGUOUS)
     heights, grid = resampled(task.sensor, points, _strength(artifacts.reading), device)
-    sigma = artifacts.reading.sigma[np.isfinite(artifacts.reading.sigma)]
-    usual = _SIGMAS * float(np.median(sigma)) if sigma.size else 0.0
     return Simulation(
         task=task,
         artifacts=artifacts,
         points=points,
         heights=heights,
         grid=grid,
-        limit=max(usual, task.tolerance) if limit is None else limit,
+        limit=max(_usual_limit(artifacts.reading), task.tolerance) if limit is None else limit,
         mask=found,
         account=account,
         device=device,
@@ -381,6 +366,44 @@ def _whole_light(store: BlockStore, bins: int) -> tuple[dict[str, Exposure], Tru
         name: Exposure(*(np.concatenate(each) for each in zip(*parts, strict=True))) for name, parts in light.items()
     }
     return whole, Truth(*(np.concatenate(each) for each in zip(*truths, strict=True)))
+
+
+def _explained(
+    store: BlockStore, simulator: PsdSimulator | CameraSimulator, seed: int | None, device: Device
+) -> tuple[Artifacts, dict[str, float]]:
+    """Return the artifacts of all profiles, and what was modelled of them.
+
+    Raises
+    ------
+    ValueError
+        There is no profile in which the sensor sees a lit surface.
+    """
+    parts: list[Artifacts] = []
+    account: dict[str, float] = {}
+    first = 0
+    for block in store:
+        parts.append(explain(simulator, block.exposures, block.truth, seed=seed, first=first, device=device))
+        account = _added(account, block)
+        first += len(block.truth.h)
+    artifacts = _joined(parts)
+    if not np.isfinite(artifacts.truth.h).any():
+        raise ValueError(
+            f"the sensor sees nothing lit in any of {first} profiles: {_place(store.task.part)}; "
+            "is that where sheet and sensor are, and the unit right?"
+        )
+    return artifacts, account
+
+
+def _points(task: Task, reading: Reading, device: Device) -> RangePoints:
+    """Return the organised range image of what a sensor reads."""
+    place = [np.ascontiguousarray(each, np.float32) for each in (reading.g, reading.h)]
+    return assembled(task.sensor, place, task.transports, reading.status, device)
+
+
+def _usual_limit(reading: Reading) -> float:
+    """Return the error that noise alone hardly ever makes [m]."""
+    sigma = reading.sigma[np.isfinite(reading.sigma)]
+    return _SIGMAS * float(np.median(sigma)) if sigma.size else 0.0
 
 
 def _added(account: Mapping[str, float], block: Block) -> dict[str, float]:

@@ -17,8 +17,8 @@ from gpuvision.camera.undistort_image import Border, Interpolation, UndistortIma
 from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.host import Device
 from gpuvision.host.errors import RecordingError
+from gpuvision.host.files import whole_folder
 from gpuvision.host.recordings import read_image
-from gpuvision.scan import whole_folder
 
 Progress = Callable[[int, int | None], object]
 

@@ -19,7 +19,7 @@ import pytest
 from gpuvision.host import Device, RecordingError, StreamError
 from gpuvision.host.sources import ArraySource
 from gpuvision.ranging.export import read_npz, read_ply, read_png16, read_tiff
-from gpuvision.scan import Scan, scan, whole_folder
+from gpuvision.scan import Scan, scan
 from gpuvision.sensor import Sensor
 from gpuvision.status import Status
 from scanning import Ran, check_refused, currents, line_frames
@@ -164,35 +164,6 @@ def test_files_hold_what_was_scanned(tmp_path: Path) -> None:
         picture = cv2.imread(str(out / name))
         assert picture is not None
         assert min(picture.shape[:2]) > 100
-
-
-def half_way(out: Path) -> None:
-    with whole_folder(out) as inside:
-        (inside / "first").write_text("new")
-        (inside / "nowhere" / "second").write_text("new")
-
-
-def test_a_folder_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    out = tmp_path / "deep" / "out"
-    with pytest.raises(FileNotFoundError):
-        half_way(out)
-    assert list(tmp_path.iterdir()) == []
-    out.mkdir(parents=True)
-    (out / "first").write_text("old")
-    (out / "other").write_text("stays")
-    with pytest.raises(FileNotFoundError):
-        half_way(out)
-    assert (out / "first").read_text() == "old"
-    with whole_folder(out) as inside:
-        (inside / "first").write_text("new")
-        (inside / "sub").mkdir()
-        (inside / "sub" / "third").write_text("3")
-    assert {each.name: each.read_text() for each in out.rglob("*") if each.is_file()} == {
-        "first": "new",
-        "other": "stays",
-        "third": "3",
-    }
-    assert [each.name for each in out.parent.iterdir()] == ["out"]
 
 
 # ---- the command and bad input --------------------------------------------------------------------------------------

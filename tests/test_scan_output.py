@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpuvision.scan import check_file, check_folder, scan, whole_folder
+from gpuvision.host.files import check_file, check_folder, whole_folder
+from gpuvision.scan import scan
 from gpuvision.sensor import Sensor
 from scanning import Ran, check_refused, currents
 
@@ -56,23 +57,6 @@ def test_a_folder_in_the_way_of_a_file_is_named_and_nothing_is_written(
     ran = run("scan", plane, "--sensor", "psd_line", "--out", out)
     check_refused(ran, rf"cannot write {out / name}: it is a folder, expected a file")
     assert ".part" not in ran.err
-    assert all_of(tmp_path) == before
-
-
-def two_files(out: Path) -> None:
-    with whole_folder(out) as inside:
-        (inside / "first").write_text("new")
-        (inside / "sub").mkdir()
-        (inside / "sub" / "second").write_text("new")
-
-
-def test_a_file_in_the_way_of_a_folder(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "sub").write_text("old")
-    before = all_of(tmp_path)
-    with pytest.raises(NotADirectoryError, match=r"cannot write into .*sub: it is a file"):
-        two_files(out)
     assert all_of(tmp_path) == before
 
 

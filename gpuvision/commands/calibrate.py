@@ -98,7 +98,7 @@ def calibrate(
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.calibration import calibrate as run
-    from gpuvision.scan import check_file
+    from gpuvision.host.files import check_file
 
     corners = None if inner is None else _corners(inner)
     if out.suffix in (".json", ".png"):

@@ -29,7 +29,8 @@ def demo(
     from gpuvision.commands.scan import progress_bar
     from gpuvision.demo import SENSORS, part, scanned_part
     from gpuvision.host import Device
-    from gpuvision.scan import check_folder, scan, whole_folder
+    from gpuvision.host.files import check_folder, whole_folder
+    from gpuvision.scan import scan
     from gpuvision.simulate import recorded, simulate
 
     check_folder(out)

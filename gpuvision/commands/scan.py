@@ -76,7 +76,7 @@ def scan(
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host import Device
-    from gpuvision.scan import check_file, check_folder
+    from gpuvision.host.files import check_file, check_folder
     from gpuvision.scan import scan as run
     from gpuvision.sensor import Sensor
 

@@ -98,8 +98,8 @@ def simulate(
     --noise costs nothing anew.
     """
     from gpuvision.host import Device
+    from gpuvision.host.files import check_folder
     from gpuvision.materials_file import read_materials
-    from gpuvision.scan import check_folder
     from gpuvision.sensor import Sensor
     from gpuvision.simulate import part_of, prepare
 

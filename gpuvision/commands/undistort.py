@@ -60,8 +60,8 @@ def undistort(
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host import Device
+    from gpuvision.host.files import check_folder
     from gpuvision.lens_file import read_lens
-    from gpuvision.scan import check_folder
     from gpuvision.undistortion import undistort_files
 
     model = read_lens(lens)

@@ -1,8 +1,9 @@
-"""Files are written whole or not at all."""
+"""Files and folders are written whole or not at all."""
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -47,3 +48,49 @@ def test_written_whole_or_not_at_all(monkeypatch, tmp_path):
         files.write_whole(path, "new")
     assert [each.name for each in path.parent.iterdir()] == ["file"]
     assert path.read_text() == "old"
+
+
+def half_way(out: Path) -> None:
+    with files.whole_folder(out) as inside:
+        (inside / "first").write_text("new")
+        (inside / "nowhere" / "second").write_text("new")
+
+
+def test_a_folder_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "out"
+    with pytest.raises(FileNotFoundError):
+        half_way(out)
+    assert list(tmp_path.iterdir()) == []
+    out.mkdir(parents=True)
+    (out / "first").write_text("old")
+    (out / "other").write_text("stays")
+    with pytest.raises(FileNotFoundError):
+        half_way(out)
+    assert (out / "first").read_text() == "old"
+    with files.whole_folder(out) as inside:
+        (inside / "first").write_text("new")
+        (inside / "sub").mkdir()
+        (inside / "sub" / "third").write_text("3")
+    assert {each.name: each.read_text() for each in out.rglob("*") if each.is_file()} == {
+        "first": "new",
+        "other": "stays",
+        "third": "3",
+    }
+    assert [each.name for each in out.parent.iterdir()] == ["out"]
+
+
+def two_files(out: Path) -> None:
+    with files.whole_folder(out) as inside:
+        (inside / "first").write_text("new")
+        (inside / "sub").mkdir()
+        (inside / "sub" / "second").write_text("new")
+
+
+def test_a_file_in_the_way_of_a_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "sub").write_text("old")
+    with pytest.raises(NotADirectoryError, match=r"cannot write into .*sub: it is a file"):
+        two_files(out)
+    assert [(each.name, each.read_text()) for each in out.iterdir()] == [("sub", "old")]
+    assert [each.name for each in tmp_path.iterdir()] == ["out"]

@@ -26,8 +26,10 @@ def application() -> typer.Typer:
     from gpuvision.commands.calibrate import calibrate
     from gpuvision.commands.demo import demo
     from gpuvision.commands.devices import devices
+    from gpuvision.commands.locate import locate
     from gpuvision.commands.profile import profile
     from gpuvision.commands.scan import scan
+    from gpuvision.commands.select import select
     from gpuvision.commands.simulate import simulate
     from gpuvision.commands.undistort import undistort
 
@@ -38,7 +40,7 @@ def application() -> typer.Typer:
         add_completion=False,
         pretty_exceptions_enable=False,
     )
-    for command in (scan, simulate, calibrate, undistort, demo, devices, profile):
+    for command in (scan, simulate, calibrate, undistort, select, locate, demo, devices, profile):
         app.command()(command)
     return app
 

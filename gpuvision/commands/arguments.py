@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -21,3 +23,40 @@ def named_path(text: str | Path) -> Path:
     if not str(text):
         raise typer.BadParameter("the name is empty; give one, or . for this folder")
     return Path(text)
+
+
+_UNITS = {
+    "m": {"": 1.0, "m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
+    "rad": {"": 1.0, "rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180},
+}
+_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµ]*)\s*")
+
+
+def quantities(text: str, option: str, units: str) -> tuple[float, ...]:
+    """Return numbers, parted by commas, in metres and radians.
+
+    Parameters
+    ----------
+    text
+        As "1.5e-3,2mm,90deg": m, mm, um and rad, mrad, deg may stand behind a number.
+    option
+        Its name, for the message.
+    units
+        What is expected, as "m,m,rad".
+
+    Raises
+    ------
+    ValueError
+        It is something else.
+    """
+    kinds, parts = units.split(","), text.split(",")
+    found = [_NUMBER.fullmatch(part) for part in parts]
+    if len(parts) == len(kinds):
+        known = [each and each[2] in _UNITS[kind] for each, kind in zip(found, kinds, strict=True)]
+        if all(known):
+            return tuple(
+                float(each[1]) * _UNITS[kind][each[2]] for each, kind in zip(found, kinds, strict=True) if each
+            )
+    ends = {"m": "m (or mm, um)", "rad": "rad (or mrad, deg)"}
+    wanted = ", ".join(ends[kind] for kind in kinds)
+    raise ValueError(f"{option} is {text!r}, expected {len(kinds)} number{'s' * (len(kinds) > 1)}: {wanted}")

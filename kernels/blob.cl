@@ -12,8 +12,7 @@
 // The layout has six rows of ROOM numbers: where the ruler's centre lies, its direction (outwards from the mark's own
 // area), the distance of the edge from the centre of the mark; all for a mark of size 1. The sixth is 1, or 0 for what
 // only fills the vectors.
-#include "least_squares.h"
-#include "robust.h"
+#include "blob_match.h"
 #include "ruler.h"
 
 #define LEAST_REACH (real)1     // [px] within which edges count before their scale is known
@@ -21,18 +20,15 @@
 #define STILL (real)0.1f        // [px] less than which a mark lies from where the rulers were laid for
 #define MOST_STEPS 12
 #define STEPS_AT_SCALE 2
-#define RING (real)2 // [px] of background about a mark
+#define RING (real)2    // [px] of background about a mark
+#define BILINEAR (real)(1.0f / 6) // [px^2] of bilinear samples, the variance
+#define BEYOND (real)2.5f // blurs of an edge away from it
 
 #ifdef ROUND
 #define PLACE 3
 #else
 #define PLACE 4
 #endif
-
-// Relative to the nominal place.
-typedef struct {
-    real x, y, size, angle;
-} blob_shape;
 
 // The edges of a mark: places relative to the nominal one, variances of the blur and of the place.
 typedef struct {
@@ -215,6 +211,7 @@ inline int fit_shape(private const blob_edges *edges, blob_layout layout, real r
 typedef struct {
     real covariance[FREEDOMS][FREEDOMS];
     real residual, symmetry, contrast;
+    real weights[ROOM + SPOKES / 2 + LANES];
     int inliers, saturated, regular;
 } blob_facts;
 
@@ -224,7 +221,8 @@ inline blob_facts facts_of(private blob_edges *edges, blob_layout layout, blob_s
     blob_facts facts;
     reals matrix[TRIANGLE], weights = 0, squares = 0, noises = 0, amplitudes = 0, inliers = 0;
     reals slopes = 0;
-    real of[ROOM + SPOKES / 2 + LANES], height[ROOM + SPOKES / 2 + LANES];
+    real height[ROOM + SPOKES / 2 + LANES];
+    private real *of = facts.weights;
     for (int j = 0; j < TRIANGLE; j++) matrix[j] = 0;
     facts.saturated = 0;
     for (int i = 0; i < ROOM; i += LANES) {
@@ -275,13 +273,23 @@ inline blob_facts facts_of(private blob_edges *edges, blob_layout layout, blob_s
     return facts;
 }
 
-#ifdef STRIP
-#define PIXELS(from) LANED(convert_real)(vload16(0, from))
-#define COUNTED (reals)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
-#else
-#define PIXELS(from) convert_real(*(from))
-#define COUNTED (reals)0
-#endif
+// The grey level of the background, beyond the edges of the fit.
+inline real background_of(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
+                          private const blob_edges *edges, private const real *weights, blob_layout layout, real blur) {
+    const real cosine = cos(shape.angle), sine = sin(shape.angle), out = BEYOND * blur + (real)0.5f;
+    real sum = 0, all = 0;
+    for (int i = 0; i < SPOKES; i++) {
+        const real nx = layout.nx[i], ny = layout.ny[i];
+        const int column = (int)rint(x + edges->x[i] + out * (cosine * nx - sine * ny));
+        const int row = (int)rint(y + edges->y[i] + out * (sine * nx + cosine * ny));
+        const int inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows);
+        const real level = convert_real(image[inside ? row * columns + column : 0]);
+        const real weight = (inside && !not_finite(level)) ? weights[i] : 0;
+        sum += weight > 0 ? weight * level : 0;
+        all += weight;
+    }
+    return sum / all;
+}
 
 // The centre of gravity of what differs from the ring about the mark, relative to (x, y); false where the ring leaves
 // the image.
@@ -352,7 +360,8 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
                        global real *restrict gravity_y, global real *restrict distance, global real *restrict contrast,
                        global real *restrict blur, global uchar *restrict status, constant real *table,
                        constant real *laid, const int rows, const int columns, const uint count, const uint each,
-                       const real search, const int least, const real across, const real overlap, const real extent) {
+                       const real search, const int least, const real across, const real overlap, const real extent,
+                       const real pixel_noise) {
     const blob_layout layout = {laid, laid + ROOM, laid + 2 * ROOM, laid + 3 * ROOM, laid + 4 * ROOM, laid + 5 * ROOM};
 #ifdef STRIP
     const uint first = get_global_id(0) * each, end = min(first + each, count);
@@ -425,6 +434,18 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
             if (facts.inliers < least || !facts.regular) what = STATUS_AMBIGUOUS;
             else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
         }
+#ifdef MATCH
+        if (!what) {
+            blob_grey grey = {0, facts.contrast, sqrt(fmax(variance - BILINEAR, SHARPEST * SHARPEST))};
+            grey.background = background_of(image, rows, columns, place[0], place[1], shape, &edges, facts.weights,
+                                            layout, grey.blur);
+            if (!match(image, rows, columns, place[0], place[1], pixel_noise, extent, &shape, &grey, facts.covariance))
+                what = STATUS_AMBIGUOUS;
+            else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
+            facts.contrast = grey.contrast;
+            variance = grey.blur * grey.blur;
+        }
+#endif
         const int good = !what;
         x[n] = good ? place[0] + shape.x : REAL_NAN;
         y[n] = good ? place[1] + shape.y : REAL_NAN;

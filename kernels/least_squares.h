@@ -1,4 +1,5 @@
-// Small least squares in lanes: sums over the lanes, and Cholesky's solution of equations in FREEDOMS unknowns.
+// Small least squares in lanes: sums over the lanes, and Cholesky's solution of equations, of FREEDOMS unknowns unless
+// said otherwise.
 #ifndef LEAST_SQUARES_H
 #define LEAST_SQUARES_H
 
@@ -23,9 +24,9 @@ inline real sum_of(reals value) { return value; }
 #define CELL(row, column) ((row) * ((row) + 1) / 2 + (column))
 
 // Cholesky: the matrix becomes its factor, with the diagonal's inverse on the diagonal. Returns where it has none.
-inline masks factored(private reals *matrix) {
+inline masks factored_of(const int unknowns, private reals *matrix) {
     masks bad = 0;
-    for (int i = 0; i < FREEDOMS; i++) {
+    for (int i = 0; i < unknowns; i++) {
         const reals diagonal = matrix[CELL(i, i)];
         for (int j = 0; j <= i; j++) {
             reals sum = matrix[CELL(i, j)];
@@ -41,17 +42,21 @@ inline masks factored(private reals *matrix) {
     return bad;
 }
 
-inline void solved(private const reals *factor, private const reals *right, private reals *solution) {
-    for (int i = 0; i < FREEDOMS; i++) {
+inline void solved_of(const int unknowns, private const reals *factor, private const reals *right,
+                      private reals *solution) {
+    for (int i = 0; i < unknowns; i++) {
         reals sum = right[i];
         for (int k = 0; k < i; k++) sum -= factor[CELL(i, k)] * solution[k];
         solution[i] = sum * factor[CELL(i, i)];
     }
-    for (int i = FREEDOMS - 1; i >= 0; i--) {
+    for (int i = unknowns - 1; i >= 0; i--) {
         reals sum = solution[i];
-        for (int k = i + 1; k < FREEDOMS; k++) sum -= factor[CELL(k, i)] * solution[k];
+        for (int k = i + 1; k < unknowns; k++) sum -= factor[CELL(k, i)] * solution[k];
         solution[i] = sum * factor[CELL(i, i)];
     }
 }
+
+#define factored(matrix) factored_of(FREEDOMS, matrix)
+#define solved(factor, right, solution) solved_of(FREEDOMS, factor, right, solution)
 
 #endif

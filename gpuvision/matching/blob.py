@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr
 
 from gpuvision.host import Device, Launch, Operation, Walk, in_strips
 from gpuvision.matching.losses import efficiency, loss_defines
@@ -35,6 +36,7 @@ _LANES, _GROUP = 16, 64
 _SHARES_PER_CORE = 4  # keep the cores even
 _ALONE = 8  # marks that the caller's thread does sooner than it wakes another
 _REAL = np.dtype(np.float32)
+_SMOOTHING, _TAPS = 3, 11  # in the table of ruler.h
 # Of rulers across a mark's edge: polarity along the ruler, which leaves the mark's area.
 _POLARITIES: dict[str, Literal["falling", "rising", "any"]] = {"bright": "falling", "dark": "rising", "either": "any"}
 
@@ -163,10 +165,11 @@ class FindBlobs(Operation[Blobs]):
     ratio: float = 0.5
     polarity: Contrast = "bright"
     search_px: float = 6.0
-    spokes: int = 32
-    width: int = 3
+    spokes: int = 16
+    width: int = 1
     smoothing_px: float = 1.5
     passes: int = 2
+    match: bool = True
     agreement: float = 0.5
     saturation: float | None = None
     noise: float = 1.0
@@ -231,7 +234,8 @@ class FindBlobs(Operation[Blobs]):
             "inliers": ((self.count,), np.dtype(np.int32)),
             "status": ((self.count,), np.dtype(np.uint8)),
         }
-        numbers = ((self.width**2 - 1) / 12.0, self._overlap(layout), self._extent())
+        noise = math.hypot(self.noise, math.sqrt(1.0 / 12.0) if dtype.kind == "u" else 0.0)
+        numbers = ((self.width**2 - 1) / 12.0, self._overlap(layout), self._extent(), noise)
         least = max(math.ceil(self.agreement * self.spokes), freedoms + 1)
         return Launch(
             stem="blob",
@@ -240,7 +244,7 @@ class FindBlobs(Operation[Blobs]):
             inputs=[(shape, dtype), ((self.count, freedoms), _REAL)],
             outputs=fields,
             arguments=[
-                edges.arguments[0],
+                self._table(edges),
                 layout.astype(_REAL),
                 *map(np.int32, shape),
                 np.uint32(self.count),
@@ -254,11 +258,27 @@ class FindBlobs(Operation[Blobs]):
             passes_once=strip and self.count <= _ALONE,
         )
 
+    def _table(self, edges: Launch) -> npt.NDArray[Any]:
+        """Return the table of ``ruler.h`` with the smoothing's variance as the peak of an edge has it.
+
+        The filter ends at three deviations: what its own variance lacks by that the peak does not, and the curvature
+        correction would take for blur. Made exact for the blur whose best smoothing it is.
+        """
+        table = np.array(edges.arguments[0])
+        taps, blur = table[_TAPS:].astype(np.float64), self.smoothing_px / math.sqrt(5.0)
+        k = np.arange(-taps.size, taps.size + 1)
+        weights = np.concatenate([-taps[::-1], [0.0], taps])
+        peak, beside = (float(np.sum(weights * ndtr((k + at) / blur))) for at in (0.0, 1.0))
+        table[_SMOOTHING] = 0.5 / math.log(peak / beside) - blur**2
+        return table
+
     def _defines(self, freedoms: int) -> dict[str, Any]:
         defines: dict[str, Any] = dict(loss_defines("tukey", BEND)) | {"EFFICIENCY": efficiency("tukey", BEND)}
         defines |= {"FREEDOMS": freedoms, "SPOKES": self.spokes, "ROOM": -(-self.spokes // _LANES) * _LANES}
         defines |= {"PASSES": self.passes}
-        present = {"ROUND": self._round, "EITHER": self.polarity == "either"}
+        present = {"ROUND": self._round, "EITHER": self.polarity == "either", "MATCH": self.match}
+        if self.shape in ("ring", "cross"):
+            defines["RATIO"] = float(self.ratio)
         return defines | {name: None for name, is_present in present.items() if is_present}
 
     def _layout(self) -> npt.NDArray[np.float64]:

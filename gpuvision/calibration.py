@@ -334,7 +334,7 @@ def _look(
     if not seen:
         file, why = passed_over[0]
         more = f" (and {len(passed_over) - 1} more images)" if len(passed_over) > 1 else ""
-        raise ValueError(f"no {pattern} found in {file}{more}: {why}")
+        raise ValueError(f"{file}{more}: {why}")
     return seen, passed_over, size
 
 

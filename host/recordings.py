@@ -266,6 +266,8 @@ def read_image(path: Path) -> HostArray:
     RecordingError
         It is none that can be read, or it holds several.
     """
+    if path.is_dir():
+        raise RecordingError(f"{path}: a folder, expected an image; name the images in it")
     if path.suffix.lower() in _TIFF:
         with _open_tiff(path) as file:
             if len(file.pages) != 1:

@@ -172,11 +172,16 @@ def test_images_keep_their_type(device: Device, kind: str, channels: int, tmp_pa
 
 def test_image_without_a_pattern(image: Path, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "empty.png"), np.full((480, 640), 80, np.uint8))
-    with pytest.raises(ValueError, match=r"no dots found in .*empty\.png: "):
+    with pytest.raises(ValueError, match=r"empty\.png: no dots found; expected"):
         calibrate([tmp_path / "empty.png"])
     done = calibrate([tmp_path / "empty.png", image])
     assert [path.name for path, _ in done.passed_over] == ["empty.png"]
     assert "1 of 2 images" in done.summary()
+
+
+def test_a_folder_is_no_image(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="a folder, expected an image; name the images in it"):
+        calibrate([tmp_path])
 
 
 def test_images_of_two_sizes(image: Path, tmp_path: Path) -> None:

@@ -44,6 +44,17 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return seen
 
 
+@pytest.mark.parametrize(("option", "name"), [("--json", "."), ("--json", "file/rows.json"), ("--plots", "file")])
+def test_what_cannot_be_written_is_told_before_the_measurement(
+    asked: dict[str, Any], tmp_path: Path, option: str, name: str
+) -> None:
+    (tmp_path / "file").touch()
+    ran = CliRunner().invoke(application(), ["profile", "psd", option, str(tmp_path / name)])
+    assert isinstance(ran.exception, OSError)
+    assert str(ran.exception).startswith("cannot write ")
+    assert asked == {}
+
+
 def test_what_was_asked_for_is_measured_and_shown(asked: dict[str, Any], tmp_path: Path) -> None:
     label = Device.best().label
     file = tmp_path / "rows.json"

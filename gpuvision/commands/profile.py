@@ -39,8 +39,13 @@ def profile(
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("numba is missing, the strongest peer; install it: pip install 'gpuvision[profile]'")
     from gpuvision.host import Device
+    from gpuvision.host.files import check_file, check_folder
     from gpuvision.profiling import harness
 
+    if as_json is not None:
+        check_file(as_json)
+    if plots is not None:
+        check_folder(plots)
     for name in operations or ():
         if name not in harness.OPERATIONS:
             raise ValueError(f"no operation {name!r} to profile; expected some of {', '.join(harness.OPERATIONS)}")

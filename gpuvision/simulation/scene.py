@@ -16,6 +16,18 @@ from gpuvision.simulation.bvh import Bvh, sorted_by
 # An odd number of 64 bits that looks like noise (of the golden ratio).
 _MIXER = 0x9E3779B97F4A7C15
 
+# What trimesh's readers raise where a file breaks off or is garbled; some look for a package that guesses encodings.
+_DAMAGED = (
+    ArithmeticError,
+    AttributeError,
+    ImportError,
+    LookupError,
+    NameError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+
 Integers = npt.NDArray[np.int64]
 
 
@@ -129,16 +141,23 @@ class Scene:
         ------
         FileNotFoundError
             There is no such file.
+        IsADirectoryError
+            It is a folder.
         ValueError
-            It is of another kind, or holds no triangles.
+            It is of another kind, damaged, or holds no triangles.
         """
         import trimesh
 
+        if os.path.isdir(path):
+            raise IsADirectoryError(f"{os.fspath(path)}: a folder, expected a file with a mesh")
         if not os.path.isfile(path):
             raise FileNotFoundError(f"{os.fspath(path)}: no such file")
         if os.path.splitext(path)[1].lower() not in (".stl", ".ply", ".obj", ".glb"):
             raise ValueError(f"{os.fspath(path)}: expected a mesh as .stl, .ply, .obj or .glb")
-        scene = cls.of(trimesh.load(os.fspath(path), process=False), metres=metres)
+        try:
+            scene = cls.of(trimesh.load(os.fspath(path), process=False), metres=metres)
+        except _DAMAGED as error:
+            raise ValueError(f"{os.fspath(path)}: not a readable mesh: damaged, cut short or no mesh at all") from error
         if not len(scene.corners):
             raise ValueError(f"{os.fspath(path)}: holds no triangles")
         return scene

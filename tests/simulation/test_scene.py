@@ -51,6 +51,23 @@ def test_a_file_that_is_none(tmp_path: Path) -> None:
         Scene.of([np.zeros((1, 3, 3))])
 
 
+@pytest.mark.parametrize("ending", ["stl", "ply", "obj", "glb"])
+@pytest.mark.parametrize("harm", ["empty", "cut", "garbled"])
+def test_a_damaged_file_is_named(tmp_path: Path, ending: str, harm: str) -> None:
+    path = tmp_path / f"box.{ending}"
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
+    whole = path.read_bytes()
+    path.write_bytes({"empty": b"", "cut": whole[: len(whole) // 2], "garbled": b"\x92\x00\x81mesh" * 40}[harm])
+    with pytest.raises(ValueError, match=rf"box\.{ending}: (not a readable mesh|holds no triangles)"):
+        Scene.load(path)
+
+
+def test_a_folder_is_no_mesh(tmp_path: Path) -> None:
+    (tmp_path / "part.stl").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"part\.stl: a folder, expected a file"):
+        Scene.load(tmp_path / "part.stl")
+
+
 def test_no_area(box: np.ndarray) -> None:
     flat = np.array([[[0, 0, 0], [1, 1, 1], [3, 3, 3]], [[1, 2, 3]] * 3, [[0, 0, 0], [1, 0, 0], [1, 0, 0]]], float)
     # Slivers are triangles: a nanometre by a metre, and all of it a micrometre.

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
+from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import replacing
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor import Sensor
@@ -125,17 +126,26 @@ class Block(NamedTuple):
 
     @classmethod
     def from_file(cls, path: Path) -> Block:
-        """Read what `to_bytes` gave."""
-        with np.load(path) as file:
-            parts: dict[str, dict[str, Any]] = {"truth": {}, "account": {}, "power": {}, "moment": {}}
-            for name in file.files:
-                kind, key = name.split("/", 1)
-                parts[kind][key] = file[name]
-        exposures = {
-            path: Exposure(power.astype(np.float64), parts["moment"][path].astype(np.float64))
-            for path, power in parts["power"].items()
-        }
-        return cls(exposures, Truth(**parts["truth"]), parts["account"])
+        """Read what `to_bytes` gave.
+
+        Raises
+        ------
+        RecordingError
+            The file holds something else.
+        """
+        parts: dict[str, dict[str, Any]] = {"truth": {}, "account": {}, "power": {}, "moment": {}}
+        try:
+            with np.load(path) as file:
+                for name in file.files:
+                    kind, key = name.split("/", 1)
+                    parts[kind][key] = file[name]
+            exposures = {
+                name: Exposure(power.astype(np.float64), parts["moment"][name].astype(np.float64))
+                for name, power in parts["power"].items()
+            }
+            return cls(exposures, Truth(**parts["truth"]), parts["account"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise RecordingError(f"{path}: holds no simulated light; delete it, and it is computed again") from error
 
 
 class BlockStore:

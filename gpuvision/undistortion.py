@@ -94,7 +94,7 @@ def undistort_files(
 def _points(file: Path, model: Lens | Camera, device: Device) -> npt.NDArray[Any]:
     try:
         points = np.load(file, allow_pickle=False)
-    except ValueError as error:
+    except (EOFError, ValueError) as error:
         raise RecordingError(f"{file}: not a readable NPY array: {error}") from error
     if points.ndim < 1 or points.shape[-1] != 2 or points.dtype not in (np.float32, np.float64):
         raise RecordingError(

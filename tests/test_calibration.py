@@ -201,6 +201,9 @@ def test_missing_and_unreadable_files(tmp_path: Path, device: Device) -> None:
     for name, said in (("text.png", "not a readable image"), ("none.png", "no such file")):
         with pytest.raises((RecordingError, FileNotFoundError), match=said):
             undistort_files([tmp_path / name], LENS, tmp_path / "out", device=device)
+    (tmp_path / "nothing.npy").touch()
+    with pytest.raises(RecordingError, match=r"nothing\.npy: not a readable NPY array"):
+        undistort_files([tmp_path / "nothing.npy"], LENS, tmp_path / "out", device=device)
     np.save(tmp_path / "three.npy", np.zeros((4, 3)))
     with pytest.raises(RecordingError, match=r"three\.npy: float64 of shape \(4, 3\), expected"):
         undistort_files([tmp_path / "three.npy"], LENS, tmp_path / "out", device=device)

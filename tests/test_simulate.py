@@ -16,6 +16,7 @@ import pytest
 import trimesh
 
 from gpuvision import cli
+from gpuvision.host.errors import RecordingError
 from gpuvision.ranging.export import read_npz
 from gpuvision.sensor import Sensor
 from gpuvision.simulate import part_of, prepare, simulate
@@ -121,6 +122,9 @@ def test_half_a_block_counts_as_none(part_file: Path, tmp_path: Path) -> None:
     assert store.missing() == [1]
     assert compute_missing(store) == 1
     assert compute_missing(store) == 0
+    np.savez(store.path(1), light=np.zeros(3))
+    with pytest.raises(RecordingError, match=r"block_00001\.npz: holds no simulated light; delete it"):
+        list(store)
 
 
 def test_another_task_has_other_light(part_file: Path) -> None:

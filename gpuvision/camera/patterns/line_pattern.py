@@ -68,7 +68,7 @@ def find_lines(image: npt.NDArray[Any]) -> LineFamilies:
     if blobs.cover < _LEAST_COVER:
         raise ValueError(
             f"what was found covers {blobs.cover:.0%} of the grid, cells between lines cover at least "
-            f"{_LEAST_COVER:.0%}: use find_dots for dots"
+            f"{_LEAST_COVER:.0%}: is it a pattern of dots?"
         )
     grid = whole_grid(blobs.points, _FEWEST_CELLS, "cells between lines")
     cells = np.where(grid[..., None] < 0, np.nan, blobs.points[grid])

@@ -126,7 +126,7 @@ def test_a_grid_larger_than_the_image(rng: np.random.Generator) -> None:
     [
         (np.zeros((300, 400), np.uint8), "no cells between lines found; expected at least 9"),
         (np.zeros((1, 1), np.uint8), "no cells between lines found"),
-        (photo(dots(view(SIZE, 10, 14, 40.0), np.ones((10, 14), bool)), np.random.default_rng(1)), "use find_dots"),
+        (photo(dots(view(SIZE, 10, 14, 40.0), np.ones((10, 14), bool)), np.random.default_rng(1)), "a pattern of dots"),
     ],
 )
 def test_what_is_no_grid_is_told(image: np.ndarray, message: str) -> None:

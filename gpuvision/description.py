@@ -164,11 +164,11 @@ class Section:
     def choice(self, key: str, choices: Sequence[Choice], default: Any = _REQUIRED) -> Choice | None:
         """Return one of some words; as `number`."""
         expected = "one of " + ", ".join(f'"{each}"' for each in choices)
-        value = self._value(key, expected, default)
+        value: Choice | None = self._value(key, expected, default)
         if value is not default and value not in choices:
             close = difflib.get_close_matches(str(value), choices, 1)
             raise self._wrong(key, value, "", expected + (f' (did you mean "{close[0]}"?)' if close else ""))
-        return value  # type: ignore[no-any-return]
+        return value
 
     @overload
     def text(self, key: str, default: str = ...) -> str: ...
@@ -176,10 +176,10 @@ class Section:
     def text(self, key: str, default: None) -> str | None: ...
     def text(self, key: str, default: Any = _REQUIRED) -> str | None:
         """Return a string; as `number`."""
-        value = self._value(key, "text", default)
+        value: str | None = self._value(key, "text", default)
         if value is not default and not isinstance(value, str):
             raise self._wrong(key, value, "", "text")
-        return value  # type: ignore[no-any-return]
+        return value
 
     def finish(self) -> None:
         """Check that every key was asked for.

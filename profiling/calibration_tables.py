@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.lines.line_families import grid_lines, pack
 from gpuvision.camera.lines.strategies import STRATEGIES, alternate
-from gpuvision.camera.vanishing_points import fit_lens, straightness_px
+from gpuvision.camera.vanishing_points import Strategy, fit_lens, straightness_px
 from gpuvision.profiling.calibration import Families, Float64, Radial, discorpy_fit, tilted_grid
 
 _SIZE = (1024, 1024)
@@ -36,9 +37,9 @@ def strategies(noise: float = 0.05) -> Iterator[str]:
         ideal = tilted_grid(shape, 20.0, _SIZE)
         points = lens.distort(ideal) + np.random.default_rng(1).normal(0.0, noise, ideal.shape)
         families = grid_lines(points)
-        for strategy in ("variable_projection", *STRATEGIES):
+        for strategy in get_args(Strategy):
             start = time.perf_counter()
-            fit = fit_lens(families, model="k1,k2", lines="vanishing", strategy=strategy)  # type: ignore[arg-type]
+            fit = fit_lens(families, model="k1,k2", lines="vanishing", strategy=strategy)
             taken = 1e3 * (time.perf_counter() - start)
             assert fit.lens is not None
             rounds = fit.iterations

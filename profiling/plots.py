@@ -52,7 +52,9 @@ def _draw(path: Path, draw: Callable[[Any, Sequence[Row]], None], rows: Sequence
 def _growth(axes: Any, rows: Sequence[Row]) -> None:
     lines: dict[str, dict[int, float]] = {}
     for row in rows:
-        what, times = _GROWTH.match(row.case).groups()  # type: ignore[union-attr]
+        grown = _GROWTH.match(row.case)
+        assert grown is not None  # draw_plots chose such rows
+        what, times = grown.groups()
         lines.setdefault(what or "all, within a tolerance", {})[int(times)] = row.seconds
         if row.peer == "gpuvision":
             lines.setdefault("all, all pairs", {})[int(times)] = row.peer_seconds

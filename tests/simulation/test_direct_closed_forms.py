@@ -39,7 +39,7 @@ def step_shift(k: float, x: float) -> float:
     return (k - 1.0) * bell(x) / (float(ndtr(x)) + k * float(ndtr(-x)))
 
 
-# domain.md E: the largest shift in sigmas of the beam, by the ratio of reflectances; it is its own offset.
+# The largest shift in sigmas of the beam, by the ratio of reflectances; it is its own offset.
 STEPS = [(1.5, 0.162), (2.0, 0.276), (5.0, 0.636), (10.0, 0.902), (50.0, 1.485), (100.0, 1.721), (1000.0, 2.436)]
 
 
@@ -172,7 +172,7 @@ def test_a_plate_gives_a_gaussian(count: int) -> None:
 
 
 def test_light_that_falls_beside_the_sensor_is_lost() -> None:
-    """Half of the spot over the end of the strips: half of the power, and the bias of domain.md A."""
+    """Half of the spot over the end of the strips: half of the power, and sqrt(2 / pi) of its widths in its place."""
     whole = sight(scale=FAR, bins=4, samples=1)
     middle = whole.project([0.0, 0.0, 1e-3])[0]
     cut = sight(scale=FAR, samples=1, u_edges=np.array([-3e-3, 0.0, middle]))

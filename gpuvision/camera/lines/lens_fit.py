@@ -189,12 +189,11 @@ def residuals_px(packed: PackedLines, found: Minimum, families: LineFamilies) ->
     """Distances as in `LensFit`."""
     every = np.full(len(packed.used), np.nan)
     every[packed.used] = found.here.distance * packed.unit
-    ends = iter(np.cumsum([len(line) for family in families for line in family]))  # type: ignore[arg-type]
     start, sorted_out = 0, []
     for family in families:
         pieces = []
-        for _ in family:
-            end = next(ends)
+        for line in family:
+            end = start + len(np.asarray(line))
             pieces.append(every[start:end])
             start = end
         sorted_out.append(tuple(pieces))

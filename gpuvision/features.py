@@ -198,12 +198,17 @@ def read_features(path: str | Path) -> FeatureSet:
 
 
 def _imaging(top: Section, table: Section) -> Imaging:
-    whole = table.integer("width_px", at_least=1)
-    names = [each.name for each in fields(Imaging) if each.name != "width_px"]
-    numbers = {name: table.number(name, "", at_least=0.0) for name in names}
+    given: dict[str, Any] = {}
+    for each in fields(Imaging):
+        if isinstance(each.default, tuple):
+            given[each.name] = table.numbers(each.name, "", (len(each.default),))
+        elif isinstance(each.default, int):
+            given[each.name] = table.integer(each.name, at_least=1)
+        else:
+            given[each.name] = table.number(each.name, "", at_least=0.0)
     table.finish()
     try:
-        return Imaging(width_px=whole, **numbers)
+        return Imaging(**given)
     except ValueError as error:
         raise top.error(f"[imaging]: {error}") from None
 

@@ -37,7 +37,7 @@ SEARCHED = (2e-3, 5 * math.pi / 180)  # and where it is not
 _MOST_RULED = (2.5e-4, 1.0 * math.pi / 180)  # what rulers alone are asked to bridge
 _AFTER_SEARCH = (6e-5, 2e-3)
 _AGAIN_PX = 4.0  # reach of rulers that are laid at a pose that was found
-_SAMPLED_PX = 0.01  # [px] standard deviation of what bilinear samples cost an edge
+_SAMPLED_PX = 0.02  # [px] standard deviation of what bilinear samples cost an edge; neighbours have some in common
 _LEAST_SHARE = 0.3  # of the rulers in the image that must agree
 _WORST_PX = 0.5  # by so much edges may disagree with a pose
 _USUAL_CANDIDATES = 2500
@@ -369,9 +369,10 @@ def _searched(
         return view, left, found, f"the search found no place for the board: {best}; is it in view, is the scale right?"
     there = _moved(view, found.pose)
     if found.status & Status.AMBIGUOUS:
-        x, y, _ = _moved(view, found.runner_up_pose).pose
-        other = f"{found.runner_up:.0%} of its edges are also where x {1e3 * x:.2f} mm, y {1e3 * y:.2f} mm has them"
-        return there, left, found, f"the search found the board at two places: {other}; say near which it is"
+        places = (there.pose, _moved(view, found.runner_up_pose).pose)
+        told = " and ".join(f"x {1e3 * x:.2f} mm, y {1e3 * y:.2f} mm" for x, y, _ in places)
+        shares = f"with {found.score:.0%} and {found.runner_up:.0%} of its edges"
+        return there, left, found, f"the search found the board at {told}, {shares}; say near which of them it is"
     return there, left, found, ""
 
 
@@ -515,15 +516,16 @@ class _Looking:
         position, sigma = np.full(count, np.nan), np.full(count, np.nan)
         status = np.zeros(count, np.uint8)
         spacing_px = features.spacing / view.scale
+        smoothing = best_smoothing(self.blur_px)
+        # One length for all, of few that there are: every other one would be a build of its own.
+        room = max(float(length_px.max()), 2 * math.ceil(3 * smoothing) + 3)
+        length = min(16 * math.ceil(room / 16), LONGEST)
         for low, high in _alike(spacing_px):
             group = np.flatnonzero((spacing_px >= low) & (spacing_px <= high))
             across = low > 0
-            smoothing = best_smoothing(self.blur_px)
-            room = max(float(length_px[group].max()), 2 * math.ceil(3 * smoothing) + 3)
             edges = RulerEdges(
                 threshold=self.threshold,
-                # Of multiples of eight there are few, and so few builds.
-                length=min(8 * math.ceil(room / 8), LONGEST),
+                length=length,
                 width=features.imaging.width_px,
                 smoothing_px=smoothing,
                 polarity="rising" if (copper == "bright") == across else "falling",
@@ -560,7 +562,8 @@ class _Looking:
         told = rulers._replace(weight=weight, residual=np.asarray(fit.residuals, np.float64))
         solution = _Solution(
             pose=_about(np.asarray(fit.pose, np.float64), placement),
-            covariance=np.asarray(fit.covariance, np.float64) + extra,
+            # Of few edges that happen to agree better than they should the scatter is not to be trusted.
+            covariance=np.asarray(fit.covariance, np.float64) / min(float(fit.spread), 1.0) ** 2 + extra,
             etching=etched if single.any() else Etching(math.nan, math.nan),
             spread=float(fit.spread),
             condition=float(fit.condition),

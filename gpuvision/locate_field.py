@@ -79,7 +79,7 @@ class LocatedRobot:
         each = self.candidates[number]
         x, y, heading = each.pose
         sx, sy, turn = np.sqrt(np.diag(each.covariance))
-        sigmas = f"sigmas {1e3 * sx:.1f} mm, {1e3 * sy:.1f} mm, {math.degrees(turn):.2f} degrees"
+        sigmas = f"sigmas {1e3 * sx:.2g} mm, {1e3 * sy:.2g} mm, {math.degrees(turn):.2g} degrees"
         if each.status & Status.AMBIGUOUS:
             sigmas = "the points fix a part of it only"
         twin = "" if each.twin is None else f"; twin of {each.twin + 1}"

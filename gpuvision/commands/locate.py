@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpuvision.commands.arguments import DeviceLabel, named_path, quantities
+from gpuvision.commands.arguments import DeviceLabel, LayerNames, layers_of, named_path, quantities
 from gpuvision.commands.select import Side
 
 if TYPE_CHECKING:
@@ -96,6 +96,7 @@ def locate(
     camera: Lens = None,
     features: Features = None,
     side: Annotated[Side | None, typer.Option(help="Of the board; otherwise top.")] = None,
+    layers: LayerNames = None,
     budget: Budget = 60,
     blur: Blur = None,
     etch: Etch = "10um",
@@ -133,18 +134,19 @@ def locate(
         "device": device,
     }
     if field is not None:
-        _reject_for_field({"within": within, "features": features, "side": side, "blur": blur})
+        _reject_for_field({"within": within, "features": features, "side": side, "blur": blur, "layers": layers})
         located, draw = _robot(image, field, line_width, quantities(blind, "--blind", "m")[0], **given)
     else:
         assert board is not None  # one of the two
         more = {"within": within, "features": features, "side": side, "budget": budget, "blur": blur}
+        more["layers"] = layers
         located, draw = _board(image, board, etch=etch, copper=copper, **more, **given)
     _tell(located, draw, out, as_json)
 
 
 def _reject_for_field(given: dict[str, Any]) -> None:
     for name, value in given.items():
-        if value is not None:
+        if value:
             raise ValueError(f"--{name} is of --board, not of --field; leave it out")
 
 
@@ -173,7 +175,7 @@ def _robot(
         points = read_points(image)
     else:
         if scale is None:
-            raise ValueError("--scale is missing: how wide a pixel is on the floor, as 1cm is 10mm")
+            raise ValueError("--scale is missing: how wide a pixel is on the floor, as 1cm")
         picture = read_floor(image)
         points = floor_points(
             picture,
@@ -197,6 +199,7 @@ def _board(
     within: str | None,
     features: Path | None,
     side: Side | None,
+    layers: list[str] | None,
     budget: int,
     blur: float | None,
     etch: str,
@@ -222,7 +225,7 @@ def _board(
         raise ValueError(f"--side is {side.value}, but {features} is of the {chosen.side}; leave it out")
     picture = read_image(image)
     of = chosen.side if chosen is not None else "top" if side is None else side.value
-    artwork = read_artwork(board, side=of)
+    artwork = read_artwork(board, side=of, layers=layers_of(layers))
     located = locate_board(
         picture,
         artwork,

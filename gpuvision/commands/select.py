@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.commands.arguments import DeviceLabel, named_path, quantities
+from gpuvision.commands.arguments import DeviceLabel, LayerNames, layers_of, named_path, quantities
 
 
 class Side(StrEnum):
@@ -59,6 +59,7 @@ def select(
     width: Annotated[int, typer.Option(min=1, max=255, help="Lines that a ruler averages.")] = 5,
     etch: Etch = "10um",
     missing: Missing = 0.0,
+    layers: LayerNames = None,
     device: DeviceLabel = None,
 ) -> None:
     """Choose the edges of a board that fix its pose best, for `gpuvision locate --features DIR/features.toml`.
@@ -91,7 +92,7 @@ def select(
     )
     at = None if placement is None else quantities(placement, "--placement", "m,m")
     check_folder(out)
-    artwork = read_artwork(gerbers, side=side.value)
+    artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers))
     box = (region[:2], region[2:])
     features = choose_features(
         artwork,

@@ -1,0 +1,395 @@
+"""First fixes from far away: the search against its definition, poses of boards, real pictures with their defects."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from canary import Guarded
+from gpuvision.host import Device
+from gpuvision.matching.artwork import Artwork, read_artwork
+from gpuvision.matching.edge_search import (
+    LEVELS,
+    CellMeans,
+    EdgeLevels,
+    Levels,
+    Means,
+    SearchEdges,
+    best_shifts,
+    shifts_of,
+)
+from gpuvision.matching.field import PoseCosts
+from gpuvision.matching.registration import FirstFix, board_fix, register
+from gpuvision.matching.ruler import RulerEdges
+from gpuvision.status import Status
+from reference import registration as reference
+from reference.board_images import View, board_image
+
+WALKS = pytest.mark.parametrize("walk", ["strip", "item"])
+PIXEL, NOISE = 25e-6, 3.0
+
+
+def rotation(angle: float) -> np.ndarray:
+    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+
+
+# ---- the search ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_cells_and_levels_are_those_of_their_definition(device: Device, dtype: Any, rng: np.random.Generator) -> None:
+    for shape, cell, border in (((47, 61), 3, 5), ((13, 9), 1, 0), ((66, 91), 7, 2)):
+        image = (rng.uniform(0, 200, shape) * (rng.uniform(size=shape) > 0.5)).astype(dtype)
+        if dtype == np.float32:
+            image[10, 3] = np.nan
+        op = CellMeans(cell_px=cell)
+        means = Guarded(Means(np.empty((shape[0] // cell, shape[1] // cell), np.float32)))
+        op(image, device=device, out=means.out)
+        means.assert_intact()
+        exact = reference.cell_means(image, cell)
+        # As many roundings as pixels.
+        np.testing.assert_allclose(means.out.means, exact, rtol=cell**2 * 2.0**-24)
+        cells = tuple(each + 2 * border for each in exact.shape)
+        level = Guarded(Levels(np.empty((8, *cells), np.uint16)))
+        EdgeLevels(threshold=25.0, border=border)(means.out.means, device=device, out=level.out)
+        level.assert_intact()
+        costs = LEVELS * reference.edge_costs(exact, 25.0, border)
+        # Half a step of rounding; single precision's 1e-6 is a hundredth of one where the mean is 100 times the step.
+        np.testing.assert_allclose(level.out.level, costs, atol=0.51 if dtype != np.float32 else 0.52)
+        assert level.out.level.min() < 0.5 * LEVELS
+
+
+@WALKS
+@pytest.mark.parametrize(("rows", "columns"), [(9, 7), (5, 64), (1, 1), (3, 131)])
+def test_scores_are_sums_of_levels(
+    device: Device, walk: Any, rows: int, columns: int, rng: np.random.Generator
+) -> None:
+    height, stride, points, headings = 21, 160, 77, 3
+    level = rng.integers(0, LEVELS + 1, (8, height, stride)).astype(np.uint16)
+    limit = 8 * height * stride - (rows - 1) * stride - max(columns, 64) + 1
+    shifts = rng.integers(0, limit, (headings, points)).astype(np.int32)
+    shifts[0, ::5], shifts[2] = -1, -1
+    op = SearchEdges(rows=rows, columns=columns, headings=headings, points=points, with_scores=True, walk=walk)
+    expected = reference.pose_costs(level, shifts, rows, columns)
+    # Beyond the last cell from which all positions lie in the map: not used.
+    shifts[0, 0], shifts[0, 5] = limit, 2**31 - 1
+    blocks = -(-columns // 64)
+    guarded = Guarded(
+        PoseCosts(
+            np.empty((headings, rows, columns), np.float32),
+            np.empty((headings, rows, blocks), np.float32),
+            np.empty((headings, rows, blocks), np.int32),
+            np.empty(headings, np.int32),
+        )
+    )
+    found = op(level, shifts, device=device, out=guarded.out)
+    guarded.assert_intact()
+    np.testing.assert_array_equal(found.seen, [np.count_nonzero(shifts[0, 1:] >= 0) - 1, points, 0])
+    # Exact sums, one division.
+    np.testing.assert_allclose(found.scores, expected, rtol=2e-7)
+    assert np.isnan(found.least[2]).all()
+    for block in range(blocks):
+        first = min(block * 64, max(columns - 64, 0))
+        part = expected[:2, :, first : first + 64]
+        np.testing.assert_allclose(found.least[:2, :, block], part.min(axis=-1), rtol=2e-7)
+        np.testing.assert_array_equal(found.column[:2, :, block], first + part.argmin(axis=-1))
+
+
+def test_a_shift_is_where_its_edge_is_cheap(device: Device) -> None:
+    """A bright square, seen 3 cells to the right and 2 up of where it is looked for; its sides cost nothing there."""
+    image = np.zeros((90, 121), np.uint8)
+    image[30:60, 40:80] = 200
+    cell, border, positions = 2, 9, (13, 11)
+    level = EdgeLevels(threshold=20.0, border=border)(CellMeans(cell_px=cell)(image, device=device).means).level
+    along = np.linspace(5.0, 25.0, 11)
+    off = np.array([-3.0 * cell, 2.0 * cell])
+    sides = [(x, 30.0 + y, 1.0, 0.0) for x in (39.5, 79.5) for y in along]
+    sides += [(40.0 + x, y, 0.0, -1.0) for y in (29.5, 59.5) for x in along]
+    edges = np.array(sides)
+    shifts = shifts_of((edges[:, :2] + off)[None], edges[None, :, 2:], cell, border, level.shape, positions)
+    op = SearchEdges(rows=13, columns=11, headings=1, points=len(edges))
+    best = best_shifts(op(level, shifts, device=device), positions, 3, (3, 1))
+    # An edge costs as little in the cells beside its own.
+    assert np.abs(best.cells[0] - [3, -2]).max() <= 1
+    assert best.scores[0] < 0.02 < 0.2 < best.scores[1]
+    assert np.all(np.abs(best.cells[1:] - best.cells[0]).max(axis=1) > 3)
+    far = shifts_of((edges[:, :2] + 200.0)[None], edges[None, :, 2:], cell, border, level.shape, positions)
+    assert (far == -1).all()
+
+
+# ---- boards --------------------------------------------------------------------------------------------------
+
+
+def board(folder: Path, lines: list[tuple[float, float, float, float, float]]) -> Artwork:
+    """Traces: x, y, x, y of their ends and their widths [mm]."""
+    widths = sorted({each[4] for each in lines})
+    text = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
+    text += "".join(f"%ADD{10 + number}C,{width}*%\n" for number, width in enumerate(widths))
+    for x0, y0, x1, y1, width in lines:
+        x0, y0, x1, y1 = (round(each * 1e6) for each in (x0, y0, x1, y1))
+        text += f"D{10 + widths.index(width)}*\nX{x0}Y{y0}D02*\nX{x1}Y{y1}D01*\n"
+    (folder / "copper.gbr").write_text(text + "M02*\n")
+    return read_artwork(folder, layers={r"copper\.gbr": "top copper"})
+
+
+@cache
+def scattered(folder: Path) -> Artwork:
+    """Traces this way and that, 0.2 to 0.4 mm wide, nowhere alike; all over 24 x 20 mm."""
+    rng = np.random.default_rng(4)
+    lines = []
+    for x in range(0, 24, 2):
+        for y in range(0, 20, 2):
+            turn, half = rng.integers(0, 4) * math.pi / 4, rng.uniform(0.4, 0.8)
+            cx, cy = x + 1 + rng.uniform(-0.3, 0.3), y + 1 + rng.uniform(-0.3, 0.3)
+            dx, dy = half * math.cos(turn), half * math.sin(turn)
+            lines.append((cx - dx, cy - dy, cx + dx, cy + dy, round(float(rng.uniform(0.2, 0.4)), 2)))
+    return board(folder, lines)
+
+
+@pytest.fixture(scope="module")
+def artwork(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
+    return scattered(tmp_path_factory.mktemp("scattered"))
+
+
+def looking_at(middle: Any, shape: tuple[int, int], **arguments: Any) -> tuple[View, np.ndarray]:
+    """A view, and the nominal map from board to image."""
+    corner = np.array(middle) + (np.array(shape[::-1]) - 1) / 2 * PIXEL * (-1, 1)
+    view = View(corner=tuple(corner), pixel=PIXEL, shape=shape, noise=NOISE, **arguments)
+    x, y = corner / PIXEL
+    return view, np.array([[1 / PIXEL, 0.0, -x], [0.0, -1 / PIXEL, y], [0.0, 0.0, 1.0]])
+
+
+MIDDLE = (12e-3, 10e-3)
+
+
+@cache
+def prepared(artwork: Artwork, shape: tuple[int, int] = (301, 407)) -> tuple[View, FirstFix]:
+    view, matrix = looking_at(MIDDLE, shape)
+    return view, board_fix(artwork, matrix, shape)
+
+
+def off(found: Any, pose: Any) -> np.ndarray:
+    """Errors of the placement point [px] and of the angle [rad]."""
+    return np.array([*(found.placement - MIDDLE - pose[:2]) / PIXEL, found.pose[2] - pose[2]])
+
+
+@settings(max_examples=6, deadline=None)
+@example(x=-0.001934151639503977, y=0.001953125, degrees=0.0, missing=0.125, seed=0)
+@given(
+    x=st.floats(-2e-3, 2e-3),
+    y=st.floats(-2e-3, 2e-3),
+    degrees=st.floats(-5.0, 5.0),
+    missing=st.floats(0.0, 0.3),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_a_board_is_found_wherever_it_lies(
+    artwork: Artwork, device: Device, x: float, y: float, degrees: float, missing: float, seed: int
+) -> None:
+    view, fix = prepared(artwork)
+    rng, pose = np.random.default_rng(seed), (x, y, math.radians(degrees))
+    gone = set(np.flatnonzero(rng.uniform(size=len(artwork.copper)) < missing))
+    found = fix(board_image(artwork, view, pose, MIDDLE, missing=gone, rng=rng), device=device)
+    assert found.status == Status.OK
+    # Noise is worth 0.01 px; what the neighbours of a ruler do to it, where copper is missing, stays below 0.1 px.
+    error = off(found, pose)
+    assert np.hypot(*error[:2]) < 0.1
+    assert abs(error[2]) < 0.1 / 200
+    # Of 50 traces in view or so, another share is missing than of all: 0.05, and four times that does not happen.
+    assert found.score > 0.95 * (1 - missing) - 0.2
+    # The origin's pose and the placement point's are one.
+    turned = rotation(found.pose[2]) @ MIDDLE + found.pose[:2]
+    np.testing.assert_allclose(turned, found.placement, atol=1e-12)
+    assert found.covariance.shape == (3, 3)
+    assert np.all(np.sqrt(np.diag(found.covariance)) < [2e-6, 2e-6, 1e-3])
+
+
+@pytest.mark.parametrize("shape", [(257, 333), (480, 222)])
+def test_images_of_any_size_and_type(artwork: Artwork, device: Device, shape: Any, rng: np.random.Generator) -> None:
+    view, matrix = looking_at(MIDDLE, shape)
+    fix, pose = board_fix(artwork, matrix, shape), (0.9e-3, -1.3e-3, -0.05)
+    image = board_image(artwork, view, pose, MIDDLE, rng=rng)
+    for each in (image.clip(0, 255).astype(np.uint8), (image.clip(0) * 200).astype(np.uint16)):
+        scale = 1.0 if each.dtype == np.uint8 else 200.0
+        ruler = RulerEdges(threshold=10.0 * scale, smoothing_px=fix.ruler.smoothing_px)
+        error = off(FirstFix(**{**vars(fix), "ruler": ruler})(each, device=device), pose)
+        assert np.abs(error).max() < 0.1
+
+
+def test_another_camera_and_reversed_contrast(artwork: Artwork, device: Device, rng: np.random.Generator) -> None:
+    """Copper darker than laminate, and a camera that is turned by 30 degrees and sees a mild perspective."""
+    shape, pose = (300, 400), (-1.1e-3, 0.7e-3, 0.06)
+    levels = (210.0, 160.0, 230.0, 60.0, 240.0, 15.0)
+    view, matrix = looking_at(MIDDLE, (700, 700), levels=levels)
+    wide = board_image(artwork, view, pose, MIDDLE, rng=rng)
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(math.radians(30.0))
+    turn[:2, 2] = np.array([199.5, 149.5]) - turn[:2, :2] @ [349.5, 349.5]
+    tilted = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [2e-5, -1e-5, 1.0]]) @ turn
+    image = cv2.warpPerspective(wide, tilted, shape[::-1], flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+    found = board_fix(artwork, tilted @ matrix, shape, placement=MIDDLE)(image, device=device)
+    assert found.status == Status.OK
+    assert np.abs(off(found, pose)).max() < 0.1
+
+
+def test_a_repeated_pitch_is_ambiguous(device: Device, tmp_path: Path, rng: np.random.Generator) -> None:
+    """Bars like a connector's, 0.8 mm apart, farther than the camera sees, and two traces that say where y is."""
+    bars = [(0.8 * number, 5.0, 0.8 * number, 8.0, 0.3) for number in range(-10, 40)]
+    artwork = board(tmp_path, [*bars, (-8.0, 12.0, 32.0, 12.0, 0.3)])
+    view, matrix = looking_at(MIDDLE, (300, 400))
+    fix, pose = board_fix(artwork, matrix, (300, 400)), (0.2e-3, -0.3e-3, 0.03)
+    found = fix(board_image(artwork, view, pose, MIDDLE, rng=rng), device=device)
+    assert found.status == Status.AMBIGUOUS
+    assert found.runner_up > 0.9 * found.score
+    # Both are the pose but for whole pitches.
+    for placement in (found.placement, rotation(found.runner_up_pose[2]) @ MIDDLE + found.runner_up_pose[:2]):
+        x, y = rotation(pose[2]).T @ (placement - MIDDLE - pose[:2]) / PIXEL
+        assert abs(y) < 1.0
+        assert abs(x / 32 - round(x / 32)) < 1.0 / 32
+    narrow = board_fix(artwork, matrix, (300, 400), shift=0.35e-3, angle=0.04)
+    alone = narrow(board_image(artwork, view, pose, MIDDLE, rng=rng), device=device)
+    assert alone.status == Status.OK
+    assert np.abs(off(alone, pose)).max() < 0.1
+
+
+def test_all_parallel_edges_are_refused(device: Device, tmp_path: Path, rng: np.random.Generator) -> None:
+    artwork = board(tmp_path, [(-20.0, y, 44.0, y, 0.3) for y in (5.0, 7.3, 10.1, 13.9)])
+    view, matrix = looking_at(MIDDLE, (300, 400))
+    found = board_fix(artwork, matrix, (300, 400))(board_image(artwork, view, rng=rng), device=device)
+    assert found.status in (Status.AMBIGUOUS, Status.DARK)
+    assert np.isnan(found.pose).all()
+
+
+def test_an_image_of_nothing_is_refused(artwork: Artwork, device: Device, rng: np.random.Generator) -> None:
+    _, fix = prepared(artwork)
+    shape = (301, 407)
+    clutter = np.kron(rng.uniform(0, 250, (31, 41)), np.ones((10, 10)))[: shape[0], : shape[1]]
+    for image in (np.full(shape, 90.0), rng.normal(90.0, NOISE, shape), clutter, np.full(shape, np.nan)):
+        found = fix(image.astype(np.float32), device=device)
+        assert found.status == Status.DARK
+        assert np.isnan(found.pose).all()
+        assert np.isnan(found.covariance).all()
+
+
+def test_a_board_that_is_elsewhere_is_refused(artwork: Artwork, device: Device) -> None:
+    shape = (301, 407)
+    _, matrix = looking_at((80e-3, 80e-3), shape)
+    found = board_fix(artwork, matrix, shape)(np.zeros(shape, np.uint8), device=device)
+    assert found.status == Status.HOLE
+    assert found.rulers == 0
+    assert np.isnan(found.pose).all()
+
+
+@cache
+def pictures(folder: Path, middle: tuple[float, float]) -> tuple[FirstFix, list[tuple[np.ndarray, tuple[float, ...]]]]:
+    """A first fix, and pictures with their poses."""
+    artwork, shape, rng = read_artwork(folder), (480, 640), np.random.default_rng(8)
+    view, matrix = looking_at(middle, shape, mask_shift=(60e-6, -40e-6), silk_shift=(1e-4, 1e-4))
+    poses = [(*rng.uniform(-2e-3, 2e-3, 2), math.radians(rng.uniform(-5, 5))) for _ in range(3)]
+    images = [board_image(artwork, view, pose, middle, rng=rng) for pose in poses]
+    return board_fix(artwork, matrix, shape), list(zip(images, poses, strict=True))
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "middle"),
+    [
+        ("upverter", (-59.3e-3, 6.2e-3)),
+        pytest.param("fritzing", (20e-3, 25e-3), marks=pytest.mark.slow),
+    ],
+)
+def test_real_boards_are_found(data: Path, name: str, middle: tuple[float, float], device: Device) -> None:
+    fix, images = pictures(data / "gerber" / name, middle)
+    for image, pose in images:
+        found = fix(image, device=device)
+        assert found.status == Status.OK
+        error = np.array([*(found.placement - middle - pose[:2]) / PIXEL, found.pose[2] - pose[2]])
+        # A first fix: edges of the mask lie 3 px off, and pull at copper's.
+        assert np.hypot(*error[:2]) < 0.25
+        assert abs(error[2]) < 1e-3
+
+
+# ---- pictures ------------------------------------------------------------------------------------------------
+
+PAIRS = [f"0004100{number}" for number in range(6)]
+
+
+class Moved:
+    """A picture turned about its middle and shifted, by a cubic spline; NaN where nothing is known."""
+
+    def __init__(self, image: np.ndarray, shape: tuple[int, int]) -> None:
+        self.image, self.shape = image, shape
+        self._spline = ndimage.spline_filter(image.astype(np.float64), 3, mode="nearest")
+
+    def motion(self, angle: float, shift: np.ndarray) -> np.ndarray:
+        """(2, 3) of x, y: from the picture to the other one."""
+        middle, other = ((np.array(each[::-1]) - 1) / 2 for each in (self.image.shape, self.shape))
+        turn = rotation(angle)
+        return np.column_stack([turn, other + shift - turn @ middle])
+
+    def moved(self, motion: np.ndarray) -> np.ndarray:
+        """The picture at its new place."""
+        back = np.linalg.inv(motion[:, :2])
+        start = -back @ motion[:, 2]
+        return np.asarray(
+            ndimage.affine_transform(
+                self._spline,
+                back[::-1, ::-1],
+                start[::-1],
+                self.shape,
+                order=3,
+                mode="constant",
+                cval=np.nan,
+                prefilter=False,
+            ).astype(np.float32)
+        )
+
+    def seen(self, motion: np.ndarray) -> np.ndarray:
+        """What the other picture shows of this one, at its own place."""
+        y, x = np.indices(self.image.shape)
+        at = np.tensordot(motion[:, :2], np.stack([x, y]), 1) + motion[:, 2, None, None]
+        rows, columns = self.shape
+        inside = (at[0] >= 0) & (at[0] <= columns - 1) & (at[1] >= 0) & (at[1] <= rows - 1)
+        return np.where(inside, self.image, np.nan).astype(np.float32)
+
+
+def agreement(pair: Path, shape: tuple[int, int], draws: int, device: Device) -> np.ndarray:
+    """Worst disagreement [px, degrees] of what was applied and what is recovered, the pair's own offset taken out."""
+    template, image = (cv2.imread(f"{pair}_{each}.jpg", cv2.IMREAD_GRAYSCALE) for each in ("temp", "test"))
+    mover, rng, worst = Moved(image, shape), np.random.default_rng(6), np.zeros(2)
+    for _ in range(draws):
+        angle, shift = math.radians(rng.uniform(-8, 8)), rng.uniform(-40, 40, 2)
+        motion = mover.motion(angle, shift)
+        own = register(mover.seen(motion), template, device=device)
+        found = register(mover.moved(motion), template, device=device)
+        assert own.status == found.status == Status.OK
+        miss = found.placement - motion[:, :2] @ own.placement - motion[:, 2]
+        turn = math.degrees(found.pose[2] - own.pose[2] - angle)
+        worst = np.maximum(worst, np.abs([np.hypot(*miss), turn]))
+    return worst
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", PAIRS)
+def test_what_was_applied_to_a_real_picture_is_recovered(data: Path, name: str, device: Device) -> None:
+    # All of the picture is kept.
+    miss, turn = agreement(data / "pcb" / "deeppcb" / name, (860, 860), 2, device)
+    assert miss <= 0.05
+    assert turn <= 0.01
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", PAIRS)
+def test_what_leaves_the_picture_does_not_count(data: Path, name: str, device: Device) -> None:
+    # A part is lost; the pair's own offset is that of the rest.
+    miss, turn = agreement(data / "pcb" / "deeppcb" / name, (640, 640), 2, device)
+    assert miss <= 0.05
+    assert turn <= 0.01

@@ -176,10 +176,11 @@ class Section:
     def text(self, key: str, default: None) -> str | None: ...
     def text(self, key: str, default: Any = _REQUIRED) -> str | None:
         """Return a string; as `number`."""
-        value: str | None = self._value(key, "text", default)
+        value = self._value(key, "text", default)
         if value is not default and not isinstance(value, str):
             raise self._wrong(key, value, "", "text")
-        return value
+        found: str | None = value
+        return found
 
     def finish(self) -> None:
         """Check that every key was asked for.

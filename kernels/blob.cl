@@ -15,7 +15,7 @@
 #include "blob_match.h"
 #include "ruler.h"
 
-#define LEAST_REACH (real)1     // [px] within which edges count before their scale is known
+#define LEAST_REACH (real)0.6f     // [px] within which edges count before their scale is known
 #define LEAST_SCALE (real)0.01f // [px]
 #define STILL (real)0.1f        // [px] less than which a mark lies from where the rulers were laid for
 #define MOST_STEPS 12
@@ -23,11 +23,15 @@
 #define RING (real)2    // [px] of background about a mark
 #define BILINEAR (real)(1.0f / 6) // [px^2] of bilinear samples, the variance
 #define BEYOND (real)2.5f // blurs of an edge away from it
+#define OWN (real)0.5f    // least weight of an edge of the mark's own
+#define HIDDEN_BLURS 4
 
 #ifdef ROUND
 #define PLACE 3
+#define START_REACH LEAST_REACH // of edges of a start
 #else
 #define PLACE 4
+#define START_REACH (3 * LEAST_REACH) // the angle is that of the place
 #endif
 
 // The edges of a mark: places relative to the nominal one, variances of the blur and of the place.
@@ -183,6 +187,111 @@ inline int fit_step(private const blob_edges *edges, blob_layout layout, real sc
     return shape->size > 0 && !not_finite(shape->x + shape->y + shape->size + shape->angle);
 }
 
+// Three rulers of a start: so many sixteenths of all rulers from the first to the second, and to the third.
+#define PATTERNS 4
+constant const int pattern[PATTERNS][2] = {{4, 8}, {5, 10}, {3, 6}, {2, 6}};
+#define START_STEPS 3
+#define WRAPPED (ROOM + SPOKES + LANES)
+
+// Edges one after the other, the first after the last again; normals of straight ones as they are at the nominal angle.
+typedef struct {
+    real x[WRAPPED], y[WRAPPED], there[WRAPPED], height[WRAPPED];
+#ifndef ROUND
+    real nx[WRAPPED], ny[WRAPPED];
+#endif
+} blob_circuit;
+
+inline void wrap(private const blob_edges *edges, blob_layout layout, real cosine, real sine,
+                 private blob_circuit *circuit) {
+    for (int from = 0; from <= SPOKES; from += SPOKES)
+        for (int i = 0; i < ROOM; i += LANES) {
+            *(private reals_at *)(circuit->x + from + i) = READ(edges->x, i);
+            *(private reals_at *)(circuit->y + from + i) = READ(edges->y, i);
+            *(private reals_at *)(circuit->there + from + i) = READ(edges->there, i);
+            *(private reals_at *)(circuit->height + from + i) = FROM(layout.height, i);
+#ifndef ROUND
+            const reals nx = FROM(layout.nx, i), ny = FROM(layout.ny, i);
+            *(private reals_at *)(circuit->nx + from + i) = cosine * nx - sine * ny;
+            *(private reals_at *)(circuit->ny + from + i) = sine * nx + cosine * ny;
+#endif
+        }
+}
+
+// A shape in each lane: centre and size.
+typedef struct {
+    reals x, y, size;
+} laned_shape;
+
+// The normal of an edge as a shape has it, and how far the edge lies outside.
+#ifdef ROUND
+#define NORMAL(of, circuit, take, i, nx, ny, off)                                                                      \
+    const reals ax = take((circuit)->x, i) - (of).x, ay = take((circuit)->y, i) - (of).y;                               \
+    const reals square = ax * ax + ay * ay + (reals)1e-12f, per = rsqrt(square), nx = ax * per, ny = ay * per;          \
+    const reals off = square * per - (of).size * take((circuit)->height, i)
+#else
+#define NORMAL(of, circuit, take, i, nx, ny, off)                                                                      \
+    const reals nx = take((circuit)->nx, i), ny = take((circuit)->ny, i);                                               \
+    const reals off = nx * (take((circuit)->x, i) - (of).x) + ny * (take((circuit)->y, i) - (of).y) -                   \
+                      (of).size * take((circuit)->height, i)
+#endif
+#define FOR_ALL(from, i) ((reals)((from)[i]))
+
+// Through three edges each, the first of them i and on: Newton's steps.
+inline laned_shape shape_through(private const blob_circuit *circuit, int i, int j, int k, laned_shape shape) {
+    for (int step = 0; step < START_STEPS; step++) {
+        reals ux, uy, u, vx, vy, v, wx, wy, w;
+        {
+            NORMAL(shape, circuit, READ, i, nx, ny, off);
+            ux = nx, uy = ny, u = off;
+        }
+        {
+            NORMAL(shape, circuit, READ, j, nx, ny, off);
+            vx = nx, vy = ny, v = off;
+        }
+        {
+            NORMAL(shape, circuit, READ, k, nx, ny, off);
+            wx = nx, wy = ny, w = off;
+        }
+        const reals uh = READ(circuit->height, i), vh = READ(circuit->height, j), wh = READ(circuit->height, k);
+        const reals a = vy * wh - vh * wy, b = vh * wx - vx * wh, c = vx * wy - vy * wx;
+        const reals whole = 1 / (ux * a + uy * b + uh * c);
+        shape.x += whole * (u * a + v * (wy * uh - wh * uy) + w * (uy * vh - uh * vy));
+        shape.y += whole * (u * b + v * (wh * ux - wx * uh) + w * (uh * vx - ux * vh));
+        shape.size += whole * (u * c + v * (wx * uy - wy * ux) + w * (ux * vy - uy * vx));
+    }
+    return shape;
+}
+
+// The shape through three edges that most edges agree with: the least sum of squares, none more than within reach.
+inline blob_shape start_of(private const blob_edges *edges, blob_layout layout, blob_shape near, real reach) {
+    blob_circuit circuit;
+    wrap(edges, layout, cos(near.angle), sin(near.angle), &circuit);
+    const laned_shape from = {(reals)near.x, (reals)near.y, (reals)near.size};
+    blob_shape best = near;
+    real least = SPOKES * reach * reach;
+    for (int p = 0; p < PATTERNS; p++)
+        for (int i = 0; i < ROOM; i += LANES) {
+            const int j = i + pattern[p][0] * SPOKES / 16, k = i + pattern[p][1] * SPOKES / 16;
+            const laned_shape tried = shape_through(&circuit, i, j, k, from);
+            const masks all = mask_of(READ(circuit.there, i) * READ(circuit.there, j) * READ(circuit.there, k) > (reals)0);
+            reals loss = 0;
+            for (int m = 0; m < SPOKES; m++) {
+                NORMAL(tried, &circuit, FOR_ALL, m, nx, ny, off);
+                const reals squared = off * off;
+                const masks in = mask_of(squared < (reals)(reach * reach)) & mask_of((reals)circuit.there[m] > (reals)0);
+                loss += in ? squared : (reals)(reach * reach);
+            }
+            loss = all ? loss : (reals)INFINITY;
+            if (!any_lane(mask_of(loss < (reals)least))) continue;
+            for (int lane = 0; lane < LANES; lane++) {
+                if (!(LANE(loss, lane) < least)) continue;
+                least = LANE(loss, lane);
+                best.x = LANE(tried.x, lane), best.y = LANE(tried.y, lane), best.size = LANE(tried.size, lane);
+            }
+        }
+    return best;
+}
+
 // From where it is to where most edges within reach agree, the reach halved from step to step; returns whether there is
 // such a place. `scale` is that of the residuals there.
 inline int fit_shape(private const blob_edges *edges, blob_layout layout, real reach, real noise, real across,
@@ -200,8 +309,8 @@ inline int fit_shape(private const blob_edges *edges, blob_layout layout, real r
 #else
         const real bent = 0;
 #endif
-        const real measured = scale_of(edges, layout, *shape, bent, TUNING * least);
-        *scale = fmin(fmax(measured, predicted), 2 * least);
+        const real measured = scale_of(edges, layout, *shape, bent, TUNING * *scale);
+        *scale = fmin(fmax(measured, predicted), least);
         if (!fit_step(edges, layout, *scale, shape, blur, across)) return 0;
     }
     return 1;
@@ -291,6 +400,23 @@ inline real background_of(global const CODE *image, int rows, int columns, real 
     return sum / all;
 }
 
+// Where the contour is not the mark's own, as wide as the rulers beside those that say so.
+inline void hide(blob_shape shape, private const real *weights, blob_layout layout, real spacing, real blur,
+                 private blob_hidden *hidden) {
+    const real cosine = cos(shape.angle), sine = sin(shape.angle);
+    hidden->count = 0;
+    hidden->half_width = spacing * shape.size;
+    hidden->half_length = HIDDEN_BLURS * blur;
+    for (int i = 0; i < SPOKES; i++) {
+        if (weights[i] >= OWN) continue;
+        const real bx = layout.bx[i], by = layout.by[i], nx = layout.nx[i], ny = layout.ny[i];
+        hidden->x[hidden->count] = shape.size * (cosine * bx - sine * by);
+        hidden->y[hidden->count] = shape.size * (sine * bx + cosine * by);
+        hidden->nx[hidden->count] = cosine * nx - sine * ny;
+        hidden->ny[hidden->count++] = sine * nx + cosine * ny;
+    }
+}
+
 // The centre of gravity of what differs from the ring about the mark, relative to (x, y); false where the ring leaves
 // the image.
 inline int gravity_of(global const CODE *image, int rows, int columns, real x, real y, real reach, private real *to_x,
@@ -361,7 +487,7 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
                        global real *restrict blur, global uchar *restrict status, constant real *table,
                        constant real *laid, const int rows, const int columns, const uint count, const uint each,
                        const real search, const int least, const real across, const real overlap, const real extent,
-                       const real pixel_noise) {
+                       const real pixel_noise, const real spacing) {
     const blob_layout layout = {laid, laid + ROOM, laid + 2 * ROOM, laid + 3 * ROOM, laid + 4 * ROOM, laid + 5 * ROOM};
 #ifdef STRIP
     const uint first = get_global_id(0) * each, end = min(first + each, count);
@@ -397,8 +523,9 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
             if (mine) {
                 const real cosine = cos(nominal.angle), sine = sin(nominal.angle);
                 found = keep_edges(&edges, layout, nominal, cosine, sine, search, &noise, &variance);
-                agreed = found >= least && fit_shape(&edges, layout, pass ? 2 * LEAST_REACH : 2 * search, noise, across,
-                                                     &shape, &variance, &scale);
+                if (pass == 0 && found >= least) shape = start_of(&edges, layout, nominal, START_REACH);
+                agreed = found >= least && fit_shape(&edges, layout, 2 * START_REACH, noise, across, &shape, &variance,
+                                                     &scale);
                 const real dx = shape.x - from.x, dy = shape.y - from.y, ds = shape.size - from.size;
                 const real da = (shape.angle - from.angle) * from.size;
                 done = !agreed || dx * dx + dy * dy + ds * ds + da * da < STILL * STILL;
@@ -439,7 +566,9 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
             blob_grey grey = {0, facts.contrast, sqrt(fmax(variance - BILINEAR, SHARPEST * SHARPEST))};
             grey.background = background_of(image, rows, columns, place[0], place[1], shape, &edges, facts.weights,
                                             layout, grey.blur);
-            if (!match(image, rows, columns, place[0], place[1], pixel_noise, extent, &shape, &grey, facts.covariance))
+            blob_hidden hidden;
+            hide(shape, facts.weights, layout, spacing, grey.blur, &hidden);
+            if (!match(image, rows, columns, place[0], place[1], pixel_noise, extent, &hidden, &shape, &grey, facts.covariance))
                 what = STATUS_AMBIGUOUS;
             else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
             facts.contrast = grey.contrast;

@@ -116,6 +116,25 @@ inline blob_model model_at(reals x, reals y, blob_shape shape, real cosine, real
 }
 #endif
 
+// Parts of the contour that are not this mark's: what rulers there saw does not agree with the shape. Relative to the
+// mark's centre.
+typedef struct {
+    real x[SPOKES], y[SPOKES], nx[SPOKES], ny[SPOKES];
+    real half_width, half_length;
+    int count;
+} blob_hidden;
+
+inline masks hidden_at(private const blob_hidden *hidden, reals dx, reals dy) {
+    masks in = 0;
+    for (int i = 0; i < hidden->count; i++) {
+        const reals x = dx - (reals)hidden->x[i], y = dy - (reals)hidden->y[i];
+        const reals nx = (reals)hidden->nx[i], ny = (reals)hidden->ny[i];
+        in |= mask_of(FABS(x * nx + y * ny) < (reals)hidden->half_length) &
+              mask_of(FABS(x * ny - y * nx) < (reals)hidden->half_width);
+    }
+    return in;
+}
+
 #ifdef STRIP
 #define PIXELS(from) LANED(convert_real)(vload16(0, from))
 #define COUNTED (reals)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
@@ -130,7 +149,8 @@ typedef struct {
 
 // The equations of the pixels about (x, y), as far as they are of this mark and its background.
 inline void match_summed(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
-                         blob_grey grey, real slope_x, real slope_y, real scale, real reach, private match_sums *sums) {
+                         blob_grey grey, real slope_x, real slope_y, real scale, real reach,
+                         private const blob_hidden *hidden, private match_sums *sums) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale, per_size = 1 / shape.size;
     const int top = max((int)ceil(y - reach), 0), bottom = min((int)(y + reach), rows - 1);
     for (int i = 0; i < UNKNOWN_CELLS; i++) sums->matrix[i] = 0;
@@ -143,6 +163,7 @@ inline void match_summed(global const CODE *image, int rows, int columns, real x
             const int from = min(column, columns - LANES);
             const reals place = (reals)(real)from + COUNTED, dx = place - (reals)x;
             masks in = mask_of(place >= (reals)(real)column) & mask_of(FABS(dx) <= (reals)half_chord);
+            if (hidden->count) in &= ~hidden_at(hidden, dx, (reals)dy);
             const blob_model model = model_at(dx, (reals)dy, shape, cosine, sine, grey.blur);
             const reals pixel = PIXELS(image + row * columns + from) - (reals)grey.background;
             reals equation[UNKNOWNS];
@@ -175,7 +196,7 @@ inline void match_summed(global const CODE *image, int rows, int columns, real x
 // Moves the shape to where its pixels have it; returns whether there is such a place near by. `covariance` is what
 // their differences from the model make of it.
 inline int match(global const CODE *image, int rows, int columns, real x, real y, real noise, real extent,
-                 private blob_shape *shape, private blob_grey *grey, real covariance[FREEDOMS][FREEDOMS]) {
+                 private const blob_hidden *hidden, private blob_shape *shape, private blob_grey *grey, real covariance[FREEDOMS][FREEDOMS]) {
     const blob_shape first = *shape;
     const real reach = extent * first.size + ABOUT_BLURS * grey->blur + ABOUT;
     real slope_x = 0, slope_y = 0;
@@ -184,7 +205,7 @@ inline int match(global const CODE *image, int rows, int columns, real x, real y
         reals moved[UNKNOWNS];
         const real scale = (MATCH_SHARE * fabs(grey->contrast) + MATCH_NOISES * noise) / TUNING;
         match_summed(image, rows, columns, x + shape->x, y + shape->y, *shape, *grey, slope_x, slope_y, scale, reach,
-                     &sums);
+                     hidden, &sums);
         for (int i = 0; i < UNKNOWN_CELLS; i++) sums.matrix[i] = (reals)sum_of(sums.matrix[i]);
         for (int i = 0; i < UNKNOWNS; i++) sums.right[i] = (reals)sum_of(sums.right[i]);
         if (any_lane(factored_of(UNKNOWNS, sums.matrix))) return 0;

@@ -437,13 +437,26 @@ def _check_apart(inputs: Sequence[Any], outputs: Sequence[Any], same: Callable[[
             raise ValueError("an output shares its memory with an input or another output; expected arrays apart")
 
 
-def real_of(precision: Precision, dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the real type of an operation: asked for, or following the input (float64 computes in double)."""
+def real_of(precision: Precision, dtype: np.dtype[Any], *, narrows: bool = False) -> np.dtype[Any]:
+    """Return the real type of an operation: asked for, or following the input (float64 computes in double).
+
+    Parameters
+    ----------
+    precision, dtype
+        What was asked for, and the input's.
+    narrows
+        The kernel makes float64 input single by itself, where that loses least: "single" takes it, too.
+
+    Raises
+    ------
+    TypeError, ValueError
+        It does not take float64 input in single precision; the word is unknown.
+    """
     if precision is None:
         return np.dtype(np.float64 if dtype == np.float64 else np.float32)
     if precision not in ("single", "double"):
         raise ValueError(f"precision must be 'single', 'double' or None, got {precision!r}")
-    if precision == "single" and dtype == np.float64:
+    if precision == "single" and dtype == np.float64 and not narrows:
         raise TypeError("precision='single' does not take float64 input; convert it, or ask for 'double'")
     return np.dtype(np.float64 if precision == "double" else np.float32)
 

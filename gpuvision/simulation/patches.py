@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines
+from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
 from gpuvision.simulation.line_irradiance import Irradiance
 from gpuvision.simulation.patch_making import cut, in_two
 from gpuvision.simulation.scene import Scene
@@ -242,10 +242,7 @@ class _FromPatches(Operation[R]):
             raise ValueError(f"{name} takes receivers (..., 6), place and normal, got shape {shape}")
         if dtype == np.float64 and not device.has_double:
             raise ValueError(f"device {device.label} has no double precision; give receivers as float32")
-        if self.precision not in ("single", "double", None):
-            raise ValueError(f"precision must be 'single', 'double' or None, got {self.precision!r}")
-        is_double = self.precision == "double" or (self.precision is None and dtype == np.float64)
-        return np.dtype(np.float64 if is_double else np.float32)
+        return real_of(self.precision, dtype, narrows=True)
 
     def _launch_of(
         self,

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines
+from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
 from gpuvision.simulation.scene import Scene
 
 _RAYS_PER_STRIP, _GROUP = 256, 64
@@ -69,11 +69,7 @@ class _Rays(Operation[R]):
     def _real(self, dtype: np.dtype[Any]) -> np.dtype[Any]:
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"{type(self).__name__} takes float32 or float64, got {dtype}")
-        if self.precision not in ("single", "double", None):
-            raise ValueError(f"precision must be 'single', 'double' or None, got {self.precision!r}")
-        if self.precision is None:
-            return dtype
-        return np.dtype(np.float64 if self.precision == "double" else np.float32)
+        return real_of(self.precision, dtype, narrows=True)
 
     def _launch_of(
         self, kernel: str, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any], outputs: dict[str, Spec]

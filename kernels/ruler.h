@@ -34,14 +34,8 @@
 #define RULER_SLOPES (LENGTH - 2 * TAPS)
 #define RULER_MIDDLE ((real)0.5f * (LENGTH - 1))
 #define RULER_LARGEST 1e37f  // of sums over lines: gradients of them are numbers
-#define RULER_ROOT_TWO_PI 2.5066282746310002f
 // What leaves no edge to look for.
 #define RULER_USELESS (STATUS_NOT_FINITE | STATUS_OUT_OF_RANGE | STATUS_FOLDED)
-
-typedef struct {
-    reals position, amplitude, width, sigma, spacing;
-    masks status;
-} ruler_edge;
 
 // Where a ruler lies: the first sample of its first line, relative to a pixel near it, which keeps the digits.
 typedef struct {
@@ -99,22 +93,6 @@ inline masks ruler_distort(reals *x, reals *y, const ruler_place *place, constan
 }
 #endif
 
-// Splits (x, y) from the place's pixel into a pixel that has neighbours, and what is left.
-inline masks ruler_split(const ruler_place *place, int pitch, reals *x, reals *y) {
-    masks column = LANED(convert_bits)(*x), row = LANED(convert_bits)(*y);
-    column = column < place->last_column ? column : place->last_column;
-    row = row < place->last_row ? row : place->last_row;
-    *x -= LANED(convert_real)(column);
-    *y -= LANED(convert_real)(row);
-    return place->pixel + row * pitch + column;
-}
-
-inline reals ruler_between(reals a, reals b, reals c, reals d, reals x, reals y) {
-    a += x * (b - a);
-    c += x * (d - c);
-    return a + y * (c - a);
-}
-
 // What is wrong with a sample itself, and with a sum of them.
 inline masks ruler_judge(reals sample, constant real *table) {
 #ifdef SATURATION
@@ -141,72 +119,7 @@ inline masks ruler_judge_sum(reals sum) {
 #define RULER_STRENGTH(slope) fabs(slope)
 #endif
 
-// A peak of the gradient, and its neighbours.
-typedef struct {
-    reals at, before, here, after;
-} ruler_peak;
-
-inline ruler_peak ruler_either(masks first, ruler_peak one, ruler_peak other) {
-    const ruler_peak either = {first ? one.at : other.at, first ? one.before : other.before,
-                               first ? one.here : other.here, first ? one.after : other.after};
-    return either;
-}
-
-// The edge at a peak: a parabola through the logarithms of the gradients there, which is exact for a Gaussian. An edge
-// that bends about a point ahead is seen ahead of where it is, by the variances of the blur and of the lines over twice
-// the radius.
-inline ruler_edge ruler_refine(ruler_peak peak, constant real *table) {
-    const reals size = fabs(peak.here), sign = peak.here < 0 ? (reals)-1 : (reals)1, per = 1 / peak.here;
-    // A neighbour of other sign is far below the peak: noise.
-    const reals before = log(fmax(peak.before * per, (reals)1e-6f));
-    const reals after = log(fmax(peak.after * per, (reals)1e-6f));
-    const reals variance = -1 / (before + after), tilt = (real)0.5f * (after - before), shift = tilt * variance;
-    ruler_edge edge;
-    edge.position = (peak.at + shift + (TAPS - RULER_MIDDLE)) * table[RULER_STEP];
-    edge.amplitude = peak.here * exp((real)0.5f * tilt * shift) *
-                     ((real)RULER_ROOT_TWO_PI * table[RULER_PER_LINE]) * sqrt(variance);
-    edge.width = sqrt(fmax(variance - table[RULER_SMOOTHING], (reals)0)) * table[RULER_STEP];
-    // The logarithms beside the peak have the noise over the gradients there, which are smaller.
-    edge.sigma = table[RULER_NOISE] * table[RULER_STEP] * variance * exp((real)0.5f / variance) / size;
-    edge.spacing = REAL_NAN;
-    edge.status = 0;
-#ifdef CURVED
-    edge.position -= table[RULER_BEND] * (edge.width * edge.width + table[RULER_ACROSS]);
-#endif
-    return edge;
-}
-
-inline ruler_edge ruler_pair(ruler_peak first, ruler_peak second, constant real *table) {
-    ruler_edge edge = ruler_refine(first, table);
-    const ruler_edge other = ruler_refine(second, table);
-    edge.spacing = other.position - edge.position;
-    edge.position = (real)0.5f * (edge.position + other.position);
-    edge.amplitude = (real)0.5f * (edge.amplitude - other.amplitude);
-    edge.width = (real)0.5f * (edge.width + other.width);
-    edge.sigma = (real)0.5f * sqrt(edge.sigma * edge.sigma + other.sigma * other.sigma);
-    return edge;
-}
-
-#ifdef PAIRS
-#define RULER_TAKEN(first, second) ruler_pair(first, second, table)
-#else
-#define RULER_TAKEN(first, second) ruler_refine(second, table)
-#endif
-
-// Puts what is not known yet, or wrong, into an edge.
-inline ruler_edge ruler_marked(ruler_edge edge, masks there, masks flags) {
-    const masks broken = there & mask_of(LANED(not_finite)(edge.position + edge.amplitude + edge.sigma) != 0);
-    const masks useless = mask_of((flags & RULER_USELESS) != 0);
-    const masks none = ~there | broken | useless;
-    edge.position = nan_where(none, edge.position);
-    edge.amplitude = nan_where(none, edge.amplitude);
-    edge.width = nan_where(none, edge.width);
-    edge.sigma = nan_where(none, edge.sigma);
-    edge.spacing = nan_where(none, edge.spacing);
-    const masks found = flags | (there ? edge.status : (masks)STATUS_DARK) | (broken & STATUS_NOT_FINITE);
-    edge.status = useless ? flags : found;
-    return edge;
-}
+#include "ruler_refine.h"
 
 #ifdef STRIP
 inline reals ruler_slope(private const reals *profile, int i, constant real *table) {
@@ -230,7 +143,8 @@ inline real ruler_slope(local const real *profile, int i, constant real *table) 
 
 // The edges along profiles (in lanes) or gradients (of one ruler); what is wrong with the rulers themselves is in
 // `flags`.
-inline void ruler_find(RULER_SPACE const reals *values, masks flags, constant real *table, private ruler_edge *edges) {
+inline void ruler_find(RULER_SPACE const reals *values, const ruler_place *place, masks flags, constant real *table,
+                       private ruler_edge *edges) {
     const real threshold = table[RULER_THRESHOLD];
     masks found = 0, wins;
     reals best = 0, rival = 0;
@@ -238,7 +152,8 @@ inline void ruler_find(RULER_SPACE const reals *values, masks flags, constant re
     ruler_peak first = peak, second = peak;
 #ifdef CHOOSE_ALL
     masks count = 0;
-    for (int k = 0; k < MOST; k++) edges[k] = RULER_TAKEN(peak, peak);
+    edges[0] = RULER_TAKEN(peak, peak);
+    for (int k = 1; k < MOST; k++) edges[k] = edges[0];
 #endif
 #ifdef PAIRS
     ruler_peak other = peak;
@@ -315,103 +230,7 @@ inline void ruler_find(RULER_SPACE const reals *values, masks flags, constant re
 }
 
 #ifdef STRIP
-// The four pixels about a sample, fetched one after the other and unpacked 16 at a time: a vector made of single loads
-// takes longer, and so does one that is read right after its parts were written, so several samples go at once.
-#if WIDTH < 8
-#define RULER_LINES WIDTH
-#else
-#define RULER_LINES 8
-#endif
-#define RULER_STRIDE 4  // samples
-#define RULER_BATCH (RULER_STRIDE * RULER_LINES)
-#ifdef CODE_uchar
-typedef uint ruler_part;
-#define RULER_PARTS 1
-inline void ruler_fetch(global const CODE *above, global const CODE *below, private ruler_part *to) {
-    to[0] = as_ushort(vload2(0, above)) | (uint)as_ushort(vload2(0, below)) << 16;
-}
-inline void ruler_unpack(private const uint16 *from, reals *a, reals *b, reals *c, reals *d) {
-    const uint16 four = from[0];
-    *a = convert_real16(as_int16(four & 0xff));
-    *b = convert_real16(as_int16(four >> 8 & 0xff));
-    *c = convert_real16(as_int16(four >> 16 & 0xff));
-    *d = convert_real16(as_int16(four >> 24));
-}
-#elif defined(CODE_ushort)
-typedef uint ruler_part;
-#define RULER_PARTS 2
-inline void ruler_fetch(global const CODE *above, global const CODE *below, private ruler_part *to) {
-    to[0] = as_uint(vload2(0, above));
-    to[16 * RULER_BATCH] = as_uint(vload2(0, below));
-}
-inline void ruler_unpack(private const uint16 *from, reals *a, reals *b, reals *c, reals *d) {
-    const uint16 above = from[0], below = from[RULER_BATCH];
-    *a = convert_real16(as_int16(above & 0xffff));
-    *b = convert_real16(as_int16(above >> 16));
-    *c = convert_real16(as_int16(below & 0xffff));
-    *d = convert_real16(as_int16(below >> 16));
-}
-#else
-typedef float ruler_part;
-#define RULER_PARTS 4
-inline void ruler_fetch(global const CODE *above, global const CODE *below, private ruler_part *to) {
-    to[0] = above[0];
-    to[16 * RULER_BATCH] = above[1];
-    to[32 * RULER_BATCH] = below[0];
-    to[48 * RULER_BATCH] = below[1];
-}
-inline void ruler_unpack(private const uint16 *from, reals *a, reals *b, reals *c, reals *d) {
-    *a = as_reals(from[0]);
-    *b = as_reals(from[RULER_BATCH]);
-    *c = as_reals(from[2 * RULER_BATCH]);
-    *d = as_reals(from[3 * RULER_BATCH]);
-}
-#endif
-
-// Adds RULER_LINES lines (or what is left of them) of RULER_STRIDE samples to the profile; returns what is wrong.
-__attribute__((always_inline)) inline masks ruler_add(global const CODE *image, const ruler_place *place, int pitch,
-                                                      int sample, int line, constant real *table,
-                                                      constant real *model, private reals *profile) {
-    const int lines = WIDTH % RULER_LINES ? min(RULER_LINES, WIDTH - line) : RULER_LINES;
-    uint16 pixels[RULER_BATCH], parts[RULER_BATCH * RULER_PARTS];
-    reals x[RULER_BATCH], y[RULER_BATCH];
-    masks flags = 0;
-    int count = 0;
-    for (int k = 0; k < RULER_STRIDE; k++) {
-        const real index = min(sample + k, LENGTH - 1);
-        reals next_x = place->x + index * place->along_x + line * place->across_x;
-        reals next_y = place->y + index * place->along_y + line * place->across_y;
-        for (int j = 0; j < lines; j++, count++) {
-            x[count] = next_x;
-            y[count] = next_y;
-            next_x += place->across_x;
-            next_y += place->across_y;
-#if defined(LENS) || defined(CAMERA)
-            flags |= ruler_distort(x + count, y + count, place, model);
-#endif
-            pixels[count] = as_uint16(ruler_split(place, pitch, x + count, y + count));
-        }
-    }
-    global const CODE *below = image + pitch;
-#pragma clang loop vectorize(disable) unroll_count(16)
-    for (int i = 0; i < 16 * count; i++) {
-        const uint pixel = ((private const uint *)pixels)[i];
-        ruler_fetch(image + pixel, below + pixel, (private ruler_part *)parts + i);
-    }
-    count = 0;
-    for (int k = 0; k < RULER_STRIDE; k++) {
-        reals sum = profile[sample + k];
-        for (int j = 0; j < lines; j++, count++) {
-            reals a, b, c, d;
-            ruler_unpack(parts + count, &a, &b, &c, &d);
-            const reals value = ruler_between(a, b, c, d, x[count], y[count]);
-            flags |= ruler_judge(value, table);
-            sum += value;
-        }
-        profile[sample + k] = sum;
-    }
-    return flags;
-}
+#include "ruler_lanes.h"
 
 // 16 rulers, one in each lane: fills edges[MOST].
 inline void ruler_measure_lanes(global const CODE *image, int rows, int columns, reals x, reals y, reals cosine,
@@ -427,7 +246,7 @@ inline void ruler_measure_lanes(global const CODE *image, int rows, int columns,
 #ifdef CODE_float
     for (int i = 0; i < LENGTH; i++) flags |= ruler_judge_sum(profile[i]);
 #endif
-    ruler_find(profile, flags, table, edges);
+    ruler_find(profile, &place, flags, table, edges);
 }
 
 // 16 rulers from the one given on, `stride` numbers apart. There are `count`; lanes past them do the last one again.
@@ -445,6 +264,22 @@ inline void ruler_measure(global const CODE *image, int rows, int columns, globa
                         vload16(0, given[3]), table, model, edges);
 }
 #else
+// Splits (x, y) from the place's pixel into a pixel that has neighbours, and what is left.
+inline masks ruler_split(const ruler_place *place, int pitch, reals *x, reals *y) {
+    masks column = LANED(convert_bits)(*x), row = LANED(convert_bits)(*y);
+    column = column < place->last_column ? column : place->last_column;
+    row = row < place->last_row ? row : place->last_row;
+    *x -= LANED(convert_real)(column);
+    *y -= LANED(convert_real)(row);
+    return place->pixel + row * pitch + column;
+}
+
+inline reals ruler_between(reals a, reals b, reals c, reals d, reals x, reals y) {
+    a += x * (b - a);
+    c += x * (d - c);
+    return a + y * (c - a);
+}
+
 inline real ruler_sum(global const CODE *image, const ruler_place *place, int pitch, int i, constant real *table,
                       constant real *model, int *flags) {
     real sum = 0;
@@ -478,7 +313,7 @@ inline void ruler_measure(global const CODE *image, int rows, int columns, real4
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int i = item; i < RULER_SLOPES; i += RULER_GROUP) slopes[i] = ruler_slope(profile, i, table);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) ruler_find(slopes, *shared_flags, table, edges);
+    if (item == 0) ruler_find(slopes, &place, *shared_flags, table, edges);
 }
 #endif
 #endif

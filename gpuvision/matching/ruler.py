@@ -32,6 +32,7 @@ _CODES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 _LANES, _GROUP = 16, 64
 _SHARES_PER_CORE = 4  # keep the cores even
 _ALONE = 128  # rulers that the caller's thread does sooner than it wakes another
+_LEAST_BITS, _MOST_BITS = 15, 23  # of 31, as a side of an image has 15; the most are what a mantissa has
 _REAL = np.dtype(np.float32)
 
 
@@ -211,6 +212,14 @@ class RulerEdges(Operation[Edges]):
         return math.ceil(3.0 * self.smoothing_px / self.step_px)
 
     @property
+    def _binary_places(self) -> int:
+        """Return how many a fixed-point place along a ruler has, beside the whole pixels; with a model, of the image."""
+        if self.model is not None:
+            return _LEAST_BITS
+        extent = (self.length - 1) * self.step_px + self.width + 2
+        return min(max(30 - math.ceil(math.log2(extent)), _LEAST_BITS), _MOST_BITS)
+
+    @property
     def _places(self) -> int:
         return self.most if self.choice == "all" else 1
 
@@ -270,7 +279,7 @@ class RulerEdges(Operation[Edges]):
         }
         defines: dict[str, Any] = {} if self.model is None else dict(self._model_defines(self.model))
         defines |= {"CODE": code, "LENGTH": self.length, "WIDTH": self.width, "TAPS": self._reach}
-        defines |= {"MOST": self._places, "RULER_GROUP": _GROUP}
+        defines |= {"MOST": self._places, "RULER_GROUP": _GROUP, "RULER_BITS": self._binary_places}
         return defines | {name: None for name, is_present in present.items() if is_present}
 
     @staticmethod

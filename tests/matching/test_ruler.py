@@ -47,7 +47,8 @@ def expected(operation: RulerEdges, image: np.ndarray, rulers: np.ndarray) -> li
     found = []
     for ruler in rulers:
         grey, _ = reference.profile(image, ruler, operation.length, operation.width, operation.step_px)
-        found.append(reference.edges(grey, operation.smoothing_px, operation.threshold, operation.step_px))
+        options = (operation.smoothing_px, operation.threshold, operation.step_px)
+        found.append(reference.edges(grey, *options, ruler, operation.width))
     return found
 
 

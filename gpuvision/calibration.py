@@ -32,6 +32,7 @@ from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import write_whole
 from gpuvision.host.recordings import read_image
 from gpuvision.lens_file import write_lens
+from gpuvision.tables import json_tree
 
 Pattern = Literal["dots", "chessboard", "lines"]
 Method = Literal["auto", "lines", "views"]
@@ -217,7 +218,7 @@ class Calibration:
         if self.model is None:
             raise ValueError("the lines are straight without a lens: there is nothing to correct, nothing was written")
         # Numbers that nothing fixes are infinite in the covariance; JSON and its readers know no such word.
-        write_whole(path.with_suffix(".json"), json.dumps(_finite(self.report()), indent=1) + "\n")
+        write_whole(path.with_suffix(".json"), json.dumps(json_tree(self.report()), indent=1) + "\n")
         draw_calibration(path.with_suffix(".png"), self)
         write_lens(
             path,
@@ -348,12 +349,3 @@ def _seen(file: Path, image: npt.NDArray[Any], pattern: Pattern, inner: tuple[in
 def _rms(off: Float64) -> float:
     """Root mean square size of residuals (n, 2) or (n,)."""
     return float(np.sqrt(np.nanmean(np.sum(off.reshape(len(off), -1) ** 2, axis=1))))
-
-
-def _finite(value: Any) -> Any:
-    """Return a tree of plain values with None in place of infinite numbers and NaN."""
-    if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

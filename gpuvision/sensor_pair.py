@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from gpuvision.simulate import Simulation
 from gpuvision.simulation.artifacts import Artifacts
 from gpuvision.simulation.recommendations import DualSensor, pair_artifacts, rank
 from gpuvision.simulation_picture import draw_causes, draw_errors
+from gpuvision.tables import json_tree
 
 _GAP = 2.5  # samples: over wider gaps nothing is read between two of them
 
@@ -75,13 +75,4 @@ class SensorPair:
                 "ranked": [each._asdict() for each in rank(self.artifacts, self.limit)],
                 "errors": {name: each.summary(self.limit) for name, each in self.artifacts.items()},
             }
-            (inside / "report.json").write_text(json.dumps(_finite(report), indent=1, allow_nan=False) + "\n")
-
-
-def _finite(table: Any) -> Any:
-    """Return a table as JSON takes it: what is not finite is None."""
-    if isinstance(table, dict):
-        return {name: _finite(each) for name, each in table.items()}
-    if isinstance(table, list):
-        return [_finite(each) for each in table]
-    return None if isinstance(table, float) and not np.isfinite(table) else table
+            (inside / "report.json").write_text(json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n")

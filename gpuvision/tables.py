@@ -1,4 +1,4 @@
-"""Checks of plain tables (what a TOML file holds) and of the numbers in them."""
+"""Plain tables, as TOML and JSON files hold them: checks of their keys and numbers, and what JSON has no word for."""
 
 from __future__ import annotations
 
@@ -66,3 +66,12 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Any:
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{what} has a number that is not finite")
     return tuple(map(tuple, array.tolist())) if array.ndim == 2 else tuple(array.tolist())
+
+
+def json_tree(value: Any) -> Any:
+    """Return a tree of plain values with None in place of infinite numbers and NaN, for which JSON has no word."""
+    if isinstance(value, dict):
+        return {key: json_tree(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_tree(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

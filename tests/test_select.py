@@ -13,11 +13,12 @@ import pytest
 
 from boards import BOARD_MIDDLE, LAYERS, board_folder
 from gpuvision import cli
+from gpuvision.board_rulers import features_in_view
 from gpuvision.board_view import BoardView
 from gpuvision.description import DescriptionError
 from gpuvision.features import FeatureSet, choose_features, read_features
 from gpuvision.host import Device
-from gpuvision.locate import features_in_view, locate_board
+from gpuvision.locate import locate_board
 from gpuvision.matching.artwork import Artwork, read_artwork
 from gpuvision.matching.selection import Imaging
 from reference.board_images import View, board_image
@@ -109,10 +110,10 @@ def test_what_a_board_lacks_is_told(artwork: Artwork) -> None:
 
 
 def test_a_camera_is_located_as_promised(artwork: Artwork, features: FeatureSet, device: Device) -> None:
-    """Errors at the placement point, of 12 images, against the deviations that were predicted before."""
+    """Errors at the placement point, of 8 images, against the deviations that were predicted before."""
     scores = []
     rng = np.random.default_rng(7)
-    for _ in range(12):
+    for _ in range(8):
         pose = (*(np.array(BOARD_MIDDLE) + rng.uniform(-70e-6, 70e-6, 2)), rng.uniform(-3e-3, 3e-3))
         corner = np.array(pose[:2]) + (np.array(SHAPE[::-1]) - 1) / 2 * PIXEL * (-1, 1)
         view = View(corner=tuple(corner), pixel=PIXEL, shape=SHAPE, noise=NOISE)
@@ -125,7 +126,7 @@ def test_a_camera_is_located_as_promised(artwork: Artwork, features: FeatureSet,
         off = found.view.places(true.pixels(features.placement)) - features.placement
         scores.append([*(off / features.sigmas[:2]), (found.pose[2] - pose[2]) / features.sigmas[2]])
         assert np.abs((np.array(found.pose) - pose) / found.sigmas).max() < 5.0
-    # 36 Gaussian numbers have a root mean square of 1 +- 0.12. Interpolation adds 0.02 px to 0.03 px of noise.
+    # 24 Gaussian numbers have a root mean square of 1 +- 0.15. Interpolation adds 0.02 px to 0.03 px of noise.
     assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.6
 
 

@@ -126,19 +126,20 @@ def locate(
     if not image.exists():
         raise FileNotFoundError(f"{image}: there is no such file")
     about = None if near is None else quantities(near, "--near", "m,m,rad")
-    given = {
+    given: dict[str, Any] = {
         "about": about,
         "scale": None if scale is None else quantities(scale, "--scale", "m")[0],
         "threshold": threshold,
         "camera": camera,
         "device": device,
     }
+    located: LocatedBoard | LocatedRobot
     if field is not None:
         _reject_for_field({"within": within, "features": features, "side": side, "blur": blur, "layers": layers})
         located, draw = _robot(image, field, line_width, quantities(blind, "--blind", "m")[0], **given)
     else:
         assert board is not None  # one of the two
-        more = {"within": within, "features": features, "side": side, "budget": budget, "blur": blur}
+        more: dict[str, Any] = {"within": within, "features": features, "side": side, "budget": budget, "blur": blur}
         more["layers"] = layers
         located, draw = _board(image, board, etch=etch, copper=copper, **more, **given)
     _tell(located, draw, out, as_json)

@@ -1,0 +1,330 @@
+"""Rulers in an image of a board, and the pose that their edges make: laid once, and again where the board was found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.board_view import BoardView
+from gpuvision.features import FeatureSet, chosen_of
+from gpuvision.host import Device
+from gpuvision.matching.artwork import Artwork
+from gpuvision.matching.pose import BoardPose, SolvePose, line_rows
+from gpuvision.matching.ruler import LONGEST, RulerEdges, best_smoothing
+from gpuvision.matching.selection import Candidates, Imaging, candidates
+from gpuvision.status import Status
+
+Copper = Literal["auto", "bright", "dark"]
+Float64 = npt.NDArray[np.float64]
+
+_AGAIN_PX = 4.0  # reach of rulers that are laid at a pose that was found
+_SAMPLED_PX = 0.02  # [px] standard deviation of what bilinear samples cost an edge; neighbours have some in common
+_LEAST_SHARE = 0.3  # of the rulers in the image that must agree
+_WORST_PX = 0.5  # by so much edges may disagree with a pose
+_USUAL_CANDIDATES = 2500
+
+
+class Rulers(NamedTuple):
+    """What each ruler measured, (n, ...); pixels in the undistorted image.
+
+    Attributes
+    ----------
+    point, normal
+        (n, 2) on the board, as in `FeatureSet`.
+    length_px
+        (n,) along the normal.
+    position_px
+        (n,) of the edge from the ruler's middle, along the normal; NaN where there is none.
+    sigma
+        (n,) of its place on the board [m].
+    weight
+        (n,) in the pose, 0 (rejected, or no edge) to 1.
+    residual
+        (n,) what the pose leaves of it, along the normal [m].
+    status
+        (n,) uint8 `Status` flags, as in `gpuvision.matching.ruler.Edges`.
+    """
+
+    point: Float64
+    normal: Float64
+    length_px: Float64
+    position_px: Float64
+    sigma: Float64
+    weight: Float64
+    residual: Float64
+    status: npt.NDArray[np.uint8]
+
+    @property
+    def laid(self) -> npt.NDArray[np.bool_]:
+        """Which lie in the image."""
+        return np.asarray((self.status & Status.OUT_OF_RANGE) == 0)
+
+    @property
+    def found(self) -> npt.NDArray[np.bool_]:
+        """Which found an edge."""
+        return np.isfinite(self.position_px)
+
+    @property
+    def used(self) -> npt.NDArray[np.bool_]:
+        """Which found one that the pose agrees with."""
+        return self.weight > 0.05
+
+
+class Etching(NamedTuple):
+    """How much narrower copper is on each side than drawn [m], and its standard deviation; without single edges NaN."""
+
+    value: float
+    sigma: float
+
+
+class Solution(NamedTuple):
+    """What one pass made: where the board is seen, and its covariance at the placement point."""
+
+    pose: Float64
+    covariance: Float64
+    etching: Etching
+    spread: float
+    condition: float
+    rulers: Rulers
+    reason: str
+
+
+class Fix(NamedTuple):
+    """Two passes, or one that was refused."""
+
+    view: BoardView
+    before: BoardView
+    solution: Solution
+
+    @property
+    def rulers(self) -> Rulers:
+        """What they measured in the last pass."""
+        return self.solution.rulers
+
+    @property
+    def reason(self) -> str:
+        """Why the pose is refused; empty where it is not."""
+        return self.solution.reason
+
+
+class Looking:
+    """Rulers in an image, and the poses they make."""
+
+    def __init__(
+        self,
+        grey: npt.NDArray[Any],
+        features: FeatureSet,
+        noise: float,
+        threshold: float,
+        blur_px: float,
+        etch: float,
+        device: Device,
+    ) -> None:
+        self.grey, self.features, self.noise, self.threshold = grey, features, noise, threshold
+        self.blur_px, self.etch, self.device = blur_px, etch, device
+
+    def located(self, view: BoardView, copper: Copper) -> Fix:
+        """Look where the board should be, then once more where it was found, with shorter rulers."""
+        reach = np.minimum(self.features.length / view.scale, LONGEST)
+        first = self._pass(view, copper, reach)
+        if first.reason:
+            return Fix(view, view, first)
+        there = moved(view, first.pose)
+        second = self._pass(there, copper, np.minimum(reach, self._short(view.scale)))
+        return Fix(there if second.reason else moved(there, second.pose), there, second)
+
+    def _short(self, scale: float) -> Float64:
+        """(n,) lengths [px] that the edge lies on where the board is known to a few pixels."""
+        return 2 * (_AGAIN_PX + 3 * best_smoothing(self.blur_px)) + 3 + self.features.spacing / scale
+
+    def _pass(self, view: BoardView, copper: Copper, length_px: Float64) -> Solution:
+        rulers = self._measured(view, copper, length_px)
+        laid, found = int(rulers.laid.sum()), int(rulers.found.sum())
+        if laid < 3:
+            return _refused(rulers, f"{laid} of {len(rulers.laid)} rulers lie in the image, expected 3 or more")
+        if found < 3:
+            return _refused(
+                rulers,
+                f"{found} of {laid} rulers found an edge of {self.threshold:.3g} grey levels or more, expected 3",
+            )
+        return self._solved(rulers, view.scale)
+
+    def _measured(self, view: BoardView, copper: Copper, length_px: Float64) -> Rulers:
+        """Look along all rulers: those across single edges together, those across traces by the traces' widths."""
+        features = self.features
+        matrix = view.matrix
+        direction = features.normal @ matrix[:2, :2].T * view.scale
+        laid = np.concatenate([view.pixels(features.point), direction], axis=1).astype(np.float32)
+        count = len(laid)
+        position, sigma = np.full(count, np.nan), np.full(count, np.nan)
+        status = np.zeros(count, np.uint8)
+        spacing_px = features.spacing / view.scale
+        smoothing = best_smoothing(self.blur_px)
+        # One length for all, of few that there are: every other one would be a build of its own.
+        room = max(float(length_px.max()), 2 * math.ceil(3 * smoothing) + 3)
+        length = min(16 * math.ceil(room / 16), LONGEST)
+        for low, high in _alike(spacing_px):
+            group = np.flatnonzero((spacing_px >= low) & (spacing_px <= high))
+            across = low > 0
+            edges = RulerEdges(
+                threshold=self.threshold,
+                length=length,
+                width=features.imaging.width_px,
+                smoothing_px=smoothing,
+                polarity="rising" if (copper == "bright") == across else "falling",
+                pairs=across,
+                spacing_px=(max(0.6 * low - 2, 1.0), 1.4 * high + 2) if across else None,
+                noise=self.noise,
+                model=view.model,
+            )(self.grey, np.ascontiguousarray(laid[group]), device=self.device)
+            position[group], sigma[group], status[group] = edges.position, edges.sigma, edges.status
+        sigma = np.hypot(sigma, _SAMPLED_PX) * view.scale
+        nothing = np.zeros(count)
+        return Rulers(features.point, features.normal, length_px, position, sigma, nothing, nothing * np.nan, status)
+
+    def _solved(self, rulers: Rulers, scale: float) -> Solution:
+        """Solve for the pose and, where single edges were measured, for the etching: by turns, robustly."""
+        placement = self.features.placement
+        single = self.features.spacing == 0
+        off = rulers.position_px * scale
+        sigma, etched = np.hypot(rulers.sigma, np.where(single, self.etch, 0.0)), Etching(0.0, self.etch)
+        fit: BoardPose | None = None
+        for _ in range(3):
+            seen = rulers.point + rulers.normal * (off + np.where(single, etched.value, 0.0))[:, None]
+            rows = line_rows(rulers.normal, rulers.point - placement, seen - placement, sigma)
+            solver = SolvePose(
+                scale=None, smallest_scale=1.0, precision="double" if self.device.has_double else "single"
+            )
+            fit = solver(rows, device=self.device)
+            weight = np.nan_to_num(np.asarray(fit.weights, np.float64))
+            if int(fit.status):
+                return _refused(rulers._replace(weight=weight), _why(fit, int(rulers.found.sum())))
+            etched, extra = self._etching(rulers, off, weight, single, float(fit.scale))
+            sigma = rulers.sigma
+        assert fit is not None  # the loop ran
+        told = rulers._replace(weight=weight, residual=np.asarray(fit.residuals, np.float64))
+        solution = Solution(
+            pose=_about(np.asarray(fit.pose, np.float64), placement),
+            # Of few edges that happen to agree better than they should the scatter is not to be trusted.
+            covariance=np.asarray(fit.covariance, np.float64) / min(float(fit.spread), 1.0) ** 2 + extra,
+            etching=etched if single.any() else Etching(math.nan, math.nan),
+            spread=float(fit.spread),
+            condition=float(fit.condition),
+            rulers=told,
+            reason="",
+        )
+        return self._judged(solution, float(fit.scale), scale)
+
+    def _etching(
+        self, rulers: Rulers, off: Float64, weight: Float64, single: npt.NDArray[np.bool_], spread: float
+    ) -> tuple[Etching, Float64]:
+        """Return the etching, by weighted least squares for pose and etching, and what not knowing it adds."""
+        used = weight > 0
+        if not (single & used).any() or self.etch == 0:
+            return Etching(0.0, 0.0), np.zeros((3, 3))
+        arm = rulers.point - self.features.placement
+        turn = arm[:, 0] * rulers.normal[:, 1] - arm[:, 1] * rulers.normal[:, 0]
+        row = np.column_stack([rulers.normal, turn, np.where(single, -1.0, 0.0)])[used]
+        per = (weight[used] / (spread * rulers.sigma[used]) ** 2)[:, None]
+        information = (row * per).T @ row
+        information[3, 3] += 1 / self.etch**2
+        known = np.linalg.solve(information, (row * per).T @ off[used])
+        variance = float(np.linalg.inv(information)[3, 3])
+        gain = np.linalg.solve(information[:3, :3], information[:3, 3])
+        return Etching(float(known[3]), math.sqrt(variance)), np.outer(gain, gain) * variance
+
+    def _judged(self, solution: Solution, spread: float, scale: float) -> Solution:
+        """Refuse what too few rulers agree with, or what they disagree with too much."""
+        rulers = solution.rulers
+        used, laid = int(rulers.used.sum()), int(rulers.laid.sum())
+        if used < max(3, _LEAST_SHARE * laid):
+            return solution._replace(reason=f"{used} of {laid} rulers agree, expected {_LEAST_SHARE:.0%} or more")
+        off = spread * float(np.nanmedian(rulers.sigma)) / scale
+        if off > _WORST_PX:
+            return solution._replace(reason=f"the edges lie {off:.1f} px off any pose, expected {_WORST_PX} px or less")
+        return solution
+
+
+def _alike(spacing_px: Float64) -> list[tuple[float, float]]:
+    """Return intervals of spacings, each of a fifth at most: 0 for single edges is one of its own."""
+    groups: list[tuple[float, float]] = []
+    for each in np.unique(spacing_px):
+        value = float(each)
+        if groups and groups[-1][0] > 0 and value <= 1.2 * groups[-1][0]:
+            groups[-1] = (groups[-1][0], value)
+        else:
+            groups.append((value, value))
+    return groups
+
+
+def _why(fit: BoardPose, found: int) -> str:
+    if int(fit.status) & Status.AMBIGUOUS:
+        if int(fit.rank) < 3:
+            return f"the edges found fix {int(fit.rank)} of x, y and theta (all parallel, or all through one point)"
+        return f"{int(fit.inliers)} of the {found} edges found agree on a pose, expected {_LEAST_SHARE:.0%} or more"
+    return f"{found} edges were found, too few for a pose ({_flags(fit.status)})"
+
+
+def _refused(rulers: Rulers, reason: str) -> Solution:
+    nothing = np.full((3, 3), np.nan)
+    return Solution(nothing[0], nothing, Etching(math.nan, math.nan), math.nan, math.nan, rulers, reason)
+
+
+def _about(pose: Float64, point: Float64) -> Float64:
+    """Return a pose of places about a point as one of places about the origin."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    turned = np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
+    return np.array([*(pose[:2] + point - turned), pose[2]])
+
+
+def moved(view: BoardView, pose: npt.ArrayLike) -> BoardView:
+    """Return where the camera is, over a board that is seen moved by a pose of its artwork: q = R p + t."""
+    x, y, theta = (float(each) for each in np.asarray(pose, np.float64))
+    c, s = math.cos(theta), math.sin(theta)
+    off = np.array(view.pose[:2]) - (x, y)
+    turned = math.remainder(view.pose[2] - theta, 2 * math.pi)
+    return replace(view, pose=(float(c * off[0] + s * off[1]), float(-s * off[0] + c * off[1]), turned))
+
+
+def _flags(status: Any) -> str:
+    return str(Status(int(status)).name or "OK")
+
+
+def features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging, budget: float = 60) -> FeatureSet:
+    """Choose rulers that lie in an image wherever the board is within ``imaging.shift``.
+
+    Of a view with thousands of places only five windows of it are looked at, its corners and its middle.
+
+    Raises
+    ------
+    ValueError
+        There are not enough edges, or they do not fix the pose.
+    """
+    low, high = view.bounds
+    edges = artwork.edges
+    middle = (edges.start + edges.end) / 2
+    inside = np.all((middle >= low) & (middle <= high), axis=1)
+    expected = 1.5 * float(np.sum(edges.length[inside])) / (imaging.width_px * imaging.pixel)
+    windows = [np.stack([low, high])]
+    if expected > _USUAL_CANDIDATES:
+        size = (high - low) * math.sqrt(_USUAL_CANDIDATES / expected / 5)
+        shares = ((0, 0), (0, 1), (1, 0), (1, 1), (0.5, 0.5))
+        starts = [low + np.array(share) * (high - low - size) for share in shares]
+        windows = [np.stack([start, start + size]) for start in starts]
+    placement = np.array(view.pose[:2])
+    parts = [candidates(artwork, window, placement, imaging) for window in windows]
+    joined = [np.concatenate(each) for each in zip(*(part[:-1] for part in parts), strict=True)]
+    rulers = Candidates._make([*joined, placement])
+    margin = (rulers.length / 2 + imaging.shift) / imaging.pixel + imaging.width_px
+    fits = view.within(rulers.point, margin) & (rulers.length < (LONGEST - 2) * imaging.pixel)
+    rulers = Candidates._make([*(each[fits] for each in rulers[:-1]), placement])
+    if len(rulers.sigma) < 3:
+        raise ValueError(
+            f"{len(rulers.sigma)} edges of the {artwork.side} artwork in view stand free enough for a ruler, expected "
+            "3 or more; is the board there (near), is the scale right, is the blur less?"
+        )
+    return chosen_of(rulers, imaging, artwork.side, budget=budget)

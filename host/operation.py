@@ -279,7 +279,7 @@ class Bound(Generic[R]):
             if out is not None and out is not self.outputs:
                 self._check_fields(out)
             given = (*(frames or self.inputs), *self._computed(self.outputs if out is None else out))
-        site = self._site(wait_for)
+        site = self._workers if self._here is None else self._site(wait_for)
         if given is not site.given:
             self._set_arrays(site, given)
         if self._empty:
@@ -287,7 +287,8 @@ class Bound(Generic[R]):
         if site is self._here:
             return cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
         event = cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local, wait_for=wait_for)
-        self._hold(event, given)
+        if given is not self._own:
+            self._hold(event, given)
         return event
 
     def _site(self, wait_for: Sequence[Any] | None = None) -> _Site:
@@ -417,7 +418,7 @@ class Bound(Generic[R]):
         return cl.Buffer(self.device.context, flags, hostbuf=np.ascontiguousarray(table))
 
     def _hold(self, event: Any, given: tuple[Any, ...]) -> None:
-        """Keep what a running kernel uses until it has run."""
+        """Keep what a running kernel uses until it has run; its own arrays the instance keeps anyway."""
         flight = self._in_flight
         while flight and flight[0][0].command_execution_status <= _COMPLETE:
             flight.popleft()

@@ -213,7 +213,7 @@ class RulerEdges(Operation[Edges]):
 
     @property
     def _binary_places(self) -> int:
-        """Return how many a fixed-point place along a ruler has, beside the whole pixels; with a model, of the image."""
+        """Return how many a fixed-point place along a ruler, or with a model in the image, has below a pixel."""
         if self.model is not None:
             return _LEAST_BITS
         extent = (self.length - 1) * self.step_px + self.width + 2

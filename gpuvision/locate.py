@@ -10,7 +10,7 @@ import math
 import time
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,7 @@ SURE = (1e-4, 0.3 * math.pi / 180)  # [m], [rad] that a board is within, where i
 SEARCHED = (2e-3, 5 * math.pi / 180)  # and where it is not
 _MOST_RULED = (2.5e-4, 1.0 * math.pi / 180)  # what rulers alone are asked to bridge
 _AFTER_SEARCH = (6e-5, 2e-3)
+_OTHER_SHARE = 0.6  # of the rulers, up to which another place that the search likes is not believed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -253,17 +254,21 @@ def locate_board(
     least = max(4.0 * level, 0.05 * float(high - low), 1e-6) if threshold is None else threshold
     reach = _reach(within, near is not None, scale, features)
     clock = _Clock()
-    view, reach, first, reason = _searched(grey, artwork, view, reach, blur_px, least, device, clock)
+    searched = _searched(grey, artwork, view, reach, blur_px, least, device, clock)
     if features is None:
-        imaging = Imaging(pixel=scale, blur_px=blur_px, etch=etch, shift=reach[0], angle=reach[1])
-        features = features_in_view(artwork, view, imaging, budget)
+        shift, angle = searched.reach
+        imaging = Imaging(pixel=scale, blur_px=blur_px, etch=etch, shift=shift, angle=angle)
+        features = features_in_view(artwork, searched.view, imaging, budget)
         clock.told("features")
     looked = Looking(grey, features, level, least, blur_px, etch, device)
     kinds: tuple[Copper, ...] = ("bright", "dark") if copper == "auto" else (copper,)
-    fixes = [(kind, looked.located(view, kind)) for kind in kinds]
+    fixes = [(kind, looked.located(searched.view, kind)) for kind in kinds]
     kind, fix = max(fixes, key=lambda each: (not each[1].reason, np.sum(each[1].rulers.used)))
+    reason = searched.reason or fix.reason
+    if searched.other is not None and not reason:
+        reason = _undecided(searched, fix, looked.located(searched.other, kind))
     clock.told("rulers")
-    return _result(fix, kind, features, looked, first, reason or fix.reason, device, clock)
+    return _result(fix, kind, features, looked, searched.found, reason, device, clock)
 
 
 def _reach(
@@ -281,6 +286,19 @@ def _reach(
     return max(SURE[0], 4 * scale), SURE[1]
 
 
+class _Searched(NamedTuple):
+    """Where the board is, as far as the search knows it, what is left to reach [m], [rad], and why it is nowhere.
+
+    ``found`` is None where none was made; ``other`` is where the board may be as well.
+    """
+
+    view: BoardView
+    reach: tuple[float, float]
+    found: Registration | None = None
+    reason: str = ""
+    other: BoardView | None = None
+
+
 def _searched(
     grey: npt.NDArray[Any],
     artwork: Artwork,
@@ -290,10 +308,10 @@ def _searched(
     least: float,
     device: Device,
     clock: _Clock,
-) -> tuple[BoardView, tuple[float, float], Registration | None, str]:
-    """Find the board where rulers alone would not reach: the view, what is left to reach, and what was found."""
+) -> _Searched:
+    """Find the board where rulers alone would not reach."""
     if reach[0] <= max(_MOST_RULED[0], 10 * view.scale) and reach[1] <= _MOST_RULED[1]:
-        return view, reach, None, ""
+        return _Searched(view, reach)
     search = board_fix(
         artwork, view.matrix, view.shape, shift=reach[0], angle=reach[1], blur_px=blur_px, threshold=least
     )
@@ -306,14 +324,23 @@ def _searched(
     left = (max(_AFTER_SEARCH[0], 3 * view.scale), _AFTER_SEARCH[1])
     if not np.all(np.isfinite(found.pose)):
         best = f"the best one has {found.score:.0%} of its edges" if found.rulers else "there are too few edges"
-        return view, left, found, f"the search found no place for the board: {best}; is it in view, is the scale right?"
-    there = moved(view, found.pose)
-    if found.status & Status.AMBIGUOUS:
-        places = (there.pose, moved(view, found.runner_up_pose).pose)
-        told = " and ".join(f"x {1e3 * x:.2f} mm, y {1e3 * y:.2f} mm" for x, y, _ in places)
-        shares = f"with {found.score:.0%} and {found.runner_up:.0%} of its edges"
-        return there, left, found, f"the search found the board at {told}, {shares}; say near which of them it is"
-    return there, left, found, ""
+        reason = f"the search found no place for the board: {best}; is it in view, is the scale right?"
+        return _Searched(view, left, found, reason)
+    other = moved(view, found.runner_up_pose) if found.status & Status.AMBIGUOUS else None
+    return _Searched(moved(view, found.pose), left, found, other=other)
+
+
+def _undecided(searched: _Searched, best: Fix, other: Fix) -> str:
+    """Return why a board that the search found at two places may be at either; empty where rulers tell them apart.
+
+    Rulers that were chosen to fix the pose look at more than at what is repeated, and at traces by their widths.
+    """
+    if other.reason or other.rulers.used.sum() <= _OTHER_SHARE * best.rulers.used.sum():
+        return ""
+    places = (searched.view.pose, other.view.pose)
+    told = " or ".join(f"x {1e3 * x:.2f} mm, y {1e3 * y:.2f} mm" for x, y, _ in places)
+    shares = f"{best.rulers.used.sum()} and {other.rulers.used.sum()} rulers agree"
+    return f"the board may be at {told}: {shares}; say near which of them it is"
 
 
 class _Clock:

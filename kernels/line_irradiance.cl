@@ -1,7 +1,7 @@
 // Irradiance of receivers (position, normal) from all lit segments, unoccluded. CPU runtimes take strips of 16
 // receivers, GPUs an item per receiver. Segments that lie alike, along one direction in surfaces of one normal, share a
-// frame: receivers are turned into it once, and a segment's start is subtracted there, both in `place`, double wherever
-// the device has it: 1e-6 of a segment's length away from it, single would have no digit left.
+// frame: receivers are turned into it once, and shifted to each segment. Both in `place`, double wherever the device
+// has it: 1e-6 of a segment's length away from it, single would have no digit left.
 #include "line_irradiance.h"
 #include "status.h"
 
@@ -30,6 +30,8 @@ typedef float places;
 #else
 #define narrow convert_real
 #endif
+
+#define FEW 16
 
 // Places and normals of 16 receivers, six numbers each, as columns. (From single numbers the compilers make gathers.)
 #if defined(STRIP) && __has_builtin(__builtin_shufflevector)
@@ -80,19 +82,21 @@ inline void load_columns(global const INPUT *from, places *columns) {
 }
 #endif
 
-inline places dot3(places x, places y, places z, global const place *row) {
-    return x * row[0] + y * row[1] + z * row[2];
+inline places placed(places x, places y, places z, global const place *row) {
+    return x * row[0] + (y * row[1] + (z * row[2] + row[3]));
 }
 inline reals turned(reals x, reals y, reals z, global const real *row) { return x * row[0] + y * row[1] + z * row[2]; }
 
-// `middle`: what is subtracted from places first. frames, and axes, the same for normals: direction, normal, across (3
-// each); `firsts`: where the segments of each frame begin, and the end of the last. starts: along, height, aside of a
-// segment's start in its frame, its length; lines: its length, exitance / 2 pi.
+// `middle`: what is subtracted from places first. rows, for each frame: from a place to how far it lies before the
+// first segment's start along the line, above the surface, and aside (three factors and what is added each). axes: of
+// normals, along the line, against the surface's normal, and against what is aside. `firsts`: where the segments of
+// each frame begin, and the end of the last; the first `alone` frames have one segment. starts: what a segment adds to
+// the three lengths of its frame, and its length; lines: its length, exitance / 2 pi.
 kernel void line_irradiance(global const INPUT *restrict receivers, global real *restrict irradiance,
                             global uchar *restrict status, constant place *restrict middle,
-                            global const place *restrict frames, global const real *restrict axes,
+                            global const place *restrict rows, global const real *restrict axes,
                             global const uint *restrict firsts, global const place *restrict starts,
-                            global const real *restrict lines, const uint alike, const ulong count,
+                            global const real *restrict lines, const uint alone, const uint frames, const ulong count,
                             const ulong each) {
     // The last vector, or work-group, moves back to end with the last receiver.
 #ifdef STRIP
@@ -113,27 +117,46 @@ kernel void line_irradiance(global const INPUT *restrict receivers, global real 
         const reals per = (real)1 / sqrt(nx * nx + ny * ny + nz * nz);
         const reals normal_x = nx * per, normal_y = ny * per, normal_z = nz * per;
         places sum = (place)0;
-        for (uint frame = 0; frame < alike; frame++) {
-            global const place *row = frames + frame * 9;
-            const places along = dot3(x, y, z, row), height = dot3(x, y, z, row + 3), aside = dot3(x, y, z, row + 6);
-            global const real *axis = axes + frame * 9;
+        uint k = 0;
+        while (k < alone) {
+            // Few are summed in `real`.
+            reals few = (reals)0;
+            for (const uint to = min(k + FEW, alone); k < to; k++) {
+                global const place *row = rows + 12 * k;
+                global const real *axis = axes + 9 * k;
+                const reals height = narrow(placed(x, y, z, row + 4));
+                // Most pairs do not face each other.
+                if (!any_of(mask_of(height > (reals)0))) continue;
+                const places tau = placed(x, y, z, row);
+                const reals aside = narrow(placed(x, y, z, row + 8));
+                const reals by_u = turned(normal_x, normal_y, normal_z, axis);
+                const reals foot = turned(normal_x, normal_y, normal_z, axis + 3) * height +
+                                   turned(normal_x, normal_y, normal_z, axis + 6) * aside;
+                // The far end, too, may be near.
+                few += lines[2 * k + 1] * LANED(end_factor)(narrow(tau), narrow(tau + starts[4 * k + 3]),
+                                                            (reals)lines[2 * k], height, aside, by_u, foot);
+            }
+            sum += convert_places(few);
+        }
+        for (uint frame = alone; frame < frames; frame++) {
+            global const place *row = rows + 12 * frame;
+            global const real *axis = axes + 9 * frame;
+            const places before = placed(x, y, z, row), above = placed(x, y, z, row + 4);
+            const places beside = placed(x, y, z, row + 8);
             const reals by_u = turned(normal_x, normal_y, normal_z, axis);
             const reals by_n = turned(normal_x, normal_y, normal_z, axis + 3);
             const reals by_w = turned(normal_x, normal_y, normal_z, axis + 6);
             const uint last = firsts[frame + 1];
-            for (uint k = firsts[frame]; k < last;) {
-                // Few are summed in `real`.
+            while (k < last) {
                 reals few = (reals)0;
-                for (const uint to = min(k + 16, last); k < to; k++) {
+                for (const uint to = min(k + FEW, last); k < to; k++) {
                     global const place *start = starts + 4 * k;
-                    const reals above = narrow(height - start[1]);
-                    // Most pairs do not face each other.
-                    if (!any_lane(mask_of(above > (reals)0))) continue;
-                    const places from = along - start[0];
-                    // The far end, too, may be near.
-                    few += lines[2 * k + 1] * LANED(line_factor)(narrow(from), above, narrow(aside - start[2]),
-                                                                narrow(start[3] - from), (reals)lines[2 * k], by_u,
-                                                                by_n, by_w);
+                    const reals height = narrow(above + start[1]);
+                    if (!any_of(mask_of(height > (reals)0))) continue;
+                    const places tau = before + start[0];
+                    const reals aside = narrow(beside + start[2]), foot = by_n * height + by_w * aside;
+                    few += lines[2 * k + 1] * LANED(end_factor)(narrow(tau), narrow(tau + start[3]),
+                                                                (reals)lines[2 * k], height, aside, by_u, foot);
                 }
                 sum += convert_places(few);
             }

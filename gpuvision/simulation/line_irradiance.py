@@ -62,30 +62,39 @@ class LitSegments:
             array.flags.writeable = False
 
     def tables(self, place: np.dtype[Any], real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
-        """Return middle, frames, axes, firsts, starts, lines as kernels/line_irradiance.cl takes them: what emits."""
+        """Return middle, rows, axes, firsts, starts, lines as kernels/line_irradiance.cl takes them: what emits."""
         across = self.ends[:, 1] - self.ends[:, 0]
         length = np.linalg.norm(across, axis=1)
         emits = np.flatnonzero((length > 0.0) & (self.exitance > 0.0))
         if not len(emits):
             # A runtime takes no table without rows.
-            frame, firsts = np.zeros((1, 9)), np.zeros(2, np.uint32)
-            start, line = np.zeros((1, 4), place), np.zeros((1, 2), real)
-            return np.zeros(3, place), frame.astype(place), frame.astype(real), firsts, start, line
+            shapes = (3,), (1, 12), (1, 9), (2,), (1, 4), (1, 2)
+            types = place, place, real, np.uint32, place, real
+            return tuple(np.zeros(shape, dtype) for shape, dtype in zip(shapes, types, strict=True))
         along, normals = _unit(across[emits]), self.normals[emits]
         frames = np.stack([along, normals, np.cross(along, normals)], axis=1)
         # In single, what lies alike but for rounding is alike.
         key = frames.reshape(-1, 9) if real == np.float64 else np.rint(frames.reshape(-1, 9) / _ALIKE)
-        _, example, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
-        order = np.argsort(group, kind="stable")
-        emits, group = emits[order], group[order]
-        firsts = np.searchsorted(group, np.arange(len(example) + 1)).astype(np.uint32)
-        frames = frames[example]
-        middle = self.ends[emits, 0].mean(axis=0)
-        places = np.einsum("nij,nj->ni", frames[group], self.ends[emits, 0] - middle)
-        starts = np.column_stack([places, length[emits]]).astype(place)
-        lines = np.column_stack([length[emits], self.exitance[emits] / math.tau]).astype(real)
-        rows = frames.reshape(-1, 9)
-        return middle.astype(place), rows.astype(place), rows.astype(real), firsts, starts, lines
+        _, group, members = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+        # The kernel takes what is alone in its frame first.
+        order = np.lexsort((group, members[group] > 1))
+        emits, frames, group = emits[order], frames[order], group[order]
+        firsts = np.flatnonzero(np.diff(group, prepend=-1))
+        segments = np.diff(firsts, append=len(emits))
+        # A frame stands where its first segment starts; along it, lengths are from the receiver.
+        frames = frames[firsts] * [[[-1.0], [1.0], [1.0]]]
+        begin = self.ends[emits, 0]
+        middle = begin.mean(axis=0)
+        rows = np.dstack([frames, _inside(frames, middle - begin[firsts])])
+        shifts = _inside(np.repeat(frames, segments, axis=0), np.repeat(begin[firsts], segments, axis=0) - begin)
+        return (
+            middle.astype(place),
+            rows.reshape(-1, 12).astype(place),
+            -frames.reshape(-1, 9).astype(real),
+            np.append(firsts, len(emits)).astype(np.uint32),
+            np.column_stack([shifts, length[emits]]).astype(place),
+            np.column_stack([length[emits], self.exitance[emits] / math.tau]).astype(real),
+        )
 
 
 class Irradiance(NamedTuple):
@@ -161,7 +170,7 @@ class LineIrradiance(Operation[Irradiance]):
             raise ValueError(f"device {device.label} has no double precision; give receivers as float32")
         real = _real_of(self.precision, dtype)
         place = np.dtype(np.float64 if device.has_double else np.float32)
-        middle, frames, axes, firsts, starts, lines = self.segments.tables(place, real)
+        middle, rows, axes, firsts, starts, lines = self.segments.tables(place, real)
         count = math.prod(shape[:-1])
         strip = in_strips(self.walk, device) and count >= _LANES
         each = _strip_of(count, int(firsts[-1]), device) if strip else max(min(count, _GROUP), 1)
@@ -179,11 +188,12 @@ class LineIrradiance(Operation[Irradiance]):
             outputs={"irradiance": (shape[:-1], real), "status": (shape[:-1], np.dtype(np.uint8))},
             arguments=[
                 middle,
-                frames,
+                rows,
                 axes,
                 firsts,
                 starts,
                 lines,
+                np.uint32(np.count_nonzero(np.diff(firsts) == 1)),
                 np.uint32(len(firsts) - 1),
                 np.uint64(count),
                 np.uint64(each),
@@ -224,6 +234,12 @@ def _checked(values: Any, shape: tuple[int, ...], what: str) -> npt.NDArray[np.f
 def _refuse(wrong: Any, what: str) -> None:
     if wrong.any():
         raise ValueError(f"LitSegments: segment {int(np.argmax(wrong))} {what}")
+
+
+def _inside(frames: npt.NDArray[np.float64], vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the vectors, each in a frame."""
+    inside: npt.NDArray[np.float64] = np.einsum("nij,nj->ni", frames, vectors)
+    return inside
 
 
 def _unit(vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

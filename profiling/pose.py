@@ -69,7 +69,7 @@ def scene() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _fit_line(u, v, w, pairs):  # type: ignore[no-untyped-def]
+def fit_line(u, v, w, pairs):  # type: ignore[no-untyped-def]
     """Return middle, direction and variances of the robust line through places with certainties."""
     best_x, best_y, best_c, best_s, least = _ZERO, _ZERO, _ONE, _ZERO, np.float32(np.inf)
     for t in range(pairs.shape[0]):
@@ -253,7 +253,7 @@ def _fused(image, plain, rulers, lines, taps, numbers, pairs, starts, edges, sta
             sigma = edges[3, at] * np.exp(_HALF / (edges[2, at] * edges[2, at] + numbers[1]))
             across = abs(rulers[at, 7] - b * rulers[at, 8]) * per * sigma
             w[k] = _ONE / across if found else _ZERO
-        x, y, c, s, of_offset, of_angle = _fit_line(u, v, w, pairs)
+        x, y, c, s, of_offset, of_angle = fit_line(u, v, w, pairs)
         reach = np.sqrt(of_offset / of_angle)
         for side in range(2):
             way = reach if side else -reach

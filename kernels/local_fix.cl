@@ -9,7 +9,10 @@
 #include "ruler.h"
 
 #define RULER 9
-#define LINE 5 // unit normal, point, standard deviation of where it was made
+#define LINE 6 // unit normal, point, standard deviation of where it was made, how much the etching displaces it
+
+// Rows that a line makes: offset and angle, or of a single edge its offset.
+#define EACH_ROWS (EACH > 1 ? 2 : 1)
 
 #ifdef STRIP
 #define SHARED private
@@ -43,6 +46,7 @@ typedef struct {
     SHARED real *ex;
     SHARED real *ey;
     SHARED real *certainty;
+    SHARED real *grows;
 } fix_rows;
 
 inline void put_row(fix_rows rows, int i, global const real *line, real u, real v, real variance) {
@@ -55,6 +59,7 @@ inline void put_row(fix_rows rows, int i, global const real *line, real u, real 
     rows.ex[i] = good ? v * line[0] : 0;
     rows.ey[i] = good ? v * line[1] : 0;
     rows.certainty[i] = good ? 1 / sigma : 0;
+    rows.grows[i] = line[5];
 }
 
 // A line is two rows: places either side of its middle whose offsets are uncorrelated carry its offset and its angle.
@@ -62,8 +67,9 @@ inline void put_row(fix_rows rows, int i, global const real *line, real u, real 
 inline void put_line(fix_rows rows, int i, global const real *line, real x, real y, real c, real s, real of_offset,
                      real of_angle, int has_angle) {
     const real reach = has_angle ? sqrt(of_offset / of_angle) : 0, side = c < 0 ? -reach : reach;
-    put_row(rows, 2 * i, line, x - side * c, y - side * s, has_angle ? 2 * of_offset : of_offset);
-    put_row(rows, 2 * i + 1, line, x + side * c, y + side * s, has_angle ? 2 * of_offset : REAL_NAN);
+    put_row(rows, EACH_ROWS * i, line, x - side * c, y - side * s, has_angle ? 2 * of_offset : of_offset);
+    if (EACH_ROWS > 1)
+        put_row(rows, EACH_ROWS * i + 1, line, x + side * c, y + side * s, has_angle ? 2 * of_offset : REAL_NAN);
 }
 
 // Lines `first` on of this item, LANES at once: rows of each, and a weight for each edge.
@@ -94,15 +100,17 @@ kernel void local_fix(global const CODE *restrict image, global const real *rest
                       global real *restrict placement, global real *restrict covariance,
                       global real *restrict residuals, global real *restrict weights, global real *restrict scale,
                       global real *restrict spread, global real *restrict condition, global int *restrict rank,
-                      global int *restrict inliers, global uchar *restrict status, global real *restrict edges,
+                      global int *restrict inliers, global uchar *restrict status, global real *restrict etch, global real *restrict agreement,
+                      global real *restrict leverage, global real *restrict edges,
                       global uchar *restrict edge_status, global real *restrict edge_weights, constant real *table,
                       constant real *model, const int rows, const int columns, const int lines, const int each,
                       constant int *pairs, const int pair_trials, constant int *subsets, const int trials,
-                      const int steps, const real share, const real agreement, const real place_x,
-                      const real place_y) {
-    const int count = 2 * lines, padded = (count + LANES - 1) / LANES * LANES;
-    SHARED real row[7][CAPACITY];
-    const fix_rows lined = {row[0], row[1], row[2], row[3], row[4], row[5], row[6]};
+                      const int steps, const real share, const real least_agreeing,
+                      const real largest_leverage, const real shift_within, const real turn_within, const real place_x,
+                      const real place_y, const real etch_certainty) {
+    const int count = EACH_ROWS * lines, padded = (count + LANES - 1) / LANES * LANES;
+    SHARED real row[8][CAPACITY];
+    const fix_rows lined = {row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7]};
     ruler_edge edge[MOST];
     SHARED real place[3][ROOM];
     const fix_places places_of = {place[0], place[1], place[2]};
@@ -150,6 +158,7 @@ kernel void local_fix(global const CODE *restrict image, global const real *rest
     if (item) return;
 #endif
     real nx[CAPACITY], ny[CAPACITY], px[CAPACITY], py[CAPACITY], ex[CAPACITY], ey[CAPACITY], certain[CAPACITY];
+    real grows[CAPACITY];
     reals room[CAPACITY];
     real sum = 0, sum_x = 0, sum_y = 0;
     for (int i = 0; i < padded; i++) {
@@ -161,15 +170,18 @@ kernel void local_fix(global const CODE *restrict image, global const real *rest
         ex[i] = there ? row[4][i] : 0;
         ey[i] = there ? row[5][i] : 0;
         certain[i] = there ? row[6][i] : 0;
+        grows[i] = there ? row[7][i] : 0;
         sum += certain[i] > 0;
         sum_x += px[i];
         sum_y += py[i];
     }
-    const pose_rows all = {nx, ny, px, py, ex, ey, certain, padded};
-    const pose_frame frame = framed(all, sum, sum_x, sum_y);
-    const laned_pose about = {0, 0, 0, 0, 0, 0};
+    pose_rows all = {nx, ny, px, py, ex, ey, certain, grows, padded, etch_certainty};
+    const pose_frame frame = framed(&all, sum, sum_x, sum_y);
+    const laned_pose about = {0, 0, 0, 0, 0, 0, 0};
     const solved_pose fit = pose_solved(about, all, subsets, trials, steps, 1e-3f, share, room);
     const pose_outputs outputs = {pose,   deformation, placement, covariance, residuals, weights,
-                                  scale,  spread,      condition, rank,       inliers,   status};
-    store_pose(fit, all, frame, 1, 0, count, agreement, place_x, place_y, outputs);
+                                  scale,  spread,      condition, rank,       inliers,   status,     etch,
+                                  agreement, leverage};
+    const pose_limits asked = {least_agreeing, largest_leverage, shift_within, turn_within};
+    store_pose(fit, all, frame, 1, 0, count, asked, place_x, place_y, outputs);
 }

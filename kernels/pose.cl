@@ -2,8 +2,12 @@
 // a time.
 #include "pose_result.h"
 
-// Numbers of a row: normal, place, displacement seen, sigma.
+// Numbers of a row: normal, place, displacement seen, sigma; and with ETCHED how much the etching displaces it.
+#ifdef ETCHED
+#define ROW 8
+#else
 #define ROW 7
+#endif
 
 kernel void pose_sets(global const INPUT *restrict rows,
 #ifdef WITH_NEAR
@@ -13,13 +17,20 @@ kernel void pose_sets(global const INPUT *restrict rows,
                       global real *restrict covariance, global real *restrict residuals, global real *restrict weights,
                       global real *restrict scale, global real *restrict spread, global real *restrict condition,
                       global int *restrict rank, global int *restrict inliers, global uchar *restrict status,
-                      const long poses, const int count, constant int *subsets, const int trials, const int steps,
-                      const real smallest, const real share, const real agreement, const real place_x,
-                      const real place_y) {
+                      global real *restrict etch, global real *restrict agreement,
+                      global real *restrict leverage,                       const long poses, const int count, constant int *subsets, const int trials, const int steps,
+                      const real smallest, const real share, const real least_agreeing,
+                      const real largest_leverage, const real shift_within, const real turn_within, const real place_x,
+                      const real place_y, const real etch_certainty) {
     const long item = (long)get_global_id(0);
     if (item >= poses) return;
     real nx[CAPACITY], ny[CAPACITY], px[CAPACITY], py[CAPACITY], ex[CAPACITY], ey[CAPACITY], certainty[CAPACITY];
     reals room[CAPACITY];
+#ifdef ETCHED
+    real grows[CAPACITY];
+#else
+    private real *grows = 0;
+#endif
     const int padded = (count + LANES - 1) / LANES * LANES;
     global const INPUT *row = rows + item * count * ROW;
     real sum = 0, sum_x = 0, sum_y = 0;
@@ -36,13 +47,16 @@ kernel void pose_sets(global const INPUT *restrict rows,
         ex[i] = good ? row[at + 4] : 0;
         ey[i] = good ? row[at + 5] : 0;
         certainty[i] = good ? 1 / (real)row[at + 6] : 0;
+#ifdef ETCHED
+        grows[i] = good ? row[at + 7] : 0;
+#endif
         sum += good;
         sum_x += px[i];
         sum_y += py[i];
     }
-    const pose_rows all = {nx, ny, px, py, ex, ey, certainty, padded};
-    const pose_frame frame = framed(all, sum, sum_x, sum_y);
-    laned_pose about = {0, 0, 0, 0, 0, 0};
+    pose_rows all = {nx, ny, px, py, ex, ey, certainty, grows, padded, etch_certainty};
+    const pose_frame frame = framed(&all, sum, sum_x, sum_y);
+    laned_pose about = {0, 0, 0, 0, 0, 0, 0};
 #ifdef WITH_NEAR
     const real x = near[3 * item], y = near[3 * item + 1], turn = near[3 * item + 2];
     all_finite = !(not_finite(x) | not_finite(y) | not_finite(turn));
@@ -51,6 +65,8 @@ kernel void pose_sets(global const INPUT *restrict rows,
     const solved_pose fit = pose_solved(about, all, subsets, trials, steps, smallest, share, room);
 
     const pose_outputs outputs = {pose,   deformation, placement, covariance, residuals, weights,
-                                  scale,  spread,      condition, rank,       inliers,   status};
-    store_pose(fit, all, frame, all_finite, item, count, agreement, place_x, place_y, outputs);
+                                  scale,  spread,      condition, rank,       inliers,   status,     etch,
+                                  agreement, leverage};
+    const pose_limits asked = {least_agreeing, largest_leverage, shift_within, turn_within};
+    store_pose(fit, all, frame, all_finite, item, count, asked, place_x, place_y, outputs);
 }

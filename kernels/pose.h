@@ -4,21 +4,34 @@
 // n . (T^-1(q) - p) = 0, for a feature's normal n: of an edge its own, of a point two at right angles. With
 // w = e - t - D p that is n . (I + D)^-1 w, in which nothing large is subtracted. A step d of the pose turns it into
 // T exp(d), and adds h . d to n . (T^-1(q) - p): h = (n, n . J p', ...) with p' = T^-1(q).
+//
+// With ETCHED the copper of the whole board is larger all round by one more unknown, about which something is known
+// before: an edge out of the copper lies that much further along its normal, h has 1 more.
 #ifndef POSE_H
 #define POSE_H
 
 #include "least_squares.h"
 #include "robust.h"
 
-// FREEDOMS: 3, the board is rigid; 4, with a scale; 6, with scales along both axes and a shear.
+// OF_POSE: 3, the board is rigid; 4, with a scale; 6, with scales along both axes and a shear. FREEDOMS: the etching, too.
 typedef struct {
-    reals dxx, dxy, dyx, dyy, x, y;
+    reals dxx, dxy, dyx, dyy, x, y, etch;
 } laned_pose;
 
-// One equation: normal, place, what it was seen to be displaced by, 1/sigma.
+// One equation: normal, place, what it was seen to be displaced by, 1/sigma, and how much the etching displaces it.
 typedef struct {
-    reals nx, ny, px, py, ex, ey, certainty;
+    reals nx, ny, px, py, ex, ey, certainty, grows;
 } laned_row;
+
+#ifdef ETCHED
+#define ETCH_OF(from, i) READ((from), i)
+#define ETCH_FOR_ALL(from, i) ((reals)((from)[i]))
+#define ETCH_GATHERED(from, at) GATHERED(from, at)
+#else
+#define ETCH_OF(from, i) ((reals)0)
+#define ETCH_FOR_ALL(from, i) ((reals)0)
+#define ETCH_GATHERED(from, at) ((reals)0)
+#endif
 
 // Equations side by side, padded with ones of certainty zero to whole vectors.
 typedef struct {
@@ -29,7 +42,9 @@ typedef struct {
     private const real *ex;
     private const real *ey;
     private const real *certainty;
+    private const real *grows; // null without ETCHED
     int count;
+    real etch; // 1/sigma of what is known of the etching before
 } pose_rows;
 
 typedef struct {
@@ -38,13 +53,14 @@ typedef struct {
 
 inline laned_row row_of(pose_rows all, int i) {
     return (laned_row){READ(all.nx, i), READ(all.ny, i), READ(all.px, i),       READ(all.py, i),
-                       READ(all.ex, i), READ(all.ey, i), READ(all.certainty, i)};
+                       READ(all.ex, i), READ(all.ey, i), READ(all.certainty, i), ETCH_OF(all.grows, i)};
 }
 
 // The same one for all lanes.
 inline laned_row row_for_all(pose_rows all, int i) {
     return (laned_row){(reals)all.nx[i], (reals)all.ny[i], (reals)all.px[i],       (reals)all.py[i],
-                       (reals)all.ex[i], (reals)all.ey[i], (reals)all.certainty[i]};
+                       (reals)all.ex[i], (reals)all.ey[i], (reals)all.certainty[i],
+                       ETCH_FOR_ALL(all.grows, i)};
 }
 
 inline pose_equation equation_of(laned_pose pose, laned_row at) {
@@ -55,16 +71,19 @@ inline pose_equation equation_of(laned_pose pose, laned_row at) {
     const reals bx = (ayy * wx - pose.dxy * wy) * per, by = (axx * wy - pose.dyx * wx) * per;
     const reals x = at.px + bx, y = at.py + by;
     pose_equation equation;
-    equation.residual = at.nx * bx + at.ny * by;
+    equation.residual = at.nx * bx + at.ny * by - at.grows * pose.etch;
     equation.row[0] = at.nx;
     equation.row[1] = at.ny;
     equation.row[2] = at.ny * x - at.nx * y;
-#if FREEDOMS == 4
+#if OF_POSE == 4
     equation.row[3] = at.nx * x + at.ny * y;
-#elif FREEDOMS == 6
+#elif OF_POSE == 6
     equation.row[3] = at.nx * x;
     equation.row[4] = at.ny * y;
     equation.row[5] = at.nx * y;
+#endif
+#ifdef ETCHED
+    equation.row[OF_POSE] = at.grows;
 #endif
     return equation;
 }
@@ -76,16 +95,21 @@ inline laned_pose pose_after(laned_pose pose, private const reals *step) {
     const reals tangent = step[2], cosine = (reals)1 / sqrt((reals)1 + tangent * tangent), sine = tangent * cosine;
     const reals less = -sine * sine / ((reals)1 + cosine); // cosine - 1, to all its digits
     reals exx = less, exy = -sine, eyx = sine, eyy = less;
-#if FREEDOMS == 4
+#if OF_POSE == 4
     exx += cosine * step[3], exy -= sine * step[3], eyx += sine * step[3], eyy += cosine * step[3];
-#elif FREEDOMS == 6
+#elif OF_POSE == 6
     exx += cosine * step[3], exy += cosine * step[5] - sine * step[4];
     eyx += sine * step[3], eyy += sine * step[5] + cosine * step[4];
 #endif
     const reals axx = (reals)1 + pose.dxx, ayy = (reals)1 + pose.dyy;
     const laned_pose next = {pose.dxx + axx * exx + pose.dxy * eyx,  pose.dxy + axx * exy + pose.dxy * eyy,
                              pose.dyx + pose.dyx * exx + ayy * eyx,  pose.dyy + pose.dyx * exy + ayy * eyy,
-                             pose.x + axx * step[0] + pose.dxy * step[1], pose.y + pose.dyx * step[0] + ayy * step[1]};
+                             pose.x + axx * step[0] + pose.dxy * step[1], pose.y + pose.dyx * step[0] + ayy * step[1],
+#ifdef ETCHED
+                             pose.etch + step[OF_POSE]};
+#else
+                             0};
+#endif
     return next;
 }
 
@@ -95,6 +119,15 @@ inline void add_equation(pose_equation equation, reals weight, private reals *ma
         right[i] += weighted * equation.residual;
         for (int j = 0; j <= i; j++) matrix[CELL(i, j)] += weighted * equation.row[j];
     }
+}
+
+// Adds what is known of the etching before, as one more equation.
+inline void add_etch(laned_pose pose, real certainty, private reals *matrix, private reals *right) {
+#ifdef ETCHED
+    const reals square = (reals)(certainty * certainty);
+    matrix[CELL(OF_POSE, OF_POSE)] += square;
+    right[OF_POSE] -= square * pose.etch;
+#endif
 }
 
 #ifdef STRIP
@@ -108,7 +141,12 @@ inline void add_equation(pose_equation equation, reals weight, private reals *ma
 
 // How badly each lane's pose does: the loss at the scale that is known, or the median of the residuals to a percent.
 inline reals pose_score(laned_pose pose, pose_rows all, private reals *distances, int present) {
+#ifdef ETCHED
+    const reals off = pose.etch * (reals)all.etch;
+    reals loss = (reals)0.5f * off * off;
+#else
     reals loss = 0;
+#endif
     for (int i = 0; i < all.count; i++) {
         const laned_row at = row_for_all(all, i);
         const reals z = residual_of(pose, at) * at.certainty;
@@ -135,7 +173,7 @@ inline laned_pose pose_start(laned_pose near, pose_rows all, constant const int 
             constant const int *at = subsets + (size_t)trial * FREEDOMS + k * LANES;
             of[k] = (laned_row){GATHERED(all.nx, at), GATHERED(all.ny, at), GATHERED(all.px, at),
                                 GATHERED(all.py, at), GATHERED(all.ex, at), GATHERED(all.ey, at),
-                                GATHERED(all.certainty, at)};
+                                GATHERED(all.certainty, at), ETCH_GATHERED(all.grows, at)};
         }
         laned_pose tried = near;
         masks bad = 0;
@@ -143,9 +181,15 @@ inline laned_pose pose_start(laned_pose near, pose_rows all, constant const int 
             reals matrix[TRIANGLE], right[FREEDOMS], change[FREEDOMS];
             for (int i = 0; i < TRIANGLE; i++) matrix[i] = 0;
             for (int i = 0; i < FREEDOMS; i++) right[i] = 0;
-            for (int k = 0; k < FREEDOMS; k++)
-                add_equation(equation_of(tried, of[k]), mask_of(of[k].certainty > (reals)0) ? (reals)1 : (reals)0, matrix,
-                             right);
+            for (int k = 0; k < FREEDOMS; k++) {
+#ifdef ETCHED
+                const reals weight = of[k].certainty * of[k].certainty;
+#else
+                const reals weight = mask_of(of[k].certainty > (reals)0) ? (reals)1 : (reals)0;
+#endif
+                add_equation(equation_of(tried, of[k]), weight, matrix, right);
+            }
+            add_etch(tried, all.etch, matrix, right);
             bad |= factored(matrix);
             solved(matrix, right, change);
             tried = pose_after(tried, change);
@@ -155,7 +199,8 @@ inline laned_pose pose_start(laned_pose near, pose_rows all, constant const int 
             if (LANE_BITS(bad, lane) || !(LANE(loss, lane) < least)) continue;
             least = LANE(loss, lane);
             best = (laned_pose){(reals)LANE(tried.dxx, lane), (reals)LANE(tried.dxy, lane), (reals)LANE(tried.dyx, lane),
-                                (reals)LANE(tried.dyy, lane), (reals)LANE(tried.x, lane),   (reals)LANE(tried.y, lane)};
+                                (reals)LANE(tried.dyy, lane), (reals)LANE(tried.x, lane),   (reals)LANE(tried.y, lane),
+                                (reals)LANE(tried.etch, lane)};
         }
     }
     return best;
@@ -196,8 +241,11 @@ typedef struct {
     real slopes, squares;
 } pose_sums;
 
-// Those that count at all count fully for `evenly`.
-inline void pose_summed(laned_pose pose, pose_rows all, real per_scale, int evenly, private pose_sums *sums) {
+#define WEIGHTED 0
+#define EVENLY 1     // those that count at all count fully
+#define EVERY_ROW 2  // that there is
+
+inline void pose_summed(laned_pose pose, pose_rows all, real per_scale, int how, private pose_sums *sums) {
     masks inliers = 0;
     reals slopes = 0, squares = 0;
     for (int i = 0; i < TRIANGLE; i++) sums->matrix[i] = 0;
@@ -207,7 +255,7 @@ inline void pose_summed(laned_pose pose, pose_rows all, real per_scale, int even
         const pose_equation equation = equation_of(pose, at);
         const reals z = equation.residual * at.certainty * (reals)per_scale, weight = loss_weight(z);
         const masks is_in = mask_of(at.certainty * weight > (reals)0);
-        const reals counts = evenly ? kept_where(is_in, (reals)1) : weight;
+        const reals counts = how == WEIGHTED ? weight : how == EVENLY ? kept_where(is_in, (reals)1) : (reals)1;
         add_equation(equation, at.certainty * at.certainty * counts, sums->matrix, sums->right);
         inliers -= is_in;
         slopes += kept_where(is_in, loss_slope(z));
@@ -215,51 +263,98 @@ inline void pose_summed(laned_pose pose, pose_rows all, real per_scale, int even
     }
     for (int i = 0; i < TRIANGLE; i++) sums->matrix[i] = (reals)sum_of(sums->matrix[i]);
     for (int i = 0; i < FREEDOMS; i++) sums->right[i] = (reals)sum_of(sums->right[i]);
+    add_etch(pose, all.etch / per_scale, sums->matrix, sums->right);
     sums->inliers = (int)sum_of(LANED(convert_real)(inliers));
     sums->slopes = sum_of(slopes);
     sums->squares = sum_of(squares);
 }
 
+typedef struct {
+    real cell[OF_POSE][OF_POSE];
+} pose_matrix;
+
+// The pose's part of a matrix: what the etching takes is taken out.
+inline pose_matrix pose_part(private const reals *triangle) {
+    pose_matrix of;
+    for (int i = 0; i < OF_POSE; i++)
+        for (int j = 0; j <= i; j++) {
+            of.cell[i][j] = FIRST(triangle[CELL(i, j)]);
+#ifdef ETCHED
+            of.cell[i][j] -= FIRST(triangle[CELL(OF_POSE, i)]) * FIRST(triangle[CELL(OF_POSE, j)]) /
+                             FIRST(triangle[CELL(OF_POSE, OF_POSE)]);
+#endif
+            of.cell[j][i] = of.cell[i][j];
+        }
+    return of;
+}
+
 // Eigenvalues of a symmetric matrix by Jacobi's rotations: least and largest, and how many are over a share of the
 // largest.
-inline int eigenvalues(private const reals *triangle, real share, private real *least, private real *largest) {
-    real a[FREEDOMS][FREEDOMS];
-    for (int i = 0; i < FREEDOMS; i++)
-        for (int j = 0; j <= i; j++) a[i][j] = a[j][i] = FIRST(triangle[CELL(i, j)]);
+inline int eigenvalues(pose_matrix of, real share, private real *least, private real *largest) {
     for (int sweep = 0; sweep < 5; sweep++)
-        for (int p = 0; p < FREEDOMS - 1; p++)
-            for (int q = p + 1; q < FREEDOMS; q++) {
-                if (a[p][q] == 0) continue;
-                const real ratio = (a[q][q] - a[p][p]) / (2 * a[p][q]);
+        for (int p = 0; p < OF_POSE - 1; p++)
+            for (int q = p + 1; q < OF_POSE; q++) {
+                if (of.cell[p][q] == 0) continue;
+                const real ratio = (of.cell[q][q] - of.cell[p][p]) / (2 * of.cell[p][q]);
                 const real t = (ratio < 0 ? -1 : 1) / (fabs(ratio) + sqrt(ratio * ratio + 1));
                 const real c = 1 / sqrt(t * t + 1), s = t * c;
-                for (int k = 0; k < FREEDOMS; k++) {
-                    const real kp = a[k][p], kq = a[k][q];
-                    a[k][p] = c * kp - s * kq;
-                    a[k][q] = s * kp + c * kq;
+                for (int k = 0; k < OF_POSE; k++) {
+                    const real kp = of.cell[k][p], kq = of.cell[k][q];
+                    of.cell[k][p] = c * kp - s * kq;
+                    of.cell[k][q] = s * kp + c * kq;
                 }
-                for (int k = 0; k < FREEDOMS; k++) {
-                    const real pk = a[p][k], qk = a[q][k];
-                    a[p][k] = c * pk - s * qk;
-                    a[q][k] = s * pk + c * qk;
+                for (int k = 0; k < OF_POSE; k++) {
+                    const real pk = of.cell[p][k], qk = of.cell[q][k];
+                    of.cell[p][k] = c * pk - s * qk;
+                    of.cell[q][k] = s * pk + c * qk;
                 }
-                a[p][q] = a[q][p] = 0;
+                of.cell[p][q] = of.cell[q][p] = 0;
             }
-    *least = *largest = a[0][0];
-    for (int i = 1; i < FREEDOMS; i++) *least = min(*least, a[i][i]), *largest = max(*largest, a[i][i]);
+    *least = *largest = of.cell[0][0];
+    for (int i = 1; i < OF_POSE; i++) {
+        *least = min(*least, of.cell[i][i]);
+        *largest = max(*largest, of.cell[i][i]);
+    }
     int rank = 0;
-    for (int i = 0; i < FREEDOMS; i++) rank += a[i][i] > share * *largest;
+    for (int i = 0; i < OF_POSE; i++) rank += of.cell[i][i] > share * *largest;
     return rank;
+}
+
+// Which share of all that the rows say of the pose agrees, of the combination of freedoms of which least does: the
+// least eigenvalue of L^-1 M L^-T, M of those that agree and L L^T of all.
+inline real least_agreement(pose_matrix agrees, pose_matrix all) {
+    real factor[OF_POSE][OF_POSE];
+    for (int i = 0; i < OF_POSE; i++)
+        for (int j = 0; j <= i; j++) {
+            real sum = all.cell[i][j];
+            for (int k = 0; k < j; k++) sum -= factor[i][k] * factor[j][k];
+            if (i == j && !(sum > all.cell[i][i] * (8 * REAL_EPSILON))) return 0;
+            factor[i][j] = i == j ? sqrt(sum) : sum / factor[j][j];
+        }
+    for (int column = 0; column < OF_POSE; column++)
+        for (int i = 0; i < OF_POSE; i++) {
+            for (int k = 0; k < i; k++) agrees.cell[i][column] -= factor[i][k] * agrees.cell[k][column];
+            agrees.cell[i][column] /= factor[i][i];
+        }
+    for (int row = 0; row < OF_POSE; row++)
+        for (int i = 0; i < OF_POSE; i++) {
+            for (int k = 0; k < i; k++) agrees.cell[row][i] -= factor[i][k] * agrees.cell[row][k];
+            agrees.cell[row][i] /= factor[i][i];
+        }
+    real least, largest;
+    eigenvalues(agrees, 0, &least, &largest);
+    return least;
 }
 
 typedef struct {
     laned_pose pose;
     real covariance[FREEDOMS][FREEDOMS]; // of the step in the artwork's frame, about the origin of the rows' places
     real scale, spread, condition;
+    real agreement, leverage; // least share that agrees, and the largest of a row in its own residual
     int present, inliers, rank;
 } solved_pose;
 
-inline void pose_covariance(private solved_pose *fit, private const pose_sums *sums) {
+inline void pose_covariance(private solved_pose *fit, pose_rows all, private const pose_sums *sums) {
     reals factor[TRIANGLE];
     for (int i = 0; i < TRIANGLE; i++) factor[i] = sums->matrix[i];
     factored(factor);
@@ -276,6 +371,20 @@ inline void pose_covariance(private solved_pose *fit, private const pose_sums *s
         solved(factor, unit, column);
         for (int k = 0; k < FREEDOMS; k++) fit->covariance[i][k] = variance * FIRST(column[k]);
     }
+    fit->leverage = 0;
+#ifdef ROBUST
+    for (int at = 0; at < all.count; at += LANES) {
+        const laned_row row = row_of(all, at);
+        const pose_equation equation = equation_of(fit->pose, row);
+        const masks is_in = mask_of(row.certainty * loss_weight(equation.residual * row.certainty / fit->scale) > (reals)0);
+        reals sum = 0;
+        for (int i = 0; i < FREEDOMS; i++)
+            for (int k = 0; k < FREEDOMS; k++)
+                sum += equation.row[i] * equation.row[k] * (reals)(fit->covariance[i][k] / variance);
+        sum = kept_where(is_in, sum * row.certainty * row.certainty);
+        for (int lane = 0; lane < LANES; lane++) fit->leverage = max(fit->leverage, LANE(sum, lane));
+    }
+#endif
 }
 
 // The places' unit must be about their distance from the origin. `room` has as many reals as there are rows.
@@ -295,7 +404,7 @@ inline solved_pose pose_solved(laned_pose near, pose_rows all, constant const in
     for (int step = 0; step < steps; step++) {
         if (RESCALED_AT(step)) fit.scale = pose_scale(fit.pose, all, room, (real)2.5f * fit.scale, FEW_FITTED, smallest);
         reals change[FREEDOMS];
-        pose_summed(fit.pose, all, 1 / fit.scale, 0, &sums);
+        pose_summed(fit.pose, all, 1 / fit.scale, WEIGHTED, &sums);
         if (any_lane(factored(sums.matrix))) break;
         solved(sums.matrix, sums.right, change);
         fit.pose = pose_after(fit.pose, change);
@@ -303,12 +412,16 @@ inline solved_pose pose_solved(laned_pose near, pose_rows all, constant const in
 #ifndef ROBUST
     fit.scale = pose_scale(fit.pose, all, room, INFINITY, FEW_FITTED, smallest);
 #endif
-    pose_summed(fit.pose, all, 1 / fit.scale, 1, &sums);
+    pose_summed(fit.pose, all, 1 / fit.scale, EVERY_ROW, &sums);
+    const pose_matrix every = pose_part(sums.matrix);
+    pose_summed(fit.pose, all, 1 / fit.scale, EVENLY, &sums);
+    const pose_matrix agrees = pose_part(sums.matrix);
     fit.inliers = sums.inliers;
     real least, largest;
-    fit.rank = eigenvalues(sums.matrix, share, &least, &largest);
+    fit.rank = eigenvalues(agrees, share, &least, &largest);
+    fit.agreement = least_agreement(agrees, every);
     fit.condition = sqrt(largest / max(least, (real)REAL_EPSILON * largest));
-    pose_covariance(&fit, &sums);
+    pose_covariance(&fit, all, &sums);
     return fit;
 }
 

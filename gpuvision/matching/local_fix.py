@@ -19,7 +19,7 @@ from gpuvision.matching.ruler import RulerEdges
 
 Float64 = npt.NDArray[np.float64]
 RULER = ("x_px", "y_px", "cosine", "sine", "u", "v", "u_per_px", "v_per_px", "bend")
-LINE = ("normal_x", "normal_y", "x", "y", "sigma")
+LINE = ("normal_x", "normal_y", "x", "y", "sigma", "grows")
 _GROUP, _MOST_RULERS = 64, 2048
 _REAL = np.dtype(np.float32)
 
@@ -29,10 +29,10 @@ class Fix(NamedTuple):
 
     Attributes
     ----------
-    pose, deformation, placement, covariance, scale, spread, condition, rank, inliers, status
-        As in `BoardPose`, of one pose; of two rows for each line.
+    pose, deformation, placement, covariance, scale, spread, condition, rank, inliers, status, etch, agreement, leverage
+        As in `BoardPose`, of one pose; of two rows for each line, or one where a line has one ruler.
     residuals, weights
-        (lines, 2): of the rows of each line, either side of its middle [m].
+        (lines, 2): of the rows of each line, either side of its middle [m]; (lines, 1) where it has one ruler.
     edges
         (lines, each) positions along the rulers [px]; NaN where there is none.
     edge_status
@@ -53,12 +53,17 @@ class Fix(NamedTuple):
     rank: Any
     inliers: Any
     status: Any
+    etch: Any
+    agreement: Any
+    leverage: Any
     edges: Any
     edge_status: Any
     edge_weights: Any
 
 
-def lay_rulers(normal: Any, point: Any, along: Any, board_to_image: Any, sigma: Any = 0.0) -> tuple[Any, Any]:
+def lay_rulers(
+    normal: Any, point: Any, along: Any, board_to_image: Any, sigma: Any = 0.0, grows: Any = 0.0
+) -> tuple[Any, Any]:
     """Lay rulers across lines of the artwork.
 
     Parameters
@@ -71,15 +76,18 @@ def lay_rulers(normal: Any, point: Any, along: Any, board_to_image: Any, sigma: 
     board_to_image
         3 x 3, the board where it is expected to the (undistorted) image [m to px].
     sigma
-        (lines,) standard deviation of a line's place on the board, all its rulers together [m]: etching, mask, copper
-        layer.
+        (lines,) standard deviation of a line's place on the board, all its rulers together and every line on its own
+        [m]: rough edges, a mask's opening, silk.
+    grows
+        (lines,) by how much of the board's etching a line lies further along its normal, for a solver with ``etch``: 1
+        out of the copper, 0 for the middle of a trace.
 
     Returns
     -------
     rulers : numpy.ndarray
         float32 (lines, each, 9): centre and direction in the image, and where its pixels lie in the line's own frame.
     lines : numpy.ndarray
-        float32 (lines, 5).
+        float32 (lines, 6).
     """
     normal, point, along = (np.asarray(each, np.float64) for each in (normal, point, along))
     matrix = np.asarray(board_to_image, np.float64)
@@ -100,8 +108,8 @@ def lay_rulers(normal: Any, point: Any, along: Any, board_to_image: Any, sigma: 
     moved = slope[..., :2] * per - origin * bend
     frame = [np.sum(each * axis, axis=-1, keepdims=True) for each in (offset, moved) for axis in (way, across)]
     rulers = np.concatenate([centre, direction, *frame, bend], axis=-1).astype(np.float32)
-    of = np.broadcast_to(np.asarray(sigma, np.float64), normal.shape[:1])[:, None]
-    return rulers, np.concatenate([normal, point, of], axis=-1).astype(np.float32)
+    more = [np.broadcast_to(np.asarray(each, np.float64), normal.shape[:1])[:, None] for each in (sigma, grows)]
+    return rulers, np.concatenate([normal, point, *more], axis=-1).astype(np.float32)
 
 
 def _through(matrix: Float64, points: Float64) -> Float64:
@@ -113,7 +121,7 @@ def _through(matrix: Float64, points: Float64) -> Float64:
 class LocalFix(Operation[Fix]):
     """A pose from a frame: ``op(image, rulers, lines) -> Fix``.
 
-    The image is as `RulerEdges` takes it; the rulers float32 of (lines, each, 9) and the lines float32 of (lines, 5)
+    The image is as `RulerEdges` takes it; the rulers float32 of (lines, each, 9) and the lines float32 of (lines, 6)
     are those of `lay_rulers`. The pose is that of the artwork where it is seen on the board's plane, 0 where it is as
     expected.
 
@@ -160,19 +168,20 @@ class LocalFix(Operation[Fix]):
             raise ValueError(
                 f"LocalFix: {self.lines} lines of {self.each} rulers, expected {_MOST_RULERS} or fewer in all"
             )
-        if 2 * self.lines < FREEDOMS[self.solver.freedom]:
+        if self._rows_of_line * self.lines < self.solver.unknowns:
             raise ValueError(f"LocalFix.lines is {self.lines}: too few for the freedom '{self.solver.freedom}'")
 
     def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         edges = self._edges(device, shape, dtype)
-        strip, count, solver = in_strips(self.ruler.walk, device), 2 * self.lines, self.solver
+        strip, count, solver = in_strips(self.ruler.walk, device), self._rows_of_line * self.lines, self.solver
         freedoms = FREEDOMS[solver.freedom]
         pairs = subsets(max(self.each, 2), 2, solver.trials) if self.each > 1 else np.zeros((1, 2), np.int32)
+        of_rows = (self.lines, self._rows_of_line)
         sizes: dict[str, tuple[int, ...]] = {"pose": (3,), "deformation": (3,), "placement": (2,)}
-        sizes |= {"covariance": (freedoms, freedoms), "residuals": (self.lines, 2), "weights": (self.lines, 2)}
+        sizes |= {"covariance": (freedoms, freedoms), "residuals": of_rows, "weights": of_rows}
         sizes |= dict.fromkeys(("scale", "spread", "condition"), ())
         found = (self.lines, self.each)
-        limits = (solver.largest_condition**-2, solver.least_agreement, *solver.placement)
+        limits = (*solver.limits, *solver.placement, solver.certainty_of_etch)
         return Launch(
             stem="local_fix",
             kernel="local_fix",
@@ -182,6 +191,7 @@ class LocalFix(Operation[Fix]):
                 **{name: (size, _REAL) for name, size in sizes.items()},
                 **{name: ((), np.dtype(np.int32)) for name in ("rank", "inliers")},
                 "status": ((), np.dtype(np.uint8)),
+                **dict.fromkeys(("etch", "agreement", "leverage"), ((), _REAL)),
                 "edges": (found, _REAL),
                 "edge_status": (found, np.dtype(np.uint8)),
                 "edge_weights": (found, _REAL),
@@ -205,6 +215,10 @@ class LocalFix(Operation[Fix]):
     def _edges(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Return what the rulers alone would launch: their table, model and defines."""
         return replace(self.ruler, count=self.lines * self.each)._launch(device, shape, dtype)
+
+    @property
+    def _rows_of_line(self) -> int:
+        return 2 if self.each > 1 else 1
 
     def _capacities(self) -> dict[str, int]:
         """Return the sizes of the arrays; powers of two, so that there are few builds."""

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.matching.artwork import Artwork
-from gpuvision.matching.artwork_shapes import Float64, Layer, covered
+from gpuvision.matching.artwork_shapes import Float64, Layer, Shape, capsule, covered
 
 _ITSELF = 2e-6  # [m] within which a step is the edge that is looked for, to the chords of arcs
 _WORST_CONDITION = 1e4  # worst standard deviation over best: beyond it a pose is refused
@@ -31,28 +31,35 @@ class Imaging:
     pixel
         On the board [m].
     blur_px
-        Standard deviation of the edges' blur [px].
+        Standard deviation of the edges' blur [px], the extent of the pixels included (12^-1/2 px).
+    motion_px
+        x, y by which the picture is smeared [px]: edges across it are blurred more than the smoothing is for.
     contrast_bare, contrast_masked
         Step at an edge over the noise of a pixel, of bare copper and of copper under the mask.
     width_px
         Lines that a ruler averages.
     etch
         Standard deviation of how far copper was etched beside its drawn edge, the same all over the board [m].
+    registration
+        Greatest distance, along x and along y, of the mask, the silk and the holes from where they belong on the copper
+        [m].
     shift, angle
         Greatest distance [m], along x and along y, and greatest angle [rad] from where the board is looked for.
 
     Raises
     ------
     ValueError
-        A parameter that is not finite, or not positive (``etch`` and ``angle`` may be 0).
+        A parameter that is not finite, or not positive (``motion_px``, ``etch``, ``registration``, ``angle`` may be 0).
     """
 
     pixel: float
     blur_px: float = 1.0
+    motion_px: tuple[float, float] = (0.0, 0.0)
     contrast_bare: float = 40.0
     contrast_masked: float = 15.0
     width_px: int = 5
     etch: float = 10e-6
+    registration: float = 50e-6
     shift: float = 100e-6
     angle: float = 5e-3
 
@@ -60,18 +67,34 @@ class Imaging:
         positive = (self.pixel, self.blur_px, self.contrast_bare, self.contrast_masked, self.width_px, self.shift)
         if not all(math.isfinite(each) and each > 0 for each in positive):
             raise ValueError("pixel, blur, contrasts, width and shift must be positive and finite")
-        if not all(math.isfinite(each) and each >= 0 for each in (self.etch, self.angle)):
-            raise ValueError("etch and angle must be finite and not negative")
+        if not all(math.isfinite(each) and each >= 0 for each in (self.etch, self.registration, self.angle)):
+            raise ValueError("etch, registration and angle must be finite and not negative")
+        if len(self.motion_px) != 2 or not all(map(math.isfinite, self.motion_px)):
+            raise ValueError("motion_px must be a finite x, y")
 
-    def sigma(self, bare: npt.ArrayLike) -> Float64:
-        """Return the standard deviation [m] of an isolated edge, at the smoothing that is best for it.
+    @property
+    def smoothing_px(self) -> float:
+        """Best smoothing for an edge without motion: sqrt(5) blurs."""
+        return math.sqrt(5.0) * self.blur_px
 
-        1.883 sqrt(blur) / (contrast sqrt(width)) pixels is the bound for Gaussian edges in white noise; a gradient's
-        peak at the best smoothing, sqrt(5) blurs, reaches 1.2 times that.
+    @property
+    def most_blur_px(self) -> float:
+        """Standard deviation of the blur of edges across the motion [px]."""
+        return math.hypot(self.blur_px, math.hypot(*self.motion_px) / math.sqrt(12.0))
+
+    def sigma(self, bare: npt.ArrayLike, normal: npt.ArrayLike = (1.0, 0.0)) -> Float64:
+        """Return the standard deviation [m] of an isolated edge with a normal (..., 2), at ``smoothing_px``.
+
+        1.883 sqrt(blur) / (contrast sqrt(width)) pixels is the bound for Gaussian edges in white noise. A gradient's
+        peak has (3/8) (a^2 + s^2)^3 / (a^5 s) of its variance for a smoothing a and a blur s: 1.2 times the bound
+        without motion. A smear of a length m blurs edges across it by m / sqrt(12) more.
         """
         contrast = np.where(bare, self.contrast_bare, self.contrast_masked)
-        bound = math.sqrt(2 * math.sqrt(math.pi) * self.blur_px / self.width_px) / contrast
-        return np.asarray(math.sqrt(3 / 8 * 6**3 / math.sqrt(5) ** 5) * bound * self.pixel)
+        smear = np.asarray(normal, dtype=np.float64) @ np.asarray(self.motion_px) / math.sqrt(12.0)
+        blur = np.hypot(self.blur_px, smear)
+        bound = np.sqrt(2 * math.sqrt(math.pi) * blur / self.width_px) / contrast
+        worse = np.sqrt(3 / 8 * (self.smoothing_px**2 + blur**2) ** 3 / (self.smoothing_px**5 * blur))
+        return np.asarray(worse * bound * self.pixel)
 
 
 class Candidates(NamedTuple):
@@ -90,8 +113,9 @@ class Candidates(NamedTuple):
     length
         (n,) [m] so that the edge lies on it wherever the board is.
     ambiguity
-        (n,) how likely another edge of the same sense is nearer to the ruler's middle, for shifts along the normal
-        that are all equally likely; 0 where none is in reach.
+        (n,) how likely another edge of the same sense lies on the ruler, and may be taken for the one that is meant:
+        copper, ink or an opening that ends, or a hole that begins, for shifts along the normal that are all equally
+        likely; 0 where none can.
     source
         (n,) the same number for rulers on one trace, or on one side of a land.
     spacing
@@ -148,9 +172,10 @@ def candidates(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike
     """Rulers across every edge of a region, side by side, and across both edges of traces where both can be seen.
 
     A ruler lies so that its whole width stays on the edge wherever the board is within ``imaging.shift``; edges cut by
-    the mask, by silk or by other copper are cut already (:func:`~gpuvision.matching.artwork.read_artwork`). Edges with
-    copper's, ink's or an opening's next border nearer than 3 times the best smoothing, sqrt(5) blurs, are left out:
-    it would pull at them.
+    the mask, by silk or by other copper are cut already (:func:`~gpuvision.matching.artwork.read_artwork`; its
+    clearance should be ``imaging.registration`` and two blurs). Edges with copper's, ink's, a hole's or an opening's
+    next border nearer than 3 times the best smoothing, sqrt(5) blurs, and ``registration``, are left out: it would
+    pull at them. All rulers may be laid as long as the longest.
 
     Parameters
     ----------
@@ -173,8 +198,7 @@ def candidates(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike
         raise ValueError("region must be finite ((x, y), (x, y)), the least first and the greatest second")
     if place.shape != (2,) or not np.all(np.isfinite(place)):
         raise ValueError("placement must be a finite x, y")
-    copper = Layer(artwork.copper)
-    layers = (copper, Layer(artwork.mask), Layer(artwork.silk))
+    layers = _layers(artwork, imaging)
     rows = [
         row
         for row in [*_single_rows(artwork, imaging), *_pair_rows(artwork, imaging)]
@@ -184,18 +208,42 @@ def candidates(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike
     normal = np.array([row[1] for row in rows]).reshape(-1, 2)
     pair = np.array([row[2] > 0 for row in rows], dtype=np.bool_)
     across = np.array([row[2] for row in rows], dtype=np.float64)
-    sigma = imaging.sigma(np.array([row[3] for row in rows], dtype=np.bool_)) / np.where(pair, math.sqrt(2.0), 1.0)
+    bare = np.array([row[3] for row in rows], dtype=np.bool_)
+    sigma = imaging.sigma(bare, normal) / np.where(pair, math.sqrt(2.0), 1.0)
     reach = imaging.shift * np.abs(normal).sum(axis=1) + imaging.angle * np.abs(_lever(point - place, normal))
-    tails = 4 * imaging.blur_px * math.sqrt(6) * imaging.pixel  # blurred and smoothed: sqrt(1 + 5) blurs
+    tails = 4 * math.hypot(imaging.most_blur_px, imaging.smoothing_px) * imaging.pixel
+    length = 2 * (reach + tails) + across
+    # An edge is found where the smoothing's reach is on the ruler. Of a trace's two edges the first one counts.
+    found = (np.max(length - across, initial=0.0) / 2) - 3 * imaging.smoothing_px * imaging.pixel
     ambiguity = [
-        _ambiguity(copper, *each) for each in zip(point + normal * across[:, None] / 2, normal, reach, strict=True)
+        _ambiguity(layers, *each, found)
+        for each in zip(point + normal * across[:, None] / 2, normal, reach, strict=True)
     ]
     source = np.array([row[4] for row in rows], dtype=np.int64)
-    length = 2 * (reach + tails) + across
     return Candidates(point, normal, sigma, pair, length, np.array(ambiguity, dtype=np.float64), source, across, place)
 
 
 _Row = tuple[Float64, Float64, float, bool, int]
+
+
+class _Sheet(NamedTuple):
+    """A layer, how far it may lie off the copper, and whether it is dark where the others are bright: holes are."""
+
+    layer: Layer
+    off: float
+    dark: bool = False
+
+
+def _layers(artwork: Artwork, imaging: Imaging) -> tuple[_Sheet, ...]:
+    holes = zip(artwork.holes.start, artwork.holes.end, artwork.holes.diameter, strict=True)
+    drilled = tuple(Shape(capsule(start, end, across / 2)) for start, end, across in holes)
+    off = imaging.registration
+    return (
+        _Sheet(Layer(artwork.copper), 0.0),
+        _Sheet(Layer(artwork.mask), off),
+        _Sheet(Layer(artwork.silk), off),
+        _Sheet(Layer(drilled), off, dark=True),
+    )
 
 
 def _single_rows(artwork: Artwork, imaging: Imaging) -> list[_Row]:
@@ -256,25 +304,34 @@ def _steps(layer: Layer, point: Float64, normal: Float64, reach: float) -> tuple
     return (cuts[1:-1][step] - 0.5) * 2 * reach, laid[:-1][step]
 
 
-def _is_isolated(layers: tuple[Layer, ...], row: _Row, imaging: Imaging) -> bool:
+def _is_isolated(layers: tuple[_Sheet, ...], row: _Row, imaging: Imaging) -> bool:
     """Whether no other step of any layer is so near to an edge as to pull it (see `RulerEdges.smoothing_px`)."""
     point, normal, across, _, _ = row
-    reach = 3 * math.sqrt(5.0) * imaging.blur_px * imaging.pixel
+    reach = 3 * imaging.smoothing_px * imaging.pixel
     if 0 < across < reach:
         return False
     edges = (point,) if not across else (point - normal * across / 2, point + normal * across / 2)
-    places = np.concatenate([_steps(layer, edge, normal, reach)[0] for layer in layers for edge in edges])
-    return not np.any(np.abs(places) > _ITSELF)
+    for sheet in layers:
+        away = reach + sheet.off * float(np.abs(normal).sum())
+        places = np.concatenate([_steps(sheet.layer, edge, normal, away)[0] for edge in edges])
+        if np.any(np.abs(places) > _ITSELF):
+            return False
+    return True
 
 
-def _ambiguity(copper: Layer, point: Float64, normal: Float64, reach: float) -> float:
-    """Chance that another edge out of copper along the normal is nearer to the middle than the edge itself.
+def _ambiguity(layers: tuple[_Sheet, ...], point: Float64, normal: Float64, reach: float, found: float) -> float:
+    """Chance that another edge of the same sense comes as near to a ruler's middle as edges are found.
 
-    An edge at a distance a from it is nearer where the board is shifted by more than a / 2 the other way.
+    An edge at a distance a from the one that is meant does where the board is shifted by more than a less that the
+    other way.
     """
-    place, outwards = _steps(copper, point, normal, 2 * reach)
-    away = np.abs(place[outwards & (np.abs(place) > _ITSELF)])
-    return float(min(1.0, np.sum((reach - away / 2) / (2 * reach))))
+    chance = 0.0
+    for sheet in layers:
+        off = sheet.off * float(np.abs(normal).sum())
+        place, ends = _steps(sheet.layer, point, normal, reach + found + off)
+        away = np.abs(place[(ends != sheet.dark) & (np.abs(place) > _ITSELF)]) - off
+        chance += float(np.sum(np.clip((reach + found - away) / (2 * reach), 0.0, 1.0)))
+    return min(1.0, chance)
 
 
 def select(
@@ -316,18 +373,50 @@ def select(
     ValueError
         What was chosen does not fix x, y and theta: traces all parallel, too small a budget, too few edges.
     """
+    price = _price(rulers, costs)
+    if per_source < 1:
+        raise ValueError(f"per_source must be 1 or more, not {per_source}")
+    if criterion not in ("determinant", "placement"):
+        raise ValueError(f"criterion must be 'determinant' or 'placement', not {criterion!r}")
+    weight = _weight(rulers, missing)
+    chosen = _greedy(_rows(rulers), weight, price, rulers, imaging, (budget, criterion, per_source))
+    return promise(rulers, imaging, chosen, costs=costs, missing=missing)
+
+
+def promise(
+    rulers: Candidates, imaging: Imaging, chosen: npt.ArrayLike, *, costs: Any = None, missing: float = 0.0
+) -> Selection:
+    """Say what rulers would deliver that were chosen in another way: by hand, or at random.
+
+    Parameters
+    ----------
+    rulers, imaging, costs, missing
+        As in :func:`select`.
+    chosen
+        (k,) indices of the candidates.
+
+    Raises
+    ------
+    ValueError
+        They do not fix x, y and theta.
+    """
+    price, weight, rows = _price(rulers, costs), _weight(rulers, missing), _rows(rulers)
+    which = np.asarray(chosen, dtype=np.int64)
+    covariance, condition = _promised(rows[which], weight[which], rulers, which, imaging)
+    return Selection(which, covariance, float(price[which].sum()), condition, _region(rulers, which, imaging))
+
+
+def _price(rulers: Candidates, costs: Any) -> Float64:
     price = np.ones(len(rulers.sigma)) if costs is None else np.asarray(costs, dtype=np.float64)
     if price.shape != rulers.sigma.shape or not np.all(price > 0):
         raise ValueError(f"costs must be {len(rulers.sigma)} positive numbers, one for each candidate")
-    if not (0 <= missing < 1 and per_source >= 1):
-        raise ValueError("missing must be in [0, 1), per_source 1 or more")
-    if criterion not in ("determinant", "placement"):
-        raise ValueError(f"criterion must be 'determinant' or 'placement', not {criterion!r}")
-    rows = _rows(rulers)
-    weight = (1 - missing) * (1 - rulers.ambiguity) / rulers.sigma**2
-    chosen = _greedy(rows, weight, price, rulers, imaging, (budget, criterion, per_source))
-    covariance, condition = _promised(rows[chosen], weight[chosen], rulers, chosen, imaging)
-    return Selection(chosen, covariance, float(price[chosen].sum()), condition, _region(rulers, chosen, imaging))
+    return price
+
+
+def _weight(rulers: Candidates, missing: float) -> Float64:
+    if not 0 <= missing < 1:
+        raise ValueError(f"missing must be in [0, 1), not {missing}")
+    return np.asarray((1 - missing) * (1 - rulers.ambiguity) / rulers.sigma**2)
 
 
 def _rows(rulers: Candidates) -> Float64:

@@ -1,9 +1,9 @@
-"""Pictures of boards, from their artwork: sampled 8 x 8 times in a pixel, then blurred, smeared and noisy."""
+"""Pictures of boards, from their artwork: sampled 8 x 8 times in a pixel, blurred, and then seen many times."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -11,9 +11,15 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.matching.artwork import Artwork
-from gpuvision.matching.artwork_shapes import Shape, capsule
+from gpuvision.matching.artwork_shapes import Shape, area, capsule
+
+Float64 = npt.NDArray[np.float64]
 
 SAMPLES = 8
+FINE = 4  # values in a pixel that are kept of the samples
+# Eight rows of samples stand aside by eighths of a sample, in this order, and eight columns by eighths in theirs: an
+# edge along a row or a column passes 64 different places in a pixel, not 8.
+_ASIDE = (np.array([0, 4, 2, 6, 1, 5, 3, 7]) + 0.5) / SAMPLES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +40,8 @@ class View:
         Standard deviation [grey levels].
     mask_shift, silk_shift
         x, y [m] by which the mask's openings and the silk are printed off.
-    etch
-        How far copper is etched beyond its drawn edge [m], to an eighth of a pixel.
+    growth
+        How far copper reaches beyond its drawn edge [m], below 0 where too much was etched.
     levels
         Grey levels of laminate and copper under the mask, laminate and copper in its openings, silk, holes.
     """
@@ -48,8 +54,92 @@ class View:
     noise: float = 0.0
     mask_shift: tuple[float, float] = (0.0, 0.0)
     silk_shift: tuple[float, float] = (0.0, 0.0)
-    etch: float = 0.0
+    growth: float = 0.0
     levels: tuple[float, float, float, float, float, float] = (60.0, 110.0, 90.0, 200.0, 240.0, 15.0)
+
+    @property
+    def edge_blur_px(self) -> float:
+        """Standard deviation of an edge's blur without the smear, a pixel's own included."""
+        return math.hypot(self.blur_px, math.sqrt(1 / 12))
+
+
+class BoardPicture:
+    """A board in front of a camera, painted once: seen with other small motions and other noise in a millisecond.
+
+    Parameters
+    ----------
+    artwork, view
+        What is seen, and how.
+    pose, about
+        x, y [m] and theta [rad] of the board, turned about a point [m].
+    missing
+        Numbers of the copper's areas of which none is left.
+    more
+        Areas that are drawn over the copper: splashes (dark), and scratches (not dark).
+    growths
+        How much further than ``view.growth`` the edges of each of the copper's areas lie [m].
+    margin
+        Pixels beside the picture that motions may bring into it.
+    """
+
+    def __init__(
+        self,
+        artwork: Artwork,
+        view: View,
+        pose: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        about: tuple[float, float] = (0.0, 0.0),
+        *,
+        missing: Collection[int] = (),
+        more: Sequence[Shape] = (),
+        growths: npt.ArrayLike = 0.0,
+        margin: int = 12,
+    ) -> None:
+        self.view, self._pose, self._about, self._margin = view, pose, np.array(about), margin
+        painter = _Painter(view, pose, about, margin)
+        each = np.broadcast_to(np.asarray(growths, np.float64) + view.growth, len(artwork.copper))
+        left = [
+            Shape(grown(shape.outline, growth if shape.dark else -growth), shape.dark)
+            for index, (shape, growth) in enumerate(zip(artwork.copper, each, strict=True))
+            if index not in missing
+        ]
+        copper = painter.painted([*left, *more], (0.0, 0.0))
+        opened = painter.painted(artwork.mask, view.mask_shift) if artwork.mask else np.ones_like(copper)
+        fine = np.asarray(view.levels, dtype=np.float32)[copper + 2 * opened]
+        fine[painter.painted(artwork.silk, view.silk_shift)] = view.levels[4]
+        holes = zip(artwork.holes.start, artwork.holes.end, artwork.holes.diameter, strict=True)
+        fine[painter.painted([Shape(capsule(start, end, across / 2)) for start, end, across in holes], (0, 0))] = (
+            view.levels[5]
+        )
+        rows, columns = painter.shape
+        step = SAMPLES // FINE
+        fine = fine.reshape(rows * FINE, step, columns * FINE, step).mean(axis=(1, 3), dtype=np.float32)
+        along, across = (_blurs(view.blur_px, smear) for smear in (view.motion_px, 0.0))
+        self._fine = cv2.sepFilter2D(fine, -1, along, across, borderType=cv2.BORDER_REPLICATE)
+
+    def seen(
+        self, pose: tuple[float, float, float] = (0.0, 0.0, 0.0), rng: np.random.Generator | None = None
+    ) -> npt.NDArray[np.float32]:
+        """float32 picture of the board when it has moved on by a small pose, about the same point; noise with a rng."""
+        view, per = self.view, FINE / self.view.pixel
+        # From the picture's pixels to the board, back by the motion, to the painted values.
+        away = np.array(view.corner) - self._about - self._pose[:2] - pose[:2]
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        back = np.array([[cos, sin], [-sin, cos]])
+        flip = np.array([1.0, -1.0])
+        matrix = back * flip * flip[:, None] * FINE
+        first = (back @ away + self._about + self._pose[:2] - view.corner) * flip * per
+        offset = first + (self._margin + 0.5) * FINE - 0.5
+        warp = np.concatenate([matrix, offset[:, None]], axis=1)
+        picture = cv2.warpAffine(
+            self._fine,
+            warp,
+            view.shape[::-1],
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        if rng is not None:
+            picture = picture + np.float32(view.noise) * rng.standard_normal(picture.shape, dtype=np.float32)
+        return np.asarray(picture, dtype=np.float32)
 
 
 def board_image(
@@ -62,70 +152,86 @@ def board_image(
     rng: np.random.Generator | None = None,
 ) -> npt.NDArray[np.float32]:
     """float32 picture of a board that is turned about a point and shifted; of some of its copper areas none is left."""
-    painter = _Painter(view, pose, about)
-    copper = painter.painted([each for index, each in enumerate(artwork.copper) if index not in missing], (0.0, 0.0))
-    if round(view.etch / view.pixel * SAMPLES):
-        inside = cv2.distanceTransform(copper.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        copper = inside > view.etch / view.pixel * SAMPLES + 0.5
-    opened = painter.painted(artwork.mask, view.mask_shift) if artwork.mask else np.ones_like(copper)
-    fine = np.asarray(view.levels, dtype=np.float32)[copper + 2 * opened]
-    fine[painter.painted(artwork.silk, view.silk_shift)] = view.levels[4]
-    holes = zip(artwork.holes.start, artwork.holes.end, artwork.holes.diameter, strict=True)
-    fine[painter.painted([Shape(capsule(start, end, across / 2)) for start, end, across in holes], (0, 0))] = (
-        view.levels[5]
-    )
-    rows, columns = view.shape
-    picture = fine.reshape(rows, SAMPLES, columns, SAMPLES).mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
-    picture = cv2.GaussianBlur(picture, (0, 0), view.blur_px, borderType=cv2.BORDER_REPLICATE)
-    if view.motion_px > 1:
-        smear = _smear(view.motion_px)
-        picture = cv2.filter2D(picture, -1, smear, borderType=cv2.BORDER_REPLICATE)
-    if rng is not None:
-        picture = picture + rng.normal(0, view.noise, picture.shape).astype(np.float32)
-    return np.asarray(picture, dtype=np.float32)
+    return BoardPicture(artwork, view, pose, about, missing=missing).seen(rng=rng)
 
 
-def _smear(length: float) -> npt.NDArray[np.float32]:
-    half = math.ceil((length - 1) / 2)
-    places = np.abs(np.arange(-half, half + 1))
-    weights = np.clip(length / 2 - places + 0.5, 0, 1).astype(np.float32)
-    return np.asarray((weights / weights.sum())[None])
+def grown(outline: Float64, by: float) -> Float64:
+    """Corners of an outline whose sides lie further out [m]; sharp corners at most twice as far."""
+    if by == 0.0:
+        return outline
+    kept = outline[np.any(outline != np.roll(outline, 1, axis=0), axis=1)]
+    side = np.roll(kept, -1, axis=0) - kept
+    out = np.stack([side[:, 1], -side[:, 0]], axis=1) / np.hypot(*side.T)[:, None]
+    out *= 1.0 if area(kept) > 0 else -1.0
+    corner = out + np.roll(out, 1, axis=0)
+    return np.asarray(kept + by * corner / np.maximum(np.sum(corner**2, axis=1) / 2, 0.5)[:, None])
+
+
+def _blurs(blur_px: float, smear_px: float) -> npt.NDArray[np.float32]:
+    """Gaussian blur, the extent of a pixel, and a smear, one after the other, on the painted values."""
+    reach = math.ceil(4 * blur_px * FINE)
+    places = np.arange(-reach, reach + 1)
+    kernel = np.exp(-0.5 * (places / (blur_px * FINE)) ** 2)
+    for width in (FINE, smear_px * FINE):
+        if width > 0:
+            half = math.ceil((width - 1) / 2)
+            kernel = np.convolve(kernel, np.clip(width / 2 + 0.5 - np.abs(np.arange(-half, half + 1)), 0, 1))
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)
 
 
 class _Painter:
-    def __init__(self, view: View, pose: tuple[float, float, float], about: tuple[float, float]) -> None:
-        self._view, self._about = view, np.array(about)
+    def __init__(self, view: View, pose: tuple[float, float, float], about: tuple[float, float], margin: int) -> None:
+        self.shape = (view.shape[0] + 2 * margin, view.shape[1] + 2 * margin)
+        self._view, self._about, self._margin = view, np.array(about), margin
         self._shift = np.array(pose[:2])
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         self._turn = np.array([[cos, -sin], [sin, cos]])
 
-    def samples(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Column and row of the fine picture, whole at the samples."""
+    def samples(self, points: Float64) -> Float64:
+        """Where points lie, in samples from the picture's upper left corner, to the right and down."""
         seen = self._about + (points - self._about) @ self._turn.T + self._shift - self._view.corner
         pixels = seen * (1 / self._view.pixel, -1 / self._view.pixel)
-        return np.asarray((pixels + 0.5) * SAMPLES - 0.5)
+        return np.asarray((pixels + 0.5 + self._margin) * SAMPLES)
 
     def painted(self, shapes: Collection[Shape], shift: tuple[float, float]) -> npt.NDArray[np.bool_]:
-        rows, columns = (SAMPLES * each for each in self._view.shape)
-        picture = np.zeros((rows, columns), dtype=bool)
+        """Which samples are laid, (rows, columns).
+
+        A row of samples goes down by one at every eighth column: pixel by pixel the columns are moved up again.
+        """
+        rows, columns = (SAMPLES * each for each in self.shape)
+        slanted = np.zeros((rows + self.shape[1], columns), dtype=bool)
         for each in shapes:
             corners = self.samples(each.outline + shift)
-            low = np.maximum(np.ceil(corners.min(axis=0)), 0).astype(int)
-            high = np.minimum(np.floor(corners.max(axis=0)), (columns - 1, rows - 1)).astype(int)
-            if np.all(high >= low):
-                inside = _inside(corners - low, int(high[1] - low[1] + 1), int(high[0] - low[0] + 1))
-                picture[low[1] : high[1] + 1, low[0] : high[0] + 1][inside] = each.dark
+            if not (np.all(corners.max(axis=0) > 0) and np.all(corners.min(axis=0) < (columns, rows))):
+                continue
+            corners[:, 1] += self.shape[1] - corners[:, 0] / SAMPLES
+            low = np.maximum(np.floor(corners.min(axis=0)) - 1, 0).astype(int)
+            high = np.minimum(np.ceil(corners.max(axis=0)) + 1, slanted.shape[::-1]).astype(int)
+            if np.all(high > low):
+                inside = _inside(corners, low, high)
+                slanted[low[1] : high[1], low[0] : high[0]][inside] = each.dark
+        picture = np.empty((rows, columns), dtype=bool)
+        for column in range(self.shape[1]):
+            span = slice(SAMPLES * column, SAMPLES * (column + 1))
+            first = self.shape[1] - column
+            picture[:, span] = slanted[first : first + rows, span]
         return picture
 
 
-def _inside(corners: npt.NDArray[np.float64], rows: int, columns: int) -> npt.NDArray[np.bool_]:
-    """Which whole places an odd number of turns of a polygon goes round: crossings to the left of each, in each row."""
-    turns = np.zeros((rows, columns + 1), dtype=np.int32)
-    for (x, y), (to_x, to_y) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        first, last = max(math.ceil(min(y, to_y)), 0), min(math.ceil(max(y, to_y)) - 1, rows - 1)
-        if last < first:
-            continue
-        line = np.arange(first, last + 1)
-        where = x + (line - y) * ((to_x - x) / (to_y - y))
-        np.add.at(turns, (line, np.clip(np.ceil(where), 0, columns).astype(int)), 1)
-    return np.asarray(np.cumsum(turns[:, :columns], axis=1) % 2 == 1)
+def _inside(corners: Float64, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Which samples an odd number of turns of a polygon goes round: crossings to the left of each, in each row."""
+    columns, rows = high - low
+    line = np.arange(low[1], high[1])
+    aside = _ASIDE[line % SAMPLES]
+    height = line + (0.5 - aside) / SAMPLES + 0.0
+    x, y = corners.T
+    to_x, to_y = np.roll(corners, -1, axis=0).T
+    first = np.searchsorted(height, np.minimum(y, to_y), side="right")
+    count = np.searchsorted(height, np.maximum(y, to_y), side="right") - first
+    side = np.repeat(np.arange(len(x)), count)
+    row = np.arange(len(side)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
+    where = x[side] + (height[row] - y[side]) * ((to_x - x)[side] / (to_y - y)[side])
+    turns = np.zeros((rows, columns + 1), dtype=np.uint8)
+    at = np.clip(np.ceil(where - aside[row]) - low[0], 0, columns).astype(int)
+    np.add.at(turns, (row, at), 1)
+    return np.asarray(np.bitwise_xor.accumulate(turns[:, :columns] & 1, axis=1), dtype=bool)

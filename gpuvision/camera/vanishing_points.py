@@ -178,7 +178,13 @@ class _Search:
         return len(self.packed.x) - self.parameters(order, meet)
 
     def check(self, order: int, *, meet: bool) -> None:
-        """Raise a ValueError if the lines cannot fix a model."""
+        """Check that the lines can fix a model.
+
+        Raises
+        ------
+        ValueError
+            They cannot; says what they lack.
+        """
         needed = 1 if self.keep_centre else 2
         if order and self.linear.rank < needed:
             raise ValueError(

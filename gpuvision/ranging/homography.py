@@ -201,7 +201,13 @@ def seen_from_beside(baseline: float, stand_off: float, focal_distance: float, t
 
 
 def of_constants(constants: tuple[float, ...]) -> tuple[tuple[tuple[float, float, float], ...], Model]:
-    """Sensor -> sheet and the model's name from its constants: see `Triangulation.from_constants`."""
+    """Sensor -> sheet and the model's name from its constants: see `Triangulation.from_constants`.
+
+    Raises
+    ------
+    ValueError
+        There are not 3, 4, 6 or 8 of them.
+    """
     match constants:
         case (c1, c2, c3):
             return ((0.0, 0.0, 0.0), (c1, 0.0, c2), (c3, 0.0, 1.0)), "C3"

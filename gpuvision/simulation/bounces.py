@@ -100,10 +100,19 @@ class Bounces:
 
         Parameters
         ----------
+        scene, albedo
+            The scene, and an albedo for every number in `Scene.material`.
+        size, both_sides
+            As of `Patches.of`; metres.
         grades
             How often patches that stand close to each other for their size are halved: in corners (`graded`).
-        size, both_sides
-            As of `Patches.of`.
+        device, dense
+            As of `Bounces`.
+
+        Raises
+        ------
+        ValueError
+            A parameter is not what is said here.
         """
         patches = Patches.of(scene, size=size, both_sides=both_sides)
         if grades:
@@ -267,6 +276,17 @@ def graded(patches: Patches, times: int, scene: Scene | None = None, *, device: 
     """Halve patches that see others close by, ``times`` times: in corners, where light changes fastest.
 
     A patch is halved where a single other one fills more than 0.15 of its view, or has it fill so much of its own.
+
+    Parameters
+    ----------
+    patches
+        To begin with.
+    times
+        How often; each computes all form factors anew.
+    scene
+        What may stand between; None: nothing does.
+    device
+        Where; None: `Device.best`.
     """
     for _ in range(times):
         every = Bounces(patches=patches, albedo=np.zeros(patches.count), scene=scene, device=device).factors

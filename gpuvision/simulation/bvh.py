@@ -63,6 +63,11 @@ class Bvh:
         time for all nodes (Wald 2007), to leaves of at most 16; then the largest nodes are opened until 16 children
         stand side by side. What is split are bundles of up to four neighbours along Morton's curve, where they lie
         close: half the time, and a tree as good to 2 % (by the areas of its boxes).
+
+        Raises
+        ------
+        ValueError
+            The corners have another shape.
         """
         if corners.ndim != 3 or corners.shape[1:] != (3, 3):
             raise ValueError(f"Bvh.build takes triangles (n, 3, 3), got shape {corners.shape}")

@@ -56,6 +56,11 @@ class Clusters:
         """Build the tree over segments (m, 10): start, end, normal, exitance (W/m); those without light count little.
 
         Halved by number along the widest of six axes, three of the place and three of the normal.
+
+        Raises
+        ------
+        ValueError
+            The segments have another shape.
         """
         table = np.asarray(segments, np.float64)
         if table.ndim != 2 or table.shape[1] != 10:

@@ -103,6 +103,11 @@ class Patches:
         both_sides
             Whether the back of every triangle is a surface, too. None: but for closed surfaces that have their front
             outside, seen from outside.
+
+        Raises
+        ------
+        ValueError
+            The size is no length.
         """
         if not (math.isfinite(size) and size > 0.0):
             raise ValueError(f"Patches.of: size is {size!r}, expected metres, more than 0")
@@ -152,6 +157,11 @@ class Patches:
         """Cut the triangles of some patches (count,) in two at their longest edge, each half a patch of its own.
 
         Patches that stand for others' triangles (`looked_at`) stay as they are.
+
+        Raises
+        ------
+        ValueError
+            ``wanted`` has another shape.
         """
         if np.shape(wanted) != (self.count,):
             raise ValueError(f"Patches.halved takes which patches, ({self.count},), got shape {np.shape(wanted)}")

@@ -68,8 +68,15 @@ class StripReading:
     ) -> StripReading:
         """Return what the direct light of a profile makes of a sensor's strips.
 
-        The slope is the largest of the height H over u anywhere on a strip, from bin to bin; what
-        looks over the horizon does not count.
+        The slope is the largest of the height H over u anywhere on a strip, from bin to bin; what looks over the
+        horizon does not count.
+
+        Parameters
+        ----------
+        sight, exposure
+            The sensor, and direct light on it, (samples, bins).
+        floor, shift
+            As of `StripReading`.
         """
         power = exposure.total()
         u, v = np.broadcast_arrays(sight.u_edges, sight.v_middles[:, None])
@@ -189,6 +196,11 @@ def bounce_power(received: float, albedo: float, solid_angle: float) -> float:
         The largest in the scene; below 1 the bounces' sum converges.
     solid_angle
         sr: the largest under which any surface sees the lens.
+
+    Raises
+    ------
+    ValueError
+        A number is negative, or the albedo more than 1.
 
     Notes
     -----

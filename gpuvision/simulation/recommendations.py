@@ -93,6 +93,17 @@ def compare_peaks(
 ) -> dict[str, Artifacts]:
     """Read the same light by each choice of a peak, where there are several; for `rank`.
 
+    Parameters
+    ----------
+    simulator
+        Its readout looks for peaks.
+    exposures, truth
+        Light by path, (profiles, samples, bins), and where the surface is.
+    choices
+        Of `LineReadout.choice`; the names in what is returned.
+    seed, device
+        As of `explain`.
+
     Raises
     ------
     ValueError

@@ -36,6 +36,11 @@ class Brdf:
         -------
         numpy.ndarray
             (...,); zero where either direction lies below the surface, NaN where it is zero or not finite.
+
+        Raises
+        ------
+        ValueError
+            The directions have another shape.
         """
         given = np.asarray(directions, np.float64)
         if given.shape[-1:] != (6,):
@@ -123,6 +128,11 @@ class OrenNayar(Brdf):
         view, the reflectance is theirs wherever light and eye stand on one side of the normal. On opposite sides
         theirs stays level and this one falls, which is what keeps it within the albedo. Sigma of pi / 2 is a
         roughness of 0.776.
+
+        Raises
+        ------
+        ValueError
+            The albedo or sigma is out of its range.
         """
         angle = finite(sigma, "OrenNayar.of_slopes: sigma")
         if not 0.0 <= angle <= math.pi / 2.0:

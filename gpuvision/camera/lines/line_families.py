@@ -80,6 +80,11 @@ def families(points: npt.ArrayLike, family: npt.ArrayLike, line: npt.ArrayLike) 
     -------
     tuple
         Families in the order of their numbers, of lines in the order of theirs.
+
+    Raises
+    ------
+    ValueError
+        The shapes do not go together.
     """
     places = np.asarray(points, dtype=np.float64)
     labels = np.stack([np.asarray(family), np.asarray(line)])

@@ -44,6 +44,11 @@ def view_of(grid: PatternGrid | npt.ArrayLike, pitch: float) -> View:
         The grid, or its points (rows, columns, 2): pixels, NaN where missing.
     pitch
         Distance of neighbours on the target, metres.
+
+    Raises
+    ------
+    ValueError
+        The points have another shape, or the pitch is not finite.
     """
     points = np.asarray(grid.points if isinstance(grid, PatternGrid) else grid, dtype=np.float64)
     if points.ndim != 3 or points.shape[2] != 2:
@@ -53,7 +58,13 @@ def view_of(grid: PatternGrid | npt.ArrayLike, pitch: float) -> View:
 
 
 def pack(views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]) -> tuple[Views, tuple[Mask, ...]]:
-    """Bring views of different lengths into arrays; say what is wrong with one."""
+    """Bring views of different lengths into arrays.
+
+    Raises
+    ------
+    ValueError
+        There is none, or one is no view of a flat target: says which, and what is wrong with it.
+    """
     if not len(views):
         raise ValueError("no views given, expected at least one")
     pairs, masks = [], []

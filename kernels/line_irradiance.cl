@@ -92,12 +92,12 @@ inline reals turned(reals x, reals y, reals z, global const real *row) { return 
 // normals, along the line, against the surface's normal, and against what is aside. `firsts`: where the segments of
 // each frame begin, and the end of the last; the first `alone` frames have one segment. starts: what a segment adds to
 // the three lengths of its frame, and its length; lines: its length, exitance / 2 pi.
-kernel void line_irradiance(global const INPUT *restrict receivers, global real *restrict irradiance,
-                            global uchar *restrict status, constant place *restrict middle,
-                            global const place *restrict rows, global const real *restrict axes,
-                            global const uint *restrict firsts, global const place *restrict starts,
-                            global const real *restrict lines, const uint alone, const uint frames, const ulong count,
-                            const ulong each) {
+AS_IT_IS kernel void line_irradiance(global const INPUT *restrict receivers, global real *restrict irradiance,
+                                     global uchar *restrict status, constant place *restrict middle,
+                                     global const place *restrict rows, global const real *restrict axes,
+                                     global const uint *restrict firsts, global const place *restrict starts,
+                                     global const real *restrict lines, const uint alone, const uint frames,
+                                     const ulong count, const ulong each) {
     // The last vector, or work-group, moves back to end with the last receiver.
 #ifdef STRIP
     const ulong begin = get_global_id(0) * each, end = min(begin + each, count);

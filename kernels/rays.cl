@@ -40,10 +40,11 @@ inline part part_within(spot origin, spot direction, place radius) {
 inline int is_far(spot origin, place radius) { return fabs(origin.x) + fabs(origin.y) + fabs(origin.z) > 8 * radius; }
 
 #ifdef SEGMENTS
-kernel void any_hit(global const INPUT *restrict rays, global uchar *restrict occluded, global uchar *restrict status,
-                    global const real *nodes, global const int *children, global const int *axes,
-                    global const real *leaves, global const int *triangles, constant place *middle,
-                    const place radius, const real clearance, const ulong count, const ulong each) {
+AS_IT_IS kernel void any_hit(global const INPUT *restrict rays, global uchar *restrict occluded,
+                             global uchar *restrict status, global const real *nodes, global const int *children,
+                             global const int *axes, global const real *leaves, global const int *triangles,
+                             constant place *middle, const place radius, const real clearance, const ulong count,
+                             const ulong each) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong first = get_global_id(0) * each, end = min(first + each, count);
     for (ulong i = first; i < end; i++) {
@@ -76,11 +77,12 @@ kernel void any_hit(global const INPUT *restrict rays, global uchar *restrict oc
     }
 }
 #else
-kernel void closest_hit(global const INPUT *restrict rays, global int *restrict triangle, global real *restrict distance,
-                        global real *restrict barycentric, global uchar *restrict status, global const real *nodes,
-                        global const int *children, global const int *axes, global const real *leaves,
-                        global const int *triangles, constant place *middle, const place radius, const real clearance,
-                        const ulong count, const ulong each) {
+AS_IT_IS kernel void closest_hit(global const INPUT *restrict rays, global int *restrict triangle,
+                                 global real *restrict distance, global real *restrict barycentric,
+                                 global uchar *restrict status, global const real *nodes, global const int *children,
+                                 global const int *axes, global const real *leaves, global const int *triangles,
+                                 constant place *middle, const place radius, const real clearance, const ulong count,
+                                 const ulong each) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong first = get_global_id(0) * each, end = min(first + each, count);
     for (ulong i = first; i < end; i++) {

@@ -20,7 +20,6 @@ from gpuvision.host.errors import RecordingError
 Clock = Callable[[], int]
 Arrivals = NDArray[np.int64]
 
-_COARSE_S = 20e-3  # a sleep that `stop` has to be able to end
 # Sleeping overshoots by some 80 us on a common kernel: yield the processor for the last stretch instead.
 _SPIN_NS = 200_000
 

@@ -459,23 +459,3 @@ def _steps(lengths: Float64, step: float) -> tuple[Integers, Float64]:
     line = np.repeat(np.arange(len(lengths)), count)
     number = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
     return line, np.stack([number, number + 1], axis=1) / count[line, None]
-
-
-def mirror_exposure(
-    sight: Sight, scene: Scene, materials: Sequence[Material], lit: LitLine, L: float, **more: Any
-) -> Exposure:
-    """Return the light that reaches a sensor from lit lines by way of mirrors; see `Mirrors`.
-
-    For many profiles keep a `Mirrors` and call `Mirrors.exposure`.
-
-    Parameters
-    ----------
-    sight, scene, materials
-        As of `Mirrors`.
-    lit, L
-        What is lit, and the sensor's transport [m].
-    **more
-        ``sheet`` and ``offset`` of `Mirrors.exposure`; the other parameters of `Mirrors`.
-    """
-    light = {name: more.pop(name) for name in ("sheet", "offset") if name in more}
-    return Mirrors(sight=sight, scene=scene, materials=materials, **more).exposure(lit, L, **light)

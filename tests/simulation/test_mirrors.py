@@ -13,7 +13,7 @@ from gpuvision.host import Device
 from gpuvision.simulation.direct import DirectLight
 from gpuvision.simulation.illumination import LightSheet, LitLine
 from gpuvision.simulation.material import Material
-from gpuvision.simulation.mirrors import Mirrors, mirror_exposure
+from gpuvision.simulation.mirrors import Mirrors
 from gpuvision.simulation.rays import AnyHit
 from gpuvision.simulation.reflectance import Lambert
 from gpuvision.simulation.scene import Scene
@@ -345,11 +345,12 @@ def test_exposure_is_the_sum_of_its_ways(device: Device) -> None:
     lit = light.lit(scene, 0.0)
     thrown = mirrors.thrown(lit, light, 0.0)
     parts = mirrors.seen(lit, 0.0) + mirrors.direct(thrown, 0.0) + mirrors.seen(thrown, 0.0)
-    whole = mirror_exposure(mirrors.sight, scene, MATERIALS, lit, 0.0, sheet=light, device=device)
+    whole = mirrors.exposure(lit, 0.0, sheet=light)
     assert mirrors.direct(thrown, 0.0).power.sum() > 0.0
     np.testing.assert_array_equal(whole.power, parts.power)
-    dark = mirror_exposure(mirrors.sight, scene, (MATERIALS[0],) * 2, lit, 0.0, sheet=light, device=device)
-    assert not dark.power.any()
+    matt = mirrors_of(scene, (MATERIALS[0],) * 2, device)
+    assert not matt.there_are_any
+    assert not matt.exposure(lit, 0.0, sheet=light).power.any()
     assert mirrors_of(scene, MATERIALS, device).there_are_any
 
 

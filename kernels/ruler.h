@@ -129,6 +129,11 @@ inline reals ruler_slope(private const reals *profile, int i, constant real *tab
     return slope;
 }
 #define RULER_SPACE private
+#if __has_builtin(__builtin_reduce_or)
+#define RULER_ANY(mask) (__builtin_reduce_or(mask) != 0)
+#else
+#define RULER_ANY(mask) any_lane(mask)
+#endif
 #define RULER_SLOPE(i) ruler_slope(values, i, table)
 #else
 inline real ruler_slope(local const real *profile, int i, constant real *table) {
@@ -138,6 +143,7 @@ inline real ruler_slope(local const real *profile, int i, constant real *table) 
     return slope;
 }
 #define RULER_SPACE local
+#define RULER_ANY(mask) (mask)
 #define RULER_SLOPE(i) values[i]
 #endif
 
@@ -167,7 +173,7 @@ inline void ruler_find(RULER_SPACE const reals *values, const ruler_place *place
         reals strength = RULER_STRENGTH(peak.here);
         const masks is_peak = mask_of(strength >= threshold) & mask_of(strength > RULER_STRENGTH(peak.before)) &
                               mask_of(strength >= RULER_STRENGTH(peak.after));
-        if (any_lane(is_peak)) {
+        if (RULER_ANY(is_peak)) {
             masks candidate = is_peak;
 #ifdef PAIRS
             const reals gap = peak.at - other.at;
@@ -237,15 +243,8 @@ inline void ruler_measure_lanes(global const CODE *image, int rows, int columns,
                                 reals sine, constant real *table, constant real *model, private ruler_edge *edges) {
     ruler_place place;
     masks flags = ruler_lay(rows, columns, x, y, cosine, sine, table, &place);
-    reals profile[LENGTH + RULER_STRIDE];
-    for (int i = 0; i < LENGTH; i += RULER_STRIDE) {
-        for (int k = 0; k < RULER_STRIDE; k++) profile[i + k] = 0;
-        for (int line = 0; line < WIDTH; line += RULER_LINES)
-            flags |= ruler_add(image, &place, columns, i, line, table, model, profile);
-    }
-#ifdef CODE_float
-    for (int i = 0; i < LENGTH; i++) flags |= ruler_judge_sum(profile[i]);
-#endif
+    reals profile[LENGTH];
+    flags |= ruler_sums(image, &place, columns, table, model, profile);
     ruler_find(profile, &place, flags, table, edges);
 }
 

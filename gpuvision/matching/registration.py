@@ -33,6 +33,7 @@ from gpuvision.tables import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
 _MOST_RULERS, _RULERS, _POINTS = 1024, 512, 512  # 1024 rows of one pose are the most
+_VERIFYING = 400
 _FEWEST = 12  # rulers and edges that a pose is believed from
 _TRIALS = {"rigid": 64, "scale": 128, "affine": 256}  # one of them all good, of 30 % bad rows: all but 1e-13
 _ROUNDS = 3
@@ -63,7 +64,7 @@ class Registration(NamedTuple):
     runner_up_pose
         (3,); NaN without one.
     rulers
-        How many lay in the picture.
+        How many lay in the picture, of those that verify.
     status
         OK. With a pose: AMBIGUOUS (the runner-up is close). Refused: DARK (nothing fits), HOLE (too few known edges in
         the picture), AMBIGUOUS with NaN (the edges that were found leave a part of the pose open).
@@ -104,7 +105,7 @@ class FirstFix:
     search
         Edges that are searched with, 4096 at most: spread evenly, in or near the picture.
     rulers
-        Edges that rulers are laid over, 1024 at most.
+        Edges that rulers are laid over, 1024 at most; some 400 of them, spread evenly, for each pose that is verified.
     to_image
         3 x 3, where known points are expected, in pixels of the (undistorted) picture.
     placement
@@ -122,9 +123,11 @@ class FirstFix:
     most
         Poses that are verified.
     least_score
-        A pose that a smaller share of the rulers agrees with is refused.
+        A pose that a smaller share of the rulers agrees with is refused; 1.5 over the root of the rulers' number comes
+        on top: of few many may agree by chance.
     ambiguity
-        Share of the best score from which on another pose's makes it AMBIGUOUS.
+        Share of the best score from which on another pose's makes it AMBIGUOUS; so does one that is less by 1.5 over
+        the root of the rulers' number.
 
     Raises
     ------
@@ -143,7 +146,7 @@ class FirstFix:
     tolerance_px: float = 1.0
     cell_px: int = 2
     most: int = 24
-    least_score: float = 0.4
+    least_score: float = 0.35
     ambiguity: float = 0.9
 
     def __post_init__(self) -> None:
@@ -183,7 +186,7 @@ class FirstFix:
         if not tried:
             return _refused(Status.HOLE)
         best, other = self._best_two(tried)
-        if not best.score >= self.least_score:
+        if not best.score >= self.least_score + _chance(best):
             return _refused(Status.DARK, best, other, self.placement)
         return self._measured(image, best, other, device)
 
@@ -237,28 +240,35 @@ class FirstFix:
         return replace(self.ruler, length=2 * (taps + 1 + math.ceil(window_px / self.ruler.step_px)) + 1)
 
     def _laid(
-        self, image: npt.NDArray[Any], motions: list[Float64], ruler: RulerEdges, device: Device | None
+        self,
+        image: npt.NDArray[Any],
+        known: KnownEdges,
+        motions: list[Float64],
+        ruler: RulerEdges,
+        device: Device | None,
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
         """Rows for `SolvePose` about where each motion has the placement point, and how many rulers see the picture."""
-        seen = [self._seen(self.rulers, motion) for motion in motions]
+        seen = [self._seen(known, motion) for motion in motions]
         laid = np.concatenate([np.concatenate(each, axis=1) for each in seen]).astype(np.float32)
         edges = ruler(image, laid, device=device)
         parts = (np.split(each, len(motions)) for each in (edges.position, edges.amplitude, edges.status))
-        sigma = np.full(len(self.rulers.point), self.tolerance_px / self._scale)
+        sigma = np.full(len(known.point), self.tolerance_px / self._scale)
         rows, counts = [], []
         for motion, (centre, direction), position, amplitude, status in zip(motions, seen, *parts, strict=True):
             # Copper is brighter than laminate everywhere, or darker: what goes the other way is something else.
             rising = amplitude > 0
             way = np.where(rising == (2 * rising.sum() > np.isfinite(position).sum()), position, np.nan)
             found = self._known(centre + direction * way.astype(np.float64)[:, None])
-            point, normal = _moved(self.rulers, motion, self.placement)
+            point, normal = _moved(known, motion, self.placement)
             rows.append(line_rows(normal, point - motion[:, 2], found - motion[:, 2], sigma))
             counts.append(np.count_nonzero((status & Status.OUT_OF_RANGE) == 0))
         return np.stack(rows).astype(np.float32), np.array(counts)
 
     def _verified(self, image: npt.NDArray[Any], starts: list[Float64], device: Device | None) -> list[_Tried]:
         """Motions that most edges agree with, one from each start."""
-        rows, counts = self._laid(image, starts, self._ruler(self._window), device)
+        step = -(-len(self.rulers.point) // _VERIFYING)
+        known = KnownEdges(*(each[::step] for each in self.rulers))
+        rows, counts = self._laid(image, known, starts, self._ruler(self._window), device)
         solver = SolvePose(
             loss="ransac", bend=1.0, least_agreement=0.0, freedom=self.freedom, trials=_TRIALS[self.freedom]
         )
@@ -297,12 +307,13 @@ class FirstFix:
         )
         motion = best.motion
         for _ in range(_ROUNDS):
-            rows, _ = self._laid(image, [motion], ruler, device)
+            rows, _ = self._laid(image, self.rulers, [motion], ruler, device)
             fit = solver(rows, device=device)
             if fit.status[0]:
                 return _refused(Status(int(fit.status[0])), best, other, self.placement)
             motion = _composed(fit, 0, motion)
-        close = other is not None and other.score >= self.ambiguity * best.score
+        limit = min(self.ambiguity * best.score, best.score - _chance(best))
+        close = other is not None and other.score >= limit
         pose, deformation = _described(motion, self.placement)
         return _refused(Status.AMBIGUOUS if close else Status.OK, best, other, self.placement)._replace(
             pose=pose,
@@ -337,6 +348,11 @@ class FirstFix:
         way = (along @ matrix[:2, :2].T - pixels * (along @ matrix[2, :2])[:, None]) / weight[:, None]
         across = np.stack([way[:, 1], -way[:, 0]], axis=-1)
         return pixels, across / np.linalg.norm(across, axis=-1, keepdims=True)
+
+
+def _chance(tried: _Tried) -> float:
+    """Return what a score may differ by without a reason: three standard deviations of a share of half."""
+    return 1.5 / math.sqrt(tried.rulers)
 
 
 def _through(matrix: Float64, points: Float64) -> Float64:

@@ -386,6 +386,7 @@ def test_what_was_applied_to_a_real_picture_is_recovered(data: Path, name: str, 
     assert turn <= 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", PAIRS)
 def test_what_leaves_the_picture_does_not_count(data: Path, name: str, device: Device) -> None:

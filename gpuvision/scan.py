@@ -224,8 +224,7 @@ def scan(
     readout = _asking_for(sensor, precision)
     device = Device.best() if device is None else device
     paced, stream = _pipeline(source, readout, device, rate, policy, timeline)
-    parts, numbers = _streamed(stream, source.length, progress)
-    fields = {key: np.concatenate([getattr(each, key) for each in parts]) for key in readout.outputs or ()}
+    fields, numbers = _streamed(stream, readout.outputs or (), source.length, progress)
     start = time.perf_counter()
     points = _points(sensor, fields, numbers, stream.device)
     intensity = fields["peak" if sensor.kind == "camera" else "total"]
@@ -308,7 +307,10 @@ def _pipeline(
     return paced, Pipeline(paced, operation, device=device, profile=True, trace=timeline, **setup)
 
 
-def _streamed(stream: Pipeline[Any], length: int | None, progress: Progress) -> tuple[list[Any], Array]:
+def _streamed(
+    stream: Pipeline[Any], names: Sequence[str], length: int | None, progress: Progress
+) -> tuple[dict[str, Array], Array]:
+    """Return the fields of all frames by name, and the frames' numbers."""
     parts, numbers = [], []
     with stream:
         for batch in stream:
@@ -318,7 +320,7 @@ def _streamed(stream: Pipeline[Any], length: int | None, progress: Progress) -> 
             progress(batch.number + len(batch), length)
     if not parts:
         raise ValueError("the recording has no frame; expected at least one")
-    return parts, np.concatenate(numbers)
+    return {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}, np.concatenate(numbers)
 
 
 def _points(sensor: Sensor, fields: dict[str, Array], numbers: Array, device: Device) -> RangePoints:

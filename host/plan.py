@@ -133,11 +133,13 @@ def plan(
             break  # larger ones are only later
         if service_rate >= margin * rate:
             return Plan(batch, _ring_for(stall, rate, batch, source), rate, tuple(trials))
-    best = max(trials, key=lambda trial: trial.service_rate)
     asked = f"{rate:.0f} frames/s with a margin of {margin:g}"
-    if latency is not None:
-        asked += f" within {latency * 1e3:.3g} ms"
-    raise StreamError(
+    raise _too_slow(trials, asked if latency is None else f"{asked} within {latency * 1e3:.3g} ms")
+
+
+def _too_slow(trials: Sequence[Trial], asked: str) -> StreamError:
+    best = max(trials, key=lambda trial: trial.service_rate)
+    return StreamError(
         f"no batch keeps up with {asked}: the fastest, {best.batch} frames, does {best.service_rate:.0f} frames/s with "
         f"{best.latency * 1e3:.3g} ms; lower the rate, allow more latency, or use a faster device"
     )

@@ -124,10 +124,7 @@ def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows:
     # Where nothing shines any weights do.
     weight = np.where(total[owner] > 0.0, power, 1.0)
     mass = sums(weight)
-    mean = sums(weight[:, None] * normal)
-    size_of_mean = np.linalg.norm(mean, axis=1)
-    facing = mean / np.where(size_of_mean > 0.0, size_of_mean, 1.0)[:, None]
-    facing[size_of_mean == 0.0] = normal[begin][size_of_mean == 0.0]
+    facing, effective = _facing(sums(weight[:, None] * normal), normal[begin])
     cosine = np.sum(normal * facing[owner], axis=1)
     # Left without a centre of its own where normals cancel; it has no aggregate there.
     lean = np.minimum.reduceat(cosine, begin)
@@ -135,13 +132,10 @@ def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows:
     centre = sums(parallel[:, None] * middle) / sums(parallel)[:, None]
     at = middle - centre[owner]
     aside = normal - cosine[:, None] * facing[owner]
-    far, across, along = (np.sum(a * b, axis=1) for a, b in ((at, at), (half, half), (at, half)))
-    square = far + across / 3.0
-    fourth = far * far + (4.0 * along * along + 2.0 * far * across) / 3.0 + across * across / 5.0
+    square, fourth = _powers(at, half)
     tilt = np.linalg.norm(aside, axis=1)
     skew = sums((weight[:, None] * aside)[:, :, None] * at[:, None, :])
     spread = sums(parallel[:, None, None] * (at[:, :, None] * at[:, None, :] + half[:, :, None] * half[:, None, :] / 3))
-    effective = np.maximum(size_of_mean, 0.0)
     ends = np.concatenate([at - half, at + half]).reshape(2, -1, 3)
     reach = np.sqrt(np.maximum.reduceat(np.max(np.sum(ends * ends, axis=2), axis=0), begin))
     arm, rest = _principal(spread, facing, effective, reach)
@@ -174,6 +168,20 @@ def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows:
     rows[full] = table
     exitance = effective * scale / np.where(arm_size > 0.0, 2.0 * arm_size, 1.0)
     aggregates[full] = np.column_stack([centre - arm, centre + arm, facing, np.where(arm_size > 0.0, exitance, 0.0)])
+
+
+def _facing(summed: Reals, first: Reals) -> tuple[Reals, Reals]:
+    """Return the direction of summed normals, and their length; the first normal's direction where they cancel."""
+    length = np.linalg.norm(summed, axis=1)
+    facing = summed / np.where(length > 0.0, length, 1.0)[:, None]
+    facing[length == 0.0] = first[length == 0.0]
+    return facing, length
+
+
+def _powers(at: Reals, half: Reals) -> tuple[Reals, Reals]:
+    """Return the means over segments, from at - half to at + half, of the distance to the power of 2 and of 4."""
+    far, across, along = (np.sum(a * b, axis=1) for a, b in ((at, at), (half, half), (at, half)))
+    return far + across / 3.0, far * far + (4.0 * along * along + 2.0 * far * across) / 3.0 + across * across / 5.0
 
 
 def _principal(spread: Reals, facing: Reals, mass: Reals, reach: Reals) -> tuple[Reals, Reals]:

@@ -268,20 +268,24 @@ def optimise_mask(
     valid = np.isfinite(true_u) & (direct.total() > 0.0)
     ends = _admissible(sight.u_edges, direct, valid, keep, margin)
     grouped = _Groups.of(sight, light, np.where(valid, true_u, np.nan), slope, ends, fixed)
-    windows = np.empty((len(grouped.low), 2))
-    share = max(_PAIRS_AT_ONCE // (grouped.power.shape[1] * _CHOICES**2), 1)
-    for first in range(0, len(windows), share):
-        best = grouped.part(first, first + share).best(objective)
-        windows[first : first + share] = sight.u_edges[np.stack(best, axis=-1)]
     shape = (sight.samples, 2) if fixed else (*light.power.shape[:-1], 2)
-    mask = Mask(windows=windows.reshape(shape))
+    mask = Mask(windows=sight.u_edges[_best_ends(grouped, objective)].reshape(shape))
+    behind, passed = (mask.apply(each, sight.u_edges) for each in (light, direct))
     with np.errstate(invalid="ignore", divide="ignore"):
         before, after = (
             np.where(valid, (each.first_moment(sight.u_edges) / each.total() - true_u) * slope, np.nan)
-            for each in (light, mask.apply(light, sight.u_edges))
+            for each in (light, behind)
         )
-        kept = np.where(valid, mask.apply(direct, sight.u_edges).total() / direct.total(), np.nan)
-    return MaskPlan(mask, before, after, kept)
+        return MaskPlan(mask, before, after, np.where(valid, passed.total() / direct.total(), np.nan))
+
+
+def _best_ends(grouped: _Groups, objective: str) -> npt.NDArray[np.intp]:
+    """Return the edges of bins between which the light of each group reads best, (groups, 2)."""
+    ends = np.empty((len(grouped.low), 2), np.intp)
+    share = max(_PAIRS_AT_ONCE // (grouped.power.shape[1] * _CHOICES**2), 1)
+    for first in range(0, len(ends), share):
+        ends[first : first + share] = np.stack(grouped.part(first, first + share).best(objective), axis=-1)
+    return ends
 
 
 def _admissible(

@@ -26,6 +26,8 @@ _SAMPLED_PX = 0.02  # [px] standard deviation of what bilinear samples cost an e
 _LEAST_SHARE = 0.3  # of the rulers in the image that must agree
 _WORST_PX = 0.5  # by so much edges may disagree with a pose
 _USUAL_CANDIDATES = 2500
+_BEYOND, _TURN = 2.0, 5e-3  # times as far as the rulers reach, and a least angle [rad]: a pose there is none of theirs
+_TRIALS = 256  # poses to start from: of four rows, all miss half of them bad in 7 of 1e8 boards
 
 
 class Rulers(NamedTuple):
@@ -74,19 +76,12 @@ class Rulers(NamedTuple):
         return self.weight > 0.05
 
 
-class Etching(NamedTuple):
-    """How much narrower copper is on each side than drawn [m], and its standard deviation; without single edges NaN."""
-
-    value: float
-    sigma: float
-
-
 class Solution(NamedTuple):
     """What one pass made: where the board is seen, and its covariance at the placement point."""
 
     pose: Float64
     covariance: Float64
-    etching: Etching
+    growth: float
     spread: float
     condition: float
     rulers: Rulers
@@ -130,7 +125,8 @@ class Looking:
     def located(self, view: BoardView, copper: Copper) -> Fix:
         """Look where the board should be, then once more where it was found, with shorter rulers."""
         reach = np.minimum(self.features.length / view.scale, LONGEST)
-        first = self._pass(view, copper, reach)
+        imaging = self.features.imaging
+        first = self._pass(view, copper, reach, (_BEYOND * imaging.shift, _BEYOND * max(imaging.angle, _TURN)))
         if first.reason:
             return Fix(view, view, first)
         there = moved(view, first.pose)
@@ -141,7 +137,9 @@ class Looking:
         """(n,) lengths [px] that the edge lies on where the board is known to a few pixels."""
         return 2 * (_AGAIN_PX + 3 * best_smoothing(self.blur_px)) + 3 + self.features.spacing / scale
 
-    def _pass(self, view: BoardView, copper: Copper, length_px: Float64) -> Solution:
+    def _pass(
+        self, view: BoardView, copper: Copper, length_px: Float64, within: tuple[float, float] | None = None
+    ) -> Solution:
         rulers = self._measured(view, copper, length_px)
         laid, found = int(rulers.laid.sum()), int(rulers.found.sum())
         if laid < 3:
@@ -151,7 +149,7 @@ class Looking:
                 rulers,
                 f"{found} of {laid} rulers found an edge of {self.threshold:.3g} grey levels or more, expected 3",
             )
-        return self._solved(rulers, view.scale)
+        return self._solved(rulers, view.scale, within)
 
     def _measured(self, view: BoardView, copper: Copper, length_px: Float64) -> Rulers:
         """Look along all rulers: those across single edges together, those across traces by the traces' widths."""
@@ -186,56 +184,36 @@ class Looking:
         nothing = np.zeros(count)
         return Rulers(features.point, features.normal, length_px, position, sigma, nothing, nothing * np.nan, status)
 
-    def _solved(self, rulers: Rulers, scale: float) -> Solution:
-        """Solve for the pose and, where single edges were measured, for the etching: by turns, robustly."""
+    def _solved(self, rulers: Rulers, scale: float, within: tuple[float, float] | None) -> Solution:
+        """Solve for the pose, and along with it for the etching where single edges were measured."""
         placement = self.features.placement
         single = self.features.spacing == 0
-        off = rulers.position_px * scale
-        sigma, etched = np.hypot(rulers.sigma, np.where(single, self.etch, 0.0)), Etching(0.0, self.etch)
-        fit: BoardPose | None = None
-        for _ in range(3):
-            seen = rulers.point + rulers.normal * (off + np.where(single, etched.value, 0.0))[:, None]
-            rows = line_rows(rulers.normal, rulers.point - placement, seen - placement, sigma)
-            solver = SolvePose(
-                scale=None, smallest_scale=1.0, precision="double" if self.device.has_double else "single"
-            )
-            fit = solver(rows, device=self.device)
-            weight = np.nan_to_num(np.asarray(fit.weights, np.float64))
-            if int(fit.status):
-                return _refused(rulers._replace(weight=weight), _why(fit, int(rulers.found.sum())))
-            etched, extra = self._etching(rulers, off, weight, single, float(fit.scale))
-            sigma = rulers.sigma
-        assert fit is not None  # the loop ran
-        told = rulers._replace(weight=weight, residual=np.asarray(fit.residuals, np.float64))
+        is_etched = bool((single & rulers.found).any()) and self.etch > 0
+        seen = rulers.point + rulers.normal * (rulers.position_px * scale)[:, None]
+        grows = np.where(single, 1.0, 0.0) if is_etched else None
+        fit = SolvePose(
+            scale=None,
+            smallest_scale=1.0,
+            etch=self.etch if is_etched else None,
+            least_agreement=_LEAST_SHARE,
+            within=within,
+            trials=_TRIALS,
+            precision="double" if self.device.has_double else "single",
+        )(line_rows(rulers.normal, rulers.point - placement, seen - placement, rulers.sigma, grows), device=self.device)
+        told = rulers._replace(weight=np.nan_to_num(fit.weights), residual=fit.residuals)
+        if int(fit.status):
+            return _refused(told, _why(fit, int(rulers.found.sum())))
         solution = Solution(
             pose=_about(np.asarray(fit.pose, np.float64), placement),
             # Of few edges that happen to agree better than they should the scatter is not to be trusted.
-            covariance=np.asarray(fit.covariance, np.float64) / min(float(fit.spread), 1.0) ** 2 + extra,
-            etching=etched if single.any() else Etching(math.nan, math.nan),
+            covariance=np.asarray(fit.covariance, np.float64) / min(float(fit.spread), 1.0) ** 2,
+            growth=float(fit.etch) if is_etched else math.nan,
             spread=float(fit.spread),
             condition=float(fit.condition),
             rulers=told,
             reason="",
         )
         return self._judged(solution, float(fit.scale), scale)
-
-    def _etching(
-        self, rulers: Rulers, off: Float64, weight: Float64, single: npt.NDArray[np.bool_], spread: float
-    ) -> tuple[Etching, Float64]:
-        """Return the etching, by weighted least squares for pose and etching, and what not knowing it adds."""
-        used = weight > 0
-        if not (single & used).any() or self.etch == 0:
-            return Etching(0.0, 0.0), np.zeros((3, 3))
-        arm = rulers.point - self.features.placement
-        turn = arm[:, 0] * rulers.normal[:, 1] - arm[:, 1] * rulers.normal[:, 0]
-        row = np.column_stack([rulers.normal, turn, np.where(single, -1.0, 0.0)])[used]
-        per = (weight[used] / (spread * rulers.sigma[used]) ** 2)[:, None]
-        information = (row * per).T @ row
-        information[3, 3] += 1 / self.etch**2
-        known = np.linalg.solve(information, (row * per).T @ off[used])
-        variance = float(np.linalg.inv(information)[3, 3])
-        gain = np.linalg.solve(information[:3, :3], information[:3, 3])
-        return Etching(float(known[3]), math.sqrt(variance)), np.outer(gain, gain) * variance
 
     def _judged(self, solution: Solution, spread: float, scale: float) -> Solution:
         """Refuse what too few rulers agree with, or what they disagree with too much."""
@@ -262,16 +240,25 @@ def _alike(spacing_px: Float64) -> list[tuple[float, float]]:
 
 
 def _why(fit: BoardPose, found: int) -> str:
-    if int(fit.status) & Status.AMBIGUOUS:
-        if int(fit.rank) < 3:
-            return f"the edges found fix {int(fit.rank)} of x, y and theta (all parallel, or all through one point)"
-        return f"{int(fit.inliers)} of the {found} edges found agree on a pose, expected {_LEAST_SHARE:.0%} or more"
-    return f"{found} edges were found, too few for a pose ({_flags(fit.status)})"
+    if int(fit.status) & Status.OUT_OF_RANGE:
+        return (
+            "the edges found agree on a pose further away than the rulers reach; say nearer where it is, or within more"
+        )
+    if not int(fit.status) & Status.AMBIGUOUS:
+        return f"{found} edges were found, too few for a pose ({_flags(fit.status)})"
+    if np.isfinite(fit.agreement) and float(fit.agreement) < _LEAST_SHARE:
+        return (
+            f"{int(fit.inliers)} of the {found} edges found agree on a pose, with {float(fit.agreement):.0%} of what "
+            f"they say of it, expected {_LEAST_SHARE:.0%} or more"
+        )
+    if np.isfinite(fit.leverage) and float(fit.leverage) > 0.0:
+        return "a part of the pose hangs on a single edge, which no other one checks; look at more edges"
+    return "the edges found do not fix x, y and theta (all parallel, or all through one point)"
 
 
 def _refused(rulers: Rulers, reason: str) -> Solution:
     nothing = np.full((3, 3), np.nan)
-    return Solution(nothing[0], nothing, Etching(math.nan, math.nan), math.nan, math.nan, rulers, reason)
+    return Solution(nothing[0], nothing, math.nan, math.nan, math.nan, rulers, reason)
 
 
 def _about(pose: Float64, point: Float64) -> Float64:

@@ -223,6 +223,14 @@ def _ruler(table: Section) -> tuple[Any, ...]:
     return row
 
 
+def clearance_of(imaging: Imaging) -> float:
+    """Return how far edges must be from silk and from the mask's openings [m], as `read_artwork` takes it.
+
+    Both may be printed off by ``imaging.registration``, and blur.
+    """
+    return imaging.registration + 2 * imaging.blur_px * imaging.pixel
+
+
 def choose_features(
     artwork: Artwork,
     region: npt.ArrayLike,

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.board_rulers import Copper, Etching, Fix, Looking, Rulers, features_in_view, moved
+from gpuvision.board_rulers import Copper, Fix, Looking, Rulers, features_in_view, moved
 from gpuvision.board_view import BoardView, grey_image, noise_of
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
@@ -55,8 +55,9 @@ class LocatedBoard:
         `Rulers` of the last pass.
     features
         What was looked for.
-    etching
-        `Etching`, as it was solved for along with the pose.
+    growth
+        How far copper reaches beyond its drawn edges, below 0 where too much was etched [m], solved for along with the
+        pose; NaN where only the middles of traces were measured.
     spread
         Of what the pose leaves of the edges, in standard deviations: about 1 where these are right.
     condition
@@ -82,7 +83,7 @@ class LocatedBoard:
     placement_covariance: Float64
     rulers: Rulers
     features: FeatureSet
-    etching: Etching
+    growth: float
     spread: float
     condition: float
     copper: Copper
@@ -133,7 +134,7 @@ class LocatedBoard:
                 "covariance": _plain(self.placement_covariance),
             },
             "predicted_covariance": _plain(self.features.covariance),
-            "etching": {"value": _plain(self.etching.value), "sigma": _plain(self.etching.sigma)},
+            "growth": _plain(self.growth),
             "spread": _plain(self.spread),
             "condition": _plain(self.condition),
             "scale": self.view.scale,
@@ -379,7 +380,7 @@ def _result(
         placement_covariance=covariance,
         rulers=solution.rulers,
         features=features,
-        etching=solution.etching,
+        growth=solution.growth,
         spread=solution.spread,
         condition=solution.condition,
         copper=copper,

@@ -107,8 +107,9 @@ def test_etching_is_solved_for(artwork: Artwork, growth: float) -> None:
         seen(artwork, pose, growth=growth), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0), budget=120
     )
     assert np.abs(off(located, pose)).max() < SIGMAS
-    # Edges are rendered to a hundredth of a pixel, all of them alike.
-    assert located.etching.value == pytest.approx(-growth, abs=4 * located.etching.sigma + 0.02 * PIXEL)
+    # Edges are rendered to a hundredth of a pixel, all of them alike, and 40 of them are measured to 0.03.
+    assert np.sum(located.features.spacing == 0) > 20
+    assert located.growth == pytest.approx(growth, abs=0.04 * PIXEL)
 
 
 def test_dark_copper_is_told_from_bright(artwork: Artwork) -> None:

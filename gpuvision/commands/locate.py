@@ -212,12 +212,13 @@ def _board(
     device: str | None,
 ) -> tuple[LocatedBoard, Callable[[Path], None]]:
     from gpuvision.board_picture import draw_located_board
-    from gpuvision.features import read_features
+    from gpuvision.features import clearance_of, read_features
     from gpuvision.host import Device
     from gpuvision.host.recordings import read_image
     from gpuvision.lens_file import read_lens
     from gpuvision.locate import locate_board
     from gpuvision.matching.artwork import read_artwork
+    from gpuvision.matching.selection import Imaging
 
     chosen = None if features is None else read_features(features)
     if scale is None and chosen is None:
@@ -226,17 +227,20 @@ def _board(
         raise ValueError(f"--side is {side.value}, but {features} is of the {chosen.side}; leave it out")
     picture = read_image(image)
     of = chosen.side if chosen is not None else "top" if side is None else side.value
-    artwork = read_artwork(board, side=of, layers=layers_of(layers))
+    pixel = chosen.imaging.pixel if scale is None and chosen is not None else float(scale or 0.0)
+    blur_px = blur or (1.0 if chosen is None else chosen.imaging.blur_px)
+    clearance = clearance_of(Imaging(pixel=pixel, blur_px=blur_px) if chosen is None else chosen.imaging)
+    artwork = read_artwork(board, side=of, layers=layers_of(layers), clearance=clearance)
     located = locate_board(
         picture,
         artwork,
-        scale=chosen.imaging.pixel if scale is None and chosen is not None else float(scale or 0.0),
+        scale=pixel,
         near=about,
         within=None if within is None else quantities(within, "--within", "m,rad"),  # type: ignore[arg-type]
         features=chosen,
         model=None if camera is None else read_lens(camera),
         budget=budget,
-        blur_px=blur or (1.0 if chosen is None else chosen.imaging.blur_px),
+        blur_px=blur_px,
         etch=quantities(etch, "--etch", "m")[0],
         threshold=threshold,
         copper=copper.value,

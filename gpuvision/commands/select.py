@@ -68,7 +68,7 @@ def select(
     deviations the pose will have at the placement point.
     """
     from gpuvision.board_picture import draw_features
-    from gpuvision.features import choose_features
+    from gpuvision.features import choose_features, clearance_of
     from gpuvision.host import Device
     from gpuvision.host.files import check_folder, whole_folder
     from gpuvision.matching.artwork import read_artwork
@@ -92,7 +92,7 @@ def select(
     )
     at = None if placement is None else quantities(placement, "--placement", "m,m")
     check_folder(out)
-    artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers))
+    artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=clearance_of(imaging))
     box = (region[:2], region[2:])
     features = choose_features(
         artwork,

@@ -3,13 +3,21 @@
 // finds them all, 16 boxes or 16 triangles at once.
 //
 // In the plane a place has two coordinates, from the point: `deep`, towards the segment's line, and `along`, such that
-// along / deep is where on the segment (0 at its start, 1 at its end) the place is seen. A cut between two corners is
-// always made from the corner before the plane to the one behind it, so that two triangles at an edge they share leave
-// no slit.
+// along / deep is where on the segment (0 at its start, 1 at its end) the place is seen. So both may be multiples, and
+// a cut between two corners needs no division. It comes out the same for both triangles at an edge: they leave no
+// slit.
 #ifndef VISIBLE_H
 #define VISIBLE_H
 
 #include "bvh.h"
+
+#ifdef STRIP
+// Of a kernel: its vectors are the code's own, a compiler need not look for more across work-items (Intel's does, for
+// seconds).
+#define AS_IT_IS __attribute__((vec_type_hint(real16)))
+#else
+#define AS_IT_IS
+#endif
 
 #define VIEW_HALVES 6
 // A node, where a leaf is to be.
@@ -132,8 +140,19 @@ BVH_INLINE void view_cut(bvh_reals v1, bvh_reals v2, bvh_reals *enter, bvh_reals
     *leave = v2 < (bvh_reals)0 ? bvh_min(*leave, cut) : *leave;
 }
 
-// The two ends of the line along which the plane cuts a triangle; returns which triangles it cuts.
-BVH_INLINE bvh_masks view_lines(const view *view, global const real *leaf, bvh_reals *deep, bvh_reals *along) {
+// What a corner and one on the other side of the plane have, each times how far the other is from the plane. Both
+// products are rounded, so that it is the same whichever corner comes first.
+BVH_INLINE bvh_reals view_mix(bvh_reals one, bvh_reals off_one, bvh_reals two, bvh_reals off_two) {
+#pragma OPENCL FP_CONTRACT OFF
+    const bvh_reals first = one * off_two;
+    const bvh_reals second = two * off_one;
+    return first + second;
+}
+
+// The two ends of the line along which the plane cuts a triangle, each times its weight, which is positive; returns
+// which triangles it cuts.
+BVH_INLINE bvh_masks view_lines(const view *view, global const real *leaf, bvh_reals *deep, bvh_reals *along,
+                                bvh_reals *weight) {
     const bvh_reals zero = (bvh_reals)0;
     const bvh_reals x = view->x, y = view->y, z = view->z;
     const bvh_reals ax = BVH_LOAD(leaf) - x, ay = BVH_LOAD(leaf + WIDTH) - y, az = BVH_LOAD(leaf + 2 * WIDTH) - z;
@@ -142,77 +161,67 @@ BVH_INLINE bvh_masks view_lines(const view *view, global const real *leaf, bvh_r
     const bvh_reals cx = BVH_LOAD(leaf + 6 * WIDTH) - x, cy = BVH_LOAD(leaf + 7 * WIDTH) - y;
     const bvh_reals cz = BVH_LOAD(leaf + 8 * WIDTH) - z;
 #define VIEW_DOT(name, corner)                                                                                         \
-    (view->name##_x * corner##x + view->name##_y * corner##y + view->name##_z * corner##z)
+    bvh_fma((bvh_reals)view->name##_x, corner##x,                                                                      \
+            bvh_fma((bvh_reals)view->name##_y, corner##y, (bvh_reals)view->name##_z * corner##z))
     const bvh_reals off_a = VIEW_DOT(across, a), off_b = VIEW_DOT(across, b), off_c = VIEW_DOT(across, c);
     const bvh_masks behind_a = BVH_MASK(off_a < zero), behind_b = BVH_MASK(off_b < zero);
     const bvh_masks behind_c = BVH_MASK(off_c < zero);
-    const bvh_masks apart = (behind_a ^ behind_b) | (behind_a ^ behind_c);
-    if (!view_any(apart)) return apart;
+    const bvh_masks cuts_ab = behind_a ^ behind_b, cuts_ca = behind_a ^ behind_c, apart = cuts_ab | cuts_ca;
     const bvh_reals deep_a = VIEW_DOT(deep, a), deep_b = VIEW_DOT(deep, b), deep_c = VIEW_DOT(deep, c);
     const bvh_reals along_a = VIEW_DOT(along, a), along_b = VIEW_DOT(along, b), along_c = VIEW_DOT(along, c);
 #undef VIEW_DOT
-    // The corner that is alone on its side, and the two others.
-    const bvh_masks is_a = ~(behind_b ^ behind_c), is_b = ~(behind_a ^ behind_c);
-    const bvh_reals off_1 = is_a ? off_a : is_b ? off_b : off_c, off_2 = is_a ? off_b : is_b ? off_c : off_a;
-    const bvh_reals off_3 = is_a ? off_c : is_b ? off_a : off_b;
-    const bvh_reals deep_1 = is_a ? deep_a : is_b ? deep_b : deep_c, deep_2 = is_a ? deep_b : is_b ? deep_c : deep_a;
-    const bvh_reals deep_3 = is_a ? deep_c : is_b ? deep_a : deep_b;
-    const bvh_reals along_1 = is_a ? along_a : is_b ? along_b : along_c;
-    const bvh_reals along_2 = is_a ? along_b : is_b ? along_c : along_a;
-    const bvh_reals along_3 = is_a ? along_c : is_b ? along_a : along_b;
-    const bvh_masks before = BVH_MASK(off_1 >= zero);
-    const bvh_reals share_2 = (before ? off_1 : off_2) / fabs(off_1 - off_2);
-    const bvh_reals share_3 = (before ? off_1 : off_3) / fabs(off_1 - off_3);
-    const bvh_reals step_deep_2 = before ? deep_2 - deep_1 : deep_1 - deep_2;
-    const bvh_reals step_deep_3 = before ? deep_3 - deep_1 : deep_1 - deep_3;
-    const bvh_reals step_along_2 = before ? along_2 - along_1 : along_1 - along_2;
-    const bvh_reals step_along_3 = before ? along_3 - along_1 : along_1 - along_3;
-    deep[0] = bvh_fma(share_2, step_deep_2, before ? deep_1 : deep_2);
-    deep[1] = bvh_fma(share_3, step_deep_3, before ? deep_1 : deep_3);
-    along[0] = bvh_fma(share_2, step_along_2, before ? along_1 : along_2);
-    along[1] = bvh_fma(share_3, step_along_3, before ? along_1 : along_3);
+    const bvh_reals far_a = fabs(off_a), far_b = fabs(off_b), far_c = fabs(off_c);
+    // Two of the three edges are cut.
+    const bvh_reals deep_bc = view_mix(deep_b, far_b, deep_c, far_c);
+    const bvh_reals along_bc = view_mix(along_b, far_b, along_c, far_c);
+    deep[0] = cuts_ab ? view_mix(deep_a, far_a, deep_b, far_b) : deep_bc;
+    deep[1] = cuts_ca ? view_mix(deep_a, far_a, deep_c, far_c) : deep_bc;
+    along[0] = cuts_ab ? view_mix(along_a, far_a, along_b, far_b) : along_bc;
+    along[1] = cuts_ca ? view_mix(along_a, far_a, along_c, far_c) : along_bc;
+    weight[0] = far_b + (cuts_ab ? far_a : far_c);
+    weight[1] = far_c + (cuts_ca ? far_a : far_b);
     return apart;
 }
 
-// Which triangles hide something, and from where to where on the segment.
-BVH_INLINE bvh_masks view_triangles(const view *view, global const real *leaf, bvh_reals *low, bvh_reals *high) {
-    bvh_reals deep[2], along[2];
-    const bvh_masks cut = view_lines(view, leaf, deep, along);
-    if (!view_any(cut)) return cut;
+// What each of a leaf's triangles hides of the segment, from `low` to `high`; nothing where low is above high.
+typedef struct {
+    bvh_reals low, high;
+} shadows;
+
+BVH_INLINE void view_shadows(const view *view, global const real *leaf, shadows *cast) {
+    bvh_reals deep[2], along[2], weight[2];
+    bvh_masks hides = view_lines(view, leaf, deep, along, weight);
     const bvh_reals zero = (bvh_reals)0;
     const bvh_reals deep1 = deep[0], deep2 = deep[1], along1 = along[0], along2 = along[1];
-    // Whether what lies between is in the window, before the segment's surface, before the point, above its surface.
-    const bvh_reals far1 = view->far - deep1, far2 = view->far - deep2;
-    const bvh_reals near1 = deep1 - view->near, near2 = deep2 - view->near;
-    const bvh_reals lift1 = view->lift_deep * deep1 + view->lift_along * along1 - view->lift;
-    const bvh_reals lift2 = view->lift_deep * deep2 + view->lift_along * along2 - view->lift;
-#define VIEW_OUT(name)                                                                                                 \
-    const bvh_masks out_##name##1 = BVH_MASK(name##1 < zero), out_##name##2 = BVH_MASK(name##2 < zero)
-    VIEW_OUT(far);
-    VIEW_OUT(near);
-    VIEW_OUT(lift);
-#undef VIEW_OUT
-    bvh_masks hides = cut & ~((out_far1 & out_far2) | (out_near1 & out_near2) | (out_lift1 & out_lift2));
+    const bvh_reals weight1 = weight[0], weight2 = weight[1];
+    // Whether what lies between is before the segment's surface, before the point, above its surface, in the window.
+    const bvh_reals far1 = view->far * weight1 - deep1, far2 = view->far * weight2 - deep2;
+    const bvh_reals near1 = deep1 - view->near * weight1, near2 = deep2 - view->near * weight2;
+    const bvh_reals lift1 = view->lift_deep * deep1 + view->lift_along * along1 - view->lift * weight1;
+    const bvh_reals lift2 = view->lift_deep * deep2 + view->lift_along * along2 - view->lift * weight2;
+    hides &= BVH_MASK(bvh_max(far1, far2) >= zero) & BVH_MASK(bvh_max(near1, near2) >= zero) &
+             BVH_MASK(bvh_max(lift1, lift2) >= zero);
     hides &= BVH_MASK(along1 >= view->from * deep1) | BVH_MASK(along2 >= view->from * deep2);
     hides &= BVH_MASK(along1 <= view->to * deep1) | BVH_MASK(along2 <= view->to * deep2);
-    if (!view_any(hides)) return hides;
+    cast->low = (bvh_reals)1, cast->high = zero;
+    if (!view_any(hides)) return;
     bvh_reals enter = zero, leave = (bvh_reals)1;
-    if (view_any(hides & (out_far1 | out_far2 | out_near1 | out_near2 | out_lift1 | out_lift2))) {
-        view_cut(far1, far2, &enter, &leave);
+    view_cut(far1, far2, &enter, &leave);
+    const bvh_reals least = bvh_min(bvh_min(near1, near2), bvh_min(lift1, lift2));
+    if (view_any(hides & BVH_MASK(least < zero))) {
         view_cut(near1, near2, &enter, &leave);
         view_cut(lift1, lift2, &enter, &leave);
-        hides &= BVH_MASK(enter < leave);
     }
+    hides &= BVH_MASK(enter < leave);
     const bvh_masks is_cut1 = BVH_MASK(enter > zero), is_cut2 = BVH_MASK(leave < (bvh_reals)1);
     const bvh_reals step_deep = deep2 - deep1, step_along = along2 - along1;
     // By rounding a cut may come out nearer than the nearest.
-    const bvh_reals near = (bvh_reals)view->near;
+    const bvh_reals nearest = view->near * bvh_min(weight1, weight2);
     const bvh_reals first = (is_cut1 ? bvh_fma(enter, step_along, along1) : along1) /
-                            bvh_max(is_cut1 ? bvh_fma(enter, step_deep, deep1) : deep1, near);
+                            bvh_max(is_cut1 ? bvh_fma(enter, step_deep, deep1) : deep1, nearest);
     const bvh_reals last = (is_cut2 ? bvh_fma(leave, step_along, along1) : along2) /
-                           bvh_max(is_cut2 ? bvh_fma(leave, step_deep, deep1) : deep2, near);
-    *low = bvh_min(first, last), *high = bvh_max(first, last);
-    return hides;
+                           bvh_max(is_cut2 ? bvh_fma(leave, step_deep, deep1) : deep2, nearest);
+    cast->low = hides ? bvh_min(first, last) : cast->low, cast->high = hides ? bvh_max(first, last) : cast->high;
 }
 
 BVH_INLINE hidden hidden_none(real from, real to) {
@@ -255,61 +264,90 @@ BVH_INLINE void hidden_sort(hidden *all) {
     }
 }
 
-BVH_INLINE void view_leaf(const view *view, global const real *leaf, hidden *all) {
-    bvh_reals low = (bvh_reals)0, high = (bvh_reals)0;
+BVH_INLINE int hidden_is_done(const hidden *all) { return all->is_full || all->from >= all->to; }
+
+// Hides what a leaf's triangles do; returns how much that is of what was not hidden yet (twice where two do).
+BVH_INLINE real hidden_add_all(hidden *all, const shadows *cast) {
+    const bvh_reals low = cast->low, high = cast->high;
+    bvh_masks hides = BVH_MASK(low < high) & BVH_MASK(low < all->to) & BVH_MASK(high > all->from);
+    for (int n = 0; n < all->count; n++) hides &= BVH_MASK(low < all->low[n]) | BVH_MASK(high > all->high[n]);
+    real gone = 0;
 #ifdef STRIP
-    uint met = bvh_lanes(view_triangles(view, leaf, &low, &high));
-    if (!met) return;
-    real lows[WIDTH], highs[WIDTH];
-    *(bvh_reals_at *)lows = low, *(bvh_reals_at *)highs = high;
-    for (; met; met &= met - 1) {
-        const int lane = bvh_lowest(met);
+    const real *lows = (const real *)&cast->low, *highs = (const real *)&cast->high;
+    for (uint left = bvh_lanes(hides); left; left &= left - 1) {
+        const int lane = bvh_lowest(left);
+        gone += highs[lane] - lows[lane];
         hidden_add(all, lows[lane], highs[lane]);
     }
 #else
-    for (int lane = 0; lane < WIDTH; lane++)
-        if (view_triangles(view, leaf + lane, &low, &high)) hidden_add(all, low, high);
+    if (hides) gone = high - low, hidden_add(all, low, high);
 #endif
+    return gone;
 }
 
-// Finds what is hidden; stops when all is, or when more than can be kept is. Looks first into the leaf that hid all
+BVH_INLINE real view_leaf(const bvh_tree *tree, const view *view, int child, hidden *all) {
+    global const real *leaf = tree->leaves + (size_t)~child * (9 * WIDTH);
+    shadows cast;
+    real gone = 0;
+#ifdef STRIP
+    view_shadows(view, leaf, &cast);
+    gone = hidden_add_all(all, &cast);
+#else
+    for (int lane = 0; lane < WIDTH; lane++) {
+        view_shadows(view, leaf + lane, &cast);
+        gone += hidden_add_all(all, &cast);
+    }
+#endif
+    return gone;
+}
+
+// Hides what the leaves among a node's children do, but for `known`; returns those children that are nodes. `hint`
+// becomes the leaf that hides most, if that is more than `most`.
+BVH_INLINE uint view_leaves(const bvh_tree *tree, const view *view, int node, uint met, int known, hidden *all,
+                            real *most, int *hint) {
+    uint inner = 0;
+    int count = 0, leaves[WIDTH];
+    for (; met; met &= met - 1) {
+        const int child = tree->children[node * WIDTH + bvh_lowest(met)];
+        if (child >= 0) inner |= met & -met;
+        else if (child != known) leaves[count++] = child;
+    }
+#ifdef STRIP
+    // All shadows first: to look at one would hold up the next, whose arithmetic a core begins meanwhile.
+    shadows cast[WIDTH];
+    for (int n = 0; n < count; n++) view_shadows(view, tree->leaves + (size_t)~leaves[n] * (9 * WIDTH), cast + n);
+#endif
+    for (int n = 0; n < count && !hidden_is_done(all); n++) {
+#ifdef STRIP
+        const real gone = hidden_add_all(all, cast + n);
+#else
+        const real gone = view_leaf(tree, view, leaves[n], all);
+#endif
+        if (gone > *most) *most = gone, *hint = leaves[n];
+    }
+    return inner;
+}
+
+// Finds what is hidden; stops when all is, or when more than can be kept is. Looks first into the leaf that hid most
 // from the last point: it often does again.
 BVH_INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all, int *hint) {
     int nodes[BVH_DEPTH];
     uint left[BVH_DEPTH];
-    int node = 0, depth = 0, is_begun = 0, child = *hint;
-    uint met = 0;
-    view->from = all->from, view->to = all->to;
-    while (true) {
-        if (child < 0) {
-            view_leaf(view, tree->leaves + (size_t)~child * (9 * WIDTH), all);
-            if (all->is_full || all->from >= all->to) {
-                *hint = child;
-                return;
-            }
-        } else if (is_begun) {
-            node = child;
-            met = view_met(view, tree->nodes + (size_t)node * (6 * WIDTH));
-        }
-        if (!met) {
-            if (depth) {
-                node = nodes[--depth];
-                met = left[depth];
-            } else {
-                if (is_begun) return;
-                is_begun = 1;
-                view_set_window(view, all->from, all->to);
-                child = 0;
-                continue;
-            }
-        }
-        child = tree->children[node * WIDTH + bvh_lowest(met)];
-        met &= met - 1;
-        if (child >= 0 && met) {
-            nodes[depth] = node;
-            left[depth++] = met;
-            met = 0;
-        }
+    int node = 0, depth = 0;
+    const int known = *hint;
+    real most = 0;
+    view_set_window(view, all->from, all->to);
+    if (known < 0) view_leaf(tree, view, known, all);
+    while (!hidden_is_done(all)) {
+        if (all->from > view->from || all->to < view->to) view_set_window(view, all->from, all->to);
+        const uint met = view_met(view, tree->nodes + (size_t)node * (6 * WIDTH));
+        const uint inner = view_leaves(tree, view, node, met, known, all, &most, hint);
+        if (inner) nodes[depth] = node, left[depth++] = inner;
+        if (!depth) return;
+        const uint lane = bvh_lowest(left[depth - 1]);
+        node = tree->children[nodes[depth - 1] * WIDTH + lane];
+        left[depth - 1] &= left[depth - 1] - 1;
+        if (!left[depth - 1]) depth--;
     }
 }
 

@@ -1,11 +1,13 @@
 // Irradiance of a sensor strip's receivers from all lit segments, as far as each sees them, and what it adds to the
-// strip's two currents. A CPU's work-item has a strip and takes its receivers 16 at a time, a GPU's work-group has one
-// and takes an item per receiver.
+// strip's two currents. A CPU's work-item has several strips and takes their receivers 16 at a time, a GPU's work-group
+// has one and takes an item per receiver.
 //
-// Facing comes first: of the few pairs left, what is seen is found one after another (visible.h, or shadow rays to
-// parts of the segment), and the pieces wait until 16 of them, of any receiver and segment, are worth the closed form.
+// Segments on one line, like those of a sheet of light on a board between its parts, are looked at together. Facing
+// comes first: of the few pairs of receivers and lines left, what is seen is found one after another (visible.h, or
+// shadow rays to parts of each segment), and the pieces wait until 16 of them, of any receiver and segment, are worth
+// the closed form.
 #include "line_irradiance.h"
-#include "places.h"
+#include "lit_lines.h"
 #include "status.h"
 #include "visible.h"
 
@@ -14,31 +16,20 @@
 // Of how high either stands above the other's surface: a clearance takes no more of it.
 #define LEAST_SHARE ((real)0.5)
 
-#ifdef STRIP
-#define LOAD_PLACES(from) (*(const places_at *)(from))
-#define narrow convert_real16
-#define STORE_LANES(value, to) (*(reals_at *)(to) = (value))
-#define LOAD_LANES(from) (*(const reals_at *)(from))
-#else
-#define LOAD_PLACES(from) (*(from))
-#define narrow convert_real
-#define STORE_LANES(value, to) (*(to) = (value))
-#define LOAD_LANES(from) (*(from))
-#endif
+// Which segments are loaded: those from so many on, or none.
+#define NONE_HELD (-1)
 
-// A lit segment: its start and its frame, `off` being the normal of its surface.
-typedef struct {
-    place x, y, z, along_x, along_y, along_z, off_x, off_y, off_z, across_x, across_y, across_z;
-    place length;
-    real exitance; // over 2 pi
-    int is_lit, is_good;
-} lit;
-
-// Receivers, in the frame of the segment: as line_irradiance.h takes them.
+// Receivers, in the frame of a segment: as line_irradiance.h takes them.
 typedef struct {
     real along[LANES], height[LANES], aside[LANES], past[LANES], by_u[LANES], by_n[LANES], by_w[LANES];
     real toward[LANES], toward_end[LANES]; // how far above the receiver's plane the segment's ends are
 } facing;
+
+// Receivers before a line, in its frame and those of its segments, and which of them see any of each.
+typedef struct {
+    facing whole, own[SEGMENTS];
+    uint lanes[SEGMENTS];
+} before;
 
 // What waits for the closed form: visible parts of segments, each with its lane's receiver.
 typedef struct {
@@ -47,41 +38,6 @@ typedef struct {
     int lane[LANES];
     int count;
 } pieces;
-
-inline int has_no_number(place value) { return not_finite((real)value); }
-
-// A segment's start, and not yet of unit length: along it, and off it its normal.
-lit lit_of(global const INPUT *row, constant place *middle) {
-    lit one;
-    one.x = (place)row[0] - middle[0], one.y = (place)row[1] - middle[1], one.z = (place)row[2] - middle[2];
-    one.along_x = (place)row[3] - (place)row[0], one.along_y = (place)row[4] - (place)row[1];
-    one.along_z = (place)row[5] - (place)row[2];
-    const place nx = row[6], ny = row[7], nz = row[8];
-    const place square = one.along_x * one.along_x + one.along_y * one.along_y + one.along_z * one.along_z;
-    const place lean = one.along_x * nx + one.along_y * ny + one.along_z * nz;
-    one.off_x = square * nx - lean * one.along_x, one.off_y = square * ny - lean * one.along_y;
-    one.off_z = square * nz - lean * one.along_z;
-    one.exitance = (real)(row[9] * (INPUT)0.15915494309189533577);
-    const place size = fabs(one.off_x) + fabs(one.off_y) + fabs(one.off_z);
-    const int emits = one.exitance > 0 && square > 0;
-    one.is_good = !(has_no_number(one.x + one.y + one.z) | has_no_number(square + size) | not_finite(one.exitance)) &&
-                  !(emits && size == 0);
-    one.is_lit = one.is_good && emits;
-    return one;
-}
-
-// Completes a segment that a receiver faces.
-void finish_lit(lit *one) {
-    one->length = sqrt(one->along_x * one->along_x + one->along_y * one->along_y + one->along_z * one->along_z);
-    const place per = (place)1 / one->length;
-    one->along_x *= per, one->along_y *= per, one->along_z *= per;
-    const place size = sqrt(one->off_x * one->off_x + one->off_y * one->off_y + one->off_z * one->off_z);
-    const place per_size = (place)1 / size;
-    one->off_x *= per_size, one->off_y *= per_size, one->off_z *= per_size;
-    one->across_x = one->along_y * one->off_z - one->along_z * one->off_y;
-    one->across_y = one->along_z * one->off_x - one->along_x * one->off_z;
-    one->across_z = one->along_x * one->off_y - one->along_y * one->off_x;
-}
 
 // The closed form for what waits.
 __attribute__((noinline)) void finish(pieces *waiting, place *sums) {
@@ -96,38 +52,38 @@ __attribute__((noinline)) void finish(pieces *waiting, place *sums) {
     waiting->count = 0;
 }
 
-// A lane's receiver sees the segment from `start` to `stop` of its length.
-__attribute__((noinline)) void add_piece(const lit *one, const facing *all, int lane, real start, real stop,
+// A lane's receiver sees segment k from `start` to `stop` of its length.
+__attribute__((noinline)) void add_piece(const chunk *lit, int k, const facing *all, int lane, real start, real stop,
                                          pieces *waiting, place *sums) {
     if (!(start < stop)) return;
     const int n = waiting->count++;
-    const real length = (real)one->length;
+    const real length = (real)lit->each.length[k];
     waiting->along[n] = all->along[lane] - start * length;
     waiting->height[n] = all->height[lane];
     waiting->aside[n] = all->aside[lane];
     waiting->past[n] = all->past[lane] - ((real)1 - stop) * length;
     waiting->length[n] = (stop - start) * length;
     waiting->by_u[n] = all->by_u[lane], waiting->by_n[n] = all->by_n[lane], waiting->by_w[n] = all->by_w[lane];
-    waiting->exitance[n] = one->exitance;
+    waiting->exitance[n] = lit->exitance[k];
     waiting->lane[n] = lane;
     if (waiting->count == LANES) finish(waiting, sums);
 }
 
 #ifdef INTERVALS
 // (x, y, z) is the receiver and (nx, ny, nz) its normal.
-view view_from(const lit *one, const facing *all, int lane, real x, real y, real z, real nx, real ny, real nz,
+view view_from(const frames *of, int n, const facing *all, int lane, real x, real y, real z, real nx, real ny, real nz,
                real clearance) {
     view v;
     const real height = all->height[lane], aside = all->aside[lane], along = all->along[lane];
     const real toward = all->toward[lane], most = fmax(toward, all->toward_end[lane]);
     const real depth = sqrt(height * height + aside * aside), per = (real)1 / depth;
-    const real up = -height * per, side = -aside * per, per_length = (real)1 / (real)one->length;
-    const real ux = (real)one->along_x, uy = (real)one->along_y, uz = (real)one->along_z;
-    const real ex = (real)one->off_x, ey = (real)one->off_y, ez = (real)one->off_z;
-    const real wx = (real)one->across_x, wy = (real)one->across_y, wz = (real)one->across_z;
+    const real up = -height * per, side = -aside * per, per_length = (real)1 / (real)of->length[n];
+    const real ux = (real)of->along_x[n], uy = (real)of->along_y[n], uz = (real)of->along_z[n];
+    const real ex = (real)of->off_x[n], ey = (real)of->off_y[n], ez = (real)of->off_z[n];
+    const real wx = (real)of->across_x[n], wy = (real)of->across_y[n], wz = (real)of->across_z[n];
     v.x = x, v.y = y, v.z = z;
-    v.start_x = (real)one->x, v.start_y = (real)one->y, v.start_z = (real)one->z;
-    v.step_x = (real)one->length * ux, v.step_y = (real)one->length * uy, v.step_z = (real)one->length * uz;
+    v.start_x = (real)of->x[n], v.start_y = (real)of->y[n], v.start_z = (real)of->z[n];
+    v.step_x = (real)of->length[n] * ux, v.step_y = (real)of->length[n] * uy, v.step_z = (real)of->length[n] * uz;
     v.deep_x = up * ex + side * wx, v.deep_y = up * ey + side * wy, v.deep_z = up * ez + side * wz;
     v.across_x = up * wx - side * ex, v.across_y = up * wy - side * ey, v.across_z = up * wz - side * ez;
     v.along_x = (depth * ux + along * v.deep_x) * per_length;
@@ -145,12 +101,26 @@ view view_from(const lit *one, const facing *all, int lane, real x, real y, real
     return v;
 }
 
-// Returns whether all is found: it is, unless there is more to keep than fits even in a small part of the segment.
-int add_visible(const bvh_tree *tree, const lit *one, const facing *all, int lane, view *v, int *hint,
+// What a lane's receiver sees of segment k, if it sees the line from `from` to `to` but for what is hidden, in order.
+void add_seen(const hidden *dark, real from, real to, const chunk *lit, int k, const facing *own, int lane,
+              pieces *waiting, place *sums) {
+    const real begin = lit->begin[k], end = lit->end[k], per = (real)1 / (end - begin), stop = fmin(to, end);
+    real start = fmax(from, begin);
+    for (int n = 0; n <= dark->count && start < stop; n++) {
+        const real low = n < dark->count ? fmin(dark->low[n], stop) : stop;
+        const real share = low == end ? (real)1 : (low - begin) * per;
+        add_piece(lit, k, own, lane, (start - begin) * per, share, waiting, sums);
+        if (n < dark->count) start = fmax(start, dark->high[n]);
+    }
+}
+
+// What a lane's receiver sees of a line's segments. Returns whether all is found: it is, unless there is more to keep
+// than fits even in a small part of the line.
+int add_visible(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, view *v, int *hint,
                 pieces *waiting, place *sums) {
     // What is above the receiver's plane; the closed form cuts it exactly.
-    const real toward = all->toward[lane], toward_end = all->toward_end[lane], slack = (real)8 * (real)REAL_EPSILON;
-    const real horizon = toward / (toward - toward_end);
+    const real toward = all->whole.toward[lane], toward_end = all->whole.toward_end[lane];
+    const real slack = (real)8 * (real)REAL_EPSILON, horizon = toward / (toward - toward_end);
     const real begin = toward < 0 ? fmax(horizon - slack, (real)0) : 0;
     const real end = toward_end < 0 ? fmin(horizon + slack, (real)1) : 1;
     int is_whole = 1;
@@ -165,42 +135,14 @@ int add_visible(const bvh_tree *tree, const lit *one, const facing *all, int lan
         is_whole &= !dark.is_full;
         hidden_sort(&dark);
         // To a horizon and a little beyond, so that the end itself need not be rounded.
-        real start = dark.from == begin ? 0 : dark.from;
-        for (int n = 0; n < dark.count; n++) {
-            add_piece(one, all, lane, start, dark.low[n], waiting, sums);
-            start = dark.high[n];
+        const real first = dark.from == begin ? 0 : dark.from, last = dark.to == end ? 1 : dark.to;
+        for (uint left = dark.from < dark.to ? lit->members[line] : 0; left; left &= left - 1) {
+            const int k = bvh_lowest(left);
+            if (all->lanes[k] >> lane & 1) add_seen(&dark, first, last, lit, k, all->own + k, lane, waiting, sums);
         }
-        if (dark.from < dark.to) add_piece(one, all, lane, start, dark.to == end ? 1 : dark.to, waiting, sums);
         from = to, to = end;
     }
     return is_whole;
-}
-#endif
-
-#ifdef RAYS
-// A ray to the middle of each of `samples` parts of the segment; origin (x, y, z) and `ends` are lifted already.
-void add_sampled(const bvh_tree *tree, const lit *one, const facing *all, int lane, const real *origin,
-                 const real *start, uint samples, pieces *waiting, place *sums) {
-    const real per = (real)1 / (real)samples, length = (real)one->length;
-    const real ux = (real)one->along_x * length, uy = (real)one->along_y * length, uz = (real)one->along_z * length;
-    uint begun = 0, seen = 0;
-    for (uint n = 0; n <= samples; n++) {
-        int hit = 1;
-        if (n < samples) {
-            const real t = ((real)n + (real)0.5) * per;
-            const real dx = start[0] + t * ux - origin[0], dy = start[1] + t * uy - origin[1];
-            const real dz = start[2] + t * uz - origin[2];
-            const bvh_ray ray = bvh_ray_of(origin[0], origin[1], origin[2], dx, dy, dz, 0, 1);
-            hit = bvh_any(tree, &ray);
-        }
-        if (!hit) {
-            begun = seen ? begun : n;
-            seen = 1;
-        } else if (seen) {
-            add_piece(one, all, lane, (real)begun * per, n == samples ? (real)1 : (real)n * per, waiting, sums);
-            seen = 0;
-        }
-    }
 }
 #endif
 
@@ -235,54 +177,111 @@ void load_block(global const INPUT *receivers, constant place *middle, uint coun
     STORE_LANES(narrow(nz * per), here->at[5]);
 }
 
-// Which receivers and the segment face each other; completes the segment if any may.
-masks face(const block *here, lit *one, facing *all) {
-    const places dx = LOAD_PLACES(here->wide[0]) - one->x, dy = LOAD_PLACES(here->wide[1]) - one->y;
-    const places dz = LOAD_PLACES(here->wide[2]) - one->z;
-    const places wide_x = LOAD_PLACES(here->wide[3]), wide_y = LOAD_PLACES(here->wide[4]);
-    const places wide_z = LOAD_PLACES(here->wide[5]);
-    // Before the segment's frame: whether any receiver is above its surface, and it above the receiver's.
-    const places above = dx * one->off_x + dy * one->off_y + dz * one->off_z;
-    const places start = -(dx * wide_x + dy * wide_y + dz * wide_z);
-    const places end = start + one->along_x * wide_x + one->along_y * wide_y + one->along_z * wide_z;
-    const reals zero = (reals)0;
-    const masks may = mask_of(narrow(above) > zero) & (mask_of(narrow(start) > zero) | mask_of(narrow(end) > zero));
-    if (!any_lane(may)) return may;
-    finish_lit(one);
+// Which receivers and a segment face each other; where they are in its frame, if any do.
+uint face(const block *here, const frames *of, int n, facing *all) {
+    const places dx = LOAD_PLACES(here->wide[0]) - of->x[n], dy = LOAD_PLACES(here->wide[1]) - of->y[n];
+    const places dz = LOAD_PLACES(here->wide[2]) - of->z[n];
+    const reals zero = (reals)0, height = narrow(dx * of->off_x[n] + dy * of->off_y[n] + dz * of->off_z[n]);
+    const masks above = mask_of(height > zero);
+    if (!any_lane(above)) return 0;
+    const places along = dx * of->along_x[n] + dy * of->along_y[n] + dz * of->along_z[n];
+    const reals aside = narrow(dx * of->across_x[n] + dy * of->across_y[n] + dz * of->across_z[n]);
+    const real ux = (real)of->along_x[n], uy = (real)of->along_y[n], uz = (real)of->along_z[n];
+    const real ex = (real)of->off_x[n], ey = (real)of->off_y[n], ez = (real)of->off_z[n];
+    const real wx = (real)of->across_x[n], wy = (real)of->across_y[n], wz = (real)of->across_z[n];
     const reals nx = LOAD_LANES(here->at[3]), ny = LOAD_LANES(here->at[4]), nz = LOAD_LANES(here->at[5]);
-    const reals height = narrow(dx * one->off_x + dy * one->off_y + dz * one->off_z);
-    const places along = dx * one->along_x + dy * one->along_y + dz * one->along_z;
-    const reals aside = narrow(dx * one->across_x + dy * one->across_y + dz * one->across_z);
-    const reals by_u = nx * (real)one->along_x + ny * (real)one->along_y + nz * (real)one->along_z;
-    const reals by_n = nx * (real)one->off_x + ny * (real)one->off_y + nz * (real)one->off_z;
-    const reals by_w = nx * (real)one->across_x + ny * (real)one->across_y + nz * (real)one->across_z;
-    const reals past = narrow(one->length - along), foot = -(by_n * height + by_w * aside);
+    const reals by_u = nx * ux + ny * uy + nz * uz, by_n = nx * ex + ny * ey + nz * ez;
+    const reals by_w = nx * wx + ny * wy + nz * wz;
+    const reals past = narrow(of->length[n] - along), foot = -(by_n * height + by_w * aside);
     const reals toward = foot - by_u * narrow(along), toward_end = foot + by_u * past;
+    const uint found = lanes_of(above & (mask_of(toward > zero) | mask_of(toward_end > zero)));
+    if (!found) return 0;
     STORE_LANES(narrow(along), all->along), STORE_LANES(height, all->height), STORE_LANES(aside, all->aside);
     STORE_LANES(past, all->past), STORE_LANES(by_u, all->by_u), STORE_LANES(by_n, all->by_n);
     STORE_LANES(by_w, all->by_w), STORE_LANES(toward, all->toward), STORE_LANES(toward_end, all->toward_end);
-    return mask_of(height > zero) & (mask_of(toward > zero) | mask_of(toward_end > zero));
+    return found & (uint)((1ul << here->count) - 1);
 }
 
-// What a lane's receiver gets from a segment that it faces.
-void add_light(const bvh_tree *tree, const lit *one, const facing *all, int lane, real clearance, uint samples,
-               int *hint, block *here, pieces *waiting) {
-#if defined(INTERVALS)
-    view v = view_from(one, all, lane, here->at[0][lane], here->at[1][lane], here->at[2][lane], here->at[3][lane],
-                       here->at[4][lane], here->at[5][lane], clearance);
-    if (!add_visible(tree, one, all, lane, &v, hint, waiting, here->sums)) here->flags[lane] = STATUS_AMBIGUOUS;
-#elif defined(RAYS)
-    const real over = fmin(clearance, LEAST_SHARE * all->height[lane]);
-    const real lift = fmin(clearance, LEAST_SHARE * fmax(all->toward[lane], all->toward_end[lane]));
+#ifdef RAYS
+// A ray from a lane's receiver to the middle of each of `samples` parts of segment k.
+void add_sampled(const bvh_tree *tree, const chunk *lit, int k, const facing *own, int lane, real clearance,
+                 uint samples, block *here, pieces *waiting) {
+    const frames *of = &lit->each;
+    const real over = fmin(clearance, LEAST_SHARE * own->height[lane]);
+    const real lift = fmin(clearance, LEAST_SHARE * fmax(own->toward[lane], own->toward_end[lane]));
     const real origin[3] = {here->at[0][lane] + lift * here->at[3][lane], here->at[1][lane] + lift * here->at[4][lane],
                             here->at[2][lane] + lift * here->at[5][lane]};
-    const real start[3] = {(real)one->x + over * (real)one->off_x, (real)one->y + over * (real)one->off_y,
-                           (real)one->z + over * (real)one->off_z};
-    add_sampled(tree, one, all, lane, origin, start, samples, waiting, here->sums);
-#else
-    add_piece(one, all, lane, 0, 1, waiting, here->sums);
-#endif
+    const real start[3] = {(real)of->x[k] + over * (real)of->off_x[k], (real)of->y[k] + over * (real)of->off_y[k],
+                           (real)of->z[k] + over * (real)of->off_z[k]};
+    const real per = (real)1 / (real)samples, length = (real)of->length[k];
+    const real ux = (real)of->along_x[k] * length, uy = (real)of->along_y[k] * length;
+    const real uz = (real)of->along_z[k] * length;
+    uint begun = 0, seen = 0;
+    for (uint n = 0; n <= samples; n++) {
+        int hit = 1;
+        if (n < samples) {
+            const real t = ((real)n + (real)0.5) * per;
+            const real dx = start[0] + t * ux - origin[0], dy = start[1] + t * uy - origin[1];
+            const real dz = start[2] + t * uz - origin[2];
+            const bvh_ray ray = bvh_ray_of(origin[0], origin[1], origin[2], dx, dy, dz, 0, 1);
+            hit = bvh_any(tree, &ray);
+        }
+        if (!hit) {
+            begun = seen ? begun : n;
+            seen = 1;
+        } else if (seen) {
+            const real stop = n == samples ? (real)1 : (real)n * per;
+            add_piece(lit, k, own, lane, (real)begun * per, stop, waiting, here->sums);
+            seen = 0;
+        }
+    }
 }
+#endif
+
+// What a lane's receiver gets from a line that it faces.
+void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, real clearance,
+               uint samples, int *hint, block *here, pieces *waiting) {
+    const uint members = lit->members[line];
+#if defined(INTERVALS)
+    if (!(members & lit->unseen)) {
+        view v = view_from(&lit->lines, line, &all->whole, lane, here->at[0][lane], here->at[1][lane],
+                           here->at[2][lane], here->at[3][lane], here->at[4][lane], here->at[5][lane], clearance);
+        if (!add_visible(tree, lit, line, all, lane, &v, hint, waiting, here->sums))
+            here->flags[lane] = STATUS_AMBIGUOUS;
+        return;
+    }
+#endif
+    for (uint left = members; left; left &= left - 1) {
+        const int k = bvh_lowest(left);
+        const facing *own = all->own + k;
+        if (!(all->lanes[k] >> lane & 1)) continue;
+#if defined(RAYS)
+        if (!(members & lit->unseen)) {
+            add_sampled(tree, lit, k, own, lane, clearance, samples, here, waiting);
+            continue;
+        }
+#endif
+        add_piece(lit, k, own, lane, 0, 1, waiting, here->sums);
+    }
+}
+
+// What all receivers of a block get from a line.
+void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearance, uint samples, int *hint, block *here,
+                 pieces *waiting) {
+    before all;
+    uint lanes = face(here, &lit->lines, line, &all.whole);
+    if (!lanes) return;
+    const uint members = lit->members[line];
+    for (uint left = members; left; left &= left - 1) {
+        const int k = bvh_lowest(left);
+        if (members == (1u << k)) all.own[k] = all.whole, all.lanes[k] = lanes;
+        else all.lanes[k] = face(here, &lit->each, k, all.own + k);
+    }
+    for (; lanes; lanes &= lanes - 1)
+        add_light(tree, lit, line, &all, bvh_lowest(lanes), clearance, samples, hint, here, waiting);
+}
+
+inline int has_no_number(place value) { return not_finite((real)value); }
 
 // A receiver's result; returns what is to be added to the currents for a unit of weight.
 place result_of(const block *here, int lane, uchar flag, global real *irradiance, global uchar *status) {
@@ -296,6 +295,16 @@ place result_of(const block *here, int lane, uchar flag, global real *irradiance
     return is_none ? 0 : light;
 }
 
+// The block's results; adds to the currents.
+void store_block(const block *here, uchar flag, global real *irradiance, global uchar *status,
+                 global const INPUT *weights, place *to_left, place *to_right) {
+    for (uint lane = 0; lane < here->count; lane++) {
+        const place light = result_of(here, lane, flag, irradiance + lane, status + lane);
+        if (here->is_none[lane]) continue;
+        *to_left += light * (place)weights[2 * lane], *to_right += light * (place)weights[2 * lane + 1];
+    }
+}
+
 AS_IT_IS kernel void visible_light(global const INPUT *restrict receivers, global const INPUT *restrict weights,
                                    global const INPUT *restrict segments,
 #ifdef PICKED
@@ -306,70 +315,58 @@ AS_IT_IS kernel void visible_light(global const INPUT *restrict receivers, globa
                                    global const real *nodes, global const int *children, global const int *axes,
                                    global const real *leaves, global const int *triangles, constant place *middle,
                                    const real clearance, const uint samples, const uint each,
-                                   const uint segment_count, const uint pick_count) {
+                                   const uint segment_count, const uint pick_count, const uint strips) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
-    const ulong strip = get_group_id(0);
-    int hint = NO_HINT;
-    place to_left = 0, to_right = 0;
-    for (uint first = get_local_id(0) * LANES; first < each; first += get_local_size(0) * LANES) {
-        const ulong row = strip * each + first;
-        block here;
-        load_block(receivers + 6 * row, middle, min((uint)LANES, each - first), &here);
-        uchar flag = STATUS_OK;
-        pieces waiting;
-        waiting.count = 0;
-#ifdef PICKED
-        const ulong list = strip * ((each + PICK_BLOCK - 1) / PICK_BLOCK) + first / PICK_BLOCK;
-        const int begin = starts[list], end = starts[list + 1];
-        if (begin < 0 || end > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;
-        for (int k = max(begin, 0); k < min(end, (int)pick_count); k++) {
-            const int unseen = picks[k] < 0;
-            const uint number = unseen ? ~picks[k] : picks[k];
-            if (number >= segment_count) {
-                flag |= STATUS_OUT_OF_RANGE;
-                continue;
-            }
-#else
-        for (uint number = 0; number < segment_count; number++) {
-            const int unseen = 0;
-#endif
-            lit one = lit_of(segments + 10 * (ulong)number, middle);
-            if (!one.is_good) flag |= STATUS_NOT_FINITE;
-            if (!one.is_lit) continue;
-            facing all;
-            const masks faces = face(&here, &one, &all);
-#ifdef STRIP
-            uint lanes = bvh_lanes(faces) & ((1u << here.count) - 1);
-#else
-            uint lanes = faces ? 1 : 0;
-#endif
-            for (; lanes; lanes &= lanes - 1) {
-                const int lane = bvh_lowest(lanes);
-                if (unseen) add_piece(&one, &all, lane, 0, 1, &waiting, here.sums);
-                else add_light(&tree, &one, &all, lane, clearance, samples, &hint, &here, &waiting);
-            }
-        }
-        finish(&waiting, here.sums);
-        for (uint lane = 0; lane < here.count; lane++) {
-            const ulong i = row + lane;
-            const place light = result_of(&here, lane, flag, irradiance + i, status + i);
-            if (here.is_none[lane]) continue;
-            to_left += light * (place)weights[2 * i], to_right += light * (place)weights[2 * i + 1];
-        }
-    }
-#ifdef STRIP
-    left[strip] = (real)to_left, right[strip] = (real)to_right;
-#else
+    const ulong group = get_group_id(0), groups = get_num_groups(0);
+#ifndef STRIP
     local place both[2 * GROUP];
-    const uint item = get_local_id(0);
-    both[2 * item] = to_left, both[2 * item + 1] = to_right;
-    for (uint half_size = GROUP / 2; half_size; half_size /= 2) {
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (item < half_size) {
-            both[2 * item] += both[2 * (item + half_size)];
-            both[2 * item + 1] += both[2 * (item + half_size) + 1];
-        }
-    }
-    if (item == 0) left[strip] = (real)both[0], right[strip] = (real)both[1];
 #endif
+    chunk lit;
+    int hint = NO_HINT;
+#ifndef PICKED
+    int held = NONE_HELD;
+#endif
+    for (ulong strip = strips * group / groups; strip < strips * (group + 1) / groups; strip++) {
+        place to_left = 0, to_right = 0;
+        for (uint first = get_local_id(0) * LANES; first < each; first += get_local_size(0) * LANES) {
+            const ulong row = strip * each + first;
+            block here;
+            load_block(receivers + 6 * row, middle, min((uint)LANES, each - first), &here);
+            uchar flag = STATUS_OK;
+            pieces waiting;
+            waiting.count = 0;
+#ifdef PICKED
+            const ulong list = strip * ((each + PICK_BLOCK - 1) / PICK_BLOCK) + first / PICK_BLOCK;
+            if (starts[list] < 0 || starts[list + 1] > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;
+            const int end = min(starts[list + 1], (int)pick_count);
+            for (int next = max(starts[list], 0); next < end;) {
+                next = load_picked(segments, picks, next, end, segment_count, middle, &lit, &flag);
+#else
+            for (int next = 0; next < (int)segment_count; next += SEGMENTS) {
+                if (held != next) load_from(segments, next, (int)segment_count, middle, &lit);
+                held = next;
+#endif
+                if (!lit.is_good) flag |= STATUS_NOT_FINITE;
+                for (int line = 0; line < lit.line_count; line++)
+                    light_block(&tree, &lit, line, clearance, samples, &hint, &here, &waiting);
+            }
+            finish(&waiting, here.sums);
+            store_block(&here, flag, irradiance + row, status + row, weights + 2 * row, &to_left, &to_right);
+        }
+#ifdef STRIP
+        left[strip] = (real)to_left, right[strip] = (real)to_right;
+#else
+        const uint item = get_local_id(0);
+        both[2 * item] = to_left, both[2 * item + 1] = to_right;
+        for (uint half_size = GROUP / 2; half_size; half_size /= 2) {
+            barrier(CLK_LOCAL_MEM_FENCE);
+            if (item < half_size) {
+                both[2 * item] += both[2 * (item + half_size)];
+                both[2 * item + 1] += both[2 * (item + half_size) + 1];
+            }
+        }
+        if (item == 0) left[strip] = (real)both[0], right[strip] = (real)both[1];
+        barrier(CLK_LOCAL_MEM_FENCE);
+#endif
+    }
 }

@@ -21,6 +21,8 @@ PICK_BLOCK = 16
 """Receivers of a strip that share a list of picked segments."""
 
 _GROUP = 64
+# Of work for a CPU: enough that none waits for another, few, as each looks for lines among the segments anew.
+_SHARES_PER_CORE = 8
 # Small scenes share a build.
 _LEAST_DEPTH = 4
 # Of the scene's size: within this of a surface rounding, the caller's too, decides what lies before it.
@@ -90,8 +92,8 @@ class VisibleLight(Operation[ReceivedLight]):
         Of the arithmetic and the outputs; None follows the input. "single" takes float64 places, too: they are
         subtracted before they are rounded.
     walk
-        "strip" (a work-item per strip, 16 boxes at once, for CPU runtimes), "item" (a work-group per strip, an item
-        per receiver, for GPUs), or "auto".
+        "strip" (a work-item for some strips, 16 boxes at once, for CPU runtimes), "item" (a work-group per strip, an
+        item per receiver, for GPUs), or "auto".
 
     Raises
     ------
@@ -132,6 +134,7 @@ class VisibleLight(Operation[ReceivedLight]):
         real = _real_of(device, dtype, self.precision)
         strips, each = shape[:2]
         strip, place, tree = in_strips(self.walk, device), _place(device), self.scene.bvh
+        shares = min(strips, _SHARES_PER_CORE * device.handle.max_compute_units)
         present = {
             "STRIP": strip,
             "WIDE_PLACES": device.has_double,
@@ -168,8 +171,9 @@ class VisibleLight(Operation[ReceivedLight]):
                 np.uint32(each),
                 np.uint32(self.segments),
                 np.uint32(self.picks or 0),
+                np.uint32(strips),
             ],
-            global_size=(strips if strip else strips * _GROUP,),
+            global_size=(shares if strip else strips * _GROUP,),
             local_size=(1 if strip else _GROUP,),
         )
 

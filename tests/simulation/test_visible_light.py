@@ -290,6 +290,44 @@ def test_grazing(device: Device, walk: Any, dtype: Any, angle: float) -> None:
     assert seen == pytest.approx(free, rel=1e-5 if dtype == np.float32 else 1e-12)
 
 
+# ---- segments on one line --------------------------------------------------------------------------------------
+
+
+def on_one_line(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Parts of a slanting line in any order, some with nothing between and some that overlap, each of its exitance."""
+    start, along = rng.uniform(-1.0, 0.0, 3), rng.uniform(0.5, 1.0, 3)
+    cuts = np.sort(rng.uniform(0.0, 1.0, (count, 2)) * 0.8 / count + np.arange(count)[:, None] / count, axis=1)
+    cuts[1, 0], cuts[3, 1] = cuts[0, 1], cuts[4, 1]
+    normal = np.cross(along, rng.normal(size=3))
+    ends = start + cuts[..., None] * along
+    rows = np.column_stack([ends.reshape(-1, 6), np.tile(normal, (count, 1)), rng.uniform(0.5, 2.0, count)])
+    return rng.permutation(rows)
+
+
+@functools.cache
+def lit_line(count: int, receivers: int, dtype: Any) -> tuple[np.ndarray, ...]:
+    """Triangles, receivers, segments on one line, dark ones and turned ones among them, and their light by rays."""
+    rng = np.random.default_rng(count)
+    corners, places, rows = soup(rng, 30, 0.4), receivers_of(rng, 1, receivers), on_one_line(rng, count)
+    rows[2, 9], rows[4, 6:9], rows[5, :6] = 0.0, -rows[4, 6:9], np.roll(rows[5, :6], 3)
+    rows = rows.astype(dtype).astype(float)
+    return corners, places, rows, *reference.light(corners, places[0], rows, 1e-5)
+
+
+@WAYS
+@pytest.mark.parametrize(("count", "receivers"), [(6, 37), (35, 7)])
+def test_segments_on_one_line(device: Device, walk: Any, dtype: Any, count: int, receivers: int) -> None:
+    """Together, as is faster, they give what rays to each say; also where they are more than are taken together."""
+    corners, places, rows, value, most = lit_line(count, receivers, dtype)
+    result = light_of(corners, places.astype(dtype), rows, device, walk=walk, clearance=1e-5).irradiance[0]
+    error = np.abs(result - value) / np.where(most > 0.0, most, 1.0)
+    assert error.max() <= (1e-9 if dtype == np.float64 else 2e-3)
+    assert np.quantile(error, 0.9) <= 5e-6
+    assert np.mean(value > 0.0) > 0.3
+    free = light_of(NO_TRIANGLES, places.astype(dtype), rows, device, walk=walk).irradiance[0]
+    assert np.mean(np.abs(result - free) > 0.01 * free) > 0.2
+
+
 # ---- picks -----------------------------------------------------------------------------------------------------
 
 

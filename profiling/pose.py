@@ -373,7 +373,7 @@ class _Numpy:
         x, y, c, s, of_offset, of_angle = _numpy_lines(u, v, w, self.pairs)
         reach = np.sqrt(of_offset / of_angle)[:, None] * [-1.0, 1.0]
         on, off = x[:, None] + reach * c[:, None], y[:, None] + reach * s[:, None]
-        nx, ny, px, py, of = (np.repeat(each[:, None], 2, axis=1) for each in self.lines.T)
+        nx, ny, px, py, of = (np.repeat(each[:, None], 2, axis=1) for each in self.lines.T[:5])
         certainty = 1.0 / np.sqrt(2.0 * of_offset[:, None] + of**2)
         rows = np.stack([nx, ny, px + on * ny, py - on * nx, off * nx, off * ny, certainty], axis=-1)
         return _numpy_pose(rows.reshape(-1, 7), self.starts)

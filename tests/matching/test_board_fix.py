@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -9,44 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from gpuvision.host import Device
 from gpuvision.matching.artwork import Artwork, read_artwork
-from gpuvision.matching.pose import SolvePose, line_rows
-from gpuvision.matching.ruler import RulerEdges, best_smoothing
-from gpuvision.matching.selection import Candidates, Imaging, Selection, candidates, select
-from reference.board_images import SAMPLES, View, board_image
+from reference.board_fixes import GROSS, KINDS, BoardFix
+from reference.board_images import SAMPLES, BoardPicture, View, board_image
 
-PIXEL, BLUR, NOISE = 25e-6, 1.0, 2.0
-SHAPE = (480, 640)
-# Steps of 50 under the mask and of 110 in the open, over the noise.
-IMAGING = Imaging(
-    pixel=PIXEL, blur_px=BLUR, contrast_bare=110 / NOISE, contrast_masked=50 / NOISE, width_px=5, etch=0.0
-)
-
-
-def placed(artwork: Artwork, middle: np.ndarray) -> tuple[Candidates, Selection, View]:
-    half = (np.array(SHAPE[::-1]) / 2 - 30) * PIXEL
-    rulers = candidates(artwork, (middle - half, middle + half), middle, IMAGING)
-    single = Candidates(*(each[~rulers.pair] for each in rulers[:-1]), rulers.placement)
-    corner = middle + (np.array(SHAPE[::-1]) - 1) / 2 * PIXEL * (-1, 1)
-    view = View(corner=tuple(corner), pixel=PIXEL, shape=SHAPE, blur_px=BLUR, noise=NOISE)
-    return single, select(single, IMAGING, 40), view
-
-
-def fixed(picture: np.ndarray, rulers: Candidates, chosen: np.ndarray, view: View, device: Device) -> tuple:
-    """The pose about the placement point, and its covariance."""
-    point, normal = rulers.point[chosen], rulers.normal[chosen]
-    pixels = (point - view.corner) / (PIXEL, -PIXEL)
-    laid = np.concatenate([pixels, normal * (1, -1)], axis=1).astype(np.float32)
-    length = math.ceil(rulers.length[chosen].max() / PIXEL)
-    edges = RulerEdges(
-        threshold=15.0, length=length, width=5, smoothing_px=best_smoothing(BLUR), polarity="falling", noise=NOISE
-    )(picture, laid, device=device)
-    seen = point + normal * (edges.position.astype(np.float64) * PIXEL)[:, None]
-    rows = line_rows(normal, point - rulers.placement, seen - rulers.placement, rulers.sigma[chosen])
-    found = SolvePose(precision="double" if device.has_double else None)(rows[None], device=device)
-    return found.pose[0], found.covariance[0], found.status.ravel()[0]
+PIXEL = 25e-6
 
 
 def square(folder: Path) -> Artwork:
@@ -82,19 +53,142 @@ def test_pictures_hold_what_is_on_the_board(tmp_path: Path) -> None:
     assert copper_of(view, missing={0})[0] == 0.0
 
 
-@pytest.mark.realdata
-@pytest.mark.parametrize(("name", "middle"), [("upverter", (-50e-3, 10e-3)), ("fritzing", (20e-3, 25e-3))])
-def test_a_picture_s_pose_lies_where_promised(
-    data: Path, name: str, middle: tuple[float, float], device: Device, rng: np.random.Generator
+TOOLS = {"upverter": (-50e-3, 10e-3), "fritzing": (20e-3, 25e-3), "kicad-x2-tests/x2ap": (60e-3, -45e-3)}
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> BoardFix:
+    """Traces in four directions and pads in the open, 16 mm x 12 mm, and a frame of silk."""
+    folder = tmp_path_factory.mktemp("drawn")
+    head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
+
+    def at(x: float, y: float, how: str) -> str:
+        return f"X{round(x * 1e6)}Y{round(y * 1e6)}{how}*\n"
+
+    copper, mask = head + "%ADD10C,0.4*%\n%ADD11R,1.4X1.0*%\nD10*\n", head + "%ADD11R,1.8X1.4*%\nD11*\n"
+    for x, y in ((1, 2), (5.2, 2), (9.4, 2), (1, 10.2), (5.2, 10.2), (9.4, 10.2)):
+        copper += at(x, y, "D02") + at(x + 2.5, y, "D01")
+    for x, y in ((1.5, 3.6), (13.2, 3.6), (3.2, 6.2), (12.4, 6.6)):
+        copper += at(x, y, "D02") + at(x, y + 2.2, "D01")
+    for x, y, way in ((5, 3.4, 1), (8, 5.6, -1), (5.2, 6.6, 1), (9.6, 3.4, 1)):
+        copper += at(x, y, "D02") + at(x + 1.8, y + 1.8 * way, "D01")
+    copper += "D11*\n"
+    for x, y in ((13.5, 1.8), (13.5, 10.4), (8.6, 8.6), (2.2, 8.9)):
+        copper, mask = copper + at(x, y, "D03"), mask + at(x, y, "D03")
+    silk = head + "%ADD10C,0.2*%\nD10*\n" + at(0.2, 0.4, "D02") + at(15.5, 0.4, "D01") + at(15.5, 11.6, "D01")
+    (folder / "copper.gbr").write_text(copper + "M02*\n")
+    (folder / "mask.gbr").write_text(mask + "M02*\n")
+    (folder / "silk.gbr").write_text(silk + "M02*\n")
+    layers = {r"copper\.gbr": "top copper", r"mask\.gbr": "top mask", r"silk\.gbr": "top silk"}
+    return BoardFix(artwork=read_artwork(folder, layers=layers, clearance=100e-6), middle=(8e-3, 6e-3))
+
+
+@functools.cache
+def of_tool(path: Path, middle: tuple[float, float]) -> BoardFix:
+    return BoardFix(artwork=read_artwork(path, clearance=100e-6), middle=middle)
+
+
+def band(count: int) -> np.ndarray:
+    """Ratios of standard deviations: within 15 %, and what so many draws leave open, to one in 1e4 either side."""
+    return np.array([0.85, 1.15]) * np.sqrt(chi2.ppf([1e-4, 1 - 1e-4], count) / count)
+
+
+def assert_as_promised(ratios: np.ndarray, limits: np.ndarray) -> None:
+    assert (ratios > limits[0]).all(), ratios
+    assert (ratios < limits[1]).all(), ratios
+
+
+def test_errors_are_those_promised(drawn: BoardFix, device: Device, rng: np.random.Generator) -> None:
+    fixes = drawn.fixes(drawn.sharp(2, rng), 100, device, rng)
+    assert fixes.good.all()
+    assert_as_promised(fixes.scatter / drawn.chosen.sigmas, band(100))
+    assert_as_promised(fixes.scatter / fixes.said, band(100))
+    assert fixes.squares.max() < GROSS
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_wrong_pose_of_a_disturbed_board(
+    drawn: BoardFix, kind: str, device: Device, rng: np.random.Generator
 ) -> None:
-    artwork = read_artwork(data / "gerber" / name)
-    rulers, selection, view = placed(artwork, np.array(middle))
-    sigmas, scores = selection.sigmas, []
-    for _ in range(3):
-        pose = (*rng.uniform(-60e-6, 60e-6, 2), rng.uniform(-3e-3, 3e-3))
-        picture = board_image(artwork, view, pose, middle, rng=rng)
-        found, _, status = fixed(picture, rulers, selection.chosen, view, device)
-        assert status == 0
-        scores.append((found - pose) / sigmas)
-    # Of 9 Gaussian numbers one in 1e4 boards is beyond 4.5. The samples' interpolation (0.01 px) is in it, too.
-    assert np.abs(scores).max() < 4.5
+    board = replace(drawn, motion_px=5.0 if kind == "motion" else 0.0)
+    pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else 2)]
+    fixes = board.fixes(pictures, 60, device, rng)
+    if kind == "reversed":
+        # Dark copper, where bright was looked for: nothing is said, and all where dark was.
+        assert not fixes.good.any()
+        fixes = board.fixes(pictures, 60, device, rng, polarity="rising")
+    assert np.mean(fixes.good) > 0.6
+    assert fixes.squares.max() < GROSS
+    assert_as_promised(fixes.scatter / fixes.said, band(int(fixes.good.sum())))
+    if kind == "motion":
+        assert_as_promised(fixes.scatter / board.chosen.sigmas, band(60))
+
+
+def test_chosen_rulers_beat_others_as_promised(drawn: BoardFix, device: Device, rng: np.random.Generator) -> None:
+    board = replace(drawn, budget=16)
+    assert_beats_random_sets(board, board.sharp(1, rng), 25, device, rng)
+
+
+def assert_beats_random_sets(
+    board: BoardFix, pictures: list[BoardPicture], draws: int, device: Device, rng: np.random.Generator
+) -> None:
+    """By the sixth root of the determinants: standard deviations, in the mean over all combinations."""
+    sets = [board.at_random(rng) for _ in range(8)]
+    promised = np.mean([each.covariance for each in sets], axis=0)
+    fixes = [board.fixes(pictures, draws, device, rng, selection=each) for each in sets]
+    errors = np.concatenate([each.errors[each.good] for each in fixes])
+    chosen = board.fixes(pictures, 4 * draws, device, rng)
+    assert chosen.good.all()
+
+    def size(covariance: np.ndarray) -> float:
+        return float(np.linalg.det(covariance) ** (1 / 6))
+
+    expected = size(promised) / size(board.chosen.covariance)
+    measured = size(errors.T @ errors / len(errors)) / size(chosen.errors.T @ chosen.errors / (4 * draws))
+    assert expected > 1.2
+    # Three standard deviations of so many draws, twice: that of the sixth root is one of 6 n numbers.
+    left = 3 / math.sqrt(6 * 4 * draws) + 3 / math.sqrt(6 * len(errors))
+    assert measured == pytest.approx(expected, rel=0.15 + left)
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", TOOLS)
+def test_a_real_board_s_errors_are_those_promised(
+    data: Path, name: str, device: Device, rng: np.random.Generator
+) -> None:
+    board = of_tool(data / "gerber" / name, TOOLS[name])
+    fixes = board.fixes(board.sharp(1, rng), 50, device, rng)
+    assert fixes.good.all()
+    assert_as_promised(fixes.scatter / board.chosen.sigmas, band(50))
+    assert fixes.squares.max() < GROSS
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", TOOLS)
+def test_a_thousand_fixes_of_a_real_board(data: Path, name: str, device: Device, rng: np.random.Generator) -> None:
+    board = of_tool(data / "gerber" / name, TOOLS[name])
+    fixes = board.fixes(board.sharp(10, rng), 1000, device, rng)
+    assert np.mean(fixes.good) > 0.99
+    assert fixes.squares.max() < GROSS
+    assert_as_promised(fixes.scatter / board.chosen.sigmas, np.array([0.85, 1.15]))
+    assert_beats_random_sets(board, board.sharp(1, rng), 100, device, rng)
+
+
+@pytest.mark.slow
+@pytest.mark.realdata
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", TOOLS)
+def test_no_wrong_pose_in_a_thousand_of_disturbed_real_boards(
+    data: Path, name: str, kind: str, device: Device, rng: np.random.Generator
+) -> None:
+    board = replace(of_tool(data / "gerber" / name, TOOLS[name]), motion_px=5.0 if kind == "motion" else 0.0)
+    pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else 20)]
+    fixes = board.fixes(pictures, 1000, device, rng)
+    assert not (fixes.squares > GROSS).any()
+    if kind == "reversed":
+        assert not fixes.good.any()
+        fixes = board.fixes(pictures, 1000, device, rng, polarity="rising")
+        assert not (fixes.squares > GROSS).any()
+    if fixes.good.sum() > 100:
+        assert_as_promised(fixes.scatter / fixes.said, band(int(fixes.good.sum())))

@@ -1,0 +1,223 @@
+"""Fixes of boards in pictures: rulers chosen from artwork, laid as a camera sees them, and poses of many pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device
+from gpuvision.matching.artwork import Artwork
+from gpuvision.matching.artwork_shapes import Shape
+from gpuvision.matching.local_fix import LocalFix, lay_rulers
+from gpuvision.matching.pose import SolvePose
+from gpuvision.matching.ruler import Polarity, RulerEdges
+from gpuvision.matching.selection import Candidates, Imaging, Selection, candidates, promise, select
+from reference.board_images import BoardPicture, View
+
+Float64 = npt.NDArray[np.float64]
+
+PIXEL, NOISE, SHAPE = 25e-6, 2.0, (480, 640)
+SHIFT, ANGLE = 80e-6, 4e-3  # that boards lie off by; they are looked for within 100 um and 5 mrad
+GROSS = 40.0  # squared distance in standard deviations: of three Gaussian numbers one in 1e8 is beyond
+KINDS = ("missing", "outliers", "motion", "reversed")
+
+
+class Fixes(NamedTuple):
+    """Of pictures: errors (n, 3) about the placement point, and covariances, NaN where refused; and the status."""
+
+    errors: Float64
+    covariances: Float64
+    status: npt.NDArray[np.uint8]
+
+    @property
+    def good(self) -> npt.NDArray[np.bool_]:
+        return self.status == 0
+
+    @property
+    def squares(self) -> Float64:
+        """(good,) squared errors in units of what each fix itself says."""
+        found = self.errors[self.good]
+        return np.asarray(np.einsum("bi,bij,bj->b", found, np.linalg.inv(self.covariances[self.good]), found))
+
+    @property
+    def said(self) -> Float64:
+        """(3,) standard deviations that the fixes say, in the mean."""
+        return np.asarray(np.sqrt(np.mean(self.covariances[self.good][:, [0, 1, 2], [0, 1, 2]], axis=0)))
+
+    @property
+    def scatter(self) -> Float64:
+        """(3,) standard deviations of the errors, about 0."""
+        return np.asarray(np.sqrt(np.mean(self.errors[self.good] ** 2, axis=0)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BoardFix:
+    """A board, the part of it that a camera sees, and rulers on single edges there.
+
+    Parameters
+    ----------
+    artwork, middle
+        What is seen, and about which point [m]: the placement point, too.
+    budget
+        How many rulers.
+    motion_px
+        By which the picture is smeared along the rows, and is expected to be.
+    """
+
+    artwork: Artwork
+    middle: tuple[float, float]
+    budget: int = 40
+    motion_px: float = 0.0
+
+    @cached_property
+    def view(self) -> View:
+        corner = np.array(self.middle) + (np.array(SHAPE[::-1]) - 1) / 2 * PIXEL * (-1, 1)
+        return View(
+            corner=(float(corner[0]), float(corner[1])),
+            pixel=PIXEL,
+            shape=SHAPE,
+            noise=NOISE,
+            motion_px=self.motion_px,
+        )
+
+    @cached_property
+    def imaging(self) -> Imaging:
+        """Steps of 50 under the mask and of 110 in the open, over the noise."""
+        return Imaging(
+            pixel=PIXEL,
+            blur_px=self.view.edge_blur_px,
+            motion_px=(self.motion_px, 0.0),
+            contrast_bare=110 / NOISE,
+            contrast_masked=50 / NOISE,
+        )
+
+    @cached_property
+    def rulers(self) -> Candidates:
+        half = (np.array(SHAPE[::-1]) / 2 - 30) * PIXEL
+        found = candidates(self.artwork, (self.middle - half, self.middle + half), self.middle, self.imaging)
+        keep = ~found.pair & (found.ambiguity == 0)
+        return Candidates(*(each[keep] for each in found[:-1]), found.placement)
+
+    @cached_property
+    def chosen(self) -> Selection:
+        return select(self.rulers, self.imaging, self.budget, per_source=8)
+
+    def at_random(self, rng: np.random.Generator) -> Selection:
+        """As many rulers as were chosen, any that fix a pose."""
+        while True:
+            try:
+                some = rng.choice(len(self.rulers.sigma), len(self.chosen.chosen), replace=False)
+                return promise(self.rulers, self.imaging, some)
+            except ValueError:
+                continue
+
+    def fixes(
+        self,
+        pictures: Sequence[BoardPicture],
+        draws: int,
+        device: Device,
+        rng: np.random.Generator,
+        *,
+        selection: Selection | None = None,
+        polarity: Polarity = "falling",
+    ) -> Fixes:
+        """Poses of boards that lie anywhere within reach, one picture after the other, as bytes."""
+        which = (selection or self.chosen).chosen
+        normal, point = self.rulers.normal[which], self.rulers.point[which] - self.middle
+        per, (x, y) = 1 / PIXEL, np.array(self.view.corner) - self.middle
+        matrix = np.array([[per, 0.0, -x * per], [0.0, -per, y * per], [0.0, 0.0, 1.0]])
+        laid = lay_rulers(normal, point, np.zeros((len(which), 1)), matrix, grows=1.0)
+        ruler = RulerEdges(
+            threshold=15.0,
+            length=math.ceil(self.rulers.length.max() / PIXEL),
+            width=self.imaging.width_px,
+            smoothing_px=self.imaging.smoothing_px,
+            polarity=polarity,
+            noise=NOISE,
+        )
+        # Boards lie within a circle about the square of what was asked for.
+        within = (1.5 * self.imaging.shift, 1.5 * self.imaging.angle)
+        solver = SolvePose(etch=self.imaging.etch, trials=256, within=within)
+        fix = LocalFix(ruler=ruler, lines=len(which), each=1, solver=solver)
+        errors, covariances, status = (
+            np.full((draws, 3), np.nan),
+            np.full((draws, 3, 3), np.nan),
+            np.empty(draws, np.uint8),
+        )
+        for draw in range(draws):
+            pose = (*rng.uniform(-SHIFT, SHIFT, 2), rng.uniform(-ANGLE, ANGLE))
+            picture = pictures[draw % len(pictures)].seen(pose, rng)
+            found = fix(np.clip(np.rint(picture), 0, 255).astype(np.uint8), *laid, device=device)
+            status[draw] = found.status
+            errors[draw], covariances[draw] = found.pose - pose, found.covariance
+        return Fixes(errors, covariances, status)
+
+    def sharp(self, count: int, rng: np.random.Generator) -> list[BoardPicture]:
+        """Boards etched wider or narrower all over, mask and silk printed off."""
+        off = self.imaging.registration
+        return [
+            self._painted(
+                replace(
+                    self.view,
+                    growth=self.imaging.etch * float(rng.normal()),
+                    mask_shift=tuple(rng.uniform(-off, off, 2)),
+                    silk_shift=tuple(rng.uniform(-off, off, 2)),
+                )
+            )
+            for _ in range(count)
+        ]
+
+    def disturbed(self, kind: str, rng: np.random.Generator) -> BoardPicture:
+        """A board with 30 % of the areas with rulers gone, 30 % of the rulers on wrong edges, or dark copper."""
+        view = replace(self.view, growth=self.imaging.etch * float(rng.normal()))
+        if kind == "reversed":
+            return self._painted(replace(view, levels=(110.0, 60.0, 200.0, 90.0, 20.0, 240.0)))
+        if kind == "missing":
+            gone = rng.choice(self._areas, round(0.3 * len(self._areas)), replace=False)
+            return self._painted(view, missing=set(gone.tolist()))
+        return self._painted(view, more=self._splashes(rng) if kind == "outliers" else ())
+
+    def _painted(
+        self, view: View, missing: set[int] | frozenset[int] = frozenset(), more: Sequence[Shape] = ()
+    ) -> BoardPicture:
+        return BoardPicture(self.artwork, view, about=self.middle, missing=missing, more=more)
+
+    @cached_property
+    def _areas(self) -> list[int]:
+        """Areas of copper whose borders carry chosen rulers."""
+        points = self.rulers.point[self.chosen.chosen]
+        return [number for number, each in enumerate(self.artwork.copper) if _near(each.outline, points).any()]
+
+    def _splashes(self, rng: np.random.Generator) -> list[Shape]:
+        """Too much copper, or too little, across edges of which 30 % of the rulers see nothing else."""
+        points, normals = self.rulers.point[self.chosen.chosen], self.rulers.normal[self.chosen.chosen]
+        half, seen = 6 * PIXEL, (6 + 2.6) * PIXEL
+        hit: set[int] = set()
+        shapes = []
+        for index in rng.permutation(len(points)):
+            normal, along = normals[index], np.array([-normals[index, 1], normals[index, 0]])
+            away = points - points[index]
+            near = (np.abs(away @ along) < seen) & (np.abs(away @ normal) < 350e-6)
+            more = hit | set(np.flatnonzero(near).tolist())
+            if len(more) > round(0.3 * len(points)):
+                continue
+            hit = more
+            by = rng.choice([-1.0, 1.0]) * rng.uniform(60e-6, 250e-6)
+            inner, outer = points[index] - 20e-6 * np.sign(by) * normal, points[index] + by * normal
+            corners = [inner - half * along, inner + half * along, outer + half * along, outer - half * along]
+            shapes.append(Shape(np.array(corners), bool(by > 0)))
+        return shapes
+
+
+def _near(outline: Float64, points: Float64) -> npt.NDArray[np.bool_]:
+    """Which points lie on an outline, to 3 micrometres."""
+    side = np.roll(outline, -1, axis=0) - outline
+    away = points[:, None] - outline
+    share = np.clip(np.sum(away * side, axis=-1) / np.maximum(np.sum(side**2, axis=-1), 1e-30), 0, 1)
+    return np.asarray(np.min(np.linalg.norm(away - share[..., None] * side, axis=-1), axis=1) < 3e-6)

@@ -223,6 +223,24 @@ def compute_missing(
     return len(missing)
 
 
+def light_paths(task: Task, device: Device) -> LightPaths:
+    """Return what computes the light of a task's profiles."""
+    light = light_of(task.sensor)
+    return LightPaths(
+        sight=sight_of(task.sensor),
+        sheet=sheet_of(task.sensor),
+        scene=task.part,
+        materials=task.materials,
+        paths=task.paths,
+        sub_sheets=light.sub_sheets,
+        blur=light.blur,
+        nodes=light.nodes,
+        tolerance=task.tolerance,
+        floor=floor_of(task.sensor),
+        device=device,
+    )
+
+
 def compute_block(task: Task, number: int, device: Device | None = None) -> bytes:
     """Compute a block; the bytes of its file."""
     with _BENCH_LOCK:
@@ -270,20 +288,7 @@ def _bench(task: Task, device: Device | None) -> LightPaths:
     key = (task.fingerprint, chosen.label)
     if key not in _BENCH:
         _BENCH.clear()
-        light = light_of(task.sensor)
-        _BENCH[key] = LightPaths(
-            sight=sight_of(task.sensor),
-            sheet=sheet_of(task.sensor),
-            scene=task.part,
-            materials=task.materials,
-            paths=task.paths,
-            sub_sheets=light.sub_sheets,
-            blur=light.blur,
-            nodes=light.nodes,
-            tolerance=task.tolerance,
-            floor=floor_of(task.sensor),
-            device=chosen,
-        )
+        _BENCH[key] = light_paths(task, chosen)
     return _BENCH[key]
 
 

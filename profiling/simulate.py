@@ -16,10 +16,9 @@ from gpuvision.demo import scanned_part
 from gpuvision.host import Device
 from gpuvision.profiling.harness import Case
 from gpuvision.profiling.visible_light import Board, embree_of, error_of, irradiance_by_samples
-from gpuvision.simulated_sensor import light_of, sheet_of, sight_of
-from gpuvision.simulation.light_paths import LightPaths
 from gpuvision.simulation.line_irradiance import LitSegments
 from gpuvision.simulation.visible_light import VisibleLight, segment_rows
+from gpuvision.simulation_blocks import light_paths
 
 _SAMPLES = 256
 _AT = 0.006  # m: over the cylinder's rim, the box and the ball
@@ -33,17 +32,7 @@ def cases(device: Device) -> Iterator[Case]:
 
 def _case(device: Device, name: str) -> Case:
     task = scanned_part(name)
-    light = light_of(task.sensor)
-    model = LightPaths(
-        sight=sight_of(task.sensor),
-        sheet=sheet_of(task.sensor),
-        scene=task.part,
-        materials=task.materials,
-        paths=task.paths,
-        sub_sheets=light.sub_sheets,
-        blur=light.blur,
-        device=device,
-    )
+    model = light_paths(task, device)
     seen = model.lines.surface(_AT)
     lit = model.sheet.lit(task.part, _AT)
     segments = LitSegments(lit.ends, lit.normals, task.materials[0].albedo * lit.power)

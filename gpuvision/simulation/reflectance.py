@@ -12,11 +12,12 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, real_defines, real_of
+from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
 from gpuvision.tables import finite
 
 Array = npt.NDArray[np.float64]
 _SMOOTHEST = 1e-4
+_LANES, _GROUP, _STRIP = 16, 64, 4096
 
 
 class Brdf:
@@ -245,6 +246,8 @@ class Reflectance(Operation[Reflected]):
         One of the models.
     precision
         Of the arithmetic and the outputs; None follows the input.
+    walk
+        "strip" (16-wide vectors, for CPU runtimes), "item" (a work-item per pair, for GPUs), or "auto".
 
     Raises
     ------
@@ -256,6 +259,7 @@ class Reflectance(Operation[Reflected]):
 
     model: Brdf
     precision: Precision = None
+    walk: Walk = "auto"
 
     def __post_init__(self) -> None:
         if not isinstance(self.model, Brdf):
@@ -266,19 +270,24 @@ class Reflectance(Operation[Reflected]):
             raise TypeError(f"Reflectance takes float32 or float64 directions, got {dtype}")
         if shape[-1:] != (6,):
             raise ValueError(f"Reflectance takes directions (..., 6), got shape {shape}")
-        real = real_of(self.precision, dtype)
+        real, count = real_of(self.precision, dtype), math.prod(shape[:-1])
+        strip = in_strips(self.walk, device) and count >= _LANES
+        each = _STRIP if strip else max(min(count, _GROUP), 1)
+        items = -(-count // each)
         return Launch(
             stem="reflectance",
             kernel="reflectance",
             defines={
                 **real_defines(device, real),
                 self.model.kind: None,
+                **({"STRIP": None} if strip else {}),
                 "INPUT": "float" if dtype == np.float32 else "double",
             },
             inputs=[(shape, dtype)],
             outputs={"value": (shape[:-1], real), "status": (shape[:-1], np.dtype(np.uint8))},
-            arguments=[np.array(self.model.parameters, real)],
-            global_size=(math.prod(shape[:-1]),),
+            arguments=[np.array(self.model.parameters, real), np.uint64(count), np.uint64(each)],
+            global_size=(items,) if strip else (items * each,),
+            local_size=(1,) if strip else (each,),
         )
 
 

@@ -133,15 +133,19 @@ def test_limits_to_the_mirror(angle: float) -> None:
     assert abs(lobe(half, angle, 1e-3) / schlick - 1.0) < 1e-2
 
 
+TWO_WAYS = pytest.mark.parametrize("walk", ["strip", "item"])
+
+
+@TWO_WAYS
 @pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_devices_as_the_host(device: Device, name: str, dtype: Any, rng: np.random.Generator) -> None:
+def test_devices_as_the_host(device: Device, name: str, dtype: Any, walk: Any, rng: np.random.Generator) -> None:
     pairs = above(rng, 5003).astype(dtype)
     pairs[:100, 2] *= -1.0
     pairs[100:200, 2] *= 1e-6
     model = MODELS[name]
     guarded = Guarded(Reflected(np.empty(5003, dtype), np.empty(5003, np.uint8)))
-    result = Reflectance(model=model)(pairs, device=device, out=guarded.out)
+    result = Reflectance(model=model, walk=walk)(pairs, device=device, out=guarded.out)
     guarded.assert_intact()
     expected = model.value(pairs)
     # Far out in a lobe a power's or exponential's large exponent magnifies the roundings: digits down to 1e-6 only.
@@ -150,13 +154,24 @@ def test_devices_as_the_host(device: Device, name: str, dtype: Any, rng: np.rand
     assert np.all(result.value[:100] == 0.0)
 
 
+@TWO_WAYS
 @pytest.mark.parametrize("name", MODELS)
-def test_not_finite(device: Device, name: str) -> None:
+def test_not_finite(device: Device, name: str, walk: Any) -> None:
     good = [0.1, 0.2, 0.9, -0.1, 0.3, 0.8]
-    pairs = np.array([good, [0.0, 0.0, 0.0, *good[3:]], [math.nan, *good[1:]], [*good[:5], math.inf]])
-    result = Reflectance(model=MODELS[name])(pairs, device=device)
-    np.testing.assert_array_equal(result.status, [0] + 3 * [Status.NOT_FINITE])
+    pairs = np.array(5 * [good, [0.0, 0.0, 0.0, *good[3:]], [math.nan, *good[1:]], [*good[:5], math.inf]])
+    result = Reflectance(model=MODELS[name], walk=walk)(pairs, device=device)
+    np.testing.assert_array_equal(result.status, 5 * ([0] + 3 * [Status.NOT_FINITE]))
     np.testing.assert_array_equal(np.isnan(result.value), np.isnan(MODELS[name].value(pairs)))
+
+
+@TWO_WAYS
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 31, 63, 64, 65, 4097])
+def test_sizes_and_canaries(device: Device, count: int, walk: Any, rng: np.random.Generator) -> None:
+    pairs = above(rng, count)
+    guarded = Guarded(Reflected(np.empty(count), np.empty(count, np.uint8)))
+    Reflectance(model=MODELS["ggx"], walk=walk)(pairs, device=device, out=guarded.out)
+    guarded.assert_intact()
+    np.testing.assert_allclose(guarded.out.value, MODELS["ggx"].value(pairs), rtol=1e-12)
 
 
 def test_wrong_inputs(device: Device) -> None:

@@ -147,7 +147,8 @@ class Looking:
         if found < 3:
             return _refused(
                 rulers,
-                f"{found} of {laid} rulers found an edge of {self.threshold:.3g} grey levels or more, expected 3",
+                f"{found} of {laid} rulers found an edge of {self.threshold:.3g} grey levels or more, expected 3; is "
+                "it this side of this board, near there, at this scale?",
             )
         return self._solved(rulers, view.scale, within)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import re
@@ -336,6 +337,11 @@ def test_points_of_any_camera_will_do(tmp_path: Path, run: Locate, rng: np.rando
     assert "2 points on lines, expected 4" in run(tmp_path / "few.npy", "--field", "robocup_msl")[2]
 
 
+@functools.cache
+def board_of(folder: Path) -> Artwork:
+    return read_artwork(folder)
+
+
 @pytest.mark.realdata
 @pytest.mark.parametrize(
     ("name", "middle"),
@@ -345,10 +351,8 @@ def test_points_of_any_camera_will_do(tmp_path: Path, run: Locate, rng: np.rando
         ("kicad-x2-tests/x2ap", (60e-3, -45e-3)),
     ],
 )
-def test_boards_of_three_tools_are_located(
-    data: Path, name: str, middle: tuple[float, float], device: Device, tmp_path: Path
-) -> None:
-    board = read_artwork(data / "gerber" / name)
+def test_boards_of_three_tools_are_located(data: Path, name: str, middle: tuple[float, float], device: Device) -> None:
+    board = board_of(data / "gerber" / name)
     pose = (middle[0] + 45e-6, middle[1] - 60e-6, 3e-3)
     located = locate_board(seen(board, pose, growth=-8e-6), board, scale=PIXEL, near=(*middle, 0.0), device=device)
     assert located.reason == ""

@@ -85,6 +85,46 @@ def test_odd_sizes_and_steps(device: Device, walk: Any, rng: np.random.Generator
     assert_like(ours, strongest)
 
 
+@pytest.mark.parametrize(
+    ("length", "width", "step_px", "angle"), [(129, 12, 1.5, 0.7), (61, 5, 4.0, 0.1), (200, 41, 1.0, 3.0)]
+)
+def test_long_and_wide_ones(
+    device: Device, length: int, width: int, step_px: float, angle: float, rng: np.random.Generator
+) -> None:
+    """Places in fixed point have fewer digits there, and still enough."""
+    distance = float(np.dot((170.0, 160.0), (math.cos(angle), math.sin(angle))))
+    image = (reference.step_image((320, 340), angle, distance, 3.0) + rng.normal(0.0, 2.0, (320, 340))).astype(
+        np.float32
+    )
+    rulers = reference.across(angle, distance, 5, rng, (170.0, 160.0))
+    smoothing = 2.0 * step_px
+    operation = RulerEdges(threshold=20.0, length=length, width=width, step_px=step_px, smoothing_px=smoothing)
+    ours = operation(image, rulers, device=device)
+    assert (ours.status == 0).all()
+    strongest = [max(each, key=lambda edge: abs(edge["gradient"])) for each in expected(operation, image, rulers)]
+    assert_like(ours, strongest)
+
+
+@pytest.mark.parametrize("angle", [0.0, math.pi / 2, math.pi, -math.pi / 2, math.pi / 4])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_all_of_an_image(device: Device, dtype: Any, angle: float) -> None:
+    """Samples and lines from the first pixel to the last, whatever the rounding: nothing beside them is read."""
+    turned, diagonal = abs(math.sin(angle)) > 0.9, abs(math.sin(2.0 * angle)) > 0.9
+    shape = (64, 16) if turned else (16, 64)
+    length, width = (45, 12) if diagonal else (64, 16)
+    if diagonal:
+        shape = (40, 40)
+    middle = (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))
+    distance = float(np.dot(middle, (math.cos(angle), math.sin(angle)))) + 0.25
+    inner = image_of(reference.step_image(shape, angle, distance, 1.2), dtype)
+    operation = RulerEdges(threshold=20.0, length=length, width=width)
+    ruler = np.round(one_ruler(*middle, angle), 7)  # along the pixels without what pi lacks
+    ours = operation(inner, ruler, device=device)
+    assert ours.status[0] == 0
+    theirs = max(expected(operation, inner, ruler)[0], key=lambda edge: abs(edge["gradient"]))
+    assert_like(ours, [theirs])
+
+
 def test_shortest_and_a_single_line(device: Device) -> None:
     image = reference.step_image((20, 20), 0.0, 10.25, 0.8).astype(np.float32)
     operation = RulerEdges(threshold=20.0, length=9, width=1, smoothing_px=1.0)
@@ -302,6 +342,27 @@ def test_saturated_and_ambiguous_edges_come_with_a_value(device: Device) -> None
     twice = operation(stripe, one_ruler(), device=device)
     assert twice.status[0] == Status.AMBIGUOUS
     assert abs(abs(twice.position[0]) - 8.0) < 0.02
+
+
+@WALKS
+@pytest.mark.parametrize(("dtype", "level"), [(np.uint8, 0), (np.uint8, 255), (np.uint16, 65535), (np.float32, -1e30)])
+def test_no_contrast(device: Device, walk: Any, dtype: Any, level: float) -> None:
+    rulers = np.concatenate([one_ruler(), one_ruler(70.3, 61.7, 0.7)])
+    ours = replace(STRONGEST, walk=walk)(np.full(SHAPE, level, dtype), rulers, device=device)
+    assert (ours.status == Status.DARK).all()
+    assert np.isnan(ours.position).all()
+    assert np.isnan(ours.sigma).all()
+
+
+@WALKS
+def test_all_levels_of_16_bits(device: Device, walk: Any) -> None:
+    image = np.rint(reference.step_image(SHAPE, 0.2, 86.0, 1.2, 0.0, 65535.0)).astype(np.uint16)
+    rulers = reference.across(0.2, 86.0, 5, np.random.default_rng(1), MIDDLE)
+    operation = replace(STRONGEST, width=16, walk=walk)
+    ours = operation(image, rulers, device=device)
+    assert (ours.status == 0).all()
+    strongest = [max(each, key=lambda edge: abs(edge["gradient"])) for each in expected(operation, image, rulers)]
+    assert_like(ours, strongest, 65535.0)
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-3, 1e6, 1e30])

@@ -68,7 +68,7 @@ def _any_hit(device: Device, name: str, mesh: Any, shuffled: bool) -> Case:
     segments, scene = shadow_segments(mesh, shuffled), Scene.of(mesh)
     bound = AnyHit(scene=scene).bind(device, segments.shape, segments.dtype)
     bound.inputs[0].set(segments)
-    theirs = _embree(scene.corners)
+    theirs = embree_scene(scene.corners)
     queries = [
         (np.ascontiguousarray(some[:, :3]), some[:, 3:] - some[:, :3], np.ones(len(some), np.float32))
         for some in np.array_split(segments, os.cpu_count() or 1)
@@ -92,11 +92,11 @@ def _build(mesh: Any, size: str) -> Case:
     corners = np.asarray(mesh.triangles)
     # Of embreex's time the larger part goes into handing over the triangles, not into the tree.
     facts = {"triangles": len(corners), "peer_tree_s": min(_embree_tree_time(corners) for _ in range(3))}
-    peers = {"embreex": lambda: _embree(corners)}
+    peers = {"embreex": lambda: embree_scene(corners)}
     return Case("bvh", f"build/{size}", lambda: Bvh.build(corners), peers, 0.0, facts=facts)
 
 
-def _embree(corners: NDArray[Any]) -> Any:
+def embree_scene(corners: NDArray[Any]) -> Any:
     """Return Embree's scene, its tree built."""
     scene = EmbreeScene()
     TriangleMesh(scene, corners.astype(np.float32))

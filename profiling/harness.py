@@ -35,6 +35,7 @@ OPERATIONS = (
     "reflectance",
     "mirrors",
     "bvh",
+    "fans",
     "simulate",
     "tolerance",
     "field",

@@ -188,6 +188,19 @@ typedef struct {
     bvh_reals low, high;
 } shadows;
 
+#ifdef STRIP
+// Joins every other shadow with the next one, where they touch: two triangles of a quadrangle often lie side by side.
+BVH_INLINE void shadows_join(shadows *cast) {
+    const bvh_masks is_even = {-1, 0, -1, 0, -1, 0, -1, 0, -1, 0, -1, 0, -1, 0, -1, 0};
+    const bvh_reals low = cast->low, high = cast->high;
+    const bvh_reals other_low = low.s1032547698badcfe, other_high = high.s1032547698badcfe;
+    const bvh_masks joins = BVH_MASK(low <= other_high + HIDDEN_SLIT) & BVH_MASK(other_low <= high + HIDDEN_SLIT);
+    const bvh_masks stays = joins & is_even, goes = joins & ~is_even;
+    cast->low = goes ? (bvh_reals)1 : stays ? bvh_min(low, other_low) : low;
+    cast->high = goes ? (bvh_reals)0 : stays ? bvh_max(high, other_high) : high;
+}
+#endif
+
 BVH_INLINE void view_shadows(const view *view, global const real *leaf, shadows *cast) {
     bvh_reals deep[2], along[2], weight[2];
     bvh_masks hides = view_lines(view, leaf, deep, along, weight);
@@ -222,13 +235,14 @@ BVH_INLINE void view_shadows(const view *view, global const real *leaf, shadows 
     const bvh_reals last = (is_cut2 ? bvh_fma(leave, step_along, along1) : along2) /
                            bvh_max(is_cut2 ? bvh_fma(leave, step_deep, deep1) : deep2, nearest);
     cast->low = hides ? bvh_min(first, last) : cast->low, cast->high = hides ? bvh_max(first, last) : cast->high;
+#ifdef STRIP
+    shadows_join(cast);
+#endif
 }
 
-BVH_INLINE hidden hidden_none(real from, real to) {
-    hidden none;
-    none.from = from, none.to = to;
-    none.count = 0, none.is_full = 0;
-    return none;
+BVH_INLINE void hidden_begin(hidden *all, real from, real to) {
+    all->from = from, all->to = to;
+    all->count = 0, all->is_full = 0;
 }
 
 // Hides [low, high]. What is kept is apart from each other and from the ends: so a single pass finds all that join.

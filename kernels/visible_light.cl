@@ -125,8 +125,9 @@ int add_visible(const bvh_tree *tree, const chunk *lit, int line, const before *
     const real end = toward_end < 0 ? fmin(horizon + slack, (real)1) : 1;
     int is_whole = 1;
     real from = begin, to = end;
+    hidden dark;
     while (from < end) {
-        hidden dark = hidden_none(from, to);
+        hidden_begin(&dark, from, to);
         view_trace(tree, v, &dark, hint);
         if (dark.is_full && to - from > LEAST_WINDOW) {
             to = (real)0.5 * (from + to);

@@ -7,7 +7,6 @@
 //     EITHER      marks may be brighter or darker than what is about them
 //     SPOKES      rulers of a mark, an even number; those opposite are half of them apart. ROOM: so many, to whole
 //                 vectors
-//     PASSES      how often rulers are laid
 //
 // The layout has six rows of ROOM numbers: where the ruler's centre lies, its direction (outwards from the mark's own
 // area), the distance of the edge from the centre of the mark; all for a mark of size 1. The sixth is 1, or 0 for what
@@ -17,14 +16,17 @@
 
 #define LEAST_REACH (real)0.6f     // [px] within which edges count before their scale is known
 #define LEAST_SCALE (real)0.01f // [px]
-#define STILL (real)0.1f        // [px] less than which a mark lies from where the rulers were laid for
+#ifdef MATCH
+#define STILL (real)2 // [px] less than which a mark lies from where the rulers were laid for
+#else
+#define STILL (real)0.1f
+#endif
 #define MOST_STEPS 12
 #define STEPS_AT_SCALE 2
 #define RING (real)2    // [px] of background about a mark
 #define BILINEAR (real)(1.0f / 6) // [px^2] of bilinear samples, the variance
 #define BEYOND (real)2.5f // blurs of an edge away from it
 #define OWN (real)0.5f    // least weight of an edge of the mark's own
-#define HIDDEN_BLURS 4
 
 #ifdef ROUND
 #define PLACE 3
@@ -79,19 +81,26 @@ inline blob_equation equation_of(private const blob_edges *edges, int i, blob_la
     return equation;
 }
 
+// Under STRIP an item has its edges to itself, else a group shares them.
+#ifdef STRIP
+#define EDGE_SPACE private
+#else
+#define EDGE_SPACE local
+#endif
+
 // Takes what a vector of rulers found.
 inline void take_edges(ruler_edge edge, int i, blob_layout layout, blob_shape shape, real cosine, real sine,
-                       reals from_x, reals from_y, private blob_edges *edges) {
+                       reals from_x, reals from_y, EDGE_SPACE blob_edges *edges) {
     const reals nx = FROM(layout.nx, i), ny = FROM(layout.ny, i);
     const masks counts = mask_of(FROM(layout.counts, i) > (reals)0);
     const masks none = ~counts | mask_of((edge.status & (RULER_USELESS | STATUS_DARK)) != 0);
     const reals position = zero_where(none, edge.position);
-    *(private reals_at *)(edges->x + i) = from_x + position * (cosine * nx - sine * ny);
-    *(private reals_at *)(edges->y + i) = from_y + position * (sine * nx + cosine * ny);
-    *(private reals_at *)(edges->amplitude + i) = zero_where(none, edge.amplitude);
-    *(private reals_at *)(edges->blur + i) = zero_where(none, edge.width * edge.width);
-    *(private reals_at *)(edges->noise + i) = zero_where(none, edge.sigma * edge.sigma);
-    *(private reals_at *)(edges->there + i) = zero_where(none, (reals)1);
+    *(EDGE_SPACE reals_at *)(edges->x + i) = from_x + position * (cosine * nx - sine * ny);
+    *(EDGE_SPACE reals_at *)(edges->y + i) = from_y + position * (sine * nx + cosine * ny);
+    *(EDGE_SPACE reals_at *)(edges->amplitude + i) = zero_where(none, edge.amplitude);
+    *(EDGE_SPACE reals_at *)(edges->blur + i) = zero_where(none, edge.width * edge.width);
+    *(EDGE_SPACE reals_at *)(edges->noise + i) = zero_where(none, edge.sigma * edge.sigma);
+    *(EDGE_SPACE reals_at *)(edges->there + i) = zero_where(none, (reals)1);
     const masks flags = counts & edge.status;
     for (int lane = 0; lane < LANES; lane++) {
         const int flag = LANE_BITS(flags, lane);
@@ -406,7 +415,7 @@ inline void hide(blob_shape shape, private const real *weights, blob_layout layo
     const real cosine = cos(shape.angle), sine = sin(shape.angle);
     hidden->count = 0;
     hidden->half_width = spacing * shape.size;
-    hidden->half_length = HIDDEN_BLURS * blur;
+    hidden->half_length = ABOUT_BLURS * blur + ABOUT + 1;
     for (int i = 0; i < SPOKES; i++) {
         if (weights[i] >= OWN) continue;
         const real bx = layout.bx[i], by = layout.by[i], nx = layout.nx[i], ny = layout.ny[i];
@@ -454,14 +463,18 @@ inline int gravity_of(global const CODE *image, int rows, int columns, real x, r
 
 // Lays the rulers of a mark and takes what they find.
 inline void measure(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape, real turned,
-                    constant real *table, blob_layout layout, private blob_edges *edges
+                    constant real *table, blob_layout layout, EDGE_SPACE blob_edges *edges
 #ifndef STRIP
                     ,
                     local real *profile, local real *slopes, local int *flags
 #endif
 ) {
     const real cosine = cos(turned), sine = sin(turned);
+#ifdef STRIP
     edges->outside = edges->broken = 0;
+#else
+    if (get_local_id(0) == 0) edges->outside = edges->broken = 0;
+#endif
     for (int i = 0; i < ROOM; i += LANES) {
         const reals bx = FROM(layout.bx, i), by = FROM(layout.by, i), nx = FROM(layout.nx, i), ny = FROM(layout.ny, i);
         const reals from_x = shape.x + shape.size * (cosine * bx - sine * by);
@@ -487,7 +500,7 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
                        global real *restrict blur, global uchar *restrict status, constant real *table,
                        constant real *laid, const int rows, const int columns, const uint count, const uint each,
                        const real search, const int least, const real across, const real overlap, const real extent,
-                       const real pixel_noise, const real spacing) {
+                       const real pixel_noise, const real spacing, const int passes) {
     const blob_layout layout = {laid, laid + ROOM, laid + 2 * ROOM, laid + 3 * ROOM, laid + 4 * ROOM, laid + 5 * ROOM};
 #ifdef STRIP
     const uint first = get_global_id(0) * each, end = min(first + each, count);
@@ -495,6 +508,7 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
 #else
     local real profile[LENGTH], slopes[RULER_SLOPES], told[5];
     local int flags;
+    local blob_edges shared;
     const uint first = get_group_id(0), end = first + 1;
     const int mine = get_local_id(0) == 0;
 #endif
@@ -511,16 +525,19 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
         blob_shape shape = nominal;
         real variance = 0, noise = 0, scale = 0;
         int found = 0, agreed = 0;
-        for (int pass = 0; pass < PASSES && !bad; pass++) {
+        for (int pass = 0; pass < passes && !bad; pass++) {
             const blob_shape from = shape;
             int done = 1;
 #ifdef STRIP
             measure(image, rows, columns, place[0], place[1], from, from.angle, table, layout, &edges);
 #else
-            measure(image, rows, columns, place[0], place[1], from, from.angle, table, layout, &edges, profile, slopes,
+            measure(image, rows, columns, place[0], place[1], from, from.angle, table, layout, &shared, profile, slopes,
                     &flags);
 #endif
             if (mine) {
+#ifndef STRIP
+                edges = shared;
+#endif
                 const real cosine = cos(nominal.angle), sine = sin(nominal.angle);
                 found = keep_edges(&edges, layout, nominal, cosine, sine, search, &noise, &variance);
                 if (pass == 0 && found >= least) shape = start_of(&edges, layout, nominal, START_REACH);
@@ -528,6 +545,9 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
                                                      &scale);
                 const real dx = shape.x - from.x, dy = shape.y - from.y, ds = shape.size - from.size;
                 const real da = (shape.angle - from.angle) * from.size;
+#ifndef STRIP
+                shared = edges;
+#endif
                 done = !agreed || dx * dx + dy * dy + ds * ds + da * da < STILL * STILL;
             }
 #ifndef STRIP
@@ -543,6 +563,9 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
             if (done) break;
         }
         if (!mine) continue;
+#ifndef STRIP
+        edges = shared;
+#endif
 #ifdef ROUND
         const real bent = variance + across;
 #else

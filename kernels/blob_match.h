@@ -26,10 +26,11 @@ typedef struct {
 #define UNKNOWNS (FREEDOMS + 5) // with blur, contrast, background and its two slopes
 #define UNKNOWN_CELLS (UNKNOWNS * (UNKNOWNS + 1) / 2)
 #define MATCH_STEPS 3
-#define MATCHED (real)0.1f      // [blurs] a step after which there is none
+#define MATCHED (real)0.05f     // [blurs] a step after which there is none
 #define MATCH_FURTHEST (real)1   // [px] from where the edges say
-#define MATCH_SHARE (real)0.25f  // of the contrast, and
+#define MATCH_SHARE (real)0.1f  // of the contrast, and
 #define MATCH_NOISES (real)4     // of the noise: what no pixel of the mark is off by
+#define MATCH_OWN (real)0.7f     // of the pixels that must be a mark's or its background's
 #define SHARPEST (real)0.3f      // [px]
 #define ABOUT_BLURS (real)5      // about a mark its background is looked at: so many blurs
 #define ABOUT (real)2            // [px] and so much
@@ -144,18 +145,19 @@ inline masks hidden_at(private const blob_hidden *hidden, reals dx, reals dy) {
 #endif
 
 typedef struct {
-    reals matrix[UNKNOWN_CELLS], right[UNKNOWNS], squares, weights, count;
+    reals matrix[UNKNOWN_CELLS], right[UNKNOWNS], squares, weights, count, pixels;
 } match_sums;
 
-// The equations of the pixels about (x, y), as far as they are of this mark and its background.
+// The equations of the pixels about (x, y), as far as they are of this mark and its background; in units of its contrast.
 inline void match_summed(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
                          blob_grey grey, real slope_x, real slope_y, real scale, real reach,
                          private const blob_hidden *hidden, private match_sums *sums) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale, per_size = 1 / shape.size;
+    const real per_contrast = 1 / grey.contrast;
     const int top = max((int)ceil(y - reach), 0), bottom = min((int)(y + reach), rows - 1);
     for (int i = 0; i < UNKNOWN_CELLS; i++) sums->matrix[i] = 0;
     for (int i = 0; i < UNKNOWNS; i++) sums->right[i] = 0;
-    sums->squares = sums->weights = sums->count = 0;
+    sums->squares = sums->weights = sums->count = sums->pixels = 0;
     for (int row = top; row <= bottom; row++) {
         const real dy = row - y, half_chord = sqrt(fmax(reach * reach - dy * dy, (real)0));
         const int left = max((int)ceil(x - half_chord), 0), right = min((int)(x + half_chord), columns - 1);
@@ -165,15 +167,15 @@ inline void match_summed(global const CODE *image, int rows, int columns, real x
             masks in = mask_of(place >= (reals)(real)column) & mask_of(FABS(dx) <= (reals)half_chord);
             if (hidden->count) in &= ~hidden_at(hidden, dx, (reals)dy);
             const blob_model model = model_at(dx, (reals)dy, shape, cosine, sine, grey.blur);
-            const reals pixel = PIXELS(image + row * columns + from) - (reals)grey.background;
+            const reals pixel = (PIXELS(image + row * columns + from) - (reals)grey.background) * (reals)per_contrast;
             reals equation[UNKNOWNS];
-            for (int i = 0; i < FREEDOMS + 1; i++) equation[i] = grey.contrast * model.row[i];
+            for (int i = 0; i < FREEDOMS + 1; i++) equation[i] = model.row[i];
             equation[FREEDOMS + 1] = model.level;
             equation[FREEDOMS + 2] = 1;
             equation[FREEDOMS + 3] = dx * per_size;
             equation[FREEDOMS + 4] = (reals)(dy * per_size);
-            reals residual = pixel - grey.contrast * model.level - slope_x * equation[FREEDOMS + 3] -
-                             slope_y * equation[FREEDOMS + 4];
+            reals residual =
+                pixel - model.level - slope_x * equation[FREEDOMS + 3] - slope_y * equation[FREEDOMS + 4];
 #ifdef CODE_float
             in &= ~LANED(not_finite)(residual);
 #endif
@@ -186,6 +188,7 @@ inline void match_summed(global const CODE *image, int rows, int columns, real x
 #pragma unroll
                 for (int j = 0; j <= i; j++) sums->matrix[CELL(i, j)] += weighted * equation[j];
             }
+            sums->pixels += kept_where(in, (reals)1);
             sums->squares += weight * residual * residual;
             sums->weights += weight;
             sums->count += kept_where(mask_of(weight > (reals)0), (reals)1);
@@ -203,14 +206,16 @@ inline int match(global const CODE *image, int rows, int columns, real x, real y
     for (int step = 0; step < MATCH_STEPS; step++) {
         match_sums sums;
         reals moved[UNKNOWNS];
-        const real scale = (MATCH_SHARE * fabs(grey->contrast) + MATCH_NOISES * noise) / TUNING;
-        match_summed(image, rows, columns, x + shape->x, y + shape->y, *shape, *grey, slope_x, slope_y, scale, reach,
+        const real contrast = grey->contrast, scale = (MATCH_SHARE + MATCH_NOISES * noise / fabs(contrast)) / TUNING;
+        match_summed(image, rows, columns, x + shape->x, y + shape->y, *shape, *grey, slope_x / contrast, slope_y / contrast,
+                     scale, reach,
                      hidden, &sums);
         for (int i = 0; i < UNKNOWN_CELLS; i++) sums.matrix[i] = (reals)sum_of(sums.matrix[i]);
         for (int i = 0; i < UNKNOWNS; i++) sums.right[i] = (reals)sum_of(sums.right[i]);
         if (any_lane(factored_of(UNKNOWNS, sums.matrix))) return 0;
         solved_of(UNKNOWNS, sums.matrix, sums.right, moved);
         const real dx = FIRST(moved[0]), dy = FIRST(moved[1]), ds = FIRST(moved[2]);
+        const real db = FIRST(moved[FREEDOMS]);
         real less = 0, da = 0;
         for (int i = 0; i < UNKNOWNS; i++) less += FIRST(moved[i]) * FIRST(sums.right[i]);
         shape->x += dx;
@@ -220,12 +225,13 @@ inline int match(global const CODE *image, int rows, int columns, real x, real y
         da = FIRST(moved[3]) * first.size;
         shape->angle += FIRST(moved[3]);
 #endif
-        grey->blur = fmax(grey->blur + FIRST(moved[FREEDOMS]), SHARPEST);
-        grey->contrast += FIRST(moved[FREEDOMS + 1]);
-        grey->background += FIRST(moved[FREEDOMS + 2]);
-        slope_x += FIRST(moved[FREEDOMS + 3]);
-        slope_y += FIRST(moved[FREEDOMS + 4]);
-        if (dx * dx + dy * dy + ds * ds + da * da > MATCHED * MATCHED * grey->blur * grey->blur && step < MATCH_STEPS - 1) continue;
+        grey->blur = fmax(grey->blur + db, SHARPEST);
+        grey->contrast += contrast * FIRST(moved[FREEDOMS + 1]);
+        grey->background += contrast * FIRST(moved[FREEDOMS + 2]);
+        slope_x += contrast * FIRST(moved[FREEDOMS + 3]);
+        slope_y += contrast * FIRST(moved[FREEDOMS + 4]);
+        const real off = dx * dx + dy * dy + ds * ds + da * da + db * db;
+        if (off > MATCHED * MATCHED * grey->blur * grey->blur && step < MATCH_STEPS - 1) continue;
         const real count = sum_of(sums.count), free = count - UNKNOWNS;
         const real variance = fmax(sum_of(sums.squares) - less, (real)0) / sum_of(sums.weights) * count / free;
         for (int i = 0; i < FREEDOMS; i++) {
@@ -235,7 +241,7 @@ inline int match(global const CODE *image, int rows, int columns, real x, real y
             for (int k = 0; k < FREEDOMS; k++) covariance[i][k] = variance * FIRST(column[k]);
         }
         const real off_x = shape->x - first.x, off_y = shape->y - first.y, off_size = shape->size - first.size;
-        return free > 0 && off_x * off_x + off_y * off_y + off_size * off_size <= MATCH_FURTHEST * MATCH_FURTHEST;
+        return free > 0 && count >= MATCH_OWN * sum_of(sums.pixels) && off_x * off_x + off_y * off_y + off_size * off_size <= MATCH_FURTHEST * MATCH_FURTHEST;
     }
     return 0;
 }

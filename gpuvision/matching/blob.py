@@ -81,8 +81,8 @@ class Blobs(NamedTuple):
         uint8 `Status` flags. DARK: too few rulers found an edge over the threshold, of the polarity, within the search
         radius. OUT_OF_RANGE: too many rulers leave the image, or the mark lies further than the search radius from its
         nominal place. NOT_FINITE: a place or radius is not finite, the radius not above 0, or too many pixels are not
-        finite. AMBIGUOUS: too few of the edges agree on one shape, or the pixels have none there. With a value: SATURATED (a ruler of the fit has
-        reached the saturation).
+        finite. AMBIGUOUS: too few of the edges agree on one shape, or the pixels have none there. With a value:
+        SATURATED (a ruler of the fit has reached the saturation).
     """
 
     x: Any
@@ -131,7 +131,8 @@ class FindBlobs(Operation[Blobs]):
         Of the edges; `best_smoothing` of the blur is the optimum where the mark is wide enough: less than half its
         radius (of rings and crosses half the width of the bar).
     passes
-        How often rulers are laid, at most: again where the mark was found more than 0.1 px from where they were.
+        How often rulers are laid, at most: again where the mark was found more than 2 px (without ``match`` 0.1 px)
+        from where they were.
     match
         Match the pixels; else the fit to the edges is what is returned.
     agreement
@@ -162,12 +163,12 @@ class FindBlobs(Operation[Blobs]):
     The match has the centre, size and angle, the blur, the contrast, and level and slopes of the background as unknowns
     (Gauss-Newton, Tukey's weights at a quarter of the contrast), over all pixels within five blurs and 2 px of the
     mark, but for the parts of the contour whose rulers do not agree. At SNR 6 to 200 and blurs of 0.5 px to a third of
-    the radius the centre's standard deviation is 1.0 to 1.25 times the Cramer-Rao bound of a disc on a known background,
-    the radius is right to 0.01 px. A blur over a third of the radius hides how large the mark is.
+    the radius the centre's standard deviation is 1.0 to 1.25 times the Cramer-Rao bound of a disc on a known
+    background, the radius is right to 0.01 px. A blur over a third of the radius hides how large the mark is.
 
     A blurred edge of radius R is seen at sqrt(R^2 - v) to second order, v the variance of the blur and of the averaged
-    lines: the mean of sqrt(R^2 - u^2) over u across the ruler. The fit corrects the radius for that, with the mean blur of
-    the mark's own edges; the match has a blurred disc's own profile, to first order in blur over radius.
+    lines: the mean of sqrt(R^2 - u^2) over u across the ruler. The fit corrects the radius for that, with the mean blur
+    of the mark's own edges; the match has a blurred disc's own profile, to first order in blur over radius.
     """
 
     Result: ClassVar[type[Any]] = Blobs
@@ -264,6 +265,7 @@ class FindBlobs(Operation[Blobs]):
                 np.float32(self.search_px),
                 np.int32(least),
                 *map(np.float32, numbers),
+                np.int32(self.passes),
             ],
             global_size=(-(-self.count // each),) if strip else (self.count * _GROUP,),
             local_size=(1,) if strip else (_GROUP,),
@@ -287,7 +289,6 @@ class FindBlobs(Operation[Blobs]):
     def _defines(self, freedoms: int) -> dict[str, Any]:
         defines: dict[str, Any] = dict(loss_defines("tukey", BEND)) | {"EFFICIENCY": efficiency("tukey", BEND)}
         defines |= {"FREEDOMS": freedoms, "SPOKES": self.spokes, "ROOM": -(-self.spokes // _LANES) * _LANES}
-        defines |= {"PASSES": self.passes}
         present = {"ROUND": self._round, "EITHER": self.polarity == "either", "MATCH": self.match}
         if self.shape in ("ring", "cross"):
             defines["RATIO"] = float(self.ratio)

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.special import i1e, ndtr
 
 Float64 = NDArray[np.float64]
@@ -53,3 +54,47 @@ def cross(shape: tuple[int, int], x: float, y: float, half: float, angle: float,
     wide = ratio * half
     bars = bar(shape, x, y, angle, half, wide, blur) + bar(shape, x, y, angle, wide, half, blur)
     return bars - bar(shape, x, y, angle, wide, wide, blur)
+
+
+def image_of(shape: str, size: tuple[int, int], numbers: Float64, ratio: float) -> Float64:
+    """Return levels of a mark by (x, y, size, blur), or (x, y, size, angle, blur)."""
+    if shape == "circle":
+        return disc(size, *numbers)
+    if shape == "ring":
+        x, y, radius, blur = numbers
+        return ring(size, x, y, radius, ratio, blur)
+    if shape == "square":
+        return square(size, *numbers)
+    x, y, half, angle, blur = numbers
+    return cross(size, x, y, half, angle, ratio, blur)
+
+
+def matched(image: Float64, shape: str, near: Float64, ratio: float, reach: float) -> Float64:
+    """Return the numbers of `image_of` by least squares of all pixels within reach, on a plane background.
+
+    Levels are linear in contrast, background and its slopes: those are solved for at every step.
+    """
+    row, column = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float64)
+    dx, dy = column - near[0], row - near[1]
+    inside = np.hypot(dx, dy) <= reach
+
+    def residual(numbers: Float64) -> Float64:
+        level = image_of(shape, image.shape, numbers, ratio)
+        matrix = np.stack([level, np.ones_like(level), dx, dy], axis=-1)[inside]
+        return image[inside] - matrix @ np.linalg.lstsq(matrix, image[inside], rcond=None)[0]
+
+    return np.asarray(least_squares(residual, near, x_scale="jac", diff_step=1e-5).x)
+
+
+def circle_through(points: Float64, near: Float64) -> Float64:
+    """Return x, y, radius of the circle with the least squares of distances from the points."""
+
+    def residual(circle: Float64) -> Float64:
+        return np.asarray(np.hypot(*(points - circle[:2]).T) - circle[2])
+
+    return np.asarray(least_squares(residual, near).x)
+
+
+def cramer_rao(radius: float, blur: float, noise: float) -> float:
+    """Return the least standard deviation of a disc's centre, contrast 1: white noise, everything else known."""
+    return noise * math.sqrt(2.0 * blur / (math.sqrt(math.pi) * radius))

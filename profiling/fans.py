@@ -40,7 +40,9 @@ def _case(device: Device, name: str, mesh: Any) -> Case:
     bound = FanIntervals(scene=scene).bind(device, fans.shape, fans.dtype)
     bound.inputs[0].set(fans)
     ours = _shown(bound.run().intervals.get())
-    exact = FanIntervals(scene=scene, precision="double" if device.has_double else "single", kept=49)(fans, device=device)
+    exact = FanIntervals(scene=scene, precision="double" if device.has_double else "single", kept=49)(
+        fans, device=device
+    )
     truth, known = _shown(exact.intervals), (exact.status == 0) & (bound.outputs.status.get() == 0)
     peer = _Samples(scene, fans)
     facts = {"triangles": len(mesh.faces), "fans": _FANS, "peer_error": _error(peer(), truth, known)}

@@ -68,15 +68,20 @@ BVH_INLINE view_half view_half_of(const view *view, real x, real y, real z, real
     return half_space;
 }
 
-// Sets the first two halves: what is seen between two places of the segment. And what is around it.
+// Sets the first two halves: what is seen between two places of the segment.
 BVH_INLINE void view_set_window(view *view, real from, real to) {
     view->from = from, view->to = to;
     view->halves[0] = view_half_of(view, view->along_x - from * view->deep_x, view->along_y - from * view->deep_y,
                                    view->along_z - from * view->deep_z, 0);
     view->halves[1] = view_half_of(view, to * view->deep_x - view->along_x, to * view->deep_y - view->along_y,
                                    to * view->deep_z - view->along_z, 0);
+}
+
+// Sets what is around the point and the window.
+BVH_INLINE void view_set_around(view *view) {
 #define VIEW_AROUND(x)                                                                                                 \
-    const real first_##x = view->start_##x + from * view->step_##x, last_##x = view->start_##x + to * view->step_##x;  \
+    const real first_##x = view->start_##x + view->from * view->step_##x;                                              \
+    const real last_##x = view->start_##x + view->to * view->step_##x;                                                 \
     const real slack_##x = (real)4 * (real)REAL_EPSILON * (fabs(first_##x) + fabs(last_##x) + fabs(view->x));         \
     view->low_##x = fmin(view->x, fmin(first_##x, last_##x)) - slack_##x;                                              \
     view->high_##x = fmax(view->x, fmax(first_##x, last_##x)) + slack_##x
@@ -351,6 +356,7 @@ BVH_INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all, int *h
     const int known = *hint;
     real most = 0;
     view_set_window(view, all->from, all->to);
+    view_set_around(view);
     if (known < 0) view_leaf(tree, view, known, all);
     while (!hidden_is_done(all)) {
         if (all->from > view->from || all->to < view->to) view_set_window(view, all->from, all->to);

@@ -27,6 +27,9 @@ from gpuvision.matching.artwork_shapes import Drawn, Float64, Layer, Shape, area
 Side = Literal["top", "bottom"]
 Role = Literal["via", "pad", "fiducial"]
 
+# What Gerber X2 calls what is no pad; its other words are of pads.
+_SAID: Mapping[str, Role] = {"ViaPad": "via", "FiducialPad": "fiducial"}
+
 _SAME = 5e-6  # [m] centres as near as this are one: files round to a micrometre or so
 _CONCENTRIC = 50e-6  # [m] a hole, and an opening of the mask, may lie as far from its pad's centre: tools round apart
 _FIDUCIAL_OPENING = 1.5  # diameters; IPC-7351 asks for 2 or more, a pad's opening is larger by 0.1 mm or so
@@ -353,7 +356,7 @@ def _land(spot: Drawn, finder: _Finder) -> Land:
 
 def _role(spot: Drawn, shape: str, across: float, hole: int | None, opening: Drawn | None, finder: _Finder) -> Role:
     if spot.function:
-        return {"ViaPad": "via", "FiducialPad": "fiducial"}.get(spot.function, "pad")  # type: ignore[return-value]
+        return _SAID.get(spot.function, "pad")
     if shape != "circle":
         return "pad"
     if hole is not None:

@@ -6,13 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.matching.artwork import Artwork
+from gpuvision.matching.artwork import Artwork, read_artwork
 from gpuvision.matching.artwork_shapes import Shape
 from gpuvision.matching.local_fix import LocalFix, lay_rulers
 from gpuvision.matching.pose import SolvePose
@@ -68,12 +69,40 @@ class BoardFix:
         How many rulers.
     motion_px
         By which the picture is smeared along the rows, and is expected to be.
+    largest_leverage
+        As in `SolvePose`.
     """
 
     artwork: Artwork
     middle: tuple[float, float]
     budget: int = 40
     motion_px: float = 0.0
+    largest_leverage: float = 0.95
+
+    @classmethod
+    def drawn(cls, folder: Path) -> BoardFix:
+        """Traces in four directions and pads in the open, 16 mm x 12 mm, and a frame of silk."""
+        head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
+
+        def at(x: float, y: float, how: str) -> str:
+            return f"X{round(x * 1e6)}Y{round(y * 1e6)}{how}*\n"
+
+        copper, mask = head + "%ADD10C,0.4*%\n%ADD11R,1.4X1.0*%\nD10*\n", head + "%ADD11R,1.8X1.4*%\nD11*\n"
+        for x, y in ((1, 2), (5.2, 2), (9.4, 2), (1, 10.2), (5.2, 10.2), (9.4, 10.2)):
+            copper += at(x, y, "D02") + at(x + 2.5, y, "D01")
+        for x, y in ((1.5, 3.6), (13.2, 3.6), (3.2, 6.2), (12.4, 6.6)):
+            copper += at(x, y, "D02") + at(x, y + 2.2, "D01")
+        for x, y, way in ((5, 3.4, 1), (8, 5.6, -1), (5.2, 6.6, 1), (9.6, 3.4, 1)):
+            copper += at(x, y, "D02") + at(x + 1.8, y + 1.8 * way, "D01")
+        copper += "D11*\n"
+        for x, y in ((13.5, 1.8), (13.5, 10.4), (8.6, 8.6), (2.2, 8.9)):
+            copper, mask = copper + at(x, y, "D03"), mask + at(x, y, "D03")
+        silk = head + "%ADD10C,0.2*%\nD10*\n" + at(0.2, 0.4, "D02") + at(15.5, 0.4, "D01") + at(15.5, 11.6, "D01")
+        (folder / "copper.gbr").write_text(copper + "M02*\n")
+        (folder / "mask.gbr").write_text(mask + "M02*\n")
+        (folder / "silk.gbr").write_text(silk + "M02*\n")
+        layers = {r"copper\.gbr": "top copper", r"mask\.gbr": "top mask", r"silk\.gbr": "top silk"}
+        return cls(artwork=read_artwork(folder, layers=layers, clearance=100e-6), middle=(8e-3, 6e-3))
 
     @cached_property
     def view(self) -> View:
@@ -143,7 +172,7 @@ class BoardFix:
         )
         # Boards lie within a circle about the square of what was asked for.
         within = (1.5 * self.imaging.shift, 1.5 * self.imaging.angle)
-        solver = SolvePose(etch=self.imaging.etch, trials=256, within=within)
+        solver = SolvePose(etch=self.imaging.etch, trials=256, within=within, largest_leverage=self.largest_leverage)
         fix = LocalFix(ruler=ruler, lines=len(which), each=1, solver=solver)
         errors, covariances, status = (
             np.full((draws, 3), np.nan),
@@ -162,7 +191,7 @@ class BoardFix:
         """Boards etched wider or narrower all over, mask and silk printed off."""
         off = self.imaging.registration
         return [
-            self._painted(
+            self.painted(
                 replace(
                     self.view,
                     growth=self.imaging.etch * float(rng.normal()),
@@ -177,13 +206,13 @@ class BoardFix:
         """A board with 30 % of the areas with rulers gone, 30 % of the rulers on wrong edges, or dark copper."""
         view = replace(self.view, growth=self.imaging.etch * float(rng.normal()))
         if kind == "reversed":
-            return self._painted(replace(view, levels=(110.0, 60.0, 200.0, 90.0, 20.0, 240.0)))
+            return self.painted(replace(view, levels=(110.0, 60.0, 200.0, 90.0, 20.0, 240.0)))
         if kind == "missing":
             gone = rng.choice(self._areas, round(0.3 * len(self._areas)), replace=False)
-            return self._painted(view, missing=set(gone.tolist()))
-        return self._painted(view, more=self._splashes(rng) if kind == "outliers" else ())
+            return self.painted(view, missing=set(gone.tolist()))
+        return self.painted(view, more=self.splashes(rng) if kind == "outliers" else ())
 
-    def _painted(
+    def painted(
         self, view: View, missing: set[int] | frozenset[int] = frozenset(), more: Sequence[Shape] = ()
     ) -> BoardPicture:
         return BoardPicture(self.artwork, view, about=self.middle, missing=missing, more=more)
@@ -194,8 +223,8 @@ class BoardFix:
         points = self.rulers.point[self.chosen.chosen]
         return [number for number, each in enumerate(self.artwork.copper) if _near(each.outline, points).any()]
 
-    def _splashes(self, rng: np.random.Generator) -> list[Shape]:
-        """Too much copper, or too little, across edges of which 30 % of the rulers see nothing else."""
+    def splashes(self, rng: np.random.Generator, share: float = 0.3) -> list[Shape]:
+        """Too much copper, or too little, across edges of which a share of the rulers see nothing else."""
         points, normals = self.rulers.point[self.chosen.chosen], self.rulers.normal[self.chosen.chosen]
         half, seen = 6 * PIXEL, (6 + 2.6) * PIXEL
         hit: set[int] = set()
@@ -205,7 +234,7 @@ class BoardFix:
             away = points - points[index]
             near = (np.abs(away @ along) < seen) & (np.abs(away @ normal) < 350e-6)
             more = hit | set(np.flatnonzero(near).tolist())
-            if len(more) > round(0.3 * len(points)):
+            if len(more) > round(share * len(points)):
                 continue
             hit = more
             by = rng.choice([-1.0, 1.0]) * rng.uniform(60e-6, 250e-6)

@@ -44,7 +44,7 @@ inline reals turned(reals x, reals y, reals z, global const real *row) { return 
 // first segment's start along the line, above the surface, and aside (three factors and what is added each). axes: of
 // normals, along the line, against the surface's normal, and against what is aside. `firsts`: where the segments of
 // each frame begin, and the end of the last; the first `alone` frames have one segment. starts: what a segment adds to
-// the three lengths of its frame, and its length; lines: its length, exitance / 2 pi.
+// the three lengths of its frame, and its length; lines: its length, the square of that, exitance / 2 pi.
 AS_IT_IS kernel void line_irradiance(global const INPUT *restrict receivers, global real *restrict irradiance,
                                      global uchar *restrict status, constant place *restrict middle,
                                      global const place *restrict rows, global const real *restrict axes,
@@ -76,7 +76,7 @@ AS_IT_IS kernel void line_irradiance(global const INPUT *restrict receivers, glo
             reals few = (reals)0;
             for (const uint to = min(k + FEW, alone); k < to; k++) {
                 global const place *row = rows + 12 * k;
-                global const real *axis = axes + 9 * k;
+                global const real *axis = axes + 9 * k, *line = lines + 3 * k;
                 const reals height = narrow(placed(x, y, z, row + 4));
                 // Most pairs do not face each other.
                 if (!any_of(mask_of(height > (reals)0))) continue;
@@ -86,8 +86,9 @@ AS_IT_IS kernel void line_irradiance(global const INPUT *restrict receivers, glo
                 const reals foot = turned(normal_x, normal_y, normal_z, axis + 3) * height +
                                    turned(normal_x, normal_y, normal_z, axis + 6) * aside;
                 // The far end, too, may be near.
-                few += lines[2 * k + 1] * LANED(end_factor)(narrow(tau), narrow(tau + starts[4 * k + 3]),
-                                                            (reals)lines[2 * k], height, aside, by_u, foot);
+                const reals light = LANED(end_factor)(narrow(tau), narrow(tau + starts[4 * k + 3]), (reals)line[0],
+                                                      (reals)line[1], height, aside, by_u, foot);
+                few += line[2] * light;
             }
             sum += convert_places(few);
         }
@@ -104,12 +105,14 @@ AS_IT_IS kernel void line_irradiance(global const INPUT *restrict receivers, glo
                 reals few = (reals)0;
                 for (const uint to = min(k + FEW, last); k < to; k++) {
                     global const place *start = starts + 4 * k;
+                    global const real *line = lines + 3 * k;
                     const reals height = narrow(above + start[1]);
                     if (!any_of(mask_of(height > (reals)0))) continue;
                     const places tau = before + start[0];
                     const reals aside = narrow(beside + start[2]), foot = by_n * height + by_w * aside;
-                    few += lines[2 * k + 1] * LANED(end_factor)(narrow(tau), narrow(tau + start[3]),
-                                                                (reals)lines[2 * k], height, aside, by_u, foot);
+                    const reals light = LANED(end_factor)(narrow(tau), narrow(tau + start[3]), (reals)line[0],
+                                                          (reals)line[1], height, aside, by_u, foot);
+                    few += line[2] * light;
                 }
                 sum += convert_places(few);
             }

@@ -60,8 +60,9 @@ __attribute__((always_inline)) inline reals LANED(arc_less_sine)(reals w) {
 #endif
 
 // Irradiance over exitance, times 2 pi. `tau1` and `tau2` are the ends of the segment along its line, from the foot of
-// the receiver on it, and `length` is what is between them; `height` and `aside` are where the receiver stands above
-// the lit surface and across it; `by_u` is its normal along the line, `foot` how far before its plane the foot is.
+// the receiver on it, `length` is what is between them and `length2` its square; `height` and `aside` are where the
+// receiver stands above the lit surface and across it; `by_u` is its normal along the line, `foot` how far before its
+// plane the foot is.
 //
 // With theta the angle under which the receiver sees what lies before its plane, sigma the sum of the angles of both
 // ends from the foot, 2 int (foot + by_u tau) / (tau^2 + rho^2)^2 dtau is
@@ -69,8 +70,8 @@ __attribute__((always_inline)) inline reals LANED(arc_less_sine)(reals w) {
 // Neither term of the bracket is negative, and both are had without a difference: the first from tan(theta / 2), the
 // second beyond an end as sin^2 sigma / (1 - cos sigma). So one form holds near, far, and end-on. On the CPUs products
 // and sums are what it costs; divisions pass beside them.
-__attribute__((always_inline)) inline reals LANED(end_factor)(reals tau1, reals tau2, reals length, reals height,
-                                                             reals aside, reals by_u, reals foot) {
+__attribute__((always_inline)) inline reals LANED(end_factor)(reals tau1, reals tau2, reals length, reals length2,
+                                                             reals height, reals aside, reals by_u, reals foot) {
     const reals zero = (reals)0;
     masks lit = mask_of(height > zero);
     // How far before the receiver's plane the segment's ends are.
@@ -83,7 +84,9 @@ __attribute__((always_inline)) inline reals LANED(end_factor)(reals tau1, reals 
         // The cut from the foot, where both are near; what is left from the end, where it is little.
         const reals cut = -foot / by_u, left = most / fabs(by_u);
         const masks cut_first = mask_of(first < zero), cut_last = mask_of(last < zero);
-        length = (mask_of(least < zero) & mask_of(left < length)) ? left : length;
+        const masks is_cut = mask_of(least < zero) & mask_of(left < length);
+        length = is_cut ? left : length;
+        length2 = is_cut ? left * left : length2;
         tau1 = cut_first ? cut : tau1;
         tau2 = cut_last ? cut : tau2;
     }
@@ -91,7 +94,7 @@ __attribute__((always_inline)) inline reals LANED(end_factor)(reals tau1, reals 
     // length rho, cosine, sum rho and flat. Sines and tan(theta / 2) are had over rho: rho itself is not needed.
     const reals square = height * height + aside * aside, product = tau1 * tau2, sum = tau1 + tau2;
     const reals cosine = square + product, flat = square - product;
-    const reals both = cosine * cosine + length * length * square, reach = sqrt(both);
+    const reals both = cosine * cosine + length2 * square, reach = sqrt(both);
     const reals tangent = length / (reach + fabs(cosine)), sine = length / both;
     const reals w = tangent * square * tangent, wide = reach + fabs(flat);
     // reach (1 + cos sigma), and that of theta - sin theta
@@ -112,7 +115,7 @@ __attribute__((always_inline)) inline reals LANED(end_factor)(reals tau1, reals 
 // The same from where the receiver stands along the line from its start, and what is left from there to its end.
 __attribute__((always_inline)) inline reals LANED(line_factor)(reals along, reals height, reals aside, reals end,
                                                               reals whole, reals by_u, reals by_n, reals by_w) {
-    return LANED(end_factor)(-along, end, whole, height, aside, by_u, -(by_n * height + by_w * aside));
+    return LANED(end_factor)(-along, end, whole, whole * whole, height, aside, by_u, -(by_n * height + by_w * aside));
 }
 
 #endif

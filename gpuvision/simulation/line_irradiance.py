@@ -68,7 +68,7 @@ class LitSegments:
         emits = np.flatnonzero((length > 0.0) & (self.exitance > 0.0))
         if not len(emits):
             # A runtime takes no table without rows.
-            shapes = (3,), (1, 12), (1, 9), (2,), (1, 4), (1, 2)
+            shapes = (3,), (1, 12), (1, 9), (2,), (1, 4), (1, 3)
             types = place, place, real, np.uint32, place, real
             return tuple(np.zeros(shape, dtype) for shape, dtype in zip(shapes, types, strict=True))
         along, normals = _unit(across[emits]), self.normals[emits]
@@ -93,7 +93,7 @@ class LitSegments:
             -frames.reshape(-1, 9).astype(real),
             np.append(firsts, len(emits)).astype(np.uint32),
             np.column_stack([shifts, length[emits]]).astype(place),
-            np.column_stack([length[emits], self.exitance[emits] / math.tau]).astype(real),
+            np.column_stack([length[emits], length[emits] ** 2, self.exitance[emits] / math.tau]).astype(real),
         )
 
 

@@ -26,6 +26,7 @@ from gpuvision.matching.registration import register
 from gpuvision.profiling.harness import Case
 
 _ROWS, _HEADINGS, _POINTS, _CELL = 81, 21, 512, 2
+_WIDE = 96  # columns of the Numba peer, a constant: 1.7 times as fast as the 81 that it needs
 _SIDE = 640
 
 
@@ -39,25 +40,26 @@ def cases(device: Device) -> Iterator[Case]:
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_search(level, shifts, sums, least, where):  # type: ignore[no-untyped-def]
-    """Add rows of the map in 16 bits, a row of positions for one heading a task."""
+def _numba_search(level, shifts, columns, least, where):  # type: ignore[no-untyped-def]
+    """Add rows of the map in 16 bits, a row of positions for one heading a task; so many columns as LLVM likes."""
     turns, rows, blocks = least.shape
-    columns, stride = sums.shape[1], level.shape[2]
+    stride = level.shape[2]
     flat = level.reshape(-1)
     for task in numba.prange(turns * rows):
         turn, row = task // rows, task % rows
-        total, part = np.zeros(columns, np.uint32), np.empty(columns, np.uint16)
+        total, part = np.zeros(_WIDE, np.uint32), np.empty(_WIDE, np.uint16)
         used = 0
         for first in range(0, shifts.shape[1], 64):
-            part[:] = 0
+            for x in range(_WIDE):
+                part[x] = 0
             for i in range(first, min(first + 64, shifts.shape[1])):
                 shift = shifts[turn, i]
                 if shift >= 0:
                     used += 1
-                    source = flat[shift + row * stride : shift + row * stride + columns]
-                    for x in range(columns):
+                    source = flat[shift + row * stride : shift + row * stride + _WIDE]
+                    for x in range(_WIDE):
                         part[x] += source[x]
-            for x in range(columns):
+            for x in range(_WIDE):
                 total[x] += part[x]
         scale = np.float32(1.0 / (1023.0 * used))
         for block in range(blocks):
@@ -104,10 +106,9 @@ def _search(device: Device) -> Case:
     bound.inputs[1].set(shifts)
     ours = bound.run()
     least, where = np.empty((_HEADINGS, _ROWS, 2), np.float32), np.empty((_HEADINGS, _ROWS, 2), np.int64)
-    sums = np.empty((1, _ROWS), np.uint16)
 
     def by_numba() -> None:
-        _numba_search(level, shifts, sums, least, where)
+        _numba_search(level, shifts, _ROWS, least, where)
 
     def by_numpy() -> tuple[NDArray[Any], NDArray[Any]]:
         return _numpy_search(level, shifts)
@@ -162,11 +163,12 @@ def _pair(device: Device) -> Case:
     template, image, motion = pictures()
     turned = np.array([[math.cos(0.0035), -math.sin(0.0035)], [math.sin(0.0035), math.cos(0.0035)]])
     start = np.column_stack([turned @ motion[:, :2], motion[:, 2] + (1.4, -1.4)]).astype(np.float32)
+    whole = np.full(template.shape, 255, np.uint8)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-6)
 
     def by_opencv() -> NDArray[Any]:
         warp = start.copy()
-        cv2.findTransformECC(template, image, warp, cv2.MOTION_EUCLIDEAN, criteria, None, 5)
+        cv2.findTransformECC(template, image, warp, cv2.MOTION_EUCLIDEAN, criteria, whole, 5)
         return warp
 
     def ours() -> NDArray[np.float64]:

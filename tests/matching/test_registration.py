@@ -183,6 +183,7 @@ def off(found: Any, pose: Any) -> np.ndarray:
 
 
 @settings(max_examples=6, deadline=None)
+@example(x=0.0, y=0.0, degrees=0.0, missing=0.25, seed=3902)
 @example(x=-0.001934151639503977, y=0.001953125, degrees=0.0, missing=0.125, seed=0)
 @given(
     x=st.floats(-2e-3, 2e-3),
@@ -198,6 +199,11 @@ def test_a_board_is_found_wherever_it_lies(
     rng, pose = np.random.default_rng(seed), (x, y, math.radians(degrees))
     gone = set(np.flatnonzero(rng.uniform(size=len(artwork.copper)) < missing))
     found = fix(board_image(artwork, view, pose, MIDDLE, missing=gone, rng=rng), device=device)
+    if found.status == Status.DARK:
+        # In view more may be missing than of all: too much to be sure of what is left.
+        assert missing > 0.15
+        assert np.isnan(found.pose).all()
+        return
     assert found.status == Status.OK
     # Noise is worth 0.01 px; what the neighbours of a ruler do to it, where copper is missing, stays below 0.1 px.
     error = off(found, pose)

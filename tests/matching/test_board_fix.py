@@ -89,13 +89,14 @@ def test_no_wrong_pose_of_a_disturbed_board(
     drawn: BoardFix, kind: str, device: Device, rng: np.random.Generator
 ) -> None:
     board = replace(drawn, motion_px=5.0 if kind == "motion" else 0.0)
-    pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else 2)]
+    pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else 4)]
     fixes = board.fixes(pictures, 60, device, rng)
     if kind == "reversed":
         # Dark copper, where bright was looked for: nothing is said, and all where dark was.
         assert not fixes.good.any()
         fixes = board.fixes(pictures, 60, device, rng, polarity="rising")
-    assert np.mean(fixes.good) > 0.6
+    # Boards on which a freedom is left to few rulers are refused, in all of their pictures.
+    assert np.mean(fixes.good) > (0.2 if kind in ("missing", "outliers") else 0.99)
     assert fixes.squares.max() < GROSS
     assert_as_promised(fixes.scatter / fixes.said, band(int(fixes.good.sum())))
     if kind == "motion":

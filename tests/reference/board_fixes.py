@@ -226,7 +226,8 @@ class BoardFix:
     def splashes(self, rng: np.random.Generator, share: float = 0.3) -> list[Shape]:
         """Too much copper, or too little, across edges of which a share of the rulers see nothing else."""
         points, normals = self.rulers.point[self.chosen.chosen], self.rulers.normal[self.chosen.chosen]
-        half, seen = 6 * PIXEL, (6 + 2.6) * PIXEL
+        # Half of a ruler's width more, and what boards lie off along their edges.
+        half, seen = 6 * PIXEL, (6 + 2.6) * PIXEL + math.sqrt(2.0) * SHIFT
         hit: set[int] = set()
         shapes = []
         for index in rng.permutation(len(points)):

@@ -234,13 +234,13 @@ typedef struct {
 // The normal of an edge as a shape has it, and how far the edge lies outside.
 #ifdef ROUND
 #define NORMAL(of, circuit, take, i, nx, ny, off)                                                                      \
-    const reals ax = take((circuit)->x, i) - (of).x, ay = take((circuit)->y, i) - (of).y;                               \
-    const reals square = ax * ax + ay * ay + (reals)1e-12f, per = rsqrt(square), nx = ax * per, ny = ay * per;          \
+    const reals ax = take((circuit)->x, i) - (of).x, ay = take((circuit)->y, i) - (of).y;                              \
+    const reals square = ax * ax + ay * ay + (reals)1e-12f, per = rsqrt(square), nx = ax * per, ny = ay * per;         \
     const reals off = square * per - (of).size * take((circuit)->height, i)
 #else
 #define NORMAL(of, circuit, take, i, nx, ny, off)                                                                      \
-    const reals nx = take((circuit)->nx, i), ny = take((circuit)->ny, i);                                               \
-    const reals off = nx * (take((circuit)->x, i) - (of).x) + ny * (take((circuit)->y, i) - (of).y) -                   \
+    const reals nx = take((circuit)->nx, i), ny = take((circuit)->ny, i);                                              \
+    const reals off = nx * (take((circuit)->x, i) - (of).x) + ny * (take((circuit)->y, i) - (of).y) -                  \
                       (of).size * take((circuit)->height, i)
 #endif
 #define FOR_ALL(from, i) ((reals)((from)[i]))
@@ -282,12 +282,14 @@ inline blob_shape start_of(private const blob_edges *edges, blob_layout layout, 
         for (int i = 0; i < ROOM; i += LANES) {
             const int j = i + pattern[p][0] * SPOKES / 16, k = i + pattern[p][1] * SPOKES / 16;
             const laned_shape tried = shape_through(&circuit, i, j, k, from);
-            const masks all = mask_of(READ(circuit.there, i) * READ(circuit.there, j) * READ(circuit.there, k) > (reals)0);
+            const reals found = READ(circuit.there, i) * READ(circuit.there, j) * READ(circuit.there, k);
+            const masks all = mask_of(found > (reals)0);
             reals loss = 0;
             for (int m = 0; m < SPOKES; m++) {
                 NORMAL(tried, &circuit, FOR_ALL, m, nx, ny, off);
                 const reals squared = off * off;
-                const masks in = mask_of(squared < (reals)(reach * reach)) & mask_of((reals)circuit.there[m] > (reals)0);
+                const masks there = mask_of((reals)circuit.there[m] > (reals)0);
+                const masks in = there & mask_of(squared < (reals)(reach * reach));
                 loss += in ? squared : (reals)(reach * reach);
             }
             loss = all ? loss : (reals)INFINITY;
@@ -367,7 +369,8 @@ inline blob_facts facts_of(private blob_edges *edges, blob_layout layout, blob_s
     facts.contrast = -sum_of(amplitudes) / sum_of(weights);
     // Of an edge: as its noise has it, or as the edges differ from the shape, whichever is more.
     const real measured = scale * scale * sum_of(squares) / (free * mean * mean);
-    const real variance = fmax(measured, sum_of(noises) / (count * (real)EFFICIENCY)) * fmax(overlap / shape.size, (real)1);
+    const real predicted = sum_of(noises) / (count * (real)EFFICIENCY);
+    const real variance = fmax(measured, predicted) * fmax(overlap / shape.size, (real)1);
     for (int j = 0; j < TRIANGLE; j++) matrix[j] = (reals)sum_of(matrix[j]);
     facts.regular = !any_lane(factored(matrix)) && mean > 0;
     for (int j = 0; j < FREEDOMS; j++) {
@@ -591,7 +594,8 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
                                             layout, grey.blur);
             blob_hidden hidden;
             hide(shape, facts.weights, layout, spacing, grey.blur, &hidden);
-            if (!match(image, rows, columns, place[0], place[1], pixel_noise, extent, &hidden, &shape, &grey, facts.covariance))
+            if (!match(image, rows, columns, place[0], place[1], pixel_noise, extent, &hidden, &shape, &grey,
+                       facts.covariance))
                 what = STATUS_AMBIGUOUS;
             else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
             facts.contrast = grey.contrast;

@@ -148,7 +148,8 @@ typedef struct {
     reals matrix[UNKNOWN_CELLS], right[UNKNOWNS], squares, weights, count, pixels;
 } match_sums;
 
-// The equations of the pixels about (x, y), as far as they are of this mark and its background; in units of its contrast.
+// The equations of the pixels about (x, y), as far as they are of this mark and its background; in units of its
+// contrast.
 inline void match_summed(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
                          blob_grey grey, real slope_x, real slope_y, real scale, real reach,
                          private const blob_hidden *hidden, private match_sums *sums) {
@@ -199,7 +200,8 @@ inline void match_summed(global const CODE *image, int rows, int columns, real x
 // Moves the shape to where its pixels have it; returns whether there is such a place near by. `covariance` is what
 // their differences from the model make of it.
 inline int match(global const CODE *image, int rows, int columns, real x, real y, real noise, real extent,
-                 private const blob_hidden *hidden, private blob_shape *shape, private blob_grey *grey, real covariance[FREEDOMS][FREEDOMS]) {
+                 private const blob_hidden *hidden, private blob_shape *shape, private blob_grey *grey,
+                 real covariance[FREEDOMS][FREEDOMS]) {
     const blob_shape first = *shape;
     const real reach = extent * first.size + ABOUT_BLURS * grey->blur + ABOUT;
     real slope_x = 0, slope_y = 0;
@@ -207,9 +209,8 @@ inline int match(global const CODE *image, int rows, int columns, real x, real y
         match_sums sums;
         reals moved[UNKNOWNS];
         const real contrast = grey->contrast, scale = (MATCH_SHARE + MATCH_NOISES * noise / fabs(contrast)) / TUNING;
-        match_summed(image, rows, columns, x + shape->x, y + shape->y, *shape, *grey, slope_x / contrast, slope_y / contrast,
-                     scale, reach,
-                     hidden, &sums);
+        match_summed(image, rows, columns, x + shape->x, y + shape->y, *shape, *grey, slope_x / contrast,
+                     slope_y / contrast, scale, reach, hidden, &sums);
         for (int i = 0; i < UNKNOWN_CELLS; i++) sums.matrix[i] = (reals)sum_of(sums.matrix[i]);
         for (int i = 0; i < UNKNOWNS; i++) sums.right[i] = (reals)sum_of(sums.right[i]);
         if (any_lane(factored_of(UNKNOWNS, sums.matrix))) return 0;
@@ -241,7 +242,8 @@ inline int match(global const CODE *image, int rows, int columns, real x, real y
             for (int k = 0; k < FREEDOMS; k++) covariance[i][k] = variance * FIRST(column[k]);
         }
         const real off_x = shape->x - first.x, off_y = shape->y - first.y, off_size = shape->size - first.size;
-        return free > 0 && count >= MATCH_OWN * sum_of(sums.pixels) && off_x * off_x + off_y * off_y + off_size * off_size <= MATCH_FURTHEST * MATCH_FURTHEST;
+        const real away = off_x * off_x + off_y * off_y + off_size * off_size;
+        return free > 0 && count >= MATCH_OWN * sum_of(sums.pixels) && away <= MATCH_FURTHEST * MATCH_FURTHEST;
     }
     return 0;
 }

@@ -318,6 +318,34 @@ def _gravity(pixels, pitch, x, y, reach):  # type: ignore[no-untyped-def]
     return (sum_x - background * at_x) * per, (sum_y - background * at_y) * per
 
 
+@numba.njit(error_model="numpy", fastmath=_SUMS)
+def _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, found):  # type: ignore[no-untyped-def]
+    """Fill what is known of the fit, and the grey levels that the match starts from."""
+    ex, ey, there, heights, room = edges[0], edges[1], edges[2], edges[3], edges[6]
+    weights, squares, amplitude, inside, own = _F(0.0), _F(0.0), _F(0.0), _F(0.0), _F(0.0)
+    level, reach = _F(0.0), _F(2.5) * math.sqrt(max(blur - _F(1.0 / 6.0), _F(0.09))) + _F(0.5)
+    for m in range(SPOKES):
+        dx, dy = ex[m] - shape[0], ey[m] - shape[1]
+        square = dx * dx + dy * dy
+        z = (math.sqrt(square + blur + _F(0.5) * blur * blur / square) - shape[2]) / scale
+        left = max(_F(1.0) - z * z * _F(1.0 / BEND**2), _F(0.0))
+        weight = there[m] * left * left
+        room[m] = weight
+        weights += weight
+        squares += weight * weight * z * z
+        amplitude += weight * heights[m]
+        inside += _F(1.0) if weight > _F(0.0) else _F(0.0)
+        row = np.uint32(y + ey[m] + reach * directions[m, 1] + _F(0.5))
+        level += weight * _F(pixels[row * pitch + np.uint32(x + ex[m] + reach * directions[m, 0] + _F(0.5))])
+    for m in range(SPOKES // 2):
+        a, b = abs(heights[m]), abs(heights[m + SPOKES // 2])
+        own += math.sqrt(room[m] * room[m + SPOKES // 2]) * min(a, b) / max(a, b)
+    grey[0], grey[1] = level / weights, -amplitude / weights
+    grey[2] = math.sqrt(max(blur - _F(1.0 / 6.0), _F(0.09)))
+    found[3], found[4] = scale * math.sqrt(squares / weights), inside
+    found[5] = own / _F(SPOKES // 2)
+
+
 @numba.njit(parallel=True, error_model="numpy", fastmath=_SUMS)
 def _find(image, places, table, directions, noise, found, covariance, status):  # type: ignore[no-untyped-def]
     """Fill marks (n, 13): x, y, size, residual, inliers, symmetry, gravity, distance, contrast, blur, shift."""
@@ -353,34 +381,14 @@ def _find(image, places, table, directions, noise, found, covariance, status):  
             blur, scale = _fit(ex, ey, there, widths, noises, shape, count, sums, room)
             if (shape[0] - from_x) ** 2 + (shape[1] - from_y) ** 2 + (shape[2] - from_r) ** 2 < _F(4.0):
                 break
-        weights, squares, amplitude, inside, own = _F(0.0), _F(0.0), _F(0.0), _F(0.0), _F(0.0)
-        level, reach = _F(0.0), _F(2.5) * math.sqrt(max(blur - _F(1.0 / 6.0), _F(0.09))) + _F(0.5)
-        for m in range(SPOKES):
-            dx, dy = ex[m] - shape[0], ey[m] - shape[1]
-            square = dx * dx + dy * dy
-            z = (math.sqrt(square + blur + _F(0.5) * blur * blur / square) - shape[2]) / scale
-            left = max(_F(1.0) - z * z * _F(1.0 / BEND**2), _F(0.0))
-            weight = there[m] * left * left
-            room[m] = weight
-            weights += weight
-            squares += weight * weight * z * z
-            amplitude += weight * heights[m]
-            inside += _F(1.0) if weight > _F(0.0) else _F(0.0)
-            row = np.uint32(y + ey[m] + reach * directions[m, 1] + _F(0.5))
-            level += weight * _F(pixels[row * pitch + np.uint32(x + ex[m] + reach * directions[m, 0] + _F(0.5))])
-        for m in range(SPOKES // 2):
-            a, b = abs(heights[m]), abs(heights[m + SPOKES // 2])
-            own += math.sqrt(room[m] * room[m + SPOKES // 2]) * min(a, b) / max(a, b)
-        grey[0], grey[1] = level / weights, -amplitude / weights
-        grey[2] = math.sqrt(max(blur - _F(1.0 / 6.0), _F(0.09)))
+        _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, found[n])
         _match(pixels, pitch, x, y, shape, grey, noise, equation, matrix, right, to, covariance[n])
         heavy_x, heavy_y = _gravity(pixels, pitch, x + shape[0], y + shape[1], shape[2] + _F(2.5) * grey[2] + _F(1.0))
         found[n, 0], found[n, 1], found[n, 2] = x + shape[0], y + shape[1], shape[2]
-        found[n, 3], found[n, 4] = scale * math.sqrt(squares / weights), inside
-        found[n, 5], found[n, 6], found[n, 7] = own / _F(SPOKES // 2), found[n, 0] + heavy_x, found[n, 1] + heavy_y
+        found[n, 6], found[n, 7] = found[n, 0] + heavy_x, found[n, 1] + heavy_y
         found[n, 8] = math.sqrt(shape[0] ** 2 + shape[1] ** 2)
         found[n, 9], found[n, 10], found[n, 11], found[n, 12] = grey[1], grey[2], shape[0], shape[1]
-        status[n] = np.uint8(inside < _F(SPOKES // 2))
+        status[n] = np.uint8(found[n, 4] < _F(SPOKES // 2))
 
 
 def _cut(image: NDArray[Any], place: NDArray[Any]) -> tuple[NDArray[Any], int, int]:

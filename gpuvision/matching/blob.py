@@ -160,11 +160,12 @@ class FindBlobs(Operation[Blobs]):
     starts from, edges further than the search radius from the *nominal* contour are left out: it cannot walk away to
     another mark.
 
-    The match has the centre, size and angle, the blur, the contrast, and level and slopes of the background as unknowns
-    (Gauss-Newton, Tukey's weights at a quarter of the contrast), over all pixels within five blurs and 2 px of the
-    mark, but for the parts of the contour whose rulers do not agree. At SNR 6 to 200 and blurs of 0.5 px to a third of
-    the radius the centre's standard deviation is 1.0 to 1.25 times the Cramer-Rao bound of a disc on a known
-    background, the radius is right to 0.01 px. A blur over a third of the radius hides how large the mark is.
+    The match has the centre, size and angle, the blur, the contrast, and level and slopes of the background as
+    unknowns (Gauss-Newton, Tukey's weights, none past a tenth of the contrast and four deviations of the noise), over
+    all pixels within five blurs and 2 px of the mark, but for the parts of the contour whose rulers do not agree. At
+    SNR 6 to 200 and blurs of 0.5 px to a third of the radius the centre's standard deviation is 1.0 to 1.25 times the
+    Cramer-Rao bound of a disc on a known background, the radius is right to 0.01 px. A blur over a third of the radius
+    hides how large the mark is.
 
     A blurred edge of radius R is seen at sqrt(R^2 - v) to second order, v the variance of the blur and of the averaged
     lines: the mean of sqrt(R^2 - u^2) over u across the ruler. The fit corrects the radius for that, with the mean blur

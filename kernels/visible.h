@@ -291,6 +291,7 @@ BVH_INLINE real hidden_add_all(hidden *all, const shadows *cast) {
     bvh_masks hides = BVH_MASK(low < high) & BVH_MASK(low < all->to) & BVH_MASK(high > all->from);
     for (int n = 0; n < all->count; n++) hides &= BVH_MASK(low < all->low[n]) | BVH_MASK(high > all->high[n]);
     real gone = 0;
+    if (!view_any(hides)) return gone;
 #ifdef STRIP
     const real *lows = (const real *)&cast->low, *highs = (const real *)&cast->high;
     for (uint left = bvh_lanes(hides); left; left &= left - 1) {

@@ -12,7 +12,8 @@ Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 WIDTH = 16
-_BINS = 16
+# Bins of a cut; of few triangles all are split on their own, into more bins, as that takes no time to speak of.
+_BINS, _FINE_BINS, _FEW = 16, 64, 8192
 # From here on halves by number, so that the tree stays shallow whatever the triangles.
 _DEEP = 48
 _UNITS_IN_LAST_PLACE = 4.0
@@ -60,9 +61,10 @@ class Bvh:
         """Build the tree over triangles (n, 3, 3), finite, those that are ``wanted`` (n,); there may be none.
 
         Binary splits by the surface-area heuristic in 16 bins along the widest axis of the centroids, a level at a
-        time for all nodes (Wald 2007), to leaves of at most 16; then the largest nodes are opened until 16 children
-        stand side by side. What is split are bundles of up to four neighbours along Morton's curve, where they lie
-        close: half the time, and a tree as good to 2 % (by the areas of its boxes).
+        time for all nodes (Wald 2007), where a box costs its triangles and its leaves, in equal parts; to leaves of
+        at most 16; then the largest nodes are opened until 16 children stand side by side. What is split are bundles
+        of up to four neighbours along Morton's curve, where they lie close: half the time, and a tree as good to 2 %
+        (by the areas of its boxes). Up to 8192 triangles are split one by one, in 64 bins.
 
         Raises
         ------
@@ -153,6 +155,9 @@ class _Bundles(NamedTuple):
 
 def _bundles(extents: Reals) -> _Bundles:
     """Take neighbours along a space-filling curve as one where their box is not much more than theirs together."""
+    if extents.shape[1] <= _FEW:
+        each = np.arange(extents.shape[1])
+        return _Bundles(each, each, np.ones_like(each), extents.astype(np.float32))
     order = _along_the_curve(extents)
     one = extents.astype(np.float32)[:, order]
     count = -(-len(order) // 4) * 4
@@ -247,16 +252,17 @@ def _binary_tree(extents: Reals) -> _Binary:
     bundles = _bundles(extents)
     tree, levels = _Binary(bundles.size), []
     active = np.flatnonzero(tree.load > WIDTH)
+    bins = _FINE_BINS if extents.shape[1] <= _FEW else _BINS
     while len(active):
         levels.append(active)
-        fresh = _split_level(tree, active, bundles, halve=len(levels) > _DEEP)
+        fresh = _split_level(tree, active, bundles, bins, halve=len(levels) > _DEEP)
         active = fresh[tree.load[fresh] > WIDTH]
     tree.unbundle(bundles)
     tree.measure(extents, levels)
     return tree
 
 
-def _split_level(tree: _Binary, active: Integers, bundles: _Bundles, *, halve: bool) -> Integers:
+def _split_level(tree: _Binary, active: Integers, bundles: _Bundles, bins: int, *, halve: bool) -> Integers:
     """Split each active node once and put the bundles in order; return the children."""
     start, count = tree.start[active], tree.count[active]
     owner = np.repeat(np.arange(len(active)), count)
@@ -268,23 +274,23 @@ def _split_level(tree: _Binary, active: Integers, bundles: _Bundles, *, halve: b
     axis = np.argmax(high - low, axis=0)
     each = np.arange(len(active))
     bottom, span = low[axis, each], (high - low)[axis, each]
-    scale = np.where(span > 0.0, _BINS * (1.0 - 1e-6) / np.maximum(span, 1e-37), 0.0).astype(np.float32)
+    scale = np.where(span > 0.0, bins * (1.0 - 1e-6) / np.maximum(span, 1e-36), 0.0).astype(np.float32)
     value = centre[axis[owner], np.arange(len(owner))]
-    bins = np.clip(((value - bottom[owner]) * scale[owner]).astype(np.int64), 0, _BINS - 1)
+    at = np.clip(((value - bottom[owner]) * scale[owner]).astype(np.int64), 0, bins - 1)
     # Sorting by node and bin also puts the two sides of every cut side by side.
-    key = owner * _BINS + bins
+    key = owner * bins + at
     order = sorted_by(key)
     members, key = members[order], key[order]
     tree.order[places] = members
     cuts = np.append(0, np.flatnonzero(key[1:] != key[:-1]) + 1)
     cells = key[cuts]
-    grid = np.full((6, len(active) * _BINS), np.inf, np.float32)
+    grid = np.full((6, len(active) * bins), np.inf, np.float32)
     grid[:, cells] = np.minimum.reduceat(bundles.extents[:, members], cuts, axis=1)
-    held = np.zeros((2, len(active) * _BINS), np.int64)
+    held = np.zeros((2, len(active) * bins), np.int64)
     sums = np.append(0, np.cumsum(bundles.size[members]))
     held[0, cells] = np.diff(cuts, append=len(key))
     held[1, cells] = np.diff(sums[cuts], append=sums[-1])
-    on_the_left = _best_cuts(grid.reshape(6, -1, _BINS), *held.reshape(2, -1, _BINS))
+    on_the_left = _best_cuts(grid.reshape(6, -1, bins), *held.reshape(2, -1, bins))
     on_the_left = np.where((on_the_left <= 0) | (on_the_left >= count) | halve, count // 2, on_the_left)
     return tree.split(active, on_the_left, sums[first + on_the_left] - sums[first])
 
@@ -298,9 +304,14 @@ def _best_cuts(grid: npt.NDArray[Any], filled: Integers, load: Integers) -> Inte
     right = _areas(np.minimum.accumulate(grid[:, :, ::-1], axis=2))[:, ::-1][:, 1:]
     below = np.cumsum(load, axis=1)[:, :-1]
     above = load.sum(axis=1, keepdims=True) - below
-    cost = np.where((below > 0) & (above > 0), left * below + right * above, np.inf)
+    cost = np.where((below > 0) & (above > 0), left * _work(below) + right * _work(above), np.inf)
     best: Integers = np.cumsum(filled, axis=1)[np.arange(len(below)), np.argmin(cost, axis=1)]
     return best
+
+
+def _work(triangles: Integers) -> Integers:
+    """Return what a box of so many triangles costs: leaves are looked at whole, and full ones are fewer."""
+    return triangles - (-triangles // WIDTH) * WIDTH
 
 
 def _areas(extents: npt.NDArray[Any]) -> npt.NDArray[Any]:

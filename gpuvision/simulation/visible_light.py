@@ -22,7 +22,7 @@ PICK_BLOCK = 16
 
 _GROUP = 64
 # Of work for a CPU: enough that none waits for another, few, as each looks for lines among the segments anew.
-_SHARES_PER_CORE = 16
+_SHARES_PER_CORE = 8
 # Small scenes share a build.
 _LEAST_DEPTH = 4
 # Of the scene's size: within this of a surface rounding, the caller's too, decides what lies before it.

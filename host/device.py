@@ -20,6 +20,8 @@ from gpuvision.host.errors import DeviceUnusableError, NoDeviceError
 VARIABLE = "GPUVISION_DEVICE"
 _COMPLETE = cl.command_execution_status.COMPLETE
 _WATCHED_NS = 200_000
+_LOCAL_THREAD = "cl_intel_exec_by_local_thread"
+_LOCAL_THREAD_QUEUE = 1 << 31  # CL_QUEUE_THREAD_LOCAL_EXEC_ENABLE_INTEL
 _LEAST_LAST_CACHE = 32 << 20  # Intel's runtime tells of the second level only
 
 
@@ -165,6 +167,18 @@ class Device:
         if not profiling:
             return cl.CommandQueue(self.context, self.handle)
         return cl.CommandQueue(self.context, self.handle, properties=cl.command_queue_properties.PROFILING_ENABLE)
+
+    def callers_queue(self, like: Any, *, groups: int) -> Any:
+        """Return a queue like another, whose kernels run in the thread that enqueues them; None where there is none.
+
+        Intel's runtime, whose workers are awake sooner than PoCL's, has one for work of a single group: there is
+        nothing to share with a worker.
+        """
+        if self.callers_thread is not None:
+            return cl.CommandQueue(self.context, self.callers_thread, properties=like.properties)
+        if groups == 1 and _LOCAL_THREAD in self.handle.extensions.split():
+            return cl.CommandQueue(self.context, self.handle, properties=like.properties | _LOCAL_THREAD_QUEUE)
+        return None
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike, queue: Any = None) -> DeviceArray:
         """Return an uninitialised device array; on shared memory `arrays.host_view` shows it to NumPy."""

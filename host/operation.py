@@ -69,6 +69,11 @@ class Launch:
     passes_once: bool = False
 
     @property
+    def groups(self) -> int:
+        """Work-groups; as many as work-items where the runtime chooses their size."""
+        return math.prod(self.global_size) // math.prod(self.local_size or (1,))
+
+    @property
     def nbytes(self) -> int:
         """Bytes of inputs and outputs."""
         specs = (*self.inputs, *(each for each in self.outputs.values() if each is not None))
@@ -238,9 +243,9 @@ class Bound(Generic[R]):
         self._own = (*self.inputs, *self._computed(self.outputs))
         self._workers = self._site_on(device.handle, self.queue)
         self._here: _Site | None = None
-        if device.callers_thread is not None and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
-            own = cl.CommandQueue(device.context, device.callers_thread, properties=self.queue.properties)
-            self._here = self._site_on(device.callers_thread, own)
+        if launch.passes_once and launch.nbytes <= _SHORT_BYTES:
+            own = device.callers_queue(self.queue, groups=launch.groups)
+            self._here = None if own is None else self._site_on(own.device, own)
         for array in self.inputs:
             self._clear(array)
         self().wait()

@@ -117,6 +117,19 @@ def test_short_work_runs_in_the_callers_thread(device, pairs):
         np.testing.assert_allclose(host_view(bound.outputs.position), expected(frame), atol=5e-7)
 
 
+def test_work_of_one_group_runs_in_the_callers_thread(device):
+    if device.kind != "intel":
+        pytest.skip("only Intel's runtime does so by the work's groups")
+    for count, here in ((16, True), (400_000, False)):
+        frame = np.linspace(0.1, 1.0, 2 * count, dtype=np.float32).reshape(count, 2)
+        bound = READOUT.bind(device, frame.shape, frame.dtype)
+        host_view(bound.inputs[0])[...] = frame
+        event = bound()
+        assert (event.get_info(cl.event_info.COMMAND_QUEUE) != device.queue) is here
+        event.wait()
+        np.testing.assert_allclose(host_view(bound.outputs.position), expected(frame), atol=5e-7)
+
+
 def test_short_work_comes_after_the_long_work_before_it(device, rng):
     long = READOUT.bind(device, (400_000, 2), np.float32)
     short = READOUT.bind(device, (1000, 2), np.float32)

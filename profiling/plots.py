@@ -21,12 +21,14 @@ _GROWTH = re.compile(r"^growth/(?:(\w+)-)?x(\d+)$")
 def draw_plots(folder: str | Path, rows: Sequence[Row]) -> list[str]:
     """Draw what the rows hold into a folder, as PNG; return the names of the files.
 
-    ``growth.png``: times over the work, of all cases ``growth/...``; ``tolerance.png``: times and errors over the
-    tolerance asked for, of the cases that have one.
+    ``growth.png``: times over the work, of all cases ``growth/...``, from their ``base`` on; ``tolerance.png``: times
+    and errors over the tolerance asked for, of the cases that have one.
     """
     drawn = []
+    grown = [row for row in rows if _GROWTH.match(row.case)]
+    bases = {row.facts.get("base") for row in grown}
     for name, draw, chosen in (
-        ("growth.png", _growth, [row for row in rows if _GROWTH.match(row.case)]),
+        ("growth.png", _growth, grown and [row for row in rows if row in grown or row.case in bases]),
         ("tolerance.png", _tolerance, [row for row in rows if "tolerance" in row.facts and "/" in row.case]),
     ):
         some = [row for row in chosen if name == "growth.png" or not row.case.startswith("growth/")]
@@ -51,11 +53,16 @@ def _draw(path: Path, draw: Callable[[Any, Sequence[Row]], None], rows: Sequence
 
 def _growth(axes: Any, rows: Sequence[Row]) -> None:
     lines: dict[str, dict[int, float]] = {}
+    bases = {row.case: row.seconds for row in rows}
     for row in rows:
         grown = _GROWTH.match(row.case)
-        assert grown is not None  # draw_plots chose such rows
+        if grown is None:
+            continue
         what, times = grown.groups()
-        lines.setdefault(what or "all, within a tolerance", {})[int(times)] = row.seconds
+        line = lines.setdefault(what or "all, within a tolerance", {})
+        line[int(times)] = row.seconds
+        if "base" in row.facts:
+            line[1] = bases[row.facts["base"]]
         if row.peer == "gpuvision":
             lines.setdefault("all, all pairs", {})[int(times)] = row.peer_seconds
     for colour, (name, line) in zip(_COLOURS, lines.items(), strict=False):

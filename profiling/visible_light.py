@@ -33,6 +33,7 @@ _PARTS, _STRIPS, _EACH = 40, 100, 30
 _LIFT = 1e-6  # metres, within which of a surface nothing hides; the peer's rays begin and end so far off
 _PROFILES = 8  # one after another, as a scan has them; the peer gains nothing by that
 _BLOCK = 1 << 22  # pairs of a block of the peer's
+_BASE = "board/1024"  # what the boards of growth/... have more of
 _AT = 0.0  # metres, where the sheet of light stands: along the middle row of parts
 
 
@@ -93,13 +94,13 @@ def cases(device: Device) -> Iterator[Case]:
     board = Board.of()
     for samples in (1024, 16_384):
         yield _case(device, board, f"board/{samples}", samples)
-    yield _case(device, Board.of(parts_of_segments=4), "growth/segments-x4")
-    yield _case(device, Board.of(strips=4 * _STRIPS), "growth/receivers-x4")
+    yield _case(device, Board.of(parts_of_segments=4), "growth/segments-x4", base=_BASE)
+    yield _case(device, Board.of(strips=4 * _STRIPS), "growth/receivers-x4", base=_BASE)
     for finer in (1, 2):
-        yield _case(device, Board.of(finer=finer), f"growth/triangles-x{4**finer}")
+        yield _case(device, Board.of(finer=finer), f"growth/triangles-x{4**finer}", base=_BASE)
 
 
-def _case(device: Device, board: Board, name: str, samples: int = 1024) -> Case:
+def _case(device: Device, board: Board, name: str, samples: int = 1024, **more: str) -> Case:
     rows, receivers = segment_rows(board.segments), board.receivers
     weights = np.ones((*receivers.shape[:2], 2), np.float32)
     operation = VisibleLight(scene=board.scene, segments=len(rows), clearance=_LIFT)
@@ -116,6 +117,7 @@ def _case(device: Device, board: Board, name: str, samples: int = 1024) -> Case:
         "segments": len(rows),
         "receivers": ours.size,
         "peer_error": error_of(peer(), truth.ravel()),
+        **more,
     }
     return Case(
         "reflections",

@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import cv2
 
+from gpuvision.profiling import plots
 from gpuvision.profiling.harness import Row
 from gpuvision.profiling.plots import draw_plots
 
 
-def row(case: str, seconds: float, **facts: float) -> Row:
+def row(case: str, seconds: float, **facts: object) -> Row:
     return Row("any", case, "pocl", seconds, "gpuvision", "1", 2.0 * seconds, 2.0, 1e-6, None, facts)
 
 
@@ -20,6 +21,15 @@ def test_what_grows_and_what_accuracy_costs_is_drawn(tmp_path):
         picture = cv2.imread(str(tmp_path / name))
         assert picture.shape[1] > 1000
         assert picture.std() > 5
+
+
+def test_growth_begins_at_its_base(tmp_path, monkeypatch):
+    drawn = {}
+    monkeypatch.setattr(plots.Figure, "savefig", lambda self, *_, **__: drawn.update(lines=self.axes[0].lines))
+    rows = [row("board/1", 1e-3), row("growth/triangles-x4", 2e-3, base="board/1"), row("board/2", 5e-3)]
+    assert draw_plots(tmp_path, rows) == ["growth.png"]
+    (line,) = (each for each in drawn["lines"] if each.get_label() == "triangles")
+    assert line.get_xydata().tolist() == [[1.0, 1.0], [4.0, 2.0]]
 
 
 def test_nothing_is_drawn_of_other_rows(tmp_path):

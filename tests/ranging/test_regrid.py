@@ -156,6 +156,19 @@ def test_samples_on_one_place_are_folded_there(device):
     np.testing.assert_array_equal(np.flatnonzero(made.status[3] == Status.FOLDED), [8])
 
 
+def test_a_fold_is_known_on_the_row_beside_it(device):
+    """Cells on the very place of a row lie between it and both its neighbours: what is folded in one is not trusted."""
+    x, y, z, intensity, status = flat((7, 11))
+    x[:] = np.linspace(-1.0, 1.0, 11).round(2)
+    y[:] = np.arange(7)[:, None] / 4 - 0.5
+    x[4, 9] = x[4, 10]  # = 1.0, the centre of a cell; rows 3 and 5 are whole
+    op = dataclasses.replace(OP, grid=GRID, max_gap=0.25, max_step=1.0, folded="drop")
+    frames = x, y, z, intensity, status
+    made = op(*frames, device=device)
+    close(made, reference.regrid(op, *frames), 1e-12)
+    np.testing.assert_array_equal(np.flatnonzero(made.status[:, 16] == Status.FOLDED), [5, 6, 7])
+
+
 @hypothesis.settings(max_examples=60, deadline=None)
 @hypothesis.given(data=st.data(), shape=hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12))
 def test_as_the_oracle(data, shape):

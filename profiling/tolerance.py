@@ -3,11 +3,13 @@
 The peer is this library without a plan: `VisibleLight` over all pairs, with its copies to and from the device; ours has
 the plan in its time. A row's error is the largest error of the range among the strips, metres, against all pairs in
 double; ``within`` is the part of the strips that keep the tolerance, ``bound`` what the plan proves. Strips lie across
-the sheet and see what is lit and what is beside it; one metre of their reading is one metre of range.
+the sheet and see what is lit and what is beside it; one metre of their reading is one metre of range. Where ``planned``
+is false all is computed, as it is at tolerance 0: no tolerance takes longer than that one.
 
 ``groove``: a line through a groove of 90 degrees, whose sides light each other and hide nothing. ``valley``: a curved
-surface, which hides some of itself. ``board``: a board with parts. ``growth/...``: the groove with twice and four times
-the segments and receivers; ``exponent`` is that of the work over the pairs since the smallest, 1 for all pairs.
+surface, which hides some of itself. ``board``: a board with parts. ``small-...``, ``large-...``: these with fewer and
+with more segments and receivers. ``growth/...``: the groove with twice and four times the segments and receivers,
+planned whether that pays or not; ``exponent`` is that of the work over the pairs since the smallest, 1 for all pairs.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ Reals = NDArray[np.float64]
 Heights = Callable[[Reals, Reals], Reals]
 
 _TOLERANCES = (0.0, 1e-6, 5e-6, 5e-5, 5e-4)
+_FEW_TOLERANCES = (0.0, 5e-6, 5e-4)
 _AT_GROWTH = 5e-6
 _SIZES = (1, 2, 4)
 _STRIPS, _EACH = 64, 64
@@ -87,9 +90,9 @@ class Part:
         )
 
     @classmethod
-    def board(cls) -> Part:
+    def board(cls, **more: int) -> Part:
         """Return the board of the section `reflections`, its line in 4 times as many parts."""
-        board = Board.of(parts_of_segments=4)
+        board = Board.of(parts_of_segments=4, **more)
         count = board.receivers[..., 0].size
         area, width = 0.1 * 0.08 / count, 0.1 / len(board.receivers)
         rows = segment_rows(board.segments)
@@ -169,23 +172,36 @@ def cases(device: Device) -> Iterator[Case]:
         "valley": functools.partial(Part.surface, _valley, 64, 24),
         "board": Part.board,
     }
-    for name, make in scenes.items():
+    sizes: dict[str, Callable[[], Part]] = {
+        "small-groove": functools.partial(Part.surface, _groove, 16, 8, strips=16, each=32),
+        "small-valley": functools.partial(Part.surface, _valley, 24, 12, strips=32, each=32),
+        "large-groove": functools.partial(Part.surface, _groove, 128, 16, strips=128),
+        "large-valley": functools.partial(Part.surface, _valley, 128, 48, strips=128),
+        "large-board": functools.partial(Part.board, strips=800),
+    }
+    for name, make in (scenes | sizes).items():
         part = make()
         exact = part.exactly(device)
-        for tolerance in _TOLERANCES:
+        for tolerance in _TOLERANCES if name in scenes else _FEW_TOLERANCES:
             yield _case(device, f"{name}/{tolerance:g}", part, tolerance, exact)
     first: Case | None = None
     for times in _SIZES:
         part = Part.surface(_groove, 32 * times, 16, strips=32 * times)
-        grown = _case(device, f"growth/x{times}", part, _AT_GROWTH, part.exactly(device), since=first)
+        grown = _case(device, f"growth/x{times}", part, _AT_GROWTH, part.exactly(device), since=first, least=None)
         first = first or grown
         yield grown
 
 
 def _case(
-    device: Device, name: str, part: Part, tolerance: float, exact: NDArray[Any], since: Case | None = None
+    device: Device,
+    name: str,
+    part: Part,
+    tolerance: float,
+    exact: NDArray[Any],
+    since: Case | None = None,
+    **least: int | None,
 ) -> Case:
-    light = PlannedLight(scene=part.scene, tolerance=tolerance, clearance=part.clearance, device=device)
+    light = PlannedLight(scene=part.scene, tolerance=tolerance, clearance=part.clearance, device=device, **least)
     call = functools.partial(light, part.segments, part.receivers, part.weights, part.reading)
     result = call()
     off = np.abs(part.shifts(result.irradiance) - part.shifts(exact))
@@ -197,6 +213,7 @@ def _case(
         "within": float(np.mean(off <= max(tolerance, _ROUNDING))),
         "shift": float(np.median(np.abs(part.shifts(exact)))),
         "pairs": pairs,
+        "planned": result.plan.planned,
         **{kind: counts[kind] / pairs for kind in ("exact", "clear", "clustered", "work")},
     }
     if since is not None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Bound, Device
+from gpuvision.host import Device
 from gpuvision.simulation.bounces import Bounces
 from gpuvision.simulation.direct import DirectLight
 from gpuvision.simulation.illumination import LightSheet, LitLine
@@ -22,11 +22,9 @@ from gpuvision.simulation.readings import PATHS, Truth
 from gpuvision.simulation.scene import Scene
 from gpuvision.simulation.sight import Exposure, Sight
 from gpuvision.simulation.sight_lines import SeenSurface, SightLines
-from gpuvision.simulation.visible_light import VisibleLight, segment_rows
+from gpuvision.simulation.visible_light import segment_rows
 
 Float64 = npt.NDArray[np.float64]
-# Segments are bound by the hundred and more, so that few profiles ask for another kernel.
-_LEAST_ROOM = 64
 
 
 class Profile(NamedTuple):
@@ -103,7 +101,6 @@ class LightPaths:
     _mirrors: Mirrors = field(init=False, repr=False)
     lines: SightLines = field(init=False, repr=False)
     _bounces: Bounces | None = field(init=False, repr=False)
-    _bound: dict[int, Bound[Any]] = field(init=False, repr=False, default_factory=dict)
     _planned: PlannedLight = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -204,22 +201,13 @@ class LightPaths:
         rows = segment_rows(segments)
         light, plan = self._planned(rows, seen.receivers, weights, reading, tolerance=tolerance)
         told = {f"pairs {name}": float(plan.counts[name]) for name in ("exact", "clustered", "left out")}
+        told["profiles in full (cheaper than a plan)"] = float(not plan.planned)
         bound = {"bound of pairs left out [m]": float(plan.bound.max(initial=0.0))}
         return light, {"pairs": float(plan.counts["pairs"])} | told | bound
 
     def irradiance(self, seen: SeenSurface, segments: LitSegments) -> Float64:
         """Return the irradiance [W/m^2] of what the sensor sees from lit segments, (samples, n)."""
-        room = max(_LEAST_ROOM, 1 << max(len(segments.exitance) - 1, 0).bit_length())
-        if room not in self._bound:
-            shape = seen.receivers.shape
-            operation = VisibleLight(scene=self.scene, segments=room, precision="single")
-            self._bound[room] = operation.bind(self.device, shape, self._real)
-        bound = self._bound[room]
-        # What it would sum up behind the bins is not needed: the weights stay zero.
-        receivers, _, rows = bound.inputs
-        receivers.set(seen.receivers.astype(self._real))
-        rows.set(segment_rows(segments, room).astype(self._real))
-        return np.asarray(bound.run().irradiance.get(), np.float64)
+        return self._planned.exactly(segment_rows(segments), seen.receivers)
 
     def _diffuse(self, lit: LitLine) -> LitSegments:
         assert self.scene.material is not None  # set by Scene itself
@@ -234,8 +222,3 @@ class LightPaths:
             size = float(np.linalg.norm(np.ptp(corners, axis=0))) / 16.0
         albedo = [each.albedo for each in self.materials]
         return Bounces.of(self.scene, albedo, size=size, device=self.device)
-
-    @property
-    def _real(self) -> np.dtype[Any]:
-        assert self.device is not None
-        return np.dtype(np.float64 if self.device.has_double else np.float32)

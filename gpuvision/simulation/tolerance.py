@@ -57,6 +57,8 @@ class LightPlan:
     counts
         "segments", as given; "pairs" of receiver and segment, all, and by what becomes of them: "exact", "clear" (those
         of them that nothing can hide), "clustered", "left out"; "work": pairs that are left to compute.
+    planned
+        False: all is to be computed, because that takes less time than to find out what need not be.
     """
 
     segments: Reals
@@ -66,6 +68,33 @@ class LightPlan:
     bound: Reals
     worst: Reals
     counts: Mapping[str, int]
+    planned: bool = True
+
+    @classmethod
+    def of_all(
+        cls, segments: npt.NDArray[Any], shape: tuple[int, ...], direct: StripReading, tolerance: float
+    ) -> LightPlan:
+        """Return the plan that leaves out nothing for receivers of a shape (strips, n, 6): every segment for all."""
+        strips, count = shape[:2]
+        blocks, pairs = strips * -(-count // BLOCK), strips * count * len(segments)
+        return cls(
+            np.asarray(segments, np.float64),
+            np.arange(blocks + 1, dtype=np.int32) * np.int32(len(segments)),
+            np.tile(np.arange(len(segments), dtype=np.int32), blocks),
+            tolerance,
+            np.zeros(strips),
+            direct.widest(),
+            {
+                "segments": len(segments),
+                "pairs": pairs,
+                "exact": pairs,
+                "clear": 0,
+                "clustered": 0,
+                "left out": 0,
+                "work": pairs,
+            },
+            planned=False,
+        )
 
     @property
     def modelled(self) -> bool:
@@ -88,6 +117,7 @@ class LightPlan:
         """Return what was modelled and what was left out, with which bound, as JSON takes it; no bound is None."""
         return {
             "modelled": self.modelled,
+            "planned": self.planned,
             "tolerance": self.tolerance,
             "bound": _largest(self.bound),
             "bound if left out": _largest(self.worst),
@@ -180,8 +210,7 @@ class LightPlanner:
         device
             Where to plan; `Device.best` if left out.
         """
-        asked = self.tolerance if tolerance is None else tolerance
-        _check_metres(asked, "LightPlanner.tolerance")
+        asked = self.asked(tolerance)
         segments = np.asarray(segments, np.float64)
         if (
             receivers.ndim != 3
@@ -196,6 +225,12 @@ class LightPlanner:
         costs = direct.costs(weights)
         places = np.ascontiguousarray(receivers)
         return _planned(self, asked, tree, segments, places, costs, direct, device or Device.best())
+
+    def asked(self, tolerance: float | None) -> float:
+        """Return the tolerance of a profile, metres: the one given, or else the planner's."""
+        asked = self.tolerance if tolerance is None else tolerance
+        _check_metres(asked, "LightPlanner.tolerance")
+        return asked
 
 
 def _check_metres(value: float, what: str) -> None:

@@ -162,23 +162,39 @@ class Device:
                 os.sched_yield()  # to a worker of the runtime that waits for this processor
         event.wait()
 
-    def new_queue(self, *, profiling: bool = False) -> Any:
-        """Return another in-order queue; with `profiling`, its events carry device times."""
-        if not profiling:
-            return cl.CommandQueue(self.context, self.handle)
-        return cl.CommandQueue(self.context, self.handle, properties=cl.command_queue_properties.PROFILING_ENABLE)
+    def new_queue(self, *, profiling: bool = False, callers_thread: bool = False) -> Any:
+        """Return another in-order queue; with `profiling`, its events carry device times.
+
+        With `callers_thread`, what is enqueued runs in the thread that enqueues it and is done when that returns: for
+        chains of work of a few microseconds each. Where the runtime has no such queue it is one as any other.
+        """
+        properties = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
+        return (self._callers_queue(properties) if callers_thread else None) or self._queue(self.handle, properties)
 
     def callers_queue(self, like: Any, *, groups: int) -> Any:
         """Return a queue like another, whose kernels run in the thread that enqueues them; None where there is none.
 
-        Intel's runtime, whose workers are awake sooner than PoCL's, has one for work of a single group: there is
+        Intel's runtime, whose workers are awake sooner than PoCL's, gets one for work of a single group: there is
         nothing to share with a worker.
         """
+        worthwhile = groups == 1 or self.callers_thread is not None
+        return self._callers_queue(like.properties) if worthwhile else None
+
+    def is_callers(self, queue: Any) -> bool:
+        """Tell whether what is enqueued in a queue of this device is done when that returns."""
+        if _LOCAL_THREAD not in self.handle.extensions.split():
+            return bool(queue.device == self.callers_thread)
+        return _LOCAL_THREAD_QUEUE in queue.get_info(cl.command_queue_info.PROPERTIES_ARRAY)
+
+    def _callers_queue(self, properties: int) -> Any:
         if self.callers_thread is not None:
-            return cl.CommandQueue(self.context, self.callers_thread, properties=like.properties)
-        if groups == 1 and _LOCAL_THREAD in self.handle.extensions.split():
-            return cl.CommandQueue(self.context, self.handle, properties=like.properties | _LOCAL_THREAD_QUEUE)
+            return self._queue(self.callers_thread, properties)
+        if _LOCAL_THREAD in self.handle.extensions.split():
+            return self._queue(self.handle, properties | _LOCAL_THREAD_QUEUE)
         return None
+
+    def _queue(self, handle: Any, properties: int) -> Any:
+        return cl.CommandQueue(self.context, handle, properties=properties)
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike, queue: Any = None) -> DeviceArray:
         """Return an uninitialised device array; on shared memory `arrays.host_view` shows it to NumPy."""

@@ -15,7 +15,8 @@ from typing import BinaryIO
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a file that takes the place of `path` when the block ends well, and vanishes when it does not.
 
-    The bytes are on the disk before the name is: whoever opens `path` sees the old file or the whole new one.
+    The bytes are on the disk before the name is: whoever opens `path` sees the old file or the whole new one. A link
+    stays, and leads to the new file; a device or a pipe (``/dev/null``, ``/dev/stdout``) is written into.
 
     Raises
     ------
@@ -23,6 +24,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         The folder does not exist.
     """
     path = Path(path)
+    if path.exists() and not path.is_file() and not path.is_dir():
+        with path.open("wb") as device:
+            yield device
+        return
+    path = path.resolve()
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
     beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")

@@ -208,6 +208,7 @@ class _Site:
     queue: Any
     kernel: Any
     given: tuple[Any, ...]
+    at_once: bool  # in the caller's thread, done when enqueued
 
 
 class Bound(Generic[R]):
@@ -241,17 +242,20 @@ class Bound(Generic[R]):
         # Of the arrays that calls bind, among the kernel's arguments.
         self._places = [*range(len(launch.inputs)), *(place for place, spec in after_inputs if spec is not None)]
         self._own = (*self.inputs, *self._computed(self.outputs))
-        self._workers = self._site_on(device.handle, self.queue)
+        # Intel's runtime looks an SVM pointer up at every launch; a buffer over the same memory it knows.
+        known = self._own if device.kind == "intel" and device.shares_memory else ()
+        self._known = {id(each): _buffer_over(each) for each in known}
+        self._site_of_queue = self._site_on(self.queue)
         self._here: _Site | None = None
-        if launch.passes_once and launch.nbytes <= _SHORT_BYTES:
+        if not self._site_of_queue.at_once and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
             own = device.callers_queue(self.queue, groups=launch.groups)
-            self._here = None if own is None else self._site_on(own.device, own)
+            self._here = None if own is None else self._site_on(own)
         for array in self.inputs:
             self._clear(array)
         self().wait()
         if self._here is not None and not self._empty:
-            self._set_arrays(self._workers, self._own)
-            cl.enqueue_nd_range_kernel(self.queue, self._workers.kernel, self._global, self._local).wait()
+            self._set_arrays(self._site_of_queue, self._own)
+            cl.enqueue_nd_range_kernel(self.queue, self._site_of_queue.kernel, self._global, self._local).wait()
 
     def allocate(self) -> R:
         """Return fresh device arrays for the outputs."""
@@ -280,18 +284,30 @@ class Bound(Generic[R]):
         TypeError, ValueError
             A frame is not what the instance was bound to.
         """
-        if not frames and out is None:
-            given = self._own
-        else:
-            if out is not None and out is not self.outputs:
-                self._check_fields(out)
-            given = (*(frames or self.inputs), *self._computed(self.outputs if out is None else out))
-        site = self._workers if self._here is None else self._site(wait_for)
+        return self._enqueue(self._own if not frames and out is None else self._given(frames, out), wait_for)
+
+    def run(self, *frames: DeviceArray, out: R | None = None) -> R:
+        """Call, wait with the least delay, and return what was written: `out`, or `outputs`."""
+        event = self._enqueue(self._own if not frames and out is None else self._given(frames, out))
+        if not self._site_of_queue.at_once:
+            self._wait(event)
+        return self.outputs if out is None else out
+
+    def _given(self, frames: tuple[DeviceArray, ...], out: R | None) -> tuple[Any, ...]:
+        """Return the arrays of a call in the kernel's order, its own in place of what is not given."""
+        if out is not None and out is not self.outputs:
+            self._check_fields(out)
+        return (*(frames or self.inputs), *self._computed(self.outputs if out is None else out))
+
+    def _enqueue(self, given: tuple[Any, ...], wait_for: Sequence[Any] | None = None) -> Any:
+        site = self._site_of_queue if self._here is None else self._site(wait_for)
         if given is not site.given:
             self._set_arrays(site, given)
         if self._empty:
             return cl.enqueue_marker(self.queue, wait_for=wait_for)
-        if site is self._here:
+        if site.at_once:
+            if wait_for:
+                cl.wait_for_events(wait_for)
             return cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
         event = cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local, wait_for=wait_for)
         if given is not self._own:
@@ -303,15 +319,10 @@ class Bound(Generic[R]):
 
         Work that must wait is left to the workers: PoCL hangs where one of its devices waits for an event of the other.
         """
-        if self._here is None or any(each.command_execution_status > _COMPLETE for each in wait_for or ()):
-            return self._workers
+        if self._here is None or (wait_for and any(each.command_execution_status > _COMPLETE for each in wait_for)):
+            return self._site_of_queue
         self.queue.finish()
         return self._here
-
-    def run(self, *frames: DeviceArray, out: R | None = None) -> R:
-        """Call, wait with the least delay, and return what was written: `out`, or `outputs`."""
-        self._wait(self(*frames, out=out) if frames or out is not None else self())
-        return self.outputs if out is None else out
 
     def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
         """Run on NumPy arrays and wait; on shared memory the kernel reads and writes them in place."""
@@ -381,7 +392,7 @@ class Bound(Generic[R]):
         _check_apart(given[:inputs], given[inputs:], lambda a, b: a.base_data is b.base_data)
         for place, array, before in zip(self._places, given, site.given, strict=True):
             if array is not before:
-                site.kernel.set_arg(place, memory_of(array))
+                site.kernel.set_arg(place, self._known.get(id(array)) or memory_of(array))
         site.given = given
 
     def _check_fields(self, out: R) -> None:
@@ -406,10 +417,10 @@ class Bound(Generic[R]):
         elif array.nbytes:
             cl.enqueue_fill_buffer(self.queue, memory_of(array), np.zeros(1, np.uint8), 0, array.nbytes)
 
-    def _site_on(self, handle: Any, queue: Any) -> _Site:
-        """Compile the kernel for a device of the context and set what no call changes."""
+    def _site_on(self, queue: Any) -> _Site:
+        """Compile the kernel for a queue's device and set what no call changes."""
         launch = self._launch
-        kernel = cl.Kernel(build(self.device, launch.stem, launch.defines, handle=handle), launch.kernel)
+        kernel = cl.Kernel(build(self.device, launch.stem, launch.defines, handle=queue.device), launch.kernel)
         after_inputs = len(launch.inputs)
         after_outputs = after_inputs + len(launch.outputs)
         for place, spec in enumerate(launch.outputs.values(), after_inputs):
@@ -418,7 +429,7 @@ class Bound(Generic[R]):
         tables = iter(self._tables)
         for place, value in enumerate(launch.arguments, after_outputs):
             kernel.set_arg(place, next(tables) if isinstance(value, np.ndarray) else value)
-        return _Site(queue, kernel, (None,) * len(self._own))
+        return _Site(queue, kernel, (None,) * len(self._own), self.device.is_callers(queue))
 
     def _upload(self, table: HostArray) -> Any:
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
@@ -430,6 +441,12 @@ class Bound(Generic[R]):
         while flight and flight[0][0].command_execution_status <= _COMPLETE:
             flight.popleft()
         flight.append((event, given))
+
+
+def _buffer_over(array: DeviceArray) -> Any:
+    """Return a buffer that is an array's shared memory."""
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
+    return cl.Buffer(array.context, flags, hostbuf=host_view(array)) if array.nbytes else None
 
 
 def _device(device: Device | None) -> Device:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -94,3 +95,24 @@ def test_a_file_in_the_way_of_a_folder(tmp_path: Path) -> None:
         two_files(out)
     assert [(each.name, each.read_text()) for each in out.iterdir()] == [("sub", "old")]
     assert [each.name for each in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_link_stays_and_leads_to_the_new_file(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere" / "file")
+    for text in ("a", "b"):
+        files.write_whole(tmp_path / "link", text)
+        assert (tmp_path / "link").is_symlink()
+        assert (tmp_path / "elsewhere" / "file").read_text() == text
+
+
+def test_a_pipe_is_written_into(tmp_path: Path) -> None:
+    """And so is a device: taking its place would take it from everybody."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    with files.replacing(pipe) as file:
+        file.write(b"told")
+    assert os.read(reader, 10) == b"told"
+    os.close(reader)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)

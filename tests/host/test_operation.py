@@ -144,6 +144,41 @@ def test_short_work_comes_after_the_long_work_before_it(device, rng):
         np.testing.assert_allclose(short.outputs.position.get(), expected(middle), atol=1e-5)
 
 
+@pytest.mark.parametrize("count", [0, 16, 400_000])
+def test_in_a_queue_of_the_callers_thread_work_is_done_on_return(device, rng, count):
+    queue = device.new_queue(callers_thread=True)
+    assert device.is_callers(queue) or not device.is_cpu
+    assert not device.is_callers(device.queue)
+    if not device.is_callers(queue):
+        pytest.skip("the runtime has no such queue")
+    bound = READOUT.bind(device, (count, 2), np.float32, queue=queue)
+    for _ in range(5 if count > 16 else 200):
+        frame = rng.uniform(0.1, 1.0, (count, 2)).astype(np.float32)
+        host_view(bound.inputs[0])[...] = frame
+        assert bound().command_execution_status == cl.command_execution_status.COMPLETE
+        np.testing.assert_allclose(host_view(bound.outputs.position), expected(frame), atol=5e-7)
+        host_view(bound.outputs.position)[...] = 7.0
+        np.testing.assert_allclose(host_view(bound.run().position), expected(frame), atol=5e-7)
+
+
+def test_a_queue_of_the_callers_thread_waits_for_others(device, rng):
+    queue = device.new_queue(callers_thread=True)
+    workers = READOUT.bind(device, (400_000, 2), np.float32)
+    short = READOUT.bind(device, (1000, 2), np.float32, queue=queue)
+    both = cl.array.Array(device.queue, (1000, 2), np.float32, data=workers.outputs.position.base_data)
+    for _ in range(10):
+        currents = rng.uniform(0.1, 1.0, (400_000, 2)).astype(np.float32) * np.array([0.1, 1.0], np.float32)
+        workers.inputs[0].set(currents)
+        short(both, wait_for=[workers()]).wait()
+        middle = expected(currents)[:2000].reshape(1000, 2)
+        np.testing.assert_allclose(short.outputs.position.get(), expected(middle), atol=1e-5)
+
+
+def test_arrays_of_a_queue_of_the_callers_thread(device, pairs):
+    frame = cl.array.to_device(device.new_queue(callers_thread=True), pairs)
+    np.testing.assert_allclose(READOUT(frame).position.get(), expected(pairs), atol=5e-7)
+
+
 def test_threads_do_not_share_a_kernel(device, rng):
     batches = [rng.uniform(0.1, 1.0, (2000, 2)).astype(np.float32) for _ in range(4)]
     wrong = []

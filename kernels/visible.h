@@ -11,14 +11,6 @@
 
 #include "bvh.h"
 
-#ifdef STRIP
-// Of a kernel: its vectors are the code's own, a compiler need not look for more across work-items (Intel's does, for
-// seconds).
-#define AS_IT_IS __attribute__((vec_type_hint(real16)))
-#else
-#define AS_IT_IS
-#endif
-
 #define VIEW_HALVES 6
 // A node, where a leaf is to be.
 #define NO_HINT 0

@@ -31,8 +31,11 @@ Float64 = npt.NDArray[np.float64]
 MOST_RULERS = 1024  # rows of one pose
 _VERIFYING = 512
 _FEWEST = 12  # rulers and edges that a pose is believed from
-_TRIALS = {"rigid": 64, "scale": 128, "affine": 256}  # one of them all good, of 30 % bad rows: all but 1e-11
+_SOLVED = 256  # of the edges that were found about a start
+_TRIALS = {"rigid": 128, "scale": 256, "affine": 512}  # one of them all good, of half bad rows: all but 6e-8
 _ROUNDS = 3
+_CLEAR = 2.0
+_BEYOND = 0.7
 
 
 class Registration(NamedTuple):
@@ -52,15 +55,17 @@ class Registration(NamedTuple):
         (f, f) of the placement point's x, y, of theta, and of the deformation that is free, from the scatter of the
         edges themselves.
     score
-        Share of the rulers in the picture whose edge lies within the tolerance, 0 to 1.
+        Share of the rulers in the picture whose edge lies within the tolerance of this pose, 0 to 1. Refused, of the
+        best one.
     runner_up
-        Score of the best other pose, 0 without one.
+        Score of the best other pose; where AMBIGUOUS, of those that edges do not tell from this one. 0 without one.
     runner_up_pose
         (3,); NaN without one.
     rulers
         How many lay in the picture, of those that verify.
     status
-        OK. With a pose: AMBIGUOUS (the runner-up is close). Refused: DARK (nothing fits), HOLE (too few known edges in
+        OK. With a pose: AMBIGUOUS (of the rulers that agree with only one of the two, too few more do with this one
+        than with the runner-up). Refused: DARK (nothing fits), HOLE (too few known edges in
         the picture), AMBIGUOUS with NaN (the edges that were found leave a part of the pose open).
     """
 
@@ -83,11 +88,39 @@ class KnownEdges(NamedTuple):
 
 
 class _Tried(NamedTuple):
-    """A motion (2, 3), of points relative to the placement point, and what its rulers say."""
+    """A motion (2, 3), of points relative to the placement point; which rulers lie in the picture, and which agree."""
 
     motion: Float64
-    score: float
-    rulers: int
+    inside: npt.NDArray[np.bool_]
+    agrees: npt.NDArray[np.bool_]
+
+    @property
+    def rulers(self) -> int:
+        return int(np.count_nonzero(self.inside))
+
+    @property
+    def score(self) -> float:
+        return float(np.count_nonzero(self.agrees)) / self.rulers
+
+    def is_clear_of(self, other: _Tried) -> bool:
+        """Whether the rulers that tell two motions apart, in the picture for both, speak for this one.
+
+        Of two right ones as many agree with the one as with the other. What is gone of one place is there at another
+        one by chance only: three standard deviations of their difference, and twice as many.
+        """
+        both = self.inside & other.inside
+        own = np.count_nonzero(both & self.agrees & ~other.agrees)
+        its = np.count_nonzero(both & other.agrees & ~self.agrees)
+        return bool(own >= max(_CLEAR * its, its + 3.0 * math.sqrt(own + its), 1.0))
+
+
+class _Ruled(NamedTuple):
+    """Rulers in the picture, (n, 2) each; how far away the edge is [px], NaN without one; and which lie inside."""
+
+    centre: Float64
+    direction: Float64
+    away: Float64
+    inside: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,9 +152,6 @@ class FirstFix:
     least_score
         A pose that a smaller share of the rulers agrees with is refused; 1.5 over the root of the rulers' number comes
         on top: of few many may agree by chance.
-    ambiguity
-        Share of the best score from which on another pose's makes it AMBIGUOUS; so does one that is less by 1.5 over
-        the root of the rulers' number.
 
     Raises
     ------
@@ -139,9 +169,8 @@ class FirstFix:
     freedom: Freedom = "rigid"
     tolerance_px: float = 1.0
     cell_px: int = 2
-    most: int = 24
+    most: int = 48
     least_score: float = 0.4
-    ambiguity: float = 0.9
 
     def __post_init__(self) -> None:
         matrix = np.asarray(self.to_image, np.float64)
@@ -156,7 +185,7 @@ class FirstFix:
             if not (np.all(np.isfinite(point)) and np.allclose(np.hypot(*normal.T), 1.0)):
                 raise ValueError(f"FirstFix.{name} must have finite points and unit normals")
             object.__setattr__(self, name, KnownEdges(point, normal))
-        for name, most in (("shift", math.inf), ("tolerance_px", 64.0), ("least_score", 1.0), ("ambiguity", 1.0)):
+        for name, most in (("shift", math.inf), ("tolerance_px", 64.0), ("least_score", 1.0)):
             if not 0.0 < finite(getattr(self, name), f"FirstFix.{name}") <= most:
                 raise ValueError(f"FirstFix.{name} is {getattr(self, name)}, expected above 0 and up to {most}")
         if not 0.0 <= finite(self.angle, "FirstFix.angle") <= math.pi:
@@ -175,14 +204,15 @@ class FirstFix:
             The picture is not one, or is smaller than five cells or than a ruler.
         """
         if len(self.rulers.point) < _FEWEST or len(self.search.point) < _FEWEST:
-            return _refused(Status.HOLE)
+            return _NOTHING
         tried = self._verified(image, self._searched(image, device), device)
         if not tried:
-            return _refused(Status.HOLE)
-        best, other = self._best_two(tried)
-        if not best.score >= self.least_score + _chance(best):
-            return _refused(Status.DARK, best, other, self.placement)
-        return self._measured(image, best, other, device)
+            return _NOTHING
+        best = max(tried, key=lambda each: each.score)
+        others = self._others(best, tried)
+        if not self._is_enough(best):
+            return self._refused(Status.DARK, best, others)
+        return self._measured(image, best, others, device)
 
     # ---- the search ------------------------------------------------------------------------------------------
 
@@ -210,6 +240,7 @@ class FirstFix:
         border = max(positions) // 2 + 2 + math.ceil(min(turned, max(image.shape)) / self.cell_px)
         means = CellMeans(cell_px=self.cell_px)(image, device=device).means
         level = EdgeLevels(threshold=self.ruler.threshold, border=border)(means, device=device).level
+        _blank_border(level, border)
         shifts = shifts_of(points, normals, self.cell_px, border, level.shape, positions)
         search = SearchEdges(
             rows=positions[0], columns=positions[1], headings=len(headings), points=len(self.search.point)
@@ -233,61 +264,80 @@ class FirstFix:
         taps = math.ceil(3.0 * self.ruler.smoothing_px / self.ruler.step_px)
         return replace(self.ruler, length=2 * (taps + 1 + math.ceil(window_px / self.ruler.step_px)) + 1)
 
-    def _laid(
+    def _ruled(
         self,
         image: npt.NDArray[Any],
         known: KnownEdges,
         motions: list[Float64],
         ruler: RulerEdges,
         device: Device | None,
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
-        """Rows for `SolvePose` about where each motion has the placement point, and how many rulers see the picture."""
+    ) -> list[_Ruled]:
+        """Edges along rulers about where each motion has the known ones."""
         seen = [self._seen(known, motion) for motion in motions]
         laid = np.concatenate([np.concatenate(each, axis=1) for each in seen]).astype(np.float32)
         edges = ruler(image, laid, device=device)
         parts = (np.split(each, len(motions)) for each in (edges.position, edges.amplitude, edges.status))
-        sigma = np.full(len(known.point), self.tolerance_px / self._scale)
-        rows, counts = [], []
-        for motion, (centre, direction), position, amplitude, status in zip(motions, seen, *parts, strict=True):
+        ruled = []
+        for (centre, direction), position, amplitude, status in zip(seen, *parts, strict=True):
             # Copper is brighter than laminate everywhere, or darker: what goes the other way is something else.
             rising = amplitude > 0
-            way = np.where(rising == (2 * rising.sum() > np.isfinite(position).sum()), position, np.nan)
-            found = self._known(centre + direction * way.astype(np.float64)[:, None])
-            point, normal = _moved(known, motion, self.placement)
-            rows.append(line_rows(normal, point - motion[:, 2], found - motion[:, 2], sigma))
-            counts.append(np.count_nonzero((status & Status.OUT_OF_RANGE) == 0))
-        return np.stack(rows).astype(np.float32), np.array(counts)
+            away = np.where(rising == (2 * rising.sum() > np.isfinite(position).sum()), position, np.nan)
+            inside = (status & Status.OUT_OF_RANGE) == 0
+            ruled.append(_Ruled(centre, direction, away.astype(np.float64), inside))
+        return ruled
+
+    def _rows(self, known: KnownEdges, motion: Float64, ruled: _Ruled) -> npt.NDArray[np.float32]:
+        """Rows for `SolvePose` about where a motion has the placement point."""
+        found = self._known(ruled.centre + ruled.direction * ruled.away[:, None])
+        point, normal = _moved(known, motion, self.placement)
+        sigma = np.full(len(point), self.tolerance_px / self._scale)
+        return line_rows(normal, point - motion[:, 2], found - motion[:, 2], sigma).astype(np.float32)
 
     def _verified(self, image: npt.NDArray[Any], starts: list[Float64], device: Device | None) -> list[_Tried]:
         """Motions that most edges agree with, one from each start."""
-        step = -(-len(self.rulers.point) // _VERIFYING)
-        known = KnownEdges(*(each[::step] for each in self.rulers))
-        rows, counts = self._laid(image, known, starts, self._ruler(self._window), device)
+        known = self._verifying
+        ruled = self._ruled(image, known, starts, self._ruler(self._window), device)
+        rows = np.stack([_found(self._rows(known, *each)) for each in zip(starts, ruled, strict=True)])
         solver = SolvePose(
             loss="ransac", bend=1.0, least_agreement=0.0, freedom=self.freedom, trials=_TRIALS[self.freedom]
         )
         fits = solver(rows, device=device)
-        tried = []
-        for number in np.flatnonzero(counts >= _FEWEST):
-            failed, count = bool(fits.status[number]), int(counts[number])
-            motion = starts[number] if failed else _composed(fits, int(number), starts[number])
-            tried.append(_Tried(motion, 0.0 if failed else float(fits.inliers[number]) / count, count))
-        return tried
+        return self._judged(
+            image,
+            [start if fits.status[at] else _composed(fits, at, start) for at, start in enumerate(starts)],
+            device,
+        )
 
-    def _best_two(self, tried: list[_Tried]) -> tuple[_Tried, _Tried | None]:
-        """Return the best motion, and the best of those that are another one: that put the rulers elsewhere."""
-        ordered = sorted(tried, key=lambda each: -each.score)
-        best, limit = ordered[0], (2.0 * self.tolerance_px + 1.0) / self._scale
+    @property
+    def _verifying(self) -> KnownEdges:
+        step = -(-len(self.rulers.point) // _VERIFYING)
+        return KnownEdges(*(each[::step] for each in self.rulers))
+
+    def _judged(self, image: npt.NDArray[Any], motions: list[Float64], device: Device | None) -> list[_Tried]:
+        """Motions with the share of the rulers, laid where each has the edges, that find one there.
+
+        The start of a motion does not count: from there some edges lie beyond the rulers' ends, however good it was.
+        """
+        ruled = self._ruled(image, self._verifying, motions, self._ruler(self._window), device)
+        tried = [
+            _Tried(motion, each.inside, np.abs(each.away) <= self.tolerance_px)
+            for motion, each in zip(motions, ruled, strict=True)
+        ]
+        return [each for each in tried if each.rulers >= _FEWEST]
+
+    def _others(self, best: _Tried, tried: list[_Tried]) -> list[_Tried]:
+        """Those that put the rulers elsewhere than the best one does, best first."""
+        limit = (2.0 * self.tolerance_px + 1.0) / self._scale
         points = _moved(self.rulers, best.motion, self.placement).point
 
         def is_other(each: _Tried) -> bool:
             away = np.linalg.norm(_moved(self.rulers, each.motion, self.placement).point - points, axis=-1)
             return bool(np.median(away) > limit)
 
-        return best, next(filter(is_other, ordered[1:]), None)
+        return sorted(filter(is_other, tried), key=lambda each: -each.score)
 
     def _measured(
-        self, image: npt.NDArray[Any], best: _Tried, other: _Tried | None, device: Device | None
+        self, image: npt.NDArray[Any], best: _Tried, others: list[_Tried], device: Device | None
     ) -> Registration:
         """Measure the best pose again, a few times, along rulers about where it has the edges."""
         ruler = self._ruler(2.0 * self.tolerance_px)
@@ -296,20 +346,36 @@ class FirstFix:
         solver = SolvePose(loss="huber", scale=1.0, freedom=self.freedom, trials=_TRIALS[self.freedom])
         motion = best.motion
         for _ in range(_ROUNDS):
-            rows, _ = self._laid(image, self.rulers, [motion], ruler, device)
-            fit = solver(rows, device=device)
+            (ruled,) = self._ruled(image, self.rulers, [motion], ruler, device)
+            fit = solver(self._rows(self.rulers, motion, ruled)[None], device=device)
             if fit.status[0]:
-                return _refused(Status(int(fit.status[0])), best, other, self.placement)
+                return self._refused(Status(int(fit.status[0])), best, others)
             motion = _composed(fit, 0, motion)
-        limit = min(self.ambiguity * best.score, best.score - _chance(best))
-        close = other is not None and other.score >= limit
+        judged = self._judged(image, [motion], device)
+        if not judged:
+            return self._refused(Status.HOLE, best, others)
+        (last,) = judged
+        if not self._is_enough(last):
+            return self._refused(Status.DARK, last, others)
+        close = [other for other in others if not last.is_clear_of(other)]
         pose, deformation = _described(motion, self.placement)
-        return _refused(Status.AMBIGUOUS if close else Status.OK, best, other, self.placement)._replace(
+        return self._refused(Status.AMBIGUOUS if close else Status.OK, last, close or others)._replace(
             pose=pose,
             deformation=deformation if self.freedom != "rigid" else np.zeros(3),
             placement=motion[:, 2],
             covariance=fit.covariance[0].astype(np.float64) * float(fit.spread[0]) ** 2,
         )
+
+    def _refused(self, status: Status, best: _Tried, others: list[_Tried]) -> Registration:
+        """Say no pose, and what scores there were."""
+        said = _NOTHING._replace(score=best.score, rulers=best.rulers, status=status)
+        if not others:
+            return said
+        pose, _ = _described(others[0].motion, self.placement)
+        return said._replace(runner_up=others[0].score, runner_up_pose=pose)
+
+    def _is_enough(self, tried: _Tried) -> bool:
+        return tried.score >= self.least_score + _chance(tried)
 
     # ---- places ----------------------------------------------------------------------------------------------
 
@@ -339,6 +405,18 @@ class FirstFix:
         return pixels, across / np.linalg.norm(across, axis=-1, keepdims=True)
 
 
+def _blank_border(level: npt.NDArray[np.uint16], border: int) -> None:
+    """Let edges beyond the picture cost somewhat less than they do on average in it.
+
+    If they cost all, poses that keep more of the edges in the picture would do better than right ones; on boards that
+    repeat themselves they still do at the average's cost, and if they cost less than half, those that keep few.
+    """
+    inside = (slice(None), slice(border, -border), slice(border, -border))
+    own = level[inside].copy()
+    level[:] = np.rint(_BEYOND * own.mean(axis=(1, 2)))[:, None, None]
+    level[inside] = own
+
+
 def _chance(tried: _Tried) -> float:
     """Return what a score may differ by without a reason: three standard deviations of a share of half."""
     return 1.5 / math.sqrt(tried.rulers)
@@ -363,6 +441,14 @@ def _moved(edges: KnownEdges, motion: Float64, placement: tuple[float, float]) -
     )
 
 
+def _found(rows: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Pick as many rows for each start, evenly, of those with an edge: a trial of a missing one is none."""
+    there = np.flatnonzero(np.all(np.isfinite(rows), axis=1))
+    if not len(there):
+        return np.full((_SOLVED, rows.shape[1]), np.nan, np.float32)
+    return rows[there[np.arange(_SOLVED) * len(there) // _SOLVED]]
+
+
 def _composed(fits: BoardPose, index: int, motion: Float64) -> Float64:
     """After a motion another one, which was measured about where the placement point is."""
     x, y, theta = np.asarray(fits.pose[index], np.float64)
@@ -379,19 +465,14 @@ def _described(motion: Float64, placement: tuple[float, float]) -> tuple[Float64
     return np.array([*(motion[:, 2] - turn @ placement), theta]), np.array([bent[0, 0] - 1, bent[1, 1] - 1, bent[0, 1]])
 
 
-def _refused(
-    status: Status, best: _Tried | None = None, other: _Tried | None = None, placement: tuple[float, float] = (0.0, 0.0)
-) -> Registration:
-    """Say no pose, and what scores there were."""
-    nothing = np.full(3, np.nan)
-    return Registration(
-        pose=nothing,
-        deformation=nothing,
-        placement=np.full(2, np.nan),
-        covariance=np.full((3, 3), np.nan),
-        score=0.0 if best is None else best.score,
-        runner_up=0.0 if other is None else other.score,
-        runner_up_pose=nothing if other is None else _described(other.motion, placement)[0],
-        rulers=0 if best is None else best.rulers,
-        status=status,
-    )
+_NOTHING = Registration(
+    pose=np.full(3, np.nan),
+    deformation=np.full(3, np.nan),
+    placement=np.full(2, np.nan),
+    covariance=np.full((3, 3), np.nan),
+    score=0.0,
+    runner_up=0.0,
+    runner_up_pose=np.full(3, np.nan),
+    rulers=0,
+    status=Status.HOLE,
+)

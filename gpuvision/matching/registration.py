@@ -23,6 +23,7 @@ from gpuvision.matching.selection import Imaging, candidates
 
 Float64 = npt.NDArray[np.float64]
 _RULERS, _POINTS = 512, 512
+_ENOUGH = 128  # of them: where the best smoothing leaves room for fewer, it is less
 _TILE = 8  # px, in which a template has one edge
 
 __all__ = ["FirstFix", "KnownEdges", "Registration", "board_fix", "register", "template_edges"]
@@ -80,21 +81,32 @@ def board_fix(
     pixel = math.sqrt(abs(_area(seen[:4])) / max((columns - 1) * (rows - 1), 1))
     low, high = seen[:4].min(axis=0), seen[:4].max(axis=0)
     reach = shift + 2.0 * math.sin(min(angle, math.pi) / 2.0) * np.hypot(*(high - low)) / 2.0
-    imaging = Imaging(pixel=pixel, blur_px=blur_px, shift=2.0 * pixel, angle=0.0)
-    laid = candidates(artwork, (low - reach, high + reach), place, imaging)
-    single = np.flatnonzero(~laid.pair)
-    chosen = _some(single, _RULERS)
+    region = (low - reach, high + reach)
+    smoothing_px = best_smoothing(blur_px)
+    single = _singles(artwork, region, place, Imaging(pixel=pixel, blur_px=blur_px, shift=2.0 * pixel, angle=0.0))
+    if len(single.point) < _ENOUGH:
+        # Neighbours are too near. Smoothed half as much, they are not: by the blur again, root 3 less than best in all.
+        smoothing_px = blur_px
+        near = Imaging(pixel=pixel, blur_px=blur_px / math.sqrt(3.0), shift=2.0 * pixel, angle=0.0)
+        single = _singles(artwork, region, place, near)
+    chosen = _some(np.arange(len(single.point)), _RULERS)
     return FirstFix(
         search=_edge_points(artwork, low, high, cell_px * pixel),
-        rulers=KnownEdges(laid.point[chosen], laid.normal[chosen]),
+        rulers=KnownEdges(single.point[chosen], single.normal[chosen]),
         to_image=matrix,
         placement=place,
         shift=shift,
         angle=angle,
-        ruler=RulerEdges(threshold=threshold, width=5, smoothing_px=best_smoothing(blur_px)),
+        ruler=RulerEdges(threshold=threshold, width=5, smoothing_px=smoothing_px),
         tolerance_px=tolerance_px,
         cell_px=cell_px,
     )
+
+
+def _singles(artwork: Artwork, region: tuple[Float64, Float64], place: Any, imaging: Imaging) -> KnownEdges:
+    """Return where rulers may lie across one edge."""
+    laid = candidates(artwork, region, place, imaging)
+    return KnownEdges(laid.point[~laid.pair], laid.normal[~laid.pair])
 
 
 def _area(corners: Float64) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -44,6 +45,28 @@ def finite(value: Any, what: str) -> float:
         raise TypeError(f"{what} must be a number, got {value!r}") from None
     if not math.isfinite(number):
         raise ValueError(f"{what} must be finite, got {number}")
+    return number
+
+
+def whole(value: Any, what: str, *, least: int | None = None, most: int | None = None) -> int:
+    """Return a count as an int; a bool is none.
+
+    Raises
+    ------
+    TypeError
+        It is no whole number.
+    ValueError
+        It is less than the least, or more than the most.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool):
+        raise TypeError(f"{what} must be a whole number, got {value!r}")
+    if (least is not None and number < least) or (most is not None and number > most):
+        expected = f"{least} to {most}" if most is not None else f"at least {least}"
+        raise ValueError(f"{what} is {number}, expected {expected}")
     return number
 
 

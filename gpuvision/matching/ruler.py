@@ -8,7 +8,6 @@ logarithms of the peak and its neighbours (exact for a Gaussian edge).
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -18,7 +17,7 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, Launch, Operation, Walk, in_strips
-from gpuvision.tables import finite
+from gpuvision.tables import finite, whole
 
 Polarity = Literal["any", "rising", "falling"]
 Choice = Literal["strongest", "first", "last", "all"]
@@ -172,9 +171,9 @@ class RulerEdges(Operation[Edges]):
 
     def __post_init__(self) -> None:
         for name, least, limit in (("length", 5, LONGEST), ("width", 1, WIDEST), ("most", 1, MOST_EDGES)):
-            object.__setattr__(self, name, _whole(getattr(self, name), f"RulerEdges.{name}", least, limit))
+            object.__setattr__(self, name, whole(getattr(self, name), f"RulerEdges.{name}", least=least, most=limit))
         if self.count is not None:
-            object.__setattr__(self, "count", _whole(self.count, "RulerEdges.count", 0, 2**31 - 1))
+            object.__setattr__(self, "count", whole(self.count, "RulerEdges.count", least=0, most=2**31 - 1))
         for name in ("threshold", "step_px", "smoothing_px"):
             if finite(getattr(self, name), f"RulerEdges.{name}") <= 0.0:
                 raise ValueError(f"RulerEdges.{name} is {getattr(self, name)}, expected a number above 0")
@@ -343,16 +342,3 @@ def _cubic_spline(distance: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     far = np.abs(distance).astype(np.float64)
     near = 2.0 / 3.0 - far**2 + 0.5 * far**3
     return np.asarray(np.where(far < 1.0, near, np.maximum(2.0 - far, 0.0) ** 3 / 6.0))
-
-
-def _whole(value: Any, what: str, least: int, most: int) -> int:
-    """Return a count as an int; a bool is none."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = None
-    if number is None or isinstance(value, bool):
-        raise TypeError(f"{what} must be a whole number, got {value!r}")
-    if not least <= number <= most:
-        raise ValueError(f"{what} is {number}, expected {least} to {most}")
-    return number

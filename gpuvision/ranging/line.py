@@ -7,7 +7,6 @@ its rows axis (``along="rows"``: a column coordinate for every row). One such co
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
-from gpuvision.tables import finite
+from gpuvision.tables import finite, whole
 
 Method = Literal["whole", "windowed", "gauss3", "fir", "ml"]
 Choice = Literal["strongest", "first", "last", "nearest"]
@@ -29,17 +28,6 @@ _LANES = 16
 _GROUP = 64  # items of a work-group
 _STRIP = 1024  # columns of a strip at most, MAX_STRIP in line_strip.h
 _WIDE_BYTES = 64  # of neighbouring samples that a strip works on at once
-
-
-def _whole(value: Any, what: str) -> int:
-    """Return a count as an int; a bool is none."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = None
-    if number is None or isinstance(value, bool):
-        raise TypeError(f"{what} must be a whole number, got {value!r}")
-    return number
 
 
 class LineReading(NamedTuple):
@@ -166,7 +154,7 @@ class LineReadout(Operation[LineReading]):
     def __post_init__(self) -> None:
         for name in ("window", "minimum_width", "maximum_width", "fir_length"):
             if getattr(self, name) is not None or name != "maximum_width":
-                object.__setattr__(self, name, _whole(getattr(self, name), f"LineReadout.{name}"))
+                object.__setattr__(self, name, whole(getattr(self, name), f"LineReadout.{name}"))
         self._check_names()
         self._check_numbers()
         possible = LineReading._fields if self.triangulation is not None else LineReading._fields[:5]

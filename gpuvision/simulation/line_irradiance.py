@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines
+from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
 
 _LANES, _GROUP = 16, 64
 # Strips are to keep the cores even, and each is to be worth its start.
@@ -168,7 +168,7 @@ class LineIrradiance(Operation[Irradiance]):
             raise ValueError(f"LineIrradiance takes receivers (..., 6), place and normal, got shape {shape}")
         if dtype == np.float64 and not device.has_double:
             raise ValueError(f"device {device.label} has no double precision; give receivers as float32")
-        real = _real_of(self.precision, dtype)
+        real = real_of(self.precision, dtype, narrows=True)
         place = np.dtype(np.float64 if device.has_double else np.float32)
         middle, rows, axes, firsts, starts, lines = self.segments.tables(place, real)
         count = math.prod(shape[:-1])
@@ -208,13 +208,6 @@ def _strip_of(count: int, segments: int, device: Device) -> int:
     share = -(-count // (_STRIPS_PER_CORE * _LANES * device.handle.max_compute_units)) * _LANES
     worth = -(-_PAIRS_PER_STRIP // (max(segments, 1) * _LANES)) * _LANES
     return int(max(share, worth))
-
-
-def _real_of(precision: Precision, dtype: np.dtype[Any]) -> np.dtype[Any]:
-    if precision not in ("single", "double", None):
-        raise ValueError(f"precision must be 'single', 'double' or None, got {precision!r}")
-    is_double = precision == "double" or (precision is None and dtype == np.float64)
-    return np.dtype(np.float64 if is_double else np.float32)
 
 
 def _checked(values: Any, shape: tuple[int, ...], what: str) -> npt.NDArray[np.float64]:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-import operator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines
+from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
 from gpuvision.simulation.line_irradiance import LitSegments
 from gpuvision.simulation.scene import Scene
+from gpuvision.tables import whole
 
 Spec = tuple[tuple[int, ...], np.dtype[Any]]
 Visibility = Literal["intervals", "rays", "none"]
@@ -121,17 +121,20 @@ class VisibleLight(Operation[ReceivedLight]):
 
     def __post_init__(self) -> None:
         _check_scene(self.scene, self.clearance)
-        _check_count("VisibleLight.segments", self.segments, 1)
-        _check_count("VisibleLight.samples", self.samples, 1)
-        if self.picks is not None:
-            _check_count("VisibleLight.picks", self.picks, 1)
+        for name in ("segments", "samples", "picks"):
+            if name != "picks" or self.picks is not None:
+                whole(getattr(self, name), f"VisibleLight.{name}", least=1, most=2**31 - 1)
         if self.visibility not in ("intervals", "rays", "none"):
             raise ValueError(f"VisibleLight.visibility is {self.visibility!r}, expected 'intervals', 'rays' or 'none'")
 
     def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         if len(shape) != 3 or shape[-1] != 6 or not shape[1]:
             raise ValueError(f"VisibleLight takes receivers (strips, n, 6), n at least 1, got shape {shape}")
-        real = _real_of(device, dtype, self.precision)
+        if dtype not in (np.float32, np.float64):
+            raise TypeError(f"VisibleLight takes float32 or float64, got {dtype}")
+        if dtype == np.float64 and not device.has_double:
+            raise ValueError(f"device {device.label} has no double precision; give float32")
+        real = real_of(self.precision, dtype, narrows=True)
         strips, each = shape[:2]
         strip, place, tree = in_strips(self.walk, device), _place(device), self.scene.bvh
         shares = min(strips, _SHARES_PER_CORE * device.handle.max_compute_units)
@@ -206,27 +209,6 @@ def _check_scene(scene: object, clearance: float | None) -> None:
         raise TypeError(f"VisibleLight.scene is {scene!r}, expected a Scene")
     if clearance is not None and not (math.isfinite(clearance) and clearance >= 0.0):
         raise ValueError(f"VisibleLight.clearance is {clearance!r}, expected metres, 0 or more, or None")
-
-
-def _check_count(what: str, value: object, least: int) -> None:
-    try:
-        number = operator.index(value)  # type: ignore[arg-type]
-    except TypeError:
-        raise TypeError(f"{what} is {value!r}, expected an integer") from None
-    if not least <= number < 2**31:
-        raise ValueError(f"{what} is {number}, expected {least} or more, below 2^31")
-
-
-def _real_of(device: Device, dtype: np.dtype[Any], precision: Precision) -> np.dtype[Any]:
-    if dtype not in (np.float32, np.float64):
-        raise TypeError(f"VisibleLight takes float32 or float64, got {dtype}")
-    if precision not in ("single", "double", None):
-        raise ValueError(f"precision must be 'single', 'double' or None, got {precision!r}")
-    if dtype == np.float64 and not device.has_double:
-        raise ValueError(f"device {device.label} has no double precision; give float32")
-    if precision is None:
-        return dtype
-    return np.dtype(np.float64 if precision == "double" else np.float32)
 
 
 def _place(device: Device) -> np.dtype[Any]:

@@ -10,7 +10,7 @@
 // as long as the visibility of one that it would spare. A block looks so often in vain, and some times more for each time
 // that it did not.
 #define MOST_LOOKED_AT 16
-#define PATIENCE 256
+#define PATIENCE 32
 #define PATIENCE_WON 2
 // Of a block's tallies.
 #define OUT 0

@@ -186,14 +186,14 @@ class Device:
             return bool(queue.device == self.callers_thread)
         return _LOCAL_THREAD_QUEUE in queue.get_info(cl.command_queue_info.PROPERTIES_ARRAY)
 
-    def _callers_queue(self, properties: int) -> Any:
+    def _callers_queue(self, properties: Any) -> Any:
         if self.callers_thread is not None:
             return self._queue(self.callers_thread, properties)
         if _LOCAL_THREAD in self.handle.extensions.split():
             return self._queue(self.handle, properties | _LOCAL_THREAD_QUEUE)
         return None
 
-    def _queue(self, handle: Any, properties: int) -> Any:
+    def _queue(self, handle: Any, properties: Any) -> Any:
         return cl.CommandQueue(self.context, handle, properties=properties)
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike, queue: Any = None) -> DeviceArray:

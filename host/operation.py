@@ -244,7 +244,7 @@ class Bound(Generic[R]):
         self._own = (*self.inputs, *self._computed(self.outputs))
         # Intel's runtime looks an SVM pointer up at every launch; a buffer over the same memory it knows.
         known = self._own if device.kind == "intel" and device.shares_memory else ()
-        self._known = {id(each): _buffer_over(each) for each in known}
+        self._known = {id(each): _buffer_over(device.context, each) for each in known}
         self._site_of_queue = self._site_on(self.queue)
         self._here: _Site | None = None
         if not self._site_of_queue.at_once and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
@@ -443,10 +443,10 @@ class Bound(Generic[R]):
         flight.append((event, given))
 
 
-def _buffer_over(array: DeviceArray) -> Any:
+def _buffer_over(context: Any, array: DeviceArray) -> Any:
     """Return a buffer that is an array's shared memory."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
-    return cl.Buffer(array.context, flags, hostbuf=host_view(array)) if array.nbytes else None
+    return cl.Buffer(context, flags, hostbuf=host_view(array)) if array.nbytes else None
 
 
 def _device(device: Device | None) -> Device:

@@ -50,11 +50,12 @@ def _draw_view(axes: Axes, located: LocatedRobot, image: npt.NDArray[Any] | None
     else:
         axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
     on = np.zeros(len(located.points), np.bool_)
-    if located.candidates:
-        pose = located.candidates[0].pose
+    shown_poses = located.candidates or located.doubtful
+    if shown_poses:
+        pose = shown_poses[0].pose
         lines = [_into(line, pose) for line in field_lines(located.field)]
         axes.add_collection(LineCollection(lines, colors="#ffe14d", linewidths=0.8))
-        on = _distances(located.points, lines) < 3.0 * max(located.candidates[0].scale, 1e-3)
+        on = _distances(located.points, lines) < 3.0 * max(shown_poses[0].scale, 1e-3)
     for name, which, colour in (("on lines", on, _ON), ("beside them", ~on, _OFF)):
         axes.plot(
             *located.points[which].T, ".", color=colour, markersize=4.0, label=f"{int(which.sum())} points {name}"

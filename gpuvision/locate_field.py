@@ -17,15 +17,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.board_view import BoardView, grey_image, noise_of
+from gpuvision.board_view import BoardView, grey_image
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
+from gpuvision.floor_scan import FloorScan, least_edge, scan_top_view
 from gpuvision.host import Device
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.recordings import read_image
 from gpuvision.matching.field import Candidate, locate
+from gpuvision.matching.field_evidence import Evidence, evidence
 from gpuvision.matching.field_map import Field, FieldMap
-from gpuvision.matching.ruler import RulerEdges
 from gpuvision.status import Status
 
 Float32 = npt.NDArray[np.float32]
@@ -34,8 +35,8 @@ POINT_FILES = (".npy", ".csv")
 RAYS = 128
 _MOST_POINTS = 4096
 _FEWEST = 4
-_RULER, _TAPS = 128, 3.0  # samples of a piece of a ray; sigmas of its smoothing either side
-_FINEST_PX = 3.0  # a line's width, at least
+_STARTS = 24  # so many poses are refined
+_BY_CHANCE, _MISSING = math.log(1e-3), 1.0 / 3.0
 _SMALL_FIELD, _SMALL_LINES, _LARGE_LINES = 5.0, 0.02, 0.125  # [m]: a field's length; a junior's lines, and others'
 
 
@@ -46,7 +47,11 @@ class LocatedRobot:
     Attributes
     ----------
     candidates
-        As `gpuvision.matching.field.locate` gives them.
+        As `gpuvision.matching.field.locate` gives them, those that explain best what is seen, and what is not, first.
+    doubtful
+        Where it is refused: what the points would fit best, but do not carry.
+    evidence
+        What speaks for the first of them; None where there is none.
     points
         float32 (points, 2), on lines, in the robot's frame [m].
     field
@@ -62,6 +67,8 @@ class LocatedRobot:
     """
 
     candidates: tuple[Candidate, ...]
+    doubtful: tuple[Candidate, ...]
+    evidence: Evidence | None
     points: Float32
     field: Field
     scale: float | None
@@ -73,7 +80,11 @@ class LocatedRobot:
         """Return the candidates, a line for each, or why there are none."""
         if self.reason:
             return f"refused: {self.reason}"
-        return "\n".join([f"{len(self.points)} points on lines", *map(self._line, range(len(self.candidates)))])
+        assert self.evidence is not None  # there are candidates
+        found = f"{len(self.points)} points, {self.evidence.on_lines:.0%} of them on lines"
+        if self.evidence.expected:
+            found += f"; {max(self.evidence.seen, 0.0):.0%} of what should be seen of the lines is"
+        return "\n".join([found, *map(self._line, range(len(self.candidates)))])
 
     def _line(self, number: int) -> str:
         each = self.candidates[number]
@@ -97,11 +108,23 @@ class LocatedRobot:
             "field": self.field.name,
             "symmetric": self.field.is_symmetric,
             "candidates": [_told(each) for each in self.candidates],
+            "evidence": _weighed(self.evidence),
             "scale": self.scale,
             "points": self.points.tolist(),
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
             "seconds": self.seconds,
         }
+
+
+def _weighed(evidence: Evidence | None) -> dict[str, Any] | None:
+    if evidence is None:
+        return None
+    return {
+        "log10_chance": evidence.chance / math.log(10.0),
+        "on_lines": evidence.on_lines,
+        "expected": evidence.expected,
+        "seen": evidence.seen if evidence.expected else None,
+    }
 
 
 def _told(each: Candidate) -> dict[str, Any]:
@@ -122,7 +145,7 @@ def _told(each: Candidate) -> dict[str, Any]:
 
 
 def locate_robot(
-    points: Float32,
+    points: Float32 | FloorScan,
     field: Field,
     *,
     near: tuple[float, float, float] | None = None,
@@ -136,7 +159,8 @@ def locate_robot(
     Parameters
     ----------
     points
-        float32 (points, 2), in the robot's frame: x ahead, y to its left [m]; from `floor_points`, or any camera.
+        float32 (points, 2), in the robot's frame: x ahead, y to its left [m]; or what `scan_floor` found: then lines
+        that should be seen and are not count, too.
     field
         Its lines.
     near
@@ -154,37 +178,72 @@ def locate_robot(
     ------
     ValueError
         A parameter is out of its range.
+
+    Notes
+    -----
+    Refused is what random points would reach by chance in more than one of a thousand searches; and, of scans, a pose
+    at which more of the lines is missing than a third of what it explains of the points (`Evidence.missing`): clutter
+    leaves points unexplained, robots in the way hide lines, but the wrong field does both.
     """
     device = Device.best() if device is None else device
     start = time.perf_counter()
-    used = points[np.isfinite(points).all(axis=1)]
-    used = np.ascontiguousarray(used[:: -(-max(len(used), 1) // _MOST_POINTS)], np.float32)
+    scan = points if isinstance(points, FloorScan) else None
+    used = _usable(points.points if isinstance(points, FloorScan) else points)
+    kept: dict[str, Any] = {"points": used, "field": field, "scale": scale, "device": device}
     if len(used) < _FEWEST:
         reason = f"{len(used)} points on lines, expected {_FEWEST} or more"
-        return LocatedRobot(
-            candidates=(), points=used, field=field, scale=scale, reason=reason, device=device, seconds={}
-        )
+        return LocatedRobot(candidates=(), doubtful=(), evidence=None, reason=reason, seconds={}, **kept)
     size = max(field.length, field.width)
     bend = min(0.25, 0.02 * size)  # a quarter of a metre in a field of 20 m, as the map's own
-    field_map = FieldMap(
-        field=field,
-        cell=0.4 * bend,
-        scale=bend,
-        reach=min(float(np.hypot(*used.T).max()) * 1.001 + bend, 1.5 * size),
-        outside=0.05 * size if outside is None else outside,
-        device=device,
-    )
+    beside = 0.05 * size if outside is None else outside
+    reach = min(float(np.hypot(*used.T).max()) * 1.001 + bend, 1.5 * size)
+    field_map = FieldMap(field=field, cell=0.4 * bend, scale=bend, reach=reach, outside=beside, device=device)
     mapped = time.perf_counter()
-    found = locate(field_map, used, near=near, most=most, device=device)
+    found = locate(field_map, used, near=near, most=max(most, _STARTS), device=device)
+    paths, wide = (None, line_width_of(field)) if scan is None else (scan.paths, scan.line_width)
+    looked: dict[str, Any] = {"scale": bend, "reach": reach, "outside": beside if near is None else None}
+    weights = [evidence(used, paths, field, each.pose, near=0.5 * wide, **looked) for each in found]
+    ordered, weights = _by_weight(found, weights, most)
+    reason = _doubt(weights[0] if weights else None, len(used))
     return LocatedRobot(
-        candidates=found,
-        points=used,
-        field=field,
-        scale=scale,
-        reason="" if found else "no pose on the field fits the points; are they in metres, is it this field?",
-        device=device,
+        candidates=() if reason else ordered,
+        doubtful=ordered[:1] if reason else (),
+        evidence=weights[0] if weights else None,
+        reason=reason,
         seconds={"map": mapped - start, "search": time.perf_counter() - mapped},
+        **kept,
     )
+
+
+def _usable(points: Float32) -> Float32:
+    """Return those that are finite; where they are too many, one of every few."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    return np.ascontiguousarray(finite[:: -(-max(len(finite), 1) // _MOST_POINTS)], np.float32)
+
+
+def _by_weight(
+    found: tuple[Candidate, ...], weights: list[Evidence], most: int
+) -> tuple[tuple[Candidate, ...], list[Evidence]]:
+    """Return candidates by how little is missing that they would show; of those that are alike in that, by score."""
+    order = sorted(range(len(found)), key=lambda number: (round(max(weights[number].missing, 0.0), 1), number))[:most]
+    place = {number: rank for rank, number in enumerate(order)}
+    moved = [found[number] for number in order]
+    ordered = [each._replace(twin=None if each.twin is None else place.get(each.twin)) for each in moved]
+    return tuple(ordered), [weights[number] for number in order]
+
+
+def _doubt(best: Evidence | None, count: int) -> str:
+    """Return why the best pose is none, or nothing."""
+    if best is None:
+        return "no pose on the field fits the points; are they in metres, is it this field?"
+    if best.chance > _BY_CHANCE:
+        return f"{count} points fit the field no better than random ones would; is it a field, are they in metres?"
+    if best.missing > _MISSING:
+        return (
+            f"it does not look like this field: where it fits best, {max(best.seen, 0.0):.0%} of what should be seen "
+            f"of its lines is, and {best.on_lines:.0%} of the points are on them; is the scale right?"
+        )
+    return ""
 
 
 def read_points(path: Path) -> Float32:
@@ -221,7 +280,7 @@ def line_width_of(field: Field) -> float:
     return _SMALL_LINES if max(field.length, field.width) < _SMALL_FIELD else _LARGE_LINES
 
 
-def floor_points(
+def scan_floor(
     image: npt.NDArray[Any],
     *,
     scale: float,
@@ -231,8 +290,8 @@ def floor_points(
     threshold: float | None = None,
     model: Lens | Camera | None = None,
     device: Device | None = None,
-) -> Float32:
-    """Return the middles of white stripes along rays from the middle of a top view of the floor.
+) -> FloorScan:
+    """Find the middles of white stripes along rays from the middle of a top view of the floor.
 
     Parameters
     ----------
@@ -253,77 +312,26 @@ def floor_points(
     device
         Where to run; None: `Device.best`.
 
-    Returns
-    -------
-    numpy.ndarray
-        float32 (points, 2), x ahead and y to the left [m].
-
     Raises
     ------
     ValueError
         Lines are too narrow in the image, or it is too small.
     """
     white = white_of(image)
-    width_px = line_width / scale
-    if not width_px >= _FINEST_PX:
-        raise ValueError(
-            f"lines of {line_width:.3g} m are {width_px:.1f} px wide at {scale:.3g} m per pixel, expected "
-            f"{_FINEST_PX:g} px or more; is the scale right?"
-        )
-    view = BoardView(scale=scale, shape=white.shape, pose=(0.0, 0.0, 0.0), model=model)
-    low, high = np.percentile(white, [1, 99])
-    least = max(4.0 * noise_of(white), 0.1 * float(high - low), 1e-6) if threshold is None else threshold
-    step = max(width_px / 8.0, 1.0)
-    smoothing = 1.5 * step
-    pieces, reach = _pieces(view, rays, blind, step, width_px, math.ceil(_TAPS * smoothing / step))
-    if not len(pieces):
-        raise ValueError(
-            f"the image of {white.shape[1]} x {white.shape[0]} px has no room for a ray of {reach:.0f} px beside what "
-            "is blind; give a larger one"
-        )
-    edges = RulerEdges(
-        threshold=least,
-        length=_RULER,
-        width=3,
-        step_px=step,
-        smoothing_px=smoothing,
-        polarity="rising",
-        choice="all",
-        most=8,
-        pairs=True,
-        spacing_px=(0.4 * width_px, 3.0 * width_px),
-        model=model,
-    )(white, pieces, device=device)
-    places = pieces[:, None, :2] + edges.position[..., None] * pieces[:, None, 2:]
-    ray = np.broadcast_to(np.arctan2(pieces[:, 3], pieces[:, 2])[:, None], edges.position.shape)
-    found = np.isfinite(edges.position)
-    return _once(view.places(places[found]), ray[found], line_width)
+    return scan_top_view(
+        white,
+        BoardView(scale=scale, shape=white.shape, pose=(0.0, 0.0, 0.0), model=model),
+        line_width=line_width,
+        rays=rays,
+        blind=blind,
+        threshold=least_edge(white) if threshold is None else threshold,
+        device=device,
+    )
 
 
-def _pieces(view: BoardView, rays: int, blind: float, step: float, width_px: float, taps: int) -> tuple[Float32, float]:
-    """Rulers (n, 4) that follow each other along rays so that each stripe lies whole on one, and their length [px]."""
-    length = (_RULER - 1) * step
-    hop = length - 2 * taps * step - 3.0 * width_px
-    farthest = math.hypot(*view.shape) / 2
-    middles = np.arange(blind / view.scale + length / 2 - taps * step, farthest, max(hop, 0.25 * length))
-    angle = np.arange(rays) * (2 * math.pi / rays)
-    turn = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    rulers = [(*(view.centre_px + middle * way), *way) for way in turn for middle in middles]
-    laid = np.array(rulers, np.float32).reshape(-1, 4)
-    ends = laid[:, None, :2] + np.array([-0.5, 0.5])[:, None] * length * laid[:, None, 2:]
-    fits = view.within(view.places(ends), 3.0).all(axis=1)
-    return np.ascontiguousarray(laid[fits]), length
-
-
-def _once(points: npt.NDArray[np.float64], ray: npt.NDArray[Any], line_width: float) -> Float32:
-    """Drop what two pieces of one ray have both found."""
-    order = np.lexsort((np.hypot(*points.T), ray))
-    points, ray = points[order], ray[order]
-    gone = np.zeros(len(points), np.bool_)
-    if len(points) > 1:
-        near = np.hypot(*(points[1:] - points[:-1]).T) < 0.5 * line_width
-        gone[1:] = near & (np.abs(ray[1:] - ray[:-1]) < 1e-4)
-    return np.ascontiguousarray(points[~gone], np.float32)
+def floor_points(image: npt.NDArray[Any], **how: Any) -> Float32:
+    """Return the points on lines that `scan_floor` finds, float32 (points, 2) [m]: it says what can be given."""
+    return scan_floor(image, **how).points
 
 
 def read_floor(path: Path) -> npt.NDArray[Any]:

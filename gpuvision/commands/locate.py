@@ -167,18 +167,18 @@ def _robot(
     from gpuvision.field_picture import draw_located_robot
     from gpuvision.host import Device
     from gpuvision.lens_file import read_lens
-    from gpuvision.locate_field import POINT_FILES, floor_points, line_width_of, locate_robot, read_floor, read_points
+    from gpuvision.locate_field import POINT_FILES, line_width_of, locate_robot, read_floor, read_points, scan_floor
 
     described = read_field(field)
     chosen = None if device is None else Device.named(device)
     picture = None
     if image.suffix.lower() in POINT_FILES:
-        points = read_points(image)
+        located = locate_robot(read_points(image), described, near=about, scale=scale, device=chosen)
     else:
         if scale is None:
             raise ValueError("--scale is missing: how wide a pixel is on the floor, as 1cm")
         picture = read_floor(image)
-        points = floor_points(
+        scan = scan_floor(
             picture,
             scale=scale,
             line_width=line_width_of(described)
@@ -189,7 +189,7 @@ def _robot(
             model=None if camera is None else read_lens(camera),
             device=chosen,
         )
-    located = locate_robot(points, described, near=about, scale=scale, device=chosen)
+        located = locate_robot(scan, described, near=about, scale=scale, device=chosen)
     return located, lambda path: draw_located_robot(path, located, picture)
 
 

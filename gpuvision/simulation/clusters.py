@@ -125,25 +125,27 @@ def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows:
     weight = np.where(total[owner] > 0.0, power, 1.0)
     mass = sums(weight)
     facing, effective = _facing(sums(weight[:, None] * normal), normal[begin])
-    cosine = np.sum(normal * facing[owner], axis=1)
+    face = facing[owner]
+    cosine = _dot(normal, face)
     # Left without a centre of its own where normals cancel; it has no aggregate there.
     lean = np.minimum.reduceat(cosine, begin)
     parallel = np.where(lean[owner] > _MOST_LEAN, weight * cosine, weight)
     centre = sums(parallel[:, None] * middle) / sums(parallel)[:, None]
     at = middle - centre[owner]
-    aside = normal - cosine[:, None] * facing[owner]
+    aside = normal - cosine[:, None] * face
     square, fourth = _powers(at, half)
-    tilt = np.linalg.norm(aside, axis=1)
+    tilt = np.sqrt(_dot(aside, aside))
     skew = sums((weight[:, None] * aside)[:, :, None] * at[:, None, :])
     spread = sums(parallel[:, None, None] * (at[:, :, None] * at[:, None, :] + half[:, :, None] * half[:, None, :] / 3))
-    ends = np.concatenate([at - half, at + half]).reshape(2, -1, 3)
-    reach = np.sqrt(np.maximum.reduceat(np.max(np.sum(ends * ends, axis=2), axis=0), begin))
+    one, other = at - half, at + half
+    reach = np.sqrt(np.maximum.reduceat(np.maximum(_dot(one, one), _dot(other, other)), begin))
     arm, rest = _principal(spread, facing, effective, reach)
     arm_size = np.linalg.norm(arm, axis=1)
-    height = -np.sum(normal * at, axis=1)
-    slab = np.maximum.reduceat(np.max(np.abs(np.sum(ends * facing[owner], axis=2)), axis=0), begin)
-    low = np.minimum.reduceat(np.minimum(ends[0], ends[1]), begin)
-    high = np.maximum.reduceat(np.maximum(ends[0], ends[1]), begin)
+    height = -_dot(normal, at)
+    slab = np.maximum.reduceat(np.maximum(np.abs(_dot(one, face)), np.abs(_dot(other, face))), begin)
+    low = np.minimum.reduceat(np.minimum(one, other), begin)
+    high = np.maximum.reduceat(np.maximum(one, other), begin)
+    turn = normal - face
     scale, each = np.where(total > 0.0, total / mass, 0.0), np.where(total > 0.0, 1.0 / mass, 0.0)
     table = np.column_stack(
         [
@@ -152,7 +154,7 @@ def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows:
             centre + np.maximum(high, np.abs(arm)),
             facing,
             np.maximum(reach, arm_size),
-            np.sqrt(np.maximum.reduceat(np.sum((normal - facing[owner]) ** 2, axis=1), begin)),
+            np.sqrt(np.maximum.reduceat(_dot(turn, turn), begin)),
             np.maximum.reduceat(height, begin),
             np.minimum.reduceat(height, begin),
             slab,
@@ -170,6 +172,11 @@ def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows:
     aggregates[full] = np.column_stack([centre - arm, centre + arm, facing, np.where(arm_size > 0.0, exitance, 0.0)])
 
 
+def _dot(a: Reals, b: Reals) -> Reals:
+    """Return the products of rows: several times as fast as a sum over so short an axis."""
+    return np.asarray(np.einsum("ni,ni->n", a, b))
+
+
 def _facing(summed: Reals, first: Reals) -> tuple[Reals, Reals]:
     """Return the direction of summed normals, and their length; the first normal's direction where they cancel."""
     length = np.linalg.norm(summed, axis=1)
@@ -180,7 +187,7 @@ def _facing(summed: Reals, first: Reals) -> tuple[Reals, Reals]:
 
 def _powers(at: Reals, half: Reals) -> tuple[Reals, Reals]:
     """Return the means over segments, from at - half to at + half, of the distance to the power of 2 and of 4."""
-    far, across, along = (np.sum(a * b, axis=1) for a, b in ((at, at), (half, half), (at, half)))
+    far, across, along = (_dot(a, b) for a, b in ((at, at), (half, half), (at, half)))
     return far + across / 3.0, far * far + (4.0 * along * along + 2.0 * far * across) / 3.0 + across * across / 5.0
 
 
@@ -192,13 +199,13 @@ def _principal(spread: Reals, facing: Reals, mass: Reals, reach: Reals) -> tuple
     one = np.column_stack([1.0 + sign * facing[:, 0] ** 2 * a, sign * b, -sign * facing[:, 0]])
     two = np.column_stack([b, sign + facing[:, 1] ** 2 * a, -facing[:, 1]])
     by_one, by_two, by_normal = (np.einsum("nij,nj->ni", spread, v) for v in (one, two, facing))
-    s11, s12, s22 = (np.sum(u * v, axis=1) for u, v in ((one, by_one), (one, by_two), (two, by_two)))
+    s11, s12, s22 = (_dot(u, v) for u, v in ((one, by_one), (one, by_two), (two, by_two)))
     angle = 0.5 * np.arctan2(2.0 * s12, s11 - s22)
     axis = np.cos(angle)[:, None] * one + np.sin(angle)[:, None] * two
     gap = np.hypot(s11 - s22, 2.0 * s12)
     large, small = 0.5 * (s11 + s22 + gap), np.maximum(0.5 * (s11 + s22 - gap), 0.0)
-    up = np.sum(facing * by_normal, axis=1)
-    lean = np.hypot(np.sum(one * by_normal, axis=1), np.sum(two * by_normal, axis=1))
+    up = _dot(facing, by_normal)
+    lean = np.hypot(_dot(one, by_normal), _dot(two, by_normal))
     length = np.sqrt(3.0 * large / np.where(mass > 0.0, mass, np.inf))
     length = np.maximum(length, _SHORTEST * reach)
     rest = small + np.abs(up) + 2.0 * lean + np.abs(mass * length**2 / 3.0 - large)

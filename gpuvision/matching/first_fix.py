@@ -31,7 +31,7 @@ Float64 = npt.NDArray[np.float64]
 MOST_RULERS = 1024  # rows of one pose
 _VERIFYING = 512
 _FEWEST = 12  # rulers and edges that a pose is believed from
-_SOLVED = 256  # of the edges that were found about a start
+_SOLVED = 128  # of the edges that were found about a start
 _TRIALS = {"rigid": 128, "scale": 256, "affine": 512}  # one of them all good, of half bad rows: all but 6e-8
 _ROUNDS = 3
 _CLEAR = 2.0
@@ -328,10 +328,11 @@ class FirstFix:
     def _others(self, best: _Tried, tried: list[_Tried]) -> list[_Tried]:
         """Those that put the rulers elsewhere than the best one does, best first."""
         limit = (2.0 * self.tolerance_px + 1.0) / self._scale
-        points = _moved(self.rulers, best.motion, self.placement).point
+        points = self.rulers.point - self.placement
 
         def is_other(each: _Tried) -> bool:
-            away = np.linalg.norm(_moved(self.rulers, each.motion, self.placement).point - points, axis=-1)
+            change = each.motion - best.motion
+            away = np.linalg.norm(points @ change[:, :2].T + change[:, 2], axis=-1)
             return bool(np.median(away) > limit)
 
         return sorted(filter(is_other, tried), key=lambda each: -each.score)

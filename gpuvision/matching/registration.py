@@ -24,6 +24,7 @@ from gpuvision.matching.selection import Imaging, candidates
 Float64 = npt.NDArray[np.float64]
 _RULERS, _POINTS = 512, 512
 _ENOUGH = 128  # of them: where the best smoothing leaves room for fewer, it is less
+_PLACES = 24  # that are verified of a picture: of larger cells there are fewer than of a board's
 _TILE = 8  # px, in which a template has one edge
 
 __all__ = ["FirstFix", "KnownEdges", "Registration", "board_fix", "register", "template_edges"]
@@ -197,6 +198,7 @@ def register(
         freedom=freedom,
         tolerance_px=tolerance_px,
         cell_px=cell_px,
+        most=_PLACES,
     )
     found, start = fix(image, device=device), np.array([*away, 0.0])
     return found._replace(

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Circle, Rectangle
 
 from gpuvision.board_view import BoardView
 from gpuvision.features import FeatureSet
@@ -44,6 +44,8 @@ def draw_features(path: str | Path, artwork: Artwork, features: FeatureSet, regi
     pair = features.spacing > 0
     for which, colour in ((~pair, _USED), (pair, "#ff66ff")):
         axes.add_collection(LineCollection(list(lines[which]), colors=colour, linewidths=1.4))
+    for middle, radius in zip(features.marks.point, features.marks.radius, strict=True):
+        axes.add_patch(Circle(_MM * middle, _MM * radius, fill=False, edgecolor=_USED, linewidth=1.6))
     axes.plot(*(_MM * features.placement), marker="+", color="white", markersize=16, markeredgewidth=2)
     axes.set(xlim=_MM * window[:, 0], ylim=_MM * window[:, 1], aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
     if artwork.side == "bottom":
@@ -78,7 +80,7 @@ def _fill(
 
 
 def draw_located_board(path: str | Path, image: npt.NDArray[Any], artwork: Artwork, located: LocatedBoard) -> None:
-    """Draw an image with the artwork at the pose that was found, the rulers, and their edges, as PNG.
+    """Draw an image with the artwork at the pose that was found, the rulers, their edges, and marks, as PNG.
 
     The rulers are drawn as straight lines between their ends; through a lens they are bent by less than is seen.
     """
@@ -101,11 +103,32 @@ def draw_located_board(path: str | Path, image: npt.NDArray[Any], artwork: Artwo
         axes.plot(*places[which].T, ".", color=colour, markersize=4.0)
         handles.append(Line2D([], [], color=colour, label=f"{int(which.sum())} rulers: {name}"))
     axes.plot(*located.placement_px, marker="+", color="white", markersize=18, markeredgewidth=1.6)
+    handles += _draw_marks(axes, located)
     _draw_axes(axes, view)
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="column [px]", ylabel="row [px]")
     axes.set_title(located.summary(), fontsize=8, loc="left")
     figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8, frameon=False)
     _write(figure, path)
+
+
+def _draw_marks(axes: Any, located: LocatedBoard) -> list[Line2D]:
+    """Draw marks as circles where they were found, and where they were not as they should lie; a legend's handles."""
+    told, view = located.marks, located.view
+    middles = np.where(told.found[:, None], told.image_px, view.measured(told.point))
+    size = np.where(told.found, np.nan_to_num(told.size), told.radius) / view.scale
+    handles = []
+    for name, which, colour in (
+        ("agree", told.used, _USED),
+        ("rejected", told.found & ~told.used, _REJECTED),
+        ("not found", told.laid & ~told.found, _NOTHING),
+    ):
+        for middle, radius in zip(middles[which], size[which], strict=True):
+            axes.add_patch(Circle(middle, radius, fill=False, edgecolor=colour, linewidth=1.4))
+            axes.plot(*middle, "x", color=colour, markersize=4.0)
+        if told.laid.any():
+            label = f"{int(which.sum())} marks: {name}"
+            handles.append(Line2D([], [], color=colour, marker="o", fillstyle="none", linestyle="", label=label))
+    return handles
 
 
 def _as_expected(located: LocatedBoard) -> str:

@@ -1,4 +1,4 @@
-"""Rulers in an image of a board, and the pose that their edges make: laid once, and again where the board was found."""
+"""Rulers and marks in an image of a board, and the pose that they make: once, and again where the board was found."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.board_marks import FoundMarks, find_marks
 from gpuvision.board_view import BoardView
 from gpuvision.features import FeatureSet, chosen_of
 from gpuvision.host import Device
 from gpuvision.matching.artwork import Artwork
+from gpuvision.matching.marks import marks_of, reach_of
 from gpuvision.matching.pose import BoardPose, SolvePose, line_rows
 from gpuvision.matching.ruler import LONGEST, RulerEdges, best_smoothing
 from gpuvision.matching.selection import Candidates, Imaging, candidates
@@ -23,9 +25,12 @@ Float64 = npt.NDArray[np.float64]
 
 _AGAIN_PX = 4.0  # reach of rulers that are laid at a pose that was found
 _SAMPLED_PX = 0.02  # [px] standard deviation of what bilinear samples cost an edge; neighbours have some in common
-_LEAST_SHARE = 0.3  # of the rulers in the image that must agree
+_LEAST_SHARE = 0.3  # of the rulers and marks in the image that must agree
 _WORST_PX = 0.5  # by so much edges may disagree with a pose
 _USUAL_CANDIDATES = 2500
+_MOST_MARKS = 40
+_MOST_SEARCHED_PX = 190.0  # rulers of marks are no longer
+_SLACK_PX = 1.0  # by which marks may lie further out than expected, besides how they are etched
 _BEYOND, _TURN = 2.0, 5e-3  # times as far as the rulers reach, and a least angle [rad]: a pose there is none of theirs
 _TRIALS = 256  # poses to start from: of four rows, all miss half of them bad in 7 of 1e8 boards
 
@@ -85,6 +90,7 @@ class Solution(NamedTuple):
     spread: float
     condition: float
     rulers: Rulers
+    marks: FoundMarks
     reason: str
 
 
@@ -101,13 +107,18 @@ class Fix(NamedTuple):
         return self.solution.rulers
 
     @property
+    def agreeing(self) -> int:
+        """How many rulers and marks the pose agrees with."""
+        return _count(self.solution.rulers.used, self.solution.marks.used)
+
+    @property
     def reason(self) -> str:
         """Why the pose is refused; empty where it is not."""
         return self.solution.reason
 
 
 class Looking:
-    """Rulers in an image, and the poses they make."""
+    """Rulers and marks in an image, and the poses they make."""
 
     def __init__(
         self,
@@ -140,17 +151,45 @@ class Looking:
     def _pass(
         self, view: BoardView, copper: Copper, length_px: Float64, within: tuple[float, float] | None = None
     ) -> Solution:
-        rulers = self._measured(view, copper, length_px)
-        laid, found = int(rulers.laid.sum()), int(rulers.found.sum())
+        rulers, marks = self._measured(view, copper, length_px), self._found(view, copper, is_first=within is not None)
+        what = "rulers and marks" if len(marks.laid) else "rulers"
+        laid, found = _count(rulers.laid, marks.laid), _count(rulers.found, marks.found)
         if laid < 3:
-            return _refused(rulers, f"{laid} of {len(rulers.laid)} rulers lie in the image, expected 3 or more")
+            told = f"{laid} of {len(rulers.laid) + len(marks.laid)} {what} lie in the image, expected 3 or more"
+            return _refused(rulers, marks, told)
         if found < 3:
             return _refused(
                 rulers,
-                f"{found} of {laid} rulers found an edge of {self.threshold:.3g} grey levels or more, expected 3; is "
+                marks,
+                f"{found} of {laid} {what} found an edge of {self.threshold:.3g} grey levels or more, expected 3; is "
                 "it this side of this board, near there, at this scale?",
             )
-        return self._solved(rulers, view.scale, within)
+        solution = self._solved(rulers, marks, view.scale, within)
+        if not solution.reason or not marks.found.any():
+            return solution
+        # A mark may say as much as all the rest together. Where it disagrees with the rest, all are asked alike.
+        sigmas = np.concatenate([rulers.sigma, *marks.axes[0].T])
+        alike = marks.known_to(float(np.nanmedian(sigmas)))
+        again = self._solved(rulers, alike, view.scale, within)
+        return solution if again.reason else again
+
+    def _found(self, view: BoardView, copper: Copper, *, is_first: bool) -> FoundMarks:
+        """Find marks as far as the board may be off, and nearer where it was found."""
+        features = self.features
+        reach = reach_of(features.marks.point, features.placement, features.imaging).max(initial=0.0) / view.scale
+        reach += 3 * self.etch / view.scale + _SLACK_PX
+        return find_marks(
+            self.grey,
+            features.marks,
+            view,
+            is_bright=copper == "bright",
+            search_px=float(min(reach, _MOST_SEARCHED_PX if is_first else _AGAIN_PX)),
+            threshold=self.threshold,
+            noise=self.noise,
+            blur_px=self.blur_px,
+            etch=self.etch,
+            device=self.device,
+        )
 
     def _measured(self, view: BoardView, copper: Copper, length_px: Float64) -> Rulers:
         """Look along all rulers: those across single edges together, those across traces by the traces' widths."""
@@ -164,7 +203,7 @@ class Looking:
         spacing_px = features.spacing / view.scale
         smoothing = best_smoothing(self.blur_px)
         # One length for all, of few that there are: every other one would be a build of its own.
-        room = max(float(length_px.max()), 2 * math.ceil(3 * smoothing) + 3)
+        room = max(float(length_px.max(initial=0.0)), 2 * math.ceil(3 * smoothing) + 3)
         length = min(16 * math.ceil(room / 16), LONGEST)
         for low, high in _alike(spacing_px):
             group = np.flatnonzero((spacing_px >= low) & (spacing_px <= high))
@@ -185,13 +224,16 @@ class Looking:
         nothing = np.zeros(count)
         return Rulers(features.point, features.normal, length_px, position, sigma, nothing, nothing * np.nan, status)
 
-    def _solved(self, rulers: Rulers, scale: float, within: tuple[float, float] | None) -> Solution:
+    def _solved(self, rulers: Rulers, marks: FoundMarks, scale: float, within: tuple[float, float] | None) -> Solution:
         """Solve for the pose, and along with it for the etching where single edges were measured."""
         placement = self.features.placement
         single = self.features.spacing == 0
         is_etched = bool((single & rulers.found).any()) and self.etch > 0
         seen = rulers.point + rulers.normal * (rulers.position_px * scale)[:, None]
-        grows = np.where(single, 1.0, 0.0) if is_etched else None
+        across = line_rows(
+            rulers.normal, rulers.point - placement, seen - placement, rulers.sigma, np.where(single, 1.0, 0.0)
+        )
+        rows = np.concatenate([across, marks.rows(placement)])
         fit = SolvePose(
             scale=None,
             smallest_scale=1.0,
@@ -200,10 +242,12 @@ class Looking:
             within=within,
             trials=_TRIALS,
             precision="double" if self.device.has_double else "single",
-        )(line_rows(rulers.normal, rulers.point - placement, seen - placement, rulers.sigma, grows), device=self.device)
-        told = rulers._replace(weight=np.nan_to_num(fit.weights), residual=fit.residuals)
+        )(np.ascontiguousarray(rows if is_etched else rows[:, :-1]), device=self.device)
+        count = len(rulers.sigma)
+        told = rulers._replace(weight=np.nan_to_num(fit.weights[:count]), residual=fit.residuals[:count])
+        marks = marks.judged(fit.weights[count:], fit.residuals[count:])
         if int(fit.status):
-            return _refused(told, _why(fit, int(rulers.found.sum())))
+            return _refused(told, marks, _why(fit, _count(rulers.found, marks.found, marks.found)))
         solution = Solution(
             pose=_about(np.asarray(fit.pose, np.float64), placement),
             # Of few edges that happen to agree better than they should the scatter is not to be trusted.
@@ -212,17 +256,19 @@ class Looking:
             spread=float(fit.spread),
             condition=float(fit.condition),
             rulers=told,
+            marks=marks,
             reason="",
         )
         return self._judged(solution, float(fit.scale), scale)
 
     def _judged(self, solution: Solution, spread: float, scale: float) -> Solution:
-        """Refuse what too few rulers agree with, or what they disagree with too much."""
-        rulers = solution.rulers
-        used, laid = int(rulers.used.sum()), int(rulers.laid.sum())
+        """Refuse what too few rulers and marks agree with, or what they disagree with too much."""
+        rulers, marks = solution.rulers, solution.marks
+        used, laid = _count(rulers.used, marks.used), _count(rulers.laid, marks.laid)
         if used < max(3, _LEAST_SHARE * laid):
-            return solution._replace(reason=f"{used} of {laid} rulers agree, expected {_LEAST_SHARE:.0%} or more")
-        off = spread * float(np.nanmedian(rulers.sigma)) / scale
+            what = "rulers and marks" if len(marks.laid) else "rulers"
+            return solution._replace(reason=f"{used} of {laid} {what} agree, expected {_LEAST_SHARE:.0%} or more")
+        off = spread * float(np.nanmedian(np.concatenate([rulers.sigma, *marks.axes[0].T]))) / scale
         if off > _WORST_PX:
             return solution._replace(reason=f"the edges lie {off:.1f} px off any pose, expected {_WORST_PX} px or less")
         return solution
@@ -242,24 +288,26 @@ def _alike(spacing_px: Float64) -> list[tuple[float, float]]:
 
 def _why(fit: BoardPose, found: int) -> str:
     if int(fit.status) & Status.OUT_OF_RANGE:
-        return (
-            "the edges found agree on a pose further away than the rulers reach; say nearer where it is, or within more"
-        )
+        return "what was found agrees on a pose further away than was looked; say nearer where it is, or within more"
     if not int(fit.status) & Status.AMBIGUOUS:
-        return f"{found} edges were found, too few for a pose ({_flags(fit.status)})"
+        return f"{found} edges (a mark for two) were found, too few for a pose ({_flags(fit.status)})"
     if np.isfinite(fit.agreement) and float(fit.agreement) < _LEAST_SHARE:
         return (
-            f"{int(fit.inliers)} of the {found} edges found agree on a pose, with {float(fit.agreement):.0%} of what "
-            f"they say of it, expected {_LEAST_SHARE:.0%} or more"
+            f"{int(fit.inliers)} of the {found} edges found (a mark for two) agree on a pose, with "
+            f"{float(fit.agreement):.0%} of what they say of it, expected {_LEAST_SHARE:.0%} or more"
         )
     if np.isfinite(fit.leverage) and float(fit.leverage) > 0.0:
         return "a part of the pose hangs on a single edge, which no other one checks; look at more edges"
     return "the edges found do not fix x, y and theta (all parallel, or all through one point)"
 
 
-def _refused(rulers: Rulers, reason: str) -> Solution:
+def _refused(rulers: Rulers, marks: FoundMarks, reason: str) -> Solution:
     nothing = np.full((3, 3), np.nan)
-    return Solution(nothing[0], nothing, math.nan, math.nan, math.nan, rulers, reason)
+    return Solution(nothing[0], nothing, math.nan, math.nan, math.nan, rulers, marks, reason)
+
+
+def _count(*which: npt.NDArray[np.bool_]) -> int:
+    return int(sum(each.sum() for each in which))
 
 
 def _about(pose: Float64, point: Float64) -> Float64:
@@ -283,9 +331,10 @@ def _flags(status: Any) -> str:
 
 
 def features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging, budget: float = 60) -> FeatureSet:
-    """Choose rulers that lie in an image wherever the board is within ``imaging.shift``.
+    """Choose rulers and marks that lie in an image wherever the board is within ``imaging.shift``.
 
-    Of a view with thousands of places only five windows of it are looked at, its corners and its middle.
+    Of a view with thousands of places only five windows of it are looked at for rulers, its corners and its middle.
+    Marks come beside the budget.
 
     Raises
     ------
@@ -310,9 +359,13 @@ def features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging, budget
     margin = (rulers.length / 2 + imaging.shift) / imaging.pixel + imaging.width_px
     fits = view.within(rulers.point, margin) & (rulers.length < (LONGEST - 2) * imaging.pixel)
     rulers = Candidates._make([*(each[fits] for each in rulers[:-1]), placement])
-    if len(rulers.sigma) < 3:
+    marks = marks_of(artwork, view.bounds, placement, imaging, _MOST_MARKS)
+    reach = marks.radius + reach_of(marks.point, placement, imaging)
+    marks = marks.only(view.within(marks.point, reach / imaging.pixel))
+    if len(rulers.sigma) + len(marks.sigma) < 3:
         raise ValueError(
-            f"{len(rulers.sigma)} edges of the {artwork.side} artwork in view stand free enough for a ruler, expected "
-            "3 or more; is the board there (near), is the scale right, is the blur less?"
+            f"{len(rulers.sigma)} edges of the {artwork.side} artwork in view stand free enough for a ruler, and "
+            f"{len(marks.sigma)} round marks, expected 3 or more; is the board there (near), is the scale right, is "
+            "the blur less?"
         )
-    return chosen_of(rulers, imaging, artwork.side, budget=budget)
+    return chosen_of(rulers, imaging, artwork.side, marks=marks, are_free=True, budget=budget)

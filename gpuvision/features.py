@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -19,6 +19,7 @@ from gpuvision.description import Section, read
 from gpuvision.host import Device
 from gpuvision.host.files import replacing
 from gpuvision.matching.artwork import Artwork, Side
+from gpuvision.matching.marks import SPOKES, Marks, marks_of, with_marks
 from gpuvision.matching.ruler import LONGEST, RulerEdges, best_smoothing
 from gpuvision.matching.selection import Candidates, Imaging, Selection, candidates, select
 
@@ -27,12 +28,13 @@ BudgetUnit = Literal["rulers", "px", "us"]
 UNITS: tuple[str, ...] = get_args(BudgetUnit)
 _TIMED_RULERS, _TIMED_CALLS = 256, 20
 _PER_SOURCE = 4
-MOST_RULERS = 1000  # rows that one pose is solved from
+_NOTHING = 1e-9  # of the budget
+MOST_ROWS = 1000  # that one pose is solved from: one of a ruler, two of a mark
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeatureSet:
-    """Rulers on one side of a board, and what they promise.
+    """Rulers and round marks on one side of a board, and what they promise.
 
     Attributes
     ----------
@@ -55,7 +57,9 @@ class FeatureSet:
     condition
         Worst standard deviation over best.
     region
-        (2, 2) least and greatest x, y [m] that the rulers sample: what the camera must read.
+        (2, 2) least and greatest x, y [m] that they sample: what the camera must read.
+    marks
+        Vias, fiducials and other round lands.
     """
 
     side: Side
@@ -69,11 +73,15 @@ class FeatureSet:
     covariance: Float64
     condition: float
     region: Float64
+    marks: Marks = field(default_factory=Marks.none)
 
     @classmethod
-    def of(cls, rulers: Candidates, chosen: Selection, imaging: Imaging, side: Side) -> FeatureSet:
-        """Return what was chosen."""
-        kept = chosen.chosen
+    def of(
+        cls, rulers: Candidates, chosen: Selection, imaging: Imaging, side: Side, marks: Marks | None = None
+    ) -> FeatureSet:
+        """Return what was chosen of rulers, and of marks that come after them (`with_marks`)."""
+        is_mark = rulers.radius[chosen.chosen] > 0
+        kept, first = chosen.chosen[~is_mark], len(rulers.radius) - (0 if marks is None else len(marks.radius))
         return cls(
             side=side,
             placement=rulers.placement,
@@ -86,6 +94,7 @@ class FeatureSet:
             covariance=chosen.covariance,
             condition=chosen.condition,
             region=chosen.region,
+            marks=Marks.none() if marks is None else marks.only(chosen.chosen[is_mark] - first),
         )
 
     @property
@@ -104,8 +113,9 @@ class FeatureSet:
         sx, sy, turn = self.sigmas
         pairs = int(np.sum(self.spacing > 0))
         columns, rows = self.region_px
+        marks = f" and {len(self.marks.radius)} marks" if len(self.marks.radius) else ""
         return (
-            f"{len(self.length)} rulers ({pairs} across traces), {int(self._pixels().sum())} px, in a region of "
+            f"{len(self.length)} rulers ({pairs} across traces){marks}, {int(self._pixels().sum())} px, in a region of "
             f"{columns} x {rows} px\n"
             f"predicted at ({1e3 * self.placement[0]:.3f}, {1e3 * self.placement[1]:.3f}) mm: sigma x {1e6 * sx:.2f} "
             f"µm, y {1e6 * sy:.2f} µm, theta {1e3 * turn:.4f} mrad"
@@ -146,6 +156,10 @@ class FeatureSet:
                 }
                 for number in range(len(self.length))
             ],
+            "mark": [
+                {"point": point.tolist(), "radius": float(radius), "hole": float(hole), "sigma": float(sigma)}
+                for point, radius, hole, sigma in zip(*self.marks, strict=True)
+            ],
         }
         with replacing(path) as file:
             tomli_w.dump(table, file)
@@ -178,10 +192,17 @@ def read_features(path: str | Path) -> FeatureSet:
     region.numbers("columns_and_rows", "pixel", (2,))
     region.finish()
     rows = [_ruler(table) for table in top.sections("ruler")]
+    marks = _marks(top.sections("mark"))
     top.finish()
-    if not 3 <= len(rows) <= MOST_RULERS:
-        raise top.error(f"{len(rows)} tables [[ruler]], expected 3 to {MOST_RULERS}")
-    point, normal, spacing, length, sigma = (np.array(each) for each in zip(*rows, strict=True))
+    if not 3 <= len(rows) + 2 * len(marks.radius) <= MOST_ROWS:
+        raise top.error(
+            f"{len(rows)} tables [[ruler]] and {len(marks.radius)} [[mark]], expected 3 to {MOST_ROWS}, of marks half "
+            "as many"
+        )
+    point, normal, spacing, length, sigma = (
+        np.array([row[column] for row in rows], np.float64).reshape(-1, *shape)
+        for column, shape in enumerate(((2,), (2,), (), (), ()))
+    )
     return FeatureSet(
         side=side,
         placement=placement,
@@ -194,6 +215,7 @@ def read_features(path: str | Path) -> FeatureSet:
         covariance=covariance,
         condition=condition,
         region=bounds,
+        marks=marks,
     )
 
 
@@ -221,6 +243,15 @@ def _ruler(table: Section) -> tuple[Any, ...]:
     if math.hypot(*normal) < 0.5:
         raise table.error(f"{table.dotted('normal')} is {normal}, expected a direction of length 1")
     return row
+
+
+def _marks(tables: tuple[Section, ...]) -> Marks:
+    rows = []
+    for table in tables:
+        row = (table.numbers("point", "m", (2,)), table.number("radius", "m", above=0.0))
+        rows.append((*row, table.number("hole", "m", at_least=0.0), table.number("sigma", "m", above=0.0)))
+        table.finish()
+    return Marks(*(np.array(each) for each in zip(*rows, strict=True))) if rows else Marks.none()
 
 
 def clearance_of(imaging: Imaging) -> float:
@@ -266,13 +297,16 @@ def choose_features(
         What is there does not fix x, y and theta, or the budget is too small.
     """
     box = np.asarray(region, np.float64)
-    rulers = candidates(artwork, box, box.mean(axis=0) if placement is None else placement, imaging)
-    if len(rulers.sigma) < 3:
+    place = box.mean(axis=0) if placement is None else np.asarray(placement, np.float64)
+    rulers, marks = candidates(artwork, box, place, imaging), marks_of(artwork, box, place, imaging)
+    if len(rulers.sigma) + 2 * len(marks.sigma) < 3:
         raise ValueError(
             f"{len(rulers.sigma)} edges of the region stand free enough for a ruler, expected 3 or more; give a larger "
             "region, a smaller pixel or blur, or less shift"
         )
-    return chosen_of(rulers, imaging, artwork.side, budget=budget, unit=unit, missing=missing, device=device)
+    return chosen_of(
+        rulers, imaging, artwork.side, marks=marks, budget=budget, unit=unit, missing=missing, device=device
+    )
 
 
 def chosen_of(
@@ -281,36 +315,45 @@ def chosen_of(
     side: Side,
     *,
     budget: float,
+    marks: Marks | None = None,
+    are_free: bool = False,
     unit: BudgetUnit = "rulers",
     missing: float = 0.0,
     device: Device | None = None,
 ) -> FeatureSet:
-    """Choose among rulers that could be laid; see `choose_features`."""
+    """Choose among rulers that could be laid, and marks: all of them where they are free; see `choose_features`."""
     if unit not in UNITS:
         raise ValueError(f"the budget's unit is {unit!r}, expected one of {', '.join(UNITS)}")
-    costs = None
+    marks = Marks.none() if marks is None else marks
+    both = with_marks(rulers, marks, imaging)
+    costs = np.where(both.radius > 0, SPOKES, 1.0)
     if unit == "px":
-        costs = rulers.pixels(imaging)
+        costs = both.pixels(imaging)
     elif unit == "us":
         launch, per_pixel = _microseconds(rulers, imaging, device)
-        costs, budget = per_pixel * rulers.pixels(imaging), budget - launch
+        costs, budget = per_pixel * both.pixels(imaging), budget - launch
     if unit == "rulers":
-        budget = min(budget, MOST_RULERS)
+        budget = min(budget, MOST_ROWS - (2 * len(marks.radius) if are_free else 0))
     if budget <= 0:
         raise ValueError("the budget is used up before the first ruler; give a larger one")
     # Enough of each trace for the budget, where there are few.
-    affordable = budget / (1.0 if costs is None else float(costs.mean()))
+    affordable = budget / float(costs[both.radius == 0].mean()) if len(rulers.radius) else 0.0
     each = max(_PER_SOURCE, math.ceil(2 * affordable / max(len(np.unique(rulers.source)), 1)))
-    chosen = select(rulers, imaging, budget, costs=costs, missing=missing, per_source=each)
-    if len(chosen.chosen) > MOST_RULERS:
-        raise ValueError(f"{len(chosen.chosen)} rulers fit the budget, one pose takes {MOST_RULERS} at most")
-    return FeatureSet.of(rulers, chosen, imaging, side)
+    if are_free and len(marks.radius):
+        costs = np.where(both.radius > 0, _NOTHING * budget, costs)
+        budget *= 1 + (len(marks.radius) + 1) * _NOTHING
+    chosen = select(both, imaging, budget, costs=costs, missing=missing, per_source=each)
+    rows = len(chosen.chosen) + int(np.sum(both.radius[chosen.chosen] > 0))
+    if rows > MOST_ROWS:
+        raise ValueError(f"{rows} rulers (marks twice) fit the budget, one pose takes {MOST_ROWS} at most")
+    return FeatureSet.of(both, chosen, imaging, side, marks)
 
 
 def _microseconds(rulers: Candidates, imaging: Imaging, device: Device | None) -> tuple[float, float]:
     """Return what a launch takes, and each pixel of a ruler: from a few rulers and from many, the fastest of 20."""
     device = Device.best() if device is None else device
-    length = min(max(math.ceil(float(np.median(rulers.length)) / imaging.pixel), 5), LONGEST)
+    usual = float(np.median(rulers.length)) if len(rulers.length) else 0.0
+    length = min(max(math.ceil(usual / imaging.pixel), 2 * math.ceil(3 * best_smoothing(imaging.blur_px)) + 3), LONGEST)
     smoothing = min(best_smoothing(imaging.blur_px), (length - 3) / 6.5)
     ruler = RulerEdges(threshold=10.0, length=length, width=imaging.width_px, smoothing_px=smoothing)
     image = np.random.default_rng(1).integers(0, 255, (600, 800), np.uint8)

@@ -1,7 +1,8 @@
 """Where a camera is over a board: an image and the board's artwork become a pose with a covariance.
 
-Rulers find edges, from what is measured along them a robust pose is solved, and rulers laid anew at that pose measure
-it again. Where the board is not known to a few pixels, `gpuvision.matching.registration` finds it first.
+Rulers find edges, round marks are found by their contours, from both a robust pose is solved, and looked for anew at
+that pose they measure it again. Where the board is not known to a few pixels, `gpuvision.matching.registration` finds
+it first.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.board_marks import FoundMarks
 from gpuvision.board_rulers import Copper, Fix, Looking, Rulers, features_in_view, moved
 from gpuvision.board_view import BoardView, grey_image, noise_of
 from gpuvision.camera.camera import Camera
@@ -53,6 +55,8 @@ class LocatedBoard:
         (3, 3) of the place on the board seen where the placement point is [m], and of theta [rad].
     rulers
         `Rulers` of the last pass.
+    marks
+        `FoundMarks` of the last pass.
     features
         What was looked for.
     growth
@@ -82,6 +86,7 @@ class LocatedBoard:
     placement_px: Float64
     placement_covariance: Float64
     rulers: Rulers
+    marks: FoundMarks
     features: FeatureSet
     growth: float
     spread: float
@@ -106,10 +111,12 @@ class LocatedBoard:
 
     def summary(self) -> str:
         """Return the pose in a line or two, or why there is none."""
-        told = self.rulers
-        counts = f"{np.sum(told.used)} of {np.sum(told.laid)} rulers agree, {np.sum(told.found)} found an edge"
         if self.reason:
             return f"refused: {self.reason}"
+        told, marks = self.rulers, self.marks
+        counts = f"{np.sum(told.used)} of {np.sum(told.laid)} rulers agree, {np.sum(told.found)} found an edge"
+        if marks.laid.any():
+            counts += f"; {np.sum(marks.used)} of {np.sum(marks.laid)} marks agree, {np.sum(marks.found)} were found"
         (x, y, theta), (sx, sy, turn) = self.pose, self.sigmas
         return (
             f"x {1e3 * x:.4f} mm, y {1e3 * y:.4f} mm, theta {math.degrees(theta):.4f} degrees\n"
@@ -118,7 +125,7 @@ class LocatedBoard:
 
     def report(self) -> dict[str, Any]:
         """Return what ``pose.json`` holds: metres, radians; what is not known is null."""
-        told, first = self.rulers, self.first
+        told, marks, first = self.rulers, self.marks, self.first
         points = told.point + told.normal * np.nan_to_num(told.position_px * self.view.scale)[:, None]
         return {
             "gpuvision": version("gpuvision"),
@@ -144,7 +151,8 @@ class LocatedBoard:
             "search": None
             if first is None
             else {name: _plain(getattr(first, name)) for name in ("score", "runner_up")},
-            "counts": {name: int(np.sum(getattr(told, name))) for name in ("laid", "found", "used")},
+            "counts": {name: int(np.sum(getattr(told, name))) for name in ("laid", "found", "used")}
+            | {f"marks_{name}": int(np.sum(getattr(marks, name))) for name in ("laid", "found", "used")},
             "rulers": [
                 {
                     "point": _plain(told.point[number]),
@@ -156,6 +164,19 @@ class LocatedBoard:
                     "status": str(Status(int(told.status[number])).name or "OK"),
                 }
                 for number in range(len(told.weight))
+            ],
+            "marks": [
+                {
+                    "point": _plain(marks.point[number]),
+                    "image_px": _plain(marks.image_px[number]),
+                    "found": bool(marks.found[number]),
+                    "weight": _plain(marks.weight[number]),
+                    "residual": _plain(marks.residual[number]),
+                    "sigmas": _plain(np.sqrt(np.diag(marks.covariance[number]))),
+                    "radius": _plain(marks.size[number]),
+                    "status": str(Status(int(marks.status[number])).name or "OK"),
+                }
+                for number in range(len(marks.weight))
             ],
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
             "seconds": self.seconds,
@@ -191,7 +212,7 @@ def locate_board(
     copper: Copper = "auto",
     device: Device | None = None,
 ) -> LocatedBoard:
-    """Locate a camera over a board.
+    """Locate a camera over a board, by rulers and round marks; ``reason`` of the result says why a pose is refused.
 
     Parameters
     ----------
@@ -208,7 +229,7 @@ def locate_board(
         How far from there it may be, along x and along y [m], and in angle [rad]. None: 0.1 mm (or 4 pixels) and 0.3
         degrees; where ``near`` is None, 2 mm and 5 degrees. Beyond 0.25 mm (or 10 pixels) or 1 degree it is searched.
     features
-        What to look for; None: as many rulers as the budget says are chosen now. They say how far they reach.
+        What to look for, and how far away; None: marks, and as many rulers as the budget says, are chosen now.
     model
         The lens; None: there is none.
     budget
@@ -226,50 +247,40 @@ def locate_board(
     device
         Where to run; None: `Device.best`.
 
-    Returns
-    -------
-    LocatedBoard
-        Its ``reason`` says why a pose is refused.
-
     Raises
     ------
     ValueError
-        A parameter is out of its range, or no rulers that fix the pose can be laid in the image.
+        A parameter is out of its range, or nothing that fixes the pose can be looked for in the image.
     RecordingError
         The image is none that rulers take.
     """
     grey = grey_image(image)
     if copper not in COPPER:
         raise ValueError(f"copper is {copper!r}, expected one of {', '.join(COPPER)}")
-    device = Device.best() if device is None else device
-    x, y = artwork.bounds.mean(axis=0) if near is None else near[:2]
-    view = BoardView(
-        scale=scale,
-        shape=grey.shape,
-        pose=(float(x), float(y), 0.0 if near is None else float(near[2])),
-        mirrored=artwork.side == "bottom",
-        model=model,
-    )
+    levels = _levels(grey, noise, threshold)
+    job = _Job(grey, artwork, *levels, blur_px, etch, Device.best() if device is None else device)
+    view = _view_near(near, artwork, scale, grey.shape, model)
+    searched = job.searched(view, _reach(within, near is not None, scale, features))
+    return job.located(searched, job.chosen(searched, budget) if features is None else features, copper)
+
+
+def _levels(grey: npt.NDArray[Any], noise: float | None, threshold: float | None) -> tuple[float, float]:
+    """Return a pixel's noise and the least edge [grey levels], as they are given or as the image shows them."""
     level = noise_of(grey) if noise is None else noise
     low, high = np.percentile(grey, [1, 99])
-    least = max(4.0 * level, 0.05 * float(high - low), 1e-6) if threshold is None else threshold
-    reach = _reach(within, near is not None, scale, features)
-    clock = _Clock()
-    searched = _searched(grey, artwork, view, reach, blur_px, least, device, clock)
-    if features is None:
-        shift, angle = searched.reach
-        imaging = Imaging(pixel=scale, blur_px=blur_px, etch=etch, shift=shift, angle=angle)
-        features = features_in_view(artwork, searched.view, imaging, budget)
-        clock.told("features")
-    looked = Looking(grey, features, level, least, blur_px, etch, device)
-    kinds: tuple[Copper, ...] = ("bright", "dark") if copper == "auto" else (copper,)
-    fixes = [(kind, looked.located(searched.view, kind)) for kind in kinds]
-    kind, fix = max(fixes, key=lambda each: (not each[1].reason, np.sum(each[1].rulers.used)))
-    reason = searched.reason or fix.reason
-    if searched.other is not None and not reason:
-        reason = _undecided(searched, fix, looked.located(searched.other, kind))
-    clock.told("rulers")
-    return _result(fix, kind, features, looked, searched.found, reason, device, clock)
+    return level, max(4.0 * level, 0.05 * float(high - low), 1e-6) if threshold is None else threshold
+
+
+def _view_near(
+    near: tuple[float, float, float] | None,
+    artwork: Artwork,
+    scale: float,
+    shape: tuple[int, int],
+    model: Lens | Camera | None,
+) -> BoardView:
+    x, y = artwork.bounds.mean(axis=0) if near is None else near[:2]
+    pose = (float(x), float(y), 0.0 if near is None else float(near[2]))
+    return BoardView(scale=scale, shape=shape, pose=pose, mirrored=artwork.side == "bottom", model=model)
 
 
 def _reach(
@@ -300,50 +311,6 @@ class _Searched(NamedTuple):
     other: BoardView | None = None
 
 
-def _searched(
-    grey: npt.NDArray[Any],
-    artwork: Artwork,
-    view: BoardView,
-    reach: tuple[float, float],
-    blur_px: float,
-    least: float,
-    device: Device,
-    clock: _Clock,
-) -> _Searched:
-    """Find the board where rulers alone would not reach."""
-    if reach[0] <= max(_MOST_RULED[0], 10 * view.scale) and reach[1] <= _MOST_RULED[1]:
-        return _Searched(view, reach)
-    search = board_fix(
-        artwork, view.matrix, view.shape, shift=reach[0], angle=reach[1], blur_px=blur_px, threshold=least
-    )
-    clock.told("search prepared")
-    straight = grey
-    if view.model is not None:
-        straight = UndistortImage(model=view.model, border="replicate")(grey, device=device).image
-    found = search(straight, device=device)
-    clock.told("search")
-    left = (max(_AFTER_SEARCH[0], 3 * view.scale), _AFTER_SEARCH[1])
-    if not np.all(np.isfinite(found.pose)):
-        best = f"the best one has {found.score:.0%} of its edges" if found.rulers else "there are too few edges"
-        reason = f"the search found no place for the board: {best}; is it in view, is the scale right?"
-        return _Searched(view, left, found, reason)
-    other = moved(view, found.runner_up_pose) if found.status & Status.AMBIGUOUS else None
-    return _Searched(moved(view, found.pose), left, found, other=other)
-
-
-def _undecided(searched: _Searched, best: Fix, other: Fix) -> str:
-    """Return why a board that the search found at two places may be at either; empty where rulers tell them apart.
-
-    Rulers that were chosen to fix the pose look at more than at what is repeated, and at traces by their widths.
-    """
-    if other.reason or other.rulers.used.sum() <= _OTHER_SHARE * best.rulers.used.sum():
-        return ""
-    places = (searched.view.pose, other.view.pose)
-    told = " or ".join(f"x {1e3 * x:.2f} mm, y {1e3 * y:.2f} mm" for x, y, _ in places)
-    shares = f"{best.rulers.used.sum()} and {other.rulers.used.sum()} rulers agree"
-    return f"the board may be at {told}: {shares}; say near which of them it is"
-
-
 class _Clock:
     """What each step took."""
 
@@ -356,38 +323,105 @@ class _Clock:
         self.seconds[step], self._last = now - self._last, now
 
 
-def _result(
-    fix: Fix,
-    copper: Copper,
-    features: FeatureSet,
-    looked: Looking,
-    first: Registration | None,
-    reason: str,
-    device: Device,
-    clock: _Clock,
-) -> LocatedBoard:
-    solution = fix.solution
-    # The board was seen moved by a small pose, at the placement point; the camera is moved against it. What the
-    # image's centre sees is off by the turn's error times its distance from there.
-    covariance = np.full((3, 3), math.nan) if reason else solution.covariance
-    arm = np.array(fix.view.pose[:2]) - features.placement
-    back = -np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
-    return LocatedBoard(
-        view=fix.view,
-        covariance=back @ covariance @ back.T,
-        placement=features.placement,
-        placement_px=fix.view.measured(features.placement),
-        placement_covariance=covariance,
-        rulers=solution.rulers,
-        features=features,
-        growth=solution.growth,
-        spread=solution.spread,
-        condition=solution.condition,
-        copper=copper,
-        noise=looked.noise,
-        threshold=looked.threshold,
-        reason=reason,
-        first=first,
-        device=device,
-        seconds=clock.seconds,
-    )
+@dataclass(frozen=True)
+class _Job:
+    """An image of a board, and what is known of both."""
+
+    grey: npt.NDArray[Any]
+    artwork: Artwork
+    noise: float
+    threshold: float
+    blur_px: float
+    etch: float
+    device: Device
+    clock: _Clock = field(default_factory=_Clock)
+
+    def searched(self, view: BoardView, reach: tuple[float, float]) -> _Searched:
+        """Find the board where rulers alone would not reach."""
+        if reach[0] <= max(_MOST_RULED[0], 10 * view.scale) and reach[1] <= _MOST_RULED[1]:
+            return _Searched(view, reach)
+        search = board_fix(
+            self.artwork,
+            view.matrix,
+            view.shape,
+            shift=reach[0],
+            angle=reach[1],
+            blur_px=self.blur_px,
+            threshold=self.threshold,
+        )
+        self.clock.told("search prepared")
+        straight = self.grey
+        if view.model is not None:
+            straight = UndistortImage(model=view.model, border="replicate")(self.grey, device=self.device).image
+        found = search(straight, device=self.device)
+        self.clock.told("search")
+        left = (max(_AFTER_SEARCH[0], 3 * view.scale), _AFTER_SEARCH[1])
+        if not np.all(np.isfinite(found.pose)):
+            best = f"the best one has {found.score:.0%} of its edges" if found.rulers else "there are too few edges"
+            reason = f"the search found no place for the board: {best}; is it in view, is the scale right?"
+            return _Searched(view, left, found, reason)
+        other = moved(view, found.runner_up_pose) if found.status & Status.AMBIGUOUS else None
+        return _Searched(moved(view, found.pose), left, found, other=other)
+
+    def chosen(self, searched: _Searched, budget: int) -> FeatureSet:
+        """Choose what to look for where the board is thought to be."""
+        shift, angle = searched.reach
+        imaging = Imaging(pixel=searched.view.scale, blur_px=self.blur_px, etch=self.etch, shift=shift, angle=angle)
+        features = features_in_view(self.artwork, searched.view, imaging, budget)
+        self.clock.told("features")
+        return features
+
+    def located(self, searched: _Searched, features: FeatureSet, copper: Copper) -> LocatedBoard:
+        """Look for the features, in copper of either kind where that is not known."""
+        looked = Looking(self.grey, features, self.noise, self.threshold, self.blur_px, self.etch, self.device)
+        kinds: tuple[Copper, ...] = ("bright", "dark") if copper == "auto" else (copper,)
+        fixes = [(kind, looked.located(searched.view, kind)) for kind in kinds]
+        kind, fix = max(fixes, key=lambda each: (not each[1].reason, each[1].agreeing))
+        reason = searched.reason or fix.reason
+        if searched.other is not None and not reason:
+            reason = _undecided(searched, fix, looked.located(searched.other, kind))
+        self.clock.told("rulers")
+        return self._result(fix, kind, features, searched.found, reason)
+
+    def _result(
+        self, fix: Fix, copper: Copper, features: FeatureSet, first: Registration | None, reason: str
+    ) -> LocatedBoard:
+        solution = fix.solution
+        # The board was seen moved by a small pose, at the placement point; the camera is moved against it. What the
+        # image's centre sees is off by the turn's error times its distance from there.
+        covariance = np.full((3, 3), math.nan) if reason else solution.covariance
+        arm = np.array(fix.view.pose[:2]) - features.placement
+        back = -np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
+        return LocatedBoard(
+            view=fix.view,
+            covariance=back @ covariance @ back.T,
+            placement=features.placement,
+            placement_px=fix.view.measured(features.placement),
+            placement_covariance=covariance,
+            rulers=solution.rulers,
+            marks=solution.marks,
+            features=features,
+            growth=solution.growth,
+            spread=solution.spread,
+            condition=solution.condition,
+            copper=copper,
+            noise=self.noise,
+            threshold=self.threshold,
+            reason=reason,
+            first=first,
+            device=self.device,
+            seconds=self.clock.seconds,
+        )
+
+
+def _undecided(searched: _Searched, best: Fix, other: Fix) -> str:
+    """Return why a board that the search found at two places may be at either; empty where rulers tell them apart.
+
+    Rulers that were chosen to fix the pose look at more than at what is repeated, and at traces by their widths.
+    """
+    if other.reason or other.agreeing <= _OTHER_SHARE * best.agreeing:
+        return ""
+    places = (searched.view.pose, other.view.pose)
+    told = " or ".join(f"x {1e3 * x:.2f} mm, y {1e3 * y:.2f} mm" for x, y, _ in places)
+    shares = f"{best.agreeing} and {other.agreeing} rulers and marks agree"
+    return f"the board may be at {told}: {shares}; say near which of them it is"

@@ -216,8 +216,8 @@ def _outline(primitive: Any) -> Float64:
 
 
 def disk(centre: Float64, radius: float) -> Float64:
-    """Regular polygon with the circle's area; (n, 2) corners within ``SAGITTA`` of it."""
-    count = _chords(radius, 2 * math.pi)
+    """Regular polygon with the circle's area; (n, 2) corners within ``SAGITTA`` of it, the same on all four sides."""
+    count = 4 * math.ceil(_chords(radius, 2 * math.pi) / 4)
     angle = np.arange(count) * (2 * math.pi / count)
     step = 2 * math.pi / count
     radius *= math.sqrt(step / math.sin(step))

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.matching.artwork import Artwork
-from gpuvision.matching.artwork_shapes import Float64, Layer, Shape, capsule, covered
+from gpuvision.matching.artwork_shapes import Float64
+from gpuvision.matching.sheets import Sheet, sheets_of, steps_along
 
 _ITSELF = 2e-6  # [m] within which a step is the edge that is looked for, to the chords of arcs
 _WORST_CONDITION = 1e4  # worst standard deviation over best: beyond it a pose is refused
@@ -120,6 +121,9 @@ class Candidates(NamedTuple):
         (n,) the same number for rulers on one trace, or on one side of a land.
     spacing
         (n,) of the two edges of a pair, as drawn [m]; 0 at a single edge.
+    radius
+        (n,) of a round mark [m], of which x and y are measured, each with its sigma; 0 for a ruler. Its normal is the
+        x axis, its length how far across it is looked for, in x and in y; it is a pair: etching does not move it.
     placement
         (2,) [m] the point whose pose counts.
     """
@@ -132,11 +136,13 @@ class Candidates(NamedTuple):
     ambiguity: Float64
     source: npt.NDArray[np.int64]
     spacing: Float64
+    radius: Float64
     placement: Float64
 
     def pixels(self, imaging: Imaging) -> Float64:
-        """(n,) how many pixels each ruler samples: a cost for :func:`select`."""
-        return np.asarray(np.ceil(self.length / imaging.pixel) * imaging.width_px)
+        """(n,) how many pixels each ruler samples, or lie about a mark: a cost for :func:`select`."""
+        long = np.ceil(self.length / imaging.pixel)
+        return np.asarray(long * np.where(self.radius > 0, long, imaging.width_px))
 
 
 class Selection(NamedTuple):
@@ -198,7 +204,7 @@ def candidates(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike
         raise ValueError("region must be finite ((x, y), (x, y)), the least first and the greatest second")
     if place.shape != (2,) or not np.all(np.isfinite(place)):
         raise ValueError("placement must be a finite x, y")
-    layers = _layers(artwork, imaging)
+    layers = sheets_of(artwork, imaging.registration)
     rows = [
         row
         for row in [*_single_rows(artwork, imaging), *_pair_rows(artwork, imaging)]
@@ -220,30 +226,11 @@ def candidates(artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike
         for each in zip(point + normal * across[:, None] / 2, normal, reach, strict=True)
     ]
     source = np.array([row[4] for row in rows], dtype=np.int64)
-    return Candidates(point, normal, sigma, pair, length, np.array(ambiguity, dtype=np.float64), source, across, place)
+    chances = np.array(ambiguity, dtype=np.float64)
+    return Candidates(point, normal, sigma, pair, length, chances, source, across, np.zeros(len(rows)), place)
 
 
 _Row = tuple[Float64, Float64, float, bool, int]
-
-
-class _Sheet(NamedTuple):
-    """A layer, how far it may lie off the copper, and whether it is dark where the others are bright: holes are."""
-
-    layer: Layer
-    off: float
-    dark: bool = False
-
-
-def _layers(artwork: Artwork, imaging: Imaging) -> tuple[_Sheet, ...]:
-    holes = zip(artwork.holes.start, artwork.holes.end, artwork.holes.diameter, strict=True)
-    drilled = tuple(Shape(capsule(start, end, across / 2)) for start, end, across in holes)
-    off = imaging.registration
-    return (
-        _Sheet(Layer(artwork.copper), 0.0),
-        _Sheet(Layer(artwork.mask), off),
-        _Sheet(Layer(artwork.silk), off),
-        _Sheet(Layer(drilled), off, dark=True),
-    )
 
 
 def _single_rows(artwork: Artwork, imaging: Imaging) -> list[_Row]:
@@ -294,17 +281,7 @@ def _lever(point: Float64, normal: Float64) -> Float64:
     return np.asarray(point[:, 0] * normal[:, 1] - point[:, 1] * normal[:, 0])
 
 
-def _steps(layer: Layer, point: Float64, normal: Float64, reach: float) -> tuple[Float64, npt.NDArray[np.bool_]]:
-    """Where a layer begins and ends along a normal, as far as a reach [m] either way, and whether it ends there."""
-    found = layer.crossings(point - reach * normal, point + reach * normal)
-    cuts = np.unique(np.concatenate([np.array([0.0, 1.0]), *(where for _, where in found)]))
-    cuts = cuts[(cuts >= 0) & (cuts <= 1)]
-    laid = covered(found, (cuts[1:] + cuts[:-1]) / 2)
-    step = laid[:-1] != laid[1:]
-    return (cuts[1:-1][step] - 0.5) * 2 * reach, laid[:-1][step]
-
-
-def _is_isolated(layers: tuple[_Sheet, ...], row: _Row, imaging: Imaging) -> bool:
+def _is_isolated(layers: tuple[Sheet, ...], row: _Row, imaging: Imaging) -> bool:
     """Whether no other step of any layer is so near to an edge as to pull it (see `RulerEdges.smoothing_px`)."""
     point, normal, across, _, _ = row
     reach = 3 * imaging.smoothing_px * imaging.pixel
@@ -313,13 +290,13 @@ def _is_isolated(layers: tuple[_Sheet, ...], row: _Row, imaging: Imaging) -> boo
     edges = (point,) if not across else (point - normal * across / 2, point + normal * across / 2)
     for sheet in layers:
         away = reach + sheet.off * float(np.abs(normal).sum())
-        places = np.concatenate([_steps(sheet.layer, edge, normal, away)[0] for edge in edges])
+        places = np.concatenate([steps_along(sheet.layer, edge, normal, away)[0] for edge in edges])
         if np.any(np.abs(places) > _ITSELF):
             return False
     return True
 
 
-def _ambiguity(layers: tuple[_Sheet, ...], point: Float64, normal: Float64, reach: float, found: float) -> float:
+def _ambiguity(layers: tuple[Sheet, ...], point: Float64, normal: Float64, reach: float, found: float) -> float:
     """Chance that another edge of the same sense comes as near to a ruler's middle as edges are found.
 
     An edge at a distance a from the one that is meant does where the board is shifted by more than a less that the
@@ -328,7 +305,7 @@ def _ambiguity(layers: tuple[_Sheet, ...], point: Float64, normal: Float64, reac
     chance = 0.0
     for sheet in layers:
         off = sheet.off * float(np.abs(normal).sum())
-        place, ends = _steps(sheet.layer, point, normal, reach + found + off)
+        place, ends = steps_along(sheet.layer, point, normal, reach + found + off)
         away = np.abs(place[(ends != sheet.dark) & (np.abs(place) > _ITSELF)]) - off
         chance += float(np.sum(np.clip((reach + found - away) / (2 * reach), 0.0, 1.0)))
     return min(1.0, chance)
@@ -379,7 +356,7 @@ def select(
     if criterion not in ("determinant", "placement"):
         raise ValueError(f"criterion must be 'determinant' or 'placement', not {criterion!r}")
     weight = _weight(rulers, missing)
-    chosen = _greedy(_rows(rulers), weight, price, rulers, imaging, (budget, criterion, per_source))
+    chosen = _greedy(weight, price, rulers, imaging, (budget, criterion, per_source))
     return promise(rulers, imaging, chosen, costs=costs, missing=missing)
 
 
@@ -400,9 +377,9 @@ def promise(
     ValueError
         They do not fix x, y and theta.
     """
-    price, weight, rows = _price(rulers, costs), _weight(rulers, missing), _rows(rulers)
+    price, weight = _price(rulers, costs), _weight(rulers, missing)
     which = np.asarray(chosen, dtype=np.int64)
-    covariance, condition = _promised(rows[which], weight[which], rulers, which, imaging)
+    covariance, condition = _promised(weight[which], rulers, which, imaging)
     return Selection(which, covariance, float(price[which].sum()), condition, _region(rulers, which, imaging))
 
 
@@ -425,8 +402,14 @@ def _rows(rulers: Candidates) -> Float64:
     return np.concatenate([rulers.normal, lever[:, None], np.where(rulers.pair, 0.0, 1.0)[:, None]], axis=1)
 
 
+def _second_rows(rulers: Candidates) -> Float64:
+    """(n, 4): what a mark says across its normal; zeros for rulers."""
+    across = np.where(rulers.radius[:, None] > 0, np.stack([-rulers.normal[:, 1], rulers.normal[:, 0]], axis=1), 0.0)
+    lever = _lever(rulers.point - rulers.placement, across)
+    return np.concatenate([across, lever[:, None], np.zeros((len(lever), 1))], axis=1)
+
+
 def _greedy(
-    rows: Float64,
     weight: Float64,
     price: Float64,
     rulers: Candidates,
@@ -434,6 +417,7 @@ def _greedy(
     limits: tuple[float, str, int],
 ) -> npt.NDArray[np.int64]:
     budget, criterion, per_source = limits
+    rows, second = _rows(rulers), _second_rows(rulers)
     # Variances of what is equally likely within limits; of nothing, where no angle or etching is expected.
     prior = np.array([imaging.shift**2 / 3, imaging.shift**2 / 3, imaging.angle**2 / 3, imaging.etch**2])
     covariance, of_etch = np.diag(np.maximum(prior, 1e-18)), 1 / max(prior[3], 1e-18)
@@ -444,16 +428,22 @@ def _greedy(
         free &= price <= budget
         if not free.any():
             return np.array(chosen, dtype=np.int64)
-        seen = rows @ covariance
-        total = 1 + weight * np.einsum("ij,ij->i", seen, rows)
+        seen, also = rows @ covariance, second @ covariance
+        # The determinant of I + w R C R', R the two rows of a mark; a ruler's second one is 0.
+        one, two = (1 + weight * np.einsum("ij,ij->i", *each) for each in ((seen, rows), (also, second)))
+        mixed = weight * np.einsum("ij,ij->i", seen, second)
+        total = one * two - mixed**2
         if criterion == "determinant":
             # Of the pose alone: what is learnt of the etching is none of its information.
             gain = np.log(total) - np.log1p(weight * rows[:, 3] ** 2 / of_etch)
         else:
-            gain = weight * np.sum(seen[:, :2] ** 2, axis=1) / total
+            products = [np.sum(a[:, :2] * b[:, :2], axis=1) for a, b in ((seen, seen), (seen, also), (also, also))]
+            gain = weight * (two * products[0] - 2 * mixed * products[1] + one * products[2]) / total
         best = int(np.argmax(np.where(free, gain / price, -np.inf)))
         chosen.append(best)
-        covariance -= weight[best] / total[best] * np.outer(seen[best], seen[best])
+        for row in (rows[best], second[best]):
+            pulled = covariance @ row
+            covariance -= weight[best] / (1 + weight[best] * (row @ pulled)) * np.outer(pulled, pulled)
         of_etch += weight[best] * rows[best, 3] ** 2
         budget -= price[best]
         free[best] = False
@@ -464,12 +454,13 @@ def _greedy(
 
 
 def _promised(
-    rows: Float64, weight: Float64, rulers: Candidates, chosen: npt.NDArray[np.int64], imaging: Imaging
+    weight: Float64, rulers: Candidates, chosen: npt.NDArray[np.int64], imaging: Imaging
 ) -> tuple[Float64, float]:
     """Covariance without what was known before, and its condition; the etching is taken out."""
-    if len(chosen) < 3:
+    if len(chosen) + int(np.sum(rulers.radius[chosen] > 0)) < 3:
         raise ValueError(f"{len(chosen)} rulers do not fix x, y and theta: give a larger budget or region")
-    information = (rows * weight[:, None]).T @ rows
+    both = (_rows(rulers)[chosen], _second_rows(rulers)[chosen])
+    information = np.asarray(sum((rows * weight[:, None]).T @ rows for rows in both))
     information[3, 3] += 1 / max(imaging.etch, 1e-9) ** 2
     pose = information[:3, :3] - np.outer(information[:3, 3], information[3, :3]) / information[3, 3]
     distance = max(float(np.hypot(*(rulers.point[chosen] - rulers.placement).T).mean()), imaging.pixel)
@@ -482,5 +473,6 @@ def _promised(
 
 def _region(rulers: Candidates, chosen: npt.NDArray[np.int64], imaging: Imaging) -> Float64:
     normal = np.abs(rulers.normal[chosen])
-    half = normal * rulers.length[chosen, None] / 2 + normal[:, ::-1] * (imaging.width_px * imaging.pixel / 2)
+    wide = np.where(rulers.radius[chosen] > 0, rulers.length[chosen], imaging.width_px * imaging.pixel)
+    half = normal * rulers.length[chosen, None] / 2 + normal[:, ::-1] * wide[:, None] / 2
     return np.stack([(rulers.point[chosen] - half).min(axis=0), (rulers.point[chosen] + half).max(axis=0)])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +15,7 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.matching.ruler import RulerEdges
+from gpuvision.mounted_camera import MountedCamera
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -99,7 +102,7 @@ def scan_top_view(
     places = pieces[:, None, :2] + edges.position[..., None] * pieces[:, None, 2:]
     found = np.isfinite(edges.position)
     points = view.places(places[found])
-    kept = once(points, np.broadcast_to(path[:, None], found.shape)[found], line_width)
+    kept = once(points, np.broadcast_to(path[:, None], found.shape)[found], np.hypot(*points.T), line_width)
     used = np.unique(path)
     paths = np.concatenate([view.places(starts), view.places(ends - unseen)], axis=-1)
     return FloorScan(
@@ -149,7 +152,7 @@ def laid_along(
 
     Scan lines that are shorter than a ruler have none.
     """
-    length = (_RULER - 1) * rulers.step_px
+    length = (rulers.length - 1) * rulers.step_px
     hop = max(length - 2.0 * trimmed(rulers) - 3.0 * width_px, 0.25 * length)
     laid: list[tuple[float, ...]] = []
     path: list[int] = []
@@ -164,9 +167,9 @@ def laid_along(
     return np.array(laid, np.float32).reshape(-1, 4), np.array(path, np.intp)
 
 
-def once(points: Float64, path: npt.NDArray[Any], line_width: float) -> npt.NDArray[np.intp]:
+def once(points: Float64, path: npt.NDArray[Any], away: Float64, line_width: float) -> npt.NDArray[np.intp]:
     """Return which points are left where two pieces of one scan line have found the same: sorted along it."""
-    order = np.lexsort((np.hypot(*points.T), path))
+    order = np.lexsort((away, path))
     points, path = points[order], path[order]
     gone = np.zeros(len(points), np.bool_)
     if len(points) > 1:
@@ -185,3 +188,177 @@ def _rays(view: BoardView, rays: int, blind: float) -> tuple[Float64, Float64]:
     starts, ends = view.centre_px + first * ways, view.centre_px + last[:, None] * ways
     ahead = last > first
     return starts[ahead], ends[ahead]
+
+
+# ---- through a tilted camera -------------------------------------------------------------------------------------
+
+_SHORT = 64  # samples of a ruler
+_SAMPLES = 512  # of a scan line, where it is looked at what of it the image shows
+
+
+def scan_ahead(
+    white: npt.NDArray[Any],
+    camera: MountedCamera,
+    *,
+    line_width: float,
+    lines: int,
+    reach: float,
+    threshold: float,
+    device: Device | None,
+) -> FloorScan:
+    """Scan what a tilted camera sees of the floor: along rays from the place below it, and across them.
+
+    A line that lies across is soon thinner than pixels tell, one that runs ahead is not: scan lines across see it as
+    far as it is three pixels wide. Rulers are as long as lines are wide in the image there, an octave at a time.
+
+    Parameters
+    ----------
+    white
+        Grey levels.
+    camera
+        How it sees the floor.
+    line_width
+        Of the stripes [m].
+    lines
+        How many rays, and half as many as lines across them.
+    reach
+        No further than that from the camera [m].
+    threshold
+        Least edge [grey levels].
+    device
+        Where to run; None: `Device.best`.
+
+    Raises
+    ------
+    ValueError
+        No part of the floor is seen with lines wide enough.
+    """
+    runs = _runs(camera, _scan_lines(camera, white.shape, lines, reach), white.shape, line_width)
+    octaves = [[run for run in runs if run.octave == each] for each in sorted({run.octave for run in runs})]
+    scans = [_octave(white, camera, each, line_width, threshold, device) for each in octaves]
+    parts = [each for each in scans if each is not None]
+    if not parts:
+        raise ValueError(
+            f"lines of {line_width:.3g} m are nowhere on the floor {FINEST_PX:g} px wide in this image; are height, "
+            "tilt and focal length right?"
+        )
+    return FloorScan(
+        points=np.concatenate([each.points for each in parts]),
+        sigmas=np.concatenate([each.sigmas for each in parts]),
+        paths=np.concatenate([each.paths for each in parts]),
+        line_width=line_width,
+    )
+
+
+class _Run(NamedTuple):
+    """A part of a scan line: both ends [px], how wide lines are there [px], and whether the image ends there."""
+
+    start: Float64
+    end: Float64
+    octave: int
+    cut: tuple[bool, bool]
+
+
+def _scan_lines(camera: MountedCamera, shape: tuple[int, ...], lines: int, reach: float) -> Float64:
+    """Return samples of scan lines on the floor, (lines, samples, 2) [m]: rays from below the camera, and across."""
+    rows, columns = shape
+    grid = np.stack(np.meshgrid(np.linspace(0, columns - 1, 64), np.linspace(0, rows - 1, 64)), axis=-1)
+    seen = camera.floor(grid if camera.model is None else camera.model.undistort(grid)).reshape(-1, 2) - camera.place
+    far = np.hypot(*seen.T)
+    seen = seen[far <= reach]
+    if not len(seen):
+        return np.empty((0, _SAMPLES, 2))
+    far = np.hypot(*seen.T)
+    # Even in the angle below the camera, about as its pixels are.
+    angle = np.linspace(np.arctan(far.min() / camera.height), np.arctan(far.max() / camera.height), _SAMPLES)
+    c, s = math.cos(camera.heading), math.sin(camera.heading)
+    ahead, aside = seen @ (c, s), seen @ (-s, c)
+    turn = np.arctan2(aside, ahead)
+    turns = np.linspace(turn.min(), turn.max(), lines) + camera.heading
+    rays = camera.height * np.tan(angle)[:, None] * np.stack([np.cos(turns), np.sin(turns)], axis=-1)[:, None]
+    nearest, farthest = (math.atan(each / camera.height) for each in (float(ahead.min()), float(ahead.max())))
+    tilts = np.linspace(nearest, farthest, 2 * lines)
+    wide = np.linspace(aside.min(), aside.max(), _SAMPLES)
+    across = camera.height * np.tan(tilts)[:, None, None] * np.array([c, s]) + wide[:, None] * np.array([-s, c])
+    return np.asarray(camera.place + np.concatenate([rays, across]))
+
+
+def _runs(camera: MountedCamera, floors: Float64, shape: tuple[int, ...], line_width: float) -> list[_Run]:
+    """Return what the image shows of scan lines, cut where lines across them are twice as wide."""
+    pixels = camera.pixels(floors)
+    measured = camera.measured(pixels)
+    with np.errstate(invalid="ignore"):
+        inside = (measured >= _MARGIN_PX) & (measured <= np.array(shape[::-1]) - 1 - _MARGIN_PX)
+        steps = np.gradient(pixels, axis=1), np.gradient(floors, axis=1)
+        width = line_width * np.hypot(*np.moveaxis(steps[0], -1, 0)) / np.hypot(*np.moveaxis(steps[1], -1, 0))
+        octave = np.floor(np.log2(width / FINEST_PX))
+        shown = inside.all(axis=-1) & (octave >= 0)
+    runs = []
+    for line, kind in zip(pixels, np.where(shown, octave, -1).astype(int), strict=True):
+        cuts = [0, *(np.flatnonzero(np.diff(kind)) + 1), len(kind)]
+        for first, last in itertools.pairwise(cuts):
+            if kind[first] >= 0 and last - first > 2:
+                cut = (first == 0 or kind[first - 1] < 0, last == len(kind) or kind[last] < 0)
+                # Up to where the next part begins.
+                runs.append(_Run(line[first], line[last - 1 if cut[1] else last], int(kind[first]), cut))
+    return runs
+
+
+def _octave(
+    white: npt.NDArray[Any],
+    camera: MountedCamera,
+    runs: list[_Run],
+    line_width: float,
+    threshold: float,
+    device: Device | None,
+) -> FloorScan | None:
+    """Scan runs along which lines are about as wide; None where none has room for a ruler."""
+    wide = FINEST_PX * 2.0 ** (runs[0].octave + 0.5)
+    rulers = replace(stripe_rulers(white, wide, threshold, camera.model), length=_SHORT)
+    edge, length = trimmed(rulers), (rulers.length - 1) * rulers.step_px
+    laid = [(run, _room(run, edge, edge + 2.0 * wide, length)) for run in runs]
+    runs, rooms = [run for run, room in laid if room is not None], [room for _, room in laid if room is not None]
+    if not runs:
+        return None
+    starts = np.array([each.start for each in runs])
+    far = np.linalg.norm([each.end - each.start for each in runs], axis=-1)
+    ways = np.array([each.end - each.start for each in runs]) / far[:, None]
+    room = np.array(rooms)
+    pieces, path = laid_along(starts + room[:, :1] * ways, starts + room[:, 1:2] * ways, rulers, wide)
+    edges = rulers(white, pieces, device=device)
+    assert edges.spacing is not None
+    places = pieces[:, None, :2] + edges.position[..., None] * pieces[:, None, 2:]
+    away = np.sum((places - starts[path][:, None]) * ways[path][:, None], axis=-1)
+    with np.errstate(invalid="ignore"):
+        found = (away >= 0.0) & (away < far[path][:, None])
+    half = 0.5 * edges.spacing[found][:, None] * np.broadcast_to(pieces[:, None, 2:], places.shape)[found]
+    sides = camera.floor(places[found] - half), camera.floor(places[found] + half)
+    size = np.hypot(*(sides[1] - sides[0]).T)
+    good = (size > 0.4 * line_width) & (size < 3.0 * line_width)
+    points = (0.5 * (sides[0] + sides[1]))[good]
+    number = np.broadcast_to(path[:, None], found.shape)[found][good]
+    kept = once(points, number, away[found][good], line_width)
+    per_px = (size / edges.spacing[found])[good]
+    ends = [camera.floor(starts + room[:, which, None] * ways) for which in (2, 3)]
+    whole = room[:, 3] > room[:, 2]
+    return FloorScan(
+        points=np.ascontiguousarray(points[kept], np.float32),
+        sigmas=np.ascontiguousarray((per_px * edges.sigma[found][good])[kept], np.float32),
+        paths=np.ascontiguousarray(np.concatenate(ends, axis=-1)[whole], np.float32),
+        line_width=line_width,
+    )
+
+
+def _room(run: _Run, edge: float, over: float, length: float) -> tuple[float, float, float, float] | None:
+    """Return where rulers along a run begin and end, and what of it they see [px from its start]; None: no room.
+
+    Where the image goes on, so do they, so that what lies where two runs meet is seen whole.
+    """
+    far = float(np.linalg.norm(run.end - run.start))
+    begin, end = (0.0 if run.cut[0] else -over), far + (0.0 if run.cut[1] else over)
+    lack = length * (1.0 + 1e-6) - (end - begin)
+    if lack > 0.0:
+        if all(run.cut):
+            return None
+        begin, end = (begin, end + lack) if run.cut[0] else (begin - lack, end)
+    return begin, end, edge if run.cut[0] else 0.0, far - (edge if run.cut[1] else 0.0)

@@ -2,7 +2,7 @@
 
 A file holds one of two tables: ``[lens]``, radial distortion of measured pixels (`Lens`), as a sensor file has it; or
 ``[camera]``, a camera matrix and OpenCV's coefficients (`Camera`). The others, ``[image]``, ``[uncertainty]`` and
-``[fit]``, say how it came about; nothing depends on them.
+``[fit]``, say how it came about; nothing depends on them. A table ``[mount]`` is `gpuvision.mounted_camera`'s.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gpuvision.camera.lens import Lens
 from gpuvision.description import Section, read
 from gpuvision.host.files import replacing
 
-_ABOUT = ("image", "uncertainty", "fit")
+_ABOUT = ("image", "uncertainty", "fit", "mount")
 
 
 def read_lens(path: str | Path) -> Lens | Camera:

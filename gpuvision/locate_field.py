@@ -20,13 +20,14 @@ import numpy.typing as npt
 from gpuvision.board_view import BoardView, grey_image
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
-from gpuvision.floor_scan import FloorScan, least_edge, scan_top_view
+from gpuvision.floor_scan import FloorScan, least_edge, scan_ahead, scan_top_view
 from gpuvision.host import Device
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.recordings import read_image
 from gpuvision.matching.field import Candidate, locate
 from gpuvision.matching.field_evidence import Evidence, evidence
 from gpuvision.matching.field_map import Field, FieldMap
+from gpuvision.mounted_camera import MountedCamera
 from gpuvision.status import Status
 
 Float32 = npt.NDArray[np.float32]
@@ -35,6 +36,7 @@ POINT_FILES = (".npy", ".csv")
 RAYS = 128
 _MOST_POINTS = 4096
 _FEWEST = 4
+_FARTHEST = 12.0  # [m]: further away pixels tell little, and errors of the tilt much
 _STARTS = 24  # so many poses are refined
 _BY_CHANCE, _MISSING = math.log(1e-3), 1.0 / 3.0
 _SMALL_FIELD, _SMALL_LINES, _LARGE_LINES = 5.0, 0.02, 0.125  # [m]: a field's length; a junior's lines, and others'
@@ -283,22 +285,24 @@ def line_width_of(field: Field) -> float:
 def scan_floor(
     image: npt.NDArray[Any],
     *,
-    scale: float,
+    scale: float | None = None,
     line_width: float,
     rays: int = RAYS,
     blind: float = 0.0,
     threshold: float | None = None,
-    model: Lens | Camera | None = None,
+    model: Lens | Camera | MountedCamera | None = None,
+    reach: float = _FARTHEST,
     device: Device | None = None,
 ) -> FloorScan:
-    """Find the middles of white stripes along rays from the middle of a top view of the floor.
+    """Find the middles of white stripes on the floor, along rays from the robot's place (and, tilted, across them).
 
     Parameters
     ----------
     image
-        Grey or colour (blue, green, red): the floor from above, the robot in its middle, ahead to the right.
+        Grey or colour (blue, green, red): the floor from above, the robot in its middle, ahead to the right; or what a
+        `MountedCamera` sees.
     scale
-        Of a pixel on the floor [m].
+        Of a pixel on the floor [m]; a mounted camera has none.
     line_width
         Of the stripes [m].
     rays
@@ -308,23 +312,32 @@ def scan_floor(
     threshold
         Least edge [grey levels]; None: 4 times the noise, and a tenth of the image's range.
     model
-        The lens; None: the image is free of distortion.
+        The lens, or a camera that is mounted on the robot; None: the image is free of distortion.
+    reach
+        Of a mounted camera: how far from it lines are looked for [m].
     device
         Where to run; None: `Device.best`.
 
     Raises
     ------
     ValueError
-        Lines are too narrow in the image, or it is too small.
+        Lines are too narrow in the image, it is too small, or a scale is given where it is not known, or none.
     """
     white = white_of(image)
+    least = least_edge(white) if threshold is None else threshold
+    if isinstance(model, MountedCamera):
+        if scale is not None:
+            raise ValueError("a mounted camera has no scale: its height and its focal length tell; leave it out")
+        return scan_ahead(white, model, line_width=line_width, lines=rays, reach=reach, threshold=least, device=device)
+    if scale is None:
+        raise ValueError("the scale is missing: how wide a pixel is on the floor [m]")
     return scan_top_view(
         white,
         BoardView(scale=scale, shape=white.shape, pose=(0.0, 0.0, 0.0), model=model),
         line_width=line_width,
         rays=rays,
         blind=blind,
-        threshold=least_edge(white) if threshold is None else threshold,
+        threshold=least,
         device=device,
     )
 

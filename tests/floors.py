@@ -1,4 +1,4 @@
-"""Top views of a field's floor, as a robot over it sees them."""
+"""Views of a field's floor, as a robot on it sees them: from above, and through a tilted camera."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import numpy.typing as npt
 
 from gpuvision.field_picture import field_lines
 from gpuvision.matching.artwork_shapes import capsule
+from gpuvision.matching.field_evidence import onto_field
 from gpuvision.matching.field_map import Field
+from gpuvision.mounted_camera import MountedCamera
 
 _FINE = 4  # samples of a pixel, along each side
 _SHIFT = 6  # bits of a fine pixel
@@ -42,3 +44,40 @@ def floor_image(
     picture = fine.reshape(shape[0], _FINE, shape[1], _FINE, 3).mean(axis=(1, 3))
     picture = cv2.GaussianBlur(picture, (0, 0), 0.8) + rng.normal(0, noise, picture.shape)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+
+
+def carpet_of(field: Field, line_width: float, pixel: float = 0.01, margin: float = 3.0) -> npt.NDArray[np.float32]:
+    """Whiteness 0 to 1 of a field and its surroundings from above, x to the right and y up."""
+    columns, rows = (math.ceil((size + 2.0 * margin) / pixel) for size in (field.length, field.width))
+    white = np.zeros((rows, columns), np.uint8)
+    for line in field_lines(field):
+        for start, end in itertools.pairwise(line):
+            corners = capsule(start, end, line_width / 2) / pixel * (1, -1) + (np.array([columns, rows]) - 1) / 2
+            cv2.fillPoly(white, [np.rint(corners * 2**_SHIFT).astype(np.int32)], 255, cv2.LINE_AA, _SHIFT)
+    return (white / 255).astype(np.float32)
+
+
+def seen_ahead(
+    carpet: npt.NDArray[np.float32],
+    camera: MountedCamera,
+    pose: tuple[float, float, float],
+    *,
+    shape: tuple[int, int],
+    pixel: float = 0.01,
+    noise: float = 3.0,
+    samples: int = 5,
+    rng: np.random.Generator,
+) -> npt.NDArray[np.uint8]:
+    """uint8 (rows, columns): a carpet through a tilted camera and its lens, samples of each pixel traced to it."""
+    pixels = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1).astype(np.float64)
+    ideal = pixels if camera.model is None else camera.model.undistort(pixels)
+    down, across = np.gradient(ideal, axis=0), np.gradient(ideal, axis=1)
+    middle = (np.array(carpet.shape[::-1]) - 1) / 2
+    total = np.zeros(shape)
+    offsets = (np.arange(samples) + 0.5) / samples - 0.5
+    for a, b in itertools.product(offsets, offsets):
+        at = onto_field(camera.floor(ideal + a * across + b * down), pose) / pixel * (1, -1) + middle
+        at = np.where(np.isfinite(at), at, -9.0).clip(-9.0, 1e5).astype(np.float32)
+        total += cv2.remap(carpet, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    grey = cv2.GaussianBlur(60.0 + 170.0 * total / samples**2, (0, 0), 0.7) + rng.normal(0, noise, shape)
+    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)

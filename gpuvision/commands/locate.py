@@ -60,7 +60,13 @@ Within = Annotated[
     ),
 ]
 Lens = Annotated[
-    Path | None, typer.Option(metavar="FILE.toml", parser=named_path, help="What `gpuvision calibrate` wrote.")
+    Path | None,
+    typer.Option(
+        metavar="FILE.toml",
+        parser=named_path,
+        help="What `gpuvision calibrate` wrote. On a field it may hold a table `mount`, too (height, tilt_degrees): "
+        "the image is then no top view but what a camera on the robot sees, and has no --scale.",
+    ),
 ]
 Features = Annotated[
     Path | None, typer.Option(metavar="FILE.toml", parser=named_path, help="What `gpuvision select` wrote.")
@@ -168,6 +174,7 @@ def _robot(
     from gpuvision.host import Device
     from gpuvision.lens_file import read_lens
     from gpuvision.locate_field import POINT_FILES, line_width_of, locate_robot, read_floor, read_points, scan_floor
+    from gpuvision.mounted_camera import read_mounted
 
     described = read_field(field)
     chosen = None if device is None else Device.named(device)
@@ -175,18 +182,20 @@ def _robot(
     if image.suffix.lower() in POINT_FILES:
         located = locate_robot(read_points(image), described, near=about, scale=scale, device=chosen)
     else:
-        if scale is None:
-            raise ValueError("--scale is missing: how wide a pixel is on the floor, as 1cm")
         picture = read_floor(image)
+        mounted = None if camera is None else read_mounted(camera, picture.shape[:2])
+        if scale is None and mounted is None:
+            raise ValueError("--scale is missing: how wide a pixel is on the floor, as 1cm")
+        if scale is not None and mounted is not None:
+            raise ValueError(f"--scale is of top views, but {camera} says how it is mounted; leave one out")
+        wide = line_width_of(described) if line_width is None else quantities(line_width, "--line-width", "m")[0]
         scan = scan_floor(
             picture,
             scale=scale,
-            line_width=line_width_of(described)
-            if line_width is None
-            else quantities(line_width, "--line-width", "m")[0],
+            line_width=wide,
             blind=blind,
             threshold=threshold,
-            model=None if camera is None else read_lens(camera),
+            model=mounted or (None if camera is None else read_lens(camera)),
             device=chosen,
         )
         located = locate_robot(scan, described, near=about, scale=scale, device=chosen)

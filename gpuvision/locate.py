@@ -114,13 +114,14 @@ class LocatedBoard:
         if self.reason:
             return f"refused: {self.reason}"
         told, marks = self.rulers, self.marks
-        counts = f"{np.sum(told.used)} of {np.sum(told.laid)} rulers agree, {np.sum(told.found)} found an edge"
+        counts = f"; {np.sum(told.used)} of {np.sum(told.laid)} rulers agree, {np.sum(told.found)} found an edge"
         if marks.laid.any():
+            counts = counts if told.laid.any() else ""
             counts += f"; {np.sum(marks.used)} of {np.sum(marks.laid)} marks agree, {np.sum(marks.found)} were found"
         (x, y, theta), (sx, sy, turn) = self.pose, self.sigmas
         return (
             f"x {1e3 * x:.4f} mm, y {1e3 * y:.4f} mm, theta {math.degrees(theta):.4f} degrees\n"
-            f"sigmas {1e6 * sx:.2f} µm, {1e6 * sy:.2f} µm, {math.degrees(turn):.5f} degrees; {counts}"
+            f"sigmas {1e6 * sx:.2f} µm, {1e6 * sy:.2f} µm, {math.degrees(turn):.5f} degrees{counts}"
         )
 
     def report(self) -> dict[str, Any]:
@@ -357,8 +358,12 @@ class _Job:
         self.clock.told("search")
         left = (max(_AFTER_SEARCH[0], 3 * view.scale), _AFTER_SEARCH[1])
         if not np.all(np.isfinite(found.pose)):
-            best = f"the best one has {found.score:.0%} of its edges" if found.rulers else "there are too few edges"
-            reason = f"the search found no place for the board: {best}; is it in view, is the scale right?"
+            best = f"the best one has {found.score:.0%} of its edges; is it in view, is the scale right?"
+            if not found.rulers:
+                best = (
+                    "it has too few straight edges in view; say near where it is (marks will do then), or another scale"
+                )
+            reason = f"the search found no place for the board: {best}"
             return _Searched(view, left, found, reason)
         other = moved(view, found.runner_up_pose) if found.status & Status.AMBIGUOUS else None
         return _Searched(moved(view, found.pose), left, found, other=other)

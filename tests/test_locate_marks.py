@@ -155,6 +155,13 @@ def test_fiducials_that_agree_with_nothing_are_no_pose(rounds: Artwork, device: 
         assert not found.marks.used[:2].any()
 
 
+def test_a_board_of_marks_is_not_searched(rounds: Artwork) -> None:
+    """The search looks at straight edges, of which there are none: it says what to do."""
+    image, _ = moved_picture(round_picture(rounds), np.random.default_rng(13))
+    found = locate_board(image, rounds, scale=PIXEL)
+    assert "too few straight edges in view; say near where it is" in found.reason
+
+
 def test_two_marks_are_too_few(tmp_path: Path) -> None:
     """Nothing would check them."""
     artwork = round_artwork(round_board(tmp_path, lands=((6, 6), (14, 10)), fiducials=()))

@@ -1,4 +1,4 @@
-"""``gpuvision select``: which edges of a board to look at, chosen from its artwork before it is seen."""
+"""``gpuvision select``: which edges and marks of a board to look at, chosen from its artwork before it is seen."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ Gerbers = Annotated[
 Region = Annotated[
     str, typer.Option(metavar="X0,Y0,X1,Y1", help="What the camera may read, in the files' frame: m, or 12mm.")
 ]
-Budget = Annotated[str, typer.Option(help="What may be spent: 60 or 60rulers, 20000px, or 150us on this device.")]
+Budget = Annotated[
+    str, typer.Option(help="What may be spent: 60 or 60rulers (a mark: 16), 20000px, or 150us on this device.")
+]
 Results = Annotated[
     Path, typer.Option(metavar="DIR", parser=named_path, help="Folder for features.toml and features.png.")
 ]
@@ -62,9 +64,9 @@ def select(
     layers: LayerNames = None,
     device: DeviceLabel = None,
 ) -> None:
-    """Choose the edges of a board that fix its pose best, for `gpuvision locate --features DIR/features.toml`.
+    """Choose the edges and round marks of a board that fix its pose best, for `gpuvision locate --features`.
 
-    The file says how long each ruler is so that its edge lies on it, which region they read, and what standard
+    DIR/features.toml says how long each ruler is so that its edge lies on it, which region they read, and what standard
     deviations the pose will have at the placement point.
     """
     from gpuvision.board_picture import draw_features

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ class Sheet(NamedTuple):
     dark: bool = False
 
 
+@lru_cache(maxsize=1)  # rulers and marks of a board are chosen one after the other
 def sheets_of(artwork: Artwork, off: float) -> tuple[Sheet, ...]:
     """Return copper, and then what may lie on it, off by so much at most [m]."""
     holes = zip(artwork.holes.start, artwork.holes.end, artwork.holes.diameter, strict=True)

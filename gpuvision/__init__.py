@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from gpuvision.field_file import read_field
     from gpuvision.host import Device, GpuVisionError, Pipeline, Step, host_view, open_recording
     from gpuvision.locate import LocatedBoard, locate_board
-    from gpuvision.locate_field import LocatedRobot, floor_points, locate_robot
+    from gpuvision.locate_field import LocatedRobot, floor_points, locate_robot, scan_floor
     from gpuvision.matching.artwork import Artwork, read_artwork
     from gpuvision.matching.blob import Blobs, FindBlobs
     from gpuvision.matching.field import Candidate, RefinePoses, SearchField
@@ -178,6 +178,7 @@ _PLACES = {
     "read_features": "gpuvision.features",
     "read_field": "gpuvision.field_file",
     "register": "gpuvision.matching.registration",
+    "scan_floor": "gpuvision.locate_field",
     "straightness_px": "gpuvision.camera.vanishing_points",
     "view_of": "gpuvision.camera.views.target_views",
 }
@@ -286,6 +287,7 @@ __all__ = [
     "read_features",
     "read_field",
     "register",
+    "scan_floor",
     "straightness_px",
     "view_of",
 ]

@@ -106,8 +106,11 @@ class _Tried(NamedTuple):
         """Whether the rulers that tell two motions apart, in the picture for both, speak for this one.
 
         Of two right ones as many agree with the one as with the other. What is gone of one place is there at another
-        one by chance only: three standard deviations of their difference, and twice as many.
+        one by chance only: three standard deviations of their difference, and twice as many; or twice the share, where
+        the picture has few rulers for both.
         """
+        if self.score >= _CLEAR * other.score:
+            return True
         both = self.inside & other.inside
         own = np.count_nonzero(both & self.agrees & ~other.agrees)
         its = np.count_nonzero(both & other.agrees & ~self.agrees)

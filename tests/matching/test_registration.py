@@ -211,6 +211,8 @@ def there(artwork: Artwork, pose: Any, gone: set[int]) -> tuple[float, int]:
 @example(x=0.0, y=0.0, degrees=0.0, missing=0.25, seed=3902)
 @example(x=0.0, y=0.0019167218494290034, degrees=-4.25, missing=0.0, seed=1)
 @example(x=-0.001934151639503977, y=0.001953125, degrees=0.0, missing=0.125, seed=0)
+@example(x=0.0, y=-0.002, degrees=5.0, missing=0.2961, seed=3163250790)
+@example(x=-0.002, y=0.002, degrees=5.0, missing=0.21, seed=1862755871)
 @example(x=0.00059447, y=-0.0018775, degrees=0.0, missing=0.25, seed=867392631)
 @given(
     x=st.floats(-2e-3, 2e-3),

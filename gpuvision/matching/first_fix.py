@@ -7,6 +7,8 @@ that lie where the edges are. What is known is a board or another picture (`gpuv
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -118,7 +120,7 @@ class _Tried(NamedTuple):
 
 
 class _Ruled(NamedTuple):
-    """Rulers in the picture, (n, 2) each; how far away the edge is [px], NaN without one; and which lie inside."""
+    """Rulers for each motion, (k, n, 2) in the picture; how far away the edge is [px], or NaN; which are inside."""
 
     centre: Float64
     direction: Float64
@@ -237,7 +239,7 @@ class FirstFix:
     def _searched(self, image: npt.NDArray[Any], device: Device | None) -> list[Float64]:
         """Motions that are worth rulers, best first."""
         headings, positions = self.headings(), self.positions()
-        points, normals = (np.stack(each) for each in zip(*map(self._turned, headings), strict=True))
+        points, normals = self._seen(self.search, [np.column_stack([_rotation(k), self.placement]) for k in headings])
         middle = self._pixels(np.array(self.placement))
         turned = 2.0 * math.sin(min(self.angle, math.pi) / 2.0) * np.linalg.norm(points[0] - middle, axis=-1).max()
         border = max(positions) // 2 + 2 + math.ceil(min(turned, max(image.shape)) / self.cell_px)
@@ -251,10 +253,6 @@ class FirstFix:
         rough = best_shifts(search(level, shifts, device=device), positions, self.most, (3, 2))
         places = self._known(middle + self.cell_px * rough.cells)
         return [np.column_stack([_rotation(headings[k]), at]) for at, k in zip(places, rough.heading, strict=True)]
-
-    def _turned(self, heading: float) -> tuple[Float64, Float64]:
-        """Points and normals in the picture of the edges to search with, turned about the placement point."""
-        return self._seen(self.search, np.column_stack([_rotation(heading), self.placement]))
 
     # ---- rulers ----------------------------------------------------------------------------------------------
 
@@ -274,33 +272,34 @@ class FirstFix:
         motions: list[Float64],
         ruler: RulerEdges,
         device: Device | None,
-    ) -> list[_Ruled]:
+    ) -> _Ruled:
         """Edges along rulers about where each motion has the known ones."""
-        seen = [self._seen(known, motion) for motion in motions]
-        laid = np.concatenate([np.concatenate(each, axis=1) for each in seen]).astype(np.float32)
+        centre, direction = self._seen(known, motions)
+        laid = np.concatenate([centre, direction], axis=-1).reshape(-1, 4).astype(np.float32)
         edges = ruler(image, laid, device=device)
-        parts = (np.split(each, len(motions)) for each in (edges.position, edges.amplitude, edges.status))
-        ruled = []
-        for (centre, direction), position, amplitude, status in zip(seen, *parts, strict=True):
-            # Copper is brighter than laminate everywhere, or darker: what goes the other way is something else.
-            rising = amplitude > 0
-            away = np.where(rising == (2 * rising.sum() > np.isfinite(position).sum()), position, np.nan)
-            inside = (status & Status.OUT_OF_RANGE) == 0
-            ruled.append(_Ruled(centre, direction, away.astype(np.float64), inside))
-        return ruled
+        position, amplitude, status = (
+            each.reshape(centre.shape[:2]) for each in (edges.position, edges.amplitude, edges.status)
+        )
+        # Copper is brighter than laminate everywhere, or darker: what goes the other way is something else.
+        rising = amplitude > 0
+        is_bright = 2 * rising.sum(axis=1) > np.isfinite(position).sum(axis=1)
+        away = np.where(rising == is_bright[:, None], position, np.nan)
+        return _Ruled(centre, direction, away.astype(np.float64), (status & Status.OUT_OF_RANGE) == 0)
 
-    def _rows(self, known: KnownEdges, motion: Float64, ruled: _Ruled) -> npt.NDArray[np.float32]:
-        """Rows for `SolvePose` about where a motion has the placement point."""
-        found = self._known(ruled.centre + ruled.direction * ruled.away[:, None])
-        point, normal = _moved(known, motion, self.placement)
-        sigma = np.full(len(point), self.tolerance_px / self._scale)
-        return line_rows(normal, point - motion[:, 2], found - motion[:, 2], sigma).astype(np.float32)
+    def _rows(self, known: KnownEdges, motions: list[Float64], ruled: _Ruled) -> npt.NDArray[np.float32]:
+        """Rows for `SolvePose`, (k, n, 7), about where each motion has the placement point."""
+        found = self._known(ruled.centre + ruled.direction * ruled.away[..., None])
+        point, normal = _moved(known, motions, self.placement)
+        place = np.stack(motions)[:, None, :, 2]
+        sigma = np.full(point.shape[:2], self.tolerance_px / self._scale)
+        rows = line_rows(normal, point - place, found - place, sigma)
+        return rows.reshape(*point.shape[:2], -1).astype(np.float32)
 
     def _verified(self, image: npt.NDArray[Any], starts: list[Float64], device: Device | None) -> list[_Tried]:
         """Motions that most edges agree with, one from each start."""
         known = self._verifying
         ruled = self._ruled(image, known, starts, self._ruler(self._window), device)
-        rows = np.stack([_found(self._rows(known, *each)) for each in zip(starts, ruled, strict=True)])
+        rows = np.stack([_found(each) for each in self._rows(known, starts, ruled)])
         solver = SolvePose(
             loss="ransac", bend=1.0, least_agreement=0.0, freedom=self.freedom, trials=_TRIALS[self.freedom]
         )
@@ -311,7 +310,7 @@ class FirstFix:
             device,
         )
 
-    @property
+    @functools.cached_property
     def _verifying(self) -> KnownEdges:
         step = -(-len(self.rulers.point) // _VERIFYING)
         return KnownEdges(*(each[::step] for each in self.rulers))
@@ -322,23 +321,16 @@ class FirstFix:
         The start of a motion does not count: from there some edges lie beyond the rulers' ends, however good it was.
         """
         ruled = self._ruled(image, self._verifying, motions, self._ruler(self._window), device)
-        tried = [
-            _Tried(motion, each.inside, np.abs(each.away) <= self.tolerance_px)
-            for motion, each in zip(motions, ruled, strict=True)
-        ]
+        tried = map(_Tried, motions, ruled.inside, np.abs(ruled.away) <= self.tolerance_px)
         return [each for each in tried if each.rulers >= _FEWEST]
 
     def _others(self, best: _Tried, tried: list[_Tried]) -> list[_Tried]:
         """Those that put the rulers elsewhere than the best one does, best first."""
         limit = (2.0 * self.tolerance_px + 1.0) / self._scale
-        points = self.rulers.point - self.placement
-
-        def is_other(each: _Tried) -> bool:
-            change = each.motion - best.motion
-            away = np.linalg.norm(points @ change[:, :2].T + change[:, 2], axis=-1)
-            return bool(np.median(away) > limit)
-
-        return sorted(filter(is_other, tried), key=lambda each: -each.score)
+        change = np.stack([each.motion for each in tried]) - best.motion
+        points = (self.rulers.point - self.placement) @ change[..., :2].swapaxes(1, 2) + change[:, None, :, 2]
+        is_other = np.median(np.hypot(points[..., 0], points[..., 1]), axis=1) > limit
+        return sorted(itertools.compress(tried, is_other), key=lambda each: -each.score)
 
     def _measured(
         self, image: npt.NDArray[Any], best: _Tried, others: list[_Tried], device: Device | None
@@ -350,8 +342,8 @@ class FirstFix:
         solver = SolvePose(loss="huber", scale=1.0, freedom=self.freedom, trials=_TRIALS[self.freedom])
         motion = best.motion
         for _ in range(_ROUNDS):
-            (ruled,) = self._ruled(image, self.rulers, [motion], ruler, device)
-            fit = solver(self._rows(self.rulers, motion, ruled)[None], device=device)
+            ruled = self._ruled(image, self.rulers, [motion], ruler, device)
+            fit = solver(self._rows(self.rulers, [motion], ruled), device=device)
             if fit.status[0]:
                 return self._refused(Status(int(fit.status[0])), best, others)
             motion = _composed(fit, 0, motion)
@@ -383,7 +375,7 @@ class FirstFix:
 
     # ---- places ----------------------------------------------------------------------------------------------
 
-    @property
+    @functools.cached_property
     def _scale(self) -> float:
         """Pixels of a unit, at the placement point."""
         place = np.array(self.placement)
@@ -397,16 +389,21 @@ class FirstFix:
     def _known(self, pixels: Float64) -> Float64:
         return through(np.linalg.inv(np.asarray(self.to_image)), pixels)
 
-    def _seen(self, edges: KnownEdges, motion: Float64) -> tuple[Float64, Float64]:
-        """Points and unit normals of edges in the picture: what is along an edge stays along it."""
-        point, normal = _moved(edges, motion, self.placement)
-        matrix = np.asarray(self.to_image)
-        pixels = self._pixels(point)
-        weight = point @ matrix[2, :2] + matrix[2, 2]
-        along = np.stack([-normal[:, 1], normal[:, 0]], axis=-1)
-        way = (along @ matrix[:2, :2].T - pixels * (along @ matrix[2, :2])[:, None]) / weight[:, None]
-        across = np.stack([way[:, 1], -way[:, 0]], axis=-1)
-        return pixels, across / np.linalg.norm(across, axis=-1, keepdims=True)
+    def _seen(self, edges: KnownEdges, motions: list[Float64]) -> tuple[Float64, Float64]:
+        """Points and unit normals in the picture, (k, n, 2) each, of edges where each motion has them.
+
+        What is along an edge stays along it: the way along is taken to the picture, as the map is about the point.
+        """
+        moved = np.zeros((len(motions), 3, 3))
+        moved[:, :2], moved[:, 2, 2] = motions, 1.0
+        matrix = (np.asarray(self.to_image) @ moved).swapaxes(1, 2)
+        lifted = (edges.point - self.placement) @ matrix[:, :2] + matrix[:, 2:]
+        x, y = edges.normal.T
+        along = np.stack([-y, x], axis=-1) @ matrix[:, :2]
+        pixels = lifted[..., :2] / lifted[..., 2:]
+        way = (along[..., :2] - pixels * along[..., 2:]) / lifted[..., 2:]
+        way /= np.hypot(way[..., 0], way[..., 1])[..., None]
+        return pixels, np.stack([way[..., 1], -way[..., 0]], axis=-1)
 
 
 def _blank_border(level: npt.NDArray[np.uint16], border: int) -> None:
@@ -436,13 +433,13 @@ def _rotation(angle: float) -> Float64:
     return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
 
 
-def _moved(edges: KnownEdges, motion: Float64, placement: tuple[float, float]) -> KnownEdges:
-    """Edges where a motion of points relative to the placement point has them."""
-    turn = motion[:, :2]
+def _moved(edges: KnownEdges, motions: list[Float64], placement: tuple[float, float]) -> KnownEdges:
+    """Edges, (k, n, 2), where each motion of points relative to the placement point has them."""
+    motion = np.stack(motions)
+    turn = motion[..., :2]
     normal = edges.normal @ np.linalg.inv(turn)
-    return KnownEdges(
-        (edges.point - placement) @ turn.T + motion[:, 2], normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-    )
+    point = (edges.point - placement) @ turn.swapaxes(1, 2) + motion[:, None, :, 2]
+    return KnownEdges(point, normal / np.hypot(normal[..., 0], normal[..., 1])[..., None])
 
 
 def _found(rows: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -91,7 +91,8 @@ class LightSheet:
         Standard deviation of the light across the sheet, metres along the transport; 0 is a thin sheet. The light of a
         thick one stays in sheets side by side.
     source
-        (G, H) of the point that a fan comes from, H > 0: it lights what lies below. None: parallel light.
+        (G, H) of the point that a fan comes from, H > 0: it lights what lies below, by more than a thousandth of H;
+        what is nearer to it does not stop its light. None: parallel light.
     g_limits
         Between which G there is light; of a fan, where it meets H = 0. None: everywhere.
     profile

@@ -12,7 +12,8 @@ from reference import rays as reference
 def first_met(sheet: Any, corners: np.ndarray, L: float, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the triangle that the sheet's rays meet first (-1: none), and where, (n, 3).
 
-    ``x`` is G of parallel rays, and where those of a fan meet H = 0.
+    ``x`` is G of parallel rays, and where those of a fan meet H = 0. A fan's begin a thousandth of the way there from
+    its source: what is nearer does not stop them.
     """
     move = sheet.transport
     g_axis, h_axis = np.array(move.g_axis), np.array(move.h_axis)
@@ -21,8 +22,9 @@ def first_met(sheet: Any, corners: np.ndarray, L: float, x: np.ndarray) -> tuple
     if sheet.source is None:
         start, way = foot + 100.0 * h_axis, np.broadcast_to(-h_axis, foot.shape)
     else:
-        start = np.broadcast_to(place + sheet.source[0] * g_axis + sheet.source[1] * h_axis, foot.shape)
-        way = foot - start
+        source = place + sheet.source[0] * g_axis + sheet.source[1] * h_axis
+        way = foot - source
+        start = source + 1e-3 * way
     rays = np.hstack([start, way])
     triangle, distance, _, _ = reference.closest(corners, rays)
     unit = way / np.linalg.norm(way, axis=1, keepdims=True)

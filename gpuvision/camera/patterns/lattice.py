@@ -18,8 +18,10 @@ _NEIGHBOURS = 10
 _MIRRORED = 0.25
 # Two steps span a lattice when the sine of their angle is at least this.
 _SPANNING = 0.4
-# A prediction is met when the point lies within this part of a step.
-_MET = 0.3
+# A prediction is met when the point lies within this part of a step; surely, within that.
+_MET, _SURELY = 0.3, 0.15
+# A step differs from its neighbour's by less than this part of it.
+_ALIKE = 0.2
 # Vectors that turn round from neighbour to neighbour have at most this scalar product.
 _TURNED = -0.5
 _SIDE = 1024
@@ -86,8 +88,8 @@ class _Walk:
         self.index[members] = index
         self.at[index[:, 0], index[:, 1]] = members
 
-    def grow(self, wave: Int64) -> Int64:
-        """Find the neighbours of a wave's points; return the new ones."""
+    def grow(self, wave: Int64, met: float) -> Int64:
+        """Find the neighbours of a wave's points, within a part of a step; return the new ones."""
         target = (self.index[wave, None] + _STEPS).reshape(-1, 2)
         parent = np.repeat(wave, len(_STEPS))
         steps = np.stack([self.bases[wave], -self.bases[wave]], axis=2).reshape(-1, 2)
@@ -95,10 +97,10 @@ class _Walk:
         target, parent, steps = target[free], parent[free], steps[free]
         distance, found = self.tree.query(self.points[parent] + steps)
         error = distance / np.hypot(steps[:, 0], steps[:, 1])
-        met = (error < _MET) & (self.index[found, 0] < 0)
+        is_met = (error < met) & (self.index[found, 0] < 0)
         if self.turning is not None:
-            met &= np.sum(self.turning[parent] * self.turning[found], axis=1) < _TURNED
-        order = np.flatnonzero(met)[np.argsort(error[met], kind="stable")]
+            is_met &= np.sum(self.turning[parent] * self.turning[found], axis=1) < _TURNED
+        order = np.flatnonzero(is_met)[np.argsort(error[is_met], kind="stable")]
         # The best prediction of a place, then the best place of a point.
         key = target[:, 0] * _SIDE + target[:, 1]
         for names in (key, found):
@@ -118,17 +120,26 @@ class _Walk:
             backward = np.where((behind >= 0)[:, None], self.points[new] - self.points[behind], np.nan)
             count = (ahead >= 0).astype(int) + (behind >= 0)
             total = np.nan_to_num(forward) + np.nan_to_num(backward)
-            known = count > 0
-            self.bases[new[known], axis] = total[known] / count[known, None]
+            known = np.flatnonzero(count)
+            step, parents = total[known] / count[known, None], self.bases[new[known], axis]
+            # A spurious point's steps are no steps of the lattice.
+            like = np.linalg.norm(step - parents, axis=1) < _ALIKE * np.linalg.norm(parents, axis=1)
+            self.bases[new[known[like]], axis] = step[like]
 
 
 def _walked(points: Float64, tree: cKDTree, seed: int, basis: Float64, turning: Float64 | None) -> Chart:
-    """Index the points that can be reached from a seed, neighbour by neighbour."""
+    """Index the points that can be reached from a seed, neighbour by neighbour.
+
+    First those that surely are neighbours: a spurious point beside a missing one leads astray, but nowhere once the
+    places beyond it are taken.
+    """
     lattice = _Walk(points, tree, seed, basis, turning)
-    wave = np.array([seed])
+    members = wave = np.array([seed])
     while wave.size:
-        wave = lattice.grow(wave)
-    members = np.flatnonzero(lattice.index[:, 0] >= 0)
+        while wave.size:
+            wave = lattice.grow(wave, _SURELY)
+        members = np.flatnonzero(lattice.index[:, 0] >= 0)
+        wave = lattice.grow(members, _MET)
     return Chart(members, lattice.index[members])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gpuvision.camera.patterns.grid_polynomial import on_grid
@@ -19,7 +19,30 @@ def _consistent(grid: np.ndarray, names: np.ndarray) -> bool:
     return bool((shift == shift[0]).all())
 
 
+_NAMES = ("turn", "tilt", "towards", "barrel", "mirrored", "missing", "seed")
+# Where spurious points beside missing ones led the walk astray: whole parts of the grid, or a few points, a place off.
+_DRAWN = [
+    dict(zip(_NAMES, each, strict=True))
+    for each in (
+        (-8.679535931937117, 2.920758976806423, 1.2362816287058618, 63.951994543745855, True, 0.0, 1584898745),
+        (-37.743953150849116, 21.19434267113786, 1.8455849013266112, 56.311318743219005, True, 0.2, 3544802411),
+        (
+            6.822829465827816,
+            13.485490497539633,
+            3.940391544380166,
+            -2.4183961515259433,
+            False,
+            0.1317159725615218,
+            2556887436,
+        ),
+    )
+]
+
+
 @settings(deadline=None, max_examples=100)
+@example(**_DRAWN[0])
+@example(**_DRAWN[1])
+@example(**_DRAWN[2])
 @given(
     turn=st.floats(-43, 43),
     tilt=st.floats(0, 45),

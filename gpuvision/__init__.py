@@ -13,7 +13,13 @@ or bind it to a device and a shape for the hot path, or stream frames through it
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
+
+# In a checkout the packages `host`, `kernels` and `profiling` lie beside this folder; a wheel has them inside it.
+# Extending the search path makes `import gpuvision.host` work when Python starts in the repository's root.
+if not os.path.isdir(os.path.join(__path__[0], "host")):
+    __path__.append(os.path.dirname(__path__[0]))
 
 if TYPE_CHECKING:
     from gpuvision.camera.camera import Camera

@@ -167,3 +167,12 @@ def test_no_file_knows_a_machine() -> None:
     ]
     assert len(texts) > 20
     assert found == []
+
+
+def test_package_works_from_the_repository_root() -> None:
+    """Python started in the root finds the bare folder ``gpuvision/`` before the installed package."""
+    code = "import gpuvision.host, gpuvision.kernels, gpuvision.profiling; print(gpuvision.host.__file__)"
+    run = subprocess.run([sys.executable, "-S", "-c", code], cwd=ROOT, capture_output=True, text=True)
+    hidden = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert "No module named 'gpuvision" not in run.stderr
+    assert Path(hidden.stdout.strip()) == ROOT / "host" / "__init__.py"

@@ -12,6 +12,7 @@ import operator
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import numpy as np
@@ -40,8 +41,10 @@ class Launch:
 
     Attributes
     ----------
-    stem, kernel : str
-        File in ``kernels/`` without its ending, and the function in it.
+    source : str
+        Path of the ``.cl`` file relative to the operation's `kernel_folder`.
+    kernel : str
+        Name of the kernel function in the file.
     inputs : sequence of (shape, dtype)
     outputs : mapping of str to (shape, dtype) or None
         By the names of the result's fields, in the kernel's order. ``None``: the kernel has the argument and gets
@@ -58,7 +61,7 @@ class Launch:
         than to wake a worker thread.
     """
 
-    stem: str
+    source: str
     kernel: str
     inputs: Sequence[Spec]
     outputs: Mapping[str, Spec | None]
@@ -83,18 +86,43 @@ class Launch:
 class Operation(Generic[R]):
     """Base of the operations: frozen dataclasses of physics and units, validated once.
 
-    A subclass names its result type in `Result` and says in `_launch` what runs.
+    A subclass names its result type in `Result`, its kernel folder in `kernel_folder`, and describes in `launch` which
+    kernel runs.
+
+    Attributes
+    ----------
+    Result : type of named tuple
+        Class of the results.
+    kernel_folder : pathlib.Path
+        Folder of the kernel sources.
+    include_folders : tuple of pathlib.Path
+        More folders that are searched for headers, such as ``gpuvision.operation.KERNEL_FOLDER``.
     """
 
     Result: ClassVar[type[Any]]
+    kernel_folder: ClassVar[Path | None] = None
+    include_folders: ClassVar[tuple[Path, ...]] = ()
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
-        """Check shape and dtype and say what to build and run.
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Check shape and dtype of the first input and describe the kernel launch for it.
+
+        Parameters
+        ----------
+        device : Device
+            Device on which the kernel will run.
+        shape : tuple of int
+            Shape of the first input.
+        dtype : numpy.dtype
+            Dtype of the first input.
+
+        Returns
+        -------
+        Launch
 
         Raises
         ------
         TypeError, ValueError
-            The operation does not take such input; says what it takes.
+            The operation does not take such input; the message names the inputs that it takes.
         """
         raise NotImplementedError
 
@@ -225,7 +253,7 @@ class Bound(Generic[R]):
     def __init__(
         self, operation: Operation[R], device: Device, shape: tuple[int, ...], dtype: np.dtype[Any], queue: Any
     ) -> None:
-        launch = operation._launch(device, shape, dtype)
+        launch = operation.launch(device, shape, dtype)
         self.operation, self.device = operation, device
         self.queue = device.queue if queue is None else queue
         self._launch = launch
@@ -419,8 +447,18 @@ class Bound(Generic[R]):
 
     def _site_on(self, queue: Any) -> _Site:
         """Compile the kernel for a queue's device and set what no call changes."""
-        launch = self._launch
-        kernel = cl.Kernel(build(self.device, launch.stem, launch.defines, handle=queue.device), launch.kernel)
+        launch, operation = self._launch, self.operation
+        if operation.kernel_folder is None:
+            raise ValueError(f"{type(operation).__name__} has no kernel_folder; set it to the folder of its .cl files")
+        program = build(
+            self.device,
+            operation.kernel_folder,
+            launch.source,
+            launch.defines,
+            include_folders=operation.include_folders,
+            handle=queue.device,
+        )
+        kernel = cl.Kernel(program, launch.kernel)
         after_inputs = len(launch.inputs)
         after_outputs = after_inputs + len(launch.outputs)
         for place, spec in enumerate(launch.outputs.values(), after_inputs):

@@ -1,12 +1,11 @@
-"""Compile kernels: once per context, file and set of defines."""
+"""Compile kernels: once per context, source file and set of defines."""
 
 from __future__ import annotations
 
 import functools
-import importlib.resources
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,6 @@ from gpuvision.host.errors import BuildError
 Define = int | float | str | None
 
 
-def kernel_folder() -> Path:
-    """Return the folder of the OpenCL sources."""
-    return Path(str(importlib.resources.files("gpuvision.kernels")))
-
-
 def options(defines: Mapping[str, Define]) -> list[str]:
     """Write defines as compiler options; ``None`` defines a name without a value.
 
@@ -32,16 +26,28 @@ def options(defines: Mapping[str, Define]) -> list[str]:
     return ["-cl-mad-enable", *words]
 
 
-def build(device: Device, stem: str, defines: Mapping[str, Define], *, handle: Any = None) -> Any:
-    """Return the program of ``kernels/<stem>.cl`` for a device.
+def build(
+    device: Device,
+    folder: Path,
+    source: str,
+    defines: Mapping[str, Define],
+    *,
+    include_folders: Sequence[Path] = (),
+    handle: Any = None,
+) -> Any:
+    """Return the program of a kernel file for a device; build it on the first call.
 
     Parameters
     ----------
     device : Device
-    stem : str
-        Name of the kernel file without its ending.
+    folder : pathlib.Path
+        Folder of the kernel sources. Kernels include headers by their path relative to it.
+    source : str
+        Path of the ``.cl`` file relative to `folder`.
     defines : mapping of str to value
-        What changes the code: the real type, the terms that exist. Sizes are kernel arguments.
+        Macros that change the code: the real type, the terms that exist. Sizes are kernel arguments.
+    include_folders : sequence of pathlib.Path, optional
+        More folders that are searched for headers, after `folder`.
     handle : pyopencl.Device, optional
         Which device of the context; ``device.handle`` unless another is named.
 
@@ -54,19 +60,22 @@ def build(device: Device, stem: str, defines: Mapping[str, Define], *, handle: A
     BuildError
         The source does not compile; carries the log.
     """
-    return _build(device.context, device.handle if handle is None else handle, stem, tuple(options(defines)))
+    handle = device.handle if handle is None else handle
+    return _build(device.context, handle, folder, source, tuple(options(defines)), tuple(include_folders))
 
 
 @functools.lru_cache(maxsize=256)
-def _build(context: Any, handle: Any, stem: str, words: tuple[str, ...]) -> Any:
-    folder = kernel_folder()
-    source = (folder / f"{stem}.cl").read_text()
-    program = cl.Program(context, source)
+def _build(
+    context: Any, handle: Any, folder: Path, source: str, words: tuple[str, ...], include_folders: tuple[Path, ...]
+) -> Any:
+    program = cl.Program(context, (folder / source).read_text())
+    includes = [word for each in (folder, *include_folders) for word in ("-I", os.fspath(each))]
     try:
         with warnings.catch_warnings():
             # Both CPU runtimes report success ("Device ... successfully vectorised") as compiler output.
             warnings.simplefilter("ignore", cl.CompilerWarning)
-            return program.build(options=[*words, "-I", os.fspath(folder)], devices=[handle])
+            return program.build(options=[*words, *includes], devices=[handle])
     except cl.RuntimeError as error:
         said = [line for line in str(error).splitlines() if line.strip()]
-        raise BuildError(f"kernels/{stem}.cl does not build with {' '.join(words)}:\n" + "\n".join(said)) from error
+        name = f"{folder.name}/{source}"
+        raise BuildError(f"{name} does not build with {' '.join(words)}:\n" + "\n".join(said)) from error

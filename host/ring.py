@@ -71,12 +71,12 @@ def check_chain(steps: Sequence[Step], device: Device, batch: int, shape: tuple[
 def _specs(
     steps: Sequence[Step], device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]
 ) -> Mapping[str, Spec | None]:
-    launch = steps[0].operation._launch(device, shape, dtype)
+    launch = steps[0].operation.launch(device, shape, dtype)
     if len(launch.inputs) != 1:
         raise ValueError(f"{_named(steps[0])} takes {len(launch.inputs)} arrays, a stream's source gives one")
     for step in steps[1:]:
         given = _taken(step, dict(launch.outputs))
-        launch = step.operation._launch(device, *given[0])
+        launch = step.operation.launch(device, *given[0])
         expected = [(tuple(shape), np.dtype(dtype)) for shape, dtype in launch.inputs]
         if expected != [(tuple(shape), np.dtype(dtype)) for shape, dtype in given]:
             raise ValueError(

@@ -455,7 +455,7 @@ def _case(device: Device, count: int) -> Case:
     blobs = bound.run()
     if np.any(blobs.status.get()):
         raise AssertionError("a mark was not found")
-    table = np.asarray(operation._launch(device, image.shape, image.dtype).arguments[0])
+    table = np.asarray(operation.launch(device, image.shape, image.dtype).arguments[0])
     numbers = np.concatenate([table[[0, 3, 2]], table[-REACH:]]).astype(np.float32)
     angle = np.arange(SPOKES) * 2.0 * math.pi / SPOKES
     directions = np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)

@@ -106,6 +106,7 @@ LAYERS = {
     "host": 1,
     "status": 2,
     "tables": 2,
+    "operation": 2,
     "camera": 3,
     "matching": 4,
     "ranging": 4,

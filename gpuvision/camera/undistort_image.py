@@ -13,7 +13,8 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.image_map import Packer, PixelMap, Taps
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines
+from gpuvision.operation import VisionOperation
 from gpuvision.status import Status
 from gpuvision.tables import finite, numbers
 
@@ -63,7 +64,7 @@ class UndistortedImage(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class UndistortImage(Operation[UndistortedImage]):
+class UndistortImage(VisionOperation[UndistortedImage]):
     """Measured images -> ideal images.
 
     ``op(image)`` with uint8, uint16 or float32 of shape (..., rows, columns), or (..., rows, columns, 3) for three
@@ -192,7 +193,8 @@ class UndistortImage(Operation[UndistortedImage]):
             raise ValueError(f"UndistortImage.region {self.region} leaves the map of {columns} x {rows} pixels")
         return left, top, wide, high
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         *batch, rows, columns = self._checked(shape, dtype)
         region = self._region((rows, columns))
         strip = in_strips(self.walk, device)
@@ -208,7 +210,7 @@ class UndistortImage(Operation[UndistortedImage]):
         moved = (math.prod(shape) + math.prod(made)) * dtype.itemsize
         past_caches = {"PAST_CACHES": None} if strip and device.is_cpu and moved > device.cache_bytes else {}
         return Launch(
-            stem="undistort_image",
+            source="undistort_image.cl",
             kernel="undistort",
             inputs=((shape, dtype),),
             outputs={"image": (made, dtype), "status": ((made_rows, made_columns), np.dtype(np.uint8))},

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.polynomial import PlanePolynomial
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.tables import numbers
 
 _LANES, _GROUP = 16, 256
@@ -38,7 +39,7 @@ class UndistortedPoints(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class UndistortPoints(Operation[UndistortedPoints]):
+class UndistortPoints(VisionOperation[UndistortedPoints]):
     """Measured pixels to ideal ones: ``op(points) -> UndistortedPoints``, points float32 or float64 (..., 2).
 
     Parameters
@@ -86,7 +87,8 @@ class UndistortPoints(Operation[UndistortedPoints]):
             object.__setattr__(self, "matrix", numbers(self.matrix, (3, 3), "UndistortPoints.matrix"))
             self.model.defines(self.matrix)
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"UndistortPoints takes float32 or float64 points, got {dtype}")
         if not shape or shape[-1] != 2:
@@ -100,7 +102,7 @@ class UndistortPoints(Operation[UndistortedPoints]):
         items = -(-count // each)
         present = {"STRIP": strip, "INVERSE": self.inverse}
         return Launch(
-            stem="undistort_points",
+            source="undistort_points.cl",
             kernel="undistort_points",
             defines={
                 **self._model_defines(real),

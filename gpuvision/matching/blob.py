@@ -21,9 +21,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from gpuvision.host import Device, Launch, Operation, Walk, in_strips
+from gpuvision.host import Device, Launch, Walk, in_strips
 from gpuvision.matching.losses import efficiency, loss_defines
 from gpuvision.matching.ruler import RulerEdges
+from gpuvision.operation import VisionOperation
 from gpuvision.tables import finite
 
 Shape = Literal["circle", "ring", "square", "cross"]
@@ -103,7 +104,7 @@ class Blobs(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FindBlobs(Operation[Blobs]):
+class FindBlobs(VisionOperation[Blobs]):
     """Marks near their nominal places: ``op(image, places) -> Blobs``.
 
     Takes a uint8, uint16 or float32 image (rows, columns), 16 columns or more, and float32 places: (n, 3) x, y and
@@ -231,10 +232,11 @@ class FindBlobs(Operation[Blobs]):
     def _round(self) -> bool:
         return self.shape in ("circle", "ring")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if self.count is None:
             raise ValueError("FindBlobs.count is None; to bind it say how many marks there will be")
-        edges = self._ruler()._launch(device, shape, dtype)
+        edges = self._ruler().launch(device, shape, dtype)
         if shape[1] < _LANES:
             raise ValueError(f"FindBlobs takes images of {_LANES} columns or more, got shape {shape}")
         strip = in_strips(self.walk, device)
@@ -252,7 +254,7 @@ class FindBlobs(Operation[Blobs]):
         numbers = ((self.width**2 - 1) / 12.0, self._overlap(), self._extent(), noise, self._contour() / self.spokes)
         least = max(math.ceil(self.agreement * self.spokes), freedoms + 1)
         return Launch(
-            stem="blob",
+            source="blob.cl",
             kernel="find_blobs",
             defines=dict(edges.defines) | self._defines(freedoms),
             inputs=[(shape, dtype), ((self.count, freedoms), _REAL)],

@@ -14,8 +14,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Walk, in_strips
+from gpuvision.host import Device, Launch, Walk, in_strips
 from gpuvision.matching.field import PoseCosts
+from gpuvision.operation import VisionOperation
 from gpuvision.tables import finite
 
 CHANNELS, LEVELS = 8, 1023
@@ -39,7 +40,7 @@ class Levels(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CellMeans(Operation[Means]):
+class CellMeans(VisionOperation[Means]):
     """Means of square cells: ``op(image) -> Means``, of uint8, uint16 or float32 (rows, columns).
 
     Parameters
@@ -60,14 +61,15 @@ class CellMeans(Operation[Means]):
         if not isinstance(self.cell_px, int) or not 1 <= self.cell_px <= 64:
             raise ValueError(f"CellMeans.cell_px is {self.cell_px!r}, expected a whole number, 1 to 64")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype.name not in _CODES:
             raise TypeError(f"CellMeans takes uint8, uint16 or float32 images, got {dtype}")
         if len(shape) != 2 or min(shape) < 3 * self.cell_px:
             raise ValueError(f"CellMeans takes images (rows, columns) of 3 cells or more each way, got shape {shape}")
         cells = (shape[0] // self.cell_px, shape[1] // self.cell_px)
         return Launch(
-            stem="edge_search",
+            source="edge_search.cl",
             kernel="cell_means",
             defines={"CODE": _CODES[dtype.name]},
             inputs=[(shape, dtype)],
@@ -78,7 +80,7 @@ class CellMeans(Operation[Means]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EdgeLevels(Operation[Levels]):
+class EdgeLevels(VisionOperation[Levels]):
     """What an edge costs in each cell: ``op(means) -> Levels``, of float32 (rows, columns).
 
     1 - (g_k^2 / (g^2 + t^2))^2, the least of the cell and its eight neighbours: g is the gradient by 3 x 3 cells
@@ -108,7 +110,8 @@ class EdgeLevels(Operation[Levels]):
         if not isinstance(self.border, int) or self.border < 0:
             raise ValueError(f"EdgeLevels.border is {self.border!r}, expected a whole number, 0 or more")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype != _REAL or len(shape) != 2 or min(shape) < 3:
             raise TypeError(f"EdgeLevels takes float32 means of 3 cells or more each way, got {dtype} of {shape}")
         rows, columns = (each + 2 * self.border for each in shape)
@@ -116,7 +119,7 @@ class EdgeLevels(Operation[Levels]):
             raise ValueError(f"EdgeLevels: {rows} x {columns} cells with the border are too many; make cells larger")
         angles = np.arange(CHANNELS) * (math.pi / CHANNELS)
         return Launch(
-            stem="edge_search",
+            source="edge_search.cl",
             kernel="edge_levels",
             defines={"FROM_MEANS": None},
             inputs=[(shape, dtype)],
@@ -131,7 +134,7 @@ class EdgeLevels(Operation[Levels]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchEdges(Operation[PoseCosts]):
+class SearchEdges(VisionOperation[PoseCosts]):
     """Score all shifts for all headings: ``op(level, shifts) -> PoseCosts``.
 
     ``level`` is uint16 (channels, rows, columns) as `EdgeLevels` gives it; ``shifts`` int32 (headings, points), for
@@ -168,7 +171,8 @@ class SearchEdges(Operation[PoseCosts]):
             if not isinstance(getattr(self, name), int) or not 1 <= getattr(self, name) <= most:
                 raise ValueError(f"SearchEdges.{name} is {getattr(self, name)!r}, expected 1 to {most}")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype != np.uint16 or len(shape) != 3:
             raise TypeError(f"SearchEdges takes uint16 levels (channels, rows, columns), got {dtype} of {shape}")
         # A whole block of positions is read.
@@ -185,7 +189,7 @@ class SearchEdges(Operation[PoseCosts]):
         present = {"STRIP": strip, "WITH_SCORES": self.with_scores}
         capacity = max(64, 1 << (self.points - 1).bit_length())
         return Launch(
-            stem="edge_search",
+            source="edge_search.cl",
             kernel="edge_search",
             defines={"CAPACITY": capacity} | {name: None for name, is_present in present.items() if is_present},
             inputs=[(shape, dtype), ((self.headings, self.points), _WHOLE)],

@@ -15,8 +15,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Walk, in_strips
+from gpuvision.host import Device, Launch, Walk, in_strips
 from gpuvision.matching.field_map import LEVELS, FieldMap
+from gpuvision.operation import VisionOperation
 from gpuvision.status import Status
 from gpuvision.tables import finite
 
@@ -49,7 +50,7 @@ class PoseCosts(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchField(Operation[PoseCosts]):
+class SearchField(VisionOperation[PoseCosts]):
     """Score all poses of a grid: ``op(points) -> PoseCosts``, points float32 (points, 2), in the robot's frame [m].
 
     Parameters
@@ -98,7 +99,8 @@ class SearchField(Operation[PoseCosts]):
         count = max(operator.index(self.headings), 0)
         return np.array(np.arange(count) * (2.0 * math.pi / max(count, 1)), np.float64)
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         count = _checked_points(shape, dtype, "SearchField")
         rows, columns = self.map.positions
         blocks, angles = -(-columns // _BLOCK), self.angles
@@ -109,7 +111,7 @@ class SearchField(Operation[PoseCosts]):
         defines: dict[str, Any] = {"CAPACITY": max(64, 1 << (count - 1).bit_length()), "FIELD_LEVELS": LEVELS}
         present = {"STRIP": strip, "WITH_SCORES": self.with_scores}
         return Launch(
-            stem="field_search",
+            source="field_search.cl",
             kernel="field_search",
             defines=defines | {name: None for name, is_present in present.items() if is_present},
             inputs=[(shape, dtype)],
@@ -204,7 +206,7 @@ class FieldPoses(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefinePoses(Operation[FieldPoses]):
+class RefinePoses(VisionOperation[FieldPoses]):
     """Take rough poses to the least cost: ``op(points, starts) -> FieldPoses``, float32 (points, 2) and (starts, 3).
 
     Parameters
@@ -243,14 +245,15 @@ class RefinePoses(Operation[FieldPoses]):
             return replace(self, count=len(inputs[1]))(*inputs, device=device, out=out)
         return super().__call__(*inputs, device=device, out=out)
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         points = _checked_points(shape, dtype, "RefinePoses")
         if self.count is None:
             raise ValueError("RefinePoses.count is None; to bind it say how many starts there will be")
         cells = self.map.cells.nearest
         spec, matrices = ((self.count,), _REAL), ((self.count, 3, 3), _REAL)
         return Launch(
-            stem="field_refine",
+            source="field_refine.cl",
             kernel="field_refine",
             defines={"WEAKEST": f"{_WEAKEST}f"},
             inputs=[(shape, dtype), ((self.count, 3), _REAL)],

@@ -10,7 +10,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation
+from gpuvision.host import Device, Launch
+from gpuvision.operation import VisionOperation
 from gpuvision.tables import finite, numbers
 
 LEVELS = 1023
@@ -136,7 +137,7 @@ class FieldCells(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapField(Operation[FieldCells]):
+class MapField(VisionOperation[FieldCells]):
     """Cells over a field: ``op(x) -> FieldCells``, x float32 (columns,): where the columns are [m].
 
     Parameters
@@ -161,13 +162,14 @@ class MapField(Operation[FieldCells]):
     rows: int
     scale: float
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype != np.float32 or len(shape) != 1 or not shape[0]:
             raise TypeError(f"MapField takes float32 of (columns,), got {dtype} of {shape}")
         shapes = self.field.shapes.astype(np.float32)
         cells = (self.rows, *shape)
         return Launch(
-            stem="field_map",
+            source="field_map.cl",
             kernel="field_map",
             defines={"FIELD_LEVELS": LEVELS},
             inputs=[(shape, dtype)],

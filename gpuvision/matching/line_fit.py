@@ -8,8 +8,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
 from gpuvision.matching.losses import Loss, bend_of, efficiency, loss_defines, subsets
+from gpuvision.operation import VisionOperation
 from gpuvision.tables import finite
 
 _LANES, _GROUP = 16, 64
@@ -52,7 +53,7 @@ class LineFits(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitLines(Operation[LineFits]):
+class FitLines(VisionOperation[LineFits]):
     """Lines through sets of points: ``op(points) -> LineFits``, points float32 or float64 of (..., points, 2).
 
     A point with a coordinate that is not finite is missing. With ``weighted`` there is a second input of shape
@@ -126,7 +127,8 @@ class FitLines(Operation[LineFits]):
             if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
                 raise ValueError(f"FitLines.{name} is {getattr(self, name)!r}, expected a whole number > 0")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"FitLines takes float32 or float64 points, got {dtype}")
         if len(shape) < 2 or shape[-1] != 2 or not 2 <= shape[-2] <= _LARGEST_SET:
@@ -141,7 +143,7 @@ class FitLines(Operation[LineFits]):
         assert self.bend is not None
         sizes = {"normal": (2,), "distance": (), "centre": (2,), "covariance": (2, 2), "scale": ()}
         return Launch(
-            stem="line_fit",
+            source="line_fit.cl",
             kernel="line_fit_sets",
             defines={
                 **real_defines(device, real),

@@ -12,10 +12,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, in_strips
+from gpuvision.host import Device, Launch, in_strips
 from gpuvision.matching.losses import subsets
 from gpuvision.matching.pose import FREEDOMS, SolvePose
 from gpuvision.matching.ruler import RulerEdges
+from gpuvision.operation import VisionOperation
 
 Float64 = npt.NDArray[np.float64]
 RULER = ("x_px", "y_px", "cosine", "sine", "u", "v", "u_per_px", "v_per_px", "bend")
@@ -118,7 +119,7 @@ def _through(matrix: Float64, points: Float64) -> Float64:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LocalFix(Operation[Fix]):
+class LocalFix(VisionOperation[Fix]):
     """A pose from a frame: ``op(image, rulers, lines) -> Fix``.
 
     The image is as `RulerEdges` takes it; the rulers float32 of (lines, each, 9) and the lines float32 of (lines, 6)
@@ -171,7 +172,8 @@ class LocalFix(Operation[Fix]):
         if self._rows_of_line * self.lines < self.solver.unknowns:
             raise ValueError(f"LocalFix.lines is {self.lines}: too few for the freedom '{self.solver.freedom}'")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         edges = self._edges(device, shape, dtype)
         strip, count, solver = in_strips(self.ruler.walk, device), self._rows_of_line * self.lines, self.solver
         freedoms = FREEDOMS[solver.freedom]
@@ -183,7 +185,7 @@ class LocalFix(Operation[Fix]):
         found = (self.lines, self.each)
         limits = (*solver.limits, *solver.placement, solver.certainty_of_etch)
         return Launch(
-            stem="local_fix",
+            source="local_fix.cl",
             kernel="local_fix",
             defines=dict(edges.defines) | solver.defines(count, strip) | self._capacities(),
             inputs=[(shape, dtype), ((*found, len(RULER)), _REAL), ((self.lines, len(LINE)), _REAL)],
@@ -214,7 +216,7 @@ class LocalFix(Operation[Fix]):
 
     def _edges(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Return what the rulers alone would launch: their table, model and defines."""
-        return replace(self.ruler, count=self.lines * self.each)._launch(device, shape, dtype)
+        return replace(self.ruler, count=self.lines * self.each).launch(device, shape, dtype)
 
     @property
     def _rows_of_line(self) -> int:

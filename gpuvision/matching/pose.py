@@ -16,8 +16,9 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
 from gpuvision.matching.losses import Loss, bend_of, efficiency, loss_defines, subsets
+from gpuvision.operation import VisionOperation
 from gpuvision.tables import finite, numbers
 
 Freedom = Literal["rigid", "scale", "affine"]
@@ -159,7 +160,7 @@ def fitted_line_rows(normal: Any, point: Any, centre: Any, covariance: Any, angl
 
 
 @dataclass(frozen=True, kw_only=True)
-class SolvePose(Operation[BoardPose]):
+class SolvePose(VisionOperation[BoardPose]):
     """Poses from rows: ``op(rows) -> BoardPose``, rows float32 or float64 of (..., rows, 7), with ``etch`` 8.
 
     A row is a normal, a place in the artwork [m], how far from it the feature was seen [m], and the standard deviation
@@ -269,7 +270,8 @@ class SolvePose(Operation[BoardPose]):
         if not isinstance(self.steps, int) or self.steps < 1:
             raise ValueError(f"SolvePose.steps is {self.steps!r}, expected a whole number > 0")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"SolvePose takes float32 or float64 rows, got {dtype}")
         freedoms, numbers_of_row = FREEDOMS[self.freedom], len(ROW) + (self.etch is not None)
@@ -283,7 +285,7 @@ class SolvePose(Operation[BoardPose]):
         sizes |= dict.fromkeys(("scale", "spread", "condition"), ())
         limits = (self.smallest_scale, *self.limits, *self.placement, self.certainty_of_etch)
         return Launch(
-            stem="pose",
+            source="pose.cl",
             kernel="pose_sets",
             defines={**real_defines(device, real), **self.defines(count, strip), "INPUT": _code(dtype)}
             | ({"WITH_NEAR": None} if self.near else {}),

@@ -16,7 +16,8 @@ import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Operation, Walk, in_strips
+from gpuvision.host import Device, Launch, Walk, in_strips
+from gpuvision.operation import VisionOperation
 from gpuvision.tables import finite, whole
 
 Polarity = Literal["any", "rising", "falling"]
@@ -77,7 +78,7 @@ def best_smoothing(blur_px: float) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RulerEdges(Operation[Edges]):
+class RulerEdges(VisionOperation[Edges]):
     """Edges along rulers: ``op(image, rulers) -> Edges``.
 
     Takes a uint8, uint16 or float32 image (rows, columns) and float32 rulers (n, 4): centre x, y [px], and the cosine
@@ -231,7 +232,8 @@ class RulerEdges(Operation[Edges]):
             return replace(self, count=len(inputs[1]))(*inputs, device=device, out=out)
         return super().__call__(*inputs, device=device, out=out)
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype.name not in _CODES:
             raise TypeError(f"RulerEdges takes uint8, uint16 or float32 images, got {dtype}")
         if len(shape) != 2 or min(shape) < 2 or max(shape) >= 2**15:
@@ -243,7 +245,7 @@ class RulerEdges(Operation[Edges]):
         each = max(share, 1) * _LANES
         spec = ((self.count, self.most) if self.choice == "all" else (self.count,), _REAL)
         return Launch(
-            stem="ruler",
+            source="ruler.cl",
             kernel="ruler_edges",
             defines=self._defines(dtype, strip),
             inputs=[(shape, dtype), ((self.count, 4), _REAL)],

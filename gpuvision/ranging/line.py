@@ -12,7 +12,8 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.tables import finite, whole
 
@@ -65,7 +66,7 @@ class LineReading(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LineReadout(Operation[LineReading]):
+class LineReadout(VisionOperation[LineReading]):
     """Light lines to positions: ``readout(frames) -> LineReading``.
 
     Takes uint8, uint16 or float32 frames of shape (..., rows, columns). Light is what a sample has over the
@@ -212,7 +213,8 @@ class LineReadout(Operation[LineReading]):
     def _has_candidates(self) -> bool:
         return self.method != "whole" and (self.choice != "strongest" or self._judges_width)
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype.name not in _CODES:
             raise TypeError(f"LineReadout takes uint8, uint16 or float32 frames, got {dtype}")
         if len(shape) < 2 or 0 in shape[-2:]:
@@ -232,7 +234,7 @@ class LineReadout(Operation[LineReading]):
         chosen = self.outputs or ()
         types = dict.fromkeys(LineReading._fields, real) | {"status": np.dtype(np.uint8)}
         return Launch(
-            stem="line",
+            source="line.cl",
             kernel="line_readout",
             inputs=inputs,
             outputs={name: ((*batch, samples), types[name]) if name in chosen else None for name in types},

@@ -13,7 +13,8 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.tables import finite
 
@@ -81,7 +82,7 @@ class PsdNoise:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PsdReadout(Operation[PsdReading]):
+class PsdReadout(VisionOperation[PsdReading]):
     """Pairs of PSD currents to positions: ``readout(currents) -> PsdReading``.
 
     Takes float32 or float64 currents [A] or uint16 codes, of shape (..., 2) with (left, right) side by side, or
@@ -200,7 +201,8 @@ class PsdReadout(Operation[PsdReading]):
             raise ValueError("PsdReadout.linearity: expected a row per strip, all of one length of at least 2 knots")
         object.__setattr__(self, "linearity", rows)
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype.name not in _CODES:
             raise TypeError(f"PsdReadout takes float32, float64 or uint16 currents, got {dtype}")
         pair_axis = -1 if self.layout == "pairs" else 0
@@ -225,7 +227,7 @@ class PsdReadout(Operation[PsdReading]):
         moved = samples * (2 * dtype.itemsize + sum(spec[1].itemsize for spec in outputs.values() if spec))
         past_caches = {"PAST_CACHES": None} if strip and device.is_cpu and moved > device.cache_bytes else {}
         return Launch(
-            stem="psd",
+            source="psd.cl",
             kernel="psd_readout",
             inputs=[(shape, dtype)],
             outputs=outputs,

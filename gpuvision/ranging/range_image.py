@@ -22,7 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.tables import checked_keys, finite, numbers
 
 _STRIP = 1024  # samples, as in range_image.cl
@@ -322,7 +323,7 @@ class RotatingSheet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RangeImage(Operation[RangePoints]):
+class RangeImage(VisionOperation[RangePoints]):
     """Profiles and the transport of each -> an organised range image.
 
     Called as ``op(g, h, transport, status)`` with a `StraightTransport` and ``op(position, transport, status)`` with a
@@ -370,7 +371,8 @@ class RangeImage(Operation[RangePoints]):
         limits = np.clip(np.array(self.limits).T.ravel(), -largest, largest)
         return np.concatenate([limits, self.geometry.packed()]).astype(real)
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype.name not in _INPUTS:
             raise TypeError(f"RangeImage takes float32 or float64 profiles, got {dtype}")
         if len(shape) != 2:
@@ -380,7 +382,7 @@ class RangeImage(Operation[RangePoints]):
         strips = samples >= _LANES and in_strips(self.walk, device)
         byte = np.dtype(np.uint8)
         return Launch(
-            stem="range_image",
+            source="range_image.cl",
             kernel="assemble_profiles",
             defines={
                 **self.geometry.defines,

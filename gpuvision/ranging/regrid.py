@@ -15,7 +15,8 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Bound, Device, DeviceArray, Launch, Operation, Precision, real_defines, real_of
+from gpuvision.host import Bound, Device, DeviceArray, Launch, Precision, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.tables import finite
 
 R = TypeVar("R", bound=tuple[Any, ...])
@@ -286,7 +287,7 @@ def _alone(device: Device) -> tuple[int, ...] | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Pass(Operation[R]):
+class _Pass(VisionOperation[R]):
     """One pass of a `Regrid`: lines of an array onto the cells of one direction."""
 
     regrid: Regrid
@@ -321,14 +322,15 @@ class _AlongSamples(_Pass[_Lines]):
 
     Result: ClassVar[type[Any]] = _Lines
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         real = self._real(device, shape, dtype)
         profiles, samples = shape
         cells = self._cells()
         value, flags = (shape, dtype), (shape, np.dtype(np.uint8))
         made = (profiles, cells)
         return Launch(
-            stem="regrid",
+            source="regrid.cl",
             kernel="resample",
             defines={**real_defines(device, real), "CARRY": None, "INPUT": _INPUTS[dtype.name]},
             inputs=(value, value, value, flags, value),
@@ -353,7 +355,8 @@ class _AlongProfiles(_Pass[HeightMap]):
 
     Result: ClassVar[type[Any]] = HeightMap
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         real = self._real(device, shape, dtype)
         profiles, lines = shape
         cells = self._cells()
@@ -363,7 +366,7 @@ class _AlongProfiles(_Pass[HeightMap]):
         line_pitch, cell_pitch = (cells, 1) if self.direction[-1] == "x" else (1, lines)
         drop = int(self.regrid.folded == "drop")
         return Launch(
-            stem="regrid",
+            source="regrid.cl",
             kernel="resample",
             defines={**real_defines(device, real), "INPUT": _INPUTS[dtype.name]},
             inputs=(value, value, value, flags),

@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.ranging import homography
 from gpuvision.ranging.homography import Model
 from gpuvision.tables import checked_keys, finite, numbers
@@ -76,7 +77,7 @@ class SampleAxes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Triangulation(Operation[SheetPoints]):
+class Triangulation(VisionOperation[SheetPoints]):
     """Sensor coordinates (u, v) to sheet coordinates (G, H), with the lens undone in the same pass.
 
     ``(G, H, 1) ~ homography (u, v, 1)``, a plane-plane homography: it holds for any pinhole sensor however
@@ -213,7 +214,8 @@ class Triangulation(Operation[SheetPoints]):
         seen_by_g, seen_by_h = (0, 1, 2, 6, 7), (3, 4, 5, 6, 7)
         return homography.packed_factor(covariance, seen_by_g), homography.packed_factor(covariance, seen_by_h)
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"Triangulation takes float32 or float64 coordinates u and v, got {dtype}")
         real = real_of(self.precision, dtype)
@@ -232,7 +234,7 @@ class Triangulation(Operation[SheetPoints]):
         sigma = self.sigma or (0.0, 0.0)
         outputs = {"g": (shape, real), "h": (shape, real), "status": (shape, np.dtype(np.uint8))}
         return Launch(
-            stem="triangulation",
+            source="triangulation.cl",
             kernel="triangulate",
             defines=defines,
             inputs=((shape, dtype), (shape, dtype)),

@@ -8,7 +8,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene import Scene
 
 _NUMBERS, _GROUP = 11, 64
@@ -35,7 +36,7 @@ class Intervals(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FanIntervals(Operation[Intervals]):
+class FanIntervals(VisionOperation[Intervals]):
     """Which parts of segments are visible from points: ``op(fans) -> Intervals``, float32 or float64 (..., 11).
 
     A fan is the rays from an apex to a segment: the apex, the two ends, in metres, and the shares of the ways to the
@@ -79,7 +80,8 @@ class FanIntervals(Operation[Intervals]):
         if not 1 <= self.kept <= 49:
             raise ValueError(f"FanIntervals.kept is {self.kept}, expected 1 to 49")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"FanIntervals takes float32 or float64, got {dtype}")
         if not shape or shape[-1] != _NUMBERS:
@@ -88,7 +90,7 @@ class FanIntervals(Operation[Intervals]):
         strip, tree, where = in_strips(self.walk, device), self.scene.bvh, shape[:-1]
         count = math.prod(where)
         return Launch(
-            stem="fans",
+            source="fans.cl",
             kernel="fan_intervals",
             defines={
                 **real_defines(device, real),

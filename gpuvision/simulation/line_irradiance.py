@@ -9,7 +9,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 
 _LANES, _GROUP = 16, 64
 # Strips are to keep the cores even, and each is to be worth its start.
@@ -113,7 +114,7 @@ class Irradiance(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LineIrradiance(Operation[Irradiance]):
+class LineIrradiance(VisionOperation[Irradiance]):
     """Diffuse light from lit segments: ``op(receivers) -> Irradiance``, receivers float32 or float64 (..., 6).
 
     A receiver is a place in metres and a normal of any length, in the frame of the segments. What lies behind the
@@ -161,7 +162,8 @@ class LineIrradiance(Operation[Irradiance]):
         if not isinstance(self.segments, LitSegments):
             raise TypeError(f"LineIrradiance.segments is {type(self.segments).__name__}, expected LitSegments")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"LineIrradiance takes float32 or float64 receivers, got {dtype}")
         if not shape or shape[-1] != 6:
@@ -177,7 +179,7 @@ class LineIrradiance(Operation[Irradiance]):
         items = -(-count // each)
         present = {"STRIP": strip, "WIDE_PLACES": device.has_double}
         return Launch(
-            stem="line_irradiance",
+            source="line_irradiance.cl",
             kernel="line_irradiance",
             defines={
                 **real_defines(device, real),

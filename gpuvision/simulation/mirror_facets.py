@@ -10,7 +10,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.simulation.mirror_points import Blocks
 
 Float64 = npt.NDArray[np.float64]
@@ -33,7 +34,7 @@ class NearFacets(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MirrorFacets(Operation[NearFacets]):
+class MirrorFacets(VisionOperation[NearFacets]):
     """Which blocks of plane mirrors may show lines: ``op(lines, lens) -> NearFacets``; compared by identity.
 
     Lines are float32 or float64 (..., 6), two ends in metres; the lens is a place, (3,).
@@ -81,7 +82,8 @@ class MirrorFacets(Operation[NearFacets]):
         # Put apart by direction, then measured where they are.
         return Blocks.of(corners, normals, corners + reach * normals)
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"MirrorFacets takes float32 or float64, got {dtype}")
         if not shape or shape[-1] != 6:
@@ -92,7 +94,7 @@ class MirrorFacets(Operation[NearFacets]):
         items = -(-count // _LANES) if strip else -(-count // _GROUP) * _GROUP
         middle = (0.5 * (self.corners.min((0, 1)) + self.corners.max((0, 1)))).astype(dtype)
         return Launch(
-            stem="mirrors",
+            source="mirrors.cl",
             kernel="mirror_facets",
             defines={
                 **real_defines(device, real),

@@ -10,7 +10,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.simulation.bvh import Bvh
 from gpuvision.simulation.closed_surfaces import places_of
 from gpuvision.simulation.scene import Scene
@@ -177,7 +178,7 @@ def bulge_of(corners: Float64, normals: Float64) -> Float64:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MirrorPoints(Operation[MirroredPoints]):
+class MirrorPoints(VisionOperation[MirroredPoints]):
     """Where a lens sees points in curved mirrors: ``op(points, lens) -> MirroredPoints``; compared by identity.
 
     Points are float32 or float64 (..., 6): a place and a step, any vector, in metres. The lens is a place, (3,). On
@@ -259,7 +260,8 @@ class MirrorPoints(Operation[MirroredPoints]):
     def _blocks(self) -> Blocks:
         return Blocks.of(self.corners, self.normals, outside=self.outside)
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"MirrorPoints takes float32 or float64, got {dtype}")
         if not shape or shape[-1] != 6:
@@ -272,7 +274,7 @@ class MirrorPoints(Operation[MirroredPoints]):
         # The kernel subtracts the middle as its input's type holds it.
         middle = middle.astype(dtype)
         return Launch(
-            stem="mirrors",
+            source="mirrors.cl",
             kernel="mirror_points",
             defines={
                 **real_defines(device, real),

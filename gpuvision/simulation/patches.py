@@ -10,7 +10,8 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.simulation.line_irradiance import Irradiance
 from gpuvision.simulation.patch_making import cut, in_two
 from gpuvision.simulation.scene import Scene
@@ -225,7 +226,7 @@ class Factors(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _FromPatches(Operation[R]):
+class _FromPatches(VisionOperation[R]):
     patches: Patches
     scene: Scene | None = None
     rays: float = 256.0
@@ -273,7 +274,7 @@ class _FromPatches(Operation[R]):
         clearance = _CLEARANCE * eps * reach if self.clearance is None else self.clearance
         present = {"STRIP": strip, "FACTORS": kernel == "form_factors", "OCCLUSION": tree is not None}
         return Launch(
-            stem="patches",
+            source="patches.cl",
             kernel=kernel,
             defines={
                 **real_defines(device, real),
@@ -344,7 +345,8 @@ class FormFactors(_FromPatches[Factors]):
 
     Result: ClassVar[type[Any]] = Factors
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         real = self._real(device, shape, dtype)
         outputs = {"factors": ((*shape[:-1], self.patches.count), real)}
         return self._launch_of("form_factors", device, [(shape, dtype)], outputs, real)
@@ -360,7 +362,8 @@ class PatchLight(_FromPatches[Irradiance]):
 
     Result: ClassVar[type[Any]] = Irradiance
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         real = self._real(device, shape, dtype)
         inputs = [(shape, dtype), ((self.patches.count,), real)]
         return self._launch_of("patch_light", device, inputs, {"irradiance": (shape[:-1], real)}, real)

@@ -8,7 +8,8 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene import Scene
 
 _RAYS_PER_STRIP, _GROUP = 256, 64
@@ -54,7 +55,7 @@ class Occlusion(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Rays(Operation[R]):
+class _Rays(VisionOperation[R]):
     scene: Scene
     clearance: float = 0.0
     precision: Precision = None
@@ -83,7 +84,7 @@ class _Rays(Operation[R]):
         place = np.dtype(np.float64 if device.has_double else np.float32)
         present = {"STRIP": strip, "SEGMENTS": kernel == "any_hit", "WIDE_PLACES": device.has_double}
         return Launch(
-            stem="rays",
+            source="rays.cl",
             kernel=kernel,
             defines={
                 **real_defines(device, real),
@@ -139,7 +140,8 @@ class ClosestHit(_Rays[Hits]):
 
     Result: ClassVar[type[Any]] = Hits
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         where = _shape_of("ClosestHit", "rays", shape)
         real = self._real(dtype)
         outputs: dict[str, Spec] = {
@@ -175,7 +177,8 @@ class AnyHit(_Rays[Occlusion]):
 
     Result: ClassVar[type[Any]] = Occlusion
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         where = _shape_of("AnyHit", "segments", shape)
         flags = (where, np.dtype(np.uint8))
         return self._launch_of("any_hit", device, shape, dtype, {"occluded": flags, "status": flags})

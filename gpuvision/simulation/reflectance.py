@@ -12,7 +12,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.tables import finite
 
 Array = npt.NDArray[np.float64]
@@ -237,7 +238,7 @@ class Reflected(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reflectance(Operation[Reflected]):
+class Reflectance(VisionOperation[Reflected]):
     """`Brdf.value` on a device: ``op(directions) -> Reflected``, directions float32 or float64 (..., 6).
 
     Parameters
@@ -265,7 +266,8 @@ class Reflectance(Operation[Reflected]):
         if not isinstance(self.model, Brdf):
             raise TypeError(f"Reflectance.model is {self.model!r}, expected a Brdf such as Lambert(albedo=0.5)")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"Reflectance takes float32 or float64 directions, got {dtype}")
         if shape[-1:] != (6,):
@@ -275,7 +277,7 @@ class Reflectance(Operation[Reflected]):
         each = _STRIP if strip else max(min(count, _GROUP), 1)
         items = -(-count // each)
         return Launch(
-            stem="reflectance",
+            source="reflectance.cl",
             kernel="reflectance",
             defines={
                 **real_defines(device, real),

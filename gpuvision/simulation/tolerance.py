@@ -10,7 +10,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Walk, in_strips
+from gpuvision.host import Device, Launch, Walk, in_strips
+from gpuvision.operation import VisionOperation
 from gpuvision.simulation.clusters import COLUMNS, Clusters
 from gpuvision.simulation.range_error import StripReading
 from gpuvision.simulation.scene import Scene
@@ -249,7 +250,7 @@ class _Found(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _PlanLight(Operation[_Found]):
+class _PlanLight(VisionOperation[_Found]):
     """Traverses the clusters for every block of receivers (strips, n, 6)."""
 
     Result: ClassVar[type[Any]] = _Found
@@ -262,7 +263,8 @@ class _PlanLight(Operation[_Found]):
     clusters: bool
     walk: Walk
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if dtype not in (np.float32, np.float64):
             raise TypeError(f"LightPlanner takes float32 or float64 receivers, got {dtype}")
         if dtype == np.float64 and not device.has_double:
@@ -282,7 +284,7 @@ class _PlanLight(Operation[_Found]):
         reach = 0.0 if self.scene is None else _reach(self.scene, dtype)
         margin = max(self.clearance, _MARGIN * reach)
         return Launch(
-            stem="tolerance",
+            source="tolerance.cl",
             kernel="plan_light",
             defines={
                 **{name: None for name, is_present in present.items() if is_present},

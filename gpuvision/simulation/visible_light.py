@@ -9,7 +9,8 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.operation import VisionOperation
 from gpuvision.simulation.line_irradiance import LitSegments
 from gpuvision.simulation.scene import Scene
 from gpuvision.tables import whole
@@ -52,7 +53,7 @@ class ReceivedLight(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VisibleLight(Operation[ReceivedLight]):
+class VisibleLight(VisionOperation[ReceivedLight]):
     """Diffuse light of lit segments on strips of receivers: ``op(receivers, weights, segments) -> ReceivedLight``.
 
     All inputs are float32 or float64, alike, and change from call to call: one bound instance serves all profiles.
@@ -127,7 +128,8 @@ class VisibleLight(Operation[ReceivedLight]):
         if self.visibility not in ("intervals", "rays", "none"):
             raise ValueError(f"VisibleLight.visibility is {self.visibility!r}, expected 'intervals', 'rays' or 'none'")
 
-    def _launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+    def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if len(shape) != 3 or shape[-1] != 6 or not shape[1]:
             raise ValueError(f"VisibleLight takes receivers (strips, n, 6), n at least 1, got shape {shape}")
         if dtype not in (np.float32, np.float64):
@@ -150,7 +152,7 @@ class VisibleLight(Operation[ReceivedLight]):
             integers = np.dtype(np.int32)
             inputs += [((strips * -(-each // PICK_BLOCK) + 1,), integers), ((self.picks,), integers)]
         return Launch(
-            stem="visible_light",
+            source="visible_light.cl",
             kernel="visible_light",
             defines={
                 **real_defines(device, real),

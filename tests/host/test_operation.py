@@ -12,6 +12,7 @@ import pytest
 from gpuvision.host import BuildError, Device, host_view
 from gpuvision.host.arrays import memory_of
 from gpuvision.host.program import build, options
+from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.ranging.psd import PsdReadout
 
 READOUT = PsdReadout(strip_length=2.0)
@@ -329,12 +330,14 @@ def test_host_view_refuses_memory_that_is_not_shared(device):
 
 def test_a_program_is_built_once(device):
     defines = {"CODE": "float", "CODE16": "float16", "WITH_POSITION": None}
-    assert build(device, "psd", defines) is build(device, "psd", dict(reversed(defines.items())))
+    assert build(device, KERNEL_FOLDER, "psd.cl", defines) is build(
+        device, KERNEL_FOLDER, "psd.cl", dict(reversed(defines.items()))
+    )
 
 
 def test_a_kernel_that_does_not_compile_is_told_with_its_log(device):
     with pytest.raises(BuildError, match=r"kernels/psd\.cl does not build with .*-DCODE=nonsense"):
-        build(device, "psd", {"CODE": "nonsense", "CODE16": "float16"})
+        build(device, KERNEL_FOLDER, "psd.cl", {"CODE": "nonsense", "CODE16": "float16"})
 
 
 def test_no_option_gives_up_on_nan():

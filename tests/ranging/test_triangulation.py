@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
-from gpuvision.host.program import kernel_folder, options
+from gpuvision.host.program import options
+from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.ranging.triangulation import SampleAxes, SheetPoints, Triangulation
 from gpuvision.status import Status
 from reference import triangulation as reference
@@ -266,7 +267,7 @@ def test_fused_strips_take_positions_and_sample_numbers(
     covariance = np.diag(rng.uniform(1e-12, 1e-10, 8))
     operation = scanner(lens=lens, covariance=tuple(map(tuple, covariance)), sigma=(0.05, 0.2))
     defines = {**operation.defines, "STRIP": None, **({"REAL_IS_DOUBLE": None} if dtype == np.float64 else {})}
-    program = cl.Program(device.context, FUSED).build([*options(defines), "-I", str(kernel_folder())])
+    program = cl.Program(device.context, FUSED).build([*options(defines), "-I", str(KERNEL_FOLDER)])
     position = rng.uniform(0.0, 1800.0, 256).astype(dtype)
     position[[17, 200]] = math.nan
     queue = device.queue

@@ -1,6 +1,7 @@
 """Run kernels: find devices, build programs, bind operations, stream frames. Knows no vision."""
 
-from gpuvision.host.arrays import DeviceArray, HostArray, host_view
+from gpuvision.host.arrays import Array, DeviceArray, FloatArray, HostArray, IntArray, StatusArray, host_view, to_numpy
+from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
 from gpuvision.host.errors import (
     BuildError,
@@ -10,26 +11,43 @@ from gpuvision.host.errors import (
     RecordingError,
     StreamError,
 )
-from gpuvision.host.operation import Bound, Launch, Operation, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host.launch import Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, type_defines
+from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Batch, Pipeline
 from gpuvision.host.plan import Plan, plan
+from gpuvision.host.program import Define
 from gpuvision.host.recordings import open_recording
 from gpuvision.host.report import StreamReport
 from gpuvision.host.ring import Step
 from gpuvision.host.sources import ArraySource, PacedSource, Source
 from gpuvision.host.trace import Trace
+from gpuvision.host.work_size import (
+    WorkSize,
+    capacity,
+    ceil_div,
+    fitted_groups,
+    padded_groups,
+    round_up,
+    vector_work,
+)
 
 __all__ = [
+    "Array",
     "ArraySource",
     "Batch",
     "Bound",
     "BuildError",
+    "Define",
     "Device",
     "DeviceArray",
     "DeviceUnusableError",
+    "FloatArray",
     "GpuVisionError",
     "HostArray",
+    "IntArray",
     "Launch",
+    "LaunchBuilder",
     "NoDeviceError",
     "Operation",
     "PacedSource",
@@ -38,15 +56,27 @@ __all__ = [
     "Precision",
     "RecordingError",
     "Source",
+    "StatusArray",
     "Step",
     "StreamError",
     "StreamReport",
     "Trace",
     "Walk",
+    "WorkSize",
+    "capacity",
+    "ceil_div",
+    "fitted_groups",
+    "flags",
     "host_view",
     "in_strips",
     "open_recording",
+    "opencl_type",
+    "padded_groups",
     "plan",
     "real_defines",
     "real_of",
+    "round_up",
+    "to_numpy",
+    "type_defines",
+    "vector_work",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import pyopencl as cl
@@ -11,6 +11,13 @@ from numpy.typing import NDArray
 
 DeviceArray: TypeAlias = cl.array.Array
 HostArray: TypeAlias = NDArray[Any]
+# Fields of results: NumPy arrays from NumPy inputs, device arrays from device inputs.
+Array: TypeAlias = NDArray[Any] | cl.array.Array
+FloatArray: TypeAlias = NDArray[np.floating[Any]] | cl.array.Array
+IntArray: TypeAlias = NDArray[np.int32] | cl.array.Array
+StatusArray: TypeAlias = NDArray[np.uint8] | cl.array.Array
+
+S = TypeVar("S", bound=np.generic)
 
 SHARED_FLAGS = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUFFER
 
@@ -42,6 +49,30 @@ def host_view(array: DeviceArray) -> HostArray:
     if not isinstance(memory, cl.SVMPointer):
         raise ValueError("the array lies in device memory; copy it with array.get(), host_view needs shared memory")
     return np.asarray(_Shared(array, memory))
+
+
+def to_numpy(array: NDArray[S] | DeviceArray) -> NDArray[S]:
+    """Return a field of a result as a NumPy array: a NumPy array itself, a device array copied to the host.
+
+    Parameters
+    ----------
+    array : numpy.ndarray or pyopencl.array.Array
+
+    Returns
+    -------
+    numpy.ndarray
+
+    Raises
+    ------
+    TypeError
+        The value is neither; a field that was not computed is ``None``.
+    """
+    if isinstance(array, np.ndarray):
+        return array
+    if isinstance(array, cl.array.Array):
+        copied: NDArray[S] = array.get()
+        return copied
+    raise TypeError(f"expected a NumPy array or a pyopencl array, got {type(array).__name__}")
 
 
 def memory_of(array: DeviceArray) -> Any:

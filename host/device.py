@@ -42,6 +42,8 @@ class Device:
         Whether kernels should walk strips with wide vectors (CPU runtimes) or run one item per sample.
     shares_memory : bool
         Whether host and device read and write the same allocations with no map or copy (fine-grained SVM).
+    compute_units : int
+        Cores of a CPU, multiprocessors of a GPU.
     has_double : bool
         Whether `precision="double"` works here.
     cache_bytes : int
@@ -61,6 +63,7 @@ class Device:
         self.callers_thread = callers_thread
         self.queue = queue if queue is not None else cl.CommandQueue(self.context, handle)
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
+        self.compute_units = int(handle.max_compute_units)
         self.has_double = bool(handle.double_fp_config)
         self.cache_bytes = max(int(handle.global_mem_cache_size), _LEAST_LAST_CACHE)
         self.shares_memory = self.is_cpu and _has_fine_grained_memory(handle)

@@ -10,8 +10,10 @@ import numpy as np
 import pyopencl as cl
 
 from gpuvision.host.arrays import HostArray, host_view
+from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
-from gpuvision.host.operation import Bound, Operation, Spec
+from gpuvision.host.launch import Spec
+from gpuvision.host.operation import Operation
 
 R = TypeVar("R", bound=tuple[Any, ...])
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Walk, capacity, flags, type_defines
 from gpuvision.matching.losses import Loss, bend_of, efficiency, loss_defines, subsets
 from gpuvision.operation import VisionOperation
 from gpuvision.tables import finite
@@ -129,38 +129,37 @@ class FitLines(VisionOperation[LineFits]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"FitLines takes float32 or float64 points, got {dtype}")
-        if len(shape) < 2 or shape[-1] != 2 or not 2 <= shape[-2] <= _LARGEST_SET:
-            raise ValueError(f"FitLines takes points (..., 2 to {_LARGEST_SET}, 2), got shape {shape}")
-        real, (*batch, count, _) = real_of(self.precision, dtype), shape
-        lines, strip = math.prod(batch), in_strips(self.walk, device)
-        items = -(-lines // _LANES) if strip else -(-lines // _GROUP) * _GROUP
-        pairs = subsets(count, 2, self.trials)
-        code = "float" if dtype == np.float32 else "double"
-        present = {"STRIP": strip, "WITH_SIGMA": self.weighted, "WITH_WEIGHTS": self.with_weights}
-        more = {} if self.scale is None else {"GIVEN_SCALE": self.scale}
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, walk=self.walk)
+        build.check_dtype("float32", "float64", of="points")
+        is_valid = len(shape) >= 2 and shape[-1] == 2 and 2 <= shape[-2] <= _LARGEST_SET
+        build.check_shape(is_valid, f"points (..., 2 to {_LARGEST_SET}, 2)")
+        batch, count = shape[:-2], shape[-2]
+        lines, pairs = math.prod(batch), subsets(count, 2, self.trials)
+        work = build.work(lines, each=_LANES, group=_GROUP)
         assert self.bend is not None
-        sizes = {"normal": (2,), "distance": (), "centre": (2,), "covariance": (2, 2), "scale": ()}
-        return Launch(
-            source="line_fit.cl",
-            kernel="line_fit_sets",
+        shapes = {
+            "normal": (*batch, 2),
+            "distance": batch,
+            "centre": (*batch, 2),
+            "covariance": (*batch, 2, 2),
+            "scale": batch,
+            "inliers": batch,
+            "weights": (*batch, count) if self.with_weights else None,
+            "status": batch,
+        }
+        return build.launch(
+            "line_fit.cl",
+            "line_fit_sets",
+            work=work,
+            more_inputs=[(shape[:-1], dtype)] if self.weighted else [],
+            outputs=build.outputs(shapes, inliers=np.int32),
             defines={
-                **real_defines(device, real),
+                **type_defines("INPUT", dtype),
                 **loss_defines(self.loss, self.bend),
-                **{name: None for name, is_present in present.items() if is_present},
-                **more,
+                **flags(WITH_SIGMA=self.weighted, WITH_WEIGHTS=self.with_weights),
+                **({} if self.scale is None else {"GIVEN_SCALE": self.scale}),
                 "EFFICIENCY": efficiency(self.loss, self.bend),
-                "INPUT": code,
-                # Powers of two: few builds for sets of many sizes.
-                "CAPACITY": max(8, 1 << (count - 1).bit_length()),
-            },
-            inputs=[(shape, dtype), *([(shape[:-1], dtype)] if self.weighted else [])],
-            outputs={
-                **{name: ((*batch, *size), real) for name, size in sizes.items()},
-                "inliers": (tuple(batch), np.dtype(np.int32)),
-                "weights": ((*batch, count), real) if self.with_weights else None,
-                "status": (tuple(batch), np.dtype(np.uint8)),
+                "CAPACITY": capacity(count, least=8),
             },
             arguments=[
                 np.int64(lines),
@@ -168,9 +167,7 @@ class FitLines(VisionOperation[LineFits]):
                 pairs.ravel(),
                 np.int32(len(pairs)),
                 np.int32(self.steps),
-                real.type(self.smallest_scale),
+                build.real.type(self.smallest_scale),
             ],
-            global_size=(items,),
-            local_size=(1,) if strip else (_GROUP,),
-            passes_once=strip and items == 1,
+            passes_once=work.vectors and lines <= _LANES,
         )

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Define, Device, Launch, LaunchBuilder, Precision, Walk, WorkSize, flags, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.tables import finite
@@ -22,7 +22,6 @@ ELECTRON = 1.602176634e-19  # C
 # Samples of a strip: long where enough strips remain to share among the cores, a multiple of 16 always.
 _SHORT_STRIP, _LONG_STRIP, _STRIPS_PER_CORE = 4096, 65536, 4
 _LANES = 16
-_CODES = {"float32": "float", "float64": "double", "uint16": "ushort"}
 
 
 class PsdReading(NamedTuple):
@@ -203,12 +202,10 @@ class PsdReadout(VisionOperation[PsdReading]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype.name not in _CODES:
-            raise TypeError(f"PsdReadout takes float32, float64 or uint16 currents, got {dtype}")
-        pair_axis = -1 if self.layout == "pairs" else 0
-        if not shape or shape[pair_axis] != 2:
-            expected = "(..., 2)" if self.layout == "pairs" else "(2, ...)"
-            raise ValueError(f"PsdReadout takes {self.layout} of shape {expected}, got {shape}")
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, walk=self.walk)
+        build.check_dtype("float32", "float64", "uint16", of="currents")
+        pair_axis, expected = (-1, "(..., 2)") if self.layout == "pairs" else (0, "(2, ...)")
+        build.check_shape(bool(shape) and shape[pair_axis] == 2, f"{self.layout} of shape {expected}")
         batch = shape[:-1] if self.layout == "pairs" else shape[1:]
         strips = batch[-1] if batch else 1
         if self.linearity is not None and len(self.linearity) != strips:
@@ -216,59 +213,48 @@ class PsdReadout(VisionOperation[PsdReading]):
         samples = math.prod(batch)
         if samples >= 2**30:
             raise ValueError(f"PsdReadout takes fewer than 2**30 samples at once, got {samples}; split the batch")
-        real = real_of(self.precision, dtype)
-        strip = in_strips(self.walk, device) and samples >= _LANES
-        many = samples >= _STRIPS_PER_CORE * _LONG_STRIP * device.handle.max_compute_units
+        many = samples >= _STRIPS_PER_CORE * _LONG_STRIP * device.compute_units
         each = _LONG_STRIP if many else _SHORT_STRIP
-        items = max(samples // each, 1) if strip else samples
+        if build.uses_vectors and samples >= _LANES:
+            # The last work-item takes the rest: less than two strips.
+            work = WorkSize((max(samples // each, 1),), (1,), each, vectors=True)
+        else:
+            work = WorkSize((samples,), None, each)
+        chosen = self.outputs or ()
         sheet = self.triangulation
-        table = None if self.linearity is None else np.array(self.linearity, real)
-        outputs = self._outputs(batch, real)
-        moved = samples * (2 * dtype.itemsize + sum(spec[1].itemsize for spec in outputs.values() if spec))
-        past_caches = {"PAST_CACHES": None} if strip and device.is_cpu and moved > device.cache_bytes else {}
-        return Launch(
-            source="psd.cl",
-            kernel="psd_readout",
-            inputs=[(shape, dtype)],
-            outputs=outputs,
-            global_size=(items,),
-            local_size=(1,) if strip else None,
-            defines=self._defines(device, real, dtype, strip) | past_caches,
+        table = None if self.linearity is None else np.array(self.linearity, build.real)
+        return build.launch(
+            "psd.cl",
+            "psd_readout",
+            work=work,
+            outputs=build.outputs({name: batch if name in chosen else None for name in PsdReading._fields}),
+            defines=self._defines(dtype),
             arguments=[
-                self._packed(real, dtype),
+                self._packed(build.real, dtype),
                 np.int32(samples),
                 np.int32(each),
                 table,
                 np.int32(strips),
                 np.int32(0 if table is None else table.shape[1]),
-                None if sheet is None else sheet.packed(real, self.axes),
+                None if sheet is None else sheet.packed(build.real, self.axes),
             ],
-            passes_once=strip,
+            passes_once=work.vectors,
+            streams=True,
         )
 
-    def _outputs(self, batch: tuple[int, ...], real: np.dtype[Any]) -> dict[str, Any]:
-        chosen = self.outputs or ()
-        types = dict.fromkeys(PsdReading._fields, real) | {"status": np.dtype(np.uint8)}
-        return {name: (batch, types[name]) if name in chosen else None for name in PsdReading._fields}
-
-    def _defines(self, device: Device, real: np.dtype[Any], dtype: np.dtype[Any], strip: bool) -> dict[str, Any]:
-        chosen = self.outputs or ()
-        defines: dict[str, Any] = real_defines(device, real)
-        code = _CODES[dtype.name]
-        defines |= {"CODE": code, "CODE16": f"{code}16"}
-        defines |= {f"WITH_{name.upper()}": None for name in PsdReading._fields if name in chosen}
+    def _defines(self, dtype: np.dtype[Any]) -> dict[str, Define]:
+        defines = type_defines("CODE", dtype, 16)
+        defines |= flags(**{f"WITH_{name.upper()}": True for name in self.outputs or ()})
         if self.triangulation is not None:
             defines |= {"WITH_SHEET": None} | self.triangulation.defines
-        present = {
-            "STRIP": strip,
-            "PLANAR": self.layout == "planar",
-            "DARK": any(self.dark),
+        return defines | flags(
+            PLANAR=self.layout == "planar",
+            DARK=any(self.dark),
             # Where a current can be negative or not finite, or the load resistors shrink the range.
-            "SIGNED": dtype.kind == "f" or any(self.dark) or self.load_resistance > 0.0,
-            "GAIN": self.right_gain != 1.0,
-            "LINEARITY": self.linearity is not None,
-        }
-        return defines | {name: None for name, is_present in present.items() if is_present}
+            SIGNED=dtype.kind == "f" or any(self.dark) or self.load_resistance > 0.0,
+            GAIN=self.right_gain != 1.0,
+            LINEARITY=self.linearity is not None,
+        )
 
     def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any]) -> Any:
         """Return the parameters of ``psd.cl``, in its order and in the input's unit."""

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Walk, flags, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging import homography
 from gpuvision.ranging.homography import Model
@@ -216,34 +216,31 @@ class Triangulation(VisionOperation[SheetPoints]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"Triangulation takes float32 or float64 coordinates u and v, got {dtype}")
-        real = real_of(self.precision, dtype)
-        code = "float" if dtype == np.float32 else "double"
-        defines = {**self.defines, **real_defines(device, real), "INPUT": code, "INPUT16": f"{code}16"}
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, walk=self.walk)
+        build.check_dtype("float32", "float64", of="coordinates u and v")
         points = math.prod(shape)
-        strip = in_strips(self.walk, device) and points >= _LANES
-        if strip:
-            defines["STRIP"] = None
-        share = -(-points // (_STRIPS_PER_CORE * _LANES * device.handle.max_compute_units)) * _LANES
-        each = min(max(share, _SHORTEST_STRIP), _LONGEST_STRIP) if strip else max(min(points, _GROUP), 1)
-        items = -(-points // each)
-        spread = None
-        if self.sigma is not None:
-            defines["SHEET_SIGMAS"], spread = None, (shape, real)
-        sigma = self.sigma or (0.0, 0.0)
-        outputs = {"g": (shape, real), "h": (shape, real), "status": (shape, np.dtype(np.uint8))}
-        return Launch(
-            source="triangulation.cl",
-            kernel="triangulate",
-            defines=defines,
-            inputs=((shape, dtype), (shape, dtype)),
-            outputs={**outputs, "sigma_g": spread, "sigma_h": spread},
-            arguments=(np.uint64(points), np.uint64(each), self.packed(real), *map(real.type, sigma)),
-            # Left to itself PoCL may put all strips into one group, and so on one core.
-            global_size=(items,) if strip else (items * each,),
-            local_size=(1,) if strip else (each,),
-            passes_once=strip,
+        share = build.share(points, per_core=_STRIPS_PER_CORE, multiple=_LANES)
+        each = min(max(share, _SHORTEST_STRIP), _LONGEST_STRIP)
+        work = build.work(points, each=each, group=_GROUP, least=_LANES, fitted=True)
+        spread = None if self.sigma is None else shape
+        return build.launch(
+            "triangulation.cl",
+            "triangulate",
+            work=work,
+            more_inputs=[(shape, dtype)],
+            outputs=build.outputs({"g": shape, "h": shape, "status": shape, "sigma_g": spread, "sigma_h": spread}),
+            defines={
+                **self.defines,
+                **type_defines("INPUT", dtype, 16),
+                **flags(SHEET_SIGMAS=self.sigma is not None),
+            },
+            arguments=[
+                np.uint64(points),
+                np.uint64(work.each),
+                self.packed(build.real),
+                *map(build.real.type, self.sigma or (0.0, 0.0)),
+            ],
+            passes_once=work.vectors,
         )
 
     # ---- on the host: simulators, planners, error budgets --------------------------------------------------

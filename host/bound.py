@@ -1,0 +1,293 @@
+"""An operation bound to a device, a queue and a shape: its program, its arrays and the calls that launch it."""
+
+from __future__ import annotations
+
+import collections
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+
+from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
+from gpuvision.host.device import Device
+from gpuvision.host.program import build
+
+if TYPE_CHECKING:
+    from gpuvision.host.operation import Operation
+
+R = TypeVar("R", bound=tuple[Any, ...])
+
+_COMPLETE = cl.command_execution_status.COMPLETE
+# One core of a PC moves so much in the time in which PoCL wakes two.
+_SHORT_BYTES = 1 << 20
+
+
+@dataclass(slots=True, eq=False)
+class _Site:
+    """Where a bound operation runs: a queue, the kernel as compiled for its device, and the arrays set in that.
+
+    The runtime may abort the process on a freed buffer: what the kernel was given stays referenced.
+    """
+
+    queue: Any
+    kernel: Any
+    given: tuple[Any, ...]
+    at_once: bool  # in the caller's thread, done when enqueued
+
+
+class Bound(Generic[R]):
+    """An operation bound to a device, a queue and a shape: call it with frames.
+
+    Attributes
+    ----------
+    inputs : tuple of pyopencl.array.Array
+        Its own input slot: fill it (`arrays.host_view` where memory is shared) and call with no arguments.
+    outputs : Result of pyopencl.array.Array
+        What each call writes, unless it is given ``out``; ``None`` where nothing is computed.
+    """
+
+    def __init__(
+        self, operation: Operation[R], device: Device, shape: tuple[int, ...], dtype: np.dtype[Any], queue: Any
+    ) -> None:
+        launch = operation.launch(device, shape, dtype)
+        self.operation, self.device = operation, device
+        self.queue = device.queue if queue is None else queue
+        self._launch = launch
+        self._computed_specs = {name: spec for name, spec in launch.outputs.items() if spec is not None}
+        self._global, self._local = launch.global_size, launch.local_size
+        # What `Device.wait` comes to, found out once: a call of short work is a few microseconds in all.
+        self._wait: Callable[[Any], object] = device.wait if device.kind == "pocl" else cl.Event.wait
+        self._empty = not all(launch.global_size)
+        self.inputs = tuple(device.empty(shape, dtype, self.queue) for shape, dtype in launch.inputs)
+        self.outputs = self.allocate()
+        self._tables = [self._upload(each) for each in launch.arguments if isinstance(each, np.ndarray)]
+        self._in_flight: collections.deque[tuple[Any, Any]] = collections.deque()
+        after_inputs = enumerate(launch.outputs.values(), len(launch.inputs))
+        # Of the arrays that calls bind, among the kernel's arguments.
+        self._places = [*range(len(launch.inputs)), *(place for place, spec in after_inputs if spec is not None)]
+        self._own = (*self.inputs, *self._computed(self.outputs))
+        # Intel's runtime looks an SVM pointer up at every launch; a buffer over the same memory it knows.
+        known = self._own if device.kind == "intel" and device.shares_memory else ()
+        self._known = {id(each): _buffer_over(device.context, each) for each in known}
+        self._site_of_queue = self._site_on(self.queue)
+        self._here: _Site | None = None
+        if not self._site_of_queue.at_once and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
+            own = device.callers_queue(self.queue, groups=launch.groups)
+            self._here = None if own is None else self._site_on(own)
+        for array in self.inputs:
+            self._clear(array)
+        self().wait()
+        if self._here is not None and not self._empty:
+            self._set_arrays(self._site_of_queue, self._own)
+            cl.enqueue_nd_range_kernel(self.queue, self._site_of_queue.kernel, self._global, self._local).wait()
+
+    def allocate(self) -> R:
+        """Return fresh device arrays for the outputs."""
+        arrays = {
+            name: self.device.empty(shape, dtype, self.queue) for name, (shape, dtype) in self._computed_specs.items()
+        }
+        return self._result(arrays)
+
+    def __call__(self, *frames: DeviceArray, out: R | None = None, wait_for: Sequence[Any] | None = None) -> Any:
+        """Enqueue the operation and return its event.
+
+        Parameters
+        ----------
+        *frames : pyopencl.array.Array
+            Device arrays of the bound shape and dtype; none: the instance's own `inputs`.
+        out : Result of pyopencl.array.Array, optional
+            Where to write instead of `outputs`.
+        wait_for : sequence of pyopencl.Event, optional
+
+        Returns
+        -------
+        pyopencl.Event
+
+        Raises
+        ------
+        TypeError, ValueError
+            A frame is not what the instance was bound to.
+        """
+        return self._enqueue(self._own if not frames and out is None else self._given(frames, out), wait_for)
+
+    def run(self, *frames: DeviceArray, out: R | None = None) -> R:
+        """Call, wait with the least delay, and return what was written: `out`, or `outputs`."""
+        event = self._enqueue(self._own if not frames and out is None else self._given(frames, out))
+        if not self._site_of_queue.at_once:
+            self._wait(event)
+        return self.outputs if out is None else out
+
+    def _given(self, frames: tuple[DeviceArray, ...], out: R | None) -> tuple[Any, ...]:
+        """Return the arrays of a call in the kernel's order, its own in place of what is not given."""
+        if out is not None and out is not self.outputs:
+            self._check_fields(out)
+        return (*(frames or self.inputs), *self._computed(self.outputs if out is None else out))
+
+    def _enqueue(self, given: tuple[Any, ...], wait_for: Sequence[Any] | None = None) -> Any:
+        site = self._site_of_queue if self._here is None else self._site(wait_for)
+        if given is not site.given:
+            self._set_arrays(site, given)
+        if self._empty:
+            return cl.enqueue_marker(self.queue, wait_for=wait_for)
+        if site.at_once:
+            if wait_for:
+                cl.wait_for_events(wait_for)
+            return cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
+        event = cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local, wait_for=wait_for)
+        if given is not self._own:
+            self._hold(event, given)
+        return event
+
+    def _site(self, wait_for: Sequence[Any] | None = None) -> _Site:
+        """Return where to run: short work in the caller's thread, once all before it in the queue is done.
+
+        Work that must wait is left to the workers: PoCL hangs where one of its devices waits for an event of the other.
+        """
+        if self._here is None or (wait_for and any(each.command_execution_status > _COMPLETE for each in wait_for)):
+            return self._site_of_queue
+        self.queue.finish()
+        return self._here
+
+    def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
+        """Run on NumPy arrays and wait; on shared memory the kernel reads and writes them in place."""
+        if len(frames) != len(self.inputs):
+            raise TypeError(f"expected {len(self.inputs)} input arrays, got {len(frames)}")
+        for number, (frame, (shape, dtype)) in enumerate(zip(frames, self._launch.inputs, strict=True)):
+            check_host(frame, shape, dtype, f"input {number}")
+        if out is None:
+            out = self._result({k: np.empty(shape, dtype) for k, (shape, dtype) in self._computed_specs.items()})
+        targets = self._computed(out)
+        self._check_fields(out)
+        for (name, (shape, dtype)), array in zip(self._computed_specs.items(), targets, strict=True):
+            check_host(array, shape, dtype, f"out.{name}")
+        _check_apart(frames, targets, np.may_share_memory)
+        if self._empty:
+            return out
+        if self.device.shares_memory:
+            self._run_in_place(frames, targets)
+        else:
+            self._run_with_copies(frames, targets)
+        return out
+
+    def _run_in_place(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
+        flags, context = cl.mem_flags, self.device.context
+        read = [cl.Buffer(context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in frames]
+        write = [cl.Buffer(context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=each) for each in targets]
+        site = self._site()
+        site.given = (None,) * len(self._own)
+        for index, memory in zip(self._places, (*read, *write), strict=True):
+            site.kernel.set_arg(index, memory)
+        cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
+        for memory, array in zip(write, targets, strict=True):
+            # The map is what makes the kernel's writes visible to the host; the address stays the same.
+            mapped, _ = cl.enqueue_map_buffer(
+                site.queue, memory, cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
+            )
+            mapped.base.release(site.queue)
+        site.queue.finish()
+        # The next call binds others before these go away: a preset argument must never dangle.
+        self._set_arrays(site, self._own)
+
+    def _run_with_copies(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
+        for array, frame in zip(self.inputs, frames, strict=True):
+            cl.enqueue_copy(self.queue, memory_of(array), frame, is_blocking=False)
+        self()
+        for array, target in zip(self._computed(self.outputs), targets, strict=True):
+            cl.enqueue_copy(self.queue, target, memory_of(array), is_blocking=False)
+        self.queue.finish()
+
+    def _computed(self, result: R) -> tuple[Any, ...]:
+        return tuple(getattr(result, name) for name in self._computed_specs)
+
+    def _result(self, arrays: Mapping[str, Any]) -> R:
+        result: R = self.operation.Result(**{name: arrays.get(name) for name in self.operation.Result._fields})
+        return result
+
+    def _set_arrays(self, site: _Site, given: tuple[Any, ...]) -> None:
+        specs = (*self._launch.inputs, *self._computed_specs.values())
+        if len(given) != len(specs):
+            raise TypeError(
+                f"expected {len(self.inputs)} input arrays, got {len(given) - len(specs) + len(self.inputs)}"
+            )
+        for array, before, spec in zip(given, site.given, specs, strict=True):
+            if array is not before:
+                self._check(array, *spec)
+        inputs = len(self.inputs)
+        _check_apart(given[:inputs], given[inputs:], lambda a, b: a.base_data is b.base_data)
+        for place, array, before in zip(self._places, given, site.given, strict=True):
+            if array is not before:
+                site.kernel.set_arg(place, self._known.get(id(array)) or memory_of(array))
+        site.given = given
+
+    def _check_fields(self, out: R) -> None:
+        for name, array in zip(self.operation.Result._fields, out, strict=True):
+            if (array is not None) != (name in self._computed_specs):
+                what = "is missing" if array is None else "is not computed; expected None"
+                raise ValueError(f"out.{name} {what}")
+
+    def _check(self, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        if not isinstance(array, cl.array.Array):
+            raise TypeError(f"expected a pyopencl array on {self.device.label}, got {type(array).__name__}")
+        if array.dtype != dtype:
+            raise TypeError(f"expected dtype {dtype}, got {array.dtype}; bind the operation to it")
+        if array.shape != shape:
+            raise ValueError(f"expected shape {shape}, got {array.shape}; bind the operation to it")
+        if array.context != self.device.context:
+            raise ValueError(f"the array lies on another device than {self.device.label}; copy it there first")
+
+    def _clear(self, array: DeviceArray) -> None:
+        if self.device.shares_memory:
+            host_view(array).fill(0)
+        elif array.nbytes:
+            cl.enqueue_fill_buffer(self.queue, memory_of(array), np.zeros(1, np.uint8), 0, array.nbytes)
+
+    def _site_on(self, queue: Any) -> _Site:
+        """Compile the kernel for a queue's device and set what no call changes."""
+        launch, operation = self._launch, self.operation
+        if operation.kernel_folder is None:
+            raise ValueError(f"{type(operation).__name__} has no kernel_folder; set it to the folder of its .cl files")
+        program = build(
+            self.device,
+            operation.kernel_folder,
+            launch.source,
+            launch.defines,
+            include_folders=operation.include_folders,
+            handle=queue.device,
+        )
+        kernel = cl.Kernel(program, launch.kernel)
+        after_inputs = len(launch.inputs)
+        after_outputs = after_inputs + len(launch.outputs)
+        for place, spec in enumerate(launch.outputs.values(), after_inputs):
+            if spec is None:
+                kernel.set_arg(place, None)
+        tables = iter(self._tables)
+        for place, value in enumerate(launch.arguments, after_outputs):
+            kernel.set_arg(place, next(tables) if isinstance(value, np.ndarray) else value)
+        return _Site(queue, kernel, (None,) * len(self._own), self.device.is_callers(queue))
+
+    def _upload(self, table: HostArray) -> Any:
+        flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+        return cl.Buffer(self.device.context, flags, hostbuf=np.ascontiguousarray(table))
+
+    def _hold(self, event: Any, given: tuple[Any, ...]) -> None:
+        """Keep what a running kernel uses until it has run; its own arrays the instance keeps anyway."""
+        flight = self._in_flight
+        while flight and flight[0][0].command_execution_status <= _COMPLETE:
+            flight.popleft()
+        flight.append((event, given))
+
+
+def _buffer_over(context: Any, array: DeviceArray) -> Any:
+    """Return a buffer that is an array's shared memory."""
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
+    return cl.Buffer(context, flags, hostbuf=host_view(array)) if array.nbytes else None
+
+
+def _check_apart(inputs: Sequence[Any], outputs: Sequence[Any], same: Callable[[Any, Any], bool]) -> None:
+    """Check that no output is an input or another output: kernels read and write in an order of their own."""
+    for number, output in enumerate(outputs):
+        if any(same(output, other) for other in (*inputs, *outputs[:number])):
+            raise ValueError("an output shares its memory with an input or another output; expected arrays apart")

@@ -1,0 +1,121 @@
+"""Description of a kernel launch: source, macros, arrays, arguments and work size for inputs of one shape."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from gpuvision.host.device import Device
+from gpuvision.host.program import Define
+
+Precision = Literal["single", "double"] | None
+Walk = Literal["auto", "strip", "item"]
+Shape = tuple[int, ...]
+Spec = tuple[Shape, np.dtype[Any]]
+
+
+@dataclass(frozen=True)
+class Launch:
+    """Kernel launch for one shape on one device; the kernel takes inputs, outputs and arguments in this order.
+
+    Attributes
+    ----------
+    source : str
+        Path of the ``.cl`` file relative to the operation's `kernel_folder`.
+    kernel : str
+        Name of the kernel function in the file.
+    inputs : sequence of (shape, dtype)
+    outputs : mapping of str to (shape, dtype) or None
+        By the names of the result's fields, in the kernel's order. ``None``: the kernel gets a null pointer for this
+        argument, and the field stays ``None``.
+    global_size, local_size : tuple of int, optional
+        Work-items in all and per work-group. ``local_size=None`` leaves the choice to the runtime.
+    defines : mapping
+        Macros that change the code.
+    arguments : sequence
+        NumPy scalars, passed by value; NumPy arrays, uploaded once (tables, parameters); ``None``: a null pointer for
+        a table that this build does not read.
+    passes_once : bool
+        Whether the kernel does little more than read and write its memory once. Small launches of such kernels run in
+        the calling thread, because waking a worker thread takes longer than the work.
+    """
+
+    source: str
+    kernel: str
+    inputs: Sequence[Spec]
+    outputs: Mapping[str, Spec | None]
+    global_size: Shape
+    local_size: Shape | None = None
+    defines: Mapping[str, Define] = field(default_factory=dict)
+    arguments: Sequence[Any] = ()
+    passes_once: bool = False
+
+    @property
+    def groups(self) -> int:
+        """Number of work-groups; the number of work-items where the runtime chooses the group size."""
+        return math.prod(self.global_size) // math.prod(self.local_size or (1,))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of inputs and outputs."""
+        return nbytes_of((*self.inputs, *self.outputs.values()))
+
+
+def nbytes_of(specs: Iterable[Spec | None]) -> int:
+    """Return the bytes of arrays of these shapes and dtypes; ``None`` counts nothing."""
+    return sum(math.prod(spec[0]) * spec[1].itemsize for spec in specs if spec is not None)
+
+
+def real_of(precision: Precision, dtype: np.dtype[Any], *, narrows: bool = False) -> np.dtype[Any]:
+    """Return the floating-point type of an operation's arithmetic and outputs.
+
+    Parameters
+    ----------
+    precision : {"single", "double", None}
+        ``None`` follows the input: double for float64, else single.
+    dtype : numpy.dtype
+        Dtype of the input.
+    narrows : bool
+        Whether the kernel itself converts float64 input to single, where this loses least; then "single" takes
+        float64 input.
+
+    Raises
+    ------
+    TypeError
+        The operation does not take float64 input in single precision.
+    ValueError
+        The precision is unknown.
+    """
+    if precision is None:
+        return np.dtype(np.float64 if dtype == np.float64 else np.float32)
+    if precision not in ("single", "double"):
+        raise ValueError(f"precision must be 'single', 'double' or None, got {precision!r}")
+    if precision == "single" and dtype == np.float64 and not narrows:
+        raise TypeError("precision='single' does not take float64 input; convert it, or ask for 'double'")
+    return np.dtype(np.float64 if precision == "double" else np.float32)
+
+
+def real_defines(device: Device, real: np.dtype[Any]) -> dict[str, Define]:
+    """Return the macros that select the real type.
+
+    Raises
+    ------
+    ValueError
+        The device has no double precision.
+    """
+    if real == np.float32:
+        return {}
+    if not device.has_double:
+        raise ValueError(f"device {device.label} has no double precision; use precision='single'")
+    return {"REAL_IS_DOUBLE": None}
+
+
+def in_strips(walk: Walk, device: Device) -> bool:
+    """Decide between the vector variant of a kernel (CPU runtimes) and one work-item per element."""
+    if walk not in ("auto", "strip", "item"):
+        raise ValueError(f"walk must be 'auto', 'strip' or 'item', got {walk!r}")
+    return device.is_cpu if walk == "auto" else walk == "strip"

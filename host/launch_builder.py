@@ -1,0 +1,222 @@
+"""Builder of launch descriptions: the checks, types, macros and output specifications that all operations share."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from gpuvision.host.device import Device
+from gpuvision.host.launch import (
+    Launch,
+    Precision,
+    Shape,
+    Spec,
+    Walk,
+    in_strips,
+    nbytes_of,
+    real_defines,
+    real_of,
+)
+from gpuvision.host.program import Define
+from gpuvision.host.work_size import WorkSize, ceil_div, fitted_groups, padded_groups, vector_work
+
+_OPENCL_TYPES = {
+    "int8": "char",
+    "uint8": "uchar",
+    "int16": "short",
+    "uint16": "ushort",
+    "int32": "int",
+    "uint32": "uint",
+    "int64": "long",
+    "uint64": "ulong",
+    "float32": "float",
+    "float64": "double",
+}
+
+
+class LaunchBuilder:
+    """Builder of the `Launch` of an operation for a first input of one shape and dtype.
+
+    Parameters
+    ----------
+    operation : Operation
+        Its class name stands in the messages.
+    device : Device
+    shape : tuple of int
+    dtype : numpy.dtype
+        Shape and dtype of the first input.
+    precision : {"single", "double", None}
+        Real type that the user asks for; see `real_of`.
+    narrows : bool
+        Whether "single" takes float64 input; see `real_of`.
+    walk : {"auto", "strip", "item"}
+        Kernel variant that the user asks for.
+    """
+
+    def __init__(
+        self,
+        operation: object,
+        device: Device,
+        shape: Shape,
+        dtype: np.dtype[Any],
+        *,
+        precision: Precision = None,
+        narrows: bool = False,
+        walk: Walk = "auto",
+    ) -> None:
+        self.name = type(operation).__name__
+        self.device, self.shape, self.dtype = device, shape, dtype
+        self._precision, self._narrows, self._walk = precision, narrows, walk
+
+    @functools.cached_property
+    def real(self) -> np.dtype[Any]:
+        """Floating-point type of the arithmetic and the outputs."""
+        return real_of(self._precision, self.dtype, narrows=self._narrows)
+
+    @functools.cached_property
+    def uses_vectors(self) -> bool:
+        """Whether the vector variant runs on this device."""
+        return in_strips(self._walk, self.device)
+
+    def check_dtype(self, *names: str, of: str) -> None:
+        """Check that the first input has one of these dtypes and that the device reads it.
+
+        Raises
+        ------
+        TypeError
+            The dtype is not among `names`.
+        ValueError
+            The kernel reads float64 and the device has no double precision.
+        """
+        if self.dtype.name not in names:
+            raise TypeError(f"{self.name} takes {_or(names)} {of}, got {self.dtype}")
+        if self._narrows and self.dtype == np.float64 and not self.device.has_double:
+            raise ValueError(f"device {self.device.label} has no double precision; give {of} as float32")
+
+    def check_shape(self, is_valid: bool, expected: str) -> None:
+        """Raise a ValueError that names the expected input where the shape is not valid."""
+        if not is_valid:
+            raise ValueError(f"{self.name} takes {expected}, got shape {self.shape}")
+
+    def work(self, count: int, *, each: int, group: int, least: int = 0, fitted: bool = False) -> WorkSize:
+        """Return the work size for `count` elements in the kernel variant that runs on this device.
+
+        Parameters
+        ----------
+        count : int
+        each : int
+            Elements of one work-item of the vector variant.
+        group : int
+            Work-group size of the other variant, which computes one element per work-item.
+        least : int
+            Fewest elements for the vector variant.
+        fitted : bool
+            Whether a group of `count` work-items runs where `count` is below `group`; see `fitted_groups`.
+        """
+        if self.uses_vectors and count >= least:
+            return vector_work(count, each)
+        return fitted_groups(count, group) if fitted else padded_groups(count, group)
+
+    def share(self, count: int, *, per_core: int, multiple: int = 1) -> int:
+        """Return the elements of one share, a multiple of a number, when each core gets `per_core` shares."""
+        return ceil_div(count, per_core * multiple * self.device.compute_units) * multiple
+
+    def outputs(self, shapes: Mapping[str, Shape | None], **types: DTypeLike) -> dict[str, Spec | None]:
+        """Return the specifications of the outputs, in the kernel's order.
+
+        Parameters
+        ----------
+        shapes : mapping of str to tuple of int or None
+            Shape of each field of the result; ``None``: not computed.
+        **types : dtype
+            Dtypes of fields. A field that is not named here has the real type; ``status`` has uint8.
+        """
+        kinds: dict[str, DTypeLike] = {"status": np.uint8, **types}
+        return {
+            name: None if shape is None else (shape, np.dtype(kinds.get(name, self.real)))
+            for name, shape in shapes.items()
+        }
+
+    def launch(
+        self,
+        source: str,
+        kernel: str,
+        *,
+        work: WorkSize,
+        outputs: Mapping[str, Spec | None],
+        more_inputs: Sequence[Spec] = (),
+        defines: Mapping[str, Define] | None = None,
+        arguments: Sequence[Any] = (),
+        passes_once: bool = False,
+        streams: bool = False,
+    ) -> Launch:
+        """Return the launch; add the macros of the real type and of the kernel variant.
+
+        Parameters
+        ----------
+        source, kernel, outputs, arguments, passes_once
+            As in `Launch`.
+        work : WorkSize
+        more_inputs : sequence of (shape, dtype)
+            Inputs after the first one.
+        defines : mapping
+            Macros besides those of the real type and of the kernel variant.
+        streams : bool
+            Whether the vector variant of the kernel writes past the caches of a CPU (macro ``PAST_CACHES``) when the
+            launch moves more bytes than the last cache holds.
+
+        Raises
+        ------
+        ValueError
+            The device has no double precision.
+        """
+        inputs = [(self.shape, self.dtype), *more_inputs]
+        moved = nbytes_of((*inputs, *outputs.values()))
+        past_caches = streams and work.vectors and self.device.is_cpu and moved > self.device.cache_bytes
+        variant = flags(STRIP=work.vectors, PAST_CACHES=past_caches)
+        return Launch(
+            source=source,
+            kernel=kernel,
+            inputs=inputs,
+            outputs=outputs,
+            global_size=work.global_size,
+            local_size=work.local_size,
+            defines={**real_defines(self.device, self.real), **variant, **(defines or {})},
+            arguments=arguments,
+            passes_once=passes_once,
+        )
+
+
+def flags(**present: bool) -> dict[str, Define]:
+    """Return macros without a value for the names that are true."""
+    return {name: None for name, is_present in present.items() if is_present}
+
+
+def opencl_type(dtype: DTypeLike) -> str:
+    """Return the OpenCL C name of a NumPy dtype: ``float32`` is ``float``, ``uint8`` is ``uchar``.
+
+    Raises
+    ------
+    TypeError
+        OpenCL C has no such scalar type.
+    """
+    name = np.dtype(dtype).name
+    if name not in _OPENCL_TYPES:
+        raise TypeError(f"OpenCL C has no type for dtype {name}; expected one of {_or(_OPENCL_TYPES)}")
+    return _OPENCL_TYPES[name]
+
+
+def type_defines(name: str, dtype: DTypeLike, *lanes: int) -> dict[str, Define]:
+    """Return macros for the OpenCL type of a dtype: `name`, and the vector types `name` with each width appended."""
+    word = opencl_type(dtype)
+    return {name: word, **{f"{name}{width}": f"{word}{width}" for width in lanes}}
+
+
+def _or(names: Iterable[str]) -> str:
+    """Return names as an enumeration: ``a, b or c``."""
+    *before, last = names
+    return f"{', '.join(before)} or {last}" if before else last

@@ -1,0 +1,64 @@
+"""Work sizes: how a launch divides its elements into work-items and work-groups."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+Shape = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class WorkSize:
+    """Division of a launch into work-items.
+
+    Attributes
+    ----------
+    global_size, local_size : tuple of int
+        As in `Launch`.
+    each : int
+        Elements of one work-item (vector variant) or of one work-group.
+    vectors : bool
+        Whether this is the kernel's vector variant (wide vectors, work-groups of one work-item).
+    """
+
+    global_size: Shape
+    local_size: Shape | None
+    each: int = 1
+    vectors: bool = False
+
+
+def vector_work(count: int, each: int) -> WorkSize:
+    """Return the work size of a vector variant: one work-item, alone in its work-group, per `each` elements.
+
+    The group size is explicit because PoCL may put all work-items into one group, and so on one core.
+    """
+    return WorkSize((ceil_div(count, each),), (1,), each, vectors=True)
+
+
+def padded_groups(count: int, group: int) -> WorkSize:
+    """Return the work size of one work-item per element in whole groups; the kernel skips items beyond `count`."""
+    return WorkSize((round_up(count, group),), (group,))
+
+
+def fitted_groups(count: int, group: int) -> WorkSize:
+    """Return the work size of `padded_groups` with a single smaller group where `count` is below `group`."""
+    each = max(min(count, group), 1)
+    return WorkSize((round_up(count, each),), (each,), each)
+
+
+def ceil_div(count: int, size: int) -> int:
+    """Return the number of parts of `size` that hold `count` elements: count / size, rounded up."""
+    return -(-count // size)
+
+
+def round_up(count: int, multiple: int) -> int:
+    """Return the smallest multiple of a number that is not below `count`."""
+    return ceil_div(count, multiple) * multiple
+
+
+def capacity(count: int, least: int = 1) -> int:
+    """Return the power of two for arrays of `count` elements in a kernel, not below `least`.
+
+    Powers of two as compile-time sizes keep the number of builds small for inputs of many sizes.
+    """
+    return max(least, 1 << max(count - 1, 0).bit_length())

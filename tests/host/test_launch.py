@@ -1,0 +1,221 @@
+"""Launch descriptions: macros, types and work sizes, against values written by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from gpuvision.host import (
+    Device,
+    Launch,
+    LaunchBuilder,
+    WorkSize,
+    capacity,
+    ceil_div,
+    fitted_groups,
+    flags,
+    opencl_type,
+    padded_groups,
+    real_of,
+    round_up,
+    to_numpy,
+    type_defines,
+    vector_work,
+)
+
+SINGLE, DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
+
+
+class Scale:
+    """Stands for an operation: the builder takes its name only."""
+
+
+class Machine:
+    """Stands for a device with the properties that a launch asks for."""
+
+    label = "machine"
+
+    def __init__(self, *, is_cpu: bool = True, has_double: bool = True) -> None:
+        self.is_cpu, self.has_double = is_cpu, has_double
+        self.compute_units, self.cache_bytes = 2, 32 << 20
+
+
+def builder(shape: tuple[int, ...], dtype: Any = np.float32, *, machine: Any = None, **options: Any) -> LaunchBuilder:
+    return LaunchBuilder(Scale(), machine or Machine(), shape, np.dtype(dtype), **options)
+
+
+TYPES = {
+    "int8": "char",
+    "uint8": "uchar",
+    "int16": "short",
+    "uint16": "ushort",
+    "int32": "int",
+    "uint32": "uint",
+    "int64": "long",
+    "uint64": "ulong",
+    "float32": "float",
+    "float64": "double",
+}
+
+
+@pytest.mark.parametrize(("dtype", "word"), TYPES.items())
+def test_opencl_type(dtype: Any, word: str) -> None:
+    assert opencl_type(dtype) == word
+
+
+def test_a_dtype_without_an_opencl_type_is_refused() -> None:
+    with pytest.raises(TypeError, match=r"no type for dtype complex64; expected one of int8, .* or float64"):
+        opencl_type(np.complex64)
+
+
+def test_opencl_types_have_the_size_of_their_dtypes(device: Device) -> None:
+    """Asked of the compiler itself: ``sizeof`` and the sign of -1."""
+    names = [name for name in TYPES if device.has_double or name != "float64"]
+    words = [opencl_type(name) for name in names]
+    lines = [
+        f"out[{2 * n}] = sizeof({word}); out[{2 * n + 1}] = (({word})(-1)) < (({word})0);"
+        for n, word in enumerate(words)
+    ]
+    program = cl.Program(device.context, f"kernel void sizes(global int *out) {{ {' '.join(lines)} }}").build()
+    found = cl.array.zeros(device.queue, 2 * len(names), np.int32)
+    cl.Kernel(program, "sizes")(device.queue, (1,), None, found.data)
+    expected = [[np.dtype(name).itemsize, np.dtype(name).kind != "u"] for name in names]
+    np.testing.assert_array_equal(found.get().reshape(-1, 2), expected)
+
+
+def test_macros() -> None:
+    assert type_defines("INPUT", np.uint8) == {"INPUT": "uchar"}
+    assert type_defines("CODE", np.float32, 4, 16) == {"CODE": "float", "CODE4": "float4", "CODE16": "float16"}
+    assert flags(A=True, B=False, C=True) == {"A": None, "C": None}
+
+
+def test_arithmetic_of_work_sizes() -> None:
+    counts = [0, 1, 15, 16, 17, 64, 65]
+    assert [ceil_div(count, 16) for count in counts] == [0, 1, 1, 1, 2, 4, 5]
+    assert [round_up(count, 16) for count in counts] == [0, 16, 16, 16, 32, 64, 80]
+    assert [capacity(count) for count in counts] == [1, 1, 16, 16, 32, 64, 128]
+    assert [capacity(count, least=32) for count in counts] == [32, 32, 32, 32, 32, 64, 128]
+
+
+def test_work_sizes() -> None:
+    assert vector_work(33, 16) == WorkSize((3,), (1,), 16, vectors=True)
+    assert padded_groups(33, 64) == WorkSize((64,), (64,), 1)
+    assert padded_groups(65, 64) == WorkSize((128,), (64,), 1)
+    assert padded_groups(0, 64) == WorkSize((0,), (64,), 1)
+    assert fitted_groups(33, 64) == WorkSize((33,), (33,), 33)
+    assert fitted_groups(65, 64) == WorkSize((128,), (64,), 64)
+    assert fitted_groups(0, 64) == WorkSize((0,), (1,), 1)
+
+
+def test_variant_follows_the_device_unless_it_is_named() -> None:
+    cpu, gpu = Machine(), Machine(is_cpu=False)
+    for machine, walk, expected in (
+        (cpu, "auto", True),
+        (gpu, "auto", False),
+        (cpu, "item", False),
+        (gpu, "strip", True),
+    ):
+        build = builder((100,), machine=machine, walk=walk)
+        assert build.uses_vectors is expected
+        assert build.work(100, each=16, group=64) == (vector_work(100, 16) if expected else padded_groups(100, 64))
+    assert builder((15,)).work(15, each=16, group=64, least=16, fitted=True) == WorkSize((15,), (15,), 15)
+    with pytest.raises(ValueError, match="walk must be"):
+        _ = builder((100,), walk="sideways").uses_vectors
+
+
+def test_shares_of_two_cores() -> None:
+    build = builder((1000,))
+    assert build.share(1000, per_core=4) == 125
+    assert build.share(1001, per_core=4) == 126
+    assert build.share(1000, per_core=4, multiple=16) == 128
+    assert build.share(1025, per_core=4, multiple=16) == 144
+    assert build.share(0, per_core=4, multiple=16) == 0
+
+
+def test_the_launch_of_a_builder_is_the_one_written_by_hand() -> None:
+    build = builder((100, 2), np.float64, precision="double", walk="strip")
+    found = build.launch(
+        "scale/scale.cl",
+        "scale_points",
+        work=build.work(100, each=16, group=64),
+        more_inputs=[((100,), DOUBLE)],
+        outputs=build.outputs({"points": (100, 2), "count": (100,), "sigma": None, "status": (100,)}, count=np.int32),
+        defines={**type_defines("INPUT", np.float64), "TERMS": 3, **flags(OFFSET=True, GAIN=False)},
+        arguments=[np.int32(100)],
+        passes_once=True,
+    )
+    assert found == Launch(
+        source="scale/scale.cl",
+        kernel="scale_points",
+        inputs=[((100, 2), DOUBLE), ((100,), DOUBLE)],
+        outputs={
+            "points": ((100, 2), DOUBLE),
+            "count": ((100,), np.dtype(np.int32)),
+            "sigma": None,
+            "status": ((100,), np.dtype(np.uint8)),
+        },
+        global_size=(7,),
+        local_size=(1,),
+        defines={"REAL_IS_DOUBLE": None, "STRIP": None, "INPUT": "double", "TERMS": 3, "OFFSET": None},
+        arguments=[np.int32(100)],
+        passes_once=True,
+    )
+    assert found.groups == 7
+    assert found.nbytes == 100 * (2 * 8 + 8) + 100 * (2 * 8 + 4 + 1)
+
+
+@pytest.mark.parametrize("rows", [1 << 20, 4 << 20])
+def test_only_a_cpu_writes_much_data_past_its_caches(rows: int) -> None:
+    """One input and one output of 4 bytes a row: 8 MB fit into the cache of 32 MB, 32 MB and a status do not."""
+    for machine, walk in ((Machine(), "strip"), (Machine(), "item"), (Machine(is_cpu=False), "strip")):
+        build = builder((rows,), machine=machine, walk=walk)
+        outputs = build.outputs({"value": (rows,), "status": (rows,)})
+        work = build.work(rows, each=16, group=64)
+        launch = build.launch("a.cl", "a", work=work, outputs=outputs, streams=True)
+        assert ("PAST_CACHES" in launch.defines) == (rows > 1 << 20 and machine.is_cpu and walk == "strip")
+        assert "PAST_CACHES" not in build.launch("a.cl", "a", work=work, outputs=outputs).defines
+
+
+def test_inputs_that_an_operation_does_not_take_are_named() -> None:
+    build = builder((3,), np.uint8)
+    with pytest.raises(TypeError, match=r"^Scale takes float32, float64 or uint16 points, got uint8$"):
+        build.check_dtype("float32", "float64", "uint16", of="points")
+    with pytest.raises(TypeError, match=r"^Scale takes float32 means, got uint8$"):
+        build.check_dtype("float32", of="means")
+    with pytest.raises(ValueError, match=r"^Scale takes points \(\.\.\., 2\), got shape \(3,\)$"):
+        build.check_shape(False, "points (..., 2)")
+    build.check_dtype("uint8", of="points")
+    build.check_shape(True, "points (..., 2)")
+
+
+def test_doubles_need_a_device_with_doubles() -> None:
+    single = Machine(has_double=False)
+    build = builder((3,), np.float64, machine=single)
+    build.check_dtype("float64", of="points")
+    with pytest.raises(ValueError, match="machine has no double precision; use precision='single'"):
+        build.launch("a.cl", "a", work=build.work(3, each=16, group=64), outputs={})
+    with pytest.raises(ValueError, match="give points as float32"):
+        builder((3,), np.float64, machine=single, narrows=True).check_dtype("float64", of="points")
+
+
+def test_real_types() -> None:
+    assert [real_of(None, np.dtype(name)) for name in ("uint8", "float32", "float64")] == [SINGLE, SINGLE, DOUBLE]
+    assert real_of("double", SINGLE) == DOUBLE
+    assert real_of("single", DOUBLE, narrows=True) == SINGLE
+    with pytest.raises(TypeError, match="does not take float64"):
+        real_of("single", DOUBLE)
+    with pytest.raises(ValueError, match="precision must be"):
+        real_of("half", SINGLE)  # type: ignore[arg-type]
+
+
+def test_results_become_numpy_arrays(device: Device) -> None:
+    values = np.arange(5, dtype=np.float32)
+    assert to_numpy(values) is values
+    array = device.empty(values.shape, values.dtype)
+    array.set(values)
+    np.testing.assert_array_equal(to_numpy(array), values)
+    with pytest.raises(TypeError, match="got NoneType"):
+        to_numpy(None)  # type: ignore[type-var]

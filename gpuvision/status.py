@@ -13,7 +13,7 @@ class Status(enum.IntFlag):
     """
 
     OK = 0
-    DARK = 1
+    LOW_SIGNAL = 1
     """Less light than the threshold asks for."""
     SATURATED = 2
     """A channel or pixel at its upper limit."""
@@ -25,7 +25,7 @@ class Status(enum.IntFlag):
     """More than one candidate of comparable strength."""
     HORIZON = 32
     """The point's ray runs (nearly) parallel to the sheet of light."""
-    HOLE = 64
+    NO_DATA = 64
     """No measurement near enough."""
-    FOLDED = 128
+    NOT_INVERTIBLE = 128
     """The sampling runs backwards here: two surfaces share one place."""

@@ -11,7 +11,7 @@ from gpuvision.host.errors import (
     RecordingError,
     StreamError,
 )
-from gpuvision.host.launch import Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host.launch import Launch, Precision, Variant, uses_vectors, real_defines, real_of
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, type_defines
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Batch, Pipeline
@@ -61,14 +61,14 @@ __all__ = [
     "StreamError",
     "StreamReport",
     "Trace",
-    "Walk",
+    "Variant",
     "WorkSize",
     "capacity",
     "ceil_div",
     "fitted_groups",
     "flags",
     "host_view",
-    "in_strips",
+    "uses_vectors",
     "open_recording",
     "opencl_type",
     "padded_groups",

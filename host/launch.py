@@ -13,7 +13,7 @@ from gpuvision.host.device import Device
 from gpuvision.host.program import Define
 
 Precision = Literal["single", "double"] | None
-Walk = Literal["auto", "strip", "item"]
+Variant = Literal["auto", "vector", "work_item"]
 Shape = tuple[int, ...]
 Spec = tuple[Shape, np.dtype[Any]]
 
@@ -114,8 +114,8 @@ def real_defines(device: Device, real: np.dtype[Any]) -> dict[str, Define]:
     return {"REAL_IS_DOUBLE": None}
 
 
-def in_strips(walk: Walk, device: Device) -> bool:
+def uses_vectors(variant: Variant, device: Device) -> bool:
     """Decide between the vector variant of a kernel (CPU runtimes) and one work-item per element."""
-    if walk not in ("auto", "strip", "item"):
-        raise ValueError(f"walk must be 'auto', 'strip' or 'item', got {walk!r}")
-    return device.is_cpu if walk == "auto" else walk == "strip"
+    if variant not in ("auto", "vector", "work_item"):
+        raise ValueError(f"variant must be 'auto', 'vector' or 'work_item', got {variant!r}")
+    return device.is_cpu if variant == "auto" else variant == "vector"

@@ -15,8 +15,8 @@ from gpuvision.host.launch import (
     Precision,
     Shape,
     Spec,
-    Walk,
-    in_strips,
+    Variant,
+    uses_vectors,
     nbytes_of,
     real_defines,
     real_of,
@@ -53,7 +53,7 @@ class LaunchBuilder:
         Real type that the user asks for; see `real_of`.
     narrows : bool
         Whether "single" takes float64 input; see `real_of`.
-    walk : {"auto", "strip", "item"}
+    variant : {"auto", "vector", "work_item"}
         Kernel variant that the user asks for.
     """
 
@@ -66,11 +66,11 @@ class LaunchBuilder:
         *,
         precision: Precision = None,
         narrows: bool = False,
-        walk: Walk = "auto",
+        variant: Variant = "auto",
     ) -> None:
         self.name = type(operation).__name__
         self.device, self.shape, self.dtype = device, shape, dtype
-        self._precision, self._narrows, self._walk = precision, narrows, walk
+        self._precision, self._narrows, self._variant = precision, narrows, variant
 
     @functools.cached_property
     def real(self) -> np.dtype[Any]:
@@ -80,7 +80,7 @@ class LaunchBuilder:
     @functools.cached_property
     def uses_vectors(self) -> bool:
         """Whether the vector variant runs on this device."""
-        return in_strips(self._walk, self.device)
+        return uses_vectors(self._variant, self.device)
 
     def check_dtype(self, *names: str, of: str) -> None:
         """Check that the first input has one of these dtypes and that the device reads it.
@@ -177,7 +177,7 @@ class LaunchBuilder:
         inputs = [(self.shape, self.dtype), *more_inputs]
         moved = nbytes_of((*inputs, *outputs.values()))
         past_caches = streams and work.vectors and self.device.is_cpu and moved > self.device.cache_bytes
-        variant = flags(STRIP=work.vectors, PAST_CACHES=past_caches)
+        variant = flags(VECTOR_VARIANT=work.vectors, PAST_CACHES=past_caches)
         return Launch(
             source=source,
             kernel=kernel,

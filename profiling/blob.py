@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
-from gpuvision.matching.blob import BEND, FindBlobs
+from gpuvision.matching.features.blob import BEND, FindBlobs
 from gpuvision.profiling.harness import Case
 
 CELL, RADIUS, BLUR, CONTRAST, NOISE, OFF = 40, 8.0, 1.0, 100.0, 2.0, 2.0

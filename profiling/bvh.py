@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Device
 from gpuvision.profiling.harness import Case
-from gpuvision.simulation.bvh import Bvh
-from gpuvision.simulation.rays import AnyHit
-from gpuvision.simulation.scene import Scene
+from gpuvision.simulation.scene.bvh import Bvh
+from gpuvision.simulation.scene.rays import AnyHit
+from gpuvision.simulation.scene.scene import Scene
 
 _PARTS, _RECEIVERS, _SAMPLES = 40, 4000, 64
 _LIFT = 1e-5  # metres, off the surface that a segment starts on

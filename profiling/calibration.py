@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.lines.line_families import grid_lines
+from gpuvision.camera.lines.vanishing_points import fit_lens, straightness_px
 from gpuvision.camera.patterns.dots import find_dots
 from gpuvision.camera.patterns.line_pattern import find_lines
-from gpuvision.camera.vanishing_points import fit_lens, straightness_px
 from gpuvision.host import Device
 from gpuvision.profiling.harness import Case
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
+from gpuvision.camera.lines.alternating_minimisation import STRATEGIES, alternate
 from gpuvision.camera.lines.line_families import grid_lines, pack
-from gpuvision.camera.lines.strategies import STRATEGIES, alternate
-from gpuvision.camera.vanishing_points import Strategy, fit_lens, straightness_px
+from gpuvision.camera.lines.vanishing_points import Strategy, fit_lens, straightness_px
 from gpuvision.profiling.calibration import Families, Float64, Radial, discorpy_fit, tilted_grid
 
 _SIZE = (1024, 1024)

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from gpuvision.field_file import read_field
+from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
-from gpuvision.matching.field import RefinePoses, SearchField
-from gpuvision.matching.field_map import LEVELS, FieldMap
+from gpuvision.matching.field.distance_map import LEVELS, DistanceMap
+from gpuvision.matching.field.field_pose import FieldPoseRefinement, FieldPoseSearch
 from gpuvision.profiling.harness import Case
 
 _BLOCK, _RAYS = 64, 64
@@ -29,15 +29,15 @@ _BLOCK, _RAYS = 64, 64
 
 def cases(device: Device) -> Iterator[Case]:
     """Yield the global search, with one heading and with 72, and the local one."""
-    junior = FieldMap(field=read_field("robocup_junior"), cell=0.01, scale=0.05, reach=1.5, device=device)
-    large = FieldMap(field=read_field("robocup_msl"), cell=0.1, scale=0.25, reach=6.0, device=device)
+    junior = DistanceMap(field=read_field("robocup_junior"), cell=0.01, scale=0.05, reach=1.5, device=device)
+    large = DistanceMap(field=read_field("robocup_msl"), cell=0.1, scale=0.25, reach=6.0, device=device)
     pose = (0.213, -0.177, 0.4)
     yield from _global(device, junior, pose)
     yield _turns(device, large, (3.1, -2.2, 0.7))
     yield _local(device, large, (3.1, -2.2, 0.7))
 
 
-def _points(field_map: FieldMap, pose: tuple[float, ...], sigma: float) -> NDArray[np.float32]:
+def _points(field_map: DistanceMap, pose: tuple[float, ...], sigma: float) -> NDArray[np.float32]:
     """As many points as rays, on lines within the reach, as seen from a pose."""
     rng = np.random.default_rng(5)
     spread: list[NDArray[np.float64]] = []
@@ -122,9 +122,13 @@ def _numpy_least(scores: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 class _Search:
     """Our call on one map with its points, and the peers' arrays."""
 
-    def __init__(self, device: Device, field_map: FieldMap, points: NDArray[Any], headings: tuple[float, ...]) -> None:
+    def __init__(
+        self, device: Device, field_map: DistanceMap, points: NDArray[Any], headings: tuple[float, ...]
+    ) -> None:
         self.map, self.points, self.headings = field_map, points, np.array(headings)
-        self.bound = SearchField(map=field_map, headings=headings, with_scores=True).bind(device, points.shape, "f4")
+        self.bound = FieldPoseSearch(map=field_map, headings=headings, with_scores=True).bind(
+            device, points.shape, "f4"
+        )
         self.bound.inputs[0].set(points)
         self.ours = self.bound.run()
         self.scores = np.empty(self.ours.scores.shape, np.float32)
@@ -195,7 +199,7 @@ class _Search:
         return float(np.max(np.abs(self.ours.scores.get()[turn, row, column] - exact)))
 
 
-def _global(device: Device, field_map: FieldMap, pose: tuple[float, ...]) -> Iterator[Case]:
+def _global(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> Iterator[Case]:
     search = _Search(device, field_map, _points(field_map, pose, 0.003), (pose[2],))
     height, width = field_map.positions
     facts = {"poses": height * width, "rays": _RAYS}
@@ -206,7 +210,7 @@ def _global(device: Device, field_map: FieldMap, pose: tuple[float, ...]) -> Ite
     yield Case("field", "global-shifts", search.bound.run, peers, search.error, search.traffic, facts=facts)
 
 
-def _turns(device: Device, field_map: FieldMap, pose: tuple[float, ...]) -> Case:
+def _turns(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> Case:
     headings = tuple(np.arange(72) * (np.pi / 36.0))
     search = _Search(device, field_map, _points(field_map, pose, 0.02), headings)
     search.check(search.numba_shifts)
@@ -235,10 +239,10 @@ def _offsets(shapes: NDArray[Any], which: NDArray[Any], x: NDArray[Any], y: NDAr
     return away, c * nx - s * ny, s * nx + c * ny
 
 
-def _local(device: Device, field_map: FieldMap, pose: tuple[float, ...]) -> Case:
+def _local(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> Case:
     points = _points(field_map, pose, 0.02)
     start = np.add(pose, [0.06, -0.05, 0.06])
-    bound = RefinePoses(map=field_map, count=1).bind(device, points.shape, "f4")
+    bound = FieldPoseRefinement(map=field_map, count=1).bind(device, points.shape, "f4")
     bound.inputs[0].set(points)
     bound.inputs[1].set(start[None].astype(np.float32))
     ours = bound.run()

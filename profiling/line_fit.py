@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
-from gpuvision.matching.line_fit import FitLines
-from gpuvision.matching.losses import subsets
+from gpuvision.matching.features.line_fit import FitLines
+from gpuvision.matching.robust import subsets
 from gpuvision.profiling.harness import Case
 from gpuvision.profiling.pose import STEPS, TRIALS, fit_line
 

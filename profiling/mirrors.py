@@ -24,14 +24,14 @@ from gpuvision.host import Device
 from gpuvision.profiling.harness import Case
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
-from gpuvision.simulation.illumination import LightSheet, LitLine
-from gpuvision.simulation.material import Material
-from gpuvision.simulation.mirror_points import MirrorPoints
-from gpuvision.simulation.mirrors import Mirrors
-from gpuvision.simulation.plane_mirrors import planes_of
-from gpuvision.simulation.reflectance import Lambert
-from gpuvision.simulation.scene import Scene
-from gpuvision.simulation.sight import Exposure, Sight
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.reflectance import Lambert
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
+from gpuvision.simulation.transport.illumination import LightSheet, LitLine
+from gpuvision.simulation.transport.mirror_points import MirrorPoints
+from gpuvision.simulation.transport.mirrors import Mirrors
+from gpuvision.simulation.transport.plane_mirrors import planes_of
 
 _BALLS, _POINTS, _BOXES, _LIFT = 20, 2048, 30, 1e-7
 _LENS = np.array([0.0, 0.08, 0.15])
@@ -204,7 +204,7 @@ def _facets(device: Device, samples: int) -> Case:
     )
 
 
-def _box_scene() -> tuple[Scene, Sight, LitLine]:
+def _box_scene() -> tuple[Scene, SensorView, LitLine]:
     """Return boxes on a floor whose sides are mirrors, a sensor beside a sheet of light, and what that lights."""
     rng = np.random.default_rng(1)
     floor = np.array(
@@ -224,7 +224,7 @@ def _box_scene() -> tuple[Scene, Sight, LitLine]:
     )
     edges = np.linspace(-6e-3, 6e-3, 257)
     lens = (float(_LENS[0]), float(_LENS[1]), float(_LENS[2]))
-    sight = Sight(triangulation=geometry, transport=transport, lens=lens, u_edges=edges, v_edges=edges)
+    sight = SensorView(triangulation=geometry, transport=transport, lens=lens, u_edges=edges, v_edges=edges)
     scene = Scene(corners, upright.astype(np.int32))
     return scene, sight, LightSheet(transport=transport, g_limits=(-0.025, 0.025)).lit(scene, 0.0)
 
@@ -236,7 +236,7 @@ def _turned(angle: float) -> Array:
     return turn
 
 
-def _by_samples(scene: Scene, sight: Sight, lit: LitLine, embree: Any, samples: int) -> Exposure:
+def _by_samples(scene: Scene, sight: SensorView, lit: LitLine, embree: Any, samples: int) -> Exposure:
     """Return the light of samples of lit segments in mirrors: images, and rays for both ways of each."""
     assert scene.material is not None
     dull = scene.material[lit.triangle] == 0

@@ -23,13 +23,13 @@ import trimesh
 from numpy.typing import NDArray
 
 from gpuvision.host import Device, Precision
-from gpuvision.profiling.visible_light import Board
+from gpuvision.profiling.occluded_irradiance import Board
 from gpuvision.ranging.range_image import Vector
-from gpuvision.simulation.line_irradiance import LineIrradiance, LitSegments
-from gpuvision.simulation.rays import ClosestHit
-from gpuvision.simulation.scene import Scene
-from gpuvision.simulation.sight_lines import unit_normals
-from gpuvision.simulation.visible_light import VisibleLight, segment_rows
+from gpuvision.simulation.scene.rays import ClosestHit
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.view_rays import unit_normals
+from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
+from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
 
 Float64 = NDArray[np.float64]
 Picture = NDArray[np.float64]
@@ -202,7 +202,7 @@ def bound_closed_form(
     places = receivers.rows.reshape(lit.pixels[0], -1, 6)
     light: Any = LineIrradiance(segments=lines, precision=precision)
     if occluding:
-        light = VisibleLight(scene=lit.scene, segments=len(lines.exitance), precision=precision)
+        light = OccludedIrradiance(scene=lit.scene, segments=len(lines.exitance), precision=precision)
     bound = light.bind(device, places.shape, places.dtype)
     if occluding:
         bound.inputs[1].set(np.zeros((*places.shape[:2], 2)))

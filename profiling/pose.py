@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
-from gpuvision.matching.local_fix import LocalFix, lay_rulers
-from gpuvision.matching.losses import efficiency, subsets
-from gpuvision.matching.pose import SolvePose
-from gpuvision.matching.ruler import RulerEdges
+from gpuvision.matching.features.ruler import RulerEdges
+from gpuvision.matching.pose.board_pose import BoardPoseEstimator, place_rulers
+from gpuvision.matching.pose.pose import SolvePose
+from gpuvision.matching.robust import efficiency, subsets
 from gpuvision.profiling import ruler as of_ruler
 from gpuvision.profiling.harness import Case
 
@@ -37,7 +37,7 @@ _rulers = of_ruler._compiled(of_ruler._sample_flat)
 
 
 def scene() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
-    """Return a frame, and rulers and lines of `LocalFix`; every edge has a part of the frame to itself."""
+    """Return a frame, and rulers and lines of `BoardPoseEstimator`; every edge has a part of the frame to itself."""
     rng = np.random.default_rng(11)
     columns, rows = of_ruler.COLUMNS // PATCH, of_ruler.ROWS // PATCH
     matrix = np.array([[1.0 / PIXEL, 0.0, 320.0], [0.0, -1.0 / PIXEL, 240.0], [2.0, 1.0, 1.0]])
@@ -48,7 +48,7 @@ def scene() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]
     point = np.column_stack([middle, np.ones(LINES)]) @ back.T
     point = point[:, :2] / point[:, 2:]
     along = np.tile(np.linspace(-30.0, 30.0, EACH) * PIXEL, (LINES, 1))
-    rulers, lines = lay_rulers(normal, point, along, matrix)
+    rulers, lines = place_rulers(normal, point, along, matrix)
     row, column = np.mgrid[: of_ruler.ROWS, : of_ruler.COLUMNS]
     seen = np.stack([column, row, np.ones_like(row)], axis=-1) @ back.T
     seen = seen[..., :2] / seen[..., 2:] - TRUE_POSE[:2]
@@ -390,7 +390,9 @@ def cases(device: Device) -> Iterator[Case]:
         noise=2.0,
     )
     solver = SolvePose(placement=PLACEMENT, trials=TRIALS, steps=STEPS)
-    bound = LocalFix(ruler=edges, lines=LINES, each=EACH, solver=solver).bind(device, image.shape, image.dtype)
+    bound = BoardPoseEstimator(ruler=edges, lines=LINES, each=EACH, solver=solver).bind(
+        device, image.shape, image.dtype
+    )
     inputs: tuple[NDArray[Any], ...] = (image, rulers, lines)
     for array, values in zip(bound.inputs, inputs, strict=True):
         array.set(values)

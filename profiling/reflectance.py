@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Device
 from gpuvision.profiling.harness import Case
-from gpuvision.simulation.reflectance import Brdf, Ggx, Reflectance, Ward
+from gpuvision.simulation.scene.reflectance import Brdf, Ggx, Reflectance, Ward
 
 _BLOCK = 1024
 F = np.float32

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
-from gpuvision.profiling import bounces, visible_light
+from gpuvision.profiling import bounces, occluded_irradiance
 from gpuvision.profiling.harness import Case
-from gpuvision.simulation.line_irradiance import LineIrradiance, LitSegments
+from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 
 _BLOCK = 512
 F = np.float32
@@ -80,7 +80,7 @@ def cases(device: Device) -> Iterator[Case]:
     yield _case(device, *_board(20_000), "closed-form/board/64x20000")
     yield _case(device, *_slopes(64, 20_000), "closed-form-slopes/64x20000")
     yield from bounces.cases(device)
-    yield from visible_light.cases(device)
+    yield from occluded_irradiance.cases(device)
 
 
 def _case(device: Device, segments: LitSegments, receivers: NDArray[np.float32], name: str) -> Case:

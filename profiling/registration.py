@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
-from gpuvision.matching.edge_search import SearchEdges, shifts_of
-from gpuvision.matching.registration import register
+from gpuvision.matching.pose.edge_search import SearchEdges, shifts_of
+from gpuvision.matching.pose.registration import register
 from gpuvision.profiling.harness import Case
 
 _ROWS, _HEADINGS, _POINTS, _CELL = 81, 21, 512, 2

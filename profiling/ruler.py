@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
-from gpuvision.matching.ruler import RulerEdges
+from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.profiling.harness import Case
 
 ROWS, COLUMNS, RADIUS = 480, 640, 150.0

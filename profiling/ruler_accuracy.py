@@ -21,7 +21,7 @@ from scipy.ndimage import map_coordinates
 from scipy.special import ndtr
 
 from gpuvision.host import Device
-from gpuvision.matching.ruler import RulerEdges, best_smoothing
+from gpuvision.matching.features.ruler import RulerEdges, best_smoothing
 
 SIDE, BLUR, LENGTH, WIDTH = 140, 1.2, 41, 5
 NOISES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)

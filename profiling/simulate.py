@@ -1,8 +1,8 @@
 """A whole profile of a simulated scan, against what NumPy and Embree need for its secondary light alone.
 
 Ours: lit segments, shadows, what the lens sees of them, the causes of errors, what every bin sees, secondary light with
-exact visibility, truth. The peer: 256 samples of the line, rays to the same elements of the surface (`visible_light`).
-The errors are those of the secondary light, medians relative to the same in double.
+exact visibility, truth. The peer: 256 samples of the line, rays to the same elements of the surface
+(`occluded_irradiance`). The errors are those of the secondary light, medians relative to the same in double.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gpuvision.demo import scanned_part
 from gpuvision.host import Device
 from gpuvision.profiling.harness import Case
-from gpuvision.profiling.visible_light import Board, embree_of, error_of, irradiance_by_samples
-from gpuvision.simulation.line_irradiance import LitSegments
-from gpuvision.simulation.visible_light import VisibleLight, segment_rows
-from gpuvision.simulation_blocks import light_paths
+from gpuvision.profiling.occluded_irradiance import Board, embree_of, error_of, irradiance_by_samples
+from gpuvision.simulation.transport.line_irradiance import LitSegments
+from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
+from gpuvision.workflows.demo import scanned_part
+from gpuvision.workflows.light_cache import light_paths
 
 _SAMPLES = 256
 _AT = 0.006  # m: over the cylinder's rim, the box and the ball
@@ -40,7 +40,7 @@ def _case(device: Device, name: str) -> Case:
     ours, truth = model.irradiance(seen, segments), np.full(seen.weights.shape, np.nan)
     if device.has_double:
         rows = segment_rows(segments)
-        exact = VisibleLight(scene=task.part, segments=len(rows), precision="double")
+        exact = OccludedIrradiance(scene=task.part, segments=len(rows), precision="double")
         truth = exact(seen.receivers, np.zeros((*seen.weights.shape, 2)), rows, device=device).irradiance
     peer = functools.partial(irradiance_by_samples, board, _SAMPLES, embree_of(task.part))
     seen_at_all = seen.weights > 0.0

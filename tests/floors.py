@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.field_picture import field_lines
-from gpuvision.matching.artwork_shapes import capsule
-from gpuvision.matching.field_evidence import onto_field
-from gpuvision.matching.field_map import Field
-from gpuvision.mounted_camera import MountedCamera
+from gpuvision.camera.ground_plane import MountedCamera
+from gpuvision.matching.artwork.shapes import capsule
+from gpuvision.matching.field.distance_map import Field
+from gpuvision.matching.field.evidence import onto_field
+from gpuvision.plots.field import field_lines
 
 _FINE = 4  # samples of a pixel, along each side
 _SHIFT = 6  # bits of a fine pixel

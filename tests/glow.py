@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from gpuvision.ranging.range_image import RotatingSheet
-from gpuvision.sensor import Sensor
-from gpuvision.simulation.line_irradiance import LineIrradiance, LitSegments
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 
 Float64 = NDArray[np.float64]
 

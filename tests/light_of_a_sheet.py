@@ -9,18 +9,18 @@ import numpy as np
 from gpuvision.camera.lens import Lens
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
-from gpuvision.simulation.direct import DirectLight
-from gpuvision.simulation.illumination import LightSheet
-from gpuvision.simulation.material import Material
-from gpuvision.simulation.reflectance import Lambert
-from gpuvision.simulation.scene import Scene
-from gpuvision.simulation.sight import Exposure, Sight
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.reflectance import Lambert
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
+from gpuvision.simulation.transport.direct import DirectLight
+from gpuvision.simulation.transport.illumination import LightSheet
 
 TRANSPORT = StraightTransport(step=1e-4)
 GREY = Material(diffuse=Lambert(albedo=0.5))
 
 
-def sight(*, scale: float = 1.0, bins: int = 12, samples: int = 8, lens: Lens | None = None, **more: Any) -> Sight:
+def sight(*, scale: float = 1.0, bins: int = 12, samples: int = 8, lens: Lens | None = None, **more: Any) -> SensorView:
     """A lens beside the sheet, 0.15 m up; ``scale`` takes it farther, its focal distance along: the image stays."""
     baseline, stand_off, focal = 0.08 * scale, 0.15 * scale, 0.04 * scale
     geometry = Triangulation.from_stand_off(
@@ -33,10 +33,10 @@ def sight(*, scale: float = 1.0, bins: int = 12, samples: int = 8, lens: Lens | 
         "u_edges": np.linspace(-3e-3, 3e-3, bins + 1),
         "v_edges": np.linspace(-6e-3, 6e-3, samples + 1),
     }
-    return Sight(**(values | more))
+    return SensorView(**(values | more))
 
 
-def light_of(corners: Any, materials: Any = (GREY,), *, seen_by: Sight | None = None, **more: Any) -> DirectLight:
+def light_of(corners: Any, materials: Any = (GREY,), *, seen_by: SensorView | None = None, **more: Any) -> DirectLight:
     values = {key: more.pop(key) for key in ("sub_sheets", "device") if key in more}
     scene = corners if isinstance(corners, Scene) else Scene(corners)
     sheet = LightSheet(transport=TRANSPORT, **more)
@@ -51,7 +51,7 @@ def plate(x: float = 1.0, y: float = 1.0, z: float = 0.0) -> np.ndarray:
     return quad((-x, -y, z), (x, -y, z), (x, y, z), (-x, y, z))
 
 
-def u_of(exposure: Exposure, seen_by: Sight) -> np.ndarray:
+def u_of(exposure: Exposure, seen_by: SensorView) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         return exposure.first_moment(seen_by.u_edges) / exposure.total()
 

@@ -9,37 +9,37 @@ from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
-from gpuvision.simulation.camera_simulator import CameraSimulator
-from gpuvision.simulation.psd_simulator import PsdSimulator
-from gpuvision.simulation.sight import Exposure, Sight
+from gpuvision.simulation.sensors.camera_simulator import CameraSimulator
+from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
+from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 
 LENGTH, PITCH, STRIPS = 6e-3, 1e-4, 5
 
 
-def psd_sight(bins: int = 60, strips: int = STRIPS) -> Sight:
+def psd_sight(bins: int = 60, strips: int = STRIPS) -> SensorView:
     """Return strips of 6 mm beside a sheet that shines straight down."""
     half, v = 0.5 * LENGTH, PITCH * (np.arange(strips + 1) - 0.5 * strips)
     triangulation = Triangulation.from_stand_off(
         baseline=0.08, stand_off=0.15, focal_distance=0.04, region=((-half, half), (v[0], v[-1]))
     )
     edges = np.linspace(-half, half, bins + 1)
-    return Sight(
+    return SensorView(
         triangulation=triangulation, transport=StraightTransport(), lens=(0.0, 0.08, 0.15), u_edges=edges, v_edges=v
     )
 
 
-def strip_axes(sight: Sight) -> SampleAxes:
+def strip_axes(sight: SensorView) -> SampleAxes:
     return SampleAxes(sample_origin=float(sight.v_middles[0]), sample_pitch=PITCH)
 
 
-def psd(sight: Sight | None = None, *, readout: dict | None = None, **more) -> PsdSimulator:
+def psd(sight: SensorView | None = None, *, readout: dict | None = None, **more) -> PsdSimulator:
     sight = psd_sight() if sight is None else sight
     return PsdSimulator(
         sight=sight, readout=PsdReadout(strip_length=LENGTH, **{"axes": strip_axes(sight), **(readout or {})}), **more
     )
 
 
-def camera_sight(rows: int = 64, columns: int = 8) -> Sight:
+def camera_sight(rows: int = 64, columns: int = 8) -> SensorView:
     """Return a camera's columns beside the same sheet, 10 um pixels."""
     axes = [10e-6 * (np.arange(count + 1) - 0.5 * count) for count in (rows, columns)]
     triangulation = Triangulation.from_stand_off(
@@ -48,7 +48,7 @@ def camera_sight(rows: int = 64, columns: int = 8) -> Sight:
         focal_distance=0.04,
         region=((axes[0][0], axes[0][-1]), (axes[1][0], axes[1][-1])),
     )
-    return Sight(
+    return SensorView(
         triangulation=triangulation,
         transport=StraightTransport(),
         lens=(0.0, 0.08, 0.15),
@@ -57,7 +57,7 @@ def camera_sight(rows: int = 64, columns: int = 8) -> Sight:
     )
 
 
-def pixel_axes(sight: Sight) -> SampleAxes:
+def pixel_axes(sight: SensorView) -> SampleAxes:
     return SampleAxes(
         position_origin=float(sight.u_middles[0]),
         position_pitch=10e-6,
@@ -66,12 +66,12 @@ def pixel_axes(sight: Sight) -> SampleAxes:
     )
 
 
-def camera(sight: Sight | None = None, *, readout: dict | None = None, **more) -> CameraSimulator:
+def camera(sight: SensorView | None = None, *, readout: dict | None = None, **more) -> CameraSimulator:
     sight = camera_sight() if sight is None else sight
     return CameraSimulator(sight=sight, readout=LineReadout(**{"axes": pixel_axes(sight), **(readout or {})}), **more)
 
 
-def gaussian(sight: Sight, u, power, sigma: float) -> Exposure:
+def gaussian(sight: SensorView, u, power, sigma: float) -> Exposure:
     """Return spots of a Gaussian profile, exact in every bin: u and power broadcast to (..., samples)."""
     u, power = np.broadcast_arrays(np.asarray(u, float), np.asarray(power, float))
     u, power = (np.array(np.broadcast_to(each, (*u.shape[:-1], sight.samples)))[..., None] for each in (u, power))

@@ -10,15 +10,15 @@ import numpy as np
 from gpuvision.host import Device
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
-from gpuvision.simulation.material import Material
-from gpuvision.simulation.mirrors import Mirrors
-from gpuvision.simulation.scene import Scene
-from gpuvision.simulation.sight import Sight
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.sensor_view import SensorView
+from gpuvision.simulation.transport.mirrors import Mirrors
 
 LENS = (0.0, 0.08, 0.15)
 
 
-def sight(samples: int = 120, bins: int = 240) -> Sight:
+def sight(samples: int = 120, bins: int = 240) -> SensorView:
     """Return a sensor of 12 mm x 12 mm that sees some 50 mm of the sheet, from 80 mm beside it and 150 mm above."""
     geometry = Triangulation.from_stand_off(
         baseline=LENS[1],
@@ -27,7 +27,7 @@ def sight(samples: int = 120, bins: int = 240) -> Sight:
         tilt=0.0,
         region=((-6e-3, 6e-3), (-6e-3, 6e-3)),
     )
-    return Sight(
+    return SensorView(
         triangulation=geometry,
         transport=StraightTransport(step=1e-4),
         lens=LENS,

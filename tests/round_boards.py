@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from boards import BOARD_MIDDLE, LAYERS
-from gpuvision.matching.artwork import Artwork, read_artwork
+from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from reference.board_images import BoardPicture, View
 
 PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0

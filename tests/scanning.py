@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpuvision import cli
-from gpuvision.sensor import Sensor
+from gpuvision.cli import main as cli
+from gpuvision.sensor.sensor import Sensor
 
 
 def currents(frames: int, height: float = 2e-3, total: float = 1e-6) -> Any:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ ROOMS = {
     "kernels": "gpuvision/kernels",
     "profiling": "gpuvision/profiling",
 }
-SHIPPED = {".py", ".cl", ".h", ".toml", ".typed"}
+SHIPPED = {".py", ".pyi", ".cl", ".h", ".toml", ".typed"}
 
 
 def _files(*places: str) -> Iterator[Path]:
@@ -79,42 +80,61 @@ def test_wheel_installs_one_package(wheel: zipfile.ZipFile) -> None:
     assert "License-Expression: MIT" in wheel.read(metadata).decode()
     assert any(name.endswith("licenses/LICENSE") for name in names)
     (entry,) = [name for name in names if name.endswith("entry_points.txt")]
-    assert "gpuvision = gpuvision.cli:main" in wheel.read(entry).decode()
+    assert "gpuvision = gpuvision.cli.main:main" in wheel.read(entry).decode()
 
 
 def test_status_is_the_same_in_kernels() -> None:
-    header = (ROOT / "kernels" / "status.h").read_text()
+    header = (ROOT / "kernels" / "common" / "status.h").read_text()
     defined = {name: int(value) for name, value in re.findall(r"#define STATUS_(\w+) (\d+)$", header, re.MULTILINE)}
     assert defined == {name: int(flag) for name, flag in Status.__members__.items()}
 
 
 def test_headers_that_kernels_include_exist() -> None:
     kernels = ROOT / "kernels"
-    included = {
-        (path.name, name)
-        for path in (*kernels.glob("*.cl"), *kernels.glob("*.h"))
-        for name in re.findall(r'#include "([^"]+)"', path.read_text())
-    }
+    sources = [path for path in _files("kernels") if path.suffix in {".cl", ".h"}]
+    included = {(path.name, name) for path in sources for name in re.findall(r'#include "([^"]+)"', path.read_text())}
     assert {(user, name) for user, name in included if not (kernels / name).exists()} == set()
-    unused = {path.name for path in kernels.glob("*.h")} - {name for _, name in included}
-    assert unused == set()
+    headers = {path.relative_to(kernels).as_posix() for path in sources if path.suffix == ".h"}
+    assert headers - {name for _, name in included} == set()
 
 
-# A room imports from rooms of a lower number, and from itself; whatever is not named here stands on top.
-LAYERS = {
-    "kernels": 0,
-    "host": 1,
-    "status": 2,
-    "tables": 2,
-    "operation": 2,
-    "camera": 3,
-    "matching": 4,
-    "ranging": 4,
-    "servoing": 5,
-    "simulation": 5,
-    "accuracy": 6,
-}
-TOP = 7
+def test_kernel_includes_are_not_circular() -> None:
+    kernels = ROOT / "kernels"
+    graph = {
+        path.relative_to(kernels).as_posix(): set(re.findall(r'#include "([^"]+)"', path.read_text()))
+        for path in _files("kernels")
+        if path.suffix in {".cl", ".h"}
+    }
+    assert list(TopologicalSorter(graph).static_order())
+
+
+# Floors of the packages, bottom to top. A name with a dot is a sub-package, or a module that stands above its package's
+# sub-packages. A module imports from lower floors and from its own package only.
+FLOORS = (
+    ("kernels", "host", "status", "validation", "schema"),
+    ("operation",),
+    ("camera",),
+    ("camera.patterns",),
+    ("camera.lines", "camera.views"),
+    ("camera.calibration",),
+    ("ranging", "matching"),
+    ("matching.artwork",),
+    ("matching.features",),
+    ("matching.field",),
+    ("matching.pose",),
+    ("matching.board",),
+    ("simulation.scene",),
+    ("simulation.sensors",),
+    ("simulation.errors", "simulation.transport"),
+    ("simulation.clustering",),
+    ("simulation",),
+    ("formats", "plots"),
+    ("sensor",),
+    ("workflows",),
+    ("profiling",),
+    ("cli",),
+)
+FLOOR = {package: number for number, packages in enumerate(FLOORS) for package in packages}
 
 
 def _imported(tree: ast.AST) -> Iterator[str]:
@@ -126,19 +146,53 @@ def _imported(tree: ast.AST) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def _room(module: str) -> str:
-    return ([*module.split("."), ""])[1]
+def _package(name: str) -> str:
+    """Return the package with a floor that a module, or a name in it, belongs to: the longest that fits."""
+    parts = name.split(".")[1:]
+    fitting = [".".join(parts[:count]) for count in range(len(parts), 0, -1) if ".".join(parts[:count]) in FLOOR]
+    return fitting[0] if fitting else ""
 
 
-def test_imports_run_one_way() -> None:
-    wrong = []
+def _gpuvision_imports() -> Iterator[tuple[str, str]]:
+    """Yield (module, imported name) for every import within gpuvision, those for type checkers included."""
     for module, path in _modules():
-        layer = LAYERS.get(_room(module), TOP)
         for name in _imported(ast.parse(path.read_text())):
-            if not name.startswith("gpuvision.") or _room(name) == _room(module):
-                continue
-            if LAYERS.get(_room(name), TOP) >= layer and layer < TOP:
-                wrong.append(f"{module} imports {name}")
+            if name.split(".")[0] == "gpuvision":
+                yield module, name
+
+
+def test_every_package_has_a_floor() -> None:
+    modules = {module for module, _ in _modules()} - {"gpuvision"}
+    assert {module for module in modules if not _package(module)} == set()
+    packages = {module.removeprefix("gpuvision.") for module in modules}
+    assert set(FLOOR) - packages == set()
+
+
+def test_imports_run_down_the_floors() -> None:
+    wrong = [
+        f"{module} imports {name}"
+        for module, name in _gpuvision_imports()
+        if _package(module) != _package(name) and FLOOR[_package(module)] <= FLOOR.get(_package(name), len(FLOORS))
+    ]
+    assert wrong == []
+
+
+def test_no_import_is_circular() -> None:
+    modules = {module for module, _ in _modules()}
+    graph: dict[str, set[str]] = {module: set() for module in modules}
+    for module, name in _gpuvision_imports():
+        target = name if name in modules else name.rpartition(".")[0]
+        if target in modules and target != module:
+            graph[module].add(target)
+    assert list(TopologicalSorter(graph).static_order())
+
+
+def test_no_module_imports_private_names_of_another() -> None:
+    wrong = [
+        f"{module} imports {name}"
+        for module, name in _gpuvision_imports()
+        if any(part.startswith("_") and not part.startswith("__") for part in name.split("."))
+    ]
     assert wrong == []
 
 

@@ -24,9 +24,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.fold import OneToOne, one_to_one
-from gpuvision.camera.guess import Guess
+from gpuvision.camera.inverse_start import Guess
 from gpuvision.camera.newton import determinant, undo
-from gpuvision.tables import checked_keys, numbers
+from gpuvision.validation import checked_keys, numbers
 
 Matrix = tuple[tuple[float, float, float], ...]
 Float64 = npt.NDArray[np.float64]
@@ -79,7 +79,7 @@ class Camera:
     # ---- what the kernels take -----------------------------------------------------------------------------
 
     def defines(self, matrix: npt.ArrayLike | None = None) -> dict[str, int | None]:
-        """Return what ``kernels/camera.h`` has to compile for this camera, with ideal pixels under ``matrix``."""
+        """Return the defines of ``kernels/common/camera.h`` for this camera and ideal pixels under ``matrix``."""
         k = self._radial
         defines = {"CAMERA": None, "CAMERA_RADIAL": _terms(k[:3]), "CAMERA_RATIONAL": _terms(k[3:])}
         present = {
@@ -93,7 +93,7 @@ class Camera:
     def packed(
         self, real: npt.DTypeLike, direction: Direction, matrix: npt.ArrayLike | None = None
     ) -> npt.NDArray[Any]:
-        """Return the table of ``kernels/camera.h``.
+        """Return the table of ``kernels/common/camera.h``.
 
         Parameters
         ----------

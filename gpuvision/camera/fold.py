@@ -91,7 +91,7 @@ def _in_radius(terms: Any) -> Float64:
 def _along_ray(over: Float64, under: Float64, p: Float64, s: Float64, c: float, d: float) -> Any:
     """Return the determinant along the ray (c, d), times the fourth power of the denominator; by powers of radius.
 
-    Written as in kernels/camera.h, every term times the squared denominator.
+    Written as in kernels/common/camera.h, every term times the squared denominator.
     """
     add, mul = polynomial.polyadd, polynomial.polymul
     square = _in_radius(mul(under, under))

@@ -1,4 +1,4 @@
-"""Maps of an image's pixels to their places in another image, packed for ``kernels/undistort_image.cl``.
+"""Pixel maps between images, packed for ``kernels/undistort_image/undistort_image.cl``.
 
 A lens bends a row of pixels gently, so a run of 16 of them is packed as two cubics, which single precision holds to a
 millionth of a pixel where a float per coordinate does not, in a seventh of the memory. What cubics do not describe is

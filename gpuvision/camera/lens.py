@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.tables import checked_keys, finite, numbers
+from gpuvision.validation import checked_keys, finite, numbers
 
 _NEWTON_STEPS = 64
 # No lens comes near them in any unit, and they keep the powers of fold radius and table within single precision.
@@ -59,11 +59,11 @@ class Lens:
 
     @property
     def defines(self) -> dict[str, None]:
-        """What ``kernels/lens.h`` has to compile: ``LENS`` always, ``LENS_K2`` only where k2 is not 0."""
+        """What ``kernels/common/lens.h`` has to compile: ``LENS`` always, ``LENS_K2`` only where k2 is not 0."""
         return {"LENS": None, "LENS_K2": None} if self.k2 != 0.0 else {"LENS": None}
 
     def packed(self, origin: Sequence[float], scale: float, *, inverse: bool = False) -> npt.NDArray[np.float64]:
-        """Return the table of ``kernels/lens.h`` for a kernel which works in (point - origin) scale.
+        """Return the table of ``kernels/common/lens.h`` for a kernel which works in (point - origin) scale.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The place which a displacement takes to a given one: Newton's method for the way back, as in kernels/newton.h."""
+"""Newton's method for the inverse of a displacement field, as in ``kernels/common/newton.h``."""
 
 from __future__ import annotations
 

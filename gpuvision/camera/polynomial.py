@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.newton import determinant, undo
-from gpuvision.tables import checked_keys, numbers
+from gpuvision.validation import checked_keys, numbers
 
 Float64 = npt.NDArray[np.float64]
 Region = tuple[tuple[float, float], tuple[float, float]]
@@ -134,11 +134,11 @@ class PlanePolynomial:
 
     @property
     def defines(self) -> dict[str, None]:
-        """What ``kernels/plane.h`` needs to be told."""
+        """What ``kernels/undistort_points/plane.h`` needs to be told."""
         return {"PLANE": None}
 
     def packed(self, real: npt.DTypeLike) -> npt.NDArray[Any]:
-        """Return the table of ``kernels/plane.h`` for float32 or float64."""
+        """Return the table of ``kernels/undistort_points/plane.h`` for float32 or float64."""
         middle, half = self._middle_and_half
         # Origin and scale are rounded before the rest is computed from them.
         origin = middle.astype(real).astype(np.float64)

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
-from gpuvision.camera.views.tilted_projection import Floats, tilt_matrix
-from gpuvision.tables import finite, numbers
+from gpuvision.camera.tilted_projection import Floats, tilt_matrix
+from gpuvision.validation import finite, numbers
 
 _RIGHT_ANGLE = 0.5 * math.pi
 

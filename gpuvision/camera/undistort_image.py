@@ -13,10 +13,10 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.image_map import Packer, PixelMap, Taps
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines
+from gpuvision.host import Device, Launch, Precision, Variant, real_defines, uses_vectors
 from gpuvision.operation import VisionOperation
 from gpuvision.status import Status
-from gpuvision.tables import finite, numbers
+from gpuvision.validation import finite, numbers
 
 Interpolation = Literal["bilinear", "bicubic"]
 Border = Literal["mask", "constant", "replicate", "reflect"]
@@ -55,8 +55,8 @@ class UndistortedImage(NamedTuple):
     image
         (..., rows, columns[, 3]), in the input's dtype.
     status
-        (rows, columns) uint8 `Status` flags, the same for every image of a batch. HOLE: the place lies outside the
-        source image's pixels. FOLDED: past the fold of the camera model no place exists.
+        (rows, columns) uint8 `Status` flags, the same for every image of a batch. NO_DATA: the place lies outside the
+        source image's pixels. NOT_INVERTIBLE: past the fold of the camera model no place exists.
     """
 
     image: Any
@@ -96,8 +96,8 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         image, from a `Lens` or a `Camera`; it needs no memory and no time to begin with.
     precision
         Of computed places. ``"single"`` (and None) keeps them to a rounding of the coordinate.
-    walk
-        ``"strip"`` for CPU runtimes, ``"item"`` for GPUs, ``"auto"`` by the device.
+    variant
+        ``"vector"`` for CPU runtimes, ``"work_item"`` for GPUs, ``"auto"`` by the device.
 
     Raises
     ------
@@ -107,8 +107,8 @@ class UndistortImage(VisionOperation[UndistortedImage]):
     Notes
     -----
     Places of a map are good to 1e-5 px, beside the rounding to whole numbers and that of single precision (about
-    1e-7 of the largest value). Pixels without any place (FOLDED) are as the border's policy says for ``"mask"`` and
-    ``"constant"``; for the others as for ``"mask"``.
+    1e-7 of the largest value). Pixels without any place (NOT_INVERTIBLE) are as the border's policy says for ``"mask"``
+    and ``"constant"``; for the others as for ``"mask"``.
     """
 
     Result: ClassVar[type[Any]] = UndistortedImage
@@ -123,7 +123,7 @@ class UndistortImage(VisionOperation[UndistortedImage]):
     matrix: Matrix | None = None
     coordinates: Literal["map", "computed"] = "map"
     precision: Precision = None
-    walk: Walk = "auto"
+    variant: Variant = "auto"
 
     def __post_init__(self) -> None:
         if isinstance(self.model, np.ndarray):
@@ -197,7 +197,7 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         *batch, rows, columns = self._checked(shape, dtype)
         region = self._region((rows, columns))
-        strip = in_strips(self.walk, device)
+        strip = uses_vectors(self.variant, device)
         made_columns, made_rows = region[2:]
         if max(rows * columns, made_rows * made_columns) * self.channels >= _LARGEST_FRAME:
             raise ValueError(f"UndistortImage takes images of fewer than 2**30 samples, got {rows} x {columns} pixels")
@@ -210,7 +210,7 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         moved = (math.prod(shape) + math.prod(made)) * dtype.itemsize
         past_caches = {"PAST_CACHES": None} if strip and device.is_cpu and moved > device.cache_bytes else {}
         return Launch(
-            source="undistort_image.cl",
+            source="undistort_image/undistort_image.cl",
             kernel="undistort",
             inputs=((shape, dtype),),
             outputs={"image": (made, dtype), "status": ((made_rows, made_columns), np.dtype(np.uint8))},
@@ -244,7 +244,7 @@ class UndistortImage(VisionOperation[UndistortedImage]):
             taps=taps,
             channels=self.channels,
             missing=int(self._missing),
-            outside=int(Status.HOLE) if known else None,
+            outside=int(Status.NO_DATA) if known else None,
             margin=(0.5, 0.5) if self.border == "mask" else (float(taps.after), float(taps.before + 1)),
         )
         return tuple(packer.pack(self.places((rows, columns))))
@@ -252,7 +252,7 @@ class UndistortImage(VisionOperation[UndistortedImage]):
     @property
     def _missing(self) -> Status:
         """What it means that a pixel has no place."""
-        return Status.HOLE if isinstance(self.model, PixelMap) else Status.FOLDED
+        return Status.NO_DATA if isinstance(self.model, PixelMap) else Status.NOT_INVERTIBLE
 
     def _table(self, real: np.dtype[Any]) -> npt.NDArray[Any]:
         if isinstance(self.model, Lens):
@@ -266,7 +266,7 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         if dtype.kind == "u":
             defines["LARGEST"] = f"{np.iinfo(dtype).max}.0f"
         if strip:
-            defines |= {"STRIP": None, "CODE16": f"{code}16", "CONVERT_CODES": f"convert_{code}16"}
+            defines |= {"VECTOR_VARIANT": None, "CODE16": f"{code}16", "CONVERT_CODES": f"convert_{code}16"}
         if self.interpolation == "bicubic":
             defines["BICUBIC"] = None
         defines[_BORDERS[self.border]] = None

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.polynomial import PlanePolynomial
-from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
 from gpuvision.operation import VisionOperation
-from gpuvision.tables import numbers
+from gpuvision.validation import numbers
 
 _LANES, _GROUP = 16, 256
 # Points of a strip: several strips per core keep the cores even.
@@ -30,8 +30,8 @@ class UndistortedPoints(NamedTuple):
         (..., 2), as the input; NaN where the status is not OK.
     status
         uint8 `Status` flags, (...): NOT_FINITE (a coordinate is not, or lies so far away that its place is not),
-        FOLDED (past the fold of the lens, or behind the tilted sensor: no such point), OUT_OF_RANGE (outside the
-        region of a `PlanePolynomial`).
+        NOT_INVERTIBLE (past the fold of the lens, or behind the tilted sensor: no such point), OUT_OF_RANGE (outside
+        the region of a `PlanePolynomial`).
     """
 
     points: Any
@@ -52,8 +52,8 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
         3 x 3, of the ideal pixels of a `Camera`; None: its own.
     precision
         Of the arithmetic and the outputs; None follows the input.
-    walk
-        "strip" (16-wide vectors, for CPU runtimes), "item" (a work-item per point, for GPUs), or "auto".
+    variant
+        "vector" (16-wide vectors, for CPU runtimes), "work_item" (a work-item per point, for GPUs), or "auto".
 
     Raises
     ------
@@ -76,7 +76,7 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
     inverse: bool = False
     matrix: tuple[tuple[float, ...], ...] | None = None
     precision: Precision = None
-    walk: Walk = "auto"
+    variant: Variant = "auto"
 
     def __post_init__(self) -> None:
         if not isinstance(self.model, Camera | Lens | PlanePolynomial):
@@ -96,13 +96,13 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
         real = real_of(self.precision, dtype)
         code = "float" if dtype == np.float32 else "double"
         count = math.prod(shape[:-1])
-        strip = in_strips(self.walk, device) and count >= _LANES
+        strip = uses_vectors(self.variant, device) and count >= _LANES
         share = -(-count // (_STRIPS_PER_CORE * _LANES * device.handle.max_compute_units)) * _LANES
         each = min(max(share, _SHORTEST_STRIP), _LONGEST_STRIP) if strip else max(min(count, _GROUP), 1)
         items = -(-count // each)
-        present = {"STRIP": strip, "INVERSE": self.inverse}
+        present = {"VECTOR_VARIANT": strip, "INVERSE": self.inverse}
         return Launch(
-            source="undistort_points.cl",
+            source="undistort_points/undistort_points.cl",
             kernel="undistort_points",
             defines={
                 **self._model_defines(real),

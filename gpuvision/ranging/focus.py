@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.status import Status
-from gpuvision.tables import finite
+from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]
 
@@ -37,9 +37,9 @@ class FocusReading(NamedTuple):
     sigma_image, sigma_object
         Predicted standard deviations of LI and LO [m]; None unless ``sigma_intensity`` is known.
     status
-        uint8 `Status` flags: NOT_FINITE; DARK (fewer than three pinholes above the minimum; with three pinholes: one
-        of them not); AMBIGUOUS (no maximum: equal intensities, or a valley); OUT_OF_RANGE (the peak lies outside the
-        pinholes, or no object in front of the lens has its image there).
+        uint8 `Status` flags: NOT_FINITE; LOW_SIGNAL (fewer than three pinholes above the minimum; with three pinholes:
+        one of them not); AMBIGUOUS (no maximum: equal intensities, or a valley); OUT_OF_RANGE (the peak lies outside
+        the pinholes, or no object in front of the lens has its image there).
     """
 
     image_distance: Float64
@@ -128,7 +128,7 @@ class DepthFromFocus:
         status = np.zeros(light.shape[:-1], dtype=np.uint8)
         status[~(np.abs(peak) <= 0.5 * (count - 1))] = Status.OUT_OF_RANGE
         status[~(curvature < -flat)] = Status.AMBIGUOUS
-        status[~enough] = Status.DARK
+        status[~enough] = Status.LOW_SIGNAL
         status[~known] = Status.NOT_FINITE
         good = status == Status.OK
         image = np.where(good, image, np.nan)

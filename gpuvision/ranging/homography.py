@@ -26,7 +26,7 @@ import scipy.optimize
 import scipy.special
 
 from gpuvision.camera.lens import Lens
-from gpuvision.tables import finite
+from gpuvision.validation import finite
 
 Model = Literal["C3", "C4", "D6", "H8"]
 Float64 = npt.NDArray[np.float64]

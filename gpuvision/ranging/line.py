@@ -12,10 +12,10 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
-from gpuvision.tables import finite, whole
+from gpuvision.validation import finite, whole
 
 Method = Literal["whole", "windowed", "gauss3", "fir", "ml"]
 Choice = Literal["strongest", "first", "last", "nearest"]
@@ -37,7 +37,7 @@ class LineReading(NamedTuple):
     Attributes
     ----------
     position
-        Place of the light along the profile [pixel]; NaN where the status has DARK, OUT_OF_RANGE or NOT_FINITE.
+        Place of the light along the profile [pixel]; NaN where the status has LOW_SIGNAL, OUT_OF_RANGE or NOT_FINITE.
     peak
         The peak's sample as recorded; the strongest sample where there is no peak.
     width
@@ -45,12 +45,12 @@ class LineReading(NamedTuple):
     total
         Light over the threshold [grey levels]: in the window, for ``method="whole"`` in the whole profile.
     status
-        uint8 `Status` flags. DARK: no peak that the parameters allow, or too little light beside it for the method.
-        OUT_OF_RANGE: the border cuts the window, or a flat top wider than it (for ``"whole"``: a border sample has
-        half the peak's light or more). NOT_FINITE: a sample of the profile is NaN or infinite, or the sums are beyond
-        the largest number. With a value:
+        uint8 `Status` flags. LOW_SIGNAL: no peak that the parameters allow, or too little light beside it for the
+        method. OUT_OF_RANGE: the border cuts the window, or a flat top wider than it (for ``"whole"``: a border sample
+        has half the peak's light or more). NOT_FINITE: a sample of the profile is NaN or infinite, or the sums are
+        beyond the largest number. With a value:
         SATURATED (the peak is at the saturation level), AMBIGUOUS (a second peak is comparable, a flat top is wider
-        than the window, or the fit fell back to the middle of a flat top). HORIZON and FOLDED come from the
+        than the window, or the fit fell back to the middle of a flat top). HORIZON and NOT_INVERTIBLE come from the
         triangulation.
     g, h
         The point in the sheet of light [m], where the readout has a triangulation.
@@ -114,7 +114,7 @@ class LineReadout(VisionOperation[LineReading]):
         Names of the `LineReading` fields to compute; what is not asked for is not compiled. ``None``: all.
     precision
         Of the arithmetic and the outputs; ``None`` is single.
-    walk
+    variant
         Wide strips or one item per profile; ``"auto"`` follows the device. Frames smaller than a strip's vectors
         are walked by items.
 
@@ -150,7 +150,7 @@ class LineReadout(VisionOperation[LineReading]):
     axes: SampleAxes = SampleAxes()  # noqa: RUF009 (frozen, no state)
     outputs: tuple[str, ...] | None = None
     precision: Precision = None
-    walk: Walk = "auto"
+    variant: Variant = "auto"
 
     def __post_init__(self) -> None:
         for name in ("window", "minimum_width", "maximum_width", "fir_length"):
@@ -226,7 +226,7 @@ class LineReadout(VisionOperation[LineReading]):
                 f"LineReadout takes profiles of up to {LONGEST_PROFILE} samples in frames below 2**31, got {shape}"
             )
         real = real_of(self.precision, dtype)
-        strip = in_strips(self.walk, device) and self._fits_strip(rows, columns, dtype)
+        strip = uses_vectors(self.variant, device) and self._fits_strip(rows, columns, dtype)
         frames = math.prod(batch)
         inputs: list[Any] = [(shape, dtype)]
         if self.choice == "nearest":
@@ -234,7 +234,7 @@ class LineReadout(VisionOperation[LineReading]):
         chosen = self.outputs or ()
         types = dict.fromkeys(LineReading._fields, real) | {"status": np.dtype(np.uint8)}
         return Launch(
-            source="line.cl",
+            source="line/line.cl",
             kernel="line_readout",
             inputs=inputs,
             outputs={name: ((*batch, samples), types[name]) if name in chosen else None for name in types},
@@ -253,7 +253,8 @@ class LineReadout(VisionOperation[LineReading]):
 
     def _fits_strip(self, rows: int, columns: int, dtype: np.dtype[Any]) -> bool:
         if self._has_candidates:
-            # Along a row one profile is walked at a time, whatever the walk: its dark parts are passed by in vectors.
+            # Along a row one profile is walked at a time, whatever the variant: its dark parts are passed by in
+            # vectors.
             return self.along == "columns" and columns >= _LANES
         return columns >= _WIDE_BYTES // dtype.itemsize and (self.along == "columns" or rows >= _LANES)
 
@@ -300,7 +301,7 @@ class LineReadout(VisionOperation[LineReading]):
         if self.triangulation is not None:
             defines |= {"WITH_SHEET": None} | self.triangulation.defines
         present = {
-            "STRIP": strip,
+            "VECTOR_VARIANT": strip,
             "PREFETCH": device.is_cpu,
             "ALONG_ROWS": self.along == "rows",
             "AMBIGUITY": self.ambiguity is not None,

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.status import Status
-from gpuvision.tables import finite
+from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]
 
@@ -166,7 +166,7 @@ class ShearedProfile(NamedTuple):
     x
         X of every sample [m], folded ones too; NaN where H is not finite.
     status
-        uint8 `Status` flags: NOT_FINITE (H is not), FOLDED (X does not advance from the sample before it: the
+        uint8 `Status` flags: NOT_FINITE (H is not), NOT_INVERTIBLE (X does not advance from the sample before it: the
         surface is steeper than the beam, or two samples coincide).
     """
 
@@ -212,5 +212,5 @@ def sheared(start: npt.ArrayLike, height: npt.ArrayLike, angle: float = 0.25 * m
     before = np.take_along_axis(x, np.maximum(number[..., :-1], 0), axis=-1)
     folded = known[..., 1:] & (number[..., :-1] >= 0) & (forward * (x[..., 1:] - before) <= 0.0)
     status = np.where(known, 0, Status.NOT_FINITE).astype(np.uint8)
-    status[..., 1:][folded] = Status.FOLDED
+    status[..., 1:][folded] = Status.NOT_INVERTIBLE
     return ShearedProfile(np.where(known, x, np.nan), status)

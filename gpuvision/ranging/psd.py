@@ -13,10 +13,10 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Define, Device, Launch, LaunchBuilder, Precision, Walk, WorkSize, flags, type_defines
+from gpuvision.host import Define, Device, Launch, LaunchBuilder, Precision, Variant, WorkSize, flags, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
-from gpuvision.tables import finite
+from gpuvision.validation import finite
 
 ELECTRON = 1.602176634e-19  # C
 # Samples of a strip: long where enough strips remain to share among the cores, a multiple of 16 always.
@@ -30,12 +30,12 @@ class PsdReading(NamedTuple):
     Attributes
     ----------
     position
-        u [m]; NaN where the status has DARK, SATURATED, OUT_OF_RANGE or NOT_FINITE.
+        u [m]; NaN where the status has LOW_SIGNAL, SATURATED, OUT_OF_RANGE or NOT_FINITE.
     total
         Sum of both currents after dark level and gain [A].
     status
-        uint8 `Status` flags: DARK (total not above the minimum), SATURATED (either channel), OUT_OF_RANGE (beyond
-        the strip's ends), NOT_FINITE; HORIZON and FOLDED from the triangulation.
+        uint8 `Status` flags: LOW_SIGNAL (total not above the minimum), SATURATED (either channel), OUT_OF_RANGE (beyond
+        the strip's ends), NOT_FINITE; HORIZON and NOT_INVERTIBLE from the triangulation.
     sigma
         Predicted standard deviation of the position [m].
     g, h
@@ -100,7 +100,7 @@ class PsdReadout(VisionOperation[PsdReading]):
     interelectrode_resistance, load_resistance
         R_ie and the load R_L at either end [Ohm]: the position shrinks to R_ie / (R_ie + 2 R_L); undone exactly.
     minimum_total
-        The total that makes a position trustworthy [A]; at or below it the sample is DARK.
+        The total that makes a position trustworthy [A]; at or below it the sample is LOW_SIGNAL.
     saturation
         Current at which a channel saturates, dark level included [A]; ``None``: the highest code of integer input,
         and no limit for currents.
@@ -118,7 +118,7 @@ class PsdReadout(VisionOperation[PsdReading]):
         total and status, with sigma if there is ``noise``, with g and h if there is a ``triangulation``.
     precision
         Of the arithmetic and the outputs; ``None`` follows the input.
-    walk
+    variant
         Wide strips or one item per sample; ``"auto"`` follows the device.
 
     Raises
@@ -149,7 +149,7 @@ class PsdReadout(VisionOperation[PsdReading]):
     layout: Literal["pairs", "planar"] = "pairs"
     outputs: tuple[str, ...] | None = None
     precision: Precision = None
-    walk: Walk = "auto"
+    variant: Variant = "auto"
 
     def __post_init__(self) -> None:
         for name in ("strip_length", "ampere", "right_gain"):
@@ -202,7 +202,7 @@ class PsdReadout(VisionOperation[PsdReading]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, walk=self.walk)
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
         build.check_dtype("float32", "float64", "uint16", of="currents")
         pair_axis, expected = (-1, "(..., 2)") if self.layout == "pairs" else (0, "(2, ...)")
         build.check_shape(bool(shape) and shape[pair_axis] == 2, f"{self.layout} of shape {expected}")
@@ -249,7 +249,7 @@ class PsdReadout(VisionOperation[PsdReading]):
             defines |= {"WITH_SHEET": None} | self.triangulation.defines
         return defines | flags(
             PLANAR=self.layout == "planar",
-            DARK=any(self.dark),
+            LOW_SIGNAL=any(self.dark),
             # Where a current can be negative or not finite, or the load resistors shrink the range.
             SIGNED=dtype.kind == "f" or any(self.dark) or self.load_resistance > 0.0,
             GAIN=self.right_gain != 1.0,

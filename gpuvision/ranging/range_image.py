@@ -22,9 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Precision, Walk, in_strips, real_defines, real_of
+from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
 from gpuvision.operation import VisionOperation
-from gpuvision.tables import checked_keys, finite, numbers
+from gpuvision.validation import checked_keys, finite, numbers
 
 _STRIP = 1024  # samples, as in range_image.cl
 _LANES = 16
@@ -47,7 +47,7 @@ class RangePoints(NamedTuple):
         The point in the scene [m]; NaN where a flag other than SATURATED and AMBIGUOUS is set.
     status
         uint8 `Status` flags: those that came in, and NOT_FINITE (a coordinate, the transport, or the result is not),
-        FOLDED (beyond the lens' fold), HORIZON (the ray does not meet the sheet in front of the camera),
+        NOT_INVERTIBLE (beyond the lens' fold), HORIZON (the ray does not meet the sheet in front of the camera),
         OUT_OF_RANGE (outside the limits).
     """
 
@@ -141,11 +141,11 @@ class StraightTransport:
 
     @property
     def defines(self) -> dict[str, None]:
-        """What ``kernels/range_image.cl`` has to compile."""
+        """What ``kernels/range_image/range_image.cl`` has to compile."""
         return {}
 
     def packed(self) -> npt.NDArray[np.float64]:
-        """Table of ``kernels/range_image.cl`` after its limits."""
+        """Table of ``kernels/range_image/range_image.cl`` after its limits."""
         return np.concatenate([self.origin, self.g_axis, self.h_axis, self.direction])
 
     def to_dict(self) -> dict[str, Any]:
@@ -271,11 +271,11 @@ class RotatingSheet:
 
     @property
     def defines(self) -> dict[str, None]:
-        """What ``kernels/range_image.cl`` has to compile."""
+        """What ``kernels/range_image/range_image.cl`` has to compile."""
         return {"GEOMETRY_ROTATING": None} | ({} if self.lens is None else self.lens.defines)
 
     def packed(self) -> npt.NDArray[np.float64]:
-        """Table of ``kernels/range_image.cl`` after its limits."""
+        """Table of ``kernels/range_image/range_image.cl`` after its limits."""
         # The kernel knows (position, sample), not (column, row).
         order = [0, 1, 2] if self.along == "rows" else [1, 0, 2]
         to_scene, normals = np.array(self.scene_axes), self.normals()
@@ -342,8 +342,8 @@ class RangeImage(VisionOperation[RangePoints]):
         Lowest and highest x, y and z that a point can have [m]; what lies outside is OUT_OF_RANGE.
     precision
         ``"single"``, ``"double"``, or None: follows the profiles.
-    walk
-        ``"strip"`` (CPU runtimes), ``"item"`` (GPUs), or ``"auto"``.
+    variant
+        ``"vector"`` (CPU runtimes), ``"work_item"`` (GPUs), or ``"auto"``.
 
     Raises
     ------
@@ -356,7 +356,7 @@ class RangeImage(VisionOperation[RangePoints]):
     geometry: StraightTransport | RotatingSheet
     limits: Limits = _EVERYWHERE
     precision: Precision = None
-    walk: Walk = "auto"
+    variant: Variant = "auto"
 
     def __post_init__(self) -> None:
         limits = tuple((float(low), float(high)) for low, high in self.limits)
@@ -365,7 +365,7 @@ class RangeImage(VisionOperation[RangePoints]):
         object.__setattr__(self, "limits", limits)
 
     def packed(self, real: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
-        """Table of ``kernels/range_image.cl`` in the device's real type."""
+        """Table of ``kernels/range_image/range_image.cl`` in the device's real type."""
         # Finite limits keep infinite results out by the same comparisons.
         largest = np.finfo(np.dtype(real)).max
         limits = np.clip(np.array(self.limits).T.ravel(), -largest, largest)
@@ -379,15 +379,15 @@ class RangeImage(VisionOperation[RangePoints]):
             raise ValueError(f"RangeImage takes (profiles, samples), got an array of shape {shape}")
         real = real_of(self.precision, dtype)
         profiles, samples = shape
-        strips = samples >= _LANES and in_strips(self.walk, device)
+        strips = samples >= _LANES and uses_vectors(self.variant, device)
         byte = np.dtype(np.uint8)
         return Launch(
-            source="range_image.cl",
+            source="range_image/range_image.cl",
             kernel="assemble_profiles",
             defines={
                 **self.geometry.defines,
                 **real_defines(device, real),
-                **({"STRIP": None} if strips else {}),
+                **({"VECTOR_VARIANT": None} if strips else {}),
                 "INPUT": _INPUTS[dtype.name],
                 "INPUT16": f"{_INPUTS[dtype.name]}16",
             },

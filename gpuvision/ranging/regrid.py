@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from gpuvision.host import Bound, Device, DeviceArray, Launch, Precision, real_defines, real_of
 from gpuvision.operation import VisionOperation
-from gpuvision.tables import finite
+from gpuvision.validation import finite
 
 R = TypeVar("R", bound=tuple[Any, ...])
 Direction = Literal["x", "-x", "y", "-y"]
@@ -35,8 +35,8 @@ class HeightMap(NamedTuple):
     intensity
         Of the light, in the units of the input; NaN in holes.
     status
-        uint8 `Status` flags. HOLE: no measurement near enough. FOLDED: the sampling ran backwards here. SATURATED and
-        AMBIGUOUS come with a value.
+        uint8 `Status` flags. NO_DATA: no measurement near enough. NOT_INVERTIBLE: the sampling ran backwards here.
+        SATURATED and AMBIGUOUS come with a value.
     """
 
     z: Any
@@ -131,8 +131,8 @@ class Regrid:
     between them are bridged then) and at most `max_step` in height.
 
     Where the coordinate along a line runs backwards (dX/di <= 0), two surfaces share the cells: all cells from there to
-    the furthest point reached before are FOLDED. Noise makes a fine sampling run backwards by a little everywhere:
-    `fold_tolerance` says how much is noise.
+    the furthest point reached before are NOT_INVERTIBLE. Noise makes a fine sampling run backwards by a little
+    everywhere: `fold_tolerance` says how much is noise.
 
     Error: interpolation of a surface with curvature k between samples at a distance d errs by k d^2 / 8; in single
     precision a cell's place is good to 6e-8 of its distance from the origin.
@@ -151,7 +151,7 @@ class Regrid:
     fold_tolerance
         How far a line may fall back before it counts as folded [m].
     folded
-        ``"drop"``: FOLDED cells are NaN. ``"top"``: they keep the highest surface found, with the flag.
+        ``"drop"``: NOT_INVERTIBLE cells are NaN. ``"top"``: they keep the highest surface found, with the flag.
     precision
         ``"single"``, ``"double"``, or None: follows the input.
 
@@ -330,7 +330,7 @@ class _AlongSamples(_Pass[_Lines]):
         value, flags = (shape, dtype), (shape, np.dtype(np.uint8))
         made = (profiles, cells)
         return Launch(
-            source="regrid.cl",
+            source="regrid/regrid.cl",
             kernel="resample",
             defines={**real_defines(device, real), "CARRY": None, "INPUT": _INPUTS[dtype.name]},
             inputs=(value, value, value, flags, value),
@@ -366,7 +366,7 @@ class _AlongProfiles(_Pass[HeightMap]):
         line_pitch, cell_pitch = (cells, 1) if self.direction[-1] == "x" else (1, lines)
         drop = int(self.regrid.folded == "drop")
         return Launch(
-            source="regrid.cl",
+            source="regrid/regrid.cl",
             kernel="resample",
             defines={**real_defines(device, real), "INPUT": _INPUTS[dtype.name]},
             inputs=(value, value, value, flags),

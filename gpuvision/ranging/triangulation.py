@@ -18,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Walk, flags, type_defines
+from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, flags, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging import homography
 from gpuvision.ranging.homography import Model
-from gpuvision.tables import checked_keys, finite, numbers
+from gpuvision.validation import checked_keys, finite, numbers
 
 Along = Literal["columns", "rows"]
 Matrix = tuple[tuple[float, float, float], ...]
@@ -42,7 +42,7 @@ class SheetPoints(NamedTuple):
     g, h
         Along the sheet and up in it [m]; NaN where the status is not OK.
     status
-        uint8 `Status` flags: NOT_FINITE (u or v is not, or lies a million half regions away), FOLDED (beyond the
+        uint8 `Status` flags: NOT_FINITE (u or v is not, or lies a million half regions away), NOT_INVERTIBLE (beyond the
         fold of the lens polynomial), HORIZON (the ray does not meet the sheet, or too far away to mean anything).
     sigma_g, sigma_h
         Their standard deviations [m]; None unless the triangulation knows the sensor's ``sigma``.
@@ -107,8 +107,8 @@ class Triangulation(VisionOperation[SheetPoints]):
         1/horizon times the usual distance is flagged HORIZON.
     precision
         Of the arithmetic and the outputs; None follows the input.
-    walk
-        "strip" (16-wide vectors, for CPU runtimes), "item" (a work-item per point, for GPUs), or "auto".
+    variant
+        "vector" (16-wide vectors, for CPU runtimes), "work_item" (a work-item per point, for GPUs), or "auto".
 
     Raises
     ------
@@ -128,7 +128,7 @@ class Triangulation(VisionOperation[SheetPoints]):
     sigma: tuple[float, float] | None = None
     horizon: float = 1e-3
     precision: Precision = None
-    walk: Walk = "auto"
+    variant: Variant = "auto"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "homography", numbers(self.homography, (3, 3), "Triangulation.homography"))
@@ -157,12 +157,12 @@ class Triangulation(VisionOperation[SheetPoints]):
 
     @property
     def defines(self) -> dict[str, None]:
-        """What ``kernels/sheet.h`` has to compile for this triangulation."""
+        """What ``kernels/common/sheet.h`` has to compile for this triangulation."""
         lens = {} if self.lens is None else self.lens.defines
         return lens if self.covariance is None else {**lens, "SHEET_COVARIANCE": None}
 
     def packed(self, real: npt.DTypeLike, axes: SampleAxes | None = None) -> npt.NDArray[Any]:
-        """Return the parameter table of ``kernels/sheet.h``: what its device functions take as ``sheet``.
+        """Return the parameter table of ``kernels/common/sheet.h``: what its device functions take as ``sheet``.
 
         Parameters
         ----------
@@ -216,7 +216,7 @@ class Triangulation(VisionOperation[SheetPoints]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, walk=self.walk)
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
         build.check_dtype("float32", "float64", of="coordinates u and v")
         points = math.prod(shape)
         share = build.share(points, per_core=_STRIPS_PER_CORE, multiple=_LANES)

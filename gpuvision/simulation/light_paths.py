@@ -10,19 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.simulation.bounces import Bounces
-from gpuvision.simulation.direct import DirectLight
-from gpuvision.simulation.illumination import LightSheet, LitLine
-from gpuvision.simulation.line_irradiance import LitSegments
-from gpuvision.simulation.material import Material
-from gpuvision.simulation.mirrors import Mirrors
-from gpuvision.simulation.planned_light import PlannedLight
-from gpuvision.simulation.range_error import StripReading, bounce_power, choose_paths
-from gpuvision.simulation.readings import PATHS, Truth
-from gpuvision.simulation.scene import Scene
-from gpuvision.simulation.sight import Exposure, Sight
-from gpuvision.simulation.sight_lines import SeenSurface, SightLines
-from gpuvision.simulation.visible_light import segment_rows
+from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance
+from gpuvision.simulation.errors.range_error import StripReading, bounce_power, choose_paths
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.readings import PATHS, Truth
+from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
+from gpuvision.simulation.sensors.view_rays import SeenSurface, ViewRays
+from gpuvision.simulation.transport.direct import DirectLight
+from gpuvision.simulation.transport.illumination import LightSheet, LitLine
+from gpuvision.simulation.transport.line_irradiance import LitSegments
+from gpuvision.simulation.transport.mirrors import Mirrors
+from gpuvision.simulation.transport.occluded_irradiance import segment_rows
+from gpuvision.simulation.transport.radiosity import Radiosity
 
 Float64 = npt.NDArray[np.float64]
 
@@ -56,14 +56,14 @@ class LightPaths:
     scene, materials
         What is there; a material for every number in `Scene.material`.
     paths
-        Which of `gpuvision.simulation.readings.PATHS` are modelled; without "direct" there is no reading.
+        Which of `gpuvision.simulation.sensors.readings.PATHS` are modelled; without "direct" there is no reading.
     sub_sheets
         Thin sheets that stand for a thick one, on the direct path. Secondary light comes from the middle one: it sees
         the sheet from further away than the sheet is thick.
     blur
         Standard deviation of a point's image along u [sensor unit]; light by diffuse detours is even enough without.
     nodes
-        Of `SightLines`.
+        Of `ViewRays`.
     patch
         Size of the patches between which light bounces on [m]; None: a sixteenth of the scene.
     tolerance
@@ -85,7 +85,7 @@ class LightPaths:
         What the sensor sees of the scene.
     """
 
-    sight: Sight
+    sight: SensorView
     sheet: LightSheet
     scene: Scene
     materials: Sequence[Material]
@@ -99,9 +99,9 @@ class LightPaths:
     device: Device | None = None
     _direct: DirectLight = field(init=False, repr=False)
     _mirrors: Mirrors = field(init=False, repr=False)
-    lines: SightLines = field(init=False, repr=False)
-    _bounces: Bounces | None = field(init=False, repr=False)
-    _planned: PlannedLight = field(init=False, repr=False)
+    lines: ViewRays = field(init=False, repr=False)
+    _bounces: Radiosity | None = field(init=False, repr=False)
+    _planned: ClusteredIrradiance = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for path in self.paths:
@@ -109,9 +109,7 @@ class LightPaths:
                 raise ValueError(f"unknown path {path!r}, expected some of {', '.join(PATHS)}")
         device = Device.best() if self.device is None else self.device
         object.__setattr__(self, "device", device)
-        lines = SightLines(
-            sight=self.sight, scene=self.scene, materials=self.materials, nodes=self.nodes, device=device
-        )
+        lines = ViewRays(sight=self.sight, scene=self.scene, materials=self.materials, nodes=self.nodes, device=device)
         direct = DirectLight(
             sight=self.sight,
             scene=self.scene,
@@ -121,7 +119,7 @@ class LightPaths:
             device=device,
         )
         mirrors = Mirrors(sight=self.sight, scene=self.scene, materials=self.materials, device=device)
-        planned = PlannedLight(scene=self.scene, tolerance=self.tolerance, device=device)
+        planned = ClusteredIrradiance(scene=self.scene, tolerance=self.tolerance, device=device)
         object.__setattr__(self, "_planned", planned)
         object.__setattr__(self, "_direct", direct)
         object.__setattr__(self, "_mirrors", mirrors)
@@ -215,10 +213,10 @@ class LightPaths:
         albedo = np.array([each.albedo for each in self.materials])[self.scene.material[lit.triangle]]
         return LitSegments(lit.ends, lit.normals, albedo * lit.power)
 
-    def _between_patches(self) -> Bounces:
+    def _between_patches(self) -> Radiosity:
         size = self.patch
         if size is None:
             corners = self.scene.corners.reshape(-1, 3)
             size = float(np.linalg.norm(np.ptp(corners, axis=0))) / 16.0
         albedo = [each.albedo for each in self.materials]
-        return Bounces.of(self.scene, albedo, size=size, device=self.device)
+        return Radiosity.of(self.scene, albedo, size=size, device=self.device)

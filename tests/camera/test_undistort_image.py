@@ -23,7 +23,7 @@ from gpuvision.status import Status
 from reference import undistort_image as reference
 
 ON_DEVICES = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-WALKS = ["strip", "item"]
+VARIANTS = ["vector", "work_item"]
 BORDERS = ["mask", "constant", "replicate", "reflect"]
 DTYPES = [np.uint8, np.uint16, np.float32]
 LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): 1.0}
@@ -59,7 +59,13 @@ def near_edge(places: np.ndarray, source: tuple[int, ...]) -> np.ndarray:
 
 
 def assert_right(
-    result: Any, image: np.ndarray, places: np.ndarray, *, missing: int = Status.HOLE, channels: int = 1, **options: Any
+    result: Any,
+    image: np.ndarray,
+    places: np.ndarray,
+    *,
+    missing: int = Status.NO_DATA,
+    channels: int = 1,
+    **options: Any,
 ) -> None:
     """Compare with the oracle: every value within what places and rounding allow, whole numbers rounded to nearest."""
     source = image.shape[-3:-1] if channels == 3 else image.shape[-2:]
@@ -80,22 +86,22 @@ def assert_right(
             assert np.abs(values[clear] - whole[clear]).max(initial=0.0) <= 0.5 + slack
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_batch_against_the_oracle(
-    device: Device, dtype: Any, interpolation: Any, channels: int, walk: Any, rng: np.random.Generator
+    device: Device, dtype: Any, interpolation: Any, channels: int, variant: Any, rng: np.random.Generator
 ) -> None:
     lens = Lens(k1=4e-6, k2=1e-11, centre=(60.0, 41.0))
     # Borders are the same code for every type.
     for border in BORDERS if dtype == np.float32 else ["mask", "constant"]:
         op = UndistortImage(
-            model=lens, interpolation=interpolation, channels=channels, border=border, value=0.75, walk=walk
+            model=lens, interpolation=interpolation, channels=channels, border=border, value=0.75, variant=variant
         )
         image = pixels(rng, (2, 83, 117, 3)[: 3 + channels // 3], dtype)
         places = op.places((83, 117))
-        options = {"interpolation": interpolation, "border": border, "value": 0.75, "missing": Status.FOLDED}
+        options = {"interpolation": interpolation, "border": border, "value": 0.75, "missing": Status.NOT_INVERTIBLE}
         assert_right(op(image, device=device), image, places, channels=channels, **options)
 
 
@@ -120,11 +126,11 @@ def test_every_window(device: Device, name: str, channels: int, interpolation: A
     image = pixels(rng, (*source, 3)[: 2 + channels // 3], np.float32)
     places = map_of((80, 80), source, **options)
     taps = Taps(1, 2) if interpolation == "bicubic" else Taps(0, 1)
-    heads = Packer(source, taps, channels, Status.HOLE, Status.HOLE, (0.5, 0.5)).pack(places).heads
+    heads = Packer(source, taps, channels, Status.NO_DATA, Status.NO_DATA, (0.5, 0.5)).pack(places).heads
     found = set(np.unique(heads[..., 2] & 255))
     # Three channels need three times the width.
     assert found & {what, what | (channels == 3 and what < 6)}
-    op = UndistortImage(model=places, interpolation=interpolation, channels=channels, walk="strip")
+    op = UndistortImage(model=places, interpolation=interpolation, channels=channels, variant="vector")
     assert_right(op(image, device=device), image, places, channels=channels, interpolation=interpolation)
 
 
@@ -139,7 +145,7 @@ def test_every_window(device: Device, name: str, channels: int, interpolation: A
     interpolation=st.sampled_from(["bilinear", "bicubic"]),
     channels=st.sampled_from([1, 3]),
     dtype=st.sampled_from(DTYPES),
-    walk=st.sampled_from(WALKS),
+    variant=st.sampled_from(VARIANTS),
 )
 def test_any_shape_and_map(
     device: Device,
@@ -149,14 +155,14 @@ def test_any_shape_and_map(
     scale: float,
     shift: Any,
     dtype: Any,
-    walk: Any,
+    variant: Any,
     **options: Any,
 ) -> None:
     rng = np.random.default_rng(1)
     channels = options.pop("channels")
     image = pixels(rng, (*source, 3)[: 2 + channels // 3], dtype)
     places = map_of(shape, source, turn=turn, scale=scale) + shift
-    op = UndistortImage(model=places, channels=channels, walk=walk, **options)
+    op = UndistortImage(model=places, channels=channels, variant=variant, **options)
     guarded = Guarded(op(image, device=device))
     result = op(image, device=device, out=guarded.out)
     guarded.assert_intact()
@@ -176,7 +182,7 @@ def test_no_window_reads_outside_the_image(
     source: Any, turn: float, scale: float, shift: Any, bicubic: bool, channels: int
 ) -> None:
     taps = Taps(1, 2) if bicubic else Taps(0, 1)
-    packed = Packer(source, taps, channels, Status.HOLE, None, (0.5, 0.5)).pack(
+    packed = Packer(source, taps, channels, Status.NO_DATA, None, (0.5, 0.5)).pack(
         map_of((40, 48), source, turn=turn, scale=scale) + shift
     )
     what = packed.heads[..., 2] & 255
@@ -195,16 +201,18 @@ def test_no_window_reads_outside_the_image(
     assert (highest <= source[0] * source[1] * channels).all()
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_whole_shifts_are_exact(
-    device: Device, dtype: Any, interpolation: Any, walk: Any, rng: np.random.Generator
+    device: Device, dtype: Any, interpolation: Any, variant: Any, rng: np.random.Generator
 ) -> None:
     image = pixels(rng, (37, 129), dtype)
     grid = np.stack(np.meshgrid(np.arange(129.0), np.arange(37.0)), -1)
     for shift in ((0, 0), (3, -2), (-17, 5)):
-        op = UndistortImage(model=grid + shift, interpolation=interpolation, border="constant", value=1.0, walk=walk)
+        op = UndistortImage(
+            model=grid + shift, interpolation=interpolation, border="constant", value=1.0, variant=variant
+        )
         expected = np.ones_like(image)
         inner = [slice(max(-s, 0), size - max(s, 0)) for s, size in zip(shift[::-1], image.shape, strict=True)]
         outer = [slice(max(s, 0), size + min(s, 0)) for s, size in zip(shift[::-1], image.shape, strict=True)]
@@ -232,9 +240,9 @@ def test_against_opencv(device: Device, border: str, dtype: Any, interpolation: 
     np.testing.assert_allclose(ours.astype(np.float64), theirs, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("border", BORDERS)
-def test_places_that_are_none_or_far_away(device: Device, border: Any, walk: Any, rng: np.random.Generator) -> None:
+def test_places_that_are_none_or_far_away(device: Device, border: Any, variant: Any, rng: np.random.Generator) -> None:
     image = pixels(rng, (20, 40), np.float32)
     places = map_of((6, 64), image.shape)
     places[0, ::3] = math.nan
@@ -242,22 +250,22 @@ def test_places_that_are_none_or_far_away(device: Device, border: Any, walk: Any
     places[2, 5:] = 1e12
     places[3] = (-3e9, 4.0)
     places[4, :, 0] = np.geomspace(1.0, 1e300, 64)
-    op = UndistortImage(model=places, border=border, value=0.5, walk=walk)
+    op = UndistortImage(model=places, border=border, value=0.5, variant=variant)
     result = op(image, device=device)
     if border != "reflect":
         assert_right(result, image, places, border=border, value=0.5)
     lost = ~np.isfinite(places).all(-1)
-    assert (result.status[lost | (np.abs(places) > 1e3).any(-1)] == Status.HOLE).all()
+    assert (result.status[lost | (np.abs(places) > 1e3).any(-1)] == Status.NO_DATA).all()
     expected = 0.5 if border == "constant" else math.nan
     np.testing.assert_array_equal(result.image[lost], expected)
     assert np.isfinite(result.image[~lost]).all() or border == "mask"
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("coordinates", ["map", "computed"])
-def test_past_the_fold(device: Device, coordinates: Any, walk: Any, rng: np.random.Generator) -> None:
+def test_past_the_fold(device: Device, coordinates: Any, variant: Any, rng: np.random.Generator) -> None:
     lens = Lens(k1=-2e-4, centre=(50.0, 30.0))
-    op = UndistortImage(model=lens, coordinates=coordinates, walk=walk)
+    op = UndistortImage(model=lens, coordinates=coordinates, variant=variant)
     image = pixels(rng, (61, 101), np.uint8)
     result = op(image, device=device)
     folded = np.isnan(op.places(image.shape)).any(-1)
@@ -265,20 +273,20 @@ def test_past_the_fold(device: Device, coordinates: Any, walk: Any, rng: np.rand
     reach = np.hypot(*np.moveaxis(np.argwhere(np.ones_like(folded)) - (30.0, 50.0), -1, 0)).reshape(folded.shape)
     clear = np.abs(reach - lens.undistort([50.0 + 0.999999 * lens.fold_radius, 30.0])[0] + 50.0) > 0.01
     assert folded.any()
-    np.testing.assert_array_equal((result.status == Status.FOLDED)[clear], folded[clear])
+    np.testing.assert_array_equal((result.status == Status.NOT_INVERTIBLE)[clear], folded[clear])
     assert (result.image[folded & clear] == 0).all()
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
 def test_a_missing_pixel_spoils_only_what_looks_at_it(
-    device: Device, interpolation: Any, walk: Any, rng: np.random.Generator
+    device: Device, interpolation: Any, variant: Any, rng: np.random.Generator
 ) -> None:
     image = pixels(rng, (60, 100), np.float32)
     image[rng.integers(0, 60, 9), rng.integers(0, 100, 9)] = math.nan
     for turn in (0.3, 8.0):
         places = map_of((50, 96), image.shape, turn=turn, scale=0.9)
-        result = UndistortImage(model=places, interpolation=interpolation, walk=walk)(image, device=device)
+        result = UndistortImage(model=places, interpolation=interpolation, variant=variant)(image, device=device)
         expected, _ = reference.undistort(image[..., None].astype(np.float64), places, interpolation=interpolation)
         np.testing.assert_array_equal(np.isnan(result.image), np.isnan(expected[..., 0]))
 
@@ -290,17 +298,17 @@ CAMERA = Camera(
 OTHER = ((130.0, 0.0, 70.0), (0.0, 128.0, 52.0), (0.0, 0.0, 1.0))
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("precision", ["single", "double"])
 @pytest.mark.parametrize(
     ("model", "matrix"), [(Lens(k1=2e-6, centre=(60.0, 40.0)), None), (CAMERA, None), (CAMERA, OTHER)]
 )
 def test_computed_places(
-    device: Device, model: Any, matrix: Any, precision: Any, channels: int, walk: Any, rng: np.random.Generator
+    device: Device, model: Any, matrix: Any, precision: Any, channels: int, variant: Any, rng: np.random.Generator
 ) -> None:
     image = pixels(rng, (83, 117, 3)[: 2 + channels // 3], np.float32)
-    options: dict[str, Any] = {"model": model, "matrix": matrix, "channels": channels, "walk": walk}
+    options: dict[str, Any] = {"model": model, "matrix": matrix, "channels": channels, "variant": variant}
     op = UndistortImage(**options, coordinates="computed", precision=precision, size=(140, 100), border="replicate")
     result = op(image, device=device)
     places = op.places((83, 117))
@@ -325,7 +333,7 @@ def test_region_size_and_matrix(device: Device, rng: np.random.Generator) -> Non
         np.testing.assert_array_equal(part.status, whole.status[20:53, 31:81])
         np.testing.assert_allclose(part.image, whole.image[20:53, 31:81], atol=4 * 4e-5)
     beyond = UndistortImage(model=CAMERA, region=(-60, -60, 20, 20))(image, device=device)
-    assert (beyond.status == Status.HOLE).all()
+    assert (beyond.status == Status.NO_DATA).all()
     places = PixelMap(map_of((40, 60), image.shape))
     part = UndistortImage(model=places, region=(7, 3, 30, 20))(image, device=device)
     np.testing.assert_allclose(
@@ -357,7 +365,7 @@ def test_batches_beyond_the_caches_are_the_same(device: Device, columns: int, rn
 def test_wide_maps_are_kept_exactly_where_cubics_do_not_do(device: Device, rng: np.random.Generator) -> None:
     image = pixels(rng, (50, 60), np.float32)
     places = map_of((30, 50), image.shape) + rng.uniform(-0.5, 0.5, (30, 50, 2))
-    packed = Packer(image.shape, Taps(0, 1), 1, Status.HOLE, Status.HOLE, (0.5, 0.5)).pack(places)
+    packed = Packer(image.shape, Taps(0, 1), 1, Status.NO_DATA, Status.NO_DATA, (0.5, 0.5)).pack(places)
     assert len(packed.points) == 30 * math.ceil(50 / RUN)
     assert_right(UndistortImage(model=places)(image, device=device), image, places)
 

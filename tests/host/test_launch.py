@@ -112,18 +112,18 @@ def test_work_sizes() -> None:
 
 def test_variant_follows_the_device_unless_it_is_named() -> None:
     cpu, gpu = Machine(), Machine(is_cpu=False)
-    for machine, walk, expected in (
+    for machine, variant, expected in (
         (cpu, "auto", True),
         (gpu, "auto", False),
-        (cpu, "item", False),
-        (gpu, "strip", True),
+        (cpu, "work_item", False),
+        (gpu, "vector", True),
     ):
-        build = builder((100,), machine=machine, walk=walk)
+        build = builder((100,), machine=machine, variant=variant)
         assert build.uses_vectors is expected
         assert build.work(100, each=16, group=64) == (vector_work(100, 16) if expected else padded_groups(100, 64))
     assert builder((15,)).work(15, each=16, group=64, least=16, fitted=True) == WorkSize((15,), (15,), 15)
-    with pytest.raises(ValueError, match="walk must be"):
-        _ = builder((100,), walk="sideways").uses_vectors
+    with pytest.raises(ValueError, match="variant must be"):
+        _ = builder((100,), variant="sideways").uses_vectors
 
 
 def test_shares_of_two_cores() -> None:
@@ -136,7 +136,7 @@ def test_shares_of_two_cores() -> None:
 
 
 def test_the_launch_of_a_builder_is_the_one_written_by_hand() -> None:
-    build = builder((100, 2), np.float64, precision="double", walk="strip")
+    build = builder((100, 2), np.float64, precision="double", variant="vector")
     found = build.launch(
         "scale/scale.cl",
         "scale_points",
@@ -159,7 +159,7 @@ def test_the_launch_of_a_builder_is_the_one_written_by_hand() -> None:
         },
         global_size=(7,),
         local_size=(1,),
-        defines={"REAL_IS_DOUBLE": None, "STRIP": None, "INPUT": "double", "TERMS": 3, "OFFSET": None},
+        defines={"REAL_IS_DOUBLE": None, "VECTOR_VARIANT": None, "INPUT": "double", "TERMS": 3, "OFFSET": None},
         arguments=[np.int32(100)],
         passes_once=True,
     )
@@ -170,12 +170,12 @@ def test_the_launch_of_a_builder_is_the_one_written_by_hand() -> None:
 @pytest.mark.parametrize("rows", [1 << 20, 4 << 20])
 def test_only_a_cpu_writes_much_data_past_its_caches(rows: int) -> None:
     """One input and one output of 4 bytes a row: 8 MB fit into the cache of 32 MB, 32 MB and a status do not."""
-    for machine, walk in ((Machine(), "strip"), (Machine(), "item"), (Machine(is_cpu=False), "strip")):
-        build = builder((rows,), machine=machine, walk=walk)
+    for machine, variant in ((Machine(), "vector"), (Machine(), "work_item"), (Machine(is_cpu=False), "vector")):
+        build = builder((rows,), machine=machine, variant=variant)
         outputs = build.outputs({"value": (rows,), "status": (rows,)})
         work = build.work(rows, each=16, group=64)
         launch = build.launch("a.cl", "a", work=work, outputs=outputs, streams=True)
-        assert ("PAST_CACHES" in launch.defines) == (rows > 1 << 20 and machine.is_cpu and walk == "strip")
+        assert ("PAST_CACHES" in launch.defines) == (rows > 1 << 20 and machine.is_cpu and variant == "vector")
         assert "PAST_CACHES" not in build.launch("a.cl", "a", work=work, outputs=outputs).defines
 
 

@@ -93,7 +93,7 @@ def test_most_rows_have_a_point_and_the_others_a_reason(scan):
     assert 0.88 < good.mean() < 0.95
     assert np.all(scan.points.status[~good] != 0)
     # Behind the left edge of the cylinder and of the boxes the light is hidden, and the sweep begins and ends outside.
-    assert 0.03 < np.mean((scan.points.status & Status.DARK) != 0) < 0.12
+    assert 0.03 < np.mean((scan.points.status & Status.LOW_SIGNAL) != 0) < 0.12
 
 
 def test_floor_ceiling_and_wall_are_planes_at_right_angles(scan):
@@ -163,4 +163,4 @@ def test_the_height_map_shows_them(scan):
         assert abs(np.nanmedian(made.z[row - 2 : row + 3, column - 2 : column + 3]) - height) < 0.01
     # In the sphere's shadow nothing is invented.
     column, row = round((0.23 - grid.left) / grid.cell_x), round((grid.top - 1.35) / grid.cell_y)
-    assert np.all(made.status[row - 3 : row + 4, column - 3 : column + 4] == Status.HOLE)
+    assert np.all(made.status[row - 3 : row + 4, column - 3 : column + 4] == Status.NO_DATA)

@@ -92,8 +92,8 @@ def test_valley_has_no_peak() -> None:
 
 def test_dark_pinhole() -> None:
     light = np.array([[0.0, 5.0, 3.0], [3.0, 5.0, -1.0], [0.0, 0.0, 0.0], [3.0, 5.0, 3.0]])
-    np.testing.assert_array_equal(system()(light).status, [Status.DARK, Status.DARK, Status.DARK, 0])
-    np.testing.assert_array_equal(system(minimum=3.5)(light[3]).status, Status.DARK)
+    np.testing.assert_array_equal(system()(light).status, [Status.LOW_SIGNAL, Status.LOW_SIGNAL, Status.LOW_SIGNAL, 0])
+    np.testing.assert_array_equal(system(minimum=3.5)(light[3]).status, Status.LOW_SIGNAL)
 
 
 def test_dark_pinhole_among_many_is_left_out() -> None:
@@ -104,7 +104,7 @@ def test_dark_pinhole_among_many_is_left_out() -> None:
     assert reading.status == 0
     assert reading.image_distance == pytest.approx(peak, abs=1e-14)
     light[:3] = 0.0
-    assert system()(light).status == Status.DARK
+    assert system()(light).status == Status.LOW_SIGNAL
 
 
 def test_peak_outside_the_pinholes() -> None:

@@ -16,13 +16,13 @@ from gpuvision.host import Device
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.status import Status
-from reference.line import AMBIGUOUS, DARK, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
+from reference.line import AMBIGUOUS, LOW_SIGNAL, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
 from reference.triangulation import triangulate
 
 TOP = {"uint8": 180.0, "uint16": 40_000.0, "float32": 100.0}
 LEVEL = {"uint8": 20, "uint16": 4000, "float32": 8.5}
-WALKS = ("strip", "item")
-EVERY = list(itertools.product(TOP, ("columns", "rows"), WALKS))
+VARIANTS = ("vector", "work_item")
+EVERY = list(itertools.product(TOP, ("columns", "rows"), VARIANTS))
 
 
 def line_frames(rng, dtype, shape, along="columns", sigma=1.7):
@@ -51,10 +51,10 @@ def assert_same(reading, expected, precision=np.float32, slack=1.0):
 
 
 @pytest.mark.parametrize("method", ["whole", "windowed"])
-@pytest.mark.parametrize(("dtype", "along", "walk"), EVERY)
-def test_centre_of_gravity(device, rng, method, dtype, along, walk):
+@pytest.mark.parametrize(("dtype", "along", "variant"), EVERY)
+def test_centre_of_gravity(device, rng, method, dtype, along, variant):
     parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": 6}
-    readout = LineReadout(walk=walk, **parameters)
+    readout = LineReadout(variant=variant, **parameters)
     # The last one has a column more than one strip takes, or a row of many blocks and a rest.
     for shape in ((2, 137, 201), (64, 64), (50, 1025)):
         frames = line_frames(rng, dtype, shape, along)
@@ -63,23 +63,23 @@ def test_centre_of_gravity(device, rng, method, dtype, along, walk):
 
 
 @pytest.mark.parametrize(
-    ("method", "dtype", "along", "walk"),
+    ("method", "dtype", "along", "variant"),
     [
-        ("gauss3", "uint8", "columns", "strip"),
-        ("gauss3", "float32", "rows", "item"),
-        ("fir", "uint16", "rows", "strip"),
-        ("fir", "uint8", "columns", "item"),
-        ("ml", "uint8", "columns", "strip"),
-        ("ml", "uint16", "rows", "item"),
+        ("gauss3", "uint8", "columns", "vector"),
+        ("gauss3", "float32", "rows", "work_item"),
+        ("fir", "uint16", "rows", "vector"),
+        ("fir", "uint8", "columns", "work_item"),
+        ("ml", "uint8", "columns", "vector"),
+        ("ml", "uint16", "rows", "work_item"),
     ],
 )
-def test_fits(device, rng, method, dtype, along, walk):
+def test_fits(device, rng, method, dtype, along, variant):
     noise = {"read_noise": TOP[dtype] * 0.02, "gain": 0.3} if method == "ml" else {}
     parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": 7, **noise}
     frames = line_frames(rng, dtype, (40, 83) if along == "columns" else (83, 40), along)
     if dtype == "uint8":
         frames = np.pad(frames, ((5, 5), (0, 0)))
-    reading = LineReadout(walk=walk, **parameters)(frames, device=device)
+    reading = LineReadout(variant=variant, **parameters)(frames, device=device)
     expected = read_lines(frames, **parameters)
     if method == "ml":
         # The fit stops when a step moves less than 1e-4 px; the next one would move less than a tenth of that.
@@ -94,10 +94,10 @@ def test_fits(device, rng, method, dtype, along, walk):
 
 @pytest.mark.parametrize("choice", ["first", "last", "nearest", "strongest"])
 @pytest.mark.parametrize(
-    ("dtype", "along", "walk"),
-    [("uint8", "columns", "strip"), ("uint16", "rows", "strip"), ("float32", "columns", "item")],
+    ("dtype", "along", "variant"),
+    [("uint8", "columns", "vector"), ("uint16", "rows", "vector"), ("float32", "columns", "work_item")],
 )
-def test_choice(device, rng, choice, dtype, along, walk):
+def test_choice(device, rng, choice, dtype, along, variant):
     parameters = {"along": along, "threshold": LEVEL[dtype], "window": 3, "choice": choice}
     parameters |= {"minimum_width": 2, "maximum_width": 9, "minimum_peak": LEVEL[dtype] * 2}
     shape = (2, 90, 50) if along == "columns" else (2, 50, 90)
@@ -111,17 +111,17 @@ def test_choice(device, rng, choice, dtype, along, walk):
         parameters["previous"] = previous
     expected = read_lines(frames, **parameters)
     parameters.pop("previous", None)
-    assert_same(LineReadout(walk=walk, **parameters)(frames, *second, device=device), expected)
+    assert_same(LineReadout(variant=variant, **parameters)(frames, *second, device=device), expected)
 
 
-@pytest.mark.parametrize("walk", WALKS)
-def test_double(device, rng, walk):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_double(device, rng, variant):
     if not device.has_double:
         pytest.skip("no double precision on this device")
     frames = line_frames(rng, "float32", (130, 33))
     for method in ("whole", "windowed"):
         parameters = {"method": method, "threshold": 8.5, "window": 6}
-        reading = LineReadout(walk=walk, precision="double", **parameters)(frames, device=device)
+        reading = LineReadout(variant=variant, precision="double", **parameters)(frames, device=device)
         assert reading.position.dtype == np.float64
         assert_same(reading, read_lines(frames, **parameters), np.float64, slack=10.0)
 
@@ -131,19 +131,21 @@ def test_double(device, rng, walk):
 def test_any_shape(rows, columns, frames, seed):
     rng = np.random.default_rng(seed)
     image = line_frames(rng, "uint8", (frames, rows, columns))
-    for device, method, walk in itertools.product(Device.all(), ("whole", "windowed"), WALKS):
+    for device, method, variant in itertools.product(Device.all(), ("whole", "windowed"), VARIANTS):
         parameters = {"method": method, "threshold": 20, "window": 6}
         assert_same(
-            LineReadout(walk=walk, **parameters)(image, device=device), read_lines(image, **parameters), slack=4.0
+            LineReadout(variant=variant, **parameters)(image, device=device), read_lines(image, **parameters), slack=4.0
         )
 
 
-@pytest.mark.parametrize(("method", "walk"), [("whole", "strip"), ("windowed", "strip"), ("windowed", "item")])
+@pytest.mark.parametrize(
+    ("method", "variant"), [("whole", "vector"), ("windowed", "vector"), ("windowed", "work_item")]
+)
 @pytest.mark.parametrize("along", ["columns", "rows"])
-def test_writes_nothing_else(device, rng, method, walk, along):
+def test_writes_nothing_else(device, rng, method, variant, along):
     shape = (2, 71, 83)
     frames = line_frames(rng, "uint8", shape, along)
-    readout = LineReadout(method=method, walk=walk, along=along, threshold=20, window=6)
+    readout = LineReadout(method=method, variant=variant, along=along, threshold=20, window=6)
     guarded = Guarded(readout(frames, device=device))
     assert readout(frames, device=device, out=guarded.out) is guarded.out
     guarded.assert_intact()
@@ -165,7 +167,7 @@ def column(*values, dtype=np.uint8):
 
 DARKNESS = (0,) * 6
 EXTREMES = {
-    "all zero": (column(*[0] * 20), DARK),
+    "all zero": (column(*[0] * 20), LOW_SIGNAL),
     "flat top": (column(*DARKNESS, 90, 255, 255, 255, 255, 255, 60, *DARKNESS), SATURATED),
     "top wider than half the window": (column(*DARKNESS, *[255] * 8, *DARKNESS), SATURATED),
     "top as wide as the window": (column(*DARKNESS, *[255] * 9, *DARKNESS), SATURATED),
@@ -179,15 +181,15 @@ EXTREMES = {
     "tie of neighbours": (column(*DARKNESS, 30, 90, 90, 30, *DARKNESS), 0),
     "one pixel": (column(*DARKNESS, 200, *DARKNESS), 0),
     "narrow": (column(*DARKNESS, 1, 250, 3, *DARKNESS), 0),
-    "plateau at the threshold": (column(*DARKNESS, 5, 5, 5, 5, *DARKNESS), DARK),
+    "plateau at the threshold": (column(*DARKNESS, 5, 5, 5, 5, *DARKNESS), LOW_SIGNAL),
     "all saturated": (column(*[255] * 20), SATURATED | OUT_OF_RANGE | AMBIGUOUS),
 }
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("along", ["columns", "rows"])
-def test_extremes(device, walk, along):
-    readout = LineReadout(threshold=5, window=4, ambiguity=0.8, along=along, walk=walk)
+def test_extremes(device, variant, along):
+    readout = LineReadout(threshold=5, window=4, ambiguity=0.8, along=along, variant=variant)
     for name, (frame, status) in EXTREMES.items():
         frame = frame if along == "columns" else np.ascontiguousarray(np.pad(frame.T, ((0, 0), (0, 64))))
         if along == "rows" and name in ("last row", "all saturated", "wide top at the end"):
@@ -195,38 +197,38 @@ def test_extremes(device, walk, along):
         reading = readout(frame, device=device)
         assert_same(reading, read_lines(frame, threshold=5, window=4, ambiguity=0.8, along=along))
         assert set(reading.status.ravel()) == {status}, name
-        assert np.all(np.isnan(reading.position) == bool(status & (DARK | OUT_OF_RANGE))), name
+        assert np.all(np.isnan(reading.position) == bool(status & (LOW_SIGNAL | OUT_OF_RANGE))), name
 
 
 def test_flat_top_is_read_in_its_middle(device):
     frame = column(*[0] * 9, *[255] * 6, *[0] * 9)
     for method in ("windowed", "gauss3", "fir"):
         reading = LineReadout(method=method, threshold=5, window=6)(frame, device=device)
-        np.testing.assert_allclose(reading.position[reading.status & DARK == 0], 11.5)
+        np.testing.assert_allclose(reading.position[reading.status & LOW_SIGNAL == 0], 11.5)
 
 
 METHODS_WITH_PEAKS = ("windowed", "gauss3", "fir", "ml")
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize(("along", "choice"), [("columns", "strongest"), ("rows", "strongest"), ("columns", "last")])
-def test_top_wider_than_the_window(device, walk, along, choice):
+def test_top_wider_than_the_window(device, variant, along, choice):
     for method, width in itertools.product(METHODS_WITH_PEAKS, (20, 21)):
         frame = column(*[0] * 20, *[255] * width, *[0] * 40)
         frame = frame if along == "columns" else np.ascontiguousarray(frame.T)
-        readout = LineReadout(method=method, threshold=5, window=4, along=along, choice=choice, walk=walk)
+        readout = LineReadout(method=method, threshold=5, window=4, along=along, choice=choice, variant=variant)
         reading = readout(frame, device=device)
         np.testing.assert_array_equal(reading.position, 20 + (width - 1) / 2)
         np.testing.assert_array_equal(reading.status, SATURATED | AMBIGUOUS)
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("choice", ["first", "strongest"])
-def test_only_neighbours_make_a_flat_top(device, walk, choice):
+def test_only_neighbours_make_a_flat_top(device, variant, choice):
     frame = column(*[0] * 19, 100, 255, 100, *[0] * 4, 100, 255, 255, *[0] * 20)
     for method in ("gauss3", "fir", "windowed"):
         parameters = {"method": method, "threshold": 5, "window": 8 if method == "gauss3" else 3, "choice": choice}
-        reading = LineReadout(walk=walk, **parameters)(frame, device=device)
+        reading = LineReadout(variant=variant, **parameters)(frame, device=device)
         np.testing.assert_array_equal(reading.status, SATURATED)
         np.testing.assert_allclose(reading.position, 20.0, atol=1e-5)
 
@@ -237,8 +239,8 @@ def test_fit_of_noise_stays_at_its_peak(device, rng, dtype, gain):
     frame = rng.integers(0, 255, (70, 400)).astype(dtype)
     gravity = LineReadout(threshold=20, window=5)(frame, device=device)
     readings = []
-    for walk in WALKS:
-        fit = LineReadout(method="ml", threshold=20, window=5, gain=gain, walk=walk)(frame, device=device)
+    for variant in VARIANTS:
+        fit = LineReadout(method="ml", threshold=20, window=5, gain=gain, variant=variant)(frame, device=device)
         given = ~np.isnan(gravity.position)
         np.testing.assert_array_equal(np.isnan(fit.position), ~given)
         peak = frame.argmax(axis=0)
@@ -263,9 +265,9 @@ def test_fit_leaves_saturated_samples_out(device):
     np.testing.assert_allclose(reading.position, place, atol=0.02)
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("along", ["columns", "rows"])
-def test_not_finite(device, rng, walk, along):
+def test_not_finite(device, rng, variant, along):
     for method, choice in (("whole", "strongest"), ("windowed", "strongest"), ("windowed", "last")):
         frames = line_frames(rng, "float32", (60, 70), along) - 50.0  # negative after a dark frame
         frames[7, 20], frames[11, 21], frames[13, 22] = np.nan, np.inf, -np.inf
@@ -278,7 +280,7 @@ def test_not_finite(device, rng, walk, along):
             "saturation": 1e9,
         }
         reading, expected = (
-            LineReadout(walk=walk, **parameters)(frames, device=device),
+            LineReadout(variant=variant, **parameters)(frames, device=device),
             read_lines(frames, **parameters),
         )
         lost = expected["status"] & NOT_FINITE != 0
@@ -288,51 +290,51 @@ def test_not_finite(device, rng, walk, along):
         np.testing.assert_allclose(reading.position[~lost], expected["position"][~lost], rtol=4e-7, atol=2e-5)
 
 
-@pytest.mark.parametrize(("along", "walk"), list(itertools.product(("columns", "rows"), WALKS)))
+@pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
 @pytest.mark.parametrize("method", ["whole", "windowed", "fir"])
-def test_nothing_finite(device, along, walk, method):
+def test_nothing_finite(device, along, variant, method):
     """Profiles without any number have no peak whose place could be looked up."""
     second = {} if method == "whole" else {"ambiguity": 0.5}
-    readout = LineReadout(along=along, walk=walk, method=method, threshold=1, **second)
+    readout = LineReadout(along=along, variant=variant, method=method, threshold=1, **second)
     for value in (np.nan, -np.inf, np.inf):
         reading = readout(np.full((64, 64), value, np.float32), device=device)
         assert np.all(reading.status & NOT_FINITE)
         assert np.isnan(reading.position).all()
 
 
-@pytest.mark.parametrize(("along", "walk"), list(itertools.product(("columns", "rows"), WALKS)))
+@pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
 @pytest.mark.parametrize("choice", ["strongest", "last"])
-def test_sums_beyond_the_largest_number(device, along, walk, choice):
+def test_sums_beyond_the_largest_number(device, along, variant, choice):
     """Samples that are numbers, but their light is none in single precision."""
     frame = column(*[0.0] * 20, 2e38, 3e38, 2e38, *[0.0] * 41, dtype=np.float32)
     for threshold, method in itertools.product((-1e38, 1.0), ("windowed", "whole", "gauss3")):
         if method == "whole" and choice == "last":
             continue
-        readout = LineReadout(method=method, along=along, threshold=threshold, choice=choice, walk=walk)
+        readout = LineReadout(method=method, along=along, threshold=threshold, choice=choice, variant=variant)
         reading = readout(frame if along == "columns" else np.ascontiguousarray(frame.T), device=device)
         np.testing.assert_array_equal(reading.status, NOT_FINITE)
         assert all(np.isnan(getattr(reading, name)).all() for name in ("position", "peak", "width", "total"))
 
 
-@pytest.mark.parametrize(("along", "walk"), list(itertools.product(("columns", "rows"), WALKS)))
+@pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
 @pytest.mark.parametrize("method", ["whole", "windowed"])
-def test_faintest_light(device, along, walk, method):
+def test_faintest_light(device, along, variant, method):
     """Light whose reciprocal is infinite: read, or dark on a device that takes such numbers for zero."""
     frame = column(*[0.0] * 20, 1e-40, 2e-40, 1e-40, *[0.0] * 41, dtype=np.float32)
-    readout = LineReadout(method=method, along=along, walk=walk)
+    readout = LineReadout(method=method, along=along, variant=variant)
     reading = readout(frame if along == "columns" else np.ascontiguousarray(frame.T), device=device)
     read = reading.status == 0
-    assert np.all(reading.status[~read] & (DARK | NOT_FINITE) != 0)
+    assert np.all(reading.status[~read] & (LOW_SIGNAL | NOT_FINITE) != 0)
     np.testing.assert_allclose(reading.position[read], 21.0, atol=1e-5)
     assert np.isnan(reading.position[~read]).all()
 
 
-@pytest.mark.parametrize("walk", WALKS)
-def test_large_moments_are_exact(device, rng, walk):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_large_moments_are_exact(device, rng, variant):
     """16 bit, 4100 rows on a bright background: the moment needs 40 bits."""
     frame = rng.integers(2900, 3100, (4100, 64)).astype(np.uint16)
     frame[3270:3275] = 65_535
-    reading = LineReadout(method="whole", walk=walk)(frame, device=device)
+    reading = LineReadout(method="whole", variant=variant)(frame, device=device)
     expected = read_lines(frame, method="whole")
     np.testing.assert_allclose(reading.position, expected["position"], rtol=1.2e-7)
 
@@ -350,7 +352,7 @@ def test_tall_frames(device, rng):
     frame = np.zeros((9000, 70), np.uint8)
     frame[rng.integers(20, 8980, 70), np.arange(70)] = 200
     parameters = {"threshold": 5, "window": 4}
-    assert_same(LineReadout(walk="strip", **parameters)(frame, device=device), read_lines(frame, **parameters))
+    assert_same(LineReadout(variant="vector", **parameters)(frame, device=device), read_lines(frame, **parameters))
 
 
 @pytest.mark.parametrize(
@@ -393,16 +395,16 @@ def test_counts_of_numpy(device, rng):
     np.testing.assert_array_equal(same(frame, device=device).position, plain(frame, device=device).position)
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("method", ["whole", "windowed"])
-def test_widths_beyond_the_profile(device, rng, method, walk):
+def test_widths_beyond_the_profile(device, rng, method, variant):
     frame = line_frames(rng, "uint8", (64, 70))
-    parameters = {"method": method, "threshold": 20, "walk": walk}
+    parameters = {"method": method, "threshold": 20, "variant": variant}
     free = LineReadout(**parameters)(frame, device=device)
     wide = LineReadout(maximum_width=2**31, **parameters)(frame, device=device)
     np.testing.assert_array_equal(wide.position, free.position)
     none = LineReadout(minimum_width=2**31, **parameters)(frame, device=device)
-    assert np.all(none.status & DARK)
+    assert np.all(none.status & LOW_SIGNAL)
 
 
 def test_bad_frames(device):
@@ -423,14 +425,14 @@ SHEET = Triangulation(
 LENS = Lens(k1=4e-8, k2=1e-14, centre=(450.0, 350.0))
 
 
-@pytest.mark.parametrize(("along", "walk"), list(itertools.product(("columns", "rows"), WALKS)))
-def test_triangulates_in_the_same_pass(device, rng, along, walk):
+@pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
+def test_triangulates_in_the_same_pass(device, rng, along, variant):
     sheet = replace(SHEET, along=along, lens=LENS)
     frames = line_frames(rng, "uint8", (2, 99, 130), along)
     axes = SampleAxes(position_origin=300.0, sample_origin=400.0, sample_pitch=2.0)
     for method in ("whole", "windowed"):
         parameters = {"method": method, "along": along, "threshold": 20, "window": 6}
-        reading = LineReadout(walk=walk, triangulation=sheet, axes=axes, **parameters)(frames, device=device)
+        reading = LineReadout(variant=variant, triangulation=sheet, axes=axes, **parameters)(frames, device=device)
         expected = read_lines(frames, **parameters)
         samples = np.broadcast_to(400.0 + 2.0 * np.arange(reading.position.shape[1]), reading.position.shape)
         g, h, status = triangulate(

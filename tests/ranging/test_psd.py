@@ -17,7 +17,7 @@ from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.status import Status
 from reference import psd as reference
 
-WALKS = ("strip", "item")
+VARIANTS = ("vector", "work_item")
 LENGTH = 6e-3
 # Roundings of L/2 in the position: of the difference, the sum, the quotient and the product, and of the packed
 # constant itself; and of the parameters where they act.
@@ -45,12 +45,14 @@ def assert_like_reference(readout, reading, left, right):
         np.testing.assert_allclose(reading.sigma, expected.sigma, rtol=2e-5 if real == np.float32 else 1e-12)
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("dtype", ["float32", "float64", "uint16"])
 @pytest.mark.parametrize("layout", ["pairs", "planar"])
 @pytest.mark.parametrize("batch", [(1,), (15,), (16,), (17,), (3, 5), (4095,), (4097,), (8193,), (7, 1023)])
-def test_like_float64(device, rng, walk, dtype, layout, batch):
-    readout = PsdReadout(strip_length=LENGTH, walk=walk, layout=layout, ampere=1e-11 if dtype == "uint16" else 1.0)
+def test_like_float64(device, rng, variant, dtype, layout, batch):
+    readout = PsdReadout(
+        strip_length=LENGTH, variant=variant, layout=layout, ampere=1e-11 if dtype == "uint16" else 1.0
+    )
     values = currents(rng, (2, *batch), dtype)
     given_ = np.ascontiguousarray(np.moveaxis(values, 0, -1)) if layout == "pairs" else values
     reading = readout(given_, device=device)
@@ -71,8 +73,8 @@ def test_more_than_the_caches_hold(device, rng, shift):
     assert_like_reference(readout, readout(values, device=device, out=out), *values)
 
 
-@pytest.mark.parametrize("walk", WALKS)
-def test_everything_at_once(device, rng, walk):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_everything_at_once(device, rng, variant):
     strips = 37
     linearity = tuple(map(tuple, rng.normal(0, 20e-6, (strips, 9))))
     readout = PsdReadout(
@@ -86,7 +88,7 @@ def test_everything_at_once(device, rng, walk):
         saturation=1.1e-6,
         linearity=linearity,
         noise=PsdNoise(independent=1e-11, opposed=2e-12, spot=50e-6, bandwidth=100e3),
-        walk=walk,
+        variant=variant,
     )
     codes = rng.integers(0, 65_536, (200, strips, 2)).astype(np.uint16)
     # A code that float32 and float64 put on two sides of a limit is no test of either.
@@ -100,14 +102,14 @@ def test_everything_at_once(device, rng, walk):
     np.testing.assert_allclose(reading.sigma[good], expected.sigma[good], rtol=2e-5)
 
 
-@pytest.mark.parametrize("walk", WALKS)
-def test_every_reason_is_told(device, walk):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_reason_is_told(device, variant):
     nan, inf = np.nan, np.inf
     cases = [
         ((1.0, 3.0), Status.OK),
-        ((0.0, 0.0), Status.DARK),
-        ((0.04, 0.05), Status.DARK),
-        ((-0.5, 0.2), Status.DARK),
+        ((0.0, 0.0), Status.LOW_SIGNAL),
+        ((0.04, 0.05), Status.LOW_SIGNAL),
+        ((-0.5, 0.2), Status.LOW_SIGNAL),
         ((-0.1, 2.0), Status.OUT_OF_RANGE),
         ((2.0, -0.1), Status.OUT_OF_RANGE),
         ((0.0, 2.0), Status.OK),
@@ -121,7 +123,7 @@ def test_every_reason_is_told(device, walk):
         ((inf, inf), Status.NOT_FINITE),
         ((-inf, inf), Status.NOT_FINITE),
     ]
-    readout = PsdReadout(strip_length=2.0, minimum_total=0.1, saturation=8.0, walk=walk)
+    readout = PsdReadout(strip_length=2.0, minimum_total=0.1, saturation=8.0, variant=variant)
     for repeat in (1, 64):  # within one vector, and in blocks that are read twice
         pairs = np.repeat(np.array([pair for pair, _ in cases], np.float32), repeat, axis=0)
         reading = readout(pairs, device=device)
@@ -132,24 +134,24 @@ def test_every_reason_is_told(device, walk):
     assert readout(np.array([[2.0, 0.0]], np.float32), device=device).position[0] == -1.0
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("real", [np.float32, np.float64])
-def test_a_sum_that_overflows_is_flagged(device, walk, real):
+def test_a_sum_that_overflows_is_flagged(device, variant, real):
     largest = np.finfo(real).max
     pairs = np.array([[0.7 * largest, 0.9 * largest]] * 20, real)
-    reading = PsdReadout(strip_length=LENGTH, walk=walk)(pairs, device=device)
+    reading = PsdReadout(strip_length=LENGTH, variant=variant)(pairs, device=device)
     assert (reading.status == Status.SATURATED).all()
     assert np.isnan(reading.position).all()
 
 
-@pytest.mark.parametrize("walk", WALKS)
-def test_denormal_currents_keep_their_ratio_or_are_dark(device, walk):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_denormal_currents_keep_their_ratio_or_are_dark(device, variant):
     tiny = np.full((32, 2), 1e-40, np.float32) * np.array([1.0, 3.0], np.float32)
-    reading = PsdReadout(strip_length=2.0, walk=walk)(tiny, device=device)
+    reading = PsdReadout(strip_length=2.0, variant=variant)(tiny, device=device)
     good = reading.status == 0
     # A runtime may flush denormals: then the light is dark, not anywhere.
     np.testing.assert_allclose(reading.position[good], 0.5, rtol=1e-4)
-    assert (reading.status[~good] == Status.DARK).all()
+    assert (reading.status[~good] == Status.LOW_SIGNAL).all()
 
 
 def test_a_thousandfold_change_of_light_does_not_move_the_position(device):
@@ -220,8 +222,8 @@ def test_load_resistors_shrink_and_the_readout_undoes_it(device):
     assert readout(beyond, device=device).status[0] == Status.OUT_OF_RANGE
 
 
-@pytest.mark.parametrize("walk", WALKS)
-def test_the_sheet_in_the_same_pass(device, rng, walk):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_sheet_in_the_same_pass(device, rng, variant):
     sheet = Triangulation(
         homography=((0.8, 0.01, 1e-3), (0.02, 1.0, 2e-3), (5.0, 0.3, 1.0)),
         region=((-3e-3, 3e-3), (-4e-3, 4e-3)),
@@ -229,7 +231,7 @@ def test_the_sheet_in_the_same_pass(device, rng, walk):
     axes = SampleAxes(sample_pitch=1e-4, sample_origin=-32e-4)
     pairs = currents(rng, (50, 65, 2))
     pairs[3, 7] = np.nan
-    readout = PsdReadout(strip_length=LENGTH, triangulation=sheet, axes=axes, walk=walk)
+    readout = PsdReadout(strip_length=LENGTH, triangulation=sheet, axes=axes, variant=variant)
     reading = readout(pairs, device=device)
     expected = reference.read_out(readout, pairs[..., 0], pairs[..., 1])
     v = -32e-4 + 1e-4 * np.arange(65)
@@ -244,7 +246,7 @@ def test_the_sheet_in_the_same_pass(device, rng, walk):
         assert np.isnan(value[~good]).all()
 
 
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("variant", VARIANTS)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     batch=st.lists(st.integers(1, 90), min_size=0, max_size=3).map(tuple),
@@ -252,10 +254,10 @@ def test_the_sheet_in_the_same_pass(device, rng, walk):
     layout=st.sampled_from(["pairs", "planar"]),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_any_shape(device, walk, batch, dtype, layout, seed):
+def test_any_shape(device, variant, batch, dtype, layout, seed):
     values = currents(np.random.default_rng(seed), (2, *batch), dtype)
     given_ = np.ascontiguousarray(np.moveaxis(values, 0, -1)) if layout == "pairs" else values
-    readout = PsdReadout(strip_length=LENGTH, layout=layout, walk=walk)
+    readout = PsdReadout(strip_length=LENGTH, layout=layout, variant=variant)
     guarded = Guarded(readout(given_, device=device))
     reading = readout(given_, device=device, out=guarded.out)
     assert reading is guarded.out

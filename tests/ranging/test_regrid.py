@@ -65,20 +65,20 @@ def test_the_direction_of_the_scan_does_not_matter(device, directions):
 def test_a_scan_against_its_direction_is_folded_all_over(device):
     x, y, z, intensity, status = flat((40, 61))
     made = dataclasses.replace(OP, along="-x")(x, y, z, intensity, status, device=device)
-    assert np.all(made.status == Status.FOLDED)
+    assert np.all(made.status == Status.NOT_INVERTIBLE)
     assert np.all(np.isnan(made.z))
 
 
 def test_a_gap_stays_a_hole(device):
     frames = flat((40, 61))
     x, y, status = frames[0], frames[1], frames[4]
-    status[8:32, 20:40] = Status.DARK
+    status[8:32, 20:40] = Status.LOW_SIGNAL
     made = OP(*frames, device=device)
     inside = (GRID.x > x[0, 19]) & (GRID.x < x[0, 40])
     assert inside.sum() > 3
     within = (GRID.y > y[7, 0]) & (GRID.y < y[32, 0])
     gap = within[:, None] & inside
-    assert np.all(made.status[gap] == Status.HOLE)
+    assert np.all(made.status[gap] == Status.NO_DATA)
     assert np.all(np.isnan(made.z[gap]))
     assert np.all(made.status[~gap] == 0)
     bridged = dataclasses.replace(OP, max_gap=0.8, max_step=0.8)(*frames, device=device)
@@ -119,7 +119,7 @@ def test_a_scan_that_turns_back_is_folded_where_it_does(device, dtype):
     frames = [np.ascontiguousarray(each) for each in (x, y, z, z)] + [np.zeros(shape, np.uint8)]
     made = OP(*frames, device=device)
     folded = (GRID.x >= -0.5) & (GRID.x <= 0.5)
-    np.testing.assert_array_equal(made.status, np.broadcast_to(np.where(folded, Status.FOLDED, 0), GRID.shape))
+    np.testing.assert_array_equal(made.status, np.broadcast_to(np.where(folded, Status.NOT_INVERTIBLE, 0), GRID.shape))
     assert np.all(np.isnan(made.z[:, folded]))
     kept = dataclasses.replace(OP, folded="top")(*frames, device=device)
     np.testing.assert_array_equal(kept.status, made.status)
@@ -136,16 +136,16 @@ def test_of_two_surfaces_the_higher_one_is_kept(device):
     row = made.z[0, (GRID.x >= 0) & (GRID.x <= 1)]
     np.testing.assert_array_equal(row, np.ones(9))
     flags = made.status[0, (GRID.x >= 0) & (GRID.x <= 1)]
-    np.testing.assert_array_equal(flags, [0, 0] + [Status.FOLDED] * 7)
+    np.testing.assert_array_equal(flags, [0, 0] + [Status.NOT_INVERTIBLE] * 7)
 
 
 def test_noise_within_the_tolerance_is_no_fold(device, rng):
     x, y, z, intensity, status = flat((40, 61))
     x = x + rng.uniform(-0.03, 0.03, x.shape)
     assert np.any(np.diff(x, axis=1) < 0)
-    assert np.any(OP(x, y, z, intensity, status, device=device).status & Status.FOLDED)
+    assert np.any(OP(x, y, z, intensity, status, device=device).status & Status.NOT_INVERTIBLE)
     made = dataclasses.replace(OP, fold_tolerance=0.1)(x, y, z, intensity, status, device=device)
-    assert not np.any(made.status & Status.FOLDED)
+    assert not np.any(made.status & Status.NOT_INVERTIBLE)
 
 
 def test_samples_on_one_place_are_folded_there(device):
@@ -153,7 +153,7 @@ def test_samples_on_one_place_are_folded_there(device):
     x[:] = np.linspace(-1.0, 1.4, 61)
     x[:, 26] = x[:, 25]  # = 0.0, the centre of a cell
     made = OP(x, y, z, intensity, status, device=device)
-    np.testing.assert_array_equal(np.flatnonzero(made.status[3] == Status.FOLDED), [8])
+    np.testing.assert_array_equal(np.flatnonzero(made.status[3] == Status.NOT_INVERTIBLE), [8])
 
 
 def test_a_fold_is_known_on_the_row_beside_it(device):
@@ -166,7 +166,7 @@ def test_a_fold_is_known_on_the_row_beside_it(device):
     frames = x, y, z, intensity, status
     made = op(*frames, device=device)
     close(made, reference.regrid(op, *frames), 1e-12)
-    np.testing.assert_array_equal(np.flatnonzero(made.status[:, 16] == Status.FOLDED), [5, 6, 7])
+    np.testing.assert_array_equal(np.flatnonzero(made.status[:, 16] == Status.NOT_INVERTIBLE), [5, 6, 7])
 
 
 @hypothesis.settings(max_examples=60, deadline=None)
@@ -205,7 +205,7 @@ def test_a_large_scan_as_the_oracle(device, rng, dtype):
     x, y, _, intensity, status = flat(shape)
     x, y = x + rng.normal(0, 0.002, shape), y + 0.1 * x
     z = np.sin(3 * x) * np.cos(2 * y)
-    status[rng.random(shape) < 0.1] = Status.DARK
+    status[rng.random(shape) < 0.1] = Status.LOW_SIGNAL
     frames = [each.astype(dtype) for each in (x, y, z, intensity)] + [status]
     made, truth = OP(*frames, device=device), reference.regrid(OP, *frames)
     # In single precision a sample next to a cell's centre may fall on its other side: the value is the same there.
@@ -220,7 +220,7 @@ def test_too_few_points_are_holes(device, shape):
     frames = [np.zeros(shape, np.float32) for _ in range(4)] + [np.zeros(shape, np.uint8)]
     made = OP(*frames, device=device)
     assert made.z.shape == GRID.shape
-    assert np.all((made.status & Status.HOLE) != 0)
+    assert np.all((made.status & Status.NO_DATA) != 0)
     assert np.all(np.isnan(made.z))
 
 

@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.matching.artwork import Artwork, read_artwork
-from gpuvision.matching.artwork_shapes import Shape
-from gpuvision.matching.local_fix import LocalFix, lay_rulers
-from gpuvision.matching.pose import SolvePose
-from gpuvision.matching.ruler import Polarity, RulerEdges
-from gpuvision.matching.selection import Candidates, Imaging, Selection, candidates, promise, select
+from gpuvision.matching.artwork.artwork import Artwork, read_artwork
+from gpuvision.matching.artwork.shapes import Shape
+from gpuvision.matching.features.ruler import Polarity, RulerEdges
+from gpuvision.matching.features.selection import Candidates, Imaging, Selection, candidates, promise, select
+from gpuvision.matching.pose.board_pose import BoardPoseEstimator, place_rulers
+from gpuvision.matching.pose.pose import SolvePose
 from reference.board_images import BoardPicture, View
 
 Float64 = npt.NDArray[np.float64]
@@ -161,7 +161,7 @@ class BoardFix:
         normal, point = self.rulers.normal[which], self.rulers.point[which] - self.middle
         per, (x, y) = 1 / PIXEL, np.array(self.view.corner) - self.middle
         matrix = np.array([[per, 0.0, -x * per], [0.0, -per, y * per], [0.0, 0.0, 1.0]])
-        laid = lay_rulers(normal, point, np.zeros((len(which), 1)), matrix, grows=1.0)
+        laid = place_rulers(normal, point, np.zeros((len(which), 1)), matrix, grows=1.0)
         ruler = RulerEdges(
             threshold=15.0,
             length=math.ceil(self.rulers.length.max() / PIXEL),
@@ -173,7 +173,7 @@ class BoardFix:
         # Boards lie within a circle about the square of what was asked for.
         within = (1.5 * self.imaging.shift, 1.5 * self.imaging.angle)
         solver = SolvePose(etch=self.imaging.etch, trials=256, within=within, largest_leverage=self.largest_leverage)
-        fix = LocalFix(ruler=ruler, lines=len(which), each=1, solver=solver)
+        fix = BoardPoseEstimator(ruler=ruler, lines=len(which), each=1, solver=solver)
         errors, covariances, status = (
             np.full((draws, 3), np.nan),
             np.full((draws, 3, 3), np.nan),

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.matching.artwork import Artwork
-from gpuvision.matching.artwork_shapes import Shape, area, capsule
+from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.matching.artwork.shapes import Shape, area, capsule
 
 Float64 = npt.NDArray[np.float64]
 

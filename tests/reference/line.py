@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize, special
 
-DARK, SATURATED, OUT_OF_RANGE, NOT_FINITE, AMBIGUOUS = 1, 2, 4, 8, 16
+LOW_SIGNAL, SATURATED, OUT_OF_RANGE, NOT_FINITE, AMBIGUOUS = 1, 2, 4, 8, 16
 
 
 def read_lines(frames, *, along="columns", previous=None, **settings):
@@ -42,7 +42,7 @@ def read_whole(x, threshold, saturation, *, minimum_peak=-np.inf, minimum_width=
     status = SATURATED if x.max() >= saturation else 0
     widest = len(x) if maximum_width is None else maximum_width
     if lit == 0 or x.max() < minimum_peak or not minimum_width <= lit <= widest:
-        return np.nan, x.max(), lit, v.sum(), status | DARK
+        return np.nan, x.max(), lit, v.sum(), status | LOW_SIGNAL
     if max(v[0], v[-1]) >= v.max() / 2.0:
         return np.nan, x.max(), lit, v.sum(), status | OUT_OF_RANGE
     return np.sum(v * np.arange(len(x))) / v.sum(), x.max(), lit, v.sum(), status
@@ -77,7 +77,7 @@ def read_peak(
 ):  # fmt: skip
     found = choose(x, threshold, previous, choice, minimum_peak, minimum_width, maximum_width)
     if found is None:
-        return np.nan, x.max(), 0, 0.0, DARK | (SATURATED if x.max() >= saturation else 0)
+        return np.nan, x.max(), 0, 0.0, LOW_SIGNAL | (SATURATED if x.max() >= saturation else 0)
     at, width = found
     top = x[at]
     others = np.flatnonzero(x[at:] != top)
@@ -106,12 +106,12 @@ def read_peak(
         offset, flag = fir(x, at, window, fir_length // 2)
     else:
         offset, flag = likeliest(near, window, saturation, read_noise, gain), 0
-    return (np.nan if flag & DARK else at + offset), top, width, total, status | flag
+    return (np.nan if flag & LOW_SIGNAL else at + offset), top, width, total, status | flag
 
 
 def gauss3(v, at, equals):
     if v[at - 1] <= 0.0 or v[at + 1] <= 0.0:
-        return np.nan, DARK
+        return np.nan, LOW_SIGNAL
     a, b, c = np.log(v[at - 1 : at + 2])
     bend = a - 2.0 * b + c
     if bend >= 0.0 or abs(0.5 * (a - c) / bend) > 1.0:
@@ -127,7 +127,7 @@ def fir(x, at, window, half):
     nearest = []
     for crosses in ((g[:-1] < 0.0) & (g[1:] >= 0.0), (g[:-1] <= 0.0) & (g[1:] > 0.0)):
         if not crosses.any():
-            return np.nan, DARK
+            return np.nan, LOW_SIGNAL
         places = k[crosses] + g[:-1][crosses] / (g[:-1] - g[1:])[crosses]
         nearest.append(places[np.argmin(np.abs(places))])
     return np.mean(nearest), 0

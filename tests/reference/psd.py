@@ -49,7 +49,7 @@ def _status(readout, raw_left, raw_right, a, b, saturation, load) -> NDArray[np.
         dark = total <= readout.minimum_total
         outside = (np.abs(b - a) * load > total) & ~dark
         status[outside] = Status.OUT_OF_RANGE
-        status[dark] = Status.DARK
+        status[dark] = Status.LOW_SIGNAL
         status[(raw_left >= saturation) | (raw_right >= saturation)] |= np.uint8(Status.SATURATED)
     status[~(np.isfinite(raw_left) & np.isfinite(raw_right))] = Status.NOT_FINITE
     return status

@@ -69,7 +69,7 @@ def judged(
         outside = np.any((points < low) | (points > high), axis=-1)
     causes = [
         (unknown, Status.NOT_FINITE),
-        (folded, Status.FOLDED),
+        (folded, Status.NOT_INVERTIBLE),
         (missed, Status.HORIZON),
         (~np.isfinite(points).all(axis=-1), Status.NOT_FINITE),
         (outside, Status.OUT_OF_RANGE),

@@ -9,7 +9,7 @@ import numpy as np
 from gpuvision import Status
 from gpuvision.ranging.regrid import HeightMap, Regrid
 
-_INFORMS = Status.SATURATED | Status.AMBIGUOUS | Status.FOLDED
+_INFORMS = Status.SATURATED | Status.AMBIGUOUS | Status.NOT_INVERTIBLE
 
 
 def resample_line(
@@ -17,7 +17,7 @@ def resample_line(
 ) -> tuple[np.ndarray, np.ndarray]:
     """One line of points at `at` with `values` (k, n), height first, at the centres: values (k, cells) and status."""
     made = np.full((len(values), len(centres)), np.nan)
-    status = np.full(len(centres), Status.HOLE, np.uint8)
+    status = np.full(len(centres), Status.NO_DATA, np.uint8)
     good = np.isfinite(at) & np.isfinite(values[0]) & ((given & ~np.uint8(_INFORMS)) == 0)
     kept = np.flatnonzero(good)
     reached = sense * at[kept]
@@ -33,11 +33,15 @@ def resample_line(
         over &= ~(made[0] > new[0] + regrid.max_step)
         made[:, over] = new[:, over]
         # On the very place of a sample two pairs lie over a cell: what either knows of a fold is kept.
-        status[over] = ((given[first] | given[second]) & np.uint8(_INFORMS)) | (status[over] & np.uint8(Status.FOLDED))
+        status[over] = ((given[first] | given[second]) & np.uint8(_INFORMS)) | (
+            status[over] & np.uint8(Status.NOT_INVERTIBLE)
+        )
     for n in range(1, len(kept)):
         behind = furthest[n] - reached[n]
         if behind >= regrid.fold_tolerance and reached[n] <= furthest[n - 1]:
-            status[(sense * centres >= reached[n]) & (sense * centres <= furthest[n])] |= np.uint8(Status.FOLDED)
+            status[(sense * centres >= reached[n]) & (sense * centres <= furthest[n])] |= np.uint8(
+                Status.NOT_INVERTIBLE
+            )
     return made, status
 
 
@@ -62,6 +66,6 @@ def regrid(
     if along == "x":
         made, status = made.transpose(0, 2, 1), status.T
     if op.folded == "drop":
-        folds = (status & np.uint8(Status.FOLDED)) != 0
-        made[:, folds], status[folds] = np.nan, Status.FOLDED
+        folds = (status & np.uint8(Status.NOT_INVERTIBLE)) != 0
+        made[:, folds], status[folds] = np.nan, Status.NOT_INVERTIBLE
     return HeightMap(made[0], made[1], status)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-NOT_FINITE, HORIZON, FOLDED = 8, 32, 128
+NOT_FINITE, HORIZON, NOT_INVERTIBLE = 8, 32, 128
 
 
 def undistort(column, row, k1, k2, centre):
@@ -34,7 +34,7 @@ def triangulate(u, v, homography, region, *, horizon=1e-3, lens=None, along="col
         if lens is not None:
             k1, k2, centre = lens
             column, row = (v, u) if along == "columns" else (u, v)
-            status = np.where(beyond_fold(column, row, k1, k2, centre), FOLDED, status)
+            status = np.where(beyond_fold(column, row, k1, k2, centre), NOT_INVERTIBLE, status)
             column, row = undistort(column, row, k1, k2, centre)
             straight_u, straight_v = (row, column) if along == "columns" else (column, row)
         g, h, w = (line[0] * straight_u + line[1] * straight_v + line[2] for line in matrix)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-HOLE, FOLDED = 64, 128
+NO_DATA, NOT_INVERTIBLE = 64, 128
 
 
 def cubic(distance: np.ndarray) -> np.ndarray:
@@ -54,7 +54,7 @@ def undistort(
     interpolation: str = "bilinear",
     border: str = "mask",
     value: float = 0.0,
-    missing: int = HOLE,
+    missing: int = NO_DATA,
 ) -> tuple[np.ndarray, np.ndarray]:
     """One image (rows, columns, channels) at places (r, c, 2): values, NaN where there are none, and status."""
     rows, columns = image.shape[:2]
@@ -62,7 +62,7 @@ def undistort(
     with np.errstate(invalid="ignore"):
         hole = (x < -0.5) | (x > columns - 0.5) | (y < -0.5) | (y > rows - 0.5)
     lost = ~np.isfinite(x + y)
-    status = np.where(lost, missing, np.where(hole, HOLE, 0)).astype(np.uint8)
+    status = np.where(lost, missing, np.where(hole, NO_DATA, 0)).astype(np.uint8)
     result = interpolate(image, places, interpolation=interpolation, border=border, value=value)
     blank = lost | hole if border == "mask" else lost
     result[blank] = value if border == "constant" else np.nan

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 import trimesh
-
-from gpuvision.simulation.illumination import LightSheet
-from gpuvision.simulation.light_paths import LightPaths
-from gpuvision.simulation.material import Material
-from gpuvision.simulation.range_error import StripReading
-from gpuvision.simulation.reflectance import Lambert
-from gpuvision.simulation.scene import Scene
 from simulation.test_sight import sight
+
+from gpuvision.simulation.errors.range_error import StripReading
+from gpuvision.simulation.light_paths import LightPaths
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.reflectance import Lambert
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.transport.illumination import LightSheet
 
 GREY = Material(diffuse=Lambert(albedo=0.5))
 PATHS = ("direct", "diffuse-diffuse")

@@ -11,9 +11,18 @@ import numpy as np
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.scheimpflug import TiltedSensor
-from gpuvision.camera.views.bundle import Loss, State, System, Views, linearise, residuals, robust_scale, solve
-from gpuvision.camera.views.chart import OPENCV, Chart, internal_of, opencv_of
-from gpuvision.camera.views.tilted_projection import Floats, tilt_matrix
+from gpuvision.camera.tilted_projection import Floats, tilt_matrix
+from gpuvision.camera.views.bundle_adjustment import (
+    Loss,
+    State,
+    System,
+    Views,
+    linearise,
+    residuals,
+    robust_scale,
+    solve,
+)
+from gpuvision.camera.views.parameters import OPENCV, Chart, internal_of, opencv_of
 
 
 class Pose(NamedTuple):

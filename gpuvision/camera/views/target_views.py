@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.patterns.pattern import PatternGrid
-from gpuvision.camera.views.bundle import Views
-from gpuvision.camera.views.tilted_projection import Floats
-from gpuvision.tables import finite
+from gpuvision.camera.tilted_projection import Floats
+from gpuvision.camera.views.bundle_adjustment import Views
+from gpuvision.validation import finite
 
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
@@ -35,7 +35,7 @@ class View(NamedTuple):
     image: npt.NDArray[np.float64]
 
 
-def view_of(grid: PatternGrid | npt.ArrayLike, pitch: float) -> View:
+def make_view(grid: PatternGrid | npt.ArrayLike, pitch: float) -> View:
     """Return the view of a regular grid, as the pattern finders return it.
 
     Parameters

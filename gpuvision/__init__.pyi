@@ -1,0 +1,308 @@
+"""Public names of gpuvision. ``__init__.py`` reads this stub: it is the only list of them."""
+
+from .camera.camera import (
+    Camera as Camera,
+)
+from .camera.image_map import (
+    PixelMap as PixelMap,
+)
+from .camera.lens import (
+    Lens as Lens,
+)
+from .camera.lines.lens_fit import (
+    LensFit as LensFit,
+)
+from .camera.lines.line_families import (
+    grid_lines as grid_lines,
+)
+from .camera.lines.vanishing_points import (
+    fit_lens as fit_lens,
+)
+from .camera.lines.vanishing_points import (
+    straightness_px as straightness_px,
+)
+from .camera.patterns.chessboard import (
+    find_chessboard as find_chessboard,
+)
+from .camera.patterns.dots import (
+    find_dots as find_dots,
+)
+from .camera.patterns.line_pattern import (
+    find_lines as find_lines,
+)
+from .camera.patterns.pattern import (
+    PatternGrid as PatternGrid,
+)
+from .camera.polynomial import (
+    PlanePolynomial as PlanePolynomial,
+)
+from .camera.scheimpflug import (
+    TiltedSensor as TiltedSensor,
+)
+from .camera.undistort_image import (
+    UndistortedImage as UndistortedImage,
+)
+from .camera.undistort_image import (
+    UndistortImage as UndistortImage,
+)
+from .camera.undistort_points import (
+    UndistortedPoints as UndistortedPoints,
+)
+from .camera.undistort_points import (
+    UndistortPoints as UndistortPoints,
+)
+from .camera.views.camera_fit import (
+    CameraFit as CameraFit,
+)
+from .camera.views.known_lens import (
+    fit_tilt as fit_tilt,
+)
+from .camera.views.planar_calibration import (
+    fit_camera as fit_camera,
+)
+from .camera.views.target_views import (
+    make_view as make_view,
+)
+from .camera.views.tsai import (
+    fit_tsai as fit_tsai,
+)
+from .formats.features_file import (
+    read_features as read_features,
+)
+from .formats.field_file import (
+    read_field as read_field,
+)
+from .host import (
+    Device as Device,
+)
+from .host import (
+    GpuVisionError as GpuVisionError,
+)
+from .host import (
+    Pipeline as Pipeline,
+)
+from .host import (
+    Step as Step,
+)
+from .host import (
+    host_view as host_view,
+)
+from .host import (
+    open_recording as open_recording,
+)
+from .matching.artwork.artwork import (
+    Artwork as Artwork,
+)
+from .matching.artwork.artwork import (
+    read_artwork as read_artwork,
+)
+from .matching.board.located_board import (
+    LocatedBoard as LocatedBoard,
+)
+from .matching.features.blob import (
+    Blobs as Blobs,
+)
+from .matching.features.blob import (
+    FindBlobs as FindBlobs,
+)
+from .matching.features.feature_set import (
+    FeatureSet as FeatureSet,
+)
+from .matching.features.feature_set import (
+    choose_features as choose_features,
+)
+from .matching.features.line_fit import (
+    FitLines as FitLines,
+)
+from .matching.features.line_fit import (
+    LineFits as LineFits,
+)
+from .matching.features.ruler import (
+    Edges as Edges,
+)
+from .matching.features.ruler import (
+    RulerEdges as RulerEdges,
+)
+from .matching.features.ruler import (
+    best_smoothing as best_smoothing,
+)
+from .matching.features.selection import (
+    Imaging as Imaging,
+)
+from .matching.features.selection import (
+    Selection as Selection,
+)
+from .matching.field.distance_map import (
+    DistanceMap as DistanceMap,
+)
+from .matching.field.distance_map import (
+    Field as Field,
+)
+from .matching.field.field_pose import (
+    Candidate as Candidate,
+)
+from .matching.field.field_pose import (
+    FieldPoseRefinement as FieldPoseRefinement,
+)
+from .matching.field.field_pose import (
+    FieldPoseSearch as FieldPoseSearch,
+)
+from .matching.field.located_robot import (
+    LocatedRobot as LocatedRobot,
+)
+from .matching.field.odometry import (
+    PoseEstimate as PoseEstimate,
+)
+from .matching.pose.board_pose import (
+    BoardPoseEstimator as BoardPoseEstimator,
+)
+from .matching.pose.board_pose import (
+    Fix as Fix,
+)
+from .matching.pose.board_pose import (
+    place_rulers as place_rulers,
+)
+from .matching.pose.pose import (
+    BoardPose as BoardPose,
+)
+from .matching.pose.pose import (
+    SolvePose as SolvePose,
+)
+from .matching.pose.pose import (
+    line_rows as line_rows,
+)
+from .matching.pose.pose import (
+    point_rows as point_rows,
+)
+from .matching.pose.registration import (
+    CoarseRegistration as CoarseRegistration,
+)
+from .matching.pose.registration import (
+    Registration as Registration,
+)
+from .matching.pose.registration import (
+    register as register,
+)
+from .matching.pose.registration import (
+    register_board as register_board,
+)
+from .ranging.line import (
+    LineReading as LineReading,
+)
+from .ranging.line import (
+    LineReadout as LineReadout,
+)
+from .ranging.psd import (
+    PsdNoise as PsdNoise,
+)
+from .ranging.psd import (
+    PsdReading as PsdReading,
+)
+from .ranging.psd import (
+    PsdReadout as PsdReadout,
+)
+from .ranging.range_image import (
+    RangeImage as RangeImage,
+)
+from .ranging.range_image import (
+    RangePoints as RangePoints,
+)
+from .ranging.range_image import (
+    RotatingSheet as RotatingSheet,
+)
+from .ranging.range_image import (
+    StraightTransport as StraightTransport,
+)
+from .ranging.regrid import (
+    Grid as Grid,
+)
+from .ranging.regrid import (
+    HeightMap as HeightMap,
+)
+from .ranging.regrid import (
+    Regrid as Regrid,
+)
+from .ranging.triangulation import (
+    SampleAxes as SampleAxes,
+)
+from .ranging.triangulation import (
+    SheetPoints as SheetPoints,
+)
+from .ranging.triangulation import (
+    Triangulation as Triangulation,
+)
+from .simulation.errors.error_attribution import (
+    ErrorAttribution as ErrorAttribution,
+)
+from .simulation.errors.error_attribution import (
+    attribute_errors as attribute_errors,
+)
+from .simulation.errors.recommendations import (
+    DualSensor as DualSensor,
+)
+from .simulation.light_paths import (
+    LightPaths as LightPaths,
+)
+from .simulation.scene.material import (
+    Material as Material,
+)
+from .simulation.scene.rays import (
+    AnyHit as AnyHit,
+)
+from .simulation.scene.rays import (
+    ClosestHit as ClosestHit,
+)
+from .simulation.scene.reflectance import (
+    Ggx as Ggx,
+)
+from .simulation.scene.reflectance import (
+    Lambert as Lambert,
+)
+from .simulation.scene.reflectance import (
+    OrenNayar as OrenNayar,
+)
+from .simulation.scene.reflectance import (
+    Phong as Phong,
+)
+from .simulation.scene.reflectance import (
+    Reflectance as Reflectance,
+)
+from .simulation.scene.reflectance import (
+    Ward as Ward,
+)
+from .simulation.scene.scene import (
+    Scene as Scene,
+)
+from .simulation.sensors.camera_simulator import (
+    CameraSimulator as CameraSimulator,
+)
+from .simulation.sensors.masks import (
+    Mask as Mask,
+)
+from .simulation.sensors.masks import (
+    optimise_mask as optimise_mask,
+)
+from .simulation.sensors.psd_simulator import (
+    PsdSimulator as PsdSimulator,
+)
+from .simulation.sensors.sensor_view import (
+    SensorView as SensorView,
+)
+from .simulation.transport.illumination import (
+    LightSheet as LightSheet,
+)
+from .simulation.transport.line_irradiance import (
+    LineIrradiance as LineIrradiance,
+)
+from .simulation.transport.line_irradiance import (
+    LitSegments as LitSegments,
+)
+from .simulation.transport.occluded_irradiance import (
+    OccludedIrradiance as OccludedIrradiance,
+)
+from .simulation.transport.radiosity import (
+    Radiosity as Radiosity,
+)
+from .status import (
+    Status as Status,
+)

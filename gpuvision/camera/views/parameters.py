@@ -1,0 +1,141 @@
+"""Which numbers of a tilted camera a fit may move, and in which coordinates it moves them.
+
+Between f', centre c and tilt data with little distortion leave a bent valley. Its coordinates are the virtual camera
+(f, v) and the centre c: the optical axis leaves the sensor's pinhole along g = (c - v, f), so that alpha is the angle
+between g and the sensor's normal, f' = |g| and f = f' cos(alpha) (eq. 3.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpuvision.camera.tilted_projection import INTERNAL, Floats
+
+NUMBERS = ("f", "aspect", "v_column", "v_row", "c_column", "c_row", "k1", "k2", "p1", "p2", "k3")
+"""The coordinates in which a fit moves."""
+OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "tauX", "tauY")
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chart:
+    """The free numbers of one camera model.
+
+    Parameters
+    ----------
+    coefficients
+        Distortion coefficients that are free, out of `COEFFICIENTS`; the others keep their values.
+    tilt
+        Whether the sensor is tilted: the centre c is then free beside v, else it *is* v.
+    aspect
+        Whether fy / fx is free.
+    focal_length
+        f' where it is known, pixels.
+    centre
+        Whether the centre is free; else it keeps its value.
+    direction
+        Where the sensor's direction of tilt is known, radians from the columns' axis towards the rows': v then moves
+        along it alone.
+    """
+
+    coefficients: tuple[str, ...]
+    tilt: bool
+    aspect: bool = False
+    focal_length: float | None = None
+    centre: bool = True
+    direction: float | None = None
+
+    @property
+    def basis(self) -> Floats:
+        """How the free numbers move `NUMBERS`, shape (11, free). Without a tilt the centre moves, and v with it."""
+        names = [] if self.focal_length is not None else ["f"]
+        names += ["aspect"] if self.aspect else []
+        names += ["v_column"] if self.tilt else []
+        names += ["v_row"] if self.tilt and self.direction is None else []
+        names += ["c_column", "c_row"] if self.centre else []
+        names += self.coefficients
+        basis = np.eye(len(NUMBERS))[:, [NUMBERS.index(name) for name in names]]
+        if self.tilt and self.direction is not None:
+            basis[2:4, names.index("v_column")] = np.cos(self.direction), np.sin(self.direction)
+        return basis
+
+    @property
+    def free(self) -> int:
+        """How many numbers are free."""
+        return len(self.basis.T)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """OpenCV's names of what is free; `f` where fx and fy share one."""
+        names = [] if self.focal_length is not None else ["fx", "fy"] if self.aspect else ["f"]
+        names += ["fy"] if self.aspect and self.focal_length is not None else []
+        names += ["cx", "cy"] if self.centre else []
+        names += [*self.coefficients, *(("tauX", "tauY") if self.tilt else ())]
+        return tuple(names)
+
+    def settled(self, numbers: Floats) -> Floats:
+        """Return the numbers with those that others fix brought in line: v without a tilt, f where f' is known.
+
+        f is NaN where no tilt brings the axis from v to c at this f'.
+        """
+        result = numbers.copy()
+        if not self.tilt:
+            result[2:4] = result[4:6]
+        if self.focal_length is not None:
+            reach = self.focal_length**2 - (result[4] - result[2]) ** 2 - ((result[5] - result[3]) / result[1]) ** 2
+            result[0] = np.sqrt(reach) if reach > 0.0 else np.nan
+        return result
+
+    def spread(self, numbers: Floats) -> Floats:
+        """d(`NUMBERS`) / d(free numbers), shape (11, free)."""
+        derivative = self.basis
+        if not self.tilt:
+            derivative[2:4] = derivative[4:6]
+        elif self.focal_length is not None:
+            f, aspect, v_column, v_row, c_column, c_row = numbers[:6]
+            across, down = c_column - v_column, (c_row - v_row) / aspect
+            moves_down = (derivative[5] - derivative[3] - down * derivative[1]) / aspect
+            derivative[0] = -(across * (derivative[4] - derivative[2]) + down * moves_down) / f
+        return derivative
+
+
+def internal_of(numbers: Floats) -> tuple[Floats, Floats]:
+    """Return what `tilted_projection.project` takes, and its derivative (11, 11) by the numbers."""
+    f, aspect, v_column, v_row, c_column, c_row = numbers[:6].tolist()
+    g = np.array([c_column - v_column, (c_row - v_row) / aspect, f])
+    by_numbers = np.zeros((3, len(NUMBERS)))
+    by_numbers[0, 4], by_numbers[0, 2] = 1.0, -1.0
+    by_numbers[1, 5], by_numbers[1, 3], by_numbers[1, 1] = 1.0 / aspect, -1.0 / aspect, -g[1] / aspect
+    by_numbers[2, 0] = 1.0
+    # g leads along (-sin tauY cos tauX, sin tauX, cos tauY cos tauX).
+    flat2, whole2 = g[0] ** 2 + g[2] ** 2, g @ g
+    flat = np.sqrt(flat2)
+    tau_x, tau_y = np.arctan2(g[1], flat), np.arctan2(-g[0], g[2])
+    by_g_x = np.array([-g[0] * g[1] / flat, flat, -g[2] * g[1] / flat]) / whole2
+    by_g_y = np.array([-g[2], 0.0, g[0]]) / flat2
+    internal = numbers.copy()
+    internal[4], internal[5] = tau_x, tau_y
+    derivative = np.eye(len(INTERNAL))
+    derivative[4], derivative[5] = by_g_x @ by_numbers, by_g_y @ by_numbers
+    return internal, derivative
+
+
+def opencv_of(numbers: Floats) -> tuple[Floats, Floats]:
+    """Return the numbers named in `OPENCV`, and their derivative (11, 11) by `NUMBERS`."""
+    internal, turned = internal_of(numbers)
+    f, aspect, v_column, v_row, c_column, c_row = numbers[:6].tolist()
+    g = np.array([c_column - v_column, (c_row - v_row) / aspect, f])
+    fx = float(np.linalg.norm(g))
+    values = np.array([fx, aspect * fx, c_column, c_row, *numbers[6:], internal[4], internal[5]])
+    derivative = np.zeros((len(OPENCV), len(NUMBERS)))
+    by_g = g / fx
+    derivative[0, [4, 2, 0]] = by_g[0], -by_g[0], by_g[2]
+    derivative[0, [5, 3, 1]] = by_g[1] / aspect, -by_g[1] / aspect, -by_g[1] * g[1] / aspect
+    derivative[1] = aspect * derivative[0]
+    derivative[1, 1] += fx
+    derivative[2, 4] = derivative[3, 5] = 1.0
+    derivative[4:9, 6:] = np.eye(5)
+    derivative[9:] = turned[4:6]
+    return values, derivative

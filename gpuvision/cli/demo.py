@@ -1,0 +1,66 @@
+"""``gpuvision demo``: a part with a known shape is recorded, scanned, and compared with what it is."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gpuvision.cli.arguments import DeviceLabel, named_path
+
+
+def demo(
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", parser=named_path, help="Folder for recordings, range images and pictures.")
+    ] = Path("out/demo"),
+    seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 1,
+    device: DeviceLabel = None,
+) -> None:
+    """Record a part with a camera and with PSD strips, scan both recordings, and compare with the truth.
+
+    The recordings are simulated, the scans are what `gpuvision scan` does. The part's corners glow, which moves the
+    PSD's readings; a mask made for the part helps.
+    """
+    import numpy as np
+
+    from gpuvision.cli.scan import progress_bar
+    from gpuvision.host import Device
+    from gpuvision.host.files import check_folder, whole_folder
+    from gpuvision.workflows.demo import SENSORS, part, scanned_part
+    from gpuvision.workflows.scanning import scan
+    from gpuvision.workflows.simulating import recorded, simulate
+
+    check_folder(out)
+    chosen = Device.best() if device is None else Device.named(device)
+    typer.echo(f"device {chosen.label}: {chosen.name}")
+    results: dict[str, Any] = {}
+    with whole_folder(out) as inside, tempfile.TemporaryDirectory() as light:
+        part().export(inside / "part.ply")
+        for name in SENSORS:
+            task = scanned_part(name)
+            with progress_bar(f"{name}: simulating") as progress:
+                known = simulate(task, light, seed=seed, device=chosen, progress=progress)
+            recording = recorded(task, light, seed=seed, device=chosen)
+            done = scan(recording, task.sensor, device=chosen)
+            known.write(inside / name)
+            done.write(inside / name)
+            np.save(inside / name / "recording.npy", recording)
+            results[name] = {"predicted": known.report(), **done.report()}
+            typer.echo(f"{name}: {done.summary()}\n  {known.summary()}")
+        masked = simulate(task, light, seed=seed, mask="best", device=chosen)
+        masked.write(inside / f"{name}_masked")
+        results[f"{name}_masked"] = {"predicted": masked.report()}
+        (inside / "report.json").write_text(json.dumps(results, indent=1) + "\n")
+    typer.echo(f"{name} behind a mask made for the part: {masked.summary()}")
+    camera = out / "camera_line"
+    typer.echo(
+        f"scan one yourself: gpuvision scan {camera / 'recording.npy'} --sensor camera_line --out {out / 'again'}"
+    )
+    typer.echo(
+        f"A part as it is measured: look at {camera / 'picture.png'}. How its glowing corners pull the readings of PSD "
+        f"strips: {out / name / 'errors.png'} and causes.png beside it; with a mask: "
+        f"{out / f'{name}_masked' / 'errors.png'}."
+    )

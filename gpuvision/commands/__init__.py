@@ -1,4 +1,0 @@
-"""The commands of ``gpuvision``, one module and function each; `gpuvision.cli` registers them.
-
-A command imports what it needs inside its function, so that ``gpuvision --help`` answers at once.
-"""

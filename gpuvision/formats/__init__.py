@@ -1,0 +1,1 @@
+"""File formats: every file that gpuvision reads or writes."""

@@ -1,0 +1,15 @@
+"""JSON reports: plain trees without infinities or NaN."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def json_tree(value: Any) -> Any:
+    """Return a tree of plain values with None in place of infinite numbers and NaN, for which JSON has no word."""
+    if isinstance(value, dict):
+        return {key: json_tree(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_tree(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

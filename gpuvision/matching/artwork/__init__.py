@@ -1,0 +1,1 @@
+"""Board artwork from Gerber and Excellon files: layers, shapes, straight edges."""

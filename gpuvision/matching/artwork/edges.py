@@ -1,0 +1,197 @@
+"""Straight edges of a board's copper, cut to what a camera can see of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.matching.artwork.shapes import SAGITTA, Crossings, Drawn, Float64, Layer, covered
+
+# Lines are one where their angle [rad], distance from the origin and width [m] round to the same multiple. It is no
+# decimal fraction, so that lengths as files write them never lie on the border between two multiples.
+_QUANTUM = math.pi * 1e-8
+_CLOSE = 2 * SAGITTA
+_SHORTEST = 100e-6  # [m] of an edge, what a ruler of five pixels needs at 20 um each
+
+
+class BoardEdges(NamedTuple):
+    """Straight edges between copper and what lies beside it.
+
+    Attributes
+    ----------
+    start, end
+        (n, 2) [m] of what can be seen: to the clearance from silk, from other copper and from the mask's openings.
+    normal
+        (n, 2) unit, out of the copper.
+    width
+        (n,) of the copper there, to its other edge [m].
+    bare
+        (n,) bool: True where the mask is open on both sides, False where both lie under it. Under the mask an edge
+        has another contrast, and the mask's own offset does not touch it; where the mask ends the edge is cut.
+    trace
+        (n,) which trace, the same for its two edges; -1 for the side of a land.
+    land
+        (n,) index of the land whose side it is; -1 for a trace's.
+    """
+
+    start: Float64
+    end: Float64
+    normal: Float64
+    width: Float64
+    bare: npt.NDArray[np.bool_]
+    trace: npt.NDArray[np.int64]
+    land: npt.NDArray[np.int64]
+
+    @property
+    def length(self) -> Float64:
+        """(n,) [m]."""
+        return np.asarray(np.hypot(*(self.end - self.start).T))
+
+
+class _Candidate(NamedTuple):
+    start: Float64
+    end: Float64
+    normal: Float64
+    width: float
+    trace: int
+    land: int
+
+
+def board_edges(
+    strokes: Sequence[Drawn],
+    outlines: Sequence[Float64],
+    copper: Layer,
+    mask: Layer | None,
+    silk: Layer,
+    clearance: float,
+) -> BoardEdges:
+    """BoardEdges of strokes with a round aperture and of the straight sides of lands.
+
+    Parameters
+    ----------
+    strokes
+        Of the copper; those that lie in line and are equally wide are one trace.
+    outlines
+        Of the lands, counter-clockwise.
+    copper, mask, silk
+        What may hide an edge; no mask: everything is bare.
+    clearance
+        [m], on both sides of an edge and at its ends.
+    """
+    rows = []
+    for each in [*_trace_sides(strokes), *_land_sides(outlines)]:
+        for low, high, bare in _seen(each, copper, mask, silk, clearance):
+            along = each.end - each.start
+            rows.append((each.start + low * along, each.start + high * along, each.normal, each.width, bare, *each[4:]))
+    columns: list[Any] = list(zip(*rows, strict=True)) if rows else [[]] * 7
+    return BoardEdges(
+        np.array(columns[0], dtype=np.float64).reshape(-1, 2),
+        np.array(columns[1], dtype=np.float64).reshape(-1, 2),
+        np.array(columns[2], dtype=np.float64).reshape(-1, 2),
+        np.array(columns[3], dtype=np.float64),
+        np.array(columns[4], dtype=np.bool_),
+        np.array(columns[5], dtype=np.int64),
+        np.array(columns[6], dtype=np.int64),
+    )
+
+
+def _trace_sides(strokes: Sequence[Drawn]) -> Iterator[_Candidate]:
+    for index, (start, end, width) in enumerate(_joined(strokes)):
+        x, y = (end - start) / math.dist(start, end)
+        for normal in (np.array([-y, x]), np.array([y, -x])):
+            shift = normal * (width / 2)
+            yield _Candidate(start + shift, end + shift, normal, width, index, -1)
+
+
+def _joined(strokes: Sequence[Drawn]) -> list[tuple[Float64, Float64, float]]:
+    """Straight strokes, those on one line joined where they touch: start, end and width [m]."""
+    lines: dict[tuple[int, int, int], list[tuple[float, float, Drawn]]] = {}
+    for each in strokes:
+        if each.ends is None or not each.width > 0 or not each.shapes[0].dark:
+            continue
+        axis = _axis(each.ends)
+        offset = float(axis[0] * each.ends[0, 1] - axis[1] * each.ends[0, 0])
+        key = tuple(round(value / _QUANTUM) for value in (math.atan2(axis[1], axis[0]), offset, each.width))
+        low, high = sorted(float(value) for value in each.ends @ axis)
+        lines.setdefault((key[0], key[1], key[2]), []).append((low, high, each))
+    return [trace for pieces in lines.values() for trace in _united(sorted(pieces, key=lambda piece: piece[:2]))]
+
+
+def _axis(ends: Float64) -> Float64:
+    """Give the unit vector along a line, the same for both of its senses."""
+    along = ends[1] - ends[0]
+    backwards = along[0] < 0 or (along[0] == 0 and along[1] < 0)
+    return np.asarray((-along if backwards else along) / math.hypot(*along))
+
+
+def _united(pieces: list[tuple[float, float, Drawn]]) -> Iterator[tuple[Float64, Float64, float]]:
+    first = pieces[0][2]
+    assert first.ends is not None
+    axis = _axis(first.ends)
+    origin = first.ends[0] - axis * float(first.ends[0] @ axis)
+    low, high = pieces[0][:2]
+    for start, end, _ in [*pieces[1:], (math.inf, math.inf, first)]:
+        if start <= high + _QUANTUM:
+            high = max(high, end)
+            continue
+        yield origin + low * axis, origin + high * axis, first.width
+        low, high = start, end
+
+
+def _land_sides(outlines: Sequence[Float64]) -> Iterator[_Candidate]:
+    for index, outline in enumerate(outlines):
+        for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+            length = math.dist(start, end)
+            if length < _SHORTEST:
+                continue
+            normal = np.array([end[1] - start[1], start[0] - end[0]]) / length
+            width = float(np.max((start - outline) @ normal))
+            yield _Candidate(start, end, normal, width, -1, index)
+
+
+def _seen(
+    edge: _Candidate, copper: Layer, mask: Layer | None, silk: Layer, clearance: float
+) -> list[tuple[float, float, bool]]:
+    """Pieces, from 0 at the start to 1 at the end, that can be seen, and whether they are bare.
+
+    Copper is looked for along lines close to the edge and at the clearance, on either side; ink and openings along the
+    edge and at the clearance. What lies wholly between two of these lines is not found. Each piece is then cut by the
+    clearance at both ends.
+    """
+
+    def along(layer: Layer, *offsets: float) -> list[Crossings]:
+        shifts = [offset * edge.normal for offset in offsets]
+        return [layer.crossings(edge.start + shift, edge.end + shift) for shift in shifts]
+
+    inside, outside = along(copper, -clearance, -_CLOSE), along(copper, _CLOSE, clearance)
+    inks = along(silk, -clearance, 0.0, clearance)
+    openings = [] if mask is None else along(mask, -clearance, 0.0, clearance)
+    crossings = [where for found in (*inside, *outside, *inks, *openings) for _, where in found]
+    cuts = np.unique(np.concatenate([np.array([0.0, 1.0]), *crossings]))
+    cuts = cuts[(cuts >= 0) & (cuts <= 1)]
+    middle = (cuts[1:] + cuts[:-1]) / 2
+    hidden = np.logical_or.reduce([covered(each, middle) for each in (*outside, *inks)])
+    good = np.logical_and.reduce([covered(each, middle) for each in inside]) & ~hidden
+    bare = np.ones(len(middle), dtype=np.int64)
+    if mask is not None:
+        bare = np.sum([covered(each, middle) for each in openings], axis=0)
+        good &= (bare == 0) | (bare == len(openings))
+    return list(_pieces(cuts, good, bare > 0, clearance, math.dist(edge.start, edge.end)))
+
+
+def _pieces(
+    cuts: Float64, good: npt.NDArray[np.bool_], bare: npt.NDArray[np.bool_], clearance: float, length: float
+) -> Iterator[tuple[float, float, bool]]:
+    """Neighbouring good intervals of one kind joined, and shortened at both ends."""
+    state = np.where(good, 1 + bare.astype(np.int64), 0)
+    starts = np.flatnonzero(np.diff(state, prepend=-1))
+    stops = np.append(starts[1:], len(state))
+    margin = clearance / length
+    for start, stop in zip(starts, stops, strict=True):
+        low, high = float(cuts[start]) + margin, float(cuts[stop]) - margin
+        if state[start] and (high - low) * length >= _SHORTEST:
+            yield low, high, bool(state[start] == 2)

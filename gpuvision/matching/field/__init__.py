@@ -1,0 +1,1 @@
+"""Robot localisation on a field with marked lines."""

@@ -1,0 +1,365 @@
+"""White stripes on a floor along scan lines through an image of it: points on lines, and where they were looked for."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.ground_plane import MountedCamera
+from gpuvision.camera.image import noise_of
+from gpuvision.camera.lens import Lens
+from gpuvision.camera.orthographic import BoardView
+from gpuvision.host import Device
+from gpuvision.matching.features.ruler import RulerEdges
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+
+FINEST_PX = 3.0
+"""A line's width in the image, at least."""
+_RULER, _TAPS = 128, 3.0  # samples of a piece of a scan line; sigmas of its smoothing either side
+_MARGIN_PX = 3.0
+
+
+class FloorScan(NamedTuple):
+    """What scan lines over a floor found, in the robot's frame: x ahead, y to its left [m].
+
+    Attributes
+    ----------
+    points
+        float32 (points, 2), the middles of white stripes.
+    sigmas
+        float32 (points,), standard deviations along their scan lines, as the image's noise has it [m].
+    paths
+        float32 (paths, 4), x, y of both ends of what was scanned: a stripe across one of them would have been found.
+    line_width
+        Of the stripes [m].
+    """
+
+    points: Float32
+    sigmas: Float32
+    paths: Float32
+    line_width: float
+
+
+def scan_top_view(
+    white: npt.NDArray[Any],
+    view: BoardView,
+    *,
+    line_width: float,
+    rays: int,
+    blind: float,
+    threshold: float,
+    device: Device | None,
+) -> FloorScan:
+    """Scan a top view along rays from its middle.
+
+    Parameters
+    ----------
+    white
+        Grey levels.
+    view
+        How the camera sees the floor.
+    line_width
+        Of the stripes [m].
+    rays
+        How many, all around.
+    blind
+        Where they begin [m].
+    threshold
+        Least edge [grey levels].
+    device
+        Where to run; None: `Device.best`.
+
+    Raises
+    ------
+    ValueError
+        Lines are too narrow in the image, or it is too small.
+    """
+    width_px = line_width / view.scale
+    if not width_px >= FINEST_PX:
+        raise ValueError(
+            f"lines of {line_width:.3g} m are {width_px:.1f} px wide at {view.scale:.3g} m per pixel, expected "
+            f"{FINEST_PX:g} px or more; is the scale right?"
+        )
+    rulers = stripe_rulers(white, width_px, threshold, view.model)
+    starts, ends = _rays(view, rays, blind)
+    ways = (ends - starts) / np.linalg.norm(ends - starts, axis=-1, keepdims=True)
+    # Near a ruler's ends nothing is found: rays begin so much behind the middle, and end so much before the border.
+    unseen = trimmed(rulers) * ways
+    pieces, path = laid_along(starts - unseen, ends, rulers, width_px)
+    if not len(pieces):
+        raise ValueError(
+            f"the image of {white.shape[1]} x {white.shape[0]} px has no room for a ray of "
+            f"{(_RULER - 1) * rulers.step_px:.0f} px beside what is blind; give a larger one"
+        )
+    edges = rulers(white, pieces, device=device)
+    places = pieces[:, None, :2] + edges.position[..., None] * pieces[:, None, 2:]
+    found = np.isfinite(edges.position)
+    points = view.places(places[found])
+    kept = once(points, np.broadcast_to(path[:, None], found.shape)[found], np.hypot(*points.T), line_width)
+    used = np.unique(path)
+    paths = np.concatenate([view.places(starts), view.places(ends - unseen)], axis=-1)
+    return FloorScan(
+        points=np.ascontiguousarray(points[kept], np.float32),
+        sigmas=np.ascontiguousarray(view.scale * edges.sigma[found][kept], np.float32),
+        paths=np.ascontiguousarray(paths[used], np.float32),
+        line_width=line_width,
+    )
+
+
+def least_edge(white: npt.NDArray[Any]) -> float:
+    """Return the least edge that counts [grey levels]: 4 times the noise, and a tenth of the image's range."""
+    low, high = np.percentile(white, [1, 99])
+    return max(4.0 * noise_of(white), 0.1 * float(high - low), 1e-6)
+
+
+def stripe_rulers(
+    white: npt.NDArray[Any], width_px: float, threshold: float, model: Lens | Camera | None
+) -> RulerEdges:
+    """Return what looks for bright stripes about so wide [px], a piece of a scan line at a time."""
+    step = max(width_px / 8.0, 1.0)
+    return RulerEdges(
+        threshold=threshold,
+        length=_RULER,
+        width=3,
+        step_px=step,
+        smoothing_px=1.5 * step,
+        polarity="rising",
+        choice="all",
+        most=8,
+        pairs=True,
+        spacing_px=(0.4 * width_px, 3.0 * width_px),
+        noise=noise_of(white),
+        model=model,
+    )
+
+
+def trimmed(rulers: RulerEdges) -> float:
+    """Return how far from a ruler's ends edges are found [px]."""
+    return math.ceil(_TAPS * rulers.smoothing_px / rulers.step_px) * rulers.step_px
+
+
+def laid_along(
+    starts: Float64, ends: Float64, rulers: RulerEdges, width_px: float
+) -> tuple[Float32, npt.NDArray[np.intp]]:
+    """Return rulers (n, 4) along scan lines, so that each stripe lies whole on one; and which line each is along.
+
+    Scan lines that are shorter than a ruler have none.
+    """
+    length = (rulers.length - 1) * rulers.step_px
+    hop = max(length - 2.0 * trimmed(rulers) - 3.0 * width_px, 0.25 * length)
+    laid: list[tuple[float, ...]] = []
+    path: list[int] = []
+    for number, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        far = float(np.linalg.norm(end - start))
+        if not far >= length:
+            continue
+        way = (end - start) / far
+        middles = [*np.arange(length / 2, far - length / 2, hop), far - length / 2]
+        laid += [(*(start + middle * way), *way) for middle in middles]
+        path += [number] * len(middles)
+    return np.array(laid, np.float32).reshape(-1, 4), np.array(path, np.intp)
+
+
+def once(points: Float64, path: npt.NDArray[Any], away: Float64, line_width: float) -> npt.NDArray[np.intp]:
+    """Return which points are left where two pieces of one scan line have found the same: sorted along it."""
+    order = np.lexsort((away, path))
+    points, path = points[order], path[order]
+    gone = np.zeros(len(points), np.bool_)
+    if len(points) > 1:
+        gone[1:] = (np.hypot(*(points[1:] - points[:-1]).T) < 0.5 * line_width) & (path[1:] == path[:-1])
+    return order[~gone]
+
+
+def _rays(view: BoardView, rays: int, blind: float) -> tuple[Float64, Float64]:
+    """Return where rays from the middle of a view begin and where they leave the image, (n, 2) each [px]."""
+    turns = np.arange(rays) * (2 * math.pi / rays)
+    ways = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    away = np.arange(math.ceil(0.5 * math.hypot(*view.shape)) + 2)
+    inside = view.within(view.places(view.centre_px + away[:, None, None] * ways), _MARGIN_PX)
+    last = np.where(inside.all(axis=0), len(away), np.argmin(inside, axis=0)) - 1.0
+    first = blind / view.scale
+    starts, ends = view.centre_px + first * ways, view.centre_px + last[:, None] * ways
+    ahead = last > first
+    return starts[ahead], ends[ahead]
+
+
+# ---- through a tilted camera -------------------------------------------------------------------------------------
+
+_SHORT = 64  # samples of a ruler
+_SAMPLES = 512  # of a scan line, where it is looked at what of it the image shows
+
+
+def scan_ahead(
+    white: npt.NDArray[Any],
+    camera: MountedCamera,
+    *,
+    line_width: float,
+    lines: int,
+    reach: float,
+    threshold: float,
+    device: Device | None,
+) -> FloorScan:
+    """Scan what a tilted camera sees of the floor: along rays from the place below it, and across them.
+
+    A line that lies across is soon thinner than pixels tell, one that runs ahead is not: scan lines across see it as
+    far as it is three pixels wide. Rulers are as long as lines are wide in the image there, an octave at a time.
+
+    Parameters
+    ----------
+    white
+        Grey levels.
+    camera
+        How it sees the floor.
+    line_width
+        Of the stripes [m].
+    lines
+        How many rays, and half as many as lines across them.
+    reach
+        No further than that from the camera [m].
+    threshold
+        Least edge [grey levels].
+    device
+        Where to run; None: `Device.best`.
+
+    Raises
+    ------
+    ValueError
+        No part of the floor is seen with lines wide enough.
+    """
+    runs = _runs(camera, _scan_lines(camera, white.shape, lines, reach), white.shape, line_width)
+    octaves = [[run for run in runs if run.octave == each] for each in sorted({run.octave for run in runs})]
+    scans = [_octave(white, camera, each, line_width, threshold, device) for each in octaves]
+    parts = [each for each in scans if each is not None]
+    if not parts:
+        raise ValueError(
+            f"lines of {line_width:.3g} m are nowhere on the floor {FINEST_PX:g} px wide in this image; are height, "
+            "tilt and focal length right?"
+        )
+    return FloorScan(
+        points=np.concatenate([each.points for each in parts]),
+        sigmas=np.concatenate([each.sigmas for each in parts]),
+        paths=np.concatenate([each.paths for each in parts]),
+        line_width=line_width,
+    )
+
+
+class _Run(NamedTuple):
+    """A part of a scan line: both ends [px], how wide lines are there [px], and whether the image ends there."""
+
+    start: Float64
+    end: Float64
+    octave: int
+    cut: tuple[bool, bool]
+
+
+def _scan_lines(camera: MountedCamera, shape: tuple[int, ...], lines: int, reach: float) -> Float64:
+    """Return samples of scan lines on the floor, (lines, samples, 2) [m]: rays from below the camera, and across."""
+    rows, columns = shape
+    grid = np.stack(np.meshgrid(np.linspace(0, columns - 1, 64), np.linspace(0, rows - 1, 64)), axis=-1)
+    seen = camera.floor(grid if camera.model is None else camera.model.undistort(grid)).reshape(-1, 2) - camera.place
+    far = np.hypot(*seen.T)
+    seen = seen[far <= reach]
+    if not len(seen):
+        return np.empty((0, _SAMPLES, 2))
+    far = np.hypot(*seen.T)
+    # Even in the angle below the camera, about as its pixels are.
+    angle = np.linspace(np.arctan(far.min() / camera.height), np.arctan(far.max() / camera.height), _SAMPLES)
+    c, s = math.cos(camera.heading), math.sin(camera.heading)
+    ahead, aside = seen @ (c, s), seen @ (-s, c)
+    turn = np.arctan2(aside, ahead)
+    turns = np.linspace(turn.min(), turn.max(), lines) + camera.heading
+    rays = camera.height * np.tan(angle)[:, None] * np.stack([np.cos(turns), np.sin(turns)], axis=-1)[:, None]
+    nearest, farthest = (math.atan(each / camera.height) for each in (float(ahead.min()), float(ahead.max())))
+    tilts = np.linspace(nearest, farthest, 2 * lines)
+    wide = np.linspace(aside.min(), aside.max(), _SAMPLES)
+    across = camera.height * np.tan(tilts)[:, None, None] * np.array([c, s]) + wide[:, None] * np.array([-s, c])
+    return np.asarray(camera.place + np.concatenate([rays, across]))
+
+
+def _runs(camera: MountedCamera, floors: Float64, shape: tuple[int, ...], line_width: float) -> list[_Run]:
+    """Return what the image shows of scan lines, cut where lines across them are twice as wide."""
+    pixels = camera.pixels(floors)
+    measured = camera.measured(pixels)
+    with np.errstate(invalid="ignore"):
+        inside = (measured >= _MARGIN_PX) & (measured <= np.array(shape[::-1]) - 1 - _MARGIN_PX)
+        steps = np.gradient(pixels, axis=1), np.gradient(floors, axis=1)
+        width = line_width * np.hypot(*np.moveaxis(steps[0], -1, 0)) / np.hypot(*np.moveaxis(steps[1], -1, 0))
+        octave = np.floor(np.log2(width / FINEST_PX))
+        shown = inside.all(axis=-1) & (octave >= 0)
+    runs = []
+    for line, kind in zip(pixels, np.where(shown, octave, -1).astype(int), strict=True):
+        cuts = [0, *(np.flatnonzero(np.diff(kind)) + 1), len(kind)]
+        for first, last in itertools.pairwise(cuts):
+            if kind[first] >= 0 and last - first > 2:
+                cut = (first == 0 or kind[first - 1] < 0, last == len(kind) or kind[last] < 0)
+                # Up to where the next part begins.
+                runs.append(_Run(line[first], line[last - 1 if cut[1] else last], int(kind[first]), cut))
+    return runs
+
+
+def _octave(
+    white: npt.NDArray[Any],
+    camera: MountedCamera,
+    runs: list[_Run],
+    line_width: float,
+    threshold: float,
+    device: Device | None,
+) -> FloorScan | None:
+    """Scan runs along which lines are about as wide; None where none has room for a ruler."""
+    wide = FINEST_PX * 2.0 ** (runs[0].octave + 0.5)
+    rulers = replace(stripe_rulers(white, wide, threshold, camera.model), length=_SHORT)
+    edge, length = trimmed(rulers), (rulers.length - 1) * rulers.step_px
+    laid = [(run, _room(run, edge, edge + 2.0 * wide, length)) for run in runs]
+    runs, rooms = [run for run, room in laid if room is not None], [room for _, room in laid if room is not None]
+    if not runs:
+        return None
+    starts = np.array([each.start for each in runs])
+    far = np.linalg.norm([each.end - each.start for each in runs], axis=-1)
+    ways = np.array([each.end - each.start for each in runs]) / far[:, None]
+    room = np.array(rooms)
+    pieces, path = laid_along(starts + room[:, :1] * ways, starts + room[:, 1:2] * ways, rulers, wide)
+    edges = rulers(white, pieces, device=device)
+    assert edges.spacing is not None
+    places = pieces[:, None, :2] + edges.position[..., None] * pieces[:, None, 2:]
+    away = np.sum((places - starts[path][:, None]) * ways[path][:, None], axis=-1)
+    with np.errstate(invalid="ignore"):
+        found = (away >= 0.0) & (away < far[path][:, None])
+    half = 0.5 * edges.spacing[found][:, None] * np.broadcast_to(pieces[:, None, 2:], places.shape)[found]
+    sides = camera.floor(places[found] - half), camera.floor(places[found] + half)
+    size = np.hypot(*(sides[1] - sides[0]).T)
+    good = (size > 0.4 * line_width) & (size < 3.0 * line_width)
+    points = (0.5 * (sides[0] + sides[1]))[good]
+    number = np.broadcast_to(path[:, None], found.shape)[found][good]
+    kept = once(points, number, away[found][good], line_width)
+    per_px = (size / edges.spacing[found])[good]
+    ends = [camera.floor(starts + room[:, which, None] * ways) for which in (2, 3)]
+    whole = room[:, 3] > room[:, 2]
+    return FloorScan(
+        points=np.ascontiguousarray(points[kept], np.float32),
+        sigmas=np.ascontiguousarray((per_px * edges.sigma[found][good])[kept], np.float32),
+        paths=np.ascontiguousarray(np.concatenate(ends, axis=-1)[whole], np.float32),
+        line_width=line_width,
+    )
+
+
+def _room(run: _Run, edge: float, over: float, length: float) -> tuple[float, float, float, float] | None:
+    """Return where rulers along a run begin and end, and what of it they see [px from its start]; None: no room.
+
+    Where the image goes on, so do they, so that what lies where two runs meet is seen whole.
+    """
+    far = float(np.linalg.norm(run.end - run.start))
+    begin, end = (0.0 if run.cut[0] else -over), far + (0.0 if run.cut[1] else over)
+    lack = length * (1.0 + 1e-6) - (end - begin)
+    if lack > 0.0:
+        if all(run.cut):
+            return None
+        begin, end = (begin, end + lack) if run.cut[0] else (begin - lack, end)
+    return begin, end, edge if run.cut[0] else 0.0, far - (edge if run.cut[1] else 0.0)

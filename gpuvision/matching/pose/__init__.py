@@ -1,0 +1,1 @@
+"""Pose estimation: robust pose from features, fused board pose, coarse registration."""

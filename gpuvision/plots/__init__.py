@@ -1,0 +1,1 @@
+"""Pictures of results. A plot takes plain results and imports no workflow."""

@@ -1,0 +1,176 @@
+"""Pictures of boards: the artwork, the rulers that were chosen, and those that an image was measured with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Rectangle
+
+from gpuvision.camera.orthographic import BoardView
+from gpuvision.host.files import replacing
+from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.matching.artwork.shapes import Shape, capsule
+from gpuvision.matching.board.located_board import LocatedBoard
+from gpuvision.matching.features.feature_set import FeatureSet
+
+Float64 = npt.NDArray[np.float64]
+
+_DPI = 150
+_LAMINATE, _COPPER, _OPEN, _SILK, _HOLE = "#1f3d2b", "#4f8a5b", "#d9b75f", "#f4f4f0", "#111111"
+# Of different lightness, too, for people who see few colours.
+_USED, _REJECTED, _NOTHING, _ARTWORK = "#00e5ff", "#ff9f1c", "#ff3366", "#ffe14d"
+_MM = 1e3
+
+
+def draw_features(path: str | Path, artwork: Artwork, features: FeatureSet, region: npt.ArrayLike) -> None:
+    """Draw a region of the artwork with the rulers chosen in it, as PNG, whole or not at all."""
+    box = np.asarray(region, np.float64)
+    window = np.stack([np.minimum(box[0], features.region[0]), np.maximum(box[1], features.region[1])])
+    border = 0.04 * (window[1] - window[0]).max()
+    window = window + border * np.array([[-1.0], [1.0]])
+    wide, high = window[1] - window[0]
+    figure, axes = _page((9.0, min(max(9.0 * high / wide, 3.0), 12.0) + 0.9))
+    draw_artwork(axes, artwork, window)
+    axes.add_patch(Rectangle(_MM * box[0], *(_MM * (box[1] - box[0])), fill=False, edgecolor="white", linestyle="--"))
+    ends = features.normal * features.length[:, None] / 2
+    lines = _MM * np.stack([features.point - ends, features.point + ends], axis=1)
+    pair = features.spacing > 0
+    for which, colour in ((~pair, _USED), (pair, "#ff66ff")):
+        axes.add_collection(LineCollection(list(lines[which]), colors=colour, linewidths=1.4))
+    for middle, radius in zip(features.marks.point, features.marks.radius, strict=True):
+        axes.add_patch(Circle(_MM * middle, _MM * radius, fill=False, edgecolor=_USED, linewidth=1.6))
+    axes.plot(*(_MM * features.placement), marker="+", color="white", markersize=16, markeredgewidth=2)
+    axes.set(xlim=_MM * window[:, 0], ylim=_MM * window[:, 1], aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
+    if artwork.side == "bottom":
+        axes.invert_xaxis()
+    axes.set_title(features.summary(), fontsize=8, loc="left")
+    handles = [Line2D([], [], color=_USED, label="across an edge"), Line2D([], [], color="#ff66ff", label="a trace")]
+    handles.append(Line2D([], [], color="grey", marker="+", linestyle="", label="placement point"))
+    figure.legend(handles=handles, loc="outside lower left", ncols=3, fontsize=8, frameon=False)
+    _write(figure, path)
+
+
+def draw_artwork(axes: Any, artwork: Artwork, window: Float64) -> None:
+    """Fill copper, what the mask opens, silk and holes of a window [m], in millimetres."""
+    axes.set_facecolor(_LAMINATE)
+    _fill(axes, artwork.copper, window, _COPPER, _LAMINATE)
+    _fill(axes, artwork.mask, window, _OPEN, _COPPER, alpha=0.55)
+    _fill(axes, artwork.silk, window, _SILK, _LAMINATE)
+    drilled = zip(artwork.holes.start, artwork.holes.end, artwork.holes.diameter, strict=True)
+    _fill(axes, tuple(Shape(capsule(start, end, across / 2)) for start, end, across in drilled), window, _HOLE, _HOLE)
+
+
+def _fill(
+    axes: Any, shapes: tuple[Shape, ...], window: Float64, dark: str, clear: str, alpha: float | None = None
+) -> None:
+    near = [
+        each
+        for each in shapes
+        if np.all(each.outline.max(axis=0) >= window[0]) and np.all(each.outline.min(axis=0) <= window[1])
+    ]
+    colours = [dark if each.dark else clear for each in near]
+    axes.add_collection(PolyCollection([_MM * each.outline for each in near], facecolors=colours, alpha=alpha))
+
+
+def draw_located_board(path: str | Path, image: npt.NDArray[Any], artwork: Artwork, located: LocatedBoard) -> None:
+    """Draw an image with the artwork at the pose that was found, the rulers, their edges, and marks, as PNG.
+
+    The rulers are drawn as straight lines between their ends; through a lens they are bent by less than is seen.
+    """
+    rows, columns = located.view.shape
+    figure, axes = _page((10.0, min(max(10.0 * rows / columns, 3.0), 14.0) + 0.8))
+    _show(axes, image)
+    _draw_outlines(axes, artwork, located.view)
+    told, view = located.rulers, located.view
+    classes = (
+        ("agree", told.used, _USED),
+        ("rejected", told.found & ~told.used, _REJECTED),
+        ("no edge found", told.laid & ~told.found, _NOTHING),
+    )
+    ends = told.normal * (told.length_px * view.scale / 2)[:, None]
+    lines = np.stack([view.measured(told.point - ends), view.measured(told.point + ends)], axis=1)
+    places = view.measured(told.point + told.normal * (told.position_px * view.scale)[:, None])
+    handles = [Line2D([], [], color=_ARTWORK, label="artwork's edges" + _as_expected(located))]
+    for name, which, colour in classes:
+        axes.add_collection(LineCollection(list(lines[which]), colors=colour, linewidths=1.1))
+        axes.plot(*places[which].T, ".", color=colour, markersize=4.0)
+        handles.append(Line2D([], [], color=colour, label=f"{int(which.sum())} rulers: {name}"))
+    axes.plot(*located.placement_px, marker="+", color="white", markersize=18, markeredgewidth=1.6)
+    handles += _draw_marks(axes, located)
+    _draw_axes(axes, view)
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="column [px]", ylabel="row [px]")
+    axes.set_title(located.summary(), fontsize=8, loc="left")
+    figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8, frameon=False)
+    _write(figure, path)
+
+
+def _draw_marks(axes: Any, located: LocatedBoard) -> list[Line2D]:
+    """Draw marks as circles where they were found, and where they were not as they should lie; a legend's handles."""
+    told, view = located.marks, located.view
+    middles = np.where(told.found[:, None], told.image_px, view.measured(told.point))
+    size = np.where(told.found, np.nan_to_num(told.size), told.radius) / view.scale
+    handles = []
+    for name, which, colour in (
+        ("agree", told.used, _USED),
+        ("rejected", told.found & ~told.used, _REJECTED),
+        ("not found", told.laid & ~told.found, _NOTHING),
+    ):
+        for middle, radius in zip(middles[which], size[which], strict=True):
+            axes.add_patch(Circle(middle, radius, fill=False, edgecolor=colour, linewidth=1.4))
+            axes.plot(*middle, "x", color=colour, markersize=4.0)
+        if told.laid.any():
+            label = f"{int(which.sum())} marks: {name}"
+            handles.append(Line2D([], [], color=colour, marker="o", fillstyle="none", linestyle="", label=label))
+    return handles
+
+
+def _as_expected(located: LocatedBoard) -> str:
+    return " where last looked for" if located.reason else ""
+
+
+def _draw_outlines(axes: Any, artwork: Artwork, view: BoardView) -> None:
+    """Draw the straight edges that can be seen."""
+    edges = artwork.edges
+    ends = np.stack([edges.start, edges.end], axis=1)
+    low, high = view.bounds
+    near = np.all((ends.max(axis=1) >= low) & (ends.min(axis=1) <= high), axis=1)
+    axes.add_collection(LineCollection(list(view.measured(ends[near])), colors=_ARTWORK, linewidths=0.5, alpha=0.8))
+
+
+def _draw_axes(axes: Any, view: BoardView) -> None:
+    """Draw the board's axes at the image's middle: x with a long arm, y with a short one."""
+    x, y, _ = view.pose
+    arm = 0.08 * min(view.shape) * view.scale
+    centre = view.measured(np.array([x, y]))
+    for name, tip in (("x", (1.6 * arm, 0.0)), ("y", (0.0, arm))):
+        end = view.measured(np.array([x, y]) + tip)
+        axes.annotate("", end, centre, arrowprops={"arrowstyle": "->", "color": "white", "lw": 1.3})
+        axes.annotate(name, end, color="white", fontsize=8, fontweight="bold")
+
+
+def _show(axes: Any, image: npt.NDArray[Any]) -> None:
+    grey = image if image.ndim == 2 else image[..., 2::-1]
+    if grey.ndim == 3 and grey.dtype == np.uint8:
+        axes.imshow(grey, interpolation="nearest")
+        return
+    grey = grey if grey.ndim == 2 else grey.mean(axis=2)
+    low, high = np.nanpercentile(grey, [0.5, 99.5])
+    axes.imshow(grey, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="nearest")
+
+
+def _page(size: tuple[float, float]) -> tuple[Figure, Any]:
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.add_subplot()
+
+
+def _write(figure: Figure, path: str | Path) -> None:
+    with replacing(path) as file:
+        figure.savefig(file, format="png")

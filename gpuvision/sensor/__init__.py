@@ -1,0 +1,1 @@
+"""A sensor as its description file gives it: readout, light source, simulated twin."""

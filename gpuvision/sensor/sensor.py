@@ -1,0 +1,451 @@
+"""A sensor as a file: ``sensor.toml`` says how it reads, how it triangulates and how it moves over the scene.
+
+Tables of the file (the ones in ``gpuvision/sensors`` are commented examples):
+
+====================  ==================================================================================================
+``kind``, ``name``    ``"camera"`` or ``"psd"``; a name for the report
+``[recording]``       see `Recording`
+``[line]``            camera: fields of `LineReadout`
+``[psd]``             PSD: number of strips, fields of `PsdReadout`; ``[psd.noise]``: fields of `PsdNoise`
+``[frame]``           camera: columns and rows of a frame; needed for a triangulation
+``[axes]``            where positions and samples lie in the triangulation's coordinates, see `SampleAxes`
+``[lens]``            radial distortion, see `Lens`
+``[triangulation]``   sensor to sheet, for a straight transport: ``baseline``, ``stand_off`` and so on (see
+                      `Triangulation.from_stand_off`); or a camera's ``focal_length_px``, ``principal_point_px`` and the
+                      sheet in its frame, ``sheet_origin``, ``g_axis``, ``h_axis``; or ``homography``; or ``constants``
+                      (`Triangulation.from_constants`); or ``points``: calibration points (u, v, G, H) to fit
+``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`
+``[output]``          see `Output`
+``[light]``           what ``gpuvision simulate`` must know beside: see `gpuvision.sensor.light_source`
+====================  ==================================================================================================
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from gpuvision.camera.lens import Lens
+from gpuvision.formats.camera_file import radial_lens
+from gpuvision.host.recordings import CHANNELS, Channel
+from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
+from gpuvision.ranging.psd import PsdNoise, PsdReadout
+from gpuvision.ranging.range_image import Limits, RotatingSheet, StraightTransport, Vector
+from gpuvision.ranging.triangulation import Along, SampleAxes, Triangulation
+from gpuvision.schema import DescriptionError, Section, read
+from gpuvision.sensor.light_source import Light, read_light
+
+Folded = Literal["drop", "top"]
+Ambiguous = Literal["drop", "keep"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """How the sensor was recorded.
+
+    Attributes
+    ----------
+    channel
+        Which channel of colour frames holds the line.
+    key
+        Which array of an NPZ file, if it holds more than one.
+    rate
+        Frames per second of the sensor; a scan says how many times faster it is.
+    """
+
+    channel: Channel = "grey"
+    key: str | None = None
+    rate: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """The height map: size of its cells, what counts as neighbours, what lies in the scene; all in metres.
+
+    Attributes
+    ----------
+    cell
+        Distance between cells.
+    max_gap, max_step, fold_tolerance, folded
+        As for `gpuvision.ranging.regrid.Regrid`.
+    ambiguous
+        Whether a sample with more than one candidate for the light keeps its point beside the flag.
+    limits
+        Lowest and highest x, y and z of the scene; what lies outside is OUT_OF_RANGE.
+    """
+
+    cell: float
+    max_gap: float
+    max_step: float
+    fold_tolerance: float = 0.0
+    folded: Folded = "drop"
+    ambiguous: Ambiguous = "drop"
+    limits: Limits = ((-math.inf, math.inf),) * 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """A sensor: its readout (with the triangulation in the same pass), its transport, and what to make of them.
+
+    Attributes
+    ----------
+    name
+        For reports.
+    readout
+        `LineReadout` for a camera, `PsdReadout` for a PSD.
+    transport
+        `StraightTransport` for a readout with a triangulation, or a `RotatingSheet`, which triangulates itself.
+    frame
+        Shape that a frame must have, where the file says: (rows, columns), or (strips, 2).
+    recording, output
+        See there.
+    light
+        Where the file says: what a simulation needs.
+    """
+
+    name: str
+    readout: LineReadout | PsdReadout
+    transport: StraightTransport | RotatingSheet
+    output: Output
+    recording: Recording = Recording()
+    frame: tuple[int, int] | None = None
+    light: Light | None = None
+
+    @classmethod
+    def load(cls, path: str | Path) -> Sensor:
+        """Read a sensor from a TOML file, or one that the package brings by its name (``"corner_scene"``).
+
+        Raises
+        ------
+        FileNotFoundError
+            There is neither such a file nor such a name.
+        DescriptionError
+            The file says something that it cannot say: key, value, unit and allowed range are in the message.
+        """
+        brought = {
+            Path(each.name).stem: each for each in resources.files("gpuvision").joinpath("presets", "sensors").iterdir()
+        }
+        if str(path) in brought:
+            with resources.as_file(brought[str(path)]) as file:
+                return cls.from_section(read(file))
+        path = Path(path)
+        if not path.is_file():
+            close = difflib.get_close_matches(path.stem, brought, 1)
+            hint = f"did you mean '{close[0]}'?" if close else f"give a file or one of {', '.join(sorted(brought))}"
+            raise FileNotFoundError(f"there is no sensor file {path}; {hint}")
+        return cls.from_section(read(path))
+
+    @classmethod
+    def from_section(cls, top: Section) -> Sensor:
+        """Read a sensor from an opened description.
+
+        Raises
+        ------
+        DescriptionError
+            See `load`.
+        """
+        try:
+            sensor = cls._read(top)
+        except DescriptionError:
+            raise
+        except (TypeError, ValueError, OverflowError) as error:
+            raise top.error(str(error)) from error
+        return sensor
+
+    @classmethod
+    def _read(cls, top: Section) -> Sensor:
+        kind = top.choice("kind", ("camera", "psd"))
+        name = top.text("name", "")
+        recording = _recording(top.optional_section("recording"))
+        radial = top.optional_section("lens")
+        lens = None if radial is None else radial_lens(radial)
+        readout = top.section("line" if kind == "camera" else "psd")
+        along: Along = readout.choice("along", ("columns", "rows"), "columns") if kind == "camera" else "columns"
+        frame = _frame(kind, top, readout)
+        moving = top.section("transport")
+        axes, sheet = SampleAxes(), None
+        transport: StraightTransport | RotatingSheet
+        # A PSD does not say where in the beam's plane the light is: it cannot stand beside a sheet that turns.
+        if moving.choice("kind", ("straight", "rotating") if kind == "camera" else ("straight",)) == "rotating":
+            transport = _rotating(moving, lens, along)
+        else:
+            transport, axes = _straight(moving), _axes(top.optional_section("axes"))
+            region = _region(kind, top, frame, along, axes, readout)
+            sheet = _triangulation(top.section("triangulation"), {"region": region, "along": along, "lens": lens})
+        output = _output(top.section("output"))
+        light = _light(top, transport)
+        top.finish()
+        return cls(
+            name=name,
+            readout=_line(readout, along, sheet, axes) if kind == "camera" else _psd(readout, sheet, axes),
+            transport=transport,
+            output=output,
+            recording=recording,
+            frame=frame,
+            light=light,
+        )
+
+    @property
+    def kind(self) -> Literal["camera", "psd"]:
+        """What makes the frames."""
+        return "camera" if isinstance(self.readout, LineReadout) else "psd"
+
+    def check_frame(self, shape: tuple[int, ...], what: str) -> None:
+        """Check that a recording's frames are this sensor's.
+
+        Raises
+        ------
+        ValueError
+            They are of another shape.
+        """
+        words = "(rows, columns)" if self.kind == "camera" else "(strips, 2)"
+        if len(shape) != 2 or shape != (self.frame or shape):
+            expected = words if self.frame is None else f"{words} = {self.frame}"
+            raise ValueError(f"{what}: frames have shape {shape}, the sensor file expects {expected}")
+
+
+def _recording(table: Section | None) -> Recording:
+    if table is None:
+        return Recording()
+    channel = table.choice("channel", CHANNELS, "grey")
+    rate = table.number("rate", "frames/s", None, above=0.0)
+    key = table.text("key", None)
+    table.finish()
+    return Recording(channel=channel, key=key, rate=rate)
+
+
+def _frame(kind: str, top: Section, readout: Section) -> tuple[int, int] | None:
+    if kind == "psd":
+        return readout.integer("strips", 1, at_least=1), 2
+    table = top.optional_section("frame")
+    if table is None:
+        return None
+    columns, rows = table.integer("columns", at_least=1), table.integer("rows", at_least=1)
+    table.finish()
+    return rows, columns
+
+
+def _axes(table: Section | None) -> SampleAxes:
+    if table is None:
+        return SampleAxes()
+    names = ("position_origin", "position_pitch", "sample_origin", "sample_pitch")
+    values = {name: table.number(name, "sensor unit", getattr(SampleAxes(), name)) for name in names}
+    table.finish()
+    return SampleAxes(**values)
+
+
+def _region(
+    kind: str, top: Section, frame: tuple[int, int] | None, along: Along, axes: SampleAxes, readout: Section
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return what the sensor covers in u and v: the positions of a strip or the pixels of a frame."""
+    if frame is None:
+        raise top.error("the table [frame] with columns and rows [pixel] is missing; a triangulation needs it")
+    if kind == "psd":
+        half = 0.5 * readout.number("strip_length", "m", above=0.0)
+        positions, samples = (-half, half), frame[0]
+    else:
+        length, samples = frame if along == "columns" else frame[::-1]
+        positions = (0.0, length - 1.0)
+    u = sorted(axes.position_origin + axes.position_pitch * each for each in positions)
+    v = sorted(axes.sample_origin + axes.sample_pitch * each for each in (0.0, samples - 1.0))
+    return (u[0], u[1]), (v[0], v[1])
+
+
+def _triangulation(table: Section, common: dict[str, Any]) -> Triangulation:
+    """Read a triangulation: a homography, constants, calibration points, a setup in metres, or a camera's pose."""
+    common = common | {"horizon": table.number("horizon", "", 1e-3, above=0.0, below=1.0)}
+    given = [way for way in _WAYS if way in table]
+    if len(given) != 1:
+        problem = f"has {' and '.join(given)} at once" if given else "has no geometry"
+        raise table.error(f"[{table.name}] {problem}, expected one of {', '.join(_WAYS)}")
+    made = _WAYS[given[0]](table, common)
+    table.finish()
+    return made
+
+
+def _from_homography(table: Section, common: dict[str, Any]) -> Triangulation:
+    return Triangulation(homography=table.rows("homography", "m per sensor unit", 3), **common)
+
+
+def _from_constants(table: Section, common: dict[str, Any]) -> Triangulation:
+    return Triangulation.from_constants(table.numbers("constants", "", (3, 4, 6, 8)), **common)
+
+
+def _from_points(table: Section, common: dict[str, Any]) -> Triangulation:
+    """Fit rows of (u, v, G, H)."""
+    points = np.array(table.rows("points", "u, v in sensor units, G, H in m", 4))
+    horizon = common.pop("horizon")
+    fitted = Triangulation.fit(points[:, :2], points[:, 2:], **common)
+    return replace(fitted, horizon=horizon)
+
+
+def _from_stand_off(table: Section, common: dict[str, Any]) -> Triangulation:
+    return Triangulation.from_stand_off(
+        baseline=table.number("baseline", "m", above=0.0),
+        stand_off=table.number("stand_off", "m", above=0.0),
+        focal_distance=table.number("focal_distance", "sensor unit", above=0.0),
+        tilt=table.number("tilt", "rad", None, above=-math.pi / 2, below=math.pi / 2),
+        **common,
+    )
+
+
+def _from_camera(table: Section, common: dict[str, Any]) -> Triangulation:
+    focal = table.number("focal_length_px", "pixel", above=0.0)
+    column, row = table.numbers("principal_point_px", "pixel", (2,))
+    return Triangulation.from_camera(
+        [[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]],
+        np.eye(3),
+        np.zeros(3),
+        origin=table.numbers("sheet_origin", "m", (3,)),
+        g_axis=table.numbers("g_axis", "", (3,)),
+        h_axis=table.numbers("h_axis", "", (3,)),
+        **common,
+    )
+
+
+_WAYS = {
+    "homography": _from_homography,
+    "constants": _from_constants,
+    "points": _from_points,
+    "baseline": _from_stand_off,
+    "focal_length_px": _from_camera,
+}
+
+
+def _line(table: Section, along: Along, sheet: Triangulation | None, axes: SampleAxes) -> LineReadout:
+    default = LineReadout()
+    readout = LineReadout(
+        along=along,
+        method=table.choice("method", cast(tuple[Method, ...], METHODS), default.method),
+        threshold=table.number("threshold", "grey levels", default.threshold, at_least=0.0),
+        window=table.integer("window", default.window, at_least=1, at_most=WIDEST_WINDOW),
+        # "nearest" needs the reading before: a recording is read in batches, of which all frames run at once.
+        choice=table.choice("choice", ("strongest", "first", "last"), default.choice),
+        minimum_peak=table.number("minimum_peak", "grey levels", None, at_least=0.0),
+        minimum_width=table.integer("minimum_width", default.minimum_width, at_least=1),
+        maximum_width=table.integer("maximum_width", None, at_least=1),
+        saturation=table.number("saturation", "grey levels", None, above=0.0),
+        ambiguity=table.number("ambiguity", "share of the peak", None, above=0.0, at_most=1.0),
+        fir_length=cast(Literal[4, 8], table.integer("fir_length", default.fir_length, at_least=4, at_most=8)),
+        read_noise=table.number("read_noise", "grey levels", default.read_noise, at_least=0.0),
+        gain=table.number("gain", "grey levels per electron", default.gain, at_least=0.0),
+        triangulation=sheet,
+        axes=axes,
+    )
+    table.finish()
+    return readout
+
+
+def _psd(table: Section, sheet: Triangulation | None, axes: SampleAxes) -> PsdReadout:
+    left, right = table.numbers("dark", "A", (2,), (0.0, 0.0))
+    readout = PsdReadout(
+        strip_length=table.number("strip_length", "m", above=0.0),
+        ampere=table.number("ampere", "A per unit of the recording", 1.0, above=0.0),
+        dark=(left, right),
+        right_gain=table.number("right_gain", "", 1.0, above=0.0),
+        interelectrode_resistance=table.number("interelectrode_resistance", "Ohm", None, above=0.0),
+        load_resistance=table.number("load_resistance", "Ohm", 0.0, at_least=0.0),
+        minimum_total=table.number("minimum_total", "A", 0.0, at_least=0.0),
+        saturation=table.number("saturation", "A", None, above=0.0),
+        linearity=table.rows("linearity", "m", default=None),
+        noise=_noise(table.optional_section("noise")),
+        triangulation=sheet,
+        axes=axes,
+    )
+    table.finish()
+    return readout
+
+
+def _noise(table: Section | None) -> PsdNoise | None:
+    if table is None:
+        return None
+    units = {"independent": "A", "opposed": "A", "spot": "m", "bandwidth": "Hz"}
+    noise = PsdNoise(**{name: table.number(name, unit, 0.0, at_least=0.0) for name, unit in units.items()})
+    table.finish()
+    return noise
+
+
+def _straight(table: Section) -> StraightTransport:
+    default = StraightTransport()
+    transport = StraightTransport(
+        step=table.number("step", "m per profile"),
+        start=table.number("start", "m", 0.0),
+        g_axis=_vector(table, "g_axis", "", default.g_axis),
+        h_axis=_vector(table, "h_axis", "", default.h_axis),
+        direction=_vector(table, "direction", "", default.direction),
+        origin=_vector(table, "origin", "m", default.origin),
+    )
+    table.finish()
+    return transport
+
+
+def _rotating(table: Section, lens: Lens | None, along: Along) -> RotatingSheet:
+    column, row = table.numbers("principal_point_px", "pixel", (2,))
+    identity = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    sheet = RotatingSheet(
+        along=along,
+        lens=lens,
+        focal_length_px=table.number("focal_length_px", "pixel", above=0.0),
+        principal_point_px=(column, row),
+        axis_point=_vector(table, "axis_point", "m"),
+        axis_direction=_vector(table, "axis_direction", ""),
+        sheet_normal=_vector(table, "sheet_normal", ""),
+        sheet_offset=table.number("sheet_offset", "m", 0.0),
+        first_angle=table.number("first_angle", "rad", at_least=-2 * math.pi, at_most=2 * math.pi),
+        angle_step=table.number("angle_step", "rad per profile", above=-math.pi, below=math.pi),
+        scene_axes=table.rows("scene_axes", "", 3, identity),
+        scene_origin=_vector(table, "scene_origin", "m", (0.0, 0.0, 0.0)),
+        horizon=table.number("horizon", "", 1e-4, above=0.0, below=1.0),
+    )
+    table.finish()
+    return sheet
+
+
+def _light(top: Section, transport: StraightTransport | RotatingSheet) -> Light | None:
+    table = top.optional_section("light")
+    if table is None:
+        return None
+    light = read_light(table)
+    setup = top.optional_section("triangulation")
+    if light.lens is not None or setup is None or "baseline" not in setup:
+        return light
+    assert isinstance(transport, StraightTransport)  # the others have no triangulation
+    up = np.array(transport.h_axis) / np.linalg.norm(transport.h_axis)
+    beside = np.cross(transport.g_axis, transport.h_axis)
+    beside *= np.sign(beside @ np.array(transport.direction)) / np.linalg.norm(beside)
+    place = np.array(transport.origin) + setup.number("baseline", "m") * beside + setup.number("stand_off", "m") * up
+    return replace(light, lens=(float(place[0]), float(place[1]), float(place[2])))
+
+
+def _output(table: Section) -> Output:
+    cell = table.number("cell", "m", above=0.0)
+    x, y, z = (_limits(table, name) for name in "xyz")
+    output = Output(
+        cell=cell,
+        max_gap=table.number("max_gap", "m", 3.0 * cell, at_least=cell),
+        max_step=table.number("max_step", "m", math.inf, above=0.0),
+        fold_tolerance=table.number("fold_tolerance", "m", 0.0, at_least=0.0),
+        folded=table.choice("folded", ("drop", "top"), "drop"),
+        ambiguous=table.choice("ambiguous", ("drop", "keep"), "drop"),
+        limits=(x, y, z),
+    )
+    table.finish()
+    return output
+
+
+def _limits(table: Section, key: str) -> tuple[float, float]:
+    low, high = table.numbers(key, "m", (2,), (-math.inf, math.inf))
+    if not low < high:
+        raise table.error(f"{table.dotted(key)} is [{low}, {high}], expected the lowest below the highest [m]")
+    return low, high
+
+
+def _vector(table: Section, key: str, unit: str, default: tuple[float, ...] | None = None) -> Vector:
+    x, y, z = table.numbers(key, unit, (3,)) if default is None else table.numbers(key, unit, (3,), default)
+    return x, y, z

@@ -1,0 +1,1 @@
+"""Error-bounded clustering of lights (in the manner of lightcuts)."""

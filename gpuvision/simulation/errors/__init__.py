@@ -1,0 +1,1 @@
+"""Range errors of simulated readings: size, causes, remedies."""

@@ -1,0 +1,1 @@
+"""Scenes: triangles with materials, ray queries, visibility, reflectance models."""

@@ -1,0 +1,311 @@
+"""A sensor's sight of a scene: rays from its pixels or strips, images of points, and the light that they get.
+
+Sheet and sensor move together along the transport; everything here takes the transport L of a profile. A point is
+imaged along the ray from the lens through it: where that ray meets the sheet of light, at (G, H), is the point which
+the sensor takes it for, and the triangulation says where on the sensor that is. This holds for every pinhole sensor,
+tilted or not, as the sheet and the sensor are planes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtr
+
+from gpuvision.ranging.range_image import StraightTransport, Vector
+from gpuvision.ranging.triangulation import Triangulation
+from gpuvision.validation import finite, numbers
+
+Float64 = npt.NDArray[np.float64]
+# Sigmas: beyond, a Gaussian has less than 3e-12 of its light.
+_SPOT = 7.0
+
+
+class Exposure(NamedTuple):
+    """Light on a sensor, in bins along u for every sample along v; exposures add.
+
+    Attributes
+    ----------
+    power
+        (samples, bins), W.
+    moment
+        (samples, bins), W times sensor unit: the sum of power times its distance from the middle of its bin, so that
+        the first moment of a strip does not depend on how fine the bins are.
+    """
+
+    power: Float64
+    moment: Float64
+
+    def __add__(self, other: object) -> Exposure:
+        if not isinstance(other, Exposure):
+            return NotImplemented
+        return Exposure(self.power + other.power, self.moment + other.moment)
+
+    def total(self) -> Float64:
+        """Return the power of every sample, (samples,), W."""
+        return np.asarray(self.power.sum(axis=-1))
+
+    def first_moment(self, u_edges: Float64) -> Float64:
+        """Return the sum of power times u of every sample, (samples,), W times sensor unit."""
+        return np.asarray(self.moment.sum(axis=-1) + self.power @ (0.5 * (u_edges[1:] + u_edges[:-1])))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SensorView:
+    """What a pinhole sensor beside a sheet of light sees; compared by identity.
+
+    Parameters
+    ----------
+    triangulation
+        From the sensor to the sheet, its lens distortion included.
+    transport
+        How sheet and sensor move over the scene.
+    lens
+        Where the pinhole is, in the scene, at transport 0 [m].
+    u_edges
+        (bins + 1,) sensor units, ascending: in what bins along u a sample's light is kept. A PSD's strip ends at the
+        first and the last one; a camera has a bin for every pixel.
+    v_edges
+        (samples + 1,) sensor units, ascending: where strips or columns begin and end.
+    aperture
+        Diameter of the lens' opening [m].
+    axis
+        Where the lens points, in the scene; None: at what the middle of the sensor sees of the sheet.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter is not what is said here; the lens lies in the sheet.
+    """
+
+    triangulation: Triangulation
+    transport: StraightTransport
+    lens: Vector
+    u_edges: Float64
+    v_edges: Float64
+    aperture: float = 1e-3
+    axis: Vector | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "lens", numbers(self.lens, (3,), "SensorView.lens"))
+        object.__setattr__(self, "u_edges", _edges(self.u_edges, "SensorView.u_edges"))
+        object.__setattr__(self, "v_edges", _edges(self.v_edges, "SensorView.v_edges"))
+        if finite(self.aperture, "SensorView.aperture") <= 0.0:
+            raise ValueError(f"SensorView.aperture is {self.aperture:g} m, expected a diameter > 0")
+        if abs(self._off_sheet) <= 1e-9 * float(np.linalg.norm(self._to_sheet)):
+            raise ValueError("SensorView.lens lies in the sheet of light: nothing can be triangulated")
+        if self.axis is not None:
+            towards: npt.ArrayLike = numbers(self.axis, (3,), "SensorView.axis")
+        else:
+            middle = 0.5 * (self.u_edges[0] + self.u_edges[-1]), 0.5 * (self.v_edges[0] + self.v_edges[-1])
+            towards = self.points_in_sheet(*middle) - self.lens
+        length = float(np.linalg.norm(towards))
+        if not 0.0 < length < math.inf:
+            raise ValueError("SensorView.axis has no direction")
+        object.__setattr__(self, "axis", numbers(np.asarray(towards) / length, (3,), "SensorView.axis"))
+
+    @property
+    def samples(self) -> int:
+        """Number of strips or columns."""
+        return len(self.v_edges) - 1
+
+    @property
+    def bins(self) -> int:
+        """Number of bins along each of them."""
+        return len(self.u_edges) - 1
+
+    @property
+    def u_middles(self) -> Float64:
+        """Middles of the bins, (bins,)."""
+        return 0.5 * (self.u_edges[1:] + self.u_edges[:-1])
+
+    @property
+    def v_middles(self) -> Float64:
+        """Middles of the samples, (samples,)."""
+        return 0.5 * (self.v_edges[1:] + self.v_edges[:-1])
+
+    def lens_at(self, L: float) -> Float64:
+        """Return where the lens is, (3,), at a transport L [m]."""
+        return np.asarray(np.array(self.lens) + L * np.array(self.transport.direction))
+
+    # ---- where things are seen -----------------------------------------------------------------------------
+
+    def sheet_coordinates(self, points: npt.ArrayLike, L: float = 0.0) -> Float64:
+        """Return where in the sheet a point is taken to be: (..., 3) to (G, H), (..., 2) [m].
+
+        NaN for points that are not in front of the lens, or whose ray does not meet the sheet in front of it.
+        """
+        rays = np.asarray(points, np.float64) - self.lens_at(L)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            way = self._off_sheet / (rays @ self._normal)
+            met = np.where(((way > 0.0) & (rays @ np.array(self.axis) > 0.0))[..., None], way[..., None] * rays, np.nan)
+        return self._in_sheet(met)
+
+    def project(self, points: npt.ArrayLike, L: float = 0.0) -> Float64:
+        """Return where points are imaged: (..., 3) to (u, v), (..., 2); NaN as in `sheet_coordinates`."""
+        return self.triangulation.to_sensor(self.sheet_coordinates(points, L))
+
+    def points_in_sheet(self, u: npt.ArrayLike, v: npt.ArrayLike, L: float = 0.0) -> Float64:
+        """Return which point of the sheet is imaged at (u, v), (..., 3) in the scene [m]; NaN beyond the horizon."""
+        sensor = np.stack(np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64)), axis=-1)
+        lens = self.triangulation.sensor_lens
+        straight = sensor if lens is None else lens.undistort(sensor)
+        lifted = straight @ self._matrix[:, :2].T + self._matrix[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sheet = np.where((lifted[..., 2] * self._front > 0.0)[..., None], lifted[..., :2] / lifted[..., 2:], np.nan)
+        move = self.transport
+        place = np.array(move.origin) + L * np.array(move.direction)
+        return np.asarray(place + sheet @ np.array([move.g_axis, move.h_axis]))
+
+    def rays(self, u: npt.ArrayLike, v: npt.ArrayLike, L: float = 0.0) -> Float64:
+        """Return the rays on which (u, v) lies, (..., 6): the lens, and a unit vector into the scene.
+
+        NaN for what looks over the horizon of the sheet.
+        """
+        lens = self.lens_at(L)
+        towards = self.points_in_sheet(u, v, L) - lens
+        towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+        return np.concatenate([np.broadcast_to(lens, towards.shape), towards], axis=-1)
+
+    def etendue(self, u: npt.ArrayLike, v: npt.ArrayLike) -> Float64:
+        """Return power over radiance of a sensor element per its area, m^2 sr per squared sensor unit.
+
+        Aperture times the cosine to the lens' axis times the solid angle that the element sees; behind an untilted
+        lens this is the law of cos^4. Zero where the element looks over the horizon or away from the lens' axis.
+        """
+        sensor = np.stack(np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64)), axis=-1)
+        lens = self.triangulation.sensor_lens
+        straight = sensor if lens is None else lens.undistort(sensor)
+        lifted = straight @ self._matrix[2, :2] + self._matrix[2, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            stretch = np.abs(np.linalg.det(self._matrix) / lifted**3)
+            if lens is not None:
+                stretch = stretch * np.abs(np.linalg.det(lens.jacobian(sensor)))
+            towards = self.points_in_sheet(u, v) - self.lens
+            distance = np.linalg.norm(towards, axis=-1)
+            cosine = towards @ np.array(self.axis) / distance
+            area = np.abs(self._off_sheet) * self._metric * stretch
+            value = self._opening * np.maximum(cosine, 0.0) * area / distance**3
+        return np.where(np.isfinite(value), value, 0.0)
+
+    def received(self, points: npt.ArrayLike, L: float = 0.0) -> Float64:
+        """Return power on the sensor over intensity (W/sr) of points seen, (..., 3) to (...,): the lens' solid angle.
+
+        Zero behind the lens.
+        """
+        towards = np.asarray(points, np.float64) - self.lens_at(L)
+        square = np.sum(towards * towards, axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value = self._opening * np.maximum(towards @ np.array(self.axis), 0.0) / square**1.5
+        return np.where(np.isfinite(value), value, 0.0)
+
+    # ---- the light that arrives ----------------------------------------------------------------------------
+
+    def sample_of(self, v: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return the samples that places v belong to; -1 where they belong to none."""
+        return _slot(self.v_edges, v)
+
+    def bin_of(self, u: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return the bins that places u belong to; -1 where they belong to none."""
+        return _slot(self.u_edges, u)
+
+    def dark(self) -> Exposure:
+        """Return an exposure without light."""
+        return Exposure(np.zeros((self.samples, self.bins)), np.zeros((self.samples, self.bins)))
+
+    def deposit(self, u: npt.ArrayLike, v: npt.ArrayLike, power: npt.ArrayLike) -> Exposure:
+        """Return the exposure by spots of light at (u, v) of some power [W]; what falls off the sensor is lost."""
+        u, v, power = (np.ravel(each) for each in np.broadcast_arrays(u, v, power))
+        sample, place = self.sample_of(v), self.bin_of(u)
+        on = (sample >= 0) & (place >= 0)
+        at, size = sample[on] * self.bins + place[on], self.samples * self.bins
+        weights = np.asarray(power, np.float64)[on]
+        total = np.bincount(at, weights, minlength=size)
+        moment = np.bincount(at, weights * (u[on] - self.u_middles[place[on]]), minlength=size)
+        shape = (self.samples, self.bins)
+        return Exposure(np.asarray(total.reshape(shape), np.float64), np.asarray(moment.reshape(shape), np.float64))
+
+    def blurred(self, exposure: Exposure, sigma: float) -> Exposure:
+        """Return the exposure behind a lens that images a point as a Gaussian along u, sigma in sensor units.
+
+        The light of a bin is taken as a spot at its centre of gravity. What comes to lie beyond the sensor's ends, and
+        what is more than 7 sigma away, is lost.
+        """
+        if sigma == 0.0:
+            return exposure
+        sample, place = np.nonzero(exposure.power)
+        light = exposure.power[sample, place]
+        at = self.u_middles[place] + exposure.moment[sample, place] / light
+        first = np.maximum(np.searchsorted(self.u_edges, at - _SPOT * sigma) - 1, 0)
+        last = np.minimum(np.searchsorted(self.u_edges, at + _SPOT * sigma), self.bins)
+        widest = int(np.max(last - first, initial=0))
+        bins = np.minimum(first[:, None] + np.arange(widest + 1), self.bins)
+        edges = (self.u_edges[bins] - at[:, None]) / sigma
+        below, bell = ndtr(edges), np.exp(-0.5 * edges**2) / math.sqrt(math.tau)
+        power = light[:, None] * np.diff(below, axis=1)
+        bins = np.minimum(bins[:, :-1], self.bins - 1)
+        first_moment = -sigma * light[:, None] * np.diff(bell, axis=1)
+        moment = first_moment + (at[:, None] - self.u_middles[bins]) * power
+        slot = (sample[:, None] * self.bins + bins).ravel()
+        shape, size = (self.samples, self.bins), self.samples * self.bins
+        whole = (np.bincount(slot, each.ravel(), minlength=size).reshape(shape) for each in (power, moment))
+        return Exposure(*(np.asarray(each, np.float64) for each in whole))
+
+    # ---- what follows from the parameters ------------------------------------------------------------------
+
+    @property
+    def _matrix(self) -> Float64:
+        return np.array(self.triangulation.homography)
+
+    @property
+    def _front(self) -> float:
+        """The sign of the homography's third coordinate in front of the sensor."""
+        middle = np.mean(np.array(self.triangulation.region), axis=1)
+        return float(np.sign(self._matrix[2] @ [*middle, 1.0]))
+
+    @property
+    def _normal(self) -> Float64:
+        across = np.cross(self.transport.g_axis, self.transport.h_axis)
+        return np.asarray(across / np.linalg.norm(across))
+
+    @property
+    def _metric(self) -> float:
+        """Area in the scene per unit of G and H."""
+        return float(np.linalg.norm(np.cross(self.transport.g_axis, self.transport.h_axis)))
+
+    @property
+    def _to_sheet(self) -> Float64:
+        return np.asarray(np.array(self.transport.origin) - np.array(self.lens))
+
+    @property
+    def _off_sheet(self) -> float:
+        return float(self._to_sheet @ self._normal)
+
+    @property
+    def _opening(self) -> float:
+        return 0.25 * math.pi * self.aperture**2
+
+    def _in_sheet(self, from_lens: Float64) -> Float64:
+        """Return (G, H) of points of the sheet, given from the lens."""
+        axes = np.array([self.transport.g_axis, self.transport.h_axis])
+        return np.asarray((from_lens - self._to_sheet) @ np.linalg.pinv(axes))
+
+
+def _edges(values: npt.ArrayLike, what: str) -> Float64:
+    edges = np.array(values, np.float64)
+    if edges.ndim != 1 or len(edges) < 2 or not np.isfinite(edges).all() or np.any(np.diff(edges) <= 0.0):
+        raise ValueError(f"{what}: expected two or more numbers, each larger than the one before")
+    edges.flags.writeable = False
+    return edges
+
+
+def _slot(edges: Float64, values: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """Return between which edges values lie; the last edge belongs to the last slot."""
+    values = np.asarray(values, np.float64)
+    at = np.searchsorted(edges, values, side="right") - 1
+    at = np.where(values == edges[-1], len(edges) - 2, at)
+    return np.where((at >= 0) & (at < len(edges) - 1) & np.isfinite(values), at, -1).astype(np.int64)

@@ -1,0 +1,1 @@
+"""Light transport from the sheet of light over the scene to the sensor."""

@@ -1,0 +1,461 @@
+"""Lit lines in mirrors: diffuse lines that the lens sees in them, and the light that they throw on other surfaces."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.host import Device
+from gpuvision.simulation.scene.closed_surfaces import outward
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.padded import run_padded
+from gpuvision.simulation.scene.rays import AnyHit
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.scene.visible_intervals import VisibleIntervals
+from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
+from gpuvision.simulation.sensors.view_rays import check_materials
+from gpuvision.simulation.transport.illumination import LightSheet, LitLine
+from gpuvision.simulation.transport.line_exposure import line_exposure
+from gpuvision.simulation.transport.mirror_facets import MirrorFacets
+from gpuvision.simulation.transport.mirror_points import MirrorPoints, bulge_of, smooth_normals
+from gpuvision.simulation.transport.plane_mirrors import heights, mirrored, planes_of, windows
+from gpuvision.simulation.transport.sheet_cut import ranges
+from gpuvision.simulation.transport.specular_interreflection import SpecularInterreflection, lines_of
+from gpuvision.status import Status
+
+Float64 = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+# Corner normals that lean more than this from the triangle's make it curved [rad].
+_FLAT = 1e-6
+# Windows of which more parts are visible than are kept are halved so often.
+_HALVINGS = 12
+# Images of a point in curved mirrors that there is room for, at first and at last.
+_KEPT, _MOST_KEPT = 32, 255
+# Clearance of rays between surfaces, in sizes of the scene.
+_CLEARANCE = 1e-7
+
+
+class _Seen(NamedTuple):
+    """Parts of lines that are seen in mirrors: which line, in which mirror, from where to where."""
+
+    line: Integers
+    mirror: Integers
+    share: Float64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mirrors:
+    """The mirrors of a scene, before a sensor; compared by identity.
+
+    A triangle whose material has a `mirror` share reflects on both sides. Where the normals at its corners agree with
+    its own it is a plane mirror, and its images are exact; else it is part of a curved one.
+
+    Parameters
+    ----------
+    sight
+        The sensor.
+    scene, materials
+        The surfaces; a material for every number in `Scene.material`.
+    normals
+        (n, 3, 3): normals at the corners of all triangles; None: `smooth_normals` of the scene.
+    per_sample
+        Curved mirrors show a line in steps, so many in what a sample of the sensor sees of the sheet.
+    throws
+        How many mirrors the light of the sheet may meet one after another, 0 or more.
+    device
+        Where kernels run; None: `Device.best`.
+
+    Raises
+    ------
+    ValueError
+        A triangle has no material; a parameter is out of range.
+
+    Notes
+    -----
+    Plane mirrors: exact windows, visible intervals on both ways, images cut exactly at the sensor's bins; errors are
+    roundings. Curved ones: as `MirrorPoints` says for the place, and of second order in the step; of first order where
+    an image ends. Of the light that a point sends, the diffuse part is taken, as `Lambert`'s of the same albedo; one
+    mirror between line and lens. What a curved mirror throws on is found by rays, one step apart.
+    """
+
+    sight: SensorView
+    scene: Scene
+    materials: Sequence[Material]
+    normals: Float64 | None = None
+    per_sample: float = 2.0
+    throws: int = 2
+    device: Device | None = None
+
+    def __post_init__(self) -> None:
+        check_materials(self.scene, self.materials)
+        if self.normals is not None and np.shape(self.normals) != self.scene.corners.shape:
+            raise ValueError(f"Mirrors.normals has shape {np.shape(self.normals)}, expected {self.scene.corners.shape}")
+        if not self.per_sample > 0.0 or not math.isfinite(self.per_sample):
+            raise ValueError(f"Mirrors.per_sample is {self.per_sample}, expected a number > 0")
+        if self.throws < 0:
+            raise ValueError(f"Mirrors.throws is {self.throws}, expected 0 or more")
+
+    def exposure(self, lit: LitLine, L: float, sheet: LightSheet | None = None, offset: float = 0.0) -> Exposure:
+        """Return the light that reaches the sensor by way of a mirror, before or after a diffuse surface.
+
+        Parameters
+        ----------
+        lit
+            What the sheet lights.
+        L
+            Transport of the sensor [m].
+        sheet, offset
+            Where the light comes from, for what mirrors throw on; None: only what is seen in mirrors is taken.
+        """
+        if not self.there_are_any:
+            return self.sight.dark()
+        total = self.seen(lit, L)
+        if sheet is None:
+            return total
+        thrown = self.thrown(lit, sheet, L + offset)
+        return total + self.direct(thrown, L) + self.seen(thrown, L)
+
+    @functools.cached_property
+    def there_are_any(self) -> bool:
+        """Whether any triangle reflects."""
+        return bool(self._reflects.any())
+
+    # ---- diffuse lines ---------------------------------------------------------------------------------------
+
+    def seen(self, lit: LitLine, L: float) -> Exposure:
+        """Return what the sensor sees of lit lines in mirrors, as they are diffuse."""
+        exitance = self._exitance(lit)
+        shining = np.flatnonzero(exitance > 0.0)
+        lit, exitance = lines_of(lit, shining), exitance[shining]
+        if not len(exitance):
+            return self.sight.dark()
+        return self._in_planes(lit, exitance, L) + self._in_curves(lit, exitance, L)
+
+    def direct(self, lit: LitLine, L: float) -> Exposure:
+        """Return what the sensor sees of lit lines without a mirror, as they are diffuse."""
+        exitance = self._exitance(lit)
+        shining = np.flatnonzero(exitance > 0.0)
+        lit, exitance = lines_of(lit, shining), exitance[shining]
+        if not len(exitance):
+            return self.sight.dark()
+        lens = self.sight.lens_at(L)
+        whole = np.tile([0.0, 1.0], (len(exitance), 1))
+        apex = np.broadcast_to(lens, (len(exitance), 3))
+        row, share = self._visible(apex, lit.ends, np.zeros((len(exitance), 2)), whole)
+        ends = _between(lit.ends[row], share)
+        return self._exposed(ends, lit.normals[row], exitance[row], L)
+
+    def _exitance(self, lit: LitLine) -> Float64:
+        """Return the power that leaves a metre of the lines diffusely [W/m]."""
+        albedos = np.array([each.albedo for each in self.materials])
+        return np.asarray(lit.power * albedos[self._material[lit.triangle]])
+
+    def _exposed(self, ends: Float64, normals: Float64, exitance: Float64, L: float) -> Exposure:
+        """Return the exposure by diffuse lines, or their images, seen from end to end."""
+        length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        lens = self.sight.lens_at(L)
+
+        def strength(line: Integers, at: Float64) -> Float64:
+            place = ends[line, 0] + at[:, None] * (ends[line, 1] - ends[line, 0])
+            towards = lens - place
+            cosine = np.sum(towards * normals[line], axis=1) / np.linalg.norm(towards, axis=1)
+            intensity = exitance[line] / math.pi * np.maximum(cosine, 0.0) * length[line]
+            return np.asarray(intensity * self.sight.received(place, L))
+
+        return line_exposure(self.sight, L, ends, strength)
+
+    # ---- plane mirrors ---------------------------------------------------------------------------------------
+
+    def _in_planes(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
+        if not len(self._flat):
+            return self.sight.dark()
+        seen = self._through_windows(lit, L)
+        if not len(seen.line):
+            return self.sight.dark()
+        planes = self._planes[seen.mirror]
+        ends = mirrored(_between(lit.ends[seen.line], seen.share), planes[:, None])
+        normals = lit.normals[seen.line]
+        turned = normals - 2.0 * np.sum(normals * planes[:, :3], axis=1, keepdims=True) * planes[:, :3]
+        return self._exposed(ends, turned, exitance[seen.line] * self._share_of(self._flat[seen.mirror]), L)
+
+    def _through_windows(self, lit: LitLine, L: float) -> _Seen:
+        """Return the parts of lines that the lens sees in plane mirrors, nothing in the way before or behind them."""
+        lens = self.sight.lens_at(L)
+        line, mirror, share = windows(lens, lit.ends, self._facets.corners, self._planes, *self._pairs(lit, lens))
+        # The side that the light comes from faces the mirror image of the lens.
+        apex = mirrored(lens, self._planes[mirror])
+        facing = np.sum((apex - lit.ends[line].mean(axis=1)) * lit.normals[line], axis=1) > 0.0
+        line, mirror, share, apex = line[facing], mirror[facing], share[facing], apex[facing]
+        up = np.abs(heights(lens, self._planes[mirror]))
+        ends = _between(lit.ends[line], share)
+        away = np.abs(heights(ends, self._planes[mirror][:, None]))
+        near = up[:, None] / (up[:, None] + away)
+        row, behind = self._visible(apex, ends, near, np.tile([0.0, 1.0], (len(line), 1)))
+        line, mirror, share, apex, near = line[row], mirror[row], share[row], apex[row], near[row]
+        # Where the parts are on the mirror: as seen from the apex, on the way to their ends.
+        ends = _between(ends[row], behind)
+        near = 1.0 / ((1.0 - behind) / near[:, :1] + behind / near[:, 1:])
+        on_mirror = apex[:, None] + near[..., None] * (ends - apex[:, None])
+        low, width = share[:, :1], np.diff(share)
+        share = low + width * behind
+        lenses = np.broadcast_to(lens, apex.shape)
+        row, before = self._visible(lenses, on_mirror, np.zeros(share.shape), np.tile([0.0, 1.0], (len(row), 1)))
+        # What is even on the mirror is not on the line.
+        near, share = near[row], share[row]
+        weight = np.stack([1.0 - before, before], axis=-1) * near[:, None, :]
+        before = weight[..., 1] / weight.sum(axis=-1)
+        return _Seen(line[row], mirror[row], share[:, :1] + np.diff(share) * before)
+
+    def _pairs(self, lit: LitLine, lens: Float64) -> tuple[Integers, Integers]:
+        """Return which lines may be seen in which plane mirrors."""
+        blocks = self._facets.blocks
+        line, block = np.nonzero(self._run(self._facets, lit.ends.reshape(-1, 6), lens).near)
+        count = np.diff(blocks.start)[block]
+        line, mirror = np.repeat(line, count), blocks.order[ranges(blocks.start[block], count)]
+        seen = heights(lens, self._planes) * self._sides[self._flat] >= 0.0
+        return line[seen[mirror]], mirror[seen[mirror]]
+
+    def _visible(self, apex: Float64, ends: Float64, near: Float64, share: Float64) -> tuple[Integers, Float64]:
+        """Return visible parts of segments (k, 2, 3): which segment, from where to where."""
+        rows, parts = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+        row = np.arange(len(apex))
+        for _ in range(_HALVINGS):
+            if not len(row):
+                break
+            some = _between(ends[row], share)
+            nears = 1.0 / ((1.0 - share) / np.maximum(near[row, :1], 1e-30) + share / np.maximum(near[row, 1:], 1e-30))
+            result = self._run(self._fans, np.hstack([apex[row], some.reshape(-1, 6), nears]))
+            which, slot = np.nonzero(np.arange(result.intervals.shape[1]) < result.count[:, None])
+            rows.append(row[which])
+            low, width = share[which, :1], np.diff(share[which])
+            parts.append(low + width * result.intervals[which, slot])
+            many = np.flatnonzero(result.status)
+            row, middle = np.tile(row[many], 2), share[many].mean(axis=1)
+            share = np.concatenate(
+                [np.column_stack([share[many, 0], middle]), np.column_stack([middle, share[many, 1]])]
+            )
+        return np.concatenate(rows), np.concatenate(parts)
+
+    # ---- curved mirrors --------------------------------------------------------------------------------------
+
+    def _in_curves(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
+        if not len(self._curved):
+            return self.sight.dark()
+        line, share = _steps(lit.lengths, self.step)
+        place = _between(lit.ends[line], share)
+        move, middle = place[:, 1] - place[:, 0], place.mean(axis=1)
+        lens = self.sight.lens_at(L)
+        point, spot, spot_move, density, triangle = self._images(np.hstack([middle, move]), lens)
+        origin = middle[point]
+        towards = spot - origin
+        way = np.linalg.norm(towards, axis=1)
+        cosine = np.sum(towards * lit.normals[line[point]], axis=1) / way
+        good = (cosine > 0.0) & np.isfinite(density)
+        good[good] = self._free(origin[good], spot[good], lens, triangle[good])
+        point, spot, spot_move, density, triangle, cosine = (
+            each[good] for each in (point, spot, spot_move, density, triangle, cosine)
+        )
+        source = line[point]
+        intensity = exitance[source] / math.pi * cosine * np.linalg.norm(move[point], axis=1)
+        # Aperture and cosine at the lens are those of the spot; the solid angle is the mirror's doing.
+        square = np.sum((spot - lens) ** 2, axis=1) * density
+        power = intensity * self._share_of(triangle) * self.sight.received(spot, L) * square
+        ends = np.stack([spot - 0.5 * spot_move, spot + 0.5 * spot_move], axis=1)
+        return line_exposure(self.sight, L, ends, lambda line, at: power[line])
+
+    def _images(self, points: Float64, lens: Float64) -> tuple[Integers, Float64, Float64, Float64, Integers]:
+        """Return images of points: of which point, where, how they move, their density, on which triangle."""
+        found: list[tuple[Any, ...]] = []
+        row, kept = np.arange(len(points)), _KEPT
+        while len(row):
+            images = self._run(self._points(kept), points[row], lens)
+            # Where there may be more, all are sought again.
+            more = (images.status & Status.AMBIGUOUS != 0) & (kept < _MOST_KEPT)
+            which, slot = np.nonzero((images.triangle >= 0) & ~more[:, None])
+            found.append((row[which], *(each[which, slot] for each in images[:4])))
+            row, kept = row[more], min(4 * kept, _MOST_KEPT)
+        point, spot, move, density, triangle = (np.concatenate(each) for each in zip(*found, strict=True))
+        # One on the edge of two triangles is found on both.
+        order = np.lexsort((*spot.T, point))
+        near = np.abs(np.diff(spot[order], axis=0)).max(axis=1, initial=0.0) <= self._clearance
+        once = order[np.append(True, ~near | (np.diff(point[order]) != 0))[: len(order)]]
+        return point[once], spot[once], move[once], density[once], triangle[once]
+
+    def _free(self, origin: Float64, spot: Float64, lens: Float64, triangle: Integers) -> npt.NDArray[np.bool_]:
+        """Return whether nothing is in the way from points to spots on curved mirrors and on to the lens.
+
+        The smooth surface bulges out of its triangle: that much of the way at the mirror does not count.
+        """
+        bulge = self._bulge[triangle]
+        free = np.ones(len(spot), bool)
+        for other in (origin, np.broadcast_to(lens, spot.shape)):
+            way = other - spot
+            length = np.linalg.norm(way, axis=1)
+            along = way / length[:, None]
+            rise = np.abs(np.sum(along * self._normal_of[triangle], axis=1))
+            left_out = np.minimum(2.0 * bulge / np.maximum(rise, 1e-9) + self._clearance, 0.5 * length)
+            start = spot + left_out[:, None] * along
+            free &= self._run(self._any_hit, np.hstack([start, other])).occluded == 0
+        return free
+
+    # ---- light thrown on ---------------------------------------------------------------------------------------
+
+    def thrown(self, lit: LitLine, sheet: LightSheet, place: float) -> LitLine:
+        """Return what lit lines on mirrors throw on other surfaces, up to `throws` mirrors on the way.
+
+        Parameters
+        ----------
+        lit
+            What the sheet lights.
+        sheet, place
+            Where the light comes from: the sheet, at its transport [m].
+
+        Notes
+        -----
+        Plane mirrors: the mirrored sheet cuts the scene, exactly, and the energy is; `LitLine.power` is a mean, as the
+        sheet's `uniformity` says. Curved mirrors: as even between rays that are a step apart, to second order; a lit
+        piece ends within 2^-12 of a step.
+        """
+        return self._thrown_light.after(lit, sheet, place, self.throws)
+
+    # ---- what follows from the parameters ----------------------------------------------------------------------
+
+    @functools.cached_property
+    def step(self) -> float:
+        """How far apart points of a line are that curved mirrors show [m]."""
+        middle = float(np.mean(self.sight.u_edges[[0, -1]]))
+        first, last = self.sight.points_in_sheet(middle, self.sight.v_edges[[0, -1]])
+        length = float(np.linalg.norm(last - first))
+        return length / self.sight.samples / self.per_sample
+
+    @functools.cached_property
+    def _device(self) -> Device:
+        return Device.best() if self.device is None else self.device
+
+    @functools.cached_property
+    def _material(self) -> npt.NDArray[np.int32]:
+        assert self.scene.material is not None  # set by Scene itself
+        return self.scene.material
+
+    @functools.cached_property
+    def _reflects(self) -> npt.NDArray[np.bool_]:
+        mirror = np.array([each.mirror for each in self.materials] or [0.0])
+        there = np.zeros(len(self._material), bool)
+        there[self.scene.bvh.numbers] = True
+        return there & (mirror[self._material] > 0.0)
+
+    @functools.cached_property
+    def _normals(self) -> Float64:
+        """Return normals at the corners, of closed surfaces outwards; those of what does not reflect are not used."""
+        if self.normals is not None:
+            found = np.array(self.normals, np.float64)
+        else:
+            found = np.zeros(self.scene.corners.shape)
+            some = np.flatnonzero(self._reflects)
+            if len(some):
+                found[some] = smooth_normals(Scene(self.scene.corners[some]))
+        with np.errstate(invalid="ignore"):
+            inward = np.sum(found.sum(axis=1) * self._normal_of, axis=1) * self._sides < 0.0
+        found[inward] *= -1.0
+        return found
+
+    @functools.cached_property
+    def _sides(self) -> npt.NDArray[np.int8]:
+        return outward(self.scene, self.sight.lens, self.sight.transport.direction)
+
+    @functools.cached_property
+    def _is_curved(self) -> npt.NDArray[np.bool_]:
+        lean = np.linalg.norm(np.cross(self._normals, self._normal_of[:, None]), axis=2).max(axis=1, initial=0.0)
+        return np.asarray(self._reflects & (lean > _FLAT))
+
+    @functools.cached_property
+    def _normal_of(self) -> Float64:
+        with np.errstate(all="ignore"):
+            return planes_of(self.scene.corners)[:, :3]
+
+    @functools.cached_property
+    def _flat(self) -> Integers:
+        return np.flatnonzero(self._reflects & ~self._is_curved)
+
+    @functools.cached_property
+    def _curved(self) -> Integers:
+        return np.flatnonzero(self._is_curved)
+
+    @functools.cached_property
+    def _planes(self) -> Float64:
+        return planes_of(self._facets.corners)
+
+    @functools.cached_property
+    def _bulge(self) -> Float64:
+        return bulge_of(self.scene.corners, self._normals)
+
+    @functools.cached_property
+    def _clearance(self) -> float:
+        corners = self.scene.bvh.corners
+        return _CLEARANCE * float(np.abs(corners).max(initial=0.0))
+
+    def _share_of(self, triangle: Integers) -> Float64:
+        return np.array([each.mirror for each in self.materials])[self._material[triangle]]
+
+    @functools.cached_property
+    def _thrown_light(self) -> SpecularInterreflection:
+        return SpecularInterreflection(
+            scene=self.scene,
+            reflectance=np.array([each.mirror for each in self.materials])[self._material],
+            normals=self._normals,
+            is_curved=self._is_curved,
+            step=self.step,
+            clearance=self._clearance,
+            device=self._device,
+        )
+
+    @functools.cached_property
+    def _fans(self) -> VisibleIntervals:
+        return VisibleIntervals(scene=self.scene)
+
+    @functools.cached_property
+    def _facets(self) -> MirrorFacets:
+        return MirrorFacets(corners=self.scene.corners[self._flat])
+
+    @functools.cached_property
+    def _any_hit(self) -> AnyHit:
+        return AnyHit(scene=self.scene, clearance=self._clearance)
+
+    def _points(self, kept: int) -> MirrorPoints:
+        if kept not in self._by_kept:
+            some = self._curved
+            self._by_kept[kept] = MirrorPoints(
+                corners=self.scene.corners[some],
+                normals=self._normals[some],
+                numbers=some.astype(np.int32),
+                outside=self._sides[some] != 0,
+                kept=kept,
+            )
+        return self._by_kept[kept]
+
+    @functools.cached_property
+    def _by_kept(self) -> dict[int, MirrorPoints]:
+        return {}
+
+    def _run(self, operation: Any, rows: Float64, *more: Float64) -> Any:
+        return run_padded(operation, self._device, rows, *more)
+
+
+def _between(ends: Float64, share: Float64) -> Float64:
+    """Return the parts of segments (k, 2, 3) from share to share (k, 2)."""
+    return np.asarray(ends[:, :1] + share[..., None] * (ends[:, 1:] - ends[:, :1]))
+
+
+def _steps(lengths: Float64, step: float) -> tuple[Integers, Float64]:
+    """Cut lines into even steps: which line, from where to where."""
+    count = np.maximum(np.ceil(lengths / step), 1).astype(np.int64)
+    line = np.repeat(np.arange(len(lengths)), count)
+    number = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
+    return line, np.stack([number, number + 1], axis=1) / count[line, None]

@@ -1,0 +1,1 @@
+"""Jobs on files: scan, simulate, calibrate, undistort, locate. The commands call these."""

@@ -1,0 +1,631 @@
+// Marks of a known shape near a place: rulers (ruler.h) across the contour, and a robust fit of the shape to the edges
+// they find. On CPU runtimes an item takes `each` marks, the rulers of one 16 at a time; on GPUs a group of RULER_GROUP
+// items takes one, ruler after ruler.
+//
+//     ROUND       the contour is one circle or two, FREEDOMS is 3: x, y, size; else of straight edges, FREEDOMS is 4:
+//                 x, y, size, angle
+//     EITHER      marks may be brighter or darker than what is about them
+//     SPOKES      rulers of a mark, an even number; those opposite are half of them apart. ROOM: so many, to whole
+//                 vectors
+//
+// The layout has six rows of ROOM numbers: where the ruler's centre lies, its direction (outwards from the mark's own
+// area), the distance of the edge from the centre of the mark; all for a mark of size 1. The sixth is 1, or 0 for what
+// only fills the vectors.
+#include "blob/blob_match.h"
+#include "ruler/ruler.h"
+
+#define LEAST_REACH (real)0.6f     // [px] within which edges count before their scale is known
+#define LEAST_SCALE (real)0.01f // [px]
+#ifdef MATCH
+#define STILL (real)2 // [px] less than which a mark lies from where the rulers were laid for
+#else
+#define STILL (real)0.1f
+#endif
+#define MOST_STEPS 12
+#define STEPS_AT_SCALE 2
+#define RING (real)2    // [px] of background about a mark
+#define BILINEAR (real)(1.0f / 6) // [px^2] of bilinear samples, the variance
+#define BEYOND (real)2.5f // blurs of an edge away from it
+#define OWN (real)0.5f    // least weight of an edge of the mark's own
+
+#ifdef ROUND
+#define PLACE 3
+#define START_REACH LEAST_REACH // of edges of a start
+#else
+#define PLACE 4
+#define START_REACH (3 * LEAST_REACH) // the angle is that of the place
+#endif
+
+// The edges of a mark: places relative to the nominal one, variances of the blur and of the place.
+typedef struct {
+    real x[ROOM], y[ROOM], amplitude[ROOM], blur[ROOM], noise[ROOM], there[ROOM];
+    int saturated[ROOM];
+    int outside, broken;
+} blob_edges;
+
+typedef struct {
+    constant real *bx;
+    constant real *by;
+    constant real *nx;
+    constant real *ny;
+    constant real *height;
+    constant real *counts;
+} blob_layout;
+
+typedef struct {
+    reals row[FREEDOMS], residual;
+} blob_equation;
+
+#define FROM(table, i) (*(constant const reals_at *)((table) + (i)))
+
+// How far an edge lies outside the shape. A round edge is seen nearer to the centre than it is: blurred and averaged
+// across by a variance v its mean place along the radius is that of sqrt(R^2 - u^2), u of that variance.
+inline blob_equation equation_of(private const blob_edges *edges, int i, blob_layout layout, blob_shape shape,
+                                 real cosine, real sine, real bent) {
+    blob_equation equation;
+    const reals x = READ(edges->x, i) - shape.x, y = READ(edges->y, i) - shape.y, height = FROM(layout.height, i);
+#ifdef ROUND
+    const reals square = x * x + y * y + (reals)1e-12f, per = rsqrt(square);
+    equation.residual = sqrt(square + bent + (real)0.5f * bent * bent * per * per) - shape.size * height;
+    equation.row[0] = x * per;
+    equation.row[1] = y * per;
+#else
+    const reals nx = FROM(layout.nx, i), ny = FROM(layout.ny, i);
+    const reals across_x = cosine * nx - sine * ny, across_y = sine * nx + cosine * ny;
+    equation.residual = across_x * x + across_y * y - shape.size * height;
+    equation.row[0] = across_x;
+    equation.row[1] = across_y;
+    equation.row[3] = across_y * x - across_x * y;
+#endif
+    equation.row[2] = height;
+    return equation;
+}
+
+// Under VECTOR_VARIANT an item has its edges to itself, else a group shares them.
+#ifdef VECTOR_VARIANT
+#define EDGE_SPACE private
+#else
+#define EDGE_SPACE local
+#endif
+
+// Takes what a vector of rulers found.
+inline void take_edges(ruler_edge edge, int i, blob_layout layout, blob_shape shape, real cosine, real sine,
+                       reals from_x, reals from_y, EDGE_SPACE blob_edges *edges) {
+    const reals nx = FROM(layout.nx, i), ny = FROM(layout.ny, i);
+    const masks counts = mask_of(FROM(layout.counts, i) > (reals)0);
+    const masks none = ~counts | mask_of((edge.status & (RULER_USELESS | STATUS_LOW_SIGNAL)) != 0);
+    const reals position = zero_where(none, edge.position);
+    *(EDGE_SPACE reals_at *)(edges->x + i) = from_x + position * (cosine * nx - sine * ny);
+    *(EDGE_SPACE reals_at *)(edges->y + i) = from_y + position * (sine * nx + cosine * ny);
+    *(EDGE_SPACE reals_at *)(edges->amplitude + i) = zero_where(none, edge.amplitude);
+    *(EDGE_SPACE reals_at *)(edges->blur + i) = zero_where(none, edge.width * edge.width);
+    *(EDGE_SPACE reals_at *)(edges->noise + i) = zero_where(none, edge.sigma * edge.sigma);
+    *(EDGE_SPACE reals_at *)(edges->there + i) = zero_where(none, (reals)1);
+    const masks flags = counts & edge.status;
+    for (int lane = 0; lane < LANES; lane++) {
+        const int flag = LANE_BITS(flags, lane);
+        edges->saturated[i + lane] = (flag & STATUS_SATURATED) != 0;
+        edges->outside += (flag & STATUS_OUT_OF_RANGE) != 0;
+        edges->broken += (flag & STATUS_NOT_FINITE) != 0;
+    }
+}
+
+// Leaves out edges that lie further than `search` from the nominal contour, wherever the rulers were, and under EITHER
+// those of the polarity that there is less of.
+inline int keep_edges(private blob_edges *edges, blob_layout layout, blob_shape nominal, real cosine, real sine,
+                      real search, private real *noise, private real *blur) {
+#ifdef EITHER
+    reals sum = 0;
+    for (int i = 0; i < ROOM; i += LANES) sum += READ(edges->amplitude, i);
+    const reals sign = sum_of(sum) < 0 ? (reals)-1 : (reals)1;
+#endif
+    reals kept = 0, noises = 0, blurs = 0;
+    for (int i = 0; i < ROOM; i += LANES) {
+        const blob_equation equation = equation_of(edges, i, layout, nominal, cosine, sine, 0);
+        masks near = mask_of(READ(edges->there, i) > (reals)0) & mask_of(FABS(equation.residual) <= (reals)search);
+#ifdef EITHER
+        near &= mask_of(sign * READ(edges->amplitude, i) > (reals)0);
+#endif
+        kept += kept_where(near, (reals)1);
+        noises += kept_where(near, READ(edges->noise, i));
+        blurs += kept_where(near, READ(edges->blur, i));
+        *(private reals_at *)(edges->there + i) = kept_where(near, (reals)1);
+    }
+    const real count = sum_of(kept);
+    *noise = sum_of(noises) / fmax(count, (real)1);
+    *blur = sum_of(blurs) / fmax(count, (real)1);
+    return (int)count;
+}
+
+// The scale of the residuals within reach, by their median.
+inline real scale_of(private const blob_edges *edges, blob_layout layout, blob_shape shape, real bent, real reach) {
+    const real cosine = cos(shape.angle), sine = sin(shape.angle);
+    real distances[ROOM];
+    masks inside = 0;
+    for (int i = 0; i < ROOM; i += LANES) {
+        const reals distance = FABS(equation_of(edges, i, layout, shape, cosine, sine, bent).residual);
+        const masks near = mask_of(READ(edges->there, i) > (reals)0) & mask_of(distance <= (reals)reach);
+        inside -= near;
+        *(private reals_at *)(distances + i) = near ? distance : (reals)INFINITY;
+    }
+    const int within = (int)sum_of(LANED(convert_real)(inside));
+    bits found = 0;
+    for (int bit = BITS_BELOW_SIGN - 1; bit >= BITS_TO_ONE_PERCENT; bit--) {
+        const bits next = found | ((bits)1 << bit);
+        masks below = 0;
+        for (int i = 0; i < ROOM; i += LANES) below -= mask_of(as_masks(READ(distances, i)) < (masks)next);
+        found = (int)sum_of(LANED(convert_real)(below)) > within / 2 ? found : next;
+    }
+    return MAD_TO_SIGMA * (1 + FEW_FITTED / fmax((real)(within - FREEDOMS), (real)1)) * as_real(found);
+}
+
+// A step of the fit; returns whether there is one.
+inline int fit_step(private const blob_edges *edges, blob_layout layout, real scale, private blob_shape *shape,
+                    private real *blur, real across) {
+    const real cosine = cos(shape->angle), sine = sin(shape->angle), per_scale = 1 / scale;
+#ifdef ROUND
+    const real bent = *blur + across;
+#else
+    const real bent = 0;
+#endif
+    reals matrix[TRIANGLE], right[FREEDOMS], step[FREEDOMS], weights = 0, blurs = 0;
+    for (int j = 0; j < TRIANGLE; j++) matrix[j] = 0;
+    for (int j = 0; j < FREEDOMS; j++) right[j] = 0;
+    for (int i = 0; i < ROOM; i += LANES) {
+        const blob_equation equation = equation_of(edges, i, layout, *shape, cosine, sine, bent);
+        const reals weight = READ(edges->there, i) * loss_weight(equation.residual * (reals)per_scale);
+        for (int j = 0; j < FREEDOMS; j++) {
+            const reals weighted = weight * equation.row[j];
+            right[j] += weighted * equation.residual;
+            for (int k = 0; k <= j; k++) matrix[CELL(j, k)] += weighted * equation.row[k];
+        }
+        weights += weight;
+        blurs += weight * READ(edges->blur, i);
+    }
+    for (int j = 0; j < TRIANGLE; j++) matrix[j] = (reals)sum_of(matrix[j]);
+    for (int j = 0; j < FREEDOMS; j++) right[j] = (reals)sum_of(right[j]);
+    if (any_lane(factored(matrix))) return 0;
+    solved(matrix, right, step);
+    shape->x += FIRST(step[0]);
+    shape->y += FIRST(step[1]);
+    shape->size += FIRST(step[2]);
+#ifndef ROUND
+    shape->angle += FIRST(step[3]);
+#endif
+    *blur = sum_of(blurs) / sum_of(weights);
+    return shape->size > 0 && !not_finite(shape->x + shape->y + shape->size + shape->angle);
+}
+
+// Three rulers of a start: so many sixteenths of all rulers from the first to the second, and to the third.
+#define PATTERNS 4
+constant const int pattern[PATTERNS][2] = {{4, 8}, {5, 10}, {3, 6}, {2, 6}};
+#define START_STEPS 3
+#define WRAPPED (ROOM + SPOKES + LANES)
+
+// Edges one after the other, the first after the last again; normals of straight ones as they are at the nominal angle.
+typedef struct {
+    real x[WRAPPED], y[WRAPPED], there[WRAPPED], height[WRAPPED];
+#ifndef ROUND
+    real nx[WRAPPED], ny[WRAPPED];
+#endif
+} blob_circuit;
+
+inline void wrap(private const blob_edges *edges, blob_layout layout, real cosine, real sine,
+                 private blob_circuit *circuit) {
+    for (int from = 0; from <= SPOKES; from += SPOKES)
+        for (int i = 0; i < ROOM; i += LANES) {
+            *(private reals_at *)(circuit->x + from + i) = READ(edges->x, i);
+            *(private reals_at *)(circuit->y + from + i) = READ(edges->y, i);
+            *(private reals_at *)(circuit->there + from + i) = READ(edges->there, i);
+            *(private reals_at *)(circuit->height + from + i) = FROM(layout.height, i);
+#ifndef ROUND
+            const reals nx = FROM(layout.nx, i), ny = FROM(layout.ny, i);
+            *(private reals_at *)(circuit->nx + from + i) = cosine * nx - sine * ny;
+            *(private reals_at *)(circuit->ny + from + i) = sine * nx + cosine * ny;
+#endif
+        }
+}
+
+// A shape in each lane: centre and size.
+typedef struct {
+    reals x, y, size;
+} laned_shape;
+
+// The normal of an edge as a shape has it, and how far the edge lies outside.
+#ifdef ROUND
+#define NORMAL(of, circuit, take, i, nx, ny, off)                                                                      \
+    const reals ax = take((circuit)->x, i) - (of).x, ay = take((circuit)->y, i) - (of).y;                              \
+    const reals square = ax * ax + ay * ay + (reals)1e-12f, per = rsqrt(square), nx = ax * per, ny = ay * per;         \
+    const reals off = square * per - (of).size * take((circuit)->height, i)
+#else
+#define NORMAL(of, circuit, take, i, nx, ny, off)                                                                      \
+    const reals nx = take((circuit)->nx, i), ny = take((circuit)->ny, i);                                              \
+    const reals off = nx * (take((circuit)->x, i) - (of).x) + ny * (take((circuit)->y, i) - (of).y) -                  \
+                      (of).size * take((circuit)->height, i)
+#endif
+#define FOR_ALL(from, i) ((reals)((from)[i]))
+
+// Through three edges each, the first of them i and on: Newton's steps.
+inline laned_shape shape_through(private const blob_circuit *circuit, int i, int j, int k, laned_shape shape) {
+    for (int step = 0; step < START_STEPS; step++) {
+        reals ux, uy, u, vx, vy, v, wx, wy, w;
+        {
+            NORMAL(shape, circuit, READ, i, nx, ny, off);
+            ux = nx, uy = ny, u = off;
+        }
+        {
+            NORMAL(shape, circuit, READ, j, nx, ny, off);
+            vx = nx, vy = ny, v = off;
+        }
+        {
+            NORMAL(shape, circuit, READ, k, nx, ny, off);
+            wx = nx, wy = ny, w = off;
+        }
+        const reals uh = READ(circuit->height, i), vh = READ(circuit->height, j), wh = READ(circuit->height, k);
+        const reals a = vy * wh - vh * wy, b = vh * wx - vx * wh, c = vx * wy - vy * wx;
+        const reals whole = 1 / (ux * a + uy * b + uh * c);
+        shape.x += whole * (u * a + v * (wy * uh - wh * uy) + w * (uy * vh - uh * vy));
+        shape.y += whole * (u * b + v * (wh * ux - wx * uh) + w * (uh * vx - ux * vh));
+        shape.size += whole * (u * c + v * (wx * uy - wy * ux) + w * (ux * vy - uy * vx));
+    }
+    return shape;
+}
+
+// The shape through three edges that most edges agree with: the least sum of squares, none more than within reach.
+inline blob_shape start_of(private const blob_edges *edges, blob_layout layout, blob_shape near, real reach) {
+    blob_circuit circuit;
+    wrap(edges, layout, cos(near.angle), sin(near.angle), &circuit);
+    const laned_shape from = {(reals)near.x, (reals)near.y, (reals)near.size};
+    blob_shape best = near;
+    real least = SPOKES * reach * reach;
+    for (int p = 0; p < PATTERNS; p++)
+        for (int i = 0; i < ROOM; i += LANES) {
+            const int j = i + pattern[p][0] * SPOKES / 16, k = i + pattern[p][1] * SPOKES / 16;
+            const laned_shape tried = shape_through(&circuit, i, j, k, from);
+            const reals found = READ(circuit.there, i) * READ(circuit.there, j) * READ(circuit.there, k);
+            const masks all = mask_of(found > (reals)0);
+            reals loss = 0;
+            for (int m = 0; m < SPOKES; m++) {
+                NORMAL(tried, &circuit, FOR_ALL, m, nx, ny, off);
+                const reals squared = off * off;
+                const masks there = mask_of((reals)circuit.there[m] > (reals)0);
+                const masks in = there & mask_of(squared < (reals)(reach * reach));
+                loss += in ? squared : (reals)(reach * reach);
+            }
+            loss = all ? loss : (reals)INFINITY;
+            if (!any_lane(mask_of(loss < (reals)least))) continue;
+            for (int lane = 0; lane < LANES; lane++) {
+                if (!(LANE(loss, lane) < least)) continue;
+                least = LANE(loss, lane);
+                best.x = LANE(tried.x, lane), best.y = LANE(tried.y, lane), best.size = LANE(tried.size, lane);
+            }
+        }
+    return best;
+}
+
+// From where it is to where most edges within reach agree, the reach halved from step to step; returns whether there is
+// such a place. `scale` is that of the residuals there.
+inline int fit_shape(private const blob_edges *edges, blob_layout layout, real reach, real noise, real across,
+                     private blob_shape *shape, private real *blur, private real *scale) {
+    const real predicted = fmax(sqrt(noise), LEAST_SCALE), least = fmax(LEAST_REACH / TUNING, predicted);
+    *scale = fmax(reach / TUNING, least);
+    for (int step = 0; step < MOST_STEPS; step++) {
+        if (!fit_step(edges, layout, *scale, shape, blur, across)) return 0;
+        if (*scale <= least) break;
+        *scale = fmax(*scale / 2, least);
+    }
+    for (int step = 0; step < STEPS_AT_SCALE; step++) {
+#ifdef ROUND
+        const real bent = *blur + across;
+#else
+        const real bent = 0;
+#endif
+        const real measured = scale_of(edges, layout, *shape, bent, TUNING * *scale);
+        *scale = fmin(fmax(measured, predicted), least);
+        if (!fit_step(edges, layout, *scale, shape, blur, across)) return 0;
+    }
+    return 1;
+}
+
+// What is known of a mark besides its place.
+typedef struct {
+    real covariance[FREEDOMS][FREEDOMS];
+    real residual, symmetry, contrast;
+    real weights[ROOM + SPOKES / 2 + LANES];
+    int inliers, saturated, regular;
+} blob_facts;
+
+inline blob_facts facts_of(private blob_edges *edges, blob_layout layout, blob_shape shape, real scale, real bent,
+                           real overlap) {
+    const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale;
+    blob_facts facts;
+    reals matrix[TRIANGLE], weights = 0, squares = 0, noises = 0, amplitudes = 0, inliers = 0;
+    reals slopes = 0;
+    real height[ROOM + SPOKES / 2 + LANES];
+    private real *of = facts.weights;
+    for (int j = 0; j < TRIANGLE; j++) matrix[j] = 0;
+    facts.saturated = 0;
+    for (int i = 0; i < ROOM; i += LANES) {
+        const blob_equation equation = equation_of(edges, i, layout, shape, cosine, sine, bent);
+        const reals z = equation.residual * (reals)per_scale, weight = READ(edges->there, i) * loss_weight(z);
+        const masks is_in = mask_of(weight > (reals)0);
+        for (int j = 0; j < FREEDOMS; j++)
+            for (int k = 0; k <= j; k++)
+                matrix[CELL(j, k)] += kept_where(is_in, equation.row[j] * equation.row[k]);
+        weights += weight;
+        squares += weight * weight * z * z;
+        slopes += kept_where(is_in, loss_slope(z));
+        noises += kept_where(is_in, READ(edges->noise, i));
+        amplitudes += weight * READ(edges->amplitude, i);
+        inliers += kept_where(is_in, (reals)1);
+        *(private reals_at *)(of + i) = weight;
+        *(private reals_at *)(height + i) = FABS(READ(edges->amplitude, i));
+        for (int lane = 0; lane < LANES; lane++)
+            facts.saturated |= edges->saturated[i + lane] & (LANE_BITS(is_in, lane) != 0);
+    }
+    const real count = sum_of(inliers), free = fmax(count - FREEDOMS, (real)1), mean = sum_of(slopes) / count;
+    facts.inliers = (int)count;
+    facts.residual = scale * sqrt(sum_of(squares) / sum_of(weights));
+    facts.contrast = -sum_of(amplitudes) / sum_of(weights);
+    // Of an edge: as its noise has it, or as the edges differ from the shape, whichever is more.
+    const real measured = scale * scale * sum_of(squares) / (free * mean * mean);
+    const real predicted = sum_of(noises) / (count * (real)EFFICIENCY);
+    const real variance = fmax(measured, predicted) * fmax(overlap / shape.size, (real)1);
+    for (int j = 0; j < TRIANGLE; j++) matrix[j] = (reals)sum_of(matrix[j]);
+    facts.regular = !any_lane(factored(matrix)) && mean > 0;
+    for (int j = 0; j < FREEDOMS; j++) {
+        reals unit[FREEDOMS], column[FREEDOMS];
+        for (int k = 0; k < FREEDOMS; k++) unit[k] = (reals)(real)(j == k);
+        solved(matrix, unit, column);
+        for (int k = 0; k < FREEDOMS; k++) facts.covariance[j][k] = variance * FIRST(column[k]);
+    }
+    for (int i = 0; i < SPOKES / 2 + LANES; i++) {
+        of[SPOKES + i] = of[i];
+        height[SPOKES + i] = height[i];
+    }
+    reals agreed = 0;
+    for (int i = 0; i < ROOM; i += LANES) {
+        const reals here = READ(height, i), there = READ(height, i + SPOKES / 2);
+        const reals low = here < there ? here : there, high = here < there ? there : here;
+        const reals product = READ(of, i) * READ(of, i + SPOKES / 2) * FROM(layout.counts, i);
+        agreed += sqrt(product) * low / (high + (reals)1e-30f);
+    }
+    facts.symmetry = sum_of(agreed) / SPOKES;
+    return facts;
+}
+
+// The grey level of the background, beyond the edges of the fit.
+inline real background_of(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
+                          private const blob_edges *edges, private const real *weights, blob_layout layout, real blur) {
+    const real cosine = cos(shape.angle), sine = sin(shape.angle), out = BEYOND * blur + (real)0.5f;
+    real sum = 0, all = 0;
+    for (int i = 0; i < SPOKES; i++) {
+        const real nx = layout.nx[i], ny = layout.ny[i];
+        const int column = (int)rint(x + edges->x[i] + out * (cosine * nx - sine * ny));
+        const int row = (int)rint(y + edges->y[i] + out * (sine * nx + cosine * ny));
+        const int inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows);
+        const real level = convert_real(image[inside ? row * columns + column : 0]);
+        const real weight = (inside && !not_finite(level)) ? weights[i] : 0;
+        sum += weight > 0 ? weight * level : 0;
+        all += weight;
+    }
+    return sum / all;
+}
+
+// Where the contour is not the mark's own, as wide as the rulers beside those that say so.
+inline void hide(blob_shape shape, private const real *weights, blob_layout layout, real spacing, real blur,
+                 private blob_hidden *hidden) {
+    const real cosine = cos(shape.angle), sine = sin(shape.angle);
+    hidden->count = 0;
+    hidden->half_width = spacing * shape.size;
+    hidden->half_length = ABOUT_BLURS * blur + ABOUT + 1;
+    for (int i = 0; i < SPOKES; i++) {
+        if (weights[i] >= OWN) continue;
+        const real bx = layout.bx[i], by = layout.by[i], nx = layout.nx[i], ny = layout.ny[i];
+        hidden->x[hidden->count] = shape.size * (cosine * bx - sine * by);
+        hidden->y[hidden->count] = shape.size * (sine * bx + cosine * by);
+        hidden->nx[hidden->count] = cosine * nx - sine * ny;
+        hidden->ny[hidden->count++] = sine * nx + cosine * ny;
+    }
+}
+
+// The centre of gravity of what differs from the ring about the mark, relative to (x, y); false where the ring leaves
+// the image.
+inline int gravity_of(global const CODE *image, int rows, int columns, real x, real y, real reach, private real *to_x,
+                      private real *to_y) {
+    const real outer = reach + RING;
+    if (!(x - outer >= 0 && y - outer >= 0 && x + outer <= columns - 1 && y + outer <= rows - 1)) return 0;
+    const int left = (int)(x - outer), right = (int)(x + outer), top = (int)(y - outer), bottom = (int)(y + outer);
+    // Grey levels relative to one of them keep their digits.
+    const reals level = (reals)convert_real(image[(int)y * columns + (int)x]);
+    reals area = 0, sum = 0, sum_x = 0, sum_y = 0, at_x = 0, at_y = 0, about = 0, sum_about = 0;
+    for (int row = top; row <= bottom; row++) {
+        const reals dy = (reals)(row - y);
+        for (int column = left; column <= right; column += LANES) {
+            const int from = min(column, columns - LANES);
+            const reals place = (reals)(real)from + COUNTED, dx = place - (reals)x, square = dx * dx + dy * dy;
+            const masks fresh = mask_of(place >= (reals)(real)column);
+            const masks in = fresh & mask_of(square <= (reals)(reach * reach));
+            const masks ring = fresh & ~in & mask_of(square <= (reals)(outer * outer));
+            const reals grey = PIXELS(image + row * columns + from) - level, mine = kept_where(in, grey);
+            area += kept_where(in, (reals)1);
+            at_x += kept_where(in, dx);
+            at_y += kept_where(in, dy);
+            sum += mine;
+            sum_x += mine * dx;
+            sum_y += mine * dy;
+            about += kept_where(ring, (reals)1);
+            sum_about += kept_where(ring, grey);
+        }
+    }
+    const real background = sum_of(sum_about) / sum_of(about), per = 1 / (sum_of(sum) - background * sum_of(area));
+    *to_x = (sum_of(sum_x) - background * sum_of(at_x)) * per;
+    *to_y = (sum_of(sum_y) - background * sum_of(at_y)) * per;
+    return !not_finite(*to_x + *to_y) && fabs(*to_x) <= reach && fabs(*to_y) <= reach;
+}
+
+// Lays the rulers of a mark and takes what they find.
+inline void measure(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape, real turned,
+                    constant real *table, blob_layout layout, EDGE_SPACE blob_edges *edges
+#ifndef VECTOR_VARIANT
+                    ,
+                    local real *profile, local real *slopes, local int *flags
+#endif
+) {
+    const real cosine = cos(turned), sine = sin(turned);
+#ifdef VECTOR_VARIANT
+    edges->outside = edges->broken = 0;
+#else
+    if (get_local_id(0) == 0) edges->outside = edges->broken = 0;
+#endif
+    for (int i = 0; i < ROOM; i += LANES) {
+        const reals bx = FROM(layout.bx, i), by = FROM(layout.by, i), nx = FROM(layout.nx, i), ny = FROM(layout.ny, i);
+        const reals from_x = shape.x + shape.size * (cosine * bx - sine * by);
+        const reals from_y = shape.y + shape.size * (sine * bx + cosine * by);
+        const reals along_x = cosine * nx - sine * ny, along_y = sine * nx + cosine * ny;
+        ruler_edge edge;
+#ifdef VECTOR_VARIANT
+        ruler_measure_lanes(image, rows, columns, x + from_x, y + from_y, along_x, along_y, table, 0, &edge);
+        take_edges(edge, i, layout, shape, cosine, sine, from_x, from_y, edges);
+#else
+        ruler_measure(image, rows, columns, (real4)(x + from_x, y + from_y, along_x, along_y), table, 0, profile,
+                      slopes, flags, &edge);
+        if (get_local_id(0) == 0) take_edges(edge, i, layout, shape, cosine, sine, from_x, from_y, edges);
+#endif
+    }
+}
+
+kernel void find_blobs(global const CODE *restrict image, global const real *restrict places, global real *restrict x,
+                       global real *restrict y, global real *restrict shift, global real *restrict size,
+                       global real *restrict angle, global real *restrict covariance, global real *restrict residual,
+                       global int *restrict inliers, global real *restrict symmetry, global real *restrict gravity_x,
+                       global real *restrict gravity_y, global real *restrict distance, global real *restrict contrast,
+                       global real *restrict blur, global uchar *restrict status, constant real *table,
+                       constant real *laid, const int rows, const int columns, const uint count, const uint each,
+                       const real search, const int least, const real across, const real overlap, const real extent,
+                       const real pixel_noise, const real spacing, const int passes) {
+    const blob_layout layout = {laid, laid + ROOM, laid + 2 * ROOM, laid + 3 * ROOM, laid + 4 * ROOM, laid + 5 * ROOM};
+#ifdef VECTOR_VARIANT
+    const uint first = get_global_id(0) * each, end = min(first + each, count);
+    const int mine = 1;
+#else
+    local real profile[LENGTH], slopes[RULER_SLOPES], told[5];
+    local int flags;
+    local blob_edges shared;
+    const uint first = get_group_id(0), end = first + 1;
+    const int mine = get_local_id(0) == 0;
+#endif
+    blob_edges edges;
+    for (uint n = first; n < end; n++) {
+        global const real *place = places + (ulong)n * PLACE;
+#ifdef ROUND
+        const blob_shape nominal = {0, 0, place[2], 0};
+#else
+        const blob_shape nominal = {0, 0, place[2], place[3]};
+#endif
+        const int bad = not_finite(place[0]) | not_finite(place[1]) | not_finite(nominal.size) |
+                        not_finite(nominal.angle) | !(nominal.size > 0);
+        blob_shape shape = nominal;
+        real variance = 0, noise = 0, scale = 0;
+        int found = 0, agreed = 0;
+        for (int pass = 0; pass < passes && !bad; pass++) {
+            const blob_shape from = shape;
+            int done = 1;
+#ifdef VECTOR_VARIANT
+            measure(image, rows, columns, place[0], place[1], from, from.angle, table, layout, &edges);
+#else
+            measure(image, rows, columns, place[0], place[1], from, from.angle, table, layout, &shared, profile, slopes,
+                    &flags);
+#endif
+            if (mine) {
+#ifndef VECTOR_VARIANT
+                edges = shared;
+#endif
+                const real cosine = cos(nominal.angle), sine = sin(nominal.angle);
+                found = keep_edges(&edges, layout, nominal, cosine, sine, search, &noise, &variance);
+                if (pass == 0 && found >= least) shape = start_of(&edges, layout, nominal, START_REACH);
+                agreed = found >= least && fit_shape(&edges, layout, 2 * START_REACH, noise, across, &shape, &variance,
+                                                     &scale);
+                const real dx = shape.x - from.x, dy = shape.y - from.y, ds = shape.size - from.size;
+                const real da = (shape.angle - from.angle) * from.size;
+#ifndef VECTOR_VARIANT
+                shared = edges;
+#endif
+                done = !agreed || dx * dx + dy * dy + ds * ds + da * da < STILL * STILL;
+            }
+#ifndef VECTOR_VARIANT
+            barrier(CLK_LOCAL_MEM_FENCE);
+            if (mine) {
+                told[0] = shape.x, told[1] = shape.y, told[2] = shape.size, told[3] = shape.angle;
+                told[4] = done;
+            }
+            barrier(CLK_LOCAL_MEM_FENCE);
+            shape.x = told[0], shape.y = told[1], shape.size = told[2], shape.angle = told[3];
+            done = told[4] != 0;
+#endif
+            if (done) break;
+        }
+        if (!mine) continue;
+#ifndef VECTOR_VARIANT
+        edges = shared;
+#endif
+#ifdef ROUND
+        const real bent = variance + across;
+#else
+        const real bent = 0;
+#endif
+        blob_facts facts;
+        int what = bad ? STATUS_NOT_FINITE : 0;
+        if (!bad) {
+            what |= SPOKES - edges.outside < least ? STATUS_OUT_OF_RANGE : 0;
+            what |= SPOKES - edges.broken < least ? STATUS_NOT_FINITE : 0;
+            if (!what && found < least) what = STATUS_LOW_SIGNAL;
+            if (!what && !agreed) what = STATUS_AMBIGUOUS;
+        }
+        if (!what) {
+            facts = facts_of(&edges, layout, shape, scale, bent, overlap);
+            if (facts.inliers < least || !facts.regular) what = STATUS_AMBIGUOUS;
+            else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
+        }
+#ifdef MATCH
+        if (!what) {
+            blob_grey grey = {0, facts.contrast, sqrt(fmax(variance - BILINEAR, SHARPEST * SHARPEST))};
+            grey.background = background_of(image, rows, columns, place[0], place[1], shape, &edges, facts.weights,
+                                            layout, grey.blur);
+            blob_hidden hidden;
+            hide(shape, facts.weights, layout, spacing, grey.blur, &hidden);
+            if (!match(image, rows, columns, place[0], place[1], pixel_noise, extent, &hidden, &shape, &grey,
+                       facts.covariance))
+                what = STATUS_AMBIGUOUS;
+            else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
+            facts.contrast = grey.contrast;
+            variance = grey.blur * grey.blur;
+        }
+#endif
+        const int good = !what;
+        x[n] = good ? place[0] + shape.x : REAL_NAN;
+        y[n] = good ? place[1] + shape.y : REAL_NAN;
+        shift[2 * n] = good ? shape.x : REAL_NAN;
+        shift[2 * n + 1] = good ? shape.y : REAL_NAN;
+        size[n] = good ? shape.size : REAL_NAN;
+#ifndef ROUND
+        angle[n] = good ? shape.angle : REAL_NAN;
+#endif
+        for (int j = 0; j < FREEDOMS; j++)
+            for (int k = 0; k < FREEDOMS; k++)
+                covariance[((ulong)n * FREEDOMS + j) * FREEDOMS + k] = good ? facts.covariance[j][k] : REAL_NAN;
+        residual[n] = good ? facts.residual : REAL_NAN;
+        inliers[n] = good ? facts.inliers : 0;
+        symmetry[n] = good ? facts.symmetry : REAL_NAN;
+        distance[n] = good ? sqrt(shape.x * shape.x + shape.y * shape.y) : REAL_NAN;
+        contrast[n] = good ? facts.contrast : REAL_NAN;
+        blur[n] = good ? sqrt(variance) : REAL_NAN;
+        real to_x = 0, to_y = 0;
+        const real middle_x = place[0] + shape.x, middle_y = place[1] + shape.y;
+        const int heavy = good && gravity_of(image, rows, columns, middle_x, middle_y,
+                                             shape.size * extent + (real)2.5f * sqrt(variance) + 1, &to_x, &to_y);
+        gravity_x[n] = heavy ? middle_x + to_x : REAL_NAN;
+        gravity_y[n] = heavy ? middle_y + to_y : REAL_NAN;
+        status[n] = (uchar)(what | (good && facts.saturated ? STATUS_SATURATED : 0));
+    }
+}

@@ -1,0 +1,250 @@
+// A mark as its pixels have it: least squares of grey levels against a blurred shape on a plane background, from where
+// its edges say it is. No interpolation between pixels, and all of the contour's pixels count once.
+//
+//     ROUND, FREEDOMS     as in blob.cl
+//     RATIO               of a ring, or of a cross; else the mark is a disc or a square
+#ifndef BLOB_MATCH_H
+#define BLOB_MATCH_H
+#include "common/least_squares.h"
+#include "common/robust.h"
+
+// Relative to the nominal place.
+typedef struct {
+    real x, y, size, angle;
+} blob_shape;
+
+// Level (0 to 1), and its derivatives with respect to the shape and the blur.
+typedef struct {
+    reals level, row[FREEDOMS + 1];
+} blob_model;
+
+// A mark's grey levels: of the background at its centre, and above that; and how wide its edges are.
+typedef struct {
+    real background, contrast, blur;
+} blob_grey;
+
+#define UNKNOWNS (FREEDOMS + 5) // with blur, contrast, background and its two slopes
+#define UNKNOWN_CELLS (UNKNOWNS * (UNKNOWNS + 1) / 2)
+#define MATCH_STEPS 3
+#define MATCHED (real)0.05f     // [blurs] a step after which there is none
+#define MATCH_FURTHEST (real)1   // [px] from where the edges say
+#define MATCH_SHARE (real)0.1f  // of the contrast, and
+#define MATCH_NOISES (real)4     // of the noise: what no pixel of the mark is off by
+#define MATCH_OWN (real)0.7f     // of the pixels that must be a mark's or its background's
+#define SHARPEST (real)0.3f      // [px]
+#define ABOUT_BLURS (real)5      // about a mark its background is looked at: so many blurs
+#define ABOUT (real)2            // [px] and so much
+
+// A step blurred by a Gaussian at t deviations, and its density; zero past 3.5. Odd polynomials, so that what they are
+// off by (2.4e-4 at most) moves no edge.
+#define STEP_END (real)3.5f
+inline reals blurred_step(reals t, private reals *density) {
+    const reals end = (reals)STEP_END;
+    const reals within = (t > end) ? end : ((t < -end) ? -end : t), v = within * (reals)(1 / STEP_END), q = v * v;
+    const reals even =
+        (((((reals)-0.711542f * q + 2.831766f) * q - 4.759453f) * q + 4.513241f) * q - 2.767476f) * q + 1.393465f;
+    *density = ((((((reals)(-0.711542f * 11) * q + 2.831766f * 9) * q - 4.759453f * 7) * q + 4.513241f * 5) * q -
+                 2.767476f * 3) * q + 1.393465f) * (reals)(1 / STEP_END);
+    return v * even + (reals)0.5f;
+}
+
+#ifdef ROUND
+// A disc of so much of the size. Its edge bends: to first order in the blur over the radius the level is lower by
+// density times half of that.
+inline void add_disc(reals r, real size, real share, real sign, real per_blur, private blob_model *model) {
+    reals density;
+    const reals t = (share * size - r) * per_blur;
+    const reals step = blurred_step(t, &density);
+    const reals slope = sign * per_blur * density;
+    model->level += sign * (step - density * ((real)0.5f / (share * size * per_blur)));
+    model->row[0] += slope;
+    model->row[2] += share * slope;
+    model->row[3] -= t * slope;
+}
+
+inline blob_model model_at(reals x, reals y, blob_shape shape, real cosine, real sine, real blur) {
+    const reals square = x * x + y * y + (reals)1e-12f, per = rsqrt(square), r = square * per;
+    const real per_blur = 1 / blur;
+    blob_model model = {0, {0, 0, 0, 0}};
+    add_disc(r, shape.size, 1, 1, per_blur, &model);
+#ifdef RATIO
+    add_disc(r, shape.size, (real)(RATIO), -1, per_blur, &model);
+#endif
+    model.row[1] = model.row[0] * y * per;
+    model.row[0] *= x * per;
+    return model;
+}
+#else
+// Between two edges at distance `half` of 0: level, and derivatives by place, half and blur.
+typedef struct {
+    reals level, place, half_, blur;
+} blob_band;
+
+inline blob_band band_at(reals u, real half_, real per_blur) {
+    blob_band band;
+    reals density;
+    const reals t = ((reals)half_ - FABS(u)) * per_blur;
+    band.level = blurred_step(t, &density);
+    band.half_ = density * per_blur;
+    band.place = u > (reals)0 ? -band.half_ : band.half_;
+    band.blur = -t * band.half_;
+    return band;
+}
+
+inline blob_model model_at(reals x, reals y, blob_shape shape, real cosine, real sine, real blur) {
+    const reals u = cosine * x + sine * y, v = cosine * y - sine * x;
+    const real per_blur = 1 / blur;
+    const blob_band a = band_at(u, shape.size, per_blur), b = band_at(v, shape.size, per_blur);
+    blob_model model;
+#ifdef RATIO
+    const real share = (real)(RATIO);
+    const blob_band c = band_at(u, share * shape.size, per_blur), d = band_at(v, share * shape.size, per_blur);
+    const reals left_c = b.level - d.level, left_d = a.level - c.level;
+    model.level = a.level * d.level + c.level * left_c;
+    const reals by_u = a.place * d.level + c.place * left_c, by_v = d.place * left_d + c.level * b.place;
+    model.row[2] = a.half_ * d.level + share * c.half_ * left_c + share * d.half_ * left_d + c.level * b.half_;
+    model.row[4] = a.blur * d.level + c.blur * left_c + d.blur * left_d + c.level * b.blur;
+#else
+    model.level = a.level * b.level;
+    const reals by_u = a.place * b.level, by_v = a.level * b.place;
+    model.row[2] = a.half_ * b.level + a.level * b.half_;
+    model.row[4] = a.blur * b.level + a.level * b.blur;
+#endif
+    model.row[0] = sine * by_v - cosine * by_u;
+    model.row[1] = -sine * by_u - cosine * by_v;
+    model.row[3] = by_u * v - by_v * u;
+    return model;
+}
+#endif
+
+// Parts of the contour that are not this mark's: what rulers there saw does not agree with the shape. Relative to the
+// mark's centre.
+typedef struct {
+    real x[SPOKES], y[SPOKES], nx[SPOKES], ny[SPOKES];
+    real half_width, half_length;
+    int count;
+} blob_hidden;
+
+inline masks hidden_at(private const blob_hidden *hidden, reals dx, reals dy) {
+    masks in = 0;
+    for (int i = 0; i < hidden->count; i++) {
+        const reals x = dx - (reals)hidden->x[i], y = dy - (reals)hidden->y[i];
+        const reals nx = (reals)hidden->nx[i], ny = (reals)hidden->ny[i];
+        in |= mask_of(FABS(x * nx + y * ny) < (reals)hidden->half_length) &
+              mask_of(FABS(x * ny - y * nx) < (reals)hidden->half_width);
+    }
+    return in;
+}
+
+#ifdef VECTOR_VARIANT
+#define PIXELS(from) LANED(convert_real)(vload16(0, from))
+#define COUNTED (reals)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
+#else
+#define PIXELS(from) convert_real(*(from))
+#define COUNTED (reals)0
+#endif
+
+typedef struct {
+    reals matrix[UNKNOWN_CELLS], right[UNKNOWNS], squares, weights, count, pixels;
+} match_sums;
+
+// The equations of the pixels about (x, y), as far as they are of this mark and its background; in units of its
+// contrast.
+inline void match_summed(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
+                         blob_grey grey, real slope_x, real slope_y, real scale, real reach,
+                         private const blob_hidden *hidden, private match_sums *sums) {
+    const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale, per_size = 1 / shape.size;
+    const real per_contrast = 1 / grey.contrast;
+    const int top = max((int)ceil(y - reach), 0), bottom = min((int)(y + reach), rows - 1);
+    for (int i = 0; i < UNKNOWN_CELLS; i++) sums->matrix[i] = 0;
+    for (int i = 0; i < UNKNOWNS; i++) sums->right[i] = 0;
+    sums->squares = sums->weights = sums->count = sums->pixels = 0;
+    for (int row = top; row <= bottom; row++) {
+        const real dy = row - y, half_chord = sqrt(fmax(reach * reach - dy * dy, (real)0));
+        const int left = max((int)ceil(x - half_chord), 0), right = min((int)(x + half_chord), columns - 1);
+        for (int column = left; column <= right; column += LANES) {
+            const int from = min(column, columns - LANES);
+            const reals place = (reals)(real)from + COUNTED, dx = place - (reals)x;
+            masks in = mask_of(place >= (reals)(real)column) & mask_of(FABS(dx) <= (reals)half_chord);
+            if (hidden->count) in &= ~hidden_at(hidden, dx, (reals)dy);
+            const blob_model model = model_at(dx, (reals)dy, shape, cosine, sine, grey.blur);
+            const reals pixel = (PIXELS(image + row * columns + from) - (reals)grey.background) * (reals)per_contrast;
+            reals equation[UNKNOWNS];
+            for (int i = 0; i < FREEDOMS + 1; i++) equation[i] = model.row[i];
+            equation[FREEDOMS + 1] = model.level;
+            equation[FREEDOMS + 2] = 1;
+            equation[FREEDOMS + 3] = dx * per_size;
+            equation[FREEDOMS + 4] = (reals)(dy * per_size);
+            reals residual =
+                pixel - model.level - slope_x * equation[FREEDOMS + 3] - slope_y * equation[FREEDOMS + 4];
+#ifdef CODE_float
+            in &= ~LANED(not_finite)(residual);
+#endif
+            residual = kept_where(in, residual);
+            const reals weight = kept_where(in, loss_weight(residual * (reals)per_scale));
+#pragma unroll
+            for (int i = 0; i < UNKNOWNS; i++) {
+                const reals weighted = weight * equation[i];
+                sums->right[i] += weighted * residual;
+#pragma unroll
+                for (int j = 0; j <= i; j++) sums->matrix[CELL(i, j)] += weighted * equation[j];
+            }
+            sums->pixels += kept_where(in, (reals)1);
+            sums->squares += weight * residual * residual;
+            sums->weights += weight;
+            sums->count += kept_where(mask_of(weight > (reals)0), (reals)1);
+        }
+    }
+}
+
+// Moves the shape to where its pixels have it; returns whether there is such a place near by. `covariance` is what
+// their differences from the model make of it.
+inline int match(global const CODE *image, int rows, int columns, real x, real y, real noise, real extent,
+                 private const blob_hidden *hidden, private blob_shape *shape, private blob_grey *grey,
+                 real covariance[FREEDOMS][FREEDOMS]) {
+    const blob_shape first = *shape;
+    const real reach = extent * first.size + ABOUT_BLURS * grey->blur + ABOUT;
+    real slope_x = 0, slope_y = 0;
+    for (int step = 0; step < MATCH_STEPS; step++) {
+        match_sums sums;
+        reals moved[UNKNOWNS];
+        const real contrast = grey->contrast, scale = (MATCH_SHARE + MATCH_NOISES * noise / fabs(contrast)) / TUNING;
+        match_summed(image, rows, columns, x + shape->x, y + shape->y, *shape, *grey, slope_x / contrast,
+                     slope_y / contrast, scale, reach, hidden, &sums);
+        for (int i = 0; i < UNKNOWN_CELLS; i++) sums.matrix[i] = (reals)sum_of(sums.matrix[i]);
+        for (int i = 0; i < UNKNOWNS; i++) sums.right[i] = (reals)sum_of(sums.right[i]);
+        if (any_lane(factored_of(UNKNOWNS, sums.matrix))) return 0;
+        solved_of(UNKNOWNS, sums.matrix, sums.right, moved);
+        const real dx = FIRST(moved[0]), dy = FIRST(moved[1]), ds = FIRST(moved[2]);
+        const real db = FIRST(moved[FREEDOMS]);
+        real less = 0, da = 0;
+        for (int i = 0; i < UNKNOWNS; i++) less += FIRST(moved[i]) * FIRST(sums.right[i]);
+        shape->x += dx;
+        shape->y += dy;
+        shape->size += ds;
+#ifndef ROUND
+        da = FIRST(moved[3]) * first.size;
+        shape->angle += FIRST(moved[3]);
+#endif
+        grey->blur = fmax(grey->blur + db, SHARPEST);
+        grey->contrast += contrast * FIRST(moved[FREEDOMS + 1]);
+        grey->background += contrast * FIRST(moved[FREEDOMS + 2]);
+        slope_x += contrast * FIRST(moved[FREEDOMS + 3]);
+        slope_y += contrast * FIRST(moved[FREEDOMS + 4]);
+        const real off = dx * dx + dy * dy + ds * ds + da * da + db * db;
+        if (off > MATCHED * MATCHED * grey->blur * grey->blur && step < MATCH_STEPS - 1) continue;
+        const real count = sum_of(sums.count), free = count - UNKNOWNS;
+        const real variance = fmax(sum_of(sums.squares) - less, (real)0) / sum_of(sums.weights) * count / free;
+        for (int i = 0; i < FREEDOMS; i++) {
+            reals unit[UNKNOWNS], column[UNKNOWNS];
+            for (int k = 0; k < UNKNOWNS; k++) unit[k] = (reals)(real)(i == k);
+            solved_of(UNKNOWNS, sums.matrix, unit, column);
+            for (int k = 0; k < FREEDOMS; k++) covariance[i][k] = variance * FIRST(column[k]);
+        }
+        const real off_x = shape->x - first.x, off_y = shape->y - first.y, off_size = shape->size - first.size;
+        const real away = off_x * off_x + off_y * off_y + off_size * off_size;
+        return free > 0 && count >= MATCH_OWN * sum_of(sums.pixels) && away <= MATCH_FURTHEST * MATCH_FURTHEST;
+    }
+    return 0;
+}
+#endif

@@ -1,0 +1,62 @@
+// Small least squares in lanes: sums over the lanes, and Cholesky's solution of equations, of FREEDOMS unknowns unless
+// said otherwise.
+#ifndef LEAST_SQUARES_H
+#define LEAST_SQUARES_H
+
+#include "common/lanes.h"
+
+#define READ(from, i) (*(private const reals_at *)((from) + (i)))
+
+#ifdef VECTOR_VARIANT
+inline real sum_of(reals value) {
+    const real8 a = value.lo + value.hi;
+    const real4 b = a.lo + a.hi;
+    return (b.x + b.y) + (b.z + b.w);
+}
+#define FIRST(value) (value).s0
+#else
+inline real sum_of(reals value) { return value; }
+#define FIRST(value) (value)
+#endif
+
+// Triangles of a symmetric matrix, row by row: (0, 0), (1, 0), (1, 1), ...
+#define TRIANGLE (FREEDOMS * (FREEDOMS + 1) / 2)
+#define CELL(row, column) ((row) * ((row) + 1) / 2 + (column))
+
+// Cholesky: the matrix becomes its factor, with the diagonal's inverse on the diagonal. Returns where it has none.
+inline masks factored_of(const int unknowns, private reals *matrix) {
+    masks bad = 0;
+    for (int i = 0; i < unknowns; i++) {
+        const reals diagonal = matrix[CELL(i, i)];
+        for (int j = 0; j <= i; j++) {
+            reals sum = matrix[CELL(i, j)];
+            for (int k = 0; k < j; k++) sum -= matrix[CELL(i, k)] * matrix[CELL(j, k)];
+            if (j < i) matrix[CELL(i, j)] = sum * matrix[CELL(j, j)];
+            else {
+                const masks none = mask_of(!(sum > diagonal * (reals)(8 * REAL_EPSILON)));
+                bad |= none;
+                matrix[CELL(i, i)] = (reals)1 / sqrt(none ? (reals)1 : sum);
+            }
+        }
+    }
+    return bad;
+}
+
+inline void solved_of(const int unknowns, private const reals *factor, private const reals *right,
+                      private reals *solution) {
+    for (int i = 0; i < unknowns; i++) {
+        reals sum = right[i];
+        for (int k = 0; k < i; k++) sum -= factor[CELL(i, k)] * solution[k];
+        solution[i] = sum * factor[CELL(i, i)];
+    }
+    for (int i = unknowns - 1; i >= 0; i--) {
+        reals sum = solution[i];
+        for (int k = i + 1; k < unknowns; k++) sum -= factor[CELL(k, i)] * solution[k];
+        solution[i] = sum * factor[CELL(i, i)];
+    }
+}
+
+#define factored(matrix) factored_of(FREEDOMS, matrix)
+#define solved(factor, right, solution) solved_of(FREEDOMS, factor, right, solution)
+
+#endif

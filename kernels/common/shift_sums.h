@@ -1,0 +1,117 @@
+// Sums of a map's cells under many shifts, for positions that are neighbours as the cells are. Sums of integers: exact,
+// in any order. CPU runtimes take 64 positions at once in registers, for some rows; GPUs an item per position.
+#ifndef SHIFT_SUMS_H
+#define SHIFT_SUMS_H
+
+#define BLOCK 64
+// So many cells of LEVELS each fit sixteen bits.
+#define CHUNK 64
+#define NO_KEY 0xffffffffu
+
+// Where a block begins: the last one moves back, so as to be whole, and does some positions twice.
+inline int block_from(int block, int columns) { return min(block * BLOCK, max(columns - BLOCK, 0)); }
+
+// From a sum to a score: NaN where there is none.
+inline float score_scale(int used) { return used ? 1.0f / (float)(LEVELS * used) : NAN; }
+
+// The least cost of a block and where it is, in one number.
+inline void store_least(uint key, float scale, global float *least, global int *column, size_t to, int from) {
+    least[to] = (float)(key / BLOCK) * scale;
+    column[to] = from + (int)(key % BLOCK);
+}
+
+#ifdef VECTOR_VARIANT
+typedef ushort16 ushorts_at __attribute__((aligned(2)));
+typedef float16 floats_at __attribute__((aligned(4)));
+
+#define LOWER(a, b) ((a) < (b) ? (a) : (b))
+
+inline uint least_lane(uint16 of) {
+    const uint8 eight = LOWER(of.lo, of.hi);
+    const uint4 four = LOWER(eight.lo, eight.hi);
+    const uint2 two = LOWER(four.lo, four.hi);
+    return LOWER(two.x, two.y);
+}
+
+// All positions of the rows from `first` up to `end`, for the shifts of one heading.
+inline void sum_rows(global const ushort *restrict level, private const int *shifts, int used, int turn, int first,
+                     int end, int rows, int columns, int stride, global float *restrict scores,
+                     global float *restrict least, global int *restrict column) {
+    const int blocks = (columns + BLOCK - 1) / BLOCK;
+    const float scale = score_scale(used);
+    const uint16 lane = (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    for (int row = first; row < end; row++)
+        for (int block = 0; block < blocks; block++) {
+            const int from = block_from(block, columns);
+            global const ushort *here = level + (size_t)row * stride + from;
+            uint16 a = 0, b = 0, c = 0, d = 0;
+            for (int chunk = 0; chunk < used; chunk += CHUNK) {
+                ushort16 p = 0, q = 0, r = 0, s = 0;
+                const int last = min(chunk + CHUNK, used);
+                for (int i = chunk; i < last; i++) {
+                    global const ushort *at = here + shifts[i];
+                    p += *(global const ushorts_at *)at;
+                    q += *(global const ushorts_at *)(at + 16);
+                    r += *(global const ushorts_at *)(at + 32);
+                    s += *(global const ushorts_at *)(at + 48);
+                }
+                a += convert_uint16(p);
+                b += convert_uint16(q);
+                c += convert_uint16(r);
+                d += convert_uint16(s);
+            }
+            const size_t place = (size_t)turn * rows + row;
+            const uint16 ka = a * BLOCK + lane, kb = b * BLOCK + lane + 16, kc = c * BLOCK + lane + 32,
+                         kd = d * BLOCK + lane + 48;
+            uint key = NO_KEY;
+            if (columns >= BLOCK) {
+                const uint16 ab = LOWER(ka, kb), cd = LOWER(kc, kd);
+                key = least_lane(LOWER(ab, cd));
+#ifdef WITH_SCORES
+                global float *to = scores + place * columns + from;
+                *(global floats_at *)to = convert_float16(a) * scale;
+                *(global floats_at *)(to + 16) = convert_float16(b) * scale;
+                *(global floats_at *)(to + 32) = convert_float16(c) * scale;
+                *(global floats_at *)(to + 48) = convert_float16(d) * scale;
+#endif
+            } else {
+                uint keys[BLOCK];
+                vstore16(ka, 0, keys);
+                vstore16(kb, 1, keys);
+                vstore16(kc, 2, keys);
+                vstore16(kd, 3, keys);
+                for (int k = 0; k < columns; k++) {
+                    key = min(key, keys[k]);
+#ifdef WITH_SCORES
+                    scores[place * columns + from + k] = (float)(keys[k] / BLOCK) * scale;
+#endif
+                }
+            }
+            store_least(key, scale, least, column, place * blocks + block, from);
+        }
+}
+#else
+// One block of positions by a group of BLOCK items; `key` holds NO_KEY, and both it and the shifts stand for all items.
+inline void sum_block(global const ushort *restrict level, local const int *shifts, int used, local uint *key,
+                      int columns, int stride, global float *restrict scores, global float *restrict least,
+                      global int *restrict column) {
+    const int item = (int)get_local_id(0), block = (int)get_group_id(0), row = (int)get_group_id(1),
+              turn = (int)get_group_id(2), rows = (int)get_num_groups(1), blocks = (int)get_num_groups(0);
+    const int from = block_from(block, columns), at = from + item;
+    const float scale = score_scale(used);
+    const size_t place = (size_t)turn * rows + row;
+    if (at < columns) {
+        global const ushort *here = level + (size_t)row * stride + at;
+        uint sum = 0;
+        for (int i = 0; i < used; i++) sum += here[shifts[i]];
+        atomic_min(key, sum * BLOCK + (uint)item);
+#ifdef WITH_SCORES
+        scores[place * columns + at] = (float)sum * scale;
+#endif
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0) store_least(*key, scale, least, column, place * blocks + block, from);
+}
+#endif
+
+#endif

@@ -1,0 +1,15 @@
+// Status flags of a sample; the same bits as gpuvision.status.Status (a test holds them together).
+#ifndef STATUS_H
+#define STATUS_H
+
+#define STATUS_OK 0
+#define STATUS_LOW_SIGNAL 1
+#define STATUS_SATURATED 2
+#define STATUS_OUT_OF_RANGE 4
+#define STATUS_NOT_FINITE 8
+#define STATUS_AMBIGUOUS 16
+#define STATUS_HORIZON 32
+#define STATUS_NO_DATA 64
+#define STATUS_NOT_INVERTIBLE 128
+
+#endif

@@ -1,0 +1,219 @@
+// What a cluster of lit segments, or one segment, can give a block of receivers at most, and what the segment that
+// stands for a cluster is off by at most.
+#ifndef LIGHT_BOUNDS_H
+#define LIGHT_BOUNDS_H
+#include "common/bvh.h"
+
+// Of a row of a cluster.
+#define COLUMNS 24
+#define CENTRE 0
+#define LOW 3
+#define HIGH 6
+#define NORMAL 9
+#define RADIUS 12
+#define SPREAD 13
+#define MOST_HEIGHT 14
+#define LEAST_HEIGHT 15
+#define SLAB 16
+#define POWER 17
+#define FIRST_ORDER 18
+#define SECOND_ORDER 19
+#define THIRD_MOMENT 20
+#define FOURTH_MOMENT 21
+#define ARM 22
+#define LENGTH 23
+
+// Of a lit segment: its normal, the height of its plane, start, end.
+#define PLACED 10
+
+#define PER_PI ((real)0.31830988618379067)
+#define PI ((real)3.14159265358979324)
+// Rounding of the bounds themselves.
+#define UP ((real)1 + (real)256 * (real)REAL_EPSILON)
+
+// The receivers of a block that count: their box about its middle, mean normal, how far their normals are from that, how
+// high the middle is above their planes, how far they are from the mean plane through it.
+typedef struct {
+    real centre[3], low[3], high[3], normal[3];
+    real radius, spread, most_height, least_height, slab, cost;
+    real places[3 * BLOCK], normals[3 * BLOCK];
+    real lanes[7 * WIDTH]; // x, y, z of places, then of normals, and costs, side by side; no cost behind the last
+    int count;
+} receivers_block;
+
+typedef struct {
+    real bound; // the largest cos cos / (pi r^2) of any two points
+    int faces;  // whether all of one face all of the other
+} meeting;
+
+// A runtime may call a function for fmin and fmax. A second number that is NaN does not count.
+inline real lower(real a, real b) { return b < a ? b : a; }
+inline real higher(real a, real b) { return b > a ? b : a; }
+
+inline real dot3(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+inline real length3(const real *a) { return sqrt(dot3(a, a)); }
+
+inline void cross3(const real *a, const real *b, real *c) {
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+// Those without cost have no part in the reading; a normal of zero is no receiver.
+inline receivers_block block_of(global const INPUT *receivers, global const real *costs, int count,
+                                global const INPUT *middle) {
+    receivers_block block;
+    int kept = 0;
+    block.cost = 0;
+    for (int k = 0; k < 3; k++) block.low[k] = INFINITY, block.high[k] = -INFINITY, block.normal[k] = 0;
+    for (int i = 0; i < count; i++) {
+        real size = 0;
+        for (int k = 0; k < 3; k++) size += (real)receivers[6 * i + 3 + k] * (real)receivers[6 * i + 3 + k];
+        if (!(costs[i] > 0 && size > 0)) continue;
+        block.lanes[6 * WIDTH + kept] = costs[i], block.cost += costs[i];
+        real *place = block.places + 3 * kept, *normal = block.normals + 3 * kept;
+        for (int k = 0; k < 3; k++) {
+            place[k] = (real)(receivers[6 * i + k] - middle[k]);
+            normal[k] = (real)receivers[6 * i + 3 + k];
+            block.low[k] = lower(block.low[k], place[k]);
+            block.high[k] = higher(block.high[k], place[k]);
+        }
+        const real per = (real)1 / sqrt(size);
+        for (int k = 0; k < 3; k++) block.normal[k] += normal[k] *= per;
+        kept++;
+    }
+    block.count = kept;
+    if (!kept) return block;
+    for (int i = 0; i < WIDTH; i++) {
+        const int from = i < kept ? i : 0;
+        for (int k = 0; k < 3; k++) {
+            block.lanes[k * WIDTH + i] = block.places[3 * from + k];
+            block.lanes[(3 + k) * WIDTH + i] = block.normals[3 * from + k];
+        }
+        if (i >= kept) block.lanes[6 * WIDTH + i] = 0;
+    }
+    const real size = length3(block.normal);
+    for (int k = 0; k < 3; k++) {
+        block.centre[k] = (real)0.5 * (block.low[k] + block.high[k]);
+        block.normal[k] = size > 0 ? block.normal[k] / size : block.normals[k];
+    }
+    block.radius = block.spread = block.slab = 0;
+    block.most_height = -INFINITY, block.least_height = INFINITY;
+    for (int i = 0; i < kept; i++) {
+        real from[3], off[3];
+        for (int k = 0; k < 3; k++) {
+            from[k] = block.places[3 * i + k] - block.centre[k];
+            off[k] = block.normals[3 * i + k] - block.normal[k];
+        }
+        const real height = -dot3(block.normals + 3 * i, from);
+        block.radius = higher(block.radius, length3(from));
+        block.spread = higher(block.spread, length3(off));
+        block.slab = higher(block.slab, fabs(dot3(block.normal, from)));
+        block.most_height = higher(block.most_height, height);
+        block.least_height = lower(block.least_height, height);
+    }
+    return block;
+}
+
+inline meeting meeting_of(const receivers_block *block, global const real *row, int single, real rounding) {
+    real to[3], side[3], reach = 0, back = 0, front = 0;
+    const real normal[3] = {row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]};
+    for (int k = 0; k < 3; k++) {
+        to[k] = block->centre[k] - row[CENTRE + k];
+        side[k] = (real)0.5 * (block->high[k] - block->low[k]);
+        reach += fabs(normal[k]) * side[k];
+        const real low = block->normal[k] * (row[LOW + k] - row[CENTRE + k]);
+        const real high = block->normal[k] * (row[HIGH + k] - row[CENTRE + k]);
+        front += higher(low, high), back -= lower(low, high);
+    }
+    // Points of a box reach no further along a normal than its sides, those of a disc no further than that.
+    real across[3];
+    cross3(normal, block->normal, across);
+    const real sine = length3(across), cosine = fabs(dot3(normal, block->normal));
+    const real between = length3(to), wide = row[RADIUS], lit_disc = cosine * row[SLAB] + sine * wide;
+    reach = lower(reach, cosine * block->slab + sine * block->radius);
+    front = lower(front, lit_disc), back = lower(back, lit_disc);
+    // How high receivers stand above the lit surfaces, and the lit above the receivers' planes.
+    const real lit_turn = row[SPREAD] * (between + block->radius), got_turn = block->spread * (between + wide);
+    const real lit = dot3(normal, to), got = -dot3(block->normal, to);
+    const real lit_most = lit + lit_turn + row[MOST_HEIGHT] + reach;
+    const real got_most = got + got_turn + block->most_height + front;
+    meeting met = {0, 0};
+    if (!(lit_most > 0 && got_most > 0)) return met;
+    met.faces = lit - lit_turn + row[LEAST_HEIGHT] - reach > rounding &&
+                got - got_turn + block->least_height - back > rounding;
+    real gap = 0;
+    for (int k = 0; k < 3; k++) {
+        const real apart = higher(higher(block->low[k] - row[HIGH + k], row[LOW + k] - block->high[k]), (real)0);
+        gap += apart * apart;
+    }
+    const real distance = higher(sqrt(gap), between - block->radius - wide) - rounding;
+    if (!(distance > 0)) {
+        met.bound = INFINITY;
+        return met;
+    }
+    const real per = UP / distance;
+    const real cosines = lower((lit_most + rounding) * per, (real)1) * lower((got_most + rounding) * per, (real)1);
+    // The integral of dt / r^2 over a line is pi / r at most.
+    const real spread = single ? PI * per / row[LENGTH] : (real)INFINITY;
+    met.bound = cosines * lower(per * per, spread) * PER_PI * UP;
+    return met;
+}
+
+// What the cluster's own segment is off by at most, as irradiance by a watt.
+inline real error_of(const receivers_block *block, global const real *row, real rounding) {
+    real gap = 0;
+    for (int k = 0; k < 3; k++) {
+        const real apart =
+            higher(higher(block->low[k] - row[CENTRE + k], row[CENTRE + k] - block->high[k]), (real)0);
+        gap += apart * apart;
+    }
+    const real distance = sqrt(gap) - rounding, per = UP / distance;
+    const real q = row[RADIUS] * per, arm = row[ARM] * per;
+    if (!(distance > 0 && q < 1 && arm < 1)) return INFINITY;
+    const real third = ((real)4 - 3 * q) / ((1 - q) * (1 - q)), fourth = ((real)5 - 4 * arm) / ((1 - arm) * (1 - arm));
+    const real beyond = row[SECOND_ORDER] + per * (row[THIRD_MOMENT] * third + per * row[FOURTH_MOMENT] * fourth);
+    return per * per * per * (row[FIRST_ORDER] + per * beyond) * PER_PI * UP;
+}
+
+#ifdef VECTOR_VARIANT
+#define RECEIVER_LANE(from) (*(const bvh_reals_at *)(from))
+#else
+#define RECEIVER_LANE(from) (*(from))
+#endif
+
+// What a watt of a segment costs at most at a lane's receiver, times pi.
+BVH_INLINE bvh_reals most_of_lane(const real *lane, global const real *lit, real length, real rounding) {
+    const bvh_reals zero = (bvh_reals)0, one = (bvh_reals)1;
+    const bvh_reals nx = RECEIVER_LANE(lane + 3 * WIDTH), ny = RECEIVER_LANE(lane + 4 * WIDTH);
+    const bvh_reals nz = RECEIVER_LANE(lane + 5 * WIDTH), cost = RECEIVER_LANE(lane + 6 * WIDTH);
+    const bvh_reals x = RECEIVER_LANE(lane) - lit[4], y = RECEIVER_LANE(lane + WIDTH) - lit[5];
+    const bvh_reals z = RECEIVER_LANE(lane + 2 * WIDTH) - lit[6];
+    const real dx = lit[7] - lit[4], dy = lit[8] - lit[5], dz = lit[9] - lit[6];
+    const bvh_reals up = x * lit[0] + y * lit[1] + z * lit[2];
+    const bvh_reals start = -(nx * x + ny * y + nz * z);
+    const bvh_reals ahead = start + bvh_max(nx * dx + ny * dy + nz * dz, zero);
+    const bvh_reals part = bvh_min(bvh_max((x * dx + y * dy + z * dz) / (length * length), zero), one);
+    const bvh_reals u = x - part * dx, v = y - part * dy, w = z - part * dz;
+    const bvh_reals distance = sqrt(u * u + v * v + w * w) - rounding, per = UP / distance;
+    const bvh_reals cosines = bvh_min((up + rounding) * per, one) * bvh_min((ahead + rounding) * per, one);
+    const bvh_reals light = cost * cosines * bvh_min(per * per, per * (PI / length));
+    const bvh_masks gets = BVH_MASK(up > 0) & BVH_MASK(ahead > 0) & BVH_MASK(cost > 0);
+    return gets ? (BVH_MASK(distance > 0) ? light : (bvh_reals)INFINITY) : zero;
+}
+
+// What a segment costs at most, each receiver for itself: so that it stays finite where a block touches what is lit.
+inline real most_of_segment(const receivers_block *block, global const real *lit, real length, real power,
+                            real rounding) {
+    real sum = 0;
+#ifdef VECTOR_VARIANT
+    real each[WIDTH];
+    *(bvh_reals_at *)each = most_of_lane(block->lanes, lit, length, rounding);
+    for (int i = 0; i < WIDTH; i++) sum += each[i];
+#else
+    for (int i = 0; i < WIDTH; i++) sum += most_of_lane(block->lanes + i, lit, length, rounding);
+#endif
+    return sum * power * PER_PI * UP;
+}
+
+#endif

@@ -1,0 +1,301 @@
+// Which lit segments each block of receivers needs, to a tolerance: the tree of gpuvision/simulation/clusters.py from
+// its root, a block at a time. A cluster is left out where the light that it could send at most is under its share;
+// replaced by one segment where that is close enough and nothing can stand between; else opened.
+#include "light_clustering/light_bounds.h"
+#include "light_clustering/shaft.h"
+
+// Of a pick: a segment that nothing can hide; else without it. A cluster is ~node.
+#define CLEAR (1 << 30)
+// Whether anything may stand between is looked at for so many segments at once, and fewer, but not for one: a look takes
+// as long as the visibility of one that it would spare. A block looks so often in vain, and some times more for each time
+// that it did not.
+#define MOST_LOOKED_AT 16
+#define PATIENCE 32
+#define PATIENCE_WON 2
+// Of a block's tallies.
+#define OUT 0
+#define TOGETHER 1
+#define TALLIES 2
+
+#ifdef OCCLUDERS
+typedef struct {
+    bvh_reals x, y, z;
+} vectors;
+
+// What stands for many points with normals: as far as they reach, as a box and as a disc, and their planes.
+typedef struct {
+    real centre[3], low[3], high[3], normal[3];
+    real radius, slab, spread, most_height;
+} extent;
+
+BVH_INLINE int any_of(bvh_masks mask) {
+#ifdef VECTOR_VARIANT
+    return bvh_lanes(mask) != 0;
+#else
+    return mask != 0;
+#endif
+}
+
+BVH_INLINE vectors corner_of(global const real *leaf, int corner) {
+    global const real *at = leaf + 3 * corner * WIDTH;
+    const vectors v = {BVH_LOAD(at), BVH_LOAD(at + WIDTH), BVH_LOAD(at + 2 * WIDTH)};
+    return v;
+}
+
+BVH_INLINE vectors from(vectors v, const real *place) {
+    const vectors way = {v.x - place[0], v.y - place[1], v.z - place[2]};
+    return way;
+}
+
+BVH_INLINE vectors cross(vectors p, vectors q) {
+    const vectors n = {p.y * q.z - p.z * q.y, p.z * q.x - p.x * q.z, p.x * q.y - p.y * q.x};
+    return n;
+}
+
+BVH_INLINE bvh_reals along(vectors v, real x, real y, real z) { return v.x * x + v.y * y + v.z * z; }
+BVH_INLINE bvh_reals size_of(vectors v) { return sqrt(v.x * v.x + v.y * v.y + v.z * v.z); }
+
+BVH_INLINE bvh_reals highest(vectors a, vectors b, vectors c, const real *up) {
+    const bvh_reals u = along(a, up[0], up[1], up[2]), v = along(b, up[0], up[1], up[2]);
+    return bvh_max(bvh_max(u, v), along(c, up[0], up[1], up[2]));
+}
+
+// How high a place is above any of the planes, at most.
+BVH_INLINE bvh_reals rise(const extent *many, vectors corner) {
+    const vectors way = from(corner, many->centre);
+    return along(way, many->normal[0], many->normal[1], many->normal[2]) + many->spread * size_of(way) +
+           many->most_height;
+}
+
+// Between what the points lie along a direction, from a place.
+BVH_INLINE void between(const extent *many, vectors n, bvh_reals size, bvh_reals level, bvh_reals *low,
+                        bvh_reals *high) {
+    const bvh_reals middle = along(n, many->centre[0], many->centre[1], many->centre[2]) - level;
+    bvh_reals front = (bvh_reals)0, back = (bvh_reals)0;
+    const bvh_reals parts[3] = {n.x, n.y, n.z};
+    for (int k = 0; k < 3; k++) {
+        const bvh_reals one = parts[k] * (many->low[k] - many->centre[k]);
+        const bvh_reals two = parts[k] * (many->high[k] - many->centre[k]);
+        front += bvh_max(one, two), back += bvh_min(one, two);
+    }
+    const bvh_reals cosine = fabs(along(n, many->normal[0], many->normal[1], many->normal[2]));
+    const bvh_reals sine = sqrt(bvh_max(size * size - cosine * cosine, (bvh_reals)0));
+    const bvh_reals disc = cosine * many->slab + sine * many->radius;
+    *low = middle + bvh_max(back, -disc), *high = middle + bvh_min(front, disc);
+}
+
+// Which triangles of a leaf may hide some of the lit from a receiver: they meet the hull of both; rise above a plane of
+// each; have the receiver on one side of their own plane and something lit on the other; and, seen from the receiver,
+// none of their edges has all that is lit on its outer side.
+BVH_INLINE int hides(const shaft *hull, const receivers_block *block, const extent *got, const extent *out,
+                     global const real *lit, int count, real margin, global const real *leaf) {
+    bvh_masks left = shaft_leaf(hull, leaf);
+    if (!any_of(left)) return 0;
+    const vectors a = corner_of(leaf, 0), b = corner_of(leaf, 1), c = corner_of(leaf, 2);
+    left &= BVH_MASK(bvh_max(rise(got, a), bvh_max(rise(got, b), rise(got, c))) > margin);
+    if (!any_of(left)) return 0;
+    const vectors p = {b.x - a.x, b.y - a.y, b.z - a.z}, q = {c.x - a.x, c.y - a.y, c.z - a.z};
+    const vectors n = cross(p, q);
+    const bvh_reals level = n.x * a.x + n.y * a.y + n.z * a.z, slack = margin * size_of(n);
+    bvh_masks above = (bvh_masks)(0), below = (bvh_masks)(0);
+    for (int i = 0; i < count; i++) {
+        const real normal[3] = {lit[0], lit[1], lit[2]};
+        const bvh_masks over = left & BVH_MASK(highest(a, b, c, normal) > lit[3] + margin);
+        const bvh_reals start = along(n, lit[4], lit[5], lit[6]) - level;
+        const bvh_reals end = along(n, lit[7], lit[8], lit[9]) - level;
+        above |= over & BVH_MASK(bvh_max(start, end) > slack);
+        below |= over & BVH_MASK(bvh_min(start, end) < -slack);
+        lit += PLACED;
+    }
+    left &= above | below;
+    if (!any_of(left)) return 0;
+    for (int i = 0; i < block->count; i++) {
+        const real *place = block->places + 3 * i, *normal = block->normals + 3 * i;
+        const vectors u = from(a, place), v = from(b, place), w = from(c, place);
+        const bvh_reals top = highest(u, v, w, normal);
+        const bvh_reals side = along(n, place[0], place[1], place[2]) - level;
+        bvh_masks may = left & BVH_MASK(top > margin);
+        may &= (BVH_MASK(side > slack) & below) | (BVH_MASK(side < -slack) & above);
+        if (!any_of(may)) continue;
+        // The cone from the receiver over the triangle: inside is where all edges have the sign of `side`, turned.
+        const vectors edges[3] = {cross(u, v), cross(v, w), cross(w, u)};
+        for (int edge = 0; edge < 3; edge++) {
+            const vectors m = edges[edge];
+            bvh_reals first, last;
+            between(out, m, size_of(m), along(m, place[0], place[1], place[2]), &first, &last);
+            may &= (BVH_MASK(side < 0) & BVH_MASK(last > 0)) | (BVH_MASK(side > 0) & BVH_MASK(first < 0));
+            if (!any_of(may)) break;
+        }
+        if (any_of(may)) return 1;
+    }
+    return 0;
+}
+
+BVH_INLINE uint shaft_met(const shaft *hull, global const real *node) {
+#ifdef VECTOR_VARIANT
+    return bvh_lanes(shaft_node(hull, node));
+#else
+    uint met = 0;
+    for (int lane = 0; lane < WIDTH; lane++) met |= shaft_node(hull, node + lane) ? 1u << lane : 0;
+    return met;
+#endif
+}
+
+inline int leaf_hides(const shaft *hull, const receivers_block *block, const extent *got, const extent *out,
+                      global const real *lit, int count, real margin, global const real *leaf) {
+#ifdef VECTOR_VARIANT
+    return hides(hull, block, got, out, lit, count, margin, leaf);
+#else
+    for (int lane = 0; lane < WIDTH; lane++)
+        if (hides(hull, block, got, out, lit, count, margin, leaf + lane)) return 1;
+    return 0;
+#endif
+}
+
+// Whether nothing can stand between a block and a cluster. A leaf that hides some of one cluster may hide some of the
+// next: it is tried first.
+inline int is_clear(const bvh_tree *tree, const receivers_block *block, global const real *row, global const real *lit,
+                    int count, real margin, int *culprit) {
+    extent got, out;
+    for (int k = 0; k < 3; k++) {
+        got.centre[k] = block->centre[k], got.low[k] = block->low[k], got.high[k] = block->high[k];
+        got.normal[k] = block->normal[k];
+        out.centre[k] = row[CENTRE + k], out.low[k] = row[LOW + k], out.high[k] = row[HIGH + k];
+        out.normal[k] = row[NORMAL + k];
+    }
+    got.radius = block->radius, got.slab = block->slab;
+    got.spread = block->spread, got.most_height = block->most_height;
+    out.radius = row[RADIUS], out.slab = row[SLAB], out.spread = row[SPREAD], out.most_height = row[MOST_HEIGHT];
+    const shaft hull = shaft_of(got.low, got.high, out.low, out.high, margin);
+    if (*culprit >= 0) {
+        global const real *leaf = tree->leaves + (size_t)*culprit * (9 * WIDTH);
+        if (leaf_hides(&hull, block, &got, &out, lit, count, margin, leaf)) return 0;
+    }
+    int nodes[BVH_DEPTH];
+    uint left[BVH_DEPTH];
+    int node = 0, depth = 0;
+    uint met = shaft_met(&hull, tree->nodes);
+    while (true) {
+        if (!met) {
+            if (!depth) return 1;
+            node = nodes[--depth];
+            met = left[depth];
+            continue;
+        }
+        const int lane = bvh_lowest(met);
+        met ^= 1u << lane;
+        const int child = tree->children[node * WIDTH + lane];
+        if (child < 0) {
+            global const real *leaf = tree->leaves + (size_t)~child * (9 * WIDTH);
+            if (!leaf_hides(&hull, block, &got, &out, lit, count, margin, leaf)) continue;
+            *culprit = ~child;
+            return 0;
+        }
+        if (met) {
+            nodes[depth] = node;
+            left[depth++] = met;
+        }
+        node = child;
+        met = shaft_met(&hull, tree->nodes + (size_t)node * (6 * WIDTH));
+    }
+}
+#endif
+
+// The node after all of those below one, in the order of a heap: 0 after the last.
+inline uint after(uint node) {
+    const uint next = node + 1;
+    const uint at = next >> popcount((next & -next) - 1);
+    return at == 1 ? 0 : at;
+}
+
+#ifdef OCCLUDERS
+#define OPEN_LEVEL 99
+#else
+#define OPEN_LEVEL -1
+#endif
+
+kernel void plan_light(global const INPUT *restrict receivers, global const real *restrict costs,
+                       global const real *restrict shares, global const real *restrict rows,
+                       global const int *restrict spans, global const real *restrict placed,
+                       global const INPUT *restrict frame,
+                       global int *restrict picks, global float *restrict errors, global int *restrict counts,
+                       global real *restrict spent, global int *restrict tallies, global const real *nodes,
+                       global const int *children, global const int *axes, global const real *leaves,
+                       global const int *triangles, const real margin, const uint capacity,
+                       const uint blocks, const uint blocks_of_strip, const uint of_strip, const uint each) {
+#ifdef OCCLUDERS
+    const bvh_tree tree = {nodes, children, axes, leaves, triangles};
+#endif
+    // Places are from the frame's middle; behind it stands by how much they may be rounded.
+    const real rounding = (real)frame[3];
+    const uint begin = get_global_id(0) * each, end = min(begin + each, blocks);
+    for (uint b = begin; b < end; b++) {
+        const uint strip = b / blocks_of_strip, first = (b % blocks_of_strip) * BLOCK;
+        const size_t at = (size_t)strip * of_strip + first;
+        const receivers_block block =
+            block_of(receivers + 6 * at, costs + at, (int)min((uint)BLOCK, of_strip - first), frame);
+        const real share = shares[strip];
+        global int *pick = picks + (size_t)b * capacity;
+        global float *error = errors + (size_t)b * capacity;
+        uint found = 0;
+        int out = 0, together = 0, culprit = -1, patience = PATIENCE;
+        // The level of the cluster that nothing can hide, whose parts are being looked at; else below all levels.
+        int open_level = OPEN_LEVEL;
+        real lost = 0, whole = 0;
+        uint node = block.count ? 1 : 0;
+        while (node) {
+            const int place = spans[2 * node], count = spans[2 * node + 1], level = 31 - (int)clz(node);
+            global const real *row = rows + (size_t)node * COLUMNS;
+            const uint next = after(node);
+            if (level <= open_level) open_level = OPEN_LEVEL;
+            if (!(row[POWER] > 0)) {
+                node = next;
+                continue;
+            }
+            const meeting met = meeting_of(&block, row, count == 1, rounding);
+            // A bound of zero may meet a cost that is infinite.
+            real most = met.bound > 0 ? met.bound * row[POWER] * block.cost : 0;
+            if (count == 1 && met.bound > share) {
+                global const real *lit = placed + PLACED * place;
+                most = lower(most, most_of_segment(&block, lit, row[LENGTH], row[POWER], rounding));
+            }
+            if (most == 0 || met.bound <= share || most <= share * row[POWER] * block.cost) {
+                out += count;
+                lost += most, whole += most;
+                node = next;
+                continue;
+            }
+            real wrong = count > 1 ? (real)INFINITY : (real)0;
+#ifdef CLUSTERS
+            if (count > 1 && met.faces) wrong = error_of(&block, row, rounding);
+#endif
+            const int close = wrong <= share;
+#ifdef OCCLUDERS
+            // Looked at where that may spare something: many at once, or few that one could stand for.
+            const int worth = count > 1 && count <= MOST_LOOKED_AT && (2 * count > MOST_LOOKED_AT || close);
+            if (level < open_level && patience > 0 && worth) {
+                const int clear = is_clear(&tree, &block, row, placed + PLACED * place, count, margin, &culprit);
+                if (clear) open_level = level;
+                patience += clear ? PATIENCE_WON : -1;
+            }
+#endif
+            const int open = level >= open_level;
+            if (count > 1 && !(open && close)) {
+                node = 2 * node;
+                continue;
+            }
+            if (count > 1) together += count, lost += wrong * row[POWER] * block.cost;
+            whole += most;
+            if (found < capacity) {
+                pick[found] = count > 1 ? ~(int)node : open ? place | CLEAR : place;
+                error[found] = (float)most * 1.000001f;
+            }
+            found++;
+            node = next;
+        }
+        counts[b] = (int)found;
+        spent[2 * b] = lost * UP, spent[2 * b + 1] = whole * UP;
+        tallies[TALLIES * b + OUT] = out;
+        tallies[TALLIES * b + TOGETHER] = together;
+    }
+}

@@ -1,0 +1,129 @@
+// One-dimensional resampling of lines of points onto regular cells; regrid.py runs it along the samples of every
+// profile and then along the profiles. One work-item per line: whether the sampling runs backwards is known only in
+// order.
+//
+// A line carries a coordinate along itself, a height, and what rides along: the intensity, and, under CARRY, the other
+// coordinate. Between two neighbouring good samples everything is linear in the coordinate; a pair further apart than
+// max_gap or with a larger step in height than max_step is not joined. Where the line has fallen back by at least
+// fold_tolerance behind the furthest point it had reached, all cells up to that point are NOT_INVERTIBLE: two surfaces share
+// them.
+#include "common/real.h"
+#include "common/status.h"
+
+#define STATUS_INFORMS (STATUS_SATURATED | STATUS_AMBIGUOUS | STATUS_NOT_INVERTIBLE)
+
+#define COUNT_SAMPLES 0
+#define COUNT_LINE_PITCH 1 // elements between lines, and between samples of a line
+#define COUNT_SAMPLE_PITCH 2
+#define COUNT_CELLS 3
+#define COUNT_OUT_LINE_PITCH 4
+#define COUNT_CELL_PITCH 5
+#define COUNT_DROP_FOLDED 6
+
+#define GRID_ORIGIN 0
+#define GRID_PER_METRE 1
+#define GRID_SENSE 2
+#define GRID_MAX_GAP 3 // in cells
+#define GRID_MAX_STEP 4
+#define GRID_FOLD_TOLERANCE 5 // in cells
+
+typedef struct {
+    real at, height, intensity, other;
+    uint status;
+} Sample;
+
+#ifdef CARRY
+#define LINES_IN                                                                                                       \
+    global const INPUT *restrict along, global const INPUT *restrict height, global const INPUT *restrict intensity,   \
+        global const uchar *restrict given, global const INPUT *restrict other
+#define LINES_OUT                                                                                                      \
+    global real *restrict out_height, global real *restrict out_intensity, global uchar *restrict out_status,          \
+        global real *restrict out_other
+#define OUT_ARRAYS out_height, out_intensity, out_status, out_other
+#define OTHER_OF(i) other[i]
+#define SET_OTHER(i, value) out_other[i] = value
+#else
+#define LINES_IN                                                                                                       \
+    global const INPUT *restrict along, global const INPUT *restrict height, global const INPUT *restrict intensity,   \
+        global const uchar *restrict given
+#define LINES_OUT                                                                                                      \
+    global real *restrict out_height, global real *restrict out_intensity, global uchar *restrict out_status
+#define OUT_ARRAYS out_height, out_intensity, out_status
+#define OTHER_OF(i) 0
+#define SET_OTHER(i, value)
+#endif
+
+// First and last cell whose centre lies in [low, high]; none where first > last. (Casts, because the library's ceil,
+// floor and fmax cost PoCL more than all else here.)
+inline int first_cell(real low, int cells) {
+    const real kept = low < 0 ? 0 : low < cells ? low : cells;
+    const int cell = (int)kept;
+    return cell < kept ? cell + 1 : cell;
+}
+inline int last_cell(real high, int cells) { return high < 0 ? -1 : high < cells ? (int)high : cells - 1; }
+
+// What lies between two neighbouring good samples: the line through them, where they are joined.
+inline void fill_between(Sample before, Sample now, LINES_OUT, ulong out, constant uint *count, constant real *grid) {
+    const real length = now.at - before.at, rise = now.height - before.height;
+    if (fabs(length) > grid[GRID_MAX_GAP] || fabs(rise) > grid[GRID_MAX_STEP]) return;
+    const uint found = (before.status | now.status) & STATUS_INFORMS;
+    const int cells = count[COUNT_CELLS], last = last_cell(length < 0 ? before.at : now.at, cells);
+    for (int cell = first_cell(length < 0 ? now.at : before.at, cells); cell <= last; ++cell) {
+        const ulong i = out + (ulong)cell * count[COUNT_CELL_PITCH];
+        const uint old = out_status[i];
+        const real part = length == 0 ? 0 : (cell - before.at) / length;
+        const real height = before.height + part * rise;
+        // A cell that was passed before keeps the higher surface; within a step the later one is as good.
+        if (!(old & STATUS_NO_DATA) && out_height[i] > height + grid[GRID_MAX_STEP]) continue;
+        out_height[i] = height;
+        out_intensity[i] = before.intensity + part * (now.intensity - before.intensity);
+        SET_OTHER(i, before.other + part * (now.other - before.other));
+        out_status[i] = (uchar)(found | (old & STATUS_NOT_INVERTIBLE));
+    }
+}
+
+inline void mark_folded(real from, real to, global uchar *restrict out_status, ulong out, constant uint *count) {
+    const int cells = count[COUNT_CELLS], last = last_cell(from < to ? to : from, cells);
+    for (int cell = first_cell(from < to ? from : to, cells); cell <= last; ++cell)
+        out_status[out + (ulong)cell * count[COUNT_CELL_PITCH]] |= STATUS_NOT_INVERTIBLE;
+}
+
+// Before the walk: nothing but holes. After it, where folds are dropped: no value in them.
+inline void clear(LINES_OUT, ulong out, constant uint *count, uint only, uchar status) {
+    for (uint cell = 0; cell < count[COUNT_CELLS]; ++cell) {
+        const ulong i = out + (ulong)cell * count[COUNT_CELL_PITCH];
+        if (only && !(out_status[i] & only)) continue;
+        out_height[i] = REAL_NAN;
+        out_intensity[i] = REAL_NAN;
+        SET_OTHER(i, REAL_NAN);
+        out_status[i] = status;
+    }
+}
+
+kernel void resample(LINES_IN, LINES_OUT, constant uint *count, constant real *grid) {
+    const ulong line = get_global_id(0);
+    const ulong in = line * count[COUNT_LINE_PITCH], out = line * count[COUNT_OUT_LINE_PITCH];
+    const real sense = grid[GRID_SENSE], tolerance = grid[GRID_FOLD_TOLERANCE];
+    clear(OUT_ARRAYS, out, count, 0, STATUS_NO_DATA);
+
+    Sample before;
+    int started = 0;
+    real furthest = 0, back = 0;  // how far the line has come, and how far it has fallen back since
+    for (uint sample = 0; sample < count[COUNT_SAMPLES]; ++sample) {
+        const ulong i = in + (ulong)sample * count[COUNT_SAMPLE_PITCH];
+        const Sample now = {(along[i] - grid[GRID_ORIGIN]) * grid[GRID_PER_METRE], height[i], intensity[i], OTHER_OF(i),
+                            given[i]};
+        if ((now.status & ~STATUS_INFORMS) || not_finite(now.at) || not_finite(now.height)) continue;
+        const real reached = sense * now.at;
+        if (started) fill_between(before, now, OUT_ARRAYS, out, count, grid);
+        if (!started || reached > furthest) {
+            furthest = back = reached;
+        } else if (reached <= furthest - tolerance && reached <= back) {
+            mark_folded(sense * reached, sense * back, out_status, out, count);
+            back = reached;
+        }
+        before = now;
+        started = 1;
+    }
+    if (count[COUNT_DROP_FOLDED]) clear(OUT_ARRAYS, out, count, STATUS_NOT_INVERTIBLE, STATUS_NOT_INVERTIBLE);
+}

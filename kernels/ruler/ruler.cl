@@ -1,0 +1,44 @@
+// Edges along rulers (ruler.h). On CPU runtimes an item takes `each` rulers, 16 at a time, on GPUs a group of
+// RULER_GROUP items takes one.
+#include "ruler/ruler.h"
+
+// Under VECTOR_VARIANT of the 16 rulers from `ruler` on, as far as there are any.
+inline void store_edges(private const ruler_edge *edges, uint ruler, uint count, global real *position,
+                        global real *amplitude, global real *width, global real *sigma, global real *spacing,
+                        global uchar *status) {
+    for (int k = 0; k < MOST; k++) {
+        for (uint lane = 0; lane < LANES && ruler + lane < count; lane++) {
+            const ulong i = ((ulong)ruler + lane) * MOST + k;
+            position[i] = ((private const real *)&edges[k].position)[lane];
+            amplitude[i] = ((private const real *)&edges[k].amplitude)[lane];
+            width[i] = ((private const real *)&edges[k].width)[lane];
+            sigma[i] = ((private const real *)&edges[k].sigma)[lane];
+#ifdef PAIRS
+            spacing[i] = ((private const real *)&edges[k].spacing)[lane];
+#endif
+            status[i] = ((private const bits *)&edges[k].status)[lane];
+        }
+    }
+}
+
+kernel void ruler_edges(global const CODE *restrict image, global const real *restrict rulers,
+                        global real *restrict position, global real *restrict amplitude, global real *restrict width,
+                        global real *restrict sigma, global real *restrict spacing, global uchar *restrict status,
+                        constant real *table, constant real *model, const int rows, const int columns,
+                        const uint count, const uint each) {
+    ruler_edge edges[MOST];
+#ifdef VECTOR_VARIANT
+    const uint first = get_global_id(0) * each, end = min(first + each, count);
+    for (uint ruler = first; ruler < end; ruler += LANES) {
+        ruler_measure(image, rows, columns, rulers + 4 * (ulong)ruler, 4, count - ruler, table, model, edges);
+        store_edges(edges, ruler, count, position, amplitude, width, sigma, spacing, status);
+    }
+#else
+    local real profile[LENGTH], slopes[RULER_SLOPES];
+    local int flags;
+    const uint ruler = get_group_id(0);
+    ruler_measure(image, rows, columns, vload4(ruler, rulers), table, model, profile, slopes, &flags, edges);
+    if (get_local_id(0) == 0)
+        store_edges(edges, ruler, count, position, amplitude, width, sigma, spacing, status);
+#endif
+}

@@ -1,0 +1,168 @@
+// Samples of 16 rulers at once, one in each lane (ruler.h, under VECTOR_VARIANT).
+//
+// Places are fixed-point numbers of RULER_BITS binary places, from a pixel of the ruler's own: their fraction is the
+// mantissa of a number from 1 to 2. Pixels are inserted into vectors one after the other, which takes less time than the
+// processor's gathers.
+#ifndef RULER_LANES_H
+#define RULER_LANES_H
+
+#define RULER_ONE (1 << RULER_BITS)
+
+// Of the sample in lane k and the next one.
+#define RULER_FIRST(k) ((uint)at[(k) / 2])
+#define RULER_SECOND(k) ((uint)(at[(k) / 2] >> 32))
+#ifdef CODE_float
+typedef reals ruler_levels;
+#define RULER_REAL(levels) (levels)
+#else
+typedef masks ruler_levels;
+#define RULER_REAL(levels) LANED(convert_real)(levels)
+#endif
+
+// The grey levels about a sample: a and b above, c and d below. Integers come 32 bits at a time; of bytes those are two
+// too many, behind the pixels above and before those below, so that none is out of the image.
+#ifdef CODE_float
+#define RULER_FOUR(row, k) \
+    vload2(0, (row) + RULER_FIRST(k)), vload2(0, (row) + RULER_SECOND(k)), vload2(0, (row) + RULER_FIRST(k + 2)), \
+        vload2(0, (row) + RULER_SECOND(k + 2))
+inline void ruler_row(global const CODE *row, private const ulong *at, ruler_levels *left, ruler_levels *right) {
+    const float16 low = (float16)(RULER_FOUR(row, 0), RULER_FOUR(row, 4));
+    const float16 high = (float16)(RULER_FOUR(row, 8), RULER_FOUR(row, 12));
+    *left = (float16)(low.even, high.even);
+    *right = (float16)(low.odd, high.odd);
+}
+inline void ruler_fetch(global const CODE *above, global const CODE *below, private const ulong *at, ruler_levels *a,
+                        ruler_levels *b, ruler_levels *c, ruler_levels *d) {
+    ruler_row(above, at, a, b);
+    ruler_row(below, at, c, d);
+}
+#else
+#ifdef POCL_DEVICE_ADDRESS_BITS // makes gathers of them otherwise, which take longer
+#define RULER_ONE_BY_ONE volatile
+#else
+#define RULER_ONE_BY_ONE
+#endif
+typedef RULER_ONE_BY_ONE uint ruler_bits __attribute__((aligned(sizeof(CODE))));
+#define RULER_WORD(pixel) (*(global const ruler_bits *)(row + (pixel)))
+#define RULER_FOUR(k) \
+    RULER_WORD(RULER_FIRST(k)), RULER_WORD(RULER_SECOND(k)), RULER_WORD(RULER_FIRST(k + 2)), \
+        RULER_WORD(RULER_SECOND(k + 2))
+inline masks ruler_row(global const CODE *row, private const ulong *at) {
+    return as_int16((uint16)(RULER_FOUR(0), RULER_FOUR(4), RULER_FOUR(8), RULER_FOUR(12)));
+}
+inline void ruler_fetch(global const CODE *above, global const CODE *below, private const ulong *at, ruler_levels *a,
+                        ruler_levels *b, ruler_levels *c, ruler_levels *d) {
+#ifdef CODE_uchar
+    const masks first = ruler_row(above, at), second = ruler_row(below - 2, at);
+    *a = first & 0xff;
+    *b = first >> 8 & 0xff;
+    *c = second >> 16 & 0xff;
+    *d = second >> 24 & 0xff;
+#else
+    const masks first = ruler_row(above, at), second = ruler_row(below, at);
+    *a = first & 0xffff;
+    *b = first >> 16 & 0xffff;
+    *c = second & 0xffff;
+    *d = second >> 16 & 0xffff;
+#endif
+}
+#endif
+
+inline reals ruler_fraction(masks place) {
+    return as_reals((place << (23 - RULER_BITS) & 0x7fffff) | 0x3f800000) - 1;
+}
+
+// The last place before the last neighbour, or so far away that no ruler reaches it.
+inline masks ruler_end(masks last) {
+    const int room = 1 << (30 - RULER_BITS);
+    return ((last < room ? last + 1 : (masks)room) << RULER_BITS) - 1;
+}
+
+// Where the lines of a sample begin; all of them between a pixel and its last neighbour, whatever the rounding.
+inline masks ruler_begin(reals from, masks last, masks across) {
+    const masks span = across * (WIDTH - 1), most = ruler_end(last);
+    const masks low = span < 0 ? -span : (masks)0, high = span < 0 ? most : most - span;
+    masks place = LANED(convert_bits)(from * (real)RULER_ONE);
+    place = place < low ? low : place;
+    return place > high ? high : place;
+}
+
+// A sample on one line after the other.
+typedef struct {
+    masks column, row, across_x, across_y;
+} ruler_walk;
+
+inline void ruler_start(ruler_walk *walk, const ruler_place *place, int sample) {
+#if !defined(LENS) && !defined(CAMERA)
+    // A little less than a pixel, so that lines across all of an image have room in it.
+    const real less = RULER_ONE * (1 - (real)0x1p-20f);
+    walk->across_x = LANED(convert_bits)(place->across_x * less);
+    walk->across_y = LANED(convert_bits)(place->across_y * less);
+    const reals x = place->x + sample * place->along_x, y = place->y + sample * place->along_y;
+    walk->column = ruler_begin(x, place->last_column, walk->across_x);
+    walk->row = ruler_begin(y, place->last_row, walk->across_y);
+#endif
+}
+
+// Puts down where the sample is on the next line; returns what is wrong with that.
+inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int pitch, int sample, int line,
+                        constant real *model, private reals *x, private reals *y, private uint16 *pixel) {
+    masks flags = 0;
+#if defined(LENS) || defined(CAMERA)
+    reals from_x = place->x + sample * place->along_x + line * place->across_x;
+    reals from_y = place->y + sample * place->along_y + line * place->across_y;
+    flags = ruler_distort(&from_x, &from_y, place, model);
+    const masks most_x = ruler_end(place->last_column), most_y = ruler_end(place->last_row);
+    walk->column = LANED(convert_bits)(from_x * (real)RULER_ONE);
+    walk->row = LANED(convert_bits)(from_y * (real)RULER_ONE);
+    walk->column = walk->column < most_x ? walk->column : most_x;
+    walk->row = walk->row < most_y ? walk->row : most_y;
+#endif
+    *x = ruler_fraction(walk->column);
+    *y = ruler_fraction(walk->row);
+    *pixel = as_uint16(place->pixel + (walk->column >> RULER_BITS) + (walk->row >> RULER_BITS) * pitch);
+#if !defined(LENS) && !defined(CAMERA)
+    walk->column += walk->across_x;
+    walk->row += walk->across_y;
+#endif
+    return flags;
+}
+
+// The sums over the lines; returns what is wrong. While pixels are on their way the places of the next sample's are
+// worked out: what is read from them in parts was written long before.
+__attribute__((always_inline)) inline masks ruler_sums(global const CODE *image, const ruler_place *place, int pitch,
+                                                       constant real *table, constant real *model,
+                                                       private reals *profile) {
+    uint16 pixels[2 * WIDTH];
+    reals x[2 * WIDTH], y[2 * WIDTH];
+    masks flags = 0;
+    ruler_walk walk;
+    ruler_start(&walk, place, 0);
+    for (int j = 0; j < WIDTH; j++) flags |= ruler_next(&walk, place, pitch, 0, j, model, x + j, y + j, pixels + j);
+    global const CODE *below = image + pitch;
+    for (int i = 0; i < LENGTH; i++) {
+        const int now = i % 2 * WIDTH, then = WIDTH - now, next = min(i + 1, LENGTH - 1);
+        ruler_start(&walk, place, next);
+        ruler_levels whole = 0;
+        reals rest = 0;
+        for (int j = 0; j < WIDTH; j++) {
+            ruler_levels a, b, c, d;
+            ruler_fetch(image, below, (private const ulong *)(pixels + now + j), &a, &b, &c, &d);
+            flags |= ruler_next(&walk, place, pitch, next, j, model, x + then + j, y + then + j, pixels + then + j);
+            b -= a;
+            d -= c + b;
+            c -= a;
+            const reals step_x = RULER_REAL(b), step_y = RULER_REAL(c) + x[now + j] * RULER_REAL(d);
+#ifdef SATURATION
+            flags |= ruler_judge(RULER_REAL(a) + (x[now + j] * step_x + y[now + j] * step_y), table);
+#endif
+            whole += a;
+            rest += x[now + j] * step_x;
+            rest += y[now + j] * step_y;
+        }
+        profile[i] = RULER_REAL(whole) + rest;
+        flags |= ruler_judge_sum(profile[i]);
+    }
+    return flags;
+}
+#endif

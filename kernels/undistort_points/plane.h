@@ -1,0 +1,91 @@
+// Sensor -> measurement plane by two cubic polynomials (F. de Jong, eq. 3.6 and 3.7), and back. They are taken apart
+// into a displacement on the sensor and an affine map, which the displacement is small beside:
+//
+//     x = (u - u0) su, y = (v - v0) sv                      -1 .. 1 within the region that the polynomials hold for
+//     bent x - x = a0 x^2 + a1 x y + a2 y^2 + a3 x^3 + a4 x^2 y + a5 x y^2 + a6 y^3,  y likewise with b0 .. b6
+//     (G, H) = (g0, h0) + M (bent x, bent y)
+//
+// The table is PlanePolynomial.packed in polynomial.py. Compiled only under PLANE.
+#ifndef PLANE_H
+#define PLANE_H
+#include "common/lanes.h"
+#ifdef PLANE
+
+#define PLANE_ORIGIN 0   // u0, v0
+#define PLANE_SCALE 2    // su, sv
+#define PLANE_PER_SCALE 4
+#define PLANE_OFFSET 6   // g0, h0
+#define PLANE_MATRIX 8   // M: gx, gy, hx, hy
+#define PLANE_BACK 12    // its inverse
+#define PLANE_A 16
+#define PLANE_B 23
+// The region's edge, given and found.
+#define PLANE_EDGE ((real)(1 + 4 * REAL_EPSILON))
+#define PLANE_FOUND_EDGE ((real)(1 + 64 * REAL_EPSILON))
+// How far out of the region a Newton step may look.
+#define PLANE_OUTSKIRTS ((real)1.25)
+// No bending takes a place in the region as far as that.
+#define PLANE_FARTHEST ((real)1e3)
+
+inline masks LANED(plane_within)(reals x, reals y, real edge) {
+    return mask_of(fabs(x) <= edge) & mask_of(fabs(y) <= edge);
+}
+
+inline reals LANED(plane_bend)(reals x, reals y, constant real *c) {
+    return x * x * (c[0] + c[3] * x + c[4] * y) + y * (x * c[1] + y * (c[2] + c[5] * x + c[6] * y));
+}
+
+inline void LANED(plane_slopes)(reals x, reals y, constant real *c, reals *by_x, reals *by_y) {
+    *by_x = x * (2 * c[0] + 3 * c[3] * x + 2 * c[4] * y) + y * (c[1] + c[5] * y);
+    *by_y = x * (c[1] + c[4] * x) + y * (2 * c[2] + 2 * c[5] * x + 3 * c[6] * y);
+}
+
+// Moves sensor coordinates to the plane; returns which lie outside the region.
+inline masks LANED(plane_measure)(reals *u, reals *v, constant real *plane) {
+    constant real *matrix = plane + PLANE_MATRIX;
+    const reals x = (*u - plane[PLANE_ORIGIN]) * plane[PLANE_SCALE];
+    const reals y = (*v - plane[PLANE_ORIGIN + 1]) * plane[PLANE_SCALE + 1];
+    const reals bent_x = x + LANED(plane_bend)(x, y, plane + PLANE_A);
+    const reals bent_y = y + LANED(plane_bend)(x, y, plane + PLANE_B);
+    *u = plane[PLANE_OFFSET] + (matrix[0] * bent_x + matrix[1] * bent_y);
+    *v = plane[PLANE_OFFSET + 1] + (matrix[2] * bent_x + matrix[3] * bent_y);
+    return ~LANED(plane_within)(x, y, PLANE_EDGE);
+}
+
+// As newton.h asks for it.
+inline masks LANED(plane_newton)(reals x, reals y, reals back_x, reals back_y, constant real *plane, reals *step_x,
+                                 reals *step_y, reals *left) {
+    const reals at_x = x + back_x, at_y = y + back_y;
+    reals xx, xy, yx, yy;
+    LANED(plane_slopes)(at_x, at_y, plane + PLANE_A, &xx, &xy);
+    LANED(plane_slopes)(at_x, at_y, plane + PLANE_B, &yx, &yy);
+    xx += 1;
+    yy += 1;
+    const reals left_x = back_x + LANED(plane_bend)(at_x, at_y, plane + PLANE_A);
+    const reals left_y = back_y + LANED(plane_bend)(at_x, at_y, plane + PLANE_B);
+    const reals determinant = xx * yy - xy * yx, per = 1 / determinant;
+    *left = left_x * left_x + left_y * left_y;
+    *step_x = (xy * left_y - yy * left_x) * per;
+    *step_y = (yx * left_x - xx * left_y) * per;
+    return LANED(plane_within)(at_x, at_y, PLANE_OUTSKIRTS) & mask_of(determinant > 0);
+}
+
+#define NEWTON_STEP LANED(plane_newton)
+#include "common/newton.h"
+
+// Moves plane coordinates to the sensor; returns which are not seen within the region.
+inline masks LANED(plane_show)(reals *g, reals *h, constant real *plane) {
+    constant real *back = plane + PLANE_BACK;
+    const reals along = *g - plane[PLANE_OFFSET], up = *h - plane[PLANE_OFFSET + 1];
+    const reals x = back[0] * along + back[1] * up, y = back[2] * along + back[3] * up;
+    reals back_x = 0, back_y = 0;
+    masks unseen = ~LANED(plane_within)(x, y, PLANE_FARTHEST);
+    unseen |= LANED(newton_back)(x, y, ~unseen, plane, &back_x, &back_y);
+    unseen |= ~LANED(plane_within)(x + back_x, y + back_y, PLANE_FOUND_EDGE);
+    *g = plane[PLANE_ORIGIN] + plane[PLANE_PER_SCALE] * (x + back_x);
+    *h = plane[PLANE_ORIGIN + 1] + plane[PLANE_PER_SCALE + 1] * (y + back_y);
+    return unseen;
+}
+
+#endif
+#endif

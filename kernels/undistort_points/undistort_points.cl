@@ -1,0 +1,85 @@
+// Measured points -> ideal ones, or back under INVERSE, pairs (column, row) side by side. CPU runtimes take strips of
+// 16-wide vectors, GPUs an item per point; `each` is the number of points of a strip, or of a work-group. Which model,
+// CAMERA or LENS or PLANE, says what is compiled.
+#include "common/camera.h"
+#include "common/lens.h"
+#include "undistort_points/plane.h"
+#include "common/status.h"
+
+#ifdef VECTOR_VARIANT
+typedef INPUT16 inputs_at __attribute__((aligned(sizeof(INPUT))));
+#define LOAD(from) convert_real16(*(global const inputs_at *)(from))
+#endif
+
+inline void load_points(global const INPUT *points, ulong i, reals *x, reals *y) {
+#ifdef VECTOR_VARIANT
+    const reals low = LOAD(points + 2 * i), high = LOAD(points + 2 * i + LANES);
+    *x = (reals)(low.even, high.even);
+    *y = (reals)(low.odd, high.odd);
+#else
+    *x = points[2 * i];
+    *y = points[2 * i + 1];
+#endif
+}
+
+inline void store_points(reals x, reals y, global real *points, ulong i) {
+#ifdef VECTOR_VARIANT
+    reals low, high;
+    low.even = x.lo;
+    low.odd = y.lo;
+    high.even = x.hi;
+    high.odd = y.hi;
+    store_reals(low, points + 2 * i);
+    store_reals(high, points + 2 * i + LANES);
+#else
+    points[2 * i] = x;
+    points[2 * i + 1] = y;
+#endif
+}
+
+// Moves (x, y); returns the flag of those that have no such place.
+__attribute__((always_inline)) inline masks LANED(moved)(reals *x, reals *y, constant real *model) {
+#if defined(PLANE) && defined(INVERSE)
+    return LANED(plane_show)(x, y, model) & STATUS_OUT_OF_RANGE;
+#elif defined(PLANE)
+    return LANED(plane_measure)(x, y, model) & STATUS_OUT_OF_RANGE;
+#elif defined(CAMERA) && defined(INVERSE)
+    return LANED(camera_distort)(x, y, model) & STATUS_NOT_INVERTIBLE;
+#elif defined(CAMERA)
+    return LANED(camera_undistort)(x, y, model) & STATUS_NOT_INVERTIBLE;
+#elif defined(INVERSE)
+    return LANED(lens_distort)(x, y, model) & STATUS_NOT_INVERTIBLE;
+#else
+    return mask_of(LANED(lens_undistort)(x, y, model)) & STATUS_NOT_INVERTIBLE;
+#endif
+}
+
+kernel void undistort_points(global const INPUT *restrict points, global real *restrict moved_points,
+                             global uchar *restrict status, constant real *model, const ulong count,
+                             const ulong each) {
+    // The last vector, or work-group, moves back to end with the last point, and does some points twice: a test for the
+    // end within it would cost more than they do.
+#ifdef VECTOR_VARIANT
+    const ulong first = get_global_id(0) * each, end = min(first + each, count);
+    for (ulong next = first; next < end; next += LANES) {
+        const ulong i = min(next, count - LANES);
+#else
+    {
+        const ulong i = min(get_group_id(0) * each, count - each) + get_local_id(0);
+#endif
+        reals x, y;
+        load_points(points, i, &x, &y);
+        const reals given_x = x, given_y = y;
+        masks flags = LANED(moved)(&x, &y, model);
+        // Flags are rare.
+        const masks bad = mask_of(flags != 0) | mask_of(LANED(not_finite)(x)) | mask_of(LANED(not_finite)(y));
+        if (any_lane(bad)) {
+            const masks good = ~mask_of(LANED(not_finite)(given_x)) & ~mask_of(LANED(not_finite)(given_y));
+            x = nan_where(bad, x);
+            y = nan_where(bad, y);
+            flags = bad & ~(good & mask_of(flags != 0)) ? (masks)STATUS_NOT_FINITE : flags;
+        }
+        store_points(x, y, moved_points, i);
+        store_bytes(convert_bytes(flags), status + i);
+    }
+}

@@ -1,0 +1,201 @@
+"""Light of a lit line on a board with parts, as far as it is seen: OccludedIrradiance against NumPy with Embree.
+
+The peer takes samples of the line, keeps the pairs that face each other (by matrix products, in blocks), traces a
+shadow ray for each through Embree, on all cores, and sums, a profile at a time; ours are eight profiles in a row. Its
+error and ours are medians over the receivers that get light, relative to OccludedIrradiance in double (which the tests
+hold to rays in float64); NaN on a device without double. Cases ``growth/...`` have four times the segments or receivers
+of the board, or four and sixteen times its triangles.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
+
+from gpuvision.host import Bound, Device
+from gpuvision.profiling.harness import Case
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.transport.line_irradiance import LitSegments
+from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
+
+_PARTS, _STRIPS, _EACH = 40, 100, 30
+_LIFT = 1e-6  # metres, within which of a surface nothing hides; the peer's rays begin and end so far off
+_PROFILES = 8  # one after another, as a scan has them; the peer gains nothing by that
+_BLOCK = 1 << 22  # pairs of a block of the peer's
+_BASE = "board/1024"  # what the boards of growth/... have more of
+_AT = 0.0  # metres, where the sheet of light stands: along the middle row of parts
+
+
+@dataclass(frozen=True, eq=False)
+class Board:
+    """A plate with boxes and cylinders, a line of light over it, and receivers on all that faces up or aside."""
+
+    scene: Scene
+    segments: LitSegments
+    receivers: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, *, finer: int = 0, strips: int = _STRIPS, parts_of_segments: int = 1) -> Board:
+        """Return the board, each triangle cut into four so often, each lit segment into so many."""
+        rng = np.random.default_rng(1)
+        mesh: Any = trimesh.creation.box((0.1, 0.08, 0.0016)).apply_translation((0.0, 0.0, -0.0008))
+        parts = [mesh.subdivide().subdivide().subdivide()]
+        tops = [(-0.05, 0.05, 0.0)]
+        for number in range(_PARTS):
+            row, column = divmod(number, 9)
+            x, y = np.array([0.01 * column - 0.04, 0.016 * row - 0.032]) + rng.uniform(-5e-4, 5e-4, 2)
+            size = rng.uniform((2e-3, 2e-3, 1e-3), (8e-3, 12e-3, 6e-3))
+            if number % 3 == 0:
+                part = trimesh.creation.cylinder(3e-3, 5e-3, sections=22)
+                size[:] = 2.0 * np.sqrt(max(9e-6 - (_AT - y) ** 2, 0.0)), 6e-3, 5e-3
+            else:
+                part = trimesh.creation.box(size)
+            parts.append(part.apply_translation((x, y, 0.5 * size[2])))
+            if abs(_AT - y) < 0.5 * size[1]:
+                tops.append((x - 0.5 * size[0], x + 0.5 * size[0], size[2]))
+        mesh = trimesh.util.concatenate(parts)
+        seen = np.where(mesh.face_normals[:, 2] > -0.5, mesh.area_faces, 0.0)
+        points, faces = trimesh.sample.sample_surface(mesh, strips * _EACH, face_weight=seen, seed=3)
+        receivers = np.hstack([points, mesh.face_normals[faces]])[np.argsort(points[:, 0])].reshape(strips, _EACH, 6)
+        # A strip of a sensor sees a slice of the board, from one of its edges to the other.
+        receivers = np.take_along_axis(receivers, np.argsort(receivers[:, :, 1], axis=1)[:, :, None], axis=1)
+        for _ in range(finer):
+            mesh = mesh.subdivide()
+        return cls(Scene.of(mesh), _line(tops, parts_of_segments), receivers.astype(np.float32))
+
+
+def _line(tops: list[tuple[float, float, float]], parts: int) -> LitSegments:
+    """Return what is highest of tops (from, to, height) along x, each piece cut into parts of one length."""
+    cuts = np.unique([edge for top in tops for edge in top[:2]])
+    middles = 0.5 * (cuts[1:] + cuts[:-1])
+    heights = np.max([np.where((middles > low) & (middles < high), z, -1.0) for low, high, z in tops], axis=0)
+    change = np.flatnonzero(np.diff(heights, prepend=-1.0))
+    edges = np.append(cuts[change], cuts[-1])
+    steps = np.linspace(edges[:-1], edges[1:], parts + 1)
+    x = np.stack([steps[:-1], steps[1:]], axis=-1).transpose(1, 0, 2).reshape(-1, 2)
+    z = np.repeat(heights[change], parts)
+    ends = np.stack([x, np.full_like(x, _AT), np.tile(z[:, None], 2)], axis=-1)
+    return LitSegments(ends, np.tile([0.0, 0.0, 1.0], (len(x), 1)), np.ones(len(x)))
+
+
+def cases(device: Device) -> Iterator[Case]:
+    """Yield the board at the peer's 1024 and 16384 samples a line, and boards that are larger in one way."""
+    board = Board.of()
+    for samples in (1024, 16_384):
+        yield _case(device, board, f"board/{samples}", samples)
+    yield _case(device, Board.of(parts_of_segments=4), "growth/segments-x4", base=_BASE)
+    yield _case(device, Board.of(strips=4 * _STRIPS), "growth/receivers-x4", base=_BASE)
+    for finer in (1, 2):
+        yield _case(device, Board.of(finer=finer), f"growth/triangles-x{4**finer}", base=_BASE)
+
+
+def _case(device: Device, board: Board, name: str, samples: int = 1024, **more: str) -> Case:
+    rows, receivers = segment_rows(board.segments), board.receivers
+    weights = np.ones((*receivers.shape[:2], 2), np.float32)
+    operation = OccludedIrradiance(scene=board.scene, segments=len(rows), clearance=_LIFT)
+    bound = operation.bind(device, receivers.shape, receivers.dtype)
+    for there, here in zip(bound.inputs, (receivers, weights, rows.astype(np.float32)), strict=True):
+        there.set(here)
+    ours = bound.run().irradiance.get()
+    truth = np.full(ours.shape, np.nan)
+    if device.has_double:
+        truth = operation(receivers.astype(float), weights.astype(float), rows, device=device).irradiance
+    peer = functools.partial(irradiance_by_samples, board, samples, embree_of(board.scene))
+    facts = {
+        "triangles": len(board.scene.corners),
+        "segments": len(rows),
+        "receivers": ours.size,
+        "peer_error": error_of(peer(), truth.ravel()),
+        **more,
+    }
+    return Case(
+        "reflections",
+        name,
+        functools.partial(_in_a_row, bound),
+        {"numpy+embreex": peer},
+        error_of(ours, truth),
+        repeats=_PROFILES,
+        facts=facts,
+        factors={"numpy+embreex": _PROFILES},
+    )
+
+
+def _in_a_row(bound: Bound[Any]) -> None:
+    for _ in range(_PROFILES - 1):
+        bound()
+    bound.run()
+
+
+def error_of(values: NDArray[Any], truth: NDArray[np.float64]) -> float:
+    """Return the median relative error of what gets light; NaN where nothing does."""
+    lit = truth > 1e-6 * np.nanmax(truth)
+    return float(np.median(np.abs(values[lit] / truth[lit] - 1.0))) if lit.any() else float("nan")
+
+
+def embree_of(scene: Scene) -> Any:
+    """Return a scene as Embree takes it."""
+    embree = EmbreeScene()
+    TriangleMesh(embree, scene.corners.astype(np.float32))
+    return embree
+
+
+def irradiance_by_samples(board: Board, samples: int, embree: Any) -> NDArray[np.float32]:
+    """Return the irradiance of all receivers from samples of the line."""
+    points, normals, light = _samples(board.segments, samples)
+    places, facing = board.receivers.reshape(-1, 6)[:, :3], board.receivers.reshape(-1, 6)[:, 3:]
+    own = np.einsum("nk,nk->n", places, facing)[:, None]
+    lit = np.einsum("nk,nk->n", points, normals)[:, None]
+    total = np.zeros(len(places), np.float32)
+    step = max(_BLOCK // samples, 1)
+    for first in range(0, len(places), step):
+        some = np.s_[first : first + step]
+        toward = facing[some] @ points.T - own[some]
+        height = (normals @ places[some].T - lit).T
+        i, j = np.nonzero((toward > 0.0) & (height > 0.0))
+        start = places[some][i] + _LIFT * facing[some][i]
+        step_to = points[j] + _LIFT * normals[j] - start
+        seen = _free(embree, start, step_to)
+        i, j = i[seen], j[seen]
+        square = np.einsum("nk,nk->n", step_to, step_to)[seen]
+        value = toward[i, j] * height[i, j] * light[j] / (square * square)
+        total[some] = np.bincount(i, value, minlength=len(toward))
+    return total
+
+
+def _samples(segments: LitSegments, samples: int) -> tuple[NDArray[np.float32], ...]:
+    """Return places, normals and exitance over pi of samples at even distances along all of the line."""
+    lengths = np.linalg.norm(segments.ends[:, 1] - segments.ends[:, 0], axis=1)
+    begin = np.cumsum(lengths) - lengths
+    at = (np.arange(samples) + 0.5) * (lengths.sum() / samples)
+    which = np.searchsorted(begin, at, side="right") - 1
+    share = ((at - begin[which]) / lengths[which])[:, None]
+    places = (1.0 - share) * segments.ends[which, 0] + share * segments.ends[which, 1]
+    light = segments.exitance[which] * (lengths.sum() / samples / np.pi)
+    return places.astype(np.float32), segments.normals[which].astype(np.float32), light.astype(np.float32)
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count() or 1)
+
+
+def _free(embree: Any, start: NDArray[np.float32], step: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def query(some: slice) -> NDArray[Any]:
+        far = np.ones(len(start[some]), np.float32)
+        return np.asarray(embree.run(start[some], step[some], dists=far, query="OCCLUDED"))
+
+    cuts = np.linspace(0, len(start), (os.cpu_count() or 1) + 1).astype(int)
+    answers = _pool().map(query, itertools.starmap(slice, itertools.pairwise(cuts)))
+    free: NDArray[np.bool_] = np.concatenate(list(answers)) != 0
+    return free

@@ -1,0 +1,96 @@
+"""The thesis' alternating minimisation: from its own start it finds what ours finds, at its own price."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gpuvision.camera.lens import Lens
+from gpuvision.camera.lines.alternating_minimisation import (
+    STRATEGIES,
+    alternate,
+    centre_from_curvature,
+    points_from_intersections,
+)
+from gpuvision.camera.lines.line_families import PackedLines, grid_lines, pack
+from gpuvision.camera.lines.vanishing_points import fit_lens
+from reference.straight_lines import plane_grid, radial_lens
+
+
+@pytest.fixture
+def points(rng: np.random.Generator) -> np.ndarray:
+    """The thesis' grid of 5 x 9 points, tilted, 20 pixels of distortion."""
+    ideal = plane_grid(rng, 30.0, rows=5, columns=9)
+    return radial_lens(20.0).distort(ideal) + rng.normal(0.0, 0.02, ideal.shape)
+
+
+def test_centre_from_curvature(rng: np.random.Generator) -> None:
+    """On strong distortion without noise the extremes of curvature point at the centre."""
+    lens = Lens(k1=-2e-7, centre=(480.0, 530.0))
+    packed = pack(grid_lines(lens.distort(plane_grid(rng, 0.0))))
+    centre = packed.origin + packed.unit * centre_from_curvature(packed)
+    # A quartic is not the curve: a few pixels are left.
+    assert np.hypot(*(centre - lens.centre)) < 10.0
+
+
+def test_straight_lines_have_no_centre(rng: np.random.Generator) -> None:
+    packed = pack(grid_lines(plane_grid(rng, 20.0)))
+    assert np.all(np.abs(centre_from_curvature(packed)) < packed.corner)
+    np.testing.assert_array_equal(centre_from_curvature(pack([[np.arange(8.0).reshape(4, 2)]])), 0.0)
+
+
+def test_points_from_intersections(rng: np.random.Generator) -> None:
+    ideal = plane_grid(rng, 40.0)
+    packed = pack(grid_lines(ideal))
+    exact = fit_lens(grid_lines(ideal), model="none", lines="vanishing").vanishing_points
+    found = packed.origin + packed.unit * points_from_intersections(packed)
+    np.testing.assert_allclose(found, exact[:, :2] / exact[:, 2:], rtol=1e-6)
+
+
+def distance_sum(packed: PackedLines, lens: np.ndarray, points: np.ndarray) -> float:
+    """Eq. 3.10 to 3.15 as they are written, each line's angle by the scatter about its vanishing point."""
+    total = 0.0
+    place = np.stack([packed.x, packed.y], axis=-1)
+    offset = place - lens[2:]
+    square = np.sum(offset**2, axis=-1, keepdims=True)
+    moved = lens[2:] + offset * (1.0 + square * (lens[0] + lens[1] * square))
+    for line in range(len(packed.counts)):
+        about = moved[packed.line == line] - points[packed.family[line]]
+        total += np.linalg.svd(about, compute_uv=False)[1] ** 2
+    return total
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_strategies_minimise_what_the_thesis_says(points: np.ndarray, strategy: str) -> None:
+    packed = pack(grid_lines(points))
+    found = alternate(packed, 2, strategy, rounds=3)
+    at = found.minimum.at
+    lens, places = np.concatenate([at.k, at.centre]), at.vanishing[:, :2] / at.vanishing[:, 2:]
+    start = np.concatenate([np.zeros(2), centre_from_curvature(packed)])
+    before = distance_sum(packed, start, points_from_intersections(packed))
+    # Alternating, three rounds are far from the end.
+    assert distance_sum(packed, lens, places) < 0.5 * before
+    assert found.evaluations > found.minimum.steps == 3
+
+
+def test_fit_by_a_strategy(points: np.ndarray) -> None:
+    """A fit says what the strategy reached, in its own rounds; ours is never worse."""
+    families = grid_lines(points)
+    ours, theirs = (
+        fit_lens(families, model="k1", lines="vanishing", strategy=each)
+        for each in ("variable_projection", "gauss_newton")
+    )
+    assert theirs.rms_px > ours.rms_px * (1.0 - 1e-6)
+    assert theirs.iterations > ours.iterations
+
+
+@pytest.mark.slow
+def test_the_simplex_ends_where_ours_does(points: np.ndarray) -> None:
+    families = grid_lines(points)
+    ours = fit_lens(families, model="k1", lines="vanishing")
+    theirs = fit_lens(families, model="k1", lines="vanishing", strategy="nelder_mead")
+    # The thesis' distances shrink with the lens, which pulls it off by less than its uncertainty.
+    sigma = np.sqrt(np.diag(ours.covariance))
+    assert np.all(np.abs(theirs.values - ours.values)[:3] < 0.5 * sigma[:3])
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(theirs.covariance / scale, ours.covariance / scale, atol=0.1)

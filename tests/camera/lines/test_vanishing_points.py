@@ -1,0 +1,422 @@
+"""Lenses from straight lines: exact data, errors against the Cramer-Rao bound, choice of model, what data lack."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gpuvision.camera.lens import Lens
+from gpuvision.camera.lines.line_families import grid_lines
+from gpuvision.camera.lines.vanishing_points import LensFit, fit_lens, straightness_px
+from gpuvision.camera.patterns.dots import find_dots
+from gpuvision.camera.patterns.line_pattern import find_lines
+from reference.straight_lines import bound, plane_grid, radial_lens, straightness
+
+NAMES = ("k1", "k2", "C_c", "R_c")
+
+
+def seen(rng: np.random.Generator, tilt: float, border: float, sigma: float) -> tuple[np.ndarray, Lens]:
+    """Noisy grid of 23 x 31 points, and the lens it was seen through."""
+    lens = radial_lens(border)
+    points = lens.distort(plane_grid(rng, tilt))
+    return points + rng.normal(0.0, sigma, points.shape), lens
+
+
+def errors(fit: LensFit, lens: Lens) -> np.ndarray:
+    """Errors of the parameters in standard deviations."""
+    true = np.array([{"k1": lens.k1, "k2": lens.k2, "C_c": lens.centre[0], "R_c": lens.centre[1]}[n] for n in NAMES])
+    return (fit.values[:4] - true) / np.sqrt(np.diag(fit.covariance))[:4]
+
+
+@pytest.mark.parametrize("lines", ["free", "vanishing"])
+@pytest.mark.parametrize("tilt", [0.0, 45.0])
+@pytest.mark.parametrize("border", [-20.0, 0.3, 20.0])
+def test_exact_lines_give_the_lens(rng: np.random.Generator, border: float, tilt: float, lines: str) -> None:
+    points, lens = seen(rng, tilt, border, 0.0)
+    fit = fit_lens(grid_lines(points, diagonals=True), model="k1,k2", lines=lines)
+    # Rounding of the points, 1e-13 pixels, over the distortion they see: 1e-12 of it at the smallest.
+    np.testing.assert_allclose(fit.values[:4], [lens.k1, lens.k2, *lens.centre], rtol=1e-9)
+    assert fit.rms_px < 1e-12
+    assert fit.warnings == ()
+    assert fit.names[:4] == NAMES
+    ideal = lens.undistort(points)
+    for number, line in ((0, ideal[0]), (1, ideal[:, 0])):
+        point = fit.vanishing_points[number]
+        # The point lies on the undistorted lines of its family.
+        across = np.linalg.svd(line - line.mean(axis=0))[2][1]
+        far = (across @ point[:2] - point[2] * (across @ line.mean(axis=0))) / np.linalg.norm(point[:2])
+        assert abs(far) < 1e-7
+        assert abs(np.linalg.norm(point) - 1.0) < 1e-14
+
+
+@pytest.mark.parametrize("lines", ["free", "vanishing"])
+@pytest.mark.parametrize("tilt", [0.0, 20.0, 45.0])
+@pytest.mark.parametrize("border", [0.3, 3.0, 20.0])
+def test_predicted_errors_are_the_bound(rng: np.random.Generator, border: float, tilt: float, lines: str) -> None:
+    """At most a tenth above what any estimator could reach."""
+    lens = radial_lens(border)
+    ideal = plane_grid(rng, tilt)
+    fit = fit_lens(grid_lines(lens.distort(ideal)), model="k1,k2", lines=lines, sigma=0.05)
+    ratio = np.sqrt(np.diag(fit.covariance))[:4] / bound(ideal, lens, 0.05, meet=lines == "vanishing")
+    assert np.all(ratio > 0.999)
+    assert np.all(ratio < 1.1)
+
+
+def coverage(rng: np.random.Generator, draws: int, cases: list[tuple[float, float, float]]) -> np.ndarray:
+    """Errors in standard deviations (draws, 4), over cases (tilt, border, sigma) in turn."""
+    found = []
+    for number in range(draws):
+        points, lens = seen(rng, *cases[number % len(cases)])
+        fit = fit_lens(grid_lines(points), model="k1,k2", lines=("free", "vanishing")[number % 2])
+        found.append(errors(fit, lens))
+    return np.array(found)
+
+
+def test_errors_are_as_predicted(rng: np.random.Generator) -> None:
+    """Cold starts, none of which fails: every error within six standard deviations, their mean square 1."""
+    cases = [
+        (tilt, border, sigma) for tilt in (0.0, 20.0, 45.0) for border, sigma in ((0.3, 0.02), (3.0, 0.2), (20.0, 0.2))
+    ]
+    found = coverage(rng, 180, cases)
+    assert np.all(np.abs(found) < 6.0)
+    # 720 errors: the mean of their squares has a standard deviation of sqrt(2/720) = 0.053 if they were independent,
+    # and about twice that as the four of a fit are not.
+    assert abs(np.mean(found**2) - 1.0) < 0.4
+
+
+def test_uncertainties_cover_the_truth(rng: np.random.Generator) -> None:
+    cases = [
+        (t, b, s) for t in (0.0, 10.0, 20.0, 30.0, 45.0) for b, s in ((0.3, 0.02), (3.0, 0.02), (3.0, 0.2), (20.0, 0.2))
+    ]
+    found = coverage(rng, 1000, cases)
+    covered = np.mean(np.abs(found) < 1.96, axis=0)
+    np.testing.assert_allclose(covered, 0.95, atol=0.03)
+    assert np.all(np.abs(found) < 6.0)
+
+
+def test_vanishing_points_have_errors_as_predicted(rng: np.random.Generator) -> None:
+    """Their three components lie in a plane, so a draw has two degrees of freedom per point."""
+    ideal, lens = plane_grid(rng, 30.0), radial_lens(10.0)
+    exact = fit_lens(grid_lines(lens.distort(ideal)), model="k1,k2", lines="vanishing").values
+    squares = []
+    for _ in range(100):
+        points = lens.distort(ideal) + rng.normal(0.0, 0.1, ideal.shape)
+        fit = fit_lens(grid_lines(points), model="k1,k2", lines="vanishing")
+        for first in (4, 7):
+            part = slice(first, first + 3)
+            assert fit.names[first].startswith("v")
+            wrong = fit.values[part] * np.sign(fit.values[part] @ exact[part]) - exact[part]
+            values, vectors = np.linalg.eigh(fit.covariance[part, part])
+            assert values[0] < 1e-9 * values[2]
+            squares += list((vectors[:, 1:].T @ wrong) ** 2 / values[1:])
+    # 400 squares: standard deviation of the mean 0.07 to 0.14.
+    assert abs(np.mean(squares) - 1.0) < 0.45
+
+
+def test_rms_is_of_the_measured_image(rng: np.random.Generator) -> None:
+    points, _ = seen(rng, 20.0, 20.0, 0.1)
+    fit = fit_lens(grid_lines(points), model="k1,k2")
+    freedom = len(np.concatenate([np.concatenate(family) for family in fit.residuals_px]))
+    assert fit.rms_px == pytest.approx(0.1, rel=0.1)
+    assert fit.sigma_px == pytest.approx(fit.rms_px * np.sqrt(freedom / fit.degrees_of_freedom))
+    # On an undistorted line through the centre of the image both agree to the scale of the lens, 3 % at the border.
+    straight = straightness_px(grid_lines(points), fit.lens)
+    assert straight == pytest.approx(fit.rms_px, rel=0.03)
+    corrected = fit.lens.undistort(points)
+    lines = [line for family in grid_lines(corrected) for line in family]
+    scale = np.sqrt(np.sum(np.var(np.concatenate(lines), axis=0)))
+    before = np.concatenate([line for family in grid_lines(points) for line in family])
+    assert straight == pytest.approx(straightness(lines) / scale * np.sqrt(np.sum(np.var(before, axis=0))), rel=1e-12)
+    assert straightness_px(grid_lines(points)) == pytest.approx(
+        straightness([*points, *points.swapaxes(0, 1)]), rel=1e-9
+    )
+
+
+def test_distances_keep_their_place(rng: np.random.Generator) -> None:
+    points, _ = seen(rng, 10.0, 5.0, 0.1)
+    points[3, 4:9] = np.nan
+    points[0, 2:] = np.nan
+    rows = list(points)
+    fit = fit_lens([rows, list(points.swapaxes(0, 1))], model="k1")
+    assert [len(line) for line in fit.residuals_px[0]] == [31] * 23
+    np.testing.assert_array_equal(np.isnan(fit.residuals_px[0][3]), np.isnan(points[3, :, 0]))
+    assert np.all(np.isnan(fit.residuals_px[0][0]))
+
+
+def test_several_images_share_a_lens(rng: np.random.Generator) -> None:
+    lens, families = radial_lens(10.0), []
+    for tilt in (0.0, 15.0, 30.0):
+        points = lens.distort(plane_grid(rng, tilt))
+        families += grid_lines(points + rng.normal(0.0, 0.1, points.shape))
+    many, one = (fit_lens(each, model="k1,k2", lines="vanishing") for each in (families, families[:2]))
+    assert many.vanishing_points.shape == (6, 3)
+    assert np.all(np.abs(errors(many, lens)) < 4.0)
+    assert np.all(np.sqrt(np.diag(many.covariance))[:4] < np.sqrt(np.diag(one.covariance))[:4])
+
+
+@pytest.mark.parametrize(
+    ("border", "k2_part", "sigma", "model"),
+    [(0.0, 0.0, 0.05, "none"), (5.0, 0.0, 0.05, "k1"), (5.0, -0.6, 0.02, "k1,k2"), (5.0, -0.6, 0.0, "k1,k2")],
+)
+def test_the_smallest_sufficient_model(border: float, k2_part: float, sigma: float, model: str) -> None:
+    rng = np.random.default_rng(7)
+    lens = radial_lens(border, k2_part=k2_part)
+    chosen = []
+    for _ in range(20):
+        points = lens.distort(plane_grid(rng, 20.0))
+        fit = fit_lens(grid_lines(points + rng.normal(0.0, sigma, points.shape)))
+        chosen.append(fit.model)
+        assert {(fit.model, fit.lines)}.isdisjoint((other.model, other.lines) for other in fit.alternatives)
+    # One in twenty may be larger than needed, at a probability of 0.05.
+    assert chosen.count(model) >= 16
+    assert "none" not in chosen or model == "none"
+
+
+def test_lines_that_do_not_meet_are_found_out(rng: np.random.Generator) -> None:
+    """A target whose rows are turned by ten microradians to a milliradian each."""
+    lens = radial_lens(5.0)
+    for turn, kind in ((0.0, "vanishing"), (1e-3, "free")):
+        ideal = plane_grid(rng, 20.0)
+        middle = ideal.mean(axis=1, keepdims=True)
+        angle = rng.normal(0.0, turn, len(ideal))[:, None]
+        x, y = np.moveaxis(ideal - middle, -1, 0)
+        ideal = middle + np.stack([x - angle * y, y + angle * x], axis=-1)
+        points = lens.distort(ideal) + rng.normal(0.0, 0.05, ideal.shape)
+        fit = fit_lens(grid_lines(points)[:1] + grid_lines(plane_grid(rng, 20.0))[1:1], model="k1")
+        assert fit.lines == kind
+        other = next(each for each in fit.alternatives if each.lines != kind)
+        assert (other.p_value < 0.05) is (kind == "free")
+
+
+def test_alternatives_say_how_far_their_centres_lie(rng: np.random.Generator) -> None:
+    points, _ = seen(rng, 20.0, 10.0, 0.05)
+    fit = fit_lens(grid_lines(points))
+    assert fit.model == "k1,k2"
+    by_model = {(each.model, each.lines): each for each in fit.alternatives}
+    k1 = by_model["k1", "vanishing"]
+    assert k1.p_value < 0.05 < by_model["k1,k2", "free"].p_value
+    assert k1.rms_px > fit.rms_px
+    assert k1.centre_distance_px == pytest.approx(np.hypot(*np.subtract(k1.centre, fit.lens.centre)))
+    none = by_model["none", "vanishing"]
+    assert none.centre is None
+    assert np.isnan(none.centre_distance_px)
+    assert none.aic > k1.aic > 0.0
+
+
+def test_no_distortion_leaves_no_centre(rng: np.random.Generator) -> None:
+    points = plane_grid(rng, 20.0) + rng.normal(0.0, 0.05, (23, 31, 2))
+    assert fit_lens(grid_lines(points)).lens is None
+    fit = fit_lens(grid_lines(points), model="k1")
+    assert any("as straight without a lens" in each for each in fit.warnings)
+    assert any("fix the centre only to" in each for each in fit.warnings)
+    # What is measured is still within its own, large, uncertainty.
+    assert abs(fit.lens.k1) < 4.0 * fit.uncertainties["k1"]
+    assert max(fit.uncertainties["C_c"], fit.uncertainties["R_c"]) > 100.0
+    exact = fit_lens(grid_lines(plane_grid(rng, 20.0)), model="k1")
+    assert any("as straight without a lens" in each for each in exact.warnings)
+
+
+@pytest.mark.parametrize(("sigma", "faint"), [(0.2, True), (0.01, False)])
+def test_a_faint_distortion_is_said_to_be_faint(rng: np.random.Generator, sigma: float, faint: bool) -> None:
+    """0.3 pixels of distortion under 0.2 pixels of noise: no linear uncertainty holds, and each fit says so."""
+    for _ in range(20):
+        points, _ = seen(rng, 20.0, 0.3, sigma)
+        fit = fit_lens(grid_lines(points), model="k1,k2")
+        assert any("faint" in each or "as straight" in each for each in fit.warnings) is faint
+
+
+def test_mirrored_image(rng: np.random.Generator) -> None:
+    points, _ = seen(rng, 20.0, 10.0, 0.05)
+    plain = fit_lens(grid_lines(points))
+    mirrored = fit_lens(grid_lines([1023.0, 0.0] + points * [-1.0, 1.0]))
+    assert mirrored.lens.centre == pytest.approx((1023.0 - plain.lens.centre[0], plain.lens.centre[1]), rel=1e-7)
+    assert mirrored.lens.k1 == pytest.approx(plain.lens.k1, rel=1e-7)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_missing_points(rng: np.random.Generator, share: float) -> None:
+    points, lens = seen(rng, 20.0, 10.0, 0.05)
+    points[rng.random(points.shape[:2]) < share] = np.nan
+    assert np.all(np.abs(errors(fit_lens(grid_lines(points), model="k1,k2"), lens)) < 5.0)
+
+
+@pytest.mark.parametrize("kept", [np.s_[:, :16], np.s_[12:], np.s_[12:, 16:]])
+def test_part_of_the_grid(rng: np.random.Generator, kept: tuple[slice, ...]) -> None:
+    points, lens = seen(rng, 20.0, 20.0, 0.05)
+    assert np.all(np.abs(errors(fit_lens(grid_lines(points[kept]), model="k1,k2"), lens)) < 5.0)
+
+
+@pytest.mark.parametrize("factor", [8.0, 1e-5])
+def test_any_unit(rng: np.random.Generator, factor: float) -> None:
+    """8192 pixels, or metres on a PSD; also in single precision."""
+    points, _ = seen(rng, 20.0, 10.0, 0.05)
+    plain, scaled = fit_lens(grid_lines(points)), fit_lens(grid_lines(factor * points))
+    assert scaled.values[:4] * factor ** np.array([2.0, 4.0, -1.0, -1.0]) == pytest.approx(plain.values[:4], rel=1e-7)
+    single = fit_lens(grid_lines((factor * points).astype(np.float32)))
+    assert np.all(np.abs(single.values - scaled.values)[:4] < 0.05 * np.sqrt(np.diag(scaled.covariance))[:4])
+
+
+@pytest.mark.parametrize("part", [0.8, 0.95])
+def test_near_the_fold(rng: np.random.Generator, part: float) -> None:
+    """The image reaches out to that part of the radius at which the lens turns back."""
+    lens = Lens(k1=-1.0 / (3.0 * 700.0**2), centre=(512.0, 512.0))
+    radius = part * lens.fold_radius
+    grid = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 21), np.linspace(-1.0, 1.0, 21)), axis=-1) / np.sqrt(2.0)
+    points = lens.distort(512.0 + grid * radius * (1.0 + lens.k1 * radius**2))
+    fit = fit_lens(grid_lines(points + rng.normal(0.0, 0.05, points.shape)), model="k1")
+    true = [lens.k1, *lens.centre]
+    assert np.all(np.abs(fit.values[:3] - true) < 5.0 * np.sqrt(np.diag(fit.covariance))[:3])
+    assert np.all(np.isfinite(fit.lens.undistort(points)))
+
+
+def test_points_beyond_a_fold_are_never_the_answer(rng: np.random.Generator) -> None:
+    """Random points want no lens; the one that is forced on them is monotone over all of them."""
+    for seed in range(20):
+        scattered = np.random.default_rng(seed).uniform(0.0, 1000.0, (6, 8, 2))
+        fit = fit_lens(grid_lines(scattered), model="k1,k2", lines="free")
+        assert np.all(np.isfinite(fit.lens.undistort(scattered)))
+        assert np.hypot(*np.subtract(fit.lens.centre, 500.0)) < 4.1 * np.hypot(500.0, 500.0)
+
+
+def test_one_family_of_parallel_lines(rng: np.random.Generator) -> None:
+    """A flat object moved along H in front of a PSD camera: few points on each line, a vanishing point at infinity."""
+    lens = Lens(k1=-2e-7, k2=1e-14, centre=(530.0, 500.0))
+    along = np.linspace(60.0, 960.0, 16)
+    lines = [np.column_stack([along, np.full(16, height)]) for height in np.linspace(80.0, 900.0, 12)]
+    points = [lens.distort(line) + rng.normal(0.0, 0.05, line.shape) for line in lines]
+    fit = fit_lens([points], model="k1,k2", lines="vanishing")
+    assert np.all(np.abs(errors(fit, lens)) < 5.0)
+    point = fit.vanishing_points[0]
+    assert abs(point[2]) < 1e-5 * abs(point[0])
+    assert fit.uncertainties["C_c"] > 3.0 * fit.uncertainties["R_c"]
+
+
+@pytest.mark.parametrize("loss", ["huber", "tukey"])
+def test_outliers(loss: str) -> None:
+    """Two in a hundred points are 5 to 50 pixels off; the errors stay near those of the clean data."""
+    rng = np.random.default_rng(3)
+    squares = []
+    for _ in range(30):
+        points, lens = seen(rng, 20.0, 20.0, 0.1)
+        wrong = rng.random(points.shape[:2]) < 0.02
+        angle = rng.uniform(0.0, 2.0 * np.pi, np.count_nonzero(wrong))
+        points[wrong] += rng.uniform(5.0, 50.0, len(angle))[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        squares.append(errors(fit_lens(grid_lines(points), model="k1,k2", lines="free", loss=loss), lens) ** 2)
+    # Rows and columns of an outlier are down-weighted each for itself: predicted errors hold to about a third.
+    assert 0.6 < np.sqrt(np.mean(squares)) < 1.5
+
+
+def test_outliers_are_pointed_out(rng: np.random.Generator) -> None:
+    points, _ = seen(rng, 20.0, 20.0, 0.1)
+    assert fit_lens(grid_lines(points)).warnings == ()
+    points[5, 7] += [15.0, 0.0]
+    points[10, 20] -= [0.0, 40.0]
+    (said,) = (each for each in fit_lens(grid_lines(points)).warnings if "outliers" in each)
+    assert said.endswith("there are outliers; use loss='tukey'")
+    assert not any("outliers" in each for each in fit_lens(grid_lines(points), loss="tukey").warnings)
+
+
+@pytest.mark.parametrize("loss", ["huber", "tukey"])
+def test_a_line_of_outliers(rng: np.random.Generator, loss: str) -> None:
+    """A row that belongs to something else: it is a line, but no straight one."""
+    points, lens = seen(rng, 20.0, 20.0, 0.1)
+    rows, columns = grid_lines(points)
+    zigzag = rows[5] + np.where(np.arange(len(rows[5])) % 2, 30.0, -30.0)[:, None] * [0.0, 1.0]
+    fit = fit_lens([(*rows[:5], zigzag, *rows[6:]), columns], model="k1,k2", lines="free", loss=loss)
+    assert np.all(np.abs(errors(fit, lens)) < 5.0)
+    assert fit.rms_px < (5.0 if loss == "huber" else 0.15)
+
+
+def test_loss_without_outliers_costs_little(rng: np.random.Generator) -> None:
+    points, lens = seen(rng, 20.0, 20.0, 0.1)
+    plain = fit_lens(grid_lines(points), model="k1,k2", lines="vanishing")
+    for loss in ("huber", "tukey"):
+        robust = fit_lens(grid_lines(points), model="k1,k2", lines="vanishing", loss=loss)
+        ratio = np.sqrt(np.diag(robust.covariance) / np.diag(plain.covariance))
+        assert np.all((ratio > 0.85) & (ratio < 1.2))
+        assert np.all(np.abs(errors(robust, lens)) < 5.0)
+
+
+def test_known_centre(rng: np.random.Generator) -> None:
+    points, lens = seen(rng, 20.0, 10.0, 0.05)
+    fit = fit_lens(grid_lines(points), model="k1,k2", centre=lens.centre)
+    assert fit.lens.centre == pytest.approx(lens.centre, rel=1e-12)
+    assert fit.uncertainties["C_c"] == fit.uncertainties["R_c"] == 0.0
+    assert np.all(np.abs(fit.values[:2] - [lens.k1, lens.k2]) < 5.0 * np.sqrt(np.diag(fit.covariance))[:2])
+    # One line is enough then.
+    single = fit_lens([[points[3]]], model="k1", centre=lens.centre)
+    assert single.lens.k1 == pytest.approx(lens.k1, abs=5.0 * single.uncertainties["k1"] + 0.15 * lens.k1)
+
+
+def one_line(rng: np.random.Generator, count: int = 1) -> list[list[np.ndarray]]:
+    """The same line, bent, measured several times."""
+    lens = radial_lens(10.0)
+    line = np.column_stack([np.linspace(50.0, 900.0, 20), np.linspace(100.0, 300.0, 20)])
+    return [[lens.distort(line) + rng.normal(0.0, 0.05, line.shape) for _ in range(count)]]
+
+
+@pytest.mark.parametrize("model", ["auto", "k1", "k1,k2"])
+@pytest.mark.parametrize("count", [1, 4])
+def test_one_line_is_not_enough(rng: np.random.Generator, model: str, count: int) -> None:
+    with pytest.raises(ValueError, match="all points lie along one line, whose bend k1 and the centre share"):
+        fit_lens(one_line(rng, count), model=model)
+    assert fit_lens(one_line(rng, count), model="none").lens is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"model": "k3"}, "model is 'k3', expected 'auto' or one of"),
+        ({"lines": "straight"}, "lines is 'straight', expected one of"),
+        ({"loss": "l1"}, "loss is 'l1', expected one of"),
+        ({"strategy": "simplex"}, "strategy is 'simplex', expected one of"),
+        ({"sigma": 0.0}, "sigma is 0.0, expected more than 0 pixels"),
+        ({"strategy": "gauss_newton"}, "needs lines='vanishing'"),
+    ],
+)
+def test_wrong_words_are_refused(rng: np.random.Generator, wrong: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        fit_lens(grid_lines(plane_grid(rng, 0.0)), **wrong)
+
+
+def test_too_few_points_are_refused(rng: np.random.Generator) -> None:
+    points = plane_grid(rng, 20.0)
+    with pytest.raises(ValueError, match="9 points on 3 lines leave 3 numbers for 4 parameters and the errors"):
+        fit_lens([[points[0, :3], points[9, :3], points[20, :3]]], model="k1,k2", lines="free")
+    with pytest.raises(ValueError, match="no family has two lines, so none has a vanishing point"):
+        fit_lens([[points[0]], [points[:, 0]]], model="k1", lines="vanishing")
+    with pytest.raises(ValueError, match="all lines go through the centre"):
+        fit_lens([[points[11]]], model="k1", centre=tuple(points[11, 3]))
+
+
+def test_a_family_of_one_line_is_free(rng: np.random.Generator) -> None:
+    points, lens = seen(rng, 20.0, 10.0, 0.05)
+    rows, columns = grid_lines(points)
+    fit = fit_lens([rows, columns[:1], ()], model="k1,k2", lines="vanishing")
+    assert np.all(np.isnan(fit.vanishing_points[1:]))
+    assert np.all(np.abs(errors(fit, lens)) < 5.0)
+    assert any("families [1, 2] have fewer than two lines" in each for each in fit.warnings)
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "raw", "best", "centre"),
+    [
+        ("dot_pattern_01", 3.3, 0.079, (1257.0, 1020.0)),
+        ("dot_pattern_02", 0.94, 0.695, None),
+        ("line_pattern_01", 0.6, 0.117, None),
+    ],
+)
+def test_real_targets(data: Path, name: str, raw: float, best: float, centre: tuple[float, float] | None) -> None:
+    """As straight as the best known, and nearly as well with the model chosen from the data."""
+    image = cv2.imread(str(data / "calibration" / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
+    families = find_lines(image) if name.startswith("line") else grid_lines(find_dots(image).points)
+    assert straightness_px(families) == pytest.approx(raw, rel=0.2)
+    for lines, model in (("free", "k1,k2"), ("auto", "auto")):
+        fit = fit_lens(families, lines=lines, model=model)
+        assert straightness_px(families, fit.lens) <= best
+        if centre is not None:
+            assert np.hypot(*np.subtract(fit.lens.centre, centre)) < 3.0

@@ -1,0 +1,106 @@
+"""``gpuvision profile``: hands over what was asked for, shows the rows, says what is missing."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from gpuvision.cli.main import application
+from gpuvision.host import Device, GpuVisionError, NoDeviceError
+from gpuvision.profiling import harness
+from gpuvision.profiling.harness import Row, Run
+
+ROW = Row(
+    operation="psd",
+    case="float32/1e6",
+    device="pocl",
+    seconds=0.0123,
+    peer="numpy",
+    peer_version="2.9",
+    peer_seconds=4.56e-5,
+    ratio=3.14159,
+    error=1.5e-9,
+    fraction=0.5,
+    facts={"rate": 4000, "p50": 1e-4},
+)
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Stand in for the measurement; tell what it was asked for."""
+    seen: dict[str, Any] = {}
+
+    def profile(operations: Sequence[str], devices: Sequence[Device], **options: Any) -> Run:
+        seen.update(operations=list(operations), devices=[each.label for each in devices], **options)
+        return Run([ROW], seen.get("valid", True), {"processor": "abacus"})
+
+    monkeypatch.setattr(harness, "profile", profile)
+    return seen
+
+
+@pytest.mark.parametrize(("option", "name"), [("--json", "."), ("--json", "file/rows.json"), ("--plots", "file")])
+def test_what_cannot_be_written_is_told_before_the_measurement(
+    asked: dict[str, Any], tmp_path: Path, option: str, name: str
+) -> None:
+    (tmp_path / "file").touch()
+    ran = CliRunner().invoke(application(), ["profile", "psd", option, str(tmp_path / name)])
+    assert isinstance(ran.exception, OSError)
+    assert str(ran.exception).startswith("cannot write ")
+    assert asked == {}
+
+
+def test_what_was_asked_for_is_measured_and_shown(asked: dict[str, Any], tmp_path: Path) -> None:
+    label = Device.best().label
+    file = tmp_path / "rows.json"
+    args = ["profile", "psd", "line", "--device", label, "--seconds", "0.5", "--json", str(file)]
+    ran = CliRunner().invoke(application(), args, env={"COLUMNS": "80"})
+    assert ran.exit_code == 0
+    assert (asked["operations"], asked["devices"], asked["seconds"]) == (["psd", "line"], [label], 0.5)
+    for shown in (
+        "float32/1e6",
+        "12.3 ms",
+        "numpy",
+        "45.6 µs",
+        "3.14",
+        "1.5e-09",
+        "50 %",
+        "float32/1e6 on pocl: rate 4000, p50 0.0001",
+    ):
+        assert shown in ran.output
+    written = json.loads(file.read_text())
+    assert (written["valid"], written["machine"]) == (True, {"processor": "abacus"})
+    assert written["rows"][0]["case"] == "float32/1e6"
+
+
+def test_without_names_everything_is_measured_everywhere(asked: dict[str, Any]) -> None:
+    asked["valid"] = False
+    ran = CliRunner().invoke(application(), ["profile"])
+    assert asked["operations"] == list(harness.OPERATIONS)
+    assert asked["devices"] == [each.label for each in Device.all()]
+    assert "not valid: the machine changed its speed" in ran.output
+
+
+@pytest.mark.parametrize(
+    ("args", "kind", "message"),
+    [
+        (["psd", "abacus"], ValueError, "no operation 'abacus' to profile; expected some of psd, line"),
+        (["psd", "--device", "abacus"], NoDeviceError, "no device answers to 'abacus'"),
+    ],
+)
+def test_what_is_not_there(asked: dict[str, Any], args: list[str], kind: type[Exception], message: str) -> None:
+    with pytest.raises(kind, match=message):
+        CliRunner().invoke(application(), ["profile", *args], catch_exceptions=False)
+    assert not asked
+
+
+def test_without_numba_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "numba" else find(name, *more))
+    with pytest.raises(GpuVisionError, match=r"pip install 'gpuvision\[profile\]'"):
+        CliRunner().invoke(application(), ["profile", "psd"], catch_exceptions=False)

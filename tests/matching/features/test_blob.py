@@ -1,0 +1,383 @@
+"""FindBlobs on devices: marks of every shape where they are, as float64 references have it, and flagged where not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from canary import Guarded
+from gpuvision.host import Device
+from gpuvision.matching.features.blob import FindBlobs
+from gpuvision.matching.features.ruler import RulerEdges
+from gpuvision.status import Status
+from reference import blob as reference
+
+SHAPE, TRUE = (80, 96), np.array([48.7, 39.4])
+VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
+PLAIN = FindBlobs(threshold=20.0, noise=2.0, spokes=32)
+POLARITY: dict[str, Any] = {"circle": "bright", "ring": "dark", "square": "dark", "cross": "bright"}
+RATIO = {"circle": 0.5, "ring": 0.5, "square": 0.5, "cross": 0.3}
+ON_DEVICES = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def image_of(values: np.ndarray, dtype: Any) -> np.ndarray:
+    return values.astype(dtype) if np.dtype(dtype).kind == "f" else np.rint(values).astype(dtype)
+
+
+def place(x: float = 47.9, y: float = 40.0, size: float = 10.0, *angle: float) -> np.ndarray:
+    return np.array([[x, y, size, *angle]], np.float32)
+
+
+def a_disc(radius: float = 10.0, blur: float = 1.0) -> np.ndarray:
+    return 50.0 + 100.0 * reference.disc(SHAPE, *TRUE, radius, blur)
+
+
+def centre(blobs: Any, k: int = 0) -> np.ndarray:
+    return np.array([blobs.x[k], blobs.y[k]], np.float64)
+
+
+@pytest.mark.parametrize(("dtype", "variant"), [(np.uint8, "vector"), (np.uint16, "vector"), (np.float32, "work_item")])
+def test_a_disc(device: Device, dtype: Any, variant: Any) -> None:
+    blobs = replace(PLAIN, variant=variant)(image_of(a_disc(), dtype), place(), device=device)
+    assert blobs.status[0] == 0
+    np.testing.assert_allclose(centre(blobs), TRUE, rtol=0, atol=2e-3)  # rounded grey levels: 0.3 of 100
+    np.testing.assert_allclose(blobs.shift[0], TRUE - [47.9, 40.0], rtol=0, atol=2e-3)
+    np.testing.assert_allclose([blobs.gravity_x[0], blobs.gravity_y[0]], TRUE, rtol=0, atol=5e-3)
+    assert abs(blobs.size[0] - 10.0) < 5e-3
+    assert abs(blobs.contrast[0] - 100.0) < 0.3
+    assert abs(blobs.blur[0] - 1.0) < 0.01
+    assert abs(blobs.distance[0] - math.hypot(0.8, 0.6)) < 3e-3
+    assert blobs.inliers[0] == 32
+    assert blobs.symmetry[0] > 0.95
+    assert blobs.residual[0] < 0.05
+    assert blobs.angle is None
+
+
+@VARIANTS
+@pytest.mark.parametrize("shape", ["circle", "ring", "square", "cross"])
+def test_every_shape_without_noise(device: Device, variant: Any, shape: Any) -> None:
+    """Exact but for the profile of an edge, 2.4e-4 of the contrast, and the bend of a disc's to first order."""
+    straight, polarity = shape in ("square", "cross"), POLARITY[shape]
+    numbers = np.array([*TRUE, 14.0, 0.35, 1.1] if straight else [*TRUE, 14.0, 1.1])
+    level = reference.image_of(shape, SHAPE, numbers, RATIO[shape])
+    image = (50.0 + 100.0 * level if polarity == "bright" else 150.0 - 100.0 * level).astype(np.float32)
+    operation = replace(PLAIN, shape=shape, ratio=RATIO[shape], polarity=polarity, variant=variant)
+    blobs = operation(image, place(48.0, 40.0, 14.5, *((0.3,) if straight else ())), device=device)
+    assert blobs.status[0] == 0
+    np.testing.assert_allclose(centre(blobs), TRUE, rtol=0, atol=1e-3)
+    assert abs(blobs.size[0] - 14.0) < 3e-3
+    assert abs(abs(blobs.contrast[0]) - 100.0) < 0.1
+    assert (blobs.contrast[0] > 0) == (polarity == "bright")
+    if straight:
+        assert abs(blobs.angle[0] - 0.35) < 2e-4
+    assert blobs.covariance.shape == (1, 4, 4) if straight else (1, 3, 3)
+
+
+@VARIANTS
+@pytest.mark.parametrize("shape", ["circle", "ring", "square", "cross"])
+def test_matched_as_least_squares_have_it(device: Device, variant: Any, shape: Any, rng: np.random.Generator) -> None:
+    """The same pixels by SciPy, exact profiles: apart by half the deviation that the noise makes, or less.
+
+    Tukey's weights, which the reference lacks, make a part of that, and steps that end once they are short.
+    """
+    straight = shape in ("square", "cross")
+    numbers = np.array([*TRUE, 13.0, 0.2, 1.0] if straight else [*TRUE, 13.0, 1.0])
+    sign = 1.0 if POLARITY[shape] == "bright" else -1.0
+    image = 150.0 + sign * 100.0 * reference.image_of(shape, SHAPE, numbers, RATIO[shape]) + rng.normal(0.0, 3.0, SHAPE)
+    extent = {"square": math.sqrt(2.0), "cross": math.hypot(1.0, 0.3)}.get(shape, 1.0)
+    exact = reference.matched(image, shape, numbers, RATIO[shape], 13.0 * extent + 7.0)
+    operation = replace(PLAIN, shape=shape, ratio=RATIO[shape], polarity=POLARITY[shape], noise=3.0, variant=variant)
+    blobs = operation(image.astype(np.float32), place(48.0, 40.0, 13.0, *((0.2,) if straight else ())), device=device)
+    assert blobs.status[0] == 0
+    fields = ("x", "y", "size", "angle") if straight else ("x", "y", "size")
+    sigma = np.sqrt(np.diagonal(blobs.covariance[0]))
+    ours = [getattr(blobs, name)[0] for name in fields]
+    assert np.all(np.abs(ours - exact[: len(fields)]) < 0.5 * sigma)
+
+
+@VARIANTS
+@pytest.mark.parametrize("radius", [7.0, 15.0])
+def test_edges_alone_as_their_circle_has_it(device: Device, variant: Any, radius: float) -> None:
+    """Without the match: edges along the same rulers, SciPy's circle through them, moved out by the bend.
+
+    Edges that are off by interpolation between pixels weigh less here: that is what the two differ by.
+    """
+    image = a_disc(radius).astype(np.float32)
+    operation = replace(PLAIN, match=False, passes=1, variant=variant)
+    nominal = place(48.4, 39.7, radius)
+    blobs = operation(image, nominal, device=device)
+    angle = np.arange(32) * math.pi / 16.0
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
+    start = nominal[0, :2] + radius * direction
+    rulers = np.concatenate([start, direction], axis=-1).astype(np.float32)
+    edges = RulerEdges(threshold=20.0, length=25, width=1, smoothing_px=1.5, polarity="falling")
+    points = start + edges(image, rulers, device=device).position[:, None] * direction
+    found = reference.circle_through(points.astype(np.float64), np.array([*TRUE, radius]))
+    bent = math.sqrt(found[2] ** 2 + float(blobs.blur[0]) ** 2)
+    np.testing.assert_allclose([*centre(blobs), blobs.size[0]], [*found[:2], bent], rtol=0, atol=2e-3)
+    np.testing.assert_allclose(centre(blobs), TRUE, rtol=0, atol=0.01)
+    assert abs(blobs.size[0] - radius) < 0.01
+
+
+@pytest.mark.parametrize(("spokes", "match"), [(8, True), (20, True), (44, False)])
+def test_any_number_of_rulers(device: Device, spokes: int, match: bool) -> None:
+    """To whole vectors and not."""
+    blobs = replace(PLAIN, spokes=spokes, match=match)(a_disc().astype(np.float32), place(), device=device)
+    assert blobs.status[0] == 0
+    assert blobs.inliers[0] == spokes
+    assert np.hypot(*(centre(blobs) - TRUE)) < (2e-3 if match else 0.02)
+
+
+def occluded(image: np.ndarray, kind: str, rng: np.random.Generator) -> np.ndarray:
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    image = image.copy()
+    if kind == "cut":
+        image[column > TRUE[0] + 4.5] = 50.0
+    elif kind == "wedge":
+        image[np.abs(np.arctan2(row - TRUE[1], column - TRUE[0])) < 0.3 * math.pi] = 50.0
+    elif kind == "silk":
+        image += (190.0 - image) * reference.bar(SHAPE, 52.0, 33.0, -0.6, 40.0, 2.0, 0.8)
+    elif kind == "neighbour":
+        image = np.maximum(image, 50.0 + 130.0 * reference.disc(SHAPE, 66.0, 40.0, 6.0, 1.0))
+    else:
+        for _ in range(25):
+            x, y, grey = rng.uniform(20.0, 76.0), rng.uniform(10.0, 70.0), rng.uniform(20.0, 200.0)
+            image += (grey - image) * reference.disc(SHAPE, x, y, rng.uniform(1.0, 3.0), 0.7)
+    return image
+
+
+@pytest.mark.parametrize("kind", ["cut", "wedge", "silk", "neighbour", "clutter"])
+def test_what_hides_a_part_of_the_mark(device: Device, kind: str, rng: np.random.Generator) -> None:
+    """30 % of the contour gone, silk over it, a brighter disc within the search radius, 25 specks: within 0.05 px.
+
+    The centre of gravity is drawn away by all but the specks, and the symmetry says so.
+    """
+    plain = PLAIN(a_disc().astype(np.float32), place(), device=device)
+    image = occluded(a_disc(), kind, rng) + rng.normal(0.0, 2.0, SHAPE)
+    blobs = PLAIN(image.astype(np.float32), place(), device=device)
+    assert blobs.status[0] == 0
+    assert np.hypot(*(centre(blobs) - TRUE)) < 0.05
+    assert abs(blobs.size[0] - 10.0) < 0.05
+    assert blobs.symmetry[0] < 0.97 * plain.symmetry[0]
+    assert blobs.covariance[0, 0, 0] > plain.covariance[0, 0, 0]
+    if kind != "clutter":
+        assert blobs.inliers[0] < 32
+        assert np.hypot(blobs.gravity_x[0] - TRUE[0], blobs.gravity_y[0] - TRUE[1]) > 0.3
+
+
+@ON_DEVICES
+@given(
+    angle=st.floats(0.0, 2.0 * math.pi),
+    share=st.floats(0.0, 0.3),
+    grey=st.floats(30.0, 140.0),
+    off=st.floats(0.0, 3.0),
+    towards=st.floats(0.0, 2.0 * math.pi),
+)
+def test_a_wedge_anywhere(device: Device, angle: float, share: float, grey: float, off: float, towards: float) -> None:
+    """Up to 30 % of the disc of any other grey level, from any nominal place within 3 px: within 0.1 px, or refused."""
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    image = a_disc()
+    away = np.angle(np.exp(1j * (np.arctan2(row - TRUE[1], column - TRUE[0]) - angle)))
+    image[np.abs(away) < share * math.pi] = grey
+    image += np.random.default_rng(3).normal(0.0, 2.0, SHAPE)
+    near = place(TRUE[0] + off * math.cos(towards), TRUE[1] + off * math.sin(towards))
+    blobs = PLAIN(image.astype(np.float32), near, device=device)
+    assert blobs.status[0] == 0
+    assert np.hypot(*(centre(blobs) - TRUE)) < 0.1
+
+
+def test_not_chasing_what_lies_beyond(device: Device, rng: np.random.Generator) -> None:
+    """A mark 5 px away is found with passes to spare, one 9 px away is not, nor after many passes."""
+    image = (a_disc() + rng.normal(0.0, 2.0, SHAPE)).astype(np.float32)
+    for match in (True, False):
+        operation = replace(PLAIN, passes=6, match=match)
+        near = operation(image, place(TRUE[0] - 5.0, TRUE[1]), device=device)
+        assert near.status[0] == 0
+        assert np.hypot(*(centre(near) - TRUE)) < 0.05
+        assert abs(near.distance[0] - 5.0) < 0.05
+        far = operation(image, place(TRUE[0] - 9.0, TRUE[1]), device=device)
+        assert far.status[0] != 0
+        assert np.isnan(far.x[0])
+
+
+def test_contrast_reversed(device: Device) -> None:
+    """Refused, or found where either is allowed, each mark for itself."""
+    bright, dark = a_disc().astype(np.float32), (200.0 - a_disc()).astype(np.float32)
+    either = replace(PLAIN, polarity="either")
+    for image, polarity, sign in ((bright, "bright", 1.0), (dark, "dark", -1.0)):
+        assert replace(PLAIN, polarity=polarity)(image, place(), device=device).status[0] == 0
+        other = "dark" if polarity == "bright" else "bright"
+        assert replace(PLAIN, polarity=other)(image, place(), device=device).status[0] == Status.LOW_SIGNAL
+        blobs = either(image, place(), device=device)
+        assert blobs.status[0] == 0
+        assert np.hypot(*(centre(blobs) - TRUE)) < 2e-3
+        assert abs(blobs.contrast[0] - sign * 100.0) < 0.2
+
+
+@VARIANTS
+def test_what_is_not_trusted(device: Device, variant: Any) -> None:
+    image = np.full((80, 200), 50.0, np.float32)
+    image[:, :96] = a_disc()
+    image[:, 104:] = a_disc()
+    row, column = np.mgrid[:80, :96]
+    image[:, 104:][(column > 35) & (column < 60) & (row > 20) & (row < 41)] = np.nan
+    places = np.concatenate(
+        [
+            place(),
+            place(150.0, 70.0),
+            place(90.0, 60.0, 8.0),
+            place(0.0, 40.0),
+            place(-1e30, 1e30),
+            place(math.nan),
+            place(48.0, math.inf),
+            place(48.0, 40.0, 0.0),
+            place(48.0, 40.0, -3.0),
+            place(48.0, 40.0, math.nan),
+            place(104.0 + TRUE[0], TRUE[1]),
+        ]
+    )
+    dark, out, bad = Status.LOW_SIGNAL, Status.OUT_OF_RANGE, Status.NOT_FINITE
+    blobs = replace(PLAIN, variant=variant)(image, places, device=device)
+    expected = [Status.OK, out | dark, dark, out, out, bad, bad, bad, bad, bad, bad]
+    found = [Status(each) for each in blobs.status]
+    assert found[0] == Status.OK
+    assert found[1] in (out, dark)
+    assert found[2:] == expected[2:]
+    assert blobs.inliers[0] == 32
+    for name, values in blobs._asdict().items():
+        if values is not None and name not in ("status", "inliers"):
+            assert np.isnan(values[1:]).all(), name
+    assert (blobs.inliers[1:] == 0).all()
+
+
+def test_specks_all_over_are_no_marks(device: Device, rng: np.random.Generator) -> None:
+    """Few of the edges agree anywhere, or few of the pixels: of 117 places one at most is taken for a mark."""
+    image = np.full(SHAPE, 100.0)
+    for _ in range(220):
+        x, y, grey = rng.uniform(0.0, 96.0), rng.uniform(0.0, 80.0), rng.uniform(0.0, 250.0)
+        image += (grey - image) * reference.disc(SHAPE, x, y, rng.uniform(1.0, 3.0), 0.7)
+    places = np.array([(x, y, 10.0) for x in range(24, 73, 4) for y in range(24, 57, 4)], np.float32)
+    blobs = PLAIN(image.astype(np.float32), places, device=device)
+    assert (blobs.status == Status.AMBIGUOUS).sum() > 20
+    assert (blobs.status == 0).sum() <= 1
+    assert np.array_equal(np.isnan(blobs.x), blobs.status != 0)
+
+
+def test_a_mark_that_leaves_the_image(device: Device) -> None:
+    """Some rulers leave it: found, but for the centre of gravity. Most of them: refused."""
+    for x, status in ((10.5, 0), (-3.0, Status.OUT_OF_RANGE)):
+        image = (50.0 + 100.0 * reference.disc(SHAPE, x, 40.2, 10.0, 1.0)).astype(np.float32)
+        blobs = PLAIN(image, place(x + 0.4, 40.0), device=device)
+        assert blobs.status[0] == status
+        if not status:
+            assert np.hypot(*(centre(blobs) - [x, 40.2])) < 5e-3
+            assert np.isnan(blobs.gravity_x[0])
+
+
+def test_saturated_marks_come_with_a_value(device: Device) -> None:
+    image = np.clip(np.rint(2.0 * a_disc()), 0.0, 255.0).astype(np.uint8)
+    blobs = replace(PLAIN, saturation=255.0)(image, place(), device=device)
+    assert blobs.status[0] == Status.SATURATED
+    assert np.hypot(*(centre(blobs) - TRUE)) < 0.02
+
+
+def test_a_slope_of_the_lighting(device: Device) -> None:
+    """One grey level in ten pixels moves the match by nothing, and the centre of gravity by a tenth of a pixel."""
+    image = (a_disc() + 0.1 * np.arange(SHAPE[1])).astype(np.float32)
+    blobs = PLAIN(image, place(), device=device)
+    assert np.hypot(*(centre(blobs) - TRUE)) < 1e-3
+    assert abs(blobs.gravity_x[0] - TRUE[0]) > 0.05
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-3, 1e6, 1e30])
+def test_any_scale_of_grey_levels(device: Device, scale: float) -> None:
+    image = (a_disc() * scale).astype(np.float32)
+    blobs = replace(PLAIN, threshold=20.0 * scale, noise=2.0 * scale)(image, place(), device=device)
+    assert blobs.status[0] == 0
+    np.testing.assert_allclose(centre(blobs), TRUE, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(blobs.contrast, 100.0 * scale, rtol=2e-3)
+
+
+def test_smallest_images(device: Device) -> None:
+    """Rows of one vector, and fewer rows than a mark is high."""
+    image = (50.0 + 100.0 * reference.disc((17, 16), 7.6, 8.3, 2.4, 0.6)).astype(np.float32)
+    operation = FindBlobs(threshold=20.0, search_px=1.0, smoothing_px=0.8)
+    blobs = operation(image, place(7.5, 8.2, 2.4), device=device)
+    assert blobs.status[0] == 0
+    assert np.hypot(*(centre(blobs) - [7.6, 8.3])) < 0.01
+    flat = operation(np.ascontiguousarray(image[5:12]), place(7.5, 3.2, 2.4), device=device)
+    assert flat.status[0] == Status.OUT_OF_RANGE
+
+
+@VARIANTS
+def test_canaries_and_bound_calls(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    image = (a_disc() + rng.normal(0.0, 2.0, SHAPE)).astype(np.float32)
+    places = np.repeat(place(), 19, axis=0)
+    places[:, :2] += rng.uniform(-2.0, 2.0, (19, 2)).astype(np.float32)
+    for operation in (
+        replace(PLAIN, variant=variant),
+        replace(PLAIN, shape="square", polarity="dark", variant=variant),
+    ):
+        given_places = places if operation.shape == "circle" else np.pad(places, ((0, 0), (0, 1)))
+        operation = replace(operation, count=19)
+        plain = operation(image, given_places, device=device)
+        guarded = Guarded(plain)
+        operation(image, given_places, device=device, out=guarded.out)
+        guarded.assert_intact()
+        bound = operation.bind(device, image.shape, image.dtype)
+        result = bound.run(*(cl.array.to_device(device.queue, each) for each in (image, given_places)))
+        for mine, theirs, out in zip(result, plain, guarded.out, strict=True):
+            if theirs is not None:
+                np.testing.assert_array_equal(mine.get(), theirs)
+                np.testing.assert_array_equal(out, theirs)
+
+
+def test_no_marks(device: Device) -> None:
+    blobs = PLAIN(np.zeros((40, 40), np.uint8), np.zeros((0, 3), np.float32), device=device)
+    assert blobs.x.shape == (0,)
+    assert blobs.covariance.shape == (0, 3, 3)
+
+
+def test_wrong_input(device: Device) -> None:
+    with pytest.raises(TypeError, match="uint8, uint16 or float32"):
+        PLAIN(np.zeros(SHAPE), place(), device=device)
+    with pytest.raises(ValueError, match="16 columns or more"):
+        PLAIN(np.zeros((80, 15), np.uint8), place(), device=device)
+    with pytest.raises(ValueError, match="say how many marks"):
+        PLAIN.bind(device, SHAPE, np.uint8)
+    with pytest.raises(ValueError, match="shape"):
+        replace(PLAIN, shape="square")(np.zeros(SHAPE, np.uint8), place(), device=device)
+    with pytest.raises(TypeError, match="float32"):
+        PLAIN(np.zeros(SHAPE, np.uint8), place().astype(np.float64), device=device)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"shape": "star"}, ValueError, "expected one of circle, ring, square, cross"),
+        ({"polarity": "light"}, ValueError, "expected one of bright, dark, either"),
+        ({"ratio": 1.0}, ValueError, "ratio"),
+        ({"agreement": 0.0}, ValueError, "agreement"),
+        ({"search_px": math.nan}, ValueError, "search_px"),
+        ({"spokes": 18}, ValueError, "a multiple of 4"),
+        ({"spokes": 20, "shape": "ring"}, ValueError, "a multiple of 8"),
+        ({"spokes": 16.0}, TypeError, "spokes must be a whole number"),
+        ({"passes": 0}, ValueError, "passes is 0"),
+        ({"threshold": 0.0}, ValueError, "threshold"),
+        ({"noise": -1.0}, ValueError, "noise"),
+        ({"width": 0}, ValueError, "width"),
+        ({"smoothing_px": 0.0}, ValueError, "smoothing_px"),
+        ({"count": -1}, ValueError, "count"),
+    ],
+)
+def test_wrong_parameters(options: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        FindBlobs(**{"threshold": 20.0, **options})

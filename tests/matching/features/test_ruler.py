@@ -1,0 +1,454 @@
+"""RulerEdges on devices: as the float64 reference says, on every kind of image, and flagged where it cannot be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from canary import Guarded
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.lens import Lens
+from gpuvision.host import Device
+from gpuvision.matching.features.ruler import RulerEdges, best_smoothing
+from gpuvision.status import Status
+from reference import ruler as reference
+
+SHAPE, MIDDLE = (120, 150), (75.0, 60.0)
+VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
+STRONGEST = RulerEdges(threshold=20.0)
+ON_DEVICES = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def image_of(values: np.ndarray, dtype: Any) -> np.ndarray:
+    return values.astype(dtype) if np.dtype(dtype).kind == "f" else np.rint(values).astype(dtype)
+
+
+def one_ruler(x: float = 75.0, y: float = 60.0, angle: float = 0.0) -> np.ndarray:
+    return np.array([[x, y, math.cos(angle), math.sin(angle)]], np.float32)
+
+
+def step(rng: np.random.Generator, angle: float = 0.4, noise: float = 2.0, **more: Any) -> tuple[np.ndarray, ...]:
+    """A noisy edge in the middle, and 40 rulers across it."""
+    distance = float(np.dot(MIDDLE, (math.cos(angle), math.sin(angle))))
+    image = reference.step_image(SHAPE, angle, distance, 1.2, **more) + rng.normal(0.0, noise, SHAPE)
+    return image, reference.across(angle, distance, 40, rng, MIDDLE)
+
+
+def expected(operation: RulerEdges, image: np.ndarray, rulers: np.ndarray) -> list[list[dict[str, float]]]:
+    """Return all the edges of each ruler."""
+    found = []
+    for ruler in rulers:
+        grey, _ = reference.profile(image, ruler, operation.length, operation.width, operation.step_px)
+        options = (operation.smoothing_px, operation.threshold, operation.step_px)
+        found.append(reference.edges(grey, *options, ruler, operation.width))
+    return found
+
+
+def assert_like(ours: Any, theirs: list[dict[str, float]], scale: float = 100.0) -> None:
+    """Samples are relative to a pixel of the ruler's own: a few roundings of 64 px in place, and of the grey levels.
+
+    A step's position has those of its samples over its slope, magnified by the logarithms' difference.
+    """
+    for name, tolerance in (("position", 1e-4), ("amplitude", 2e-4 * scale), ("width", 5e-4)):
+        values = [each[name] for each in theirs]
+        np.testing.assert_allclose(getattr(ours, name), values, rtol=0, atol=tolerance, err_msg=name)
+
+
+@VARIANTS
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_against_the_reference(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
+    values, rulers = step(rng)
+    image = image_of(values, dtype)
+    ours = replace(STRONGEST, variant=variant)(image, rulers, device=device)
+    assert (ours.status == 0).all()
+    assert ours.spacing is None
+    strongest = [max(each, key=lambda edge: abs(edge["gradient"])) for each in expected(STRONGEST, image, rulers)]
+    assert_like(ours, strongest)
+
+
+@VARIANTS
+def test_odd_sizes_and_steps(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    values, rulers = step(rng, angle=2.5)
+    image = values.astype(np.float32)
+    operation = RulerEdges(threshold=20.0, length=51, width=4, step_px=0.75, smoothing_px=1.5, variant=variant)
+    ours = operation(image, rulers, device=device)
+    assert (ours.status == 0).all()
+    strongest = [max(each, key=lambda edge: abs(edge["gradient"])) for each in expected(operation, image, rulers)]
+    assert_like(ours, strongest)
+
+
+@pytest.mark.parametrize(
+    ("length", "width", "step_px", "angle"), [(129, 12, 1.5, 0.7), (61, 5, 4.0, 0.1), (200, 41, 1.0, 3.0)]
+)
+def test_long_and_wide_ones(
+    device: Device, length: int, width: int, step_px: float, angle: float, rng: np.random.Generator
+) -> None:
+    """Places in fixed point have fewer digits there, and still enough."""
+    distance = float(np.dot((170.0, 160.0), (math.cos(angle), math.sin(angle))))
+    image = (reference.step_image((320, 340), angle, distance, 3.0) + rng.normal(0.0, 2.0, (320, 340))).astype(
+        np.float32
+    )
+    rulers = reference.across(angle, distance, 5, rng, (170.0, 160.0))
+    smoothing = 2.0 * step_px
+    operation = RulerEdges(threshold=20.0, length=length, width=width, step_px=step_px, smoothing_px=smoothing)
+    ours = operation(image, rulers, device=device)
+    assert (ours.status == 0).all()
+    strongest = [max(each, key=lambda edge: abs(edge["gradient"])) for each in expected(operation, image, rulers)]
+    assert_like(ours, strongest)
+
+
+@pytest.mark.parametrize("angle", [0.0, math.pi / 2, math.pi, -math.pi / 2, math.pi / 4])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_all_of_an_image(device: Device, dtype: Any, angle: float) -> None:
+    """Samples and lines from the first pixel to the last, whatever the rounding: nothing beside them is read."""
+    turned, diagonal = abs(math.sin(angle)) > 0.9, abs(math.sin(2.0 * angle)) > 0.9
+    shape = (64, 16) if turned else (16, 64)
+    length, width = (45, 12) if diagonal else (64, 16)
+    if diagonal:
+        shape = (40, 40)
+    middle = (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1))
+    distance = float(np.dot(middle, (math.cos(angle), math.sin(angle)))) + 0.25
+    inner = image_of(reference.step_image(shape, angle, distance, 1.2), dtype)
+    operation = RulerEdges(threshold=20.0, length=length, width=width)
+    ruler = np.round(one_ruler(*middle, angle), 7)  # along the pixels without what pi lacks
+    ours = operation(inner, ruler, device=device)
+    assert ours.status[0] == 0
+    theirs = max(expected(operation, inner, ruler)[0], key=lambda edge: abs(edge["gradient"]))
+    assert_like(ours, [theirs])
+
+
+def test_shortest_and_a_single_line(device: Device) -> None:
+    image = reference.step_image((20, 20), 0.0, 10.25, 0.8).astype(np.float32)
+    operation = RulerEdges(threshold=20.0, length=9, width=1, smoothing_px=1.0)
+    ours = operation(image, one_ruler(10.0, 7.0), device=device)
+    (theirs,) = expected(operation, image, one_ruler(10.0, 7.0))
+    assert_like(ours, theirs)
+
+
+@ON_DEVICES
+@given(angle=st.floats(0.0, 2.0 * math.pi), x=st.floats(60.0, 90.0), y=st.floats(45.0, 75.0))
+def test_any_direction(device: Device, angle: float, x: float, y: float) -> None:
+    """An image that is linear along an edge: the reference at any direction, on and off the grid."""
+    image = reference.step_image(SHAPE, 0.0, 75.2, 2.0).astype(np.float32)
+    image += reference.step_image(SHAPE, math.pi / 2, 60.4, 2.0).astype(np.float32)
+    ruler = one_ruler(x, y, angle)
+    ours = STRONGEST(image, ruler, device=device)
+    (theirs,) = expected(STRONGEST, image, ruler)
+    ranked = sorted(theirs, key=lambda edge: -abs(edge["gradient"]))
+    if len(ranked) > 1 and abs(ranked[1]["gradient"]) > 0.9999 * abs(ranked[0]["gradient"]):
+        return  # either may come first
+    if not ranked or abs(abs(ranked[0]["amplitude"]) - STRONGEST.threshold) < 5.0:
+        return  # about the threshold
+    np.testing.assert_allclose(ours.position, [ranked[0]["position"]], rtol=0, atol=2e-3)
+
+
+@VARIANTS
+@pytest.mark.parametrize("choice", ["strongest", "first", "last", "all"])
+def test_choices(device: Device, variant: Any, choice: Any, rng: np.random.Generator) -> None:
+    image = reference.stripe_image(SHAPE, 0.3, 90.0, 16.0, 1.0) + rng.normal(0.0, 1.0, SHAPE)
+    image += 0.4 * reference.step_image(SHAPE, 0.3, 112.0, 1.0)
+    rulers = reference.across(0.3, 94.0, 10, rng, MIDDLE)
+    operation = RulerEdges(threshold=15.0, length=80, smoothing_px=1.5, choice=choice, most=5, variant=variant)
+    ours = operation(image.astype(np.float32), rulers, device=device)
+    for k, found in enumerate(expected(operation, image, rulers)):
+        assert 2 <= len(found) <= 4
+        mine = type(ours)(*(None if each is None else each[k] for each in ours))
+        if choice == "all":
+            assert_like(type(ours)(*(None if each is None else each[: len(found)] for each in mine)), found)
+            assert (mine.status[: len(found)] == 0).all()
+            assert (mine.status[len(found) :] == Status.LOW_SIGNAL).all()
+            assert np.isnan(mine.position[len(found) :]).all()
+        else:
+            wanted = {
+                "first": found[0],
+                "last": found[-1],
+                "strongest": max(found, key=lambda edge: abs(edge["gradient"])),
+            }[choice]
+            assert_like(mine, [wanted])
+
+
+def test_more_edges_than_places(device: Device) -> None:
+    image = reference.stripe_image(SHAPE, 0.0, 75.0, 20.0, 1.0).astype(np.float32)
+    ours = RulerEdges(threshold=15.0, choice="all", most=1)(image, one_ruler(), device=device)
+    assert ours.status.shape == (1, 1)
+    assert ours.status[0, 0] == Status.AMBIGUOUS
+    assert abs(ours.position[0, 0] + 10.0) < 0.05
+
+
+@VARIANTS
+@pytest.mark.parametrize(("polarity", "sign", "place"), [("rising", 1.0, -8.0), ("falling", -1.0, 8.0)])
+def test_polarity(device: Device, variant: Any, polarity: Any, sign: float, place: float) -> None:
+    image = reference.stripe_image(SHAPE, 0.0, 75.0, 16.0, 1.0).astype(np.float32)
+    ours = RulerEdges(threshold=15.0, polarity=polarity, variant=variant)(image, one_ruler(), device=device)
+    assert np.sign(ours.amplitude) == sign
+    assert abs(ours.position[0] - place) < 0.01
+    # A ruler that points the other way sees the signs swapped, not the places in the image.
+    back = RulerEdges(threshold=15.0, polarity=polarity, variant=variant)(
+        image, one_ruler(angle=math.pi), device=device
+    )
+    assert abs(back.position[0] - place) < 0.01
+
+
+@VARIANTS
+@pytest.mark.parametrize("spacing", [9.3, 14.0])
+def test_pairs_have_the_middle_whatever_the_width(device: Device, variant: Any, spacing: float) -> None:
+    image = reference.stripe_image(SHAPE, 0.6, 95.5, spacing, 1.0).astype(np.float32)
+    rulers = reference.across(0.6, 95.5, 12, np.random.default_rng(3), MIDDLE)
+    true = 95.5 - np.einsum("ij,ij->i", rulers[:, :2].astype(float), rulers[:, 2:].astype(float))
+    operation = RulerEdges(threshold=15.0, pairs=True, polarity="rising", smoothing_px=1.2, variant=variant)
+    ours = operation(image, rulers, device=device)
+    assert (ours.status == 0).all()
+    np.testing.assert_allclose(ours.position, true, rtol=0, atol=0.01)
+    np.testing.assert_allclose(ours.spacing, spacing, rtol=0, atol=0.02)
+    single = replace(operation, pairs=False)(image, rulers, device=device)
+    np.testing.assert_allclose(ours.sigma, single.sigma / math.sqrt(2.0), rtol=0.05)
+    # The same stripe is no dark one.
+    none = replace(operation, polarity="falling")(image, rulers, device=device)
+    assert (none.status == Status.LOW_SIGNAL).all()
+
+
+def test_pairs_of_a_spacing(device: Device) -> None:
+    """Two stripes: the one whose width was asked for."""
+    image = reference.stripe_image(SHAPE, 0.0, 60.0, 8.0, 0.8) + reference.stripe_image(SHAPE, 0.0, 90.0, 14.0, 0.8)
+    for limits, place in (((6.0, 10.0), -15.0), ((12.0, 16.0), 15.0)):
+        operation = RulerEdges(threshold=15.0, pairs=True, polarity="rising", spacing_px=limits, length=72)
+        ours = operation(image.astype(np.float32), one_ruler(), device=device)
+        assert abs(ours.position[0] - place) < 0.02
+
+
+@VARIANTS
+@pytest.mark.parametrize("radius", [12.0, 25.0])
+def test_curved_edges(device: Device, variant: Any, radius: float) -> None:
+    """Radial rulers on a disc: off by (blur^2 + lines) / (2 radius) when taken for straight, and right when not.
+
+    What is left is the second order, (variance / radius^2) of that.
+    """
+    image = reference.disc_image(SHAPE, MIDDLE, radius, 1.2).astype(np.float32)
+    angle = np.linspace(0.0, 2.0 * math.pi, 60, endpoint=False)
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rulers = np.concatenate([MIDDLE + radius * direction, direction], axis=1).astype(np.float32)
+    operation = RulerEdges(threshold=20.0, length=21, width=3, smoothing_px=1.5, variant=variant)
+    straight = operation(image, rulers, device=device).position.mean()
+    # The centre lies behind rulers that point outwards.
+    curved = replace(operation, radius_px=-radius)(image, rulers, device=device).position.mean()
+    bias = (1.2**2 + 2.0 / 3.0 + 1.0 / 6.0) / (2.0 * radius)
+    assert abs(straight + bias) < 0.2 * bias
+    assert abs(curved) < 0.2 * bias
+    inward = np.concatenate([rulers[:, :2], -rulers[:, 2:]], axis=1)
+    turned = replace(operation, radius_px=radius)(image, inward, device=device).position.mean()
+    assert abs(turned) < 0.2 * bias
+
+
+LENSES = {
+    "lens": Lens(k1=-3e-6, k2=1e-11, centre=(70.0, 64.0)),
+    "camera": Camera(
+        matrix=((200.0, 0.0, 74.0), (0.0, 205.0, 59.0), (0.0, 0.0, 1.0)),
+        distortion=(-0.2, 0.05, 1e-3, -5e-4, *(0.0,) * 10),
+    ),
+}
+
+
+@VARIANTS
+@pytest.mark.parametrize("model", LENSES.values(), ids=LENSES)
+def test_through_a_lens(device: Device, variant: Any, model: Any, rng: np.random.Generator) -> None:
+    """A straight edge of the scene is bent in the image: found where it is straight."""
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float64)
+    ideal = model.undistort(np.stack([column, row], axis=-1))
+    angle, distance = 0.5, float(np.dot((30.0, 90.0), (math.cos(0.5), math.sin(0.5))))
+    place = ideal @ [math.cos(angle), math.sin(angle)] - distance
+    image = (100.0 + 50.0 * np.tanh(place / 1.5)).astype(np.float32)
+    rulers = reference.across(angle, distance, 20, rng, (30.0, 90.0))
+    operation = replace(STRONGEST, length=33, smoothing_px=1.5, model=model, variant=variant)
+    ours = operation(image, rulers, device=device)
+    inside = ours.status == 0
+    assert inside.sum() >= 10
+    assert (ours.status[~inside] == Status.OUT_OF_RANGE).all()
+    true = distance - np.einsum("ij,ij->i", rulers[:, :2].astype(float), rulers[:, 2:].astype(float))
+    np.testing.assert_allclose(ours.position[inside], true[inside], rtol=0, atol=0.02)
+    ignored = replace(operation, model=None)(image, rulers, device=device)
+    assert np.nanmax(np.abs(ignored.position - true)) > 0.2
+    for k in np.flatnonzero(inside)[:5]:
+        grey, _ = reference.profile(image, rulers[k], 33, operation.width, 1.0, model.distort)
+        theirs = max(reference.edges(grey, 1.5, 20.0), key=lambda edge: abs(edge["gradient"]))
+        assert abs(ours.position[k] - theirs["position"]) < 5e-4
+
+
+def test_past_the_fold_of_the_lens(device: Device) -> None:
+    lens = Lens(k1=-3e-4, centre=(75.0, 60.0))
+    ours = replace(STRONGEST, model=lens)(np.zeros(SHAPE, np.uint8), one_ruler(), device=device)
+    assert ours.status[0] & Status.NOT_INVERTIBLE
+    assert np.isnan(ours.position[0])
+
+
+@VARIANTS
+def test_what_cannot_be_read_is_flagged(device: Device, variant: Any) -> None:
+    image = reference.step_image(SHAPE, 0.0, 75.0, 1.0).astype(np.float32)
+    image[100, 70] = np.nan
+    image[20, 80] = np.inf
+    rulers = np.concatenate(
+        [
+            one_ruler(),
+            one_ruler(31.4),
+            one_ruler(y=1.9),
+            one_ruler(118.0),
+            one_ruler(y=118.0),
+            one_ruler(1e30, -1e30),
+            one_ruler(math.nan),
+            np.array([[75, 60, math.inf, 0]], np.float32),
+            one_ruler(y=100.0),
+            one_ruler(y=20.0),
+            np.array([[75, 60, 0, 0]], np.float32),
+            one_ruler(angle=math.pi / 2),
+            one_ruler(-500.0),
+        ]
+    )
+    out, bad, dark = Status.OUT_OF_RANGE, Status.NOT_FINITE, Status.LOW_SIGNAL
+    ours = replace(STRONGEST, variant=variant)(image, rulers, device=device)
+    assert [Status(each) for each in ours.status] == [
+        *(Status(0), out, out, out, out, out),
+        *(bad, bad, bad, bad, dark, dark, out),
+    ]
+    for values in (ours.position, ours.amplitude, ours.width, ours.sigma):
+        assert np.array_equal(np.isnan(values), ours.status != 0)
+
+
+@VARIANTS
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_up_to_the_border(device: Device, variant: Any, dtype: Any) -> None:
+    """The outermost pixels belong to the image, and nothing behind them is read."""
+    image = image_of(reference.step_image((5, 64), 0.0, 33.25, 1.0), dtype)
+    operation = replace(STRONGEST, variant=variant)
+    ruler = one_ruler(31.5, 2.0)
+    ours = operation(image, ruler, device=device)
+    assert ours.status[0] == 0
+    assert abs(ours.position[0] - 1.75) < 0.01
+    across = operation(np.ascontiguousarray(image.T), one_ruler(2.0, 31.5, math.pi / 2), device=device)
+    np.testing.assert_allclose(across.position, ours.position, atol=1e-4)
+
+
+def test_saturated_and_ambiguous_edges_come_with_a_value(device: Device) -> None:
+    image = np.clip(np.rint(reference.step_image(SHAPE, 0.0, 75.0, 1.0, 50.0, 300.0)), 0, 255).astype(np.uint8)
+    operation = replace(STRONGEST, saturation=255.0, ambiguity=0.8)
+    ours = operation(image, one_ruler(), device=device)
+    assert ours.status[0] == Status.SATURATED
+    assert abs(ours.position[0]) < 0.5
+    stripe = np.rint(reference.stripe_image(SHAPE, 0.0, 75.0, 16.0, 1.0)).astype(np.uint8)
+    twice = operation(stripe, one_ruler(), device=device)
+    assert twice.status[0] == Status.AMBIGUOUS
+    assert abs(abs(twice.position[0]) - 8.0) < 0.02
+
+
+@VARIANTS
+@pytest.mark.parametrize(("dtype", "level"), [(np.uint8, 0), (np.uint8, 255), (np.uint16, 65535), (np.float32, -1e30)])
+def test_no_contrast(device: Device, variant: Any, dtype: Any, level: float) -> None:
+    rulers = np.concatenate([one_ruler(), one_ruler(70.3, 61.7, 0.7)])
+    ours = replace(STRONGEST, variant=variant)(np.full(SHAPE, level, dtype), rulers, device=device)
+    assert (ours.status == Status.LOW_SIGNAL).all()
+    assert np.isnan(ours.position).all()
+    assert np.isnan(ours.sigma).all()
+
+
+@VARIANTS
+def test_all_levels_of_16_bits(device: Device, variant: Any) -> None:
+    image = np.rint(reference.step_image(SHAPE, 0.2, 86.0, 1.2, 0.0, 65535.0)).astype(np.uint16)
+    rulers = reference.across(0.2, 86.0, 5, np.random.default_rng(1), MIDDLE)
+    operation = replace(STRONGEST, width=16, variant=variant)
+    ours = operation(image, rulers, device=device)
+    assert (ours.status == 0).all()
+    strongest = [max(each, key=lambda edge: abs(edge["gradient"])) for each in expected(operation, image, rulers)]
+    assert_like(ours, strongest, 65535.0)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-3, 1e6, 1e30])
+def test_any_scale_of_grey_levels(device: Device, scale: float) -> None:
+    image = (reference.step_image(SHAPE, 0.2, 86.0, 1.2) * scale).astype(np.float32)
+    rulers = reference.across(0.2, 86.0, 5, np.random.default_rng(1), MIDDLE)
+    ours = replace(STRONGEST, threshold=20.0 * scale)(image, rulers, device=device)
+    true = 86.0 - np.einsum("ij,ij->i", rulers[:, :2].astype(float), rulers[:, 2:].astype(float))
+    np.testing.assert_allclose(ours.position, true, rtol=0, atol=0.01)
+    np.testing.assert_allclose(ours.amplitude, 100.0 * scale, rtol=0.03)
+
+
+def test_beyond_the_largest_number(device: Device) -> None:
+    image = (reference.step_image(SHAPE, 0.0, 75.0, 1.2) * 2e36).astype(np.float32)
+    ours = replace(STRONGEST, threshold=1e30)(image, one_ruler(), device=device)
+    assert ours.status[0] == Status.NOT_FINITE
+    assert np.isnan(ours.position[0])
+
+
+@VARIANTS
+def test_canaries_and_bound_calls(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    values, rulers = step(rng)
+    image = image_of(values, np.uint8)
+    operation = replace(STRONGEST, variant=variant, count=len(rulers))
+    plain = operation(image, rulers, device=device)
+    guarded = Guarded(plain)
+    operation(image, rulers, device=device, out=guarded.out)
+    guarded.assert_intact()
+    bound = operation.bind(device, image.shape, image.dtype)
+    frames = [cl.array.to_device(device.queue, each) for each in (image, rulers)]
+    result = bound.run(*frames)
+    for mine, theirs, out in zip(result, plain, guarded.out, strict=True):
+        if theirs is not None:
+            np.testing.assert_array_equal(mine.get(), theirs)
+            np.testing.assert_array_equal(out, theirs)
+
+
+def test_no_rulers(device: Device) -> None:
+    ours = STRONGEST(np.zeros((40, 40), np.uint8), np.zeros((0, 4), np.float32), device=device)
+    assert ours.position.shape == (0,)
+
+
+def test_wrong_input(device: Device) -> None:
+    rulers = one_ruler()
+    with pytest.raises(TypeError, match="uint8, uint16 or float32"):
+        STRONGEST(np.zeros(SHAPE), rulers, device=device)
+    with pytest.raises(ValueError, match=r"images \(rows, columns\)"):
+        STRONGEST(np.zeros((3, 4, 5), np.uint8), rulers, device=device)
+    with pytest.raises(ValueError, match="say how many rulers"):
+        STRONGEST.bind(device, SHAPE, np.uint8)
+    with pytest.raises(TypeError, match="float32"):
+        STRONGEST(np.zeros(SHAPE, np.uint8), rulers.astype(np.float64), device=device)
+    with pytest.raises(ValueError, match="shape"):
+        replace(STRONGEST, count=2)(np.zeros(SHAPE, np.uint8), rulers, device=device)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"threshold": 0.0}, ValueError, "threshold is 0.0, expected a number above 0"),
+        ({"threshold": math.nan}, ValueError, "threshold"),
+        ({"smoothing_px": -1.0}, ValueError, "smoothing_px"),
+        ({"length": 14}, ValueError, "expected 15 samples or more"),
+        ({"length": 10.5}, TypeError, "length must be a whole number"),
+        ({"length": 513}, ValueError, "expected 5 to 512"),
+        ({"width": 0}, ValueError, "width is 0"),
+        ({"polarity": "up"}, ValueError, "expected one of any, rising, falling"),
+        ({"choice": "best"}, ValueError, "expected one of strongest"),
+        ({"ambiguity": 1.5}, ValueError, "0 < share <= 1"),
+        ({"ambiguity": 0.5, "choice": "all"}, ValueError, "choice='strongest' only"),
+        ({"spacing_px": (3.0, 5.0)}, ValueError, "pairs=True only"),
+        ({"pairs": True, "spacing_px": (5.0, 3.0)}, ValueError, "0 <= least <= greatest"),
+        ({"radius_px": 0.0}, ValueError, "radius_px is 0"),
+        ({"noise": -1.0}, ValueError, "noise"),
+        ({"model": 3}, TypeError, "expected a Lens or a Camera"),
+        ({"count": -1}, ValueError, "count"),
+    ],
+)
+def test_wrong_parameters(options: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        RulerEdges(**{"threshold": 20.0, **options})
+
+
+def test_the_recommended_smoothing() -> None:
+    """The least variance of a gradient's peak, (a^2 + s^2)^3 / (a^5 s), over a."""
+    a = np.linspace(0.5, 5.0, 4501)
+    assert abs(a[np.argmin((a**2 + 1.0) ** 3 / a**5)] - best_smoothing(1.0)) < 1e-3

@@ -1,0 +1,292 @@
+"""Selections of rulers: what they promise is what least squares deliver, and others do no better."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpuvision.matching.artwork.artwork import Artwork, Holes, read_artwork
+from gpuvision.matching.artwork.shapes import Shape
+from gpuvision.matching.features.selection import Candidates, Imaging, Selection, candidates, select
+
+IMAGING = Imaging(pixel=20e-6)
+REGION = ((-1e-3, -1e-3), (21e-3, 21e-3))
+MIDDLE = (10e-3, 10e-3)
+Trace = tuple[float, float, float, float]
+CROSS: tuple[Trace, ...] = ((2, 10, 9, 10), (11, 10, 18, 10), (10, 2, 10, 9), (10, 11, 10, 18), (2, 2, 6, 6))
+
+
+def board(folder: Path, *traces: Trace, flashes: tuple[tuple[float, float], ...] = ()) -> Artwork:
+    """Traces 0.3 mm wide, and square pads of 1 mm."""
+    lines = ["%FSLAX46Y46*%", "%MOMM*%", "%LPD*%", "%ADD10C,0.3*%", "%ADD11R,1.0X1.0*%", "G01*", "D10*"]
+    for x, y, to_x, to_y in traces:
+        lines += [f"X{round(x * 1e6)}Y{round(y * 1e6)}D02*", f"X{round(to_x * 1e6)}Y{round(to_y * 1e6)}D01*"]
+    lines.append("D11*")
+    lines += [f"X{round(x * 1e6)}Y{round(y * 1e6)}D03*" for x, y in flashes]
+    (folder / "copper.gbr").write_text("\n".join([*lines, "M02*", ""]))
+    return read_artwork(folder, layers={r"copper\.gbr": "top copper"})
+
+
+def rulers_of(artwork: Artwork, imaging: Imaging = IMAGING) -> Candidates:
+    return candidates(artwork, REGION, MIDDLE, imaging)
+
+
+def seen_offsets(rulers: Candidates, shift: np.ndarray, angle: float) -> np.ndarray:
+    """How far along each ruler the edge is met, of a board turned about the placement point and shifted."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    point = rulers.placement + (rulers.point - rulers.placement) @ turn.T + shift
+    normal = rulers.normal @ turn.T
+    return np.sum(normal * (point - rulers.point), axis=1) / np.sum(normal * rulers.normal, axis=1)
+
+
+def covariance_of(rulers: Candidates, chosen: np.ndarray, imaging: Imaging) -> np.ndarray:
+    """Of generalised least squares: derivatives by differences, the etching as noise that all edges share."""
+    step = 1e-7
+    columns = [
+        (seen_offsets(rulers, step * np.array(shift), step * angle) - seen_offsets(rulers, np.zeros(2), 0)) / step
+        for shift, angle in (((1, 0), 0), ((0, 1), 0), ((0, 0), 1))
+    ]
+    rows = np.stack(columns, axis=1)[chosen]
+    shared = imaging.etch * (~rulers.pair[chosen])
+    noise = np.diag(rulers.sigma[chosen] ** 2) + np.outer(shared, shared)
+    return np.linalg.inv(rows.T @ np.linalg.inv(noise) @ rows)
+
+
+@pytest.mark.parametrize("criterion", ["determinant", "placement"])
+def test_promises_what_least_squares_deliver(tmp_path: Path, criterion: str) -> None:
+    rulers = rulers_of(board(tmp_path, *CROSS, flashes=((5, 15), (15, 5))))
+    for which in (rulers.pair, ~rulers.pair):
+        some = only(rulers, which)
+        found = select(some, IMAGING, 12, criterion=criterion)  # type: ignore[arg-type]
+        expected = covariance_of(some, found.chosen, IMAGING)
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        assert found.covariance / scale == pytest.approx(expected / scale, abs=1e-4)
+        assert found.sigmas == pytest.approx(np.sqrt(np.diag(expected)), rel=1e-4)
+        assert len(found.chosen) == len(set(found.chosen.tolist())) == 12
+
+
+def only(rulers: Candidates, which: np.ndarray) -> Candidates:
+    return Candidates(*(each[which] for each in rulers[:-1]), rulers.placement)
+
+
+def test_measured_poses_scatter_as_promised(tmp_path: Path, rng: np.random.Generator) -> None:
+    rulers = rulers_of(board(tmp_path, *CROSS, flashes=((5, 15), (15, 5))))
+    found = select(rulers, IMAGING, 20)
+    rows = np.concatenate([rulers.normal, lever(rulers)[:, None]], axis=1)[found.chosen]
+    shared = IMAGING.etch * (~rulers.pair[found.chosen])
+    noise = np.linalg.inv(np.diag(rulers.sigma[found.chosen] ** 2) + np.outer(shared, shared))
+    solve = np.linalg.inv(rows.T @ noise @ rows) @ rows.T @ noise
+    errors = []
+    for _ in range(1000):
+        shift, angle = rng.uniform(-50e-6, 50e-6, 2), rng.uniform(-1e-4, 1e-4)
+        measured = seen_offsets(rulers, shift, angle)[found.chosen]
+        measured += rng.normal(0, rulers.sigma[found.chosen]) + shared * rng.normal()
+        errors.append(solve @ measured - (*shift, angle))
+    # 1000 draws: a standard deviation is known to 1 / sqrt(2000) = 2.2 %; four of these.
+    assert np.std(errors, axis=0) == pytest.approx(found.sigmas, rel=0.09)
+
+
+def lever(rulers: Candidates) -> np.ndarray:
+    away = rulers.point - rulers.placement
+    return np.asarray(away[:, 0] * rulers.normal[:, 1] - away[:, 1] * rulers.normal[:, 0])
+
+
+def test_comes_near_to_the_best_of_all_sets(tmp_path: Path, rng: np.random.Generator) -> None:
+    imaging = replace(IMAGING, etch=0.0)
+    all_rulers = rulers_of(board(tmp_path, *CROSS), imaging)
+    which = rng.choice(len(all_rulers.sigma), 14, replace=False)
+    rulers = only(all_rulers, which)
+    rows = np.concatenate([rulers.normal, lever(rulers)[:, None]], axis=1)
+    prior = np.diag([3 / imaging.shift**2, 3 / imaging.shift**2, 3 / imaging.angle**2])
+    weight = (1 - rulers.ambiguity) / rulers.sigma**2
+
+    def gain(chosen: tuple[int, ...]) -> float:
+        some = rows[list(chosen)]
+        information = prior + (some * weight[list(chosen), None]).T @ some
+        return float(np.linalg.slogdet(information)[1] - np.linalg.slogdet(prior)[1])
+
+    found = select(rulers, imaging, 4, per_source=14)
+    best = max(gain(each) for each in itertools.combinations(range(14), 4))
+    assert best >= gain(tuple(found.chosen)) >= (1 - 1 / math.e) * best
+
+
+def test_beats_what_is_picked_at_random(tmp_path: Path, rng: np.random.Generator) -> None:
+    rulers = rulers_of(board(tmp_path, *CROSS, flashes=((5, 15), (15, 5))))
+    found = select(rulers, IMAGING, 12)
+    placed = select(rulers, IMAGING, 12, criterion="placement")
+    sets = [rng.choice(len(rulers.sigma), 12, replace=False) for _ in range(200)]
+    others = [covariance_of(rulers, each, IMAGING) for each in sets]
+    assert np.linalg.det(found.covariance) < min(np.linalg.det(each) for each in others)
+    assert np.trace(placed.covariance[:2, :2]) < min(np.trace(each[:2, :2]) for each in others)
+    assert np.trace(placed.covariance[:2, :2]) <= np.trace(found.covariance[:2, :2])
+
+
+@pytest.mark.parametrize(
+    ("traces", "budget", "message"),
+    [
+        (((2, 10, 18, 10), (2, 5, 18, 5), (2, 15, 18, 15)), 20, "do not fix"),
+        (((2, 2, 9, 9), (11, 11, 18, 18)), 20, "do not fix"),
+        (CROSS, 2, "2 rulers do not fix"),
+        (((1, 1, 1.2, 1.2),), 20, "0 rulers do not fix"),
+    ],
+)
+def test_refuses_what_fixes_no_pose(tmp_path: Path, traces: tuple[Trace, ...], budget: float, message: str) -> None:
+    rulers = rulers_of(board(tmp_path, *traces))
+    with pytest.raises(ValueError, match=message):
+        select(rulers, IMAGING, budget, per_source=100)
+
+
+def test_etching_spoils_edges_that_face_one_way_and_no_others(tmp_path: Path) -> None:
+    artwork = board(tmp_path, flashes=((2, 5), (18, 5), (5, 2), (5, 18)))
+    sure, unsure = replace(IMAGING, etch=1e-9), replace(IMAGING, etch=30e-6)
+    rulers = rulers_of(artwork)
+    one_way = only(rulers, (rulers.normal @ (1, 1) > 0.9) & ~rulers.pair)
+    assert select(one_way, sure, 16).sigmas[:2].max() < 1e-6
+    assert select(one_way, unsure, 16).sigmas[:2].min() > 20e-6
+    assert select(rulers, unsure, 16).sigmas[:2].max() < 1e-6
+    traces = rulers_of(board(tmp_path, *CROSS), unsure)
+    pairs = only(traces, traces.pair)
+    assert select(pairs, unsure, 16).covariance == pytest.approx(select(pairs, sure, 16).covariance, rel=1e-6)
+
+
+def test_repeated_edges_on_a_ruler_are_ambiguous(tmp_path: Path, rng: np.random.Generator) -> None:
+    comb = tuple((2.0, y, 8.0, y) for y in (10.0, 10.7, 11.4))
+    apart = tuple((12.0, y, 18.0, y) for y in (10.0, 13.0))
+    imaging = replace(IMAGING, shift=400e-6, angle=0.0)
+    rulers = rulers_of(board(tmp_path, *comb, *apart, (10, 2, 10, 8)), imaging)
+    # Edges are found on a ruler less the smoothing's reach at either end.
+    found = np.max(rulers.length[~rulers.pair]) / 2 - 3 * math.sqrt(5.0) * imaging.pixel
+    up = (rulers.normal[:, 1] > 0.9) & (rulers.point[:, 0] < 9e-3)
+    shifts = rng.uniform(-400e-6, 400e-6, 20000)
+    for y, others in ((10.15e-3, (0.7e-3,)), (10.85e-3, (-0.7e-3, 0.7e-3))):
+        here = up & ~rulers.pair & np.isclose(rulers.point[:, 1], y, rtol=0, atol=1e-6)
+        seen = np.sum([np.mean(np.abs(shifts + other) < found) for other in others])
+        assert here.any()
+        assert 0.05 < seen < 0.95
+        assert rulers.ambiguity[here] == pytest.approx(seen, abs=0.015)
+    assert not rulers.ambiguity[rulers.point[:, 0] > 9e-3].any()
+    chosen = select(rulers, imaging, 8).chosen
+    assert not rulers.ambiguity[chosen].any()
+
+
+def test_ink_and_holes_are_ambiguous_too_and_may_lie_off(tmp_path: Path) -> None:
+    """A trace 0.3 mm wide along y = 10 mm, silk above it, and a hole below it."""
+    artwork = board(tmp_path, (2, 10, 18, 10), (1, 2, 1, 18))
+    ink = Shape(np.array([[12.0, 10.6], [16.0, 10.6], [16.0, 10.65], [12.0, 10.65]]) * 1e-3)
+    hole = np.array([[6.0, 10.8]]) * 1e-3
+    holes = Holes(hole, hole + np.array([2e-3, 0.0]), np.array([0.4e-3]), np.array([0], dtype=np.int8))
+    artwork = replace(artwork, silk=(ink,), holes=holes)
+    far, near = (rulers_of(artwork, replace(IMAGING, registration=each)) for each in (0.0, 0.3e-3))
+
+    def upper(rulers: Candidates, low: float, high: float) -> np.ndarray:
+        x, y = rulers.point.T * 1e3
+        return rulers.ambiguity[(x > low) & (x < high) & np.isclose(y, 10.15) & ~rulers.pair]
+
+    # A ruler finds edges as far as 0.1 mm, a turn by 5 mrad about up to 8 mm, and 0.06 mm; the board itself lies off by
+    # the former two. The ink ends 0.5 mm from the edge, the hole begins 0.45 mm from it.
+    assert upper(far, 12.2, 15.8).max() == 0.0 == upper(far, 6.2, 7.8).max()
+    assert upper(near, 12.2, 15.8).min() > 0.1
+    assert upper(near, 6.2, 7.8).min() > 0.1
+    assert upper(near, 9.0, 11.0).max() == 0.0
+
+
+def test_edges_that_pull_at_each_other_are_left_out(tmp_path: Path) -> None:
+    artwork = board(tmp_path, (2, 10, 18, 10), (2, 10.5, 18, 10.5))
+    # 0.3 mm wide and 0.2 mm apart; 3 sqrt(5) blurs are 0.134 mm at 20 um, 0.268 mm at 40 um and 0.335 mm at 50 um.
+    fine, coarse, coarsest = (rulers_of(artwork, replace(IMAGING, pixel=each)) for each in (20e-6, 40e-6, 50e-6))
+    assert sorted(set(np.round(fine.point[:, 1] * 1e3, 6))) == pytest.approx([9.85, 10, 10.15, 10.35, 10.5, 10.65])
+    assert sorted(set(np.round(coarse.point[:, 1] * 1e3, 6))) == pytest.approx([9.85, 10.65])
+    assert len(coarsest.sigma) == 0
+
+
+def test_rulers_stay_on_their_edges_and_in_the_region_to_read(tmp_path: Path, rng: np.random.Generator) -> None:
+    artwork = board(tmp_path, *CROSS, flashes=((5, 15), (15, 5)))
+    rulers = rulers_of(artwork)
+    found = select(rulers, IMAGING, 20)
+    low, high = found.region
+    half_width = IMAGING.width_px * IMAGING.pixel / 2
+    edges = artwork.edges
+    for index in found.chosen:
+        point, normal = rulers.point[index], rulers.normal[index]
+        ends = point + np.array([[-0.5], [0.5]]) * rulers.length[index] * normal
+        assert ((ends >= low - 1e-12) & (ends <= high + 1e-12)).all()
+        # The edge, shifted and turned anyhow, crosses the ruler within its ends.
+        offsets = [
+            seen_offsets(rulers, rng.choice([-1, 1], 2) * IMAGING.shift, sign * IMAGING.angle)[index]
+            for sign in (-1, 1)
+        ]
+        assert np.abs(offsets).max() < rulers.length[index] / 2
+        if not rulers.pair[index]:
+            axis = np.array([-normal[1], normal[0]])
+            on = (edges.normal @ normal > 0.999) & (np.abs(np.sum((edges.start - point) * normal, axis=1)) < 1e-9)
+            spans = np.sort(np.stack([(edges.start[on] - point) @ axis, (edges.end[on] - point) @ axis]), axis=0)
+            room = half_width + IMAGING.shift - 1e-9
+            assert np.any((spans[0] <= -room) & (spans[1] >= room))
+
+
+def test_keeps_to_its_budget_and_to_few_rulers_on_each_side(tmp_path: Path) -> None:
+    rulers = rulers_of(board(tmp_path, *CROSS, flashes=((5, 15), (15, 5))))
+    costs = rulers.pixels(IMAGING)
+    found = select(rulers, IMAGING, 3000, costs=costs)
+    assert found.cost == costs[found.chosen].sum() <= 3000
+    left = np.setdiff1d(np.arange(len(costs)), found.chosen)
+    full = [source for source in set(rulers.source) if np.sum(rulers.source[found.chosen] == source) == 4]
+    assert (costs[left][~np.isin(rulers.source[left], full)] > 3000 - found.cost).all()
+    counts = [np.sum(rulers.source[found.chosen] == each) for each in set(rulers.source)]
+    assert max(counts) <= 4
+    # The board is as it is when mirrored in its diagonal: x may be y.
+    assert np.sort(select(rulers, IMAGING, 12, missing=0.19).sigmas) == pytest.approx(
+        np.sort(select(rulers, IMAGING, 12).sigmas) / 0.9, rel=0.01
+    )
+
+
+def test_the_sigma_is_1_2_times_the_bound() -> None:
+    bound = 1.883 * math.sqrt(2.0) / (40 * math.sqrt(16)) * 10e-6
+    imaging = Imaging(pixel=10e-6, blur_px=2.0, width_px=16)
+    assert imaging.sigma(True) == pytest.approx(1.2 * bound, rel=5e-3)
+    assert imaging.sigma([True, False]) == pytest.approx(1.2 * bound * np.array([1, 40 / 15]), rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    "changed", [{"pixel": 0.0}, {"blur_px": -1.0}, {"shift": math.nan}, {"etch": -1.0}, {"angle": math.inf}]
+)
+def test_refuses_a_camera_that_is_none(changed: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="must be"):
+        replace(IMAGING, **changed)
+
+
+def test_refuses_what_makes_no_sense(tmp_path: Path) -> None:
+    artwork = board(tmp_path, *CROSS)
+    rulers = rulers_of(artwork)
+    with pytest.raises(ValueError, match="region must be"):
+        candidates(artwork, ((0, 0), (0, 1)), MIDDLE, IMAGING)
+    with pytest.raises(ValueError, match="placement must be"):
+        candidates(artwork, REGION, (0, math.nan), IMAGING)
+    with pytest.raises(ValueError, match="costs must be"):
+        select(rulers, IMAGING, 5, costs=[1.0])
+    with pytest.raises(ValueError, match="missing must be"):
+        select(rulers, IMAGING, 5, missing=1.0)
+    with pytest.raises(ValueError, match="criterion must be"):
+        select(rulers, IMAGING, 5, criterion="trace")  # type: ignore[arg-type]
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", ["fritzing", "upverter", "kicad-x2-tests/x2ap"])
+def test_finds_rulers_on_the_boards_of_three_tools(data: Path, name: str, rng: np.random.Generator) -> None:
+    artwork = read_artwork(data / "gerber" / name)
+    middle = artwork.bounds.mean(axis=0)
+    rulers = candidates(artwork, (middle - 8e-3, middle + 8e-3), middle, IMAGING)
+    found: Selection = select(rulers, IMAGING, 30)
+    others = [
+        np.sqrt(np.diag(covariance_of(rulers, rng.choice(len(rulers.sigma), 30, replace=False), IMAGING)))
+        for _ in range(50)
+    ]
+    assert (found.sigmas < np.median(others, axis=0)).all()
+    assert found.sigmas[:2].max() < 2e-6
+    assert found.condition < 100

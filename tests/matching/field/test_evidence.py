@@ -1,0 +1,114 @@
+"""What speaks for a pose: chance, and lines that must be seen."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from gpuvision.formats.field_file import read_field
+from gpuvision.matching.field.distance_map import Arc, Field
+from gpuvision.matching.field.evidence import (
+    chance,
+    distances_to_lines,
+    evidence,
+    expected_crossings,
+    line_length,
+    onto_field,
+    seen_share,
+)
+from gpuvision.plots.field import field_lines
+
+CROSS = Field(length=10.0, width=6.0, lines=((-4.0, 0.0, 4.0, 0.0), (0.0, -2.0, 0.0, 2.0)))
+ROUND = Field(length=10.0, width=6.0, arcs=(Arc(0.0, 0.0, 2.0), Arc(3.0, 0.0, 1.0, 0.0, 0.5 * math.pi)))
+
+
+@pytest.mark.parametrize("name", ["robocup_msl", "robocup_junior"])
+def test_distances_are_those_to_dense_samples(name: str, rng: np.random.Generator) -> None:
+    field = read_field(name)
+    places = rng.uniform(-0.6, 0.6, (300, 2)) * (field.length, field.width)
+    samples = []
+    for line in field_lines(field):
+        for start, end in itertools.pairwise(line):
+            samples.append(start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start))
+    every = np.concatenate(samples)
+    nearest = np.array([np.hypot(*(every - place).T).min() for place in places])
+    # Samples up to 0.11 m apart, chords of arcs of 0.08 rad: half a step aside, and r (1 - cos(0.04)) within.
+    np.testing.assert_allclose(distances_to_lines(field, places), nearest, atol=0.06)
+    assert distances_to_lines(field, every[::50]).max() < 0.002
+
+
+def test_crossings_are_where_scan_lines_meet_lines() -> None:
+    paths = [(-3.0, -1.0, -3.0, 1.0), (-3.5, -1.0, -1.5, 1.0), (-1.0, 1.0, 1.0, 1.0), (2.0, 0.5, 2.0, 2.0)]
+    found = expected_crossings(CROSS, (0.0, 0.0, 0.0), paths, line_width=0.1)
+    np.testing.assert_allclose(found.places, [(-3.0, 0.0), (-2.5, 0.0), (0.0, 1.0)], atol=1e-12)
+    np.testing.assert_allclose(found.sines, [1.0, math.sqrt(0.5), 1.0])
+    # As a robot that is turned and elsewhere has the same paths.
+    pose = (0.7, -0.4, 1.1)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    seen = (np.reshape(paths, (-1, 2, 2)) - pose[:2]) @ np.array([[c, -s], [s, c]])
+    turned = expected_crossings(CROSS, pose, seen.reshape(-1, 4), line_width=0.1)
+    np.testing.assert_allclose(onto_field(turned.places, pose), found.places, atol=1e-12)
+
+
+def test_crossings_that_need_not_be_found_are_left_out() -> None:
+    grazing, at_the_end = (-3.0, -0.2, 3.0, 0.2), (3.95, -1.0, 3.95, 1.0)
+    beside_another, ends_on_it = (-0.25, -1.5, 0.25, 1.5), (-3.0, -1.0, -3.0, 0.05)
+    for path in (grazing, at_the_end, beside_another, ends_on_it):
+        assert not len(expected_crossings(CROSS, (0.0, 0.0, 0.0), [path], line_width=0.1).places)
+
+
+def test_circles_are_crossed_twice() -> None:
+    paths = [(-3.0, 0.5, 2.9, 0.5), (3.0, -2.0, 3.0, 2.0), (3.7, -2.0, 3.7, 2.0)]
+    found = expected_crossings(ROUND, (0.0, 0.0, 0.0), paths, line_width=0.05)
+    far = math.sqrt(4.0 - 0.25)
+    np.testing.assert_allclose(found.places, [(-far, 0.5), (far, 0.5), (3.7, math.sqrt(1 - 0.49))], atol=1e-12)
+    assert not len(expected_crossings(ROUND, (0.0, 0.0, 0.0), [(-3.0, 1.9, 1.0, 1.9)], line_width=0.05).places)
+
+
+def test_seen_is_what_has_a_point() -> None:
+    paths = [(x, -1.0, x, 1.0) for x in (-3.5, -3.0, -2.5, -2.0)]
+    crossings = expected_crossings(CROSS, (0.0, 0.0, 0.0), paths, line_width=0.1)
+    assert seen_share(crossings, np.array([(-3.5, 0.04), (-2.0, -0.06), (5.0, 5.0)]), 0.05) == 0.25
+    assert seen_share(crossings, crossings.places, 0.05) == 1.0
+    nothing = expected_crossings(CROSS, (0.0, 0.0, 0.0), [(5.0, 1.0, 5.0, 2.0)], line_width=0.1)
+    assert math.isnan(seen_share(nothing, crossings.places, 0.05))
+
+
+def test_chance_bounds_what_random_points_reach(rng: np.random.Generator) -> None:
+    """One pose of all is the same as none looked for: a thousandth is reached at most once in a thousand draws."""
+    field = read_field("robocup_msl")
+    # Straight ones; goal and penalty areas; the circle; corners of 79.568 degrees.
+    straight, areas = 2 * 21.875 + 3 * 13.875, 2 * (2 * 0.625 + 3.775 + 2 * 2.125 + 6.775)
+    arcs = 2 * math.pi * 1.9375 + 4 * 0.6875 * math.radians(79.568)
+    assert line_length(field) == pytest.approx(straight + areas + arcs, abs=1e-4)
+    reached = []
+    for _ in range(1000):
+        places = rng.uniform(-0.5, 0.5, (60, 2)) * (field.length, field.width)
+        reached.append(chance(distances_to_lines(field, places), field, scale=0.25, reach=6.0, outside=None))
+    # Expected below ln(1/100): 10 at most, and 4 sigmas of that.
+    assert np.sum(np.array(reached) < math.log(0.01)) < 10 + 4 * math.sqrt(10)
+    assert chance([], field, scale=0.25, reach=6.0, outside=None) == math.inf
+    on_lines = chance(np.zeros(60), field, scale=0.25, reach=6.0, outside=1.0)
+    # All 60 points within 15 mm, but for what the poses' number takes from it.
+    assert on_lines == pytest.approx(60 * math.log(2 * 0.015 * line_length(field) / 308), rel=0.15)
+
+
+def test_missing_is_what_is_not_seen_beside_what_is_explained() -> None:
+    turns = np.linspace(0.0, 2.0 * math.pi, 64, endpoint=False)
+    ways = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    pose = (1.0, 1.0, 0.5)
+    paths = np.hstack([0.0 * ways, 3.0 * ways])
+    places = expected_crossings(CROSS, pose, paths, line_width=0.1).places
+    told = {"near": 0.05, "scale": 0.2, "reach": 3.0, "outside": 0.5}
+    whole = evidence(places, paths, CROSS, pose, **told)
+    assert (whole.expected, whole.on_lines, whole.seen) == (len(places), 1.0, 1.0)
+    assert whole.missing == 0.0
+    half = evidence(places[::2], paths, CROSS, pose, **told)
+    assert half.missing == pytest.approx(0.5, abs=0.1)
+    elsewhere = np.concatenate([places[::2], places[::2] + 0.3])
+    assert evidence(elsewhere, paths, CROSS, pose, **told).missing > 0.8
+    unknown = evidence(places[::2], None, CROSS, pose, **told)
+    assert (unknown.expected, unknown.missing) == (0, 0.0)

@@ -1,0 +1,363 @@
+"""A robot on its field: scores against their definition, poses against SciPy, and views that say too little."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from canary import Guarded
+from gpuvision.formats.field_file import read_field
+from gpuvision.host import Device
+from gpuvision.matching.field.distance_map import Arc, DistanceMap, Field
+from gpuvision.matching.field.field_pose import FieldPoseRefinement, FieldPoseSearch, locate, twin_of
+from gpuvision.status import Status
+from reference import field as reference
+
+VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
+POSE = np.array([3.1, -2.2, 0.7])
+
+
+@cache
+def large(device: Device) -> DistanceMap:
+    return DistanceMap(field=read_field("robocup_msl"), cell=0.1, outside=1.0, device=device)
+
+
+@cache
+def small(device: Device, columns: int = 7) -> DistanceMap:
+    """A field of few columns, that no block fills."""
+    field = Field(length=0.1 * columns, width=0.9, lines=((-1.0, 0.13, 2.0, 0.41),), arcs=(Arc(0.2, -0.3, 0.5, -1, 2),))
+    return DistanceMap(field=field, cell=0.1, reach=2.0, device=device)
+
+
+def view(
+    field_map: DistanceMap,
+    pose: Any,
+    rng: np.random.Generator,
+    count: int = 64,
+    sigma: float = 0.03,
+    reach: float = 5.0,
+) -> np.ndarray:
+    return reference.seen(field_map.field, pose, rng, count, reach, sigma).astype(np.float32)
+
+
+def off(pose: Any, other: Any) -> np.ndarray:
+    difference = np.asarray(pose, np.float64) - other
+    difference[..., 2] = (difference[..., 2] + np.pi) % (2.0 * np.pi) - np.pi
+    return difference
+
+
+# ---- the map -------------------------------------------------------------------------------------------------
+
+
+def test_distances_are_those_to_the_nearest_line(device: Device) -> None:
+    for field_map in (large(device), small(device)):
+        rows, columns = field_map.cells.distance.shape
+        x0, y0 = field_map.first
+        x, y = np.meshgrid(x0 + field_map.cell * np.arange(columns), y0 + field_map.cell * np.arange(rows))
+        exact = reference.distance(field_map.field, np.stack([x, y], axis=-1))
+        # A few roundings of coordinates up to 20 m.
+        np.testing.assert_allclose(field_map.cells.distance, exact, atol=8e-6)
+        every = [reference.distance_to_line(line, np.stack([x, y], axis=-1)) for line in field_map.field.lines]
+        every += [reference.distance_to_arc(arc, np.stack([x, y], axis=-1)) for arc in field_map.field.arcs]
+        of_nearest = np.take_along_axis(np.array(every), field_map.cells.nearest[None, ..., 0].astype(int), axis=0)[0]
+        np.testing.assert_allclose(of_nearest, exact, atol=8e-6)
+        level = 1023.0 * exact**2 / (field_map.scale**2 + exact**2)
+        np.testing.assert_allclose(field_map.cells.level, level, atol=0.51)
+
+
+def test_a_field_may_be_symmetric() -> None:
+    msl = read_field("robocup_msl")
+    assert msl.is_symmetric
+    assert read_field("robocup_junior").is_symmetric
+    one_more = Field(length=22.0, width=14.0, lines=(*msl.lines, (1.0, 1.0, 2.0, 1.0)), arcs=msl.arcs)
+    assert not one_more.is_symmetric
+    without_an_arc = Field(length=22.0, width=14.0, lines=msl.lines, arcs=msl.arcs[:-1])
+    assert not without_an_arc.is_symmetric
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"lines": ((0.0, 0.0, 1.0, 0.0),) * 257}, "256 at most"),
+        ({"length": 0.0}, "length"),
+        ({"lines": ()}, "neither"),
+        ({"lines": ((1.0, 1.0, 1.0, 1.0),)}, "begins where it ends"),
+        ({"arcs": (Arc(0.0, 0.0, -1.0),)}, "radius"),
+        ({"arcs": (Arc(0.0, 0.0, 1.0, 2.0, 1.0),)}, "start < end"),
+    ],
+)
+def test_wrong_fields_are_refused(change: dict[str, Any], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        Field(**{"length": 2.0, "width": 1.0, "lines": ((0.0, 0.0, 1.0, 0.0),), **change})
+
+
+def test_wrong_maps_are_refused() -> None:
+    field = read_field("robocup_msl")
+    for change, match in (
+        ({"cell": 0.0}, "cell"),
+        ({"outside": -1.0}, "outside"),
+        ({"reach": math.inf}, "reach"),
+        ({"cell": 1e-3}, "or more for this field"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            DistanceMap(field=field, **change)
+
+
+# ---- the search ----------------------------------------------------------------------------------------------
+
+
+def expected_scores(search: FieldPoseSearch, points: np.ndarray) -> np.ndarray:
+    """From the map, point by point, in whole numbers."""
+    field_map, (rows, columns) = search.map, search.map.positions
+    result = np.zeros((len(search.angles), rows, columns))
+    for turn, heading in enumerate(search.angles):
+        c, s = np.float32(np.cos(heading)), np.float32(np.sin(heading))
+        x, y = points.T
+        per = np.float32(1.0 / field_map.cell)
+        at = np.rint(np.stack([s * x + c * y, c * x - s * y], axis=-1) * per).astype(int) + field_map.border
+        for row, column in at:
+            result[turn] += field_map.cells.level[row : row + rows, column : column + columns]
+    return result / (1023.0 * len(points))
+
+
+@VARIANTS
+@pytest.mark.parametrize("count", [1, 63, 65, 300])
+def test_scores_are_sums_over_the_map(device: Device, variant: Any, count: int, rng: np.random.Generator) -> None:
+    for field_map in (small(device), small(device, 64), small(device, 131)):
+        search = FieldPoseSearch(map=field_map, headings=(0.3, -2.0, 1.1), with_scores=True, variant=variant)
+        # Not so near the half of a cell that a fused multiplication rounds to another one.
+        points = rng.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
+        expected = expected_scores(search, points)
+        costs = search(points, device=device)
+        # One point in another cell, at most.
+        assert np.mean(np.abs(costs.scores - expected) < 1e-6) > 0.99 if count > 1 else True
+        np.testing.assert_allclose(costs.scores, expected, atol=1.0 / count)
+        assert (costs.seen == count).all()
+        turn, row, _ = np.indices(costs.least.shape)
+        np.testing.assert_array_equal(costs.least, costs.scores[turn, row, costs.column])
+        np.testing.assert_array_equal(costs.least.min(axis=-1), costs.scores.min(axis=-1))
+
+
+@VARIANTS
+def test_outputs_stay_within_theirs(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    points = rng.uniform(-1.0, 1.0, (65, 2)).astype(np.float32)
+    for columns in (7, 131):
+        search = FieldPoseSearch(
+            map=small(device, columns), headings=(0.3, -2.0, 1.1), with_scores=columns == 7, variant=variant
+        )
+        guarded = Guarded(search(points, device=device))
+        search(points, device=device, out=guarded.out)
+        guarded.assert_intact()
+
+
+@VARIANTS
+def test_points_that_are_none_do_not_count(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    search = FieldPoseSearch(map=small(device), headings=(0.3, -2.0, 1.1), with_scores=True, variant=variant)
+    points = rng.uniform(-1.0, 1.0, (63, 2)).astype(np.float32)
+    worse = np.concatenate([points, points[:3]])
+    # The last one is beyond the reach by less than a cell.
+    worse[7], worse[64], worse[65] = (np.nan, 0.0), (1e30, np.inf), (2.01, 0.0)
+    alike = np.delete(worse, [7, 64, 65], axis=0)
+    costs, expected = search(worse, device=device), search(alike, device=device)
+    assert (costs.seen == 63).all()
+    np.testing.assert_array_equal(costs.scores, expected.scores)
+    nothing = search(np.full((65, 2), np.nan, np.float32), device=device)
+    assert np.isnan(nothing.scores).all()
+    assert np.isnan(nothing.least).all()
+    assert (nothing.seen == 0).all()
+    assert len(search.best(nothing).poses) == 0
+
+
+def test_scores_are_near_the_exact_cost(device: Device, rng: np.random.Generator) -> None:
+    field_map = large(device)
+    search = FieldPoseSearch(map=field_map, headings=(0.7,), with_scores=True)
+    points = view(field_map, POSE, rng)
+    scores = search(points, device=device).scores[0]
+    x0, y0 = field_map.first_position
+    for row, column in rng.integers(0, field_map.positions, (40, 2)):
+        pose = (x0 + field_map.cell * column, y0 + field_map.cell * row, 0.7)
+        exact = reference.cost(field_map.field, pose, points.astype(np.float64), field_map.scale)
+        assert abs(scores[row, column] - exact) <= 0.46 * field_map.cell / field_map.scale + 1.0 / 2046.0
+
+
+# ---- both tiers ----------------------------------------------------------------------------------------------
+
+
+def assert_found(field_map: DistanceMap, pose: Any, points: np.ndarray, device: Device) -> None:
+    candidates = locate(field_map, points, device=device)
+    first = candidates[0]
+    assert first.status == Status.OK
+    assert first.twin is not None
+    pair = {0, first.twin}
+    assert candidates[first.twin].score == pytest.approx(first.score, abs=1e-6)
+    assert candidates[first.twin].twin == 0
+    assert len(candidates) == 2 or candidates[2].score > first.score + 0.005
+    right = min((candidates[number] for number in pair), key=lambda each: np.abs(off(each.pose, pose)).sum())
+    far = off(right.pose, pose)
+    # Chi squared of three degrees beyond 25: one in 65 000.
+    assert far @ right.information @ far < 25.0
+
+
+def test_kidnapped_robots_are_found(device: Device, rng: np.random.Generator) -> None:
+    field_map = large(device)
+    for _ in range(10):
+        pose = rng.uniform([-10.0, -6.0, -np.pi], [10.0, 6.0, np.pi])
+        assert_found(field_map, pose, view(field_map, pose, rng, 128, reach=6.0), device)
+
+
+def test_clutter_of_70_percent(device: Device, rng: np.random.Generator) -> None:
+    """Most points are on lines painted in the hall, people, and the ball; no robot is taken for elsewhere."""
+    field_map = large(device)
+    for _ in range(40):
+        pose = rng.uniform([-10.5, -6.5, -np.pi], [10.5, 6.5, np.pi])
+        points = view(field_map, pose, rng, 200, reach=6.0)
+        angle, far = rng.uniform(-np.pi, np.pi, 140), 6.0 * np.sqrt(rng.uniform(0.0, 1.0, 140))
+        points[:140] = np.stack([far * np.cos(angle), far * np.sin(angle)], axis=-1)
+        first = locate(field_map, points, device=device)[0]
+        assert min(np.abs(off(each, pose)[:2]).max() for each in (first.pose, twin_of(first.pose))) < 0.3
+
+
+def test_a_robot_outside_the_field(device: Device, rng: np.random.Generator) -> None:
+    field_map = large(device)
+    pose = np.array([4.0, 7.8, -1.2])
+    assert_found(field_map, pose, view(field_map, pose, rng, 128, reach=6.0), device)
+
+
+def test_a_compass_tells_twins_apart(device: Device, rng: np.random.Generator) -> None:
+    field_map = DistanceMap(field=read_field("robocup_junior"), cell=0.02, scale=0.05, reach=1.5, device=device)
+    pose = np.array([0.31, -0.22, 0.7])
+    points = view(field_map, pose, rng, sigma=0.005, reach=1.2)
+    first, *others = locate(field_map, points, headings=(0.6,), device=device)
+    assert first.twin is None
+    assert np.abs(off(first.pose, pose)).max() < 0.02
+    assert all(each.score > first.score + 0.05 for each in others)
+
+
+def test_points_twice_are_the_same_pose(device: Device, rng: np.random.Generator) -> None:
+    field_map = large(device)
+    points = view(field_map, POSE, rng)
+    once, twice = (locate(field_map, each, device=device)[0] for each in (points, np.repeat(points, 2, axis=0)))
+    other = twice.pose if np.abs(off(twice.pose, once.pose)).sum() < 1.0 else twin_of(twice.pose)
+    np.testing.assert_allclose(off(other, once.pose), 0.0, atol=3e-5)
+
+
+def test_a_mirrored_view_is_a_mirrored_pose(device: Device, rng: np.random.Generator) -> None:
+    """The field is its own mirror image, so a mirrored camera finds the mirrored pose: no score can tell that."""
+    field_map = large(device)
+    points = view(field_map, POSE, rng)
+    right, mirrored = (locate(field_map, each, device=device)[0] for each in (points, points * np.float32([1, -1])))
+    assert mirrored.score == pytest.approx(right.score, abs=1e-5)
+    mirror_pose = POSE * [1.0, -1.0, -1.0]
+    assert min(np.abs(off(each, mirror_pose)).max() for each in (mirrored.pose, twin_of(mirrored.pose))) < 0.05
+
+
+def test_a_wrong_scale_shows_in_the_scatter(device: Device, rng: np.random.Generator) -> None:
+    field_map = large(device)
+    points = view(field_map, POSE, rng, 128, reach=6.0)
+    right, wrong = (locate(field_map, np.float32(s) * points, near=POSE, device=device)[0] for s in (1.0, 1.05))
+    assert wrong.scale > 1.5 * right.scale
+    assert np.abs(off(wrong.pose, POSE)[:2]).max() < 0.3
+    np.testing.assert_array_less(np.diag(right.covariance), np.diag(wrong.covariance))
+
+
+def test_no_points_no_pose(device: Device) -> None:
+    nothing = np.full((8, 2), np.nan, np.float32)
+    assert locate(large(device), nothing, device=device) == ()
+    assert locate(large(device), nothing, near=POSE, device=device) == ()
+
+
+# ---- the local tier ------------------------------------------------------------------------------------------
+
+
+def test_poses_are_of_least_cost(device: Device, rng: np.random.Generator) -> None:
+    field_map = large(device)
+    for _ in range(4):
+        pose = rng.uniform([-10.0, -6.0, -np.pi], [10.0, 6.0, np.pi])
+        points = view(field_map, pose, rng, 96)
+        start = (pose + rng.uniform(-1.0, 1.0, 3) * [0.1, 0.1, 0.05]).astype(np.float32)
+        fit = FieldPoseRefinement(map=field_map)(points, start[None], device=device)
+        expected = reference.refined(field_map.field, start, points.astype(np.float64), field_map.scale)
+        # Where two lines are as near as one another the cost has an edge, at which SciPy stops now and then: then it
+        # may not be better, and finds nothing better from the pose that was found.
+        least, other = (
+            reference.cost(field_map.field, each, points.astype(np.float64), field_map.scale)
+            for each in (fit.poses[0], expected)
+        )
+        assert least <= other + 1e-8
+        if other < least + 1e-6:
+            np.testing.assert_allclose(off(fit.poses[0], expected), 0.0, atol=3e-5)
+        again = reference.refined(field_map.field, fit.poses[0], points.astype(np.float64), field_map.scale)
+        np.testing.assert_allclose(off(fit.poses[0], again), 0.0, atol=3e-5)
+        assert fit.score[0] == pytest.approx(least, abs=2e-6)
+
+
+def test_covariance_is_the_scatter(device: Device, rng: np.random.Generator) -> None:
+    """Normalised errors of 200 views: a chi squared of three degrees, mean 3 within 4 standard errors of 0.17."""
+    field_map = large(device)
+    refine = FieldPoseRefinement(map=field_map)
+    distances = []
+    for _ in range(200):
+        points = view(field_map, POSE, rng, 96)
+        fit = refine(points, POSE[None].astype(np.float32), device=device)
+        far = off(fit.poses[0], POSE)
+        distances.append(far @ fit.information[0] @ far)
+        np.testing.assert_allclose(fit.information[0] @ fit.covariance[0], np.eye(3), atol=2e-3)
+    assert 2.3 < np.mean(distances) < 3.7
+
+
+@pytest.mark.parametrize(
+    ("lines", "arcs"),
+    [
+        (((-5.0, 1.0, 5.0, 1.0),), ()),
+        (((-5.0, 1.0, 5.0, 1.0), (-5.0, -1.0, 5.0, -1.0)), ()),
+        ((), (Arc(0.0, 0.0, 2.0),)),
+    ],
+    ids=["one line", "parallel lines", "circle"],
+)
+def test_views_that_fix_a_part_only(device: Device, lines: Any, arcs: Any, rng: np.random.Generator) -> None:
+    field_map = DistanceMap(field=Field(length=10.0, width=6.0, lines=lines, arcs=arcs), cell=0.1, device=device)
+    pose = np.array([0.4, -0.3, 0.5])
+    points = view(field_map, pose, rng, reach=3.0)
+    fit = FieldPoseRefinement(map=field_map)(points, np.float32([pose]), device=device)
+    assert fit.status[0] == Status.AMBIGUOUS
+    assert np.isnan(fit.covariance).all()
+    assert np.isfinite(fit.poses).all()
+    values = np.linalg.eigvalsh(fit.information[0].astype(np.float64))
+    assert values[0] < 1e-3 * values[2]
+    assert values[1] > 10.0
+
+
+def test_poses_that_are_none(device: Device, rng: np.random.Generator) -> None:
+    field_map = large(device)
+    points = view(field_map, POSE, rng)
+    starts = np.float32([[np.nan, 0, 0], [0, np.inf, 0], POSE, [1e5, 0.0, 0.0]])
+    fit = FieldPoseRefinement(map=field_map)(points, starts, device=device)
+    # Far away nothing is near a line.
+    assert fit.status.tolist() == [Status.NOT_FINITE, Status.NOT_FINITE, Status.OK, Status.LOW_SIGNAL]
+    for values in (fit.poses, fit.covariance, fit.information, fit.score, fit.scale, fit.share):
+        np.testing.assert_array_equal(np.isfinite(values.reshape(4, -1)).all(axis=1), [False, False, True, False])
+    few = FieldPoseRefinement(map=field_map)(points[:3], starts[2:3], device=device)
+    assert few.status[0] == Status.LOW_SIGNAL
+
+
+def test_wrong_inputs_are_refused(device: Device) -> None:
+    field_map = large(device)
+    search, refine = FieldPoseSearch(map=field_map), FieldPoseRefinement(map=field_map)
+    with pytest.raises(TypeError, match="float32"):
+        search(np.zeros((4, 2)), device=device)
+    with pytest.raises(ValueError, match="points"):
+        search(np.zeros((4, 3), np.float32), device=device)
+    with pytest.raises(ValueError, match="points"):
+        search(np.zeros((5000, 2), np.float32), device=device)
+    with pytest.raises(ValueError, match="heading"):
+        FieldPoseSearch(map=field_map, headings=0)
+    with pytest.raises(ValueError, match="count"):
+        refine.bind(device, (4, 2), np.float32)
+    with pytest.raises(ValueError, match="near"):
+        locate(field_map, np.zeros((4, 2), np.float32), near=(1.0, 2.0), device=device)
+    with pytest.raises(TypeError, match="DistanceMap"):
+        FieldPoseSearch(map=field_map.field)

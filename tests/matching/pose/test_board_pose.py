@@ -1,0 +1,194 @@
+"""The local fix on devices: rendered edges to a pose, as its parts make it one after the other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from canary import Guarded
+from gpuvision.host import Device
+from gpuvision.matching.features.ruler import RulerEdges
+from gpuvision.matching.pose.board_pose import BoardPoseEstimator, place_rulers
+from gpuvision.matching.pose.pose import SolvePose, line_rows
+from gpuvision.status import Status
+from reference import robust
+
+VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
+PIXEL, NOISE = 10e-6, 2.0
+SHAPE, PATCH, LINES, EACH = (360, 480), 120, 12, 6
+PLACE = (3e-3, -1e-3)
+# An oblique camera that sees y upwards.
+MATRIX = np.array([[1.0 / PIXEL, 0.0, 240.0], [0.0, -1.0 / PIXEL, 180.0], [6.0, 3.0, 1.0]])
+POSE = np.array([3e-5, -2e-5, 0.006])
+
+
+def on_board(points: np.ndarray) -> np.ndarray:
+    """Pixels to the board's plane."""
+    lifted = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1) @ np.linalg.inv(MATRIX).T
+    return np.asarray(lifted[..., :2] / lifted[..., 2:])
+
+
+def artwork() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normals and points of the lines, one in the middle of each patch, and where the rulers lie along them."""
+    angle = np.arange(LINES) * np.pi / LINES + 0.1
+    middle = [((i % 4 + 0.5) * PATCH, (i // 4 + 0.5) * PATCH) for i in range(LINES)]
+    along = np.tile(np.linspace(-20.0, 20.0, EACH) * PIXEL, (LINES, 1))
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1), on_board(np.array(middle)), along
+
+
+def picture(rng: np.random.Generator, pose: np.ndarray = POSE, shifted: tuple[int, ...] = ()) -> np.ndarray:
+    """Edges of the artwork at a pose, each in its patch; some lie 10 px aside."""
+    normal, point, _ = artwork()
+    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    matrix, shift = robust.moved(pose)
+    back = (on_board(np.stack([column, row], axis=-1)) - shift) @ np.linalg.inv(matrix).T
+    which = row // PATCH * 4 + column // PATCH
+    away = np.sum((back - point[which]) * normal[which], axis=-1) / PIXEL - 10.0 * np.isin(which, shifted)
+    image = 100.0 + 50.0 * np.tanh(away / 1.3) + rng.normal(0.0, NOISE, SHAPE)
+    return np.rint(image).astype(np.uint8)
+
+
+def operation(variant: Any = "auto", **more: Any) -> BoardPoseEstimator:
+    ruler = RulerEdges(threshold=20.0, length=48, width=5, smoothing_px=2.0, noise=NOISE, variant=variant)
+    return BoardPoseEstimator(ruler=ruler, lines=LINES, each=EACH, solver=SolvePose(placement=PLACE, **more))
+
+
+def laid(sigma: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    normal, point, along = artwork()
+    return place_rulers(normal, point, along, MATRIX, sigma)
+
+
+def error(result: Any, pose: np.ndarray = POSE) -> np.ndarray:
+    matrix, shift = robust.moved(pose)
+    return np.array([*(result.placement - (matrix @ PLACE + shift)), result.pose[2] - pose[2]])
+
+
+def test_rulers_lie_where_they_say() -> None:
+    rulers, lines = laid()
+    normal, point, along = artwork()
+    for s in (-20.0, 0.0, 20.0):
+        seen = on_board(rulers[..., :2].astype(float) + s * rulers[..., 2:4])
+        per = 1.0 / (1.0 + s * rulers[..., 8])
+        u, v = (rulers[..., 4] + s * rulers[..., 6]) * per, (rulers[..., 5] + s * rulers[..., 7]) * per
+        way = np.stack([normal[:, 1], -normal[:, 0]], axis=-1)
+        said = point[:, None] + u[..., None] * way[:, None] + v[..., None] * normal[:, None]
+        # The centres are rounded to a float: 3e-5 px.
+        np.testing.assert_allclose(said, seen, atol=1e-9)
+        assert (np.sign(v) == np.sign(s)).all() or s == 0.0
+    np.testing.assert_allclose(lines[:, 2:4], point, atol=1e-9)
+    np.testing.assert_allclose(rulers[..., 4], along, atol=1e-9)
+
+
+@VARIANTS
+def test_as_its_parts(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    image, (rulers, lines) = picture(rng), laid()
+    fix = operation(variant)
+    result = fix(image, rulers, lines, device=device)
+    assert result.status == Status.OK
+    plain = np.ascontiguousarray(rulers[..., :4].reshape(-1, 4))
+    edges = fix.ruler(image, plain, device=device)
+    np.testing.assert_allclose(result.edges.ravel(), edges.position, atol=1e-4)
+    np.testing.assert_array_equal(result.edge_status.ravel(), edges.status)
+    # Without outliers lines lose nothing: the pose is that from all edges, but for a little of the weights.
+    seen = on_board(plain[:, :2] + edges.position[:, None] * plain[:, 2:].astype(float))
+    normal, point, _ = artwork()
+    sigma = edges.sigma.astype(float) * PIXEL
+    rows = line_rows(np.repeat(normal, EACH, axis=0), np.repeat(point, EACH, axis=0), seen, sigma)
+    whole = SolvePose(placement=PLACE, trials=256)(rows, device=device)
+    deviation = np.sqrt(np.diag(whole.covariance))
+    assert (np.abs(result.placement - whole.placement) < 0.3 * deviation[:2]).all()
+    assert abs(result.pose[2] - whole.pose[2]) < 0.3 * deviation[2]
+    np.testing.assert_allclose(np.sqrt(np.diag(result.covariance)), deviation, rtol=0.1)
+
+
+@VARIANTS
+def test_covariance_is_what_is_measured(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    fix, (rulers, lines) = operation(variant), laid()
+    found, covariance = [], []
+    for number in range(60):
+        pose = np.array([*rng.uniform(-5e-5, 5e-5, 2), rng.uniform(-0.01, 0.01)])
+        result = fix(picture(rng, pose, (number % LINES,)), rulers, lines, device=device)
+        assert result.status == Status.OK
+        # The line that lies aside has no say.
+        assert not result.weights[number % LINES].any()
+        found.append(error(result, pose))
+        covariance.append(result.covariance)
+    deviation = np.sqrt(np.mean(covariance, axis=0)[[0, 1, 2], [0, 1, 2]])
+    # Sixty draws say a standard deviation to 9 %.
+    ratio = np.std(found, axis=0) / deviation
+    assert (ratio < 1.3).all()
+    assert (ratio > 0.7).all()
+    squares = np.einsum("bi,bij,bj->b", np.array(found), np.linalg.inv(covariance), np.array(found))
+    assert squares.max() < 49.0
+
+
+@VARIANTS
+def test_rulers_that_find_nothing(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    image, (rulers, lines) = picture(rng), laid()
+    image[:120, 0:120] = 90
+    rulers[1, 2:] = np.nan
+    rulers[2, 1:] = np.nan
+    rulers[3, 0, :2] = [-50.0, 20.0]
+    result = operation(variant)(image, rulers, lines, device=device)
+    assert result.status == Status.OK
+    np.testing.assert_array_equal(result.edge_status[0], Status.LOW_SIGNAL)
+    np.testing.assert_array_equal(result.edge_status[1, 2:], Status.NOT_FINITE)
+    assert result.edge_status[3, 0] == Status.OUT_OF_RANGE
+    assert np.isnan(result.edges[0]).all()
+    assert np.isnan(result.residuals[0]).all()
+    # One edge is one row.
+    np.testing.assert_array_equal(np.isfinite(result.residuals[1:4]), [[True, True], [True, False], [True, True]])
+    assert not result.edge_weights[0].any()
+    assert (np.abs(error(result)) < 5.0 * np.sqrt(np.diag(result.covariance))).all()
+
+
+@VARIANTS
+def test_refuses(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    rulers, lines = laid()
+    fix = operation(variant)
+    dark = fix(np.full(SHAPE, 90, np.uint8), rulers, lines, device=device)
+    assert dark.status == Status.NO_DATA
+    assert np.isnan(dark.pose).all()
+    assert np.isnan(dark.covariance).all()
+    # All lines in one direction.
+    one = place_rulers(np.tile([[0.0, 1.0]], (LINES, 1)), artwork()[1], artwork()[2], MATRIX)
+    level = rng.normal(90.0, 1.0, SHAPE) + 60.0 * (np.arange(SHAPE[0])[:, None] % PATCH > PATCH // 2)
+    parallel = fix(level.astype(np.uint8), *one, device=device)
+    assert parallel.status == Status.AMBIGUOUS
+    assert parallel.rank < 3
+    assert np.isnan(parallel.placement).all()
+
+
+def test_place_of_lines_on_the_board(device: Device, rng: np.random.Generator) -> None:
+    """A line that was etched only so well is not better than that."""
+    image, (rulers, lines) = picture(rng), laid(1e-6)
+    result = operation()(image, rulers, lines, device=device)
+    # Two rows of a line, 24 in all: about sigma^2 / 12 in each direction, taken for independent.
+    assert np.sqrt(result.covariance[0, 0]) > 1e-6 / np.sqrt(12)
+
+
+def test_writes_within_its_outputs(device: Device, rng: np.random.Generator) -> None:
+    image, (rulers, lines) = picture(rng), laid()
+    result = operation()(image, rulers, lines, device=device)
+    guarded = Guarded(result)
+    operation()(image, rulers, lines, device=device, out=guarded.out)
+    guarded.assert_intact()
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"lines": 1}, "lines is 1"),
+        ({"each": 0}, "each is 0"),
+        ({"lines": 500, "each": 100}, "in all"),
+        ({"ruler": RulerEdges(threshold=20.0, choice="all")}, "choice='all'"),
+        ({"solver": SolvePose(near=True)}, "no pose to start from"),
+        ({"lines": 2, "solver": SolvePose(freedom="affine")}, "too few"),
+    ],
+)
+def test_refuses_parameters(more: dict[str, Any], message: str) -> None:
+    given = {"ruler": RulerEdges(threshold=20.0), "lines": 10, "each": 10} | more
+    with pytest.raises(ValueError, match=message):
+        BoardPoseEstimator(**given)

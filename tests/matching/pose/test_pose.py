@@ -1,0 +1,364 @@
+"""Poses on devices: at the minimum of their loss, with a covariance that holds, or refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+
+from canary import Guarded
+from gpuvision.host import Device
+from gpuvision.matching.features.line_fit import FitLines
+from gpuvision.matching.pose.pose import BoardPose, SolvePose, fitted_line_rows, line_rows, point_rows
+from gpuvision.status import Status
+from reference import robust
+
+VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
+SIGMA = 2e-6
+MIDDLE = np.array([0.05, 0.08])
+PLACE = (0.06, 0.07)
+
+
+def scene(
+    rng: np.random.Generator,
+    boards: int,
+    count: int,
+    *,
+    bad: float = 0.0,
+    turn: float = 0.03,
+    deformation: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return true parameters (boards, 6), and rows of edges in all directions, the first ones far off."""
+    angle = rng.uniform(0.0, np.pi, (boards, count))
+    normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    along = np.stack([normal[..., 1], -normal[..., 0]], axis=-1)
+    point = MIDDLE + rng.uniform(-0.015, 0.015, (boards, count, 2))
+    truth = np.column_stack(
+        [rng.uniform(-1e-3, 1e-3, (boards, 2)), rng.uniform(-turn, turn, boards), np.tile(deformation, (boards, 1))]
+    )
+    error = rng.normal(0.0, SIGMA, (boards, count))
+    far = int(bad * count)
+    error[:, :far] += rng.uniform(2e-5, 4e-4, (boards, far)) * rng.choice([-1.0, 1.0], (boards, far))
+    # Seen anywhere along the edge.
+    moved = point + error[..., None] * normal + rng.uniform(-3e-4, 3e-4, (boards, count, 1)) * along
+    rows = np.empty((boards, count, 7))
+    for number, parameters in enumerate(truth):
+        matrix, shift = robust.moved(parameters)
+        seen = moved[number] @ matrix.T + shift
+        rows[number] = line_rows(normal[number], point[number], seen, SIGMA)
+    return truth, rows
+
+
+def placed(truth: np.ndarray) -> np.ndarray:
+    """Return where the placement point is, and theta."""
+    rows = []
+    for parameters in truth:
+        matrix, shift = robust.moved(parameters)
+        rows.append([*(matrix @ PLACE + shift), parameters[2]])
+    return np.array(rows)
+
+
+def errors(result: BoardPose, truth: np.ndarray) -> np.ndarray:
+    return np.column_stack([result.placement, result.pose[:, 2]]) - placed(truth)
+
+
+@VARIANTS
+@pytest.mark.parametrize(("loss", "freedom"), [("tukey", "rigid"), ("huber", "scale"), ("least_squares", "affine")])
+def test_lies_at_the_minimum_of_its_loss(
+    device: Device, loss: Any, freedom: Any, variant: Any, rng: np.random.Generator
+) -> None:
+    deformation = {"rigid": (0.0, 0.0, 0.0), "scale": (1e-3, 1e-3, 0.0), "affine": (1e-3, -2e-3, 5e-4)}[freedom]
+    bad = 0.3 if loss == "tukey" else 0.0
+    truth, rows = scene(rng, 3, 33, bad=bad, deformation=deformation)
+    operation = SolvePose(loss=loss, freedom=freedom, variant=variant, steps=40, trials=64)
+    result = operation(rows, device=device)
+    assert not result.status.any()
+    freedoms = {"rigid": 3, "scale": 4, "affine": 6}[freedom]
+    for number, each in enumerate(rows):
+        start = truth[number, :freedoms]
+        found = robust.solve_pose(each, freedoms, 1.0, loss, operation.bend, start)
+        ours = np.concatenate([result.pose[number], result.deformation[number]])[:freedoms]
+        # A hundredth of their standard deviations (of the shifts, 0.1 m from the origin).
+        np.testing.assert_allclose(ours[:2], found[:2], atol=5e-8)
+        np.testing.assert_allclose(ours[2:], found[2:], atol=5e-7)
+        np.testing.assert_allclose(result.residuals[number], robust.residuals(ours, each), atol=1e-11)
+        assert (result.weights[number, : int(bad * 33)] == 0.0).all()
+
+
+def carried(rows: np.ndarray, bad: int, freedom: str) -> tuple[float, float]:
+    """The least share of what all rows say that those behind the bad ones say, and the largest leverage of these."""
+    nx, ny, px, py = rows[:, :4].T
+    px, py = 100.0 * (px - px.mean()), 100.0 * (py - py.mean())
+    moves = [nx * px, nx * py, ny * px, ny * py] if freedom == "affine" else [ny * px - nx * py]
+    every = np.column_stack([nx, ny, *moves])
+    good = every[bad:]
+    share = eigh(good.T @ good, every.T @ every, eigvals_only=True)[0]
+    return share, np.einsum("ij,ji->i", good, np.linalg.pinv(good)).max()
+
+
+@VARIANTS
+@pytest.mark.parametrize(
+    ("freedom", "scale", "count", "bad", "turn"),
+    [("rigid", 1.0, 32, 0.4, 0.08), ("rigid", None, 48, 0.3, 0.03), ("affine", 1.0, 64, 0.2, 0.03)],
+)
+def test_covariance_is_what_is_measured(
+    device: Device,
+    variant: Any,
+    freedom: Any,
+    scale: Any,
+    count: int,
+    bad: float,
+    turn: float,
+    rng: np.random.Generator,
+) -> None:
+    deformation = (1e-3, -2e-3, 5e-4) if freedom == "affine" else (0.0, 0.0, 0.0)
+    truth, rows = scene(rng, 500, count, bad=bad, turn=turn, deformation=deformation)
+    operation = SolvePose(freedom=freedom, scale=scale, placement=PLACE, variant=variant, trials=256)
+    result = operation(rows, device=device)
+    good = result.status == Status.OK
+    # What is refused is what the good rows do not carry, to what their weights make of it.
+    agreement, leverage = np.transpose([carried(each, int(bad * count), freedom) for each in rows])
+    allowed = np.where(agreement > 0.75, 1.0, 0.5) * operation.largest_leverage
+    spare = np.minimum(agreement - operation.least_agreement, allowed - leverage)
+    assert good[spare > 0.02].all()
+    assert not good[spare < -0.02].any()
+    assert np.mean(np.abs(spare) > 0.02) > 0.9
+    found = errors(result, truth)[good]
+    covariance = result.covariance[good, :3, :3]
+    # 500 draws say a standard deviation to 3 %.
+    ratio = np.std(found, axis=0) / np.sqrt(np.mean(covariance[:, [0, 1, 2], [0, 1, 2]], axis=0))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.15)
+    # No gross errors: 7 sigma have a chance of 1e-9 in three freedoms.
+    squares = np.einsum("bi,bij,bj->b", found, np.linalg.inv(covariance), found)
+    assert squares.max() < 49.0
+    np.testing.assert_allclose(np.mean(result.spread[good]), 1.0, atol=0.1)
+
+
+def test_single_follows_double(device: Device, rng: np.random.Generator) -> None:
+    _, rows = scene(rng, 20, 32, bad=0.3)
+    rows = rows.astype(np.float32)
+    operation = SolvePose(placement=PLACE, trials=256)
+    single, double = operation(rows, device=device), operation(rows.astype(np.float64), device=device)
+    # A twentieth of the standard deviations.
+    np.testing.assert_allclose(single.placement, double.placement, atol=4e-8)
+    np.testing.assert_allclose(single.pose[:, 2], double.pose[:, 2], atol=2e-6)
+    np.testing.assert_allclose(single.covariance[:, 0, 0], double.covariance[:, 0, 0], rtol=0.02)
+
+
+@VARIANTS
+def test_points_of_a_board_turned_far(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    point = MIDDLE + rng.uniform(-0.01, 0.01, (6, 2))
+    matrix, shift = robust.moved(np.array([0.02, -0.03, 1.2]))
+    rows = point_rows(point, point @ matrix.T + shift, SIGMA)
+    assert rows.shape == (12, 7)
+    result = SolvePose(variant=variant, steps=20)(rows, device=device)
+    np.testing.assert_allclose(result.pose, [0.02, -0.03, 1.2], atol=1e-10)
+    # The other way round, started nearby.
+    matrix, shift = robust.moved(np.array([0.02, -0.03, -3.0]))
+    rows = point_rows(point, point @ matrix.T + shift, SIGMA)
+    result = SolvePose(variant=variant, near=True)(rows, np.array([0.0, 0.0, 3.0]), device=device)
+    np.testing.assert_allclose(result.pose, [0.02, -0.03, -3.0], atol=1e-10)
+
+
+@VARIANTS
+def test_covariance_of_points_in_closed_form(device: Device, variant: Any) -> None:
+    """Points on a circle about the placement point: x and y have sigma^2/n, theta sigma^2/(n r^2)."""
+    angle = np.arange(8) * np.pi / 4
+    point = np.array(PLACE) + 0.01 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    rows = point_rows(point, point + np.array([1e-4, 0.0]), SIGMA)
+    operation = SolvePose(loss="least_squares", placement=PLACE, variant=variant)
+    result = operation(rows, device=device)
+    expected = np.diag([SIGMA**2 / 8, SIGMA**2 / 8, SIGMA**2 / 8 / 1e-4])
+    np.testing.assert_allclose(result.covariance, expected, rtol=1e-9, atol=1e-22)
+    np.testing.assert_allclose(result.condition, 1.0, rtol=1e-9)
+    # A lever arm adds theta's part across it.
+    away = SolvePose(loss="least_squares", placement=(PLACE[0] + 0.05, PLACE[1]), variant=variant)(rows, device=device)
+    np.testing.assert_allclose(away.covariance[1, 1], SIGMA**2 / 8 * (1 + 25), rtol=1e-9)
+    np.testing.assert_allclose(away.covariance[0, 0], SIGMA**2 / 8, rtol=1e-9)
+    assert away.rank == 3
+
+
+@VARIANTS
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_refuses_what_the_features_cannot_carry(
+    device: Device, variant: Any, dtype: Any, rng: np.random.Generator
+) -> None:
+    _, rows = scene(rng, 6, 32)
+    from_middle = rows[1, :, 2:4] - MIDDLE
+    rows[0, :, :2] = [np.cos(0.7), np.sin(0.7)]  # parallel edges
+    rows[1, :, :2] = from_middle / np.linalg.norm(from_middle, axis=-1)[:, None]  # all edges lie about one point
+    rows[:2, :, 4:6] = rng.normal(0.0, SIGMA, (2, 32, 1)) * rows[:2, :, :2]
+    rows[2, 2:, 4] = np.nan  # two rulers
+    rows[3, :, 6] = 0.0  # none
+    rows[4, :, 4:6] = rng.uniform(-1e-3, 1e-3, (32, 2))  # clutter
+    result = SolvePose(variant=variant)(rows.astype(dtype), device=device)
+    expected = [Status.AMBIGUOUS, Status.AMBIGUOUS, Status.NO_DATA, Status.NO_DATA, Status.AMBIGUOUS, Status.OK]
+    np.testing.assert_array_equal(result.status, expected)
+    np.testing.assert_array_equal(result.rank[[0, 1, 5]], [2, 2, 3])
+    assert np.isnan(result.pose[:5]).all()
+    assert np.isnan(result.placement[:5]).all()
+    assert np.isnan(result.covariance[:5]).all()
+    assert np.isfinite(result.pose[5]).all()
+
+
+def test_a_start_that_is_no_number(device: Device, rng: np.random.Generator) -> None:
+    _, rows = scene(rng, 2, 32)
+    near = np.zeros((2, 3))
+    near[1, 2] = np.nan
+    result = SolvePose(near=True)(rows, near, device=device)
+    np.testing.assert_array_equal(result.status, [Status.OK, Status.NOT_FINITE])
+    assert np.isnan(result.pose[1]).all()
+
+
+def test_missing_rows_are_as_if_they_were_not_there(device: Device, rng: np.random.Generator) -> None:
+    _, rows = scene(rng, 2, 40)
+    without = SolvePose(loss="least_squares")(np.ascontiguousarray(rows[:, :30]), device=device)
+    rows[:, 30:, 5] = np.inf
+    result = SolvePose(loss="least_squares")(rows, device=device)
+    np.testing.assert_allclose(result.pose, without.pose, atol=1e-12)
+    np.testing.assert_allclose(result.covariance, without.covariance, rtol=1e-9)
+    assert np.isnan(result.residuals[:, 30:]).all()
+    assert not result.weights[:, 30:].any()
+
+
+def test_fitted_lines_carry_their_angle(device: Device, rng: np.random.Generator) -> None:
+    """Poses from lines that were fitted to edges are the poses from those edges."""
+    lines, each = 12, 20
+    angle = np.arange(lines) * np.pi / lines
+    normal = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    point = MIDDLE + rng.uniform(-0.01, 0.01, (lines, 2))
+    on = point[:, None] + rng.uniform(-0.004, 0.004, (lines, each, 1)) * along[:, None]
+    matrix, shift = robust.moved(np.array([2e-4, -1e-4, 0.01]))
+    seen = (on + rng.normal(0.0, SIGMA, (lines, each, 1)) * normal[:, None]) @ matrix.T + shift
+    fits = FitLines(loss="least_squares", scale=SIGMA)(seen, device=device)
+    way = fits.normal * np.sign(np.sum(fits.normal * (normal @ matrix.T), axis=-1))[:, None]
+    turned = np.arcsin(normal[:, 0] * way[:, 1] - normal[:, 1] * way[:, 0])
+    rows = fitted_line_rows(normal, point, fits.centre, fits.covariance, turned)
+    operation = SolvePose(loss="least_squares", placement=PLACE)
+    by_lines = operation(rows, device=device)
+    by_edges = operation(line_rows(normal[:, None], on, seen, SIGMA), device=device)
+    np.testing.assert_allclose(by_lines.placement, by_edges.placement, atol=2e-8)
+    np.testing.assert_allclose(by_lines.covariance, by_edges.covariance, rtol=0.02, atol=1e-14)
+
+
+ETCH = 20e-6
+
+
+def etched(rng: np.random.Generator, boards: int, count: int, bad: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A scene whose edges all lie further out by what each board was etched; a fourth of them are no single edges."""
+    truth, rows = scene(rng, boards, count, bad=bad)
+    etch = rng.normal(0.0, ETCH, boards)
+    grows = np.where(np.arange(count) % 4, 1.0, 0.0) * np.ones((boards, 1))
+    for number, parameters in enumerate(truth):
+        matrix, _ = robust.moved(parameters)
+        out = rows[number, :, :2] @ matrix.T
+        rows[number, :, 4:6] += etch[number] * grows[number][:, None] * out
+    return truth, etch, np.concatenate([rows, grows[..., None]], axis=-1)
+
+
+@VARIANTS
+def test_an_etching_is_one_more_unknown(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    truth, etch, rows = etched(rng, 500, 40, 0.3)
+    # Normals all over the upper half of the circle: without it the etching is a shift.
+    plain = SolvePose(placement=PLACE, trials=256, variant=variant)(np.ascontiguousarray(rows[..., :7]), device=device)
+    result = SolvePose(placement=PLACE, trials=256, etch=ETCH, variant=variant)(rows, device=device)
+    good = result.status == Status.OK
+    assert np.mean(good) > 0.97
+    found, covariance = errors(result, truth)[good], result.covariance[good]
+    ratio = np.std(found, axis=0) / np.sqrt(np.mean(covariance[:, [0, 1, 2], [0, 1, 2]], axis=0))
+    # 500 draws say a standard deviation to 3 %.
+    np.testing.assert_allclose(ratio, 1.0, atol=0.15)
+    assert np.std(result.etch[good] - etch[good]) < 0.25 * ETCH
+    squares = np.einsum("bi,bij,bj->b", found, np.linalg.inv(covariance), found)
+    assert squares.max() < 49.0
+    seen = plain.status == Status.OK
+    wrong = np.abs(errors(plain, truth)[seen, 1]) > 5.0 * np.sqrt(plain.covariance[seen, 1, 1])
+    assert np.mean(np.append(wrong, np.ones(np.sum(~seen), bool))) > 0.5
+
+
+def test_an_etching_takes_as_much_as_least_squares_say(device: Device, rng: np.random.Generator) -> None:
+    _, _, rows = etched(rng, 1, 24, 0.0)
+    found = SolvePose(placement=(0.0, 0.0), loss="least_squares", etch=ETCH)(rows, device=device)
+    normal, point = rows[0, :, :2], rows[0, :, 2:4]
+    lever = point[:, 0] * normal[:, 1] - point[:, 1] * normal[:, 0]
+    equations = np.column_stack([normal, lever, rows[0, :, 7]])
+    matrix = equations.T @ equations / SIGMA**2 + np.diag([0.0, 0.0, 0.0, 1.0 / ETCH**2])
+    # To the pose's own size: lengths turn by 0.03, and shifts are a thousandth.
+    np.testing.assert_allclose(found.covariance[0], np.linalg.inv(matrix)[:3, :3], rtol=0.1)
+
+
+@VARIANTS
+def test_refuses_what_nothing_checks(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    """x hangs on few edges among many: on one, on two of which one is wrong, on three."""
+    _, rows = scene(rng, 5, 32)
+    rows[:, :, :2] = [0.0, 1.0]
+    upright = {0: 1, 1: 2, 2: 4, 3: 4, 4: 4}
+    for board, count in upright.items():
+        rows[board, :count, :2] = [1.0, 0.0]
+    rows[..., 4:6] = rng.normal(0.0, SIGMA, (5, 32, 1)) * rows[..., :2]
+    rows[1, 0, 4] += 1e-4
+    rows[2, :2, 4] += [1e-4, 2e-4]  # two that agree, of four
+    rows[3, 0, 4] += 1e-4  # three that agree, of four
+    result = SolvePose(variant=variant)(rows, device=device)
+    np.testing.assert_array_equal(result.status, [Status.AMBIGUOUS] * 3 + [Status.OK] * 2)
+    # About these shares: a turn takes part of what these edges say.
+    np.testing.assert_allclose(result.agreement, [1.0, 0.5, 0.5, 0.75, 1.0], atol=0.1)
+    np.testing.assert_allclose(result.leverage[[0, 1]], 1.0, atol=0.01)
+    assert (result.leverage[2:] < 0.7).all()
+    lenient = SolvePose(largest_leverage=1.0, variant=variant)(rows, device=device)
+    assert not lenient.status.any()
+
+
+def test_refuses_a_pose_out_of_where_was_looked(device: Device, rng: np.random.Generator) -> None:
+    truth, rows = scene(rng, 2, 32)
+    moved = np.hypot(*(placed(truth)[:, :2] - PLACE).T)
+    for shift, turn in ((1.1, 1.1), (0.9, 1.1), (1.1, 0.9)):
+        for board in range(2):
+            limits = (shift * moved[board], turn * abs(truth[board, 2]))
+            result = SolvePose(placement=PLACE, within=limits)(rows[board], device=device)
+            assert result.status == (Status.OK if shift > 1 < turn else Status.OUT_OF_RANGE)
+            assert np.isnan(result.pose).all() == (result.status != Status.OK)
+
+
+@VARIANTS
+def test_writes_within_its_outputs(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    _, rows = scene(rng, 3, 33)
+    operation = SolvePose(variant=variant)
+    result = operation(rows, device=device)
+    guarded = Guarded(result)
+    operation(rows, device=device, out=guarded.out)
+    guarded.assert_intact()
+    for ours, again in zip(result, guarded.out, strict=True):
+        np.testing.assert_array_equal(ours, again)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"freedom": "shear"}, "freedom is 'shear'"),
+        ({"loss": "l1"}, "loss is 'l1'"),
+        ({"loss": "ransac", "scale": None}, "give the scale"),
+        ({"scale": -1.0}, "scale is -1.0"),
+        ({"placement": (1.0, 2.0, 3.0)}, "placement"),
+        ({"trials": 10}, "multiple of 16"),
+        ({"least_agreement": 1.5}, "least_agreement"),
+        ({"largest_leverage": 0.0}, "largest_leverage"),
+        ({"within": (1e-3, -0.1)}, "within"),
+        ({"etch": 0.0}, "etch"),
+        ({"largest_condition": 0.0}, "largest_condition"),
+        ({"steps": 0}, "steps"),
+    ],
+)
+def test_refuses_parameters(parameters: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SolvePose(**parameters)
+
+
+def test_refuses_inputs(device: Device) -> None:
+    with pytest.raises(TypeError, match="float32 or float64"):
+        SolvePose()(np.zeros((8, 7), np.int32), device=device)
+    with pytest.raises(ValueError, match="rows"):
+        SolvePose()(np.zeros((2, 7)), device=device)

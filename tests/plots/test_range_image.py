@@ -1,0 +1,180 @@
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+
+from gpuvision import Status
+from gpuvision.ranging import picture
+from gpuvision.ranging.regrid import Grid, HeightMap
+
+GRID = Grid(left=0.0, top=0.4, cell_x=0.002, cell_y=0.002, columns=250, rows=200)
+
+
+@pytest.fixture
+def heights(rng):
+    z = 0.05 * np.sin(GRID.x * 20) * np.cos(GRID.y[:, None] * 15)
+    status = np.zeros(GRID.shape, np.uint8)
+    z[50:80, 20:90], status[50:80, 20:90] = np.nan, Status.NO_DATA
+    status[100:110] = Status.NOT_INVERTIBLE
+    return HeightMap(z, np.ones(GRID.shape), status)
+
+
+@pytest.mark.parametrize(
+    ("length", "bar"), [(1.0, 1.0), (0.99, 0.5), (0.51, 0.5), (0.2, 0.2), (0.0199, 0.01), (3.7e-6, 2e-6), (42.0, 20.0)]
+)
+def test_a_bar_has_a_round_length(length, bar):
+    assert picture.round_length(length) == pytest.approx(bar, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("length", "name"), [(2e-6, "µm"), (1e-3, "mm"), (0.5, "mm"), (1.0, "m"), (20.0, "m"), (-0.2, "mm"), (0.0, "µm")]
+)
+def test_lengths_have_units_of_few_digits(length, name):
+    assert picture.length_unit(length)[1] == name
+
+
+def test_light_falls_from_the_upper_left():
+    x, y = np.meshgrid(np.arange(20.0), np.arange(15.0))
+    shades = {
+        name: float(picture.relief(z, 1.0, 1.0)[7, 10])
+        for name, z in {"flat": 0 * x, "faces left": x, "faces right": -x, "faces up": y, "faces down": -y}.items()
+    }
+    assert shades["flat"] == pytest.approx(0.95)
+    assert shades["faces left"] > 0.95 > shades["faces right"]
+    assert shades["faces up"] > 0.95 > shades["faces down"]
+
+
+def test_relief_is_a_slope_not_a_number_of_cells():
+    x = np.tile(np.arange(20.0), (15, 1))
+    np.testing.assert_allclose(picture.relief(x, 1.0, 1.0), picture.relief(0.01 * x, 0.01, 0.01), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("slope", "times"), [(1.0, 1), (0.1, 2), (0.03, 10), (1e-3, 20), (0.0, 20)])
+def test_gentle_slopes_are_exaggerated(slope, times):
+    z = slope * 0.01 * np.tile(np.arange(20.0), (15, 1))
+    z[3, 4:9] = np.nan
+    z[10, 10] += 5.0  # an edge is no slope to go by
+    assert picture.steepness(z, 0.01, 0.01) == times
+
+
+def test_exaggeration_is_of_the_heights():
+    z = np.cos(np.arange(20.0) / 3) * np.ones((15, 1))
+    np.testing.assert_allclose(
+        picture.relief(z, 1.0, 1.0, exaggeration=5.0), picture.relief(5 * z, 1.0, 1.0), rtol=1e-12
+    )
+
+
+def test_relief_stops_at_holes():
+    z = np.zeros((20, 20))
+    z[5:9, 5:9] = np.nan
+    shade = picture.relief(z, 1.0, 1.0)
+    np.testing.assert_array_equal(np.isnan(shade), np.isnan(z))
+    np.testing.assert_allclose(shade[np.isfinite(z)], 0.95, rtol=1e-12)
+
+
+def test_what_is_missing_has_a_colour_of_its_own():
+    flags = [
+        Status.NO_DATA,
+        Status.NOT_INVERTIBLE,
+        Status.OUT_OF_RANGE,
+        Status.NOT_FINITE,
+        Status.HORIZON,
+        Status.LOW_SIGNAL,
+    ]
+    z = np.full((1, 7), np.nan)
+    z[0, 6] = 0.5
+    status = np.array([[*flags, 0]], np.uint8)
+    for style in ("colour", "shaded"):
+        made, legend = picture.paint(z, status, np.where(np.isfinite(z), 0.95, np.nan), (0.0, 1.0), style)
+        colours = {tuple(each) for each in made[0]}
+        assert len(colours) == 7
+        assert {to_rgb(each.colour) for each in legend} == {tuple(each) for each in made[0, :6]}
+        assert all(each.part == pytest.approx(1 / 7) for each in legend)
+
+
+def test_a_doubtful_height_is_tinted_and_a_saturated_one_is_not():
+    z = np.full((1, 3), 0.5)
+    status = np.array([[0, Status.NOT_INVERTIBLE, Status.SATURATED]], np.uint8)
+    made, legend = picture.paint(z, status, np.full_like(z, 0.95), (0.0, 1.0), "colour")
+    assert [each.meaning[:6] for each in legend] == ["folded"]
+    assert np.array_equal(made[0, 0], made[0, 2])
+    assert np.linalg.norm(made[0, 1] - to_rgb(legend[0].colour)) < np.linalg.norm(made[0, 0] - to_rgb(legend[0].colour))
+    assert not np.array_equal(made[0, 1], to_rgb(legend[0].colour))
+
+
+@pytest.mark.parametrize("style", ["colour", "shaded"])
+def test_the_length_bar_is_as_long_as_it_says(tmp_path, heights, style):
+    path = tmp_path / "map.png"
+    picture.draw_height_map(path, heights, GRID, style=style)
+    image = cv2.imread(str(path))
+    # The map, 0.5 m wide, is the longer side: 1100 pixels. A quarter of it is 0.125 m: the bar is 100 mm, 220 pixels.
+    legend = 2
+    middle = (0.12 + 0.21 * legend + 0.08 + 0.045) * 150
+    strip = image[image.shape[0] - round(middle) - 5 : image.shape[0] - round(middle) + 5]
+    inked = np.flatnonzero((strip < 128).all(axis=2).any(axis=0))
+    bar = inked[: np.flatnonzero(np.diff(inked) > 60)[0] + 1] if np.any(np.diff(inked) > 60) else inked
+    runs = np.split(bar, np.flatnonzero(np.diff(bar) > 1) + 1)
+    # Quarters 1 and 3 are filled: 55 pixels each, and a line's width.
+    filled = [len(run) for run in runs if len(run) > 20]
+    assert len(filled) == 2
+    assert all(abs(length - 55) <= 3 for length in filled)
+
+
+def test_a_picture_shows_the_cells(tmp_path, heights):
+    path = tmp_path / "map.png"
+    picture.draw_height_map(path, heights, GRID)
+    image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+    hole = np.round(255 * np.array(to_rgb("#cbd5e1"))).astype(np.uint8)
+    part = np.all(image == hole, axis=2)
+    # 30 x 70 cells of 4.4 x 4.4 pixels, and a swatch of the legend.
+    assert part.sum() == pytest.approx(30 * 70 * 4.4**2, rel=0.03)
+
+
+def test_a_scan_is_drawn_as_it_came(tmp_path):
+    z = np.linspace(0, 1, 30)[:, None] * np.ones(80)
+    status = np.zeros(z.shape, np.uint8)
+    for samples in ("down", "across"):
+        picture.draw_scan(tmp_path / f"{samples}.png", z, status, samples=samples, aspect=0.5)
+    down, across = (cv2.imread(str(tmp_path / f"{each}.png")).astype(float) for each in ("down", "across"))
+    rows, columns = (slice(200, 1000), slice(250, 600))
+    # Heights grow with the profile: along the picture where samples run down it, down it where they run across.
+    assert np.ptp(down[rows, columns], axis=0).max() == 0
+    assert np.ptp(down[rows, columns], axis=1).max() > 50
+    assert np.ptp(across[rows, columns], axis=1).max() == 0
+
+
+@pytest.mark.parametrize("fill", [0.0, np.nan, 1e-9, -3.0])
+@pytest.mark.parametrize("style", ["colour", "shaded"])
+def test_flat_and_empty_maps_are_drawn(tmp_path, fill, style):
+    z = np.full(GRID.shape, fill)
+    status = np.where(np.isnan(z), Status.NO_DATA, 0).astype(np.uint8)
+    picture.draw_height_map(tmp_path / "map.png", HeightMap(z, z, status), GRID, style=style)
+    assert cv2.imread(str(tmp_path / "map.png")) is not None
+
+
+def test_a_failure_leaves_nothing(tmp_path, heights, monkeypatch):
+    def stuck(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(picture.Figure, "savefig", stuck)
+    with pytest.raises(OSError, match="No space left"):
+        picture.draw_height_map(tmp_path / "map.png", heights, GRID)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_maps_are_refused(tmp_path, heights):
+    with pytest.raises(ValueError, match="style is 'grey', expected one of colour, shaded"):
+        picture.draw_height_map(tmp_path / "a.png", heights, GRID, style="grey")
+    with pytest.raises(ValueError, match=r"the grid has \(200, 250\)"):
+        picture.draw_height_map(tmp_path / "a.png", HeightMap(*(each.T for each in heights)), GRID)
+
+
+def test_numbers_have_the_digits_of_their_step():
+    assert picture._number(0.12345, 1e-3, 1e-4) == "123.5"
+    assert picture._number(-0.5, 1.0, 0.01) == "\N{MINUS SIGN}0.50"
+    assert picture._number(-1e-9, 1.0, 0.01) == "0.00"
+    assert math.isclose(picture.round_length(1e-3), 1e-3)

@@ -1,0 +1,302 @@
+"""Sensor files: what they say becomes operations; what they cannot say is refused with key, unit and range."""
+
+from __future__ import annotations
+
+import copy
+import math
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.psd import PsdReadout
+from gpuvision.ranging.range_image import RotatingSheet, StraightTransport
+from gpuvision.schema import DescriptionError, Section
+from gpuvision.sensor.sensor import Sensor
+
+SHIPPED = sorted(Path(each.name).stem for each in resources.files("gpuvision").joinpath("presets", "sensors").iterdir())
+
+
+def table_of(name: str) -> dict[str, Any]:
+    return tomllib.loads(
+        resources.files("gpuvision").joinpath("presets", "sensors", f"{name}.toml").read_text(encoding="utf-8")
+    )
+
+
+TABLES = {name: table_of(name) for name in SHIPPED}
+
+
+def sensor_of(table: dict[str, Any]) -> Sensor:
+    return Sensor.from_section(Section(table, "sensor.toml"))
+
+
+def changed(name: str, **values: Any) -> dict[str, Any]:
+    """A shipped table with other values; dots in the keys are double underscores, None takes the key away."""
+    table = copy.deepcopy(TABLES[name])
+    for dotted, value in values.items():
+        *way, key = dotted.split("__")
+        place = table
+        for each in way:
+            place = place.setdefault(each, {})
+        if value is None:
+            del place[key]
+        else:
+            place[key] = value
+    return table
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_sensors_load_by_name_and_as_files(name: str) -> None:
+    path = resources.files("gpuvision").joinpath("presets", "sensors", f"{name}.toml")
+    with resources.as_file(path) as file:
+        assert Sensor.load(file) == Sensor.load(name)
+    assert Sensor.load(name).kind == ("psd" if name.startswith("psd") else "camera")
+
+
+def test_values_reach_the_operations() -> None:
+    camera, psd, corner = (Sensor.load(name) for name in ("camera_line", "psd_line", "corner_scene"))
+    assert isinstance(camera.readout, LineReadout)
+    assert (camera.readout.window, camera.readout.threshold, camera.readout.ambiguity) == (4, 16.0, 0.4)
+    assert camera.readout.axes.position_pitch == -1.0
+    assert camera.readout.triangulation is not None
+    assert camera.readout.triangulation.lens is not None
+    # Rows 0 to 63 are u = 48 to -15, columns 0 to 479 are v = -239.5 to 239.5.
+    assert camera.readout.triangulation.region == ((-15.0, 48.0), (-239.5, 239.5))
+    assert isinstance(psd.readout, PsdReadout)
+    assert (psd.readout.ampere, psd.readout.dark, psd.frame) == (50e-12, (2e-9, 2e-9), (96, 2))
+    assert psd.readout.noise is not None
+    assert isinstance(psd.transport, StraightTransport)
+    assert psd.transport.step == 0.25e-3
+    assert isinstance(corner.transport, RotatingSheet)
+    assert corner.transport.along == corner.readout.along == "rows"
+    assert math.degrees(corner.transport.transport(128)[-1]) == pytest.approx(13.0, abs=1e-9)
+    assert corner.output.limits[2] == (-0.1, 3.0)
+
+
+def test_ways_to_say_the_same_triangulation_agree() -> None:
+    by_setup = sensor_of(TABLES["camera_line"]).readout.triangulation
+    assert by_setup is not None
+    G, H = (each.ravel() for each in np.meshgrid(np.linspace(-0.02, 0.02, 5), np.linspace(0.0, 0.005, 4)))
+    points = np.column_stack([G, H])
+    sensor = by_setup.to_sensor(points)
+    h = np.array(by_setup.homography) / by_setup.homography[2][2]
+    b, z0 = 0.08, 0.15
+    d = math.hypot(b, z0)
+    empty = changed("camera_line", triangulation=None)
+    ways = {
+        "homography": {"homography": h.tolist()},
+        "constants": {"constants": h.ravel()[:8].tolist()},
+        "points": {"points": np.column_stack([sensor, points]).tolist()},
+    }
+    for name, way in ways.items():
+        told = sensor_of(empty | {"triangulation": way}).readout.triangulation
+        assert told is not None
+        np.testing.assert_allclose(told.to_sensor(points), sensor, rtol=0, atol=1e-6, err_msg=name)
+    # A camera's own coordinates are columns and rows: no axes between them and u, v.
+    posed = changed("camera_line", triangulation=None, axes=None, lens=None) | {
+        "triangulation": {
+            "focal_length_px": 1600.0,
+            "principal_point_px": [239.5, 48.0],
+            # In the camera's frame (x right, y down, z forward): the sheet's origin lies on the axis, H points up.
+            "sheet_origin": [0.0, 0.0, d],
+            "g_axis": [1.0, 0.0, 0.0],
+            "h_axis": [0.0, -b / d, -z0 / d],
+        }
+    }
+    told = sensor_of(posed).readout.triangulation
+    straight = sensor_of(changed("camera_line", lens=None)).readout.triangulation
+    assert told is not None
+    assert straight is not None
+    u, v = straight.to_sensor(points).T
+    np.testing.assert_allclose(told.to_sensor(points), np.column_stack([48.0 - u, v + 239.5]), rtol=0, atol=1e-9)
+
+
+WRONG = [
+    ("camera_line", {"line__treshold": 3}, r"unknown key 'line.treshold'; did you mean 'line.threshold'\?"),
+    ("camera_line", {"colour": "red"}, r"unknown key 'colour'; known: kind, name, "),
+    ("camera_line", {"psd": {}}, r"unknown key 'psd'"),
+    ("camera_line", {"transport__step": None}, r"'transport.step' is missing, expected a number \[m per profile\]"),
+    (
+        "camera_line",
+        {"transport__step": None, "transport__stp": 1e-3},
+        r"'transport.step' is missing.*is it 'transport.stp'\?",
+    ),
+    ("camera_line", {"frame": None}, r"the table \[frame\] with columns and rows \[pixel\] is missing"),
+    ("camera_line", {"output__cell": 0}, r"output.cell is 0 m, expected a number \[m\] above 0"),
+    ("camera_line", {"output__cell": -0.5}, r"output.cell is -0.5 m, expected a number \[m\] above 0"),
+    ("camera_line", {"output__cell": "1 mm"}, r"output.cell is '1 mm', expected a number \[m\] above 0"),
+    ("camera_line", {"output__cell": True}, r"output.cell is True, expected a number"),
+    ("camera_line", {"output__cell": math.nan}, r"output.cell is nan m, expected a number"),
+    (
+        "camera_line",
+        {"output__max_gap": 1e-5},
+        r"output.max_gap is 1e-05 m, expected a number \[m\] of at least 0.0001",
+    ),
+    ("camera_line", {"output__x": [1.0, -1.0]}, r"output.x is \[1.0, -1.0\], expected the lowest below the highest"),
+    ("camera_line", {"line__method": "gauss"}, r'line.method is \'gauss\', expected one of .*did you mean "gauss3"\?'),
+    ("camera_line", {"line__window": 2.5}, r"line.window is 2.5, expected a whole number of at least 1 and of at most"),
+    ("camera_line", {"line__ambiguity": 1.5}, r"line.ambiguity is 1.5 share of the peak, expected .* of at most 1"),
+    ("camera_line", {"line__fir_length": 5}, r"LineReadout.fir_length is 5"),
+    (
+        "camera_line",
+        {"triangulation__tilt": 2.0},
+        r"triangulation.tilt is 2.0 rad, expected .*\[rad\] above -1.5708 and",
+    ),
+    ("camera_line", {"triangulation__constants": [1, 2, 3]}, r"\[triangulation\] has constants and baseline at once"),
+    ("camera_line", {"triangulation": {}}, r"\[triangulation\] has no geometry, expected one of homography, constants"),
+    ("camera_line", {"triangulation": {"homography": [[1, 0], [0, 1]]}}, r"homography is .*rows of 3 numbers"),
+    (
+        "camera_line",
+        {"triangulation": {"homography": [[1, 0, 0], [1, 0, 0], [0, 0, 1]]}},
+        r"sees the sheet of light edge-on",
+    ),
+    ("camera_line", {"triangulation": {"points": []}}, r"points is \[\].*, expected a list of rows of 4 numbers"),
+    ("camera_line", {"triangulation": {"points": [[]]}}, r"points is \[\[\]\].*, expected a list of rows of 4 numbers"),
+    ("camera_line", {"lens__k1": 1e308}, r"lens.k1 is 1e\+308 sensor unit\^-2, expected a size of at most 1e\+20"),
+    ("camera_line", {"lens__k1": 1e19}, r"Lens.k1 is 1e\+19, expected a size of at most 1e\+10"),
+    ("camera_line", {"transport__step": 1e308}, r"step is 1e\+308 m per profile, expected a size of at most 1000"),
+    ("camera_line", {"transport__step": -(10**400)}, r"step is -10+ \.\.\., expected a size of at most 1000"),
+    ("camera_line", {"line__minimum_peak": 1e308}, r"minimum_peak is 1e\+308 grey levels, expected a size of at most"),
+    ("camera_line", {"line__minimum_peak": 10**400}, r"minimum_peak is 10+ \.\.\., expected a size of at most"),
+    (
+        "camera_line",
+        {"line__minimum_width": 10**400},
+        r"minimum_width is 10+ \.\.\., expected a whole number of at most",
+    ),
+    ("camera_line", {"transport__origin": [0, 0, 1e30]}, r"transport.origin is 1e\+30 m, expected a size of at most"),
+    ("camera_line", {"transport": 3}, r"transport is 3, expected a table \[transport\]"),
+    ("camera_line", {"transport__direction": [1, 0]}, r"transport.direction is \[1, 0\], expected a list of 3 numbers"),
+    ("camera_line", {"transport__direction": [1, 0, 0]}, r"sensor.toml: StraightTransport: .*one plane"),
+    ("camera_line", {"recording__channel": "infrared"}, r"recording.channel is 'infrared', expected one of"),
+    ("camera_line", {"kind": "radar"}, r"kind is 'radar', expected one of \"camera\", \"psd\""),
+    ("camera_line", {"kind": "psd"}, r"the key 'psd' is missing, expected a table"),
+    ("psd_line", {"psd__strips": 0}, r"psd.strips is 0, expected a whole number of at least 1"),
+    ("psd_line", {"psd__strip_length": None}, r"'psd.strip_length' is missing, expected a number \[m\] above 0"),
+    ("psd_line", {"psd__noise__indepedent": 1e-9}, r"'psd.noise.indepedent'; did you mean 'psd.noise.independent'"),
+    ("psd_line", {"psd__load_resistance": 50.0}, r"load_resistance needs interelectrode_resistance"),
+    ("psd_line", {"transport__kind": "rotating"}, r'transport.kind is \'rotating\', expected one of "straight"'),
+    ("corner_scene", {"transport__angle_step": 4.0}, r"transport.angle_step is 4.0 rad per profile, expected"),
+    ("corner_scene", {"triangulation": {}}, r"unknown key 'triangulation'"),
+    ("corner_scene", {"transport__sheet_normal": [0, 1, 0]}, r"the sheet's normal lies along the axis"),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"), WRONG, ids=[f"{n}-{'+'.join(v)}-{i}" for i, (n, v, _) in enumerate(WRONG)]
+)
+def test_what_a_file_cannot_say(name: str, values: dict[str, Any], message: str) -> None:
+    with pytest.raises(DescriptionError, match=message) as caught:
+        sensor_of(changed(name, **values))
+    assert str(caught.value).startswith("sensor.toml: ")
+    assert "\n" not in str(caught.value)
+
+
+def places(table: dict[str, Any], way: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """All tables of a description."""
+    inner = [places(value, (*way, key)) for key, value in table.items() if isinstance(value, dict)]
+    return [way, *(each for found in inner for each in found)]
+
+
+@given(data=st.data(), key=st.from_regex(r"\A[a-z][a-z_]{0,11}\Z"))
+def test_an_unknown_key_is_refused_wherever_it_stands(data: st.DataObject, key: str) -> None:
+    name = data.draw(st.sampled_from(SHIPPED))
+    way = data.draw(st.sampled_from(places(TABLES[name])))
+    table = copy.deepcopy(TABLES[name])
+    place = table
+    for each in way:
+        place = place[each]
+    key = f"x_{key}"
+    place[key] = 1
+    with pytest.raises(DescriptionError, match=f"unknown key '{'.'.join((*way, key))}'"):
+        sensor_of(table)
+
+
+@given(data=st.data())
+def test_a_missing_table_or_key_never_is_more_than_a_line(data: st.DataObject) -> None:
+    name = data.draw(st.sampled_from(SHIPPED))
+    way = data.draw(st.sampled_from(places(TABLES[name])))
+    table = copy.deepcopy(TABLES[name])
+    place = table
+    for each in way:
+        place = place[each]
+    del place[data.draw(st.sampled_from(sorted(place)))]
+    told = ""
+    try:
+        sensor_of(table)
+    except DescriptionError as error:
+        told = str(error)
+    assert "\n" not in told
+
+
+def test_files_that_are_no_sensor(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.toml"
+    broken.write_text("kind = camera\n")
+    with pytest.raises(DescriptionError, match=r"broken.toml: not valid TOML: .*line 1"):
+        Sensor.load(broken)
+    broken.write_bytes(b"\xff\xfe")
+    with pytest.raises(DescriptionError, match=r"broken.toml: not valid TOML"):
+        Sensor.load(broken)
+    with pytest.raises(FileNotFoundError, match=r"no sensor file .*corner.toml; did you mean 'corner_scene'\?"):
+        Sensor.load(tmp_path / "corner.toml")
+    with pytest.raises(FileNotFoundError, match="give a file or one of camera_line, corner_scene, psd_line"):
+        Sensor.load(tmp_path)
+
+
+def test_frames_of_another_sensor_are_refused() -> None:
+    camera, psd = Sensor.load("camera_line"), Sensor.load("psd_line")
+    camera.check_frame((64, 480), "here")
+    psd.check_frame((96, 2), "here")
+    with pytest.raises(
+        ValueError, match=r"here: frames have shape \(480, 64\).*expects \(rows, columns\) = \(64, 480\)"
+    ):
+        camera.check_frame((480, 64), "here")
+    with pytest.raises(ValueError, match=r"expects \(strips, 2\) = \(96, 2\)"):
+        psd.check_frame((96,), "here")
+
+
+LIGHT = """
+[light]
+aperture = 8e-3
+power = 0.5
+thickness = 40e-6
+source = [0.0, 0.3]
+width = [-0.02, 0.02]
+profile = [[-0.02, 0.5], [0.0, 1.0], [0.02, 0.5]]
+nodes = [2, 1]
+modulated = "yes"
+"""
+
+
+def test_a_setup_in_metres_says_where_the_lens_is(tmp_path):
+    path = tmp_path / "sensor.toml"
+    brought = resources.files("gpuvision").joinpath("presets", "sensors", "psd_line.toml").read_text(encoding="utf-8")
+    path.write_text(brought.split("[light]")[0] + LIGHT)
+    light = Sensor.load(path).light
+    assert light is not None
+    assert light.lens == (0.0, 0.08, 0.15)
+    assert (light.aperture, light.power, light.thickness, light.source) == (8e-3, 0.5, 40e-6, (0.0, 0.3))
+    assert (light.width, light.nodes, light.modulated, light.bins) == ((-0.02, 0.02), (2, 1), True, 64)
+    assert light.profile == ((-0.02, 0.5), (0.0, 1.0), (0.02, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[light]\npower = 1.0", "light.aperture' is missing"),
+        ("[light]\naperture = 1.0\npower = 0.0", "light.power is 0.0 W/m, expected a number .W/m. above 0"),
+        ("[light]\naperture = 1.0\npower = 1.0\nnodes = [1.5, 1]", "two whole numbers"),
+        ("[light]\naperture = 1.0\npower = 1.0\nsigma = 1", "unknown key 'light.sigma'"),
+    ],
+)
+def test_what_a_light_cannot_be(tmp_path, text, words):
+    path = tmp_path / "sensor.toml"
+    brought = resources.files("gpuvision").joinpath("presets", "sensors", "psd_line.toml").read_text(encoding="utf-8")
+    path.write_text(brought.split("[light]")[0] + text)
+    with pytest.raises(DescriptionError, match=words):
+        Sensor.load(path)

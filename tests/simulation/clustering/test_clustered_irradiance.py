@@ -1,0 +1,202 @@
+"""ClusteredIrradiance: what the plan leaves is computed, and readings keep the tolerance, with everything in the
+way."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from simulation.test_sight import sight
+
+from gpuvision.host import Device
+from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance, facing_pairs
+from gpuvision.simulation.errors.range_error import StripReading
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.sensor_view import Exposure
+from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance
+from reference import tolerance as reference
+
+
+def boxes(rng: np.random.Generator, count: int) -> Any:
+    """Boxes on a board: triangles; and lit lines over all of it along y = 0, on the tops and on the board."""
+    low = np.column_stack([np.linspace(-0.09, 0.08, count), np.full((count, 2), [-0.01, 0.0])])
+    high = low + np.column_stack([np.full(count, 0.008), np.full(count, 0.02), rng.uniform(0.002, 0.012, count)])
+    corner = np.stack([np.where(np.array(bits), high, low) for bits in np.ndindex(2, 2, 2)], axis=1)
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [1, 5, 7, 3]])
+    board = np.array([[-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [0.2, 0.2, 0.0], [-0.2, 0.2, 0.0]])
+    sides = np.concatenate([board[None], corner[:, quads].reshape(-1, 4, 3)])
+    tops = np.column_stack([low[:, 0], 0 * low[:, 0], high[:, 2], high[:, 0], 0 * low[:, 0], high[:, 2]])
+    between = np.column_stack([high[:-1, 0], 0 * low[1:, :2], low[1:, 0], 0 * low[1:, :2]])
+    lines = np.concatenate([tops, between])
+    up = np.tile([0.0, 0.0, 1.0, 1e-2], (len(lines), 1))
+    return np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]]), np.hstack([lines, up])
+
+
+def strips(triangles: Any, count: int, each: int) -> Any:
+    """Receivers on the boxes' sides that look along x, and on the board, by strips."""
+    rng = np.random.default_rng(1)
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    sides = np.flatnonzero(np.abs(normal[:, 0]) > 0.5)
+    number = np.repeat(rng.choice(sides, count), each).reshape(count, each)
+    number[:, each // 2 :] = 0
+    weights = np.sort(rng.random((count, each, 2)), axis=2)
+    corners = triangles[number]
+    place = corners[:, :, 0] + np.sum(
+        np.diff(weights, axis=2, prepend=0.0)[..., None] * (corners[:, :, 1:] - corners[:, :, :1]), axis=2
+    )
+    return np.concatenate([place, np.where(normal[number][..., 2:] < -0.5, -1.0, 1.0) * normal[number]], axis=2)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-6, 1e-5, 1e-4])
+def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
+    triangles, segments = boxes(np.random.default_rng(0), 12)
+    receivers = strips(triangles, 6, 50)
+    scene = Scene(triangles)
+    power = np.full(receivers.shape[:2], 1e-4)
+    u = np.linspace(-0.03, 0.03, 50)
+    weights = np.stack([power, power * u], axis=2)
+    direct = np.full(6, 0.01)
+    reading = StripReading(power=direct, moment=0.005 * direct, slope=np.ones(6), limits=(-0.03, 0.03))
+    light = ClusteredIrradiance(scene=scene, tolerance=tolerance, least=None, device=device)
+    ours = light(segments, receivers, weights, reading)
+    exact = OccludedIrradiance(scene=scene, segments=len(segments), precision="single")(
+        receivers, np.zeros_like(weights), segments, device=device
+    ).irradiance
+    shift = [reference.reading(direct, 0.005 * direct, weights, light) for light in (ours.irradiance, exact)]
+    # The kernel's own rounding on top.
+    assert np.all(np.abs(shift[0] - shift[1]) <= ours.plan.bound + 1e-9)
+    assert np.all(ours.plan.bound <= tolerance)
+    if tolerance == 0.0:
+        np.testing.assert_allclose(ours.irradiance, exact, rtol=2e-5, atol=1e-6 * exact.max())
+
+
+def test_what_is_not_modelled_is_dark(device: Device) -> None:
+    triangles, segments = boxes(np.random.default_rng(0), 3)
+    receivers = strips(triangles, 2, 16)
+    weights = np.full((2, 16, 2), 1e-9)
+    reading = StripReading(power=np.ones(2), moment=np.zeros(2), slope=np.ones(2), limits=(-0.03, 0.03))
+    light = ClusteredIrradiance(scene=Scene(triangles), tolerance=1e-3, least=None, device=device)
+    result = light(segments, receivers, weights, reading)
+    assert not result.plan.modelled
+    assert not result.irradiance.any()
+
+
+def groove(strips: int, each: int, segments: int) -> Any:
+    """A groove of 90 degrees: triangles, lit segments along its line y = 0, receivers on both sides, their reading.
+
+    Half of the pairs face each other: those of two sides.
+    """
+    a, b, c, d, e, f = ([x, y, abs(x)] for y in (-0.05, 0.05) for x in (-0.12, 0.0, 0.12))
+    x = np.linspace(-0.1, 0.1, segments + 1)
+    at = np.column_stack([x, 0.0 * x, np.abs(x)])
+    side = np.sign(x[1:] + x[:-1])
+    rows = np.column_stack([at[:-1], at[1:], -side, 0.0 * side, np.ones(segments), np.full(segments, 0.01)])
+    X, Y = np.meshgrid(
+        *(width * ((np.arange(n) + 0.5) / n - 0.5) for width, n in ((0.2, strips), (0.06, each))), indexing="ij"
+    )
+    receivers = np.stack([X, Y, np.abs(X), -np.sign(X), 0.0 * X, 1.0 + 0.0 * X], axis=2)
+    power = np.full((strips, each), 0.012 / (strips * each))
+    direct = np.full(strips, 0.002 / strips)
+    reading = StripReading(power=direct, moment=0.0 * direct, slope=np.ones(strips), limits=(-0.03, 0.03))
+    triangles = np.array([[a, b, e], [a, e, d], [b, c, f], [b, f, e]])
+    return Scene(triangles), rows, receivers, np.stack([power, power * Y], axis=2), reading
+
+
+def test_what_is_not_worth_a_plan_is_computed_in_full(device: Device) -> None:
+    scene, segments, receivers, weights, reading = groove(8, 40, 50)
+    exact = OccludedIrradiance(scene=scene, segments=len(segments), precision="single")(
+        receivers, np.zeros_like(weights), segments, device=device
+    ).irradiance
+    light = ClusteredIrradiance(scene=scene, tolerance=1e-4, device=device)
+    ours = light(segments, receivers, weights, reading)
+    # Rows without exitance behind the last segment add nothing at all.
+    np.testing.assert_array_equal(ours.irradiance, exact)
+    np.testing.assert_array_equal(light.exactly(segments, receivers), exact)
+    report = ours.plan.report()
+    assert not report["planned"]
+    assert report["modelled"]
+    assert report["bound"] == report["left out"] == report["clustered"] == 0
+    assert report["exact"] == report["work"] == report["pairs"] == receivers[..., 0].size * len(segments)
+    # What the plan says is what was computed.
+    rows, starts, picks = ours.plan.tables(np.float64)
+    picked = OccludedIrradiance(scene=scene, segments=len(rows), picks=len(picks), precision="single")
+    by_plan = picked(receivers, np.zeros_like(weights), rows, starts, picks, device=device).irradiance
+    # The same sums in another order.
+    np.testing.assert_allclose(by_plan, exact, rtol=2e-5, atol=1e-6 * exact.max())
+
+
+def test_what_faces_each_other_decides_whether_there_is_a_plan(device: Device) -> None:
+    scene, segments, receivers, weights, reading = groove(8, 40, 50)
+    pairs = receivers[..., 0].size * len(segments)
+    gain = facing_pairs(segments, receivers, weights) - pairs // 4
+    assert 0 < gain < pairs // 2
+    results = [
+        ClusteredIrradiance(scene=scene, tolerance=1e-4, least=least, device=device)(
+            segments, receivers, weights, reading
+        )
+        for least in (gain, gain + 1)
+    ]
+    assert [each.plan.planned for each in results] == [True, False]
+    assert results[0].plan.counts["work"] < pairs // 2
+    shift = [reference.reading(reading.power, reading.moment, weights, each.irradiance) for each in results]
+    # Both ways agree to the bound; the kernel's own rounding on top.
+    assert np.all(np.abs(shift[0] - shift[1]) <= results[0].plan.bound + 1e-9)
+    assert np.all(results[0].plan.bound <= 1e-4)
+    nothing = ClusteredIrradiance(scene=scene, tolerance=0.0, least=gain, device=device)
+    assert not nothing(segments, receivers, weights, reading).plan.planned
+    assert nothing(segments, receivers, weights, reading, tolerance=1e-4).plan.planned
+
+
+def test_few_pairs_face_each_other_on_a_board() -> None:
+    triangles, segments = boxes(np.random.default_rng(0), 12)
+    receivers = strips(triangles, 6, 50)
+    weights = np.ones((*receivers.shape[:2], 2))
+    middle = 0.5 * (segments[:, :3] + segments[:, 3:6])
+    way = receivers.reshape(-1, 1, 6)[..., :3] - middle
+    faces = (np.sum(way * segments[:, 6:9], axis=2) > 0.0) & (
+        np.sum(way * receivers.reshape(-1, 1, 6)[..., 3:], axis=2) < 0.0
+    )
+    expected = int(np.count_nonzero(faces[:100]))
+    weights[2:] = 0.0
+    # Of 100 receivers and 23 segments each is looked at.
+    assert facing_pairs(segments, receivers, weights) == expected
+    assert 0 < expected < faces[:100].size // 4
+
+
+def test_facing_pairs_are_estimated_where_there_are_many() -> None:
+    _, segments, receivers, weights, _ = groove(40, 40, 200)
+    pairs = receivers[..., 0].size * len(segments)
+    # Half of them, and each side's receivers and segments are counted to one.
+    assert abs(facing_pairs(segments, receivers, weights) - pairs / 2) <= pairs * (1 / 127 + 1 / 61)
+
+
+def test_without_light_or_receivers_nothing_is_lit(device: Device) -> None:
+    scene, segments, receivers, weights, reading = groove(2, 16, 20)
+    light = ClusteredIrradiance(scene=scene, tolerance=1e-4, device=device)
+    assert not light(segments[:0], receivers, weights, reading).irradiance.any()
+    assert facing_pairs(segments[:0], receivers, weights) == 0
+    assert facing_pairs(segments, receivers, 0.0 * weights) == 0
+
+
+def test_a_sensor_says_how_its_readings_follow_light() -> None:
+    one = sight()
+    assert isinstance(one.transport, StraightTransport)
+    exposure = Exposure(np.ones((one.samples, one.bins)), np.zeros((one.samples, one.bins)))
+    reading = StripReading.of(one, exposure, floor=1e-3)
+    u, v = np.meshgrid(one.u_edges, one.v_middles)
+    height = one.sheet_coordinates(one.points_in_sheet(u, v))[..., 1]
+    steps = np.abs(np.diff(height, axis=1)) / np.diff(one.u_edges)
+    np.testing.assert_allclose(reading.slope, steps.max(axis=1))
+    np.testing.assert_allclose(reading.power, one.bins)
+    np.testing.assert_allclose(reading.position, one.u_middles.mean(), atol=1e-12)
+    seen = np.ones((one.samples, one.bins))
+    weights = reading.weights(seen, one.u_middles)
+    np.testing.assert_allclose(weights[..., 1], np.broadcast_to(one.u_middles, seen.shape))
+    costs = reading.costs(weights)
+    middle = 0.5 * (one.u_edges[0] + one.u_edges[-1])
+    span = one.u_edges[-1] - one.u_edges[0]
+    expected = reading.slope[:, None] * (0.5 * span + np.abs(one.u_middles - middle)) / one.bins
+    np.testing.assert_allclose(costs, expected)

@@ -1,0 +1,380 @@
+"""LightClustering: bounds hold, always; the tolerance is kept; work falls with it; nothing hidden is taken for
+clear."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from gpuvision.host import Device
+from gpuvision.simulation.clustering.light_clustering import BLOCK, LightClustering, LightCut
+from gpuvision.simulation.clustering.light_tree import LightTree
+from gpuvision.simulation.errors.range_error import StripReading, bounce_power, choose_paths
+from gpuvision.simulation.scene.scene import Scene
+from reference import tolerance as reference
+
+ON_DEVICES = settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+ANYWHERE = settings(max_examples=40, deadline=None)
+TWO_WAYS = pytest.mark.parametrize("variant", ["vector", "work_item"])
+SLOPE = 1e-3
+STRIPS, COUNT = 3, 40
+PLACES = st.integers(0, 2**32 - 1).map(np.random.default_rng)
+
+
+def random_segments(rng: np.random.Generator, count: int, *, spread: float = 0.1, length: float = 0.005) -> Any:
+    start = rng.normal(size=(count, 3)) * spread * [1.0, 1.0, 0.3]
+    along = rng.normal(size=(count, 3)) * length
+    normal = np.cross(along, rng.normal(size=(count, 3)))
+    return np.hstack([start, start + along, normal, rng.uniform(0.0, 1.0, (count, 1))])
+
+
+def random_strips(rng: np.random.Generator, count: int = COUNT) -> Any:
+    """Strips along lines, the normals of each much alike."""
+    place = rng.normal(size=(STRIPS, 1, 3)) * [0.1, 0.1, 0.03]
+    place = place + np.linspace(-0.05, 0.05, count)[:, None] * rng.normal(size=(STRIPS, 1, 3))
+    normal = rng.normal(size=(STRIPS, 1, 3)) + rng.uniform(0.0, 0.3) * rng.normal(size=(STRIPS, count, 3))
+    return np.concatenate([place, normal], axis=2)
+
+
+def weights_of(rng: np.random.Generator, count: int = COUNT) -> Any:
+    power = rng.uniform(0.0, 2e-3, (STRIPS, count)) * (rng.random((STRIPS, count)) < 0.9)
+    return np.stack([power, power * np.sort(rng.uniform(-1.0, 1.0, (STRIPS, count)), axis=1)], axis=2)
+
+
+def reading_of(rng: np.random.Generator, **more: Any) -> StripReading:
+    power = rng.uniform(0.5, 5.0, STRIPS)
+    moment = power * rng.uniform(-0.5, 0.5, STRIPS)
+    return StripReading(power=power, moment=moment, slope=np.full(STRIPS, SLOPE), limits=(-1.0, 1.0), **more)
+
+
+def picked(plan: LightCut, block: int) -> Any:
+    return plan.picks[plan.starts[block] : plan.starts[block + 1]]
+
+
+def by_plan(plan: LightCut, receivers: NDArray[Any], triangles: Any = None) -> Any:
+    """Irradiance (strips, n) from what each block is to get."""
+    strips, count, _ = receivers.shape
+    irradiance = np.zeros((strips, count))
+    of_strip = -(-count // BLOCK)
+    for block in range(strips * of_strip):
+        picks = picked(plan, block)
+        segments = plan.segments[np.where(picks < 0, ~picks, picks)]
+        here = block // of_strip, slice(block % of_strip * BLOCK, block % of_strip * BLOCK + BLOCK)
+        if len(picks):
+            light = reference.pair_irradiance(receivers[here], segments)
+            if triangles is not None:
+                seen = reference.visibility(receivers[here], segments, triangles)
+                light = light * np.where(picks < 0, 1.0, seen)
+            irradiance[here] = light.sum(axis=1)
+    return irradiance
+
+
+def off_by(plan: LightCut, receivers: Any, weights: Any, reading: StripReading, segments: Any) -> Any:
+    everything = reference.pair_irradiance(receivers.reshape(-1, 6), segments).sum(axis=1).reshape(receivers.shape[:2])
+    readings = [
+        reference.reading(reading.power, reading.moment, weights, light)
+        for light in (everything, by_plan(plan, receivers))
+    ]
+    return SLOPE * np.abs(readings[0] - readings[1])
+
+
+@TWO_WAYS
+@given(rng=PLACES, exponent=st.floats(-8.0, -3.0), count=st.integers(1, 40))
+@ON_DEVICES
+def test_bounds_hold(device: Device, variant: Any, rng: Any, exponent: float, count: int) -> None:
+    segments, receivers, weights, reading = (
+        random_segments(rng, count),
+        random_strips(rng),
+        weights_of(rng),
+        reading_of(rng),
+    )
+    tolerance = 10.0**exponent
+    plan = LightClustering(tolerance=tolerance, variant=variant)(segments, receivers, weights, reading, device=device)
+    error = off_by(plan, receivers, weights, reading, segments)
+    assert np.all(error <= plan.bound + 1e-15)
+    assert np.all(plan.bound <= tolerance)
+    everything = dataclasses.replace(plan, picks=plan.picks[:0], starts=0 * plan.starts)
+    assert np.all(off_by(everything, receivers, weights, reading, segments) <= plan.worst + 1e-15)
+
+
+@given(rng=PLACES, count=st.integers(2, 24), distance=st.floats(1.2, 20.0), turned=st.floats(0.0, 0.7))
+@ANYWHERE
+def test_a_cluster_is_off_by_its_bound_at_most(rng: Any, count: int, distance: float, turned: float) -> None:
+    """Wherever all of it faces a receiver that faces all of it."""
+    segments = random_segments(rng, count, spread=0.02, length=0.01)
+    along = segments[:, 3:6] - segments[:, :3]
+    normal = np.array([0.0, 0.0, 1.0]) + turned * rng.uniform(-1.0, 1.0, (count, 3))
+    segments[:, 6:9] = normal - along * (np.sum(normal * along, axis=1) / np.sum(along * along, axis=1))[:, None]
+    tree = LightTree.build(segments)
+    row, aggregate = tree.rows[1], tree.aggregates[1:2]
+    if not np.isfinite(row[22]):
+        return
+    way = rng.normal(size=(50, 3))
+    place = row[:3] + distance * row[12] * way / np.linalg.norm(way, axis=1, keepdims=True)
+    receivers = np.hstack([place, row[:3] - place + 0.1 * row[12] * rng.normal(size=(50, 3))])
+    ends = segments[:, :6].reshape(-1, 3)
+    facing = np.all(np.einsum("nk,nmk->nm", receivers[:, 3:], ends - place[:, None]) > 0.0, axis=1)
+    lit = np.repeat(segments[:, 6:9], 2, axis=0)
+    facing &= np.all(np.sum(lit * (place[:, None] - ends), axis=2) > 0.0, axis=1)
+    far = np.linalg.norm(place - row[:3], axis=1)
+    q, arm = row[12] / far, row[22] / far
+    with np.errstate(all="ignore"):
+        bound = row[18] / far**3 + row[19] / far**4 + row[20] * (4 - 3 * q) / (1 - q) ** 2 / far**5
+        bound = row[17] * (bound + row[21] * (5 - 4 * arm) / (1 - arm) ** 2 / far**6) / np.pi
+    light = reference.pair_irradiance(receivers, segments).sum(axis=1)
+    error = np.abs(light - reference.pair_irradiance(receivers, aggregate)[:, 0])
+    good = facing & (q < 1.0) & (arm < 1.0)
+    assert np.all(error[good] <= bound[good] * (1.0 + 1e-9))
+
+
+def test_a_cluster_keeps_the_power_of_segments_side_by_side() -> None:
+    x = np.linspace(0.0, 0.1, 9)
+    ends = np.zeros((8, 2, 3))
+    ends[:, 0, 0], ends[:, 1, 0] = x[:-1], x[1:]
+    segments = np.hstack([ends.reshape(8, 6), np.tile([0.0, 0.0, 3.0], (8, 1)), np.full((8, 1), 2.0)])
+    tree = LightTree.build(segments)
+    np.testing.assert_allclose(tree.aggregates[1], [0, 0, 0, 0.1, 0, 0, 0, 0, 1, 2.0], atol=1e-12)
+    assert tree.power == pytest.approx(0.2)
+
+
+@TWO_WAYS
+def test_tolerance_zero_leaves_out_nothing_that_shines(device: Device, variant: Any) -> None:
+    rng = np.random.default_rng(3)
+    segments, receivers, weights = random_segments(rng, 30), random_strips(rng), weights_of(rng)
+    plan = LightClustering(tolerance=0.0, variant=variant)(segments, receivers, weights, reading_of(rng), device=device)
+    assert plan.counts["clustered"] == 0
+    assert not plan.bound.any()
+    used = weights.any(axis=2)
+    everything = reference.pair_irradiance(receivers.reshape(-1, 6), segments).sum(axis=1).reshape(used.shape)
+    np.testing.assert_allclose(by_plan(plan, receivers)[used], everything[used], rtol=1e-12, atol=1e-15)
+
+
+def valley(count: int, strips: int, each: int) -> tuple[Any, Any, Any, StripReading]:
+    """A lit line into a groove of 90 degrees and out of it, and strips across."""
+    x = np.linspace(-0.1, 0.1, count + 1)
+    ends = np.zeros((count, 2, 3))
+    ends[:, 0, 0], ends[:, 1, 0] = x[:-1], x[1:]
+    ends[..., 2] = np.abs(ends[..., 0])
+    side = np.sign(0.5 * (x[1:] + x[:-1]))
+    normal = np.column_stack([-side, 0.0 * side, np.ones(count)])
+    segments = np.hstack([ends.reshape(count, 6), normal, np.full((count, 1), 1e-3)])
+    at, across = (np.arange(strips) + 0.5) / strips * 0.2 - 0.1, (np.arange(each) + 0.5) / each * 0.06 - 0.03
+    X, Y = np.meshgrid(at, across, indexing="ij")
+    receivers = np.stack([X, Y, np.abs(X), -np.sign(X), 0.0 * X, 1.0 + 0.0 * X], axis=2)
+    power = np.full((strips, each), 1e-4)
+    weights = np.stack([power, power * Y], axis=2) * 0.012 / (strips * each)
+    direct = np.full(strips, 2e-8 / strips * 100.0)
+    reading = StripReading(power=direct, moment=0.0 * direct, slope=np.ones(strips), limits=(-0.03, 0.03))
+    return segments, receivers, weights, reading
+
+
+def planes(*, wall: bool = False) -> Scene:
+    """The groove as four triangles, and a wall that stands in it."""
+    a, b, c, d, e, f = ([x, y, abs(x)] for y in (-0.05, 0.05) for x in (-0.12, 0.0, 0.12))
+    corners = [[a, b, e], [a, e, d], [b, c, f], [b, f, e]]
+    if wall:
+        corners += [[[0.0, -0.05, 0.0], [0.0, 0.05, 0.0], [0.0, 0.0, 0.08]]]
+    return Scene(np.array(corners))
+
+
+@TWO_WAYS
+def test_work_falls_as_the_tolerance_rises(device: Device, variant: Any) -> None:
+    segments, receivers, weights, reading = valley(64, 8, 64)
+    planner, works = LightClustering(tolerance=1.0, scene=planes(), variant=variant), []
+    for tolerance in (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 0.1):
+        plan = planner(segments, receivers, weights, reading, tolerance=tolerance, device=device)
+        works.append(plan.counts["work"])
+        assert np.all(plan.bound <= tolerance)
+        assert plan.counts["exact"] + plan.counts["clustered"] + plan.counts["left out"] == plan.counts["pairs"]
+        assert plan.tolerance == tolerance
+    assert works == sorted(works, reverse=True)
+    assert works[0] > 4 * works[3]
+    assert works[-1] == 0
+    assert not plan.modelled
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("with_scene", [False, True])
+def test_bounds_hold_far_from_the_origin(device: Device, dtype: Any, with_scene: bool) -> None:
+    """Places are rounded about the middle of what there is; micrometres stand beside metres."""
+    rng = np.random.default_rng(8)
+    segments, receivers, weights, reading = (
+        random_segments(rng, 20),
+        random_strips(rng),
+        weights_of(rng),
+        reading_of(rng),
+    )
+    segments[:10, 3:6] = segments[:10, :3] + 1e-3 * (segments[:10, 3:6] - segments[:10, :3])
+    segments[:, :6] += 7.0
+    receivers[..., :3] += 7.0
+    # Far below all: it hides nothing.
+    scene = Scene(np.array([[[0.0, 0.0, 0.0], [14.0, 0.0, 0.0], [14.0, 14.0, 0.0]]])) if with_scene else None
+    given = receivers.astype(dtype)
+    plan = LightClustering(tolerance=1e-8, scene=scene)(segments, given, weights, reading, device=device)
+    assert 0 < plan.counts["work"] < plan.counts["pairs"]
+    assert np.all(plan.bound <= 1e-8)
+    assert np.all(off_by(plan, given.astype(float), weights, reading, segments) <= plan.bound + 1e-13)
+
+
+@TWO_WAYS
+def test_nothing_hides_in_an_empty_groove(device: Device, variant: Any) -> None:
+    """Its own walls stand in the hulls, but between no receiver and no lit line."""
+    segments, receivers, weights, reading = valley(32, 4, 32)
+    planner = LightClustering(tolerance=0.0, scene=planes(), variant=variant)
+    plan = planner(segments, receivers, weights, reading, device=device)
+    assert plan.counts["exact"] == plan.counts["clear"] > 0
+
+
+def pyramids(rng: np.random.Generator, count: int) -> Any:
+    """Triangles of pyramids on the floor z = 0."""
+    base = rng.uniform(-0.1, 0.1, (count, 1, 3)) * [1.0, 1.0, 0.0]
+    turn = rng.uniform(0.0, np.pi, (count, 1)) + np.array([0.0, 2.1, 4.2])
+    feet = base + 0.03 * np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=2)
+    top = np.broadcast_to(base + rng.uniform(0.01, 0.06, (count, 1, 1)) * [0.0, 0.0, 1.0], feet.shape)
+    return np.stack([feet, np.roll(feet, -1, axis=1), top], axis=2).reshape(-1, 3, 3)
+
+
+def on_triangles(rng: np.random.Generator, triangles: Any, count: int) -> tuple[Any, Any]:
+    """Places on triangles, near each other by pairs, and normals upwards."""
+    number = rng.integers(len(triangles), size=count)
+    weights = rng.dirichlet([1.0, 1.0, 1.0], size=(count, 2)) * 0.9 + 1.0 / 30.0
+    corners = triangles[number]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal *= np.sign(normal[:, 2:])
+    return np.einsum("nek,nkx->nex", weights, corners), normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+@TWO_WAYS
+@given(rng=PLACES, exponent=st.floats(-7.0, -4.0))
+@ON_DEVICES
+def test_what_is_clear_is_seen(device: Device, variant: Any, rng: Any, exponent: float) -> None:
+    triangles = pyramids(rng, 5)
+    ends, normals = on_triangles(rng, triangles, 24)
+    segments = np.hstack([ends.reshape(-1, 6), normals, np.ones((len(ends), 1))])
+    first, up = on_triangles(rng, triangles, STRIPS)
+    part = np.linspace(0.0, 1.0, COUNT)[:, None]
+    place = first[:, :1] + part * (first[:, 1:] - first[:, :1])
+    receivers = np.concatenate([place, np.broadcast_to(up[:, None], place.shape)], axis=2)
+    weights, reading = weights_of(rng), reading_of(rng)
+    planner = LightClustering(tolerance=10.0**exponent, scene=Scene(triangles), variant=variant)
+    plan = planner(segments, receivers, weights, reading, device=device)
+    seen = reference.visibility(receivers.reshape(-1, 6), segments, triangles).reshape(STRIPS, COUNT, -1)
+    light = reference.pair_irradiance(receivers.reshape(-1, 6), segments).reshape(seen.shape)
+    of_strip = -(-COUNT // BLOCK)
+    for block in range(STRIPS * of_strip):
+        picks = picked(plan, block)
+        clear = [~pick for pick in picks if pick < 0 and ~pick < len(segments)]
+        here = block // of_strip, slice(block % of_strip * BLOCK, block % of_strip * BLOCK + BLOCK)
+        used = weights[here].any(axis=1)
+        hidden = (seen[here] < 1.0) & (light[here] > 1e-9 * light.max())
+        assert not np.any(hidden[used][:, clear])
+    exact = reference.reading(reading.power, reading.moment, weights, np.sum(seen * light, axis=2))
+    ours = reference.reading(reading.power, reading.moment, weights, by_plan(plan, receivers, triangles))
+    assert np.all(SLOPE * np.abs(exact - ours) <= plan.bound + 1e-15)
+
+
+@TWO_WAYS
+def test_a_wall_in_the_groove_is_seen(device: Device, variant: Any) -> None:
+    segments, receivers, weights, reading = valley(32, 4, 32)
+    planner = LightClustering(tolerance=1e-5, scene=planes(wall=True), variant=variant)
+    plan = planner(segments, receivers, weights, reading, device=device)
+    assert plan.counts["exact"] > plan.counts["clear"]
+
+
+def test_dark_strips_get_all_and_those_below_the_floor_what_they_need() -> None:
+    rng = np.random.default_rng(5)
+    segments, receivers, weights = random_segments(rng, 30), random_strips(rng), weights_of(rng)
+    dark = StripReading(
+        power=np.array([0.0, 1.0, 1.0]), moment=np.zeros(3), slope=np.full(3, SLOPE), limits=(-1.0, 1.0)
+    )
+    plan = LightClustering(tolerance=1e-4)(segments, receivers, weights, dark)
+    exact = LightClustering(tolerance=0.0)(segments, receivers, weights, dark)
+    of_strip = -(-COUNT // BLOCK)
+    assert plan.starts[of_strip] == exact.starts[of_strip]
+    assert plan.starts[-1] < exact.starts[-1]
+    assert plan.bound[0] == 0.0
+    floored = LightClustering(tolerance=1e-4)(segments, receivers, weights, dataclasses.replace(dark, floor=1.0))
+    assert floored.starts[of_strip] < exact.starts[of_strip]
+
+
+def test_receivers_without_weight_and_no_receivers_do_not_count() -> None:
+    rng = np.random.default_rng(6)
+    segments, receivers, weights, reading = (
+        random_segments(rng, 9),
+        random_strips(rng),
+        weights_of(rng),
+        reading_of(rng),
+    )
+    weights[0], receivers[1, :, 3:], receivers[0, 3] = 0.0, 0.0, np.nan
+    plan = LightClustering(tolerance=0.0)(segments, receivers, weights, reading)
+    of_strip = -(-COUNT // BLOCK)
+    assert plan.starts[2 * of_strip] == 0
+    assert plan.starts[-1] > 0
+
+
+def test_tables_have_room() -> None:
+    segments, receivers, weights, reading = valley(40, 4, 32)
+    plan = LightClustering(tolerance=1e-5)(segments, receivers, weights, reading)
+    rows, starts, picks = plan.tables(np.float32, segments=100, picks=10)
+    assert rows.shape == (128, 10)
+    assert rows.dtype == np.float32
+    assert len(picks) >= len(plan.picks)
+    assert len(picks).bit_count() == 1
+    assert starts[-1] == len(plan.picks)
+    assert not rows[len(plan.segments) :, 9].any()
+    used = np.where(plan.picks < 0, ~plan.picks, plan.picks)
+    assert used.max() < len(plan.segments)
+    report = plan.report()
+    assert report["clusters"] == len(plan.segments) - 40
+    assert report["bound"] <= 1e-5
+    assert report["modelled"] is True
+
+
+def test_worst_is_reached_by_light_at_the_other_limit() -> None:
+    reading = StripReading(power=np.ones(1), moment=-np.ones(1), slope=np.full(1, SLOPE), limits=(-1.0, 1.0))
+    assert reading.worst(0.25)[0] == pytest.approx(SLOPE * 2.0 * 0.25 / 1.25)
+    assert reading.worst(np.inf)[0] == pytest.approx(SLOPE * 2.0)
+    assert reading.worst(0.0)[0] == 0.0
+
+
+def test_paths_with_the_least_bounds_are_left_out() -> None:
+    choice = choose_paths({"specular": 0.0, "mirrors": [1e-7, 2e-7], "bounces": 1.5e-6, "diffuse": np.inf}, 4e-6)
+    assert choice.left_out == {"specular": 0.0, "mirrors": 2e-7, "bounces": 1.5e-6}
+    assert choice.modelled == {"diffuse": None}
+    assert choice.remaining == pytest.approx(2.3e-6)
+    assert choose_paths({"specular": 0.0, "bounces": 1e-9}, 0.0).left_out == {"specular": 0.0}
+
+
+def test_bounces_sum_to_a_geometric_series() -> None:
+    assert bounce_power(2.0, 0.5, 0.1) == pytest.approx(2.0 * sum(0.5**k for k in range(1, 60)) * 0.5 / np.pi * 0.1)
+    assert bounce_power(1.0, 1.0, 0.1) == np.inf
+    assert bounce_power(1.0, 0.0, 0.1) == 0.0
+    with pytest.raises(ValueError, match="albedo"):
+        bounce_power(1.0, 1.5, 0.1)
+
+
+def test_wrong_input_is_refused() -> None:
+    segments, receivers, weights, reading = valley(4, 2, 16)
+    with pytest.raises(ValueError, match="tolerance"):
+        LightClustering(tolerance=-1.0)
+    with pytest.raises(ValueError, match=r"weights \(strips, n, 2\)"):
+        LightClustering(tolerance=0.0)(segments, receivers, weights[..., 0], reading)
+    with pytest.raises(ValueError, match=r"segments \(m, 10\)"):
+        LightClustering(tolerance=0.0)(segments[:, :9], receivers, weights, reading)
+    with pytest.raises(ValueError, match="limits"):
+        dataclasses.replace(reading, limits=(1.0, 1.0))
+    with pytest.raises(ValueError, match="slope"):
+        dataclasses.replace(reading, slope=np.ones(3))
+
+
+def test_no_segments_need_nothing() -> None:
+    _, receivers, weights, reading = valley(4, 2, 16)
+    plan = LightClustering(tolerance=0.0)(np.zeros((0, 10)), receivers, weights, reading)
+    assert not plan.modelled
+    assert plan.counts["pairs"] == 0

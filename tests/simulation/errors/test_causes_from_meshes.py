@@ -1,0 +1,101 @@
+"""Causes of errors from the mesh on: steps of reflectivity, blades that hide a beam, and steps of the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from gpuvision.host import Device
+from gpuvision.simulation.errors.error_attribution import ErrorAttribution, Verdict, attribute_errors
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.reflectance import Lambert
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.readings import Truth
+from gpuvision.simulation.sensors.sensor_view import Exposure
+from gpuvision.simulation.transport.direct import DirectLight
+from gpuvision.simulation.transport.illumination import LightSheet
+from lights import psd, psd_sight
+
+SIGMA = 5e-5
+# The lens stands 80 mm beside the sheet and 150 mm above.
+TAN = 0.08 / 0.15
+WIDE = 0.05
+
+
+def flat(y0: float, y1: float, z: float = 0.0) -> list[list[tuple[float, float, float]]]:
+    """Return two triangles that face upwards."""
+    a, b, c, d = (-WIDE, y0, z), (WIDE, y0, z), (WIDE, y1, z), (-WIDE, y1, z)
+    return [[a, b, c], [a, c, d]]
+
+
+def found(scene: Scene, albedos: list[float], slabs, device: Device) -> ErrorAttribution:
+    """Explain what strips read of a thick sheet at y = 0."""
+    sight = psd_sight(240)
+    light = DirectLight(
+        sight=sight,
+        scene=scene,
+        materials=[Material(diffuse=Lambert(albedo=each)) for each in albedos],
+        sheet=LightSheet(transport=sight.transport, sigma=SIGMA),
+        sub_sheets=slabs,
+        device=device,
+    )
+    exposures: dict[str, Exposure] = light.exposures(0.0, causes=True)
+    level = Truth(*np.zeros((2, sight.samples)), np.zeros(sight.samples, np.uint8))
+    return attribute_errors(psd(sight), exposures, level, device=device)
+
+
+def test_reflectivity_step(device: Device) -> None:
+    """The error is sigma (k - 1) phi(x) / (Phi(x) + k (1 - Phi(x))) over tan(theta), and reflectivity's alone."""
+    x, k = 0.6, 5.0
+    edge = x * SIGMA
+    scene = Scene(corners=np.array(flat(-0.01, edge) + flat(edge, 0.01)), material=np.array([0, 0, 1, 1], np.int32))
+    told = found(scene, [0.15, 0.15 * k], [-1.0, x, 1.5], device)
+    phi = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi)
+    shift = SIGMA * (k - 1.0) * phi / (ndtr(x) + k * (1.0 - ndtr(x)))
+    # Perspective over the beam's width: 50 um of 170 mm.
+    np.testing.assert_allclose(np.abs(told.error), shift / TAN, rtol=2e-3)
+    np.testing.assert_allclose(told.causes["reflectivity"], told.error, rtol=5e-3)
+    np.testing.assert_allclose(told.causes["occlusion"], 0.0, atol=1e-9)
+    # Strips average over a line that is straight: what is left is perspective.
+    np.testing.assert_allclose(told.causes["shape"], 0.0, atol=3e-3 * shift)
+
+
+def test_blade_before_the_lens(device: Device) -> None:
+    """A blade that hides the beam up to x sigma from the lens: occlusion, sigma phi(x) / (1 - Phi(x)) over tan."""
+    x = 0.4
+    # An upright blade between the line and the lens, low enough for the ray from x sigma just to pass under it.
+    lens, foot = np.array([0.0, 0.08, 0.15]), np.array([0.0, x * SIGMA, 0.0])
+    _, y, z = foot + 0.1 * (lens - foot)
+    a, b, c, d = (-WIDE, y, z), (WIDE, y, z), (WIDE, y, z + 0.03), (-WIDE, y, z + 0.03)
+    scene = Scene(corners=np.array([*flat(-0.01, 0.02), [a, b, c], [a, c, d]]))
+    told = found(scene, [0.5], [-1.0, x, 1.5], device)
+    phi = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi)
+    np.testing.assert_allclose(np.abs(told.error), SIGMA * phi / ndtr(-x) / TAN, rtol=2e-3)
+    np.testing.assert_allclose(told.causes["occlusion"], told.error, rtol=5e-3)
+    np.testing.assert_allclose(told.causes["reflectivity"], 0.0, atol=1e-9)
+
+
+def test_step_of_the_surface(device: Device) -> None:
+    """Half the beam on either level: read in the middle, by the shape; from the other side the step hides some, too."""
+    rise = 2e-4
+    seen = found(Scene(corners=np.array(flat(-0.01, 0.0, rise) + flat(0.0, 0.01))), [0.5], [-1.0, 0.0, 1.0], device)
+    np.testing.assert_allclose(seen.error, 0.5 * rise, rtol=5e-3)
+    np.testing.assert_allclose(seen.causes["shape"], seen.error, rtol=1e-6)
+    other = found(Scene(corners=np.array(flat(-0.01, 0.0) + flat(0.0, 0.01, rise))), [0.5], 32, device)
+    np.testing.assert_allclose(other.causes["shape"], 0.5 * rise, rtol=0.02)
+    assert np.all(other.causes["occlusion"] > 0.1 * rise)
+
+
+def test_part_in_the_shadow(device: Device) -> None:
+    """Under a roof nothing is lit: no reading, and that is known."""
+    scene = Scene(corners=np.array(flat(-0.01, 0.01) + flat(-0.02, 0.02, 0.2)))
+    told = found(scene, [0.5], 9, device)
+    assert (told.verdict == Verdict.MISSING).all()
+    assert np.isnan(told.error).all()
+
+
+@pytest.mark.parametrize("albedo", [1e-3, 1.0])
+def test_even_surfaces_have_no_error(albedo: float, device: Device) -> None:
+    told = found(Scene(corners=np.array(flat(-0.01, 0.01))), [albedo], 9, device)
+    assert np.abs(told.error).max() < 1e-6

@@ -1,0 +1,304 @@
+"""What helps against artifacts: the reflection that is read, and two sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from gpuvision.host import Device
+from gpuvision.ranging.psd import PsdNoise
+from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.simulation.errors.error_attribution import attribute_errors
+from gpuvision.simulation.errors.recommendations import (
+    BOTH,
+    FIRST,
+    NONE,
+    SECOND,
+    DualSensor,
+    attribute_pair_errors,
+    compare_peaks,
+    rank,
+    resampled,
+)
+from gpuvision.simulation.sensors.readings import Reading, Truth, sheet_point
+from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
+from gpuvision.status import Status
+from lights import PITCH, camera, camera_sight, gaussian, psd, psd_sight
+
+PIXEL = 10e-6
+
+
+def reading(h, sigma=1e-6, strength=1.0, width=3.0, status=0, g=None) -> Reading:
+    h = np.asarray(h, float)
+    full = [np.broadcast_to(np.asarray(each, float), h.shape).copy() for each in (sigma, strength, width)]
+    places = np.linspace(0.0, 1e-3, h.shape[-1]) if g is None else np.asarray(g, float)
+    flags = np.broadcast_to(np.asarray(status, np.uint8), h.shape) | np.where(np.isnan(h), Status.LOW_SIGNAL, 0)
+    return Reading(h.copy(), np.broadcast_to(places, h.shape).copy(), h, *full, flags.astype(np.uint8))
+
+
+# ---- two sensors over a step -----------------------------------------------------------------------------------
+
+
+def facing(sight: SensorView) -> SensorView:
+    """Return the same sensor from the other side of the sheet."""
+    x, y, z = sight.lens
+    return SensorView(
+        triangulation=sight.triangulation,
+        transport=StraightTransport(),
+        lens=(x, -y, z),
+        u_edges=sight.u_edges,
+        v_edges=sight.v_edges,
+    )
+
+
+def thick_line(sight: SensorView, sigma: float, factor: np.ndarray, across: np.ndarray) -> Exposure:
+    """Return light of a sheet with a Gaussian across on the plane H = 0, scaled by a factor at every place across."""
+    weight = np.exp(-0.5 * (across / sigma) ** 2) * factor
+    points = np.stack(np.broadcast_arrays(0.0, across, 0.0), axis=-1)
+    u, _ = np.moveaxis(sight.project(points), -1, 0)
+    light = sight.dark()
+    for v in sight.v_middles:
+        light = light + sight.deposit(u, v, 1e-9 * weight)
+    return light
+
+
+SIGMA, X = 5e-5, 0.4
+# Where strips see the plane H = 0: 0.1 mm times 170 mm over 40 mm.
+PLACES = np.arange(-2, 3) * PITCH * 0.17 / 0.04
+ACROSS = (np.arange(-4000, 4000) + 0.5) * (6.0 * SIGMA / 4000)
+
+
+def phi(x: float) -> float:
+    return float(np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi))
+
+
+@pytest.fixture
+def level() -> Truth:
+    return Truth(np.zeros(5), np.zeros(5), np.zeros(5, np.uint8))
+
+
+def test_reflectivity_step_seen_from_both_sides(level: Truth, device: Device) -> None:
+    """Each errs by shift / tan(theta), to its own side: the mean is right. Nothing else of the rules is."""
+    sight, k = psd_sight(), 4.0
+    factor = np.where(ACROSS > X * SIGMA, k, 1.0)
+    share = float(ndtr(X))
+    shift = SIGMA * (k - 1.0) * phi(X) / (share + k * (1.0 - share))
+    sensors = [psd(each, readout={"noise": PsdNoise(independent=1e-12)}) for each in (sight, facing(sight))]
+    readings = [each.read({"direct": thick_line(each.sight, SIGMA, factor, ACROSS)}, device=device) for each in sensors]
+    expected = shift * 0.15 / 0.08
+    np.testing.assert_allclose(np.abs(readings[0].h), expected, rtol=2e-3)
+    np.testing.assert_allclose(readings[1].h, -readings[0].h, rtol=4e-3)
+    flagged = DualSensor().join(*readings)
+    assert np.isnan(flagged.h).all()
+    assert (flagged.status == Status.AMBIGUOUS).all()
+    mean = DualSensor(rule="mean").join(*readings)
+    assert np.abs(mean.h).max() < 2e-3 * expected
+    assert (mean.source == BOTH).all()
+    errors = [
+        attribute_errors(each, {"direct": thick_line(each.sight, SIGMA, factor, ACROSS)}, level, device=device).error
+        for each in sensors
+    ]
+    predicted = DualSensor(rule="predicted").join(*readings, predicted=(errors[0], errors[1]))
+    assert (predicted.source == BOTH).all()
+
+
+def test_half_a_beam_hidden_from_one(level: Truth, device: Device) -> None:
+    """The sensor that sees the whole beam is right and has more light; the mean is half wrong."""
+    sight = psd_sight()
+    hidden = (ACROSS < X * SIGMA).astype(float)
+    whole, half = (
+        psd(each).read({"direct": thick_line(each, SIGMA, factor, ACROSS)}, device=device)
+        for each, factor in ((sight, np.ones_like(ACROSS)), (facing(sight), hidden))
+    )
+    share = float(ndtr(X))
+    error = SIGMA * phi(X) / share * 0.15 / 0.08
+    np.testing.assert_allclose(np.abs(half.h), error, rtol=2e-3)
+    for rule, predicted in (("stronger", None), ("predicted", (1e-9, error))):
+        joined = DualSensor(rule=rule, tolerance=1e-6).join(whole, half, predicted)
+        assert (joined.source == FIRST).all()
+        assert np.abs(joined.h).max() < 1e-3 * error
+        turned = DualSensor(rule=rule, tolerance=1e-6).join(half, whole, predicted and predicted[::-1])
+        assert (turned.source == SECOND).all()
+    mean = DualSensor(rule="mean").join(whole, half)
+    np.testing.assert_allclose(np.abs(mean.h), 0.5 * error, rtol=5e-3)
+
+
+def test_a_part_seen_by_two(level: Truth, device: Device) -> None:
+    """A pair is ranked beside either sensor alone: half of a beam is hidden from one here, from the other there."""
+    sight = psd_sight()
+    hidden = (ACROSS < X * SIGMA).astype(float)
+    found = []
+    for each, from_here in ((sight, [0, 1]), (facing(sight), [3, 4])):
+        whole, half = (thick_line(each, SIGMA, factor, ACROSS) for factor in (np.ones_like(ACROSS), hidden))
+        seen = np.isin(np.arange(5), from_here)[:, None]
+        light = Exposure(*(np.where(seen, one, other) for one, other in zip(half, whole, strict=True)))
+        variants = {"direct": light, "direct, even": light, "direct, open": whole, "direct, even, open": whole}
+        found.append(attribute_errors(psd(each), variants, level._replace(g=PLACES), device=device))
+    candidates = attribute_pair_errors(*found, DualSensor(rule="predicted"), gap=1.0, g=PLACES)
+    order = rank(candidates, 1e-6)
+    assert order[0].name == "both"
+    assert [each.unread for each in order] == [0.0, 0.4, 0.4]
+    for each in candidates.values():
+        np.testing.assert_allclose(np.sum(list(each.causes.values()), axis=0), each.error, atol=1e-12)
+    flagged = attribute_pair_errors(*found, DualSensor(tolerance=1e-6), gap=1.0, g=PLACES)["both"]
+    assert np.isfinite(flagged.error).tolist() == [False, False, True, False, False]
+    assert flagged.summary(1e-6)["missing"] == 4
+    mean = attribute_pair_errors(*found, DualSensor(rule="mean"), gap=1.0, g=PLACES)["both"]
+    np.testing.assert_allclose(mean.causes["occlusion"][:2], 0.5 * found[0].causes["occlusion"][:2], rtol=1e-3)
+
+
+def test_what_one_does_not_see_the_other_does(device: Device) -> None:
+    """Surfaces that are hidden from the first sensor count for it as missing, and the second one fills them."""
+    sight = psd_sight()
+    u = np.zeros(5)
+    truth = Truth(*sheet_point(sight.triangulation, u, sight.v_middles), np.zeros(5, np.uint8))
+    found = []
+    for each, hidden in ((sight, [0, 1]), (facing(sight), [4])):
+        lost = np.isin(np.arange(5), hidden)
+        seen = Truth(truth.g, np.where(lost, np.nan, truth.h), np.where(lost, Status.LOW_SIGNAL, 0).astype(np.uint8))
+        found.append(
+            attribute_errors(psd(each), {"direct": gaussian(each, u, ~lost * 1e-6, 5e-5)}, seen, device=device)
+        )
+    pair = attribute_pair_errors(*found, DualSensor(tolerance=1e-6), gap=1.0)
+    assert [pair[name].unread(1e-6) for name in ("first", "second", "both")] == [0.4, 0.2, 0.0]
+    blind = found[0].without(Status.LOW_SIGNAL)
+    nothing = Truth(np.full(5, np.nan), np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL))
+    with pytest.raises(ValueError, match="give the places"):
+        attribute_pair_errors(replace(blind, truth=nothing), found[1], DualSensor(), gap=1.0)
+
+
+# ---- the rules -------------------------------------------------------------------------------------------------
+
+
+def test_agreeing_readings_are_weighed_by_their_noise() -> None:
+    one, other = reading([1e-3, 1e-3], sigma=[1e-6, 0.0]), reading([1.003e-3, 1e-3], sigma=[2e-6, 0.0])
+    joined = DualSensor(agree=3.0).join(one, other)
+    np.testing.assert_allclose(joined.h, [0.8e-3 + 0.2 * 1.003e-3, 1e-3], rtol=1e-12)
+    np.testing.assert_allclose(joined.sigma, [2e-6 / np.sqrt(5.0), 0.0], rtol=1e-12)
+    assert (joined.source == BOTH).all()
+    assert not joined.status.any()
+    assert np.isnan(DualSensor(agree=1.0).join(one, other).h).tolist() == [True, False]
+    assert np.isfinite(DualSensor(agree=0.0, tolerance=4e-6).join(one, other).h).all()
+
+
+def test_one_reading_alone() -> None:
+    one, other = reading([1e-3, np.nan, np.nan]), reading([np.nan, 2e-3, np.nan])
+    joined = DualSensor().join(one, other)
+    assert joined.source.tolist() == [FIRST, SECOND, NONE]
+    np.testing.assert_array_equal(joined.h, [1e-3, 2e-3, np.nan])
+    assert joined.status.tolist() == [0, 0, Status.LOW_SIGNAL]
+    strict = DualSensor(lone=False).join(one, other)
+    assert np.isnan(strict.h).all()
+    assert (strict.status != 0).all()
+
+
+def test_doubtful_readings_give_way() -> None:
+    """Of two that disagree, a saturated or ambiguous one has no say."""
+    one = reading([1e-3, 1e-3], status=[Status.SATURATED, 0])
+    other = reading([2e-3, 2e-3], status=[0, Status.AMBIGUOUS])
+    assert DualSensor().join(one, other).source.tolist() == [SECOND, FIRST]
+
+
+def test_margin() -> None:
+    """Where neither is clearly better there is no value."""
+    one, other = reading([1e-3] * 3, strength=[1.0, 1.4, 2.0]), reading([2e-3] * 3, strength=[2.0, 1.0, 1.0])
+    assert DualSensor(rule="stronger").join(one, other).source.tolist() == [SECOND, NONE, FIRST]
+    one, other = reading([1e-3] * 3, width=[3.0, 4.0, 9.0]), reading([2e-3] * 3, width=[6.0, 5.0, 3.0])
+    assert DualSensor(rule="narrower").join(one, other).source.tolist() == [FIRST, NONE, SECOND]
+    errors = ([1e-6, 9e-6, np.nan], [1e-3, -9e-6, 1e-6])
+    assert DualSensor(rule="predicted").join(one, other, errors).source.tolist() == [FIRST, BOTH, SECOND]
+
+
+def test_what_joining_refuses() -> None:
+    one, other = reading([1e-3]), reading([2e-3], width=np.nan)
+    with pytest.raises(ValueError, match="predicted=\\(a, b\\)"):
+        DualSensor(rule="predicted").join(one, other)
+    with pytest.raises(ValueError, match="only cameras know"):
+        DualSensor(rule="narrower").join(one, other)
+    with pytest.raises(ValueError, match="expected the same"):
+        DualSensor().join(one, reading([1e-3, 1e-3]))
+    with pytest.raises(ValueError, match="rule is 'best'"):
+        DualSensor(rule="best")
+    with pytest.raises(ValueError, match=r"margin is 0\.5"):
+        DualSensor(margin=0.5)
+
+
+# ---- places along the sheet ------------------------------------------------------------------------------------
+
+
+def test_resampling() -> None:
+    """A straight profile stays one, between its points and on them; holes stay holes but for half a sample."""
+    g = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 7.0]) * 1e-4
+    h = 2.0 * g + 1e-3
+    h[3] = np.nan
+    given = reading(h, g=g, status=[0, 0, 0, 0, Status.SATURATED, 0])
+    at = np.array([0.0, 0.25, 1.0, 2.0, 2.5, 4.0, 7.0]) * 1e-4
+    said = resampled(given, at, gap=2.5e-4)
+    np.testing.assert_allclose(said.h, 2.0 * at + 1e-3, rtol=1e-12)
+    np.testing.assert_array_equal(said.g, at)
+    assert said.status.tolist() == [0, 0, 0, 0, Status.SATURATED, Status.SATURATED, 0]
+    # Points are 0.15 mm apart in the median.
+    beside = resampled(given, np.array([-0.7, -0.8, 4.7, 4.8, 6.3, 7.8, np.nan]) * 1e-4, gap=2.5e-4)
+    np.testing.assert_array_equal(beside.h, [h[0], np.nan, h[4], np.nan, h[5], np.nan, np.nan])
+    assert beside.status.tolist() == [
+        0,
+        Status.NO_DATA,
+        Status.SATURATED,
+        Status.NO_DATA,
+        0,
+        Status.NO_DATA,
+        Status.NO_DATA,
+    ]
+    block = resampled(Reading(*(np.stack([each, each]) for each in given)), at, gap=2.5e-4)
+    np.testing.assert_array_equal(block.h, np.stack([said.h, said.h]))
+    alone = resampled(reading([np.nan, 1e-3]), np.array([0.0, 1e-3, 1.2e-3]), gap=3e-4)
+    np.testing.assert_array_equal(alone.h, [np.nan, 1e-3, np.nan])
+    assert (resampled(reading([np.nan, np.nan]), at, gap=1.0).status == Status.NO_DATA).all()
+
+
+# ---- reflections -----------------------------------------------------------------------------------------------
+
+
+def test_choice_of_a_peak(device: Device) -> None:
+    """A mirror image that outshines the line, always on the same side: the first peak is the line."""
+    sight = camera_sight()
+    u = np.full(sight.samples, sight.u_middles[20])
+    light = {
+        "direct": gaussian(sight, u, 1e-9, PIXEL),
+        "diffuse-specular": gaussian(sight, u + 25 * PIXEL, 3e-9, PIXEL),
+    }
+    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
+    truth = Truth(g, h, np.zeros(u.shape, np.uint8))
+    found = compare_peaks(camera(sight, readout={"threshold": 1.0}, gain=5e-5), light, truth, device=device)
+    order = rank(found, 1e-5)
+    assert order[0].name == "first"
+    assert [each.unread for each in order] == [0.0, 1.0, 1.0]
+    assert order[0].rms < 1e-6
+    assert (found["strongest"].dominant(1e-5) == list(found["strongest"].causes).index("secondary")).all()
+
+
+def test_rank_of_directions(device: Device) -> None:
+    """The place from which less gloss is seen comes first; false readings count as much as missing ones."""
+    sight = psd_sight()
+    u = np.zeros(sight.samples)
+    truth = Truth(*sheet_point(sight.triangulation, u, sight.v_middles), np.zeros(5, np.uint8))
+    direct = gaussian(sight, u, 1e-6, 5e-5)
+    gloss = {name: gaussian(sight, u + 1e-3, power, 5e-5) for name, power in (("shiny", 1e-6), ("dull", 1e-9))}
+    found = {
+        name: attribute_errors(psd(sight), {"direct": direct, "specular": each}, truth, device=device)
+        for name, each in gloss.items()
+    }
+    nothing = Truth(truth.g, np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL, np.uint8))
+    found["false"] = attribute_errors(psd(sight), {"direct": direct}, nothing, device=device)
+    order = rank(found, 1e-4)
+    assert order[0].name == "dull"
+    assert {each.name: (each.unread, each.false) for each in order} == {
+        "dull": (0.0, 0.0),
+        "shiny": (1.0, 0.0),
+        "false": (0.0, 1.0),
+    }
+    with pytest.raises(ValueError, match="one candidate"):
+        rank({}, 1e-4)

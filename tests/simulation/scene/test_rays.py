@@ -1,0 +1,299 @@
+"""ClosestHit and AnyHit on devices: as every triangle says in float64, as Embree says, without a gap."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from canary import Guarded
+from gpuvision.host import Device
+from gpuvision.simulation.scene.rays import AnyHit, ClosestHit
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.status import Status
+from reference import rays as reference
+
+ON_DEVICES = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+WAYS = pytest.mark.parametrize(
+    ("variant", "dtype"),
+    [(variant, dtype) for variant in ("vector", "work_item") for dtype in (np.float32, np.float64)],
+)
+TRIANGLE = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]])
+
+
+def soup(rng: np.random.Generator, count: int, size: float = 0.2) -> np.ndarray:
+    """Triangles all over a cube, in numbers that a float holds exactly."""
+    corners = rng.uniform(-1.0, 1.0, (count, 1, 3)) + rng.normal(0.0, size, (count, 3, 3))
+    return corners.astype(np.float32).astype(np.float64)
+
+
+def some_rays(rng: np.random.Generator, count: int = 500) -> np.ndarray:
+    return np.hstack([rng.uniform(-1.5, 1.5, (count, 3)), rng.normal(0.0, 1.0, (count, 3))])
+
+
+def far_from_edges(corners: np.ndarray, rays: np.ndarray, by: float = 1e-4) -> np.ndarray:
+    """Whether rounding cannot decide whether a ray meets any triangle."""
+    _, u, v = reference.crossings(corners, rays[:, :3], rays[:, 3:])
+    return (np.minimum.reduce([np.abs(u), np.abs(v), np.abs(1.0 - u - v)]) > by).all(axis=1)
+
+
+def eps_of(dtype: Any) -> float:
+    return float(np.finfo(dtype).eps)
+
+
+def assert_closest(corners: np.ndarray, rays: np.ndarray, hits: Any) -> None:
+    triangle, distance, u, v = reference.closest(corners, rays.astype(np.float64))
+    np.testing.assert_array_equal(hits.triangle, triangle)
+    np.testing.assert_array_equal(hits.status, np.where(triangle < 0, Status.NO_DATA, 0))
+    # Some roundings of coordinates up to 4 m, over the sine of incidence and the size of the triangle.
+    met = triangle >= 0
+    one, two = (corners[triangle, n] - corners[triangle, 0] for n in (1, 2))
+    along = rays[:, 3:] / np.linalg.norm(rays[:, 3:], axis=1, keepdims=True)
+    normal = np.cross(one, two)
+    thin = np.abs(np.sum(along * normal, axis=1))
+    longest = np.maximum(np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1)) + 1e-9
+    bound = 64.0 * eps_of(hits.distance.dtype) * longest**2 / thin
+    assert np.all(np.abs(hits.distance - distance)[met] <= bound[met])
+    for got, expected in zip(hits.barycentric.T, (u, v), strict=True):
+        assert np.all(np.abs(got - expected)[met] <= (bound / longest)[met])
+    assert np.isnan(hits.distance[~met]).all()
+    assert np.isnan(hits.barycentric[~met]).all()
+
+
+@WAYS
+@pytest.mark.parametrize("count", [1, 2, 16, 17, 300, 3000])
+def test_closest_as_every_triangle_says(
+    device: Device, variant: Any, dtype: Any, count: int, rng: np.random.Generator
+) -> None:
+    corners = soup(rng, count, 0.5 if count < 20 else 0.2)
+    rays = some_rays(rng, 300).astype(dtype)
+    rays = rays[far_from_edges(corners, rays.astype(np.float64), 3e-5)]
+    hits = ClosestHit(scene=Scene(corners), variant=variant)(rays, device=device)
+    assert hits.distance.dtype == dtype
+    assert_closest(corners, rays, hits)
+    assert len(rays) > 50
+
+
+@WAYS
+@pytest.mark.parametrize("count", [1, 17, 3000])
+def test_any_as_every_triangle_says(
+    device: Device, variant: Any, dtype: Any, count: int, rng: np.random.Generator
+) -> None:
+    corners = soup(rng, count)
+    segments = rng.uniform(-1.0, 1.0, (400, 6)).astype(dtype)
+    expected = reference.occluded(corners, segments.astype(np.float64))
+    sure = far_from_edges(corners, np.hstack([segments[:, :3], segments[:, 3:] - segments[:, :3]]).astype(float), 3e-5)
+    sure &= reference.occluded(corners, segments.astype(float), -1e-4) == reference.occluded(
+        corners, segments.astype(float), 1e-4
+    )
+    result = AnyHit(scene=Scene(corners), variant=variant)(segments, device=device)
+    np.testing.assert_array_equal(result.occluded[sure], expected[sure])
+    assert not result.status.any()
+    assert sure.mean() > 0.5
+
+
+@ON_DEVICES
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 80), size=st.sampled_from([1e-3, 0.1, 2.0]))
+def test_any_soup(device: Device, seed: int, count: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    corners, rays = soup(rng, count, size), some_rays(rng, 97)
+    hits = ClosestHit(scene=Scene(corners))(rays, device=device)
+    triangle = reference.closest(corners, rays)[0]
+    sure = far_from_edges(corners, rays, 1e-9)
+    np.testing.assert_array_equal(hits.triangle[sure], triangle[sure])
+
+
+def test_as_embree_says(device: Device, rng: np.random.Generator) -> None:
+    rtcore_scene = pytest.importorskip("embreex.rtcore_scene", reason="the extra 'test' is not installed")
+    construction = pytest.importorskip("embreex.mesh_construction", reason="the extra 'test' is not installed")
+    mesh = trimesh.creation.torus(1.0, 0.4, major_sections=61, minor_sections=43)
+    scene = Scene.of(mesh)
+    embree = rtcore_scene.EmbreeScene()
+    construction.TriangleMesh(embree, scene.corners.astype(np.float32))
+    segments = rng.uniform(-1.5, 1.5, (50_000, 6)).astype(np.float32)
+    origins = np.ascontiguousarray(segments[:, :3])
+    directions = np.ascontiguousarray(segments[:, 3:] - origins)
+    ones = np.ones(len(segments), np.float32)
+    theirs = embree.run(origins, directions, dists=ones, query="OCCLUDED") == 0
+    occluded = AnyHit(scene=scene)(segments, device=device).occluded != 0
+    # Silhouettes and ends in the surface are decided by rounding.
+    assert np.mean(occluded != theirs) < 2e-4
+    hits = ClosestHit(scene=scene)(np.hstack([origins, directions]), device=device)
+    nearest = embree.run(origins, directions, query="INTERSECT")
+    assert np.mean(hits.triangle != nearest) < 2e-4
+    assert 0.2 < occluded.mean() < 0.8
+
+
+@WAYS
+def test_nothing_slips_through_an_edge(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
+    """From within a closed surface, rays straight at its corners and at points of its edges."""
+    mesh = trimesh.creation.icosphere(3)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [0.1, 0.7, 0.3]))
+    corners = mesh.vertices.astype(np.float32).astype(float)[mesh.faces]
+    weights = rng.choice([0.0, 0.5, 0.25, 1.0 / 3.0, 1e-6], (len(corners), 1))
+    targets = np.concatenate([corners[:, 0], corners[:, 0] * (1 - weights) + corners[:, 1] * weights])
+    origins = np.concatenate([np.zeros((1, 3)), rng.uniform(-0.3, 0.3, (7, 3))])[rng.integers(0, 8, len(targets))]
+    rays = np.hstack([origins, targets - origins]).astype(dtype)
+    hits = ClosestHit(scene=Scene(corners), variant=variant)(rays, device=device)
+    assert not hits.status.any()
+    segments = np.hstack([origins, origins + 2.0 * (targets - origins)]).astype(dtype)
+    assert AnyHit(scene=Scene(corners), variant=variant)(segments, device=device).occluded.all()
+
+
+@WAYS
+def test_axis_parallel_rays_on_the_grid_of_a_plane(device: Device, variant: Any, dtype: Any) -> None:
+    """Rays along each axis, both ways, straight at the shared corners and edges of coplanar triangles."""
+    steps = np.arange(9) / 8.0
+    a, b = (each.ravel() for each in np.meshgrid(steps[:-1], steps[:-1]))
+    zero, side = np.zeros_like(a), 0.125
+    square = [np.stack([a + i * side, b + j * side, zero], axis=1) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    plane = np.concatenate([np.stack([square[0], square[n], square[n + 1]], axis=1) for n in (1, 2)])
+    inner = np.stack(np.meshgrid(np.arange(1, 16) / 16.0, np.arange(1, 16) / 16.0), axis=-1).reshape(-1, 2)
+    for axis in range(3):
+        corners = np.roll(plane, axis + 1, axis=2)
+        for sign in (1.0, -1.0):
+            rays = np.zeros((len(inner), 6))
+            rays[:, :3] = np.roll(np.column_stack([inner, np.full(len(inner), -sign)]), axis + 1, axis=1)
+            rays[:, 3 + axis] = 2.0 * sign
+            hits = ClosestHit(scene=Scene(corners), variant=variant)(rays.astype(dtype), device=device)
+            assert not hits.status.any()
+            np.testing.assert_allclose(hits.distance, 1.0, rtol=4 * eps_of(dtype))
+            rays[:, 3:] *= -1.0
+            assert (
+                ClosestHit(scene=Scene(corners), variant=variant)(rays.astype(dtype), device=device).triangle == -1
+            ).all()
+
+
+@WAYS
+def test_a_ray_in_the_plane_passes(device: Device, variant: Any, dtype: Any) -> None:
+    in_plane = np.array([[-1.0, 0.25, 0.0, 1.0, 0.0, 0.0], [0.25, 3.0, 0.0, 0.0, -1.0, 0.0]], dtype)
+    # A thousandth of a radian above it, and below: meets it at 0.25, and never.
+    grazing = np.array([[-0.75, 0.25, 1e-3, 1.0, 0.0, -1e-3], [-0.75, 0.25, 1e-3, 1.0, 0.0, 1e-3]], dtype)
+    operation = ClosestHit(scene=Scene(TRIANGLE), variant=variant)
+    assert (operation(in_plane, device=device).status == Status.NO_DATA).all()
+    hits = operation(grazing, device=device)
+    np.testing.assert_array_equal(hits.triangle, [0, -1])
+    np.testing.assert_allclose(hits.barycentric[0], [0.25, 0.25], atol=1e3 * 4 * eps_of(dtype))
+
+
+@WAYS
+def test_an_empty_scene(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
+    scene = Scene(np.zeros((0, 3, 3)))
+    hits = ClosestHit(scene=scene, variant=variant)(some_rays(rng, 33).astype(dtype), device=device)
+    assert (hits.triangle == -1).all()
+    assert (hits.status == Status.NO_DATA).all()
+    assert not AnyHit(scene=scene, variant=variant)(some_rays(rng, 33).astype(dtype), device=device).occluded.any()
+
+
+@WAYS
+def test_what_is_not_a_triangle_is_not_met(device: Device, variant: Any, dtype: Any) -> None:
+    bad = np.array([[[0.0, 0, 1], [1, 1, 1], [0.5, 0.5, 1]], [[0.0, 0, 2], [0, 0, 2], [1, 1, 2]], [[np.nan] * 3] * 3])
+    scene = Scene(np.concatenate([bad, TRIANGLE]))
+    rays = np.array([[0.25, 0.25, 5.0, 0.0, 0.0, -1.0]], dtype)
+    np.testing.assert_array_equal(ClosestHit(scene=scene, variant=variant)(rays, device=device).triangle, [3])
+
+
+@WAYS
+def test_numbers_that_are_none(device: Device, variant: Any, dtype: Any) -> None:
+    good = [0.25, 0.25, 1.0, 0.25, 0.25, -1.0]
+    rows = np.array([good] + [good] * 12 + [good], dtype)
+    rows[np.arange(1, 7), np.arange(6)] = np.nan
+    rows[np.arange(7, 13), np.arange(6)] = -np.inf
+    result = AnyHit(scene=Scene(TRIANGLE), variant=variant)(rows, device=device)
+    expected = np.array([0] + [Status.NOT_FINITE] * 12 + [0])
+    np.testing.assert_array_equal(result.status, expected)
+    np.testing.assert_array_equal(result.occluded, expected == 0)
+    rays = rows.copy()
+    rays[-1, 3:] = 0.0
+    rays[0, 3:5] = 0.0
+    hits = ClosestHit(scene=Scene(TRIANGLE), variant=variant)(rays, device=device)
+    np.testing.assert_array_equal(hits.status != 0, [False] + [True] * 13)
+    np.testing.assert_array_equal(hits.status[1:], Status.NOT_FINITE)
+
+
+@WAYS
+def test_ends_do_not_occlude_within_the_clearance(device: Device, variant: Any, dtype: Any) -> None:
+    segments = np.array([[0.25, 0.25, 1e-3, 0.25, 0.25, -1.0], [0.25, 0.25, -1.0, 0.25, 0.25, 1e-3]], dtype)
+    for clearance, expected in ((0.0, 1), (0.5e-3, 1), (2e-3, 0), (10.0, 0)):
+        result = AnyHit(scene=Scene(TRIANGLE), clearance=clearance, variant=variant)(segments, device=device)
+        np.testing.assert_array_equal(result.occluded, expected)
+    rays = np.array([[0.25, 0.25, 1e-3, 0.0, 0.0, -7.0]], dtype)
+    assert ClosestHit(scene=Scene(TRIANGLE), clearance=2e-3, variant=variant)(rays, device=device).triangle[0] == -1
+    # The end itself does not count.
+    touching = np.array([[0.25, 0.25, 0.0, 0.25, 0.25, 1.0]], dtype)
+    half = np.array([0.0, 0.0, 0.5])
+    both = Scene(np.concatenate([TRIANGLE - half, TRIANGLE + half]))
+    touching[:, [2, 5]] -= 0.5
+    assert not AnyHit(scene=both, variant=variant)(touching, device=device).occluded.any()
+
+
+def test_far_from_the_origin_in_single(device: Device, rng: np.random.Generator) -> None:
+    """The scene's middle goes away in double, so kilometres off a micrometre stays one."""
+    corners, away = soup(rng, 200), np.array([5000.0, -3000.0, 1000.0])
+    rays = some_rays(rng, 300)
+    rays = rays[far_from_edges(corners, rays)]
+    moved = rays + np.concatenate([away, np.zeros(3)])
+    hits = ClosestHit(scene=Scene(corners + away), precision="single")(moved, device=device)
+    assert hits.distance.dtype == np.float32
+    assert_closest(corners, rays, hits)
+
+
+@WAYS
+def test_rays_from_afar(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
+    """From a million times the scene's size they meet it, in single, as from nearby."""
+    corners, away = soup(rng, 200), np.array([3e6, -1e6, 2e6])
+    far = np.hstack([rng.normal(0.0, 1e6, (400, 3)) + away, np.zeros((400, 3))]).astype(dtype)
+    targets = np.round(rng.uniform(-1.0, 1.0, (400, 3)) * 256.0) / 256.0
+    rays = far.astype(np.float64)
+    rays[:, 3:] = targets - rays[:, :3]
+    sure = far_from_edges(corners, rays, 1e-4)
+    assert sure.mean() > 0.9
+    triangle, distance, u, v = reference.closest(corners, rays)
+    hits = ClosestHit(scene=Scene(corners), variant=variant, precision="single")(rays, device=device)
+    np.testing.assert_array_equal(hits.triangle[sure], triangle[sure])
+    met = sure & (triangle >= 0)
+    assert 0.3 < met.mean() < 0.99
+    np.testing.assert_allclose(hits.barycentric[met], np.column_stack([u, v])[met], atol=1e-4)
+    np.testing.assert_allclose(hits.distance[met], distance[met], rtol=4 * eps_of(np.float32))
+    segments = np.hstack([far[:, :3], targets.astype(dtype)])
+    exact = segments.astype(np.float64)
+    sure &= reference.occluded(corners, exact, -1e-9) == reference.occluded(corners, exact, 1e-9)
+    result = AnyHit(scene=Scene(corners), variant=variant)(segments, device=device)
+    np.testing.assert_array_equal(result.occluded[sure], reference.occluded(corners, exact)[sure])
+    # Those that point away, and those that end before it, meet nothing.
+    rays[:, 3:] *= -1.0
+    assert (ClosestHit(scene=Scene(corners), variant=variant)(rays.astype(dtype), device=device).triangle == -1).all()
+    segments[:, 3:] = segments[:, :3] * dtype(0.5)
+    assert not AnyHit(scene=Scene(corners), variant=variant)(segments, device=device).occluded.any()
+
+
+@WAYS
+def test_writes_only_its_outputs(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
+    scene = Scene(soup(rng, 100))
+    for operation in (ClosestHit(scene=scene, variant=variant), AnyHit(scene=scene, variant=variant)):
+        for shape in ((0,), (1,), (3, 7), (257,), (1000,)):
+            rays = rng.uniform(-1.0, 1.0, (*shape, 6)).astype(dtype)
+            plain = operation(rays, device=device)
+            guarded = Guarded(plain)
+            operation(rays, device=device, out=guarded.out)
+            guarded.assert_intact()
+            for one, two in zip(plain, guarded.out, strict=True):
+                np.testing.assert_array_equal(one, two)
+
+
+def test_what_it_does_not_take(device: Device) -> None:
+    scene = Scene(TRIANGLE)
+    with pytest.raises(TypeError, match="Scene"):
+        AnyHit(scene=TRIANGLE)
+    with pytest.raises(ValueError, match="clearance"):
+        ClosestHit(scene=scene, clearance=-1.0)
+    with pytest.raises(ValueError, match="rays"):
+        ClosestHit(scene=scene)(np.zeros((4, 5)), device=device)
+    with pytest.raises(TypeError, match="float32"):
+        AnyHit(scene=scene)(np.zeros((4, 6), np.int32), device=device)
+    with pytest.raises(ValueError, match="precision"):
+        AnyHit(scene=scene, precision="half")(np.zeros((4, 6)), device=device)

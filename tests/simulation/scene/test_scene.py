@@ -1,0 +1,158 @@
+"""Scenes: what files and trimesh hold, and what is wrong with their triangles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from gpuvision.host import Device
+from gpuvision.simulation.scene.rays import ClosestHit
+from gpuvision.simulation.scene.scene import Scene, _numbered
+
+
+@pytest.fixture
+def box() -> np.ndarray:
+    return np.array(trimesh.creation.box((1.0, 2.0, 3.0)).triangles)
+
+
+@pytest.mark.parametrize("ending", ["stl", "ply", "obj", "glb"])
+def test_files(tmp_path: Path, ending: str, box: np.ndarray) -> None:
+    path = tmp_path / f"box.{ending}"
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
+    scene = Scene.load(path, metres=1e-3)
+    assert scene.corners.shape == (12, 3, 3)
+    np.testing.assert_allclose(np.ptp(scene.corners, axis=(0, 1)), [1e-3, 2e-3, 3e-3], rtol=1e-6)
+    assert str(scene.defects) == "no defects"
+    assert not scene.material.any()
+
+
+def test_meshes_are_materials(tmp_path: Path) -> None:
+    one, two = trimesh.creation.box(), trimesh.creation.icosphere(1)
+    two.apply_translation([5.0, 0.0, 0.0])
+    for given in ([one, two], trimesh.Scene([one, two])):
+        scene = Scene.of(given)
+        np.testing.assert_array_equal(scene.material, np.repeat([0, 1], [12, 80]))
+        np.testing.assert_allclose(scene.corners[12:].mean(axis=(0, 1)), [5.0, 0.0, 0.0], atol=1e-12)
+    trimesh.Scene([one, two]).export(tmp_path / "two.glb")
+    np.testing.assert_array_equal(np.bincount(Scene.load(tmp_path / "two.glb").material), [12, 80])
+    assert len(Scene.of([]).corners) == 0
+
+
+def test_a_file_that_is_none(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        Scene.load(tmp_path / "none.stl")
+    (tmp_path / "part.txt").write_text("solid")
+    with pytest.raises(ValueError, match=r"\.stl"):
+        Scene.load(tmp_path / "part.txt")
+    with pytest.raises(TypeError, match="trimesh"):
+        Scene.of([np.zeros((1, 3, 3))])
+
+
+@pytest.mark.parametrize("ending", ["stl", "ply", "obj", "glb"])
+@pytest.mark.parametrize("harm", ["empty", "cut", "garbled"])
+def test_a_damaged_file_is_named(tmp_path: Path, ending: str, harm: str) -> None:
+    path = tmp_path / f"box.{ending}"
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
+    whole = path.read_bytes()
+    path.write_bytes({"empty": b"", "cut": whole[: len(whole) // 2], "garbled": b"\x92\x00\x81mesh" * 40}[harm])
+    with pytest.raises(ValueError, match=rf"box\.{ending}: (not a readable mesh|holds no triangles)"):
+        Scene.load(path)
+
+
+def test_a_folder_is_no_mesh(tmp_path: Path) -> None:
+    (tmp_path / "part.stl").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"part\.stl: a folder, expected a file"):
+        Scene.load(tmp_path / "part.stl")
+
+
+def test_no_area(box: np.ndarray) -> None:
+    flat = np.array([[[0, 0, 0], [1, 1, 1], [3, 3, 3]], [[1, 2, 3]] * 3, [[0, 0, 0], [1, 0, 0], [1, 0, 0]]], float)
+    # Slivers are triangles: a nanometre by a metre, and all of it a micrometre.
+    slivers = np.array([[[0, 0, 9], [1, 0, 9], [0, 1e-9, 9]], [[0, 0, 8], [1e-6, 0, 8], [0, 1e-6, 8]]])
+    scene = Scene(np.concatenate([box, flat, slivers]))
+    assert scene.defects.degenerate == (12, 13, 14)
+    np.testing.assert_array_equal(np.sort(scene.bvh.numbers), [*range(12), 15, 16])
+    assert "degenerate: 3 triangles (12, 13, 14)" in str(scene.defects)
+
+
+def test_not_finite(box: np.ndarray) -> None:
+    box[3, 1, 2], box[7, 0, 0] = np.nan, np.inf
+    scene = Scene(box)
+    assert scene.defects.not_finite == (3, 7)
+    assert scene.defects.degenerate == ()
+    assert len(scene.bvh.numbers) == 10
+
+
+def test_inverted_are_turned(box: np.ndarray) -> None:
+    wrong = box.copy()
+    wrong[[2, 9]] = wrong[[2, 9]][:, ::-1]
+    scene = Scene(wrong)
+    assert scene.defects.inverted == (2, 9)
+    np.testing.assert_array_equal(scene.corners, box)
+    assert Scene(box).defects.inverted == ()
+
+
+def test_each_piece_by_itself(box: np.ndarray) -> None:
+    other = box + 10.0
+    other[5] = other[5][::-1]
+    assert Scene(np.concatenate([box[:, ::-1], other])).defects.inverted == (17,)
+
+
+def test_three_on_an_edge(box: np.ndarray) -> None:
+    fin = np.concatenate([box[0, :2], [[9.0, 9.0, 9.0]]])[None]
+    defects = Scene(np.concatenate([box, fin])).defects
+    assert {0, 12} <= set(defects.non_manifold)
+    assert len(defects.non_manifold) == 3
+
+
+def test_the_same_points_have_the_same_number(rng: np.random.Generator) -> None:
+    """Whatever the sign of a zero, and though they differ in the last bit only."""
+    some = np.array([0.0, -0.0, 1.0, -1.0, np.nextafter(1.0, 2.0), 5e-324, 1e300])
+    points = rng.choice(some, (3000, 3))
+    numbers = _numbered(points)
+    _, first, expected = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
+    np.testing.assert_array_equal(numbers, numbers[first][expected])
+    assert len(np.unique(numbers)) == len(first)
+
+
+@pytest.mark.slow
+def test_a_million_triangles(device: Device, rng: np.random.Generator) -> None:
+    """A sphere of 1.3 million: each triangle once in the tree, the turned ones found, and rays that meet it."""
+    mesh = trimesh.creation.icosphere(8)
+    corners = np.array(mesh.triangles)
+    wrong = rng.choice(len(corners), 1000, replace=False)
+    corners[wrong] = corners[wrong][:, ::-1]
+    scene = Scene(corners)
+    assert scene.defects.inverted == tuple(sorted(wrong))
+    members = scene.bvh.members
+    np.testing.assert_array_equal(np.sort(members[members >= 0]), np.arange(len(corners)))
+    directions = rng.normal(size=(20_000, 3))
+    hits = ClosestHit(scene=scene)(np.hstack([np.zeros((20_000, 3)), directions]), device=device)
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    met = scene.corners[hits.triangle]
+    weights = np.column_stack([1.0 - hits.barycentric.sum(axis=1), hits.barycentric])
+    np.testing.assert_allclose(np.einsum("nc,ncx->nx", weights, met), unit * hits.distance[:, None], atol=1e-12)
+    assert not hits.status.any()
+
+
+def test_a_moebius_strip_has_no_winding() -> None:
+    turn = np.linspace(0.0, 2.0 * np.pi, 31)[:-1]
+    across = np.stack([np.cos(turn / 2) * np.cos(turn), np.cos(turn / 2) * np.sin(turn), np.sin(turn / 2)], axis=1)
+    middle = 3.0 * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
+    one, two = middle + across, middle - across
+    # After a turn the sides have changed places.
+    next_one, next_two = np.concatenate([one[1:], two[:1]]), np.concatenate([two[1:], one[:1]])
+    strip = np.concatenate([np.stack([one, two, next_one], axis=1), np.stack([two, next_two, next_one], axis=1)])
+    assert len(Scene(strip).defects.non_manifold) == len(strip)
+
+
+def test_what_a_scene_does_not_take(box: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"\(n, 3, 3\)"):
+        Scene(box[0])
+    with pytest.raises(ValueError, match="integers"):
+        Scene(box, np.zeros(3, int))
+    with pytest.raises(ValueError, match="below 0"):
+        Scene(box, np.full(12, -1))

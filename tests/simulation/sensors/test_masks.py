@@ -1,0 +1,242 @@
+"""Masks: what passes, and the windows that are best."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gpuvision.camera.lens import Lens
+from gpuvision.simulation.sensors.masks import Mask, optimise_mask
+from gpuvision.simulation.sensors.readings import Truth, height_secant, sheet_point
+from gpuvision.simulation.sensors.sensor_view import Exposure
+from lights import LENGTH, gaussian, psd, psd_sight
+
+# Where a mask of length beta a has the centre of a 90 degree corner's glow, in units of a.
+CORNER = [(1, 0.594984), (2, 0.993527), (5, 1.656779), (10, 2.224535), (100, 4.341808)]
+
+
+def corner_glow(edges: np.ndarray, a: float) -> Exposure:
+    """Return the light of E = a b / (2 (a^2 + b^2)^1.5) in bins along b, exactly."""
+    power = 0.5 * -np.diff(1.0 / np.sqrt(1.0 + (edges / a) ** 2))
+    first = 0.5 * a * np.diff(np.arcsinh(edges / a) - edges / a / np.sqrt(1.0 + (edges / a) ** 2))
+    return Exposure(power[None], (first - power * 0.5 * (edges[1:] + edges[:-1]))[None])
+
+
+def centre(light: Exposure, edges: np.ndarray) -> np.ndarray:
+    return light.first_moment(edges) / light.total()
+
+
+@pytest.mark.parametrize(("beta", "expected"), CORNER)
+def test_corner_through_a_mask(beta: int, expected: float) -> None:
+    """The centre of a corner's glow grows with the mask: 0.594984 a ... 4.341808 a, without end."""
+    a = 1e-3
+    edges = np.linspace(0.0, 200.0 * a, 4001)
+    mask = Mask(windows=[[0.0, edges[20 * beta]]])
+    assert centre(mask.apply(corner_glow(edges, a), edges), edges)[0] / a == pytest.approx(expected, abs=1e-6)
+    # Within a bin, by even light in it: to the square of the bins' width.
+    coarse = np.linspace(0.0, 200.0 * a, 777)
+    assert centre(mask.apply(corner_glow(coarse, a), coarse), coarse)[0] / a == pytest.approx(expected, rel=0.01)
+
+
+def test_windows_within_bins_converge() -> None:
+    """Of windows that end anywhere within the bins the error falls with the square of the bins' width."""
+    a = 1e-3
+    beta = np.linspace(3.0, 8.0, 40)
+    slant = np.sqrt(1.0 + beta**2)
+    exact = (np.arcsinh(beta) - beta / slant) / (1.0 - 1.0 / slant)
+    errors = []
+    for bins in (50, 100, 200):
+        edges = np.linspace(0.0, 30.0 * a, bins + 1)
+        light = corner_glow(edges, a)
+        centres = [centre(Mask(windows=[[0.0, each * a]]).apply(light, edges), edges)[0] / a for each in beta]
+        errors.append(np.sqrt(np.mean((centres - exact) ** 2)))
+    assert errors[0] < 2e-3
+    assert 3.0 < errors[0] / errors[1] < 6.0
+    assert 3.0 < errors[1] / errors[2] < 6.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    ends=st.tuples(st.floats(-4.0, 4.0), st.floats(-4.0, 4.0)),
+    leak=st.floats(0.0, 1.0),
+)
+def test_light_through_a_window(seed: int, ends: tuple[float, float], leak: float) -> None:
+    """No light is made, none lies outside its bin, two windows side by side pass what one over both does."""
+    rng = np.random.default_rng(seed)
+    edges = np.sort(rng.uniform(-3.0, 3.0, 8))
+    power = rng.uniform(0.0, 1.0, (2, 7)) * (rng.uniform(size=(2, 7)) > 0.3)
+    light = Exposure(power, power * rng.uniform(-0.5, 0.5, (2, 7)) * np.diff(edges))
+    low, high = sorted(ends)
+    passing = Mask(windows=[[low, high]] * 2, leak=leak).apply(light, edges)
+    assert np.all(passing.power >= leak * light.power - 1e-15)
+    assert np.all(passing.power <= light.power + 1e-15)
+    assert np.all(np.abs(passing.moment) <= 0.5 * np.diff(edges) * passing.power + 1e-15)
+    middle = 0.5 * (low + high)
+    halves = [Mask(windows=[pair] * 2).apply(light, edges) for pair in ([low, middle], [middle, high])]
+    whole = Mask(windows=[[low, high]] * 2).apply(light, edges)
+    np.testing.assert_allclose((halves[0] + halves[1]).power, whole.power, atol=1e-14)
+    np.testing.assert_allclose((halves[0] + halves[1]).moment, whole.moment, atol=1e-14)
+
+
+def test_a_point_of_light_passes_or_does_not() -> None:
+    """All light at one end of its bin: no width to divide."""
+    edges = np.array([0.0, 1.0, 2.0])
+    light = Exposure(np.array([[1.0, 1.0]]), np.array([[0.5, -0.5]]))
+    for window, expected in (([0.5, 1.5], [1.0, 1.0]), ([0.2, 0.9], [0.0, 0.0]), ([1.0, 1.0], [0.0, 0.0])):
+        assert Mask(windows=[window]).apply(light, edges).power.sum() == np.sum(expected)
+
+
+def test_transmission() -> None:
+    sight = psd_sight(6)
+    light = gaussian(sight, [0.3e-3], 1e-6, 1e-3)
+    shares = np.linspace(0.0, 1.0, 30).reshape(5, 6)
+    passing = Mask(transmission=shares).apply(light, sight.u_edges)
+    np.testing.assert_allclose(passing.power, shares * light.power, rtol=1e-15)
+    np.testing.assert_allclose(passing.moment, shares * light.moment, rtol=1e-15)
+
+
+def test_files(tmp_path: Path) -> None:
+    mask = Mask(windows=[[-1e-3, 1 / 3e3], [0.0, 0.0]])
+    mask.save(tmp_path / "mask.txt")
+    np.testing.assert_array_equal(Mask.load(tmp_path / "mask.txt").windows, mask.windows)
+    with pytest.raises(ValueError, match="without leak"):
+        Mask(windows=[[0.0, 1.0]], leak=0.1).save(tmp_path / "other.txt")
+    (tmp_path / "three.txt").write_text("1, 2, 3\n")
+    with pytest.raises(ValueError, match="two numbers a line"):
+        Mask.load(tmp_path / "three.txt")
+
+
+def test_what_is_refused() -> None:
+    for wrong in ({"windows": [[1.0, 0.0]]}, {"windows": [[0.0, np.nan]]}, {"windows": [0.0, 1.0]}, {"leak": 2.0}):
+        with pytest.raises(ValueError, match="expected"):
+            Mask(**wrong)
+    with pytest.raises(ValueError, match="shares from 0 to 1"):
+        Mask(transmission=[[1.5]])
+    with pytest.raises(ValueError, match="does not fit"):
+        Mask(windows=[[0.0, 1.0]] * 3).apply(psd_sight().dark(), psd_sight().u_edges)
+
+
+@pytest.mark.parametrize("lens", [None, Lens(k1=-4000.0)])
+def test_mask_about_an_expected_profile(lens: Lens | None) -> None:
+    """Its ends are seen at the heights asked for, above and below; it is closed where nothing is expected."""
+    sight = psd_sight()
+    sight = replace(sight, triangulation=replace(sight.triangulation, lens=lens))
+    u = np.array([-2e-3, -1e-3, np.nan, 1e-3, 2.9e-3])
+    truth = Truth(*sheet_point(sight.triangulation, u, sight.v_middles), np.zeros(5, np.uint8))
+    windows = Mask.about(sight, truth, 2e-3).windows
+    assert windows[2, 0] == windows[2, 1]
+    assert windows[4, 1] == 0.5 * LENGTH
+    seen = [0, 1, 3]
+    for end, rise in ((0, -2e-3), (1, 2e-3)):
+        _, h = sheet_point(sight.triangulation, windows[:, end], sight.v_middles)
+        np.testing.assert_allclose(h[seen], truth.h[seen] + rise, atol=1e-12)
+    with pytest.raises(ValueError, match="reach is 0"):
+        Mask.about(sight, truth, 0.0)
+
+
+# ---- the best mask -------------------------------------------------------------------------------------------
+
+
+def part(profiles: int = 12) -> tuple:
+    """Return a part whose line wanders over the strips, with a glow far from it, and its truth."""
+    sight = psd_sight(120)
+    rng = np.random.default_rng(1)
+    u = 1.2e-3 * np.sin(np.linspace(0.0, 4.0, profiles))[:, None] + rng.uniform(-2e-4, 2e-4, (profiles, sight.samples))
+    light = {
+        "direct": gaussian(sight, u, 1e-6, 4e-5),
+        "diffuse-diffuse": gaussian(sight, np.full((profiles, sight.samples), -2.0e-3), 2e-7, 3e-4),
+    }
+    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
+    return sight, light, Truth(g, h, np.zeros(u.shape, np.uint8)), u
+
+
+@pytest.mark.parametrize("objective", ["worst", "rms"])
+def test_fixed_mask(objective: str) -> None:
+    """No window of bins that cuts no more does better: all of them tried."""
+    sight, light, truth, u = part()
+    plan = optimise_mask(sight, light, truth, objective=objective, keep=0.999)
+    assert np.all(plan.kept >= 0.999)
+    assert plan.mask.windows.shape == (sight.samples, 2)
+    slope = height_secant(sight.triangulation, u, u, sight.v_middles)
+    total = light["direct"] + light["diffuse-diffuse"]
+    judge = (lambda e: np.abs(e).max(axis=0)) if objective == "worst" else (lambda e: np.sqrt(np.mean(e**2, axis=0)))
+    np.testing.assert_allclose(judge(plan.before), judge((centre(total, sight.u_edges) - u) * slope), rtol=1e-9)
+    best = np.full(sight.samples, np.inf)
+    for low, high in itertools.combinations(range(121), 2):
+        allowed = (_tails(light["direct"], low, high) <= 0.0005).all(axis=0)
+        if allowed.any():
+            mask = Mask(windows=np.broadcast_to(sight.u_edges[[low, high]], (sight.samples, 2)))
+            cost = judge((centre(mask.apply(total, sight.u_edges), sight.u_edges) - u) * slope)
+            best = np.where(allowed, np.minimum(best, cost), best)
+    np.testing.assert_allclose(judge(plan.after), best, rtol=1e-9)
+    assert np.all(judge(plan.after) < 0.5 * judge(plan.before))
+
+
+def _tails(direct: Exposure, low: int, high: int) -> np.ndarray:
+    """Return the larger share that is cut at either end."""
+    total = direct.power.sum(axis=-1)
+    return np.maximum(direct.power[..., :low].sum(axis=-1), direct.power[..., high:].sum(axis=-1)) / total
+
+
+def test_mask_that_follows_the_part() -> None:
+    """A window for every profile leaves next to nothing of a glow that lies apart."""
+    sight, light, truth, u = part()
+    fixed = optimise_mask(sight, light, truth)
+    follows = optimise_mask(sight, light, truth, fixed=False)
+    assert follows.mask.windows.shape == (*u.shape, 2)
+    assert np.all(follows.kept >= 0.999)
+    assert np.abs(follows.after).max() < 0.05 * np.abs(fixed.after).max()
+    assert np.all((follows.mask.windows[..., 0] < u) & (u < follows.mask.windows[..., 1]))
+
+
+def test_margin_keeps_away_from_valid_light() -> None:
+    sight, light, truth, u = part()
+    windows = optimise_mask(sight, light, truth, keep=0.999, margin=3e-4).mask.windows
+    # 99.95 % of a Gaussian on either side are 3.29 sigma; a bin is 50 um wide.
+    assert np.all(windows[:, 0] <= u.min(axis=0) - 3e-4 - 3.29 * 4e-5 + 5e-5)
+    assert np.all(windows[:, 1] >= u.max(axis=0) + 3e-4 + 3.29 * 4e-5 - 5e-5)
+
+
+def test_samples_without_valid_light_are_closed() -> None:
+    """What they would read is the glow alone: better no reading."""
+    sight, light, truth, u = part(4)
+    dark = np.zeros(u.shape, bool)
+    dark[:, 2] = dark[1, 3] = True
+    direct = Exposure(*(np.where(dark[..., None], 0.0, each) for each in light["direct"]))
+    light = light | {"direct": direct}
+    plan = optimise_mask(sight, light, Truth(truth.g, np.where(dark, np.nan, truth.h), truth.status))
+    assert plan.mask.windows[2, 0] == plan.mask.windows[2, 1]
+    assert np.isfinite(plan.after).tolist() == (~dark).tolist()
+    masked = psd(sight, mask=plan.mask).currents(light)
+    assert not masked[:, 2].any()
+    assert masked[:, [0, 1, 3, 4]].all()
+
+
+def test_a_camera_of_many_pixels() -> None:
+    """Narrowed down over several rounds: the same as the tightest window, where that is the best."""
+    edges = np.linspace(-0.5 * LENGTH, 0.5 * LENGTH, 1025)
+    sight = psd_sight(1024)
+    np.testing.assert_array_equal(edges, sight.u_edges)
+    u = np.array([[-1e-3, -5e-4, 0.0, 5e-4, 1e-3]])
+    glow = np.broadcast_to(np.linspace(0.0, 1e-9, 1024), (1, 5, 1024))
+    light = {"direct": gaussian(sight, u, 1e-6, 4e-5), "bounces": Exposure(glow, np.zeros_like(glow))}
+    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
+    plan = optimise_mask(sight, light, Truth(g, h, np.zeros(u.shape, np.uint8)), keep=0.9999)
+    assert np.abs(plan.after).max() < 0.02 * np.abs(plan.before).max()
+
+
+def test_what_optimising_refuses() -> None:
+    sight, light, truth, _ = part(2)
+    with pytest.raises(ValueError, match="objective is 'best'"):
+        optimise_mask(sight, light, truth, objective="best")
+    with pytest.raises(ValueError, match="0 < keep <= 1"):
+        optimise_mask(sight, light, truth, keep=0.0)
+    with pytest.raises(ValueError, match="profiles, samples, bins"):
+        optimise_mask(sight, {"direct": sight.dark()}, truth)

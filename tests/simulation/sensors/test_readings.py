@@ -1,0 +1,96 @@
+"""What simulated sensors share: sheet points, slopes, and light by path."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gpuvision.camera.lens import Lens
+from gpuvision.host import Device
+from gpuvision.ranging.triangulation import Triangulation
+from gpuvision.simulation.sensors.readings import (
+    AMBIENT,
+    EVEN,
+    Truth,
+    height_secant,
+    height_slope,
+    lit_by,
+    sheet_point,
+    stack,
+    with_ambient,
+)
+from lights import LENGTH, PITCH, gaussian, psd_sight
+
+LENSES = [None, Lens(k1=-4000.0), Lens(k1=2000.0, k2=1e7, centre=(1e-4, -2e-4))]
+
+
+def with_lens(lens: Lens | None) -> Triangulation:
+    return replace(psd_sight().triangulation, lens=lens)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_sheet_points_are_the_triangulation_s(lens: Lens | None, device: Device, rng: np.random.Generator) -> None:
+    triangulation = with_lens(lens)
+    u, v = rng.uniform(-0.5 * LENGTH, 0.5 * LENGTH, 64), rng.uniform(-2 * PITCH, 2 * PITCH, 64)
+    real = np.float64 if device.has_double else np.float32
+    said = triangulation(u.astype(real), v.astype(real), device=device)
+    g, h = sheet_point(triangulation, u, v)
+    np.testing.assert_allclose(g, said.g, atol=1e-12 if device.has_double else 1e-8)
+    np.testing.assert_allclose(h, said.h, atol=1e-12 if device.has_double else 1e-8)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_secants(lens: Lens | None, rng: np.random.Generator) -> None:
+    """Differences over distances, and no digit lost where the distance goes to nothing."""
+    triangulation = with_lens(lens)
+    u, other = rng.uniform(-0.5 * LENGTH, 0.5 * LENGTH, (2, 50))
+    v = rng.uniform(-2 * PITCH, 2 * PITCH, 50)
+    rise = sheet_point(triangulation, other, v)[1] - sheet_point(triangulation, u, v)[1]
+    np.testing.assert_allclose(height_secant(triangulation, u, other, v) * (other - u), rise, rtol=1e-9, atol=1e-16)
+    step = 1e-6
+    slope = (sheet_point(triangulation, u + step, v)[1] - sheet_point(triangulation, u - step, v)[1]) / (2.0 * step)
+    for near in (0.0, 1e-15, 1e-11, 1e-9):
+        # Between the derivative here and the one at the other place lies that place's distance.
+        np.testing.assert_allclose(height_secant(triangulation, u, u + near, v), slope, rtol=1e-6)
+
+
+def test_slope_at_the_truth() -> None:
+    sight = psd_sight()
+    u = np.linspace(-2e-3, 2e-3, sight.samples)
+    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
+    h[1] = np.nan
+    found, slope = height_slope(sight, Truth(g, h, np.zeros(5, np.uint8)))
+    known = np.arange(5) != 1
+    np.testing.assert_allclose(found[known], u[known], atol=1e-15)
+    assert np.isnan(found[1])
+    np.testing.assert_allclose(
+        slope[known], height_secant(sight.triangulation, u, u, sight.v_middles)[known], rtol=1e-10
+    )
+
+
+def test_beyond_the_horizon_there_is_no_point() -> None:
+    triangulation = psd_sight().triangulation
+    row = triangulation.homography[2]
+    horizon = -row[2] / row[0]
+    g, h = sheet_point(triangulation, [0.9 * horizon, 1.1 * horizon], 0.0)
+    assert np.isnan(h).tolist() == [False, True]
+    assert np.isnan(g).tolist() == [False, True]
+
+
+def test_light_of_profiles() -> None:
+    """Paths add up, variants of the direct light do not; a path that a profile lacks is dark there."""
+    sight = psd_sight()
+    spots = [gaussian(sight, [place], 1e-6, 1e-4) for place in (-1e-3, 0.0, 1e-3)]
+    block = stack([{"direct": spots[0], EVEN: spots[2]}, {"direct": spots[1], "bounces": spots[2]}])
+    assert not block["bounces"].power[0].any()
+    np.testing.assert_array_equal(lit_by(block).power, [spots[0].power, spots[1].power + spots[2].power])
+    np.testing.assert_array_equal(lit_by(block).moment, [spots[0].moment, spots[1].moment + spots[2].moment])
+    bright = with_ambient(sight, with_ambient(sight, block, 1e-6), 2e-6)
+    np.testing.assert_allclose(bright[AMBIENT].total(), 3e-6, rtol=1e-14)
+    for wrong in ([], [{}]):
+        with pytest.raises(ValueError, match="one or more profiles"):
+            stack(wrong)
+    with pytest.raises(ValueError, match="different shapes"):
+        lit_by({"direct": spots[0], "bounces": block["bounces"]})

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from simulation.test_sight import sight
+
+from gpuvision.simulation.scene.material import Material
+from gpuvision.simulation.scene.reflectance import Lambert
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.sensors.view_rays import ViewRays
+
+GREY = Material(diffuse=Lambert(albedo=0.5))
+WHITE = Material(diffuse=Lambert(albedo=1.0))
+
+
+def floor(z: float = 0.0, size: float = 0.2) -> trimesh.Trimesh:
+    corners = np.array([[-size, -size, z], [size, -size, z], [size, size, z], [-size, size, z]])
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+@pytest.mark.parametrize("nodes", [(1, 1), (2, 3)])
+def test_elements_lie_on_what_is_seen_where_its_image_is(device, nodes):
+    one = sight(tilt=0.1)
+    lines = ViewRays(sight=one, scene=Scene.of(floor(1e-3)), materials=[GREY], nodes=nodes, device=device)
+    seen = lines.surface(0.02)
+    assert seen.receivers.shape == (one.samples, one.bins * nodes[0] * nodes[1], 6)
+    np.testing.assert_allclose(seen.receivers[..., 2], 1e-3, atol=1e-15)
+    np.testing.assert_allclose(seen.receivers[..., 3:], np.broadcast_to([0, 0, 1], seen.receivers[..., 3:].shape))
+    uv = one.project(seen.receivers[..., :3], L=0.02)
+    np.testing.assert_allclose(uv[..., 0], np.broadcast_to(lines.u, uv.shape[:-1]), atol=1e-14)
+    bins = np.repeat(np.arange(one.bins), nodes[0] * nodes[1])
+    np.testing.assert_array_equal(one.bin_of(uv[..., 0]), np.broadcast_to(bins, uv.shape[:-1]))
+    np.testing.assert_array_equal(one.sample_of(uv[..., 1]), np.broadcast_to(np.arange(7)[:, None], uv.shape[:-1]))
+
+
+def test_uniform_light_gives_the_etendue_and_its_moment(device):
+    one = sight()
+    lines = ViewRays(sight=one, scene=Scene.of(floor()), materials=[GREY], nodes=(4, 4), device=device)
+    seen = lines.surface(0.0)
+    got = lines.exposure(seen, np.full(seen.weights.shape, 3.0))
+    # Radiance 3 * 0.5 / pi everywhere: an independent sum over a fine grid of the sensor.
+    u = -3e-3 + (np.arange(600) + 0.5) * 1e-5
+    v = -6e-3 + (np.arange(840) + 0.5) * (12e-3 / 840)
+    fine = one.etendue(u[None, :], v[:, None]) * 1e-5 * (12e-3 / 840) * 1.5 / math.pi
+    held = fine.reshape(7, 120, 600)
+    np.testing.assert_allclose(got.total(), held.sum(axis=(1, 2)), rtol=1e-5)
+    np.testing.assert_allclose(got.first_moment(one.u_edges), (held * u).sum(axis=(1, 2)), rtol=1e-3, atol=1e-22)
+
+
+def test_the_side_that_the_lens_sees_counts_and_the_nearer_surface(device):
+    under, over = floor(-5e-3), floor(4e-3, size=0.004)
+    over.invert()
+    scene = Scene(np.concatenate([under.triangles, over.triangles]), np.array([0, 0, 1, 1], np.int32))
+    one = sight()
+    lines = ViewRays(sight=one, scene=scene, materials=[GREY, WHITE], device=device)
+    seen = lines.surface(0.0)
+    near = seen.receivers[..., 2] > 0.0
+    assert near.any()
+    assert not near.all()
+    np.testing.assert_array_equal(seen.triangle[near] >= 2, True)
+    assert (np.abs(seen.receivers[near][:, :2]) <= 0.004 + 1e-9).all()
+    assert (seen.receivers[..., 5] == 1.0).all()
+
+
+def test_where_nothing_is_seen_nothing_comes(device):
+    one = sight()
+    lines = ViewRays(sight=one, scene=Scene.of(floor(size=0.003)), materials=[GREY], device=device)
+    seen = lines.surface(0.0)
+    missed = seen.triangle < 0
+    assert missed.any()
+    assert not missed.all()
+    np.testing.assert_array_equal(seen.weights[missed], 0.0)
+    got = lines.exposure(seen, np.where(missed, np.nan, 1.0))
+    assert np.isfinite(got.power).all()
+    assert got.power.sum() > 0.0
+
+
+def test_a_material_for_every_number(device):
+    scene = Scene(floor().triangles, np.array([0, 2], np.int32))
+    with pytest.raises(ValueError, match="materials 0 to 2"):
+        ViewRays(sight=sight(), scene=scene, materials=[GREY], device=device)

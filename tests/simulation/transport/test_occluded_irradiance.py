@@ -1,0 +1,468 @@
+"""OccludedIrradiance on devices: as a ray into every part says, in float64; extremes; what comes in."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array
+import pytest
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from reference.visible import comb, single, soup
+
+from canary import Guarded
+from gpuvision.host import Device
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
+from gpuvision.simulation.transport.occluded_irradiance import (
+    PICK_BLOCK,
+    OccludedIrradiance,
+    ReceivedLight,
+    segment_rows,
+)
+from gpuvision.status import Status
+from reference import visible as reference
+
+ON_DEVICES = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+# Builds are what takes time: each variant in one of the two types here, hypothesis and the rest in the device's own.
+WAYS = pytest.mark.parametrize(
+    ("variant", "dtype"), [("vector", np.float32), ("vector", np.float64), ("work_item", np.float32)]
+)
+FLOOR = np.array([-0.5, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0])
+NO_TRIANGLES = np.zeros((0, 3, 3))
+
+
+def segments_of(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Segments anywhere in the cube, each with a normal square to it and an exitance of its own."""
+    ends = single(rng.uniform(-1.0, 1.0, (count, 6)))
+    normals = np.cross(ends[:, 3:] - ends[:, :3], rng.normal(size=(count, 3)))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.hstack([ends, single(normals), single(rng.uniform(0.5, 2.0, (count, 1)))])
+
+
+def receivers_of(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return single(np.concatenate([rng.uniform(-1.0, 1.0, (*shape, 3)), rng.normal(size=(*shape, 3))], axis=-1))
+
+
+def light_of(
+    corners: np.ndarray, receivers: Any, segments: Any, device: Device, weights: Any = None, **how: Any
+) -> Any:
+    """What OccludedIrradiance says of receivers (strips, n, 6), in their type."""
+    dtype = receivers.dtype
+    operation = OccludedIrradiance(scene=Scene(corners), segments=len(segments), **how)
+    if weights is None:
+        weights = np.ones((*receivers.shape[:2], 2))
+    return operation(receivers, weights.astype(dtype), np.ascontiguousarray(segments, dtype), device=device)
+
+
+def subdivided(mesh: Any, times: int) -> Any:
+    for _ in range(times):
+        mesh = mesh.subdivide()
+    return mesh
+
+
+# ---- light -----------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def lit_soup(count: int) -> tuple[np.ndarray, ...]:
+    """Triangles, segments, receivers, and their light by rays."""
+    rng = np.random.default_rng(count)
+    corners = soup(rng, count, 0.6 if count < 20 else 0.3)
+    segments, receivers = segments_of(rng, 5), receivers_of(rng, 3, 23)
+    return corners, segments, receivers, *reference.light(corners, receivers.reshape(-1, 6), segments, 1e-5)
+
+
+@WAYS
+@pytest.mark.parametrize("count", [3, 60])
+def test_light_as_rays_say(device: Device, variant: Any, dtype: Any, count: int) -> None:
+    corners, segments, receivers, value, most = lit_soup(count)
+    result = light_of(corners, receivers.astype(dtype), segments, device, variant=variant, clearance=1e-5)
+    assert result.irradiance.dtype == dtype
+    assert not result.status.any()
+    error = np.abs(result.irradiance.ravel() - value) / np.where(most > 0.0, most, 1.0)
+    if dtype == np.float64:
+        assert error.max() <= 1e-9
+    else:
+        # Of the few receivers that are near an edge of a triangle, rounding moves shadows more.
+        assert np.quantile(error, 0.95) <= 5e-6
+        assert error.max() <= 2e-3
+    free = light_of(NO_TRIANGLES, receivers.astype(dtype), segments, device, variant=variant).irradiance
+    assert np.mean(np.abs(result.irradiance - free) > 0.01 * free) > 0.2
+
+
+@functools.cache
+def lit_board() -> tuple[np.ndarray, ...]:
+    """The board of the benchmarks: receivers (1, 24, 6) that face it, segments, corners, and the light by rays."""
+    pytest.importorskip("embreex", reason="the extra 'test' is not installed")
+    from gpuvision.profiling.occluded_irradiance import Board
+
+    board = Board.of()
+    everywhere = board.receivers.astype(float).reshape(-1, 6)
+    segments = segment_rows(board.segments)
+    facing = [
+        np.any(((each[:3] - segments[:, :3]) * segments[:, 6:9]).sum(axis=1) > 1e-4)
+        and np.any((segments[:, :6].reshape(-1, 2, 3) - each[:3]) @ each[3:] > 1e-4)
+        for each in everywhere
+    ]
+    receivers = everywhere[facing][::20][:24]
+    value, most = reference.light(board.scene.corners, receivers, segments, 1e-6)
+    return board.scene.corners, receivers[None], segments, value, most
+
+
+@WAYS
+def test_light_on_a_board_as_rays_say(device: Device, variant: Any, dtype: Any) -> None:
+    corners, receivers, segments, value, most = lit_board()
+    result = light_of(corners, receivers.astype(dtype), segments, device, variant=variant, clearance=1e-6).irradiance[0]
+    assert np.all(np.abs(result - value) <= (2e-5 if dtype == np.float32 else 1e-10) * most)
+    assert 0.2 < np.mean(value > 0.0) < 0.9
+
+
+@ON_DEVICES
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 30), size=st.sampled_from([0.1, 0.3, 3.0]))
+def test_light_in_any_soup(device: Device, seed: int, count: int, size: float) -> None:
+    rng = np.random.default_rng(seed)
+    corners, segments, receivers = soup(rng, count, size), segments_of(rng, 2), receivers_of(rng, 1, 5)
+    result = light_of(corners, receivers, segments, device, clearance=1e-7)
+    value, most = reference.light(corners, receivers[0], segments, 1e-7)
+    assert np.all(np.abs(result.irradiance[0] - value) <= 1e-8 * most)
+
+
+def room(kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A convex surface seen from within, receivers on it, and lit segments on it: nothing hides anything."""
+    rng = np.random.default_rng(5)
+    mesh = trimesh.creation.icosphere(3) if kind == "sphere" else subdivided(trimesh.creation.box((1.0, 0.8, 0.6)), 3)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [0.1, 0.7, 0.3]))
+    weights = rng.dirichlet(np.ones(3), len(mesh.faces))
+    places = np.einsum("nk,nkd->nd", weights, mesh.triangles)
+    receivers = np.hstack([places, -mesh.face_normals])[rng.permutation(len(places))[:96]].reshape(2, 48, 6)
+    lit = rng.permutation(len(mesh.faces))[:6]
+    ends = mesh.triangles[lit, :2].copy()
+    ends[3:, 0] = mesh.triangles[lit[3:], 2] * 0.3 + ends[3:, 1] * 0.7
+    rows = np.hstack([ends.reshape(-1, 6), -mesh.face_normals[lit], np.ones((6, 1))])
+    return np.asarray(mesh.triangles), receivers, rows
+
+
+@WAYS
+@pytest.mark.parametrize("kind", ["box", "sphere"])
+def test_the_surfaces_that_they_lie_on_hide_nothing(device: Device, variant: Any, dtype: Any, kind: str) -> None:
+    corners, receivers, segments = room(kind)
+    seen = light_of(corners, receivers.astype(dtype), segments, device, variant=variant)
+    free = light_of(corners, receivers.astype(dtype), segments, device, variant=variant, visibility="none")
+    # But for rounding, where a segment ends in another face.
+    np.testing.assert_allclose(seen.irradiance, free.irradiance, rtol=64 * float(np.finfo(dtype).eps))
+    assert np.mean(seen.irradiance > 0.0) > 0.7
+
+
+@WAYS
+def test_at_the_foot_of_a_wall(device: Device, variant: Any, dtype: Any) -> None:
+    """A line that runs into a wall, receivers on it from 1e-9 of the line's length: the closed form, nothing hides."""
+    floor, wall = trimesh.creation.box((2.0, 2.0, 0.2)), trimesh.creation.box((0.2, 2.0, 2.0))
+    meshes = [floor.apply_translation((0.0, 0.0, -0.1)), wall.apply_translation((-0.1, 0.0, 0.0))]
+    corners = np.concatenate([subdivided(each, 2).triangles for each in meshes])
+    height = np.array([1e-9, 1e-7, 1e-5, 1e-3, 0.1, 0.5])
+    receivers = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0], (1, 6, 1))
+    receivers[0, :, 2] = height
+    segments = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]])
+    result = light_of(corners, receivers.astype(dtype), segments, device, variant=variant)
+    expected = 1.0 / (2.0 * np.pi * height * (height**2 + 1.0))
+    np.testing.assert_allclose(result.irradiance[0], expected, rtol=5e-6 if dtype == np.float32 else 1e-12)
+
+
+@WAYS
+def test_a_wall_between_is_dark(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
+    """Beside a closed surface that is cut everywhere, at its edges too: not a glimmer."""
+    corners = single(trimesh.creation.icosphere(3).triangles * 0.4)
+    receivers = np.zeros((1, 40, 6))
+    receivers[0, :, :2], receivers[0, :, 2] = rng.uniform(-0.01, 0.01, (40, 2)), 0.45
+    receivers[0, ::2, :2] = 0.0
+    receivers[0, :, 5] = -1.0
+    segments = np.array([[-0.3, 0.0, -0.45, 0.3, 0.0, -0.45, 0.0, 0.0, 1.0, 1.0]])
+    result = light_of(corners, receivers.astype(dtype), segments, device, variant=variant)
+    np.testing.assert_array_equal(result.irradiance, 0.0)
+    np.testing.assert_array_equal(result.status, 0)
+
+
+@WAYS
+def test_light_through_a_comb(device: Device, variant: Any, dtype: Any) -> None:
+    """More shadows than are kept at a time: the segment is taken in parts."""
+    teeth = 300
+    at = (np.arange(teeth) + 0.25) / teeth - 0.5
+    visible = np.sort(np.concatenate([[-0.5, 0.5], at, at + 0.5 / teeth])).reshape(-1, 2)
+    receivers = np.array([[[0.0, 0.0, 1.0, 0.0, 0.0, -1.0]]], dtype)
+    parts = np.tile(FLOOR, (len(visible), 1))
+    parts[:, 0], parts[:, 3] = visible.T
+    corners = comb(teeth)
+    corners[..., 1] *= np.where(corners[..., 1] > 0.0, 1e3, 1.0)
+    result = light_of(corners, receivers, FLOOR[None], device, variant=variant)
+    expected = light_of(NO_TRIANGLES, receivers.astype(np.float64), parts, device, visibility="none")
+    assert result.status[0, 0] == Status.OK
+    np.testing.assert_allclose(result.irradiance, expected.irradiance, rtol=1e-4 if dtype == np.float32 else 2e-6)
+
+
+@pytest.mark.parametrize("variant", ["vector", "work_item"])
+def test_rays_come_to_the_same_in_first_order(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    corners, segments, receivers = soup(rng, 60, 0.3), segments_of(rng, 5), receivers_of(rng, 4, 64)
+    exact = light_of(corners, receivers, segments, device).irradiance
+    errors = []
+    for samples in (16, 256, 4096):
+        sampled = light_of(corners, receivers, segments, device, variant=variant, visibility="rays", samples=samples)
+        errors.append(np.mean(np.abs(sampled.irradiance - exact)) / np.mean(exact))
+    assert errors[2] < 2e-4
+    assert errors[1] < 0.15 * errors[0]
+    assert errors[2] < 0.15 * errors[1]
+
+
+@WAYS
+def test_without_visibility_as_line_irradiance(
+    device: Device, variant: Any, dtype: Any, rng: np.random.Generator
+) -> None:
+    receivers, rows = receivers_of(rng, 3, 37), segments_of(rng, 19)
+    segments = LitSegments(rows[:, :6].reshape(-1, 2, 3), rows[:, 6:9], rows[:, 9])
+    np.testing.assert_array_equal(segment_rows(segments)[:, 9], rows[:, 9])
+    room = segment_rows(segments, 24)
+    result = light_of(soup(rng, 20), receivers.astype(dtype), room, device, variant=variant, visibility="none")
+    expected = LineIrradiance(segments=segments)(receivers, device=device).irradiance
+    tolerance = 4e-6 if dtype == np.float32 else 1e-13
+    np.testing.assert_allclose(result.irradiance, expected, rtol=0, atol=tolerance * expected.max())
+
+
+@WAYS
+def test_currents(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
+    receivers, segments, weights = receivers_of(rng, 5, 70), segments_of(rng, 3), rng.normal(size=(5, 70, 2))
+    result = light_of(soup(rng, 20), receivers.astype(dtype), segments, device, weights=weights, variant=variant)
+    sums = np.einsum("sn,snk->ks", result.irradiance.astype(float), weights)
+    sizes = np.einsum("sn,snk->ks", result.irradiance.astype(float), np.abs(weights))
+    for current, expected, size in zip((result.left, result.right), sums, sizes, strict=True):
+        assert np.all(np.abs(current - expected) <= 4.0 * np.finfo(dtype).eps * size)
+
+
+@WAYS
+def test_metres_and_micrometres(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
+    """A scene a millionth as large gets the same light, a million times as much on a square metre; to the bit."""
+    corners, receivers = soup(rng, 60, 0.3), receivers_of(rng, 2, 40).astype(dtype)
+    segments, small = segments_of(rng, 4), 2.0**-20
+    result = light_of(corners, receivers, segments, device, variant=variant)
+    receivers[..., :3] *= small
+    segments[:, :6] *= small
+    tiny = light_of(corners * small, receivers, segments, device, variant=variant)
+    np.testing.assert_array_equal(tiny.irradiance * dtype(small), result.irradiance)
+    assert np.count_nonzero(result.irradiance) > 10
+
+
+@pytest.mark.parametrize("variant", ["vector", "work_item"])
+def test_a_part_of_micrometres_in_a_room_of_metres(device: Device, variant: Any) -> None:
+    """A box of 20 um on the floor hides what it hides in a scene of its own; in double, single knows no such place."""
+    part = trimesh.creation.box((2e-5, 2e-5, 2e-5)).apply_translation((3e-5, 0.0, 1e-5)).triangles
+    room = trimesh.creation.box((8.0, 6.0, 4.0)).apply_translation((0.0, 0.0, 2.0)).triangles
+    receivers = np.zeros((1, 32, 6))
+    receivers[0, :, 0], receivers[0, :, 2], receivers[0, :, 3] = 1e-4, np.linspace(1e-6, 1e-4, 32), -1.0
+    segments = np.array([[-2e-4, 0.0, 0.0, 1.5e-5, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]])
+    alone = light_of(part, receivers, segments, device, variant=variant, clearance=1e-9).irradiance
+    both = light_of(
+        np.concatenate([part, room]), receivers, segments, device, variant=variant, clearance=1e-9
+    ).irradiance
+    free = light_of(room, receivers, segments, device, variant=variant, clearance=1e-9).irradiance
+    np.testing.assert_allclose(both, alone, rtol=0, atol=1e-7 * free.max())
+    assert alone.max() > 0.05 * free.max()
+    assert np.mean(alone < 0.5 * free) > 0.3
+
+
+@WAYS
+def test_faces_that_coincide(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
+    corners, receivers, segments = soup(rng, 60, 0.3), receivers_of(rng, 2, 40).astype(dtype), segments_of(rng, 4)
+    once = light_of(corners, receivers, segments, device, variant=variant)
+    twice = light_of(np.repeat(corners, 3, axis=0)[:, ::-1], receivers, segments, device, variant=variant)
+    np.testing.assert_allclose(twice.irradiance, once.irradiance, rtol=64 * float(np.finfo(dtype).eps), atol=1e-7)
+
+
+@WAYS
+@pytest.mark.parametrize("angle", [1e-2, 1.7e-4, 1e-6])
+def test_grazing(device: Device, variant: Any, dtype: Any, angle: float) -> None:
+    """A wall that stands on the floor hides half the line from a receiver low over it; 89.99 degrees is 1.7e-4."""
+    wall = trimesh.creation.box((0.01, 1.0, 0.2)).apply_translation((0.5, 0.5, 0.1)).triangles
+    floor = trimesh.creation.box((2.0, 2.0, 0.1)).apply_translation((0.0, 0.0, -0.05)).triangles
+    receivers = np.array([[[1.0, 0.0, angle, -1.0, 0.0, 0.0]]], dtype)
+    segments = np.array([[0.0, -0.5, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0, 1.0]])
+    half = segments.copy()
+    half[0, 4] = 0.0
+    corners = np.concatenate([wall, floor])
+    seen = light_of(corners, receivers, segments, device, variant=variant, clearance=1e-7).irradiance[0, 0]
+    free = light_of(NO_TRIANGLES, receivers, half, device, visibility="none").irradiance[0, 0]
+    assert seen == pytest.approx(free, rel=1e-5 if dtype == np.float32 else 1e-12)
+
+
+# ---- segments on one line --------------------------------------------------------------------------------------
+
+
+def on_one_line(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Parts of a slanting line in any order, some with nothing between and some that overlap, each of its exitance."""
+    start, along = rng.uniform(-1.0, 0.0, 3), rng.uniform(0.5, 1.0, 3)
+    cuts = np.sort(rng.uniform(0.0, 1.0, (count, 2)) * 0.8 / count + np.arange(count)[:, None] / count, axis=1)
+    cuts[1, 0], cuts[3, 1] = cuts[0, 1], cuts[4, 1]
+    normal = np.cross(along, rng.normal(size=3))
+    ends = start + cuts[..., None] * along
+    rows = np.column_stack([ends.reshape(-1, 6), np.tile(normal, (count, 1)), rng.uniform(0.5, 2.0, count)])
+    return rng.permutation(rows)
+
+
+@functools.cache
+def lit_line(count: int, receivers: int, dtype: Any) -> tuple[np.ndarray, ...]:
+    """Triangles, receivers, segments on one line, dark ones and turned ones among them, and their light by rays."""
+    rng = np.random.default_rng(count)
+    corners, places, rows = soup(rng, 30, 0.4), receivers_of(rng, 1, receivers), on_one_line(rng, count)
+    rows[2, 9], rows[4, 6:9], rows[5, :6] = 0.0, -rows[4, 6:9], np.roll(rows[5, :6], 3)
+    rows = rows.astype(dtype).astype(float)
+    return corners, places, rows, *reference.light(corners, places[0], rows, 1e-5)
+
+
+@WAYS
+@pytest.mark.parametrize(("count", "receivers"), [(6, 37), (35, 7)])
+def test_segments_on_one_line(device: Device, variant: Any, dtype: Any, count: int, receivers: int) -> None:
+    """Together, as is faster, they give what rays to each say; also where they are more than are taken together."""
+    corners, places, rows, value, most = lit_line(count, receivers, dtype)
+    result = light_of(corners, places.astype(dtype), rows, device, variant=variant, clearance=1e-5).irradiance[0]
+    error = np.abs(result - value) / np.where(most > 0.0, most, 1.0)
+    assert error.max() <= (1e-9 if dtype == np.float64 else 2e-3)
+    assert np.quantile(error, 0.9) <= 5e-6
+    assert np.mean(value > 0.0) > 0.3
+    free = light_of(NO_TRIANGLES, places.astype(dtype), rows, device, variant=variant).irradiance[0]
+    assert np.mean(np.abs(result - free) > 0.01 * free) > 0.2
+
+
+# ---- picks -----------------------------------------------------------------------------------------------------
+
+
+def picked(corners: Any, receivers: Any, segments: Any, lists: Any, device: Device, variant: Any, room: int = 0) -> Any:
+    starts = np.cumsum([0, *map(len, lists)]).astype(np.int32)
+    picks = np.concatenate([*lists, np.zeros(room)]).astype(np.int32)
+    operation = OccludedIrradiance(scene=Scene(corners), segments=len(segments), picks=len(picks), variant=variant)
+    dtype = receivers.dtype
+    weights = np.ones((*receivers.shape[:2], 2), dtype)
+    return operation(receivers, weights, segments.astype(dtype), starts, picks, device=device)
+
+
+@pytest.mark.parametrize("variant", ["vector", "work_item"])
+def test_picks(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    """Each block gets its own: some seen, some taken as they are, some left out."""
+    corners, segments, receivers = soup(rng, 40, 0.3), segments_of(rng, 6), receivers_of(rng, 2, 37).astype(np.float32)
+    seen = [light_of(corners, receivers, segments[[k]], device, variant=variant).irradiance for k in range(6)]
+    free = [
+        light_of(corners, receivers, segments[[k]], device, variant=variant, visibility="none").irradiance
+        for k in range(6)
+    ]
+    lists = [rng.permutation(6)[: rng.integers(0, 7)] for _ in range(6)]
+    lists = [np.where(rng.random(len(some)) < 0.3, ~some, some) for some in lists]
+    result = picked(corners, receivers, segments, lists, device, variant, room=5)
+    for number, some in enumerate(lists):
+        strip, block = divmod(number, 3)
+        part = np.s_[strip, PICK_BLOCK * block : PICK_BLOCK * (block + 1)]
+        expected = sum((seen[k][part] if k >= 0 else free[~k][part] for k in some), np.zeros_like(seen[0][part]))
+        np.testing.assert_allclose(result.irradiance[part], expected, rtol=1e-5, atol=1e-9)
+    assert not result.status.any()
+
+
+@pytest.mark.parametrize("variant", ["vector", "work_item"])
+def test_picks_that_are_no_segments(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    segments, receivers = segments_of(rng, 3), receivers_of(rng, 1, 64).astype(np.float32)
+    lists = [[0, 1], [2, 3], [~5], [2]]
+    result = picked(soup(rng, 3), receivers, segments, lists, device, variant)
+    np.testing.assert_array_equal(result.status[0], np.repeat([0, Status.OUT_OF_RANGE, Status.OUT_OF_RANGE, 0], 16))
+    np.testing.assert_array_equal(np.isnan(result.irradiance), result.status != 0)
+    operation = OccludedIrradiance(scene=Scene(NO_TRIANGLES), segments=3, picks=1, variant=variant)
+    weights, starts = np.ones((1, 64, 2), np.float32), np.array([-1, 1, 1, 1, 7], np.int32)
+    beyond = operation(receivers, weights, segments.astype(np.float32), starts, np.zeros(1, np.int32), device=device)
+    np.testing.assert_array_equal(beyond.status[0] != 0, np.repeat([True, False, False, True], 16))
+
+
+# ---- what comes in ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", ["vector", "work_item"])
+def test_what_is_not_finite(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    corners, segments, receivers = soup(rng, 20, 0.3), segments_of(rng, 2), receivers_of(rng, 2, 40).astype(np.float32)
+    good = light_of(corners, receivers, segments, device, variant=variant)
+    wrong = receivers.copy()
+    wrong[0, np.arange(6), np.arange(6)] = np.nan
+    wrong[0, 6 + np.arange(6), np.arange(6)] = np.inf
+    wrong[0, 20, 3:] = 0.0
+    wrong[1, 39, 3:] = 0.0
+    result = light_of(corners, wrong, segments, device, variant=variant)
+    np.testing.assert_array_equal(result.status[0, :12], Status.NOT_FINITE)
+    assert result.status[0, 20] == result.status[1, 39] == Status.NO_DATA
+    np.testing.assert_array_equal(np.isnan(result.irradiance), result.status != 0)
+    fine = result.status == 0
+    np.testing.assert_array_equal(result.irradiance[fine], good.irradiance[fine])
+    assert np.isnan(result.left[0])
+    assert result.left[1] == pytest.approx(good.irradiance[1, :39].sum(), rel=1e-6)
+    for row, column in ((0, 2), (1, 7), (0, 9)):
+        broken = segments.copy()
+        broken[row, column] = np.nan
+        result = light_of(corners, receivers, broken, device, variant=variant)
+        np.testing.assert_array_equal(result.status, Status.NOT_FINITE)
+        assert np.isnan(result.irradiance).all()
+
+
+@pytest.mark.parametrize("variant", ["vector", "work_item"])
+@pytest.mark.parametrize(("strips", "each"), [(0, 5), (1, 1), (2, 15), (2, 17), (3, 64), (1, 130)])
+def test_sizes_and_canaries(device: Device, variant: Any, strips: int, each: int, rng: np.random.Generator) -> None:
+    """Also: a receiver's light is the same whatever its neighbours are."""
+    corners, segments = soup(rng, 60, 0.3), segments_of(rng, 3).astype(np.float32)
+    receivers, weights = receivers_of(rng, strips, each).astype(np.float32), np.ones((strips, each, 2), np.float32)
+    operation = OccludedIrradiance(scene=Scene(corners), segments=3, variant=variant)
+    size = np.zeros((strips, each), np.float32)
+    like = ReceivedLight(size, np.empty(strips, np.float32), np.empty(strips, np.float32), size.astype(np.uint8))
+    guarded = Guarded(like)
+    operation(receivers, weights, segments, device=device, out=guarded.out)
+    guarded.assert_intact()
+    alone = operation(receivers.reshape(-1, 1, 6), weights.reshape(-1, 1, 2), segments, device=device).irradiance
+    np.testing.assert_allclose(guarded.out.irradiance.ravel(), alone.ravel(), rtol=1e-6)
+    np.testing.assert_allclose(guarded.out.left, guarded.out.irradiance.sum(axis=1), rtol=1e-6)
+
+
+def test_no_light_and_no_triangles(device: Device, rng: np.random.Generator) -> None:
+    receivers, dark = receivers_of(rng, 1, 20), segments_of(rng, 4)
+    dark[0, 9], dark[1, 9], dark[2, 3:6], dark[3] = 0.0, -1.0, dark[2, :3], 0.0
+    result = light_of(NO_TRIANGLES, receivers, dark, device)
+    np.testing.assert_array_equal(result.irradiance, 0.0)
+    np.testing.assert_array_equal(result.status, 0)
+
+
+def test_one_bound_instance_for_all_profiles(device: Device, rng: np.random.Generator) -> None:
+    corners, receivers = soup(rng, 60, 0.3), receivers_of(rng, 2, 20).astype(np.float32)
+    operation = OccludedIrradiance(scene=Scene(corners), segments=3)
+    bound = operation.bind(device, receivers.shape, receivers.dtype)
+    bound.inputs[0].set(receivers)
+    bound.inputs[1].set(np.ones((2, 20, 2), np.float32))
+    for _ in range(3):
+        segments = segments_of(rng, 3).astype(np.float32)
+        bound.inputs[2].set(segments)
+        there = bound.run()
+        expected = operation(receivers, np.ones((2, 20, 2), np.float32), segments, device=device)
+        np.testing.assert_array_equal(there.irradiance.get(), expected.irradiance)
+    given = [cl.array.to_device(device.queue, each) for each in (receivers, np.ones((2, 20, 2), np.float32), segments)]
+    np.testing.assert_array_equal(operation(*given).left.get(), expected.left)
+
+
+def test_wrong_parameters(device: Device) -> None:
+    scene = Scene(NO_TRIANGLES)
+    with pytest.raises(TypeError, match=r"OccludedIrradiance\.scene is None, expected a Scene"):
+        OccludedIrradiance(scene=None, segments=1)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"segments must be a whole number, got 1\.5"):
+        OccludedIrradiance(scene=scene, segments=1.5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="samples is 0, expected 1 to"):
+        OccludedIrradiance(scene=scene, segments=1, samples=0)
+    with pytest.raises(ValueError, match="visibility is 'some'"):
+        OccludedIrradiance(scene=scene, segments=1, visibility="some")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"receivers \(strips, n, 6\), n at least 1, got shape \(4, 6\)"):
+        light_of(NO_TRIANGLES, np.zeros((4, 6)), np.zeros((1, 10)), device, weights=np.zeros((4, 2)))
+    with pytest.raises(TypeError, match="takes float32 or float64, got int64"):
+        light_of(NO_TRIANGLES, np.zeros((1, 4, 6), np.int64), np.zeros((1, 10)), device)
+    with pytest.raises(ValueError, match="precision must be"):
+        light_of(NO_TRIANGLES, np.zeros((1, 4, 6)), np.zeros((1, 10)), device, precision="half")
+    with pytest.raises(ValueError, match="2 segments do not fit into 1 rows"):
+        segment_rows(LitSegments([FLOOR[:6].reshape(2, 3)] * 2, [[0, 0, 1]] * 2, [1.0, 1.0]), 1)

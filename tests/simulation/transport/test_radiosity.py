@@ -1,0 +1,235 @@
+"""All bounces in rooms and boxes: energy, white walls, what hides, ways of solving, grading, and what comes in."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from gpuvision.host import Device
+from gpuvision.simulation.scene.scene import Scene
+from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
+from gpuvision.simulation.transport.patches import Patches
+from gpuvision.simulation.transport.radiosity import Radiosity, graded
+
+
+def room(*extents: float, lid: bool = False) -> Scene:
+    """The inside of a box around the origin; its lid, if asked for, is another material."""
+    box = trimesh.creation.box(extents)
+    box.invert()
+    up = np.asarray(box.triangles)[:, :, 2].min(axis=1) > 0.0
+    return Scene(np.asarray(box.triangles), (up & lid).astype(np.int32))
+
+
+def stripe(*, power: float = 1.0) -> LitSegments:
+    """A line on the floor of a room of 1 x 0.8 x 0.6, from wall to wall, of so much diffuse power."""
+    return LitSegments([[[-0.5, 0.1, -0.3], [0.5, 0.1, -0.3]]], [[0.0, 0.0, 1.0]], [power])
+
+
+def solved(size: float, albedo: Any, device: Device, *, lid: bool = False) -> Radiosity:
+    scene = room(1.0, 0.8, 0.6, lid=lid)
+    whole = Radiosity.of(scene, albedo, size=size, both_sides=False, device=device)
+    return Radiosity(patches=whole.patches, albedo=whole.albedo, device=device)
+
+
+def test_no_light_is_lost_in_a_closed_box(device: Device) -> None:
+    """What arrives first is what was sent, to rounding; what is absorbed in the end is the same, to second order."""
+    albedo, errors = 0.9, []
+    for size in (0.5, 0.25, 0.125):
+        box = solved(size, [albedo], device)
+        arrival = box.arrival(stripe(power=2.0))
+        assert arrival @ box.patches.area == pytest.approx(2.0, rel=1e-12)
+        exitance = box.exitance(arrival)
+        absorbed = exitance @ box.patches.area * (1.0 - albedo) / albedo
+        errors.append(abs(absorbed / 2.0 - 1.0))
+        np.testing.assert_allclose(box.factors.sum(axis=1), 1.0, rtol=1e-12)
+    assert errors[0] < 4e-3
+    assert errors[-1] < 1e-3
+
+
+def test_white_walls_send_everything_out(device: Device) -> None:
+    """Albedo 1 under a black lid: the lid gets all of the light, after however many bounces."""
+    errors = []
+    for size in (0.5, 0.25):
+        box = solved(size, [1.0, 0.0], device, lid=True)
+        arrival = box.arrival(stripe())
+        exitance = box.exitance(arrival)
+        on_the_lid = (arrival + box.factors @ exitance)[box.albedo == 0.0] @ box.patches.area[box.albedo == 0.0]
+        errors.append(abs(on_the_lid - 1.0))
+        assert np.all(exitance[box.albedo == 0.0] == 0.0)
+    assert errors[0] < 5e-3
+    assert errors[1] < 2e-3
+
+
+def test_white_walls_without_a_way_out_are_refused(device: Device) -> None:
+    for dense in (4096, 0):
+        box = solved(0.5, [1.0], device)
+        closed = Radiosity(patches=box.patches, albedo=box.albedo, device=device, dense=dense)
+        with pytest.raises(ValueError, match="no steady state"):
+            closed.exitance(np.ones(box.patches.count))
+
+
+def test_solved_is_what_the_series_tends_to(device: Device) -> None:
+    box = solved(0.5, [0.6], device)
+    arrival = box.arrival(stripe())
+    series, bounce = np.zeros_like(arrival), 0.6 * arrival
+    for _ in range(80):
+        series, bounce = series + bounce, 0.6 * (box.factors @ bounce)
+    np.testing.assert_allclose(box.exitance(arrival), series, rtol=1e-12)
+
+
+def test_both_ways_of_solving_agree(device: Device) -> None:
+    box = solved(0.3, [0.95], device)
+    iterated = Radiosity(patches=box.patches, albedo=box.albedo, device=device, dense=0)
+    arrival = box.arrival(stripe())
+    np.testing.assert_allclose(iterated.exitance(arrival), box.exitance(arrival), rtol=3e-5)
+
+
+def test_arrival_is_the_mean_over_patches(device: Device) -> None:
+    """Against receivers all over each patch, by the lines' own closed form; also beside the line's ends."""
+    box, lit = solved(0.5, [0.5], device), stripe()
+    inside = box.patches
+    for _ in range(8):
+        inside = inside.halved(np.ones(inside.count, bool))
+    places = np.concatenate([inside.corners.mean(axis=1), inside.normals], axis=1)
+    light = LineIrradiance(segments=lit)(places, device=device).irradiance
+    # Which patch a piece lies in: the one in whose plane and corners it is.
+    owner = _owners(box.patches.corners, places[:, :3])
+    mean = np.bincount(owner, light * inside.area) / box.patches.area
+    beside = np.abs(np.abs(box.patches.corners[:, :, 0]).min(axis=1) - 0.5) < 1e-9
+    arrival = box.arrival(lit)
+    np.testing.assert_allclose(arrival[~beside], mean[~beside], rtol=2e-3, atol=1e-4)
+    np.testing.assert_allclose(arrival[beside], mean[beside], rtol=0.05, atol=1e-4)
+
+
+def test_many_short_segments_are_as_one(device: Device) -> None:
+    """A line cut into 2000 pieces, as by a fine mesh, sends as much to every patch."""
+    box = solved(0.3, [0.5], device)
+    cuts = np.linspace(-0.5, 0.5, 2001)
+    ends = np.zeros((2000, 2, 3))
+    ends[:, 0, 0], ends[:, 1, 0], ends[:, :, 1], ends[:, :, 2] = cuts[:-1], cuts[1:], 0.1, -0.3
+    pieces = LitSegments(ends, np.tile([0.0, 0.0, 1.0], (2000, 1)), np.ones(2000))
+    whole, arrived = box.arrival(stripe()), box.arrival(pieces)
+    assert arrived @ box.patches.area == pytest.approx(1.0, rel=1e-12)
+    np.testing.assert_allclose(arrived, whole, atol=0.02 * whole.max())
+
+
+def test_single_precision_serves_where_there_is_no_double(device: Device) -> None:
+    class Single(Radiosity):
+        _real = np.float32
+
+    double = solved(0.3, [0.9], device)
+    single = Single(patches=double.patches, albedo=double.albedo, device=device)
+    iterated = Single(patches=double.patches, albedo=double.albedo, device=device, dense=0)
+    arrival = double.arrival(stripe())
+    np.testing.assert_allclose(single.arrival(stripe()), arrival, atol=1e-5 * arrival.max())
+    exact = double.exitance(arrival)
+    np.testing.assert_allclose(single.exitance(arrival), exact, rtol=1e-4)
+    np.testing.assert_allclose(iterated.exitance(arrival), exact, rtol=1e-4)
+
+
+def _owners(corners: np.ndarray, places: np.ndarray) -> np.ndarray:
+    a, one, two = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(one, two)
+    square = np.sum(normal * normal, axis=1)
+    to = places[:, None] - a
+    u = np.sum(np.cross(to, two) * normal, axis=2) / square
+    v = np.sum(np.cross(one, to) * normal, axis=2) / square
+    off = np.abs(np.sum(to * normal, axis=2)) / np.sqrt(square)
+    outside = np.maximum(np.maximum(-u, -v), u + v - 1.0)
+    return np.asarray(np.argmin(np.maximum(outside, 0.0) + off, axis=1))
+
+
+def test_light_beside_a_screen(device: Device) -> None:
+    """A wall across the room keeps the light on its side, but for rays along its seams."""
+    scene = room(1.0, 0.8, 0.6)
+    screen = np.array([[0.0, -0.4, -0.3], [0.0, 0.4, -0.3], [0.0, 0.4, 0.3], [0.0, -0.4, 0.3]])
+    both = np.concatenate([screen[[[0, 1, 2], [0, 2, 3]]], screen[[[0, 2, 1], [0, 3, 2]]] + [1e-6, 0.0, 0.0]])
+    lit = LitSegments([[[0.1, 0.1, -0.3], [0.5, 0.1, -0.3]]], [[0.0, 0.0, 1.0]], [1.0])
+    shut = Radiosity.of(Scene(np.concatenate([scene.corners, both])), [0.8], size=0.4, device=device)
+    exitance = shut.exitance(shut.arrival(lit))
+    left = shut.patches.corners[:, :, 0].max(axis=1) <= 0.0
+    right = shut.patches.corners[:, :, 0].min(axis=1) >= 0.0
+    assert exitance[left].max() < 1e-6 * exitance[right].max()
+
+
+def test_what_a_body_stands_on_is_not_lit(device: Device) -> None:
+    """Patches that it covers in part neither lose nor make light: all of it is absorbed by what is free."""
+    part = trimesh.creation.box((0.3, 0.3, 0.3)).apply_translation((0.05, -0.1, -0.15))
+    scene = Scene(np.concatenate([room(1.0, 0.8, 0.6).corners, part.triangles]))
+    albedo = 0.9
+    box = Radiosity.of(scene, [albedo], size=0.2, both_sides=False, device=device)
+    arrival = box.arrival(stripe())
+    free = box._surface.area
+    assert arrival @ free == pytest.approx(1.0, rel=3e-3)
+    absorbed = box.exitance(arrival) @ free * (1.0 - albedo) / albedo
+    assert absorbed == pytest.approx(1.0, rel=1e-2)
+    assert box.patches.area.sum() - free.sum() == pytest.approx(0.3 * 0.3, rel=0.3)
+
+
+def test_patches_in_corners_are_graded(device: Device) -> None:
+    patches = Patches.of(room(1.0, 0.8, 0.6), size=0.5, both_sides=False)
+    finer = graded(patches, 3, device=device)
+    assert finer.area.sum() == pytest.approx(patches.area.sum(), rel=1e-12)
+    assert patches.count < finer.count < 8 * patches.count
+    small = finer.area < 0.3 * patches.area.min()
+    centres = np.abs(finer.corners.mean(axis=1)) * 2.0 / [1.0, 0.8, 0.6]
+    # How far from the nearest edge of the room: the second largest coordinate is not that of the wall itself.
+    from_edge = 1.0 - np.sort(centres, axis=1)[:, 1]
+    assert from_edge[small].mean() < 0.6 * from_edge[~small].mean()
+
+
+def test_materials_and_receivers(device: Device) -> None:
+    scene = room(1.0, 0.8, 0.6, lid=True)
+    box = Radiosity.of(scene, [0.7, 0.2], size=0.5, grades=1, both_sides=True, device=device)
+    assert set(box.albedo) == {0.7, 0.2}
+    outside = np.sum(box.patches.normals * box.patches.corners.mean(axis=1), axis=1) > 0.0
+    assert outside.mean() == pytest.approx(0.5, abs=0.2)
+    exitance = box.exitance(box.arrival(stripe()))
+    # Light stays inside.
+    np.testing.assert_allclose(exitance[outside], 0.0, atol=1e-12)
+    receivers = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, -1.0], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    twice = box.light(receivers, exitance)
+    single = box.light(receivers.astype(np.float32), exitance)
+    assert twice.irradiance[0] != twice.irradiance[1]
+    np.testing.assert_allclose(single.irradiance, twice.irradiance, rtol=1e-4)
+    assert single.irradiance.dtype == np.float32
+    least = 0.5 * float(exitance.max())
+    some = box.light(receivers, exitance, leave_out=least)
+    assert np.all(some.irradiance < twice.irradiance)
+    assert np.all(some.irradiance > twice.irradiance - least)
+
+
+def test_no_light_at_all(device: Device) -> None:
+    box = solved(0.5, [0.5], device)
+    dark = LitSegments(np.zeros((1, 2, 3)), [[0.0, 0.0, 1.0]], [1.0])
+    np.testing.assert_array_equal(box.exitance(box.arrival(dark)), 0.0)
+
+
+def test_what_is_refused() -> None:
+    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
+    with pytest.raises(TypeError, match="expected Patches"):
+        Radiosity(patches=None, albedo=[0.5])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"expected \(\d+,\)"):
+        Radiosity(patches=patches, albedo=np.zeros(3))
+    with pytest.raises(ValueError, match="outside 0 to 1"):
+        Radiosity(patches=patches, albedo=np.full(patches.count, 1.1))
+    with pytest.raises(ValueError, match="takes finite irradiances"):
+        Radiosity(patches=patches, albedo=np.zeros(patches.count)).exitance(np.zeros(2))
+    with pytest.raises(ValueError, match="1 albedos for 2 materials"):
+        Radiosity.of(room(1.0, 1.0, 1.0, lid=True), [0.5], size=1.0)
+
+
+def test_convergence_of_light_in_a_room(device: Device) -> None:
+    """In points of a room with grey walls: errors fall by 2 or more when the patches' size is halved."""
+    receivers = np.array([[0.2, 0.1, 0.0, 0.3, 0.2, 0.9], [-0.1, -0.2, 0.1, 1.0, 0.0, 0.0], [0, 0.3, -0.1, 0, -1, 1]])
+    values = []
+    for size in (0.5, 0.25, 0.125):
+        box = solved(size, [0.5], device)
+        values.append(box.light(receivers, box.exitance(box.arrival(stripe()))).irradiance)
+    steps = [np.abs(fine - coarse).max() for coarse, fine in pairwise(values)]
+    assert steps[0] > 2.0 * steps[1]
+    assert steps[1] < 5e-3 * values[-1].min()

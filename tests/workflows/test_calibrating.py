@@ -1,0 +1,259 @@
+"""From images to a lens file and back to straight images: the commands `calibrate` and `undistort`, end to end."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib import resources
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from gpuvision.camera.calibration import Calibration
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.lens import Lens
+from gpuvision.cli.main import application
+from gpuvision.formats.camera_file import read_lens, write_lens
+from gpuvision.host import Device
+from gpuvision.host.errors import RecordingError
+from gpuvision.schema import DescriptionError
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.workflows.calibrating import calibrate, write_calibration
+from gpuvision.workflows.undistorting import undistort_files
+from reference.patterns import View, dots, photo, view
+
+CAMERA = Camera(
+    matrix=((900.0, 0.0, 330.0), (0.0, 900.0, 235.0), (0.0, 0.0, 1.0)),
+    distortion=(-0.2, 0.1, 1e-4, 0.0, 0.01, *(0.0,) * 7, 0.05, -0.02),
+)
+LENS = Lens(k1=2e-7, k2=-3e-14, centre=(310.25, 250.5))
+
+
+@pytest.fixture(scope="module")
+def seen() -> View:
+    return view((640, 480), 12, 16, 34.0, turn=3.0, tilt=12.0, barrel=6.0)
+
+
+@pytest.fixture(scope="module")
+def image(seen: View, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A grid of dots through a lens, as a file."""
+    return photographed(seen, tmp_path_factory.mktemp("images") / "grid.png")
+
+
+@pytest.fixture(scope="module")
+def done(image: Path) -> Calibration:
+    return calibrate([image])
+
+
+def photographed(seen: View, path: Path) -> Path:
+    """Photograph 12 x 16 dots through the view's lens, into a file."""
+    cover = dots(seen, np.ones((12, 16), bool))
+    cv2.imwrite(str(path), photo(cover, np.random.default_rng(3)))
+    return path
+
+
+def run(*arguments: object) -> None:
+    application()([str(each) for each in arguments], standalone_mode=False)
+
+
+def test_lens_is_found_within_its_uncertainty(done: Calibration, seen: View) -> None:
+    found = done.parameters
+    for name, truth in (("k1", seen.lens.k1), ("C_c", seen.lens.centre[0]), ("R_c", seen.lens.centre[1])):
+        value, sigma = found[name]
+        assert abs(value - truth) < 5.0 * sigma, name
+    assert done.fit.model == "k1"
+    before, after = done.straightness_px
+    assert after < 0.02 < 0.15 < before
+
+
+def test_report_says_what_the_fit_says(done: Calibration, tmp_path: Path) -> None:
+    write_calibration(done, tmp_path / "lens.toml")
+    report = json.loads((tmp_path / "lens.json").read_text())
+    assert report["parameters"]["k1"]["value"] == done.parameters["k1"][0]
+    assert report["rms_px"] == done.fit.rms_px
+    assert [each["model"] for each in report["alternatives"]] == [each.model for each in done.alternatives]
+    picture = cv2.imread(str(tmp_path / "lens.png"))
+    assert picture is not None
+    assert min(picture.shape[:2]) > 500
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["lens.json", "lens.png", "lens.toml"]
+
+
+def test_commands_make_bent_dots_straight(image: Path, tmp_path: Path) -> None:
+    run("calibrate", image, "--out", tmp_path / "lens.toml")
+    run("undistort", image, "--lens", tmp_path / "lens.toml", "--out", tmp_path / "straight")
+    again = calibrate([tmp_path / "straight" / "grid.png"], model="none")
+    # The pixels were interpolated, which moves a dot's centre by less than a hundredth.
+    assert again.straightness_px[0] < 0.03
+
+
+def test_three_views_calibrate_the_camera(tmp_path: Path) -> None:
+    files = []
+    for number, (tilt, towards) in enumerate(((30.0, 0.2), (-28.0, 1.4), (25.0, 2.6), (32.0, 4.0))):
+        flat = view((640, 480), 12, 16, 26.0, tilt=tilt, towards=towards, focal=1.4)
+        files.append(photographed(flat, tmp_path / f"{number}.png"))
+    done = calibrate(files, model="none", pitch=0.01)
+    assert isinstance(done.model, Camera)
+    value, sigma = done.parameters["f"]
+    assert abs(value - 1.4 * 640) < max(5.0 * sigma, 1.0)
+    assert done.report()["poses"][0]["translation"][2] > 0.0
+
+
+@pytest.mark.parametrize("model", [LENS, CAMERA, Lens(k1=-1e-7)])
+def test_lens_file_keeps_every_digit(model: Lens | Camera, tmp_path: Path) -> None:
+    write_lens(tmp_path / "lens.toml", model, {"image": {"size": [640, 480]}})
+    assert read_lens(tmp_path / "lens.toml") == model
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[image]\nsize = [1, 2]\n", r"expected one table, \[lens\] or \[camera\]"),
+        ("[lens]\nk1 = 1e-7\n[camera]\nmatrix = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n", "expected one table"),
+        ("[lens]\nk2 = 1e-7\n", "lens.k1' is missing"),
+        ("[lens]\nk1 = 1e-7\nk3 = 0.0\n", "unknown key 'lens.k3'"),
+        ("[camera]\nmatrix = [[1, 0], [0, 1]]\n", "camera.matrix"),
+        ("[camera]\nmatrix = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\nk9 = 1.0\n", "unknown key 'camera.k9'"),
+        ("[lens\n", "not valid TOML"),
+    ],
+)
+def test_wrong_lens_file(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "lens.toml").write_text(text)
+    with pytest.raises(DescriptionError, match=said):
+        read_lens(tmp_path / "lens.toml")
+
+
+def test_a_sensor_file_takes_the_lens_table(tmp_path: Path) -> None:
+    write_lens(tmp_path / "lens.toml", LENS, {})
+    text = resources.files("gpuvision").joinpath("presets", "sensors", "camera_line.toml").read_text()
+    text = re.sub(r"\[lens\].*?\n\n", "", text, flags=re.DOTALL)
+    (tmp_path / "sensor.toml").write_text(text + (tmp_path / "lens.toml").read_text())
+    found = Sensor.load(str(tmp_path / "sensor.toml"))
+    assert found.readout.triangulation is not None
+    assert found.readout.triangulation.lens == LENS
+
+
+# ---- undistort ------------------------------------------------------------------------------------------------
+
+
+def test_points_go_through_the_same_lens(device: Device, tmp_path: Path, rng: np.random.Generator) -> None:
+    points = rng.uniform(0.0, 480.0, (7, 5, 2))
+    points[2, 3] = np.nan
+    np.save(tmp_path / "points.npy", points)
+    written = undistort_files([tmp_path / "points.npy"], LENS, tmp_path / "out", device=device)
+    assert written == (tmp_path / "out" / "points.npy",)
+    np.testing.assert_allclose(np.load(written[0]), LENS.undistort(points), rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "float32"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_images_keep_their_type(device: Device, kind: str, channels: int, tmp_path: Path) -> None:
+    row, column = np.mgrid[0:61, 0:83].astype(np.float32)
+    image = (0.5 * row + column + 20.0).astype(kind)
+    if channels == 3:
+        image = np.stack([image, image + 20, image + 40], axis=-1)
+    name = "one.tif" if kind == "float32" else "one.png"
+    kind_of = {1: "minisblack", 3: "rgb"}
+    if kind == "float32":
+        tifffile.imwrite(tmp_path / name, image[..., ::-1] if channels == 3 else image, photometric=kind_of[channels])
+    else:
+        cv2.imwrite(str(tmp_path / name), image)
+    (written,) = undistort_files([tmp_path / name], Lens(k1=0.0), tmp_path / "out", device=device)
+    again = tifffile.imread(written) if kind == "float32" else cv2.imread(str(written), cv2.IMREAD_UNCHANGED)
+    if channels == 3 and kind == "float32":
+        again = again[..., ::-1]
+    assert again.dtype == kind
+    np.testing.assert_array_equal(again, image)
+
+
+# ---- what goes wrong ------------------------------------------------------------------------------------------
+
+
+def test_image_without_a_pattern(image: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "empty.png"), np.full((480, 640), 80, np.uint8))
+    with pytest.raises(ValueError, match=r"empty\.png: no dots found; expected"):
+        calibrate([tmp_path / "empty.png"])
+    done = calibrate([tmp_path / "empty.png", image])
+    assert [path.name for path, _ in done.passed_over] == ["empty.png"]
+    assert "1 of 2 images" in done.summary()
+
+
+def test_a_folder_is_no_image(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="a folder, expected an image; name the images in it"):
+        calibrate([tmp_path])
+
+
+def test_images_of_two_sizes(image: Path, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((10, 10), np.uint8))
+    with pytest.raises(RecordingError, match=r"small\.png: 10 x 10 pixels, .*grid\.png has 640 x 480"):
+        calibrate([image, tmp_path / "small.png"])
+
+
+def test_missing_and_unreadable_files(tmp_path: Path, device: Device) -> None:
+    with pytest.raises(FileNotFoundError, match="there is no such file"):
+        calibrate([tmp_path / "none.png"])
+    (tmp_path / "text.png").write_text("no image")
+    with pytest.raises(RecordingError, match=r"text\.png: not a readable image"):
+        calibrate([tmp_path / "text.png"])
+    with pytest.raises(ValueError, match="no images given"):
+        calibrate([])
+    for name, said in (("text.png", "not a readable image"), ("none.png", "no such file")):
+        with pytest.raises((RecordingError, FileNotFoundError), match=said):
+            undistort_files([tmp_path / name], LENS, tmp_path / "out", device=device)
+    (tmp_path / "nothing.npy").touch()
+    with pytest.raises(RecordingError, match=r"nothing\.npy: not a readable NPY array"):
+        undistort_files([tmp_path / "nothing.npy"], LENS, tmp_path / "out", device=device)
+    np.save(tmp_path / "three.npy", np.zeros((4, 3)))
+    with pytest.raises(RecordingError, match=r"three\.npy: float64 of shape \(4, 3\), expected"):
+        undistort_files([tmp_path / "three.npy"], LENS, tmp_path / "out", device=device)
+    assert not (tmp_path / "out").exists(), "nothing is written when something is wrong"
+
+
+def test_inputs_of_one_name(tmp_path: Path, device: Device) -> None:
+    with pytest.raises(RecordingError, match="several inputs are called a"):
+        undistort_files([tmp_path / "a.png", tmp_path / "b" / "a.tif"], LENS, tmp_path / "out", device=device)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--inner", "nine"), "--inner is 'nine', expected"),
+        (("--out", "lens.json"), "where the report and the picture go"),
+        (("--model", "k7"), "k7"),
+        (("--method", "views"), "focal"),
+    ],
+)
+def test_wrong_arguments(image: Path, arguments: tuple[str, str], said: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=said):
+        run("calibrate", image, "--out", tmp_path / "lens.toml", *arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_region(image: Path, tmp_path: Path) -> None:
+    write_lens(tmp_path / "lens.toml", LENS, {})
+    with pytest.raises(ValueError, match="--region is '1,2', expected column,row,columns,rows"):
+        run("undistort", image, "--lens", tmp_path / "lens.toml", "--out", tmp_path / "o", "--region", "1,2")
+
+
+# ---- real images ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "pattern", "best"),
+    [("dot_pattern_01", "dots", 0.079), ("dot_pattern_02", "dots", 0.691), ("line_pattern_01", "lines", 0.117)],
+)
+def test_real_patterns_are_straighter_than_known(name: str, pattern: str, best: float, data: Path) -> None:
+    done = calibrate([data / "calibration" / f"{name}.jpg"], pattern=pattern)  # type: ignore[arg-type]
+    assert done.straightness_px[1] <= best
+
+
+@pytest.mark.realdata
+def test_real_chessboards(data: Path) -> None:
+    files = sorted((data / "calibration" / "chessboard").glob("left*.jpg"))
+    done = calibrate(files, pattern="chessboard", model="k1,k2", pitch=0.025)
+    assert len(done.seen) == len(files) == 13
+    # OpenCV's corners and calibration with the same model: 0.4183 px.
+    assert done.fit.rms_px < 0.4183

@@ -1,0 +1,404 @@
+"""Locating a camera over boards, and robots on fields: as a library, and as the command."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from boards import BOARD_MIDDLE, LAYERS, board_folder
+from floors import floor_image
+from gpuvision.camera.image import grey_image, noise_of
+from gpuvision.camera.lens import Lens
+from gpuvision.camera.orthographic import BoardView
+from gpuvision.cli import main as cli
+from gpuvision.cli.arguments import quantities
+from gpuvision.formats.camera_file import write_lens
+from gpuvision.formats.field_file import read_field
+from gpuvision.host import Device
+from gpuvision.host.errors import RecordingError
+from gpuvision.matching.artwork.artwork import Artwork, read_artwork
+from gpuvision.matching.board.located_board import LocatedBoard
+from gpuvision.workflows.locating_board import locate_board
+from gpuvision.workflows.locating_robot import floor_points, line_width_of, locate_robot
+from reference.board_images import BoardPicture, View
+
+PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0
+FINE, FINE_SHAPE = 25e-6, (480, 640)  # for boards of narrow traces, and few of them
+TOLD = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
+# Of 3 numbers one in 1e5 boards is beyond 4.5 sigmas, were they Gaussian.
+SIGMAS = 4.5
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return board_folder(tmp_path_factory.mktemp("board"))
+
+
+@pytest.fixture(scope="module")
+def artwork(folder: Path) -> Artwork:
+    return read_artwork(folder, layers=LAYERS)
+
+
+@functools.cache
+def painted(
+    artwork: Artwork, place: tuple[float, float], turn: float, pixel: float, shape: tuple[int, int], **more: Any
+) -> BoardPicture:
+    """Paint a board about where a camera sees it, once for all that look there."""
+    corner = np.array(place) + (np.array(shape[::-1]) - 1) / 2 * pixel * (-1, 1)
+    view = View(corner=tuple(corner), pixel=pixel, shape=shape, noise=NOISE, **more)
+    return BoardPicture(artwork, view, (0.0, 0.0, -turn), place, margin=16)
+
+
+def seen(
+    artwork: Artwork,
+    pose: tuple[float, float, float],
+    pixel: float = PIXEL,
+    shape: tuple[int, int] = SHAPE,
+    **more: Any,
+) -> np.ndarray:
+    """uint8 image of a camera at a pose: what it sees in its middle, and how its columns are turned."""
+    place, turn = np.round(np.array(pose[:2]) / 0.5e-3) * 0.5e-3, round(20 * pose[2]) / 20
+    picture = painted(artwork, tuple(place.tolist()), turn, pixel, shape, **more)
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    shift = np.array([[cos, sin], [-sin, cos]]) @ (place - pose[:2])
+    image = picture.seen((*shift, turn - pose[2]), np.random.default_rng(1))
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def off(located: LocatedBoard, pose: tuple[float, float, float]) -> np.ndarray:
+    """How far a pose is from the true one, in its sigmas."""
+    return (np.array(located.pose) - pose) / located.sigmas
+
+
+def test_a_view_s_places_and_pixels_are_each_other_s() -> None:
+    lens = Lens(k1=1e-8, centre=(300.0, 200.0))
+    for mirrored in (False, True):
+        view = BoardView(scale=PIXEL, shape=SHAPE, pose=(3e-3, -2e-3, 2.5), mirrored=mirrored, model=lens)
+        pixels = np.array([[0.0, 0.0], [399.0, 299.0], [100.5, 7.25]])
+        np.testing.assert_allclose(view.pixels(view.places(pixels)), pixels, atol=1e-9)
+        np.testing.assert_allclose(view.places(view.centre_px), (3e-3, -2e-3), atol=1e-12)
+        ahead = view.places(view.centre_px + np.array([-1.0 if mirrored else 1.0, 0.0])) - view.pose[:2]
+        assert math.atan2(ahead[1], ahead[0]) == pytest.approx(2.5)
+        up = view.places(view.centre_px - (0.0, 1.0)) - view.pose[:2]
+        assert math.atan2(up[1], up[0]) == pytest.approx(2.5 + math.pi / 2 - 2 * math.pi)
+        np.testing.assert_allclose(lens.undistort(view.measured(view.places(pixels))), pixels, atol=1e-6)
+
+
+def test_noise_is_that_of_the_image(rng: np.random.Generator) -> None:
+    steps = np.repeat(np.repeat(rng.uniform(0, 200, (12, 16)), 40, axis=0), 40, axis=1)
+    # The median of 3e5 values is right to 0.2 %; they are not independent, and a tenth of them lie on a step.
+    assert noise_of(steps + rng.normal(0, 3.0, steps.shape)) == pytest.approx(3.0, rel=0.15)
+    assert noise_of(np.zeros((40, 40), np.uint8)) == 0.0
+
+
+@pytest.mark.parametrize("turned", [0.0, math.pi / 2, -2.2])
+def test_a_camera_is_located_where_it_is(artwork: Artwork, turned: float, device: Device) -> None:
+    pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, turned + 2e-3)
+    located = locate_board(seen(artwork, pose), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, turned), device=device)
+    assert located.reason == ""
+    assert located.copper == "bright"
+    assert np.abs(off(located, pose)).max() < SIGMAS
+    assert np.all(located.sigmas[:2] < 0.05 * PIXEL)
+    assert located.rulers.used.sum() >= 0.9 * located.rulers.laid.sum()
+    assert located.noise == pytest.approx(NOISE, rel=0.1)
+
+
+def test_the_placement_point_is_where_it_is_seen(artwork: Artwork) -> None:
+    pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 3e-3)
+    located = locate_board(seen(artwork, pose), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0))
+    true = BoardView(scale=PIXEL, shape=SHAPE, pose=pose).pixels(located.placement)
+    sigmas = np.sqrt(np.diag(located.placement_covariance))[:2] / PIXEL
+    assert np.abs((located.placement_px - true) / sigmas).max() < SIGMAS
+
+
+@pytest.mark.parametrize("growth", [-12e-6, 9e-6])
+def test_etching_is_solved_for(artwork: Artwork, growth: float) -> None:
+    pose = (BOARD_MIDDLE[0] - 30e-6, BOARD_MIDDLE[1], -2e-3)
+    located = locate_board(
+        seen(artwork, pose, growth=growth), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0), budget=120
+    )
+    assert np.abs(off(located, pose)).max() < SIGMAS
+    # Edges are rendered to a hundredth of a pixel, all of them alike, and 40 of them are measured to 0.03.
+    assert np.sum(located.features.spacing == 0) > 20
+    assert located.growth == pytest.approx(growth, abs=0.04 * PIXEL)
+
+
+def test_dark_copper_is_told_from_bright(artwork: Artwork) -> None:
+    pose = (BOARD_MIDDLE[0] + 20e-6, BOARD_MIDDLE[1] + 35e-6, 1e-3)
+    inverted = (110.0, 60.0, 200.0, 90.0, 240.0, 15.0)
+    located = locate_board(seen(artwork, pose, levels=inverted), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0))
+    assert located.copper == "dark"
+    assert np.abs(off(located, pose)).max() < SIGMAS
+
+
+def test_a_lens_is_undone(artwork: Artwork) -> None:
+    pose = (BOARD_MIDDLE[0] + 30e-6, BOARD_MIDDLE[1] - 25e-6, -1e-3)
+    lens = Lens(k1=2e-7, centre=(200.0, 147.0))
+    straight = seen(artwork, pose).astype(np.float32)
+    columns, rows = np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0]))
+    at = lens.undistort(np.stack([columns, rows], axis=-1)).astype(np.float32)
+    bent = cv2.remap(straight, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    near = (*BOARD_MIDDLE, 0.0)
+    # What the image was sampled from was noisy pixels; cubic interpolation leaves them so to some percent.
+    located = locate_board(bent, artwork, scale=PIXEL, near=near, model=lens)
+    assert np.abs(off(located, pose)).max() < SIGMAS + 1.0
+    bare = locate_board(bent, artwork, scale=PIXEL, near=near)
+    # 2e-7 px^-2 moves the corners by 5 px.
+    assert bare.reason or np.abs(np.array(bare.pose) - pose).max() > 10 * np.abs(np.array(located.pose) - pose).max()
+
+
+def test_a_board_is_searched_where_it_is_not_known(artwork: Artwork, device: Device) -> None:
+    pose = (BOARD_MIDDLE[0] + 1.3e-3, BOARD_MIDDLE[1] - 0.9e-3, 0.05)
+    located = locate_board(seen(artwork, pose), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0), within=(2e-3, 0.09))
+    assert located.first is not None
+    assert located.reason == ""
+    assert np.abs(off(located, pose)).max() < SIGMAS
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (np.full(SHAPE, 90, np.uint8), "0 of .* rulers found an edge"),
+        (np.random.default_rng(3).integers(0, 255, SHAPE).astype(np.uint8), "rulers"),
+    ],
+)
+def test_what_shows_no_board_is_refused(artwork: Artwork, image: np.ndarray, words: str) -> None:
+    located = locate_board(image, artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0))
+    assert re.search(words, located.reason)
+    assert np.isnan(located.pose).all()
+    json.dumps(located.report(), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"near": (0.5, 0.5, 0.0)}, "0 edges of the top artwork in view"),
+        ({"scale": 0.0}, "expected metres per pixel"),
+        ({"copper": "green"}, "expected one of auto, bright, dark"),
+        ({"within": (-1e-3, 0.0)}, "expected metres above 0"),
+        ({"near": (math.nan, 0.0, 0.0)}, "expected x, y"),
+    ],
+)
+def test_a_wrong_parameter_is_told(artwork: Artwork, change: dict[str, Any], words: str) -> None:
+    usual: dict[str, Any] = {"scale": PIXEL, "near": (*BOARD_MIDDLE, 0.0)}
+    with pytest.raises(ValueError, match=words):
+        locate_board(np.zeros(SHAPE, np.uint8), artwork, **{**usual, **change})
+
+
+def test_images_are_made_grey_or_refused() -> None:
+    colour = np.zeros((20, 30, 3), np.uint8)
+    colour[..., 1] = 100
+    assert grey_image(colour).shape == (20, 30)
+    assert grey_image(np.dstack([colour, colour[..., :1]])).dtype == np.uint8
+    for wrong in (np.zeros((20, 30), np.int32), np.zeros((4, 30), np.uint8), np.zeros((20, 30, 2), np.uint8)):
+        with pytest.raises(RecordingError, match="expected"):
+            grey_image(wrong)
+
+
+Locate = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Locate:
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["gpuvision", "locate", *map(str, arguments)])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        told = capfd.readouterr()
+        return code, told.out, told.err
+
+    return call
+
+
+def test_the_command_writes_pose_and_picture(folder: Path, artwork: Artwork, tmp_path: Path, run: Locate) -> None:
+    pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 2e-3)
+    cv2.imwrite(str(tmp_path / "board.png"), seen(artwork, pose))
+    near = ",".join(f"{1e3 * each}mm" for each in BOARD_MIDDLE) + ",0deg"
+    files = ("--out", tmp_path / "out", "--json", tmp_path / "pose.json")
+    code, out, _ = run(tmp_path / "board.png", "--board", folder, *TOLD, "--scale", "40um", f"--near={near}", *files)
+    assert code == 0
+    assert "rulers agree" in out
+    told = json.loads((tmp_path / "out" / "pose.json").read_text())
+    assert told == json.loads((tmp_path / "pose.json").read_text())
+    assert told["status"] == "located"
+    for name, true in zip(("x", "y", "theta"), pose, strict=True):
+        assert abs(told["pose"][name] - true) < SIGMAS * told["sigmas"][name]
+    assert len(told["rulers"]) >= told["counts"]["used"]
+    picture = cv2.imread(str(tmp_path / "out" / "located.png"))
+    assert picture.shape[0] > SHAPE[0]
+
+
+def test_a_refused_pose_is_an_error_with_a_picture(folder: Path, tmp_path: Path, run: Locate) -> None:
+    cv2.imwrite(str(tmp_path / "board.png"), np.full(SHAPE, 77, np.uint8))
+    near = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
+    arguments = ("--scale", "40um", f"--near={near}", "--out", tmp_path / "out")
+    code, out, err = run(tmp_path / "board.png", "--board", folder, *TOLD, *arguments)
+    assert (code, out) == (1, "")
+    assert err.count("\n") == 1
+    assert "no pose: 0 of" in err
+    assert (tmp_path / "out" / "located.png").exists()
+    told = json.loads((tmp_path / "out" / "pose.json").read_text())
+    assert (told["status"], told["pose"]["x"]) == ("refused", None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "--board GERBERS or --field FIELD"),
+        (("--board", "{board}", "--field", "robocup_msl"), "one of the two"),
+        (("--board", "{board}"), "--scale is missing"),
+        (("--board", "{board}", "--scale", "25furlongs"), "--scale is '25furlongs'"),
+        (("--board", "{board}", "--scale", "25um", "--near", "1,2"), "expected 3 numbers"),
+        (("--board", "nowhere", "--scale", "25um"), "nowhere"),
+        (("--field", "robocup_msl"), "--scale is missing"),
+        (("--field", "robocup_msl", "--scale", "1cm", "--within", "1,1"), "--within is of --board"),
+        (("--field", "robocup_msl", "--scale", "1m"), "is the scale right"),
+        (("--board", "{board}", "--scale", "25um"), "name its files with layers"),
+        (("--board", "{board}", "--scale", "25um", "--layers", "copper"), "expected a name, or a pattern, and a layer"),
+        (("--board", "{board}", "--scale", "25um", "--features", "nowhere.toml"), "nowhere.toml"),
+    ],
+)
+def test_the_command_says_what_is_wrong(
+    folder: Path, tmp_path: Path, run: Locate, arguments: tuple[str, ...], words: str
+) -> None:
+    cv2.imwrite(str(tmp_path / "board.png"), np.full(SHAPE, 77, np.uint8))
+    code, out, err = run(tmp_path / "board.png", *(each.format(board=folder) for each in arguments))
+    assert (code, out) == (1, "")
+    assert err.startswith("gpuvision: ")
+    assert err.count("\n") == 1
+    assert words in err
+
+
+def test_quantities_have_units() -> None:
+    assert quantities("25um", "--scale", "m") == pytest.approx((25e-6,))
+    assert quantities("1e-3, -2mm,90deg", "--near", "m,m,rad") == pytest.approx((1e-3, -2e-3, math.pi / 2))
+    for wrong in ("", "1", "1,2,3,4", "1,2,3mm", "nan,1,2", "1,2,inf"):
+        with pytest.raises(ValueError, match="expected 3 numbers"):
+            quantities(wrong, "--near", "m,m,rad")
+
+
+@pytest.mark.parametrize(
+    ("name", "pose", "scale"),
+    [("robocup_msl", (-6.0, 2.0, 0.7), 0.03), ("robocup_junior", (0.4, -0.3, -2.0), 4e-3)],
+)
+def test_a_robot_is_located_with_its_twin(
+    name: str, pose: tuple[float, float, float], scale: float, device: Device, rng: np.random.Generator
+) -> None:
+    field = read_field(name)
+    wide = line_width_of(field)
+    image = floor_image(field, pose, scale=scale, shape=(400, 440), line_width=wide, rng=rng)
+    points = floor_points(image, scale=scale, line_width=wide, device=device)
+    assert len(points) > 30
+    found = locate_robot(points, field, device=device)
+    assert found.reason == ""
+    first, second = found.candidates[:2]
+    assert (first.twin, second.twin) == (1, 0)
+    twins = [each.pose for each in (first, second)]
+    true = min(twins, key=lambda each: abs(math.remainder(each[2] - pose[2], 2 * math.pi)))
+    # A tenth of a pixel, and what 200 px away makes of it: 80 points, each found to a few tenths.
+    np.testing.assert_allclose(true[:2], pose[:2], atol=0.2 * scale)
+    assert math.remainder(true[2] - pose[2], 2 * math.pi) == pytest.approx(0.0, abs=2e-3)
+    # Where it is known about where it is, its twin is not looked at.
+    near = locate_robot(points, field, near=(pose[0] + 0.02, pose[1], pose[2] + 0.05), device=device)
+    assert len(near.candidates) == 1
+    np.testing.assert_allclose(near.candidates[0].pose[:2], pose[:2], atol=0.2 * scale)
+
+
+def test_floor_points_lie_on_the_lines(rng: np.random.Generator) -> None:
+    """Through a lens, beside a robot that hides the middle: every stripe once along each ray."""
+    field = read_field("robocup_msl")
+    pose, scale = (1.0, 3.0, 0.3), 0.02
+    image = floor_image(field, pose, scale=scale, shape=(500, 500), line_width=0.125, rng=rng)
+    lens = Lens(k1=2e-7, centre=(250.0, 250.0))
+    columns, rows = np.meshgrid(np.arange(500), np.arange(500))
+    at = lens.undistort(np.stack([columns, rows], axis=-1)).astype(np.float32)
+    bent = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    points = floor_points(bent, scale=scale, line_width=0.125, blind=0.5, model=lens)
+    assert len(points) > 60
+    assert np.hypot(*points.T).min() > 0.5
+    found = locate_robot(points, field)
+    assert found.candidates[0].share > 0.95
+    assert found.candidates[0].scale < 0.5 * scale
+    angle = np.arctan2(points[:, 1], points[:, 0])
+    for each in np.unique(np.round(angle, 3)):
+        away = np.sort(np.hypot(*points[np.abs(angle - each) < 1e-3].T))
+        assert np.all(np.diff(away) > 0.06)
+
+
+def test_points_of_any_camera_will_do(tmp_path: Path, run: Locate, rng: np.random.Generator) -> None:
+    field = read_field("robocup_msl")
+    image = floor_image(field, (-6.0, 2.0, 0.7), scale=0.03, shape=(400, 440), line_width=0.125, rng=rng)
+    points = floor_points(image, scale=0.03, line_width=0.125)
+    np.save(tmp_path / "points.npy", points)
+    np.savetxt(tmp_path / "points.csv", points, delimiter=",")
+    np.save(tmp_path / "wrong.npy", np.zeros((3, 3)))
+    np.save(tmp_path / "few.npy", points[:2])
+    for name in ("points.npy", "points.csv"):
+        code, out, _ = run(tmp_path / name, "--field", "robocup_msl", "--out", tmp_path / name.replace(".", "_"))
+        assert code == 0
+        assert "twin of 2" in out
+        told = json.loads((tmp_path / name.replace(".", "_") / "pose.json").read_text())
+        assert abs(abs(told["candidates"][0]["pose"]["x"]) - 6.0) < 0.01
+        assert (tmp_path / name.replace(".", "_") / "located.png").exists()
+    assert "expected points (n, 2)" in run(tmp_path / "wrong.npy", "--field", "robocup_msl")[2]
+    assert "2 points on lines, expected 4" in run(tmp_path / "few.npy", "--field", "robocup_msl")[2]
+
+
+@functools.cache
+def board_of(folder: Path) -> Artwork:
+    return read_artwork(folder)
+
+
+@pytest.mark.realdata
+@pytest.mark.parametrize(
+    ("name", "middle"),
+    [
+        ("upverter", (-50e-3, 10e-3)),
+        ("fritzing", (20e-3, 25e-3)),
+        ("kicad-x2-tests/x2ap", (60e-3, -45e-3)),
+    ],
+)
+def test_boards_of_three_tools_are_located(data: Path, name: str, middle: tuple[float, float], device: Device) -> None:
+    board = board_of(data / "gerber" / name)
+    pose = (middle[0] + 45e-6, middle[1] - 60e-6, 3e-3)
+    image = seen(board, pose, FINE, FINE_SHAPE, growth=-8e-6)
+    located = locate_board(image, board, scale=FINE, near=(*middle, 0.0), device=device)
+    assert located.reason == ""
+    assert np.abs(off(located, pose)).max() < SIGMAS
+    assert np.all(located.sigmas[:2] < 0.05 * FINE)
+
+
+def test_a_lens_file_goes_with_the_command(folder: Path, artwork: Artwork, tmp_path: Path, run: Locate) -> None:
+    pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 2e-3)
+    cv2.imwrite(str(tmp_path / "board.png"), seen(artwork, pose))
+    write_lens(tmp_path / "lens.toml", Lens(k1=0.0), {})
+    near = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
+    arguments = ("--scale", "40um", f"--near={near}", "--camera", tmp_path / "lens.toml")
+    code, out, _ = run(tmp_path / "board.png", "--board", folder, *TOLD, *arguments)
+    assert (code, "rulers agree" in out) == (0, True)
+    (tmp_path / "lens.toml").write_text("[lens]\nk1 = 'wide'\n")
+    code, _, err = run(tmp_path / "board.png", "--board", folder, *TOLD, *arguments)
+    assert code == 1
+    assert "lens.k1" in err
+
+
+def test_a_mirrored_side_is_seen_from_below(artwork: Artwork) -> None:
+    """The bottom as a camera below sees it: the top's image in a mirror."""
+    pose = (BOARD_MIDDLE[0] + 20e-6, BOARD_MIDDLE[1] + 10e-6, 2e-3)
+    below = np.ascontiguousarray(seen(artwork, pose)[:, ::-1])
+    located = locate_board(below, replace(artwork, side="bottom"), scale=PIXEL, near=(*BOARD_MIDDLE, 0.0))
+    assert located.reason == ""
+    assert np.abs(off(located, pose)).max() < SIGMAS

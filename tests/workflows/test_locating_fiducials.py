@@ -1,0 +1,251 @@
+"""Locating a camera over boards by round marks, alone and beside rulers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from boards import BOARD_MIDDLE, LAYERS
+from gpuvision.camera.lens import Lens
+from gpuvision.camera.orthographic import BoardView
+from gpuvision.cli import main as cli
+from gpuvision.formats.features_file import read_features, write_features
+from gpuvision.host import Device
+from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.matching.artwork.shapes import Shape
+from gpuvision.matching.board.edge_measurement import features_in_view
+from gpuvision.matching.board.located_board import LocatedBoard
+from gpuvision.matching.features.feature_set import choose_features
+from gpuvision.matching.features.selection import Imaging
+from gpuvision.workflows.locating_board import locate_board
+from round_boards import (
+    FIDUCIALS,
+    LANDS,
+    NOISE,
+    PIXEL,
+    SHAPE,
+    TRACES,
+    moved_picture,
+    round_artwork,
+    round_board,
+    round_picture,
+)
+
+NEAR = (*BOARD_MIDDLE, 0.0)
+# Steps of 110 in the open and of 50 under the mask; a pixel's own extent blurs, too.
+IMAGING = Imaging(pixel=PIXEL, blur_px=1.04, contrast_bare=110 / NOISE, contrast_masked=50 / NOISE, angle=5.3e-3)
+VIEW = BoardView(scale=PIXEL, shape=SHAPE, pose=NEAR)
+DRAWS = 40
+
+
+@pytest.fixture(scope="module")
+def rounds(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
+    """Round lands and fiducials, and not one straight edge."""
+    return round_artwork(round_board(tmp_path_factory.mktemp("rounds")))
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
+    """Traces, too: some free, and one that ends in a land."""
+    traces = (*TRACES, (*LANDS[5], LANDS[5][0] + 2.5, LANDS[5][1] + 0.5))
+    return round_artwork(round_board(tmp_path_factory.mktemp("mixed"), traces=traces))
+
+
+def located(image: np.ndarray, artwork: Artwork, **more: object) -> LocatedBoard:
+    return locate_board(image, artwork, scale=PIXEL, near=NEAR, copper="bright", **more)  # type: ignore[arg-type]
+
+
+def squares(errors: list[np.ndarray], covariances: list[np.ndarray]) -> float:
+    """Sum of squared errors in units of covariances."""
+    return float(sum(e @ np.linalg.inv(c) @ e for e, c in zip(errors, covariances, strict=True)))
+
+
+def agree(total: float, numbers: int) -> bool:
+    """Whether squared errors are as many Gaussian numbers': in all but 2 of 1e4 boards.
+
+    The deviations themselves are within 10 %: marks have 1.0 to 1.2 times the bound's, of which 1.1 is promised.
+    """
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], numbers)
+    return bool(0.9**2 * low <= total <= 1.1**2 * high)
+
+
+@pytest.mark.parametrize("board", ["rounds", "mixed"])
+def test_errors_are_as_promised(board: str, device: Device, request: pytest.FixtureRequest) -> None:
+    """Before any image is seen, and with each pose."""
+    artwork, rng = request.getfixturevalue(board), np.random.default_rng(5)
+    features = features_in_view(artwork, VIEW, IMAGING, 40)
+    assert len(features.marks.radius) == len(LANDS) + len(FIDUCIALS)
+    assert (len(features.length) == 0) == (board == "rounds")
+    picture = round_picture(artwork)
+    errors, told = [], []
+    for _ in range(DRAWS):
+        image, true = moved_picture(picture, rng)
+        found = located(image, artwork, features=features, device=device)
+        assert found.reason == ""
+        assert found.marks.used.sum() >= 15  # Tukey's loss rejects no more than a few of 1e3 good rows
+        errors.append(np.array(found.pose) - true)
+        told.append(found.covariance)
+    assert agree(squares(errors, [features.covariance] * DRAWS), 3 * DRAWS)
+    assert agree(squares(errors, told), 3 * DRAWS)
+    # A hundredth of a pixel: 0.4 um.
+    assert np.all(features.sigmas[:2] < 0.01 * PIXEL)
+
+
+def test_marks_beside_rulers_promise_more(mixed: Artwork) -> None:
+    both = features_in_view(mixed, VIEW, IMAGING, 40)
+    rulers = features_in_view(replace(mixed, lands=()), VIEW, IMAGING, 40)
+    assert len(both.length) == len(rulers.length) == 40
+    assert np.all(both.sigmas < 0.6 * rulers.sigmas)
+
+
+def shifted(artwork: Artwork, which: np.ndarray, by: np.ndarray) -> list[Shape]:
+    """Areas of the copper, some of them moved by (n, 2) [m]."""
+    moves = dict(zip(which.tolist(), by, strict=True))
+    return [Shape(each.outline + moves.get(n, 0.0), each.dark) for n, each in enumerate(artwork.copper)]
+
+
+@pytest.mark.parametrize(
+    ("how", "board"),
+    [("missing", "rounds"), ("apart", "rounds"), ("together", "rounds"), ("far", "rounds"), ("apart", "mixed")],
+)
+def test_bad_marks_do_not_spoil_a_pose(board: str, how: str, device: Device, request: pytest.FixtureRequest) -> None:
+    """Of 16 marks five are missing, or moved: each its own way, all of them alike, or beyond what is searched.
+
+    One of the two fiducials is among them; one of them says more than half of all the others.
+    """
+    artwork, rng = request.getfixturevalue(board), np.random.default_rng(11)
+    first = len(artwork.copper) - len(LANDS) - len(FIDUCIALS)
+    features = features_in_view(artwork, VIEW, IMAGING, 40)
+    errors, told = [], []
+    for _ in range(3):
+        bad = np.append(rng.choice(len(LANDS), 4, replace=False), len(LANDS) + rng.integers(len(FIDUCIALS)))
+        way = rng.normal(size=(5, 2)) if how != "together" else np.tile(rng.normal(size=2), (5, 1))
+        by = way / np.hypot(*way.T)[:, None] * {"far": 700e-6, "missing": 0.0}.get(how, 60e-6)
+        changed = replace(artwork, copper=tuple(shifted(artwork, first + bad, by)))
+        picture = round_picture(changed, missing=first + bad if how == "missing" else ())
+        for _ in range(4):
+            image, true = moved_picture(picture, rng)
+            found = located(image, artwork, features=features, device=device)
+            assert found.reason == ""
+            errors.append(np.array(found.pose) - true)
+            told.append(found.covariance)
+            places = np.stack([artwork.lands[n].centre for n in bad])
+            mine = np.hypot(*(found.marks.point[:, None] - places).T).min(axis=0) < 1e-6
+            assert mine.sum() == 5
+            assert not found.marks.used[mine].any()
+            assert found.marks.used[~mine].sum() >= 10
+            assert how in ("apart", "together") or not found.marks.found[mine].any()
+    assert squares(errors, told) < 1.1**2 * chi2.ppf(1 - 1e-4, 3 * len(errors))
+
+
+def test_fiducials_that_agree_with_nothing_are_no_pose(rounds: Artwork, device: Device) -> None:
+    """Two fiducials in the open say more than a few lands under the mask; moved together they are not believed."""
+    both = np.arange(len(LANDS), len(LANDS) + len(FIDUCIALS))
+    board = replace(rounds, copper=tuple(shifted(rounds, both, np.tile([50e-6, -40e-6], (len(both), 1)))))
+    picture, rng = round_picture(board), np.random.default_rng(12)
+    for _ in range(4):
+        image, true = moved_picture(picture, rng)
+        found = located(image, rounds, device=device)
+        assert found.reason == ""
+        assert np.abs((np.array(found.pose) - true) / found.sigmas).max() < 4.5
+        assert not found.marks.used[:2].any()
+
+
+def test_a_board_of_marks_is_not_searched(rounds: Artwork) -> None:
+    """The search looks at straight edges, of which there are none: it says what to do."""
+    image, _ = moved_picture(round_picture(rounds), np.random.default_rng(13))
+    found = locate_board(image, rounds, scale=PIXEL)
+    assert "too few straight edges in view; say near where it is" in found.reason
+
+
+def test_two_marks_are_too_few(tmp_path: Path) -> None:
+    """Nothing would check them."""
+    artwork = round_artwork(round_board(tmp_path, lands=((6, 6), (14, 10)), fiducials=()))
+    with pytest.raises(ValueError, match=r"0 edges .* and 2 round marks, expected 3"):
+        located(np.zeros(SHAPE, np.uint8), artwork)
+
+
+def test_a_picture_without_the_board_is_refused(rounds: Artwork) -> None:
+    image = np.random.default_rng(3).normal(90, 8, SHAPE).clip(0, 255).astype(np.uint8)
+    found = located(image, rounds)
+    assert found.reason
+    assert np.isnan(found.pose).all()
+    json.dumps(found.report(), allow_nan=False)
+
+
+def test_dark_marks_are_told_from_bright(rounds: Artwork, device: Device) -> None:
+    image, true = moved_picture(round_picture(rounds), np.random.default_rng(4))
+    found = locate_board(255 - image, rounds, scale=PIXEL, near=NEAR, device=device)
+    assert found.copper == "dark"
+    assert np.abs((np.array(found.pose) - true) / found.sigmas).max() < 4.5
+
+
+def test_marks_are_seen_through_a_lens(rounds: Artwork) -> None:
+    lens = Lens(k1=2e-7, centre=(205.0, 145.0))
+    straight, true = moved_picture(round_picture(rounds), np.random.default_rng(6))
+    columns, rows = np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0]))
+    at = lens.undistort(np.stack([columns, rows], axis=-1)).astype(np.float32)
+    image = cv2.remap(
+        straight.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    found = located(image, rounds, model=lens)
+    # What the image was sampled from was noisy pixels; cubic interpolation leaves them so to some percent.
+    assert np.abs((np.array(found.pose) - true) / found.sigmas).max() < 4.5 + 1.0
+    assert found.marks.used.sum() == len(LANDS) + len(FIDUCIALS)
+    # 2e-7 px^-2 moves the outer marks by a pixel.
+    bare = located(image, rounds)
+    assert bare.reason or np.abs(bare.marks.residual[bare.marks.used]).max() > 3 * np.abs(found.marks.residual).max()
+
+
+def test_a_mirrored_side_is_seen_from_below(rounds: Artwork) -> None:
+    image, true = moved_picture(round_picture(rounds), np.random.default_rng(8))
+    below = np.ascontiguousarray(image[:, ::-1])
+    found = located(below, replace(rounds, side="bottom"))
+    assert np.abs((np.array(found.pose) - true) / found.sigmas).max() < 4.5
+
+
+def test_marks_are_chosen_for_their_cost(mixed: Artwork, tmp_path: Path) -> None:
+    """A mark costs 16 rulers; fiducials in the open are worth it, and more is promised than by rulers."""
+    region = ((2.5e-3, 2.5e-3), (17e-3, 13.9e-3))
+    features = choose_features(mixed, region, IMAGING, budget=80)
+    marks = len(features.marks.radius)
+    assert marks >= len(FIDUCIALS)
+    assert 80 - 16 < len(features.length) + 16 * marks <= 80
+    rulers = choose_features(replace(mixed, lands=()), region, IMAGING, budget=80)
+    assert np.linalg.det(features.covariance) < np.linalg.det(rulers.covariance)
+    write_features(features, tmp_path / "features.toml")
+    again = read_features(tmp_path / "features.toml")
+    for name in features.marks._fields:
+        np.testing.assert_array_equal(getattr(again.marks, name), getattr(features.marks, name))
+    assert np.all(features.marks.point - features.marks.radius[:, None] > features.region[0])
+
+
+def test_the_command_tells_of_marks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = round_board(tmp_path)
+    artwork = round_artwork(folder)
+    picture = round_picture(artwork, missing=(2,))
+    image, true = moved_picture(picture, np.random.default_rng(9))
+    cv2.imwrite(str(tmp_path / "board.png"), image)
+    layers = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
+    near = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
+    where = ["--scale", "40um", f"--near={near}", "--out", str(tmp_path / "out")]
+    command = ["gpuvision", "locate", str(tmp_path / "board.png"), "--board", str(folder), *layers, *where]
+    monkeypatch.setattr("sys.argv", command)
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert not end.value.code
+    assert "15 of 16 marks agree, 15 were found" in capsys.readouterr().out
+    told = json.loads((tmp_path / "out" / "pose.json").read_text())
+    assert (told["counts"]["marks_laid"], told["counts"]["marks_used"]) == (16, 15)
+    assert sum(each["found"] for each in told["marks"]) == 15
+    for name, value in zip(("x", "y", "theta"), true, strict=True):
+        assert abs(told["pose"][name] - value) < 4.5 * told["sigmas"][name]
+    assert (tmp_path / "out" / "located.png").exists()

@@ -1,0 +1,229 @@
+"""Robots on fields, and pictures that are none: found with clutter and with robots in the way, refused otherwise."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from floors import GREEN, WHITE, floor_image
+from gpuvision.cli import main as cli
+from gpuvision.formats.field_file import read_field
+from gpuvision.host import Device
+from gpuvision.matching.field.distance_map import Arc, Field
+from gpuvision.matching.field.evidence import distances_to_lines, expected_crossings, onto_field, seen_share
+from gpuvision.status import Status
+from gpuvision.workflows.locating_robot import locate_robot, scan_floor
+
+SCALE, SHAPE, WIDE = 0.03, (400, 440), 0.125
+Image = np.ndarray[Any, np.dtype[np.uint8]]
+
+
+def seen_from(field: Field, pose: tuple[float, float, float], rng: np.random.Generator) -> Image:
+    return floor_image(field, pose, scale=SCALE, shape=SHAPE, line_width=WIDE, noise=rng.uniform(2.0, 12.0), rng=rng)
+
+
+def anywhere(rng: np.random.Generator) -> tuple[float, float, float]:
+    x, y, heading = rng.uniform([-9.0, -6.0, -math.pi], [9.0, 6.0, math.pi])
+    return float(x), float(y), float(heading)
+
+
+def carpet(rng: np.random.Generator) -> Image:
+    return np.clip(rng.normal(GREEN, 5.0, (*SHAPE, 3)), 0, 255).astype(np.uint8)
+
+
+def spotted(image: Image, count: int, rng: np.random.Generator) -> Image:
+    """White things on the floor, 5 to 30 cm."""
+    image = image.copy()
+    for _ in range(count):
+        (x, y), size = rng.uniform(0, SHAPE[::-1]), rng.uniform(1.5, 3.5)
+        axes = (int(size * rng.uniform(1.0, 3.0)), int(size))
+        cv2.ellipse(image, (int(x), int(y)), axes, rng.uniform(0, 180), 0, 360, WHITE, -1, cv2.LINE_AA)
+    return image
+
+
+def hidden(image: Image, share: float, rng: np.random.Generator) -> Image:
+    """Five robots stand in the way of a share of all directions."""
+    image, middle = image.copy(), np.array(SHAPE[::-1]) / 2
+    for first in rng.uniform(0.0, 2.0 * math.pi, 5):
+        turn = first + np.linspace(0.0, 2.0 * math.pi * share / 5.0, 6)
+        far = np.array([rng.uniform(20.0, 60.0), *[400.0] * 6])
+        turn = np.append(turn.mean(), turn)
+        corners = middle + far[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        cv2.fillPoly(image, [np.rint(corners).astype(np.int32)], (15, 15, 15))
+    return image
+
+
+def tiles(spacing: float) -> Field:
+    at = np.arange(-12.0, 12.0, spacing)
+    lines = [(-12.0, y, 12.0, y) for y in at] + [(x, -12.0, x, 12.0) for x in at]
+    return Field(length=24.0, width=24.0, lines=tuple(lines))
+
+
+def grown(field: Field, by: float) -> Field:
+    lines = tuple((by * a, by * b, by * c, by * d) for a, b, c, d in field.lines)
+    arcs = tuple(Arc(by * each.x, by * each.y, by * each.radius, each.start, each.end) for each in field.arcs)
+    return Field(length=by * field.length, width=by * field.width, lines=lines, arcs=arcs)
+
+
+def mottled(rng: np.random.Generator) -> Image:
+    rough = cv2.GaussianBlur(rng.normal(size=SHAPE).astype(np.float32), (0, 0), rng.uniform(1.0, 4.0))
+    return cv2.normalize(rough, np.empty_like(rough), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def random_lines(rng: np.random.Generator) -> Field:
+    start, turn, size = rng.uniform(-12, 12, (30, 2)), rng.uniform(0, 2 * np.pi, 30), rng.uniform(1, 8, 30)
+    ends = start + size[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    return Field(length=24.0, width=24.0, lines=tuple(map(tuple, np.hstack([start, ends]).tolist())))
+
+
+NO_FIELDS: dict[str, Callable[[np.random.Generator], Image]] = {
+    "noise": lambda rng: rng.integers(0, 256, (*SHAPE, 3)).astype(np.uint8),
+    "carpet": carpet,
+    "spots": lambda rng: spotted(carpet(rng), int(rng.integers(5, 300)), rng),
+    "mottled": mottled,
+    "tiles": lambda rng: seen_from(tiles(rng.uniform(0.8, 3.0)), anywhere(rng), rng),
+    "lines": lambda rng: seen_from(random_lines(rng), anywhere(rng), rng),
+}
+
+
+def right(found: np.ndarray, pose: tuple[float, float, float]) -> bool:
+    """Whether a pose, or its twin, is within 10 cm of what it should be."""
+    return bool(min(np.hypot(found[0] - s * pose[0], found[1] - s * pose[1]) for s in (1, -1)) < 0.1)
+
+
+@pytest.mark.parametrize("kind", sorted(NO_FIELDS))
+def test_what_is_no_field_is_refused(kind: str, rng: np.random.Generator) -> None:
+    field = read_field("robocup_msl")
+    for _ in range(6):
+        found = locate_robot(scan_floor(NO_FIELDS[kind](rng), scale=SCALE, line_width=WIDE), field)
+        assert found.reason
+        assert found.candidates == ()
+        assert found.report()["status"] == "refused"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", sorted(NO_FIELDS))
+def test_of_many_that_are_no_field_all_are_refused(kind: str, rng: np.random.Generator) -> None:
+    """All that have no lines; tiles and lines are fields of another kind, and a view of a few may fit this one, too."""
+    field = read_field("robocup_msl")
+    scans = (scan_floor(NO_FIELDS[kind](rng), scale=SCALE, line_width=WIDE) for _ in range(35))
+    refused = sum(bool(locate_robot(scan, field).reason) for scan in scans)
+    assert refused >= (32 if kind in ("lines", "tiles") else 35)
+
+
+@pytest.mark.slow
+def test_of_many_fields_nearly_all_are_found(rng: np.random.Generator) -> None:
+    """With up to 80 things on the floor; where the image shows few lines another place may look like it."""
+    field = read_field("robocup_msl")
+    found = []
+    for number in range(150):
+        pose = anywhere(rng)
+        image = spotted(seen_from(field, pose, rng), number % 3 * 40, rng)
+        located = locate_robot(scan_floor(image, scale=SCALE, line_width=WIDE), field)
+        found.append(not located.reason and right(located.candidates[0].pose, pose))
+    assert np.mean(found) > 0.9
+
+
+@pytest.mark.parametrize(("spots", "share"), [(0, 0.0), (60, 0.0), (0, 0.2), (20, 0.1)])
+def test_fields_are_found(spots: int, share: float, device: Device, rng: np.random.Generator) -> None:
+    """With things on the floor, and robots in the way."""
+    field = read_field("robocup_msl")
+    for pose in ((-6.0, 2.0, 0.7), (3.0, -1.5, -2.0), (0.5, 4.0, 1.2)):
+        image = hidden(spotted(seen_from(field, pose, rng), spots, rng), share, rng)
+        located = locate_robot(scan_floor(image, scale=SCALE, line_width=WIDE, device=device), field, device=device)
+        assert located.reason == ""
+        assert right(located.candidates[0].pose, pose)
+        assert located.evidence is not None
+        assert located.evidence.seen > 0.55
+        told = located.report()["evidence"]
+        assert told["log10_chance"] < -3.0
+        assert told["expected"] > 20
+
+
+def test_another_field_is_refused(device: Device, rng: np.random.Generator) -> None:
+    """Its lines do not fit, and lines are missing: not even a field of the same shape, a third larger."""
+    field, pose = read_field("robocup_msl"), (-6.0, 2.0, 0.7)
+    image = seen_from(grown(field, 1.33), pose, rng)
+    located = locate_robot(scan_floor(image, scale=SCALE, line_width=WIDE, device=device), field, device=device)
+    assert "it does not look like this field" in located.reason
+    assert len(located.doubtful) == 1
+    # At the scale that makes up for that it is this field.
+    scan = scan_floor(image, scale=SCALE / 1.33, line_width=WIDE / 1.33, device=device)
+    assert right(locate_robot(scan, field, device=device).candidates[0].pose, (-6.0 / 1.33, 2.0 / 1.33, 0.7))
+
+
+def test_every_stripe_along_a_ray_is_found(rng: np.random.Generator) -> None:
+    """From the robot's own place to the image's border: between them no line is lost."""
+    field = read_field("robocup_msl")
+    for pose in ((2.08, -0.31, -0.83), (-8.95, -2.24, 1.98), (-4.59, -0.4, -1.32)):
+        scan = scan_floor(seen_from(field, pose, rng), scale=SCALE, line_width=WIDE)
+        crossings = expected_crossings(field, pose, scan.paths, line_width=WIDE)
+        assert len(crossings.places) > 60
+        assert seen_share(crossings, scan.points, 0.02) > 0.97
+        assert np.abs(distances_to_lines(field, onto_field(scan.points, pose))).max() < 0.05
+        assert np.median(scan.sigmas) < 0.2 * SCALE
+
+
+def test_one_line_tells_a_part(device: Device, rng: np.random.Generator) -> None:
+    """A robot that sees one line only: candidates along it, flagged, are no refusal."""
+    field = Field(length=22.0, width=14.0, lines=((-11.0, 0.0, 11.0, 0.0),))
+    image = seen_from(field, (1.0, 2.0, 0.4), rng)
+    located = locate_robot(scan_floor(image, scale=SCALE, line_width=WIDE, device=device), field, device=device)
+    assert located.reason == ""
+    assert Status.AMBIGUOUS in located.candidates[0].status
+    assert np.isnan(located.candidates[0].covariance).all()
+    assert "fix a part of it only" in located.summary()
+
+
+def test_random_points_are_refused(rng: np.random.Generator) -> None:
+    """Points of another camera: no scan lines are known, and chance alone decides."""
+    field = read_field("robocup_msl")
+    for count in (4, 8, 30, 200, 1000):
+        for _ in range(6):
+            turn, far = rng.uniform(0, 2 * np.pi, count), 6.0 * np.sqrt(rng.uniform(0, 1, count))
+            points = (far * np.stack([np.cos(turn), np.sin(turn)])).T.astype(np.float32)
+            located = locate_robot(points, field)
+            assert located.candidates == ()
+            if located.evidence is None:  # four points may fit no pose at all
+                assert "no pose on the field fits" in located.reason
+            else:
+                assert "no better than random ones" in located.reason
+                assert located.report()["evidence"]["seen"] is None
+
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["gpuvision", "locate", *map(str, arguments)])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        told = capfd.readouterr()
+        return code, told.out, told.err
+
+    return call
+
+
+def test_the_command_refuses_in_a_line(tmp_path: Path, run: Command, rng: np.random.Generator) -> None:
+    cv2.imwrite(str(tmp_path / "tiles.png"), seen_from(tiles(1.4), (0.3, 0.2, 0.4), rng))
+    arguments = ("--field", "robocup_msl", "--scale", "3cm", "--out", tmp_path / "out")
+    code, out, err = run(tmp_path / "tiles.png", *arguments)
+    assert (code, out) == (1, "")
+    assert err.startswith("gpuvision: no pose: ")
+    assert err.count("\n") == 1
+    told = json.loads((tmp_path / "out" / "pose.json").read_text())
+    assert (told["status"], told["candidates"]) == ("refused", [])
+    assert told["evidence"]["on_lines"] < 0.6
+    assert (tmp_path / "out" / "located.png").exists()

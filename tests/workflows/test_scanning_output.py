@@ -1,0 +1,110 @@
+"""Where a scan is written: known to be possible before it is run, and one line where it is not."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gpuvision.host.files import check_file, check_folder, whole_folder
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.workflows.scanning import scan
+from scanning import Ran, check_refused, currents
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    return lambda *args: Ran(capsys, monkeypatch, *args)
+
+
+@pytest.fixture
+def plane(tmp_path: Path) -> Path:
+    np.save(tmp_path / "plane.npy", currents(4))
+    return tmp_path / "plane.npy"
+
+
+@pytest.fixture
+def shut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder in which none can be made, whoever asks; rights would not stop every user."""
+    folder = tmp_path / "shut"
+    folder.mkdir()
+    make = Path.mkdir
+
+    def refuse(path: Path, *args: Any, **options: Any) -> None:
+        if path.parent == folder and not path.exists():
+            raise PermissionError(13, "Permission denied", str(path))
+        make(path, *args, **options)
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    return folder
+
+
+def all_of(folder: Path) -> dict[str, str | None]:
+    return {str(each): None if each.is_dir() else each.read_bytes().hex() for each in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("name", ["picture.png", "scan.png", "report.json"])
+def test_a_folder_in_the_way_of_a_file_is_named_and_nothing_is_written(
+    name: str, plane: Path, tmp_path: Path, run: Any
+) -> None:
+    out = tmp_path / "out"
+    (out / name).mkdir(parents=True)
+    before = all_of(tmp_path)
+    ran = run("scan", plane, "--sensor", "psd_line", "--out", out)
+    check_refused(ran, rf"cannot write {out / name}: it is a folder, expected a file")
+    assert ".part" not in ran.err
+    assert all_of(tmp_path) == before
+
+
+def test_a_folder_that_is_there_needs_nothing_of_the_one_above(shut: Path) -> None:
+    """A mounted folder is on another file system than the one above it, which may belong to somebody else."""
+    out = shut / "out"
+    os.mkdir(out)
+    with whole_folder(out) as inside:
+        assert inside.parent == out
+        (inside / "first").write_text("new")
+    assert [each.name for each in out.iterdir()] == ["first"]
+
+
+def test_what_cannot_be_written_is_known_before_the_scan(plane: Path, shut: Path, tmp_path: Path, run: Any) -> None:
+    plane.write_bytes(b"")  # reading it would be the first thing that fails
+    before = all_of(tmp_path)
+    for args, message in (
+        (("--out", shut / "deep" / "out"), rf"cannot write into {shut / 'deep' / 'out'}: {shut}: Permission denied"),
+        (("--out", tmp_path / "out", "--trace", shut / "t.json"), rf"cannot write into {shut}: .*Permission denied"),
+        (("--out", tmp_path / "out", "--trace", shut), rf"cannot write {shut}: it is a folder, expected a file"),
+        (("--out", tmp_path / "o", "--trace", tmp_path / "o"), r"--trace is .*o, the folder of --out or one above"),
+    ):
+        ran = run("scan", plane, "--sensor", "psd_line", *args)
+        check_refused(ran, message)
+        assert ".part" not in ran.err
+        assert all_of(tmp_path) == before
+    check_refused(run("demo", "--out", shut / "out"), rf"cannot write into {shut / 'out'}: {shut}: Permission denied")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a file system into which nobody can write")
+def test_a_virtual_file_system_takes_nothing() -> None:
+    with pytest.raises(OSError, match=r"cannot write into /proc/gpuvision: /proc: "):
+        check_folder("/proc/gpuvision")
+
+
+def test_an_empty_name_is_not_this_folder(plane: Path, tmp_path: Path, run: Any) -> None:
+    for args in (
+        ("scan", "", "--sensor", "psd_line", "--out", tmp_path / "out"),
+        ("scan", plane, "--sensor", "psd_line", "--out", ""),
+        ("scan", plane, "--sensor", "psd_line", "--out", tmp_path / "out", "--trace", ""),
+        ("demo", "--out", ""),
+        ("profile", "--json", ""),
+    ):
+        ran = run(*args)
+        assert ran.code == 2
+        assert "is empty" in ran.err
+    for check in (check_folder, check_file):
+        with pytest.raises(ValueError, match="is empty; give one"):
+            check("")
+    with pytest.raises(ValueError, match="is empty"):
+        scan(currents(2), Sensor.load("psd_line")).write("")

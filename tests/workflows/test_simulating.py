@@ -1,0 +1,282 @@
+"""A part and a sensor become readings, errors and causes; what was stopped goes on."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import sys
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from gpuvision.cli import main as cli
+from gpuvision.formats.range_image import read_npz
+from gpuvision.host.errors import RecordingError
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.simulation.sensors.masks import Mask
+from gpuvision.simulation.sensors.readings import PATHS
+from gpuvision.workflows.light_cache import PROFILES_PER_BLOCK, BlockStore, compute_missing
+from gpuvision.workflows.simulating import part_of, prepare, simulate
+
+MM = 1e-3
+
+
+def mesh() -> trimesh.Trimesh:
+    """A plate with a block on it: beside the block the plate glows."""
+    plate = trimesh.creation.box((40 * MM, 20 * MM, 2 * MM))
+    plate.apply_translation((0, 0, -1 * MM))
+    block = trimesh.creation.box((10 * MM, 8 * MM, 5 * MM))
+    block.apply_translation((4 * MM, 0, 2.5 * MM))
+    joined: Any = trimesh.util.concatenate([plate, block])
+    made: trimesh.Trimesh = joined
+    return made
+
+
+@pytest.fixture(scope="module")
+def part_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("part") / "part.stl"
+    mesh().export(path)
+    return path
+
+
+def task_of(part_file: Path, sensor: str = "psd_line", **more: Any) -> Any:
+    part, materials = part_of(part_file, 1.0, None, 0.5)
+    return prepare(part, materials, Sensor.load(sensor), **({"profiles": 40} | more))
+
+
+def test_a_part_is_scanned_from_end_to_end(part_file: Path) -> None:
+    task = task_of(part_file, profiles=None)
+    # 20 mm of the plate at 0.25 mm a profile; those that touch its ends are none.
+    assert len(task.transports) == 79
+    np.testing.assert_allclose(task.transports[[0, -1]], [-9.75 * MM, 9.75 * MM], atol=1e-12)
+
+
+def test_what_is_read_is_told_apart_by_cause(part_file: Path, tmp_path: Path) -> None:
+    done = simulate(task_of(part_file), tmp_path, seed=None)
+    told = done.artifacts
+    assert told.error.shape == (40, 96)
+    total = np.sum(list(told.causes.values()), axis=0)
+    np.testing.assert_allclose(total, told.error, atol=1e-12)
+    # Before the lit block's wall the plate's reading is pulled up by the glow, on the side that the lens sees.
+    flat = np.abs(told.truth.h) < 1e-9
+    assert np.nanmax(np.abs(told.causes["secondary"][flat])) > 20e-6
+    away = flat & (np.abs(told.truth.g + 15 * MM) < 2 * MM)
+    assert np.nanmax(np.abs(told.error[away])) < 20e-6
+    done.write(tmp_path)
+    arrays, units = read_npz(tmp_path / "simulation.npz")
+    np.testing.assert_array_equal(arrays["error"], told.error)
+    assert units["cause_secondary"] == "m"
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["errors"]["read"] == np.isfinite(told.error).sum()
+    for name in ("errors.png", "causes.png", "picture.png", "range_image.tiff", "range_image.ply"):
+        assert (tmp_path / name).stat().st_size > 1000
+
+
+def test_a_mask_made_for_the_part_helps(part_file: Path, tmp_path: Path) -> None:
+    task = task_of(part_file)
+    without = simulate(task, tmp_path, seed=None)
+    found = simulate(task, tmp_path, seed=None, mask="best")
+    assert found.computed == 0
+    assert found.mask is not None
+    rms = [np.sqrt(np.nanmean(each.artifacts.error**2)) for each in (without, found)]
+    assert rms[1] < rms[0]
+    found.write(tmp_path)
+    again = simulate(task, tmp_path, seed=None, mask=Mask.load(tmp_path / "mask.txt"))
+    np.testing.assert_allclose(again.artifacts.error, found.artifacts.error, atol=1e-12)
+
+
+def test_what_was_stopped_goes_on_where_it_was(part_file: Path, tmp_path: Path) -> None:
+    task = task_of(part_file)
+
+    def stop(done: int, of: int | None) -> None:
+        if done >= 2 * PROFILES_PER_BLOCK:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(task, tmp_path, progress=stop)
+    store = BlockStore(tmp_path, task)
+    assert store.missing() == [2]
+    kept = [store.path(k).read_bytes() for k in (0, 1)]
+    seen = []
+    done = simulate(task, tmp_path, progress=lambda done, of: seen.append((done, of)))
+    assert done.computed == 1
+    assert seen == [(32, 40), (40, 40)]
+    assert [store.path(k).read_bytes() for k in (0, 1)] == kept
+    whole = simulate(task, tmp_path / "whole")
+    np.testing.assert_array_equal(whole.artifacts.error, done.artifacts.error)
+    np.testing.assert_array_equal(whole.artifacts.verdict, done.artifacts.verdict)
+
+
+def test_half_a_block_counts_as_none(part_file: Path, tmp_path: Path) -> None:
+    task = task_of(part_file, profiles=20)
+    store = BlockStore(tmp_path, task)
+    assert compute_missing(store) == 2
+    whole = store.path(1).read_bytes()
+    store.path(1).write_bytes(whole[: len(whole) // 2])
+    assert store.missing() == [1]
+    assert compute_missing(store) == 1
+    assert compute_missing(store) == 0
+    np.savez(store.path(1), light=np.zeros(3))
+    with pytest.raises(RecordingError, match=r"block_00001\.npz: holds no simulated light; delete it"):
+        list(store)
+
+
+def test_another_task_has_other_light(part_file: Path) -> None:
+    one = task_of(part_file)
+    assert task_of(part_file).fingerprint == one.fingerprint
+    others = [
+        task_of(part_file, tolerance=1e-6),
+        task_of(part_file, paths=("direct",)),
+        task_of(part_file, profiles=39),
+        task_of(part_file, sensor="camera_line"),
+        dataclasses.replace(one, materials=part_of(part_file, 1.0, None, 0.4)[1]),
+        dataclasses.replace(one, part=part_of(part_file, 1.001, None, 0.5)[0]),
+    ]
+    assert len({each.fingerprint for each in (one, *others)}) == 1 + len(others)
+    light = dataclasses.replace(one.sensor.light, responsivity=0.1)
+    electronics = dataclasses.replace(one, sensor=dataclasses.replace(one.sensor, light=light))
+    assert electronics.fingerprint == one.fingerprint
+
+
+def test_a_camera_beside_the_psd_is_hardly_moved_by_the_glow(part_file: Path, tmp_path: Path) -> None:
+    worst = {}
+    for name in ("psd_line", "camera_line"):
+        told = simulate(task_of(part_file, name), tmp_path / name, seed=None).artifacts
+        flat = np.abs(told.truth.h) < 1e-9
+        worst[name] = np.nanmax(np.abs(told.causes["secondary"][flat]))
+    assert worst["camera_line"] < 0.1 * worst["psd_line"]
+
+
+def test_noise_is_the_same_in_every_run(part_file: Path, tmp_path: Path) -> None:
+    task = task_of(part_file, profiles=20)
+    one, two, other = (simulate(task, tmp_path, seed=each).artifacts.error for each in (3, 3, 4))
+    np.testing.assert_array_equal(one, two)
+    assert np.nanmax(np.abs(one - other)) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"paths": ("direct", "defuse")}, "unknown path 'defuse'"),
+        ({"paths": ("diffuse-diffuse",)}, "lack 'direct'"),
+        ({"tolerance": -1.0}, "tolerance is -1"),
+        ({"sensor": "corner_scene"}, "straight transport"),
+    ],
+)
+def test_what_cannot_be_simulated(part_file: Path, change: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        task_of(part_file, **change)
+
+
+def test_a_part_beside_the_sensor_is_told_where_it_is(tmp_path: Path) -> None:
+    aside = mesh()
+    aside.apply_translation((1.0, 0.0, 0.0))
+    aside.export(tmp_path / "aside.stl")
+    with pytest.raises(ValueError, match="sees nothing lit in any of 8 profiles: the part lies at x 980 to 1020 mm"):
+        simulate(task_of(tmp_path / "aside.stl", profiles=8), tmp_path)
+
+
+def test_a_mesh_needs_its_materials(tmp_path: Path) -> None:
+    scene = trimesh.Scene([mesh(), trimesh.creation.box((MM, MM, MM))])
+    scene.export(tmp_path / "two.glb")
+    with pytest.raises(ValueError, match="has 2 meshes, 1 materials"):
+        part_of(tmp_path / "two.glb", 1.0, part_of(tmp_path / "two.glb", 1.0, None, 0.5)[1][:1], 0.5)
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["gpuvision", "simulate", *words])
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    return int(left.value.code or 0)
+
+
+def test_the_command(
+    part_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    millimetres = mesh()
+    millimetres.apply_scale(1000.0)
+    millimetres.export(tmp_path / "mm.stl")
+    out = tmp_path / "out"
+    words = [str(tmp_path / "mm.stl"), "--unit", "mm", "--sensor", "psd_line", "--out", str(out), "--profiles", "8"]
+    assert command(monkeypatch, *words) == 0
+    said = capsys.readouterr()
+    assert "8 profiles" in said.out
+    assert said.err == ""
+    report = json.loads((out / "report.json").read_text())
+    assert report["profiles"] == 8
+    assert report["computed_blocks"] == 1
+    assert command(monkeypatch, *words, "--no-noise", "--mask", "best") == 0
+    assert json.loads((out / "report.json").read_text())["computed_blocks"] == 0
+    capsys.readouterr()
+    for wrong, line in [
+        (["--paths", "direct,sideways"], "unknown path 'sideways'"),
+        (["--paths", ""], "lack 'direct'"),
+        (["--mask", str(tmp_path / "none.txt")], "none.txt"),
+        (["--mask", str(tmp_path / "mm.stl")], "mm.stl: expected two numbers a line"),
+        (["--materials", str(tmp_path / "none.toml")], "none.toml"),
+        (["--scheduler", "tcp://127.0.0.1:1", "--profiles", "7"], "127.0.0.1:1"),
+    ]:
+        assert command(monkeypatch, *words, *wrong) == 1
+        told = capsys.readouterr().err.strip().splitlines()
+        assert line in told[-1]
+        assert told[-1].startswith("gpuvision: ")
+
+
+def test_a_cluster_loses_a_worker_and_nothing_else(part_file: Path, tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    task = task_of(part_file, profiles=None)
+    here = simulate(task, tmp_path / "here")
+    seen: list[int] = []
+    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": ":0"}
+    with LocalCluster(**options, silence_logs=50) as cluster:
+        pids = [worker.pid for worker in cluster.workers.values()]
+
+        def kill_one(done: int, of: int | None) -> None:
+            seen.append(done)
+            if len(seen) == 2:
+                os.kill(pids[0], signal.SIGKILL)
+
+        there = simulate(task, tmp_path / "there", scheduler=cluster.scheduler_address, progress=kill_one)
+    assert there.computed == len(task.blocks())
+    assert seen[-1] == len(task.transports)
+    np.testing.assert_array_equal(there.artifacts.error, here.artifacts.error)
+
+
+def test_a_second_sensor_sees_what_is_hidden_from_the_first(
+    part_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = resources.files("gpuvision").joinpath("presets", "sensors", "camera_line.toml").read_text(encoding="utf-8")
+    across = tmp_path / "across.toml"
+    across.write_text(text.replace("[light]", "[light]\nlens = [0.0, -0.08, 0.15]"))
+    words = [str(part_file), "--sensor", "camera_line", "--second", str(across), "--out", str(tmp_path)]
+    assert command(monkeypatch, *words, "--profiles", "48", "--paths", "direct") == 0
+    assert "surfaces read within" in capsys.readouterr().out
+    report = json.loads((tmp_path / "both" / "report.json").read_text())
+    ranked = {each["name"]: each["unread"] for each in report["ranked"]}
+    assert report["ranked"][0]["name"] == "both"
+    # Behind the block each one alone misses as much as the other.
+    assert ranked["both"] < 0.5 * min(ranked["first"], ranked["second"])
+    assert (tmp_path / "second" / "errors.png").stat().st_size > 1000
+
+
+def test_a_wrong_second_sensor_costs_no_light(
+    part_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(part_file), "--sensor", "psd_line", "--out", str(tmp_path), "--profiles", "1"]
+    for second, line in [("nowhere.toml", "nowhere.toml"), ("corner_scene", "straight transport")]:
+        assert command(monkeypatch, *words, "--second", second) == 1
+        assert line in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_all_paths_by_one_word(part_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = [str(part_file), "--sensor", "psd_line", "--out", str(tmp_path), "--profiles", "1"]
+    assert command(monkeypatch, *words, "--paths", "all") == 0
+    assert json.loads((tmp_path / "report.json").read_text())["paths"] == list(PATHS)

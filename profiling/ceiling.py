@@ -29,7 +29,9 @@ def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[
     target = device.empty((max(writes, 1) * 16,), np.float32)
     source.set(np.ones(source.shape, np.float32))
     target.set(np.ones(target.shape, np.float32))  # touches the pages before anything is timed
-    kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling.cl", {}), "move" if device.is_cpu else "move_items")
+    kernel = cl.Kernel(
+        build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "move" if device.is_cpu else "move_items"
+    )
     kernel.set_args(memory_of(source), memory_of(target), np.int64(reads), np.int64(writes))
     items = device.handle.max_compute_units * _ITEMS_PER_UNIT * (1 if device.is_cpu else 64)
 
@@ -49,7 +51,7 @@ def flop_rate(device: Device, *, seconds: float = 0.15) -> float:
     """
     items = device.handle.max_compute_units * (4 if device.is_cpu else 4096)
     target = device.empty((items * 16,), np.float32)
-    kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling.cl", {}), "compute")
+    kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "compute")
     steps = 20_000 if device.is_cpu else 2_000
     kernel.set_args(memory_of(target), np.float32(1.0), np.float32(0.5), np.int32(steps))
     rates: list[float] = []

@@ -219,4 +219,4 @@ def _case(
     if since is not None:
         more = math.log(pairs / since.facts["pairs"])
         facts["exponent"] = 1.0 + math.log(facts["work"] / since.facts["work"]) / more
-    return Case("tolerance", name, call, {"gpuvision": part.all_pairs(device)}, float(off.max()), facts=facts)
+    return Case("light_clustering", name, call, {"gpuvision": part.all_pairs(device)}, float(off.max()), facts=facts)

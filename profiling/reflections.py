@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
-from gpuvision.profiling import bounces, occluded_irradiance
+from gpuvision.profiling import occluded_irradiance, patches
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 
@@ -79,7 +79,7 @@ def cases(device: Device) -> Iterator[Case]:
     yield _case(device, *_wall(16, 100_000), "closed-form/wall/16x1e5")
     yield _case(device, *_board(20_000), "closed-form/board/64x20000")
     yield _case(device, *_slopes(64, 20_000), "closed-form-slopes/64x20000")
-    yield from bounces.cases(device)
+    yield from patches.cases(device)
     yield from occluded_irradiance.cases(device)
 
 

@@ -46,7 +46,7 @@ def _case(device: Device, name: str, mesh: Any) -> Case:
     truth, known = _shown(exact.intervals), (exact.status == 0) & (bound.outputs.status.get() == 0)
     peer = _Samples(scene, fans)
     facts = {"triangles": len(mesh.faces), "fans": _FANS, "peer_error": _error(peer(), truth, known)}
-    return Case("fans", name, bound.run, {"embreex": peer}, _error(ours, truth, known), facts=facts)
+    return Case("visible_intervals", name, bound.run, {"embreex": peer}, _error(ours, truth, known), facts=facts)
 
 
 def _shown(intervals: NDArray[Any]) -> NDArray[Any]:

@@ -17,7 +17,7 @@ from gpuvision.cli.arguments import named_path
 from gpuvision.cli.scan import progress_bar
 
 if TYPE_CHECKING:
-    from gpuvision.workflows.calibrating import Calibration
+    from gpuvision.camera.calibration import Calibration
 
 
 class Seen(StrEnum):

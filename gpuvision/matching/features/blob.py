@@ -82,8 +82,8 @@ class Blobs(NamedTuple):
         uint8 `Status` flags. LOW_SIGNAL: too few rulers found an edge over the threshold, of the polarity, within the
         search radius. OUT_OF_RANGE: too many rulers leave the image, or the mark lies further than the search radius
         from its nominal place. NOT_FINITE: a place or radius is not finite, the radius not above 0, or too many
-        pixels are not finite. AMBIGUOUS: too few of the edges agree on one shape, or the pixels have none there. With a value:
-        SATURATED (a ruler of the fit has reached the saturation).
+        pixels are not finite. AMBIGUOUS: too few of the edges agree on one shape, or the pixels have none there. With
+        a value: SATURATED (a ruler of the fit has reached the saturation).
     """
 
     x: Any

@@ -11,7 +11,7 @@ from gpuvision.host.errors import (
     RecordingError,
     StreamError,
 )
-from gpuvision.host.launch import Launch, Precision, Variant, uses_vectors, real_defines, real_of
+from gpuvision.host.launch import Launch, Precision, Variant, real_defines, real_of, uses_vectors
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, type_defines
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Batch, Pipeline
@@ -68,7 +68,6 @@ __all__ = [
     "fitted_groups",
     "flags",
     "host_view",
-    "uses_vectors",
     "open_recording",
     "opencl_type",
     "padded_groups",
@@ -78,5 +77,6 @@ __all__ = [
     "round_up",
     "to_numpy",
     "type_defines",
+    "uses_vectors",
     "vector_work",
 ]

@@ -16,10 +16,10 @@ from gpuvision.host.launch import (
     Shape,
     Spec,
     Variant,
-    uses_vectors,
     nbytes_of,
     real_defines,
     real_of,
+    uses_vectors,
 )
 from gpuvision.host.program import Define
 from gpuvision.host.work_size import WorkSize, ceil_div, fitted_groups, padded_groups, vector_work

@@ -224,7 +224,7 @@ class PsdReadout(VisionOperation[PsdReading]):
         sheet = self.triangulation
         table = None if self.linearity is None else np.array(self.linearity, build.real)
         return build.launch(
-            "psd.cl",
+            "psd/psd.cl",
             "psd_readout",
             work=work,
             outputs=build.outputs({name: batch if name in chosen else None for name in PsdReading._fields}),

@@ -42,8 +42,8 @@ class SheetPoints(NamedTuple):
     g, h
         Along the sheet and up in it [m]; NaN where the status is not OK.
     status
-        uint8 `Status` flags: NOT_FINITE (u or v is not, or lies a million half regions away), NOT_INVERTIBLE (beyond the
-        fold of the lens polynomial), HORIZON (the ray does not meet the sheet, or too far away to mean anything).
+        uint8 `Status` flags: NOT_FINITE (u or v is not, or lies a million half regions away), NOT_INVERTIBLE (beyond
+        the fold of the lens polynomial), HORIZON (the ray does not meet the sheet, or too far away to mean anything).
     sigma_g, sigma_h
         Their standard deviations [m]; None unless the triangulation knows the sensor's ``sigma``.
     """
@@ -224,7 +224,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         work = build.work(points, each=each, group=_GROUP, least=_LANES, fitted=True)
         spread = None if self.sigma is None else shape
         return build.launch(
-            "triangulation.cl",
+            "triangulation/triangulation.cl",
             "triangulate",
             work=work,
             more_inputs=[(shape, dtype)],

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, capacity, flags, type_defines
-from gpuvision.matching.robust import Loss, tuning_constant_of, efficiency, loss_defines, subsets
+from gpuvision.matching.robust import Loss, efficiency, loss_defines, subsets, tuning_constant_of
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite
 
@@ -148,7 +148,7 @@ class FitLines(VisionOperation[LineFits]):
             "status": batch,
         }
         return build.launch(
-            "line_fit.cl",
+            "line_fit/line_fit.cl",
             "line_fit_sets",
             work=work,
             more_inputs=[(shape[:-1], dtype)] if self.weighted else [],

@@ -249,7 +249,7 @@ class PsdReadout(VisionOperation[PsdReading]):
             defines |= {"WITH_SHEET": None} | self.triangulation.defines
         return defines | flags(
             PLANAR=self.layout == "planar",
-            LOW_SIGNAL=any(self.dark),
+            DARK_LEVEL=any(self.dark),
             # Where a current can be negative or not finite, or the load resistors shrink the range.
             SIGNED=dtype.kind == "f" or any(self.dark) or self.load_resistance > 0.0,
             GAIN=self.right_gain != 1.0,

@@ -136,7 +136,7 @@ inline void read_out(const int careful, int sample, Verdict *verdict, global con
 #else
     masks good = ~saturated;
 #endif
-#ifdef DARK
+#ifdef DARK_LEVEL
     left -= p[DARK_LEFT];
     right -= p[DARK_RIGHT];
 #endif

@@ -1,4 +1,4 @@
-"""The commands of ``gpuvision``, one module and function each; `gpuvision.cli.main` registers them.
+"""Commands of ``gpuvision``: one module and one function each; `gpuvision.cli.main` registers them.
 
-A command imports what it needs inside its function, so that ``gpuvision --help`` answers at once.
+A command imports heavy modules inside its function, so that ``gpuvision --help`` answers at once.
 """

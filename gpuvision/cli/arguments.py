@@ -1,8 +1,9 @@
-"""What commands take from the command line beyond typer's own types."""
+"""Types and parsers of command-line arguments that several commands share."""
 
 from __future__ import annotations
 
 import fnmatch
+import json
 import math
 import re
 from collections.abc import Sequence
@@ -18,14 +19,14 @@ LayerNames = Annotated[
     typer.Option(
         "--layers",
         metavar="NAME=LAYER",
-        help="What a file is, where names do not tell: '*.gtl=top copper', '*.gko=mechanical outline'; repeat it for "
-        "all that are to be read.",
+        help="Layer of a file whose name does not show it: '*.gtl=top copper', '*.gko=mechanical outline'. Repeat the "
+        "option for every file to read.",
     ),
 ]
 
 
 def named_path(text: str | Path) -> Path:
-    """Return a path; an empty name, as a variable that is not set leaves it, would mean the current folder.
+    """Return a path. Reject an empty name: an unset shell variable must not mean the current folder.
 
     Raises
     ------
@@ -37,6 +38,63 @@ def named_path(text: str | Path) -> Path:
     return Path(text)
 
 
+ReportFile = Annotated[
+    Path | None,
+    typer.Option("--json", metavar="FILE", parser=named_path, help="Write the report there, too; - prints it."),
+]
+
+
+def check_report_file(path: Path | None) -> None:
+    """Check before long work that the report of ``--json`` can be written.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    from gpuvision.host.files import check_file
+
+    if path is not None and str(path) != "-":
+        check_file(path)
+
+
+def write_report(path: Path | None, report: object) -> None:
+    """Write a report as JSON to the file of ``--json``, whole or not at all; ``-`` is standard output.
+
+    Infinities and NaN become null: JSON has no such numbers.
+    """
+    from gpuvision.formats.json import json_tree
+    from gpuvision.host.files import write_whole
+
+    if path is None:
+        return
+    text = json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n"
+    if str(path) == "-":
+        typer.echo(text, nl=False)
+    else:
+        write_whole(path, text)
+
+
+def reject_unused(reason: str, **given: object) -> None:
+    """Raise an error for an option that was given and would have no effect.
+
+    Parameters
+    ----------
+    reason : str
+        Why the options have no effect, such as "without --second".
+    **given : object
+        Values by parameter name; None and False mean that the option was not given.
+
+    Raises
+    ------
+    ValueError
+        One of the options was given.
+    """
+    for name, value in given.items():
+        if value is not None and value is not False:
+            raise ValueError(f"--{name.replace('_', '-')} has no effect {reason}; leave it out")
+
+
 _UNITS = {
     "m": {"": 1.0, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
     "rad": {"": 1.0, "rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180},
@@ -45,21 +103,26 @@ _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-zµ]
 
 
 def quantities(text: str, option: str, units: str) -> tuple[float, ...]:
-    """Return numbers, parted by commas, in metres and radians.
+    """Parse comma-separated quantities and return them in metres and radians.
 
     Parameters
     ----------
-    text
-        As "1.5e-3,2mm,90deg": m, cm, mm, um and rad, mrad, deg may stand behind a number.
-    option
-        Its name, for the message.
-    units
-        What is expected, as "m,m,rad".
+    text : str
+        Numbers with optional units, such as "1.5e-3,2mm,90deg". Units: m, cm, mm, um; rad, mrad, deg.
+    option : str
+        Name of the option, for the error message.
+    units : str
+        Expected SI units, such as "m,m,rad".
+
+    Returns
+    -------
+    tuple of float
+        One value per unit [m] or [rad].
 
     Raises
     ------
     ValueError
-        It is something else.
+        The count or a unit differs from the expected ones.
     """
     kinds, parts = units.split(","), text.split(",")
     found = [_NUMBER.fullmatch(part) for part in parts]
@@ -75,12 +138,12 @@ def quantities(text: str, option: str, units: str) -> tuple[float, ...]:
 
 
 def layers_of(given: Sequence[str] | None) -> dict[str, str] | None:
-    """Return what ``--layers`` say, as `read_artwork` takes it; None where there is none.
+    """Parse the values of ``--layers`` into the mapping that `read_artwork` takes; None without values.
 
     Raises
     ------
     ValueError
-        One is not of the form NAME=LAYER.
+        A value is not of the form NAME=LAYER.
     """
     table = {}
     for each in given or ():

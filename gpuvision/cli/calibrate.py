@@ -1,4 +1,4 @@
-"""``gpuvision calibrate``: images of a flat pattern become a lens file, a picture and a report."""
+"""``gpuvision calibrate``: calibrate a lens or a camera from images of a flat target."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from gpuvision.cli.arguments import named_path
+from gpuvision.cli.arguments import ReportFile, check_report_file, named_path, reject_unused, write_report
 from gpuvision.cli.scan import progress_bar
 
 if TYPE_CHECKING:
     from gpuvision.camera.calibration import Calibration
 
 
-class Seen(StrEnum):
-    """What ``--pattern`` takes."""
+class TargetPattern(StrEnum):
+    """Values of ``--pattern``."""
 
     dots = "dots"
     chessboard = "chessboard"
     lines = "lines"
 
 
-class Way(StrEnum):
-    """What ``--method`` takes."""
+class CalibrationMethod(StrEnum):
+    """Values of ``--method``."""
 
     auto = "auto"
     lines = "lines"
     views = "views"
 
 
-class Outliers(StrEnum):
-    """What ``--loss`` takes."""
+class RobustLoss(StrEnum):
+    """Values of ``--loss``."""
 
     squared = "squared"
     huber = "huber"
@@ -45,63 +45,72 @@ class Outliers(StrEnum):
 
 
 Images = Annotated[
-    list[Path], typer.Argument(metavar="IMAGES...", parser=named_path, help="From one camera, all of one size.")
+    list[Path], typer.Argument(metavar="IMAGES...", parser=named_path, help="Images of one camera, all of one size.")
 ]
 LensFile = Annotated[
     Path,
     typer.Option(
         metavar="FILE.toml",
         parser=named_path,
-        help="The lens file; its report (.json) and picture (.png) beside it.",
+        help="Camera file to write; report (.json) and picture (.png) go beside it.",
     ),
 ]
-Pattern = Annotated[Seen, typer.Option(help="What the images show: a grid of dots, a chessboard, or crossing lines.")]
+Pattern = Annotated[
+    TargetPattern, typer.Option(help="Target pattern in the images: dot grid, chessboard, or grid of crossing lines.")
+]
 Method = Annotated[
-    Way,
+    CalibrationMethod,
     typer.Option(
-        help="lines: the lens alone, from what should be straight, from one image on. views: focal length, centre, "
-        "lens and tilt of the sensor. auto: views where three images show a grid or --focal-length is given."
+        help="lines: the lens distortion alone, from lines that must become straight; one image suffices. views: focal "
+        "length, centre, lens and tilt of the sensor. auto: views with three images of a grid or with --focal-length."
     ),
 ]
 Model = Annotated[
     str,
     typer.Option(
-        help="auto: the smallest model that the data do not refuse. lines: none, k1 or k1,k2. "
-        "views: names out of k1,k2,p1,p2,k3,tilt."
+        help="auto: the smallest model that the data do not reject (F test). lines: none, k1 or k1,k2. "
+        "views: some of k1,k2,p1,p2,k3,tilt."
     ),
 ]
 Inner = Annotated[
     str | None, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the chessboard, such as 9x6.")
 ]
-Pitch = Annotated[float, typer.Option(min=1e-9, help="Distance of neighbours on the pattern in metres, for the poses.")]
-FocalLength = Annotated[
-    float | None, typer.Option(help="Focal length in pixels, where it is known: one view then suffices.")
+Pitch = Annotated[
+    float | None,
+    typer.Option(min=1e-9, help="Distance of neighbouring points on the target [m]; scales the poses. Default: 1."),
 ]
-Loss = Annotated[Outliers, typer.Option(help="huber and tukey give points that lie far off less weight, or none.")]
+FocalLength = Annotated[float | None, typer.Option(help="Known focal length [px]: one view then suffices.")]
+Loss = Annotated[RobustLoss, typer.Option(help="Robust loss: huber and tukey reduce the weight of outliers.")]
 
 
 def calibrate(
     images: Images,
     out: LensFile,
-    pattern: Pattern = Seen.dots,
-    method: Method = Way.auto,
+    pattern: Pattern = TargetPattern.dots,
+    method: Method = CalibrationMethod.auto,
     model: Model = "auto",
     inner: Inner = None,
-    pitch: Pitch = 1.0,
+    pitch: Pitch = None,
     focal_length: FocalLength = None,
-    loss: Loss = Outliers.squared,
+    loss: Loss = RobustLoss.squared,
+    as_json: ReportFile = None,
 ) -> None:
-    """Calibrate a lens, or a camera with a tilted sensor, from images of a flat pattern.
+    """Calibrate a lens, or a camera with a tilted (Scheimpflug) sensor, from images of a flat target.
 
-    Every parameter comes with its uncertainty; the report names other models that fit as well, and what the images
-    cannot tell.
+    Every parameter comes with its standard deviation. The report lists other models that fit equally well and warns of
+    parameters that the images do not determine.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host.files import check_file
     from gpuvision.workflows.calibrating import calibrate as run
     from gpuvision.workflows.calibrating import write_calibration
 
+    if pattern is not TargetPattern.chessboard:
+        reject_unused(f"with --pattern {pattern.value}, only with chessboard", inner=inner)
+    if method is CalibrationMethod.lines:
+        reject_unused("with --method lines, which finds no poses", pitch=pitch, focal_length=focal_length)
     corners = None if inner is None else _corners(inner)
+    check_report_file(as_json)
     if out.suffix in (".json", ".png"):
         raise ValueError(
             f"--out is {out}, where the report and the picture go beside it; give a name such as lens.toml"
@@ -115,13 +124,14 @@ def calibrate(
             method=method.value,
             model=model,
             inner=corners,
-            pitch=pitch,
+            pitch=1.0 if pitch is None else pitch,
             focal_length=focal_length,
             loss=loss.value,
             progress=progress,
         )
     _show(done)
     write_calibration(done, out)
+    write_report(as_json, done.report())
     typer.echo(
         f"look at {out.with_suffix('.png')}; correct images with: gpuvision undistort IMAGES --lens {out} --out DIR"
     )

@@ -1,4 +1,4 @@
-"""``gpuvision demo``: a part with a known shape is recorded, scanned, and compared with what it is."""
+"""``gpuvision demo``: simulate the recording of a known part, scan it, and compare with the truth."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def demo(
     out: Annotated[
         Path, typer.Option(metavar="DIR", parser=named_path, help="Folder for recordings, range images and pictures.")
     ] = Path("out/demo"),
-    seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 1,
     device: DeviceLabel = None,
 ) -> None:
-    """Record a part with a camera and with PSD strips, scan both recordings, and compare with the truth.
+    """Simulate recordings of a part with a camera and with PSD strips, scan them, and compare with the truth.
 
-    The recordings are simulated, the scans are what `gpuvision scan` does. The part's corners glow, which moves the
-    PSD's readings; a mask made for the part helps.
+    Light between the walls of the part's concave corners shifts the PSD readings; a mask computed for the part reduces
+    the shift.
     """
     import numpy as np
 
@@ -60,7 +60,7 @@ def demo(
         f"scan one yourself: gpuvision scan {camera / 'recording.npy'} --sensor camera_line --out {out / 'again'}"
     )
     typer.echo(
-        f"A part as it is measured: look at {camera / 'picture.png'}. How its glowing corners pull the readings of PSD "
-        f"strips: {out / name / 'errors.png'} and causes.png beside it; with a mask: "
+        f"Range image of the part: {camera / 'picture.png'}. Errors of the PSD strips from light in the concave corners: "
+        f"{out / name / 'errors.png'} and causes.png beside it; with a mask: "
         f"{out / f'{name}_masked' / 'errors.png'}."
     )

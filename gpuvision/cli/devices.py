@@ -1,33 +1,32 @@
-"""``gpuvision devices``: which OpenCL devices are there, which work, and what to do about the others."""
+"""``gpuvision devices``: list the OpenCL devices, whether they work, and what to install."""
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from gpuvision.cli.arguments import ReportFile, check_report_file, write_report
 
 if TYPE_CHECKING:
     from gpuvision.host.discovery import Candidate
 
 
 def devices(
-    as_json: Annotated[bool, typer.Option("--json", help="Print a list of objects instead of the table.")] = False,
-    probe: Annotated[bool, typer.Option("--probe", help="Ask the devices again that failed before.")] = False,
+    as_json: ReportFile = None,
+    probe: Annotated[bool, typer.Option("--probe", help="Probe again the devices that failed before.")] = False,
 ) -> None:
-    """Show every OpenCL device: whether it works, why not, and what to install.
+    """List every OpenCL device: whether it works, why not, and what to install.
 
-    A device works when a kernel was built, launched and checked on it. Exit code 1 if none does.
+    A device works if a probe kernel was built, launched and checked on it. Exit code 1 if no device works.
     """
     from gpuvision.host import discovery
 
+    check_report_file(as_json)
     listed = sorted(discovery.candidates(probe_again=probe), key=lambda each: each.rank)
-    if as_json:
-        typer.echo(json.dumps([_described(each) for each in listed], indent=2))
-    elif listed:
+    write_report(as_json, [_described(each) for each in listed])
+    if str(as_json) != "-":
         _show(listed)
-    else:
-        typer.echo(f"no OpenCL device; {discovery.INSTALL_HINT}")
     if not any(each.healthy for each in listed):
         raise typer.Exit(1)
 
@@ -47,12 +46,18 @@ def _described(device: Candidate) -> dict[str, str | bool]:
 
 
 def _show(listed: list[Candidate]) -> None:
+    """Print a table of the devices; below it the reason and the advice for each broken one."""
     from rich.console import Console
     from rich.table import Table
 
+    from gpuvision.host.discovery import INSTALL_HINT
+
+    if not listed:
+        typer.echo(f"no OpenCL device; {INSTALL_HINT}")
+        return
     table = Table()
     for heading in ("label", "name", "platform", "driver", "works"):
-        # Whole words on a wide terminal; on a narrow one a cell breaks rather than ends in dots.
+        # Whole words on a wide terminal; on a narrow one a cell wraps instead of being cut.
         table.add_column(heading, overflow="fold", no_wrap=heading in ("label", "works"))
     for each in listed:
         works = "[green]yes[/]" if each.healthy else "[red]no[/]"
@@ -61,3 +66,6 @@ def _show(listed: list[Candidate]) -> None:
     for each in listed:
         if not each.healthy:
             typer.echo(f"{each.label} does not work: {each.reason}\n    {each.advice}")
+    healthy = [each.label for each in listed if each.healthy]
+    if len(healthy) > 1:
+        typer.echo(f"choose one with --device {healthy[0]} or with the variable GPUVISION_DEVICE={healthy[0]}")

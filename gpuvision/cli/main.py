@@ -1,9 +1,9 @@
 """The command ``gpuvision``.
 
-Exit code 0: done; 1: it could not be done, with one line on stderr that says why; 2: the command line is wrong; 130 and
-143: interrupted or terminated.
+Exit codes: 0 success; 1 failure, with one line on stderr that gives the reason; 2 wrong command line; 130 interrupted;
+143 terminated.
 
-What takes time to import is imported within `main`: an interrupt is an exit code from the first moment.
+Slow imports happen inside `main`, so that an interrupt is turned into an exit code from the first moment.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ TRACEBACK = "GPUVISION_TRACEBACK"
 
 
 def application() -> typer.Typer:
-    """Return the command line with its commands."""
+    """Return the typer application with all commands."""
     import typer
 
     from gpuvision.cli.calibrate import calibrate
     from gpuvision.cli.demo import demo
     from gpuvision.cli.devices import devices
     from gpuvision.cli.locate import locate
+    from gpuvision.cli.locate_robot import locate_robot
     from gpuvision.cli.profile import profile
     from gpuvision.cli.scan import scan
     from gpuvision.cli.select import select
@@ -35,12 +36,12 @@ def application() -> typer.Typer:
 
     app = typer.Typer(
         help="Range imaging and visual servoing in OpenCL.",
-        epilog=f"The variable {TRACEBACK}=1 shows where an error arose.",
+        epilog=f"Set {TRACEBACK}=1 to see the traceback of an error.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
     )
-    for command in (scan, simulate, calibrate, undistort, select, locate, demo, devices, profile):
+    for command in (scan, simulate, calibrate, undistort, select, locate, locate_robot, demo, devices, profile):
         app.command()(command)
     return app
 
@@ -48,7 +49,7 @@ def application() -> typer.Typer:
 def one_line(error: Exception) -> str:
     """Return an error's message as a single line, with the file's name where the system gave one."""
     if isinstance(error, OSError) and error.strerror:
-        # Of two files the second one is where the first, a temporary one, was to go.
+        # os.replace reports two file names; the second is the destination.
         name = error.filename2 or error.filename
         message = f"{name}: {error.strerror}" if name else error.strerror
     else:
@@ -57,8 +58,8 @@ def one_line(error: Exception) -> str:
 
 
 def main() -> None:
-    """Run the command line; what goes wrong becomes a line on stderr and an exit code."""
-    # Threads of NumPy's BLAS wait for more work in a loop, for some 20 ms, on cores that kernels then lack.
+    """Run the command line. Errors become one line on stderr and an exit code."""
+    # Idle BLAS threads of NumPy spin for about 20 ms and take cores from the kernels; shorten that (2**4 cycles).
     os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
     before = signal.signal(signal.SIGTERM, _terminated)
     try:
@@ -70,7 +71,7 @@ def main() -> None:
 
 
 def _terminated(number: int, frame: object) -> NoReturn:
-    """Leave by an exception, so that what is half-written goes; once, whatever comes while it does."""
+    """Exit by an exception, so that half-written files are removed. Ignore further signals meanwhile."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.exit(128 + number)
 

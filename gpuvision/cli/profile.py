@@ -1,4 +1,4 @@
-"""``gpuvision profile``: our operations and their peers, side by side on this machine."""
+"""``gpuvision profile``: measure operations side by side with their peers on this machine."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ if TYPE_CHECKING:
 
 def profile(
     operations: Annotated[
-        list[str] | None, typer.Argument(metavar="[OPERATION]...", help="psd, line, ...; all where none is named.")
+        list[str] | None, typer.Argument(metavar="[OPERATION]...", help="psd, line, ...; default: all.")
     ] = None,
     device: Annotated[
         list[str] | None, typer.Option(help="Label of a device, see `gpuvision devices`; may be repeated.")
     ] = None,
-    seconds: Annotated[float, typer.Option(help="About how long to measure each case.", min=0.01)] = 2.0,
+    seconds: Annotated[float, typer.Option(help="Time to measure each case [s].", min=0.01)] = 2.0,
     as_json: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", parser=named_path, help="Write the rows there.")
     ] = None,
     plots: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", parser=named_path, help="Draw how times grow, and what accuracy costs, there."),
+        typer.Option(metavar="DIR", parser=named_path, help="Folder for plots: time over size, and error over time."),
     ] = None,
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
 
-    Candidates take turns; a ratio is the peer's time over ours: above 1 we are faster. A run in which the machine
-    changed its speed is marked invalid.
+    Candidates run interleaved. The ratio is the time of the peer over the time of gpuvision. A run during which the
+    machine changed its speed is marked invalid.
     """
     if importlib.util.find_spec("numba") is None:
-        raise GpuVisionError("numba is missing, the strongest peer; install it: pip install 'gpuvision[profile]'")
+        raise GpuVisionError("the peer numba is missing; install it: pip install 'gpuvision[profile]'")
     from gpuvision.host import Device
     from gpuvision.host.files import check_file, check_folder
     from gpuvision.profiling import harness
@@ -65,7 +65,7 @@ def profile(
         draw_plots(plots, run.rows)
     _show(list(run.rows))
     if not run.valid:
-        typer.echo("not valid: the machine changed its speed while it was measured; run it again", err=True)
+        typer.echo("not valid: the machine changed its speed during the measurement; run it again", err=True)
 
 
 def _show(rows: list[Row]) -> None:

@@ -1,4 +1,4 @@
-"""``gpuvision scan``: a recording becomes a range image, pictures and a report."""
+"""``gpuvision scan``: compute a range image, pictures and a report from a recording."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, named_path
+from gpuvision.cli.arguments import DeviceLabel, ReportFile, check_report_file, named_path, write_report
 
 
-class Arithmetic(StrEnum):
-    """What ``--precision`` takes."""
+class Precision(StrEnum):
+    """Values of ``--precision``."""
 
     single = "single"
     double = "double"
 
 
-class NoRoom(StrEnum):
-    """What ``--policy`` takes."""
+class QueuePolicy(StrEnum):
+    """Values of ``--policy``."""
 
     block = "block"
     drop_oldest = "drop_oldest"
@@ -34,21 +34,19 @@ Recording = Annotated[
     typer.Argument(
         metavar="INPUT",
         parser=named_path,
-        help="Of a camera: a video, a TIFF stack, a folder of images, an NPY array (frames, rows, columns). "
-        "Of a PSD: an NPY array (frames, strips, 2).",
+        help="Camera recording: video, TIFF stack, folder of images, or NPY array (frames, rows, columns). "
+        "PSD recording: NPY array (frames, strips, 2).",
     ),
 ]
-SensorFile = Annotated[
-    str, typer.Option(help="The sensor's TOML file, or one that comes along: camera_line, corner_scene, psd_line.")
-]
+SensorFile = Annotated[str, typer.Option(help="Sensor file (TOML), or a preset: camera_line, corner_scene, psd_line.")]
 Results = Annotated[
     Path,
     typer.Option(metavar="DIR", parser=named_path, help="Folder for the range image, the pictures and report.json."),
 ]
-Rate = Annotated[float | None, typer.Option(help="Replay at so many frames per second, as a sensor would send them.")]
+Rate = Annotated[float | None, typer.Option(help="Replay the recording at this rate [frames/s].")]
 RoomPolicy = Annotated[
-    NoRoom | None,
-    typer.Option(help="Where no room is left for a frame: it waits; the oldest is given up (so with --rate); stop."),
+    QueuePolicy | None,
+    typer.Option(help="Full queue: block (default), drop_oldest (default with --rate), or raise an error."),
 ]
 TraceFile = Annotated[
     Path | None,
@@ -62,17 +60,18 @@ def scan(
     out: Results,
     device: DeviceLabel = None,
     precision: Annotated[
-        Arithmetic | None, typer.Option(help="Of the arithmetic; otherwise as the recording has it.")
+        Precision | None, typer.Option(help="Precision of the arithmetic. Default: that of the recording.")
     ] = None,
     rate: Rate = None,
     policy: RoomPolicy = None,
     trace: TraceFile = None,
+    as_json: ReportFile = None,
 ) -> None:
-    """Scan a recording: range image, pictures and a report in DIR.
+    """Compute the range image of a recording; write it with pictures and a report to DIR.
 
-    Nothing is written before all of the recording was understood.
+    Files are written only after the whole recording was processed.
     """
-    # The decoder would speak for itself on stderr; what is wrong with a video is in our own line.
+    # Silence the video decoder: the command reports a bad video in one line of its own.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host import Device
@@ -82,6 +81,7 @@ def scan(
 
     described = Sensor.load(sensor)
     check_folder(out)
+    check_report_file(as_json)
     if trace is not None:
         check_file(trace)
         if trace.absolute() in (out.absolute(), *out.absolute().parents):
@@ -99,12 +99,13 @@ def scan(
             progress=progress,
         )
     done.write(out)
+    write_report(as_json, done.report())
     typer.echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}")
 
 
 @contextlib.contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int | None], object]]:
-    """Show progress on stderr where that is a terminal; give what takes (frames done, of how many)."""
+    """Show a progress bar on stderr if it is a terminal; yield a function (done, total) that updates it."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -1,4 +1,4 @@
-"""``gpuvision simulate``: what range image a sensor will make of a part, where it will be wrong, and why."""
+"""``gpuvision simulate``: predict the range image of a part, its errors and their causes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, named_path
+from gpuvision.cli.arguments import (
+    DeviceLabel,
+    ReportFile,
+    check_report_file,
+    named_path,
+    reject_unused,
+    write_report,
+)
 from gpuvision.cli.scan import progress_bar
 
 if TYPE_CHECKING:
@@ -17,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Unit(StrEnum):
-    """What ``--unit`` takes."""
+    """Values of ``--unit``."""
 
     metre = "m"
     millimetre = "mm"
@@ -26,7 +33,7 @@ class Unit(StrEnum):
 
 
 class Rule(StrEnum):
-    """What ``--rule`` takes."""
+    """Values of ``--rule``."""
 
     flag = "flag"
     mean = "mean"
@@ -49,27 +56,31 @@ MaterialsFile = Annotated[
     Path | None,
     typer.Option(metavar="FILE", parser=named_path, help="TOML file with a material for each mesh of the part."),
 ]
-Albedo = Annotated[float, typer.Option(min=0.0, max=1.0, help="Of all surfaces, without --materials.")]
+Albedo = Annotated[
+    float | None, typer.Option(min=0.0, max=1.0, help="Albedo of all surfaces, without --materials. Default: 0.5.")
+]
 Paths = Annotated[
     str,
-    typer.Option(
-        help="Ways of the light: all, or some of direct, specular, diffuse-specular, diffuse-diffuse, bounces."
-    ),
+    typer.Option(help="Light paths: all, or some of direct, specular, diffuse-specular, diffuse-diffuse, bounces."),
 ]
 Tolerance = Annotated[
-    float, typer.Option(min=0.0, help="Range error that may come from what is left out, in metres; 0: nothing is.")
+    float, typer.Option(min=0.0, help="Range error [m] allowed for light that is left out; 0: nothing is left out.")
 ]
 MaskChoice = Annotated[
-    str, typer.Option(help="Before the sensor: none, best (a window per sample, made for the part), or a file.")
+    str,
+    typer.Option(
+        help="Mask before the sensor: none, best (a window per sample, computed for the part), or a mask file."
+    ),
 ]
 SecondSensor = Annotated[
-    str | None, typer.Option(metavar="SENSOR", help="A second sensor over the same sheet; the two become one.")
+    str | None,
+    typer.Option(metavar="SENSOR", help="Second sensor on the same sheet of light; the two readings are merged."),
 ]
-Limit = Annotated[float | None, typer.Option(min=0.0, help="Error from which on a sample counts as wrong, in metres.")]
-Profiles = Annotated[int | None, typer.Option(min=1, help="How many; otherwise as many as the part is long.")]
+Limit = Annotated[float | None, typer.Option(min=0.0, help="Smallest error [m] that counts as wrong in the summary.")]
+Profiles = Annotated[int | None, typer.Option(min=1, help="Number of profiles. Default: the length of the part.")]
 Scheduler = Annotated[
     str | None,
-    typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers compute; needs the extra cluster."),
+    typer.Option(metavar="ADDRESS", help="Address of a Dask scheduler; needs the extra cluster."),
 ]
 
 
@@ -77,25 +88,28 @@ def simulate(
     part: PartFile,
     sensor: LitSensor,
     out: Results,
-    unit: Annotated[Unit, typer.Option(help="Of the mesh.")] = Unit.metre,
+    unit: Annotated[Unit, typer.Option(help="Length unit of the mesh.")] = Unit.metre,
     materials: MaterialsFile = None,
-    albedo: Albedo = 0.5,
+    albedo: Albedo = None,
     paths: Paths = "direct,specular,diffuse-specular,diffuse-diffuse",
     tolerance: Tolerance = 0.0,
     mask: MaskChoice = "none",
     second: SecondSensor = None,
-    rule: Annotated[Rule, typer.Option(help="Which of two sensors is right where they disagree.")] = Rule.stronger,
+    rule: Annotated[
+        Rule | None, typer.Option(help="Rule for samples in which two sensors disagree. Default: stronger.")
+    ] = None,
     limit: Limit = None,
     profiles: Profiles = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 1,
-    noise: Annotated[bool, typer.Option(help="Whether there is any.")] = True,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the noise. Default: 1.")] = None,
+    noise: Annotated[bool, typer.Option(help="Simulate the noise of the sensor.")] = True,
     device: DeviceLabel = None,
     scheduler: Scheduler = None,
+    as_json: ReportFile = None,
 ) -> None:
     """Predict the range image that a sensor makes of a PART, its errors, and their causes.
 
-    The light of each profile is kept in DIR: what was stopped goes on where it was, and another --mask, --seed or
-    --noise costs nothing anew.
+    The light of each profile is kept in DIR: a stopped run continues there, and a run with another --mask, --seed or
+    --noise reuses it.
     """
     from gpuvision.formats.materials_file import read_materials
     from gpuvision.host import Device
@@ -103,12 +117,19 @@ def simulate(
     from gpuvision.sensor.sensor import Sensor
     from gpuvision.workflows.simulating import part_of, prepare
 
+    if materials is not None:
+        reject_unused("with --materials", albedo=albedo)
+    if second is None:
+        reject_unused("without --second", rule=rule)
+    if not noise:
+        reject_unused("with --no-noise", seed=seed)
+    check_report_file(as_json)
     described = Sensor.load(sensor)
     beside = None if second is None else Sensor.load(second)
     check_folder(out)
     before = _mask(mask)
     given = None if materials is None else read_materials(materials)
-    scene, made_of = part_of(part, _METRES[unit], given, albedo)
+    scene, made_of = part_of(part, _METRES[unit], given, 0.5 if albedo is None else albedo)
     if str(scene.defects) != "no defects":
         typer.echo(f"{part.name}: {'; '.join(str(scene.defects).splitlines())}", err=True)
     names = _names(paths)
@@ -118,17 +139,18 @@ def simulate(
         other = prepare(scene, made_of, beside, paths=names, tolerance=tolerance, transports=task.transports)
     made: dict[str, Any] = {
         "mask": before,
-        "seed": seed if noise else None,
+        "seed": (1 if seed is None else seed) if noise else None,
         "limit": limit,
         "device": None if device is None else Device.named(device),
         "scheduler": scheduler,
     }
-    told = _run(task, other, rule, out, made, f"simulating {part.name}")
-    typer.echo(f"{told}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}")
+    summary, report = _run(task, other, rule or Rule.stronger, out, made, f"simulating {part.name}")
+    write_report(as_json, report)
+    typer.echo(f"{summary}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}")
 
 
 def _names(paths: str) -> tuple[str, ...]:
-    """Return the ways of the light that ``--paths`` names."""
+    """Return the light paths that ``--paths`` names."""
     from gpuvision.simulation.sensors.readings import PATHS
 
     if paths.strip() == "all":
@@ -137,7 +159,7 @@ def _names(paths: str) -> tuple[str, ...]:
 
 
 def _mask(choice: str) -> Mask | str | None:
-    """Return what ``--mask`` means: None, "best", or the mask in a file."""
+    """Return the mask of ``--mask``: None, "best", or the mask in a file."""
     from gpuvision.simulation.sensors.masks import Mask
 
     if choice in ("none", "best"):
@@ -145,19 +167,21 @@ def _mask(choice: str) -> Mask | str | None:
     return Mask.load(choice)
 
 
-def _run(task: Task, other: Task | None, rule: Rule, out: Path, made: dict[str, Any], what: str) -> str:
-    """Simulate one sensor or two, write the results, and return what came out."""
+def _run(
+    task: Task, other: Task | None, rule: Rule, out: Path, made: dict[str, Any], what: str
+) -> tuple[str, dict[str, Any]]:
+    """Simulate one sensor or two, write the results, and return the summary and the first sensor's report."""
     from gpuvision.simulation.errors.recommendations import DualSensor
     from gpuvision.workflows.sensor_pair import SensorPair
     from gpuvision.workflows.simulating import simulate as run
 
     with progress_bar(what) as progress:
         done = run(task, out, progress=progress, **made)
-    told = done.summary()
+    summary = done.summary()
     if other is not None:
         with progress_bar(f"{what}, second sensor") as progress:
             pair = SensorPair.of(done, run(other, out, progress=progress, **made), DualSensor(rule=rule.value))
         pair.write(out)
-        told += f"\n{pair.summary()}"
+        summary += f"\n{pair.summary()}"
     done.write(out)
-    return told
+    return summary, done.report()

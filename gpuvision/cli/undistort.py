@@ -1,4 +1,4 @@
-"""``gpuvision undistort``: images and points as an ideal camera would have seen them."""
+"""``gpuvision undistort``: correct images and points for lens distortion."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, named_path
+from gpuvision.cli.arguments import DeviceLabel, named_path, reject_unused
 from gpuvision.cli.scan import progress_bar
 
 
-class Between(StrEnum):
-    """What ``--interpolation`` takes."""
+class Interpolation(StrEnum):
+    """Values of ``--interpolation``."""
 
     bilinear = "bilinear"
     bicubic = "bicubic"
 
 
-class Outside(StrEnum):
-    """What ``--border`` takes."""
+class Border(StrEnum):
+    """Values of ``--border``."""
 
     mask = "mask"
     constant = "constant"
@@ -37,26 +37,29 @@ def undistort(
         ),
     ],
     lens: Annotated[
-        Path, typer.Option(metavar="FILE.toml", parser=named_path, help="What `gpuvision calibrate` wrote.")
+        Path, typer.Option(metavar="FILE.toml", parser=named_path, help="Camera file of `gpuvision calibrate`.")
     ],
     out: Annotated[
         Path, typer.Option(metavar="DIR", parser=named_path, help="Folder for the results, under the inputs' names.")
     ],
-    interpolation: Annotated[Between, typer.Option(help="Between pixels.")] = Between.bilinear,
+    interpolation: Annotated[
+        Interpolation | None, typer.Option(help="Interpolation between pixels. Default: bilinear.")
+    ] = None,
     border: Annotated[
-        Outside, typer.Option(help="What lies outside the image: nothing (0, NaN), a value, or its border's pixels.")
-    ] = Outside.mask,
-    value: Annotated[float, typer.Option(help="Of --border constant.")] = 0.0,
+        Border | None,
+        typer.Option(help="Pixels outside the image: mask (0 or NaN; default), a constant, or border pixels."),
+    ] = None,
+    value: Annotated[float | None, typer.Option(help="Grey level of --border constant. Default: 0.")] = None,
     region: Annotated[
         str | None,
-        typer.Option(metavar="COLUMN,ROW,COLUMNS,ROWS", help="The part of the ideal images to make; else all."),
+        typer.Option(metavar="COLUMN,ROW,COLUMNS,ROWS", help="Part of the corrected images to compute. Default: all."),
     ] = None,
     device: DeviceLabel = None,
 ) -> None:
-    """Undo a lens in images and in points.
+    """Correct images and points for the distortion of a calibrated lens.
 
-    Whole-number images become PNG, float32 ones TIFF; points stay NPY, NaN where the lens has no ideal place. Nothing
-    is written before all is done.
+    Integer images become PNG, float32 images TIFF; points stay NPY, NaN where the lens model is not invertible. Files
+    are written only after all inputs succeeded.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.camera_file import read_lens
@@ -64,6 +67,11 @@ def undistort(
     from gpuvision.host.files import check_folder
     from gpuvision.workflows.undistorting import undistort_files
 
+    if border is not Border.constant:
+        reject_unused("without --border constant", value=value)
+    if all(each.suffix.lower() == ".npy" for each in inputs):
+        reason = "for points, only for images"
+        reject_unused(reason, interpolation=interpolation, border=border, region=region)
     model = read_lens(lens)
     check_folder(out)
     chosen = Device.best() if device is None else Device.named(device)
@@ -74,9 +82,9 @@ def undistort(
             model,
             out,
             device=chosen,
-            interpolation=interpolation.value,
-            border=border.value,
-            value=value,
+            interpolation=(interpolation or Interpolation.bilinear).value,
+            border=(border or Border.mask).value,
+            value=value or 0.0,
             region=part,
             progress=progress,
         )

@@ -175,7 +175,7 @@ def test_the_command_takes_a_mounted_camera(
 ) -> None:
     cv2.imwrite(str(tmp_path / "ahead.png"), seen_ahead(carpet(), PINHOLE, POSE, shape=SHAPE, rng=rng))
     (tmp_path / "camera.toml").write_text("[mount]\nheight = 0.8\ntilt_degrees = 25\nfocal_px = 500\n")
-    call = ["gpuvision", "locate", str(tmp_path / "ahead.png"), "--field", "robocup_msl"]
+    call = ["gpuvision", "locate-robot", str(tmp_path / "ahead.png"), "--field", "robocup_msl"]
     call += ["--camera", str(tmp_path / "camera.toml")]
     monkeypatch.setattr("sys.argv", [*call, "--out", str(tmp_path / "out")])
     with pytest.raises(SystemExit) as done:
@@ -190,5 +190,5 @@ def test_the_command_takes_a_mounted_camera(
         cli.main()
     assert end.value.code == 1
     told_wrong = capfd.readouterr().err
-    assert "leave one out" in told_wrong
+    assert "--scale has no effect" in told_wrong
     assert told_wrong.count("\n") == 1

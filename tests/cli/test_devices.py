@@ -61,7 +61,7 @@ def test_table_shows_the_best_first_and_what_to_do(paper: Paper) -> None:
 
 def test_json(paper: Paper) -> None:
     paper(intel="cannot compile", pocl="")
-    ran = _devices("--json")
+    ran = _devices("--json", "-")
     assert ran.exit_code == 0
     pocl, intel = json.loads(ran.output)
     assert pocl == {
@@ -79,7 +79,7 @@ def test_json(paper: Paper) -> None:
     assert "install" in intel["advice"]
 
 
-@pytest.mark.parametrize("words", [[], ["--json"]])
+@pytest.mark.parametrize("words", [[], ["--json", "-"]])
 def test_nothing_healthy_fails(paper: Paper, words: list[str]) -> None:
     paper(pocl="broken", intel="broken too")
     assert _devices(*words).exit_code == 1
@@ -89,7 +89,7 @@ def test_no_device_says_what_to_install(paper: Paper) -> None:
     paper()
     ran = _devices()
     assert (ran.exit_code, ran.output) == (1, f"no OpenCL device; {discovery.INSTALL_HINT}\n")
-    assert (_devices("--json").exit_code, _devices("--json").output) == (1, "[]\n")
+    assert (_devices("--json", "-").exit_code, _devices("--json", "-").output) == (1, "[]\n")
 
 
 def test_probe_asks_again(paper: Paper) -> None:
@@ -100,7 +100,7 @@ def test_probe_asks_again(paper: Paper) -> None:
 
 
 def test_installed_command(device: Device) -> None:
-    command = [Path(sys.executable).with_name("gpuvision"), "devices", "--json"]
+    command = [Path(sys.executable).with_name("gpuvision"), "devices", "--json", "-"]
     ran = subprocess.run(command, capture_output=True, text=True, check=True)
     assert device.label in [each["label"] for each in json.loads(ran.stdout) if each["healthy"]]
 

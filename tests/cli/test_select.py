@@ -166,7 +166,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], fold
 
 
 def test_the_command_writes_features_and_a_picture(tmp_path: Path, run: Select) -> None:
-    arguments = ("--roi", ROI, "--scale", "25um", "--budget", "25rulers", "--placement", "9mm,8mm")
+    arguments = ("--region", ROI, "--scale", "25um", "--budget", "25rulers", "--placement", "9mm,8mm")
     code, out, _ = run(*arguments, "--out", tmp_path / "chosen")
     assert code == 0
     assert out.startswith("25 rulers")
@@ -179,17 +179,17 @@ def test_the_command_writes_features_and_a_picture(tmp_path: Path, run: Select) 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--roi", "1,2,3"), "expected 4 numbers"),
-        (("--roi", "17mm,2mm,3mm,13mm"), "the least x, y first"),
+        (("--region", "1,2,3"), "expected 4 numbers"),
+        (("--region", "17mm,2mm,3mm,13mm"), "the least x, y first"),
         (("--budget", "40furlongs"), "60rulers, 20000px or 150us"),
         (("--budget", "0"), "above 0"),
         (("--contrast", "40"), "two numbers"),
         (("--scale", "-25um"), "must be positive"),
-        (("--roi", "0.1mm,0.1mm,1mm,1mm"), "edges of the region"),
+        (("--region", "0.1mm,0.1mm,1mm,1mm"), "edges of the region"),
     ],
 )
 def test_the_command_says_what_is_wrong(tmp_path: Path, run: Select, arguments: tuple[str, str], words: str) -> None:
-    usual = {"--roi": ROI, "--scale": "25um", "--out": str(tmp_path / "chosen")}
+    usual = {"--region": ROI, "--scale": "25um", "--out": str(tmp_path / "chosen")}
     usual[arguments[0]] = arguments[1]
     code, out, err = run(*(word for name, value in usual.items() for word in (f"{name}={value}",)))
     assert (code, out) == (1, "")

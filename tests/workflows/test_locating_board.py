@@ -210,8 +210,8 @@ Locate = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Locate:
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["gpuvision", "locate", *map(str, arguments)])
+    def call(*arguments: object, command: str = "locate") -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["gpuvision", command, *map(str, arguments)])
         code = 0
         try:
             cli.main()
@@ -228,7 +228,9 @@ def test_the_command_writes_pose_and_picture(folder: Path, artwork: Artwork, tmp
     cv2.imwrite(str(tmp_path / "board.png"), seen(artwork, pose))
     near = ",".join(f"{1e3 * each}mm" for each in BOARD_MIDDLE) + ",0deg"
     files = ("--out", tmp_path / "out", "--json", tmp_path / "pose.json")
-    code, out, _ = run(tmp_path / "board.png", "--board", folder, *TOLD, "--scale", "40um", f"--near={near}", *files)
+    code, out, _ = run(
+        tmp_path / "board.png", "--board", folder, *TOLD, "--scale", "40um", f"--initial-pose={near}", *files
+    )
     assert code == 0
     assert "rulers agree" in out
     told = json.loads((tmp_path / "out" / "pose.json").read_text())
@@ -244,7 +246,7 @@ def test_the_command_writes_pose_and_picture(folder: Path, artwork: Artwork, tmp
 def test_a_refused_pose_is_an_error_with_a_picture(folder: Path, tmp_path: Path, run: Locate) -> None:
     cv2.imwrite(str(tmp_path / "board.png"), np.full(SHAPE, 77, np.uint8))
     near = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
-    arguments = ("--scale", "40um", f"--near={near}", "--out", tmp_path / "out")
+    arguments = ("--scale", "40um", f"--initial-pose={near}", "--out", tmp_path / "out")
     code, out, err = run(tmp_path / "board.png", "--board", folder, *TOLD, *arguments)
     assert (code, out) == (1, "")
     assert err.count("\n") == 1
@@ -257,15 +259,10 @@ def test_a_refused_pose_is_an_error_with_a_picture(folder: Path, tmp_path: Path,
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((), "--board GERBERS or --field FIELD"),
-        (("--board", "{board}", "--field", "robocup_msl"), "one of the two"),
         (("--board", "{board}"), "--scale is missing"),
         (("--board", "{board}", "--scale", "25furlongs"), "--scale is '25furlongs'"),
-        (("--board", "{board}", "--scale", "25um", "--near", "1,2"), "expected 3 numbers"),
+        (("--board", "{board}", "--scale", "25um", "--initial-pose", "1,2"), "expected 3 numbers"),
         (("--board", "nowhere", "--scale", "25um"), "nowhere"),
-        (("--field", "robocup_msl"), "--scale is missing"),
-        (("--field", "robocup_msl", "--scale", "1cm", "--within", "1,1"), "--within is of --board"),
-        (("--field", "robocup_msl", "--scale", "1m"), "is the scale right"),
         (("--board", "{board}", "--scale", "25um"), "name its files with layers"),
         (("--board", "{board}", "--scale", "25um", "--layers", "copper"), "expected a name, or a pattern, and a layer"),
         (("--board", "{board}", "--scale", "25um", "--features", "nowhere.toml"), "nowhere.toml"),
@@ -282,12 +279,50 @@ def test_the_command_says_what_is_wrong(
     assert words in err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--field", "robocup_msl"), "--scale is missing"),
+        (("--field", "robocup_msl", "--scale", "1m"), "is the scale right"),
+        (("--field", "nowhere"), "nowhere"),
+    ],
+)
+def test_the_robot_command_says_what_is_wrong(
+    tmp_path: Path, run: Locate, arguments: tuple[str, ...], words: str
+) -> None:
+    cv2.imwrite(str(tmp_path / "floor.png"), np.full(SHAPE, 77, np.uint8))
+    code, out, err = run(tmp_path / "floor.png", *arguments, command="locate-robot")
+    assert (code, out) == (1, "")
+    assert err.startswith("gpuvision: ")
+    assert err.count("\n") == 1
+    assert words in err
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "value"),
+    [("locate", "--field", "robocup_msl"), ("locate-robot", "--board", "gerbers"), ("locate-robot", "--budget", "60")],
+)
+def test_options_of_the_other_command_are_unknown(
+    tmp_path: Path, run: Locate, command: str, option: str, value: str
+) -> None:
+    code, out, err = run(tmp_path / "image.png", option, value, command=command)
+    assert (code, out) == (2, "")
+    assert f"No such option: {option}" in err
+
+
+def test_board_and_field_are_required(tmp_path: Path, run: Locate) -> None:
+    for command, option in (("locate", "--board"), ("locate-robot", "--field")):
+        code, _, err = run(tmp_path / "image.png", command=command)
+        assert code == 2
+        assert option in err
+
+
 def test_quantities_have_units() -> None:
     assert quantities("25um", "--scale", "m") == pytest.approx((25e-6,))
-    assert quantities("1e-3, -2mm,90deg", "--near", "m,m,rad") == pytest.approx((1e-3, -2e-3, math.pi / 2))
+    assert quantities("1e-3, -2mm,90deg", "--initial-pose", "m,m,rad") == pytest.approx((1e-3, -2e-3, math.pi / 2))
     for wrong in ("", "1", "1,2,3,4", "1,2,3mm", "nan,1,2", "1,2,inf"):
         with pytest.raises(ValueError, match="expected 3 numbers"):
-            quantities(wrong, "--near", "m,m,rad")
+            quantities(wrong, "--initial-pose", "m,m,rad")
 
 
 @pytest.mark.parametrize(
@@ -347,14 +382,24 @@ def test_points_of_any_camera_will_do(tmp_path: Path, run: Locate, rng: np.rando
     np.save(tmp_path / "wrong.npy", np.zeros((3, 3)))
     np.save(tmp_path / "few.npy", points[:2])
     for name in ("points.npy", "points.csv"):
-        code, out, _ = run(tmp_path / name, "--field", "robocup_msl", "--out", tmp_path / name.replace(".", "_"))
+        code, out, _ = run(
+            tmp_path / name,
+            "--field",
+            "robocup_msl",
+            "--out",
+            tmp_path / name.replace(".", "_"),
+            command="locate-robot",
+        )
         assert code == 0
         assert "twin of 2" in out
         told = json.loads((tmp_path / name.replace(".", "_") / "pose.json").read_text())
         assert abs(abs(told["candidates"][0]["pose"]["x"]) - 6.0) < 0.01
         assert (tmp_path / name.replace(".", "_") / "located.png").exists()
-    assert "expected points (n, 2)" in run(tmp_path / "wrong.npy", "--field", "robocup_msl")[2]
-    assert "2 points on lines, expected 4" in run(tmp_path / "few.npy", "--field", "robocup_msl")[2]
+    assert "expected points (n, 2)" in run(tmp_path / "wrong.npy", "--field", "robocup_msl", command="locate-robot")[2]
+    assert (
+        "2 points on lines, expected 4"
+        in run(tmp_path / "few.npy", "--field", "robocup_msl", command="locate-robot")[2]
+    )
 
 
 @functools.cache
@@ -386,7 +431,7 @@ def test_a_lens_file_goes_with_the_command(folder: Path, artwork: Artwork, tmp_p
     cv2.imwrite(str(tmp_path / "board.png"), seen(artwork, pose))
     write_lens(tmp_path / "lens.toml", Lens(k1=0.0), {})
     near = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
-    arguments = ("--scale", "40um", f"--near={near}", "--camera", tmp_path / "lens.toml")
+    arguments = ("--scale", "40um", f"--initial-pose={near}", "--camera", tmp_path / "lens.toml")
     code, out, _ = run(tmp_path / "board.png", "--board", folder, *TOLD, *arguments)
     assert (code, "rulers agree" in out) == (0, True)
     (tmp_path / "lens.toml").write_text("[lens]\nk1 = 'wide'\n")

@@ -236,7 +236,7 @@ def test_the_command_tells_of_marks(
     cv2.imwrite(str(tmp_path / "board.png"), image)
     layers = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
     near = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
-    where = ["--scale", "40um", f"--near={near}", "--out", str(tmp_path / "out")]
+    where = ["--scale", "40um", f"--initial-pose={near}", "--out", str(tmp_path / "out")]
     command = ["gpuvision", "locate", str(tmp_path / "board.png"), "--board", str(folder), *layers, *where]
     monkeypatch.setattr("sys.argv", command)
     with pytest.raises(SystemExit) as end:

@@ -204,7 +204,7 @@ Command = Callable[..., tuple[int, str, str]]
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Command:
     def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["gpuvision", "locate", *map(str, arguments)])
+        monkeypatch.setattr("sys.argv", ["gpuvision", "locate-robot", *map(str, arguments)])
         code = 0
         try:
             cli.main()

@@ -1,0 +1,143 @@
+"""``gpuvision locate-robot``: find the pose of a robot on a field with marked lines."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from gpuvision.cli.arguments import DeviceLabel, ReportFile, check_report_file, named_path, quantities, reject_unused
+from gpuvision.cli.pose_output import PoseFolder, check_image, report_pose
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from gpuvision.matching.field.distance_map import Field
+    from gpuvision.matching.field.line_detection import FloorScan
+
+_WITH_POINTS = "with a file of points, which are measured already"
+
+Input = Annotated[
+    Path,
+    typer.Argument(
+        metavar="INPUT",
+        parser=named_path,
+        help="Image of the floor: a top view with the robot in the middle, or the view of a camera on the robot; or "
+        "points on lines (NPY or CSV, metres, x ahead, y to the left).",
+    ),
+]
+FieldFile = Annotated[
+    str, typer.Option(metavar="FIELD", help="Lines of the field: a TOML file, or robocup_msl, robocup_junior.")
+]
+Scale = Annotated[
+    str | None, typer.Option(metavar="LENGTH", help="Size of a pixel on the floor in a top view, such as 1cm.")
+]
+InitialPose = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y,THETA", help="Approximate pose, such as 1m,2m,90deg. Default: search the whole field."),
+]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE.toml",
+        parser=named_path,
+        help="Camera file of `gpuvision calibrate`. With a table [mount] (height, tilt_degrees) the image is the view "
+        "of that camera on the robot, and --scale is left out.",
+    ),
+]
+Threshold = Annotated[
+    float | None, typer.Option(min=0.0, help="Smallest edge [grey levels]. Default: from the image's noise and range.")
+]
+LineWidth = Annotated[
+    str | None, typer.Option(metavar="LENGTH", help="Width of the lines. Default: 125mm; 20mm on fields under 5 m.")
+]
+BlindRadius = Annotated[
+    str | None,
+    typer.Option(metavar="LENGTH", help="Radius around the middle of a top view that shows the robot. Default: 0."),
+]
+
+
+def locate_robot(
+    source: Input,
+    field: FieldFile,
+    scale: Scale = None,
+    initial_pose: InitialPose = None,
+    camera: CameraFile = None,
+    line_width: LineWidth = None,
+    blind_radius: BlindRadius = None,
+    threshold: Threshold = None,
+    out: PoseFolder = None,
+    as_json: ReportFile = None,
+    device: DeviceLabel = None,
+) -> None:
+    """Locate a robot on a field from the white lines around it: candidate poses with standard deviations.
+
+    The pose is the position of the robot on the field [m] and its heading [rad]. A symmetric field has two poses that
+    look alike; both are listed. INPUT that does not fit the field is refused with a reason.
+    """
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    from gpuvision.formats.field_file import read_field
+    from gpuvision.host import Device
+    from gpuvision.host.files import check_folder
+    from gpuvision.plots.field import draw_located_robot
+    from gpuvision.workflows.locating_robot import POINT_FILES, read_floor, read_points
+    from gpuvision.workflows.locating_robot import locate_robot as locate
+
+    check_image(source)
+    check_report_file(as_json)
+    if out is not None:
+        check_folder(out)
+    pose = None if initial_pose is None else quantities(initial_pose, "--initial-pose", "m,m,rad")
+    pixel = None if scale is None else quantities(scale, "--scale", "m")[0]
+    described = read_field(field)
+    chosen = None if device is None else Device.named(device)
+    picture = points = None
+    if source.suffix.lower() in POINT_FILES:
+        reject_unused(
+            _WITH_POINTS,
+            scale=scale,
+            camera=camera,
+            line_width=line_width,
+            blind_radius=blind_radius,
+            threshold=threshold,
+        )
+        points = read_points(source)
+    else:
+        picture = read_floor(source)
+        points = _scan(picture, described, camera, pixel, line_width, blind_radius, threshold=threshold, device=chosen)
+    located = locate(points, described, near=pose, scale=pixel, device=chosen)
+    report_pose(located, lambda path: draw_located_robot(path, located, picture), out, as_json)
+
+
+def _scan(
+    picture: npt.NDArray[np.generic],
+    field: Field,
+    camera: Path | None,
+    scale: float | None,
+    line_width: str | None,
+    blind_radius: str | None,
+    **settings: Any,
+) -> FloorScan:
+    """Find points on the lines of the floor in a top view, or in the view of a camera on the robot."""
+    from gpuvision.formats.camera_file import read_lens, read_mounted
+    from gpuvision.workflows.locating_robot import line_width_of, scan_floor
+
+    shape = (int(picture.shape[0]), int(picture.shape[1]))
+    mounted = None if camera is None else read_mounted(camera, shape)
+    if mounted is not None:
+        reason = f"with {camera}, whose table [mount] gives height and tilt"
+        reject_unused(reason, scale=scale, blind_radius=blind_radius)
+    elif scale is None:
+        raise ValueError("--scale is missing: the size of a pixel on the floor, such as 1cm")
+    width = line_width_of(field) if line_width is None else quantities(line_width, "--line-width", "m")[0]
+    return scan_floor(
+        picture,
+        scale=scale,
+        line_width=width,
+        blind=0.0 if blind_radius is None else quantities(blind_radius, "--blind-radius", "m")[0],
+        model=mounted or (None if camera is None else read_lens(camera)),
+        **settings,
+    )

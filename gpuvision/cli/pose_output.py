@@ -1,0 +1,65 @@
+"""Output of the commands that locate something: pose, report and picture, or the reason of a refusal."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import typer
+
+from gpuvision.cli.arguments import named_path, write_report
+
+PoseFolder = Annotated[
+    Path | None, typer.Option("--out", metavar="DIR", parser=named_path, help="Folder for pose.json and located.png.")
+]
+
+
+class Located(Protocol):
+    """Result of a localisation: a pose, or the reason why it was refused."""
+
+    @property
+    def reason(self) -> str:
+        """Reason of the refusal; empty for a pose."""
+
+    def summary(self) -> str:
+        """Return the pose in a few lines."""
+
+    def report(self) -> dict[str, Any]:
+        """Return the content of ``pose.json``."""
+
+
+def check_image(path: Path) -> None:
+    """Check that the input file exists, before slow imports and reading of other files.
+
+    Raises
+    ------
+    FileNotFoundError
+        The file does not exist.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+
+
+def report_pose(located: Located, draw: Callable[[Path], None], out: Path | None, as_json: Path | None) -> None:
+    """Print a pose and write its report and picture. A refused pose is an error; its picture shows the reason.
+
+    Raises
+    ------
+    ValueError
+        The pose was refused.
+    """
+    from gpuvision.host.files import whole_folder
+
+    report = located.report()
+    write_report(as_json, report)
+    shown = ""
+    if out is not None:
+        with whole_folder(out) as inside:
+            (inside / "pose.json").write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+            draw(inside / "located.png")
+        shown = f"look at {out / 'located.png'} and {out / 'pose.json'}"
+    if located.reason:
+        raise ValueError(f"no pose: {located.reason}{'; ' + shown if shown else ''}")
+    typer.echo("\n".join(filter(None, (located.summary(), shown))))

@@ -1,0 +1,47 @@
+"""Options that would have no effect are refused: a user must not believe that they did something."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gpuvision.cli.main import application
+
+
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (("calibrate", "a.png", "--out", "l.toml", "--inner", "9x6"), "--inner"),
+        (("calibrate", "a.png", "--out", "l.toml", "--method", "lines", "--pitch", "0.01"), "--pitch"),
+        (("calibrate", "a.png", "--out", "l.toml", "--method", "lines", "--focal-length", "900"), "--focal-length"),
+        (("undistort", "a.png", "--lens", "l.toml", "--out", "d", "--value", "7"), "--value"),
+        (("undistort", "a.png", "--lens", "l.toml", "--out", "d", "--border", "mask", "--value", "7"), "--value"),
+        (("undistort", "a.npy", "--lens", "l.toml", "--out", "d", "--region", "0,0,8,8"), "--region"),
+        (("undistort", "a.npy", "--lens", "l.toml", "--out", "d", "--border", "reflect"), "--border"),
+        (("undistort", "a.npy", "--lens", "l.toml", "--out", "d", "--interpolation", "bicubic"), "--interpolation"),
+        (("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--rule", "mean"), "--rule"),
+        (("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--no-noise", "--seed", "3"), "--seed"),
+        (
+            ("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--materials", "m.toml", "--albedo", "0"),
+            "--albedo",
+        ),
+        (("locate-robot", "points.npy", "--field", "robocup_msl", "--scale", "1cm"), "--scale"),
+        (("locate-robot", "points.npy", "--field", "robocup_msl", "--camera", "c.toml"), "--camera"),
+        (("locate-robot", "points.npy", "--field", "robocup_msl", "--line-width", "5cm"), "--line-width"),
+        (("locate-robot", "points.npy", "--field", "robocup_msl", "--blind-radius", "5cm"), "--blind-radius"),
+        (("locate-robot", "points.npy", "--field", "robocup_msl", "--threshold", "0"), "--threshold"),
+    ],
+)
+def test_options_without_effect_are_refused(
+    words: tuple[str, ...], option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("points.npy", np.zeros((9, 2), np.float32))
+    ran = CliRunner().invoke(application(), list(words))
+    assert isinstance(ran.exception, ValueError)
+    assert str(ran.exception).startswith(f"{option} has no effect ")
+    assert str(ran.exception).endswith("; leave it out")
+    assert {each.name for each in tmp_path.iterdir()} == {"points.npy"}

@@ -19,7 +19,7 @@ from gpuvision.cli.arguments import (
     quantities,
     reject_unused,
 )
-from gpuvision.cli.pose_output import PoseFolder, check_image, report_pose
+from gpuvision.cli.pose_output import PoseFolder, check_image, initial_pose_of, report_pose
 from gpuvision.cli.select import Side
 
 if TYPE_CHECKING:
@@ -135,8 +135,8 @@ def locate(
         picture,
         artwork,
         scale=pixel,
-        near=_quantities(initial_pose, "--initial-pose", "m,m,rad"),
-        within=_quantities(search_range, "--search-range", "m,rad"),
+        near=initial_pose_of(initial_pose),
+        within=_search_range(search_range),
         features=chosen,
         model=None if camera is None else read_lens(camera),
         budget=budget or _BUDGET,
@@ -149,8 +149,12 @@ def locate(
     report_pose(located, lambda path: draw_located_board(path, picture, artwork, located), out, as_json)
 
 
-def _quantities(text: str | None, option: str, units: str) -> Any:
-    return None if text is None else quantities(text, option, units)
+def _search_range(text: str | None) -> tuple[float, float] | None:
+    """Parse ``--search-range``: distance [m] and angle [rad]; None without the option."""
+    if text is None:
+        return None
+    distance, angle = quantities(text, "--search-range", "m,rad")
+    return distance, angle
 
 
 def _pixel(scale: str | None, features: FeatureSet | None) -> float:

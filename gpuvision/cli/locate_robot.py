@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gpuvision.cli.arguments import DeviceLabel, ReportFile, check_report_file, named_path, quantities, reject_unused
-from gpuvision.cli.pose_output import PoseFolder, check_image, report_pose
+from gpuvision.cli.pose_output import PoseFolder, check_image, initial_pose_of, report_pose
 
 if TYPE_CHECKING:
     import numpy as np
@@ -90,11 +90,12 @@ def locate_robot(
     check_report_file(as_json)
     if out is not None:
         check_folder(out)
-    pose = None if initial_pose is None else quantities(initial_pose, "--initial-pose", "m,m,rad")
+    pose = initial_pose_of(initial_pose)
     pixel = None if scale is None else quantities(scale, "--scale", "m")[0]
     described = read_field(field)
     chosen = None if device is None else Device.named(device)
-    picture = points = None
+    picture = None
+    measured: npt.NDArray[np.float32] | FloorScan
     if source.suffix.lower() in POINT_FILES:
         reject_unused(
             _WITH_POINTS,
@@ -104,11 +105,13 @@ def locate_robot(
             blind_radius=blind_radius,
             threshold=threshold,
         )
-        points = read_points(source)
+        measured = read_points(source)
     else:
         picture = read_floor(source)
-        points = _scan(picture, described, camera, pixel, line_width, blind_radius, threshold=threshold, device=chosen)
-    located = locate(points, described, near=pose, scale=pixel, device=chosen)
+        measured = _scan(
+            picture, described, camera, pixel, line_width, blind_radius, threshold=threshold, device=chosen
+        )
+    located = locate(measured, described, near=pose, scale=pixel, device=chosen)
     report_pose(located, lambda path: draw_located_robot(path, located, picture), out, as_json)
 
 

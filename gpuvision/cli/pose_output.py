@@ -9,7 +9,7 @@ from typing import Annotated, Any, Protocol
 
 import typer
 
-from gpuvision.cli.arguments import named_path, write_report
+from gpuvision.cli.arguments import named_path, quantities, write_report
 
 PoseFolder = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", parser=named_path, help="Folder for pose.json and located.png.")
@@ -40,6 +40,14 @@ def check_image(path: Path) -> None:
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
+
+
+def initial_pose_of(text: str | None) -> tuple[float, float, float] | None:
+    """Parse ``--initial-pose``: x, y [m] and theta [rad]; None without the option."""
+    if text is None:
+        return None
+    x, y, theta = quantities(text, "--initial-pose", "m,m,rad")
+    return x, y, theta
 
 
 def report_pose(located: Located, draw: Callable[[Path], None], out: Path | None, as_json: Path | None) -> None:

@@ -59,8 +59,8 @@ def demo(
     typer.echo(
         f"scan one yourself: gpuvision scan {camera / 'recording.npy'} --sensor camera_line --out {out / 'again'}"
     )
+    typer.echo(
         f"Range image of the part: {camera / 'picture.png'}. Errors of the PSD strips from light in the corners: "
-        f"Range image of the part: {camera / 'picture.png'}. Errors of the PSD strips from light in the concave corners: "
         f"{out / name / 'errors.png'} and causes.png beside it; with a mask: "
         f"{out / f'{name}_masked' / 'errors.png'}."
     )

@@ -12,7 +12,19 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import (
+    Define,
+    Device,
+    Launch,
+    LaunchBuilder,
+    Precision,
+    Variant,
+    WorkSize,
+    ceil_div,
+    flags,
+    round_up,
+    type_defines,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.validation import finite, whole
@@ -24,7 +36,6 @@ METHODS = ("whole", "windowed", "gauss3", "fir", "ml")
 CHOICES = ("strongest", "first", "last", "nearest")
 LONGEST_PROFILE = 32767  # samples: indices of narrow lanes are 16 bits
 WIDEST_WINDOW = 180  # samples either side: moments of 16-bit samples in 32 bits
-_CODES = {"uint8": ("uchar", 8), "uint16": ("ushort", 16), "float32": ("float", 32)}
 _LANES = 16
 _GROUP = 64  # items of a work-group
 _STRIP = 1024  # columns of a strip at most, MAX_STRIP in line_strip.h
@@ -215,40 +226,36 @@ class LineReadout(VisionOperation[LineReading]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype.name not in _CODES:
-            raise TypeError(f"LineReadout takes uint8, uint16 or float32 frames, got {dtype}")
-        if len(shape) < 2 or 0 in shape[-2:]:
-            raise ValueError(f"LineReadout takes frames of shape (..., rows, columns), got {shape}")
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
+        build.check_dtype("uint8", "uint16", "float32", of="frames")
+        build.check_shape(len(shape) >= 2 and 0 not in shape[-2:], "frames (..., rows, columns) of one pixel at least")
         batch, (rows, columns) = shape[:-2], shape[-2:]
         length, samples = (rows, columns) if self.along == "columns" else (columns, rows)
         if length > LONGEST_PROFILE or rows * columns >= 2**31:
             raise ValueError(
                 f"LineReadout takes profiles of up to {LONGEST_PROFILE} samples in frames below 2**31, got {shape}"
             )
-        real = real_of(self.precision, dtype)
-        strip = uses_vectors(self.variant, device) and self._fits_strip(rows, columns, dtype)
         frames = math.prod(batch)
-        inputs: list[Any] = [(shape, dtype)]
-        if self.choice == "nearest":
-            inputs.append(((*batch, samples), real))
-        chosen = self.outputs or ()
-        types = dict.fromkeys(LineReading._fields, real) | {"status": np.dtype(np.uint8)}
-        return Launch(
-            source="line/line.cl",
-            kernel="line_readout",
-            inputs=inputs,
-            outputs={name: ((*batch, samples), types[name]) if name in chosen else None for name in types},
-            global_size=(self._items(device, strip, frames, samples), frames),
-            local_size=(1, 1) if strip else (_GROUP, 1),
-            defines=self._defines(device, real, dtype, strip, length),
+        if build.uses_vectors and self._fits_strip(rows, columns, dtype):
+            work = WorkSize((self._items(device, frames, samples), frames), (1, 1), vectors=True)
+        else:
+            work = WorkSize((round_up(samples, _GROUP), frames), (_GROUP, 1))
+        chosen, of_samples = self.outputs or (), (*batch, samples)
+        return build.launch(
+            "line/line.cl",
+            "line_readout",
+            work=work,
+            more_inputs=[(of_samples, build.real)] if self.choice == "nearest" else [],
+            outputs=build.outputs({name: of_samples if name in chosen else None for name in LineReading._fields}),
+            defines=self._defines(dtype, length) | flags(PREFETCH=device.is_cpu),
             arguments=[
                 np.int32(rows),
                 np.int32(columns),
                 *self._levels(dtype),
-                self._packed(real, dtype, length),
-                None if self.triangulation is None else self.triangulation.packed(real, self.axes),
+                self._packed(build.real, dtype, length),
+                None if self.triangulation is None else self.triangulation.packed(build.real, self.axes),
             ],
-            passes_once=strip and self.method in ("whole", "windowed"),
+            passes_once=work.vectors and self.method in ("whole", "windowed"),
         )
 
     def _fits_strip(self, rows: int, columns: int, dtype: np.dtype[Any]) -> bool:
@@ -258,15 +265,13 @@ class LineReadout(VisionOperation[LineReading]):
             return self.along == "columns" and columns >= _LANES
         return columns >= _WIDE_BYTES // dtype.itemsize and (self.along == "columns" or rows >= _LANES)
 
-    def _items(self, device: Device, strip: bool, frames: int, samples: int) -> int:
-        """Return how many items work on a frame: few wide ones, but enough to keep every core busy."""
-        if not strip:
-            return math.ceil(samples / _GROUP) * _GROUP
+    def _items(self, device: Device, frames: int, samples: int) -> int:
+        """Return the work-items per frame of the vector variant: few wide ones, but enough to keep every core busy."""
         if self.along == "rows" or self._has_candidates:
-            return math.ceil(samples / _LANES)
-        units = int(device.handle.max_compute_units)
-        busy = math.ceil(2 * units / max(frames, 1)) if frames < 2 * units else 1
-        return min(max(math.ceil(samples / _STRIP), busy), max(samples // 128, 1))
+            return ceil_div(samples, _LANES)
+        units = device.compute_units
+        busy = ceil_div(2 * units, max(frames, 1)) if frames < 2 * units else 1
+        return min(max(ceil_div(samples, _STRIP), busy), max(samples // 128, 1))
 
     def _levels(self, dtype: np.dtype[Any]) -> list[Any]:
         """Return threshold, saturation and weakest peak in the frames' own type."""
@@ -286,31 +291,24 @@ class LineReadout(VisionOperation[LineReading]):
                 raise ValueError(f"LineReadout.{name} is {level}, expected 0 to {top} for {dtype} frames")
         return [dtype.type(level) for level in (self.threshold, saturation, weakest)]
 
-    def _defines(
-        self, device: Device, real: np.dtype[Any], dtype: np.dtype[Any], strip: bool, length: int
-    ) -> dict[str, Any]:
-        code, width = _CODES[dtype.name]
-        defines: dict[str, Any] = real_defines(device, real)
-        defines |= {"CODE": code, "CODE_BITS": width} | {f"CODE{n}": f"{code}{n}" for n in (4, 8, 16)}
-        defines |= {f"METHOD_{self.method.upper()}": None, f"CHOICE_{self.choice.upper()}": None}
-        defines |= {"RADIUS": self.window, "REACH": self.window, "FIR_HALF": self.fir_length // 2}
-        if self.method == "fir":
-            defines["REACH"] = self.window + self.fir_length // 2
+    def _defines(self, dtype: np.dtype[Any], length: int) -> dict[str, Define]:
+        bits = 8 * dtype.itemsize
+        defines = type_defines("CODE", dtype, 4, 8, 16) | {"CODE_BITS": bits}
+        defines |= flags(**{f"METHOD_{self.method.upper()}": True, f"CHOICE_{self.choice.upper()}": True})
+        reach = self.window + (self.fir_length // 2 if self.method == "fir" else 0)
+        defines |= {"RADIUS": self.window, "REACH": reach, "FIR_HALF": self.fir_length // 2}
         chosen = self.outputs or ()
-        defines |= {f"WITH_{name.upper()}": None for name in LineReading._fields if name in chosen}
+        defines |= flags(**{f"WITH_{name.upper()}": True for name in chosen})
         if self.triangulation is not None:
             defines |= {"WITH_SHEET": None} | self.triangulation.defines
-        present = {
-            "VECTOR_VARIANT": strip,
-            "PREFETCH": device.is_cpu,
-            "ALONG_ROWS": self.along == "rows",
-            "AMBIGUITY": self.ambiguity is not None,
-            "CANDIDATES": self._has_candidates,
-            "WIDTH_LIMITS": self._judges_width,
-            "WITH_LIT": "width" in chosen or (self.method == "whole" and self._judges_width),
-            "LONG_MOMENT": width < 32 and length**2 // 2 * np.iinfo(f"uint{width}").max >= 2**32,
-        }
-        return defines | {name: None for name, is_present in present.items() if is_present}
+        return defines | flags(
+            ALONG_ROWS=self.along == "rows",
+            AMBIGUITY=self.ambiguity is not None,
+            CANDIDATES=self._has_candidates,
+            WIDTH_LIMITS=self._judges_width,
+            WITH_LIT="width" in chosen or (self.method == "whole" and self._judges_width),
+            LONG_MOMENT=bits < 32 and length**2 // 2 * np.iinfo(f"uint{bits}").max >= 2**32,
+        )
 
     def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any], length: int) -> Any:
         """Return the parameters of ``line.cl``, in its order."""

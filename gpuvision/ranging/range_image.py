@@ -22,13 +22,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, WorkSize, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import checked_keys, finite, numbers
 
 _STRIP = 1024  # samples, as in range_image.cl
 _LANES = 16
-_INPUTS = {"float32": "float", "float64": "double"}
 _PARALLEL = 1e-9
 # A vector so near length 1 is one that was divided by its length: what was written reads back as it was.
 _UNIT_ROUNDING = 4e-16
@@ -373,26 +372,21 @@ class RangeImage(VisionOperation[RangePoints]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype.name not in _INPUTS:
-            raise TypeError(f"RangeImage takes float32 or float64 profiles, got {dtype}")
-        if len(shape) != 2:
-            raise ValueError(f"RangeImage takes (profiles, samples), got an array of shape {shape}")
-        real = real_of(self.precision, dtype)
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
+        build.check_dtype("float32", "float64", of="profiles")
+        build.check_shape(len(shape) == 2, "(profiles, samples)")
         profiles, samples = shape
-        strips = samples >= _LANES and uses_vectors(self.variant, device)
-        byte = np.dtype(np.uint8)
-        return Launch(
-            source="range_image/range_image.cl",
-            kernel="assemble_profiles",
-            defines={
-                **self.geometry.defines,
-                **real_defines(device, real),
-                **({"VECTOR_VARIANT": None} if strips else {}),
-                "INPUT": _INPUTS[dtype.name],
-                "INPUT16": f"{_INPUTS[dtype.name]}16",
-            },
-            inputs=(*[(shape, dtype)] * self.geometry.inputs, ((profiles,), dtype), (shape, byte)),
-            outputs={"x": (shape, real), "y": (shape, real), "z": (shape, real), "status": (shape, byte)},
-            arguments=(self.packed(real), np.uint32(samples)),
-            global_size=(max(samples // _STRIP, 1) if strips else samples, profiles),
+        if build.uses_vectors and samples >= _LANES:
+            work = WorkSize((max(samples // _STRIP, 1), profiles), None, vectors=True)
+        else:
+            work = WorkSize((samples, profiles), None)
+        more_coordinates = [(shape, dtype)] * (self.geometry.inputs - 1)
+        return build.launch(
+            "range_image/range_image.cl",
+            "assemble_profiles",
+            work=work,
+            more_inputs=[*more_coordinates, ((profiles,), dtype), (shape, np.dtype(np.uint8))],
+            outputs=build.outputs({"x": shape, "y": shape, "z": shape, "status": shape}),
+            defines={**self.geometry.defines, **type_defines("INPUT", dtype, 16)},
+            arguments=[self.packed(build.real), np.uint32(samples)],
         )

@@ -15,14 +15,13 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Bound, Device, DeviceArray, Launch, Precision, real_defines, real_of
+from gpuvision.host import Bound, Device, DeviceArray, Launch, LaunchBuilder, Precision, WorkSize, flags, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite
 
 R = TypeVar("R", bound=tuple[Any, ...])
 Direction = Literal["x", "-x", "y", "-y"]
 _DIRECTIONS = ("x", "-x", "y", "-y")
-_INPUTS = {"float32": "float", "float64": "double"}
 
 
 class HeightMap(NamedTuple):
@@ -281,11 +280,6 @@ class _Lines(NamedTuple):
     across: Any
 
 
-def _alone(device: Device) -> tuple[int, ...] | None:
-    """Group size: a CPU runtime that walks lines side by side spills what each of them keeps."""
-    return (1,) if device.is_cpu else None
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Pass(VisionOperation[R]):
     """One pass of a `Regrid`: lines of an array onto the cells of one direction."""
@@ -308,12 +302,38 @@ class _Pass(VisionOperation[R]):
     def _cells(self) -> int:
         return self.regrid.grid.columns if self.direction[-1] == "x" else self.regrid.grid.rows
 
-    def _real(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.dtype[Any]:
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"Regrid takes float32 or float64 points, got {dtype}")
-        if len(shape) != 2 or 0 in shape:
-            raise ValueError(f"Regrid takes arrays (profiles, samples) with one sample at least, got shape {shape}")
-        return real_of(self.regrid.precision, dtype)
+    def _builder(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> LaunchBuilder:
+        build = LaunchBuilder(self.regrid, device, shape, dtype, precision=self.regrid.precision)
+        build.check_dtype("float32", "float64", of="points")
+        build.check_shape(len(shape) == 2 and 0 not in shape, "arrays (profiles, samples) with one sample at least")
+        return build
+
+    def _resample(
+        self, build: LaunchBuilder, lines: int, made: tuple[int, int], layout: list[int], *, carries: bool
+    ) -> Launch:
+        """Describe the launch that resamples lines; with `carries` a further coordinate along with the values.
+
+        Parameters
+        ----------
+        lines : int
+            Number of lines.
+        made : tuple of int
+            Shape of the outputs.
+        layout : list of int
+            Samples of a line, pitch of lines and samples, cells of a line, pitch of lines and cells in the outputs,
+            and whether folded parts are dropped, as ``regrid.cl`` takes them.
+        """
+        value = (build.shape, build.dtype)
+        return build.launch(
+            "regrid/regrid.cl",
+            "resample",
+            # A CPU runtime that runs several lines in one group spills the state of each line.
+            work=WorkSize((lines,), (1,) if build.device.is_cpu else None),
+            more_inputs=[value, value, (build.shape, np.dtype(np.uint8)), *([value] if carries else [])],
+            outputs=build.outputs(dict.fromkeys(self.Result._fields, made)),
+            defines=type_defines("INPUT", build.dtype) | flags(CARRY=carries),
+            arguments=[np.array(layout, np.uint32), self._numbers().astype(build.real)],
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -324,29 +344,11 @@ class _AlongSamples(_Pass[_Lines]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        real = self._real(device, shape, dtype)
+        build = self._builder(device, shape, dtype)
         profiles, samples = shape
         cells = self._cells()
-        value, flags = (shape, dtype), (shape, np.dtype(np.uint8))
-        made = (profiles, cells)
-        return Launch(
-            source="regrid/regrid.cl",
-            kernel="resample",
-            defines={**real_defines(device, real), "CARRY": None, "INPUT": _INPUTS[dtype.name]},
-            inputs=(value, value, value, flags, value),
-            outputs={
-                "z": (made, real),
-                "intensity": (made, real),
-                "status": (made, np.dtype(np.uint8)),
-                "across": (made, real),
-            },
-            arguments=(
-                np.array([samples, samples, 1, cells, cells, 1, 0], dtype=np.uint32),
-                self._numbers().astype(real),
-            ),
-            global_size=(profiles,),
-            local_size=_alone(device),
-        )
+        layout = [samples, samples, 1, cells, cells, 1, 0]
+        return self._resample(build, profiles, (profiles, cells), layout, carries=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -357,24 +359,10 @@ class _AlongProfiles(_Pass[HeightMap]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        real = self._real(device, shape, dtype)
+        build = self._builder(device, shape, dtype)
         profiles, lines = shape
         cells = self._cells()
-        value, flags = (shape, dtype), (shape, np.dtype(np.uint8))
-        made = self.regrid.grid.shape
         # A line is a row of the map or a column of it.
         line_pitch, cell_pitch = (cells, 1) if self.direction[-1] == "x" else (1, lines)
-        drop = int(self.regrid.folded == "drop")
-        return Launch(
-            source="regrid/regrid.cl",
-            kernel="resample",
-            defines={**real_defines(device, real), "INPUT": _INPUTS[dtype.name]},
-            inputs=(value, value, value, flags),
-            outputs={"z": (made, real), "intensity": (made, real), "status": (made, np.dtype(np.uint8))},
-            arguments=(
-                np.array([profiles, 1, lines, cells, line_pitch, cell_pitch, drop], dtype=np.uint32),
-                self._numbers().astype(real),
-            ),
-            global_size=(lines,),
-            local_size=_alone(device),
-        )
+        layout = [profiles, 1, lines, cells, line_pitch, cell_pitch, int(self.regrid.folded == "drop")]
+        return self._resample(build, lines, self.regrid.grid.shape, layout, carries=False)

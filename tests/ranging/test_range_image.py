@@ -287,7 +287,7 @@ def test_wrong_input_is_refused(device):
     g, transport, given = np.zeros((2, 3), np.float32), np.zeros(2, np.float32), np.zeros((2, 3), np.uint8)
     with pytest.raises(TypeError, match="float32 or float64 profiles, got int32"):
         op(g.astype(np.int32), g, transport, given, device=device)
-    with pytest.raises(ValueError, match="takes \\(profiles, samples\\), got an array of shape \\(6,\\)"):
+    with pytest.raises(ValueError, match="takes \\(profiles, samples\\), got shape \\(6,\\)"):
         op(g.ravel(), g.ravel(), transport, given, device=device)
     with pytest.raises(ValueError, match="expected shape \\(2,\\), got \\(3,\\)"):
         op(g, g, np.zeros(3, np.float32), given, device=device)

@@ -76,7 +76,7 @@ def seen_ahead(
     total = np.zeros(shape)
     offsets = (np.arange(samples) + 0.5) / samples - 0.5
     for a, b in itertools.product(offsets, offsets):
-        at = onto_field(camera.floor(ideal + a * across + b * down), pose) / pixel * (1, -1) + middle
+        at = onto_field(camera.to_floor(ideal + a * across + b * down), pose) / pixel * (1, -1) + middle
         at = np.where(np.isfinite(at), at, -9.0).clip(-9.0, 1e5).astype(np.float32)
         total += cv2.remap(carpet, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     grey = cv2.GaussianBlur(60.0 + 170.0 * total / samples**2, (0, 0), 0.7) + rng.normal(0, noise, shape)

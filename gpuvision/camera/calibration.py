@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.camera import NAMES, Camera
+from gpuvision.camera.camera import COEFFICIENT_NAMES, Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.lines.lens_fit import LensFit
 from gpuvision.camera.patterns.pattern import LineFamilies
@@ -111,7 +111,14 @@ class Calibration:
             return {name: (float(values[name]), error) for name, error in errors.items() if not name.startswith("v")}
         camera = self.fit.camera
         (fx, _, cx), (_, fy, cy), _ = camera.matrix
-        known = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **dict(zip(NAMES, camera.distortion, strict=True))}
+        known = {
+            "f": fx,
+            "fx": fx,
+            "fy": fy,
+            "cx": cx,
+            "cy": cy,
+            **dict(zip(COEFFICIENT_NAMES, camera.distortion, strict=True)),
+        }
         return {name: (known[name], error) for name, error in self.fit.uncertainties.items()}
 
     @property

@@ -32,7 +32,7 @@ Matrix = tuple[tuple[float, float, float], ...]
 Float64 = npt.NDArray[np.float64]
 Direction = Literal["undistort", "distort"]
 
-NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
+COEFFICIENT_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 _LENGTHS = (4, 5, 8, 12, 14)
 
 
@@ -328,7 +328,7 @@ class Camera:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists, as TOML holds them; coefficients by name, those that are 0 left out."""
-        named = {name: value for name, value in zip(NAMES, self.distortion, strict=True) if value != 0.0}
+        named = {name: value for name, value in zip(COEFFICIENT_NAMES, self.distortion, strict=True) if value != 0.0}
         return {"matrix": [list(row) for row in self.matrix], **named}
 
     @classmethod
@@ -340,8 +340,8 @@ class Camera:
         ValueError, TypeError
             A key is unknown or missing, or a value is not what it must be.
         """
-        values = checked_keys(table, ("matrix", *NAMES), ("matrix",), "camera")
-        return cls(matrix=values["matrix"], distortion=tuple(values.get(name, 0.0) for name in NAMES))
+        values = checked_keys(table, ("matrix", *COEFFICIENT_NAMES), ("matrix",), "camera")
+        return cls(matrix=values["matrix"], distortion=tuple(values.get(name, 0.0) for name in COEFFICIENT_NAMES))
 
 
 def _checked_matrix(matrix: Any, what: str) -> Matrix:

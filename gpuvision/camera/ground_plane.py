@@ -1,4 +1,4 @@
-"""A camera on a robot: a pinhole with its lens, above a floor and tilted; pixels to places on the floor and back."""
+"""Camera mounted on a robot above a floor: pixels to floor positions and back (inverse perspective mapping)."""
 
 from __future__ import annotations
 
@@ -14,43 +14,48 @@ from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
 
-_STEEPEST = 0.5 * math.pi
+_RIGHT_ANGLE = 0.5 * math.pi
+# Downward component of a unit-depth viewing direction, at and below which a pixel shows the horizon or the sky.
+_HORIZON = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountedCamera:
-    """A camera above a floor. Its pixels are those of the undistorted image, but for those of `measured`.
+    """Pinhole camera with a lens, at a known height and orientation above a floor.
+
+    Pixels are those of the undistorted image, except for the result of `distort`.
 
     Parameters
     ----------
-    height
-        Of its centre above the floor [m].
-    tilt
-        How far it looks below the horizon [rad]; a quarter turn is straight down.
-    roll
-        How far it is turned clockwise about the direction in which it looks [rad].
-    heading
-        Of that direction, counter-clockwise from the robot's ahead [rad].
-    place
-        Where in the robot's frame it is, ahead and to the left [m].
-    focal_px
-        Focal length [px]; None: of the ``model``, a `Camera`.
-    centre_px
-        Column, row of the optical axis; None: of the ``model``, a `Camera`; of a `Lens`, its centre.
-    model
-        The lens; None: the image is free of distortion.
+    height : float
+        Height of the pinhole above the floor [m], above 0.
+    tilt : float
+        Angle of the viewing direction below the horizon [rad], -pi/2 to pi/2; pi/2 looks straight down.
+    roll : float
+        Clockwise rotation of the camera about its viewing direction [rad]. Default 0.
+    heading : float
+        Counter-clockwise angle from the robot's forward direction to the viewing direction [rad]. Default 0.
+    position : (float, float)
+        Position of the camera in the robot's frame, forward and to the left [m]. Default (0, 0).
+    focal_px : float, optional
+        Focal length [px], above 0. Required unless ``model`` is a `Camera`.
+    centre_px : (float, float), optional
+        Column and row of the principal point [px]. Default: the centre of ``model``.
+    model : Lens or Camera, optional
+        Lens distortion. A `Camera` also gives focal length and principal point. Default: no distortion.
 
     Raises
     ------
     ValueError
-        A number is out of its range, or focal length and centre are not known.
+        A number is out of its range, the focal length or the centre is missing, or both ``model`` and ``focal_px`` or
+        ``centre_px`` give them.
     """
 
     height: float
     tilt: float
     roll: float = 0.0
     heading: float = 0.0
-    place: tuple[float, float] = (0.0, 0.0)
+    position: tuple[float, float] = (0.0, 0.0)
     focal_px: float | None = None
     centre_px: tuple[float, float] | None = None
     model: Lens | Camera | None = None
@@ -58,14 +63,14 @@ class MountedCamera:
     def __post_init__(self) -> None:
         if finite(self.height, "MountedCamera.height") <= 0.0:
             raise ValueError(f"MountedCamera.height is {self.height}, expected metres above 0")
-        if not abs(finite(self.tilt, "MountedCamera.tilt")) <= _STEEPEST:
+        if not abs(finite(self.tilt, "MountedCamera.tilt")) <= _RIGHT_ANGLE:
             raise ValueError(f"MountedCamera.tilt is {self.tilt} rad, expected a right angle at most")
         for name in ("roll", "heading"):
             finite(getattr(self, name), f"MountedCamera.{name}")
-        object.__setattr__(self, "place", numbers(self.place, (2,), "MountedCamera.place"))
+        object.__setattr__(self, "position", numbers(self.position, (2,), "MountedCamera.position"))
         if isinstance(self.model, Camera):
             if self.focal_px is not None or self.centre_px is not None:
-                raise ValueError("MountedCamera has a Camera, which knows focal length and centre; leave them out")
+                raise ValueError("MountedCamera.model is a Camera, which gives focal_px and centre_px; leave them out")
             return
         if self.focal_px is None or finite(self.focal_px, "MountedCamera.focal_px") <= 0.0:
             raise ValueError(f"MountedCamera.focal_px is {self.focal_px}, expected pixels above 0")
@@ -76,7 +81,7 @@ class MountedCamera:
 
     @property
     def matrix(self) -> Float64:
-        """3 x 3, of the pinhole [px]."""
+        """Camera matrix (3, 3) of the pinhole [px]."""
         if isinstance(self.model, Camera):
             return np.array(self.model.matrix)
         own = self.model.centre if self.model is not None else (0.0, 0.0)
@@ -86,7 +91,7 @@ class MountedCamera:
 
     @property
     def rotation(self) -> Float64:
-        """3 x 3: directions in the robot's frame (ahead, left, up) to the camera's (right, down, ahead)."""
+        """Rotation (3, 3) from the robot's frame (forward, left, up) to the camera's (right, down, forward)."""
         c, s = math.cos(self.heading), math.sin(self.heading)
         down, level = math.sin(self.tilt), math.cos(self.tilt)
         right = np.array([s, -c, 0.0])
@@ -95,22 +100,33 @@ class MountedCamera:
         a, b = math.cos(self.roll), math.sin(self.roll)
         return np.stack([a * right + b * below, a * below - b * right, ahead])
 
-    def floor(self, pixels: npt.ArrayLike) -> Float64:
-        """(..., 2) places on the floor that pixels see, in the robot's frame [m]; NaN on the horizon and above."""
-        seen = np.concatenate([np.asarray(pixels, np.float64), np.ones((*np.shape(pixels)[:-1], 1))], axis=-1)
-        ways = seen @ (np.linalg.inv(self.matrix).T @ self.rotation)
+    def to_floor(self, pixels: npt.ArrayLike) -> Float64:
+        """Intersect the viewing rays of undistorted pixels with the floor.
+
+        Parameters
+        ----------
+        pixels : array_like
+            (..., 2): column, row [px].
+
+        Returns
+        -------
+        numpy.ndarray
+            (..., 2) float64: floor positions in the robot's frame, forward and left [m]; NaN on and above the horizon.
+        """
+        homogeneous = np.concatenate([np.asarray(pixels, np.float64), np.ones((*np.shape(pixels)[:-1], 1))], axis=-1)
+        rays = homogeneous @ (np.linalg.inv(self.matrix).T @ self.rotation)
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = np.where(ways[..., 2:] < -1e-9, self.height / -ways[..., 2:], np.nan)
-        return np.asarray(self.place + far * ways[..., :2])
+            length = np.where(rays[..., 2:] < -_HORIZON, self.height / -rays[..., 2:], np.nan)
+        return np.asarray(self.position + length * rays[..., :2])
 
-    def pixels(self, places: npt.ArrayLike) -> Float64:
-        """(..., 2) column, row that show places on the floor; NaN behind the camera."""
-        away = np.asarray(places, np.float64) - self.place
-        seen = np.concatenate([away, np.full((*away.shape[:-1], 1), -self.height)], axis=-1) @ self.rotation.T
-        depth = np.where(seen[..., 2:] > 0.0, seen[..., 2:], np.nan)
-        shown = seen / depth @ self.matrix.T
-        return np.asarray(shown[..., :2])
+    def to_pixels(self, positions: npt.ArrayLike) -> Float64:
+        """Project floor positions (..., 2) [m] of the robot's frame to undistorted pixels (..., 2); NaN behind it."""
+        offset = np.asarray(positions, np.float64) - self.position
+        points = np.concatenate([offset, np.full((*offset.shape[:-1], 1), -self.height)], axis=-1) @ self.rotation.T
+        depth = np.where(points[..., 2:] > 0.0, points[..., 2:], np.nan)
+        projected = points / depth @ self.matrix.T
+        return np.asarray(projected[..., :2])
 
-    def measured(self, pixels: npt.ArrayLike) -> Float64:
-        """(..., 2) column, row in the image as it was taken, through the lens; NaN where it has none."""
+    def distort(self, pixels: npt.ArrayLike) -> Float64:
+        """Measured (column, row) of undistorted pixels (..., 2), through the lens; NaN past the fold of the lens."""
         return np.asarray(pixels, np.float64) if self.model is None else np.asarray(self.model.distort(pixels))

@@ -1,4 +1,4 @@
-"""How a camera that looks straight at a board, or down at a floor, sees it: places there to pixels and back."""
+"""View of a plane (board or floor) by a camera perpendicular to it: plane coordinates to pixels and back."""
 
 from __future__ import annotations
 
@@ -16,21 +16,28 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoardView:
-    """A camera that looks straight down on a plane.
+    """Similarity between a plane and the image of a camera perpendicular to it.
+
+    Pixels are those of the undistorted image, except for the result of `to_measured_pixels`.
 
     Parameters
     ----------
-    scale
-        Of a pixel on the plane [m].
-    shape
+    scale : float
+        Size of a pixel on the plane [m], above 0.
+    shape : (int, int)
         Rows and columns of the image.
-    pose
-        Place on the plane that the image's centre sees, x, y [m], and the direction there of the image's columns from
-        left to right, theta [rad], counter-clockwise; up in the image is a quarter turn further.
-    mirrored
-        The plane is seen from behind, as a board's bottom is: columns run against that direction.
-    model
-        The lens. Pixels of this class are those of the undistorted image, but for those of `measured`.
+    pose : (float, float, float)
+        x, y [m]: the point of the plane at the image's centre. theta [rad]: counter-clockwise angle from the plane's x
+        axis to the direction of increasing columns. Decreasing rows point a quarter turn further.
+    mirrored : bool
+        The camera sees the plane from behind, as a board's bottom side: columns decrease along theta. Default False.
+    model : Lens or Camera, optional
+        Lens distortion. Default: none.
+
+    Raises
+    ------
+    ValueError
+        The scale or the pose is out of its range.
     """
 
     scale: float
@@ -47,45 +54,45 @@ class BoardView:
 
     @property
     def centre_px(self) -> Float64:
-        """(2,) column and row of the image's middle."""
+        """Column and row (2,) of the image's centre [px]."""
         return (np.array(self.shape[::-1], np.float64) - 1) / 2
 
     @property
     def matrix(self) -> Float64:
-        """3 x 3: places on the plane [m] to pixels."""
+        """Homogeneous transform (3, 3) from plane coordinates [m] to pixels."""
         x, y, theta = self.pose
-        turned = np.array([[math.cos(theta), math.sin(theta)], [-math.sin(theta), math.cos(theta)]])
-        linear = np.diag([-1.0 if self.mirrored else 1.0, -1.0]) / self.scale @ turned
+        rotation = np.array([[math.cos(theta), math.sin(theta)], [-math.sin(theta), math.cos(theta)]])
+        linear = np.diag([-1.0 if self.mirrored else 1.0, -1.0]) / self.scale @ rotation
         matrix = np.eye(3)
         matrix[:2, :2] = linear
         matrix[:2, 2] = self.centre_px - linear @ np.array([x, y])
         return matrix
 
-    def pixels(self, places: npt.ArrayLike) -> Float64:
-        """(..., 2) column, row [px] of places [m]."""
+    def to_pixels(self, points: npt.ArrayLike) -> Float64:
+        """Return undistorted (column, row) of points (..., 2) on the plane [m]."""
         matrix = self.matrix
-        return np.asarray(np.asarray(places, np.float64) @ matrix[:2, :2].T + matrix[:2, 2])
+        return np.asarray(np.asarray(points, np.float64) @ matrix[:2, :2].T + matrix[:2, 2])
 
-    def places(self, pixels: npt.ArrayLike) -> Float64:
-        """(..., 2) places [m] that pixels see."""
+    def to_plane(self, pixels: npt.ArrayLike) -> Float64:
+        """Return plane coordinates (..., 2) [m] of undistorted pixels (..., 2)."""
         matrix = self.matrix
         return np.asarray((np.asarray(pixels, np.float64) - matrix[:2, 2]) @ np.linalg.inv(matrix[:2, :2]).T)
 
-    def measured(self, places: npt.ArrayLike) -> Float64:
-        """(..., 2) column, row in the image as it was taken, through the lens; NaN where it has none."""
-        pixels = self.pixels(places)
+    def to_measured_pixels(self, points: npt.ArrayLike) -> Float64:
+        """Return measured (column, row) of points (..., 2) on the plane [m], through the lens; NaN past its fold."""
+        pixels = self.to_pixels(points)
         return pixels if self.model is None else np.asarray(self.model.distort(pixels))
 
     @property
     def bounds(self) -> Float64:
-        """(2, 2) least and greatest x, y [m] of what the undistorted image sees."""
+        """Smallest and largest x, y (2, 2) [m] in the undistorted image's field of view."""
         rows, columns = self.shape
-        corners = self.places(np.array([[0, 0], [columns - 1, 0], [0, rows - 1], [columns - 1, rows - 1]]))
+        corners = self.to_plane(np.array([[0, 0], [columns - 1, 0], [0, rows - 1], [columns - 1, rows - 1]]))
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
-    def within(self, places: npt.ArrayLike, margin_px: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Whether places are in the image as it was taken, a margin [px] from its border."""
-        pixels, margin = self.measured(places), np.asarray(margin_px)[..., None]
+    def contains(self, points: npt.ArrayLike, margin_px: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Return whether points (..., 2) on the plane [m] lie in the measured image, a margin [px] off its border."""
+        pixels, margin = self.to_measured_pixels(points), np.asarray(margin_px)[..., None]
         with np.errstate(invalid="ignore"):
             inside = (pixels >= margin) & (pixels <= np.array(self.shape[::-1]) - 1 - margin)
         return np.asarray(inside.all(axis=-1))

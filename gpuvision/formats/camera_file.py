@@ -1,8 +1,9 @@
-"""Calibrated lenses as files: ``gpuvision calibrate`` writes them, ``gpuvision undistort`` and sensor files read them.
+"""Camera files (TOML): ``gpuvision calibrate`` writes them, ``gpuvision undistort`` and sensor files read them.
 
-A file holds one of two tables: ``[lens]``, radial distortion of measured pixels (`Lens`), as a sensor file has it; or
-``[camera]``, a camera matrix and OpenCV's coefficients (`Camera`). The others, ``[image]``, ``[uncertainty]`` and
-``[fit]``, say how it came about; nothing depends on them. A table ``[mount]`` is `gpuvision.camera.ground_plane`'s.
+A file holds one of two tables: ``[lens]``, the radial distortion of measured pixels (`Lens`), as in a sensor file; or
+``[camera]``, a camera matrix and OpenCV's coefficients (`Camera`). The tables ``[image]``, ``[uncertainty]`` and
+``[fit]`` document the calibration; no reader uses them. A table ``[mount]`` describes a
+`gpuvision.camera.ground_plane.MountedCamera`.
 """
 
 from __future__ import annotations
@@ -14,28 +15,37 @@ from typing import Any
 
 import tomli_w
 
-from gpuvision.camera.camera import NAMES, Camera
+from gpuvision.camera.camera import COEFFICIENT_NAMES, Camera
 from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.camera.lens import Lens
 from gpuvision.host.files import replacing
 from gpuvision.schema import Section, read
 
-_ABOUT = ("image", "uncertainty", "fit", "mount")
+_UNREAD_TABLES = ("image", "uncertainty", "fit", "mount")
 
 
 def read_lens(path: str | Path) -> Lens | Camera:
-    """Read the camera model from a file that ``gpuvision calibrate`` wrote.
+    """Read the camera model of a camera file.
+
+    Parameters
+    ----------
+    path : str or Path
+        File that ``gpuvision calibrate`` wrote.
+
+    Returns
+    -------
+    Lens or Camera
 
     Raises
     ------
     OSError
         The file cannot be read.
     DescriptionError
-        It is no such file; the message names the key.
+        A key or table is missing, unknown or has a wrong value; the message names the key.
     """
     top = read(Path(path))
     lens, camera = top.optional_section("lens"), top.optional_section("camera")
-    for name in _ABOUT:
+    for name in _UNREAD_TABLES:
         top.optional_section(name)
     top.finish()
     if lens is not None and camera is None:
@@ -46,7 +56,7 @@ def read_lens(path: str | Path) -> Lens | Camera:
 
 
 def radial_lens(table: Section) -> Lens:
-    """Return the lens of a table ``[lens]``, and finish that."""
+    """Return the lens of a table ``[lens]``; refuse unknown keys."""
     k1 = table.number("k1", "sensor unit^-2")
     k2 = table.number("k2", "sensor unit^-4", 0.0)
     column, row = table.numbers("centre", "sensor unit", (2,), (0.0, 0.0))
@@ -54,51 +64,51 @@ def radial_lens(table: Section) -> Lens:
     return Lens(k1=k1, k2=k2, centre=(column, row))
 
 
-def write_lens(path: str | Path, model: Lens | Camera, about: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write a camera model as TOML, whole or not at all.
+def write_lens(path: str | Path, model: Lens | Camera, documentation: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write a camera model as TOML. On an error no file is left behind.
 
     Parameters
     ----------
-    path
-        Its folder must exist.
-    model
-        What `read_lens` will return.
-    about
-        The tables ``image``, ``uncertainty`` and ``fit``.
+    path : str or Path
+        Output file; its folder must exist.
+    model : Lens or Camera
+        Model that `read_lens` reads back.
+    documentation : mapping
+        Tables ``image``, ``uncertainty`` and ``fit``, which no reader uses.
     """
-    table = {"lens" if isinstance(model, Lens) else "camera": model.to_dict(), **about}
+    table = {"lens" if isinstance(model, Lens) else "camera": model.to_dict(), **documentation}
     with replacing(path) as file:
         tomli_w.dump(table, file)
 
 
 def _camera(table: Section) -> Camera:
     matrix = table.rows("matrix", "pixel", 3)
-    distortion = tuple(table.number(name, "", 0.0) for name in NAMES)
+    distortion = tuple(table.number(name, "", 0.0) for name in COEFFICIENT_NAMES)
     table.finish()
     return Camera(matrix=matrix, distortion=distortion)
 
 
 def read_mounted(path: str | Path, shape: tuple[int, int]) -> MountedCamera | None:
-    """Read a camera file's table ``[mount]``: how it is mounted, and what its other table says of the lens.
+    """Read the table ``[mount]`` of a camera file, together with the file's lens or camera.
 
     Parameters
     ----------
-    path
-        What ``gpuvision calibrate`` wrote, with a table ``[mount]`` added; or such a table alone.
-    shape
-        Rows and columns of the image: its middle is the centre where the file has none.
+    path : str or Path
+        File that ``gpuvision calibrate`` wrote, with a table ``[mount]`` added; or a file with that table alone.
+    shape : (int, int)
+        Rows and columns of the image. The image's centre is the principal point where the file gives none.
 
     Returns
     -------
     MountedCamera or None
-        None where there is no such table.
+        None if the file has no table ``[mount]``.
 
     Raises
     ------
     OSError
         The file cannot be read.
     DescriptionError
-        It says something else; the message names the key.
+        A key is missing, unknown or has a wrong value; the message names the key.
     """
     top = read(Path(path))
     table = top.optional_section("mount")
@@ -115,7 +125,7 @@ def _mounted(table: Section, model: Lens | Camera | None, middle: tuple[float, f
     height = table.number("height", "m", above=0.0)
     tilt = table.number("tilt_degrees", "degree", at_least=-90.0, at_most=90.0)
     roll, heading = (table.number(f"{name}_degrees", "degree", 0.0) for name in ("roll", "heading"))
-    ahead, left = table.numbers("place", "m", (2,), (0.0, 0.0))
+    forward, left = table.numbers("position", "m", (2,), (0.0, 0.0))
     focal = centre = None
     if not isinstance(model, Camera):
         focal = table.number("focal_px", "pixel", above=0.0)
@@ -127,7 +137,7 @@ def _mounted(table: Section, model: Lens | Camera | None, middle: tuple[float, f
         tilt=math.radians(tilt),
         roll=math.radians(roll),
         heading=math.radians(heading),
-        place=(ahead, left),
+        position=(forward, left),
         focal_px=focal,
         centre_px=centre,
         model=model,

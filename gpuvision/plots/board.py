@@ -95,8 +95,8 @@ def draw_located_board(path: str | Path, image: npt.NDArray[Any], artwork: Artwo
         ("no edge found", told.laid & ~told.found, _NOTHING),
     )
     ends = told.normal * (told.length_px * view.scale / 2)[:, None]
-    lines = np.stack([view.measured(told.point - ends), view.measured(told.point + ends)], axis=1)
-    places = view.measured(told.point + told.normal * (told.position_px * view.scale)[:, None])
+    lines = np.stack([view.to_measured_pixels(told.point - ends), view.to_measured_pixels(told.point + ends)], axis=1)
+    places = view.to_measured_pixels(told.point + told.normal * (told.position_px * view.scale)[:, None])
     handles = [Line2D([], [], color=_ARTWORK, label="artwork's edges" + _as_expected(located))]
     for name, which, colour in classes:
         axes.add_collection(LineCollection(list(lines[which]), colors=colour, linewidths=1.1))
@@ -114,7 +114,7 @@ def draw_located_board(path: str | Path, image: npt.NDArray[Any], artwork: Artwo
 def _draw_marks(axes: Any, located: LocatedBoard) -> list[Line2D]:
     """Draw marks as circles where they were found, and where they were not as they should lie; a legend's handles."""
     told, view = located.marks, located.view
-    middles = np.where(told.found[:, None], told.image_px, view.measured(told.point))
+    middles = np.where(told.found[:, None], told.image_px, view.to_measured_pixels(told.point))
     size = np.where(told.found, np.nan_to_num(told.size), told.radius) / view.scale
     handles = []
     for name, which, colour in (
@@ -141,16 +141,18 @@ def _draw_outlines(axes: Any, artwork: Artwork, view: BoardView) -> None:
     ends = np.stack([edges.start, edges.end], axis=1)
     low, high = view.bounds
     near = np.all((ends.max(axis=1) >= low) & (ends.min(axis=1) <= high), axis=1)
-    axes.add_collection(LineCollection(list(view.measured(ends[near])), colors=_ARTWORK, linewidths=0.5, alpha=0.8))
+    axes.add_collection(
+        LineCollection(list(view.to_measured_pixels(ends[near])), colors=_ARTWORK, linewidths=0.5, alpha=0.8)
+    )
 
 
 def _draw_axes(axes: Any, view: BoardView) -> None:
     """Draw the board's axes at the image's middle: x with a long arm, y with a short one."""
     x, y, _ = view.pose
     arm = 0.08 * min(view.shape) * view.scale
-    centre = view.measured(np.array([x, y]))
+    centre = view.to_measured_pixels(np.array([x, y]))
     for name, tip in (("x", (1.6 * arm, 0.0)), ("y", (0.0, arm))):
-        end = view.measured(np.array([x, y]) + tip)
+        end = view.to_measured_pixels(np.array([x, y]) + tip)
         axes.annotate("", end, centre, arrowprops={"arrowstyle": "->", "color": "white", "lw": 1.3})
         axes.annotate(name, end, color="white", fontsize=8, fontweight="bold")
 

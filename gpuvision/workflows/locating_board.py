@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
-from gpuvision.camera.image import grey_image, noise_of
+from gpuvision.camera.image import estimate_pixel_noise, grey_image
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.camera.undistort_image import UndistortImage
@@ -94,9 +94,10 @@ def locate_board(
     Raises
     ------
     ValueError
-        A parameter is out of its range, or nothing that fixes the pose can be looked for in the image.
-    RecordingError
-        The image is none that rulers take.
+        A parameter is out of its range, the image's shape is not accepted, or the image shows no features that fix the
+        pose.
+    TypeError
+        The pixels are not uint8, uint16 or float32.
     """
     grey = grey_image(image)
     if copper not in COPPER:
@@ -110,7 +111,7 @@ def locate_board(
 
 def _levels(grey: npt.NDArray[Any], noise: float | None, threshold: float | None) -> tuple[float, float]:
     """Return a pixel's noise and the least edge [grey levels], as they are given or as the image shows them."""
-    level = noise_of(grey) if noise is None else noise
+    level = estimate_pixel_noise(grey) if noise is None else noise
     low, high = np.percentile(grey, [1, 99])
     return level, max(4.0 * level, 0.05 * float(high - low), 1e-6) if threshold is None else threshold
 
@@ -244,7 +245,7 @@ class _Job:
             view=fix.view,
             covariance=back @ covariance @ back.T,
             placement=features.placement,
-            placement_px=fix.view.measured(features.placement),
+            placement_px=fix.view.to_measured_pixels(features.placement),
             placement_covariance=covariance,
             rulers=solution.rulers,
             marks=solution.marks,

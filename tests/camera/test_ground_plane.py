@@ -28,7 +28,7 @@ BARREL = Camera(
     matrix=((450.0, 0.0, 325.0), (0.0, 452.0, 236.0), (0.0, 0.0, 1.0)), distortion=(-0.25, 0.08, *[0.0] * 12)
 )
 PINHOLE = MountedCamera(height=0.8, tilt=math.radians(25.0), focal_px=500.0, centre_px=(319.5, 239.5))
-BENT = MountedCamera(height=0.8, tilt=0.5, roll=0.05, heading=0.3, place=(0.1, -0.05), model=BARREL)
+BENT = MountedCamera(height=0.8, tilt=0.5, roll=0.05, heading=0.3, position=(0.1, -0.05), model=BARREL)
 POSE = (6.0, 3.0, 0.3)
 
 
@@ -40,41 +40,41 @@ def carpet() -> np.ndarray:
 def test_straight_down_is_a_top_view() -> None:
     camera = MountedCamera(height=2.0, tilt=0.5 * math.pi, focal_px=400.0, centre_px=(300.0, 200.0))
     # A pixel is 5 mm; up in the image is ahead, and left is left.
-    places = camera.floor([(300.0, 200.0), (300.0, 100.0), (200.0, 200.0)])
+    places = camera.to_floor([(300.0, 200.0), (300.0, 100.0), (200.0, 200.0)])
     np.testing.assert_allclose(places, [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5)], atol=1e-12)
     turned = MountedCamera(height=2.0, tilt=0.5 * math.pi, roll=0.5 * math.pi, focal_px=400.0, centre_px=(300.0, 200.0))
     # Turned clockwise, its left looks ahead.
-    np.testing.assert_allclose(turned.floor([(200.0, 200.0)]), [(0.5, 0.0)], atol=1e-12)
+    np.testing.assert_allclose(turned.to_floor([(200.0, 200.0)]), [(0.5, 0.0)], atol=1e-12)
 
 
 def test_ahead_is_where_height_and_tilt_say() -> None:
     far = 0.8 / math.tan(math.radians(25.0))
-    np.testing.assert_allclose(PINHOLE.floor([(319.5, 239.5)]), [(far, 0.0)], atol=1e-12)
+    np.testing.assert_allclose(PINHOLE.to_floor([(319.5, 239.5)]), [(far, 0.0)], atol=1e-12)
     left = MountedCamera(
         height=0.8,
         tilt=math.radians(25.0),
         heading=0.5 * math.pi,
-        place=(0.2, 0.1),
+        position=(0.2, 0.1),
         focal_px=500.0,
         centre_px=(319.5, 239.5),
     )
-    np.testing.assert_allclose(left.floor([(319.5, 239.5)]), [(0.2, 0.1 + far)], atol=1e-12)
+    np.testing.assert_allclose(left.to_floor([(319.5, 239.5)]), [(0.2, 0.1 + far)], atol=1e-12)
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, BENT])
 def test_pixels_and_places_are_each_other_s(camera: MountedCamera, rng: np.random.Generator) -> None:
     pixels = rng.uniform([0, 0], [639, 479], (400, 2))
-    places = camera.floor(pixels)
+    places = camera.to_floor(pixels)
     seen = np.isfinite(places).all(axis=-1)
     assert 200 < seen.sum() < 400 or seen.all()
-    np.testing.assert_allclose(camera.pixels(places[seen]), pixels[seen], atol=1e-6)
-    assert np.isnan(camera.pixels([(-5.0, 0.0)])).all()
+    np.testing.assert_allclose(camera.to_pixels(places[seen]), pixels[seen], atol=1e-6)
+    assert np.isnan(camera.to_pixels([(-5.0, 0.0)])).all()
 
 
 def test_nothing_is_seen_above_the_horizon() -> None:
     horizon = 239.5 - 500.0 * math.tan(math.radians(25.0))
-    assert np.isnan(PINHOLE.floor([(100.0, horizon - 0.01), (600.0, -50.0)])).all()
-    assert PINHOLE.floor([(319.5, horizon + 1.0)])[0, 0] > 100.0
+    assert np.isnan(PINHOLE.to_floor([(100.0, horizon - 0.01), (600.0, -50.0)])).all()
+    assert PINHOLE.to_floor([(319.5, horizon + 1.0)])[0, 0] > 100.0
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, BENT])
@@ -109,7 +109,7 @@ def test_a_robot_is_located_through_its_camera(camera: MountedCamera, rng: np.ra
         tilt=camera.tilt - 0.07,
         roll=camera.roll,
         heading=camera.heading,
-        place=camera.place,
+        position=camera.position,
         focal_px=camera.focal_px,
         centre_px=camera.centre_px,
         model=camera.model,
@@ -149,10 +149,10 @@ def test_files_say_how_it_is_mounted(tmp_path: Path) -> None:
         height=0.8, tilt=math.radians(25.0), focal_px=500.0, centre_px=(319.5, 239.5)
     )
     matrix = "[camera]\nmatrix = [[450.0, 0, 325], [0, 452, 236], [0, 0, 1]]\nk1 = -0.25\nk2 = 0.08\n"
-    file.write_text(matrix + mount + "roll_degrees = 3\nheading_degrees = -90\nplace = [0.1, 0.2]\n")
+    file.write_text(matrix + mount + "roll_degrees = 3\nheading_degrees = -90\nposition = [0.1, 0.2]\n")
     read = read_mounted(file, SHAPE)
     assert read is not None
-    assert (read.model, read.place, read.heading) == (BARREL, (0.1, 0.2), -0.5 * math.pi)
+    assert (read.model, read.position, read.heading) == (BARREL, (0.1, 0.2), -0.5 * math.pi)
     file.write_text("[lens]\nk1 = 1e-8\ncentre = [300, 200]\n" + mount + "focal_px = 500\n")
     lens = read_mounted(file, SHAPE)
     assert lens is not None

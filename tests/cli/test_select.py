@@ -124,7 +124,7 @@ def test_a_camera_is_located_as_promised(artwork: Artwork, features: FeatureSet,
         found = locate_board(image, artwork, scale=PIXEL, near=near, features=features, blur_px=1.04, device=device)
         assert found.reason == ""
         true = BoardView(scale=PIXEL, shape=SHAPE, pose=pose)
-        off = found.view.places(true.pixels(features.placement)) - features.placement
+        off = found.view.to_plane(true.to_pixels(features.placement)) - features.placement
         scores.append([*(off / features.sigmas[:2]), (found.pose[2] - pose[2]) / features.sigmas[2]])
         assert np.abs((np.array(found.pose) - pose) / found.sigmas).max() < 5.0
     # 24 Gaussian numbers have a root mean square of 1 +- 0.15. Interpolation adds 0.02 px to 0.03 px of noise.
@@ -136,7 +136,7 @@ def test_features_of_a_view_lie_in_it(artwork: Artwork) -> None:
     chosen = features_in_view(artwork, view, IMAGING, budget=40)
     ends = chosen.normal * chosen.length[:, None] / 2
     for sign in (-1.0, 1.0):
-        pixels = view.pixels(chosen.point + sign * ends)
+        pixels = view.to_pixels(chosen.point + sign * ends)
         assert np.all((pixels >= 0) & (pixels <= np.array(SHAPE[::-1]) - 1))
     # Thousands of places: the corners and the middle of the view stand for all of it.
     coarse = replace(IMAGING, pixel=5e-6, shift=20e-6)

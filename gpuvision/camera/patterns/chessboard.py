@@ -18,7 +18,7 @@ from gpuvision.camera.patterns.pattern import (
     Float64,
     PatternGrid,
     boxed,
-    grey_image,
+    finder_image,
     localisation_noise,
     shrunk,
     trimmed,
@@ -84,7 +84,7 @@ def find_chessboard(image: npt.NDArray[Any], inner: tuple[int, int] | None = Non
     TypeError
         If the image is of another type.
     """
-    grey = grey_image(image)
+    grey = finder_image(image)
     rough = max((_board(grey, level) for level in range(_LEVELS)), key=_known)
     points = _measured(grey, rough)
     points[~on_grid(points, _OFF_USUAL, _OFF_STEP)] = np.nan

@@ -11,7 +11,14 @@ from gpuvision.camera.patterns.blobs import find_pattern_blobs
 from gpuvision.camera.patterns.centroids import Centroids, disc_shift, measure_dots
 from gpuvision.camera.patterns.grid_polynomial import GridPolynomial, cross, on_grid
 from gpuvision.camera.patterns.lattice import whole_grid
-from gpuvision.camera.patterns.pattern import Float64, PatternGrid, grey_image, localisation_noise, nan_median, trimmed
+from gpuvision.camera.patterns.pattern import (
+    Float64,
+    PatternGrid,
+    finder_image,
+    localisation_noise,
+    nan_median,
+    trimmed,
+)
 
 Bool = npt.NDArray[np.bool_]
 
@@ -54,7 +61,7 @@ def find_dots(image: npt.NDArray[Any]) -> PatternGrid:
     TypeError
         If the image is of another type.
     """
-    grey = grey_image(image)
+    grey = finder_image(image)
     blobs = find_pattern_blobs(grey)
     if blobs.cover > _MOST_COVER:
         raise ValueError(

@@ -12,7 +12,7 @@ from gpuvision.camera.patterns.blobs import find_pattern_blobs
 from gpuvision.camera.patterns.centroids import lattice_steps, sampled
 from gpuvision.camera.patterns.grid_polynomial import on_grid
 from gpuvision.camera.patterns.lattice import whole_grid
-from gpuvision.camera.patterns.pattern import Float32, Float64, LineFamilies, grey_image, nan_median
+from gpuvision.camera.patterns.pattern import Float32, Float64, LineFamilies, finder_image, nan_median
 
 _FEWEST_CELLS = 9
 _FEWEST_POINTS = 3
@@ -63,7 +63,7 @@ def find_lines(image: npt.NDArray[Any]) -> LineFamilies:
     TypeError
         If the image is of another type.
     """
-    grey = grey_image(image)
+    grey = finder_image(image)
     blobs = find_pattern_blobs(grey)
     if blobs.cover < _LEAST_COVER:
         raise ValueError(

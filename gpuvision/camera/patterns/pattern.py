@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.camera.image import grey_image
+
 Float64: TypeAlias = npt.NDArray[np.float64]
 Float32: TypeAlias = npt.NDArray[np.float32]
 
@@ -34,29 +36,23 @@ class PatternGrid(NamedTuple):
     """Noise of one coordinate in pixels, as `localisation_noise` estimates it from the points."""
 
 
-def grey_image(image: npt.NDArray[Any]) -> Float32:
-    """Return an image as float32 grey levels.
+def finder_image(image: npt.NDArray[Any]) -> Float32:
+    """Return an image of a target pattern as float32 grey levels.
 
     Parameters
     ----------
-    image
+    image : numpy.ndarray
         (height, width) or (height, width, 3) of uint8, uint16 or float32; three channels are blue, green, red, as
         OpenCV reads them.
 
     Raises
     ------
     TypeError
-        If it is no array of these types.
+        The image is no array of these types.
     ValueError
-        If its shape is another one, or a pixel is no finite number.
+        The shape is not accepted, or a pixel is not finite.
     """
-    if not isinstance(image, np.ndarray) or image.dtype not in (np.uint8, np.uint16, np.float32):
-        what = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
-        raise TypeError(f"image is {what}, expected an array of uint8, uint16 or float32")
-    if image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)) or 0 in image.shape:
-        raise ValueError(f"image has the shape {image.shape}, expected (height, width) or (height, width, 3)")
-    single = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
-    grey = single.astype(np.float32)
+    grey = grey_image(image, channels=(3,), min_size=1, convert_float64=False).astype(np.float32)
     if image.dtype == np.float32 and not np.isfinite(grey).all():
         raise ValueError(f"image has {np.count_nonzero(~np.isfinite(grey))} pixels that are no finite numbers")
     return grey

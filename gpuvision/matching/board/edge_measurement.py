@@ -196,7 +196,7 @@ class Looking:
         features = self.features
         matrix = view.matrix
         direction = features.normal @ matrix[:2, :2].T * view.scale
-        laid = np.concatenate([view.pixels(features.point), direction], axis=1).astype(np.float32)
+        laid = np.concatenate([view.to_pixels(features.point), direction], axis=1).astype(np.float32)
         count = len(laid)
         position, sigma = np.full(count, np.nan), np.full(count, np.nan)
         status = np.zeros(count, np.uint8)
@@ -357,11 +357,11 @@ def features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging, budget
     joined = [np.concatenate(each) for each in zip(*(part[:-1] for part in parts), strict=True)]
     rulers = Candidates._make([*joined, placement])
     margin = (rulers.length / 2 + imaging.shift) / imaging.pixel + imaging.width_px
-    fits = view.within(rulers.point, margin) & (rulers.length < (LONGEST - 2) * imaging.pixel)
+    fits = view.contains(rulers.point, margin) & (rulers.length < (LONGEST - 2) * imaging.pixel)
     rulers = Candidates._make([*(each[fits] for each in rulers[:-1]), placement])
     marks = marks_of(artwork, view.bounds, placement, imaging, _MOST_MARKS)
     reach = marks.radius + reach_of(marks.point, placement, imaging)
-    marks = marks.only(view.within(marks.point, reach / imaging.pixel))
+    marks = marks.only(view.contains(marks.point, reach / imaging.pixel))
     if len(rulers.sigma) + len(marks.sigma) < 3:
         raise ValueError(
             f"{len(rulers.sigma)} edges of the {artwork.side} artwork in view stand free enough for a ruler, and "

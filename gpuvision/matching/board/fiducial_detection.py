@@ -131,7 +131,7 @@ def find_marks(
         Where to run.
     """
     count = len(marks.radius)
-    inside = view.within(marks.point, marks.radius / view.scale + 2 * blur_px)
+    inside = view.contains(marks.point, marks.radius / view.scale + 2 * blur_px)
     found = FoundMarks(
         point=marks.point,
         radius=marks.radius,
@@ -161,7 +161,7 @@ def find_marks(
 
 
 def _places(point: Float64, radius: Float64, view: BoardView) -> npt.NDArray[np.float32]:
-    places = np.concatenate([view.measured(point), radius[:, None] / view.scale], axis=1)
+    places = np.concatenate([view.to_measured_pixels(point), radius[:, None] / view.scale], axis=1)
     return np.ascontiguousarray(places.astype(np.float32))
 
 
@@ -183,6 +183,6 @@ def _keep(
     straight = pixels if view.model is None else np.asarray(view.model.undistort(pixels))
     back = np.linalg.inv(view.matrix[:2, :2])
     covariance = blobs.covariance[:, :2, :2].astype(np.float64) + systematic_px**2 * np.eye(2)
-    found.image_px[which], found.seen[which] = pixels, view.places(straight)
+    found.image_px[which], found.seen[which] = pixels, view.to_plane(straight)
     found.size[which], found.status[which] = size, status
     found.covariance[which] = back @ covariance @ back.T

@@ -139,7 +139,7 @@ class LocatedBoard:
             "rulers": [
                 {
                     "point": _plain(told.point[number]),
-                    "image_px": _plain(self.view.measured(points[number])),
+                    "image_px": _plain(self.view.to_measured_pixels(points[number])),
                     "found": bool(told.found[number]),
                     "weight": _plain(told.weight[number]),
                     "residual": _plain(told.residual[number]),

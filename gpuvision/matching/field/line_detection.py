@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.ground_plane import MountedCamera
-from gpuvision.camera.image import noise_of
+from gpuvision.camera.image import estimate_pixel_noise
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device
@@ -102,10 +102,10 @@ def scan_top_view(
     edges = rulers(white, pieces, device=device)
     places = pieces[:, None, :2] + edges.position[..., None] * pieces[:, None, 2:]
     found = np.isfinite(edges.position)
-    points = view.places(places[found])
+    points = view.to_plane(places[found])
     kept = once(points, np.broadcast_to(path[:, None], found.shape)[found], np.hypot(*points.T), line_width)
     used = np.unique(path)
-    paths = np.concatenate([view.places(starts), view.places(ends - unseen)], axis=-1)
+    paths = np.concatenate([view.to_plane(starts), view.to_plane(ends - unseen)], axis=-1)
     return FloorScan(
         points=np.ascontiguousarray(points[kept], np.float32),
         sigmas=np.ascontiguousarray(view.scale * edges.sigma[found][kept], np.float32),
@@ -117,7 +117,7 @@ def scan_top_view(
 def least_edge(white: npt.NDArray[Any]) -> float:
     """Return the least edge that counts [grey levels]: 4 times the noise, and a tenth of the image's range."""
     low, high = np.percentile(white, [1, 99])
-    return max(4.0 * noise_of(white), 0.1 * float(high - low), 1e-6)
+    return max(4.0 * estimate_pixel_noise(white), 0.1 * float(high - low), 1e-6)
 
 
 def stripe_rulers(
@@ -136,7 +136,7 @@ def stripe_rulers(
         most=8,
         pairs=True,
         spacing_px=(0.4 * width_px, 3.0 * width_px),
-        noise=noise_of(white),
+        noise=estimate_pixel_noise(white),
         model=model,
     )
 
@@ -183,7 +183,7 @@ def _rays(view: BoardView, rays: int, blind: float) -> tuple[Float64, Float64]:
     turns = np.arange(rays) * (2 * math.pi / rays)
     ways = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     away = np.arange(math.ceil(0.5 * math.hypot(*view.shape)) + 2)
-    inside = view.within(view.places(view.centre_px + away[:, None, None] * ways), _MARGIN_PX)
+    inside = view.contains(view.to_plane(view.centre_px + away[:, None, None] * ways), _MARGIN_PX)
     last = np.where(inside.all(axis=0), len(away), np.argmin(inside, axis=0)) - 1.0
     first = blind / view.scale
     starts, ends = view.centre_px + first * ways, view.centre_px + last[:, None] * ways
@@ -264,7 +264,9 @@ def _scan_lines(camera: MountedCamera, shape: tuple[int, ...], lines: int, reach
     """Return samples of scan lines on the floor, (lines, samples, 2) [m]: rays from below the camera, and across."""
     rows, columns = shape
     grid = np.stack(np.meshgrid(np.linspace(0, columns - 1, 64), np.linspace(0, rows - 1, 64)), axis=-1)
-    seen = camera.floor(grid if camera.model is None else camera.model.undistort(grid)).reshape(-1, 2) - camera.place
+    seen = (
+        camera.to_floor(grid if camera.model is None else camera.model.undistort(grid)).reshape(-1, 2) - camera.position
+    )
     far = np.hypot(*seen.T)
     seen = seen[far <= reach]
     if not len(seen):
@@ -281,13 +283,13 @@ def _scan_lines(camera: MountedCamera, shape: tuple[int, ...], lines: int, reach
     tilts = np.linspace(nearest, farthest, 2 * lines)
     wide = np.linspace(aside.min(), aside.max(), _SAMPLES)
     across = camera.height * np.tan(tilts)[:, None, None] * np.array([c, s]) + wide[:, None] * np.array([-s, c])
-    return np.asarray(camera.place + np.concatenate([rays, across]))
+    return np.asarray(camera.position + np.concatenate([rays, across]))
 
 
 def _runs(camera: MountedCamera, floors: Float64, shape: tuple[int, ...], line_width: float) -> list[_Run]:
     """Return what the image shows of scan lines, cut where lines across them are twice as wide."""
-    pixels = camera.pixels(floors)
-    measured = camera.measured(pixels)
+    pixels = camera.to_pixels(floors)
+    measured = camera.distort(pixels)
     with np.errstate(invalid="ignore"):
         inside = (measured >= _MARGIN_PX) & (measured <= np.array(shape[::-1]) - 1 - _MARGIN_PX)
         steps = np.gradient(pixels, axis=1), np.gradient(floors, axis=1)
@@ -333,14 +335,14 @@ def _octave(
     with np.errstate(invalid="ignore"):
         found = (away >= 0.0) & (away < far[path][:, None])
     half = 0.5 * edges.spacing[found][:, None] * np.broadcast_to(pieces[:, None, 2:], places.shape)[found]
-    sides = camera.floor(places[found] - half), camera.floor(places[found] + half)
+    sides = camera.to_floor(places[found] - half), camera.to_floor(places[found] + half)
     size = np.hypot(*(sides[1] - sides[0]).T)
     good = (size > 0.4 * line_width) & (size < 3.0 * line_width)
     points = (0.5 * (sides[0] + sides[1]))[good]
     number = np.broadcast_to(path[:, None], found.shape)[found][good]
     kept = once(points, number, away[found][good], line_width)
     per_px = (size / edges.spacing[found])[good]
-    ends = [camera.floor(starts + room[:, which, None] * ways) for which in (2, 3)]
+    ends = [camera.to_floor(starts + room[:, which, None] * ways) for which in (2, 3)]
     whole = room[:, 3] > room[:, 2]
     return FloorScan(
         points=np.ascontiguousarray(points[kept], np.float32),

@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gpuvision.camera.patterns.grid_polynomial import GridPolynomial, on_grid
-from gpuvision.camera.patterns.pattern import grey_image, localisation_noise, nan_median, trimmed
+from gpuvision.camera.patterns.pattern import finder_image, localisation_noise, nan_median, trimmed
 from reference.patterns import view
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_grey_of_a_colour_is_opencvs(dtype: type, rng: np.random.Generator) -> None:
     image = rng.integers(0, 200, (5, 7, 3)).astype(dtype)
-    assert np.array_equal(grey_image(image), cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32))
-    assert np.array_equal(grey_image(image[..., 0]), image[..., 0].astype(np.float32))
+    assert np.array_equal(finder_image(image), cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32))
+    assert np.array_equal(finder_image(image[..., 0]), image[..., 0].astype(np.float32))
 
 
 @pytest.mark.parametrize(
@@ -27,20 +27,20 @@ def test_grey_of_a_colour_is_opencvs(dtype: type, rng: np.random.Generator) -> N
 )
 def test_other_types_are_refused(image: object) -> None:
     with pytest.raises(TypeError, match="expected an array of uint8, uint16 or float32"):
-        grey_image(image)  # type: ignore[arg-type]
+        finder_image(image)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("shape", [(4,), (4, 4, 4), (4, 4, 1), (0, 4), (4, 0, 3), ()])
 def test_other_shapes_are_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="expected \\(height, width\\)"):
-        grey_image(np.zeros(shape, np.uint8))
+        finder_image(np.zeros(shape, np.uint8))
 
 
 def test_pixels_that_are_no_numbers_are_refused() -> None:
     image = np.ones((4, 4), np.float32)
     image[1, 2:] = np.nan, np.inf
     with pytest.raises(ValueError, match="2 pixels that are no finite numbers"):
-        grey_image(image)
+        finder_image(image)
 
 
 @pytest.mark.parametrize(("rows", "columns", "within"), [(60, 60, 0.05), (6, 9, 0.35)])

@@ -183,17 +183,17 @@ def _newton(point, lens, corners, normals, x, y):  # type: ignore[no-untyped-def
 
 
 def _facets(device: Device, samples: int) -> Case:
-    scene, sight, lit = _box_scene()
+    scene, view, lit = _box_scene()
     materials = (
         Material(diffuse=Lambert(albedo=_ALBEDO)),
         Material(diffuse=Lambert(albedo=0.0), mirror=_SHARE),
     )
-    mirrors = Mirrors(sight=sight, scene=scene, materials=materials, device=device)
+    mirrors = Mirrors(view=view, scene=scene, materials=materials, device=device)
     embree = EmbreeScene()
     TriangleMesh(embree, scene.corners.astype(np.float32))
 
     def peer() -> Exposure:
-        return _by_samples(scene, sight, lit, embree, samples)
+        return _by_samples(scene, view, lit, embree, samples)
 
     ours, theirs = mirrors.seen(lit, 0.0).total(), peer().total()
     lit_up = ours > 0.0
@@ -224,9 +224,9 @@ def _box_scene() -> tuple[Scene, SensorView, LitLine]:
     )
     edges = np.linspace(-6e-3, 6e-3, 257)
     lens = (float(_LENS[0]), float(_LENS[1]), float(_LENS[2]))
-    sight = SensorView(triangulation=geometry, transport=transport, lens=lens, u_edges=edges, v_edges=edges)
+    view = SensorView(triangulation=geometry, transport=transport, lens=lens, u_edges=edges, v_edges=edges)
     scene = Scene(corners, upright.astype(np.int32))
-    return scene, sight, LightSheet(transport=transport, g_limits=(-0.025, 0.025)).lit(scene, 0.0)
+    return scene, view, LightSheet(transport=transport, g_limits=(-0.025, 0.025)).lit(scene, 0.0)
 
 
 def _turned(angle: float) -> Array:
@@ -236,7 +236,7 @@ def _turned(angle: float) -> Array:
     return turn
 
 
-def _by_samples(scene: Scene, sight: SensorView, lit: LitLine, embree: Any, samples: int) -> Exposure:
+def _by_samples(scene: Scene, view: SensorView, lit: LitLine, embree: Any, samples: int) -> Exposure:
     """Return the light of samples of lit segments in mirrors: images, and rays for both ways of each."""
     assert scene.material is not None
     dull = scene.material[lit.triangle] == 0
@@ -244,7 +244,7 @@ def _by_samples(scene: Scene, sight: SensorView, lit: LitLine, embree: Any, samp
     points = (lit.ends[dull, :1] + share * (lit.ends[dull, 1:] - lit.ends[dull, :1])).reshape(-1, 3)
     normals, each = np.repeat(lit.normals[dull], samples, axis=0), np.repeat((lit.power * lit.lengths)[dull], samples)
     mirrors = scene.corners[scene.material == 1]
-    planes, total = planes_of(mirrors), sight.dark()
+    planes, total = planes_of(mirrors), view.dark()
     for corners, plane in zip(mirrors, planes, strict=True):
         normal, up, lens_up = plane[:3], points @ plane[:3] - plane[3], _LENS @ plane[:3] - plane[3]
         front = np.flatnonzero(up * lens_up > 0.0)
@@ -260,9 +260,9 @@ def _by_samples(scene: Scene, sight: SensorView, lit: LitLine, embree: Any, samp
         free[free] = _free(embree, spot[free], points[row[free]])
         free[free] = _free(embree, spot[free], np.broadcast_to(_LENS, (int(free.sum()), 3)))
         row, image, cosine = row[free], image[free], cosine[free]
-        power = _SHARE * _ALBEDO / np.pi / samples * each[row] * cosine * sight.received(image)
-        u, v = sight.project(image).T
-        total = total + sight.deposit(u, v, power)
+        power = _SHARE * _ALBEDO / np.pi / samples * each[row] * cosine * view.received(image)
+        u, v = view.project(image).T
+        total = total + view.deposit(u, v, power)
     return total
 
 

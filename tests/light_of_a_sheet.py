@@ -20,7 +20,9 @@ TRANSPORT = StraightTransport(step=1e-4)
 GREY = Material(diffuse=Lambert(albedo=0.5))
 
 
-def sight(*, scale: float = 1.0, bins: int = 12, samples: int = 8, lens: Lens | None = None, **more: Any) -> SensorView:
+def sensor_view(
+    *, scale: float = 1.0, bins: int = 12, samples: int = 8, lens: Lens | None = None, **more: Any
+) -> SensorView:
     """A lens beside the sheet, 0.15 m up; ``scale`` takes it farther, its focal distance along: the image stays."""
     baseline, stand_off, focal = 0.08 * scale, 0.15 * scale, 0.04 * scale
     geometry = Triangulation.from_stand_off(
@@ -40,7 +42,7 @@ def light_of(corners: Any, materials: Any = (GREY,), *, seen_by: SensorView | No
     values = {key: more.pop(key) for key in ("sub_sheets", "device") if key in more}
     scene = corners if isinstance(corners, Scene) else Scene(corners)
     sheet = LightSheet(transport=TRANSPORT, **more)
-    return DirectLight(sight=seen_by or sight(), scene=scene, materials=materials, sheet=sheet, **values)
+    return DirectLight(view=seen_by or sensor_view(), scene=scene, materials=materials, sheet=sheet, **values)
 
 
 def quad(a: Any, b: Any, c: Any, d: Any) -> np.ndarray:

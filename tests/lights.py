@@ -16,7 +16,7 @@ from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 LENGTH, PITCH, STRIPS = 6e-3, 1e-4, 5
 
 
-def psd_sight(bins: int = 60, strips: int = STRIPS) -> SensorView:
+def psd_view(bins: int = 60, strips: int = STRIPS) -> SensorView:
     """Return strips of 6 mm beside a sheet that shines straight down."""
     half, v = 0.5 * LENGTH, PITCH * (np.arange(strips + 1) - 0.5 * strips)
     triangulation = Triangulation.from_stand_off(
@@ -28,18 +28,18 @@ def psd_sight(bins: int = 60, strips: int = STRIPS) -> SensorView:
     )
 
 
-def strip_axes(sight: SensorView) -> SampleAxes:
-    return SampleAxes(sample_origin=float(sight.v_middles[0]), sample_pitch=PITCH)
+def strip_axes(view: SensorView) -> SampleAxes:
+    return SampleAxes(sample_origin=float(view.v_middles[0]), sample_pitch=PITCH)
 
 
-def psd(sight: SensorView | None = None, *, readout: dict | None = None, **more) -> PsdSimulator:
-    sight = psd_sight() if sight is None else sight
+def psd(view: SensorView | None = None, *, readout: dict | None = None, **more) -> PsdSimulator:
+    view = psd_view() if view is None else view
     return PsdSimulator(
-        sight=sight, readout=PsdReadout(strip_length=LENGTH, **{"axes": strip_axes(sight), **(readout or {})}), **more
+        view=view, readout=PsdReadout(strip_length=LENGTH, **{"axes": strip_axes(view), **(readout or {})}), **more
     )
 
 
-def camera_sight(rows: int = 64, columns: int = 8) -> SensorView:
+def camera_view(rows: int = 64, columns: int = 8) -> SensorView:
     """Return a camera's columns beside the same sheet, 10 um pixels."""
     axes = [10e-6 * (np.arange(count + 1) - 0.5 * count) for count in (rows, columns)]
     triangulation = Triangulation.from_stand_off(
@@ -57,27 +57,27 @@ def camera_sight(rows: int = 64, columns: int = 8) -> SensorView:
     )
 
 
-def pixel_axes(sight: SensorView) -> SampleAxes:
+def pixel_axes(view: SensorView) -> SampleAxes:
     return SampleAxes(
-        position_origin=float(sight.u_middles[0]),
+        position_origin=float(view.u_middles[0]),
         position_pitch=10e-6,
-        sample_origin=float(sight.v_middles[0]),
+        sample_origin=float(view.v_middles[0]),
         sample_pitch=10e-6,
     )
 
 
-def camera(sight: SensorView | None = None, *, readout: dict | None = None, **more) -> CameraSimulator:
-    sight = camera_sight() if sight is None else sight
-    return CameraSimulator(sight=sight, readout=LineReadout(**{"axes": pixel_axes(sight), **(readout or {})}), **more)
+def camera(view: SensorView | None = None, *, readout: dict | None = None, **more) -> CameraSimulator:
+    view = camera_view() if view is None else view
+    return CameraSimulator(view=view, readout=LineReadout(**{"axes": pixel_axes(view), **(readout or {})}), **more)
 
 
-def gaussian(sight: SensorView, u, power, sigma: float) -> Exposure:
+def gaussian(view: SensorView, u, power, sigma: float) -> Exposure:
     """Return spots of a Gaussian profile, exact in every bin: u and power broadcast to (..., samples)."""
     u, power = np.broadcast_arrays(np.asarray(u, float), np.asarray(power, float))
-    u, power = (np.array(np.broadcast_to(each, (*u.shape[:-1], sight.samples)))[..., None] for each in (u, power))
-    x = (sight.u_edges - u) / sigma
+    u, power = (np.array(np.broadcast_to(each, (*u.shape[:-1], view.samples)))[..., None] for each in (u, power))
+    x = (view.u_edges - u) / sigma
     share = np.diff(ndtr(x), axis=-1)
     # The far side's differences of shares near 1 would cancel.
     share = np.where(x[..., :-1] > 0.0, -np.diff(ndtr(-x), axis=-1), share)
     first = -sigma * np.diff(np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), axis=-1)
-    return Exposure(power * share, power * (first + (u - sight.u_middles) * share))
+    return Exposure(power * share, power * (first + (u - view.u_middles) * share))

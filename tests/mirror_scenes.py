@@ -18,7 +18,7 @@ from gpuvision.simulation.transport.mirrors import Mirrors
 LENS = (0.0, 0.08, 0.15)
 
 
-def sight(samples: int = 120, bins: int = 240) -> SensorView:
+def sensor_view(samples: int = 120, bins: int = 240) -> SensorView:
     """Return a sensor of 12 mm x 12 mm that sees some 50 mm of the sheet, from 80 mm beside it and 150 mm above."""
     geometry = Triangulation.from_stand_off(
         baseline=LENS[1],
@@ -38,7 +38,7 @@ def sight(samples: int = 120, bins: int = 240) -> SensorView:
 
 def mirrors_of(scene: Scene, materials: Sequence[Material], device: Device, **more: Any) -> Mirrors:
     """Return the mirrors of a scene before that sensor."""
-    return Mirrors(sight=more.pop("sight", sight()), scene=scene, materials=materials, device=device, **more)
+    return Mirrors(view=more.pop("view", sensor_view()), scene=scene, materials=materials, device=device, **more)
 
 
 def quad(*corners: Sequence[float]) -> list[list[Sequence[float]]]:

@@ -61,7 +61,7 @@ def sheet_of(sensor: Sensor) -> LightSheet:
     )
 
 
-def sight_of(sensor: Sensor) -> SensorView:
+def sensor_view_of(sensor: Sensor) -> SensorView:
     """Return what the sensor sees: a PSD's strips, as wide as they lie apart, or a camera's columns of pixels.
 
     Raises
@@ -102,7 +102,7 @@ def floor_of(sensor: Sensor) -> float:
     return grey * light.full_well / _CODES * ELECTRON / (light.responsivity * light.exposure)
 
 
-def simulator_of(sensor: Sensor, sight: SensorView, mask: Mask | None = None) -> PsdSimulator | CameraSimulator:
+def simulator_of(sensor: Sensor, view: SensorView, mask: Mask | None = None) -> PsdSimulator | CameraSimulator:
     """Return what makes readings of the light.
 
     Raises
@@ -113,7 +113,7 @@ def simulator_of(sensor: Sensor, sight: SensorView, mask: Mask | None = None) ->
     light, readout = light_of(sensor), sensor.readout
     if isinstance(readout, PsdReadout):
         return PsdSimulator(
-            sight=sight,
+            view=view,
             readout=readout,
             responsivity=light.responsivity,
             ambient=light.ambient,
@@ -122,7 +122,7 @@ def simulator_of(sensor: Sensor, sight: SensorView, mask: Mask | None = None) ->
             codes=readout.ampere != 1.0,
         )
     return CameraSimulator(
-        sight=sight,
+        view=view,
         readout=readout,
         exposure_time=light.exposure,
         responsivity=light.responsivity,

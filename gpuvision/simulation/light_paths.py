@@ -51,7 +51,7 @@ class LightPaths:
 
     Parameters
     ----------
-    sight, sheet
+    view, sheet
         The sensor, and its sheet of light, over the same transport.
     scene, materials
         What is there; a material for every number in `Scene.material`.
@@ -85,7 +85,7 @@ class LightPaths:
         What the sensor sees of the scene.
     """
 
-    sight: SensorView
+    view: SensorView
     sheet: LightSheet
     scene: Scene
     materials: Sequence[Material]
@@ -109,16 +109,16 @@ class LightPaths:
                 raise ValueError(f"unknown path {path!r}, expected some of {', '.join(PATHS)}")
         device = Device.best() if self.device is None else self.device
         object.__setattr__(self, "device", device)
-        lines = ViewRays(sight=self.sight, scene=self.scene, materials=self.materials, nodes=self.nodes, device=device)
+        lines = ViewRays(view=self.view, scene=self.scene, materials=self.materials, nodes=self.nodes, device=device)
         direct = DirectLight(
-            sight=self.sight,
+            view=self.view,
             scene=self.scene,
             materials=self.materials,
             sheet=self.sheet,
             sub_sheets=self.sub_sheets,
             device=device,
         )
-        mirrors = Mirrors(sight=self.sight, scene=self.scene, materials=self.materials, device=device)
+        mirrors = Mirrors(view=self.view, scene=self.scene, materials=self.materials, device=device)
         planned = ClusteredIrradiance(scene=self.scene, tolerance=self.tolerance, device=device)
         object.__setattr__(self, "_planned", planned)
         object.__setattr__(self, "_direct", direct)
@@ -138,7 +138,7 @@ class LightPaths:
         found = []
         for k, L in enumerate(places):
             exposures = {
-                name: self.sight.blurred(Exposure(each.power[k], each.moment[k]), self.blur)
+                name: self.view.blurred(Exposure(each.power[k], each.moment[k]), self.blur)
                 for name, each in straight.items()
                 if name in self.paths or name not in PATHS
             }
@@ -151,10 +151,10 @@ class LightPaths:
         account = {"segments": float(len(lit.power)), "power": lit.total()}
         if "diffuse-specular" in self.paths and self._mirrors.there_are_any:
             mirrored = self._mirrors.exposure(lit, L, self.sheet)
-            exposures["diffuse-specular"] = self.sight.blurred(mirrored, self.blur)
+            exposures["diffuse-specular"] = self.view.blurred(mirrored, self.blur)
         if {"diffuse-diffuse", "bounces"} & set(self.paths):
             seen, segments = self.lines.surface(L), self._diffuse(lit)
-            reading = StripReading.of(self.sight, exposures["direct"], floor=self.floor)
+            reading = StripReading.of(self.view, exposures["direct"], floor=self.floor)
             remaining = self.tolerance
             if self._bounces is not None:
                 choice = choose_paths({"bounces": reading.worst(self._most_by_bounces(segments))}, self.tolerance)
@@ -179,12 +179,12 @@ class LightPaths:
         """Return the most power that the sensor can get of light that went between surfaces more than once."""
         sent = float(segments.exitance @ np.linalg.norm(segments.ends[:, 1] - segments.ends[:, 0], axis=1))
         corners = self.scene.corners.reshape(-1, 3)
-        lens = self.sight.lens_at(0.0)
+        lens = self.view.lens_at(0.0)
         # The nearest that the part can come to the lens, wherever the sheet stands on it.
         across = corners - lens
-        across -= np.outer(across @ np.array(self.sight.transport.direction), self.sight.transport.direction)
+        across -= np.outer(across @ np.array(self.view.transport.direction), self.view.transport.direction)
         nearest = float(np.linalg.norm(across, axis=1).min(initial=np.inf))
-        opening = 0.25 * np.pi * self.sight.aperture**2
+        opening = 0.25 * np.pi * self.view.aperture**2
         solid_angle = min(opening / nearest**2, 2.0 * np.pi) if nearest > 0.0 else 2.0 * np.pi
         return bounce_power(sent, max((each.albedo for each in self.materials), default=0.0), solid_angle)
 

@@ -24,7 +24,7 @@ from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import replacing
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.sensor.simulated import floor_of, light_of, sheet_of, sight_of
+from gpuvision.sensor.simulated import floor_of, light_of, sensor_view_of, sheet_of
 from gpuvision.simulation.light_paths import LightPaths
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.scene import Scene
@@ -227,7 +227,7 @@ def light_paths(task: Task, device: Device) -> LightPaths:
     """Return what computes the light of a task's profiles."""
     light = light_of(task.sensor)
     return LightPaths(
-        sight=sight_of(task.sensor),
+        view=sensor_view_of(task.sensor),
         sheet=sheet_of(task.sensor),
         scene=task.part,
         materials=task.materials,

@@ -25,7 +25,7 @@ from gpuvision.plots.simulation import draw_causes, draw_errors
 from gpuvision.ranging.range_image import RangePoints, StraightTransport
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.sensor.simulated import light_of, sight_of, simulator_of
+from gpuvision.sensor.simulated import light_of, sensor_view_of, simulator_of
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution, attribute_errors
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
@@ -263,10 +263,10 @@ def simulate(
     start = time.perf_counter()
     computed = compute_missing(store, device=device, scheduler=scheduler, progress=progress)
     lit = time.perf_counter()
-    sight = sight_of(task.sensor)
-    found = optimise_mask(sight, *_whole_light(store, sight.samples * sight.bins)) if mask == "best" else None
+    view = sensor_view_of(task.sensor)
+    found = optimise_mask(view, *_whole_light(store, view.samples * view.bins)) if mask == "best" else None
     before = found.mask if found is not None else mask if isinstance(mask, Mask) else None
-    artifacts, account = _explained(store, simulator_of(task.sensor, sight, before), seed, device)
+    artifacts, account = _explained(store, simulator_of(task.sensor, view, before), seed, device)
     points = _points(task, artifacts.reading, device)
     if task.sensor.output.ambiguous == "drop":
         artifacts = artifacts.without(Status.AMBIGUOUS)
@@ -305,7 +305,7 @@ def recorded(
     """
     store = BlockStore(Path(folder), task)
     compute_missing(store, device=device)
-    simulator = simulator_of(task.sensor, sight_of(task.sensor), mask)
+    simulator = simulator_of(task.sensor, sensor_view_of(task.sensor), mask)
     record = simulator.currents if isinstance(simulator, PsdSimulator) else simulator.frames
     parts, first = [], 0
     for block in store:

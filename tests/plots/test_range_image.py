@@ -8,7 +8,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from gpuvision import Status
-from gpuvision.ranging import picture
+from gpuvision.plots import range_image as picture
 from gpuvision.ranging.regrid import Grid, HeightMap
 
 GRID = Grid(left=0.0, top=0.4, cell_x=0.002, cell_y=0.002, columns=250, rows=200)

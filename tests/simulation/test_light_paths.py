@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from simulation.test_sight import sight
 
 from gpuvision.simulation.errors.range_error import StripReading
 from gpuvision.simulation.light_paths import LightPaths
@@ -13,6 +12,7 @@ from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.illumination import LightSheet
+from sensor_views import sensor_view
 
 GREY = Material(diffuse=Lambert(albedo=0.5))
 PATHS = ("direct", "diffuse-diffuse")
@@ -37,9 +37,9 @@ def trough(facets: int) -> Scene:
 
 
 def paths(scene, device, **more):
-    one = sight()
+    one = sensor_view()
     sheet = LightSheet(transport=one.transport, power=3.0, g_limits=(-0.02, 0.05))
-    values = {"sight": one, "sheet": sheet, "scene": scene, "materials": [GREY], "paths": PATHS, "device": device}
+    values = {"view": one, "sheet": sheet, "scene": scene, "materials": [GREY], "paths": PATHS, "device": device}
     return LightPaths(**(values | more))
 
 
@@ -81,7 +81,7 @@ def test_scene_and_sensor_may_move_together(device):
 
 def test_light_is_proportional_to_power_and_albedo(device):
     one = paths(corner(), device).profile(0.0).exposures
-    sheet = LightSheet(transport=sight().transport, power=6.0, g_limits=(-0.02, 0.05))
+    sheet = LightSheet(transport=sensor_view().transport, power=6.0, g_limits=(-0.02, 0.05))
     white = Material(diffuse=Lambert(albedo=1.0))
     more = paths(corner(), device, sheet=sheet, materials=[white]).profile(0.0).exposures
     np.testing.assert_allclose(more["direct"].power, 4.0 * one["direct"].power, rtol=1e-12)
@@ -115,9 +115,9 @@ def test_what_was_not_asked_for_is_not_there(device):
 
 @pytest.mark.parametrize("tolerance", [1e-7, 1e-5, 1e-3])
 def test_a_tolerance_is_kept(device, tolerance):
-    one = sight(u_edges=np.linspace(-3e-3, 3e-3, 129), v_edges=np.linspace(-6e-3, 6e-3, 33))
-    exact = paths(trough(160), device, sight=one).profile(0.0)
-    about = paths(trough(160), device, sight=one, tolerance=tolerance).profile(0.0)
+    one = sensor_view(u_edges=np.linspace(-3e-3, 3e-3, 129), v_edges=np.linspace(-6e-3, 6e-3, 33))
+    exact = paths(trough(160), device, view=one).profile(0.0)
+    about = paths(trough(160), device, view=one, tolerance=tolerance).profile(0.0)
     slope = StripReading.of(one, exact.exposures["direct"]).slope
 
     def place(profile):

@@ -223,7 +223,7 @@ def attribute_errors(
     behind = simulator.light(exposures)
     if chosen == "moments":
         clean = reading if seed is None else simulator.read(exposures, device=device)
-        causes = _by_moments(simulator.sight, behind, truth, clean, detail)
+        causes = _by_moments(simulator.view, behind, truth, clean, detail)
     else:
         causes = _by_removal(simulator, behind, truth, detail, device)
     error = reading.h - truth.h
@@ -282,12 +282,12 @@ def _has_variants(light: Mapping[str, Exposure]) -> bool:
 
 
 def _by_moments(
-    sight: SensorView, light: Mapping[str, Exposure], truth: Truth, clean: Reading, detail: bool
+    view: SensorView, light: Mapping[str, Exposure], truth: Truth, clean: Reading, detail: bool
 ) -> dict[str, Float64]:
-    true_u, _ = height_slope(sight, truth)
-    edges = sight.u_edges
+    true_u, _ = height_slope(view, truth)
+    edges = view.u_edges
     total = lit_by(light).total()
-    slope = height_secant(sight.triangulation, true_u, clean.position, sight.v_middles)
+    slope = height_secant(view.triangulation, true_u, clean.position, view.v_middles)
     with np.errstate(invalid="ignore", divide="ignore"):
         share = slope / total
 
@@ -298,7 +298,7 @@ def _by_moments(
         causes: dict[str, Float64] = {}
         direct = moved("direct") if "direct" in light else np.zeros(total.shape)
         if _has_variants(light):
-            causes |= _direct_causes(sight, light, light["direct"].total() * share)
+            causes |= _direct_causes(view, light, light["direct"].total() * share)
             causes["shape"] = direct - causes["occlusion"] - causes["reflectivity"]
         else:
             causes["shape"] = direct
@@ -308,12 +308,12 @@ def _by_moments(
     return {name: causes[name] for name in (*CAUSES, *_SECONDARY) if name in causes}
 
 
-def _direct_causes(sight: SensorView, light: Mapping[str, Exposure], weight: Float64) -> dict[str, Float64]:
+def _direct_causes(view: SensorView, light: Mapping[str, Exposure], weight: Float64) -> dict[str, Float64]:
     """Return what hiding and uneven reflection do to the direct light's centre, either before the other, averaged."""
     centre = {}
     for name in ("direct", *_VARIANTS):
         each = light[name].total()
-        centre[name] = np.where(each > 0.0, light[name].first_moment(sight.u_edges) / each, np.nan)
+        centre[name] = np.where(each > 0.0, light[name].first_moment(view.u_edges) / each, np.nan)
     hidden = (centre["direct"] - centre[OPEN]) + (centre[EVEN] - centre[EVEN_OPEN])
     uneven = (centre["direct"] - centre[EVEN]) + (centre[OPEN] - centre[EVEN_OPEN])
     return {

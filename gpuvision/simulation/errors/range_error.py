@@ -64,7 +64,7 @@ class StripReading:
 
     @classmethod
     def of(
-        cls, sight: SensorView, exposure: Exposure, *, floor: float = 0.0, shift: npt.ArrayLike = math.inf
+        cls, view: SensorView, exposure: Exposure, *, floor: float = 0.0, shift: npt.ArrayLike = math.inf
     ) -> StripReading:
         """Return what the direct light of a profile makes of a sensor's strips.
 
@@ -73,20 +73,20 @@ class StripReading:
 
         Parameters
         ----------
-        sight, exposure
+        view, exposure
             The sensor, and direct light on it, (samples, bins).
         floor, shift
             As of `StripReading`.
         """
         power = exposure.total()
-        u, v = np.broadcast_arrays(sight.u_edges, sight.v_middles[:, None])
-        height = sight.sheet_coordinates(sight.points_in_sheet(u, v))[..., 1]
-        slope = np.abs(np.diff(height, axis=1) / np.diff(sight.u_edges))
+        u, v = np.broadcast_arrays(view.u_edges, view.v_middles[:, None])
+        height = view.sheet_coordinates(view.points_in_sheet(u, v))[..., 1]
+        slope = np.abs(np.diff(height, axis=1) / np.diff(view.u_edges))
         return cls(
             power=power,
-            moment=exposure.first_moment(sight.u_edges),
+            moment=exposure.first_moment(view.u_edges),
             slope=np.where(np.isfinite(slope), slope, 0.0).max(axis=1),
-            limits=(sight.u_edges[0], sight.u_edges[-1]),
+            limits=(view.u_edges[0], view.u_edges[-1]),
             floor=floor,
             shift=shift,
         )

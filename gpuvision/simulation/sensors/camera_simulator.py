@@ -34,14 +34,14 @@ _MOST_ELECTRONS = 1e15
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraSimulator:
-    """A camera beside a sheet of light: every sample of its sight is a profile of the frame, every bin a pixel.
+    """A camera beside a sheet of light: every sample of its view is a profile of the frame, every bin a pixel.
 
     Parameters
     ----------
-    sight
+    view
         Its bins along u are the pixels of a profile.
     readout
-        How the line is read. Without a triangulation it takes the sight's.
+        How the line is read. Without a triangulation it takes the view's.
     exposure_time
         [s].
     responsivity
@@ -64,10 +64,10 @@ class CameraSimulator:
     Raises
     ------
     ValueError
-        A number is out of its range, or the sight is not one of the readout's pixels.
+        A number is out of its range, or the view is not one of the readout's pixels.
     """
 
-    sight: SensorView
+    view: SensorView
     readout: LineReadout
     exposure_time: float = 1e-3
     responsivity: float = 0.4
@@ -88,19 +88,19 @@ class CameraSimulator:
         given = self.readout
         readout = replace(
             given,
-            triangulation=given.triangulation or self.sight.triangulation,
+            triangulation=given.triangulation or self.view.triangulation,
             saturation=self._highest if given.saturation is None else given.saturation,
             outputs=None,
         )
         object.__setattr__(self, "readout", readout)
         axes = readout.axes
-        pixels = axes.position_origin + axes.position_pitch * (np.arange(self.sight.bins + 1) - 0.5)
-        if np.any(np.abs(self.sight.u_edges - np.sort(pixels)) > _SAME * abs(axes.position_pitch)):
+        pixels = axes.position_origin + axes.position_pitch * (np.arange(self.view.bins + 1) - 0.5)
+        if np.any(np.abs(self.view.u_edges - np.sort(pixels)) > _SAME * abs(axes.position_pitch)):
             raise ValueError(
-                f"CameraSimulator: the sight's bins are {self.sight.u_edges[0]:g} ... {self.sight.u_edges[-1]:g}, the "
+                f"CameraSimulator: the view's bins are {self.view.u_edges[0]:g} ... {self.view.u_edges[-1]:g}, the "
                 f"readout's pixels {pixels[0]:g} ... {pixels[-1]:g}; expected a bin for every pixel"
             )
-        check_samples(self.sight, axes.sample_origin, axes.sample_pitch)
+        check_samples(self.view, axes.sample_origin, axes.sample_pitch)
 
     @property
     def _highest(self) -> float:
@@ -108,7 +108,7 @@ class CameraSimulator:
 
     def light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
         """Return the light behind the mask by path, ambient light among it."""
-        return light_behind(self.mask, self.sight, with_ambient(self.sight, exposures, self.ambient))
+        return light_behind(self.mask, self.view, with_ambient(self.view, exposures, self.ambient))
 
     def electrons(self, exposures: Mapping[str, Exposure]) -> Float64:
         """Return how many electrons are expected in every pixel, (..., samples, bins), however many it holds."""
@@ -137,7 +137,7 @@ class CameraSimulator:
         return self._as_frames((levels * light.power).astype(np.float32))
 
     def heights(self, signal: npt.NDArray[np.float32], device: Device | None = None) -> Float64:
-        """Read a signal without noise: heights [m], (..., samples), in the sight's order."""
+        """Read a signal without noise: heights [m], (..., samples), in the view's order."""
         said = replace(self.readout, outputs=("h",))(self._expected(signal), device=device)
         step = -1 if self.readout.axes.sample_pitch < 0.0 else 1
         return np.asarray(said.h, np.float64)[..., ::step]
@@ -155,7 +155,7 @@ class CameraSimulator:
         Sigma is that of a centre of gravity over the readout's window about the reading (over all light, for method
         "whole"), of photon, read and rounding noise, where the threshold lies below the noise of dark pixels or far
         above it; other methods' differ from it. Without a seed the frames are those without noise. Samples are in the
-        sight's order.
+        view's order.
         """
         light = lit_by(self.light(exposures))
         electrons = light.power * (self.responsivity * self.exposure_time / ELECTRON)
@@ -165,7 +165,7 @@ class CameraSimulator:
         position = np.asarray(said.position, np.float64)
         u = axes.position_origin + axes.position_pitch * position
         sigma = abs(axes.position_pitch) * self._sigma(self._in_order(electrons), position)
-        return reading_of(self.sight, said, u, sigma, backward=axes.sample_pitch < 0.0)
+        return reading_of(self.view, said, u, sigma, backward=axes.sample_pitch < 0.0)
 
     def _expected(self, signal: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         return np.asarray(np.minimum(signal + np.float32(self.offset), np.float32(self._highest)))
@@ -195,13 +195,13 @@ class CameraSimulator:
         known = np.isfinite(position)
         middle = np.where(known, position, 0.0)
         if self.readout.method == "whole":
-            at = np.broadcast_to(np.arange(self.sight.bins), electrons.shape)
+            at = np.broadcast_to(np.arange(self.view.bins), electrons.shape)
             inside = np.ones(electrons.shape, bool)
         else:
             reach = np.arange(-self.readout.window, self.readout.window + 1)
             at = np.rint(middle)[..., None].astype(np.intp) + reach
-            inside = (at >= 0) & (at < self.sight.bins)
-            electrons = np.take_along_axis(electrons, np.clip(at, 0, self.sight.bins - 1), axis=-1)
+            inside = (at >= 0) & (at < self.view.bins)
+            electrons = np.take_along_axis(electrons, np.clip(at, 0, self.view.bins - 1), axis=-1)
         held = np.minimum(electrons, self.full_well)
         signal = np.where(inside, np.maximum(held + (self.offset - self.readout.threshold) / self.gain, 0.0), 0.0)
         # Samples that the threshold takes away have no say.

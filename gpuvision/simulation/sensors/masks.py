@@ -66,12 +66,12 @@ class Mask:
             object.__setattr__(self, "transmission", shares)
 
     @classmethod
-    def about(cls, sight: SensorView, truth: Truth, reach: float) -> Mask:
+    def about(cls, view: SensorView, truth: Truth, reach: float) -> Mask:
         """Return the mask that follows an expected profile: windows up to so much above and below it.
 
         Parameters
         ----------
-        sight
+        view
             Of the sensor.
         truth
             Expected points, (samples,) or (profiles, samples). Where there is none the mask is closed.
@@ -85,12 +85,12 @@ class Mask:
         """
         if not finite(reach, "reach") > 0.0:
             raise ValueError(f"reach is {reach:g} m, expected a number > 0")
-        u, _ = height_slope(sight, truth)
-        low, high = sight.u_edges[0], sight.u_edges[-1]
+        u, _ = height_slope(view, truth)
+        low, high = view.u_edges[0], view.u_edges[-1]
         ends = np.stack([u, u], axis=-1)
         rise = np.array([-reach, reach])
         for _ in range(_ROUNDS):
-            slope = height_secant(sight.triangulation, u[..., None], ends, sight.v_middles[:, None])
+            slope = height_secant(view.triangulation, u[..., None], ends, view.v_middles[:, None])
             with np.errstate(invalid="ignore", divide="ignore"):
                 ends = np.clip(u[..., None] + rise / slope, low, high)
         ends.sort(axis=-1)
@@ -185,11 +185,11 @@ def _through(exposure: Exposure, windows: Float64, edges: Float64) -> Exposure:
     return Exposure(power, moment)
 
 
-def light_behind(mask: Mask | None, sight: SensorView, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
+def light_behind(mask: Mask | None, view: SensorView, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
     """Return what a mask lets pass of every path; None is no mask."""
     if mask is None:
         return dict(exposures)
-    return {name: mask.apply(each, sight.u_edges) for name, each in exposures.items()}
+    return {name: mask.apply(each, view.u_edges) for name, each in exposures.items()}
 
 
 class MaskPlan(NamedTuple):
@@ -213,7 +213,7 @@ class MaskPlan(NamedTuple):
 
 
 def optimise_mask(
-    sight: SensorView,
+    view: SensorView,
     exposures: Mapping[str, Exposure],
     truth: Truth,
     *,
@@ -229,7 +229,7 @@ def optimise_mask(
 
     Parameters
     ----------
-    sight
+    view
         Of the sensor.
     exposures
         Light by path, each (profiles, samples, bins), without a mask. "direct" is the valid light.
@@ -264,16 +264,16 @@ def optimise_mask(
     light = lit_by(exposures)
     if light.power.ndim != 3 or np.shape(truth.h) != light.power.shape[:-1]:
         raise ValueError(f"expected light (profiles, samples, bins) and its truth, got {light.power.shape}")
-    true_u, slope = height_slope(sight, truth)
+    true_u, slope = height_slope(view, truth)
     valid = np.isfinite(true_u) & (direct.total() > 0.0)
-    ends = _admissible(sight.u_edges, direct, valid, keep, margin)
-    grouped = _Groups.of(sight, light, np.where(valid, true_u, np.nan), slope, ends, fixed)
-    shape = (sight.samples, 2) if fixed else (*light.power.shape[:-1], 2)
-    mask = Mask(windows=sight.u_edges[_best_ends(grouped, objective)].reshape(shape))
-    behind, passed = (mask.apply(each, sight.u_edges) for each in (light, direct))
+    ends = _admissible(view.u_edges, direct, valid, keep, margin)
+    grouped = _Groups.of(view, light, np.where(valid, true_u, np.nan), slope, ends, fixed)
+    shape = (view.samples, 2) if fixed else (*light.power.shape[:-1], 2)
+    mask = Mask(windows=view.u_edges[_best_ends(grouped, objective)].reshape(shape))
+    behind, passed = (mask.apply(each, view.u_edges) for each in (light, direct))
     with np.errstate(invalid="ignore", divide="ignore"):
         before, after = (
-            np.where(valid, (each.first_moment(sight.u_edges) / each.total() - true_u) * slope, np.nan)
+            np.where(valid, (each.first_moment(view.u_edges) / each.total() - true_u) * slope, np.nan)
             for each in (light, behind)
         )
         return MaskPlan(mask, before, after, np.where(valid, passed.total() / direct.total(), np.nan))
@@ -317,10 +317,10 @@ class _Groups(NamedTuple):
 
     @classmethod
     def of(
-        cls, sight: SensorView, light: Exposure, true_u: Float64, slope: Float64, ends: tuple[Index, Index], fixed: bool
+        cls, view: SensorView, light: Exposure, true_u: Float64, slope: Float64, ends: tuple[Index, Index], fixed: bool
     ) -> _Groups:
         zero = np.zeros((*light.power.shape[:-1], 1))
-        first = light.moment + light.power * sight.u_middles
+        first = light.moment + light.power * view.u_middles
         sums = [np.concatenate([zero, np.cumsum(each, axis=-1)], axis=-1) for each in (light.power, first)]
         arrays = [*sums, true_u, slope, *ends]
         if fixed:

@@ -40,12 +40,12 @@ class PsdSimulator:
 
     Parameters
     ----------
-    sight
+    view
         Its samples are the strips; its first and last edge along u are the strips' electrodes. Light beyond them does
         not count.
     readout
         How the currents are read, with the electronics' dark level, gain, load, linearity and noise, all of which are
-        put into the currents. Without a triangulation it takes the sight's. Its layout is "pairs".
+        put into the currents. Without a triangulation it takes the view's. Its layout is "pairs".
     responsivity
         Of the strips [A/W].
     ambient
@@ -60,10 +60,10 @@ class PsdSimulator:
     Raises
     ------
     ValueError
-        A number is out of its range, or the sight is not one of the readout's strips.
+        A number is out of its range, or the view is not one of the readout's strips.
     """
 
-    sight: SensorView
+    view: SensorView
     readout: PsdReadout
     responsivity: float = 0.4
     ambient: float = 0.0
@@ -75,21 +75,21 @@ class PsdSimulator:
         check_not_negative(self, "responsivity", "ambient")
         if self.readout.layout != "pairs":
             raise ValueError("PsdSimulator.readout has layout 'planar', expected 'pairs'")
-        sheet = self.readout.triangulation or self.sight.triangulation
+        sheet = self.readout.triangulation or self.view.triangulation
         noise = self.readout.noise or PsdNoise()
         limits = [self.readout.saturation, _HIGHEST_CODE * self.readout.ampere if self.codes else None]
         saturation = min((each for each in limits if each is not None), default=None)
         readout = replace(self.readout, triangulation=sheet, noise=noise, saturation=saturation, outputs=None)
         object.__setattr__(self, "readout", readout)
-        axes, edges = self.readout.axes, self.sight.u_edges
+        axes, edges = self.readout.axes, self.view.u_edges
         half = 0.5 * abs(axes.position_pitch) * self.readout.strip_length
         ends = np.array([axes.position_origin - half, axes.position_origin + half])
         if np.any(np.abs(edges[[0, -1]] - ends) > _SAME * half):
             raise ValueError(
-                f"PsdSimulator: the sight's light ends at u = {edges[0]:g} and {edges[-1]:g}, the readout's strips at "
+                f"PsdSimulator: the view's light ends at u = {edges[0]:g} and {edges[-1]:g}, the readout's strips at "
                 f"{ends[0]:g} and {ends[1]:g}; expected the same"
             )
-        check_samples(self.sight, axes.sample_origin, axes.sample_pitch)
+        check_samples(self.view, axes.sample_origin, axes.sample_pitch)
 
     def light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
         """Return the light behind the mask by path, ambient light among it unless it is demodulated away."""
@@ -101,7 +101,7 @@ class PsdSimulator:
     ) -> npt.NDArray[Any]:
         """Return the strips' currents (left, right), (..., strips, 2), in units of `readout.ampere`.
 
-        In the readout's order of the strips, which runs against the sight's where its axes' pitch is negative.
+        In the readout's order of the strips, which runs against the view's where its axes' pitch is negative.
 
         Parameters
         ----------
@@ -118,7 +118,7 @@ class PsdSimulator:
         total, place = self._centre(signal)
         generators = profile_generators(seed, first, total.shape[:-1])
         draws = np.reshape(
-            [each.standard_normal((5, self.sight.samples)) for each in generators], (*total.shape[:-1], 5, -1)
+            [each.standard_normal((5, self.view.samples)) for each in generators], (*total.shape[:-1], 5, -1)
         )
         kinds = self.readout.noise or PsdNoise()
         arriving = self._in_order(lit_by(self._arriving(exposures)))
@@ -141,13 +141,13 @@ class PsdSimulator:
         """Read a block of profiles: `currents`, then the readout on a device.
 
         Without a seed the reading is the one of the currents without noise; its sigma says what noise would do. A
-        strip without any light is LOW_SIGNAL. Samples are in the sight's order.
+        strip without any light is LOW_SIGNAL. Samples are in the view's order.
         """
         said = self._said(self.currents(exposures, seed=seed, first=first), device)
         axes = self.readout.axes
         u = axes.position_origin + axes.position_pitch * np.asarray(said.position, np.float64)
         sigma = abs(axes.position_pitch) * np.asarray(said.sigma, np.float64)
-        return reading_of(self.sight, said, u, sigma, backward=axes.sample_pitch < 0.0)
+        return reading_of(self.view, said, u, sigma, backward=axes.sample_pitch < 0.0)
 
     def signal(self, light: Exposure) -> Float64:
         """Return what light behind the mask adds to the strips' currents: their sum, and it times u, (..., strips, 2).
@@ -155,10 +155,10 @@ class PsdSimulator:
         In the readout's order of the strips.
         """
         light = self._in_order(light)
-        return self.responsivity * np.stack([light.total(), light.first_moment(self.sight.u_edges)], axis=-1)
+        return self.responsivity * np.stack([light.total(), light.first_moment(self.view.u_edges)], axis=-1)
 
     def heights(self, signal: Float64, device: Device | None = None) -> Float64:
-        """Read a signal without noise: heights [m], (..., samples), in the sight's order."""
+        """Read a signal without noise: heights [m], (..., samples), in the view's order."""
         step = -1 if self.readout.axes.sample_pitch < 0.0 else 1
         return np.asarray(self._said(self._expected(signal), device).h, np.float64)[..., ::step]
 
@@ -176,7 +176,7 @@ class PsdSimulator:
         return total, np.divide(signal[..., 1], total, out=np.zeros_like(total), where=total > 0.0)
 
     def _arriving(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
-        return light_behind(self.mask, self.sight, with_ambient(self.sight, exposures, self.ambient))
+        return light_behind(self.mask, self.view, with_ambient(self.view, exposures, self.ambient))
 
     def _in_order(self, light: Exposure) -> Exposure:
         step = -1 if self.readout.axes.sample_pitch < 0.0 else 1
@@ -192,7 +192,7 @@ class PsdSimulator:
         Ambient electrons add theirs, even where the mean of ambient light is demodulated away.
         """
         bandwidth = (self.readout.noise or PsdNoise()).bandwidth
-        about = _second_moment(light, self.sight.u_edges, place)
+        about = _second_moment(light, self.view.u_edges, place)
         variance = 2.0 * ELECTRON * bandwidth * self.responsivity * light.total()
         spread = np.sqrt(2.0 * ELECTRON * bandwidth * self.responsivity * about)
         noisy = total + np.sqrt(variance) * noise[..., 0, :]

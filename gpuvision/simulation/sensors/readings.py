@@ -75,7 +75,7 @@ class Simulator(Protocol):
     """A sensor that reads exposures: `PsdSimulator`, `CameraSimulator`."""
 
     @property
-    def sight(self) -> SensorView:
+    def view(self) -> SensorView:
         """What it sees."""
         ...
 
@@ -162,13 +162,13 @@ def _sum(parts: Sequence[Float64]) -> Float64:
     return total
 
 
-def with_ambient(sight: SensorView, exposures: Mapping[str, Exposure], power: float) -> dict[str, Exposure]:
+def with_ambient(view: SensorView, exposures: Mapping[str, Exposure], power: float) -> dict[str, Exposure]:
     """Return the light and, beside its paths, ambient light that is even along every sample: a power a sample [W].
 
     Raises
     ------
     ValueError
-        There is no path's light, or it is not of the sight's samples and bins.
+        There is no path's light, or it is not of the view's samples and bins.
     """
     if exposures.keys().isdisjoint(PATHS):
         raise ValueError(
@@ -176,13 +176,11 @@ def with_ambient(sight: SensorView, exposures: Mapping[str, Exposure], power: fl
         )
     light = dict(exposures)
     for name, each in light.items():
-        if each.power.shape[-2:] != (sight.samples, sight.bins):
-            raise ValueError(
-                f"{name}: light has shape {each.power.shape}, expected (..., {sight.samples}, {sight.bins})"
-            )
+        if each.power.shape[-2:] != (view.samples, view.bins):
+            raise ValueError(f"{name}: light has shape {each.power.shape}, expected (..., {view.samples}, {view.bins})")
     if power:
         like = light[AMBIENT] if AMBIENT in light else dark_exposure(light)
-        share = np.diff(sight.u_edges) / (sight.u_edges[-1] - sight.u_edges[0])
+        share = np.diff(view.u_edges) / (view.u_edges[-1] - view.u_edges[0])
         light[AMBIENT] = Exposure(like.power + power * share, like.moment)
     return light
 
@@ -205,41 +203,41 @@ def check_not_negative(simulator: Any, *names: str) -> None:
             raise ValueError(f"{type(simulator).__name__}.{name} is {getattr(simulator, name)}, expected 0 or more")
 
 
-def check_samples(sight: SensorView, origin: float, pitch: float) -> None:
-    """Check that a readout's axes place the samples where the sight has them.
+def check_samples(view: SensorView, origin: float, pitch: float) -> None:
+    """Check that a readout's axes place the samples where the view has them.
 
     Raises
     ------
     ValueError
         They do not.
     """
-    expected = np.sort(origin + pitch * np.arange(sight.samples))
-    if np.any(np.abs(sight.v_middles - expected) > _SAME * abs(pitch)):
+    expected = np.sort(origin + pitch * np.arange(view.samples))
+    if np.any(np.abs(view.v_middles - expected) > _SAME * abs(pitch)):
         raise ValueError(
-            f"the sight's samples lie about v = {sight.v_middles[0]:g} ... {sight.v_middles[-1]:g}, the readout's axes "
+            f"the view's samples lie about v = {view.v_middles[0]:g} ... {view.v_middles[-1]:g}, the readout's axes "
             f"place them at {expected[0]:g} ... {expected[-1]:g}; expected the same"
         )
 
 
-def reading_of(sight: SensorView, said: Any, u: Float64, sigma_u: Float64, *, backward: bool) -> Reading:
+def reading_of(view: SensorView, said: Any, u: Float64, sigma_u: Float64, *, backward: bool) -> Reading:
     """Return what a readout says as a simulator's reading.
 
     Parameters
     ----------
-    sight
+    view
         Of the sensor.
     said
         `PsdReading` or `LineReading`.
     u, sigma_u
         Its position and the standard deviation of that [sensor unit].
     backward
-        The readout's samples run against the sight's.
+        The readout's samples run against the view's.
     """
     step = -1 if backward else 1
     width = getattr(said, "width", np.full(u.shape, np.nan))
     numbers = (u, said.g, said.h, sigma_u, said.total, width)
     u, g, h, sigma_u, strength, width = (np.asarray(each, np.float64)[..., ::step] for each in numbers)
-    slope = height_secant(sight.triangulation, u, u, sight.v_middles)
+    slope = height_secant(view.triangulation, u, u, view.v_middles)
     return Reading(u, g, h, np.abs(slope) * sigma_u, strength, width, np.asarray(said.status)[..., ::step])
 
 
@@ -278,11 +276,11 @@ def height_secant(triangulation: Triangulation, u: npt.ArrayLike, other_u: npt.A
         return np.asarray(turned @ np.cross(matrix[1], matrix[2]) / scale)
 
 
-def height_slope(sight: SensorView, truth: Truth) -> tuple[Float64, Float64]:
+def height_slope(view: SensorView, truth: Truth) -> tuple[Float64, Float64]:
     """Return where true points are imaged, u, and how their height grows with it, dH/du: each (..., samples)."""
-    sensor = sight.triangulation.to_sensor(np.stack([truth.g, truth.h], axis=-1))
+    sensor = view.triangulation.to_sensor(np.stack([truth.g, truth.h], axis=-1))
     u, v = sensor[..., 0], sensor[..., 1]
-    return u, height_secant(sight.triangulation, u, u, v)
+    return u, height_secant(view.triangulation, u, u, v)
 
 
 def _lifted(triangulation: Triangulation, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Float64, Float64]:

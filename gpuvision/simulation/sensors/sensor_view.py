@@ -1,4 +1,4 @@
-"""A sensor's sight of a scene: rays from its pixels or strips, images of points, and the light that they get.
+"""A sensor's view of a scene: rays from its pixels or strips, images of points, and the light that they get.
 
 Sheet and sensor move together along the transport; everything here takes the transport L of a profile. A point is
 imaged along the ray from the lens through it: where that ray meets the sheet of light, at (G, H), is the point which

@@ -44,7 +44,7 @@ class ViewRays:
 
     Parameters
     ----------
-    sight
+    view
         The sensor.
     scene, materials
         What it sees; a material for every number in `Scene.material`.
@@ -65,7 +65,7 @@ class ViewRays:
     surface (`OrenNayar`) is taken for `Lambert`'s of the same albedo.
     """
 
-    sight: SensorView
+    view: SensorView
     scene: Scene
     materials: Sequence[Material]
     nodes: tuple[int, int] = (1, 1)
@@ -78,27 +78,27 @@ class ViewRays:
 
     def __post_init__(self) -> None:
         check_materials(self.scene, self.materials)
-        sight, (along_u, along_v) = self.sight, self.nodes
-        u, by_u = _nodes(sight.u_edges, along_u)
-        v, by_v = _nodes(sight.v_edges, along_v)
+        view, (along_u, along_v) = self.view, self.nodes
+        u, by_u = _nodes(view.u_edges, along_u)
+        v, by_v = _nodes(view.v_edges, along_v)
         # (samples, nodes along v, bins, nodes along u) to (samples, bins * nodes).
-        v, by_v = (each.reshape(sight.samples, along_v, 1, 1) for each in (v, by_v))
-        u, by_u = (each.reshape(1, 1, sight.bins, along_u) for each in (u, by_u))
-        weights = sight.etendue(u, v) * by_u * by_v / math.pi
-        rays = sight.rays(u, v)
-        n = sight.bins * along_u * along_v
+        v, by_v = (each.reshape(view.samples, along_v, 1, 1) for each in (v, by_v))
+        u, by_u = (each.reshape(1, 1, view.bins, along_u) for each in (u, by_u))
+        weights = view.etendue(u, v) * by_u * by_v / math.pi
+        rays = view.rays(u, v)
+        n = view.bins * along_u * along_v
         object.__setattr__(self, "u", np.ascontiguousarray(_side_by_side(np.broadcast_to(u, weights.shape))[0].ravel()))
-        object.__setattr__(self, "_weights", _side_by_side(weights).reshape(sight.samples, n))
-        object.__setattr__(self, "_rays", _side_by_side(rays).reshape(sight.samples, n, 6))
+        object.__setattr__(self, "_weights", _side_by_side(weights).reshape(view.samples, n))
+        object.__setattr__(self, "_rays", _side_by_side(rays).reshape(view.samples, n, 6))
         object.__setattr__(self, "_table", _table_of(self.scene, self.materials))
         device = Device.best() if self.device is None else self.device
         real = np.dtype(np.float64 if device.has_double else np.float32)
         cast = ClosestHit(scene=self.scene, precision="single")
-        object.__setattr__(self, "_closest", cast.bind(device, (sight.samples, n, 6), real))
+        object.__setattr__(self, "_closest", cast.bind(device, (view.samples, n, 6), real))
 
     def surface(self, L: float) -> SeenSurface:
         """Return what is seen at a transport L [m]."""
-        rays = self._rays + np.concatenate([L * np.array(self.sight.transport.direction), np.zeros(3)])
+        rays = self._rays + np.concatenate([L * np.array(self.view.transport.direction), np.zeros(3)])
         self._closest.inputs[0].set(rays.astype(self._closest.inputs[0].dtype))
         hits = self._closest.run()
         triangle = hits.triangle.get()
@@ -117,8 +117,8 @@ class ViewRays:
     def exposure(self, seen: SeenSurface, irradiance: Float64) -> Exposure:
         """Return what the sensor gets from the irradiance [W/m^2] of what it sees, (samples, n)."""
         power = np.where(seen.weights > 0.0, seen.weights * irradiance, 0.0)
-        shape = (self.sight.samples, self.sight.bins, -1)
-        beside = self.u.reshape(self.sight.bins, -1) - self.sight.u_middles[:, None]
+        shape = (self.view.samples, self.view.bins, -1)
+        beside = self.u.reshape(self.view.bins, -1) - self.view.u_middles[:, None]
         held = power.reshape(shape)
         return Exposure(held.sum(axis=-1), np.sum(held * beside, axis=-1))
 

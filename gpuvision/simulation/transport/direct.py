@@ -88,34 +88,34 @@ class _Lit(NamedTuple):
 class _Image(NamedTuple):
     """Where light is deposited: slabs, each of one of so many profiles."""
 
-    sight: SensorView
+    view: SensorView
     slabs: Slabs
     profile: Integers
     profiles: int
 
     def of(self, uv: Float64, spread: Float64, slab: Integers, lights: Mapping[str, Float64]) -> dict[str, Exposure]:
         """Return exposures by spots of slabs' light: their means at (u, v), spread by so much along u a sigma."""
-        sight, slabs = self.sight, self.slabs
-        sample = sight.sample_of(uv[:, 1])
+        view, slabs = self.view, self.slabs
+        sample = view.sample_of(uv[:, 1])
         on = np.flatnonzero(sample >= 0)
         sample, u, slab = sample[on], uv[on, 0], slab[on]
-        least = 1e-9 * float(np.diff(sight.u_edges).min())
+        least = 1e-9 * float(np.diff(view.u_edges).min())
         spread = np.where(np.abs(spread[on]) < least, least, spread[on])
         low, high, middle = slabs.low[slab], slabs.high[slab], slabs.middle[slab]
         reach = u + spread * (np.clip([low, high], -_BEYOND, _BEYOND) - middle)
-        first = np.maximum(np.searchsorted(sight.u_edges, reach.min(axis=0), side="right") - 1, 0)
-        last = np.minimum(np.searchsorted(sight.u_edges, reach.max(axis=0), side="left"), sight.bins)
+        first = np.maximum(np.searchsorted(view.u_edges, reach.min(axis=0), side="right") - 1, 0)
+        last = np.minimum(np.searchsorted(view.u_edges, reach.max(axis=0), side="left"), view.bins)
         count = np.maximum(last - first, 0)
         of, place = np.repeat(np.arange(len(u)), count), ranges(first, count)
         # The edges of the bins in sigmas of the sheet.
-        ends = middle[of] + (np.stack([sight.u_edges[place], sight.u_edges[place + 1]]) - u[of]) / spread[of]
+        ends = middle[of] + (np.stack([view.u_edges[place], view.u_edges[place + 1]]) - u[of]) / spread[of]
         ends = np.clip(np.sort(ends, axis=0), low[of], high[of])
         share = _between(*ends)
-        moment = (u - spread * middle)[of] - sight.u_middles[place]
+        moment = (u - spread * middle)[of] - view.u_middles[place]
         moment = moment * share + spread[of] * (_bell(ends[0]) - _bell(ends[1]))
-        row = self.profile[slab] * sight.samples + sample
-        at, per = row[of] * sight.bins + place, 1.0 / slabs.share[slab[of]]
-        shape = (self.profiles, sight.samples, sight.bins)
+        row = self.profile[slab] * view.samples + sample
+        at, per = row[of] * view.bins + place, 1.0 / slabs.share[slab[of]]
+        shape = (self.profiles, view.samples, view.bins)
         made = {}
         for name, power in lights.items():
             here = power[on][of] * per
@@ -130,7 +130,7 @@ class DirectLight:
 
     Parameters
     ----------
-    sight
+    view
         The sensor.
     scene, materials
         What is lit; a material for every number in `Scene.material`.
@@ -164,7 +164,7 @@ class DirectLight:
     The x axis of an anisotropic lobe is the scene's x axis laid onto the surface (y, on one that x stands on).
     """
 
-    sight: SensorView
+    view: SensorView
     scene: Scene
     materials: Sequence[Material]
     sheet: LightSheet
@@ -176,10 +176,10 @@ class DirectLight:
 
     def __post_init__(self) -> None:
         check_materials(self.scene, self.materials)
-        if self.sheet.transport != self.sight.transport:
-            raise ValueError("DirectLight: sheet and sight have different transports, expected the same one")
+        if self.sheet.transport != self.view.transport:
+            raise ValueError("DirectLight: sheet and view have different transports, expected the same one")
         object.__setattr__(self, "_slabs", _slabs(self.sub_sheets if self.sheet.sigma > 0.0 else 1))
-        object.__setattr__(self, "_images", Images(self.sight))
+        object.__setattr__(self, "_images", Images(self.view))
         device = Device.best() if self.device is None else self.device
         object.__setattr__(self, "_line_of_sight", LineOfSight(scene=self.scene, device=device))
 
@@ -209,7 +209,7 @@ class DirectLight:
         slabs = Slabs(*(np.concatenate([*each, np.zeros(0)]) for each in columns))
         lit = self._lit(places[profile] + self.sheet.sigma * slabs.middle, places[profile])
         lit = lit._replace(line=lit.line._replace(power=lit.line.power * slabs.share[lit.sheet]))
-        image = _Image(self.sight, slabs, profile, len(places))
+        image = _Image(self.view, slabs, profile, len(places))
         found = self._exposed(lit, image, self._visible(lit, hidden=causes), self._sent, causes=causes)
         if any(each.mirror > 0.0 for each in self.materials):
             found["specular"] += self._mirrored(lit, image)
@@ -240,7 +240,7 @@ class DirectLight:
         """Return what mirrors throw right into the lens."""
         line = lit.line
         shares = np.array([each.mirror for each in self.materials])[self._material(line)]
-        parts = specular_highlights(line, self.sheet, self.sight, 0.0)
+        parts = specular_highlights(line, self.sheet, self.view, 0.0)
         parts = parts.those(shares[parts.segment] > 0.0)
         of = parts.segment
         line = LitLine(parts.ends(line), line.normals[of], line.triangle[of], line.power[of] * shares[of])
@@ -275,25 +275,25 @@ class DirectLight:
 
     def truths_along(self, transports: npt.ArrayLike) -> Truth:
         """Return `truth` of several profiles, (profiles, samples): faster than one by one."""
-        sight, places = self.sight, np.atleast_1d(np.asarray(transports, np.float64))
+        view, places = self.view, np.atleast_1d(np.asarray(transports, np.float64))
         lit = self._lit(places, places)
         line, images = lit.line, self._images.of(lit.line.ends, 0.0)
         parts = images.in_view(self._visible(lit))
         v = images.at(parts.segment, np.stack([parts.start, parts.end]))[..., 1]
         low, high = v.min(axis=0), v.max(axis=0)
         # Half open, so that of two parts that touch one has the sample.
-        first = np.searchsorted(sight.v_middles, low, side="left")
-        count = np.maximum(np.searchsorted(sight.v_middles, high, side="left") - first, 0)
+        first = np.searchsorted(view.v_middles, low, side="left")
+        count = np.maximum(np.searchsorted(view.v_middles, high, side="left") - first, 0)
         owner, sample = np.repeat(np.arange(len(count)), count), ranges(first, count)
         mine = parts.those(owner)
-        share = images.where(mine, sight.v_middles[sample], 1)
+        share = images.where(mine, view.v_middles[sample], 1)
         points = along(line.ends[mine.segment], share)
         u = images.at(mine.segment, share)[:, 0]
-        on = (u >= sight.u_edges[0]) & (u <= sight.u_edges[-1])
+        on = (u >= view.u_edges[0]) & (u <= view.u_edges[-1])
         light = (line.power * line.lengths)[mine.segment] * (mine.end - mine.start) / (high - low)[owner]
-        slot = lit.sheet[mine.segment] * sight.samples + sample
-        found = _chosen(len(places) * sight.samples, slot, sight.sheet_coordinates(points), on, light)
-        return Truth(*(each.reshape(len(places), sight.samples) for each in found))
+        slot = lit.sheet[mine.segment] * view.samples + sample
+        found = _chosen(len(places) * view.samples, slot, view.sheet_coordinates(points), on, light)
+        return Truth(*(each.reshape(len(places), view.samples) for each in found))
 
     def _lit(self, sheets: Float64, transports: Float64) -> _Lit:
         """Return what sheets light on the side that the lens can see, each in a profile at a transport."""
@@ -301,21 +301,21 @@ class DirectLight:
         sheet = np.repeat(np.arange(len(sheets)), np.diff(first))
         moved = transports[sheet, None] * np.array(self.sheet.transport.direction)
         ends = line.ends - moved[:, None]
-        towards = np.array(self.sight.lens) - ends[:, 0]
+        towards = np.array(self.view.lens) - ends[:, 0]
         which = np.flatnonzero(np.sum(line.normals * towards, axis=1) > 0.0)
         return _Lit(line._replace(ends=ends).those(which), sheet[which], moved[which])
 
     def _visible(self, lit: _Lit, *, hidden: bool = False) -> Parts:
         line = lit.line._replace(ends=lit.line.ends + lit.moved[:, None])
-        return self._line_of_sight.parts(line, np.array(self.sight.lens) + lit.moved, hidden=hidden)
+        return self._line_of_sight.parts(line, np.array(self.view.lens) + lit.moved, hidden=hidden)
 
     def _split(self, parts: Parts, images: LineImages, line: LitLine) -> Parts:
         """Split parts at the edges of samples and bins, and where a lobe changes much."""
-        u_edges = self.sight.u_edges
+        u_edges = self.view.u_edges
         if self.sheet.sigma > 0.0:
             # Light is spread onto the sensor from beyond its ends.
             u_edges = np.concatenate([[-np.inf], u_edges, [np.inf]])
-        parts = images.split(images.split(parts, self.sight.v_edges, 1), u_edges, 0)
+        parts = images.split(images.split(parts, self.view.v_edges, 1), u_edges, 0)
         return self._split_lobes(parts, line)
 
     def _split_lobes(self, parts: Parts, line: LitLine) -> Parts:
@@ -325,7 +325,7 @@ class DirectLight:
             return parts
         width = widths[self._material(line)][parts.segment]
         ends = parts.ends(line)
-        half_way = _unit(self.sheet.towards(ends) + _unit(np.array(self.sight.lens) - ends))
+        half_way = _unit(self.sheet.towards(ends) + _unit(np.array(self.view.lens) - ends))
         turn = np.linalg.norm(half_way[:, 1] - half_way[:, 0], axis=1) / width
         count = np.clip(np.ceil(turn / _TURN), 1, _TURNS).astype(np.int64)
         owner, number = np.repeat(np.arange(len(count)), count), ranges(np.zeros_like(count), count)
@@ -340,8 +340,8 @@ class DirectLight:
     def _sent(self, line: LitLine, segment: Integers, points: Float64, arriving: Float64) -> dict[str, Float64]:
         """Return power on the sensor [W] of light that arrives at points [W], by kind of reflection."""
         normal = line.normals[segment]
-        eye = _unit(np.array(self.sight.lens) - points)
-        arriving = arriving * np.maximum(np.sum(normal * eye, axis=1), 0.0) * self.sight.received(points)
+        eye = _unit(np.array(self.view.lens) - points)
+        arriving = arriving * np.maximum(np.sum(normal * eye, axis=1), 0.0) * self.view.received(points)
         sent = {"even": arriving / math.pi, "diffuse": np.zeros(len(points)), "gloss": np.zeros(len(points))}
         material = self._material(line)[segment]
         for number in np.unique(material):

@@ -19,12 +19,12 @@ _NODES = 0.5 + 0.5 * np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)])
 _WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 
-def line_exposure(sight: SensorView, L: float, ends: Float64, strength: Strength) -> Exposure:
+def line_exposure(view: SensorView, L: float, ends: Float64, strength: Strength) -> Exposure:
     """Return the exposure by lines that are seen from end to end.
 
     Parameters
     ----------
-    sight
+    view
         The sensor, at transport ``L`` [m].
     ends
         (k, 2, 3), metres: the lines, or their images behind plane mirrors. What lies behind the lens or beyond the
@@ -39,12 +39,12 @@ def line_exposure(sight: SensorView, L: float, ends: Float64, strength: Strength
     Legendre's rule of 3 nodes integrates power and moment.
     """
     count = len(ends)
-    images = Images(sight).of(ends, L)
+    images = Images(view).of(ends, L)
     parts = images.in_view(Parts(np.arange(count), np.zeros(count), np.ones(count), np.ones(count, bool)))
-    parts = images.split(images.split(parts, sight.v_edges, 1), sight.u_edges, 0)
+    parts = images.split(images.split(parts, view.v_edges, 1), view.u_edges, 0)
     width = parts.end - parts.start
     at = parts.start + _NODES[:, None] * width
     which = np.broadcast_to(parts.segment, at.shape)
     power = _WEIGHTS[:, None] * width * strength(which.ravel(), at.ravel()).reshape(at.shape)
     places = images.at(which, at)
-    return sight.deposit(places[..., 0], places[..., 1], power)
+    return view.deposit(places[..., 0], places[..., 1], power)

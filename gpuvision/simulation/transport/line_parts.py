@@ -199,29 +199,29 @@ class Images:
 
     Parameters
     ----------
-    sight
+    view
         The sensor.
     """
 
-    def __init__(self, sight: SensorView) -> None:
-        move = sight.transport
+    def __init__(self, view: SensorView) -> None:
+        move = view.transport
         axes = np.array([move.g_axis, move.h_axis])
-        normal, to_sheet = np.cross(*axes), np.array(move.origin) - np.array(sight.lens)
+        normal, to_sheet = np.cross(*axes), np.array(move.origin) - np.array(view.lens)
         off = float(to_sheet @ normal)
         # From a ray to the sheet's (G, H, 1), and on to the sensor's (u, v, 1), but for factors.
         in_sheet = (off * np.eye(3) - np.outer(normal, to_sheet)) @ np.linalg.pinv(axes)
-        homography = np.array(sight.triangulation.homography)
-        middle = np.append(np.mean(np.array(sight.triangulation.region), axis=1), 1.0)
+        homography = np.array(view.triangulation.homography)
+        middle = np.append(np.mean(np.array(view.triangulation.region), axis=1), 1.0)
         in_front = np.sign(off) * np.sign(homography[2] @ middle)
         lifting = in_front * np.column_stack([in_sheet, normal]) @ np.linalg.inv(homography).T
-        self._sight, self._lens = sight, sight.triangulation.sensor_lens
+        self._view, self._lens = view, view.triangulation.sensor_lens
         self._lifting = lifting
         # In front of the lens, towards the sheet, this side of its horizon: all are positive.
-        self._limits = np.column_stack([np.array(sight.axis), np.sign(off) * normal, lifting[:, 2]])
+        self._limits = np.column_stack([np.array(view.axis), np.sign(off) * normal, lifting[:, 2]])
 
     def of(self, ends: Float64, L: float) -> LineImages:
         """Return the images of segments (m, 2, 3) at a transport [m]."""
-        rays = ends - self._sight.lens_at(L)
+        rays = ends - self._view.lens_at(L)
         lifted = rays @ self._lifting
         return LineImages(self._lens, self._lifting, rays @ self._limits, lifted[:, 0], lifted[:, 1] - lifted[:, 0])
 

@@ -59,7 +59,7 @@ class Mirrors:
 
     Parameters
     ----------
-    sight
+    view
         The sensor.
     scene, materials
         The surfaces; a material for every number in `Scene.material`.
@@ -85,7 +85,7 @@ class Mirrors:
     mirror between line and lens. What a curved mirror throws on is found by rays, one step apart.
     """
 
-    sight: SensorView
+    view: SensorView
     scene: Scene
     materials: Sequence[Material]
     normals: Float64 | None = None
@@ -115,7 +115,7 @@ class Mirrors:
             Where the light comes from, for what mirrors throw on; None: only what is seen in mirrors is taken.
         """
         if not self.there_are_any:
-            return self.sight.dark()
+            return self.view.dark()
         total = self.seen(lit, L)
         if sheet is None:
             return total
@@ -135,7 +135,7 @@ class Mirrors:
         shining = np.flatnonzero(exitance > 0.0)
         lit, exitance = lines_of(lit, shining), exitance[shining]
         if not len(exitance):
-            return self.sight.dark()
+            return self.view.dark()
         return self._in_planes(lit, exitance, L) + self._in_curves(lit, exitance, L)
 
     def direct(self, lit: LitLine, L: float) -> Exposure:
@@ -144,8 +144,8 @@ class Mirrors:
         shining = np.flatnonzero(exitance > 0.0)
         lit, exitance = lines_of(lit, shining), exitance[shining]
         if not len(exitance):
-            return self.sight.dark()
-        lens = self.sight.lens_at(L)
+            return self.view.dark()
+        lens = self.view.lens_at(L)
         whole = np.tile([0.0, 1.0], (len(exitance), 1))
         apex = np.broadcast_to(lens, (len(exitance), 3))
         row, share = self._visible(apex, lit.ends, np.zeros((len(exitance), 2)), whole)
@@ -160,25 +160,25 @@ class Mirrors:
     def _exposed(self, ends: Float64, normals: Float64, exitance: Float64, L: float) -> Exposure:
         """Return the exposure by diffuse lines, or their images, seen from end to end."""
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-        lens = self.sight.lens_at(L)
+        lens = self.view.lens_at(L)
 
         def strength(line: Integers, at: Float64) -> Float64:
             place = ends[line, 0] + at[:, None] * (ends[line, 1] - ends[line, 0])
             towards = lens - place
             cosine = np.sum(towards * normals[line], axis=1) / np.linalg.norm(towards, axis=1)
             intensity = exitance[line] / math.pi * np.maximum(cosine, 0.0) * length[line]
-            return np.asarray(intensity * self.sight.received(place, L))
+            return np.asarray(intensity * self.view.received(place, L))
 
-        return line_exposure(self.sight, L, ends, strength)
+        return line_exposure(self.view, L, ends, strength)
 
     # ---- plane mirrors ---------------------------------------------------------------------------------------
 
     def _in_planes(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
         if not len(self._flat):
-            return self.sight.dark()
+            return self.view.dark()
         seen = self._through_windows(lit, L)
         if not len(seen.line):
-            return self.sight.dark()
+            return self.view.dark()
         planes = self._planes[seen.mirror]
         ends = mirrored(_between(lit.ends[seen.line], seen.share), planes[:, None])
         normals = lit.normals[seen.line]
@@ -187,7 +187,7 @@ class Mirrors:
 
     def _through_windows(self, lit: LitLine, L: float) -> _Seen:
         """Return the parts of lines that the lens sees in plane mirrors, nothing in the way before or behind them."""
-        lens = self.sight.lens_at(L)
+        lens = self.view.lens_at(L)
         line, mirror, share = windows(lens, lit.ends, self._facets.corners, self._planes, *self._pairs(lit, lens))
         # The side that the light comes from faces the mirror image of the lens.
         apex = mirrored(lens, self._planes[mirror])
@@ -247,11 +247,11 @@ class Mirrors:
 
     def _in_curves(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
         if not len(self._curved):
-            return self.sight.dark()
+            return self.view.dark()
         line, share = _steps(lit.lengths, self.step)
         place = _between(lit.ends[line], share)
         move, middle = place[:, 1] - place[:, 0], place.mean(axis=1)
-        lens = self.sight.lens_at(L)
+        lens = self.view.lens_at(L)
         point, spot, spot_move, density, triangle = self._images(np.hstack([middle, move]), lens)
         origin = middle[point]
         towards = spot - origin
@@ -266,9 +266,9 @@ class Mirrors:
         intensity = exitance[source] / math.pi * cosine * np.linalg.norm(move[point], axis=1)
         # Aperture and cosine at the lens are those of the spot; the solid angle is the mirror's doing.
         square = np.sum((spot - lens) ** 2, axis=1) * density
-        power = intensity * self._share_of(triangle) * self.sight.received(spot, L) * square
+        power = intensity * self._share_of(triangle) * self.view.received(spot, L) * square
         ends = np.stack([spot - 0.5 * spot_move, spot + 0.5 * spot_move], axis=1)
-        return line_exposure(self.sight, L, ends, lambda line, at: power[line])
+        return line_exposure(self.view, L, ends, lambda line, at: power[line])
 
     def _images(self, points: Float64, lens: Float64) -> tuple[Integers, Float64, Float64, Float64, Integers]:
         """Return images of points: of which point, where, how they move, their density, on which triangle."""
@@ -330,10 +330,10 @@ class Mirrors:
     @functools.cached_property
     def step(self) -> float:
         """How far apart points of a line are that curved mirrors show [m]."""
-        middle = float(np.mean(self.sight.u_edges[[0, -1]]))
-        first, last = self.sight.points_in_sheet(middle, self.sight.v_edges[[0, -1]])
+        middle = float(np.mean(self.view.u_edges[[0, -1]]))
+        first, last = self.view.points_in_sheet(middle, self.view.v_edges[[0, -1]])
         length = float(np.linalg.norm(last - first))
-        return length / self.sight.samples / self.per_sample
+        return length / self.view.samples / self.per_sample
 
     @functools.cached_property
     def _device(self) -> Device:
@@ -368,7 +368,7 @@ class Mirrors:
 
     @functools.cached_property
     def _sides(self) -> npt.NDArray[np.int8]:
-        return outward(self.scene, self.sight.lens, self.sight.transport.direction)
+        return outward(self.scene, self.view.lens, self.view.transport.direction)
 
     @functools.cached_property
     def _is_curved(self) -> npt.NDArray[np.bool_]:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulation.test_sight import sight
 
 from gpuvision.host import Device
 from gpuvision.ranging.range_image import StraightTransport
@@ -16,7 +15,8 @@ from gpuvision.simulation.errors.range_error import StripReading
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance
-from reference import tolerance as reference
+from reference import light_clustering as reference
+from sensor_views import sensor_view
 
 
 def boxes(rng: np.random.Generator, count: int) -> Any:
@@ -182,7 +182,7 @@ def test_without_light_or_receivers_nothing_is_lit(device: Device) -> None:
 
 
 def test_a_sensor_says_how_its_readings_follow_light() -> None:
-    one = sight()
+    one = sensor_view()
     assert isinstance(one.transport, StraightTransport)
     exposure = Exposure(np.ones((one.samples, one.bins)), np.zeros((one.samples, one.bins)))
     reading = StripReading.of(one, exposure, floor=1e-3)

@@ -17,7 +17,7 @@ from gpuvision.simulation.clustering.light_clustering import BLOCK, LightCluster
 from gpuvision.simulation.clustering.light_tree import LightTree
 from gpuvision.simulation.errors.range_error import StripReading, bounce_power, choose_paths
 from gpuvision.simulation.scene.scene import Scene
-from reference import tolerance as reference
+from reference import light_clustering as reference
 
 ON_DEVICES = settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 ANYWHERE = settings(max_examples=40, deadline=None)

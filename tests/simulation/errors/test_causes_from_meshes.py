@@ -15,7 +15,7 @@ from gpuvision.simulation.sensors.readings import Truth
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet
-from lights import psd, psd_sight
+from lights import psd, psd_view
 
 SIGMA = 5e-5
 # The lens stands 80 mm beside the sheet and 150 mm above.
@@ -31,18 +31,18 @@ def flat(y0: float, y1: float, z: float = 0.0) -> list[list[tuple[float, float, 
 
 def found(scene: Scene, albedos: list[float], slabs, device: Device) -> ErrorAttribution:
     """Explain what strips read of a thick sheet at y = 0."""
-    sight = psd_sight(240)
+    view = psd_view(240)
     light = DirectLight(
-        sight=sight,
+        view=view,
         scene=scene,
         materials=[Material(diffuse=Lambert(albedo=each)) for each in albedos],
-        sheet=LightSheet(transport=sight.transport, sigma=SIGMA),
+        sheet=LightSheet(transport=view.transport, sigma=SIGMA),
         sub_sheets=slabs,
         device=device,
     )
     exposures: dict[str, Exposure] = light.exposures(0.0, causes=True)
-    level = Truth(*np.zeros((2, sight.samples)), np.zeros(sight.samples, np.uint8))
-    return attribute_errors(psd(sight), exposures, level, device=device)
+    level = Truth(*np.zeros((2, view.samples)), np.zeros(view.samples, np.uint8))
+    return attribute_errors(psd(view), exposures, level, device=device)
 
 
 def test_reflectivity_step(device: Device) -> None:

@@ -12,21 +12,21 @@ from gpuvision.simulation.errors.error_attribution import CAUSES, ErrorAttributi
 from gpuvision.simulation.sensors.readings import EVEN, EVEN_OPEN, OPEN, Truth, height_secant, sheet_point, stack
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.status import Status
-from lights import camera, camera_sight, gaussian, psd, psd_sight
+from lights import camera, camera_view, gaussian, psd, psd_view
 
 PIXEL = 10e-6
 
 
-def truth_at(sight: SensorView, u) -> Truth:
-    u = np.broadcast_to(np.asarray(u, float), sight.samples)
-    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
+def truth_at(view: SensorView, u) -> Truth:
+    u = np.broadcast_to(np.asarray(u, float), view.samples)
+    g, h = sheet_point(view.triangulation, u, view.v_middles)
     return Truth(g, h, np.where(np.isnan(h), Status.LOW_SIGNAL, 0).astype(np.uint8))
 
 
-def half_spots(sight: SensorView, u: np.ndarray, sigma: float, left: float, right: float, edge: np.ndarray) -> Exposure:
+def half_spots(view: SensorView, u: np.ndarray, sigma: float, left: float, right: float, edge: np.ndarray) -> Exposure:
     """Return a Gaussian whose light left of an edge is scaled by one factor, right of it by another."""
-    spot = gaussian(sight, u, 1.0, sigma)
-    below = np.clip((edge[:, None] - sight.u_edges[:-1]) / np.diff(sight.u_edges), 0.0, 1.0)
+    spot = gaussian(view, u, 1.0, sigma)
+    below = np.clip((edge[:, None] - view.u_edges[:-1]) / np.diff(view.u_edges), 0.0, 1.0)
     # Edges lie on the bins' borders in these tests.
     assert np.allclose(below, np.rint(below), atol=1e-9)
     factor = np.where(below > 0.5, left, right)
@@ -41,12 +41,12 @@ def check_sum(found: ErrorAttribution) -> None:
 @pytest.mark.parametrize("split", ["moments", "removal"])
 def test_secondary_light(split: str, device: Device) -> None:
     """One secondary spot of ratio q at distance D: error q D / (1 + q), all of it secondary."""
-    sight, q, distance = psd_sight(), 0.05, 1.2e-3
-    u = np.linspace(-2e-3, 1e-3, sight.samples)
-    light = {"direct": gaussian(sight, u, 1e-6, 5e-5), "bounces": gaussian(sight, u + distance, q * 1e-6, 5e-5)}
-    found = attribute_errors(psd(sight), light, truth_at(sight, u), split=split, device=device)
+    view, q, distance = psd_view(), 0.05, 1.2e-3
+    u = np.linspace(-2e-3, 1e-3, view.samples)
+    light = {"direct": gaussian(view, u, 1e-6, 5e-5), "bounces": gaussian(view, u + distance, q * 1e-6, 5e-5)}
+    found = attribute_errors(psd(view), light, truth_at(view, u), split=split, device=device)
     moved = q * distance / (1.0 + q)
-    slope = height_secant(sight.triangulation, u, u + moved, sight.v_middles)
+    slope = height_secant(view.triangulation, u, u + moved, view.v_middles)
     np.testing.assert_allclose(found.error, slope * moved, rtol=1e-9 if device.has_double else 1e-3)
     np.testing.assert_allclose(found.causes["secondary"], found.error, rtol=1e-6)
     assert (found.dominant() == list(found.causes).index("secondary")).all()
@@ -55,20 +55,20 @@ def test_secondary_light(split: str, device: Device) -> None:
 
 def test_moments_are_shares_of_the_light(device: Device) -> None:
     """Every light moves the reading by its share of the light times its distance, ambient light by its own."""
-    sight = psd_sight()
-    u = np.full(sight.samples, 5e-4)
+    view = psd_view()
+    u = np.full(view.samples, 5e-4)
     lights = {"specular": (8e-4, 2e-7), "diffuse-specular": (-2e-3, 5e-8), "diffuse-diffuse": (2.5e-3, 3e-8)}
-    light = {"direct": gaussian(sight, u, 1e-6, 4e-5)}
-    light |= {name: gaussian(sight, 0.0 * u + place, power, 4e-5) for name, (place, power) in lights.items()}
-    found = attribute_errors(psd(sight, ambient=1e-7), light, truth_at(sight, u), detail=True, device=device)
+    light = {"direct": gaussian(view, u, 1e-6, 4e-5)}
+    light |= {name: gaussian(view, 0.0 * u + place, power, 4e-5) for name, (place, power) in lights.items()}
+    found = attribute_errors(psd(view, ambient=1e-7), light, truth_at(view, u), detail=True, device=device)
     lights["ambient"] = (0.0, 1e-7)
     everything = 1e-6 + sum(power for _, power in lights.values())
-    slope = height_secant(sight.triangulation, u, found.reading.position, sight.v_middles)
+    slope = height_secant(view.triangulation, u, found.reading.position, view.v_middles)
     for name, (place, power) in lights.items():
         np.testing.assert_allclose(found.causes[name], slope * power * (place - 5e-4) / everything, rtol=1e-6)
         np.testing.assert_allclose(found.light[name], power, rtol=1e-9)
     check_sum(found)
-    whole = attribute_errors(psd(sight, ambient=1e-7), light, truth_at(sight, u), device=device)
+    whole = attribute_errors(psd(view, ambient=1e-7), light, truth_at(view, u), device=device)
     np.testing.assert_allclose(
         whole.causes["secondary"], found.causes["diffuse-specular"] + found.causes["diffuse-diffuse"], rtol=1e-9
     )
@@ -76,14 +76,14 @@ def test_moments_are_shares_of_the_light(device: Device) -> None:
 
 def test_the_two_splits_agree_for_little_light(device: Device) -> None:
     """They differ to second order in the secondary light's share."""
-    sight = psd_sight()
-    u = np.full(sight.samples, 5e-4)
+    view = psd_view()
+    u = np.full(view.samples, 5e-4)
     differences = []
     for share in (0.1, 0.01):
-        light = {"direct": gaussian(sight, u, 1e-6, 4e-5)}
-        light["diffuse-specular"] = gaussian(sight, 0.0 * u - 2e-3, share * 1e-6, 4e-5)
-        light["specular"] = gaussian(sight, 0.0 * u + 2e-3, share * 1e-6, 4e-5)
-        both = [attribute_errors(psd(sight), light, truth_at(sight, u), split=each, device=device) for each in SPLITS]
+        light = {"direct": gaussian(view, u, 1e-6, 4e-5)}
+        light["diffuse-specular"] = gaussian(view, 0.0 * u - 2e-3, share * 1e-6, 4e-5)
+        light["specular"] = gaussian(view, 0.0 * u + 2e-3, share * 1e-6, 4e-5)
+        both = [attribute_errors(psd(view), light, truth_at(view, u), split=each, device=device) for each in SPLITS]
         for found in both:
             check_sum(found)
         differences.append(np.abs(both[0].causes["specular"] - both[1].causes["specular"]).max())
@@ -97,19 +97,19 @@ SPLITS = ("moments", "removal")
 @pytest.mark.parametrize("split", SPLITS)
 def test_occlusion(split: str, device: Device) -> None:
     """What hides a spot beyond x sigma moves its centre by -sigma phi(x) / Phi(x)."""
-    sight, sigma = psd_sight(600), 1e-4
+    view, sigma = psd_view(600), 1e-4
     x = np.array([-0.5, 0.0, 0.5, 1.0, 1.5])
-    u = np.full(sight.samples, 2e-4)
+    u = np.full(view.samples, 2e-4)
     edge = u + x * sigma
     light = {
-        "direct": half_spots(sight, u, sigma, 1e-6, 0.0, edge),
-        EVEN: half_spots(sight, u, sigma, 1.0, 0.0, edge),
-        OPEN: gaussian(sight, u, 1e-6, sigma),
-        EVEN_OPEN: gaussian(sight, u, 1.0, sigma),
+        "direct": half_spots(view, u, sigma, 1e-6, 0.0, edge),
+        EVEN: half_spots(view, u, sigma, 1.0, 0.0, edge),
+        OPEN: gaussian(view, u, 1e-6, sigma),
+        EVEN_OPEN: gaussian(view, u, 1.0, sigma),
     }
-    found = attribute_errors(psd(sight), light, truth_at(sight, u), split=split, device=device)
+    found = attribute_errors(psd(view), light, truth_at(view, u), split=split, device=device)
     shift = -sigma * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi) / ndtr(x)
-    slope = height_secant(sight.triangulation, u, u + shift, sight.v_middles)
+    slope = height_secant(view.triangulation, u, u + shift, view.v_middles)
     rounding = 1e-8 if device.has_double else 1e-3
     np.testing.assert_allclose(found.causes["occlusion"], slope * shift, rtol=rounding)
     np.testing.assert_allclose(found.error, slope * shift, rtol=rounding)
@@ -120,15 +120,15 @@ def test_occlusion(split: str, device: Device) -> None:
 @pytest.mark.parametrize("split", SPLITS)
 def test_reflectivity_step(split: str, device: Device) -> None:
     """A step of ratio k moves it by sigma (k - 1) phi(x) / (Phi(x) + k (1 - Phi(x))), whatever the surface's albedo."""
-    sight, sigma, k = psd_sight(600), 1e-4, 5.0
+    view, sigma, k = psd_view(600), 1e-4, 5.0
     x = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-    u = np.full(sight.samples, -3e-4)
-    direct = half_spots(sight, u, sigma, 1e-7, k * 1e-7, u + x * sigma)
-    white = gaussian(sight, u, 1.0, sigma)
+    u = np.full(view.samples, -3e-4)
+    direct = half_spots(view, u, sigma, 1e-7, k * 1e-7, u + x * sigma)
+    white = gaussian(view, u, 1.0, sigma)
     light = {"direct": direct, OPEN: direct, EVEN: white, EVEN_OPEN: white}
-    found = attribute_errors(psd(sight), light, truth_at(sight, u), split=split, device=device)
+    found = attribute_errors(psd(view), light, truth_at(view, u), split=split, device=device)
     shift = sigma * (k - 1.0) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi) / (ndtr(x) + k * (1.0 - ndtr(x)))
-    slope = height_secant(sight.triangulation, u, u + shift, sight.v_middles)
+    slope = height_secant(view.triangulation, u, u + shift, view.v_middles)
     rounding = 1e-8 if device.has_double else 1e-3
     np.testing.assert_allclose(found.causes["reflectivity"], slope * shift, rtol=rounding)
     np.testing.assert_allclose(found.causes["occlusion"], 0.0, atol=1e-9)
@@ -139,14 +139,14 @@ def test_reflectivity_step(split: str, device: Device) -> None:
 
 def test_all_causes_at_once(device: Device, rng: np.random.Generator) -> None:
     """Whatever the light, the parts add up to the error, noise among them."""
-    sight = psd_sight(60)
-    u = rng.uniform(-1e-3, 1e-3, (4, sight.samples))
+    view = psd_view(60)
+    u = rng.uniform(-1e-3, 1e-3, (4, view.samples))
     light = {
-        name: gaussian(sight, u + rng.normal(scale=2e-4, size=u.shape), rng.uniform(0.1, 1.0, u.shape) * 1e-6, 1e-4)
+        name: gaussian(view, u + rng.normal(scale=2e-4, size=u.shape), rng.uniform(0.1, 1.0, u.shape) * 1e-6, 1e-4)
         for name in ("direct", "specular", "diffuse-specular", "diffuse-diffuse", "bounces", EVEN, OPEN, EVEN_OPEN)
     }
-    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
-    simulator = psd(sight, ambient=1e-7, readout={"noise": PsdNoise(independent=1e-9)})
+    g, h = sheet_point(view.triangulation, u, view.v_middles)
+    simulator = psd(view, ambient=1e-7, readout={"noise": PsdNoise(independent=1e-9)})
     for split in SPLITS:
         found = attribute_errors(
             simulator, light, Truth(g, h, np.zeros(u.shape, np.uint8)), split=split, seed=3, device=device
@@ -160,37 +160,37 @@ def test_all_causes_at_once(device: Device, rng: np.random.Generator) -> None:
 
 def test_a_camera_with_a_window(device: Device) -> None:
     """Secondary light beside the line moves a windowed reading only where it falls into the window."""
-    sight = camera_sight()
-    pixels = np.full(sight.samples, 24.0)
-    u = sight.u_middles[0] + PIXEL * pixels
+    view = camera_view()
+    pixels = np.full(view.samples, 24.0)
+    u = view.u_middles[0] + PIXEL * pixels
     glow = u + PIXEL * np.array([3.0, 4.0, 5.0, 6.0, 20.0, 25.0, 30.0, 35.0])
-    light = {"direct": gaussian(sight, u, 1e-9, PIXEL), "diffuse-diffuse": gaussian(sight, glow, 2e-11, PIXEL)}
+    light = {"direct": gaussian(view, u, 1e-9, PIXEL), "diffuse-diffuse": gaussian(view, glow, 2e-11, PIXEL)}
     found = attribute_errors(
-        camera(sight, readout={"window": 8, "threshold": 0.0}, gain=1e-3, bits=16),
+        camera(view, readout={"window": 8, "threshold": 0.0}, gain=1e-3, bits=16),
         light,
-        truth_at(sight, u),
+        truth_at(view, u),
         device=device,
     )
-    slope = height_secant(sight.triangulation, u, u, sight.v_middles)
+    slope = height_secant(view.triangulation, u, u, view.v_middles)
     expected = slope * 0.02 * (glow - u) / 1.02
     np.testing.assert_allclose(found.causes["secondary"][:4], expected[:4], rtol=0.05)
     np.testing.assert_allclose(found.causes["secondary"][4:], 0.0, atol=1e-8)
     check_sum(found)
     with pytest.raises(ValueError, match="cameras take 'removal'"):
-        attribute_errors(camera(sight), light, truth_at(sight, u), split="moments", device=device)
+        attribute_errors(camera(view), light, truth_at(view, u), split="moments", device=device)
 
 
 def test_verdicts(device: Device) -> None:
     """A surface without a reading, a reading without a surface, neither, and several surfaces."""
-    sight = psd_sight()
+    view = psd_view()
     u = np.array([0.0, 0.0, np.nan, np.nan, np.nan])
     power = np.array([1e-6, 0.0, 0.0, 0.0, 0.0])
     glow = np.array([0.0, 0.0, 1e-7, 0.0, 1e-7])
-    light = {"direct": gaussian(sight, np.zeros(5), power, 1e-4)}
-    light["diffuse-specular"] = gaussian(sight, np.full(5, 1e-3), glow, 1e-4)
-    truth = truth_at(sight, u)
+    light = {"direct": gaussian(view, np.zeros(5), power, 1e-4)}
+    light["diffuse-specular"] = gaussian(view, np.full(5, 1e-3), glow, 1e-4)
+    truth = truth_at(view, u)
     truth.status[4] = Status.AMBIGUOUS
-    found = attribute_errors(psd(sight), light, truth, device=device)
+    found = attribute_errors(psd(view), light, truth, device=device)
     assert found.verdict.tolist() == [
         Verdict.READ,
         Verdict.MISSING,
@@ -209,13 +209,13 @@ def test_verdicts(device: Device) -> None:
 
 
 def test_summary_counts_causes(device: Device) -> None:
-    sight = psd_sight()
-    u = np.zeros(sight.samples)
-    light = {"direct": gaussian(sight, u, 1e-6, 4e-5)}
-    light["specular"] = gaussian(sight, u + 1e-3, [0.0, 1e-8, 2e-7, 0.0, 0.0], 4e-5)
-    light["bounces"] = gaussian(sight, u - 1e-3, [0.0, 0.0, 1e-8, 3e-7, 0.0], 4e-5)
+    view = psd_view()
+    u = np.zeros(view.samples)
+    light = {"direct": gaussian(view, u, 1e-6, 4e-5)}
+    light["specular"] = gaussian(view, u + 1e-3, [0.0, 1e-8, 2e-7, 0.0, 0.0], 4e-5)
+    light["bounces"] = gaussian(view, u - 1e-3, [0.0, 0.0, 1e-8, 3e-7, 0.0], 4e-5)
     found = attribute_errors(
-        psd(sight), stack([light] * 2), Truth(*(np.stack([each] * 2) for each in truth_at(sight, u))), device=device
+        psd(view), stack([light] * 2), Truth(*(np.stack([each] * 2) for each in truth_at(view, u))), device=device
     )
     said = found.summary(1e-4)
     assert said["causes"]["specular"]["dominant"] == 2
@@ -228,10 +228,10 @@ def test_summary_counts_causes(device: Device) -> None:
 
 def test_what_flags_take_out(device: Device) -> None:
     """A reading that is dropped for a flag is a missing one."""
-    sight = psd_sight()
-    u = np.zeros(sight.samples)
-    light = {"direct": gaussian(sight, u, [1e-6, 1e-6, 2e-5, 1e-6, 1e-6], 4e-5)}
-    found = attribute_errors(psd(sight, ambient=1e-8), light, truth_at(sight, u), device=device)
+    view = psd_view()
+    u = np.zeros(view.samples)
+    light = {"direct": gaussian(view, u, [1e-6, 1e-6, 2e-5, 1e-6, 1e-6], 4e-5)}
+    found = attribute_errors(psd(view, ambient=1e-8), light, truth_at(view, u), device=device)
     found.reading.status[2] = Status.AMBIGUOUS
     kept = found.without(Status.AMBIGUOUS)
     assert np.isnan(kept.error).tolist() == [False, False, True, False, False]
@@ -243,10 +243,10 @@ def test_what_flags_take_out(device: Device) -> None:
 def test_signals_add_up_to_the_reading(device: Device) -> None:
     """What is split by removal is what is read."""
     for simulator in (psd(ambient=1e-7), camera(gain=1e-4, offset=3.0, ambient=1e-12, readout={"threshold": 1.0})):
-        sight = simulator.sight
-        u = np.broadcast_to(sight.u_middles[sight.bins // 3], sight.samples)
-        light = {"direct": gaussian(sight, u, 1e-9, 2.0 * np.diff(sight.u_edges)[0])}
-        light["bounces"] = gaussian(sight, u + 3.0 * np.diff(sight.u_edges)[0], 1e-10, np.diff(sight.u_edges)[0])
+        view = simulator.view
+        u = np.broadcast_to(view.u_middles[view.bins // 3], view.samples)
+        light = {"direct": gaussian(view, u, 1e-9, 2.0 * np.diff(view.u_edges)[0])}
+        light["bounces"] = gaussian(view, u + 3.0 * np.diff(view.u_edges)[0], 1e-10, np.diff(view.u_edges)[0])
         signals = [simulator.signal(each) for each in simulator.light(light).values()]
         assert len(signals) == 3
         heights = simulator.heights(sum(signals[1:], start=signals[0]), device)
@@ -255,8 +255,8 @@ def test_signals_add_up_to_the_reading(device: Device) -> None:
 
 def test_a_part_in_shadow_says_nothing(device: Device) -> None:
     """No light at all: flagged, not zero, and a report can still be made."""
-    sight = psd_sight()
-    found = attribute_errors(psd(sight), {"direct": sight.dark()}, truth_at(sight, np.nan), device=device)
+    view = psd_view()
+    found = attribute_errors(psd(view), {"direct": view.dark()}, truth_at(view, np.nan), device=device)
     assert (found.verdict == Verdict.NOTHING).all()
     assert np.isnan(found.error).all()
     said = found.summary(1e-6)
@@ -264,10 +264,10 @@ def test_a_part_in_shadow_says_nothing(device: Device) -> None:
 
 
 def test_what_is_refused(device: Device) -> None:
-    sight = psd_sight()
-    light = {"direct": gaussian(sight, [0.0], 1e-6, 1e-4)}
-    truth = truth_at(sight, 0.0)
+    view = psd_view()
+    light = {"direct": gaussian(view, [0.0], 1e-6, 1e-4)}
+    truth = truth_at(view, 0.0)
     with pytest.raises(ValueError, match="or none of them"):
-        attribute_errors(psd(sight), light | {EVEN: light["direct"]}, truth, device=device)
+        attribute_errors(psd(view), light | {EVEN: light["direct"]}, truth, device=device)
     with pytest.raises(ValueError, match="expected the same"):
-        attribute_errors(psd(sight), light, Truth(*(each[:3] for each in truth)), device=device)
+        attribute_errors(psd(view), light, Truth(*(each[:3] for each in truth)), device=device)

@@ -26,7 +26,7 @@ from gpuvision.simulation.errors.recommendations import (
 from gpuvision.simulation.sensors.readings import Reading, Truth, sheet_point
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.status import Status
-from lights import PITCH, camera, camera_sight, gaussian, psd, psd_sight
+from lights import PITCH, camera, camera_view, gaussian, psd, psd_view
 
 PIXEL = 10e-6
 
@@ -42,26 +42,26 @@ def reading(h, sigma=1e-6, strength=1.0, width=3.0, status=0, g=None) -> Reading
 # ---- two sensors over a step -----------------------------------------------------------------------------------
 
 
-def facing(sight: SensorView) -> SensorView:
+def facing(view: SensorView) -> SensorView:
     """Return the same sensor from the other side of the sheet."""
-    x, y, z = sight.lens
+    x, y, z = view.lens
     return SensorView(
-        triangulation=sight.triangulation,
+        triangulation=view.triangulation,
         transport=StraightTransport(),
         lens=(x, -y, z),
-        u_edges=sight.u_edges,
-        v_edges=sight.v_edges,
+        u_edges=view.u_edges,
+        v_edges=view.v_edges,
     )
 
 
-def thick_line(sight: SensorView, sigma: float, factor: np.ndarray, across: np.ndarray) -> Exposure:
+def thick_line(view: SensorView, sigma: float, factor: np.ndarray, across: np.ndarray) -> Exposure:
     """Return light of a sheet with a Gaussian across on the plane H = 0, scaled by a factor at every place across."""
     weight = np.exp(-0.5 * (across / sigma) ** 2) * factor
     points = np.stack(np.broadcast_arrays(0.0, across, 0.0), axis=-1)
-    u, _ = np.moveaxis(sight.project(points), -1, 0)
-    light = sight.dark()
-    for v in sight.v_middles:
-        light = light + sight.deposit(u, v, 1e-9 * weight)
+    u, _ = np.moveaxis(view.project(points), -1, 0)
+    light = view.dark()
+    for v in view.v_middles:
+        light = light + view.deposit(u, v, 1e-9 * weight)
     return light
 
 
@@ -82,12 +82,12 @@ def level() -> Truth:
 
 def test_reflectivity_step_seen_from_both_sides(level: Truth, device: Device) -> None:
     """Each errs by shift / tan(theta), to its own side: the mean is right. Nothing else of the rules is."""
-    sight, k = psd_sight(), 4.0
+    view, k = psd_view(), 4.0
     factor = np.where(ACROSS > X * SIGMA, k, 1.0)
     share = float(ndtr(X))
     shift = SIGMA * (k - 1.0) * phi(X) / (share + k * (1.0 - share))
-    sensors = [psd(each, readout={"noise": PsdNoise(independent=1e-12)}) for each in (sight, facing(sight))]
-    readings = [each.read({"direct": thick_line(each.sight, SIGMA, factor, ACROSS)}, device=device) for each in sensors]
+    sensors = [psd(each, readout={"noise": PsdNoise(independent=1e-12)}) for each in (view, facing(view))]
+    readings = [each.read({"direct": thick_line(each.view, SIGMA, factor, ACROSS)}, device=device) for each in sensors]
     expected = shift * 0.15 / 0.08
     np.testing.assert_allclose(np.abs(readings[0].h), expected, rtol=2e-3)
     np.testing.assert_allclose(readings[1].h, -readings[0].h, rtol=4e-3)
@@ -98,7 +98,7 @@ def test_reflectivity_step_seen_from_both_sides(level: Truth, device: Device) ->
     assert np.abs(mean.h).max() < 2e-3 * expected
     assert (mean.source == BOTH).all()
     errors = [
-        attribute_errors(each, {"direct": thick_line(each.sight, SIGMA, factor, ACROSS)}, level, device=device).error
+        attribute_errors(each, {"direct": thick_line(each.view, SIGMA, factor, ACROSS)}, level, device=device).error
         for each in sensors
     ]
     predicted = DualSensor(rule="predicted").join(*readings, predicted=(errors[0], errors[1]))
@@ -107,11 +107,11 @@ def test_reflectivity_step_seen_from_both_sides(level: Truth, device: Device) ->
 
 def test_half_a_beam_hidden_from_one(level: Truth, device: Device) -> None:
     """The sensor that sees the whole beam is right and has more light; the mean is half wrong."""
-    sight = psd_sight()
+    view = psd_view()
     hidden = (ACROSS < X * SIGMA).astype(float)
     whole, half = (
         psd(each).read({"direct": thick_line(each, SIGMA, factor, ACROSS)}, device=device)
-        for each, factor in ((sight, np.ones_like(ACROSS)), (facing(sight), hidden))
+        for each, factor in ((view, np.ones_like(ACROSS)), (facing(view), hidden))
     )
     share = float(ndtr(X))
     error = SIGMA * phi(X) / share * 0.15 / 0.08
@@ -128,10 +128,10 @@ def test_half_a_beam_hidden_from_one(level: Truth, device: Device) -> None:
 
 def test_a_part_seen_by_two(level: Truth, device: Device) -> None:
     """A pair is ranked beside either sensor alone: half of a beam is hidden from one here, from the other there."""
-    sight = psd_sight()
+    view = psd_view()
     hidden = (ACROSS < X * SIGMA).astype(float)
     found = []
-    for each, from_here in ((sight, [0, 1]), (facing(sight), [3, 4])):
+    for each, from_here in ((view, [0, 1]), (facing(view), [3, 4])):
         whole, half = (thick_line(each, SIGMA, factor, ACROSS) for factor in (np.ones_like(ACROSS), hidden))
         seen = np.isin(np.arange(5), from_here)[:, None]
         light = Exposure(*(np.where(seen, one, other) for one, other in zip(half, whole, strict=True)))
@@ -152,11 +152,11 @@ def test_a_part_seen_by_two(level: Truth, device: Device) -> None:
 
 def test_what_one_does_not_see_the_other_does(device: Device) -> None:
     """Surfaces that are hidden from the first sensor count for it as missing, and the second one fills them."""
-    sight = psd_sight()
+    view = psd_view()
     u = np.zeros(5)
-    truth = Truth(*sheet_point(sight.triangulation, u, sight.v_middles), np.zeros(5, np.uint8))
+    truth = Truth(*sheet_point(view.triangulation, u, view.v_middles), np.zeros(5, np.uint8))
     found = []
-    for each, hidden in ((sight, [0, 1]), (facing(sight), [4])):
+    for each, hidden in ((view, [0, 1]), (facing(view), [4])):
         lost = np.isin(np.arange(5), hidden)
         seen = Truth(truth.g, np.where(lost, np.nan, truth.h), np.where(lost, Status.LOW_SIGNAL, 0).astype(np.uint8))
         found.append(
@@ -264,15 +264,15 @@ def test_resampling() -> None:
 
 def test_choice_of_a_peak(device: Device) -> None:
     """A mirror image that outshines the line, always on the same side: the first peak is the line."""
-    sight = camera_sight()
-    u = np.full(sight.samples, sight.u_middles[20])
+    view = camera_view()
+    u = np.full(view.samples, view.u_middles[20])
     light = {
-        "direct": gaussian(sight, u, 1e-9, PIXEL),
-        "diffuse-specular": gaussian(sight, u + 25 * PIXEL, 3e-9, PIXEL),
+        "direct": gaussian(view, u, 1e-9, PIXEL),
+        "diffuse-specular": gaussian(view, u + 25 * PIXEL, 3e-9, PIXEL),
     }
-    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
+    g, h = sheet_point(view.triangulation, u, view.v_middles)
     truth = Truth(g, h, np.zeros(u.shape, np.uint8))
-    found = compare_peaks(camera(sight, readout={"threshold": 1.0}, gain=5e-5), light, truth, device=device)
+    found = compare_peaks(camera(view, readout={"threshold": 1.0}, gain=5e-5), light, truth, device=device)
     order = rank(found, 1e-5)
     assert order[0].name == "first"
     assert [each.unread for each in order] == [0.0, 1.0, 1.0]
@@ -282,17 +282,17 @@ def test_choice_of_a_peak(device: Device) -> None:
 
 def test_rank_of_directions(device: Device) -> None:
     """The place from which less gloss is seen comes first; false readings count as much as missing ones."""
-    sight = psd_sight()
-    u = np.zeros(sight.samples)
-    truth = Truth(*sheet_point(sight.triangulation, u, sight.v_middles), np.zeros(5, np.uint8))
-    direct = gaussian(sight, u, 1e-6, 5e-5)
-    gloss = {name: gaussian(sight, u + 1e-3, power, 5e-5) for name, power in (("shiny", 1e-6), ("dull", 1e-9))}
+    view = psd_view()
+    u = np.zeros(view.samples)
+    truth = Truth(*sheet_point(view.triangulation, u, view.v_middles), np.zeros(5, np.uint8))
+    direct = gaussian(view, u, 1e-6, 5e-5)
+    gloss = {name: gaussian(view, u + 1e-3, power, 5e-5) for name, power in (("shiny", 1e-6), ("dull", 1e-9))}
     found = {
-        name: attribute_errors(psd(sight), {"direct": direct, "specular": each}, truth, device=device)
+        name: attribute_errors(psd(view), {"direct": direct, "specular": each}, truth, device=device)
         for name, each in gloss.items()
     }
     nothing = Truth(truth.g, np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL, np.uint8))
-    found["false"] = attribute_errors(psd(sight), {"direct": direct}, nothing, device=device)
+    found["false"] = attribute_errors(psd(view), {"direct": direct}, nothing, device=device)
     order = rank(found, 1e-4)
     assert order[0].name == "dull"
     assert {each.name: (each.unread, each.false) for each in order} == {

@@ -14,7 +14,7 @@ from gpuvision.simulation.scene.rays import AnyHit
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.scene.visible_intervals import VisibleIntervals
 from gpuvision.status import Status
-from reference import fans as reference
+from reference import visible_intervals as reference
 
 WAYS = pytest.mark.parametrize(
     ("variant", "dtype"),

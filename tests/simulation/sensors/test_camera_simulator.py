@@ -12,7 +12,7 @@ from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.readings import height_secant, sheet_point, stack
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
-from lights import camera, camera_sight, gaussian, pixel_axes
+from lights import camera, camera_view, gaussian, pixel_axes
 
 PIXEL = 10e-6
 
@@ -22,37 +22,37 @@ def watts(electrons: float) -> float:
     return electrons * ELECTRON / (0.4 * 1e-3)
 
 
-def line(sight, pixels=30.3, electrons: float = 1e5, sigma: float = 1.2) -> dict[str, Exposure]:
-    u = sight.u_middles[0] + PIXEL * np.broadcast_to(np.asarray(pixels, float), sight.samples)
-    return {"direct": gaussian(sight, u, watts(electrons), sigma * PIXEL)}
+def line(view, pixels=30.3, electrons: float = 1e5, sigma: float = 1.2) -> dict[str, Exposure]:
+    u = view.u_middles[0] + PIXEL * np.broadcast_to(np.asarray(pixels, float), view.samples)
+    return {"direct": gaussian(view, u, watts(electrons), sigma * PIXEL)}
 
 
 def test_electrons_and_grey_levels() -> None:
-    sight = camera_sight()
-    simulator = camera(sight, gain=0.02, offset=7.0)
-    light = line(sight, electrons=1e4)
+    view = camera_view()
+    simulator = camera(view, gain=0.02, offset=7.0)
+    light = line(view, electrons=1e4)
     np.testing.assert_allclose(simulator.electrons(light).sum(axis=-1), 1e4, rtol=1e-12)
     frame = simulator.frames(light)
     assert frame.dtype == np.float32
-    assert frame.shape == (sight.bins, sight.samples)
-    np.testing.assert_allclose(frame.sum(axis=0) - 7.0 * sight.bins, 200.0, rtol=1e-5)
+    assert frame.shape == (view.bins, view.samples)
+    np.testing.assert_allclose(frame.sum(axis=0) - 7.0 * view.bins, 200.0, rtol=1e-5)
 
 
 @pytest.mark.parametrize("along", ["columns", "rows"])
 def test_reading_of_a_clean_line(along: str, device: Device) -> None:
     """The centre of gravity of all light is where the light is; the sheet's point follows."""
-    sight = camera_sight()
-    pixels = 30.0 + np.arange(sight.samples) * 0.37
-    triangulation = sight.triangulation if along == "columns" else None
+    view = camera_view()
+    pixels = 30.0 + np.arange(view.samples) * 0.37
+    triangulation = view.triangulation if along == "columns" else None
     readout = {"method": "whole", "along": along}
     if triangulation is None:
-        rows = sight.triangulation.to_dict() | {"along": "rows"}
-        readout["triangulation"] = type(sight.triangulation).from_dict(rows)
-    reading = camera(sight, readout=readout, gain=1e-3).read(stack([line(sight, pixels)] * 2), device=device)
-    u = sight.u_middles[0] + PIXEL * pixels
+        rows = view.triangulation.to_dict() | {"along": "rows"}
+        readout["triangulation"] = type(view.triangulation).from_dict(rows)
+    reading = camera(view, readout=readout, gain=1e-3).read(stack([line(view, pixels)] * 2), device=device)
+    u = view.u_middles[0] + PIXEL * pixels
     # Frames are single precision: 64 pixels of 6e-8 each.
     np.testing.assert_allclose(reading.position, np.stack([u, u]), atol=2e-5 * PIXEL)
-    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
+    g, h = sheet_point(view.triangulation, u, view.v_middles)
     np.testing.assert_allclose(reading.h[0], h, atol=1e-7)
     np.testing.assert_allclose(reading.g[1], g, atol=1e-7)
     assert not reading.status.any()
@@ -60,19 +60,19 @@ def test_reading_of_a_clean_line(along: str, device: Device) -> None:
 
 def test_photon_and_read_noise(device: Device) -> None:
     """Readings scatter as sigma says; with photons alone that is sigma / sqrt(N)."""
-    sight = camera_sight(columns=16)
-    one = line(sight, electrons=2e4)
+    view = camera_view(columns=16)
+    one = line(view, electrons=2e4)
     for read_noise in (0.0, 20.0):
         # The threshold lies below what noise leaves of the offset: nothing is cut.
         readout = {"method": "windowed", "window": 6, "threshold": 200.0 if read_noise else 300.0}
-        simulator = camera(sight, readout=readout, gain=0.5, bits=16, offset=300.0, read_noise=read_noise)
+        simulator = camera(view, readout=readout, gain=0.5, bits=16, offset=300.0, read_noise=read_noise)
         reading = simulator.read(stack([one] * 120), seed=5, device=device)
         sigma = simulator.read(one, device=device).sigma
         # 1920 samples: 1.6 % is one standard error.
         assert np.sqrt(np.mean((reading.h.std(axis=0, ddof=1) / sigma) ** 2)) == pytest.approx(1.0, abs=0.07)
         if read_noise == 0.0:
-            u = sight.u_middles[0] + 30.3 * PIXEL
-            slope = height_secant(sight.triangulation, u, u, sight.v_middles)
+            u = view.u_middles[0] + 30.3 * PIXEL
+            slope = height_secant(view.triangulation, u, u, view.v_middles)
             # A pixel blurs by itself.
             blur = np.sqrt(1.2**2 + 1.0 / 12.0) * PIXEL
             np.testing.assert_allclose(sigma, slope * blur / np.sqrt(2e4), rtol=2e-3)
@@ -80,58 +80,58 @@ def test_photon_and_read_noise(device: Device) -> None:
 
 def test_saturation_and_rounding(device: Device) -> None:
     """A full well or the highest code holds the light back; both are flagged."""
-    sight = camera_sight()
-    light = line(sight, electrons=1e6)
+    view = camera_view()
+    light = line(view, electrons=1e6)
     for limits, level in (({"gain": 0.01}, 255), ({"gain": 0.001, "full_well": 1e5}, 100)):
-        simulator = camera(sight, **limits)
+        simulator = camera(view, **limits)
         for frame in (simulator.frames(light), simulator.frames(light, seed=1)):
             assert frame.max() == level
         assert (simulator.read(light, device=device).status & Status.SATURATED).all()
         assert (simulator.read(light, seed=1, device=device).status & Status.SATURATED).all()
-    assert camera(sight, bits=12).frames(light, seed=0).dtype == np.uint16
-    assert camera(sight, bits=12, gain=1.0).frames(light, seed=0).max() == 4095
+    assert camera(view, bits=12).frames(light, seed=0).dtype == np.uint16
+    assert camera(view, bits=12, gain=1.0).frames(light, seed=0).max() == 4095
 
 
 def test_noise_belongs_to_the_profile() -> None:
-    sight = camera_sight()
-    simulator = camera(sight, gain=0.5, bits=12)
-    whole = simulator.frames(stack([line(sight)] * 4), seed=9)
-    np.testing.assert_array_equal(simulator.frames(stack([line(sight)] * 2), seed=9, first=2), whole[2:])
+    view = camera_view()
+    simulator = camera(view, gain=0.5, bits=12)
+    whole = simulator.frames(stack([line(view)] * 4), seed=9)
+    np.testing.assert_array_equal(simulator.frames(stack([line(view)] * 2), seed=9, first=2), whole[2:])
     assert not np.array_equal(whole[0], whole[1])
 
 
 def test_mask_is_a_region_of_interest(device: Device) -> None:
     """A second line that would be the stronger one is not seen behind a mask."""
-    sight = camera_sight()
-    light = line(sight, 20.0) | {"diffuse-specular": line(sight, 50.0, electrons=2e5)["direct"]}
-    mask = Mask(windows=[sight.u_edges[[10, 30]]] * sight.samples)
-    first = sight.u_middles[0]
+    view = camera_view()
+    light = line(view, 20.0) | {"diffuse-specular": line(view, 50.0, electrons=2e5)["direct"]}
+    mask = Mask(windows=[view.u_edges[[10, 30]]] * view.samples)
+    first = view.u_middles[0]
     for given, pixel in ((None, 50.0), (mask, 20.0)):
-        reading = camera(sight, mask=given, gain=1e-3).read(light, device=device)
+        reading = camera(view, mask=given, gain=1e-3).read(light, device=device)
         np.testing.assert_allclose(reading.position, first + pixel * PIXEL, atol=1e-4 * PIXEL)
 
 
 def test_axes_that_run_backwards(device: Device) -> None:
-    """A frame whose rows and columns count against the sensor's coordinates says the same, in the sight's order."""
-    sight = camera_sight()
-    light = line(sight, 30.0 + np.arange(sight.samples) * 0.37)
-    axes = pixel_axes(sight)
+    """A frame whose rows and columns count against the sensor's coordinates says the same, in the view's order."""
+    view = camera_view()
+    light = line(view, 30.0 + np.arange(view.samples) * 0.37)
+    axes = pixel_axes(view)
     turned = SampleAxes(
-        position_origin=float(sight.u_middles[-1]),
+        position_origin=float(view.u_middles[-1]),
         position_pitch=-axes.position_pitch,
-        sample_origin=float(sight.v_middles[-1]),
+        sample_origin=float(view.v_middles[-1]),
         sample_pitch=-axes.sample_pitch,
     )
     method = {"method": "windowed", "window": 6}
     ahead, back = (
-        camera(sight, readout=method | {"axes": each}, gain=1e-3).read(light, device=device) for each in (axes, turned)
+        camera(view, readout=method | {"axes": each}, gain=1e-3).read(light, device=device) for each in (axes, turned)
     )
     for one, other in zip(ahead, back, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-9)
 
 
 def test_dark_profiles(device: Device) -> None:
-    reading = camera().read({"direct": camera_sight().dark()}, device=device)
+    reading = camera().read({"direct": camera_view().dark()}, device=device)
     assert (reading.status == Status.LOW_SIGNAL).all()
     assert np.isnan(reading.h).all()
     assert np.isnan(reading.sigma).all()
@@ -139,7 +139,7 @@ def test_dark_profiles(device: Device) -> None:
 
 def test_what_is_refused() -> None:
     with pytest.raises(ValueError, match="a bin for every pixel"):
-        camera(camera_sight(), readout={"axes": camera(camera_sight(rows=60)).readout.axes})
+        camera(camera_view(), readout={"axes": camera(camera_view(rows=60)).readout.axes})
     with pytest.raises(ValueError, match="bits is 9"):
         camera(bits=9)
     with pytest.raises(ValueError, match="read_noise is -1"):

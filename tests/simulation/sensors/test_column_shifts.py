@@ -76,7 +76,7 @@ class Shifts(NamedTuple):
     peak_ratio: np.ndarray
 
 
-def sight(columns: int) -> SensorView:
+def sensor_view(columns: int) -> SensorView:
     """Return the camera, its columns so many times wider that they cover the frame; each is read in its middle."""
     forward, up = -LENS / np.linalg.norm(LENS), np.array([0.0, -1.0, 1.0]) / math.sqrt(2.0)
     focal = np.linalg.norm(LENS) / 0.12e-3 * PIXEL
@@ -106,7 +106,7 @@ def groove(angle: float) -> tuple[Scene, LitSegments]:
 
 
 def secondary(one: SensorView, scene: Scene, lit: LitSegments) -> Exposure:
-    lines = ViewRays(sight=one, scene=scene, materials=[Material(diffuse=Lambert(albedo=ALBEDO))])
+    lines = ViewRays(view=one, scene=scene, materials=[Material(diffuse=Lambert(albedo=ALBEDO))])
     seen = lines.surface(0.0)
     irradiance = LineIrradiance(segments=lit)(seen.receivers, device=Device.best()).irradiance
     return lines.exposure(seen, np.where(seen.triangle >= 0, irradiance, 0.0))
@@ -134,7 +134,7 @@ def direct(one: SensorView, lit: LitSegments) -> tuple[Exposure, np.ndarray]:
 
 
 def of_groove(degrees: float, columns: int = PIXELS) -> Shifts:
-    one = sight(columns)
+    one = sensor_view(columns)
     scene, lit = groove(math.radians(degrees))
     line, whole = direct(one, lit)
     return shifts(one, line, secondary(one, scene, lit), whole)
@@ -144,12 +144,12 @@ def of_board(columns: int = PIXELS) -> Shifts:
     """Of a board with parts, which hide light from each other."""
     from gpuvision.profiling.occluded_irradiance import Board
 
-    one, of = sight(columns), Board.of()
+    one, of = sensor_view(columns), Board.of()
     at = float(of.segments.ends[0, 0, 1])
     materials = [Material(diffuse=Lambert(albedo=ALBEDO))]
     sheet = LightSheet(transport=one.transport, power=1.0, sigma=FWHM / 2.3548)
-    line = DirectLight(sight=one, scene=of.scene, materials=materials, sheet=sheet).exposures(at)["direct"]
-    lines = ViewRays(sight=one, scene=of.scene, materials=materials)
+    line = DirectLight(view=one, scene=of.scene, materials=materials, sheet=sheet).exposures(at)["direct"]
+    lines = ViewRays(view=one, scene=of.scene, materials=materials)
     seen = lines.surface(at)
     receivers = np.where((seen.triangle >= 0)[..., None], seen.receivers, 0.0)
     lit = sheet.lit(of.scene, at)
@@ -175,7 +175,7 @@ def shifts(one: SensorView, line: Exposure, glow: Exposure, whole: np.ndarray) -
     strips = SampleAxes(sample_origin=axes.sample_origin, sample_pitch=axes.sample_pitch)
     sensors = {
         rule: CameraSimulator(
-            sight=one,
+            view=one,
             readout=LineReadout(axes=axes, **options),
             exposure_time=EXPOSED,
             gain=FULL_SCALE / electrons,
@@ -183,7 +183,7 @@ def shifts(one: SensorView, line: Exposure, glow: Exposure, whole: np.ndarray) -
         )
         for rule, options in RULES.items()
     }
-    psd = PsdSimulator(sight=one, readout=PsdReadout(strip_length=2.0 * HALF, axes=strips))
+    psd = PsdSimulator(view=one, readout=PsdReadout(strip_length=2.0 * HALF, axes=strips))
 
     def shift(sensor: CameraSimulator | PsdSimulator) -> np.ndarray:
         return ((sensor.read(together).position - sensor.read(alone).position) / PIXEL)[whole]
@@ -240,7 +240,7 @@ def test_secondary_light_is_a_broad_pedestal(found):
 
 
 def test_the_direct_line_is_read_where_it_is():
-    one = sight(64)
+    one = sensor_view(64)
     _, lit = groove(math.radians(90.0))
     line, whole = direct(one, lit)
     u = line.first_moment(one.u_edges) / line.total()
@@ -268,11 +268,11 @@ def test_parts_on_a_board_move_few_columns():
 
 
 def test_the_closed_line_is_the_simulators():
-    one = sight(64)
+    one = sensor_view(64)
     scene, lit = groove(math.radians(90.0))
     line, whole = direct(one, lit)
     sheet = LightSheet(transport=one.transport, power=1.0, sigma=FWHM / 2.3548)
-    light = DirectLight(sight=one, scene=scene, materials=[Material(diffuse=Lambert(albedo=ALBEDO))], sheet=sheet)
+    light = DirectLight(view=one, scene=scene, materials=[Material(diffuse=Lambert(albedo=ALBEDO))], sheet=sheet)
     made = light.exposures(0.0)["direct"]
     # A column 16 pixels wide against its middle, where the line is straight: all but the two at the edge.
     whole &= np.abs(np.arange(64) - 31.5) > 1.0

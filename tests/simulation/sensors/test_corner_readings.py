@@ -74,12 +74,12 @@ def columns(first: int, count: int) -> SensorView:
     )
 
 
-def light_of(scene: Scene, sight: SensorView, device: Device, sigma: float = 0.0) -> tuple[dict[str, Exposure], Truth]:
+def light_of(scene: Scene, view: SensorView, device: Device, sigma: float = 0.0) -> tuple[dict[str, Exposure], Truth]:
     """Return the direct light and what is diffusely reflected once between the walls."""
     materials = (Material(diffuse=Lambert(albedo=ALBEDO)),)
-    sheet = LightSheet(transport=sight.transport, power=1.0, sigma=sigma)
-    direct = DirectLight(sight=sight, scene=scene, materials=materials, sheet=sheet, device=device)
-    lines = ViewRays(sight=sight, scene=scene, materials=materials, device=device)
+    sheet = LightSheet(transport=view.transport, power=1.0, sigma=sigma)
+    direct = DirectLight(view=view, scene=scene, materials=materials, sheet=sheet, device=device)
+    lines = ViewRays(view=view, scene=scene, materials=materials, device=device)
     seen, lit = lines.surface(0.0), sheet.lit(scene, 0.0)
     segments = segment_rows(LitSegments(lit.ends, lit.normals, ALBEDO * lit.power))
     real = np.float64 if device.has_double else np.float32
@@ -144,8 +144,8 @@ def own_camera(degrees: float, wall: float, half_width: float, first: int, count
 def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
     """Light, full-column shift and its cause agree with a camera of this test's own, for PSD and camera alike."""
     wall, half_width, first, count = 100.0 * MM, 43.0 * MM, 200, 24
-    sight = columns(first, count)
-    light, truth = light_of(groove(degrees, wall, half_width), sight, device)
+    view = columns(first, count)
+    light, truth = light_of(groove(degrees, wall, half_width), view, device)
     secondary, direct, centre = own_camera(degrees, wall, half_width, first, count)
     np.testing.assert_allclose(light["direct"].total(), direct, rtol=1e-3)
     # A pixel at the wall's rim is on it or not by a rounding.
@@ -155,14 +155,14 @@ def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
     own = (secondary @ rows + direct * centre) / (secondary.sum(axis=1) + direct)
     axes = SampleAxes(sample_origin=float(first))
     strips = PsdSimulator(
-        sight=sight,
+        view=view,
         readout=PsdReadout(
             strip_length=float(ROWS),
             axes=SampleAxes(sample_origin=float(first), position_origin=0.5 * (ROWS - 1)),
         ),
     )
     gain = 30000.0 * ELECTRON / (direct.max() * 0.4 * 1e-3)
-    columns_read = CameraSimulator(sight=sight, readout=LineReadout(method="whole", axes=axes), bits=16, gain=gain)
+    columns_read = CameraSimulator(view=view, readout=LineReadout(method="whole", axes=axes), bits=16, gain=gain)
     assert np.abs(own - centre).min() > 4.0
     # A thin line lies in one or two pixels of a column, and is read by their middles.
     for simulator, near in ((strips, 0.01), (columns_read, 0.15)):
@@ -172,7 +172,7 @@ def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
     assert (found.dominant() == list(found.causes).index("secondary")).all()
     np.testing.assert_allclose(found.causes["secondary"], found.error, rtol=0.01)
     masked = attribute_errors(
-        PsdSimulator(sight=sight, readout=strips.readout, mask=Mask.about(sight, truth, 16.0 * PIXEL)),
+        PsdSimulator(view=view, readout=strips.readout, mask=Mask.about(view, truth, 16.0 * PIXEL)),
         light,
         truth,
         device=device,
@@ -182,10 +182,10 @@ def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
 
 def test_mask_for_a_groove(device: Device) -> None:
     """The best fixed mask takes nearly all of the error, and nothing of the line."""
-    sight = columns(12, 24)
-    light, truth = light_of(groove(90.0, 100.0 * MM, 43.0 * MM), sight, device, sigma=0.15 * MM / 2.3548)
+    view = columns(12, 24)
+    light, truth = light_of(groove(90.0, 100.0 * MM, 43.0 * MM), view, device, sigma=0.15 * MM / 2.3548)
     block = stack([light])
-    plan = optimise_mask(sight, block, Truth(*(np.asarray(each)[None] for each in truth)))
+    plan = optimise_mask(view, block, Truth(*(np.asarray(each)[None] for each in truth)))
     assert np.all(plan.kept >= 0.999)
     assert np.abs(plan.after).max() < 0.01 * np.abs(plan.before).max()
 
@@ -202,8 +202,8 @@ TABLE = {
 def test_size_of_the_effect(degrees: float) -> None:
     """Shifts of a whole camera's columns are within a factor 2 of another program's, whose walls' size is not known."""
     device = Device.best()
-    sight = columns(-512, 1024)
-    light, _ = light_of(groove(degrees, 100.0 * MM, 43.0 * MM), sight, device, sigma=0.15 * MM / 2.3548)
+    view = columns(-512, 1024)
+    light, _ = light_of(groove(degrees, 100.0 * MM, 43.0 * MM), view, device, sigma=0.15 * MM / 2.3548)
     given = {path: light[path] for path in ("direct", "diffuse-diffuse")}
     direct, secondary = (each.total() for each in given.values())
     bright = direct > 0.0
@@ -212,7 +212,7 @@ def test_size_of_the_effect(degrees: float) -> None:
     rules = ({"method": "whole"}, {"window": 16}, {"window": 4})
     for rule, expected in zip(rules, TABLE[degrees], strict=False):
         readout = LineReadout(axes=SampleAxes(sample_origin=-512.0), precision="double", **rule)
-        camera = CameraSimulator(sight=sight, readout=readout, gain=gain, bits=16)
+        camera = CameraSimulator(view=view, readout=readout, gain=gain, bits=16)
         shift = camera.read(given, device=device).position
         shift = np.abs(shift - camera.read({"direct": given["direct"]}, device=device).position)
         quantiles = np.quantile(shift[np.isfinite(shift)], [0.5, 0.95])

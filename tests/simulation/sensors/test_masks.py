@@ -15,7 +15,7 @@ from gpuvision.camera.lens import Lens
 from gpuvision.simulation.sensors.masks import Mask, optimise_mask
 from gpuvision.simulation.sensors.readings import Truth, height_secant, sheet_point
 from gpuvision.simulation.sensors.sensor_view import Exposure
-from lights import LENGTH, gaussian, psd, psd_sight
+from lights import LENGTH, gaussian, psd, psd_view
 
 # Where a mask of length beta a has the centre of a 90 degree corner's glow, in units of a.
 CORNER = [(1, 0.594984), (2, 0.993527), (5, 1.656779), (10, 2.224535), (100, 4.341808)]
@@ -94,10 +94,10 @@ def test_a_point_of_light_passes_or_does_not() -> None:
 
 
 def test_transmission() -> None:
-    sight = psd_sight(6)
-    light = gaussian(sight, [0.3e-3], 1e-6, 1e-3)
+    view = psd_view(6)
+    light = gaussian(view, [0.3e-3], 1e-6, 1e-3)
     shares = np.linspace(0.0, 1.0, 30).reshape(5, 6)
-    passing = Mask(transmission=shares).apply(light, sight.u_edges)
+    passing = Mask(transmission=shares).apply(light, view.u_edges)
     np.testing.assert_allclose(passing.power, shares * light.power, rtol=1e-15)
     np.testing.assert_allclose(passing.moment, shares * light.moment, rtol=1e-15)
 
@@ -120,25 +120,25 @@ def test_what_is_refused() -> None:
     with pytest.raises(ValueError, match="shares from 0 to 1"):
         Mask(transmission=[[1.5]])
     with pytest.raises(ValueError, match="does not fit"):
-        Mask(windows=[[0.0, 1.0]] * 3).apply(psd_sight().dark(), psd_sight().u_edges)
+        Mask(windows=[[0.0, 1.0]] * 3).apply(psd_view().dark(), psd_view().u_edges)
 
 
 @pytest.mark.parametrize("lens", [None, Lens(k1=-4000.0)])
 def test_mask_about_an_expected_profile(lens: Lens | None) -> None:
     """Its ends are seen at the heights asked for, above and below; it is closed where nothing is expected."""
-    sight = psd_sight()
-    sight = replace(sight, triangulation=replace(sight.triangulation, lens=lens))
+    view = psd_view()
+    view = replace(view, triangulation=replace(view.triangulation, lens=lens))
     u = np.array([-2e-3, -1e-3, np.nan, 1e-3, 2.9e-3])
-    truth = Truth(*sheet_point(sight.triangulation, u, sight.v_middles), np.zeros(5, np.uint8))
-    windows = Mask.about(sight, truth, 2e-3).windows
+    truth = Truth(*sheet_point(view.triangulation, u, view.v_middles), np.zeros(5, np.uint8))
+    windows = Mask.about(view, truth, 2e-3).windows
     assert windows[2, 0] == windows[2, 1]
     assert windows[4, 1] == 0.5 * LENGTH
     seen = [0, 1, 3]
     for end, rise in ((0, -2e-3), (1, 2e-3)):
-        _, h = sheet_point(sight.triangulation, windows[:, end], sight.v_middles)
+        _, h = sheet_point(view.triangulation, windows[:, end], view.v_middles)
         np.testing.assert_allclose(h[seen], truth.h[seen] + rise, atol=1e-12)
     with pytest.raises(ValueError, match="reach is 0"):
-        Mask.about(sight, truth, 0.0)
+        Mask.about(view, truth, 0.0)
 
 
 # ---- the best mask -------------------------------------------------------------------------------------------
@@ -146,34 +146,34 @@ def test_mask_about_an_expected_profile(lens: Lens | None) -> None:
 
 def part(profiles: int = 12) -> tuple:
     """Return a part whose line wanders over the strips, with a glow far from it, and its truth."""
-    sight = psd_sight(120)
+    view = psd_view(120)
     rng = np.random.default_rng(1)
-    u = 1.2e-3 * np.sin(np.linspace(0.0, 4.0, profiles))[:, None] + rng.uniform(-2e-4, 2e-4, (profiles, sight.samples))
+    u = 1.2e-3 * np.sin(np.linspace(0.0, 4.0, profiles))[:, None] + rng.uniform(-2e-4, 2e-4, (profiles, view.samples))
     light = {
-        "direct": gaussian(sight, u, 1e-6, 4e-5),
-        "diffuse-diffuse": gaussian(sight, np.full((profiles, sight.samples), -2.0e-3), 2e-7, 3e-4),
+        "direct": gaussian(view, u, 1e-6, 4e-5),
+        "diffuse-diffuse": gaussian(view, np.full((profiles, view.samples), -2.0e-3), 2e-7, 3e-4),
     }
-    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
-    return sight, light, Truth(g, h, np.zeros(u.shape, np.uint8)), u
+    g, h = sheet_point(view.triangulation, u, view.v_middles)
+    return view, light, Truth(g, h, np.zeros(u.shape, np.uint8)), u
 
 
 @pytest.mark.parametrize("objective", ["worst", "rms"])
 def test_fixed_mask(objective: str) -> None:
     """No window of bins that cuts no more does better: all of them tried."""
-    sight, light, truth, u = part()
-    plan = optimise_mask(sight, light, truth, objective=objective, keep=0.999)
+    view, light, truth, u = part()
+    plan = optimise_mask(view, light, truth, objective=objective, keep=0.999)
     assert np.all(plan.kept >= 0.999)
-    assert plan.mask.windows.shape == (sight.samples, 2)
-    slope = height_secant(sight.triangulation, u, u, sight.v_middles)
+    assert plan.mask.windows.shape == (view.samples, 2)
+    slope = height_secant(view.triangulation, u, u, view.v_middles)
     total = light["direct"] + light["diffuse-diffuse"]
     judge = (lambda e: np.abs(e).max(axis=0)) if objective == "worst" else (lambda e: np.sqrt(np.mean(e**2, axis=0)))
-    np.testing.assert_allclose(judge(plan.before), judge((centre(total, sight.u_edges) - u) * slope), rtol=1e-9)
-    best = np.full(sight.samples, np.inf)
+    np.testing.assert_allclose(judge(plan.before), judge((centre(total, view.u_edges) - u) * slope), rtol=1e-9)
+    best = np.full(view.samples, np.inf)
     for low, high in itertools.combinations(range(121), 2):
         allowed = (_tails(light["direct"], low, high) <= 0.0005).all(axis=0)
         if allowed.any():
-            mask = Mask(windows=np.broadcast_to(sight.u_edges[[low, high]], (sight.samples, 2)))
-            cost = judge((centre(mask.apply(total, sight.u_edges), sight.u_edges) - u) * slope)
+            mask = Mask(windows=np.broadcast_to(view.u_edges[[low, high]], (view.samples, 2)))
+            cost = judge((centre(mask.apply(total, view.u_edges), view.u_edges) - u) * slope)
             best = np.where(allowed, np.minimum(best, cost), best)
     np.testing.assert_allclose(judge(plan.after), best, rtol=1e-9)
     assert np.all(judge(plan.after) < 0.5 * judge(plan.before))
@@ -187,9 +187,9 @@ def _tails(direct: Exposure, low: int, high: int) -> np.ndarray:
 
 def test_mask_that_follows_the_part() -> None:
     """A window for every profile leaves next to nothing of a glow that lies apart."""
-    sight, light, truth, u = part()
-    fixed = optimise_mask(sight, light, truth)
-    follows = optimise_mask(sight, light, truth, fixed=False)
+    view, light, truth, u = part()
+    fixed = optimise_mask(view, light, truth)
+    follows = optimise_mask(view, light, truth, fixed=False)
     assert follows.mask.windows.shape == (*u.shape, 2)
     assert np.all(follows.kept >= 0.999)
     assert np.abs(follows.after).max() < 0.05 * np.abs(fixed.after).max()
@@ -197,8 +197,8 @@ def test_mask_that_follows_the_part() -> None:
 
 
 def test_margin_keeps_away_from_valid_light() -> None:
-    sight, light, truth, u = part()
-    windows = optimise_mask(sight, light, truth, keep=0.999, margin=3e-4).mask.windows
+    view, light, truth, u = part()
+    windows = optimise_mask(view, light, truth, keep=0.999, margin=3e-4).mask.windows
     # 99.95 % of a Gaussian on either side are 3.29 sigma; a bin is 50 um wide.
     assert np.all(windows[:, 0] <= u.min(axis=0) - 3e-4 - 3.29 * 4e-5 + 5e-5)
     assert np.all(windows[:, 1] >= u.max(axis=0) + 3e-4 + 3.29 * 4e-5 - 5e-5)
@@ -206,15 +206,15 @@ def test_margin_keeps_away_from_valid_light() -> None:
 
 def test_samples_without_valid_light_are_closed() -> None:
     """What they would read is the glow alone: better no reading."""
-    sight, light, truth, u = part(4)
+    view, light, truth, u = part(4)
     dark = np.zeros(u.shape, bool)
     dark[:, 2] = dark[1, 3] = True
     direct = Exposure(*(np.where(dark[..., None], 0.0, each) for each in light["direct"]))
     light = light | {"direct": direct}
-    plan = optimise_mask(sight, light, Truth(truth.g, np.where(dark, np.nan, truth.h), truth.status))
+    plan = optimise_mask(view, light, Truth(truth.g, np.where(dark, np.nan, truth.h), truth.status))
     assert plan.mask.windows[2, 0] == plan.mask.windows[2, 1]
     assert np.isfinite(plan.after).tolist() == (~dark).tolist()
-    masked = psd(sight, mask=plan.mask).currents(light)
+    masked = psd(view, mask=plan.mask).currents(light)
     assert not masked[:, 2].any()
     assert masked[:, [0, 1, 3, 4]].all()
 
@@ -222,21 +222,21 @@ def test_samples_without_valid_light_are_closed() -> None:
 def test_a_camera_of_many_pixels() -> None:
     """Narrowed down over several rounds: the same as the tightest window, where that is the best."""
     edges = np.linspace(-0.5 * LENGTH, 0.5 * LENGTH, 1025)
-    sight = psd_sight(1024)
-    np.testing.assert_array_equal(edges, sight.u_edges)
+    view = psd_view(1024)
+    np.testing.assert_array_equal(edges, view.u_edges)
     u = np.array([[-1e-3, -5e-4, 0.0, 5e-4, 1e-3]])
     glow = np.broadcast_to(np.linspace(0.0, 1e-9, 1024), (1, 5, 1024))
-    light = {"direct": gaussian(sight, u, 1e-6, 4e-5), "bounces": Exposure(glow, np.zeros_like(glow))}
-    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
-    plan = optimise_mask(sight, light, Truth(g, h, np.zeros(u.shape, np.uint8)), keep=0.9999)
+    light = {"direct": gaussian(view, u, 1e-6, 4e-5), "bounces": Exposure(glow, np.zeros_like(glow))}
+    g, h = sheet_point(view.triangulation, u, view.v_middles)
+    plan = optimise_mask(view, light, Truth(g, h, np.zeros(u.shape, np.uint8)), keep=0.9999)
     assert np.abs(plan.after).max() < 0.02 * np.abs(plan.before).max()
 
 
 def test_what_optimising_refuses() -> None:
-    sight, light, truth, _ = part(2)
+    view, light, truth, _ = part(2)
     with pytest.raises(ValueError, match="objective is 'best'"):
-        optimise_mask(sight, light, truth, objective="best")
+        optimise_mask(view, light, truth, objective="best")
     with pytest.raises(ValueError, match="0 < keep <= 1"):
-        optimise_mask(sight, light, truth, keep=0.0)
+        optimise_mask(view, light, truth, keep=0.0)
     with pytest.raises(ValueError, match="profiles, samples, bins"):
-        optimise_mask(sight, {"direct": sight.dark()}, truth)
+        optimise_mask(view, {"direct": view.dark()}, truth)

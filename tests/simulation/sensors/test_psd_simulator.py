@@ -16,7 +16,7 @@ from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
 from gpuvision.simulation.sensors.readings import height_secant, sheet_point, stack
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
-from lights import LENGTH, PITCH, gaussian, psd, psd_sight
+from lights import LENGTH, PITCH, gaussian, psd, psd_view
 
 
 def moments(simulator: PsdSimulator, light: dict[str, Exposure]) -> tuple[np.ndarray, np.ndarray]:
@@ -39,9 +39,9 @@ def moments(simulator: PsdSimulator, light: dict[str, Exposure]) -> tuple[np.nda
 )
 def test_light_beyond_the_end(inside: float, signal: float, bias: float) -> None:
     """Only light inside the strip counts: signal Phi(c), bias -sigma phi(c) / Phi(c)."""
-    sight, sigma = psd_sight(), 1e-4
+    view, sigma = psd_view(), 1e-4
     spot = 0.5 * LENGTH - inside * sigma
-    total, u = moments(psd(sight, responsivity=0.5), {"direct": gaussian(sight, [spot], 2e-6, sigma)})
+    total, u = moments(psd(view, responsivity=0.5), {"direct": gaussian(view, [spot], 2e-6, sigma)})
     # The table is good to a unit of its last digit.
     assert total[0] / 1e-6 == pytest.approx(signal, abs=1e-4)
     assert (u[0] - spot) / sigma == pytest.approx(bias, abs=1e-4)
@@ -54,42 +54,42 @@ def test_several_lights() -> None:
     """The centre of gravity of all of them, whatever their shape and their bins: sum P x / sum P."""
     places, powers = np.array([-2e-3, 1e-4, 2.5e-3]), np.array([1e-6, 5e-6, 2e-7])
     for bins in (1, 7, 60):
-        sight = psd_sight(bins)
+        view = psd_view(bins)
         light = {
-            path: sight.deposit(x, sight.v_middles, power)
+            path: view.deposit(x, view.v_middles, power)
             for path, x, power in zip(("direct", "diffuse-diffuse", "bounces"), places, powers, strict=True)
         }
-        _, u = moments(psd(sight), light)
+        _, u = moments(psd(view), light)
         np.testing.assert_allclose(u, places @ powers / powers.sum(), rtol=1e-13)
 
 
 def test_secondary_light() -> None:
     """A secondary spot of ratio q at distance D moves the reading by q D / (1 + q)."""
-    sight, q, distance = psd_sight(), 0.07, 1.3e-3
-    light = {"direct": gaussian(sight, [-1e-3], 1e-6, 5e-5)}
-    light["diffuse-specular"] = gaussian(sight, [-1e-3 + distance], q * 1e-6, 5e-5)
-    np.testing.assert_allclose(moments(psd(sight), light)[1] + 1e-3, q * distance / (1.0 + q), rtol=1e-11)
+    view, q, distance = psd_view(), 0.07, 1.3e-3
+    light = {"direct": gaussian(view, [-1e-3], 1e-6, 5e-5)}
+    light["diffuse-specular"] = gaussian(view, [-1e-3 + distance], q * 1e-6, 5e-5)
+    np.testing.assert_allclose(moments(psd(view), light)[1] + 1e-3, q * distance / (1.0 + q), rtol=1e-11)
 
 
 def test_ambient_light() -> None:
     """It pulls to the middle, by S / (S + background); demodulated it does not."""
-    sight = psd_sight()
-    light = {"direct": gaussian(sight, [1e-3], 1e-6, 5e-5)}
-    _, u = moments(psd(sight, ambient=100e-6), light)
+    view = psd_view()
+    light = {"direct": gaussian(view, [1e-3], 1e-6, 5e-5)}
+    _, u = moments(psd(view, ambient=100e-6), light)
     np.testing.assert_allclose(u, 1e-3 / 101.0, rtol=1e-11)
-    _, u = moments(psd(sight, ambient=100e-6, modulated=True), light)
+    _, u = moments(psd(view, ambient=100e-6, modulated=True), light)
     np.testing.assert_allclose(u, 1e-3, rtol=1e-12)
     # Behind a mask over the lower half ambient light lies about the middle of the upper one.
-    mask = Mask(windows=[[0.0, 3e-3]] * sight.samples)
-    total, u = moments(psd(sight, ambient=2e-6, mask=mask, responsivity=1.0), light)
+    mask = Mask(windows=[[0.0, 3e-3]] * view.samples)
+    total, u = moments(psd(view, ambient=2e-6, mask=mask, responsivity=1.0), light)
     np.testing.assert_allclose(total, 2e-6, rtol=1e-12)
     np.testing.assert_allclose(u, 0.5 * (1e-3 + 1.5e-3), rtol=1e-12)
 
 
 def test_reading_undoes_the_electronics(device: Device) -> None:
     """Dark levels, gain, load and linearity are put into the currents, and taken out by the readout."""
-    sight = psd_sight()
-    linearity = tuple(tuple(1e-5 * np.sin(np.arange(9) + strip)) for strip in range(sight.samples))
+    view = psd_view()
+    linearity = tuple(tuple(1e-5 * np.sin(np.arange(9) + strip)) for strip in range(view.samples))
     electronics = {
         "dark": (3e-9, 5e-9),
         "right_gain": 1.2,
@@ -99,33 +99,33 @@ def test_reading_undoes_the_electronics(device: Device) -> None:
         "precision": "single" if not device.has_double else "double",
     }
     places = np.array([-2.9e-3, -1e-3, 1e-6, 1.234e-3, 2.9e-3])
-    light = stack([{"direct": sight.deposit(places, sight.v_middles, 1e-6)}] * 3)
-    simulator = psd(sight, readout=electronics)
+    light = stack([{"direct": view.deposit(places, view.v_middles, 1e-6)}] * 3)
+    simulator = psd(view, readout=electronics)
     reading = simulator.read(light, device=device)
     rounding = 1e-12 if device.has_double else 1e-6
     np.testing.assert_allclose(reading.position, np.broadcast_to(places, (3, 5)), atol=LENGTH * rounding)
     np.testing.assert_allclose(reading.strength, 0.4e-6, rtol=2.0 * rounding)
-    g, h = sheet_point(sight.triangulation, places, sight.v_middles)
+    g, h = sheet_point(view.triangulation, places, view.v_middles)
     np.testing.assert_allclose(reading.h[1], h, atol=0.1 * rounding)
     np.testing.assert_allclose(reading.g[2], g, atol=0.1 * rounding)
     assert not reading.status.any()
 
 
 def test_no_light_is_no_reading(device: Device) -> None:
-    sight = psd_sight()
-    reading = psd(sight).read({"direct": sight.deposit([0.0], [sight.v_middles[1]], [1e-6])}, device=device)
+    view = psd_view()
+    reading = psd(view).read({"direct": view.deposit([0.0], [view.v_middles[1]], [1e-6])}, device=device)
     assert np.isfinite(reading.h).tolist() == [False, True, False, False, False]
     assert (reading.status == Status.LOW_SIGNAL).tolist() == [True, False, True, True, True]
 
 
 def test_codes(device: Device) -> None:
     """Codes are within half a step of the currents; what is beyond the highest one is flagged."""
-    sight = psd_sight()
-    light = {"direct": sight.deposit([1e-3] * 3, sight.v_middles[:3], [1e-6, 1e-7, 1e-2])}
-    coded = psd(sight, readout={"ampere": 1e-11, "dark": (1e-9, 1e-9)}, codes=True)
+    view = psd_view()
+    light = {"direct": view.deposit([1e-3] * 3, view.v_middles[:3], [1e-6, 1e-7, 1e-2])}
+    coded = psd(view, readout={"ampere": 1e-11, "dark": (1e-9, 1e-9)}, codes=True)
     codes = coded.currents(light, seed=0)
     assert codes.dtype == np.uint16
-    exact = psd(sight, readout={"dark": (1e-9, 1e-9)}).currents(light)
+    exact = psd(view, readout={"dark": (1e-9, 1e-9)}).currents(light)
     np.testing.assert_allclose(coded.currents(light)[:2], exact[:2] / 1e-11, rtol=1e-14)
     np.testing.assert_allclose(1e-11 * codes[:2].astype(float), exact[:2], atol=0.5e-11 * (1.0 + 1e-9))
     reading = coded.read(light, seed=0, device=device)
@@ -133,23 +133,23 @@ def test_codes(device: Device) -> None:
     assert coded.read(light, device=device).status[2] == Status.SATURATED
     # Half a step of either current.
     assert abs(reading.position[0] - 1e-3) < 0.5e-11 / 0.4e-6 * LENGTH
-    saturating = psd(sight, readout={"saturation": 1e-6}).read(light, device=device)
+    saturating = psd(view, readout={"saturation": 1e-6}).read(light, device=device)
     assert saturating.status.tolist()[:3] == [0, 0, Status.SATURATED]
 
 
 def test_noise_is_what_the_readout_predicts(device: Device) -> None:
     """Over many profiles the readings scatter by the sigma that the readout gives for them, each cause by itself."""
-    sight, spot, current = psd_sight(), 2e-4, 0.4e-6
-    places = np.linspace(-2e-3, 2e-3, sight.samples)
-    one = {"direct": gaussian(sight, places, current / 0.4, spot)}
+    view, spot, current = psd_view(), 2e-4, 0.4e-6
+    places = np.linspace(-2e-3, 2e-3, view.samples)
+    one = {"direct": gaussian(view, places, current / 0.4, spot)}
     light = stack([one] * 600)
     for kinds in ({"independent": 2e-9}, {"opposed": 2e-9}, {"spot": spot, "bandwidth": 1e9}):
-        simulator = psd(sight, readout={"noise": PsdNoise(**kinds)})
+        simulator = psd(view, readout={"noise": PsdNoise(**kinds)})
         reading = simulator.read(light, seed=7, device=device)
         sigma = simulator.read(one, device=device).sigma
         # 3000 samples: 1.3 % is one standard error; shot noise knows the spot's bins only.
         assert np.sqrt(np.mean((reading.h.std(axis=0) / sigma) ** 2)) == pytest.approx(1.0, abs=0.06)
-        slope = height_secant(sight.triangulation, places, places, sight.v_middles)
+        slope = height_secant(view.triangulation, places, places, view.v_middles)
         electrons = current / (2.0 * ELECTRON * kinds.get("bandwidth", 1.0))
         if "spot" in kinds:
             np.testing.assert_allclose(sigma, slope * spot / np.sqrt(electrons), rtol=1e-4)
@@ -157,9 +157,9 @@ def test_noise_is_what_the_readout_predicts(device: Device) -> None:
 
 def test_noise_belongs_to_the_profile() -> None:
     """Blocks do not matter: a profile's noise follows from its number; other profiles and strips have their own."""
-    sight = psd_sight()
-    light = {"direct": gaussian(sight, [0.0], 1e-6, 5e-5)}
-    simulator = psd(sight, readout={"noise": PsdNoise(independent=1e-9, bandwidth=1e6)})
+    view = psd_view()
+    light = {"direct": gaussian(view, [0.0], 1e-6, 5e-5)}
+    simulator = psd(view, readout={"noise": PsdNoise(independent=1e-9, bandwidth=1e6)})
     whole = simulator.currents(stack([light] * 6), seed=3)
     np.testing.assert_array_equal(simulator.currents(stack([light] * 2), seed=3, first=4), whole[4:])
     np.testing.assert_array_equal(simulator.currents(light, seed=3, first=2), whole[2])
@@ -168,10 +168,10 @@ def test_noise_belongs_to_the_profile() -> None:
 
 
 def test_ambient_light_has_shot_noise_also_where_its_mean_is_gone() -> None:
-    sight = psd_sight()
-    light = stack([{"direct": gaussian(sight, [0.0], 1e-6, 5e-5)}] * 400)
+    view = psd_view()
+    light = stack([{"direct": gaussian(view, [0.0], 1e-6, 5e-5)}] * 400)
     quiet, loud = (
-        psd(sight, ambient=power, modulated=True, readout={"noise": PsdNoise(bandwidth=1e6)}).currents(light, seed=1)
+        psd(view, ambient=power, modulated=True, readout={"noise": PsdNoise(bandwidth=1e6)}).currents(light, seed=1)
         for power in (0.0, 99e-6)
     )
     growth = loud.sum(axis=-1).std() / quiet.sum(axis=-1).std()
@@ -179,31 +179,31 @@ def test_ambient_light_has_shot_noise_also_where_its_mean_is_gone() -> None:
 
 
 def test_axes_that_run_backwards(device: Device) -> None:
-    """A readout whose axes point against the sensor's coordinates says the same of the light, in the sight's order."""
-    sight = psd_sight()
-    axes = SampleAxes(sample_origin=float(sight.v_middles[-1]), sample_pitch=-PITCH, position_pitch=-1.0)
-    table = tuple(tuple(1e-6 * np.arange(3) * strip) for strip in range(sight.samples))
-    light = {"direct": gaussian(sight, np.linspace(-2e-3, 2e-3, 5), [1e-6, 2e-6, 3e-6, 4e-6, 5e-6], 5e-5)}
-    ahead = psd(sight, readout={"linearity": table[::-1]}).read(light, device=device)
-    back = psd(sight, readout={"axes": axes, "linearity": table}).read(light, device=device)
+    """A readout whose axes point against the sensor's coordinates says the same of the light, in the view's order."""
+    view = psd_view()
+    axes = SampleAxes(sample_origin=float(view.v_middles[-1]), sample_pitch=-PITCH, position_pitch=-1.0)
+    table = tuple(tuple(1e-6 * np.arange(3) * strip) for strip in range(view.samples))
+    light = {"direct": gaussian(view, np.linspace(-2e-3, 2e-3, 5), [1e-6, 2e-6, 3e-6, 4e-6, 5e-6], 5e-5)}
+    ahead = psd(view, readout={"linearity": table[::-1]}).read(light, device=device)
+    back = psd(view, readout={"axes": axes, "linearity": table}).read(light, device=device)
     for one, other in zip(ahead, back, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 def test_what_is_refused() -> None:
-    sight = psd_sight()
-    light = {"direct": sight.dark()}
+    view = psd_view()
+    light = {"direct": view.dark()}
     with pytest.raises(ValueError, match="strips at"):
-        PsdSimulator(sight=sight, readout=replace(psd(sight).readout, strip_length=5e-3))
+        PsdSimulator(view=view, readout=replace(psd(view).readout, strip_length=5e-3))
     with pytest.raises(ValueError, match="samples lie about v"):
-        PsdSimulator(sight=psd_sight(strips=4), readout=psd(sight).readout)
+        PsdSimulator(view=psd_view(strips=4), readout=psd(view).readout)
     with pytest.raises(ValueError, match="layout"):
-        psd(sight, readout={"layout": "planar"})
+        psd(view, readout={"layout": "planar"})
     with pytest.raises(ValueError, match=r"responsivity is -1"):
-        psd(sight, responsivity=-1.0)
+        psd(view, responsivity=-1.0)
     with pytest.raises(ValueError, match="unknown path 'glow'"):
-        psd(sight).currents(light | {"glow": sight.dark()})
+        psd(view).currents(light | {"glow": view.dark()})
     with pytest.raises(ValueError, match="light of one path or more"):
-        psd(sight).currents({})
+        psd(view).currents({})
     with pytest.raises(ValueError, match=r"expected \(\.\.\., 5, 60\)"):
-        psd(sight).currents({"direct": psd_sight(50).dark()})
+        psd(view).currents({"direct": psd_view(50).dark()})

@@ -21,13 +21,13 @@ from gpuvision.simulation.sensors.readings import (
     stack,
     with_ambient,
 )
-from lights import LENGTH, PITCH, gaussian, psd_sight
+from lights import LENGTH, PITCH, gaussian, psd_view
 
 LENSES = [None, Lens(k1=-4000.0), Lens(k1=2000.0, k2=1e7, centre=(1e-4, -2e-4))]
 
 
 def with_lens(lens: Lens | None) -> Triangulation:
-    return replace(psd_sight().triangulation, lens=lens)
+    return replace(psd_view().triangulation, lens=lens)
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -57,21 +57,19 @@ def test_secants(lens: Lens | None, rng: np.random.Generator) -> None:
 
 
 def test_slope_at_the_truth() -> None:
-    sight = psd_sight()
-    u = np.linspace(-2e-3, 2e-3, sight.samples)
-    g, h = sheet_point(sight.triangulation, u, sight.v_middles)
+    view = psd_view()
+    u = np.linspace(-2e-3, 2e-3, view.samples)
+    g, h = sheet_point(view.triangulation, u, view.v_middles)
     h[1] = np.nan
-    found, slope = height_slope(sight, Truth(g, h, np.zeros(5, np.uint8)))
+    found, slope = height_slope(view, Truth(g, h, np.zeros(5, np.uint8)))
     known = np.arange(5) != 1
     np.testing.assert_allclose(found[known], u[known], atol=1e-15)
     assert np.isnan(found[1])
-    np.testing.assert_allclose(
-        slope[known], height_secant(sight.triangulation, u, u, sight.v_middles)[known], rtol=1e-10
-    )
+    np.testing.assert_allclose(slope[known], height_secant(view.triangulation, u, u, view.v_middles)[known], rtol=1e-10)
 
 
 def test_beyond_the_horizon_there_is_no_point() -> None:
-    triangulation = psd_sight().triangulation
+    triangulation = psd_view().triangulation
     row = triangulation.homography[2]
     horizon = -row[2] / row[0]
     g, h = sheet_point(triangulation, [0.9 * horizon, 1.1 * horizon], 0.0)
@@ -81,13 +79,13 @@ def test_beyond_the_horizon_there_is_no_point() -> None:
 
 def test_light_of_profiles() -> None:
     """Paths add up, variants of the direct light do not; a path that a profile lacks is dark there."""
-    sight = psd_sight()
-    spots = [gaussian(sight, [place], 1e-6, 1e-4) for place in (-1e-3, 0.0, 1e-3)]
+    view = psd_view()
+    spots = [gaussian(view, [place], 1e-6, 1e-4) for place in (-1e-3, 0.0, 1e-3)]
     block = stack([{"direct": spots[0], EVEN: spots[2]}, {"direct": spots[1], "bounces": spots[2]}])
     assert not block["bounces"].power[0].any()
     np.testing.assert_array_equal(lit_by(block).power, [spots[0].power, spots[1].power + spots[2].power])
     np.testing.assert_array_equal(lit_by(block).moment, [spots[0].moment, spots[1].moment + spots[2].moment])
-    bright = with_ambient(sight, with_ambient(sight, block, 1e-6), 2e-6)
+    bright = with_ambient(view, with_ambient(view, block, 1e-6), 2e-6)
     np.testing.assert_allclose(bright[AMBIENT].total(), 3e-6, rtol=1e-14)
     for wrong in ([], [{}]):
         with pytest.raises(ValueError, match="one or more profiles"):

@@ -6,32 +6,8 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.lens import Lens
-from gpuvision.ranging.range_image import StraightTransport
-from gpuvision.ranging.triangulation import Triangulation
-from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
-
-BASELINE, STAND_OFF, FOCAL = 0.08, 0.15, 0.04
-DISTANCE = math.hypot(BASELINE, STAND_OFF)
-
-
-def sight(*, tilt: float | None = 0.0, distortion: Lens | None = None, **more: object) -> SensorView:
-    geometry = Triangulation.from_stand_off(
-        baseline=BASELINE,
-        stand_off=STAND_OFF,
-        focal_distance=FOCAL,
-        tilt=tilt,
-        region=((-3e-3, 3e-3), (-6e-3, 6e-3)),
-        lens=distortion,
-    )
-    values: dict[str, object] = {
-        "triangulation": geometry,
-        "transport": StraightTransport(step=1e-4),
-        "lens": (0.0, BASELINE, STAND_OFF),
-        "u_edges": np.linspace(-3e-3, 3e-3, 13),
-        "v_edges": np.linspace(-6e-3, 6e-3, 8),
-    }
-    return SensorView(**(values | more))
-
+from gpuvision.simulation.sensors.sensor_view import Exposure
+from sensor_views import BASELINE, FOCAL, STAND_OFF, sensor_view
 
 LENSES = [None, Lens(k1=-900.0, centre=(1e-4, -2e-4))]
 
@@ -39,7 +15,7 @@ LENSES = [None, Lens(k1=-900.0, centre=(1e-4, -2e-4))]
 @pytest.mark.parametrize("tilt", [None, 0.0, 0.2])
 @pytest.mark.parametrize("lens", LENSES)
 def test_points_of_the_sheet_are_imaged_as_the_triangulation_says(tilt, lens):
-    one = sight(tilt=tilt, distortion=lens)
+    one = sensor_view(tilt=tilt, distortion=lens)
     G, H = np.array([0.0, 0.01, -0.012]), np.array([0.0, 5e-3, -4e-3])
     uv = one.project(np.stack([G, np.full(3, 0.03), H], axis=-1), L=0.03)
     np.testing.assert_allclose(uv, one.triangulation.to_sensor(np.stack([G, H], axis=-1)), atol=1e-15)
@@ -48,7 +24,7 @@ def test_points_of_the_sheet_are_imaged_as_the_triangulation_says(tilt, lens):
 
 
 def test_a_ray_passes_what_is_imaged_where_it_starts():
-    one = sight(tilt=0.1, distortion=LENSES[1])
+    one = sensor_view(tilt=0.1, distortion=LENSES[1])
     rng = np.random.default_rng(3)
     points = rng.uniform([-0.01, 0.01, -0.01], [0.01, 0.03, 0.01], (50, 3))
     uv = one.project(points, L=0.02)
@@ -59,14 +35,14 @@ def test_a_ray_passes_what_is_imaged_where_it_starts():
 
 
 def test_what_is_behind_the_lens_or_over_the_horizon_is_nowhere():
-    one = sight()
+    one = sensor_view()
     # Behind the lens; beside it, on a ray that does not come to the sheet.
     assert np.isnan(one.project([[0.0, 2 * BASELINE, 2 * STAND_OFF], [0.0, 0.5, 0.2]])).all()
     assert one.received([0.0, 2 * BASELINE, 2 * STAND_OFF]) == 0.0
 
 
 def test_an_untilted_lens_loses_by_the_fourth_power_of_the_cosine():
-    one = sight()
+    one = sensor_view()
     u, v = np.meshgrid([-3e-3, 0.0, 2e-3], [-6e-3, 0.0, 5e-3])
     cosine = FOCAL / np.sqrt(FOCAL**2 + u**2 + v**2)
     opening = 0.25 * math.pi * one.aperture**2
@@ -77,7 +53,7 @@ def test_an_untilted_lens_loses_by_the_fourth_power_of_the_cosine():
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_patch_gives_what_its_image_gets(tilt, lens):
     # A small patch of radiance 1 that does not lie in the sheet: what it sends to the lens is what its image holds.
-    one = sight(tilt=tilt, distortion=lens)
+    one = sensor_view(tilt=tilt, distortion=lens)
     middle, e1, e2 = np.array([4e-3, 6e-3, 3e-3]), np.array([1.0, 0.2, -0.1]), np.array([0.1, 0.9, 0.3])
     size = 1e-6
     normal = np.cross(e1, e2) * size**2
@@ -89,7 +65,7 @@ def test_a_patch_gives_what_its_image_gets(tilt, lens):
 
 
 def test_light_is_counted_once_and_its_moment_kept():
-    one = sight()
+    one = sensor_view()
     rng = np.random.default_rng(5)
     u, v, power = rng.uniform(-4e-3, 4e-3, 500), rng.uniform(-7e-3, 7e-3, 500), rng.uniform(0.0, 1.0, 500)
     got = one.deposit(u, v, power)
@@ -104,7 +80,7 @@ def test_light_is_counted_once_and_its_moment_kept():
 
 
 def test_the_ends_of_the_sensor_belong_to_it():
-    one = sight()
+    one = sensor_view()
     np.testing.assert_array_equal(one.bin_of([-3e-3, 3e-3, 3.1e-3, np.nan]), [0, 11, -1, -1])
     np.testing.assert_array_equal(one.sample_of([-6e-3, 6e-3, -6.1e-3]), [0, 6, -1])
 
@@ -121,12 +97,12 @@ def test_the_ends_of_the_sensor_belong_to_it():
 )
 def test_wrong_parameters_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
-        sight(**change)
+        sensor_view(**change)
 
 
 @pytest.mark.parametrize("sigma", [3e-5, 2.5e-4, 2e-3])
 def test_a_blurred_spot_is_a_gaussian(sigma):
-    one = sight(u_edges=np.linspace(-3e-3, 3e-3, 61))
+    one = sensor_view(u_edges=np.linspace(-3e-3, 3e-3, 61))
     # In one bin each, off its middle; the last one loses light at the sensor's end.
     at, light = np.array([0.37e-3, -1.02e-3, 2.94e-3]), np.array([2.0, 1.0, 0.5])
     got = one.blurred(one.deposit(at, [0.0, 0.0, 0.0], light), sigma)
@@ -141,7 +117,7 @@ def test_a_blurred_spot_is_a_gaussian(sigma):
 
 
 def test_no_blur_changes_nothing():
-    one = sight()
+    one = sensor_view()
     got = one.deposit([1e-3], [0.0], [1.0])
     assert one.blurred(got, 0.0) is got
     assert not one.blurred(one.dark(), 1e-4).power.any()

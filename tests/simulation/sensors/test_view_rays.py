@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from simulation.test_sight import sight
 
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.view_rays import ViewRays
+from sensor_views import sensor_view
 
 GREY = Material(diffuse=Lambert(albedo=0.5))
 WHITE = Material(diffuse=Lambert(albedo=1.0))
@@ -23,8 +23,8 @@ def floor(z: float = 0.0, size: float = 0.2) -> trimesh.Trimesh:
 
 @pytest.mark.parametrize("nodes", [(1, 1), (2, 3)])
 def test_elements_lie_on_what_is_seen_where_its_image_is(device, nodes):
-    one = sight(tilt=0.1)
-    lines = ViewRays(sight=one, scene=Scene.of(floor(1e-3)), materials=[GREY], nodes=nodes, device=device)
+    one = sensor_view(tilt=0.1)
+    lines = ViewRays(view=one, scene=Scene.of(floor(1e-3)), materials=[GREY], nodes=nodes, device=device)
     seen = lines.surface(0.02)
     assert seen.receivers.shape == (one.samples, one.bins * nodes[0] * nodes[1], 6)
     np.testing.assert_allclose(seen.receivers[..., 2], 1e-3, atol=1e-15)
@@ -37,8 +37,8 @@ def test_elements_lie_on_what_is_seen_where_its_image_is(device, nodes):
 
 
 def test_uniform_light_gives_the_etendue_and_its_moment(device):
-    one = sight()
-    lines = ViewRays(sight=one, scene=Scene.of(floor()), materials=[GREY], nodes=(4, 4), device=device)
+    one = sensor_view()
+    lines = ViewRays(view=one, scene=Scene.of(floor()), materials=[GREY], nodes=(4, 4), device=device)
     seen = lines.surface(0.0)
     got = lines.exposure(seen, np.full(seen.weights.shape, 3.0))
     # Radiance 3 * 0.5 / pi everywhere: an independent sum over a fine grid of the sensor.
@@ -54,8 +54,8 @@ def test_the_side_that_the_lens_sees_counts_and_the_nearer_surface(device):
     under, over = floor(-5e-3), floor(4e-3, size=0.004)
     over.invert()
     scene = Scene(np.concatenate([under.triangles, over.triangles]), np.array([0, 0, 1, 1], np.int32))
-    one = sight()
-    lines = ViewRays(sight=one, scene=scene, materials=[GREY, WHITE], device=device)
+    one = sensor_view()
+    lines = ViewRays(view=one, scene=scene, materials=[GREY, WHITE], device=device)
     seen = lines.surface(0.0)
     near = seen.receivers[..., 2] > 0.0
     assert near.any()
@@ -66,8 +66,8 @@ def test_the_side_that_the_lens_sees_counts_and_the_nearer_surface(device):
 
 
 def test_where_nothing_is_seen_nothing_comes(device):
-    one = sight()
-    lines = ViewRays(sight=one, scene=Scene.of(floor(size=0.003)), materials=[GREY], device=device)
+    one = sensor_view()
+    lines = ViewRays(view=one, scene=Scene.of(floor(size=0.003)), materials=[GREY], device=device)
     seen = lines.surface(0.0)
     missed = seen.triangle < 0
     assert missed.any()
@@ -81,4 +81,4 @@ def test_where_nothing_is_seen_nothing_comes(device):
 def test_a_material_for_every_number(device):
     scene = Scene(floor().triangles, np.array([0, 2], np.int32))
     with pytest.raises(ValueError, match="materials 0 to 2"):
-        ViewRays(sight=sight(), scene=scene, materials=[GREY], device=device)
+        ViewRays(view=sensor_view(), scene=scene, materials=[GREY], device=device)

@@ -15,7 +15,7 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 from gpuvision.simulation.transport.patches import FormFactors, Patches
 from gpuvision.simulation.transport.radiosity import Radiosity
-from reference import bounces as reference
+from reference import radiosity as reference
 
 PRECISIONS = pytest.mark.parametrize("precision", ["single", "double"])
 TO = {"single": 1e-6, "double": 1e-11}

@@ -21,7 +21,7 @@ from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet
 from gpuvision.simulation.transport.specular_highlights import specular_highlights
 from gpuvision.status import Status
-from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sight, two_plates, u_of
+from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sensor_view, two_plates, u_of
 from reference.rays import occluded
 
 # ---- power, bins, samples ----------------------------------------------------------------------------------
@@ -31,7 +31,7 @@ from reference.rays import occluded
 @pytest.mark.parametrize("sigma", [0.0, 1e-4])
 def test_power_of_a_plate(device: Device, lens: Lens | None, sigma: float) -> None:
     """Each sample gets what its part of the line sends into the lens; the place is that of the line."""
-    seen_by = sight(lens=lens, samples=16)
+    seen_by = sensor_view(lens=lens, samples=16)
     light = light_of(plate(z=3e-3), seen_by=seen_by, power=2.0, sigma=sigma, sub_sheets=5, device=device)
     direct = light.exposures(0.02)["direct"]
     node, weight = np.polynomial.legendre.leggauss(40)
@@ -58,11 +58,13 @@ def test_finer_bins_and_samples_add_up(rng: np.random.Generator) -> None:
     gloss = Material(diffuse=OrenNayar(albedo=0.4, roughness=0.5), gloss=Phong(albedo=0.3, exponent=20.0))
     sums = []
     for bins, samples in ((1, 4), (40, 4), (7, 64)):
-        light = light_of(Scene.of(mesh), (gloss,), seen_by=sight(bins=bins, samples=samples), sigma=1e-5, sub_sheets=3)
+        light = light_of(
+            Scene.of(mesh), (gloss,), seen_by=sensor_view(bins=bins, samples=samples), sigma=1e-5, sub_sheets=3
+        )
         found = light.exposures(2e-3)
         assert set(found) == {"direct", "specular"}
         sums.append([found[name].total().reshape(4, -1).sum(axis=1) for name in ("direct", "specular")])
-        moments = found["direct"].first_moment(light.sight.u_edges).reshape(4, -1).sum(axis=1)
+        moments = found["direct"].first_moment(light.view.u_edges).reshape(4, -1).sum(axis=1)
         sums[-1].append(moments / 1e-3)
     np.testing.assert_allclose(sums[1], sums[2], rtol=2e-4, atol=1e-14)
     np.testing.assert_allclose(sums[0], sums[1], rtol=2e-2, atol=1e-14)
@@ -76,7 +78,7 @@ def test_finer_bins_and_samples_add_up(rng: np.random.Generator) -> None:
 def test_as_rays_to_the_lens_say(device: Device, source: Any, lens: Lens | None, rng: np.random.Generator) -> None:
     """Light of points on the lit line, each with a ray to the lens; truths lie on the line and are seen."""
     tips = rng.uniform(-0.02, 0.02, (150, 1, 3)) + rng.normal(0.0, 4e-3, (150, 3, 3))
-    scene, seen_by, L = Scene(np.concatenate([tips, plate(0.03, 0.03, -0.02)])), sight(lens=lens, bins=6), 1e-3
+    scene, seen_by, L = Scene(np.concatenate([tips, plate(0.03, 0.03, -0.02)])), sensor_view(lens=lens, bins=6), 1e-3
     light = light_of(scene, seen_by=seen_by, source=source, device=device)
     line = light.sheet.lit(scene, L)
     count = 2000
@@ -115,10 +117,10 @@ def test_very_many_gaps() -> None:
             for a, b in zip(teeth[::2], teeth[1::2], strict=False)
         ]
     )
-    light = light_of(np.concatenate([plate(), screen]), seen_by=sight(samples=1))
+    light = light_of(np.concatenate([plate(), screen]), seen_by=sensor_view(samples=1))
     found = light.exposures(0.0, causes=True)
     assert 0.3 < found["direct"].total()[0] / found[OPEN].total()[0] < 0.9
-    parts = light._line_of_sight.parts(light.sheet.lit(light.scene, 0.0), light.sight.lens_at(0.0), hidden=True)
+    parts = light._line_of_sight.parts(light.sheet.lit(light.scene, 0.0), light.view.lens_at(0.0), hidden=True)
     assert parts.seen.sum() >= 100
     assert np.sum(parts.end - parts.start) == pytest.approx(parts.segment.max() + 1, rel=1e-12)
     # The plate is 2 m wide, and the lit line is two segments of 1 m; the shadows are the teeth's, from the lens.
@@ -144,7 +146,7 @@ def test_grazing_light(lean: float) -> None:
     tangent = math.tan(math.radians(lean))
     low, high = -2e-3 / tangent, 2e-3 / tangent
     wall = quad((low, -1, -2e-3), (high, -1, 2e-3), (high, 1, 2e-3), (low, 1, -2e-3))
-    seen_by = sight(samples=1, bins=1, lens=None)
+    seen_by = sensor_view(samples=1, bins=1, lens=None)
     light = light_of(wall, seen_by=seen_by)
     assert light.sheet.lit(light.scene, 0.0).total() == pytest.approx(high - low, rel=1e-12)
     share = np.polynomial.legendre.leggauss(30)
@@ -161,7 +163,7 @@ def test_metres_and_micrometres() -> None:
     L, fine = 100.0, 1e-6
     ground = plate(10.0, 10.0) + np.array([0.0, L, 0.0])
     tile = plate(5e-6, 1e-5, fine) + np.array([2e-3, L, 0.0])
-    seen_by = sight(samples=20001)
+    seen_by = sensor_view(samples=20001)
     light = light_of(np.concatenate([ground, tile]), seen_by=seen_by)
     truth = light.truth(L)
     on_tile = np.abs(truth.g - 2e-3) < 4.9e-6
@@ -174,7 +176,9 @@ def test_metres_and_micrometres() -> None:
 def test_out_of_view_behind_the_lens_and_beyond_the_fold(lens: Lens | None) -> None:
     """A ramp from below the sensor's range up to far above the lens: what has an image counts, and nothing else."""
     ramp = quad((-0.03, -1, -0.05), (0.5, -1, 1.0), (0.5, 1, 1.0), (-0.03, 1, -0.05))
-    seen_by = sight(lens=lens, bins=30, u_edges=np.linspace(-9e-3, 9e-3, 31), v_edges=np.linspace(-9e-3, 9e-3, 10))
+    seen_by = sensor_view(
+        lens=lens, bins=30, u_edges=np.linspace(-9e-3, 9e-3, 31), v_edges=np.linspace(-9e-3, 9e-3, 10)
+    )
     found = light_of(ramp, seen_by=seen_by).exposures(0.0)["direct"]
     line = LightSheet(transport=TRANSPORT).lit(Scene(ramp), 0.0)
     share = (np.arange(200_000) + 0.5) / 200_000
@@ -199,7 +203,7 @@ def test_truth_at_a_step() -> None:
     Where it ends right of the middle, samples see it and the plate: ambiguous; on the left they see neither.
     """
     for at, flag in ((8e-3, Status.AMBIGUOUS), (-8e-3, Status.LOW_SIGNAL)):
-        seen_by = sight(samples=2000)
+        seen_by = sensor_view(samples=2000)
         tape = quad((-1, -2e-4, 5e-3), (at, -2e-4, 5e-3), (at, 2e-4, 5e-3), (-1, 2e-4, 5e-3))
         light = light_of(np.concatenate([plate(), tape]), seen_by=seen_by)
         truth = light.truth(0.0)
@@ -216,7 +220,9 @@ def test_truth_follows_the_transport(rng: np.random.Generator) -> None:
     ball = trimesh.creation.icosphere(6, 0.02)
     light = light_of(
         Scene.of(ball),
-        seen_by=sight(samples=64, lens=Lens(k1=-900.0, centre=(1e-4, -2e-4)), bins=1, u_edges=np.array([-9e-3, 9e-3])),
+        seen_by=sensor_view(
+            samples=64, lens=Lens(k1=-900.0, centre=(1e-4, -2e-4)), bins=1, u_edges=np.array([-9e-3, 9e-3])
+        ),
     )
     for L in rng.uniform(-5e-3, 5e-3, 4):
         truth = light.truth(float(L))
@@ -244,7 +250,7 @@ def test_several_profiles_at_once(device: Device, sigma: float) -> None:
     """As one by one, in any order, some beside the part; shining mirrors and lobes among them."""
     ball = trimesh.creation.icosphere(3, 0.02)
     made_of = Material(diffuse=Lambert(albedo=0.2), gloss=Phong(albedo=0.2, exponent=30.0), mirror=0.3)
-    seen_by = sight(bins=5, aperture=0.02)
+    seen_by = sensor_view(bins=5, aperture=0.02)
     light = light_of(Scene.of(ball), (made_of,), seen_by=seen_by, sigma=sigma, source=(0.01, 0.2), device=device)
     places = np.array([3e-3, -0.5, 1e-2, *np.linspace(-4e-3, 4e-3, 9), 0.0])
     together, truths = light.exposures_along(places, causes=True), light.truths_along(places)
@@ -263,7 +269,7 @@ def test_in_a_slit_is_dark() -> None:
     """A part wholly in a deep slit, lit from above: the lens sees the walls' upper edges alone."""
     walls = [quad((-1, y, -0.05), (1, y, -0.05), (1, y, 0.0), (-1, y, 0.0)) for y in (-2e-3, 2e-3)]
     scene = np.concatenate([plate(1.0, 2e-3, -0.05), *walls])
-    truth = light_of(scene, seen_by=sight(bins=1, u_edges=np.array([-0.1, 0.1]))).truth(0.0)
+    truth = light_of(scene, seen_by=sensor_view(bins=1, u_edges=np.array([-0.1, 0.1]))).truth(0.0)
     np.testing.assert_array_equal(truth.status, Status.LOW_SIGNAL)
     assert np.isnan(truth.g).all()
 
@@ -281,7 +287,7 @@ def test_lobes_are_resolved(lobe: Any) -> None:
     fall = math.tan(tilt)
     slope = quad((-1, -1, fall), (1, -1, fall), (1, 1, -fall), (-1, 1, -fall))
     made_of = Material(diffuse=Lambert(albedo=0.2), gloss=lobe)
-    seen_by = sight(samples=2, bins=1)
+    seen_by = sensor_view(samples=2, bins=1)
     light = light_of(slope, (made_of,), seen_by=seen_by)
     found = light.exposures(0.0)
     G = np.linspace(-0.03, 0.03, 1_000_001)
@@ -310,7 +316,7 @@ def mirror_to_the_lens(turn: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 def test_a_mirror_throws_the_light_into_the_lens(device: Device) -> None:
     """Of parallel light the width of the opening, dimmed by the mirror; a degree off, nothing."""
     made_of = Material(diffuse=Lambert(albedo=0.0), mirror=0.7)
-    seen_by = sight(samples=9)
+    seen_by = sensor_view(samples=9)
     corners, _ = mirror_to_the_lens()
     glint = light_of(corners, (made_of,), seen_by=seen_by, power=3.0, device=device).exposures(0.0)
     np.testing.assert_allclose(glint["specular"].total()[4], 3.0 * 0.7 * seen_by.aperture, rtol=1e-9)
@@ -327,7 +333,7 @@ def test_a_mirror_throws_the_light_into_the_lens(device: Device) -> None:
 def test_a_thick_sheet_in_a_mirror() -> None:
     """The beam is wider than the opening: what goes in is the integral of its density over a disc."""
     made_of = Material(diffuse=Lambert(albedo=0.0), mirror=1.0)
-    seen_by, sigma = sight(samples=9, aperture=2e-4), 1e-4
+    seen_by, sigma = sensor_view(samples=9, aperture=2e-4), 1e-4
     corners, normal = mirror_to_the_lens()
     light = light_of(corners, (made_of,), seen_by=seen_by, sigma=sigma, sub_sheets=400)
     off = np.linspace(-1e-4, 1e-4, 20001)
@@ -341,7 +347,7 @@ def test_a_thick_sheet_in_a_mirror() -> None:
 @pytest.mark.parametrize("source", [None, (0.01, 0.2), (-0.02, 0.1)])
 def test_glints_as_rays_say(source: Any, rng: np.random.Generator) -> None:
     """Facets that lean any way by some degrees: of a thousand rays on each, those that meet the opening."""
-    seen_by = sight(aperture=0.02)
+    seen_by = sensor_view(aperture=0.02)
     turns = rng.normal(0.0, 0.1, (300, 2))
     made_of = Material(diffuse=Lambert(albedo=0.0), mirror=1.0)
     facets, G = [], np.linspace(-0.02, 0.02, 301)
@@ -376,7 +382,7 @@ def test_glints_as_rays_say(source: Any, rng: np.random.Generator) -> None:
 def test_causes() -> None:
     """Even surfaces, and nothing in the way: without a screen and with white surfaces nothing changes."""
     scene, materials = two_plates(0.2, 0.8)
-    light = light_of(scene, materials, seen_by=sight(), sigma=1e-4, sub_sheets=[0.0])
+    light = light_of(scene, materials, seen_by=sensor_view(), sigma=1e-4, sub_sheets=[0.0])
     found = light.exposures(0.0, causes=True)
     assert set(found) == {"direct", "specular", EVEN, OPEN, EVEN_OPEN}
     np.testing.assert_array_equal(found[OPEN].power, found["direct"].power)
@@ -397,5 +403,5 @@ def test_refused(wrong: dict[str, Any], message: str) -> None:
         light_of(plate(), ())
     with pytest.raises(ValueError, match="different transports"):
         DirectLight(
-            sight=sight(), scene=Scene(plate()), materials=(GREY,), sheet=LightSheet(transport=StraightTransport())
+            view=sensor_view(), scene=Scene(plate()), materials=(GREY,), sheet=LightSheet(transport=StraightTransport())
         )

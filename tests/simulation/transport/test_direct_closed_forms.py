@@ -16,13 +16,13 @@ from gpuvision.simulation.sensors.readings import OPEN
 from gpuvision.simulation.sensors.sensor_view import SensorView
 from gpuvision.simulation.transport.direct import Slabs
 from gpuvision.simulation.transport.sheet_cut import SheetIndex
-from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sight, two_plates, u_of
+from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sensor_view, two_plates, u_of
 
 FAR, SIGMA = 1e4, 1e-4
 
 
 def far_sight() -> SensorView:
-    return sight(scale=FAR, bins=3, samples=1)
+    return sensor_view(scale=FAR, bins=3, samples=1)
 
 
 def u_per_metre(seen_by: SensorView, towards: Any) -> float:
@@ -159,7 +159,7 @@ def test_slabs() -> None:
 @pytest.mark.parametrize("count", [1, 2, 9])
 def test_a_plate_gives_a_gaussian(count: int) -> None:
     """Whatever the number of slabs: in every bin the light that falls into it. Rounding is that of 1.7 km."""
-    seen_by = sight(scale=FAR, bins=400, samples=1)
+    seen_by = sensor_view(scale=FAR, bins=400, samples=1)
     light = light_of(plate(z=1e-3), seen_by=seen_by, sigma=SIGMA, sub_sheets=count)
     direct = light.exposures(0.0)["direct"]
     middle = seen_by.project([0.0, 0.0, 1e-3])[0]
@@ -173,9 +173,9 @@ def test_a_plate_gives_a_gaussian(count: int) -> None:
 
 def test_light_that_falls_beside_the_sensor_is_lost() -> None:
     """Half of the spot over the end of the strips: half of the power, and sqrt(2 / pi) of its widths in its place."""
-    whole = sight(scale=FAR, bins=4, samples=1)
+    whole = sensor_view(scale=FAR, bins=4, samples=1)
     middle = whole.project([0.0, 0.0, 1e-3])[0]
-    cut = sight(scale=FAR, samples=1, u_edges=np.array([-3e-3, 0.0, middle]))
+    cut = sensor_view(scale=FAR, samples=1, u_edges=np.array([-3e-3, 0.0, middle]))
     powers, places = [], []
     for seen_by in (whole, cut):
         direct = light_of(plate(z=1e-3), seen_by=seen_by, sigma=SIGMA).exposures(0.0)["direct"]

@@ -18,7 +18,7 @@ from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
 from gpuvision.simulation.transport.mirrors import Mirrors
-from mirror_scenes import mirrors_of, quad, sight
+from mirror_scenes import mirrors_of, quad, sensor_view
 from reference import mirrors as reference
 
 ALBEDO, SHARE = 0.5, 0.8
@@ -30,7 +30,7 @@ FLOOR = quad([-0.1, -0.05, 0], [0.1, -0.05, 0], [0.1, 0.05, 0], [-0.1, 0.05, 0])
 
 
 def sheet(**more: object) -> LightSheet:
-    return LightSheet(**({"transport": sight().transport, "power": 3.0} | more))
+    return LightSheet(**({"transport": sensor_view().transport, "power": 3.0} | more))
 
 
 def before_a_wall(distance: float) -> Scene:
@@ -57,9 +57,9 @@ def expected_of_line(sensor: SensorView, y: float, power: float) -> np.ndarray:
 
 def test_a_plane_mirror_shows_a_second_line_at_twice_its_distance(device: Device) -> None:
     """And a PSD reads R' D / (1 + R'): the second line's share of the light, and how far off it is."""
-    sensor, distance = sight(12, 480), 0.004
+    sensor, distance = sensor_view(12, 480), 0.004
     scene = before_a_wall(distance)
-    mirrors = mirrors_of(scene, MATERIALS, device, sight=sensor)
+    mirrors = mirrors_of(scene, MATERIALS, device, view=sensor)
     lit = sheet().lit(scene, 0.0)
     seen, direct = mirrors.seen(lit, 0.0), mirrors.direct(lit, 0.0)
     image = expected_of_line(sensor, -2.0 * distance, SHARE * ALBEDO * 3.0)
@@ -77,7 +77,7 @@ def test_a_plane_mirror_shows_a_second_line_at_twice_its_distance(device: Device
 
 def test_a_mirror_of_micrometres_in_a_scene_of_metres(device: Device) -> None:
     """20 um of mirror show the part of the line that the way to them and on says."""
-    sensor, distance, low, high = sight(), 0.004, 3e-3, 3.02e-3
+    sensor, distance, low, high = sensor_view(), 0.004, 3e-3, 3.02e-3
     wall = quad([low, -distance, 0], [high, -distance, 0], [high, -distance, 0.1], [low, -distance, 0.1])
     scene = Scene(np.concatenate([10.0 * np.array(FLOOR), wall]), np.array([0, 0, 1, 1]))
     lit = sheet(g_limits=(-0.05, 0.05)).lit(scene, 0.0)
@@ -90,14 +90,14 @@ def test_a_mirror_of_micrometres_in_a_scene_of_metres(device: Device) -> None:
         return SHARE * ALBEDO * 3.0 / np.pi * cosine * float(sensor.received(image))
 
     expected = integral(density, low / share, high / share)[0]
-    seen = mirrors_of(scene, MATERIALS, device, sight=sensor).seen(lit, 0.0)
+    seen = mirrors_of(scene, MATERIALS, device, view=sensor).seen(lit, 0.0)
     # The corners are rounded in units of 1 m where there is single only.
     assert seen.power.sum() == pytest.approx(expected, rel=1e-9 if device.has_double else 0.05)
 
 
 def test_a_mirror_seen_at_89_99_degrees(device: Device) -> None:
     """A mirror 30 um under the line, which lens and line nearly lie in."""
-    sensor, height = sight(12, 480), 3e-5
+    sensor, height = sensor_view(12, 480), 3e-5
     lens, point = np.array(sensor.lens), np.zeros(3)
     along = (lens - point) / np.linalg.norm(lens - point)
     up = np.cross([1.0, 0.0, 0.0], along)
@@ -118,7 +118,7 @@ def test_a_mirror_seen_at_89_99_degrees(device: Device) -> None:
         cosine = normal @ (spot - place) / np.linalg.norm(spot - place)
         return SHARE / 2.0 * ALBEDO * 3.0 / np.pi * cosine * float(sensor.received(image))
 
-    seen = mirrors_of(scene, materials, device, sight=sensor).seen(line, 0.0)
+    seen = mirrors_of(scene, materials, device, view=sensor).seen(line, 0.0)
     assert height / np.linalg.norm(lens - point) < 2e-4
     assert seen.power.sum() == pytest.approx(integral(density, -5e-3, 5e-3)[0], rel=1e-8 if device.has_double else 1e-2)
 
@@ -132,9 +132,9 @@ def test_direct_light_is_what_the_direct_path_says(device: Device, rng: np.rando
     )
     scene = Scene(np.concatenate([np.array(FLOOR), np.array(heap.triangles)]))
     # The line on the floor is not imaged onto the edge of a bin.
-    sensor, light = sight(120, 241), sheet(source=(0.0, 0.2))
-    theirs = DirectLight(sight=sensor, scene=scene, materials=MATERIALS, sheet=light, device=device).exposures(1e-4)
-    ours = mirrors_of(scene, MATERIALS, device, sight=sensor).direct(light.lit(scene, 1e-4), 1e-4)
+    sensor, light = sensor_view(120, 241), sheet(source=(0.0, 0.2))
+    theirs = DirectLight(view=sensor, scene=scene, materials=MATERIALS, sheet=light, device=device).exposures(1e-4)
+    ours = mirrors_of(scene, MATERIALS, device, view=sensor).direct(light.lit(scene, 1e-4), 1e-4)
     np.testing.assert_allclose(ours.power, theirs["direct"].power, atol=1e-6 * ours.power.max())
     np.testing.assert_allclose(ours.moment, theirs["direct"].moment, atol=1e-6 * np.abs(ours.moment).max())
 
@@ -181,9 +181,9 @@ def test_plane_mirrors_show_what_points_by_brute_force_say(device: Device, seed:
     ]
     dull = np.concatenate([FLOOR, *(np.array(box.triangles) for box in boxes)])
     scene = Scene(np.concatenate([facets, dull]), np.r_[np.ones(len(facets), int), np.zeros(len(dull), int)])
-    sensor = sight(40, 60)
+    sensor = sensor_view(40, 60)
     lit = sheet(g_limits=(-0.022, 0.022)).lit(scene, 0.0)
-    ours = mirrors_of(scene, MATERIALS, device, sight=sensor).seen(lit, 0.0)
+    ours = mirrors_of(scene, MATERIALS, device, view=sensor).seen(lit, 0.0)
     theirs = mirrored_points(scene, lit, sensor, device, 3000)
     assert ours.power.sum() > 0.0
     assert ours.power.sum() == pytest.approx(theirs.power.sum(), rel=2e-3)
@@ -201,7 +201,7 @@ def ball_scene(fineness: int, radius: float, middle: np.ndarray) -> Scene:
 
 def test_a_ball_shows_a_line_as_alhazen_says(device: Device) -> None:
     radius, middle = 5e-3, np.array([0.0, -0.007, 5.0e-3])
-    sensor, light = sight(240, 480), sheet(g_limits=(-0.015, 0.015))
+    sensor, light = sensor_view(240, 480), sheet(g_limits=(-0.015, 0.015))
     x = (np.arange(1500) + 0.5) / 1500 * 0.03 - 0.015
     lens = np.array(sensor.lens)
     spots, power = np.empty((len(x), 3)), np.empty(len(x))
@@ -217,7 +217,7 @@ def test_a_ball_shows_a_line_as_alhazen_says(device: Device) -> None:
     middle_of_it = expected.first_moment(sensor.u_edges).sum() / expected.power.sum()
     for fineness in (3, 4):
         scene = ball_scene(fineness, radius, middle)
-        mirrors = mirrors_of(scene, MATERIALS, device, sight=sensor, per_sample=4.0)
+        mirrors = mirrors_of(scene, MATERIALS, device, view=sensor, per_sample=4.0)
         # The line's own light: the ball must not shade it.
         ours = mirrors.seen(light.lit(scene, 0.0), 0.0)
         assert ours.power.sum() == pytest.approx(expected.power.sum(), rel=2e-2 / 4.0 ** (fineness - 3))
@@ -230,7 +230,7 @@ def test_a_curved_mirror_in_steps_converges_to_the_second_order(device: Device) 
     scene = ball_scene(3, 5e-3, np.array([0.0, -0.007, 5.0e-3]))
     lit = sheet(g_limits=(-0.015, 0.015)).lit(scene, 0.0)
     totals = [
-        mirrors_of(scene, MATERIALS, device, sight=sight(24, 24), per_sample=steps).seen(lit, 0.0).power.sum()
+        mirrors_of(scene, MATERIALS, device, view=sensor_view(24, 24), per_sample=steps).seen(lit, 0.0).power.sum()
         for steps in (1.0, 2.0, 64.0)
     ]
     assert abs(totals[0] - totals[2]) / abs(totals[1] - totals[2]) > 3.0
@@ -268,7 +268,7 @@ def test_what_stands_before_a_curved_mirror_hides_its_image(device: Device) -> N
 
 def test_an_image_on_an_edge_counts_once(device: Device) -> None:
     """A cylinder along x whose edge shows a line: lens, edge and line lie in one plane."""
-    sensor = sight(24, 24)
+    sensor = sensor_view(24, 24)
     lens, middle = np.array(sensor.lens), np.array([0.0, -0.01, 0.005])
     back = (lens - middle) * [0.0, 1.0, 1.0] / np.linalg.norm((lens - middle)[1:])
     turns, sideways = np.linspace(-0.6, 0.6, 5), np.cross([1.0, 0.0, 0.0], back)
@@ -279,7 +279,7 @@ def test_an_image_on_an_edge_counts_once(device: Device) -> None:
         rows += quad(left[0], right[0], right[1], left[1])
         normals += quad(ring[a], ring[a], ring[b], ring[b])
     scene = Scene(np.array(rows), np.ones(8, int))
-    images = mirrors_of(scene, MATERIALS, device, sight=sensor, normals=np.array(normals))
+    images = mirrors_of(scene, MATERIALS, device, view=sensor, normals=np.array(normals))
     points = np.tile(middle + 0.05 * back, (40, 1))
     points[:, 0] = np.linspace(-0.02, 0.02, 40)
     points = np.hstack([points, np.tile([1e-4, 0.0, 0.0], (40, 1))])
@@ -316,7 +316,7 @@ def test_light_that_meets_a_mirror_head_on_comes_back_and_is_lost(device: Device
 
 def test_a_lens_that_looks_into_a_mirror_head_on(device: Device) -> None:
     """A mirror square to the lens' ray: the image is behind it, as bright as its way is long."""
-    sensor, width = sight(24, 24), 2e-3
+    sensor, width = sensor_view(24, 24), 2e-3
     lens, axis = np.array(sensor.lens), np.array(sensor.axis)
     one = np.array([1.0, 0.0, 0.0])
     two = np.cross(axis, one)
@@ -329,7 +329,7 @@ def test_a_lens_that_looks_into_a_mirror_head_on(device: Device) -> None:
         np.stack([place - 1e-3 * one, place + 1e-3 * one])[None], axis[None], np.zeros(1, int), np.array([3.0])
     )
     materials = (MATERIALS[0], Material(diffuse=Lambert(albedo=ALBEDO), mirror=SHARE / 2.0))
-    seen = mirrors_of(scene, materials, device, sight=sensor).seen(line, 0.0)
+    seen = mirrors_of(scene, materials, device, view=sensor).seen(line, 0.0)
     image = place + 0.06 * axis
     towards = image - lens
     cosine = towards @ axis / np.linalg.norm(towards)
@@ -357,8 +357,8 @@ def test_exposure_is_the_sum_of_its_ways(device: Device) -> None:
 def test_what_it_does_not_take() -> None:
     scene = before_a_wall(0.01)
     with pytest.raises(ValueError, match="materials 0 to 1"):
-        Mirrors(sight=sight(), scene=scene, materials=MATERIALS[:1])
+        Mirrors(view=sensor_view(), scene=scene, materials=MATERIALS[:1])
     with pytest.raises(ValueError, match="normals"):
-        Mirrors(sight=sight(), scene=scene, materials=MATERIALS, normals=np.zeros((2, 3, 3)))
+        Mirrors(view=sensor_view(), scene=scene, materials=MATERIALS, normals=np.zeros((2, 3, 3)))
     with pytest.raises(ValueError, match="per_sample"):
-        Mirrors(sight=sight(), scene=scene, materials=MATERIALS, per_sample=0.0)
+        Mirrors(view=sensor_view(), scene=scene, materials=MATERIALS, per_sample=0.0)

@@ -12,7 +12,6 @@ import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from reference.visible import comb, single, soup
 
 from canary import Guarded
 from gpuvision.host import Device
@@ -25,7 +24,8 @@ from gpuvision.simulation.transport.occluded_irradiance import (
     segment_rows,
 )
 from gpuvision.status import Status
-from reference import visible as reference
+from reference import occluded_irradiance as reference
+from reference.occluded_irradiance import comb, single, soup
 
 ON_DEVICES = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 # Builds are what takes time: each variant in one of the two types here, hypothesis and the rest in the device's own.

@@ -166,4 +166,4 @@ def test_without_mirrors_or_throws_there_is_none(device: Device) -> None:
     away = sheet.lit(scene, 0.02)
     assert not len(mirrors_of(scene, (DULL, MIRROR), device).thrown(away, sheet, 0.02).power)
     with pytest.raises(ValueError, match="throws"):
-        Mirrors(sight=mirrors_of(scene, (DULL, MIRROR), device).sight, scene=scene, materials=(DULL, MIRROR), throws=-1)
+        Mirrors(view=mirrors_of(scene, (DULL, MIRROR), device).view, scene=scene, materials=(DULL, MIRROR), throws=-1)

@@ -225,7 +225,7 @@ class Section:
         return self.error(f"{self.dotted(key)} is {shown}, expected {expected}")
 
 
-def read(path: Path) -> Section:
+def read_toml(path: Path) -> Section:
     """Read a TOML file.
 
     Raises

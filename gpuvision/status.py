@@ -1,4 +1,4 @@
-"""Status flags: why a sample is not to be trusted."""
+"""Status flags of samples: the reason why a value is NaN or doubtful."""
 
 from __future__ import annotations
 
@@ -6,26 +6,27 @@ import enum
 
 
 class Status(enum.IntFlag):
-    """Bits of the ``status`` array that every operation returns beside its values (uint8; 0 is good).
+    """Bits of the ``status`` array (uint8) that every operation returns beside its values; 0 means a good sample.
 
-    A value that cannot be trusted is flagged *and* NaN. ``SATURATED`` and ``AMBIGUOUS`` may come with a
-    value, where the operation says so: the reader decides.
+    A flagged value is NaN, with exceptions that the docstring of each result names: a sample with ``SATURATED`` or
+    ``AMBIGUOUS`` may keep its value.
     """
 
     OK = 0
+    """The value is good."""
     LOW_SIGNAL = 1
-    """Less light than the threshold asks for."""
+    """The light is weaker than the threshold of the operation."""
     SATURATED = 2
-    """A channel or pixel at its upper limit."""
+    """A channel or pixel is at its upper limit."""
     OUT_OF_RANGE = 4
-    """The light lies outside, or its window is cut by the border."""
+    """The position lies outside the measuring range, or the image border cuts its window."""
     NOT_FINITE = 8
-    """NaN or infinity came in."""
+    """An input of the sample is NaN or infinite, or the result is too large for the number type."""
     AMBIGUOUS = 16
-    """More than one candidate of comparable strength."""
+    """More than one candidate is about equally strong."""
     HORIZON = 32
-    """The point's ray runs (nearly) parallel to the sheet of light."""
+    """The ray of the sample is parallel, or nearly parallel, to the sheet of light."""
     NO_DATA = 64
-    """No measurement near enough."""
+    """No measurement lies near enough to this place."""
     NOT_INVERTIBLE = 128
-    """The sampling runs backwards here: two surfaces share one place."""
+    """The mapping is not one-to-one here: the lens is beyond its fold, or the sampling runs backwards."""

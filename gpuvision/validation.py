@@ -1,4 +1,4 @@
-"""Plain tables, as TOML and JSON files hold them: checks of their keys and numbers, and what JSON has no word for."""
+"""Checks of parameters: finite numbers, integers, arrays of numbers, and the keys of tables (TOML, JSON)."""
 
 from __future__ import annotations
 
@@ -10,15 +10,24 @@ from typing import Any
 import numpy as np
 
 
-def checked_keys(
+def check_keys(
     table: Mapping[str, Any], allowed: Collection[str], required: Collection[str], what: str
 ) -> Mapping[str, Any]:
-    """Return the table if it has all required keys and none that is not allowed.
+    """Return a table after a check that it has all required keys and no unknown key.
+
+    Parameters
+    ----------
+    table : mapping
+        Table with string keys.
+    allowed, required : collection of str
+        Keys that the table may have, and keys that it must have.
+    what : str
+        Name of the table for the message.
 
     Raises
     ------
     ValueError
-        Names the key, and those that are known.
+        A key is unknown or missing. The message names the key, and lists the allowed keys.
     """
     for key in table:
         if key not in allowed:
@@ -30,14 +39,21 @@ def checked_keys(
 
 
 def finite(value: Any, what: str) -> float:
-    """Return a number as a float.
+    """Return a finite number as a float.
+
+    Parameters
+    ----------
+    value : number
+        Value to check.
+    what : str
+        Name of the value for the message.
 
     Raises
     ------
     TypeError
-        It is no number.
+        The value is not a number.
     ValueError
-        It is infinite or NaN.
+        The number is infinite or NaN.
     """
     try:
         number = float(value)
@@ -48,15 +64,24 @@ def finite(value: Any, what: str) -> float:
     return number
 
 
-def whole(value: Any, what: str, *, least: int | None = None, most: int | None = None) -> int:
-    """Return a count as an int; a bool is none.
+def integer(value: Any, what: str, *, minimum: int | None = None, maximum: int | None = None) -> int:
+    """Return an integer as an int; a bool is not an integer here.
+
+    Parameters
+    ----------
+    value : int
+        Value to check; NumPy integers are accepted.
+    what : str
+        Name of the value for the message.
+    minimum, maximum : int, optional
+        Smallest and largest allowed value. A maximum needs a minimum.
 
     Raises
     ------
     TypeError
-        It is no whole number.
+        The value is not an integer.
     ValueError
-        It is less than the least, or more than the most.
+        The integer is below the minimum or above the maximum.
     """
     try:
         number = operator.index(value)
@@ -64,21 +89,30 @@ def whole(value: Any, what: str, *, least: int | None = None, most: int | None =
         number = None
     if number is None or isinstance(value, bool):
         raise TypeError(f"{what} must be a whole number, got {value!r}")
-    if (least is not None and number < least) or (most is not None and number > most):
-        expected = f"{least} to {most}" if most is not None else f"at least {least}"
+    if (minimum is not None and number < minimum) or (maximum is not None and number > maximum):
+        expected = f"{minimum} to {maximum}" if maximum is not None else f"at least {minimum}"
         raise ValueError(f"{what} is {number}, expected {expected}")
     return number
 
 
 def numbers(values: Any, shape: tuple[int, ...], what: str) -> Any:
-    """Return an array of numbers, of one or two dimensions, as nested tuples of floats.
+    """Return finite numbers of a given shape (one or two dimensions) as nested tuples of floats.
+
+    Parameters
+    ----------
+    values : array_like
+        Numbers of the shape.
+    shape : tuple of int
+        Expected shape: ``(n,)`` or ``(rows, columns)``.
+    what : str
+        Name of the values for the message.
 
     Raises
     ------
     TypeError
-        They are no numbers.
+        A value is not a number.
     ValueError
-        The shape is another one, or a number is infinite or NaN.
+        The shape differs, or a number is infinite or NaN.
     """
     try:
         array = np.asarray(values, dtype=np.float64)

@@ -24,7 +24,7 @@ from gpuvision.ranging.line import LineReadout
 
 SHAPE = (512, 1024)
 RATES = (1000, 4000)
-READOUT = LineReadout(method="whole", threshold=20)
+READOUT = LineReadout(method="centroid", threshold=20)
 
 _FRAMES = 16
 _ENDLESS = 1 << 40

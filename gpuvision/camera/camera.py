@@ -26,7 +26,7 @@ import numpy.typing as npt
 from gpuvision.camera.fold import OneToOne, one_to_one
 from gpuvision.camera.inverse_start import Guess
 from gpuvision.camera.newton import determinant, undo
-from gpuvision.validation import checked_keys, numbers
+from gpuvision.validation import check_keys, numbers
 
 Matrix = tuple[tuple[float, float, float], ...]
 Float64 = npt.NDArray[np.float64]
@@ -340,7 +340,7 @@ class Camera:
         ValueError, TypeError
             A key is unknown or missing, or a value is not what it must be.
         """
-        values = checked_keys(table, ("matrix", *COEFFICIENT_NAMES), ("matrix",), "camera")
+        values = check_keys(table, ("matrix", *COEFFICIENT_NAMES), ("matrix",), "camera")
         return cls(matrix=values["matrix"], distortion=tuple(values.get(name, 0.0) for name in COEFFICIENT_NAMES))
 
 

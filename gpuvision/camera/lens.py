@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.validation import checked_keys, finite, numbers
+from gpuvision.validation import check_keys, finite, numbers
 
 _NEWTON_STEPS = 64
 # No lens comes near them in any unit, and they keep the powers of fold radius and table within single precision.
@@ -178,4 +178,4 @@ class Lens:
         ValueError
             If a key is unknown or missing, or a value is no finite number.
         """
-        return cls(**checked_keys(table, ("k1", "k2", "centre"), ("k1",), "lens"))
+        return cls(**check_keys(table, ("k1", "k2", "centre"), ("k1",), "lens"))

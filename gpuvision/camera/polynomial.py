@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.newton import determinant, undo
-from gpuvision.validation import checked_keys, numbers
+from gpuvision.validation import check_keys, numbers
 
 Float64 = npt.NDArray[np.float64]
 Region = tuple[tuple[float, float], tuple[float, float]]
@@ -248,7 +248,7 @@ class PlanePolynomial:
             A key is unknown or missing, or a value is not what it must be.
         """
         needed = ("p", "q", "region")
-        return cls(**checked_keys(table, (*needed, "covariance"), needed, "plane polynomial"))
+        return cls(**check_keys(table, (*needed, "covariance"), needed, "plane polynomial"))
 
 
 def _within(places: Float64, edge: float) -> npt.NDArray[np.bool_]:

@@ -19,7 +19,7 @@ from gpuvision.camera.camera import COEFFICIENT_NAMES, Camera
 from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.camera.lens import Lens
 from gpuvision.host.files import replacing
-from gpuvision.schema import Section, read
+from gpuvision.schema import Section, read_toml
 
 _UNREAD_TABLES = ("image", "uncertainty", "fit", "mount")
 
@@ -43,7 +43,7 @@ def read_lens(path: str | Path) -> Lens | Camera:
     DescriptionError
         A key or table is missing, unknown or has a wrong value; the message names the key.
     """
-    top = read(Path(path))
+    top = read_toml(Path(path))
     lens, camera = top.optional_section("lens"), top.optional_section("camera")
     for name in _UNREAD_TABLES:
         top.optional_section(name)
@@ -110,7 +110,7 @@ def read_mounted(path: str | Path, shape: tuple[int, int]) -> MountedCamera | No
     DescriptionError
         A key is missing, unknown or has a wrong value; the message names the key.
     """
-    top = read(Path(path))
+    top = read_toml(Path(path))
     table = top.optional_section("mount")
     if table is None:
         return None

@@ -15,7 +15,7 @@ from gpuvision.matching.artwork.artwork import Side
 from gpuvision.matching.features.feature_set import MOST_ROWS, FeatureSet
 from gpuvision.matching.features.fiducials import Marks
 from gpuvision.matching.features.selection import Imaging
-from gpuvision.schema import Section, read
+from gpuvision.schema import Section, read_toml
 
 
 def write_features(features: FeatureSet, path: str | Path) -> None:
@@ -72,7 +72,7 @@ def read_features(path: str | Path) -> FeatureSet:
     DescriptionError
         It says something else; the message names the key.
     """
-    top = read(Path(path))
+    top = read_toml(Path(path))
     side: Side = top.choice("side", get_args(Side))
     placement = np.array(top.numbers("placement", "m", (2,)))
     imaging = _imaging(top, top.section("imaging"))

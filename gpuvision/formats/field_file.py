@@ -10,7 +10,7 @@ from importlib import resources
 from pathlib import Path
 
 from gpuvision.matching.field.distance_map import Arc, Field
-from gpuvision.schema import Section, read
+from gpuvision.schema import Section, read_toml
 
 FIELDS = ("robocup_msl", "robocup_junior")
 """Those that come with the package."""
@@ -33,8 +33,8 @@ def read_field(path: str | Path) -> Field:
     """
     if str(path) in FIELDS:
         with resources.as_file(resources.files("gpuvision") / "presets" / "fields" / f"{path}.toml") as file:
-            return _field(read(file))
-    return _field(read(Path(path)))
+            return _field(read_toml(file))
+    return _field(read_toml(Path(path)))
 
 
 def _field(top: Section) -> Field:

@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from gpuvision.schema import DescriptionError, Section, read
+from gpuvision.schema import DescriptionError, Section, read_toml
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Brdf, Ggx, Lambert, OrenNayar, Phong, Ward
 
@@ -32,7 +32,7 @@ def read_materials(path: str | Path) -> tuple[Material, ...]:
     DescriptionError
         It says something that it cannot say: key, value and allowed range are in the message.
     """
-    top = read(Path(path))
+    top = read_toml(Path(path))
     materials = tuple(_material(each, top) for each in top.sections("material"))
     top.finish()
     if not materials:

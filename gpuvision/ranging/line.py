@@ -27,13 +27,13 @@ from gpuvision.host import (
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
-from gpuvision.validation import finite, whole
+from gpuvision.validation import finite, integer
 
-Method = Literal["whole", "windowed", "gauss3", "fir", "ml"]
-Choice = Literal["strongest", "first", "last", "nearest"]
+Method = Literal["centroid", "windowed", "gauss3", "fir", "ml"]
+PeakSelection = Literal["strongest", "first", "last", "nearest"]
 
-METHODS = ("whole", "windowed", "gauss3", "fir", "ml")
-CHOICES = ("strongest", "first", "last", "nearest")
+METHODS = ("centroid", "windowed", "gauss3", "fir", "ml")
+PEAK_SELECTIONS = ("strongest", "first", "last", "nearest")
 LONGEST_PROFILE = 32767  # samples: indices of narrow lanes are 16 bits
 WIDEST_WINDOW = 180  # samples either side: moments of 16-bit samples in 32 bits
 _LANES = 16
@@ -52,12 +52,12 @@ class LineReading(NamedTuple):
     peak
         The peak's sample as recorded; the strongest sample where there is no peak.
     width
-        Samples over the threshold: in the run that holds the peak, for ``method="whole"`` in the whole profile.
+        Samples over the threshold: in the run that holds the peak, for ``method="centroid"`` in the whole profile.
     total
-        Light over the threshold [grey levels]: in the window, for ``method="whole"`` in the whole profile.
+        Light over the threshold [grey levels]: in the window, for ``method="centroid"`` in the whole profile.
     status
         uint8 `Status` flags. LOW_SIGNAL: no peak that the parameters allow, or too little light beside it for the
-        method. OUT_OF_RANGE: the border cuts the window, or a flat top wider than it (for ``"whole"``: a border sample
+        method. OUT_OF_RANGE: the border cuts the window, or a flat top wider than it (for ``"centroid"``: a border sample
         has half the peak's light or more). NOT_FINITE: a sample of the profile is NaN or infinite, or the sums are
         beyond the largest number. With a value:
         SATURATED (the peak is at the saturation level), AMBIGUOUS (a second peak is comparable, a flat top is wider
@@ -86,8 +86,8 @@ class LineReadout(VisionOperation[LineReading]):
 
     Parameters
     ----------
-    method : {"windowed", "whole", "gauss3", "fir", "ml"}
-        ``"whole"``: centre of gravity of all light in the profile. The others look at the window around one peak:
+    method : {"windowed", "centroid", "gauss3", "fir", "ml"}
+        ``"centroid"``: centre of gravity of all light in the profile. The others look at the window around one peak:
         ``"windowed"`` takes its centre of gravity, ``"gauss3"`` a parabola through the logarithms of the peak and
         its neighbours, ``"fir"`` the zero crossing of a derivative filter (Blais and Rioux, 1986), ``"ml"`` the most
         likely pixel-integrated Gaussian on an unknown background, for noise of variance
@@ -98,14 +98,14 @@ class LineReadout(VisionOperation[LineReading]):
         Level below which a sample counts as no light [grey levels]; for integer frames a whole number.
     window
         Samples either side of the peak that count.
-    choice : {"strongest", "first", "last", "nearest"}
+    peak_selection : {"strongest", "first", "last", "nearest"}
         Which peak, where there are several. A peak is the strongest sample of a run of samples over the threshold.
         ``"nearest"``: to the position of an earlier reading, given as a second input of shape (..., samples) in the
         readout's precision, rounded to whole pixels; where that is NaN, the strongest.
     minimum_peak
         Weakest sample that can be a peak [grey levels].
     minimum_width, maximum_width
-        Of the run of samples over the threshold (for ``"whole"``: of their number) [pixel]. A hot pixel is a run
+        Of the run of samples over the threshold (for ``"centroid"``: of their number) [pixel]. A hot pixel is a run
         of 1.
     saturation
         Level at which a sample is saturated; ``None``: the highest code of integer frames, no limit for float32.
@@ -148,7 +148,7 @@ class LineReadout(VisionOperation[LineReading]):
     along: Literal["columns", "rows"] = "columns"
     threshold: float = 0.0
     window: int = 8
-    choice: Choice = "strongest"
+    peak_selection: PeakSelection = "strongest"
     minimum_peak: float | None = None
     minimum_width: int = 1
     maximum_width: int | None = None
@@ -166,7 +166,7 @@ class LineReadout(VisionOperation[LineReading]):
     def __post_init__(self) -> None:
         for name in ("window", "minimum_width", "maximum_width", "fir_length"):
             if getattr(self, name) is not None or name != "maximum_width":
-                object.__setattr__(self, name, whole(getattr(self, name), f"LineReadout.{name}"))
+                object.__setattr__(self, name, integer(getattr(self, name), f"LineReadout.{name}"))
         self._check_names()
         self._check_numbers()
         possible = LineReading._fields if self.triangulation is not None else LineReading._fields[:5]
@@ -179,15 +179,17 @@ class LineReadout(VisionOperation[LineReading]):
         allowed: dict[str, tuple[Any, ...]] = {
             "method": METHODS,
             "along": ("columns", "rows"),
-            "choice": CHOICES,
+            "peak_selection": PEAK_SELECTIONS,
             "fir_length": (4, 8),
         }
         for name, values in allowed.items():
             if getattr(self, name) not in values:
                 listed = ", ".join(map(str, values))
                 raise ValueError(f"LineReadout.{name} is {getattr(self, name)!r}, expected one of {listed}")
-        if self.method == "whole" and (self.choice != "strongest" or self.ambiguity is not None):
-            raise ValueError("LineReadout: method 'whole' knows no peaks; choice and ambiguity need another method")
+        if self.method == "centroid" and (self.peak_selection != "strongest" or self.ambiguity is not None):
+            raise ValueError(
+                "LineReadout: method 'centroid' finds no peaks; peak_selection and ambiguity need another method"
+            )
         if self.triangulation is not None and self.triangulation.along != self.along:
             raise ValueError(
                 f"LineReadout.along is {self.along!r}, its triangulation was made for {self.triangulation.along!r}"
@@ -222,7 +224,7 @@ class LineReadout(VisionOperation[LineReading]):
 
     @property
     def _has_candidates(self) -> bool:
-        return self.method != "whole" and (self.choice != "strongest" or self._judges_width)
+        return self.method != "centroid" and (self.peak_selection != "strongest" or self._judges_width)
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -245,7 +247,7 @@ class LineReadout(VisionOperation[LineReading]):
             "line/line.cl",
             "line_readout",
             work=work,
-            more_inputs=[(of_samples, build.real)] if self.choice == "nearest" else [],
+            more_inputs=[(of_samples, build.real)] if self.peak_selection == "nearest" else [],
             outputs=build.outputs({name: of_samples if name in chosen else None for name in LineReading._fields}),
             defines=self._defines(dtype, length) | flags(PREFETCH=device.is_cpu),
             arguments=[
@@ -255,7 +257,7 @@ class LineReadout(VisionOperation[LineReading]):
                 self._packed(build.real, dtype, length),
                 None if self.triangulation is None else self.triangulation.packed(build.real, self.axes),
             ],
-            passes_once=work.vectors and self.method in ("whole", "windowed"),
+            passes_once=work.vectors and self.method in ("centroid", "windowed"),
         )
 
     def _fits_strip(self, rows: int, columns: int, dtype: np.dtype[Any]) -> bool:
@@ -294,7 +296,7 @@ class LineReadout(VisionOperation[LineReading]):
     def _defines(self, dtype: np.dtype[Any], length: int) -> dict[str, Define]:
         bits = 8 * dtype.itemsize
         defines = type_defines("CODE", dtype, 4, 8, 16) | {"CODE_BITS": bits}
-        defines |= flags(**{f"METHOD_{self.method.upper()}": True, f"CHOICE_{self.choice.upper()}": True})
+        defines |= flags(**{f"METHOD_{self.method.upper()}": True, f"SELECT_{self.peak_selection.upper()}": True})
         reach = self.window + (self.fir_length // 2 if self.method == "fir" else 0)
         defines |= {"RADIUS": self.window, "REACH": reach, "FIR_HALF": self.fir_length // 2}
         chosen = self.outputs or ()
@@ -306,7 +308,7 @@ class LineReadout(VisionOperation[LineReading]):
             AMBIGUITY=self.ambiguity is not None,
             CANDIDATES=self._has_candidates,
             WIDTH_LIMITS=self._judges_width,
-            WITH_LIT="width" in chosen or (self.method == "whole" and self._judges_width),
+            WITH_LIT="width" in chosen or (self.method == "centroid" and self._judges_width),
             LONG_MOMENT=bits < 32 and length**2 // 2 * np.iinfo(f"uint{bits}").max >= 2**32,
         )
 

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, WorkSize, type_defines
 from gpuvision.operation import VisionOperation
-from gpuvision.validation import checked_keys, finite, numbers
+from gpuvision.validation import check_keys, finite, numbers
 
 _STRIP = 1024  # samples, as in range_image.cl
 _LANES = 16
@@ -161,7 +161,7 @@ class StraightTransport:
         TypeError, ValueError
             A key is unknown, or a value is not what it should be.
         """
-        return cls(**checked_keys(table, cls.__dataclass_fields__, (), "straight transport"))
+        return cls(**check_keys(table, cls.__dataclass_fields__, (), "straight transport"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -315,7 +315,7 @@ class RotatingSheet:
             A key is unknown or missing, or a value is not what it should be.
         """
         required = ("focal_length_px", "principal_point_px", "axis_point", "axis_direction", "sheet_normal")
-        values = dict(checked_keys(table, cls.__dataclass_fields__, required, "rotating sheet"))
+        values = dict(check_keys(table, cls.__dataclass_fields__, required, "rotating sheet"))
         if "lens" in values:
             values["lens"] = Lens.from_dict(values["lens"])
         return cls(**values)

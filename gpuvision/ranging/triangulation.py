@@ -22,7 +22,7 @@ from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, fl
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging import homography
 from gpuvision.ranging.homography import Model
-from gpuvision.validation import checked_keys, finite, numbers
+from gpuvision.validation import check_keys, finite, numbers
 
 Along = Literal["columns", "rows"]
 Matrix = tuple[tuple[float, float, float], ...]
@@ -485,7 +485,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         ValueError, TypeError
             If a key is unknown or missing, or a value is not what it must be.
         """
-        values = dict(checked_keys(table, _KEYS, ("homography", "region"), "triangulation"))
+        values = dict(check_keys(table, _KEYS, ("homography", "region"), "triangulation"))
         if "lens" in values:
             values["lens"] = Lens.from_dict(values["lens"])
         return cls(**values, precision=precision)

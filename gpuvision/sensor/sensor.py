@@ -38,7 +38,7 @@ from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.range_image import Limits, RotatingSheet, StraightTransport, Vector
 from gpuvision.ranging.triangulation import Along, SampleAxes, Triangulation
-from gpuvision.schema import DescriptionError, Section, read
+from gpuvision.schema import DescriptionError, Section, read_toml
 from gpuvision.sensor.light_source import Light, read_light
 
 Folded = Literal["drop", "top"]
@@ -133,13 +133,13 @@ class Sensor:
         }
         if str(path) in brought:
             with resources.as_file(brought[str(path)]) as file:
-                return cls.from_section(read(file))
+                return cls.from_section(read_toml(file))
         path = Path(path)
         if not path.is_file():
             close = difflib.get_close_matches(path.stem, brought, 1)
             hint = f"did you mean '{close[0]}'?" if close else f"give a file or one of {', '.join(sorted(brought))}"
             raise FileNotFoundError(f"there is no sensor file {path}; {hint}")
-        return cls.from_section(read(path))
+        return cls.from_section(read_toml(path))
 
     @classmethod
     def from_section(cls, top: Section) -> Sensor:
@@ -326,7 +326,7 @@ def _line(table: Section, along: Along, sheet: Triangulation | None, axes: Sampl
         threshold=table.number("threshold", "grey levels", default.threshold, at_least=0.0),
         window=table.integer("window", default.window, at_least=1, at_most=WIDEST_WINDOW),
         # "nearest" needs the reading before: a recording is read in batches, of which all frames run at once.
-        choice=table.choice("choice", ("strongest", "first", "last"), default.choice),
+        peak_selection=table.choice("peak_selection", ("strongest", "first", "last"), default.peak_selection),
         minimum_peak=table.number("minimum_peak", "grey levels", None, at_least=0.0),
         minimum_width=table.integer("minimum_width", default.minimum_width, at_least=1),
         maximum_width=table.integer("maximum_width", None, at_least=1),

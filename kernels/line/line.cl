@@ -74,7 +74,7 @@ inline ints common_flags(const Profiles *profiles, codes peak, ints lost) {
            flag_where(lost, STATUS_NOT_FINITE);
 }
 
-#ifdef METHOD_WHOLE
+#ifdef METHOD_CENTROID
 // Light over the threshold of sample k.
 inline reals light_at(const Profiles *profiles, int k) {
     return over_threshold(sample_of(profiles, k), profiles->threshold);
@@ -136,7 +136,7 @@ inline Place place_apart(const Profiles *profiles, Peak *peak, constant real *p)
         global real *restrict width, global real *restrict total, global uchar *restrict status,                       \
         global real *restrict g, global real *restrict h, const int rows, const int columns, const CODE threshold,     \
         const CODE saturation, const CODE minimum, constant real *p, constant real *sheet
-#ifdef CHOICE_NEAREST
+#ifdef SELECT_NEAREST
 #define INPUT_PREVIOUS global const real *restrict previous,
 #else
 #define INPUT_PREVIOUS
@@ -160,7 +160,7 @@ inline Place place_apart(const Profiles *profiles, Peak *peak, constant real *p)
     {frames + (ulong)frame * rows * columns + (long)(sample) * LANE_STRIDE,                                            \
      STRIDE, LANE_STRIDE, LENGTH, threshold, saturation, minimum}
 
-#if defined(CANDIDATES) || (!defined(VECTOR_VARIANT) && !defined(METHOD_WHOLE))
+#if defined(CANDIDATES) || (!defined(VECTOR_VARIANT) && !defined(METHOD_CENTROID))
 // LANES profiles, by a walk along them. Items beyond the last profile fill up a work-group.
 kernel void line_readout(ARGUMENTS) {
     const Outputs to = OUTPUTS;
@@ -170,7 +170,7 @@ kernel void line_readout(ARGUMENTS) {
     const ulong first = (ulong)frame * SAMPLES + sample;
 #ifdef CANDIDATES
     ints nearest = -1;
-#ifdef CHOICE_NEAREST
+#ifdef SELECT_NEAREST
     const reals before = *(global const reals_at *)(previous + first);
     nearest = choose_ints(REAL_MASK(before >= 0) & REAL_MASK(before < (real)LENGTH), to_ints(rint(before)), -1);
 #endif
@@ -182,7 +182,7 @@ kernel void line_readout(ARGUMENTS) {
     finish_peak(&profiles, &found, &place, p, &to, first, sample);
 }
 
-#elif defined(METHOD_WHOLE) && !defined(VECTOR_VARIANT)
+#elif defined(METHOD_CENTROID) && !defined(VECTOR_VARIANT)
 kernel void line_readout(ARGUMENTS) {
     const Outputs to = OUTPUTS;
     const int frame = get_global_id(1), sample = get_global_id(0);

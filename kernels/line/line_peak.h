@@ -35,11 +35,11 @@ inline void close_run(Choice *choice, const Profiles *profiles, ints closing, in
     const ints width = end - choice->start;
     const ints allowed = INT_MASK(width >= min_width) & INT_MASK(width <= max_width);
     const ints fits = allowed & ~dark_lanes(profiles, choice->level);
-#if defined(CHOICE_FIRST)
+#if defined(SELECT_FIRST)
     const ints better = ~choice->found;
-#elif defined(CHOICE_LAST)
+#elif defined(SELECT_LAST)
     const ints better = -1;
-#elif defined(CHOICE_NEAREST)
+#elif defined(SELECT_NEAREST)
     const ints stronger = CODE_MASK(choice->level > choice->chosen_level);
     const ints nearer = INT_MASK(abs(choice->at - nearest) < abs(choice->chosen - nearest));
     const ints better = ~choice->found | choose_ints(INT_MASK(nearest < 0), stronger, nearer);

@@ -14,7 +14,7 @@ inline Ahead ahead_of(global const CODE *at, int width, int columns) {
     return ahead;
 }
 
-#ifdef METHOD_WHOLE
+#ifdef METHOD_CENTROID
 
 #ifndef ALONG_ROWS
 inline void read_strip(const Profiles *frame, int begin, int end, constant real *p, const Outputs *to, ulong first) {

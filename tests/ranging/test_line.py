@@ -50,7 +50,7 @@ def assert_same(reading, expected, precision=np.float32, slack=1.0):
     np.testing.assert_allclose(reading.total, expected["total"], rtol=20 * eps)
 
 
-@pytest.mark.parametrize("method", ["whole", "windowed"])
+@pytest.mark.parametrize("method", ["centroid", "windowed"])
 @pytest.mark.parametrize(("dtype", "along", "variant"), EVERY)
 def test_centre_of_gravity(device, rng, method, dtype, along, variant):
     parameters = {"method": method, "along": along, "threshold": LEVEL[dtype], "window": 6}
@@ -92,19 +92,19 @@ def test_fits(device, rng, method, dtype, along, variant):
         assert_same(reading, expected, slack=20.0)
 
 
-@pytest.mark.parametrize("choice", ["first", "last", "nearest", "strongest"])
+@pytest.mark.parametrize("peak_selection", ["first", "last", "nearest", "strongest"])
 @pytest.mark.parametrize(
     ("dtype", "along", "variant"),
     [("uint8", "columns", "vector"), ("uint16", "rows", "vector"), ("float32", "columns", "work_item")],
 )
-def test_choice(device, rng, choice, dtype, along, variant):
-    parameters = {"along": along, "threshold": LEVEL[dtype], "window": 3, "choice": choice}
+def test_peak_selection(device, rng, peak_selection, dtype, along, variant):
+    parameters = {"along": along, "threshold": LEVEL[dtype], "window": 3, "peak_selection": peak_selection}
     parameters |= {"minimum_width": 2, "maximum_width": 9, "minimum_peak": LEVEL[dtype] * 2}
     shape = (2, 90, 50) if along == "columns" else (2, 50, 90)
     frames = np.maximum(line_frames(rng, dtype, shape, along), line_frames(rng, dtype, shape, along, sigma=0.8))
     frames[..., 20, 30] = TOP[dtype] * 1.2  # hot
     second = ()
-    if choice == "nearest":
+    if peak_selection == "nearest":
         previous = rng.uniform(-5, 95, (2, 50)).astype(np.float32)
         previous[0, ::7] = np.nan
         second = (previous,)
@@ -119,7 +119,7 @@ def test_double(device, rng, variant):
     if not device.has_double:
         pytest.skip("no double precision on this device")
     frames = line_frames(rng, "float32", (130, 33))
-    for method in ("whole", "windowed"):
+    for method in ("centroid", "windowed"):
         parameters = {"method": method, "threshold": 8.5, "window": 6}
         reading = LineReadout(variant=variant, precision="double", **parameters)(frames, device=device)
         assert reading.position.dtype == np.float64
@@ -131,7 +131,7 @@ def test_double(device, rng, variant):
 def test_any_shape(rows, columns, frames, seed):
     rng = np.random.default_rng(seed)
     image = line_frames(rng, "uint8", (frames, rows, columns))
-    for device, method, variant in itertools.product(Device.all(), ("whole", "windowed"), VARIANTS):
+    for device, method, variant in itertools.product(Device.all(), ("centroid", "windowed"), VARIANTS):
         parameters = {"method": method, "threshold": 20, "window": 6}
         assert_same(
             LineReadout(variant=variant, **parameters)(image, device=device), read_lines(image, **parameters), slack=4.0
@@ -139,7 +139,7 @@ def test_any_shape(rows, columns, frames, seed):
 
 
 @pytest.mark.parametrize(
-    ("method", "variant"), [("whole", "vector"), ("windowed", "vector"), ("windowed", "work_item")]
+    ("method", "variant"), [("centroid", "vector"), ("windowed", "vector"), ("windowed", "work_item")]
 )
 @pytest.mark.parametrize("along", ["columns", "rows"])
 def test_writes_nothing_else(device, rng, method, variant, along):
@@ -211,23 +211,32 @@ METHODS_WITH_PEAKS = ("windowed", "gauss3", "fir", "ml")
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize(("along", "choice"), [("columns", "strongest"), ("rows", "strongest"), ("columns", "last")])
-def test_top_wider_than_the_window(device, variant, along, choice):
+@pytest.mark.parametrize(
+    ("along", "peak_selection"), [("columns", "strongest"), ("rows", "strongest"), ("columns", "last")]
+)
+def test_top_wider_than_the_window(device, variant, along, peak_selection):
     for method, width in itertools.product(METHODS_WITH_PEAKS, (20, 21)):
         frame = column(*[0] * 20, *[255] * width, *[0] * 40)
         frame = frame if along == "columns" else np.ascontiguousarray(frame.T)
-        readout = LineReadout(method=method, threshold=5, window=4, along=along, choice=choice, variant=variant)
+        readout = LineReadout(
+            method=method, threshold=5, window=4, along=along, peak_selection=peak_selection, variant=variant
+        )
         reading = readout(frame, device=device)
         np.testing.assert_array_equal(reading.position, 20 + (width - 1) / 2)
         np.testing.assert_array_equal(reading.status, SATURATED | AMBIGUOUS)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("choice", ["first", "strongest"])
-def test_only_neighbours_make_a_flat_top(device, variant, choice):
+@pytest.mark.parametrize("peak_selection", ["first", "strongest"])
+def test_only_neighbours_make_a_flat_top(device, variant, peak_selection):
     frame = column(*[0] * 19, 100, 255, 100, *[0] * 4, 100, 255, 255, *[0] * 20)
     for method in ("gauss3", "fir", "windowed"):
-        parameters = {"method": method, "threshold": 5, "window": 8 if method == "gauss3" else 3, "choice": choice}
+        parameters = {
+            "method": method,
+            "threshold": 5,
+            "window": 8 if method == "gauss3" else 3,
+            "peak_selection": peak_selection,
+        }
         reading = LineReadout(variant=variant, **parameters)(frame, device=device)
         np.testing.assert_array_equal(reading.status, SATURATED)
         np.testing.assert_allclose(reading.position, 20.0, atol=1e-5)
@@ -268,12 +277,12 @@ def test_fit_leaves_saturated_samples_out(device):
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("along", ["columns", "rows"])
 def test_not_finite(device, rng, variant, along):
-    for method, choice in (("whole", "strongest"), ("windowed", "strongest"), ("windowed", "last")):
+    for method, peak_selection in (("centroid", "strongest"), ("windowed", "strongest"), ("windowed", "last")):
         frames = line_frames(rng, "float32", (60, 70), along) - 50.0  # negative after a dark frame
         frames[7, 20], frames[11, 21], frames[13, 22] = np.nan, np.inf, -np.inf
         parameters = {
             "method": method,
-            "choice": choice,
+            "peak_selection": peak_selection,
             "threshold": -40.0,
             "window": 6,
             "along": along,
@@ -291,10 +300,10 @@ def test_not_finite(device, rng, variant, along):
 
 
 @pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
-@pytest.mark.parametrize("method", ["whole", "windowed", "fir"])
+@pytest.mark.parametrize("method", ["centroid", "windowed", "fir"])
 def test_nothing_finite(device, along, variant, method):
     """Profiles without any number have no peak whose place could be looked up."""
-    second = {} if method == "whole" else {"ambiguity": 0.5}
+    second = {} if method == "centroid" else {"ambiguity": 0.5}
     readout = LineReadout(along=along, variant=variant, method=method, threshold=1, **second)
     for value in (np.nan, -np.inf, np.inf):
         reading = readout(np.full((64, 64), value, np.float32), device=device)
@@ -303,21 +312,23 @@ def test_nothing_finite(device, along, variant, method):
 
 
 @pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
-@pytest.mark.parametrize("choice", ["strongest", "last"])
-def test_sums_beyond_the_largest_number(device, along, variant, choice):
+@pytest.mark.parametrize("peak_selection", ["strongest", "last"])
+def test_sums_beyond_the_largest_number(device, along, variant, peak_selection):
     """Samples that are numbers, but their light is none in single precision."""
     frame = column(*[0.0] * 20, 2e38, 3e38, 2e38, *[0.0] * 41, dtype=np.float32)
-    for threshold, method in itertools.product((-1e38, 1.0), ("windowed", "whole", "gauss3")):
-        if method == "whole" and choice == "last":
+    for threshold, method in itertools.product((-1e38, 1.0), ("windowed", "centroid", "gauss3")):
+        if method == "centroid" and peak_selection == "last":
             continue
-        readout = LineReadout(method=method, along=along, threshold=threshold, choice=choice, variant=variant)
+        readout = LineReadout(
+            method=method, along=along, threshold=threshold, peak_selection=peak_selection, variant=variant
+        )
         reading = readout(frame if along == "columns" else np.ascontiguousarray(frame.T), device=device)
         np.testing.assert_array_equal(reading.status, NOT_FINITE)
         assert all(np.isnan(getattr(reading, name)).all() for name in ("position", "peak", "width", "total"))
 
 
 @pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
-@pytest.mark.parametrize("method", ["whole", "windowed"])
+@pytest.mark.parametrize("method", ["centroid", "windowed"])
 def test_faintest_light(device, along, variant, method):
     """Light whose reciprocal is infinite: read, or dark on a device that takes such numbers for zero."""
     frame = column(*[0.0] * 20, 1e-40, 2e-40, 1e-40, *[0.0] * 41, dtype=np.float32)
@@ -334,8 +345,8 @@ def test_large_moments_are_exact(device, rng, variant):
     """16 bit, 4100 rows on a bright background: the moment needs 40 bits."""
     frame = rng.integers(2900, 3100, (4100, 64)).astype(np.uint16)
     frame[3270:3275] = 65_535
-    reading = LineReadout(method="whole", variant=variant)(frame, device=device)
-    expected = read_lines(frame, method="whole")
+    reading = LineReadout(method="centroid", variant=variant)(frame, device=device)
+    expected = read_lines(frame, method="centroid")
     np.testing.assert_allclose(reading.position, expected["position"], rtol=1.2e-7)
 
 
@@ -363,7 +374,7 @@ def test_tall_frames(device, rng):
         ({"window": 0}, "window"),
         ({"outputs": ("g",)}, "outputs"),
         ({"minimum_width": 5, "maximum_width": 2}, "widths"),
-        ({"method": "whole", "choice": "first"}, "whole"),
+        ({"method": "centroid", "peak_selection": "first"}, "centroid"),
         ({"method": "ml", "read_noise": 0.0}, "read_noise"),
         ({"ambiguity": 2.0}, "ambiguity"),
         ({"threshold": float("nan")}, "threshold"),
@@ -396,7 +407,7 @@ def test_counts_of_numpy(device, rng):
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("method", ["whole", "windowed"])
+@pytest.mark.parametrize("method", ["centroid", "windowed"])
 def test_widths_beyond_the_profile(device, rng, method, variant):
     frame = line_frames(rng, "uint8", (64, 70))
     parameters = {"method": method, "threshold": 20, "variant": variant}
@@ -430,7 +441,7 @@ def test_triangulates_in_the_same_pass(device, rng, along, variant):
     sheet = replace(SHEET, along=along, lens=LENS)
     frames = line_frames(rng, "uint8", (2, 99, 130), along)
     axes = SampleAxes(position_origin=300.0, sample_origin=400.0, sample_pitch=2.0)
-    for method in ("whole", "windowed"):
+    for method in ("centroid", "windowed"):
         parameters = {"method": method, "along": along, "threshold": 20, "window": 6}
         reading = LineReadout(variant=variant, triangulation=sheet, axes=axes, **parameters)(frames, device=device)
         expected = read_lines(frames, **parameters)

@@ -51,7 +51,7 @@ def test_likelihood_reaches_the_bound(device, rng, sigma, peak):
 def test_classical_methods(device, rng, sigma, peak):
     places, frame = trials(rng, sigma, peak)
     methods = (
-        {"method": "whole"},
+        {"method": "centroid"},
         {"method": "windowed", "window": int(np.ceil(2.5 * sigma))},
         {"method": "gauss3", "window": 4},
         {"method": "fir", "window": 6},

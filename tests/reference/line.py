@@ -31,12 +31,12 @@ def read_profile(x, *, saturation, previous, method="windowed", threshold=0.0, w
         known = x[~np.isnan(x)]
         bright = len(known) and known.max() >= saturation
         return np.nan, np.nan, np.nan, np.nan, NOT_FINITE | (SATURATED if bright else 0)
-    if method == "whole":
-        return read_whole(x, threshold, saturation, **settings)
+    if method == "centroid":
+        return read_centroid(x, threshold, saturation, **settings)
     return read_peak(x, method, threshold, window, saturation, previous, **settings)
 
 
-def read_whole(x, threshold, saturation, *, minimum_peak=-np.inf, minimum_width=1, maximum_width=None, **_):
+def read_centroid(x, threshold, saturation, *, minimum_peak=-np.inf, minimum_width=1, maximum_width=None, **_):
     v = np.maximum(x - threshold, 0.0)
     lit = int(np.sum(v > 0.0))
     status = SATURATED if x.max() >= saturation else 0
@@ -55,27 +55,27 @@ def runs_of(x, threshold):
     return list(zip(steps[::2], steps[1::2], strict=True))
 
 
-def choose(x, threshold, previous, choice, minimum_peak, minimum_width, maximum_width):
+def choose(x, threshold, previous, peak_selection, minimum_peak, minimum_width, maximum_width):
     """(index of the peak, width of its run), or None."""
     widest = len(x) if maximum_width is None else maximum_width
     peaks = [(b + int(np.argmax(x[b:e])), e - b) for b, e in runs_of(x, threshold) if minimum_width <= e - b <= widest]
     peaks = [(at, width) for at, width in peaks if x[at] >= minimum_peak]
     if not peaks:
         return None
-    if choice == "first":
+    if peak_selection == "first":
         return peaks[0]
-    if choice == "last":
+    if peak_selection == "last":
         return peaks[-1]
-    if choice == "nearest" and 0.0 <= previous < len(x):
+    if peak_selection == "nearest" and 0.0 <= previous < len(x):
         return min(peaks, key=lambda peak: abs(peak[0] - int(np.rint(previous))))
     return max(peaks, key=lambda peak: x[peak[0]])
 
 
 def read_peak(
-    x, method, threshold, window, saturation, previous, *, choice="strongest", minimum_peak=-np.inf,
+    x, method, threshold, window, saturation, previous, *, peak_selection="strongest", minimum_peak=-np.inf,
     minimum_width=1, maximum_width=None, ambiguity=None, fir_length=4, read_noise=1.0, gain=0.0,
 ):  # fmt: skip
-    found = choose(x, threshold, previous, choice, minimum_peak, minimum_width, maximum_width)
+    found = choose(x, threshold, previous, peak_selection, minimum_peak, minimum_width, maximum_width)
     if found is None:
         return np.nan, x.max(), 0, 0.0, LOW_SIGNAL | (SATURATED if x.max() >= saturation else 0)
     at, width = found

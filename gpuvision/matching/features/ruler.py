@@ -18,7 +18,7 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device, Launch, Variant, uses_vectors
 from gpuvision.operation import VisionOperation
-from gpuvision.validation import finite, whole
+from gpuvision.validation import finite, integer
 
 Polarity = Literal["any", "rising", "falling"]
 Choice = Literal["strongest", "first", "last", "all"]
@@ -173,9 +173,11 @@ class RulerEdges(VisionOperation[Edges]):
 
     def __post_init__(self) -> None:
         for name, least, limit in (("length", 5, LONGEST), ("width", 1, WIDEST), ("most", 1, MOST_EDGES)):
-            object.__setattr__(self, name, whole(getattr(self, name), f"RulerEdges.{name}", least=least, most=limit))
+            object.__setattr__(
+                self, name, integer(getattr(self, name), f"RulerEdges.{name}", minimum=least, maximum=limit)
+            )
         if self.count is not None:
-            object.__setattr__(self, "count", whole(self.count, "RulerEdges.count", least=0, most=2**31 - 1))
+            object.__setattr__(self, "count", integer(self.count, "RulerEdges.count", minimum=0, maximum=2**31 - 1))
         for name in ("threshold", "step_px", "smoothing_px"):
             if finite(getattr(self, name), f"RulerEdges.{name}") <= 0.0:
                 raise ValueError(f"RulerEdges.{name} is {getattr(self, name)}, expected a number above 0")

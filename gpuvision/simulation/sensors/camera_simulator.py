@@ -153,7 +153,7 @@ class CameraSimulator:
         """Read a block of profiles: `frames`, then the readout on a device.
 
         Sigma is that of a centre of gravity over the readout's window about the reading (over all light, for method
-        "whole"), of photon, read and rounding noise, where the threshold lies below the noise of dark pixels or far
+        "centroid"), of photon, read and rounding noise, where the threshold lies below the noise of dark pixels or far
         above it; other methods' differ from it. Without a seed the frames are those without noise. Samples are in the
         view's order.
         """
@@ -194,7 +194,7 @@ class CameraSimulator:
         """Return the standard deviation of a centre of gravity about positions [pixel]."""
         known = np.isfinite(position)
         middle = np.where(known, position, 0.0)
-        if self.readout.method == "whole":
+        if self.readout.method == "centroid":
             at = np.broadcast_to(np.arange(self.view.bins), electrons.shape)
             inside = np.ones(electrons.shape, bool)
         else:

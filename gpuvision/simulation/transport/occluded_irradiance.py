@@ -13,7 +13,7 @@ from gpuvision.host import Device, Launch, Precision, Variant, real_defines, rea
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LitSegments
-from gpuvision.validation import whole
+from gpuvision.validation import integer
 
 Spec = tuple[tuple[int, ...], np.dtype[Any]]
 Visibility = Literal["intervals", "rays", "none"]
@@ -124,7 +124,7 @@ class OccludedIrradiance(VisionOperation[ReceivedLight]):
         _check_scene(self.scene, self.clearance)
         for name in ("segments", "samples", "picks"):
             if name != "picks" or self.picks is not None:
-                whole(getattr(self, name), f"OccludedIrradiance.{name}", least=1, most=2**31 - 1)
+                integer(getattr(self, name), f"OccludedIrradiance.{name}", minimum=1, maximum=2**31 - 1)
         if self.visibility not in ("intervals", "rays", "none"):
             raise ValueError(
                 f"OccludedIrradiance.visibility is {self.visibility!r}, expected 'intervals', 'rays' or 'none'"

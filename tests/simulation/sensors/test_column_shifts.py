@@ -40,9 +40,9 @@ ALBEDO = 0.8
 EXPOSED = 1e-3  # s
 FULL_SCALE = 50_000.0  # grey levels, of the brightest pixel
 RULES = {
-    "whole column": {"method": "whole"},
-    "threshold 5 %": {"method": "whole", "threshold": 0.05 * FULL_SCALE},
-    "threshold 20 %": {"method": "whole", "threshold": 0.2 * FULL_SCALE},
+    "whole column": {"method": "centroid"},
+    "threshold 5 %": {"method": "centroid", "threshold": 0.05 * FULL_SCALE},
+    "threshold 20 %": {"method": "centroid", "threshold": 0.2 * FULL_SCALE},
     "window 16": {"window": 16},
     "window 4": {"window": 4},
 }

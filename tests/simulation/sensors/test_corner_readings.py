@@ -162,7 +162,7 @@ def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
         ),
     )
     gain = 30000.0 * ELECTRON / (direct.max() * 0.4 * 1e-3)
-    columns_read = CameraSimulator(view=view, readout=LineReadout(method="whole", axes=axes), bits=16, gain=gain)
+    columns_read = CameraSimulator(view=view, readout=LineReadout(method="centroid", axes=axes), bits=16, gain=gain)
     assert np.abs(own - centre).min() > 4.0
     # A thin line lies in one or two pixels of a column, and is read by their middles.
     for simulator, near in ((strips, 0.01), (columns_read, 0.15)):
@@ -209,7 +209,7 @@ def test_size_of_the_effect(degrees: float) -> None:
     bright = direct > 0.0
     assert 0.8 < np.median(secondary[bright] / direct[bright]) / TABLE[degrees][3] < 1.25
     gain = 30000.0 / np.median(given["direct"].power.max(axis=1)[bright]) * ELECTRON / (0.4 * 1e-3)
-    rules = ({"method": "whole"}, {"window": 16}, {"window": 4})
+    rules = ({"method": "centroid"}, {"window": 16}, {"window": 4})
     for rule, expected in zip(rules, TABLE[degrees], strict=False):
         readout = LineReadout(axes=SampleAxes(sample_origin=-512.0), precision="double", **rule)
         camera = CameraSimulator(view=view, readout=readout, gain=gain, bits=16)

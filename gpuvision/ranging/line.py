@@ -1,7 +1,7 @@
-"""Light lines in camera frames: every column (or row) of a frame becomes a sub-pixel position of the light.
+"""Laser line readout: a camera image of a sheet of light becomes one sub-pixel line position per column (or row).
 
-The line crosses the frame along its columns axis (``along="columns"``: a row coordinate for every column) or along
-its rows axis (``along="rows"``: a column coordinate for every row). One such column or row of samples is a *profile*.
+The laser line crosses the frame along its columns axis (``along="columns"``: one row coordinate per column) or along
+its rows axis (``along="rows"``: one column coordinate per row). One such column or row of samples is a *profile*.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ import numpy as np
 from gpuvision.host import (
     Define,
     Device,
+    FloatArray,
     Launch,
     LaunchBuilder,
     Precision,
+    StatusArray,
     Variant,
     WorkSize,
     ceil_div,
@@ -34,112 +36,144 @@ PeakSelection = Literal["strongest", "first", "last", "nearest"]
 
 METHODS = ("centroid", "windowed", "gauss3", "fir", "ml")
 PEAK_SELECTIONS = ("strongest", "first", "last", "nearest")
-LONGEST_PROFILE = 32767  # samples: indices of narrow lanes are 16 bits
-WIDEST_WINDOW = 180  # samples either side: moments of 16-bit samples in 32 bits
+LONGEST_PROFILE = 32767  # samples: the vector variant keeps sample indices in 16 bits
+WIDEST_WINDOW = 180  # samples on either side: sums of 16-bit samples times their index fit 32 bits
 _LANES = 16
-_GROUP = 64  # items of a work-group
-_STRIP = 1024  # columns of a strip at most, MAX_STRIP in line_strip.h
-_WIDE_BYTES = 64  # of neighbouring samples that a strip works on at once
+_GROUP = 64  # work-items of a work-group
+_STRIP = 1024  # largest number of columns of a strip: MAX_STRIP in line_strip.h
+_WIDE_BYTES = 64  # bytes of a wide vector (one cache line): WIDE in line_wide.h
 
 
 class LineReading(NamedTuple):
-    """What a frame's line says, each array of shape (batch..., samples); fields not asked for are ``None``.
+    """Peaks of a laser line, one per profile: arrays of shape (batch..., samples); fields not requested are ``None``.
 
     Attributes
     ----------
     position
-        Place of the light along the profile [pixel]; NaN where the status has LOW_SIGNAL, OUT_OF_RANGE or NOT_FINITE.
+        Position of the line along the profile [px], in the real type. NaN where the status has LOW_SIGNAL,
+        OUT_OF_RANGE or NOT_FINITE.
     peak
-        The peak's sample as recorded; the strongest sample where there is no peak.
+        Sample value at the peak [grey levels]; the largest sample of the profile where no peak was found.
     width
-        Samples over the threshold: in the run that holds the peak, for ``method="centroid"`` in the whole profile.
+        Number of samples above the threshold [px]: in the run that contains the peak; for ``method="centroid"`` in the
+        whole profile.
     total
-        Light over the threshold [grey levels]: in the window, for ``method="centroid"`` in the whole profile.
+        Sum of the light above the threshold [grey levels]: in the window; for ``method="centroid"`` in the whole
+        profile.
     status
-        uint8 `Status` flags. LOW_SIGNAL: no peak that the parameters allow, or too little light beside it for the
-        method. OUT_OF_RANGE: the border cuts the window, or a flat top wider than it (for ``"centroid"``: a border sample
-        has half the peak's light or more). NOT_FINITE: a sample of the profile is NaN or infinite, or the sums are
-        beyond the largest number. With a value:
-        SATURATED (the peak is at the saturation level), AMBIGUOUS (a second peak is comparable, a flat top is wider
-        than the window, or the fit fell back to the middle of a flat top). HORIZON and NOT_INVERTIBLE come from the
-        triangulation.
+        uint8 `Status` flags, 0 where the position is good. The position is NaN under:
+
+        - LOW_SIGNAL: no peak meets the minimum level and the width limits, or the samples beside the peak have too
+          little light for the method.
+        - OUT_OF_RANGE: the image border cuts the window, or cuts a flat top wider than the window. For ``"centroid"``:
+          the first or last sample has at least half of the peak's light.
+        - NOT_FINITE: a sample of the profile is NaN or infinite, or a sum overflows.
+
+        The position is kept under:
+
+        - SATURATED: the peak is at the saturation level.
+        - AMBIGUOUS: a second peak is comparable, a flat top is wider than the window, or the fit did not converge and
+          the middle of the flat top or the centroid is returned.
+
+        HORIZON and NOT_INVERTIBLE come from the triangulation and make only ``g`` and ``h`` NaN.
     g, h
-        The point in the sheet of light [m], where the readout has a triangulation.
+        Point in the sheet of light [m], if the readout has a triangulation.
     """
 
-    position: Any = None
-    peak: Any = None
-    width: Any = None
-    total: Any = None
-    status: Any = None
-    g: Any = None
-    h: Any = None
+    position: FloatArray | None = None
+    peak: FloatArray | None = None
+    width: FloatArray | None = None
+    total: FloatArray | None = None
+    status: StatusArray | None = None
+    g: FloatArray | None = None
+    h: FloatArray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineReadout(VisionOperation[LineReading]):
-    """Light lines to positions: ``readout(frames) -> LineReading``.
+    """Laser line readout: peak (centroid, Gaussian fit, derivative filter) of every column: ``readout(frames)``.
 
-    Takes uint8, uint16 or float32 frames of shape (..., rows, columns). Light is what a sample has over the
-    threshold. Of samples that tie for the peak the first one counts. It and the neighbours after it that equal it are
-    a flat top, which counts by its middle; one wider than the window is read as that middle and flagged AMBIGUOUS.
+    Takes uint8, uint16 or float32 frames of shape (..., rows, columns) and returns a `LineReading`. The *light* of a
+    sample is the part of its value above the threshold. If several samples of a profile are equally large, the first
+    one is the peak. Neighbours that equal the peak form a flat top with it; the window is centred on the middle of the
+    flat top. For a flat top wider than the window that middle is the position, with the flag AMBIGUOUS.
 
     Parameters
     ----------
     method : {"windowed", "centroid", "gauss3", "fir", "ml"}
-        ``"centroid"``: centre of gravity of all light in the profile. The others look at the window around one peak:
-        ``"windowed"`` takes its centre of gravity, ``"gauss3"`` a parabola through the logarithms of the peak and
-        its neighbours, ``"fir"`` the zero crossing of a derivative filter (Blais and Rioux, 1986), ``"ml"`` the most
-        likely pixel-integrated Gaussian on an unknown background, for noise of variance
-        ``read_noise**2 + gain * level``.
+        Peak estimator, default ``"windowed"``:
+
+        - ``"centroid"``: centroid (centre of gravity) of all light in the profile.
+        - ``"windowed"``: centroid of the light in a window around the peak.
+        - ``"gauss3"``: parabola through the logarithms of the peak and its two neighbours (a Gaussian) [2]_.
+        - ``"fir"``: zero crossing of a derivative filter [1]_.
+        - ``"ml"``: maximum-likelihood fit of a pixel-integrated Gaussian on an unknown constant background, for noise
+          of variance ``read_noise**2 + gain * level``.
     along : {"columns", "rows"}
-        Which axis of the frame the line runs along: a profile is a column, or a row.
-    threshold
-        Level below which a sample counts as no light [grey levels]; for integer frames a whole number.
-    window
-        Samples either side of the peak that count.
+        Image axis along which the line runs, default ``"columns"``: each column is a profile.
+    threshold : float
+        Level below which a sample has no light [grey levels], default 0; an integer for integer frames.
+    window : int
+        Number of samples on either side of the peak in its window, 1 to 180, default 8.
     peak_selection : {"strongest", "first", "last", "nearest"}
-        Which peak, where there are several. A peak is the strongest sample of a run of samples over the threshold.
-        ``"nearest"``: to the position of an earlier reading, given as a second input of shape (..., samples) in the
-        readout's precision, rounded to whole pixels; where that is NaN, the strongest.
-    minimum_peak
-        Weakest sample that can be a peak [grey levels].
-    minimum_width, maximum_width
-        Of the run of samples over the threshold (for ``"centroid"``: of their number) [pixel]. A hot pixel is a run
-        of 1.
-    saturation
-        Level at which a sample is saturated; ``None``: the highest code of integer frames, no limit for float32.
-        ``"ml"`` leaves saturated samples out of the fit.
-    ambiguity
-        Share of the peak's light from which on a sample outside the window makes the reading AMBIGUOUS;
-        ``None`` does not look.
+        Peak to take where a profile has several, default ``"strongest"``. A peak is the largest sample of a run of
+        samples above the threshold. ``"nearest"``: nearest to the position of an earlier reading. This position is a
+        second input of shape (..., samples) in the readout's precision; it is rounded to whole pixels; where it is NaN,
+        the strongest peak is taken.
+    minimum_peak : float, optional
+        Smallest sample value that can be a peak [grey levels].
+    minimum_width, maximum_width : int
+        Limits on the length of the run of samples above the threshold (for ``"centroid"``: on their number) [px].
+        Default 1 and no limit. A hot pixel is a run of 1.
+    saturation : float, optional
+        Level at which a sample is saturated [grey levels]; default: the largest code of integer frames, no limit for
+        float32. ``"ml"`` leaves saturated samples out of the fit.
+    ambiguity : float, optional
+        Fraction of the peak's light, 0 to 1. A sample outside the window with at least this fraction sets the flag
+        AMBIGUOUS. Default: no search for such samples.
     fir_length : {4, 8}
-        Taps of the derivative filter.
-    read_noise, gain
-        For ``"ml"``: standard deviation of a dark sample [grey levels], and variance per grey level of light (grey
-        levels per electron).
-    triangulation, axes
-        Fuses sensor -> sheet into the same pass (outputs ``g`` and ``h``): u is the position, v the number of the
-        profile, as ``axes`` places them.
-    outputs
-        Names of the `LineReading` fields to compute; what is not asked for is not compiled. ``None``: all.
-    precision
-        Of the arithmetic and the outputs; ``None`` is single.
-    variant
-        Wide strips or one item per profile; ``"auto"`` follows the device. Frames smaller than a strip's vectors
-        are walked by items.
+        Taps of the derivative filter, default 4.
+    read_noise, gain : float
+        Noise model of ``"ml"``: standard deviation of a dark sample [grey levels], default 1, and variance per grey
+        level of light [grey levels per electron], default 0.
+    triangulation, axes : Triangulation, SampleAxes
+        Triangulate in the same kernel (outputs ``g`` and ``h``): u is the position, v the number of the profile,
+        converted to sensor coordinates by ``axes``.
+    outputs : tuple of str, optional
+        Names of the `LineReading` fields to compute; the code of other fields is not compiled. Default: all.
+    precision : {"single", "double", None}
+        Precision of the arithmetic and of the outputs; ``None`` is single.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: wide vectors on strips of profiles (CPU runtimes), or one work-item per profile (GPUs).
+        ``"auto"`` follows the device. Frames narrower than a vector use the work-item variant.
 
     Raises
     ------
     TypeError
-        A parameter is no number, or a count no whole one.
+        A parameter is not a number, or not an integer where one is expected.
     ValueError
         A parameter is out of its range.
 
     Notes
     -----
-    Error: integer samples are summed exactly, float32 samples with their rounding kept, so that the position has a
-    few roundings of its own size at most.
+    Error: integer samples are summed exactly. The rounding errors of float32 sums are kept in a second number
+    (compensated summation). The position has an error of a few roundings of its own size.
+
+    References
+    ----------
+    .. [1] F. Blais and M. Rioux, Real-time numerical peak detector, Signal Processing 11 (1986) 145-155.
+    .. [2] R. B. Fisher and D. K. Naidu, A comparison of algorithms for subpixel peak detection, in Image Technology,
+       Springer 1996.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import gpuvision as gv
+    >>> frame = np.zeros((9, 4), np.uint8)
+    >>> frame[3:6] = np.array([[50], [100], [50]])
+    >>> reading = gv.LineReadout(method="centroid", threshold=10)(frame)
+    >>> reading.position.tolist()
+    [4.0, 4.0, 4.0, 4.0]
     """
 
     Result: ClassVar[type[Any]] = LineReading
@@ -219,12 +253,12 @@ class LineReadout(VisionOperation[LineReading]):
             )
 
     @property
-    def _judges_width(self) -> bool:
+    def _limits_width(self) -> bool:
         return self.minimum_width > 1 or self.maximum_width is not None
 
     @property
     def _has_candidates(self) -> bool:
-        return self.method != "centroid" and (self.peak_selection != "strongest" or self._judges_width)
+        return self.method != "centroid" and (self.peak_selection != "strongest" or self._limits_width)
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -262,13 +296,12 @@ class LineReadout(VisionOperation[LineReading]):
 
     def _fits_strip(self, rows: int, columns: int, dtype: np.dtype[Any]) -> bool:
         if self._has_candidates:
-            # Along a row one profile is walked at a time, whatever the variant: its dark parts are passed by in
-            # vectors.
+            # Along rows both variants read one profile at a time; dark parts of it are skipped in vectors of samples.
             return self.along == "columns" and columns >= _LANES
         return columns >= _WIDE_BYTES // dtype.itemsize and (self.along == "columns" or rows >= _LANES)
 
     def _items(self, device: Device, frames: int, samples: int) -> int:
-        """Return the work-items per frame of the vector variant: few wide ones, but enough to keep every core busy."""
+        """Return the work-items per frame of the vector variant: few, but two per core at least over all frames."""
         if self.along == "rows" or self._has_candidates:
             return ceil_div(samples, _LANES)
         units = device.compute_units
@@ -276,7 +309,7 @@ class LineReadout(VisionOperation[LineReading]):
         return min(max(ceil_div(samples, _STRIP), busy), max(samples // 128, 1))
 
     def _levels(self, dtype: np.dtype[Any]) -> list[Any]:
-        """Return threshold, saturation and weakest peak in the frames' own type."""
+        """Return threshold, saturation and smallest peak level in the dtype of the frames."""
         if dtype.kind == "f":
             saturation = np.inf if self.saturation is None else self.saturation
             weakest = -np.inf if self.minimum_peak is None else self.minimum_peak
@@ -307,8 +340,8 @@ class LineReadout(VisionOperation[LineReading]):
             ALONG_ROWS=self.along == "rows",
             AMBIGUITY=self.ambiguity is not None,
             CANDIDATES=self._has_candidates,
-            WIDTH_LIMITS=self._judges_width,
-            WITH_LIT="width" in chosen or (self.method == "centroid" and self._judges_width),
+            WIDTH_LIMITS=self._limits_width,
+            WITH_LIT="width" in chosen or (self.method == "centroid" and self._limits_width),
             LONG_MOMENT=bits < 32 and length**2 // 2 * np.iinfo(f"uint{bits}").max >= 2**32,
         )
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.ranging.line import Choice
+from gpuvision.ranging.line import PeakSelection
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution, Verdict, attribute_errors, verdict_of
 from gpuvision.simulation.sensors.camera_simulator import CameraSimulator
 from gpuvision.simulation.sensors.readings import Reading, Truth
@@ -87,7 +87,7 @@ def compare_peaks(
     exposures: Mapping[str, Exposure],
     truth: Truth,
     *,
-    choices: Sequence[Choice] = ("strongest", "first", "last"),
+    peak_selections: Sequence[PeakSelection] = ("strongest", "first", "last"),
     seed: int | None = None,
     device: Device | None = None,
 ) -> dict[str, ErrorAttribution]:
@@ -99,8 +99,8 @@ def compare_peaks(
         Its readout looks for peaks.
     exposures, truth
         Light by path, (profiles, samples, bins), and where the surface is.
-    choices
-        Of `LineReadout.choice`; the names in what is returned.
+    peak_selections
+        Of `LineReadout.peak_selection`; the names in what is returned.
     seed, device
         As of `attribute_errors`.
 
@@ -110,14 +110,14 @@ def compare_peaks(
         The readout knows no peaks.
     """
     return {
-        choice: attribute_errors(
-            replace(simulator, readout=replace(simulator.readout, choice=choice)),
+        selection: attribute_errors(
+            replace(simulator, readout=replace(simulator.readout, peak_selection=selection)),
             exposures,
             truth,
             seed=seed,
             device=device,
         )
-        for choice in choices
+        for selection in peak_selections
     }
 
 

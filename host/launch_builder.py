@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -22,7 +22,17 @@ from gpuvision.host.launch import (
     uses_vectors,
 )
 from gpuvision.host.program import Define
-from gpuvision.host.work_size import WorkSize, ceil_div, fitted_groups, padded_groups, vector_work
+from gpuvision.host.work_size import (
+    WorkSize,
+    ceil_div,
+    fitted_groups,
+    group_per_element,
+    padded_groups,
+    vector_work,
+)
+
+Grouping = Literal["padded", "fitted", "per_element"]
+_GROUPINGS = {"padded": padded_groups, "fitted": fitted_groups, "per_element": group_per_element}
 
 _OPENCL_TYPES = {
     "int8": "char",
@@ -102,7 +112,7 @@ class LaunchBuilder:
         if not is_valid:
             raise ValueError(f"{self.name} takes {expected}, got shape {self.shape}")
 
-    def work(self, count: int, *, each: int, group: int, least: int = 0, fitted: bool = False) -> WorkSize:
+    def work(self, count: int, *, each: int, group: int, least: int = 0, grouping: Grouping = "padded") -> WorkSize:
         """Return the work size for `count` elements in the kernel variant that runs on this device.
 
         Parameters
@@ -111,15 +121,15 @@ class LaunchBuilder:
         each : int
             Elements of one work-item of the vector variant.
         group : int
-            Work-group size of the other variant, which computes one element per work-item.
+            Work-group size of the other variant.
         least : int
             Fewest elements for the vector variant.
-        fitted : bool
-            Whether a group of `count` work-items runs where `count` is below `group`; see `fitted_groups`.
+        grouping : {"padded", "fitted", "per_element"}
+            Work-groups of the other variant: `padded_groups`, `fitted_groups` or `group_per_element`.
         """
         if self.uses_vectors and count >= least:
             return vector_work(count, each)
-        return fitted_groups(count, group) if fitted else padded_groups(count, group)
+        return _GROUPINGS[grouping](count, group)
 
     def share(self, count: int, *, per_core: int, multiple: int = 1) -> int:
         """Return the elements of one share, a multiple of a number, when each core gets `per_core` shares."""

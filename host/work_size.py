@@ -46,6 +46,11 @@ def fitted_groups(count: int, group: int) -> WorkSize:
     return WorkSize((round_up(count, each),), (each,), each)
 
 
+def group_per_element(count: int, group: int) -> WorkSize:
+    """Return the work size of one work-group per element."""
+    return WorkSize((count * group,), (group,))
+
+
 def ceil_div(count: int, size: int) -> int:
     """Return the number of parts of `size` that hold `count` elements: count / size, rounded up."""
     return -(-count // size)

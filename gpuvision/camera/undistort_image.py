@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.image_map import Packer, PixelMap, Taps
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, uses_vectors
+from gpuvision.host import Define, Device, Launch, LaunchBuilder, Precision, Variant, WorkSize, round_up, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.status import Status
 from gpuvision.validation import finite, numbers
@@ -29,7 +29,6 @@ _BORDERS = {
     "reflect": "BORDER_REFLECT",
     "replicate": "BORDER_REPLICATE",
 }
-_CODES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 # An index into a frame, and one into a map, is an int on the device.
 _LARGEST_FRAME = 2**30
 # What a model computes at once stays in the caches.
@@ -195,43 +194,44 @@ class UndistortImage(VisionOperation[UndistortedImage]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        *batch, rows, columns = self._checked(shape, dtype)
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
+        *batch, rows, columns = self._checked(build)
         region = self._region((rows, columns))
-        strip = uses_vectors(self.variant, device)
         made_columns, made_rows = region[2:]
         if max(rows * columns, made_rows * made_columns) * self.channels >= _LARGEST_FRAME:
             raise ValueError(f"UndistortImage takes images of fewer than 2**30 samples, got {rows} x {columns} pixels")
         frames = math.prod(batch)
         made = (*batch, made_rows, made_columns, *((3,) if self.channels == 3 else ()))
-        real = np.dtype(np.float64 if self.precision == "double" else np.float32)
         computed = self.coordinates == "computed"
-        tables = (None, None, None, self._table(real)) if computed else (*self._packed(rows, columns), None)
+        tables = (None, None, None, self._table(build.real)) if computed else (*self._packed(rows, columns), None)
         fill = self.value if self.border == "constant" else math.nan if dtype.kind == "f" else 0.0
-        moved = (math.prod(shape) + math.prod(made)) * dtype.itemsize
-        past_caches = {"PAST_CACHES": None} if strip and device.is_cpu and moved > device.cache_bytes else {}
-        return Launch(
-            source="undistort_image/undistort_image.cl",
-            kernel="undistort",
-            inputs=((shape, dtype),),
-            outputs={"image": (made, dtype), "status": ((made_rows, made_columns), np.dtype(np.uint8))},
-            defines=real_defines(device, real) | self._defines(dtype, strip) | past_caches,
-            arguments=(
+        if build.uses_vectors:
+            work = WorkSize((made_rows, frames), (1, 1), vectors=True)
+        else:
+            wide, high = _GROUP
+            work = WorkSize((round_up(made_columns, wide), round_up(made_rows, high), frames), (wide, high, 1))
+        return build.launch(
+            "undistort_image/undistort_image.cl",
+            "undistort",
+            work=work,
+            outputs=build.outputs({"image": made, "status": (made_rows, made_columns)}, image=dtype),
+            defines=self._defines(dtype),
+            arguments=[
                 *tables,
                 np.array([columns, rows, made_columns, made_rows, *region[:2], self._missing], np.int32),
                 np.float32(fill),
-            ),
-            global_size=(made_rows, frames) if strip else (*_whole_groups(made_columns, made_rows), frames),
-            local_size=(1, 1) if strip else (*_GROUP, 1),
+            ],
+            streams=True,
         )
 
-    def _checked(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[int, ...]:
-        """Return the shape without channels, of an input that can be computed."""
-        if dtype.name not in _CODES:
-            raise TypeError(f"UndistortImage takes uint8, uint16 or float32 images, got {dtype}")
+    def _checked(self, build: LaunchBuilder) -> tuple[int, ...]:
+        """Check the input and return its shape without the channels."""
+        build.check_dtype("uint8", "uint16", "float32", of="images")
+        shape, dtype = build.shape, build.dtype
         expected = "(..., rows, columns, 3)" if self.channels == 3 else "(..., rows, columns)"
         pixels = shape if self.channels == 1 else shape[:-1]
-        if len(pixels) < 2 or 0 in pixels[-2:] or (self.channels == 3 and shape[-1] != 3):
-            raise ValueError(f"UndistortImage takes images {expected} with one pixel at least, got shape {shape}")
+        is_valid = len(pixels) >= 2 and 0 not in pixels[-2:] and (self.channels == 1 or shape[-1] == 3)
+        build.check_shape(is_valid, f"images {expected} with one pixel at least")
         if dtype.kind == "u" and not 0.0 <= self.value <= np.iinfo(dtype).max:
             raise ValueError(f"UndistortImage.value is {self.value:g}, expected what {dtype} holds")
         return pixels
@@ -260,13 +260,11 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         table: npt.NDArray[Any] = self.model.packed(real, "distort", self.matrix)
         return table
 
-    def _defines(self, dtype: np.dtype[Any], strip: bool) -> dict[str, Any]:
-        code = _CODES[dtype.name]
-        defines: dict[str, Any] = {"CODE": code, "CHANNELS": self.channels}
+    def _defines(self, dtype: np.dtype[Any]) -> dict[str, Define]:
+        defines = type_defines("CODE", dtype, 16)
+        defines |= {"CONVERT_CODES": f"convert_{defines['CODE16']}", "CHANNELS": self.channels}
         if dtype.kind == "u":
             defines["LARGEST"] = f"{np.iinfo(dtype).max}.0f"
-        if strip:
-            defines |= {"VECTOR_VARIANT": None, "CODE16": f"{code}16", "CONVERT_CODES": f"convert_{code}16"}
         if self.interpolation == "bicubic":
             defines["BICUBIC"] = None
         defines[_BORDERS[self.border]] = None
@@ -274,8 +272,3 @@ class UndistortImage(VisionOperation[UndistortedImage]):
             model = self.model.defines if isinstance(self.model, Lens) else self.model.defines(self.matrix)
             defines |= {"COMPUTED": None} | model
         return defines
-
-
-def _whole_groups(columns: int, rows: int) -> tuple[int, ...]:
-    """Return numbers of work-items, whole groups of them, that cover an image."""
-    return tuple(-(-size // group) * group for size, group in zip((columns, rows), _GROUP, strict=True))

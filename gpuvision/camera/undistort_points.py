@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.polynomial import PlanePolynomial
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, flags, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import numbers
 
@@ -89,34 +89,24 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"UndistortPoints takes float32 or float64 points, got {dtype}")
-        if not shape or shape[-1] != 2:
-            raise ValueError(f"UndistortPoints takes points (..., 2), got shape {shape}")
-        real = real_of(self.precision, dtype)
-        code = "float" if dtype == np.float32 else "double"
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
+        build.check_dtype("float32", "float64", of="points")
+        build.check_shape(shape[-1:] == (2,), "points (..., 2)")
         count = math.prod(shape[:-1])
-        strip = uses_vectors(self.variant, device) and count >= _LANES
-        share = -(-count // (_STRIPS_PER_CORE * _LANES * device.handle.max_compute_units)) * _LANES
-        each = min(max(share, _SHORTEST_STRIP), _LONGEST_STRIP) if strip else max(min(count, _GROUP), 1)
-        items = -(-count // each)
-        present = {"VECTOR_VARIANT": strip, "INVERSE": self.inverse}
-        return Launch(
-            source="undistort_points/undistort_points.cl",
-            kernel="undistort_points",
+        share = build.share(count, per_core=_STRIPS_PER_CORE, multiple=_LANES)
+        each = min(max(share, _SHORTEST_STRIP), _LONGEST_STRIP)
+        work = build.work(count, each=each, group=_GROUP, least=_LANES, grouping="fitted")
+        return build.launch(
+            "undistort_points/undistort_points.cl",
+            "undistort_points",
+            work=work,
+            outputs=build.outputs({"points": shape, "status": shape[:-1]}),
             defines={
-                **self._model_defines(real),
-                **real_defines(device, real),
-                **{name: None for name, is_present in present.items() if is_present},
-                "INPUT": code,
-                "INPUT16": f"{code}16",
+                **self._model_defines(build.real),
+                **type_defines("INPUT", dtype, 16),
+                **flags(INVERSE=self.inverse),
             },
-            inputs=[(shape, dtype)],
-            outputs={"points": (shape, real), "status": (shape[:-1], np.dtype(np.uint8))},
-            arguments=[self._packed(real), np.uint64(count), np.uint64(each)],
-            # Left to itself PoCL may put all strips into one group, and so on one core.
-            global_size=(items,) if strip else (items * each,),
-            local_size=(1,) if strip else (each,),
+            arguments=[self._packed(build.real), np.uint64(count), np.uint64(work.each)],
         )
 
     def _model_defines(self, real: np.dtype[Any]) -> dict[str, int | None]:

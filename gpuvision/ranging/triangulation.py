@@ -221,7 +221,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         points = math.prod(shape)
         share = build.share(points, per_core=_STRIPS_PER_CORE, multiple=_LANES)
         each = min(max(share, _SHORTEST_STRIP), _LONGEST_STRIP)
-        work = build.work(points, each=each, group=_GROUP, least=_LANES, fitted=True)
+        work = build.work(points, each=each, group=_GROUP, least=_LANES, grouping="fitted")
         spread = None if self.sigma is None else shape
         return build.launch(
             "triangulation/triangulation.cl",

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from gpuvision.host import Device, Launch, Variant, uses_vectors
+from gpuvision.host import Define, Device, Launch, LaunchBuilder, Variant, flags, round_up
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.robust import efficiency, loss_defines
 from gpuvision.operation import VisionOperation
@@ -37,7 +37,6 @@ MOST_SPOKES = 256
 _LANES, _GROUP = 16, 64
 _SHARES_PER_CORE = 4  # keep the cores even
 _ALONE = 8  # marks that the caller's thread does sooner than it wakes another
-_REAL = np.dtype(np.float32)
 _SMOOTHING, _TAPS = 3, 11  # in the table of ruler.h
 # Of rulers across a mark's edge: polarity along the ruler, which leaves the mark's area.
 _POLARITIES: dict[str, Literal["falling", "rising", "any"]] = {"bright": "falling", "dark": "rising", "either": "any"}
@@ -237,31 +236,26 @@ class FindBlobs(VisionOperation[Blobs]):
         if self.count is None:
             raise ValueError("FindBlobs.count is None; to bind it say how many marks there will be")
         edges = self._ruler().launch(device, shape, dtype)
-        if shape[1] < _LANES:
-            raise ValueError(f"FindBlobs takes images of {_LANES} columns or more, got shape {shape}")
-        strip = uses_vectors(self.variant, device)
-        each = max(-(-self.count // (_SHARES_PER_CORE * device.handle.max_compute_units)), 1)
+        build = LaunchBuilder(self, device, shape, dtype, variant=self.variant)
+        build.check_shape(shape[1] >= _LANES, f"images of {_LANES} columns or more")
+        each = max(build.share(self.count, per_core=_SHARES_PER_CORE), 1)
+        work = build.work(self.count, each=each, group=_GROUP, grouping="per_element")
         freedoms = 3 if self._round else 4
-        one, layout = ((self.count,), _REAL), self._layout()
-        fields = dict.fromkeys(Blobs._fields, one) | {
-            "shift": ((self.count, 2), _REAL),
-            "angle": None if self._round else one,
-            "covariance": ((self.count, freedoms, freedoms), _REAL),
-            "inliers": ((self.count,), np.dtype(np.int32)),
-            "status": ((self.count,), np.dtype(np.uint8)),
-        }
+        shapes: dict[str, tuple[int, ...] | None] = dict.fromkeys(Blobs._fields, (self.count,))
+        shapes |= {"shift": (self.count, 2), "covariance": (self.count, freedoms, freedoms)}
         noise = math.hypot(self.noise, math.sqrt(1.0 / 12.0) if dtype.kind == "u" else 0.0)
         numbers = ((self.width**2 - 1) / 12.0, self._overlap(), self._extent(), noise, self._contour() / self.spokes)
         least = max(math.ceil(self.agreement * self.spokes), freedoms + 1)
-        return Launch(
-            source="blob/blob.cl",
-            kernel="find_blobs",
-            defines=dict(edges.defines) | self._defines(freedoms),
-            inputs=[(shape, dtype), ((self.count, freedoms), _REAL)],
-            outputs=fields,
+        return build.launch(
+            "blob/blob.cl",
+            "find_blobs",
+            work=work,
+            more_inputs=[((self.count, freedoms), build.real)],
+            outputs=build.outputs(shapes | ({"angle": None} if self._round else {}), inliers=np.int32),
+            defines={**edges.defines, **self._defines(freedoms)},
             arguments=[
                 self._table(edges),
-                layout.astype(_REAL),
+                self._layout().astype(build.real),
                 *map(np.int32, shape),
                 np.uint32(self.count),
                 np.uint32(each),
@@ -270,9 +264,7 @@ class FindBlobs(VisionOperation[Blobs]):
                 *map(np.float32, numbers),
                 np.int32(self.passes),
             ],
-            global_size=(-(-self.count // each),) if strip else (self.count * _GROUP,),
-            local_size=(1,) if strip else (_GROUP,),
-            passes_once=strip and self.count <= _ALONE,
+            passes_once=work.vectors and self.count <= _ALONE,
         )
 
     def _table(self, edges: Launch) -> npt.NDArray[Any]:
@@ -289,13 +281,16 @@ class FindBlobs(VisionOperation[Blobs]):
         table[_SMOOTHING] = 0.5 / math.log(peak / beside) - blur**2
         return table
 
-    def _defines(self, freedoms: int) -> dict[str, Any]:
-        defines: dict[str, Any] = dict(loss_defines("tukey", BEND)) | {"EFFICIENCY": efficiency("tukey", BEND)}
-        defines |= {"FREEDOMS": freedoms, "SPOKES": self.spokes, "ROOM": -(-self.spokes // _LANES) * _LANES}
-        present = {"ROUND": self._round, "EITHER": self.polarity == "either", "MATCH": self.match}
-        if self.shape in ("ring", "cross"):
-            defines["RATIO"] = float(self.ratio)
-        return defines | {name: None for name, is_present in present.items() if is_present}
+    def _defines(self, freedoms: int) -> dict[str, Define]:
+        return {
+            **loss_defines("tukey", BEND),
+            "EFFICIENCY": efficiency("tukey", BEND),
+            "FREEDOMS": freedoms,
+            "SPOKES": self.spokes,
+            "ROOM": round_up(self.spokes, _LANES),
+            **({"RATIO": float(self.ratio)} if self.shape in ("ring", "cross") else {}),
+            **flags(ROUND=self._round, EITHER=self.polarity == "either", MATCH=self.match),
+        }
 
     def _layout(self) -> npt.NDArray[np.float64]:
         """Return the table of ``blob.cl``: six rows; rulers k and k + spokes / 2 are opposite."""

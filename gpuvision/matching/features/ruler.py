@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, Variant, uses_vectors
+from gpuvision.host import Define, Device, Launch, LaunchBuilder, Variant, flags, opencl_type, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite, integer
 
@@ -28,7 +28,6 @@ CHOICES = ("strongest", "first", "last", "all")
 LONGEST = 512  # samples: a bit of 32 for each 16 gradients
 WIDEST = 255
 MOST_EDGES = 64
-_CODES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 _LANES, _GROUP = 16, 64
 _SHARES_PER_CORE = 4  # keep the cores even
 _ALONE = 128  # rulers that the caller's thread does sooner than it wakes another
@@ -237,29 +236,23 @@ class RulerEdges(VisionOperation[Edges]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype.name not in _CODES:
-            raise TypeError(f"RulerEdges takes uint8, uint16 or float32 images, got {dtype}")
-        if len(shape) != 2 or min(shape) < 2 or max(shape) >= 2**15:
-            raise ValueError(f"RulerEdges takes images (rows, columns) of 2 to {2**15 - 1} each, got shape {shape}")
+        build = LaunchBuilder(self, device, shape, dtype, variant=self.variant)
+        build.check_dtype("uint8", "uint16", "float32", of="images")
+        is_valid = len(shape) == 2 and min(shape) >= 2 and max(shape) < 2**15
+        build.check_shape(is_valid, f"images (rows, columns) of 2 to {2**15 - 1} each")
         if self.count is None:
             raise ValueError("RulerEdges.count is None; to bind it say how many rulers there will be")
-        strip = uses_vectors(self.variant, device)
-        share = -(-self.count // (_SHARES_PER_CORE * device.handle.max_compute_units * _LANES))
-        each = max(share, 1) * _LANES
-        spec = ((self.count, self.most) if self.choice == "all" else (self.count,), _REAL)
-        return Launch(
-            source="ruler/ruler.cl",
-            kernel="ruler_edges",
-            defines=self._defines(dtype, strip),
-            inputs=[(shape, dtype), ((self.count, 4), _REAL)],
-            outputs={
-                "position": spec,
-                "amplitude": spec,
-                "width": spec,
-                "sigma": spec,
-                "spacing": spec if self.pairs else None,
-                "status": (spec[0], np.dtype(np.uint8)),
-            },
+        each = max(build.share(self.count, per_core=_SHARES_PER_CORE, multiple=_LANES), _LANES)
+        work = build.work(self.count, each=each, group=_GROUP, grouping="per_element")
+        found = (self.count, self.most) if self.choice == "all" else (self.count,)
+        shapes = dict.fromkeys(("position", "amplitude", "width", "sigma"), found)
+        return build.launch(
+            "ruler/ruler.cl",
+            "ruler_edges",
+            work=work,
+            more_inputs=[((self.count, 4), build.real)],
+            outputs=build.outputs({**shapes, "spacing": found if self.pairs else None, "status": found}),
+            defines=self._defines(dtype),
             arguments=[
                 self._packed(dtype),
                 self._packed_model(),
@@ -267,27 +260,29 @@ class RulerEdges(VisionOperation[Edges]):
                 np.uint32(self.count),
                 np.uint32(each),
             ],
-            global_size=(-(-self.count // each),) if strip else (self.count * _GROUP,),
-            local_size=(1,) if strip else (_GROUP,),
-            passes_once=strip and self.count <= _ALONE,
+            passes_once=work.vectors and self.count <= _ALONE,
         )
 
-    def _defines(self, dtype: np.dtype[Any], strip: bool) -> dict[str, Any]:
-        code = _CODES[dtype.name]
-        present = {
-            "VECTOR_VARIANT": strip,
-            f"CODE_{code}": True,
-            self.polarity.upper(): self.polarity != "any",
-            f"CHOOSE_{self.choice.upper()}": True,
-            "PAIRS": self.pairs,
-            "AMBIGUITY": self.ambiguity is not None,
-            "SATURATION": self.saturation is not None,
-            "CURVED": self.radius_px is not None,
+    def _defines(self, dtype: np.dtype[Any]) -> dict[str, Define]:
+        chosen = [f"CODE_{opencl_type(dtype)}", f"CHOOSE_{self.choice.upper()}"]
+        chosen += [] if self.polarity == "any" else [self.polarity.upper()]
+        return {
+            **({} if self.model is None else self._model_defines(self.model)),
+            **type_defines("CODE", dtype),
+            "LENGTH": self.length,
+            "WIDTH": self.width,
+            "TAPS": self._reach,
+            "MOST": self._places,
+            "RULER_GROUP": _GROUP,
+            "RULER_BITS": self._binary_places,
+            **dict.fromkeys(chosen),
+            **flags(
+                PAIRS=self.pairs,
+                AMBIGUITY=self.ambiguity is not None,
+                SATURATION=self.saturation is not None,
+                CURVED=self.radius_px is not None,
+            ),
         }
-        defines: dict[str, Any] = {} if self.model is None else dict(self._model_defines(self.model))
-        defines |= {"CODE": code, "LENGTH": self.length, "WIDTH": self.width, "TAPS": self._reach}
-        defines |= {"MOST": self._places, "RULER_GROUP": _GROUP, "RULER_BITS": self._binary_places}
-        return defines | {name: None for name, is_present in present.items() if is_present}
 
     @staticmethod
     def _model_defines(model: Lens | Camera) -> dict[str, int | None]:

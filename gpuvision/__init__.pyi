@@ -238,7 +238,7 @@ from .simulation.errors.error_attribution import (
     attribute_errors as attribute_errors,
 )
 from .simulation.errors.recommendations import (
-    DualSensor as DualSensor,
+    SensorFusion as SensorFusion,
 )
 from .simulation.light_paths import (
     LightPaths as LightPaths,

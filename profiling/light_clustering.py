@@ -27,7 +27,7 @@ from gpuvision.host import Device
 from gpuvision.profiling.harness import Case
 from gpuvision.profiling.occluded_irradiance import Board
 from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance
-from gpuvision.simulation.errors.range_error import StripReading
+from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
 
@@ -53,7 +53,7 @@ class Part:
     segments: Reals
     receivers: Reals
     weights: Reals
-    reading: StripReading
+    reading: StripErrorModel
     clearance: float | None = None
 
     @classmethod
@@ -65,7 +65,7 @@ class Part:
         seen = np.full(receivers.shape[:2], area * _ALBEDO / math.pi)
         limits = receivers[..., 1].min(), receivers[..., 1].max()
         direct = np.full(len(receivers), segments[0, 9] * width / math.pi)
-        reading = StripReading(power=direct, moment=0.0 * direct, slope=np.ones(len(direct)), limits=limits)
+        reading = StripErrorModel(power=direct, moment=0.0 * direct, slope=np.ones(len(direct)), limits=limits)
         return cls(scene, segments, receivers, reading.weights(seen, receivers[..., 1]), reading, *more)
 
     @classmethod

@@ -260,9 +260,9 @@ def _by_samples(scene: Scene, view: SensorView, lit: LitLine, embree: Any, sampl
         free[free] = _free(embree, spot[free], points[row[free]])
         free[free] = _free(embree, spot[free], np.broadcast_to(_LENS, (int(free.sum()), 3)))
         row, image, cosine = row[free], image[free], cosine[free]
-        power = _SHARE * _ALBEDO / np.pi / samples * each[row] * cosine * view.received(image)
+        power = _SHARE * _ALBEDO / np.pi / samples * each[row] * cosine * view.aperture_solid_angle(image)
         u, v = view.project(image).T
-        total = total + view.deposit(u, v, power)
+        total = total + view.deposit_spots(u, v, power)
     return total
 
 

@@ -72,7 +72,7 @@ def _numba(model: Any) -> Callable[..., None]:
 
 def cases(device: Device) -> Iterator[Case]:
     """Yield a smooth metal and a brushed one, a million pairs each."""
-    yield _case(device, "ggx/1e6", Ggx(alpha=0.2, facing=0.9), _numba(_ggx))
+    yield _case(device, "ggx/1e6", Ggx(alpha=0.2, f0=0.9), _numba(_ggx))
     yield _case(device, "ward/1e6", Ward(albedo=0.8, alpha_x=0.15, alpha_y=0.4), _numba(_ward))
 
 

@@ -33,7 +33,7 @@ def cases(device: Device) -> Iterator[Case]:
 def _case(device: Device, name: str) -> Case:
     task = scanned_part(name)
     model = light_paths(task, device)
-    seen = model.lines.surface(_AT)
+    seen = model.lines.visible_surface(_AT)
     lit = model.sheet.lit(task.part, _AT)
     segments = LitSegments(lit.ends, lit.normals, task.materials[0].albedo * lit.power)
     board = Board(task.part, segments, seen.receivers.astype(np.float32))

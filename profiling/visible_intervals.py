@@ -40,7 +40,7 @@ def _case(device: Device, name: str, mesh: Any) -> Case:
     bound = VisibleIntervals(scene=scene).bind(device, fans.shape, fans.dtype)
     bound.inputs[0].set(fans)
     ours = _shown(bound.run().intervals.get())
-    exact = VisibleIntervals(scene=scene, precision="double" if device.has_double else "single", kept=49)(
+    exact = VisibleIntervals(scene=scene, precision="double" if device.has_double else "single", max_intervals=49)(
         fans, device=device
     )
     truth, known = _shown(exact.intervals), (exact.status == 0) & (bound.outputs.status.get() == 0)

@@ -29,7 +29,7 @@ def psd_view(bins: int = 60, strips: int = STRIPS) -> SensorView:
 
 
 def strip_axes(view: SensorView) -> SampleAxes:
-    return SampleAxes(sample_origin=float(view.v_middles[0]), sample_pitch=PITCH)
+    return SampleAxes(sample_origin=float(view.v_centres[0]), sample_pitch=PITCH)
 
 
 def psd(view: SensorView | None = None, *, readout: dict | None = None, **more) -> PsdSimulator:
@@ -59,9 +59,9 @@ def camera_view(rows: int = 64, columns: int = 8) -> SensorView:
 
 def pixel_axes(view: SensorView) -> SampleAxes:
     return SampleAxes(
-        position_origin=float(view.u_middles[0]),
+        position_origin=float(view.u_centres[0]),
         position_pitch=10e-6,
-        sample_origin=float(view.v_middles[0]),
+        sample_origin=float(view.v_centres[0]),
         sample_pitch=10e-6,
     )
 
@@ -80,4 +80,4 @@ def gaussian(view: SensorView, u, power, sigma: float) -> Exposure:
     # The far side's differences of shares near 1 would cancel.
     share = np.where(x[..., :-1] > 0.0, -np.diff(ndtr(-x), axis=-1), share)
     first = -sigma * np.diff(np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), axis=-1)
-    return Exposure(power * share, power * (first + (u - view.u_middles) * share))
+    return Exposure(power * share, power * (first + (u - view.u_centres) * share))

@@ -171,7 +171,7 @@ def _run(
     task: Task, other: Task | None, rule: Rule, out: Path, made: dict[str, Any], what: str
 ) -> tuple[str, dict[str, Any]]:
     """Simulate one sensor or two, write the results, and return the summary and the first sensor's report."""
-    from gpuvision.simulation.errors.recommendations import DualSensor
+    from gpuvision.simulation.errors.recommendations import SensorFusion
     from gpuvision.workflows.sensor_pair import SensorPair
     from gpuvision.workflows.simulating import simulate as run
 
@@ -180,7 +180,7 @@ def _run(
     summary = done.summary()
     if other is not None:
         with progress_bar(f"{what}, second sensor") as progress:
-            pair = SensorPair.of(done, run(other, out, progress=progress, **made), DualSensor(rule=rule.value))
+            pair = SensorPair.of(done, run(other, out, progress=progress, **made), SensorFusion(rule=rule.value))
         pair.write(out)
         summary += f"\n{pair.summary()}"
     done.write(out)

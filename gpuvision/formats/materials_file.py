@@ -1,14 +1,15 @@
-"""Materials as a file, for ``gpuvision simulate --materials``: one ``[[material]]`` for each mesh of the part.
+"""Materials file (TOML) for ``gpuvision simulate --materials``: one table ``[[material]]`` for each mesh of the part.
 
-=============  =======================================================================================================
-``name``       for reports
-``albedo``     share of the light that the surface throws back diffusely
-``roughness``  0 (Lambert) to 1, see `OrenNayar`
-``slopes``     instead: standard deviation of the slopes of the surface's facets [rad], see `OrenNayar.of_slopes`
-``mirror``     share that it throws on as an ideal mirror
-``gloss``      a table: ``model = "phong"`` with ``albedo``, ``exponent``; ``"ggx"`` with ``alpha``, ``facing``; or
-               ``"ward"`` with ``albedo``, ``alpha_x``, ``alpha_y``
-=============  =======================================================================================================
+===============  =====================================================================================================
+``name``         name for reports
+``albedo``       fraction of the light that is reflected diffusely, 0 to 1
+``roughness``    roughness of the diffuse reflection, 0 (Lambert) to 1, see `OrenNayar`
+``slope_sigma``  instead of ``roughness``: standard deviation of the facets' slope angles [rad], 0 to pi / 2, see
+                 `OrenNayar.from_slope_sigma`
+``mirror``       reflectance of an ideal mirror in the surface, 0 to 1
+``gloss``        a table, the glossy lobe: ``model = "phong"`` with ``albedo``, ``exponent``; ``"ggx"`` with ``alpha``,
+                 ``f0``; or ``"ward"`` with ``albedo``, ``alpha_x``, ``alpha_y``
+===============  =====================================================================================================
 """
 
 from __future__ import annotations
@@ -23,14 +24,24 @@ from gpuvision.simulation.scene.reflectance import Brdf, Ggx, Lambert, OrenNayar
 
 
 def read_materials(path: str | Path) -> tuple[Material, ...]:
-    """Read the materials of a part.
+    """Read the materials of a part from a TOML file.
+
+    Parameters
+    ----------
+    path
+        The materials file.
+
+    Returns
+    -------
+    tuple of Material
+        In the order of the tables, one or more.
 
     Raises
     ------
     OSError
         The file cannot be read.
     DescriptionError
-        It says something that it cannot say: key, value and allowed range are in the message.
+        A key is unknown or missing, or a value is out of its range; the message names key, value and range.
     """
     top = read_toml(Path(path))
     materials = tuple(_material(each, top) for each in top.sections("material"))
@@ -44,16 +55,16 @@ def _material(table: Section, top: Section) -> Material:
     name = table.text("name", "")
     albedo = table.number("albedo", "", at_least=0.0, at_most=1.0)
     roughness = table.number("roughness", "", None, at_least=0.0, at_most=1.0)
-    slopes = table.number("slopes", "rad", None, at_least=0.0, at_most=0.5 * math.pi)
-    if roughness is not None and slopes is not None:
-        raise top.error(f"{table.name} has roughness and slopes at once, expected one of them")
+    slope_sigma = table.number("slope_sigma", "rad", None, at_least=0.0, at_most=0.5 * math.pi)
+    if roughness is not None and slope_sigma is not None:
+        raise top.error(f"{table.name} has both roughness and slope_sigma, expected one of them")
     mirror = table.number("mirror", "", 0.0, at_least=0.0, at_most=1.0)
     lobe = table.optional_section("gloss")
     gloss = None if lobe is None else _gloss(lobe)
     table.finish()
     diffuse: Lambert | OrenNayar = Lambert(albedo=albedo)
-    if slopes:
-        diffuse = OrenNayar.of_slopes(albedo=albedo, sigma=slopes)
+    if slope_sigma:
+        diffuse = OrenNayar.from_slope_sigma(albedo=albedo, sigma=slope_sigma)
     elif roughness:
         diffuse = OrenNayar(albedo=albedo, roughness=roughness)
     try:
@@ -64,7 +75,7 @@ def _material(table: Section, top: Section) -> Material:
 
 _MODELS: dict[str, tuple[Callable[..., Brdf], tuple[str, ...]]] = {
     "phong": (Phong, ("albedo", "exponent")),
-    "ggx": (Ggx, ("alpha", "facing")),
+    "ggx": (Ggx, ("alpha", "f0")),
     "ward": (Ward, ("albedo", "alpha_x", "alpha_y")),
 }
 

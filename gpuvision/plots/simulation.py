@@ -1,4 +1,4 @@
-"""Pictures of a simulation: how far off every sample is, and why."""
+"""Pictures of a simulation: range error of each sample, and its dominant cause."""
 
 from __future__ import annotations
 
@@ -20,21 +20,32 @@ Array = npt.NDArray[Any]
 
 _SIZE, _DPI = (8.0, 5.5), 150
 _NO_READING, _GOOD = "#4b5563", "#e5e7eb"
-# For people who see few colours: of different lightness, too.
+# Okabe and Ito's palette: distinguishable with colour vision deficiencies, and by lightness.
 _COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#d55e00", "#009e73", "#56b4e9", "#f0e442", "#000000")
 
 
-def draw_errors(path: Path, told: ErrorAttribution, title: str) -> None:
-    """Draw how far readings are off as PNG; where nothing is read, or nothing is true, it is dark.
+def draw_errors(path: Path, attribution: ErrorAttribution, title: str) -> None:
+    """Draw the range error of each sample as a PNG; samples without a reading or without ground truth are dark.
 
-    The scale ends at a round length that leaves about 2 % of the samples beyond.
+    Parameters
+    ----------
+    path
+        The PNG file.
+    attribution
+        Errors, (profiles, samples).
+    title
+        Name of the part or sensor, for the heading.
+
+    Notes
+    -----
+    The colour scale ends at a round length, so that about 2 % of the samples are beyond the scale.
     """
     figure, axes = _page(f"{title}: errors")
-    known = np.abs(told.error[np.isfinite(told.error)])
+    known = np.abs(attribution.error[np.isfinite(attribution.error)])
     reach = round_length(2.0 * max(float(np.percentile(known, 98)) if known.size else 0.0, 1e-9))
     unit, name = length_unit(reach)
     shown = axes.imshow(
-        told.error / unit,
+        attribution.error / unit,
         cmap="RdBu_r",
         vmin=-reach / unit,
         vmax=reach / unit,
@@ -43,18 +54,30 @@ def draw_errors(path: Path, told: ErrorAttribution, title: str) -> None:
         interpolation="nearest",
     )
     axes.set_facecolor(_NO_READING)
-    figure.colorbar(shown, label=f"height read less true height [{name}]; dark: no reading", extend="both")
+    figure.colorbar(shown, label=f"height read minus true height [{name}]; dark: no reading", extend="both")
     _write(figure, path)
 
 
-def draw_causes(path: Path, told: ErrorAttribution, limit: float, title: str) -> None:
-    """Draw which cause is to blame for most of every error beyond a limit [m], as PNG."""
-    figure, axes = _page(f"{title}: what most of each error comes from")
-    names = list(told.causes)
-    cause = told.dominant(limit).astype(int)
-    cause = np.where(~np.isfinite(told.error) & (cause < 0), -2, cause)
+def draw_causes(path: Path, attribution: ErrorAttribution, limit: float, title: str) -> None:
+    """Draw the dominant cause of each error beyond a limit as a PNG.
+
+    Parameters
+    ----------
+    path
+        The PNG file.
+    attribution
+        Errors and their causes, (profiles, samples).
+    limit
+        Errors up to this limit have no cause in the picture [m].
+    title
+        Name of the part or sensor, for the heading.
+    """
+    figure, axes = _page(f"{title}: dominant cause of each error")
+    names = list(attribution.causes)
+    cause = attribution.dominant_cause(limit).astype(int)
+    cause = np.where(~np.isfinite(attribution.error) & (cause < 0), -2, cause)
     colours = [_NO_READING, _GOOD, *_COLOURS[: len(names)]]
-    entries = ["no reading, or no truth", f"within {1e6 * limit:.1f} µm", *names]
+    entries = ["no reading, or no ground truth", f"within {1e6 * limit:.1f} µm", *names]
     picture = ListedColormap([to_rgb(each) for each in colours])(cause + 2)
     axes.imshow(picture, aspect="auto", origin="lower", interpolation="nearest")
     parts = [float(np.mean(cause == number - 2)) for number in range(len(entries))]

@@ -119,7 +119,7 @@ def simulator_of(sensor: Sensor, view: SensorView, mask: Mask | None = None) -> 
             ambient=light.ambient,
             modulated=light.modulated,
             mask=mask,
-            codes=readout.ampere != 1.0,
+            quantised=readout.ampere != 1.0,
         )
     return CameraSimulator(
         view=view,

@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from gpuvision.host import Device
 from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance
-from gpuvision.simulation.errors.range_error import StripReading, bounce_power, choose_paths
+from gpuvision.simulation.errors.range_error import StripErrorModel, interreflection_power_bound, select_paths
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.readings import PATHS, Truth
+from gpuvision.simulation.sensors.readings import PATHS, GroundTruth
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
-from gpuvision.simulation.sensors.view_rays import SeenSurface, ViewRays
+from gpuvision.simulation.sensors.view_rays import ViewRays, VisibleSurface
 from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
 from gpuvision.simulation.transport.line_irradiance import LitSegments
@@ -41,7 +41,7 @@ class Profile(NamedTuple):
     """
 
     exposures: dict[str, Exposure]
-    truth: Truth
+    truth: GroundTruth
     account: dict[str, float]
 
 
@@ -138,30 +138,30 @@ class LightPaths:
         found = []
         for k, L in enumerate(places):
             exposures = {
-                name: self.view.blurred(Exposure(each.power[k], each.moment[k]), self.blur)
+                name: self.view.blur(Exposure(each.power[k], each.moment[k]), self.blur)
                 for name, each in straight.items()
                 if name in self.paths or name not in PATHS
             }
-            truth = Truth(truths.g[k], truths.h[k], truths.status[k])
+            truth = GroundTruth(truths.g[k], truths.h[k], truths.status[k])
             found.append(self._profile(float(L), lit.those(slice(first[k], first[k + 1])), exposures, truth))
         return found
 
-    def _profile(self, L: float, lit: LitLine, exposures: dict[str, Exposure], truth: Truth) -> Profile:
+    def _profile(self, L: float, lit: LitLine, exposures: dict[str, Exposure], truth: GroundTruth) -> Profile:
         """Return the direct light of a profile with the light by detours."""
         account = {"segments": float(len(lit.power)), "power": lit.total()}
         if "diffuse-specular" in self.paths and self._mirrors.there_are_any:
             mirrored = self._mirrors.exposure(lit, L, self.sheet)
-            exposures["diffuse-specular"] = self.view.blurred(mirrored, self.blur)
+            exposures["diffuse-specular"] = self.view.blur(mirrored, self.blur)
         if {"diffuse-diffuse", "bounces"} & set(self.paths):
-            seen, segments = self.lines.surface(L), self._diffuse(lit)
-            reading = StripReading.of(self.view, exposures["direct"], floor=self.floor)
+            seen, segments = self.lines.visible_surface(L), self._diffuse(lit)
+            reading = StripErrorModel.from_exposure(self.view, exposures["direct"], min_power=self.floor)
             remaining = self.tolerance
             if self._bounces is not None:
-                choice = choose_paths({"bounces": reading.worst(self._most_by_bounces(segments))}, self.tolerance)
-                remaining = choice.remaining
+                choice = select_paths({"bounces": reading.error_bound(self._most_by_bounces(segments))}, self.tolerance)
+                remaining = choice.remaining_tolerance
                 if "bounces" in choice.modelled:
                     exposures["bounces"] = self._bounced(seen, segments)
-                account |= {"bound of bounces left out [m]": sum(choice.left_out.values())}
+                account |= {"bound of bounces left out [m]": sum(choice.omitted.values())}
             if "diffuse-diffuse" in self.paths:
                 irradiance, told = self._secondary(seen, segments, reading, remaining)
                 exposures["diffuse-diffuse"] = self.lines.exposure(seen, irradiance)
@@ -170,7 +170,7 @@ class LightPaths:
 
     # ---- light by detours ------------------------------------------------------------------------------------
 
-    def _bounced(self, seen: SeenSurface, segments: LitSegments) -> Exposure:
+    def _bounced(self, seen: VisibleSurface, segments: LitSegments) -> Exposure:
         assert self._bounces is not None  # asked for
         exitance = self._bounces.exitance(self._bounces.arrival(segments))
         return self.lines.exposure(seen, self._bounces.light(seen.receivers, exitance).irradiance)
@@ -186,10 +186,12 @@ class LightPaths:
         nearest = float(np.linalg.norm(across, axis=1).min(initial=np.inf))
         opening = 0.25 * np.pi * self.view.aperture**2
         solid_angle = min(opening / nearest**2, 2.0 * np.pi) if nearest > 0.0 else 2.0 * np.pi
-        return bounce_power(sent, max((each.albedo for each in self.materials), default=0.0), solid_angle)
+        return interreflection_power_bound(
+            sent, max((each.albedo for each in self.materials), default=0.0), solid_angle
+        )
 
     def _secondary(
-        self, seen: SeenSurface, segments: LitSegments, reading: StripReading, tolerance: float
+        self, seen: VisibleSurface, segments: LitSegments, reading: StripErrorModel, tolerance: float
     ) -> tuple[Float64, dict[str, float]]:
         """Return the irradiance by lit segments, and what of it was modelled."""
         if tolerance == 0.0:
@@ -203,7 +205,7 @@ class LightPaths:
         bound = {"bound of pairs left out [m]": float(plan.bound.max(initial=0.0))}
         return light, {"pairs": float(plan.counts["pairs"])} | told | bound
 
-    def irradiance(self, seen: SeenSurface, segments: LitSegments) -> Float64:
+    def irradiance(self, seen: VisibleSurface, segments: LitSegments) -> Float64:
         """Return the irradiance [W/m^2] of what the sensor sees from lit segments, (samples, n)."""
         return self._planned.exactly(segment_rows(segments), seen.receivers)
 

@@ -28,7 +28,7 @@ from gpuvision.sensor.simulated import floor_of, light_of, sensor_view_of, sheet
 from gpuvision.simulation.light_paths import LightPaths
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.readings import Truth
+from gpuvision.simulation.sensors.readings import GroundTruth
 from gpuvision.simulation.sensors.sensor_view import Exposure
 
 PROFILES_PER_BLOCK = 16
@@ -111,7 +111,7 @@ class Block(NamedTuple):
     """
 
     exposures: dict[str, Exposure]
-    truth: Truth
+    truth: GroundTruth
     account: dict[str, npt.NDArray[Any]]
 
     def to_bytes(self) -> bytes:
@@ -143,7 +143,7 @@ class Block(NamedTuple):
                 name: Exposure(power.astype(np.float64), parts["moment"][name].astype(np.float64))
                 for name, power in parts["power"].items()
             }
-            return cls(exposures, Truth(**parts["truth"]), parts["account"])
+            return cls(exposures, GroundTruth(**parts["truth"]), parts["account"])
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(f"{path}: holds no simulated light; delete it, and it is computed again") from error
 
@@ -251,7 +251,7 @@ def compute_block(task: Task, number: int, device: Device | None = None) -> byte
         name: Exposure(*(np.stack(each) for each in zip(*(p.exposures[name] for p in profiles), strict=True)))
         for name in names
     }
-    truth = Truth(*(np.stack(each) for each in zip(*(p.truth for p in profiles), strict=True)))
+    truth = GroundTruth(*(np.stack(each) for each in zip(*(p.truth for p in profiles), strict=True)))
     account = {name: np.array([p.account[name] for p in profiles]) for name in profiles[0].account}
     return Block(exposures, truth, account).to_bytes()
 

@@ -1,4 +1,4 @@
-"""Two simulated sensors over one sheet of light, and what they are together."""
+"""Two simulated sensors over one sheet of light, and the fusion of their readings."""
 
 from __future__ import annotations
 
@@ -12,67 +12,88 @@ from gpuvision.formats.json import json_tree
 from gpuvision.host.files import whole_folder
 from gpuvision.plots.simulation import draw_causes, draw_errors
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution
-from gpuvision.simulation.errors.recommendations import DualSensor, attribute_pair_errors, rank
+from gpuvision.simulation.errors.recommendations import SensorFusion, attribute_pair_errors, rank_candidates
 from gpuvision.workflows.simulating import Simulation
 
-_GAP = 2.5  # samples: over wider gaps nothing is read between two of them
+# Largest gap between points that is interpolated, in median distances of neighbouring samples.
+_MAX_GAP = 2.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorPair:
-    """What two sensors over one sheet make of a part.
+    """Simulations of two sensors over one sheet of light, and their fused readings.
 
     Attributes
     ----------
     first, second
-        Each alone.
-    artifacts
-        "first", "second" and "both", at common places and judged by what either sees.
-    rule
-        How they became one.
+        Simulations of the single sensors.
+    errors
+        "first", "second" and "both", at common positions, compared with the surfaces that either sensor sees.
+    fusion
+        Fusion rule.
     limit
-        Error from which on a sample counts as wrong [m].
+        Error from which on a sample counts as an outlier [m]; the larger one of both simulations.
     """
 
     first: Simulation
     second: Simulation
-    artifacts: dict[str, ErrorAttribution]
-    rule: DualSensor
+    errors: dict[str, ErrorAttribution]
+    fusion: SensorFusion
     limit: float
 
     @classmethod
-    def of(cls, first: Simulation, second: Simulation, rule: DualSensor) -> SensorPair:
-        """Join two simulations of the same profiles.
+    def of(cls, first: Simulation, second: Simulation, fusion: SensorFusion) -> SensorPair:
+        """Fuse two simulations of the same profiles.
+
+        Parameters
+        ----------
+        first, second
+            Simulations with the same transports.
+        fusion
+            Fusion rule.
 
         Raises
         ------
         ValueError
-            The profiles differ, or the first sensor sees no surface.
+            The transports differ, or the first sensor sees no surface.
         """
         if not np.array_equal(first.task.transports, second.task.transports):
             raise ValueError("the two sensors' profiles are not the same; give prepare the first one's transports")
-        apart = np.abs(np.diff(first.artifacts.truth.g, axis=-1))
-        gap = _GAP * float(np.nanmedian(apart)) if np.isfinite(apart).any() else np.inf
-        artifacts = attribute_pair_errors(first.artifacts, second.artifacts, rule, gap=gap)
-        return cls(first=first, second=second, artifacts=artifacts, rule=rule, limit=max(first.limit, second.limit))
+        steps = np.abs(np.diff(first.artifacts.truth.g, axis=-1))
+        max_gap = _MAX_GAP * float(np.nanmedian(steps)) if np.isfinite(steps).any() else np.inf
+        errors = attribute_pair_errors(first.artifacts, second.artifacts, fusion, max_gap=max_gap)
+        return cls(first=first, second=second, errors=errors, fusion=fusion, limit=max(first.limit, second.limit))
 
     def summary(self) -> str:
-        """Return how much of the surfaces each reads well, the best first."""
-        best = rank(self.artifacts, self.limit)
-        told = [f"{each.name} {100 * (1 - each.unread):.1f} % ({100 * each.false:.1f} % false)" for each in best]
-        return f"surfaces read within {1e6 * self.limit:.0f} µm: {', '.join(told)}"
+        """Return for each sensor and both, the best first: fraction read within the limit, and spurious readings."""
+        parts = [
+            f"{each.name} {100 * (1 - each.failed_fraction):.1f} % ({100 * each.spurious_fraction:.1f} % spurious)"
+            for each in rank_candidates(self.errors, self.limit)
+        ]
+        return f"surface samples read within {1e6 * self.limit:.0f} µm: {', '.join(parts)}"
 
     def write(self, folder: str | Path) -> None:
-        """Write the second sensor's results into ``second``, and pictures and a report of both into ``both``."""
+        """Write the second sensor's results into ``second``, and pictures and a report of both into ``both``.
+
+        Parameters
+        ----------
+        folder
+            Folder of the first sensor's results.
+
+        Raises
+        ------
+        OSError
+            The folders cannot be written.
+        """
         self.second.write(Path(folder) / "second")
-        both = self.artifacts["both"]
+        both = self.errors["both"]
         with whole_folder(Path(folder) / "both") as inside:
             draw_errors(inside / "errors.png", both, "Both sensors")
             draw_causes(inside / "causes.png", both, self.limit, "Both sensors")
             report = {
-                "rule": self.rule.rule,
+                "rule": self.fusion.rule,
                 "limit": self.limit,
-                "ranked": [each._asdict() for each in rank(self.artifacts, self.limit)],
-                "errors": {name: each.summary(self.limit) for name, each in self.artifacts.items()},
+                "ranking": [each._asdict() for each in rank_candidates(self.errors, self.limit)],
+                "errors": {name: each.summary(self.limit) for name, each in self.errors.items()},
             }
             (inside / "report.json").write_text(json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n")

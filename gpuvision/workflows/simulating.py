@@ -31,9 +31,9 @@ from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.camera_simulator import CameraSimulator
-from gpuvision.simulation.sensors.masks import Mask, MaskPlan, optimise_mask
+from gpuvision.simulation.sensors.masks import Mask, MaskOptimisation, optimise_mask
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
-from gpuvision.simulation.sensors.readings import PATHS, Reading, Truth
+from gpuvision.simulation.sensors.readings import PATHS, GroundTruth, Reading
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
 from gpuvision.workflows.light_cache import Block, BlockStore, Progress, Task, compute_missing
@@ -80,7 +80,7 @@ class Simulation:
     heights: HeightMap
     grid: Grid
     limit: float
-    mask: MaskPlan | None
+    mask: MaskOptimisation | None
     account: dict[str, float]
     device: Device
     seconds: dict[str, float]
@@ -92,13 +92,14 @@ class Simulation:
         worst = max(told["causes"], key=lambda name: told["causes"][name]["dominant"])
         um = 1e6
         text = (
-            f"{len(self.task.transports)} profiles, {told['read']} of {told['surface']} samples read, errors "
+            f"{len(self.task.transports)} profiles, {told['valid']} of {told['surface']} samples read, errors "
             f"{um * (told['median'] or 0.0):.1f} µm median, {um * (told['p95'] or 0.0):.0f} µm p95, "
-            f"{told['beyond_limit']} beyond {um * self.limit:.1f} µm (mostly {worst}), {told['false']} false"
+            f"{told['beyond_limit']} beyond {um * self.limit:.1f} µm (mostly {worst}), {told['spurious']} spurious "
+            "(a reading, but no lit surface in view)"
         )
         if self.mask is None:
             return text
-        before, after = (float(np.nanmax(np.abs(each))) for each in (self.mask.before, self.mask.after))
+        before, after = (float(np.nanmax(np.abs(each))) for each in (self.mask.error_before, self.mask.error_after))
         return (
             f"{text}\nmask: worst error of the light's centre {um * before:.0f} µm without, {um * after:.0f} µm with it"
         )
@@ -158,7 +159,7 @@ class Simulation:
             "true_g": (told.truth.g, "m"),
             "true_h": (told.truth.h, "m"),
             "error": (told.error, "m"),
-            "verdict": (told.verdict, "flags"),
+            "category": (told.category, "flags"),
             **{f"cause_{name}": (part, "m") for name, part in told.causes.items()},
             "sigma": (told.reading.sigma, "m"),
             "transport": (self.task.transports, "m"),
@@ -269,7 +270,7 @@ def simulate(
     artifacts, account = _explained(store, simulator_of(task.sensor, view, before), seed, device)
     points = _points(task, artifacts.reading, device)
     if task.sensor.output.ambiguous == "drop":
-        artifacts = artifacts.without(Status.AMBIGUOUS)
+        artifacts = artifacts.without_flagged(Status.AMBIGUOUS)
     heights, grid = resampled(task.sensor, points, _strength(artifacts.reading), device)
     return Simulation(
         task=task,
@@ -309,7 +310,7 @@ def recorded(
     record = simulator.currents if isinstance(simulator, PsdSimulator) else simulator.frames
     parts, first = [], 0
     for block in store:
-        parts.append(record(block.exposures, seed=seed, first=first))
+        parts.append(record(block.exposures, seed=seed, first_profile=first))
         first += len(parts[-1])
     return np.concatenate(parts)
 
@@ -354,7 +355,7 @@ def _over(part: Scene, transport: StraightTransport, profiles: int | None) -> Ar
     return transport.start + transport.step * np.arange(first, last + 1, dtype=np.float64)
 
 
-def _whole_light(store: BlockStore, bins: int) -> tuple[dict[str, Exposure], Truth]:
+def _whole_light(store: BlockStore, bins: int) -> tuple[dict[str, Exposure], GroundTruth]:
     """Return the light of all profiles by path, or of every second, third, ... where that is much."""
     every = -(-len(store.task.transports) * bins // _MOST_FOR_A_MASK)
     light: dict[str, list[Exposure]] = {}
@@ -363,11 +364,11 @@ def _whole_light(store: BlockStore, bins: int) -> tuple[dict[str, Exposure], Tru
         chosen = [k - profiles.start for k in profiles if k % every == 0]
         for name in set(PATHS) & set(block.exposures):
             light.setdefault(name, []).append(Exposure(*(each[chosen] for each in block.exposures[name])))
-        truths.append(Truth(*(each[chosen] for each in block.truth)))
+        truths.append(GroundTruth(*(each[chosen] for each in block.truth)))
     whole = {
         name: Exposure(*(np.concatenate(each) for each in zip(*parts, strict=True))) for name, parts in light.items()
     }
-    return whole, Truth(*(np.concatenate(each) for each in zip(*truths, strict=True)))
+    return whole, GroundTruth(*(np.concatenate(each) for each in zip(*truths, strict=True)))
 
 
 def _explained(
@@ -384,7 +385,9 @@ def _explained(
     account: dict[str, float] = {}
     first = 0
     for block in store:
-        parts.append(attribute_errors(simulator, block.exposures, block.truth, seed=seed, first=first, device=device))
+        parts.append(
+            attribute_errors(simulator, block.exposures, block.truth, seed=seed, first_profile=first, device=device)
+        )
         account = _added(account, block)
         first += len(block.truth.h)
     artifacts = _joined(parts)
@@ -446,14 +449,14 @@ def _strength(reading: Reading) -> Array:
     return np.nan_to_num(reading.strength).astype(np.float32)
 
 
-def _told_mask(plan: MaskPlan) -> dict[str, Any]:
+def _told_mask(plan: MaskOptimisation) -> dict[str, Any]:
     def worst(values: Array) -> float | None:
         known = np.abs(values[np.isfinite(values)])
         return float(known.max()) if known.size else None
 
-    kept = plan.kept[np.isfinite(plan.kept)]
+    kept = plan.passed_fraction[np.isfinite(plan.passed_fraction)]
     return {
-        "worst_without": worst(plan.before),
-        "worst_with": worst(plan.after),
+        "worst_without": worst(plan.error_before),
+        "worst_with": worst(plan.error_after),
         "light_kept": float(kept.min()) if kept.size else None,
     }

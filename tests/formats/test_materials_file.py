@@ -19,7 +19,7 @@ roughness = 0.4
 
 [[material]]
 albedo = 0.5
-slopes = 0.3
+slope_sigma = 0.3
 
 [[material]]
 name = "pad"
@@ -31,7 +31,7 @@ albedo = 0.0
 [material.gloss]
 model = "ggx"
 alpha = 0.1
-facing = 0.9
+f0 = 0.9
 """
 
 
@@ -45,9 +45,9 @@ def test_materials_come_in_the_order_of_the_file(tmp_path):
     assert read(tmp_path, GOOD) == (
         Material(diffuse=Lambert(albedo=0.3), gloss=Phong(albedo=0.1, exponent=40.0), name="solder mask"),
         Material(diffuse=OrenNayar(albedo=0.5, roughness=0.4)),
-        Material(diffuse=OrenNayar.of_slopes(albedo=0.5, sigma=0.3)),
+        Material(diffuse=OrenNayar.from_slope_sigma(albedo=0.5, sigma=0.3)),
         Material(diffuse=Lambert(albedo=0.1), mirror=0.6, name="pad"),
-        Material(diffuse=Lambert(albedo=0.0), gloss=Ggx(alpha=0.1, facing=0.9)),
+        Material(diffuse=Lambert(albedo=0.0), gloss=Ggx(alpha=0.1, f0=0.9)),
     )
 
 
@@ -59,9 +59,9 @@ def test_materials_come_in_the_order_of_the_file(tmp_path):
         ("[[material]]\nalbedo = 1.5", r"material\[0\].albedo is 1.5"),
         ("[[material]]\nalbedo = 0.5\nmirror = 0.7", r"material\[0\]: Material throws back 1.20"),
         ("[[material]]\nalbedo = 0.5\n[[material]]\nname = 'x'", r"material\[1\].albedo' is missing"),
-        ("[[material]]\nalbedo = 0.5\nroughness = 0.1\nslopes = 0.1", "roughness and slopes at once"),
+        ("[[material]]\nalbedo = 0.5\nroughness = 0.1\nslope_sigma = 0.1", "both roughness and slope_sigma"),
         ("[[material]]\nalbedo = 0.5\ngloss = {model = 'fong'}", "did you mean"),
-        ("[[material]]\nalbedo = 0.5\ngloss = {model = 'ggx', alpha = 0, facing = 1}", "Ggx.alpha is 0"),
+        ("[[material]]\nalbedo = 0.5\ngloss = {model = 'ggx', alpha = 0, f0 = 1}", "Ggx.alpha is 0"),
         ("[[material]]\nalbedo = 0.5\nmiror = 0.1", r"unknown key 'material\[0\].miror'"),
     ],
 )

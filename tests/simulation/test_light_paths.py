@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gpuvision.simulation.errors.range_error import StripReading
+from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.light_paths import LightPaths
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
@@ -59,7 +59,7 @@ def glow(places, normal, length, power, x0):
 def test_a_wall_glows_as_the_line_before_it_says(device):
     model = paths(corner(), device)
     lines = model.lines
-    seen = lines.surface(0.0)
+    seen = lines.visible_surface(0.0)
     wall = np.argwhere((seen.triangle >= 2) & (seen.receivers[..., 2] > 1e-3))
     assert len(wall) >= 3
     light = model.profile(0.0).exposures["diffuse-diffuse"]
@@ -118,7 +118,7 @@ def test_a_tolerance_is_kept(device, tolerance):
     one = sensor_view(u_edges=np.linspace(-3e-3, 3e-3, 129), v_edges=np.linspace(-6e-3, 6e-3, 33))
     exact = paths(trough(160), device, view=one).profile(0.0)
     about = paths(trough(160), device, view=one, tolerance=tolerance).profile(0.0)
-    slope = StripReading.of(one, exact.exposures["direct"]).slope
+    slope = StripErrorModel.from_exposure(one, exact.exposures["direct"]).slope
 
     def place(profile):
         total = profile.exposures["direct"] + profile.exposures["diffuse-diffuse"]

@@ -73,7 +73,7 @@ def test_what_is_read_is_told_apart_by_cause(part_file: Path, tmp_path: Path) ->
     np.testing.assert_array_equal(arrays["error"], told.error)
     assert units["cause_secondary"] == "m"
     report = json.loads((tmp_path / "report.json").read_text())
-    assert report["errors"]["read"] == np.isfinite(told.error).sum()
+    assert report["errors"]["valid"] == np.isfinite(told.error).sum()
     for name in ("errors.png", "causes.png", "picture.png", "range_image.tiff", "range_image.ply"):
         assert (tmp_path / name).stat().st_size > 1000
 
@@ -110,7 +110,7 @@ def test_what_was_stopped_goes_on_where_it_was(part_file: Path, tmp_path: Path) 
     assert [store.path(k).read_bytes() for k in (0, 1)] == kept
     whole = simulate(task, tmp_path / "whole")
     np.testing.assert_array_equal(whole.artifacts.error, done.artifacts.error)
-    np.testing.assert_array_equal(whole.artifacts.verdict, done.artifacts.verdict)
+    np.testing.assert_array_equal(whole.artifacts.category, done.artifacts.category)
 
 
 def test_half_a_block_counts_as_none(part_file: Path, tmp_path: Path) -> None:
@@ -259,8 +259,8 @@ def test_a_second_sensor_sees_what_is_hidden_from_the_first(
     assert command(monkeypatch, *words, "--profiles", "48", "--paths", "direct") == 0
     assert "surfaces read within" in capsys.readouterr().out
     report = json.loads((tmp_path / "both" / "report.json").read_text())
-    ranked = {each["name"]: each["unread"] for each in report["ranked"]}
-    assert report["ranked"][0]["name"] == "both"
+    ranked = {each["name"]: each["failed_fraction"] for each in report["ranking"]}
+    assert report["ranking"][0]["name"] == "both"
     # Behind the block each one alone misses as much as the other.
     assert ranked["both"] < 0.5 * min(ranked["first"], ranked["second"])
     assert (tmp_path / "second" / "errors.png").stat().st_size > 1000

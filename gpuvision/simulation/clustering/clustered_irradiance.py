@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gpuvision.host import Bound, Device
 from gpuvision.simulation.clustering.light_clustering import LightClustering, LightCut
-from gpuvision.simulation.errors.range_error import StripReading
+from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance
 
@@ -76,7 +76,7 @@ class ClusteredIrradiance:
         segments: npt.NDArray[Any],
         receivers: npt.NDArray[Any],
         weights: npt.NDArray[Any],
-        reading: StripReading,
+        reading: StripErrorModel,
         *,
         tolerance: float | None = None,
     ) -> BoundedIrradiance:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gpuvision.host import Device, Launch, Variant, uses_vectors
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.clustering.light_tree import COLUMNS, LightTree
-from gpuvision.simulation.errors.range_error import StripReading
+from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 
 Reals = npt.NDArray[np.float64]
@@ -73,7 +73,7 @@ class LightCut:
 
     @classmethod
     def of_all(
-        cls, segments: npt.NDArray[Any], shape: tuple[int, ...], direct: StripReading, tolerance: float
+        cls, segments: npt.NDArray[Any], shape: tuple[int, ...], direct: StripErrorModel, tolerance: float
     ) -> LightCut:
         """Return the plan that leaves out nothing for receivers of a shape (strips, n, 6): every segment for all."""
         strips, count = shape[:2]
@@ -84,7 +84,7 @@ class LightCut:
             np.tile(np.arange(len(segments), dtype=np.int32), blocks),
             tolerance,
             np.zeros(strips),
-            direct.widest(),
+            direct.max_error(),
             {
                 "segments": len(segments),
                 "pairs": pairs,
@@ -190,7 +190,7 @@ class LightClustering:
         segments: npt.NDArray[Any],
         receivers: npt.NDArray[Any],
         weights: npt.NDArray[Any],
-        direct: StripReading,
+        direct: StripErrorModel,
         *,
         tolerance: float | None = None,
         device: Device | None = None,
@@ -224,7 +224,7 @@ class LightClustering:
                 f"expected receivers (strips, n, 6) and weights (strips, n, 2), got {receivers.shape}, {weights.shape}"
             )
         tree = LightTree.build(segments)
-        costs = direct.costs(weights)
+        costs = direct.error_per_irradiance(weights)
         places = np.ascontiguousarray(receivers)
         return _planned(self, asked, tree, segments, places, costs, direct, device or Device.best())
 
@@ -347,7 +347,7 @@ def _planned(
     segments: Reals,
     receivers: npt.NDArray[Any],
     costs: Reals,
-    direct: StripReading,
+    direct: StripErrorModel,
     device: Device,
 ) -> LightCut:
     strips = len(costs)
@@ -358,7 +358,7 @@ def _planned(
     picks, errors = found.picks[held], found.errors[held].astype(np.float64)
     block = np.repeat(np.arange(len(found.counts)), found.counts)
     receivers_of = np.minimum(BLOCK, receivers.shape[1] - BLOCK * (np.arange(len(found.counts)) % of_strip))
-    worst = np.minimum(spent[:, 1], direct.widest())
+    worst = np.minimum(spent[:, 1], direct.max_error())
     kept, lost = _kept(picks, errors, owner[block], spent, worst, tolerance)
     bound = np.minimum(np.where(lost > 0.0, lost, 0.0), worst)
     return _assembled(tolerance, tree, segments, picks[kept], block[kept], bound, worst, receivers_of)

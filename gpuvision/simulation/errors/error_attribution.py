@@ -1,16 +1,24 @@
-"""ErrorAttribution: how far readings are from the truth, and which cause moved them by how much.
+"""Range errors of simulated readings, attributed to causes: occlusion, reflectivity, secondary light, noise, ...
 
-Two ways to split an error, both exact (the causes' parts add up to the error) and both blind to any order of causes:
+Two methods split the range error of a sample into contributions of causes. With both methods the contributions add up
+to the error exactly, and neither depends on an order of the causes.
 
-- ``"moments"``, for PSDs: their reading is the centre of gravity of all light, so that light of power P at u moves it
-  by P (u - u_true) over all power. The parts are these, times the slope of the height between truth and reading.
-- ``"removal"``, for any readout: what a cause adds, averaged over all orders in which the causes may be added one after
-  the other to evenly reflecting, fully visible direct light (Shapley's value). It reads the light 2^n times, n the
-  number of causes that are there.
+- ``"moments"``, for PSDs. A PSD reads the centroid of all light. Light of power P at position u moves the centroid by
+  P (u - u_true) / P_total. The contribution of a cause is the sum of these shifts over its light, times the slope of
+  the height between the true position and the reading.
+- ``"shapley"``, for any readout. The contribution of a cause is its Shapley value: the change of the error when the
+  cause is added to unoccluded direct light of uniform reflectivity, averaged over all orders in which the causes can be
+  added. Cost: the light is read 2^n times for n causes that have light.
 
-The two differ to the square of the light's share where there are several causes. Even reflection is that of a surface
-which sends as much to a sample as the real one, from other places: a dark surface lets secondary light weigh more, and
-that is secondary light's part.
+Where several causes act on one sample, the two methods differ by a term of second order in the share of the light.
+
+A surface of uniform reflectivity sends the same power to a sample as the real surface, from other positions. On a dark
+surface, secondary light therefore has a larger share, and the contribution of secondary light is larger.
+
+References
+----------
+L. S. Shapley, "A value for n-person games", Contributions to the Theory of Games II, Princeton 1953, pp. 307-317.
+F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 4.3.
 """
 
 from __future__ import annotations
@@ -30,95 +38,105 @@ from gpuvision.simulation.sensors.camera_simulator import CameraSimulator
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
 from gpuvision.simulation.sensors.readings import (
     AMBIENT,
-    EVEN,
-    EVEN_OPEN,
-    OPEN,
     PATHS,
+    UNIFORM,
+    UNIFORM_UNOCCLUDED,
+    UNOCCLUDED,
+    GroundTruth,
     Reading,
     Simulator,
-    Truth,
     dark_exposure,
     height_secant,
     height_slope,
-    lit_by,
+    total_exposure,
 )
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.status import Status
 
 Float64 = npt.NDArray[np.float64]
-Split = Literal["moments", "removal"]
+Method = Literal["moments", "shapley"]
 
 CAUSES = ("shape", "occlusion", "reflectivity", "specular", "secondary", "ambient", "noise")
-"""Shape is what is left of direct light that reflects evenly and is not hidden: a strip's or a spot's width on a part
-that is not flat. Where the light without the other two is not given, "shape" holds all three."""
-_VARIANTS = (EVEN, OPEN, EVEN_OPEN)
+"""Names of the causes. "shape" is the contribution of unoccluded direct light with uniform reflectivity: the width of a
+strip or of a light spot on a part that is not flat. Without the variants of the direct light, "shape" also holds the
+contributions of occlusion and reflectivity."""
+_VARIANTS = (UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED)
 _SECONDARY = ("diffuse-specular", "diffuse-diffuse", "bounces")
 
 
-class Verdict(enum.IntFlag):
-    """What a reading is worth beside the truth (uint8; 0 is a reading of a surface)."""
+class ReadingCategory(enum.IntFlag):
+    """Category of a reading compared with the ground truth (uint8 flags; 0 is a valid reading)."""
 
-    READ = 0
-    """Of a surface."""
+    VALID = 0
+    """A reading of a lit surface."""
     MISSING = 1
-    """A lit surface is there, and no reading of it."""
-    FALSE = 2
-    """A reading, and no lit surface that could be read."""
-    NOTHING = 4
-    """Neither a lit surface nor a reading."""
+    """Dropout: a lit surface is visible, but there is no reading."""
+    SPURIOUS = 2
+    """False reading: a reading where no lit surface is visible."""
+    NO_SURFACE = 4
+    """No lit surface is visible, and there is no reading."""
     AMBIGUOUS = 8
-    """Several lit surfaces in one sample."""
+    """Several lit surfaces are visible in one sample."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorAttribution:
-    """Readings beside the truth, arrays (..., samples).
+    """Readings, ground truth, range errors and their causes, arrays (..., samples).
 
     Attributes
     ----------
     reading
-        What the sensor says.
+        Readings of the sensor.
     truth
-        What it should say.
+        Ground truth of the same samples.
     error
-        Height read minus true height [m]; NaN where either is missing.
+        float64, height read minus true height [m]; NaN where the reading or the truth is missing.
     causes
-        Parts of the error by cause [m], NaN where the error is; they add up to it.
-    light
-        Light that each cause brought [W]; of "shape" all direct light, of "noise" none.
-    verdict
-        uint8 `Verdict` flags.
+        Contribution to the error by cause, float64 [m]; NaN where `error` is NaN. The contributions add up to `error`.
+    power
+        Power of the light that belongs to each cause, float64 [W]. "shape" holds all direct light, "noise" no light.
+    category
+        uint8 `ReadingCategory` flags.
     """
 
     reading: Reading
-    truth: Truth
+    truth: GroundTruth
     error: Float64
     causes: dict[str, Float64]
-    light: dict[str, Float64] = field(repr=False)
-    verdict: npt.NDArray[np.uint8]
+    power: dict[str, Float64] = field(repr=False)
+    category: npt.NDArray[np.uint8]
 
-    def dominant(self, least: float = 0.0) -> npt.NDArray[np.int8]:
-        """Return the number (in `causes`) of the cause with the largest part, -1 where the error is `least` or less.
+    def dominant_cause(self, min_error: float = 0.0) -> npt.NDArray[np.int8]:
+        """Return the cause with the largest contribution in each sample.
 
-        Of a FALSE reading it is the cause that brought most of the light; where neither applies, -1.
+        Parameters
+        ----------
+        min_error
+            Samples whose error is not larger than this have no dominant cause [m], 0 or more.
+
+        Returns
+        -------
+        numpy.ndarray
+            int8 (..., samples), index of the cause in `causes`. For a spurious reading: the cause with the most light.
+            -1: no dominant cause.
         """
         parts = np.nan_to_num(np.abs(np.stack(list(self.causes.values()))), nan=-1.0)
-        chosen = np.where(np.abs(self.error) > least, parts.argmax(axis=0), -1)
-        bright = np.stack([self.light[name] for name in self.causes]).argmax(axis=0)
-        return np.where(self.is_(Verdict.FALSE), bright, chosen).astype(np.int8)
+        largest = np.where(np.abs(self.error) > min_error, parts.argmax(axis=0), -1)
+        brightest = np.stack([self.power[name] for name in self.causes]).argmax(axis=0)
+        return np.where(self.is_category(ReadingCategory.SPURIOUS), brightest, largest).astype(np.int8)
 
-    def is_(self, verdict: Verdict) -> npt.NDArray[np.bool_]:
-        """Return where a flag is set; for READ, where none is."""
-        return np.asarray(self.verdict == 0 if verdict == Verdict.READ else (self.verdict & verdict) != 0)
+    def is_category(self, category: ReadingCategory) -> npt.NDArray[np.bool_]:
+        """Return a mask of the samples with a category flag; for VALID, of the samples without any flag."""
+        return np.asarray(self.category == 0 if category == ReadingCategory.VALID else (self.category & category) != 0)
 
-    def unread(self, limit: float) -> float:
-        """Return the share of the lit surfaces' samples that are missing or off by more than a limit [m]."""
+    def failed_fraction(self, limit: float) -> float:
+        """Return the fraction of lit-surface samples without a reading within the limit [m]: dropouts and outliers."""
         true = np.isfinite(self.truth.h)
-        wrong = true & ~(np.abs(self.error) <= limit)
-        return int(wrong.sum()) / max(int(true.sum()), 1)
+        failed = true & ~(np.abs(self.error) <= limit)
+        return int(failed.sum()) / max(int(true.sum()), 1)
 
-    def without(self, flags: Status) -> ErrorAttribution:
-        """Return them as if what has any of the flags were not read."""
+    def without_flagged(self, flags: Status) -> ErrorAttribution:
+        """Return a copy in which samples with any of the status flags have no reading."""
         dropped = (self.reading.status & flags) != 0
         values = {name: np.where(dropped, np.nan, getattr(self.reading, name)) for name in ("position", "g", "h")}
         reading = self.reading._replace(**values)
@@ -127,26 +145,36 @@ class ErrorAttribution:
             reading=reading,
             error=np.where(dropped, np.nan, self.error),
             causes={name: np.where(dropped, np.nan, part) for name, part in self.causes.items()},
-            verdict=verdict_of(reading.h, self.truth),
+            category=classify_readings(reading.h, self.truth),
         )
 
     def summary(self, limit: float) -> dict[str, Any]:
-        """Return the numbers of a report; errors in metres, None where there is no reading at all.
+        """Return counts and error statistics for a report; lengths in metres, None where no sample has an error.
 
         Parameters
         ----------
         limit
-            Error from which on a sample counts as wrong, and its dominant cause is counted [m].
+            Samples with a larger error are outliers: they are counted, each for its dominant cause [m].
+
+        Returns
+        -------
+        dict
+            ``samples``: number of all samples; ``surface``: samples that see a lit surface; ``valid``: readings of a
+            surface; ``missing``, ``spurious``, ``ambiguous``: counts by `ReadingCategory`; ``beyond_limit``: number of
+            outliers; ``failed_fraction``; ``rms``, ``median``, ``p95``, ``max`` of the absolute error [m]; ``causes``:
+            for each cause the ``rms`` and ``max`` of its contribution [m], and in how many outliers (``dominant``) and
+            spurious readings (``spurious``) it is the dominant cause.
         """
         true, error = np.isfinite(self.truth.h), np.abs(self.error[np.isfinite(self.error)])
-        dominant = self.dominant(limit)
-        wrong = np.abs(self.error) > limit
+        dominant = self.dominant_cause(limit)
+        outlier = np.abs(self.error) > limit
+        spurious = self.is_category(ReadingCategory.SPURIOUS)
         causes = {
             name: {
                 "rms": _rms(part[np.isfinite(part)]),
-                "worst": _largest(part),
-                "dominant": int(np.sum(wrong & (dominant == number))),
-                "false": int(np.sum(self.is_(Verdict.FALSE) & (dominant == number))),
+                "max": _max_abs(part),
+                "dominant": int(np.sum(outlier & (dominant == number))),
+                "spurious": int(np.sum(spurious & (dominant == number))),
             }
             for number, (name, part) in enumerate(self.causes.items())
         }
@@ -154,17 +182,17 @@ class ErrorAttribution:
         return {
             "samples": int(true.size),
             "surface": int(true.sum()),
-            "read": int(error.size),
-            "missing": int(self.is_(Verdict.MISSING).sum()),
-            "false": int(self.is_(Verdict.FALSE).sum()),
-            "ambiguous": int(self.is_(Verdict.AMBIGUOUS).sum()),
+            "valid": int(error.size),
+            "missing": int(self.is_category(ReadingCategory.MISSING).sum()),
+            "spurious": int(spurious.sum()),
+            "ambiguous": int(self.is_category(ReadingCategory.AMBIGUOUS).sum()),
             "limit": limit,
-            "beyond_limit": int(wrong.sum()),
-            "unread_share": self.unread(limit),
+            "beyond_limit": int(outlier.sum()),
+            "failed_fraction": self.failed_fraction(limit),
             "rms": _rms(error),
             "median": levels[0],
             "p95": levels[1],
-            "worst": _largest(error),
+            "max": _max_abs(error),
             "causes": causes,
         }
 
@@ -173,7 +201,7 @@ def _rms(values: Float64) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if values.size else None
 
 
-def _largest(values: Float64) -> float | None:
+def _max_abs(values: Float64) -> float | None:
     known = np.abs(values[np.isfinite(values)])
     return float(known.max()) if known.size else None
 
@@ -181,53 +209,54 @@ def _largest(values: Float64) -> float | None:
 def attribute_errors(
     simulator: PsdSimulator | CameraSimulator,
     exposures: Mapping[str, Exposure],
-    truth: Truth,
+    truth: GroundTruth,
     *,
     seed: int | None = None,
-    first: int = 0,
-    split: Split | None = None,
-    detail: bool = False,
+    first_profile: int = 0,
+    method: Method | None = None,
+    secondary_by_path: bool = False,
     device: Device | None = None,
 ) -> ErrorAttribution:
-    """Read light, compare it with the truth, and split the error by cause.
+    """Simulate readings, compare them with the ground truth, and attribute the errors to causes.
 
     Parameters
     ----------
     simulator
-        The sensor; its mask and its ambient light count.
+        The sensor, with its mask and its ambient light.
     exposures
-        Light by path, (..., samples, bins). With the direct light's variants (`EVEN`, `OPEN`, `EVEN_OPEN`, all three)
-        among them occlusion and reflectivity are told from shape.
+        Light by path, (..., samples, bins). With all three variants of the direct light (`UNIFORM`, `UNOCCLUDED`,
+        `UNIFORM_UNOCCLUDED`), occlusion and reflectivity are causes beside shape.
     truth
-        Of the same samples.
-    seed, first
-        As for `PsdSimulator.read`; without a seed there is no noise.
-    split
-        See above; None: moments for PSDs, removal for cameras. Removal counts what cannot be read as no error.
-    detail
-        Every path of secondary light is a cause of its own.
+        Ground truth of the same samples.
+    seed, first_profile
+        Seed of the noise and number of the first profile, as for `PsdSimulator.read`; ``seed=None``: no noise.
+    method
+        ``"moments"`` or ``"shapley"``, see the module's description. None: "moments" for PSDs, "shapley" for cameras.
+        "shapley" counts a height that cannot be read as no error.
+    secondary_by_path
+        True: each path of secondary light is a cause. False: one cause "secondary".
     device
-        Where readouts run.
+        Device of the readouts; None: `Device.best`.
 
     Raises
     ------
     ValueError
-        Shapes differ, a path is unknown, or a camera's error is to be split by moments.
+        Shapes differ, a path is unknown, only some of the variants are given, or ``method="moments"`` with a camera.
     """
-    chosen = split or ("moments" if isinstance(simulator, PsdSimulator) else "removal")
+    chosen = method or ("moments" if isinstance(simulator, PsdSimulator) else "shapley")
     if chosen == "moments" and not isinstance(simulator, PsdSimulator):
-        raise ValueError("split 'moments' is for PSDs, whose reading is a centre of gravity; cameras take 'removal'")
-    reading = simulator.read(exposures, seed=seed, first=first, device=device)
+        raise ValueError("method 'moments' is for PSDs, which read the centroid of all light; cameras take 'shapley'")
+    reading = simulator.read(exposures, seed=seed, first_profile=first_profile, device=device)
     if np.shape(truth.h) != reading.h.shape:
         raise ValueError(f"the truth has shape {np.shape(truth.h)}, the reading {reading.h.shape}; expected the same")
-    behind = simulator.light(exposures)
+    light = simulator.detected_light(exposures)
     if chosen == "moments":
-        clean = reading if seed is None else simulator.read(exposures, device=device)
-        causes = _by_moments(simulator.view, behind, truth, clean, detail)
+        noiseless = reading if seed is None else simulator.read(exposures, device=device)
+        causes = _attribute_by_moments(simulator.view, light, truth, noiseless, secondary_by_path)
     else:
-        causes = _by_removal(simulator, behind, truth, detail, device)
+        causes = _attribute_by_shapley_values(simulator, light, truth, secondary_by_path, device)
     error = reading.h - truth.h
-    # Rounding, and what cannot be read without its noise.
+    # "noise" takes the rest of the error: also rounding, and samples that are read only because of their noise.
     causes["noise"] = error - np.nan_to_num(np.sum(list(causes.values()), axis=0))
     known = np.isfinite(error)
     causes = {name: np.where(known, np.nan_to_num(part), np.nan) for name, part in causes.items()}
@@ -236,37 +265,54 @@ def attribute_errors(
         truth=truth,
         error=error,
         causes=causes,
-        light={name: _light_of(name, behind, detail) for name in causes},
-        verdict=verdict_of(reading.h, truth),
+        power={name: _power_of(name, light, secondary_by_path) for name in causes},
+        category=classify_readings(reading.h, truth),
     )
 
 
-def verdict_of(h: Float64, truth: Truth) -> npt.NDArray[np.uint8]:
-    """Return uint8 `Verdict` flags of heights read, NaN where there is none, beside the truth."""
+def classify_readings(h: Float64, truth: GroundTruth) -> npt.NDArray[np.uint8]:
+    """Return the categories of readings.
+
+    Parameters
+    ----------
+    h
+        Heights read [m], (..., samples); NaN: no reading.
+    truth
+        Ground truth of the same samples.
+
+    Returns
+    -------
+    numpy.ndarray
+        uint8 `ReadingCategory` flags, (..., samples).
+    """
     true, read = np.isfinite(truth.h), np.isfinite(h)
     several = (np.asarray(truth.status) & Status.AMBIGUOUS) != 0
-    verdict = np.select([true & ~read, read & ~true, ~read & ~true], [Verdict.MISSING, Verdict.FALSE, Verdict.NOTHING])
-    verdict = np.where(several & ~true, 0, verdict)
-    return (verdict | np.where(several, Verdict.AMBIGUOUS, 0)).astype(np.uint8)
+    category = np.select(
+        [true & ~read, read & ~true, ~read & ~true],
+        [ReadingCategory.MISSING, ReadingCategory.SPURIOUS, ReadingCategory.NO_SURFACE],
+    )
+    category = np.where(several & ~true, 0, category)
+    return (category | np.where(several, ReadingCategory.AMBIGUOUS, 0)).astype(np.uint8)
 
 
-def _paths_of(cause: str, detail: bool) -> tuple[str, ...]:
-    """Return the paths whose light makes a cause."""
+def _paths_of(cause: str, secondary_by_path: bool) -> tuple[str, ...]:
+    """Return the light paths that belong to a cause."""
     if cause == "shape":
         return ("direct",)
-    if cause == "secondary" and not detail:
+    if cause == "secondary" and not secondary_by_path:
         return _SECONDARY
     return (cause,) if cause in (*PATHS, AMBIENT) else ()
 
 
-def _beside_direct(light: Mapping[str, Exposure], detail: bool) -> list[str]:
-    """Return the causes beside the direct light, whether there is such light or not."""
+def _additional_causes(light: Mapping[str, Exposure], secondary_by_path: bool) -> list[str]:
+    """Return the causes that add light to the direct light, also those without light."""
     ambient = [AMBIENT] if AMBIENT in light else []
-    return ["specular", *(_SECONDARY if detail else ["secondary"]), *ambient]
+    return ["specular", *(_SECONDARY if secondary_by_path else ["secondary"]), *ambient]
 
 
-def _light_of(cause: str, light: Mapping[str, Exposure], detail: bool) -> Float64:
-    parts = [light[path].total() for path in _paths_of(cause, detail) if path in light]
+def _power_of(cause: str, light: Mapping[str, Exposure], secondary_by_path: bool) -> Float64:
+    """Return the power of the light that belongs to a cause, (..., samples) [W]."""
+    parts = [light[path].total() for path in _paths_of(cause, secondary_by_path) if path in light]
     zero = np.zeros(next(iter(light.values())).power.shape[:-1])
     return np.asarray(sum(parts, start=zero))
 
@@ -278,105 +324,123 @@ def _has_variants(light: Mapping[str, Exposure]) -> bool:
     return all(given)
 
 
-# ---- PSDs: by moments ----------------------------------------------------------------------------------------
+# ---- PSDs: contributions from moments of the light -----------------------------------------------------------
 
 
-def _by_moments(
-    view: SensorView, light: Mapping[str, Exposure], truth: Truth, clean: Reading, detail: bool
+def _attribute_by_moments(
+    view: SensorView,
+    light: Mapping[str, Exposure],
+    truth: GroundTruth,
+    noiseless: Reading,
+    secondary_by_path: bool,
 ) -> dict[str, Float64]:
     true_u, _ = height_slope(view, truth)
     edges = view.u_edges
-    total = lit_by(light).total()
-    slope = height_secant(view.triangulation, true_u, clean.position, view.v_middles)
+    total = total_exposure(light).total()
+    slope = height_secant(view.triangulation, true_u, noiseless.position, view.v_centres)
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = slope / total
+        per_power = slope / total
 
-        def moved(name: str) -> Float64:
-            each = light[name]
-            return np.asarray((each.first_moment(edges) - true_u * each.total()) * share)
+        def contribution(path: str) -> Float64:
+            exposure = light[path]
+            return np.asarray((exposure.first_moment(edges) - true_u * exposure.total()) * per_power)
 
         causes: dict[str, Float64] = {}
-        direct = moved("direct") if "direct" in light else np.zeros(total.shape)
+        direct = contribution("direct") if "direct" in light else np.zeros(total.shape)
         if _has_variants(light):
-            causes |= _direct_causes(view, light, light["direct"].total() * share)
+            causes |= _direct_contributions(view, light, light["direct"].total() * per_power)
             causes["shape"] = direct - causes["occlusion"] - causes["reflectivity"]
         else:
             causes["shape"] = direct
-        for cause in _beside_direct(light, detail):
-            parts = [moved(path) for path in _paths_of(cause, detail) if path in light]
+        for cause in _additional_causes(light, secondary_by_path):
+            parts = [contribution(path) for path in _paths_of(cause, secondary_by_path) if path in light]
             causes[cause] = np.asarray(sum(parts, start=np.zeros(total.shape)))
     return {name: causes[name] for name in (*CAUSES, *_SECONDARY) if name in causes}
 
 
-def _direct_causes(view: SensorView, light: Mapping[str, Exposure], weight: Float64) -> dict[str, Float64]:
-    """Return what hiding and uneven reflection do to the direct light's centre, either before the other, averaged."""
-    centre = {}
+def _direct_contributions(view: SensorView, light: Mapping[str, Exposure], weight: Float64) -> dict[str, Float64]:
+    """Return the contributions of occlusion and reflectivity to the centroid of the direct light.
+
+    These are Shapley values of two causes: the mean of the shifts with one cause added before and after the other.
+    """
+    centroid = {}
     for name in ("direct", *_VARIANTS):
-        each = light[name].total()
-        centre[name] = np.where(each > 0.0, light[name].first_moment(view.u_edges) / each, np.nan)
-    hidden = (centre["direct"] - centre[OPEN]) + (centre[EVEN] - centre[EVEN_OPEN])
-    uneven = (centre["direct"] - centre[EVEN]) + (centre[OPEN] - centre[EVEN_OPEN])
+        total = light[name].total()
+        centroid[name] = np.where(total > 0.0, light[name].first_moment(view.u_edges) / total, np.nan)
+    occlusion = (centroid["direct"] - centroid[UNOCCLUDED]) + (centroid[UNIFORM] - centroid[UNIFORM_UNOCCLUDED])
+    reflectivity = (centroid["direct"] - centroid[UNIFORM]) + (centroid[UNOCCLUDED] - centroid[UNIFORM_UNOCCLUDED])
     return {
-        "occlusion": np.nan_to_num(0.5 * weight * hidden),
-        "reflectivity": np.nan_to_num(0.5 * weight * uneven),
+        "occlusion": np.nan_to_num(0.5 * weight * occlusion),
+        "reflectivity": np.nan_to_num(0.5 * weight * reflectivity),
     }
 
 
-# ---- any readout: by removal ---------------------------------------------------------------------------------
+# ---- any readout: contributions as Shapley values ------------------------------------------------------------
 
 
-def _by_removal(
-    simulator: Simulator, light: Mapping[str, Exposure], truth: Truth, detail: bool, device: Device | None
+def _attribute_by_shapley_values(
+    simulator: Simulator,
+    light: Mapping[str, Exposure],
+    truth: GroundTruth,
+    secondary_by_path: bool,
+    device: Device | None,
 ) -> dict[str, Float64]:
-    beside = _beside_direct(light, detail)
+    additional = _additional_causes(light, secondary_by_path)
     direct = _direct_signals(simulator, light)
     signals = {}
-    for name in beside:
-        if np.any(_light_of(name, light, detail) > 0.0):
-            signals[name] = simulator.signal(
-                lit_by({path: light[path] for path in _paths_of(name, detail) if path in light})
-            )
-    toggles = ["occlusion", "reflectivity"] if len(direct) > 1 else []
-    players = toggles + list(signals)
+    for name in additional:
+        if np.any(_power_of(name, light, secondary_by_path) > 0.0):
+            paths = _paths_of(name, secondary_by_path)
+            signals[name] = simulator.signal(total_exposure({path: light[path] for path in paths if path in light}))
+    # Occlusion and reflectivity change the direct light; the other causes add their signals to it.
+    changes = ["occlusion", "reflectivity"] if len(direct) > 1 else []
+    present = changes + list(signals)
     errors: dict[frozenset[str], Float64] = {}
-    for count in range(len(players) + 1):
-        for group in itertools.combinations(players, count):
+    for count in range(len(present) + 1):
+        for group in itertools.combinations(present, count):
             total = sum(
-                (signals[name] for name in group if name in signals), start=direct[frozenset(group) & {*toggles}]
+                (signals[name] for name in group if name in signals), start=direct[frozenset(group) & {*changes}]
             )
             errors[frozenset(group)] = np.nan_to_num(simulator.heights(total, device) - truth.h)
     causes = {"shape": errors[frozenset()]}
-    for name in toggles + beside:
-        causes[name] = _shapley(name, players, errors) if name in players else np.zeros(np.shape(truth.h))
+    for name in changes + additional:
+        causes[name] = _shapley_value(name, present, errors) if name in present else np.zeros(np.shape(truth.h))
     return causes
 
 
 def _direct_signals(simulator: Simulator, light: Mapping[str, Exposure]) -> dict[frozenset[str], npt.NDArray[Any]]:
-    """Return the signal of the direct light for every set of its two causes; the real one's, if it alone is known."""
+    """Return the signal of the direct light for each subset of its causes, occlusion and reflectivity.
+
+    Without the variants of the direct light: the real direct light for the empty set.
+    """
     real = light["direct"] if "direct" in light else dark_exposure(light)
     if not _has_variants(light):
         return {frozenset(): simulator.signal(real)}
-    kinds = {
+    variants = {
         frozenset({"occlusion", "reflectivity"}): real,
-        frozenset({"reflectivity"}): light[OPEN],
-        frozenset({"occlusion"}): _as_bright(light[EVEN], real),
-        frozenset(): _as_bright(light[EVEN_OPEN], light[OPEN]),
+        frozenset({"reflectivity"}): light[UNOCCLUDED],
+        frozenset({"occlusion"}): _scaled_to_power(light[UNIFORM], real),
+        frozenset(): _scaled_to_power(light[UNIFORM_UNOCCLUDED], light[UNOCCLUDED]),
     }
-    return {name: simulator.signal(each) for name, each in kinds.items()}
+    return {causes: simulator.signal(exposure) for causes, exposure in variants.items()}
 
 
-def _as_bright(light: Exposure, like: Exposure) -> Exposure:
-    """Return light scaled to the power of another in every sample."""
+def _scaled_to_power(light: Exposure, reference: Exposure) -> Exposure:
+    """Return light scaled, sample by sample, to the power of a reference."""
     total = light.total()
-    factor = np.divide(like.total(), total, out=np.zeros_like(total), where=total > 0.0)[..., None]
+    factor = np.divide(reference.total(), total, out=np.zeros_like(total), where=total > 0.0)[..., None]
     return Exposure(factor * light.power, factor * light.moment)
 
 
-def _shapley(name: str, players: Sequence[str], errors: Mapping[frozenset[str], Float64]) -> Float64:
-    others = [each for each in players if each != name]
+def _shapley_value(name: str, causes: Sequence[str], errors: Mapping[frozenset[str], Float64]) -> Float64:
+    """Return the Shapley value of one cause: the weighted mean of its marginal errors over all sets of other causes.
+
+    A set S of the other n - 1 causes has the weight |S|! (n - 1 - |S|)! / n!.
+    """
+    others = [each for each in causes if each != name]
     total = np.zeros_like(errors[frozenset()])
     for count in range(len(others) + 1):
-        weight = math.factorial(count) * math.factorial(len(others) - count) / math.factorial(len(players))
+        weight = math.factorial(count) * math.factorial(len(others) - count) / math.factorial(len(causes))
         for group in itertools.combinations(others, count):
             before = frozenset(group)
             total += weight * (errors[before | {name}] - errors[before])

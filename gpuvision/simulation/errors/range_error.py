@@ -1,4 +1,4 @@
-"""What light that is missing, or too much, does to the range of a strip; and which light paths can be left out."""
+"""Bounds of the range error that missing or additional light causes on a strip, and selection of light paths."""
 
 from __future__ import annotations
 
@@ -16,70 +16,70 @@ Reals = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StripReading:
-    """The light that strips get anyway, and how their range follows their reading.
+class StripErrorModel:
+    """Range error of strips as a function of additional light, linear in the position of the light's centroid.
 
-    A strip reads the mean of u over its light, as a PSD does, or a camera's centroid in a fixed window.
+    A strip reads the mean of u over its light, as a PSD does, or as a camera's centroid in a fixed window.
 
     Parameters
     ----------
     power
-        (strips,), W: of the light that is certainly there.
+        (strips,), power of the direct light [W], 0 or more.
     moment
-        (strips,), W times sensor unit: the sum of power times u.
+        (strips,), first moment of the direct light: the sum of power times u [W sensor unit].
     slope
-        (strips,), metres of range per sensor unit.
+        (strips,), derivative of the range with respect to u [m / sensor unit].
     limits
-        (u_low, u_high): where a strip, or the window, begins and ends; each a number or (strips,).
-    floor
-        W: the least power at which a strip's reading counts. Strips below it are dark: their range is no number.
-    shift
-        Sensor units, a number or (strips,): how far from its direct light a strip's reading can come to be, if less
-        than the limits allow is known.
+        (u_low, u_high), ends of a strip or of the window [sensor unit]; each a number or (strips,).
+    min_power
+        Smallest power at which a strip is read [W]. A strip with less light is dark and has no range.
+    max_shift
+        Largest distance between the direct light's position and the reading [sensor unit], a number or (strips,).
+        Infinite: only the limits bound the reading.
 
     Raises
     ------
     ValueError
-        Shapes do not agree; a power is negative; the limits are none.
+        Shapes do not agree, a power is negative, or u_low is not below u_high.
     """
 
     power: Reals
     moment: Reals
     slope: Reals
     limits: tuple[npt.ArrayLike, npt.ArrayLike]
-    floor: float = 0.0
-    shift: npt.ArrayLike = math.inf
+    min_power: float = 0.0
+    max_shift: npt.ArrayLike = math.inf
 
     def __post_init__(self) -> None:
         power = np.asarray(self.power, np.float64)
         for name in ("power", "moment", "slope"):
             values = np.asarray(getattr(self, name), np.float64)
             if values.shape != power.shape or values.ndim != 1:
-                raise ValueError(f"StripReading.{name} has shape {values.shape}, expected (strips,) as of the power")
+                raise ValueError(f"StripErrorModel.{name} has shape {values.shape}, expected (strips,) as of the power")
             object.__setattr__(self, name, values)
         low, high = (np.broadcast_to(np.asarray(each, np.float64), power.shape) for each in self.limits)
         if np.any(power < 0.0) or np.any(low >= high):
-            raise ValueError("StripReading: expected power >= 0 and limits (u_low, u_high) with u_low < u_high")
+            raise ValueError("StripErrorModel: expected power >= 0 and limits (u_low, u_high) with u_low < u_high")
         object.__setattr__(self, "limits", (low, high))
 
     @classmethod
-    def of(
-        cls, view: SensorView, exposure: Exposure, *, floor: float = 0.0, shift: npt.ArrayLike = math.inf
-    ) -> StripReading:
-        """Return what the direct light of a profile makes of a sensor's strips.
+    def from_exposure(
+        cls, view: SensorView, exposure: Exposure, *, min_power: float = 0.0, max_shift: npt.ArrayLike = math.inf
+    ) -> StripErrorModel:
+        """Return the model of a sensor's strips under the direct light of one profile.
 
-        The slope is the largest of the height H over u anywhere on a strip, from bin to bin; what looks over the
-        horizon does not count.
+        The slope of a strip is the largest slope of the height H over u between the edges of its bins. Edges beyond
+        the horizon of the sheet are ignored.
 
         Parameters
         ----------
         view, exposure
-            The sensor, and direct light on it, (samples, bins).
-        floor, shift
-            As of `StripReading`.
+            The sensor, and the direct light on it, (samples, bins).
+        min_power, max_shift
+            As for `StripErrorModel`.
         """
         power = exposure.total()
-        u, v = np.broadcast_arrays(view.u_edges, view.v_middles[:, None])
+        u, v = np.broadcast_arrays(view.u_edges, view.v_centres[:, None])
         height = view.sheet_coordinates(view.points_in_sheet(u, v))[..., 1]
         slope = np.abs(np.diff(height, axis=1) / np.diff(view.u_edges))
         return cls(
@@ -87,126 +87,151 @@ class StripReading:
             moment=exposure.first_moment(view.u_edges),
             slope=np.where(np.isfinite(slope), slope, 0.0).max(axis=1),
             limits=(view.u_edges[0], view.u_edges[-1]),
-            floor=floor,
-            shift=shift,
+            min_power=min_power,
+            max_shift=max_shift,
         )
 
     def weights(self, seen: npt.NDArray[Any], u: npt.NDArray[Any]) -> Reals:
-        """Return the weights of `costs` and `LightClustering`: W by 1 W/m^2 of receivers (strips, n) seen at u."""
+        """Return the weights for `error_per_irradiance` and `LightClustering`.
+
+        Parameters
+        ----------
+        seen
+            (strips, n), power on the sensor per irradiance of each receiver [W per W/m^2].
+        u
+            (strips, n) or broadcastable, position of the receiver's image [sensor unit].
+
+        Returns
+        -------
+        numpy.ndarray
+            (strips, n, 2), power and first moment about u = 0 per irradiance; zero outside the limits.
+        """
         low, high = (np.asarray(each)[:, None] for each in self.limits)
         power = np.where((u >= low) & (u <= high), seen, 0.0)
         return np.stack([power, power * u], axis=-1)
 
     @property
     def position(self) -> Reals:
-        """Where the direct light alone reads, (strips,), within the limits; their middle where there is none."""
+        """Reading of the direct light alone, (strips,) [sensor unit]; without direct light the middle of the limits."""
         low, high = (np.asarray(each) for each in self.limits)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.clip(np.where(self.power > 0.0, self.moment / self.power, 0.5 * (low + high)), low, high)
 
-    def widest(self) -> Reals:
-        """Return the largest range error that any light can make, (strips,), metres: from limit to limit."""
+    def max_error(self) -> Reals:
+        """Return the range between both limits, (strips,) [m]: no light causes a larger error."""
         low, high = (np.asarray(each) for each in self.limits)
         return np.asarray(np.abs(self.slope) * (high - low))
 
-    def worst(self, power: npt.ArrayLike) -> Reals:
-        """Return the largest range error by up to so much more light, W, wherever it falls within the limits: metres.
+    def error_bound(self, power: npt.ArrayLike) -> Reals:
+        """Return a bound of the range error by additional light anywhere within the limits, (strips,) [m].
 
-        D q / (1 + q) with q the ratio to the direct light, D from limit to limit.
+        The bound is D q / (1 + q), with D the range between the limits and q the ratio of the additional power to the
+        direct power.
+
+        Parameters
+        ----------
+        power
+            Additional power, a number or (strips,) [W].
         """
-        more, least = np.asarray(power, np.float64), np.maximum(self.power, self.floor)
+        more, least = np.asarray(power, np.float64), np.maximum(self.power, self.min_power)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.where(more > 0.0, self.widest() / (1.0 + least / more), 0.0))
+            return np.asarray(np.where(more > 0.0, self.max_error() / (1.0 + least / more), 0.0))
 
-    def costs(self, weights: npt.NDArray[Any]) -> Reals:
-        """Return the range error by a unit of irradiance that is missing, or too much, at each receiver.
+    def error_per_irradiance(self, weights: npt.NDArray[Any]) -> Reals:
+        """Return the range error per irradiance that is missing or additional at each receiver.
 
-        With light p at u besides P at x, the reading x' without it is off by p (u - x) / P, and x lies within `shift`
-        of the direct light's position, and within the limits.
+        Light of power p at u beside light of power P at x: the reading without p is off by p (u - x) / P, where x is
+        within `max_shift` of the direct light's position and within the limits.
 
         Parameters
         ----------
         weights
-            (strips, n, 2): W, and W times sensor unit about u = 0, by 1 W/m^2.
+            (strips, n, 2), power and first moment per irradiance, from `weights`.
 
         Returns
         -------
         numpy.ndarray
-            (strips, n), metres per W/m^2; infinite in strips without direct light and floor.
+            (strips, n) [m per W/m^2]; infinite for strips without direct light where `min_power` is 0.
         """
         power, moment = (np.asarray(weights[..., k], np.float64) for k in range(2))
         low, high = (np.asarray(each)[:, None] for each in self.limits)
         position = self.position[:, None]
-        shift = np.broadcast_to(np.asarray(self.shift, np.float64), self.power.shape)[:, None]
-        first, last = np.maximum(low, position - shift), np.minimum(high, position + shift)
+        max_shift = np.broadcast_to(np.asarray(self.max_shift, np.float64), self.power.shape)[:, None]
+        first, last = np.maximum(low, position - max_shift), np.minimum(high, position + max_shift)
         arm = np.maximum(np.abs(moment - first * power), np.abs(moment - last * power))
-        least = np.maximum(self.power, self.floor)[:, None]
+        least = np.maximum(self.power, self.min_power)[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(arm > 0.0, np.abs(self.slope)[:, None] * arm / least, 0.0)
 
 
-class Choice(NamedTuple):
-    """Which light paths are modelled.
+class PathSelection(NamedTuple):
+    """Light paths that are simulated, and light paths that are omitted.
 
     Attributes
     ----------
-    modelled, left_out
-        The paths by name, with the largest range error that leaving each out may make, metres (None: no bound).
-    remaining
-        Metres: what those left out leave of the tolerance.
+    modelled, omitted
+        Paths by name, with a bound of the range error if the path is omitted [m] (None: no bound).
+    remaining_tolerance
+        Tolerance less the bounds of the omitted paths [m].
     """
 
     modelled: dict[str, float | None]
-    left_out: dict[str, float]
-    remaining: float
+    omitted: dict[str, float]
+    remaining_tolerance: float
 
 
-def choose_paths(worst: Mapping[str, npt.ArrayLike], tolerance: float) -> Choice:
-    """Leave out the light paths with the least bounds, as long as their sum stays within half the tolerance.
+def select_paths(error_bounds: Mapping[str, npt.ArrayLike], tolerance: float) -> PathSelection:
+    """Select the light paths to simulate: omit those with the smallest bounds, up to half the tolerance in sum.
 
-    Paths whose bound is zero are left out in any case. Errors of paths add, at most.
+    A path with the bound 0 is always omitted. The error of several omitted paths is at most the sum of their bounds.
 
     Parameters
     ----------
-    worst
-        For each path, the largest range error by leaving it out, metres: a number, or one for each strip; infinite
-        where there is no bound.
+    error_bounds
+        For each path, a bound of the range error if it is omitted [m]: a number, or one for each strip; infinite: no
+        bound.
     tolerance
-        Metres of range.
+        Allowed range error [m].
     """
-    bounds = {name: float(np.max(np.asarray(values, np.float64), initial=0.0)) for name, values in worst.items()}
-    left_out: dict[str, float] = {}
+    bounds = {name: float(np.max(np.asarray(values, np.float64), initial=0.0)) for name, values in error_bounds.items()}
+    omitted: dict[str, float] = {}
     spent = 0.0
     for name, bound in sorted(bounds.items(), key=lambda item: item[1]):
         if bound == 0.0 or spent + bound <= 0.5 * tolerance:
-            left_out[name] = bound
+            omitted[name] = bound
             spent += bound
-    modelled = {name: bound if math.isfinite(bound) else None for name, bound in bounds.items() if name not in left_out}
-    return Choice(modelled, left_out, max(tolerance - spent, 0.0))
+    modelled = {name: bound if math.isfinite(bound) else None for name, bound in bounds.items() if name not in omitted}
+    return PathSelection(modelled, omitted, max(tolerance - spent, 0.0))
 
 
-def bounce_power(received: float, albedo: float, solid_angle: float) -> float:
-    """Return the most light of further bounces that a sensor can get, W, all strips together.
+def interreflection_power_bound(received: float, albedo: float, solid_angle: float) -> float:
+    """Return a bound of the power that reaches the sensor after two or more diffuse reflections [W], of all strips.
 
     Parameters
     ----------
     received
-        W that other surfaces get from the lit ones at first; at most what those send out.
+        Power that surfaces receive from the lit surfaces directly; at most the power that these send out [W], 0 or
+        more.
     albedo
-        The largest in the scene; below 1 the bounces' sum converges.
+        Largest albedo of the scene, 0 to 1.
     solid_angle
-        sr: the largest under which any surface sees the lens.
+        Largest solid angle under which a surface sees the lens [sr], 0 or more.
+
+    Returns
+    -------
+    float
+        Infinite for an albedo of 1: the sum over the reflections does not converge.
 
     Raises
     ------
     ValueError
-        A number is negative, or the albedo more than 1.
+        A number is out of its range.
 
     Notes
     -----
-    Received light is sent out again at most ``albedo`` times as strong, and received again; so after the first bounce
-    surfaces receive at most received albedo / (1 - albedo), and of what a diffuse surface sends out albedo / pi times
-    the solid angle gets into the lens.
+    Surfaces send out at most ``albedo`` times the received power, which other surfaces receive again. After the first
+    reflection they receive at most received albedo / (1 - albedo) in sum. A diffuse surface sends albedo / pi times the
+    solid angle of that into the lens.
     """
     if not (0.0 <= albedo <= 1.0 and received >= 0.0 and solid_angle >= 0.0):
         raise ValueError(f"expected 0 <= albedo <= 1, got {albedo}; power and solid angle >= 0")

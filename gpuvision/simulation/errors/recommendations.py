@@ -1,6 +1,10 @@
-"""What to do about artifacts (F. de Jong, 4.6): choose the reflection that is read, or join two sensors.
+"""Remedies for range errors: choice of the reflection that is read, and fusion of two sensors.
 
-Masks, the third means, are in `gpuvision.simulation.sensors.masks`.
+Masks, the third remedy, are in `gpuvision.simulation.sensors.masks`.
+
+References
+----------
+F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 4.6.
 """
 
 from __future__ import annotations
@@ -14,9 +18,14 @@ import numpy.typing as npt
 
 from gpuvision.host import Device
 from gpuvision.ranging.line import PeakSelection
-from gpuvision.simulation.errors.error_attribution import ErrorAttribution, Verdict, attribute_errors, verdict_of
+from gpuvision.simulation.errors.error_attribution import (
+    ErrorAttribution,
+    ReadingCategory,
+    attribute_errors,
+    classify_readings,
+)
 from gpuvision.simulation.sensors.camera_simulator import CameraSimulator
-from gpuvision.simulation.sensors.readings import Reading, Truth
+from gpuvision.simulation.sensors.readings import GroundTruth, Reading
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
 from gpuvision.validation import finite
@@ -25,44 +34,47 @@ Float64 = npt.NDArray[np.float64]
 Rule = Literal["flag", "mean", "stronger", "narrower", "predicted"]
 
 RULES = ("flag", "mean", "stronger", "narrower", "predicted")
+"""Rules of `SensorFusion`."""
 NONE, FIRST, SECOND, BOTH = range(4)
-_WITH_VALUE = int(Status.SATURATED | Status.AMBIGUOUS)
+"""Values of `FusedReading.source`."""
+# Status flags with which a sensor still reports a value, one of lower reliability.
+_DOUBTFUL = int(Status.SATURATED | Status.AMBIGUOUS)
 
 
-# ---- which reflection is read --------------------------------------------------------------------------------
+# ---- comparison of candidates --------------------------------------------------------------------------------
 
 
-class Ranked(NamedTuple):
-    """How well a candidate reads a part.
+class RankedCandidate(NamedTuple):
+    """Reading quality of a candidate.
 
     Attributes
     ----------
     name
-        The candidate's.
-    unread
-        Share of the surfaces' samples that it misses or that are off by more than the limit.
-    false
-        Share of all samples where it reads what is no surface.
+        Name of the candidate.
+    failed_fraction
+        Fraction of the lit-surface samples that have no reading or an error larger than the limit.
+    spurious_fraction
+        Fraction of all samples with a reading where no lit surface is visible.
     rms
-        Of the errors within the limit [m]; NaN where there are none.
+        RMS of the errors within the limit [m]; NaN if no error is.
     """
 
     name: str
-    unread: float
-    false: float
+    failed_fraction: float
+    spurious_fraction: float
     rms: float
 
 
-def rank(candidates: Mapping[str, ErrorAttribution], limit: float) -> list[Ranked]:
-    """Order candidates by how well they read the same part, the best first.
+def rank_candidates(candidates: Mapping[str, ErrorAttribution], limit: float) -> list[RankedCandidate]:
+    """Rank candidates by how well they read the same part, the best first.
 
-    Candidates may be places of the sensor (which of a surface's reflections it gets), readouts, masks, or materials'
-    coatings. What counts is the share of samples that are unread or false; of equals, the smaller error.
+    Candidates can be sensor positions (a position selects which reflections of a surface the sensor sees), readouts,
+    masks, or coatings. The order is by the sum of failed and spurious fraction, then by the RMS error.
 
     Parameters
     ----------
     candidates
-        What `attribute_errors` found for each.
+        Result of `attribute_errors` for each candidate, by name.
     limit
         Largest error of a good reading [m].
 
@@ -74,40 +86,47 @@ def rank(candidates: Mapping[str, ErrorAttribution], limit: float) -> list[Ranke
     if not candidates:
         raise ValueError("expected one candidate or more")
     ranked = []
-    for name, found in candidates.items():
-        good = found.error[np.abs(found.error) <= limit]
+    for name, attribution in candidates.items():
+        good = attribution.error[np.abs(attribution.error) <= limit]
         rms = float(np.sqrt(np.mean(good**2))) if good.size else float("nan")
-        false = float(np.mean(found.is_(Verdict.FALSE)))
-        ranked.append(Ranked(name, found.unread(limit), false, rms))
-    return sorted(ranked, key=lambda each: (each.unread + each.false, np.nan_to_num(each.rms, nan=np.inf)))
+        spurious = float(np.mean(attribution.is_category(ReadingCategory.SPURIOUS)))
+        ranked.append(RankedCandidate(name, attribution.failed_fraction(limit), spurious, rms))
+    return sorted(
+        ranked, key=lambda each: (each.failed_fraction + each.spurious_fraction, np.nan_to_num(each.rms, nan=np.inf))
+    )
 
 
-def compare_peaks(
+def compare_peak_selections(
     simulator: CameraSimulator,
     exposures: Mapping[str, Exposure],
-    truth: Truth,
+    truth: GroundTruth,
     *,
     peak_selections: Sequence[PeakSelection] = ("strongest", "first", "last"),
     seed: int | None = None,
     device: Device | None = None,
 ) -> dict[str, ErrorAttribution]:
-    """Read the same light by each choice of a peak, where there are several; for `rank`.
+    """Read the same light with each peak selection, for columns with several peaks.
 
     Parameters
     ----------
     simulator
-        Its readout looks for peaks.
+        Camera with a readout that detects peaks.
     exposures, truth
-        Light by path, (profiles, samples, bins), and where the surface is.
+        Light by path, (profiles, samples, bins), and the ground truth, (profiles, samples).
     peak_selections
-        Of `LineReadout.peak_selection`; the names in what is returned.
+        Values of `LineReadout.peak_selection`.
     seed, device
-        As of `attribute_errors`.
+        As for `attribute_errors`.
+
+    Returns
+    -------
+    dict
+        Errors by peak selection; candidates for `rank_candidates`.
 
     Raises
     ------
     ValueError
-        The readout knows no peaks.
+        The method of the readout does not detect peaks.
     """
     return {
         selection: attribute_errors(
@@ -121,108 +140,115 @@ def compare_peaks(
     }
 
 
-# ---- two sensors ---------------------------------------------------------------------------------------------
+# ---- fusion of two sensors -----------------------------------------------------------------------------------
 
 
-class Joined(NamedTuple):
-    """What two sensors say together, each array (..., samples).
+class FusedReading(NamedTuple):
+    """Fused readings of two sensors, arrays (..., samples).
 
     Attributes
     ----------
     g, h
-        The point in the sheet of light [m]; NaN where neither can be trusted.
+        Point in the sheet of light [m]; NaN where neither sensor is accepted.
     sigma
-        Standard deviation of h by the sensors' noise [m].
-    share
-        Of the first sensor in g and h, 0 to 1; NaN where there is no value.
+        Standard deviation of h from the noise of the sensors [m].
+    first_weight
+        Weight of the first sensor in g and h, 0 to 1; NaN where there is no value.
     source
-        int8: 0 none, 1 the first sensor, 2 the second, 3 both.
+        int8: `NONE` (0), `FIRST` (1), `SECOND` (2) or `BOTH` (3).
     status
-        uint8 `Status` flags: AMBIGUOUS where they disagree and the rule does not decide; the two sensors' own where
-        neither has a value.
+        uint8 `Status` flags: AMBIGUOUS where the sensors disagree and the rule does not decide; the flags of both
+        sensors where neither has a value.
     """
 
     g: Float64
     h: Float64
     sigma: Float64
-    share: Float64
+    first_weight: Float64
     source: npt.NDArray[np.int8]
     status: npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)
-class DualSensor:
-    """The rule by which two sensors over one sheet of light become one.
+class SensorFusion:
+    """Fusion rule for two sensors over one sheet of light.
 
-    One value is taken as it is; of two that agree the mean is taken, weighed by their noise. Where they disagree, the
-    one that is neither SATURATED nor AMBIGUOUS has it, if the other is; else the rule decides.
+    Where one sensor has a value, that value is taken. Where both agree, the result is their mean, weighted by the
+    inverse variances. Where they disagree and one of them is SATURATED or AMBIGUOUS, the other one is taken; otherwise
+    the rule decides.
 
     Parameters
     ----------
-    agree
-        Readings agree within so many standard deviations of their difference.
+    max_sigmas
+        Two readings agree if they differ by at most this many standard deviations of their difference; 0 or more.
     tolerance
-        Beside these, a difference that does not matter [m].
+        Additional allowed difference of agreeing readings [m]; 0 or more.
     rule : {"flag", "mean", "stronger", "narrower", "predicted"}
-        Where they disagree. ``"flag"``: no value. ``"mean"``: their plain mean; sensors that face each other err by
-        as much to either side where the light's centre is not in the sheet's middle, at a step of reflectivity.
-        ``"stronger"``: the one with more light, that of a surface seen. ``"narrower"``: the one with the narrower
-        line. ``"predicted"``: the one, or the mean, for which a simulation of the part predicts the smallest error.
-    margin
-        How many times better the one must be than the other, by the rule; else there is no value.
-    lone
-        Whether a value that only one of the sensors has is taken.
+        Decision where the sensors disagree. ``"flag"``: no value. ``"mean"``: the plain mean; at a step of
+        reflectivity, two sensors that face each other have opposite errors of equal size. ``"stronger"``: the sensor
+        that receives more light. ``"narrower"``: the camera that sees the narrower line. ``"predicted"``: the first,
+        the second or the mean, whichever has the smallest error in a simulation of the part.
+    min_ratio
+        The chosen sensor must be better than the other by this factor, in the quantity of the rule; otherwise there
+        is no value; 1 or more.
+    accept_single
+        True: a value that only one of the sensors has is accepted.
 
     Raises
     ------
     TypeError, ValueError
-        A parameter is not what is said here.
+        A parameter has the wrong type or is out of its range.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 4.6.2.
     """
 
-    agree: float = 3.0
+    max_sigmas: float = 3.0
     tolerance: float = 0.0
     rule: Rule = "flag"
-    margin: float = 1.5
-    lone: bool = True
+    min_ratio: float = 1.5
+    accept_single: bool = True
 
     def __post_init__(self) -> None:
-        for name, least in (("agree", 0.0), ("tolerance", 0.0), ("margin", 1.0)):
-            if finite(getattr(self, name), f"DualSensor.{name}") < least:
-                raise ValueError(f"DualSensor.{name} is {getattr(self, name)}, expected {least:g} or more")
+        for name, least in (("max_sigmas", 0.0), ("tolerance", 0.0), ("min_ratio", 1.0)):
+            if finite(getattr(self, name), f"SensorFusion.{name}") < least:
+                raise ValueError(f"SensorFusion.{name} is {getattr(self, name)}, expected {least:g} or more")
         if self.rule not in RULES:
-            raise ValueError(f"DualSensor.rule is {self.rule!r}, expected one of {', '.join(RULES)}")
+            raise ValueError(f"SensorFusion.rule is {self.rule!r}, expected one of {', '.join(RULES)}")
 
-    def join(
+    def fuse(
         self, first: Reading, second: Reading, predicted: tuple[npt.ArrayLike, npt.ArrayLike] | None = None
-    ) -> Joined:
-        """Join readings of the same places along the sheet (see `resampled`).
+    ) -> FusedReading:
+        """Fuse readings at the same positions along the sheet (see `resample_reading`).
 
         Parameters
         ----------
         first, second
-            (..., samples) each.
+            Readings of the two sensors, (..., samples) each.
         predicted
-            Errors (..., samples) of both that a simulation predicts [m], for the rule "predicted"; NaN where it
-            predicts no reading.
+            Errors of both sensors that a simulation predicts, (..., samples) each [m]; for the rule "predicted". NaN:
+            the simulation predicts no reading.
 
         Raises
         ------
         ValueError
-            Shapes differ, or the rule needs what is not given.
+            Shapes differ, or an input that the rule needs is missing.
         """
         if first.h.shape != second.h.shape:
             raise ValueError(f"the readings have shapes {first.h.shape} and {second.h.shape}, expected the same")
-        weights = _weights(first.sigma, second.sigma)
+        weights = _inverse_variance_weights(first.sigma, second.sigma)
         has = np.isfinite(first.h), np.isfinite(second.h)
         both = has[0] & has[1]
-        spread = self.agree * np.hypot(np.nan_to_num(first.sigma), np.nan_to_num(second.sigma)) + self.tolerance
+        threshold = self.max_sigmas * np.hypot(np.nan_to_num(first.sigma), np.nan_to_num(second.sigma))
+        threshold = threshold + self.tolerance
         with np.errstate(invalid="ignore"):
-            agreed = both & (np.abs(first.h - second.h) <= spread)
+            agreed = both & (np.abs(first.h - second.h) <= threshold)
         decided, weights = self._decide(first, second, both & ~agreed, weights, predicted)
         source = np.where(agreed, BOTH, decided)
-        if self.lone:
+        if self.accept_single:
             source = np.where(has[0] & ~has[1], FIRST, np.where(has[1] & ~has[0], SECOND, source))
-        return _taken(first, second, source, weights, both)
+        return _fused(first, second, source, weights, both)
 
     def _decide(
         self,
@@ -232,165 +258,175 @@ class DualSensor:
         weights: tuple[Float64, Float64],
         predicted: tuple[npt.ArrayLike, npt.ArrayLike] | None,
     ) -> tuple[npt.NDArray[np.int64], tuple[Float64, Float64]]:
-        """Return who has it where they disagree, and the weights of means."""
-        doubtful = [(each.status & _WITH_VALUE) != 0 for each in (first, second)]
-        clear = np.where(doubtful[1] & ~doubtful[0], FIRST, np.where(doubtful[0] & ~doubtful[1], SECOND, NONE))
+        """Return the source of disputed samples (NONE elsewhere), and the weights of the mean of all samples."""
+        doubtful = [(each.status & _DOUBTFUL) != 0 for each in (first, second)]
+        reliable = np.where(doubtful[1] & ~doubtful[0], FIRST, np.where(doubtful[0] & ~doubtful[1], SECOND, NONE))
         if self.rule == "flag":
-            ruled = np.zeros(disputed.shape, np.int64)
+            by_rule = np.zeros(disputed.shape, np.int64)
         elif self.rule == "mean":
-            ruled = np.full(disputed.shape, BOTH)
+            by_rule = np.full(disputed.shape, BOTH)
         elif self.rule == "stronger":
-            ruled = self._better(1.0 / np.maximum(first.strength, 1e-300), 1.0 / np.maximum(second.strength, 1e-300))
+            # 1e-300 only avoids a division by zero: a sensor without light never wins.
+            by_rule = self._smaller(1.0 / np.maximum(first.strength, 1e-300), 1.0 / np.maximum(second.strength, 1e-300))
         elif self.rule == "narrower":
             if np.isnan(first.width).all() or np.isnan(second.width).all():
-                raise ValueError("DualSensor.rule 'narrower' needs the lines' widths, which only cameras know")
-            ruled = self._better(first.width, second.width)
+                raise ValueError("SensorFusion.rule 'narrower' needs line widths, which only cameras measure")
+            by_rule = self._smaller(first.width, second.width)
         else:
-            ruled = self._least_error(disputed, predicted)
+            by_rule = self._least_predicted_error(disputed, predicted)
         half = np.full(disputed.shape, 0.5)
         means = tuple(np.where(disputed, half, each) for each in weights)
-        decided = np.where(disputed, np.where(clear == NONE, ruled, clear), NONE)
+        decided = np.where(disputed, np.where(reliable == NONE, by_rule, reliable), NONE)
         return decided, (means[0], means[1])
 
-    def _better(self, first: Float64, second: Float64) -> npt.NDArray[np.int64]:
-        """Return whose badness is smaller by the margin."""
+    def _smaller(self, first: Float64, second: Float64) -> npt.NDArray[np.int64]:
+        """Return the sensor whose value is smaller by the factor `min_ratio`, or NONE."""
         with np.errstate(invalid="ignore"):
-            return np.where(self.margin * first <= second, FIRST, np.where(self.margin * second <= first, SECOND, NONE))
+            return np.where(
+                self.min_ratio * first <= second, FIRST, np.where(self.min_ratio * second <= first, SECOND, NONE)
+            )
 
-    def _least_error(
+    def _least_predicted_error(
         self, disputed: npt.NDArray[np.bool_], predicted: tuple[npt.ArrayLike, npt.ArrayLike] | None
     ) -> npt.NDArray[np.int64]:
         if predicted is None:
-            raise ValueError(
-                "DualSensor.rule 'predicted' needs the errors that a simulation predicts, predicted=(a, b)"
-            )
+            raise ValueError("SensorFusion.rule 'predicted' needs the errors of a simulation, predicted=(a, b)")
         one, other = (np.broadcast_to(np.asarray(each, np.float64), disputed.shape) for each in predicted)
         errors = np.abs(np.stack([one, other, 0.5 * (one + other)]))
         errors = np.where(np.isnan(errors), np.inf, errors)
         best = errors.argmin(axis=0)
         runner_up = np.sort(errors, axis=0)[1]
-        sure = np.isfinite(errors.min(axis=0)) & (self.margin * errors.min(axis=0) <= runner_up)
+        sure = np.isfinite(errors.min(axis=0)) & (self.min_ratio * errors.min(axis=0) <= runner_up)
         return np.where(sure, np.array([FIRST, SECOND, BOTH])[best], NONE)
 
 
 def attribute_pair_errors(
-    first: ErrorAttribution, second: ErrorAttribution, rule: DualSensor, *, gap: float, g: npt.ArrayLike | None = None
+    first: ErrorAttribution,
+    second: ErrorAttribution,
+    fusion: SensorFusion,
+    *,
+    max_gap: float,
+    g: npt.ArrayLike | None = None,
 ) -> dict[str, ErrorAttribution]:
-    """Return what two sensors over one sheet make of a part: "first", "second" and "both", for `rank`.
+    """Attribute the errors of two sensors over one sheet and of their fusion, for `rank_candidates`.
 
-    All three lie at the same places along the sheet and are judged by the surfaces that either sensor sees: what is
-    hidden from one of them is missing there.
+    All three results have the same positions along the sheet and the same ground truth: every surface that either
+    sensor sees. A surface that is occluded from one sensor counts as missing for that sensor.
 
     Parameters
     ----------
     first, second
-        What `attribute_errors` found for each, (profiles, samples) of the same profiles.
-    rule
-        "predicted" takes their errors without noise for what a simulation predicts.
-    gap
-        As for `resampled` [m].
+        Results of `attribute_errors` for the two sensors, (profiles, samples), with the same profiles.
+    fusion
+        Fusion rule. The rule "predicted" uses the errors without noise of the two results as the prediction.
+    max_gap
+        As for `resample_reading` [m].
     g
-        (k,) the places [m]; None: where the first one's samples see the part, in the median over the profiles.
+        (k,), positions along the sheet [m]. None: the positions at which the samples of the first sensor see the part,
+        as medians over the profiles.
 
     Returns
     -------
     dict
-        Causes of "both" have the sensors' shares of the reading; what lies between samples is added to "shape". Places
-        along u are NaN.
+        "first", "second" and "both". The contributions of "both" are weighted like the readings; errors of the
+        interpolation between samples belong to "shape". Positions along u are NaN in "both".
 
     Raises
     ------
     ValueError
-        As `DualSensor.join`; or the first sensor sees no surface and ``g`` is not given.
+        As `SensorFusion.fuse`; or the first sensor sees no surface and ``g`` is not given.
     """
-    places = _usual_places(first) if g is None else np.asarray(g, np.float64)
-    at = np.broadcast_to(places, (*first.error.shape[:-1], *places.shape))
+    positions = _median_positions(first) if g is None else np.asarray(g, np.float64)
+    at = np.broadcast_to(positions, (*first.error.shape[:-1], *positions.shape))
     truths = [
-        _Lines.through(each.truth.g, np.isfinite(each.truth.h), at, gap).values(each.truth.h)
+        _Interpolation.between(each.truth.g, np.isfinite(each.truth.h), at, max_gap).values(each.truth.h)
         for each in (first, second)
     ]
     h = np.where(np.isfinite(truths[0]), truths[0], truths[1])
-    truth = Truth(np.where(np.isfinite(h), at, np.nan), h, np.where(np.isfinite(h), 0, int(Status.LOW_SIGNAL)))
-    alone = [_resampled_artifacts(each, truth, at, gap) for each in (first, second)]
-    expected = [each.error - each.causes["noise"] for each in alone]
-    joined = rule.join(alone[0].reading, alone[1].reading, (expected[0], expected[1]))
-    error = joined.h - h
+    truth = GroundTruth(np.where(np.isfinite(h), at, np.nan), h, np.where(np.isfinite(h), 0, int(Status.LOW_SIGNAL)))
+    alone = [_resample_attribution(each, truth, at, max_gap) for each in (first, second)]
+    predicted = [each.error - each.causes["noise"] for each in alone]
+    fused = fusion.fuse(alone[0].reading, alone[1].reading, (predicted[0], predicted[1]))
+    error = fused.h - h
     causes = {}
     for name in (name for name in alone[0].causes if name in alone[1].causes):
         one, other = (each.causes[name] for each in alone)
-        mean = joined.share * one + (1.0 - joined.share) * other
-        part = np.where(joined.share == 1.0, one, np.where(joined.share == 0.0, other, mean))
+        mean = fused.first_weight * one + (1.0 - fused.first_weight) * other
+        part = np.where(fused.first_weight == 1.0, one, np.where(fused.first_weight == 0.0, other, mean))
         causes[name] = np.where(np.isfinite(error), part, np.nan)
-    nothing = np.full(h.shape, np.nan)
-    strength = np.where(joined.share >= 0.5, alone[0].reading.strength, alone[1].reading.strength)
+    unknown = np.full(h.shape, np.nan)
+    strength = np.where(fused.first_weight >= 0.5, alone[0].reading.strength, alone[1].reading.strength)
     both = ErrorAttribution(
-        reading=Reading(nothing, joined.g, joined.h, joined.sigma, strength, nothing, joined.status),
+        reading=Reading(unknown, fused.g, fused.h, fused.sigma, strength, unknown, fused.status),
         truth=truth,
         error=error,
         causes=causes,
-        light={name: alone[0].light[name] + alone[1].light[name] for name in causes},
-        verdict=verdict_of(joined.h, truth),
+        power={name: alone[0].power[name] + alone[1].power[name] for name in causes},
+        category=classify_readings(fused.h, truth),
     )
     return {"first": alone[0], "second": alone[1], "both": both}
 
 
-def _usual_places(found: ErrorAttribution) -> Float64:
-    g = np.asarray(found.truth.g, np.float64).reshape(-1, np.shape(found.truth.g)[-1])
+def _median_positions(attribution: ErrorAttribution) -> Float64:
+    """Return the median position along the sheet of each sample, (samples,); interpolated for samples without truth."""
+    g = np.asarray(attribution.truth.g, np.float64).reshape(-1, np.shape(attribution.truth.g)[-1])
     known = np.isfinite(g).any(axis=0)
     if not known.any():
-        raise ValueError("the first sensor sees no surface; give the places along the sheet, g=")
+        raise ValueError("the first sensor sees no surface; give the positions along the sheet, g=")
     at = np.flatnonzero(known)
     return np.interp(np.arange(g.shape[1]), at, np.nanmedian(g[:, at], axis=0))
 
 
-def _resampled_artifacts(found: ErrorAttribution, truth: Truth, places: Float64, gap: float) -> ErrorAttribution:
-    """Return readings at other places beside a truth of those places."""
-    reading = resampled(found.reading, places, gap=gap)
+def _resample_attribution(
+    attribution: ErrorAttribution, truth: GroundTruth, positions: Float64, max_gap: float
+) -> ErrorAttribution:
+    """Return the readings at other positions, with their errors against the ground truth of those positions."""
+    reading = resample_reading(attribution.reading, positions, max_gap=max_gap)
     error = reading.h - truth.h
-    lines = _Lines.through(found.reading.g, np.isfinite(found.reading.h), places, gap)
-    # Where the sample had no truth beside it, the other sensor's says how wrong it is, and "shape" has it all.
-    causes = {name: lines.values(np.nan_to_num(part)) for name, part in found.causes.items()}
+    lines = _Interpolation.between(attribution.reading.g, np.isfinite(attribution.reading.h), positions, max_gap)
+    # Where only the other sensor sees the surface, the causes of the error are unknown: "shape" takes all of it.
+    causes = {name: lines.values(np.nan_to_num(part)) for name, part in attribution.causes.items()}
     causes["shape"] = causes["shape"] + (error - np.sum(list(causes.values()), axis=0))
     return ErrorAttribution(
         reading=reading,
         truth=truth,
         error=error,
         causes={name: np.where(np.isfinite(error), part, np.nan) for name, part in causes.items()},
-        light={name: np.nan_to_num(lines.values(part)) for name, part in found.light.items()},
-        verdict=verdict_of(reading.h, truth),
+        power={name: np.nan_to_num(lines.values(part)) for name, part in attribution.power.items()},
+        category=classify_readings(reading.h, truth),
     )
 
 
-def resampled(reading: Reading, g: npt.ArrayLike, *, gap: float) -> Reading:
-    """Return a profile at other places along the sheet: straight lines between its points.
+def resample_reading(reading: Reading, g: npt.ArrayLike, *, max_gap: float) -> Reading:
+    """Resample profiles at other positions along the sheet, by linear interpolation between neighbouring points.
 
-    Beside a hole and at either end a point stands for what is up to half a usual distance of points away.
+    Beside a gap and at both ends of a profile, the nearest point is used up to half the median distance of points.
 
     Parameters
     ----------
     reading
         (samples,) or (profiles, samples).
     g
-        (k,) places, ascending, or (profiles, k) of another sensor's reading; NaN gives NaN [m].
-    gap
-        No line is drawn between points further apart than this along the sheet [m]. Where there is none there is no
-        value, with the status NO_DATA.
+        Positions [m]: (k,) ascending, or (profiles, k), for example of the reading of another sensor. NaN gives NaN.
+    max_gap
+        No interpolation between points farther apart along the sheet [m]. Positions in such a gap have no value and
+        the status NO_DATA.
 
     Returns
     -------
     Reading
-        Of shape (..., k). Flags of either end go with the line; its sigma, strength and width are lines too.
+        (..., k). Sigma, strength and width are interpolated too; the flags are those of both neighbours.
     """
     at = np.broadcast_to(np.asarray(g, np.float64), (*reading.h.shape[:-1], np.shape(g)[-1]))
-    lines = _Lines.through(reading.g, np.isfinite(reading.h), at, gap)
+    lines = _Interpolation.between(reading.g, np.isfinite(reading.h), at, max_gap)
     position, h, sigma, strength, width = (
         lines.values(part) for part in (reading.position, reading.h, reading.sigma, reading.strength, reading.width)
     )
     return Reading(position, np.where(lines.inside, at, np.nan), h, sigma, strength, width, lines.flags(reading.status))
 
 
-class _Lines(NamedTuple):
-    """Which two samples each place lies between, how far from the one to the other, and whether it does; (..., k)."""
+class _Interpolation(NamedTuple):
+    """Linear interpolation at positions (..., k): both neighbours, fraction of the way, and whether it is valid."""
 
     left: npt.NDArray[np.intp]
     right: npt.NDArray[np.intp]
@@ -398,26 +434,26 @@ class _Lines(NamedTuple):
     inside: npt.NDArray[np.bool_]
 
     @classmethod
-    def through(cls, g: Float64, known: npt.NDArray[np.bool_], places: Float64, gap: float) -> _Lines:
+    def between(cls, g: Float64, known: npt.NDArray[np.bool_], positions: Float64, max_gap: float) -> _Interpolation:
         lines = cls(
-            np.zeros(places.shape, np.intp),
-            np.zeros(places.shape, np.intp),
-            np.zeros(places.shape),
-            np.zeros(places.shape, bool),
+            np.zeros(positions.shape, np.intp),
+            np.zeros(positions.shape, np.intp),
+            np.zeros(positions.shape),
+            np.zeros(positions.shape, bool),
         )
         known = known & np.isfinite(g)
-        for row in np.ndindex(places.shape[:-1]):
+        for row in np.ndindex(positions.shape[:-1]):
             samples = np.flatnonzero(known[row])
             if samples.size:
                 samples = samples[np.argsort(g[row][samples], kind="stable")]
-                left, right, t, inside = _spans(g[row][samples], places[row], gap)
+                left, right, t, inside = _neighbours(g[row][samples], positions[row], max_gap)
                 lines.left[row], lines.right[row] = samples[left], samples[right]
                 lines.t[row], lines.inside[row] = t, inside
         return lines
 
     def values(self, of: npt.NDArray[Any]) -> Float64:
         left, right = (np.take_along_axis(of, ends, axis=-1) for ends in (self.left, self.right))
-        # On a point itself the other end does not matter.
+        # At t = 0 and t = 1 the value of the other neighbour is not used: it may be NaN.
         with np.errstate(invalid="ignore"):
             line = np.where(self.t == 0.0, left, np.where(self.t == 1.0, right, (1.0 - self.t) * left + self.t * right))
         return np.where(self.inside, line, np.nan)
@@ -428,51 +464,53 @@ class _Lines(NamedTuple):
         return np.where(self.inside, either, int(Status.NO_DATA)).astype(np.uint8)
 
 
-def _spans(x: Float64, at: Float64, gap: float) -> tuple[Any, ...]:
-    """Return left and right neighbours among ascending x, the share of the way between them, and whether it counts."""
+def _neighbours(x: Float64, at: Float64, max_gap: float) -> tuple[Any, ...]:
+    """Return the left and right neighbour among ascending x, the fraction of the way, and whether it is valid."""
     right = np.clip(np.searchsorted(x, at, side="left"), min(1, len(x) - 1), len(x) - 1)
     left = np.maximum(right - 1, 0)
     width = x[right] - x[left]
-    usual = min(float(np.median(np.diff(x))), gap) if len(x) > 1 else gap
+    median_step = min(float(np.median(np.diff(x))), max_gap) if len(x) > 1 else max_gap
     with np.errstate(invalid="ignore", divide="ignore"):
         t = np.where(width > 0.0, (at - x[left]) / width, np.nan)
-        between = (t >= 0.0) & (t <= 1.0) & (width <= gap)
+        between = (t >= 0.0) & (t <= 1.0) & (width <= max_gap)
         nearer = np.where(np.abs(at - x[left]) <= np.abs(at - x[right]), 0.0, 1.0)
-        beside = np.abs(at - np.where(nearer == 0.0, x[left], x[right])) <= 0.5 * usual
-    return left, right, np.where(between, t, nearer), between | beside
+        close = np.abs(at - np.where(nearer == 0.0, x[left], x[right])) <= 0.5 * median_step
+    return left, right, np.where(between, t, nearer), between | close
 
 
-def _weights(first: Float64, second: Float64) -> tuple[Float64, Float64]:
-    """Return shares of a mean by the inverse of the variances; halves where either is not known."""
+def _inverse_variance_weights(first: Float64, second: Float64) -> tuple[Float64, Float64]:
+    """Return weights of a mean, proportional to the inverse variances; 1/2 each where a sigma is unknown."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        share = second**2 / (first**2 + second**2)
-    share = np.where(np.isfinite(share), share, 0.5)
-    return share, 1.0 - share
+        weight = second**2 / (first**2 + second**2)
+    weight = np.where(np.isfinite(weight), weight, 0.5)
+    return weight, 1.0 - weight
 
 
-def _taken(
+def _fused(
     first: Reading,
     second: Reading,
     source: npt.NDArray[np.int64],
     weights: tuple[Float64, Float64],
     both: npt.NDArray[np.bool_],
-) -> Joined:
-    def chosen(one: Float64, other: Float64, mean: Float64) -> Float64:
+) -> FusedReading:
+    """Return the values of the chosen sources."""
+
+    def select(one: Float64, other: Float64, mean: Float64) -> Float64:
         return np.choose(source, [np.full(source.shape, np.nan), one, other, mean])
 
-    def of(one: Float64, other: Float64) -> Float64:
-        return chosen(one, other, weights[0] * one + weights[1] * other)
+    def weighted(one: Float64, other: Float64) -> Float64:
+        return select(one, other, weights[0] * one + weights[1] * other)
 
-    spread = np.hypot(weights[0] * first.sigma, weights[1] * second.sigma)
+    sigma_of_mean = np.hypot(weights[0] * first.sigma, weights[1] * second.sigma)
     either = first.status | second.status
-    own = np.choose(source, [np.where(both, int(Status.AMBIGUOUS), either), first.status, second.status, either])
-    # A lone value that is not taken is no value: its flags do not say so.
-    own = np.where((source == NONE) & (own == 0), int(Status.AMBIGUOUS), own)
-    return Joined(
-        g=of(first.g, second.g),
-        h=of(first.h, second.h),
-        sigma=chosen(first.sigma, second.sigma, spread),
-        share=chosen(np.ones(source.shape), np.zeros(source.shape), weights[0]),
+    status = np.choose(source, [np.where(both, int(Status.AMBIGUOUS), either), first.status, second.status, either])
+    # A single value that is not accepted can have no flag; without a value there must be one.
+    status = np.where((source == NONE) & (status == 0), int(Status.AMBIGUOUS), status)
+    return FusedReading(
+        g=weighted(first.g, second.g),
+        h=weighted(first.h, second.h),
+        sigma=select(first.sigma, second.sigma, sigma_of_mean),
+        first_weight=select(np.ones(source.shape), np.zeros(source.shape), weights[0]),
         source=source.astype(np.int8),
-        status=own.astype(np.uint8),
+        status=status.astype(np.uint8),
     )

@@ -187,10 +187,10 @@ def _along_the_curve(extents: Reals) -> Integers:
     cells = ((centre - low) * (65535.0 / span if span > 0.0 else 0.0)).astype(np.int64)
     for shift, mask in _SPREAD:
         cells = (cells | (cells << shift)) & mask
-    return sorted_by(cells[0] | (cells[1] << 1) | (cells[2] << 2))
+    return radix_argsort(cells[0] | (cells[1] << 1) | (cells[2] << 2))
 
 
-def sorted_by(key: Integers) -> Integers:
+def radix_argsort(key: Integers) -> Integers:
     """Return in which order keys, none below 0, ascend, equal ones as they stand.
 
     By digits of 16 bits: those NumPy sorts many times faster than whole numbers.
@@ -279,7 +279,7 @@ def _split_level(tree: _Binary, active: Integers, bundles: _Bundles, bins: int, 
     at = np.clip(((value - bottom[owner]) * scale[owner]).astype(np.int64), 0, bins - 1)
     # Sorting by node and bin also puts the two sides of every cut side by side.
     key = owner * bins + at
-    order = sorted_by(key)
+    order = radix_argsort(key)
     members, key = members[order], key[order]
     tree.order[places] = members
     cuts = np.append(0, np.flatnonzero(key[1:] != key[:-1]) + 1)

@@ -12,7 +12,7 @@ Float64 = npt.NDArray[np.float64]
 _LEAST_VOLUME = 1e-9
 
 
-def outward(scene: Scene, eye: npt.ArrayLike, direction: npt.ArrayLike) -> npt.NDArray[np.int8]:
+def visible_sides(scene: Scene, eye: npt.ArrayLike, direction: npt.ArrayLike) -> npt.NDArray[np.int8]:
     """Return which side of triangles an eye may see that moves along a straight line.
 
     Of a closed surface (triangles that hang together, every edge between two of them) it sees the outside only, if its
@@ -38,7 +38,7 @@ def outward(scene: Scene, eye: npt.ArrayLike, direction: npt.ArrayLike) -> npt.N
     if not len(there):
         return sides
     corners = scene.corners[there]
-    points = places_of(corners)
+    points = vertex_numbers(corners)
     tail, head = points.ravel(), np.roll(points, -1, axis=1).ravel()
     forward = tail < head
     edge = np.minimum(tail, head) * (points.max() + 1) + np.maximum(tail, head)
@@ -65,7 +65,7 @@ def outward(scene: Scene, eye: npt.ArrayLike, direction: npt.ArrayLike) -> npt.N
     return sides
 
 
-def places_of(corners: Float64) -> npt.NDArray[np.int64]:
+def vertex_numbers(corners: Float64) -> npt.NDArray[np.int64]:
     """Return a number for every corner (n, 3, 3) to (n, 3), the same where the place is to the last digit."""
     # Zero has one sign here.
     points = corners.reshape(-1, 3) + 0.0

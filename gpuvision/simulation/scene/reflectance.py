@@ -115,7 +115,7 @@ class OrenNayar(Brdf):
     """Rough and diffuse: Oren and Nayar's model in Fujii's form, which reflects no more than the albedo.
 
     (The usual form with A and B of sigma^2 returns over 1 % more than arrives at grazing incidence.)
-    A roughness of 0 is `Lambert`; 1 is the roughest. `of_slopes` takes a measured sigma.
+    A roughness of 0 is `Lambert`; 1 is the roughest. `from_slope_sigma` takes a measured sigma.
     """
 
     kind: ClassVar[str] = "BRDF_OREN_NAYAR"
@@ -123,7 +123,7 @@ class OrenNayar(Brdf):
     roughness: float
 
     @classmethod
-    def of_slopes(cls, *, albedo: float, sigma: float) -> OrenNayar:
+    def from_slope_sigma(cls, *, albedo: float, sigma: float) -> OrenNayar:
         """Take sigma, the standard deviation of the slope angles of the surface's facets, radians, 0 to pi / 2.
 
         The roughness is B / A of Oren and Nayar's qualitative model (1994): over its value at normal incidence and
@@ -136,9 +136,9 @@ class OrenNayar(Brdf):
         ValueError
             The albedo or sigma is out of its range.
         """
-        angle = finite(sigma, "OrenNayar.of_slopes: sigma")
+        angle = finite(sigma, "OrenNayar.from_slope_sigma: sigma")
         if not 0.0 <= angle <= math.pi / 2.0:
-            raise ValueError(f"OrenNayar.of_slopes: sigma is {angle:g}, expected radians, 0 to pi / 2")
+            raise ValueError(f"OrenNayar.from_slope_sigma: sigma is {angle:g}, expected radians, 0 to pi / 2")
         square = angle**2
         level, slope = 1.0 - 0.5 * square / (square + 0.33), 0.45 * square / (square + 0.09)
         return cls(albedo=albedo, roughness=slope / level)
@@ -165,21 +165,21 @@ class Ggx(Brdf):
     """Torrance and Sparrow's facets D F G / (4 cos cos), with GGX's distribution (Walter et al. 2007).
 
     Smith's masking, correlated in height (Heitz 2014); Schlick's Fresnel term. ``alpha`` from 1e-4, nearly a mirror,
-    to 1; ``facing`` is the Fresnel reflectance at normal incidence.
+    to 1; ``f0`` is the Fresnel reflectance at normal incidence.
     """
 
     kind: ClassVar[str] = "BRDF_GGX"
     alpha: float
-    facing: float = 1.0
+    f0: float = 1.0
 
     def __post_init__(self) -> None:
         _keep(self, "alpha", _SMOOTHEST, 1.0)
-        _keep(self, "facing", 0.0, 1.0)
+        _keep(self, "f0", 0.0, 1.0)
 
     @property
     def parameters(self) -> tuple[float, ...]:
         """What kernels/reflectance/brdf.h takes."""
-        return self.alpha, self.facing
+        return self.alpha, self.f0
 
     def _above(self, light: Array, eye: Array) -> Array:
         square, rest = self.alpha**2, 1.0 - self.alpha**2
@@ -189,7 +189,7 @@ class Ggx(Brdf):
         masked = eye[..., 2] * np.sqrt(square + rest * light[..., 2] ** 2)
         masked += light[..., 2] * np.sqrt(square + rest * eye[..., 2] ** 2)
         away = np.maximum(1.0 - 0.5 * np.sqrt(length), 0.0)
-        fresnel = self.facing + (1.0 - self.facing) * away**5
+        fresnel = self.f0 + (1.0 - self.f0) * away**5
         value: Array = fresnel * square / (math.pi * spread**2) * 0.5 / masked
         return value
 

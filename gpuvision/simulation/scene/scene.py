@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.simulation.scene.bvh import Bvh, sorted_by
+from gpuvision.simulation.scene.bvh import Bvh, radix_argsort
 
 # An odd number of 64 bits that looks like noise (of the golden ratio).
 _MIXER = 0x9E3779B97F4A7C15
@@ -218,7 +218,7 @@ def _numbered(points: npt.NDArray[np.float64]) -> Integers:
         mixed = (mixed ^ column) * np.uint64(_MIXER)
         mixed ^= mixed >> np.uint64(32)
     # A number of 63 bits for each; the places say whether two have the same one by chance.
-    order = sorted_by((mixed >> np.uint64(1)).astype(np.int64))
+    order = radix_argsort((mixed >> np.uint64(1)).astype(np.int64))
     mixed, columns = mixed[order] >> np.uint64(1), columns[:, order]
     is_new = np.append(True, mixed[1:] != mixed[:-1])
     if np.any((columns[:, 1:] != columns[:, :-1]).any(axis=0) & ~is_new[1:]):
@@ -237,7 +237,7 @@ def _winding(points: Integers) -> tuple[Integers, Integers]:
     tail, head = points.ravel(), np.roll(points, -1, axis=1).ravel()
     face = np.repeat(np.arange(count), 3)
     edge = np.minimum(tail, head) * (points.max() + 1) + np.maximum(tail, head)
-    order = sorted_by(edge)
+    order = radix_argsort(edge)
     edge, face, forward = edge[order], face[order], (tail < head)[order]
     first = np.append(0, np.flatnonzero(edge[1:] != edge[:-1]) + 1)
     uses = np.diff(first, append=len(edge))

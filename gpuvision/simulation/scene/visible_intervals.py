@@ -48,7 +48,7 @@ class VisibleIntervals(VisionOperation[Intervals]):
     scene
         What may be in the way; both sides of a triangle are. What lies in the segment itself is not, nor is the
         mirror, nor a triangle in the plane of the fan.
-    kept
+    max_intervals
         At most so many parts.
     precision
         Of the arithmetic and the outputs; None follows the input.
@@ -70,15 +70,15 @@ class VisibleIntervals(VisionOperation[Intervals]):
     Result: ClassVar[type[Any]] = Intervals
 
     scene: Scene
-    kept: int = 16
+    max_intervals: int = 16
     precision: Precision = None
     variant: Variant = "auto"
 
     def __post_init__(self) -> None:
         if not isinstance(self.scene, Scene):
             raise TypeError(f"VisibleIntervals.scene is {self.scene!r}, expected a Scene")
-        if not 1 <= self.kept <= 49:
-            raise ValueError(f"VisibleIntervals.kept is {self.kept}, expected 1 to 49")
+        if not 1 <= self.max_intervals <= 49:
+            raise ValueError(f"VisibleIntervals.max_intervals is {self.max_intervals}, expected 1 to 49")
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -100,7 +100,7 @@ class VisibleIntervals(VisionOperation[Intervals]):
             },
             inputs=[(shape, dtype)],
             outputs={
-                "intervals": ((*where, self.kept, 2), real),
+                "intervals": ((*where, self.max_intervals, 2), real),
                 "count": (where, np.dtype(np.uint8)),
                 "status": (where, np.dtype(np.uint8)),
             },
@@ -108,7 +108,7 @@ class VisibleIntervals(VisionOperation[Intervals]):
                 *tree.tables(real),
                 tree.middle.astype(dtype),
                 real.type(_SLACK[real]),
-                np.uint32(self.kept),
+                np.uint32(self.max_intervals),
                 np.uint64(count),
             ],
             global_size=(count,) if strip else (-(-count // _GROUP) * _GROUP,),

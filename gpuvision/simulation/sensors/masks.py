@@ -1,8 +1,12 @@
-"""Masks before a sensor: what light they let pass, and the one that suits a part best.
+"""Masks before a sensor: transmission of light, and optimisation of a mask for a part.
 
-A PSD reads the centre of gravity of all light on its strip, so that a faint glow far from the line moves it; what a
-mask keeps from the strip cannot. The glow in a corner falls off so slowly that the error depends on the mask's length
-(F. de Jong, 4.6.3).
+A PSD reads the centroid of all light on its strip. Weak secondary light far from the line shifts this centroid. A mask
+keeps such light from the strip. The secondary light in a corner falls off slowly with the distance, so the error
+depends on the length of the mask's window.
+
+References
+----------
+F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 4.6.3.
 """
 
 from __future__ import annotations
@@ -15,36 +19,46 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.simulation.sensors.readings import Truth, dark_exposure, height_secant, height_slope, lit_by
+from gpuvision.simulation.sensors.readings import (
+    GroundTruth,
+    dark_exposure,
+    height_secant,
+    height_slope,
+    total_exposure,
+)
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 
-_CHOICES = 16  # ends of a window that are tried at once
-_PAIRS_AT_ONCE = 4_000_000
-_ROUNDS = 30  # to the end of a window; each closes in by the share that the slope changes on the way
+# Candidates for each end of a window in one step of the grid search.
+_CANDIDATES = 16
+# Pairs of window ends per batch: bounds the memory of a batch, 8 bytes a pair.
+_PAIRS_PER_BATCH = 4_000_000
+# Fixed-point iterations for a window's end. Each one reduces the error by the relative change of the slope between the
+# profile and the window's end.
+_MAX_ITERATIONS = 30
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mask:
-    """What passes to a sensor: a window along u for every sample, a transmission for every bin, or both.
+    """Mask before a sensor: a window along u for every sample, a transmission for every bin, or both.
 
     Parameters
     ----------
     windows
-        (samples, 2) lower and upper end [sensor unit], or (profiles, samples, 2) for a mask that follows the part.
-        None: no window. A window whose ends are equal lets nothing pass.
+        Lower and upper end of each window [sensor unit], float64 (samples, 2), or (profiles, samples, 2) for a mask
+        that follows the part. None: no windows. A window with equal ends is closed.
     leak
-        Share of the light that passes beside the window.
+        Fraction of the light outside the window that passes, 0 to 1.
     transmission
-        (samples, bins) shares from 0 to 1; None: 1.
+        Transmission of each bin, float64 (samples, bins), 0 to 1. None: 1.
 
     Raises
     ------
     ValueError
-        Shapes or numbers are not these.
+        A shape or a number is out of its range.
     """
 
     windows: Float64 | None = None
@@ -66,54 +80,58 @@ class Mask:
             object.__setattr__(self, "transmission", shares)
 
     @classmethod
-    def about(cls, view: SensorView, truth: Truth, reach: float) -> Mask:
-        """Return the mask that follows an expected profile: windows up to so much above and below it.
+    def around_profile(cls, view: SensorView, truth: GroundTruth, half_height: float) -> Mask:
+        """Return a mask that follows an expected profile, with windows of constant height in the sheet.
 
         Parameters
         ----------
         view
-            Of the sensor.
+            View of the sensor.
         truth
-            Expected points, (samples,) or (profiles, samples). Where there is none the mask is closed.
-        reach
-            In height [m]; a window ends with the sensor at the latest.
+            Expected points, (samples,) or (profiles, samples). Samples without a point have a closed window.
+        half_height
+            Height above and below the profile that passes [m], > 0. Windows are clipped to the sensor.
 
         Raises
         ------
         ValueError
-            The reach is not positive.
+            The half height is not positive.
         """
-        if not finite(reach, "reach") > 0.0:
-            raise ValueError(f"reach is {reach:g} m, expected a number > 0")
+        if not finite(half_height, "half_height") > 0.0:
+            raise ValueError(f"half_height is {half_height:g} m, expected a number > 0")
         u, _ = height_slope(view, truth)
         low, high = view.u_edges[0], view.u_edges[-1]
         ends = np.stack([u, u], axis=-1)
-        rise = np.array([-reach, reach])
-        for _ in range(_ROUNDS):
-            slope = height_secant(view.triangulation, u[..., None], ends, view.v_middles[:, None])
+        rise = np.array([-half_height, half_height])
+        for _ in range(_MAX_ITERATIONS):
+            slope = height_secant(view.triangulation, u[..., None], ends, view.v_centres[:, None])
             with np.errstate(invalid="ignore", divide="ignore"):
                 ends = np.clip(u[..., None] + rise / slope, low, high)
         ends.sort(axis=-1)
         return cls(windows=np.where(np.isnan(ends), low, ends))
 
     def apply(self, exposure: Exposure, u_edges: npt.ArrayLike) -> Exposure:
-        """Return the light that passes.
+        """Return the light that passes the mask.
 
-        Where a window ends within a bin, the bin's light is taken to lie evenly over the widest interval in the bin
-        about its centre of gravity: exact for even light and wherever windows end at the bins' edges, never off by
-        more than the power of the two bins that are cut.
+        Where a window ends within a bin, the light of the bin is assumed uniform over the widest interval of the bin
+        that is centred on the centroid of the bin's light.
 
         Parameters
         ----------
         exposure
-            Of shape (..., samples, bins).
+            (..., samples, bins).
         u_edges
-            (bins + 1,) of it.
+            Edges of the bins, (bins + 1,) [sensor unit].
 
         Raises
         ------
         ValueError
-            The mask is one for another sensor.
+            The shapes of mask and exposure do not fit.
+
+        Notes
+        -----
+        The result is exact for uniform light, and for windows that end at edges of bins. Otherwise the error is at
+        most the power of the two bins in which the window ends.
         """
         edges = np.asarray(u_edges, np.float64)
         try:
@@ -121,7 +139,7 @@ class Mask:
                 exposure = Exposure(exposure.power * self.transmission, exposure.moment * self.transmission)
             if self.windows is None:
                 return exposure
-            passing = _through(exposure, self.windows, edges)
+            passing = _through_windows(exposure, self.windows, edges)
         except ValueError:
             raise ValueError(
                 f"this mask does not fit light of shape {exposure.power.shape} (..., samples, bins)"
@@ -132,12 +150,14 @@ class Mask:
         return Exposure(kept * passing.power + leak * exposure.power, kept * passing.moment + leak * exposure.moment)
 
     def save(self, path: str | Path) -> None:
-        """Write the windows as text, a line "lower, upper" for every sample.
+        """Write the windows as a text file with one line "lower, upper" for each sample.
 
         Raises
         ------
         ValueError
-            The mask has more or other than one window a sample: that does not fit into such a file.
+            The mask is not of one window per sample, or has a transmission or a leak.
+        OSError
+            The file cannot be written.
         """
         if self.windows is None or self.windows.ndim != 2 or self.transmission is not None or self.leak:
             raise ValueError("only a mask of one window per sample (samples, 2) without leak is written as text")
@@ -145,12 +165,14 @@ class Mask:
 
     @classmethod
     def load(cls, path: str | Path) -> Mask:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises
         ------
         ValueError
-            The file holds anything else.
+            The file does not hold two numbers in each line.
+        OSError
+            The file cannot be read.
         """
         expected = f"{path}: expected two numbers a line, the lower and the upper end of a sample's window"
         try:
@@ -162,7 +184,8 @@ class Mask:
         return cls(windows=windows)
 
 
-def _through(exposure: Exposure, windows: Float64, edges: Float64) -> Exposure:
+def _through_windows(exposure: Exposure, windows: Float64, edges: Float64) -> Exposure:
+    """Return the light inside windows (..., samples, 2) over bins with the given edges."""
     low, high = windows[..., :1], windows[..., 1:]
     left, right = edges[:-1], edges[1:]
     whole, _ = np.broadcast_arrays((low <= left) & (right <= high), exposure.power)
@@ -185,128 +208,134 @@ def _through(exposure: Exposure, windows: Float64, edges: Float64) -> Exposure:
     return Exposure(power, moment)
 
 
-def light_behind(mask: Mask | None, view: SensorView, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
-    """Return what a mask lets pass of every path; None is no mask."""
+def apply_mask(mask: Mask | None, view: SensorView, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
+    """Return the light of each path that passes a mask; None: all of it."""
     if mask is None:
         return dict(exposures)
     return {name: mask.apply(each, view.u_edges) for name, each in exposures.items()}
 
 
-class MaskPlan(NamedTuple):
-    """A mask, and what it does for the part it was made for.
+class MaskOptimisation(NamedTuple):
+    """An optimised mask and its effect on the part for which it was optimised.
 
     Attributes
     ----------
     mask
-        With a window for every sample.
-    before, after
-        (profiles, samples) error of the centre of gravity without and with the mask [m of height]; NaN where there
-        is no valid light.
-    kept
-        (profiles, samples) share of the valid light that the mask lets pass.
+        Mask with a window for every sample.
+    error_before, error_after
+        Error of the light's centroid without and with the mask, (profiles, samples) [m of height]; NaN where there is
+        no valid light.
+    passed_fraction
+        Fraction of the valid light that passes, (profiles, samples); NaN where there is none.
     """
 
     mask: Mask
-    before: Float64
-    after: Float64
-    kept: Float64
+    error_before: Float64
+    error_after: Float64
+    passed_fraction: Float64
 
 
 def optimise_mask(
     view: SensorView,
     exposures: Mapping[str, Exposure],
-    truth: Truth,
+    truth: GroundTruth,
     *,
     fixed: bool = True,
-    objective: Literal["worst", "rms"] = "rms",
-    keep: float = 0.999,
+    objective: Literal["max", "rms"] = "rms",
+    min_passed_fraction: float = 0.999,
     margin: float = 0.0,
-) -> MaskPlan:
-    """Find the windows along u, ending at edges of bins, under which a part is read best.
-
-    The windows are the best of all pairs of ends on a grid that is narrowed down to the bins; an error that has
-    several minima may hide one between the first grid's ends (15 a side).
+) -> MaskOptimisation:
+    """Find the windows along u with the least error of the light's centroid on a part.
 
     Parameters
     ----------
     view
-        Of the sensor.
+        View of the sensor.
     exposures
-        Light by path, each (profiles, samples, bins), without a mask. "direct" is the valid light.
+        Light by path, (profiles, samples, bins), before the mask. "direct" is the valid light.
     truth
-        Of the same profiles.
+        Ground truth, (profiles, samples).
     fixed
-        One window a sample for all profiles; False: another one for every profile, a mask that follows the part.
+        True: one window per sample for all profiles. False: one per sample and profile, a mask that follows the part.
     objective
-        What of the errors of a sample's profiles counts: the worst, which may be one that no mask can help and then
-        leaves the others as they are, or their root mean square.
-    keep
-        Share of the valid light that must pass, in every profile; at most half of the rest is cut at either end.
+        Minimised quantity over the profiles of a sample: ``"rms"`` or ``"max"`` of the errors. With "max", one profile
+        that no mask can improve leaves the other profiles as they are.
+    min_passed_fraction
+        Fraction of the valid light that must pass in every profile, > 0 and at most 1. At most half of the rest is cut
+        at either end.
     margin
-        The window's ends keep this distance from the valid light [sensor unit]: for a mask that is not quite in
-        place.
+        Distance of the window's ends from the valid light, for a mask with a positioning tolerance [sensor unit], 0
+        or more.
 
     Returns
     -------
-    MaskPlan
-        Samples that never get valid light have a window of no width: what they would read is no surface's place.
+    MaskOptimisation
+        Samples that receive no valid light in any profile have a closed window: their readings would be spurious.
 
     Raises
     ------
     ValueError
-        A number is not within its limits, or shapes differ.
+        A number is out of its range, or shapes differ.
+
+    Notes
+    -----
+    Window ends lie at edges of bins. A grid search over all pairs of ends is refined from 16 candidates for each end
+    down to single bins. Where the error has several local minima, the search can miss one that lies between two
+    candidates of the first grid.
     """
-    if objective not in ("worst", "rms"):
-        raise ValueError(f"objective is {objective!r}, expected 'worst' or 'rms'")
-    if not 0.0 < keep <= 1.0 or margin < 0.0:
-        raise ValueError(f"expected 0 < keep <= 1 and margin >= 0, got {keep:g} and {margin:g}")
+    if objective not in ("max", "rms"):
+        raise ValueError(f"objective is {objective!r}, expected 'max' or 'rms'")
+    if not 0.0 < min_passed_fraction <= 1.0 or margin < 0.0:
+        raise ValueError(
+            f"expected 0 < min_passed_fraction <= 1 and margin >= 0, got {min_passed_fraction:g} and {margin:g}"
+        )
     direct = exposures.get("direct", dark_exposure(exposures))
-    light = lit_by(exposures)
+    light = total_exposure(exposures)
     if light.power.ndim != 3 or np.shape(truth.h) != light.power.shape[:-1]:
         raise ValueError(f"expected light (profiles, samples, bins) and its truth, got {light.power.shape}")
     true_u, slope = height_slope(view, truth)
     valid = np.isfinite(true_u) & (direct.total() > 0.0)
-    ends = _admissible(view.u_edges, direct, valid, keep, margin)
-    grouped = _Groups.of(view, light, np.where(valid, true_u, np.nan), slope, ends, fixed)
+    ends = _widest_cuts(view.u_edges, direct, valid, min_passed_fraction, margin)
+    groups = _Groups.of(view, light, np.where(valid, true_u, np.nan), slope, ends, fixed)
     shape = (view.samples, 2) if fixed else (*light.power.shape[:-1], 2)
-    mask = Mask(windows=view.u_edges[_best_ends(grouped, objective)].reshape(shape))
+    mask = Mask(windows=view.u_edges[_best_ends(groups, objective)].reshape(shape))
     behind, passed = (mask.apply(each, view.u_edges) for each in (light, direct))
     with np.errstate(invalid="ignore", divide="ignore"):
         before, after = (
             np.where(valid, (each.first_moment(view.u_edges) / each.total() - true_u) * slope, np.nan)
             for each in (light, behind)
         )
-        return MaskPlan(mask, before, after, np.where(valid, passed.total() / direct.total(), np.nan))
+        return MaskOptimisation(mask, before, after, np.where(valid, passed.total() / direct.total(), np.nan))
 
 
-def _best_ends(grouped: _Groups, objective: str) -> npt.NDArray[np.intp]:
-    """Return the edges of bins between which the light of each group reads best, (groups, 2)."""
-    ends = np.empty((len(grouped.low), 2), np.intp)
-    share = max(_PAIRS_AT_ONCE // (grouped.power.shape[1] * _CHOICES**2), 1)
+def _best_ends(groups: _Groups, objective: str) -> npt.NDArray[np.intp]:
+    """Return the best pair of bin edges of each group, (groups, 2)."""
+    ends = np.empty((len(groups.low), 2), np.intp)
+    share = max(_PAIRS_PER_BATCH // (groups.power.shape[1] * _CANDIDATES**2), 1)
     for first in range(0, len(ends), share):
-        ends[first : first + share] = np.stack(grouped.part(first, first + share).best(objective), axis=-1)
+        ends[first : first + share] = np.stack(groups.slice(first, first + share).best(objective), axis=-1)
     return ends
 
 
-def _admissible(
-    edges: Float64, direct: Exposure, valid: npt.NDArray[np.bool_], keep: float, margin: float
+def _widest_cuts(
+    edges: Float64, direct: Exposure, valid: npt.NDArray[np.bool_], min_passed_fraction: float, margin: float
 ) -> tuple[Index, Index]:
-    """Return the highest lower end and the lowest upper end that cut no valid light, (profiles, samples)."""
+    """Return the highest lower end and the lowest upper end that pass enough valid light, (profiles, samples)."""
     below = np.cumsum(direct.power, axis=-1)
-    spare = 0.5 * (1.0 - keep) * below[..., -1:]
+    spare = 0.5 * (1.0 - min_passed_fraction) * below[..., -1:]
     low = np.sum(below <= spare, axis=-1)
-    # From the other end, so that a share of nothing is not lost in the rounding of the sum.
+    # Summed from the upper end: a spare power near 0 would be lost in the rounding of a sum from the lower end.
     high = len(edges) - 1 - np.sum(np.cumsum(direct.power[..., ::-1], axis=-1) <= spare, axis=-1)
     if margin:
         low = np.searchsorted(edges, edges[np.minimum(low, len(edges) - 1)] - margin, side="right") - 1
         high = np.searchsorted(edges, edges[np.maximum(high, 0)] + margin, side="left")
     last = len(edges) - 1
-    # A profile without valid light asks for nothing.
+    # A profile without valid light does not constrain the window.
     return np.where(valid, np.clip(low, 0, last), last), np.where(valid, np.clip(high, 0, last), 0)
 
 
 class _Groups(NamedTuple):
-    """Samples that share a window (group, profile, edge): power and first moment below every edge."""
+    """Samples that share a window: power and first moment below each edge, (groups, profiles, edges)."""
 
     power: Float64
     moment: Float64
@@ -320,7 +349,7 @@ class _Groups(NamedTuple):
         cls, view: SensorView, light: Exposure, true_u: Float64, slope: Float64, ends: tuple[Index, Index], fixed: bool
     ) -> _Groups:
         zero = np.zeros((*light.power.shape[:-1], 1))
-        first = light.moment + light.power * view.u_middles
+        first = light.moment + light.power * view.u_centres
         sums = [np.concatenate([zero, np.cumsum(each, axis=-1)], axis=-1) for each in (light.power, first)]
         arrays = [*sums, true_u, slope, *ends]
         if fixed:
@@ -330,25 +359,25 @@ class _Groups(NamedTuple):
         power, moment, true_u, slope, low, high = arrays
         return cls(power, moment, true_u, slope, low.min(axis=1), high.max(axis=1))
 
-    def part(self, first: int, last: int) -> _Groups:
+    def slice(self, first: int, last: int) -> _Groups:
         some = slice(first, last)
         return _Groups(
             self.power[some], self.moment[some], self.true_u[some], self.slope[some], self.low[some], self.high[some]
         )
 
     def best(self, objective: str) -> tuple[Index, Index]:
-        """Return the best ends of every group's window."""
+        """Return the lower and upper end of the best window of each group, (groups,) indices of edges."""
         last = self.power.shape[-1] - 1
-        none = self.low >= self.high
+        closed = self.low >= self.high
         ranges = [np.zeros_like(self.low), self.low, self.high, np.full_like(self.high, last)]
         while True:
-            low, high = _spread(ranges[0], ranges[1]), _spread(ranges[2], ranges[3])
+            low, high = _candidates(ranges[0], ranges[1]), _candidates(ranges[2], ranges[3])
             cost = self._cost(low, high, objective)
-            # Of equals, the tightest window: the last of the lower ends, the first of the upper ones.
+            # Of equal costs, the narrowest window: the last of the lower ends, the first of the upper ends.
             flat = cost[:, ::-1].reshape(len(cost), -1).argmin(axis=1)
-            at_low, at_high = _CHOICES - 1 - flat // _CHOICES, flat % _CHOICES
+            at_low, at_high = _CANDIDATES - 1 - flat // _CANDIDATES, flat % _CANDIDATES
             chosen = [np.take_along_axis(a, b[:, None], axis=1)[:, 0] for a, b in ((low, at_low), (high, at_high))]
-            steps = [-(-(ranges[1] - ranges[0]) // (_CHOICES - 1)), -(-(ranges[3] - ranges[2]) // (_CHOICES - 1))]
+            steps = [-(-(ranges[1] - ranges[0]) // (_CANDIDATES - 1)), -(-(ranges[3] - ranges[2]) // (_CANDIDATES - 1))]
             if max(int(each.max(initial=0)) for each in steps) <= 1:
                 break
             ranges = [
@@ -358,13 +387,13 @@ class _Groups(NamedTuple):
                 np.minimum(chosen[1] + steps[1] - 1, last),
             ]
             ranges[0], ranges[2] = np.minimum(ranges[0], ranges[1]), np.minimum(ranges[2], ranges[3])
-        return np.where(none, 0, chosen[0]), np.where(none, 0, chosen[1])
+        return np.where(closed, 0, chosen[0]), np.where(closed, 0, chosen[1])
 
     def _cost(self, low: Index, high: Index, objective: str) -> Float64:
-        """Return the objective of all pairs of ends, (groups, choices, choices)."""
+        """Return the objective for all pairs of ends, (groups, candidates, candidates)."""
         below, above = (
             [
-                np.take_along_axis(each, np.broadcast_to(ends[:, None], (*each.shape[:2], _CHOICES)), axis=-1)
+                np.take_along_axis(each, np.broadcast_to(ends[:, None], (*each.shape[:2], _CANDIDATES)), axis=-1)
                 for each in (self.power, self.moment)
             ]
             for ends in (low, high)
@@ -373,11 +402,11 @@ class _Groups(NamedTuple):
             centre = (above[1][:, :, None, :] - below[1][..., None]) / (above[0][:, :, None, :] - below[0][..., None])
             error = np.abs((centre - self.true_u[..., None, None]) * self.slope[..., None, None])
         error = np.where(np.isnan(error), 0.0, error)
-        if objective == "worst":
+        if objective == "max":
             return np.asarray(error.max(axis=1))
         return np.asarray(np.sqrt(np.mean(error**2, axis=1)))
 
 
-def _spread(first: Index, last: Index) -> Index:
-    """Return whole numbers from first to last, both among them, (groups, choices)."""
-    return first[:, None] + ((last - first)[:, None] * np.arange(_CHOICES)) // (_CHOICES - 1)
+def _candidates(first: Index, last: Index) -> Index:
+    """Return integers evenly spaced from first to last, both included, (groups, candidates)."""
+    return first[:, None] + ((last - first)[:, None] * np.arange(_CANDIDATES)) // (_CANDIDATES - 1)

@@ -1,8 +1,8 @@
-"""PSD strips under simulated light: their currents with noise, and what is read.
+"""Simulated PSDs: currents of the strips with noise under simulated light, and the profiles read from them.
 
-Takes the same light as `gpuvision.simulation.sensors.camera_simulator`: `Exposure` by path, (samples, bins) of a
-profile or (profiles, samples, bins) of a block. Noise is drawn anew for every profile from the seed and the profile's
-number, so that a block simulated twice, or in other blocks, is the same.
+The input is the same light as for `gpuvision.simulation.sensors.camera_simulator`: `Exposure` by path, (samples, bins)
+of a profile or (profiles, samples, bins) of a block. The noise of a profile depends on the seed and the number of the
+profile only: a block that is simulated again, or divided into other blocks, has the same noise.
 """
 
 from __future__ import annotations
@@ -16,22 +16,24 @@ import numpy.typing as npt
 
 from gpuvision.host import Device
 from gpuvision.ranging.psd import ELECTRON, PsdNoise, PsdReading, PsdReadout
-from gpuvision.simulation.sensors.masks import Mask, light_behind
+from gpuvision.simulation.sensors.masks import Mask, apply_mask
 from gpuvision.simulation.sensors.readings import (
     AMBIENT,
     Reading,
+    add_ambient,
     check_not_negative,
-    check_samples,
-    lit_by,
+    check_sample_axes,
+    make_reading,
     profile_generators,
-    reading_of,
-    with_ambient,
+    total_exposure,
 )
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 
 Float64 = npt.NDArray[np.float64]
-_HIGHEST_CODE = 65535
-_SAME = 1e-6  # of half a strip
+# Largest code of the converter, uint16.
+_MAX_CODE = 65535
+# Allowed difference between the ends of view and strips, as a fraction of half a strip: rounding of the description.
+_EDGE_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,26 +43,26 @@ class PsdSimulator:
     Parameters
     ----------
     view
-        Its samples are the strips; its first and last edge along u are the strips' electrodes. Light beyond them does
-        not count.
+        View of the sensor. Its samples are the strips; its first and last edge along u are the electrodes of the
+        strips. Light outside the edges is lost.
     readout
-        How the currents are read, with the electronics' dark level, gain, load, linearity and noise, all of which are
-        put into the currents. Without a triangulation it takes the view's. Its layout is "pairs".
+        Readout of the currents, layout "pairs". Dark level, gain, load, linearity and noise of the readout are
+        simulated. Without a triangulation it takes that of the view.
     responsivity
-        Of the strips [A/W].
+        Responsivity of the strips [A/W], 0 or more.
     ambient
-        Other light on every strip, even along it [W].
+        Power of the ambient light on every strip, uniform along u [W], 0 or more.
     modulated
-        The light is modulated and demodulated: ambient light adds its shot noise only.
+        True: the light is modulated and demodulated, so that ambient light adds its shot noise only.
     mask
-        In front of the strips.
-    codes
-        A converter makes uint16 codes of the currents, of `readout.ampere` each.
+        Mask before the strips.
+    quantised
+        True: an analogue-to-digital converter makes uint16 codes of the currents, with a step of `readout.ampere`.
 
     Raises
     ------
-    ValueError
-        A number is out of its range, or the view is not one of the readout's strips.
+    TypeError, ValueError
+        A number is out of its range, or the view does not fit the strips of the readout.
     """
 
     view: SensorView
@@ -69,7 +71,7 @@ class PsdSimulator:
     ambient: float = 0.0
     modulated: bool = False
     mask: Mask | None = None
-    codes: bool = False
+    quantised: bool = False
 
     def __post_init__(self) -> None:
         check_not_negative(self, "responsivity", "ambient")
@@ -77,106 +79,116 @@ class PsdSimulator:
             raise ValueError("PsdSimulator.readout has layout 'planar', expected 'pairs'")
         sheet = self.readout.triangulation or self.view.triangulation
         noise = self.readout.noise or PsdNoise()
-        limits = [self.readout.saturation, _HIGHEST_CODE * self.readout.ampere if self.codes else None]
+        limits = [self.readout.saturation, _MAX_CODE * self.readout.ampere if self.quantised else None]
         saturation = min((each for each in limits if each is not None), default=None)
         readout = replace(self.readout, triangulation=sheet, noise=noise, saturation=saturation, outputs=None)
         object.__setattr__(self, "readout", readout)
         axes, edges = self.readout.axes, self.view.u_edges
         half = 0.5 * abs(axes.position_pitch) * self.readout.strip_length
         ends = np.array([axes.position_origin - half, axes.position_origin + half])
-        if np.any(np.abs(edges[[0, -1]] - ends) > _SAME * half):
+        if np.any(np.abs(edges[[0, -1]] - ends) > _EDGE_TOLERANCE * half):
             raise ValueError(
-                f"PsdSimulator: the view's light ends at u = {edges[0]:g} and {edges[-1]:g}, the readout's strips at "
+                f"PsdSimulator: the view ends at u = {edges[0]:g} and {edges[-1]:g}, the readout's strips at "
                 f"{ends[0]:g} and {ends[1]:g}; expected the same"
             )
-        check_samples(self.view, axes.sample_origin, axes.sample_pitch)
+        check_sample_axes(self.view, axes.sample_origin, axes.sample_pitch)
 
-    def light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
-        """Return the light behind the mask by path, ambient light among it unless it is demodulated away."""
-        light = self._arriving(exposures)
+    def detected_light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
+        """Return the light behind the mask by path, with the ambient light unless demodulation removes it."""
+        light = self._incident(exposures)
         return {name: each for name, each in light.items() if not (self.modulated and name == AMBIENT)}
 
     def currents(
-        self, exposures: Mapping[str, Exposure], *, seed: int | None = None, first: int = 0
+        self, exposures: Mapping[str, Exposure], *, seed: int | None = None, first_profile: int = 0
     ) -> npt.NDArray[Any]:
-        """Return the strips' currents (left, right), (..., strips, 2), in units of `readout.ampere`.
+        """Return the currents (left, right) of the strips, (..., strips, 2), in units of `readout.ampere`.
 
-        In the readout's order of the strips, which runs against the view's where its axes' pitch is negative.
+        The strips are in the order of the readout: opposite to that of the view if the pitch of the axes is negative.
 
         Parameters
         ----------
         exposures
-            Light by path, as it comes from the lens.
+            Light by path behind the lens, before the mask, (..., samples, bins).
         seed
-            Of the noise, of which the rounding to codes is a part. None: the currents that are expected, float64.
-        first
-            Number of the block's first profile.
+            Seed of the noise, 0 or more; the quantisation to codes is part of the noise. None: expected currents,
+            float64.
+        first_profile
+            Number of the first profile of the block.
         """
-        signal = self.signal(lit_by(self.light(exposures)))
+        signal = self.signal(total_exposure(self.detected_light(exposures)))
         if seed is None:
             return self._expected(signal)
-        total, place = self._centre(signal)
-        generators = profile_generators(seed, first, total.shape[:-1])
+        total, centroid = self._total_and_centroid(signal)
+        generators = profile_generators(seed, first_profile, total.shape[:-1])
         draws = np.reshape(
             [each.standard_normal((5, self.view.samples)) for each in generators], (*total.shape[:-1], 5, -1)
         )
-        kinds = self.readout.noise or PsdNoise()
-        arriving = self._in_order(lit_by(self._arriving(exposures)))
-        pair = self._divided(*self._with_shot_noise(arriving, total, place, draws))
-        pair += kinds.independent * draws[..., 2:4, :].swapaxes(-1, -2)
-        pair += kinds.opposed * draws[..., 4, :, None] * (1.0, -1.0)
-        recorded = self._recorded(pair)
-        if not self.codes:
+        model = self.readout.noise or PsdNoise()
+        incident = self._in_order(total_exposure(self._incident(exposures)))
+        pair = self._divide(*self._with_shot_noise(incident, total, centroid, draws))
+        pair += model.independent * draws[..., 2:4, :].swapaxes(-1, -2)
+        pair += model.opposed * draws[..., 4, :, None] * (1.0, -1.0)
+        recorded = self._record(pair)
+        if not self.quantised:
             return recorded
-        return np.clip(np.rint(recorded), 0, _HIGHEST_CODE).astype(np.uint16)
+        return np.clip(np.rint(recorded), 0, _MAX_CODE).astype(np.uint16)
 
     def read(
         self,
         exposures: Mapping[str, Exposure],
         *,
         seed: int | None = None,
-        first: int = 0,
+        first_profile: int = 0,
         device: Device | None = None,
     ) -> Reading:
-        """Read a block of profiles: `currents`, then the readout on a device.
+        """Simulate the currents of a block of profiles and read them on a device.
 
-        Without a seed the reading is the one of the currents without noise; its sigma says what noise would do. A
-        strip without any light is LOW_SIGNAL. Samples are in the view's order.
+        Parameters
+        ----------
+        exposures, seed, first_profile
+            As for `currents`. Without a seed, the reading is that of the noiseless currents; sigma is the same.
+        device
+            Device of the readout; None: `Device.best`.
+
+        Returns
+        -------
+        Reading
+            (..., samples), in the order of the view. A strip without light has the status LOW_SIGNAL.
         """
-        said = self._said(self.currents(exposures, seed=seed, first=first), device)
+        reading = self._read(self.currents(exposures, seed=seed, first_profile=first_profile), device)
         axes = self.readout.axes
-        u = axes.position_origin + axes.position_pitch * np.asarray(said.position, np.float64)
-        sigma = abs(axes.position_pitch) * np.asarray(said.sigma, np.float64)
-        return reading_of(self.view, said, u, sigma, backward=axes.sample_pitch < 0.0)
+        u = axes.position_origin + axes.position_pitch * np.asarray(reading.position, np.float64)
+        sigma = abs(axes.position_pitch) * np.asarray(reading.sigma, np.float64)
+        return make_reading(self.view, reading, u, sigma, backward=axes.sample_pitch < 0.0)
 
     def signal(self, light: Exposure) -> Float64:
-        """Return what light behind the mask adds to the strips' currents: their sum, and it times u, (..., strips, 2).
+        """Return the total current and the current times u that light behind the mask adds, (..., strips, 2).
 
-        In the readout's order of the strips.
+        The strips are in the order of the readout. Units: A, and A times sensor unit.
         """
         light = self._in_order(light)
         return self.responsivity * np.stack([light.total(), light.first_moment(self.view.u_edges)], axis=-1)
 
     def heights(self, signal: Float64, device: Device | None = None) -> Float64:
-        """Read a signal without noise: heights [m], (..., samples), in the view's order."""
+        """Read a signal without noise: heights [m], (..., samples), in the order of the view."""
         step = -1 if self.readout.axes.sample_pitch < 0.0 else 1
-        return np.asarray(self._said(self._expected(signal), device).h, np.float64)[..., ::step]
+        return np.asarray(self._read(self._expected(signal), device).h, np.float64)[..., ::step]
 
-    def _said(self, currents: npt.NDArray[Any], device: Device | None) -> PsdReading:
+    def _read(self, currents: npt.NDArray[Any], device: Device | None) -> PsdReading:
         device = Device.best() if device is None else device
         if currents.dtype == np.float64 and not device.has_double:
             currents = currents.astype(np.float32)
         return self.readout(currents, device=device)
 
     def _expected(self, signal: Float64) -> Float64:
-        return self._recorded(self._divided(*self._centre(signal)))
+        return self._record(self._divide(*self._total_and_centroid(signal)))
 
-    def _centre(self, signal: Float64) -> tuple[Float64, Float64]:
+    def _total_and_centroid(self, signal: Float64) -> tuple[Float64, Float64]:
         total = signal[..., 0]
         return total, np.divide(signal[..., 1], total, out=np.zeros_like(total), where=total > 0.0)
 
-    def _arriving(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
-        return light_behind(self.mask, self.view, with_ambient(self.view, exposures, self.ambient))
+    def _incident(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
+        return apply_mask(self.mask, self.view, add_ambient(self.view, exposures, self.ambient))
 
     def _in_order(self, light: Exposure) -> Exposure:
         step = -1 if self.readout.axes.sample_pitch < 0.0 else 1
@@ -185,37 +197,39 @@ class PsdSimulator:
     # ---- from light to currents ----------------------------------------------------------------------------
 
     def _with_shot_noise(
-        self, light: Exposure, total: Float64, place: Float64, noise: Float64
+        self, light: Exposure, total: Float64, centroid: Float64, noise: Float64
     ) -> tuple[Float64, Float64]:
-        """Every electron divides at its own place: their number, and the mean of their places, have noise.
+        """Return total and centroid of the photocurrent with shot noise.
 
-        Ambient electrons add theirs, even where the mean of ambient light is demodulated away.
+        The number of electrons and the mean of their positions both fluctuate. Ambient light adds to both variances
+        even where demodulation removes its mean.
         """
         bandwidth = (self.readout.noise or PsdNoise()).bandwidth
-        about = _second_moment(light, self.view.u_edges, place)
+        about = _second_moment(light, self.view.u_edges, centroid)
         variance = 2.0 * ELECTRON * bandwidth * self.responsivity * light.total()
         spread = np.sqrt(2.0 * ELECTRON * bandwidth * self.responsivity * about)
         noisy = total + np.sqrt(variance) * noise[..., 0, :]
         with np.errstate(invalid="ignore", divide="ignore"):
             shift = np.where(total > 0.0, spread * noise[..., 1, :] / total, 0.0)
-        return noisy, place + shift
+        return noisy, centroid + shift
 
-    def _divided(self, total: Float64, u: Float64) -> Float64:
-        """Return what arrives at the electrodes, (..., 2) [A], without dark level and gain."""
+    def _divide(self, total: Float64, u: Float64) -> Float64:
+        """Return the currents at the electrodes, (..., 2) [A], without dark level and gain."""
         readout = self.readout
         position = (u - readout.axes.position_origin) / readout.axes.position_pitch
         half = 0.5 * readout.strip_length
         if readout.linearity is not None:
             knots = np.linspace(-half, half, len(readout.linearity[0]))
             for strip, corrections in enumerate(readout.linearity):
-                # What is read at a knot is the knot; the light is where the correction takes it.
+                # The readout maps a knot to knot + correction; light at knot + correction is thus read at the knot.
                 position[..., strip] = np.interp(position[..., strip], knots + np.array(corrections), knots)
         balance = position / half
         if readout.interelectrode_resistance:
             balance /= 1.0 + 2.0 * readout.load_resistance / readout.interelectrode_resistance
         return 0.5 * total[..., None] * np.stack([1.0 - balance, 1.0 + balance], axis=-1)
 
-    def _recorded(self, pair: Float64) -> Float64:
+    def _record(self, pair: Float64) -> Float64:
+        """Return currents with gain, dark level and saturation, in units of `readout.ampere`."""
         readout = self.readout
         raw: Float64 = pair * (1.0, readout.right_gain) + readout.dark
         if readout.saturation is not None:
@@ -223,11 +237,14 @@ class PsdSimulator:
         return raw / readout.ampere
 
 
-def _second_moment(light: Exposure, edges: Float64, place: Float64) -> Float64:
-    """Return the sum of power times squared distance from a place; light is even about its centre in every bin."""
+def _second_moment(light: Exposure, edges: Float64, position: Float64) -> Float64:
+    """Return the sum of power times squared distance from a position, (..., samples).
+
+    The light of a bin is assumed uniform over the widest interval of the bin that is centred on its centroid.
+    """
     middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = np.where(light.power > 0.0, light.moment / light.power, 0.0)
     reach = half - np.minimum(np.abs(centre), half)
-    square = (middle + centre - place[..., None]) ** 2 + reach**2 / 3.0
+    square = (middle + centre - position[..., None]) ** 2 + reach**2 / 3.0
     return np.asarray(np.sum(light.power * square, axis=-1))

@@ -20,14 +20,14 @@ PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse", "bounces")
 """Ways of the light from the sheet to the lens; together they are what the sensor gets."""
 AMBIENT = "ambient"
 """Light that is not the sheet's; it arrives beside the paths."""
-EVEN, OPEN, EVEN_OPEN = "direct, even", "direct, open", "direct, even, open"
+UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED = "direct, uniform", "direct, unoccluded", "direct, uniform, unoccluded"
 """The direct light if all surfaces reflected evenly, if nothing hid them from the lens, and both; never part of what
 the sensor gets."""
 _SAME = 1e-6  # of a sample's pitch
-_LIT, _KNOWN = (*PATHS, AMBIENT), (*PATHS, AMBIENT, EVEN, OPEN, EVEN_OPEN)
+_LIT, _KNOWN = (*PATHS, AMBIENT), (*PATHS, AMBIENT, UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED)
 
 
-class Truth(NamedTuple):
+class GroundTruth(NamedTuple):
     """Where the sheet's light truly is, each array (..., samples).
 
     Attributes
@@ -79,7 +79,7 @@ class Simulator(Protocol):
         """What it sees."""
         ...
 
-    def light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
+    def detected_light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
         """Return the light by path that moves a reading: behind the mask, ambient light among it."""
         ...
 
@@ -96,14 +96,14 @@ class Simulator(Protocol):
         exposures: Mapping[str, Exposure],
         *,
         seed: int | None = None,
-        first: int = 0,
+        first_profile: int = 0,
         device: Device | None = None,
     ) -> Reading:
         """Read a block of profiles."""
         ...
 
 
-def stack(profiles: Sequence[Mapping[str, Exposure]]) -> dict[str, Exposure]:
+def stack_profiles(profiles: Sequence[Mapping[str, Exposure]]) -> dict[str, Exposure]:
     """Join the light of profiles, each (samples, bins) by path, to blocks (profiles, samples, bins).
 
     A path that a profile lacks is dark there.
@@ -138,7 +138,7 @@ def dark_exposure(exposures: Mapping[str, Exposure]) -> Exposure:
     return Exposure(np.zeros_like(like.power), np.zeros_like(like.power))
 
 
-def lit_by(exposures: Mapping[str, Exposure]) -> Exposure:
+def total_exposure(exposures: Mapping[str, Exposure]) -> Exposure:
     """Return the light of all paths and what is ambient together.
 
     Raises
@@ -162,7 +162,7 @@ def _sum(parts: Sequence[Float64]) -> Float64:
     return total
 
 
-def with_ambient(view: SensorView, exposures: Mapping[str, Exposure], power: float) -> dict[str, Exposure]:
+def add_ambient(view: SensorView, exposures: Mapping[str, Exposure], power: float) -> dict[str, Exposure]:
     """Return the light and, beside its paths, ambient light that is even along every sample: a power a sample [W].
 
     Raises
@@ -185,9 +185,9 @@ def with_ambient(view: SensorView, exposures: Mapping[str, Exposure], power: flo
     return light
 
 
-def profile_generators(seed: int, first: int, profiles: tuple[int, ...]) -> list[np.random.Generator]:
+def profile_generators(seed: int, first_profile: int, profiles: tuple[int, ...]) -> list[np.random.Generator]:
     """Return random numbers for profiles `first`, `first` + 1, ...: each profile's depend on its number alone."""
-    return [np.random.default_rng([seed, first + each]) for each in range(math.prod(profiles))]
+    return [np.random.default_rng([seed, first_profile + each]) for each in range(math.prod(profiles))]
 
 
 def check_not_negative(simulator: Any, *names: str) -> None:
@@ -203,7 +203,7 @@ def check_not_negative(simulator: Any, *names: str) -> None:
             raise ValueError(f"{type(simulator).__name__}.{name} is {getattr(simulator, name)}, expected 0 or more")
 
 
-def check_samples(view: SensorView, origin: float, pitch: float) -> None:
+def check_sample_axes(view: SensorView, origin: float, pitch: float) -> None:
     """Check that a readout's axes place the samples where the view has them.
 
     Raises
@@ -212,14 +212,14 @@ def check_samples(view: SensorView, origin: float, pitch: float) -> None:
         They do not.
     """
     expected = np.sort(origin + pitch * np.arange(view.samples))
-    if np.any(np.abs(view.v_middles - expected) > _SAME * abs(pitch)):
+    if np.any(np.abs(view.v_centres - expected) > _SAME * abs(pitch)):
         raise ValueError(
-            f"the view's samples lie about v = {view.v_middles[0]:g} ... {view.v_middles[-1]:g}, the readout's axes "
+            f"the view's samples lie about v = {view.v_centres[0]:g} ... {view.v_centres[-1]:g}, the readout's axes "
             f"place them at {expected[0]:g} ... {expected[-1]:g}; expected the same"
         )
 
 
-def reading_of(view: SensorView, said: Any, u: Float64, sigma_u: Float64, *, backward: bool) -> Reading:
+def make_reading(view: SensorView, said: Any, u: Float64, sigma_u: Float64, *, backward: bool) -> Reading:
     """Return what a readout says as a simulator's reading.
 
     Parameters
@@ -237,7 +237,7 @@ def reading_of(view: SensorView, said: Any, u: Float64, sigma_u: Float64, *, bac
     width = getattr(said, "width", np.full(u.shape, np.nan))
     numbers = (u, said.g, said.h, sigma_u, said.total, width)
     u, g, h, sigma_u, strength, width = (np.asarray(each, np.float64)[..., ::step] for each in numbers)
-    slope = height_secant(view.triangulation, u, u, view.v_middles)
+    slope = height_secant(view.triangulation, u, u, view.v_centres)
     return Reading(u, g, h, np.abs(slope) * sigma_u, strength, width, np.asarray(said.status)[..., ::step])
 
 
@@ -276,7 +276,7 @@ def height_secant(triangulation: Triangulation, u: npt.ArrayLike, other_u: npt.A
         return np.asarray(turned @ np.cross(matrix[1], matrix[2]) / scale)
 
 
-def height_slope(view: SensorView, truth: Truth) -> tuple[Float64, Float64]:
+def height_slope(view: SensorView, truth: GroundTruth) -> tuple[Float64, Float64]:
     """Return where true points are imaged, u, and how their height grows with it, dH/du: each (..., samples)."""
     sensor = view.triangulation.to_sensor(np.stack([truth.g, truth.h], axis=-1))
     u, v = sensor[..., 0], sensor[..., 1]

@@ -119,12 +119,12 @@ class SensorView:
         return len(self.u_edges) - 1
 
     @property
-    def u_middles(self) -> Float64:
+    def u_centres(self) -> Float64:
         """Middles of the bins, (bins,)."""
         return 0.5 * (self.u_edges[1:] + self.u_edges[:-1])
 
     @property
-    def v_middles(self) -> Float64:
+    def v_centres(self) -> Float64:
         """Middles of the samples, (samples,)."""
         return 0.5 * (self.v_edges[1:] + self.v_edges[:-1])
 
@@ -192,7 +192,7 @@ class SensorView:
             value = self._opening * np.maximum(cosine, 0.0) * area / distance**3
         return np.where(np.isfinite(value), value, 0.0)
 
-    def received(self, points: npt.ArrayLike, L: float = 0.0) -> Float64:
+    def aperture_solid_angle(self, points: npt.ArrayLike, L: float = 0.0) -> Float64:
         """Return power on the sensor over intensity (W/sr) of points seen, (..., 3) to (...,): the lens' solid angle.
 
         Zero behind the lens.
@@ -217,7 +217,7 @@ class SensorView:
         """Return an exposure without light."""
         return Exposure(np.zeros((self.samples, self.bins)), np.zeros((self.samples, self.bins)))
 
-    def deposit(self, u: npt.ArrayLike, v: npt.ArrayLike, power: npt.ArrayLike) -> Exposure:
+    def deposit_spots(self, u: npt.ArrayLike, v: npt.ArrayLike, power: npt.ArrayLike) -> Exposure:
         """Return the exposure by spots of light at (u, v) of some power [W]; what falls off the sensor is lost."""
         u, v, power = (np.ravel(each) for each in np.broadcast_arrays(u, v, power))
         sample, place = self.sample_of(v), self.bin_of(u)
@@ -225,11 +225,11 @@ class SensorView:
         at, size = sample[on] * self.bins + place[on], self.samples * self.bins
         weights = np.asarray(power, np.float64)[on]
         total = np.bincount(at, weights, minlength=size)
-        moment = np.bincount(at, weights * (u[on] - self.u_middles[place[on]]), minlength=size)
+        moment = np.bincount(at, weights * (u[on] - self.u_centres[place[on]]), minlength=size)
         shape = (self.samples, self.bins)
         return Exposure(np.asarray(total.reshape(shape), np.float64), np.asarray(moment.reshape(shape), np.float64))
 
-    def blurred(self, exposure: Exposure, sigma: float) -> Exposure:
+    def blur(self, exposure: Exposure, sigma: float) -> Exposure:
         """Return the exposure behind a lens that images a point as a Gaussian along u, sigma in sensor units.
 
         The light of a bin is taken as a spot at its centre of gravity. What comes to lie beyond the sensor's ends, and
@@ -239,7 +239,7 @@ class SensorView:
             return exposure
         sample, place = np.nonzero(exposure.power)
         light = exposure.power[sample, place]
-        at = self.u_middles[place] + exposure.moment[sample, place] / light
+        at = self.u_centres[place] + exposure.moment[sample, place] / light
         first = np.maximum(np.searchsorted(self.u_edges, at - _SPOT * sigma) - 1, 0)
         last = np.minimum(np.searchsorted(self.u_edges, at + _SPOT * sigma), self.bins)
         widest = int(np.max(last - first, initial=0))
@@ -249,7 +249,7 @@ class SensorView:
         power = light[:, None] * np.diff(below, axis=1)
         bins = np.minimum(bins[:, :-1], self.bins - 1)
         first_moment = -sigma * light[:, None] * np.diff(bell, axis=1)
-        moment = first_moment + (at[:, None] - self.u_middles[bins]) * power
+        moment = first_moment + (at[:, None] - self.u_centres[bins]) * power
         slot = (sample[:, None] * self.bins + bins).ravel()
         shape, size = (self.samples, self.bins), self.samples * self.bins
         whole = (np.bincount(slot, each.ravel(), minlength=size).reshape(shape) for each in (power, moment))

@@ -19,7 +19,7 @@ from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 Float64 = npt.NDArray[np.float64]
 
 
-class SeenSurface(NamedTuple):
+class VisibleSurface(NamedTuple):
     """Surface elements that a sensor sees; n = bins times nodes of a bin, those of a bin side by side.
 
     Attributes
@@ -96,7 +96,7 @@ class ViewRays:
         cast = ClosestHit(scene=self.scene, precision="single")
         object.__setattr__(self, "_closest", cast.bind(device, (view.samples, n, 6), real))
 
-    def surface(self, L: float) -> SeenSurface:
+    def visible_surface(self, L: float) -> VisibleSurface:
         """Return what is seen at a transport L [m]."""
         rays = self._rays + np.concatenate([L * np.array(self.view.transport.direction), np.zeros(3)])
         self._closest.inputs[0].set(rays.astype(self._closest.inputs[0].dtype))
@@ -112,13 +112,13 @@ class ViewRays:
         places = origin + np.where(seen, way, 0.0)[..., None] * towards
         receivers = np.concatenate([places, np.where(slope[..., None] > 0.0, -normal, normal)], axis=-1)
         receivers = np.where((seen & (self._weights > 0.0))[..., None], receivers, 0.0)
-        return SeenSurface(receivers, np.where(seen, self._weights * albedo, 0.0), triangle)
+        return VisibleSurface(receivers, np.where(seen, self._weights * albedo, 0.0), triangle)
 
-    def exposure(self, seen: SeenSurface, irradiance: Float64) -> Exposure:
+    def exposure(self, seen: VisibleSurface, irradiance: Float64) -> Exposure:
         """Return what the sensor gets from the irradiance [W/m^2] of what it sees, (samples, n)."""
         power = np.where(seen.weights > 0.0, seen.weights * irradiance, 0.0)
         shape = (self.view.samples, self.view.bins, -1)
-        beside = self.u.reshape(self.view.bins, -1) - self.view.u_middles[:, None]
+        beside = self.u.reshape(self.view.bins, -1) - self.view.u_centres[:, None]
         held = power.reshape(shape)
         return Exposure(held.sum(axis=-1), np.sum(held * beside, axis=-1))
 

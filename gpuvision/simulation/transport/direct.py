@@ -15,7 +15,7 @@ from gpuvision.host import Device
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Brdf, Ggx, Lambert, Phong, Ward
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.readings import EVEN, EVEN_OPEN, OPEN, Truth
+from gpuvision.simulation.sensors.readings import UNIFORM, UNIFORM_UNOCCLUDED, UNOCCLUDED, GroundTruth
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.sensors.view_rays import check_materials
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
@@ -111,7 +111,7 @@ class _Image(NamedTuple):
         ends = middle[of] + (np.stack([view.u_edges[place], view.u_edges[place + 1]]) - u[of]) / spread[of]
         ends = np.clip(np.sort(ends, axis=0), low[of], high[of])
         share = _between(*ends)
-        moment = (u - spread * middle)[of] - view.u_middles[place]
+        moment = (u - spread * middle)[of] - view.u_centres[place]
         moment = moment * share + spread[of] * (_bell(ends[0]) - _bell(ends[1]))
         row = self.profile[slab] * view.samples + sample
         at, per = row[of] * view.bins + place, 1.0 / slabs.share[slab[of]]
@@ -188,7 +188,7 @@ class DirectLight:
 
         Direct light comes off the surfaces' diffuse parts, specular light off their lobes, and off mirrors right into
         the lens. With ``causes``, also what the direct light would be if all surfaces were white ones of Lambert
-        (`EVEN`), if nothing were in the way to the lens (`OPEN`), and both (`EVEN_OPEN`).
+        (`UNIFORM`), if nothing were in the way to the lens (`UNOCCLUDED`), and both (`UNIFORM_UNOCCLUDED`).
         """
         found = self.exposures_along([L], causes=causes)
         return {name: Exposure(each.power[0], each.moment[0]) for name, each in found.items()}
@@ -229,7 +229,7 @@ class DirectLight:
         sent = sent_by(line, segment, points, np.tile(0.5 * arriving, 2))
         wanted = {"direct": sent["diffuse"] * seen, "specular": sent["gloss"] * seen}
         if causes:
-            wanted |= {EVEN: sent["even"] * seen, OPEN: sent["diffuse"], EVEN_OPEN: sent["even"]}
+            wanted |= {UNIFORM: sent["even"] * seen, UNOCCLUDED: sent["diffuse"], UNIFORM_UNOCCLUDED: sent["even"]}
         uv = images.at(segment, share)
         spread = np.zeros(len(share))
         if self.sheet.sigma > 0.0:
@@ -263,7 +263,7 @@ class DirectLight:
         steps = steps[np.diff(steps, prepend=-np.inf) > _APART]
         return Slabs.between(np.sort(np.append(cuts[far], steps)))
 
-    def truth(self, L: float) -> Truth:
+    def truth(self, L: float) -> GroundTruth:
         """Return where the middle of the sheet truly is at a transport L [m], at the middle of each sample.
 
         What is lit and visible there and imaged on the sensor. Status: LOW_SIGNAL, there is none; OUT_OF_RANGE, it is
@@ -271,9 +271,9 @@ class DirectLight:
         is given.
         """
         found = self.truths_along([L])
-        return Truth(found.g[0], found.h[0], found.status[0])
+        return GroundTruth(found.g[0], found.h[0], found.status[0])
 
-    def truths_along(self, transports: npt.ArrayLike) -> Truth:
+    def truths_along(self, transports: npt.ArrayLike) -> GroundTruth:
         """Return `truth` of several profiles, (profiles, samples): faster than one by one."""
         view, places = self.view, np.atleast_1d(np.asarray(transports, np.float64))
         lit = self._lit(places, places)
@@ -282,18 +282,18 @@ class DirectLight:
         v = images.at(parts.segment, np.stack([parts.start, parts.end]))[..., 1]
         low, high = v.min(axis=0), v.max(axis=0)
         # Half open, so that of two parts that touch one has the sample.
-        first = np.searchsorted(view.v_middles, low, side="left")
-        count = np.maximum(np.searchsorted(view.v_middles, high, side="left") - first, 0)
+        first = np.searchsorted(view.v_centres, low, side="left")
+        count = np.maximum(np.searchsorted(view.v_centres, high, side="left") - first, 0)
         owner, sample = np.repeat(np.arange(len(count)), count), ranges(first, count)
         mine = parts.those(owner)
-        share = images.where(mine, view.v_middles[sample], 1)
+        share = images.where(mine, view.v_centres[sample], 1)
         points = along(line.ends[mine.segment], share)
         u = images.at(mine.segment, share)[:, 0]
         on = (u >= view.u_edges[0]) & (u <= view.u_edges[-1])
         light = (line.power * line.lengths)[mine.segment] * (mine.end - mine.start) / (high - low)[owner]
         slot = lit.sheet[mine.segment] * view.samples + sample
         found = _chosen(len(places) * view.samples, slot, view.sheet_coordinates(points), on, light)
-        return Truth(*(each.reshape(len(places), view.samples) for each in found))
+        return GroundTruth(*(each.reshape(len(places), view.samples) for each in found))
 
     def _lit(self, sheets: Float64, transports: Float64) -> _Lit:
         """Return what sheets light on the side that the lens can see, each in a profile at a transport."""
@@ -341,7 +341,7 @@ class DirectLight:
         """Return power on the sensor [W] of light that arrives at points [W], by kind of reflection."""
         normal = line.normals[segment]
         eye = _unit(np.array(self.view.lens) - points)
-        arriving = arriving * np.maximum(np.sum(normal * eye, axis=1), 0.0) * self.view.received(points)
+        arriving = arriving * np.maximum(np.sum(normal * eye, axis=1), 0.0) * self.view.aperture_solid_angle(points)
         sent = {"even": arriving / math.pi, "diffuse": np.zeros(len(points)), "gloss": np.zeros(len(points))}
         material = self._material(line)[segment]
         for number in np.unique(material):
@@ -379,7 +379,7 @@ def _slabs(given: int | Sequence[float]) -> Slabs:
     return Slabs.between(cuts)
 
 
-def _chosen(samples: int, sample: Integers, places: Float64, on: npt.NDArray[np.bool_], light: Float64) -> Truth:
+def _chosen(samples: int, sample: Integers, places: Float64, on: npt.NDArray[np.bool_], light: Float64) -> GroundTruth:
     """Return of the places (G, H) of each sample the one on the sensor with the most light."""
     order = np.lexsort((-light, ~on, sample))
     sample, places, on = sample[order], places[order], on[order]
@@ -392,7 +392,7 @@ def _chosen(samples: int, sample: Integers, places: Float64, on: npt.NDArray[np.
     status[sample[other]] |= np.uint8(Status.AMBIGUOUS)
     given = best[on[best]]
     g[sample[given]], h[sample[given]] = places[given].T
-    return Truth(g, h, status)
+    return GroundTruth(g, h, status)
 
 
 def _width(lobe: Brdf) -> float:

@@ -92,7 +92,7 @@ class LineOfSight:
 
     def __post_init__(self) -> None:
         real = np.dtype(np.float64 if self.device.has_double else np.float32)
-        fans = VisibleIntervals(scene=self.scene, kept=_KEPT)
+        fans = VisibleIntervals(scene=self.scene, max_intervals=_KEPT)
         object.__setattr__(self, "_bound", fans.bind(self.device, (_FANS, 11), real))
 
     def parts(self, line: LitLine, lens: Float64, *, hidden: bool = False) -> Parts:

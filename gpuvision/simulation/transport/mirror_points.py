@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.bvh import Bvh
-from gpuvision.simulation.scene.closed_surfaces import places_of
+from gpuvision.simulation.scene.closed_surfaces import vertex_numbers
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.sheet_cut import ranges
 
@@ -46,7 +46,7 @@ def smooth_normals(scene: Scene, crease: float = _CREASE) -> Float64:
     bad = ~(np.isfinite(weighted).all(axis=(1, 2)) & np.isfinite(flat).all(axis=1))
     weighted[bad], flat[bad] = 0.0, 0.0
     # All pairs of corners in one place.
-    place = places_of(np.where(np.isfinite(corners), corners, 0.0)).ravel()
+    place = vertex_numbers(np.where(np.isfinite(corners), corners, 0.0)).ravel()
     order, counts = np.argsort(place, kind="stable"), np.bincount(place)
     partners = counts[place]
     own = np.repeat(np.arange(len(place)), partners)
@@ -118,19 +118,19 @@ class Blocks(NamedTuple):
         cls,
         corners: Float64,
         normals: Float64,
-        sorted_by: Float64 | None = None,
+        radix_argsort: Float64 | None = None,
         outside: npt.NDArray[np.bool_] | None = None,
     ) -> Blocks:
         """Return the blocks of triangles and the normals at their corners, each (m, 3, 3).
 
-        They are sorted as if they stood where ``sorted_by`` says, (m, 3, 3); None: where they do.
+        They are sorted as if they stood where ``radix_argsort`` says, (m, 3, 3); None: where they do.
         """
         if not len(corners):
             none = np.zeros(0)
             return cls(
                 none.astype(int), np.zeros(1, int), none.reshape(0, 3), none, none.reshape(0, 3), none, none > 0.0
             )
-        members = Bvh.build(corners if sorted_by is None else sorted_by).members
+        members = Bvh.build(corners if radix_argsort is None else radix_argsort).members
         order, count = members[members >= 0], (members >= 0).sum(axis=1)
         start = np.append(0, np.cumsum(count))
         each = np.repeat(np.arange(len(count)), count)

@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.simulation.scene.closed_surfaces import outward
+from gpuvision.simulation.scene.closed_surfaces import visible_sides
 from gpuvision.simulation.scene.material import Material
-from gpuvision.simulation.scene.padded import run_padded
 from gpuvision.simulation.scene.rays import AnyHit
+from gpuvision.simulation.scene.row_padding import run_with_row_padding
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.scene.visible_intervals import VisibleIntervals
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
@@ -167,7 +167,7 @@ class Mirrors:
             towards = lens - place
             cosine = np.sum(towards * normals[line], axis=1) / np.linalg.norm(towards, axis=1)
             intensity = exitance[line] / math.pi * np.maximum(cosine, 0.0) * length[line]
-            return np.asarray(intensity * self.view.received(place, L))
+            return np.asarray(intensity * self.view.aperture_solid_angle(place, L))
 
         return line_exposure(self.view, L, ends, strength)
 
@@ -266,7 +266,7 @@ class Mirrors:
         intensity = exitance[source] / math.pi * cosine * np.linalg.norm(move[point], axis=1)
         # Aperture and cosine at the lens are those of the spot; the solid angle is the mirror's doing.
         square = np.sum((spot - lens) ** 2, axis=1) * density
-        power = intensity * self._share_of(triangle) * self.view.received(spot, L) * square
+        power = intensity * self._share_of(triangle) * self.view.aperture_solid_angle(spot, L) * square
         ends = np.stack([spot - 0.5 * spot_move, spot + 0.5 * spot_move], axis=1)
         return line_exposure(self.view, L, ends, lambda line, at: power[line])
 
@@ -368,7 +368,7 @@ class Mirrors:
 
     @functools.cached_property
     def _sides(self) -> npt.NDArray[np.int8]:
-        return outward(self.scene, self.view.lens, self.view.transport.direction)
+        return visible_sides(self.scene, self.view.lens, self.view.transport.direction)
 
     @functools.cached_property
     def _is_curved(self) -> npt.NDArray[np.bool_]:
@@ -445,7 +445,7 @@ class Mirrors:
         return {}
 
     def _run(self, operation: Any, rows: Float64, *more: Float64) -> Any:
-        return run_padded(operation, self._device, rows, *more)
+        return run_with_row_padding(operation, self._device, rows, *more)
 
 
 def _between(ends: Float64, share: Float64) -> Float64:

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.simulation.scene.padded import run_padded
 from gpuvision.simulation.scene.rays import ClosestHit
+from gpuvision.simulation.scene.row_padding import run_with_row_padding
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.envelope import upper_envelope
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
@@ -222,7 +222,7 @@ class SpecularInterreflection:
         towards = coming - 2.0 * slope * normal
         start = place + (2.0 * bulge / np.maximum(np.abs(slope[..., 0]), 1e-9) + self.clearance)[..., None] * towards
         rays = np.concatenate([start, towards], axis=-1).reshape(-1, 6)
-        hits = run_padded(ClosestHit(scene=self.scene, clearance=self.clearance), self.device, rays)
+        hits = run_with_row_padding(ClosestHit(scene=self.scene, clearance=self.clearance), self.device, rays)
         met = hits.triangle >= 0
         spots = rays[:, :3] + np.where(met, hits.distance, 0.0)[:, None] * rays[:, 3:]
         return spots.reshape(-1, 2, 3), towards, hits.triangle.reshape(-1, 2).astype(np.int64)

@@ -11,7 +11,7 @@ import pytest
 from gpuvision.host import Device
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance, facing_pairs
-from gpuvision.simulation.errors.range_error import StripReading
+from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance
@@ -59,7 +59,7 @@ def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
     u = np.linspace(-0.03, 0.03, 50)
     weights = np.stack([power, power * u], axis=2)
     direct = np.full(6, 0.01)
-    reading = StripReading(power=direct, moment=0.005 * direct, slope=np.ones(6), limits=(-0.03, 0.03))
+    reading = StripErrorModel(power=direct, moment=0.005 * direct, slope=np.ones(6), limits=(-0.03, 0.03))
     light = ClusteredIrradiance(scene=scene, tolerance=tolerance, least=None, device=device)
     ours = light(segments, receivers, weights, reading)
     exact = OccludedIrradiance(scene=scene, segments=len(segments), precision="single")(
@@ -77,7 +77,7 @@ def test_what_is_not_modelled_is_dark(device: Device) -> None:
     triangles, segments = boxes(np.random.default_rng(0), 3)
     receivers = strips(triangles, 2, 16)
     weights = np.full((2, 16, 2), 1e-9)
-    reading = StripReading(power=np.ones(2), moment=np.zeros(2), slope=np.ones(2), limits=(-0.03, 0.03))
+    reading = StripErrorModel(power=np.ones(2), moment=np.zeros(2), slope=np.ones(2), limits=(-0.03, 0.03))
     light = ClusteredIrradiance(scene=Scene(triangles), tolerance=1e-3, least=None, device=device)
     result = light(segments, receivers, weights, reading)
     assert not result.plan.modelled
@@ -100,7 +100,7 @@ def groove(strips: int, each: int, segments: int) -> Any:
     receivers = np.stack([X, Y, np.abs(X), -np.sign(X), 0.0 * X, 1.0 + 0.0 * X], axis=2)
     power = np.full((strips, each), 0.012 / (strips * each))
     direct = np.full(strips, 0.002 / strips)
-    reading = StripReading(power=direct, moment=0.0 * direct, slope=np.ones(strips), limits=(-0.03, 0.03))
+    reading = StripErrorModel(power=direct, moment=0.0 * direct, slope=np.ones(strips), limits=(-0.03, 0.03))
     triangles = np.array([[a, b, e], [a, e, d], [b, c, f], [b, f, e]])
     return Scene(triangles), rows, receivers, np.stack([power, power * Y], axis=2), reading
 
@@ -185,18 +185,18 @@ def test_a_sensor_says_how_its_readings_follow_light() -> None:
     one = sensor_view()
     assert isinstance(one.transport, StraightTransport)
     exposure = Exposure(np.ones((one.samples, one.bins)), np.zeros((one.samples, one.bins)))
-    reading = StripReading.of(one, exposure, floor=1e-3)
-    u, v = np.meshgrid(one.u_edges, one.v_middles)
+    reading = StripErrorModel.from_exposure(one, exposure, min_power=1e-3)
+    u, v = np.meshgrid(one.u_edges, one.v_centres)
     height = one.sheet_coordinates(one.points_in_sheet(u, v))[..., 1]
     steps = np.abs(np.diff(height, axis=1)) / np.diff(one.u_edges)
     np.testing.assert_allclose(reading.slope, steps.max(axis=1))
     np.testing.assert_allclose(reading.power, one.bins)
-    np.testing.assert_allclose(reading.position, one.u_middles.mean(), atol=1e-12)
+    np.testing.assert_allclose(reading.position, one.u_centres.mean(), atol=1e-12)
     seen = np.ones((one.samples, one.bins))
-    weights = reading.weights(seen, one.u_middles)
-    np.testing.assert_allclose(weights[..., 1], np.broadcast_to(one.u_middles, seen.shape))
-    costs = reading.costs(weights)
+    weights = reading.weights(seen, one.u_centres)
+    np.testing.assert_allclose(weights[..., 1], np.broadcast_to(one.u_centres, seen.shape))
+    costs = reading.error_per_irradiance(weights)
     middle = 0.5 * (one.u_edges[0] + one.u_edges[-1])
     span = one.u_edges[-1] - one.u_edges[0]
-    expected = reading.slope[:, None] * (0.5 * span + np.abs(one.u_middles - middle)) / one.bins
+    expected = reading.slope[:, None] * (0.5 * span + np.abs(one.u_centres - middle)) / one.bins
     np.testing.assert_allclose(costs, expected)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gpuvision.host import Device
 from gpuvision.simulation.clustering.light_clustering import BLOCK, LightClustering, LightCut
 from gpuvision.simulation.clustering.light_tree import LightTree
-from gpuvision.simulation.errors.range_error import StripReading, bounce_power, choose_paths
+from gpuvision.simulation.errors.range_error import StripErrorModel, interreflection_power_bound, select_paths
 from gpuvision.simulation.scene.scene import Scene
 from reference import light_clustering as reference
 
@@ -47,10 +47,10 @@ def weights_of(rng: np.random.Generator, count: int = COUNT) -> Any:
     return np.stack([power, power * np.sort(rng.uniform(-1.0, 1.0, (STRIPS, count)), axis=1)], axis=2)
 
 
-def reading_of(rng: np.random.Generator, **more: Any) -> StripReading:
+def reading_of(rng: np.random.Generator, **more: Any) -> StripErrorModel:
     power = rng.uniform(0.5, 5.0, STRIPS)
     moment = power * rng.uniform(-0.5, 0.5, STRIPS)
-    return StripReading(power=power, moment=moment, slope=np.full(STRIPS, SLOPE), limits=(-1.0, 1.0), **more)
+    return StripErrorModel(power=power, moment=moment, slope=np.full(STRIPS, SLOPE), limits=(-1.0, 1.0), **more)
 
 
 def picked(plan: LightCut, block: int) -> Any:
@@ -75,7 +75,7 @@ def by_plan(plan: LightCut, receivers: NDArray[Any], triangles: Any = None) -> A
     return irradiance
 
 
-def off_by(plan: LightCut, receivers: Any, weights: Any, reading: StripReading, segments: Any) -> Any:
+def off_by(plan: LightCut, receivers: Any, weights: Any, reading: StripErrorModel, segments: Any) -> Any:
     everything = reference.pair_irradiance(receivers.reshape(-1, 6), segments).sum(axis=1).reshape(receivers.shape[:2])
     readings = [
         reference.reading(reading.power, reading.moment, weights, light)
@@ -155,7 +155,7 @@ def test_tolerance_zero_leaves_out_nothing_that_shines(device: Device, variant: 
     np.testing.assert_allclose(by_plan(plan, receivers)[used], everything[used], rtol=1e-12, atol=1e-15)
 
 
-def valley(count: int, strips: int, each: int) -> tuple[Any, Any, Any, StripReading]:
+def valley(count: int, strips: int, each: int) -> tuple[Any, Any, Any, StripErrorModel]:
     """A lit line into a groove of 90 degrees and out of it, and strips across."""
     x = np.linspace(-0.1, 0.1, count + 1)
     ends = np.zeros((count, 2, 3))
@@ -170,7 +170,7 @@ def valley(count: int, strips: int, each: int) -> tuple[Any, Any, Any, StripRead
     power = np.full((strips, each), 1e-4)
     weights = np.stack([power, power * Y], axis=2) * 0.012 / (strips * each)
     direct = np.full(strips, 2e-8 / strips * 100.0)
-    reading = StripReading(power=direct, moment=0.0 * direct, slope=np.ones(strips), limits=(-0.03, 0.03))
+    reading = StripErrorModel(power=direct, moment=0.0 * direct, slope=np.ones(strips), limits=(-0.03, 0.03))
     return segments, receivers, weights, reading
 
 
@@ -290,7 +290,7 @@ def test_a_wall_in_the_groove_is_seen(device: Device, variant: Any) -> None:
 def test_dark_strips_get_all_and_those_below_the_floor_what_they_need() -> None:
     rng = np.random.default_rng(5)
     segments, receivers, weights = random_segments(rng, 30), random_strips(rng), weights_of(rng)
-    dark = StripReading(
+    dark = StripErrorModel(
         power=np.array([0.0, 1.0, 1.0]), moment=np.zeros(3), slope=np.full(3, SLOPE), limits=(-1.0, 1.0)
     )
     plan = LightClustering(tolerance=1e-4)(segments, receivers, weights, dark)
@@ -299,7 +299,7 @@ def test_dark_strips_get_all_and_those_below_the_floor_what_they_need() -> None:
     assert plan.starts[of_strip] == exact.starts[of_strip]
     assert plan.starts[-1] < exact.starts[-1]
     assert plan.bound[0] == 0.0
-    floored = LightClustering(tolerance=1e-4)(segments, receivers, weights, dataclasses.replace(dark, floor=1.0))
+    floored = LightClustering(tolerance=1e-4)(segments, receivers, weights, dataclasses.replace(dark, min_power=1.0))
     assert floored.starts[of_strip] < exact.starts[of_strip]
 
 
@@ -337,26 +337,28 @@ def test_tables_have_room() -> None:
 
 
 def test_worst_is_reached_by_light_at_the_other_limit() -> None:
-    reading = StripReading(power=np.ones(1), moment=-np.ones(1), slope=np.full(1, SLOPE), limits=(-1.0, 1.0))
-    assert reading.worst(0.25)[0] == pytest.approx(SLOPE * 2.0 * 0.25 / 1.25)
-    assert reading.worst(np.inf)[0] == pytest.approx(SLOPE * 2.0)
-    assert reading.worst(0.0)[0] == 0.0
+    reading = StripErrorModel(power=np.ones(1), moment=-np.ones(1), slope=np.full(1, SLOPE), limits=(-1.0, 1.0))
+    assert reading.error_bound(0.25)[0] == pytest.approx(SLOPE * 2.0 * 0.25 / 1.25)
+    assert reading.error_bound(np.inf)[0] == pytest.approx(SLOPE * 2.0)
+    assert reading.error_bound(0.0)[0] == 0.0
 
 
 def test_paths_with_the_least_bounds_are_left_out() -> None:
-    choice = choose_paths({"specular": 0.0, "mirrors": [1e-7, 2e-7], "bounces": 1.5e-6, "diffuse": np.inf}, 4e-6)
-    assert choice.left_out == {"specular": 0.0, "mirrors": 2e-7, "bounces": 1.5e-6}
+    choice = select_paths({"specular": 0.0, "mirrors": [1e-7, 2e-7], "bounces": 1.5e-6, "diffuse": np.inf}, 4e-6)
+    assert choice.omitted == {"specular": 0.0, "mirrors": 2e-7, "bounces": 1.5e-6}
     assert choice.modelled == {"diffuse": None}
-    assert choice.remaining == pytest.approx(2.3e-6)
-    assert choose_paths({"specular": 0.0, "bounces": 1e-9}, 0.0).left_out == {"specular": 0.0}
+    assert choice.remaining_tolerance == pytest.approx(2.3e-6)
+    assert select_paths({"specular": 0.0, "bounces": 1e-9}, 0.0).omitted == {"specular": 0.0}
 
 
 def test_bounces_sum_to_a_geometric_series() -> None:
-    assert bounce_power(2.0, 0.5, 0.1) == pytest.approx(2.0 * sum(0.5**k for k in range(1, 60)) * 0.5 / np.pi * 0.1)
-    assert bounce_power(1.0, 1.0, 0.1) == np.inf
-    assert bounce_power(1.0, 0.0, 0.1) == 0.0
+    assert interreflection_power_bound(2.0, 0.5, 0.1) == pytest.approx(
+        2.0 * sum(0.5**k for k in range(1, 60)) * 0.5 / np.pi * 0.1
+    )
+    assert interreflection_power_bound(1.0, 1.0, 0.1) == np.inf
+    assert interreflection_power_bound(1.0, 0.0, 0.1) == 0.0
     with pytest.raises(ValueError, match="albedo"):
-        bounce_power(1.0, 1.5, 0.1)
+        interreflection_power_bound(1.0, 1.5, 0.1)
 
 
 def test_wrong_input_is_refused() -> None:

@@ -7,11 +7,11 @@ import pytest
 from scipy.special import ndtr
 
 from gpuvision.host import Device
-from gpuvision.simulation.errors.error_attribution import ErrorAttribution, Verdict, attribute_errors
+from gpuvision.simulation.errors.error_attribution import ErrorAttribution, ReadingCategory, attribute_errors
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.readings import Truth
+from gpuvision.simulation.sensors.readings import GroundTruth
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet
@@ -41,7 +41,7 @@ def found(scene: Scene, albedos: list[float], slabs, device: Device) -> ErrorAtt
         device=device,
     )
     exposures: dict[str, Exposure] = light.exposures(0.0, causes=True)
-    level = Truth(*np.zeros((2, view.samples)), np.zeros(view.samples, np.uint8))
+    level = GroundTruth(*np.zeros((2, view.samples)), np.zeros(view.samples, np.uint8))
     return attribute_errors(psd(view), exposures, level, device=device)
 
 
@@ -91,7 +91,7 @@ def test_part_in_the_shadow(device: Device) -> None:
     """Under a roof nothing is lit: no reading, and that is known."""
     scene = Scene(corners=np.array(flat(-0.01, 0.01) + flat(-0.02, 0.02, 0.2)))
     told = found(scene, [0.5], 9, device)
-    assert (told.verdict == Verdict.MISSING).all()
+    assert (told.category == ReadingCategory.MISSING).all()
     assert np.isnan(told.error).all()
 
 

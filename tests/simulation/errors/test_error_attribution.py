@@ -8,8 +8,16 @@ from scipy.special import ndtr
 
 from gpuvision.host import Device
 from gpuvision.ranging.psd import PsdNoise
-from gpuvision.simulation.errors.error_attribution import CAUSES, ErrorAttribution, Verdict, attribute_errors
-from gpuvision.simulation.sensors.readings import EVEN, EVEN_OPEN, OPEN, Truth, height_secant, sheet_point, stack
+from gpuvision.simulation.errors.error_attribution import CAUSES, ErrorAttribution, ReadingCategory, attribute_errors
+from gpuvision.simulation.sensors.readings import (
+    UNIFORM,
+    UNIFORM_UNOCCLUDED,
+    UNOCCLUDED,
+    GroundTruth,
+    height_secant,
+    sheet_point,
+    stack_profiles,
+)
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.status import Status
 from lights import camera, camera_view, gaussian, psd, psd_view
@@ -17,10 +25,10 @@ from lights import camera, camera_view, gaussian, psd, psd_view
 PIXEL = 10e-6
 
 
-def truth_at(view: SensorView, u) -> Truth:
+def truth_at(view: SensorView, u) -> GroundTruth:
     u = np.broadcast_to(np.asarray(u, float), view.samples)
-    g, h = sheet_point(view.triangulation, u, view.v_middles)
-    return Truth(g, h, np.where(np.isnan(h), Status.LOW_SIGNAL, 0).astype(np.uint8))
+    g, h = sheet_point(view.triangulation, u, view.v_centres)
+    return GroundTruth(g, h, np.where(np.isnan(h), Status.LOW_SIGNAL, 0).astype(np.uint8))
 
 
 def half_spots(view: SensorView, u: np.ndarray, sigma: float, left: float, right: float, edge: np.ndarray) -> Exposure:
@@ -38,18 +46,18 @@ def check_sum(found: ErrorAttribution) -> None:
     np.testing.assert_allclose(total, found.error, rtol=1e-9, atol=1e-15)
 
 
-@pytest.mark.parametrize("split", ["moments", "removal"])
-def test_secondary_light(split: str, device: Device) -> None:
+@pytest.mark.parametrize("method", ["moments", "shapley"])
+def test_secondary_light(method: str, device: Device) -> None:
     """One secondary spot of ratio q at distance D: error q D / (1 + q), all of it secondary."""
     view, q, distance = psd_view(), 0.05, 1.2e-3
     u = np.linspace(-2e-3, 1e-3, view.samples)
     light = {"direct": gaussian(view, u, 1e-6, 5e-5), "bounces": gaussian(view, u + distance, q * 1e-6, 5e-5)}
-    found = attribute_errors(psd(view), light, truth_at(view, u), split=split, device=device)
+    found = attribute_errors(psd(view), light, truth_at(view, u), method=method, device=device)
     moved = q * distance / (1.0 + q)
-    slope = height_secant(view.triangulation, u, u + moved, view.v_middles)
+    slope = height_secant(view.triangulation, u, u + moved, view.v_centres)
     np.testing.assert_allclose(found.error, slope * moved, rtol=1e-9 if device.has_double else 1e-3)
     np.testing.assert_allclose(found.causes["secondary"], found.error, rtol=1e-6)
-    assert (found.dominant() == list(found.causes).index("secondary")).all()
+    assert (found.dominant_cause() == list(found.causes).index("secondary")).all()
     check_sum(found)
 
 
@@ -60,13 +68,13 @@ def test_moments_are_shares_of_the_light(device: Device) -> None:
     lights = {"specular": (8e-4, 2e-7), "diffuse-specular": (-2e-3, 5e-8), "diffuse-diffuse": (2.5e-3, 3e-8)}
     light = {"direct": gaussian(view, u, 1e-6, 4e-5)}
     light |= {name: gaussian(view, 0.0 * u + place, power, 4e-5) for name, (place, power) in lights.items()}
-    found = attribute_errors(psd(view, ambient=1e-7), light, truth_at(view, u), detail=True, device=device)
+    found = attribute_errors(psd(view, ambient=1e-7), light, truth_at(view, u), secondary_by_path=True, device=device)
     lights["ambient"] = (0.0, 1e-7)
     everything = 1e-6 + sum(power for _, power in lights.values())
-    slope = height_secant(view.triangulation, u, found.reading.position, view.v_middles)
+    slope = height_secant(view.triangulation, u, found.reading.position, view.v_centres)
     for name, (place, power) in lights.items():
         np.testing.assert_allclose(found.causes[name], slope * power * (place - 5e-4) / everything, rtol=1e-6)
-        np.testing.assert_allclose(found.light[name], power, rtol=1e-9)
+        np.testing.assert_allclose(found.power[name], power, rtol=1e-9)
     check_sum(found)
     whole = attribute_errors(psd(view, ambient=1e-7), light, truth_at(view, u), device=device)
     np.testing.assert_allclose(
@@ -74,7 +82,7 @@ def test_moments_are_shares_of_the_light(device: Device) -> None:
     )
 
 
-def test_the_two_splits_agree_for_little_light(device: Device) -> None:
+def test_the_two_methods_agree_for_little_light(device: Device) -> None:
     """They differ to second order in the secondary light's share."""
     view = psd_view()
     u = np.full(view.samples, 5e-4)
@@ -83,7 +91,7 @@ def test_the_two_splits_agree_for_little_light(device: Device) -> None:
         light = {"direct": gaussian(view, u, 1e-6, 4e-5)}
         light["diffuse-specular"] = gaussian(view, 0.0 * u - 2e-3, share * 1e-6, 4e-5)
         light["specular"] = gaussian(view, 0.0 * u + 2e-3, share * 1e-6, 4e-5)
-        both = [attribute_errors(psd(view), light, truth_at(view, u), split=each, device=device) for each in SPLITS]
+        both = [attribute_errors(psd(view), light, truth_at(view, u), method=each, device=device) for each in METHODS]
         for found in both:
             check_sum(found)
         differences.append(np.abs(both[0].causes["specular"] - both[1].causes["specular"]).max())
@@ -91,11 +99,11 @@ def test_the_two_splits_agree_for_little_light(device: Device) -> None:
     assert differences[1] < differences[0] / 50.0
 
 
-SPLITS = ("moments", "removal")
+METHODS = ("moments", "shapley")
 
 
-@pytest.mark.parametrize("split", SPLITS)
-def test_occlusion(split: str, device: Device) -> None:
+@pytest.mark.parametrize("method", METHODS)
+def test_occlusion(method: str, device: Device) -> None:
     """What hides a spot beyond x sigma moves its centre by -sigma phi(x) / Phi(x)."""
     view, sigma = psd_view(600), 1e-4
     x = np.array([-0.5, 0.0, 0.5, 1.0, 1.5])
@@ -103,13 +111,13 @@ def test_occlusion(split: str, device: Device) -> None:
     edge = u + x * sigma
     light = {
         "direct": half_spots(view, u, sigma, 1e-6, 0.0, edge),
-        EVEN: half_spots(view, u, sigma, 1.0, 0.0, edge),
-        OPEN: gaussian(view, u, 1e-6, sigma),
-        EVEN_OPEN: gaussian(view, u, 1.0, sigma),
+        UNIFORM: half_spots(view, u, sigma, 1.0, 0.0, edge),
+        UNOCCLUDED: gaussian(view, u, 1e-6, sigma),
+        UNIFORM_UNOCCLUDED: gaussian(view, u, 1.0, sigma),
     }
-    found = attribute_errors(psd(view), light, truth_at(view, u), split=split, device=device)
+    found = attribute_errors(psd(view), light, truth_at(view, u), method=method, device=device)
     shift = -sigma * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi) / ndtr(x)
-    slope = height_secant(view.triangulation, u, u + shift, view.v_middles)
+    slope = height_secant(view.triangulation, u, u + shift, view.v_centres)
     rounding = 1e-8 if device.has_double else 1e-3
     np.testing.assert_allclose(found.causes["occlusion"], slope * shift, rtol=rounding)
     np.testing.assert_allclose(found.error, slope * shift, rtol=rounding)
@@ -117,24 +125,24 @@ def test_occlusion(split: str, device: Device) -> None:
     check_sum(found)
 
 
-@pytest.mark.parametrize("split", SPLITS)
-def test_reflectivity_step(split: str, device: Device) -> None:
+@pytest.mark.parametrize("method", METHODS)
+def test_reflectivity_step(method: str, device: Device) -> None:
     """A step of ratio k moves it by sigma (k - 1) phi(x) / (Phi(x) + k (1 - Phi(x))), whatever the surface's albedo."""
     view, sigma, k = psd_view(600), 1e-4, 5.0
     x = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
     u = np.full(view.samples, -3e-4)
     direct = half_spots(view, u, sigma, 1e-7, k * 1e-7, u + x * sigma)
     white = gaussian(view, u, 1.0, sigma)
-    light = {"direct": direct, OPEN: direct, EVEN: white, EVEN_OPEN: white}
-    found = attribute_errors(psd(view), light, truth_at(view, u), split=split, device=device)
+    light = {"direct": direct, UNOCCLUDED: direct, UNIFORM: white, UNIFORM_UNOCCLUDED: white}
+    found = attribute_errors(psd(view), light, truth_at(view, u), method=method, device=device)
     shift = sigma * (k - 1.0) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi) / (ndtr(x) + k * (1.0 - ndtr(x)))
-    slope = height_secant(view.triangulation, u, u + shift, view.v_middles)
+    slope = height_secant(view.triangulation, u, u + shift, view.v_centres)
     rounding = 1e-8 if device.has_double else 1e-3
     np.testing.assert_allclose(found.causes["reflectivity"], slope * shift, rtol=rounding)
     np.testing.assert_allclose(found.causes["occlusion"], 0.0, atol=1e-9)
     np.testing.assert_allclose(found.causes["shape"], 0.0, atol=1e-9)
     check_sum(found)
-    assert (found.dominant(1e-7) == list(found.causes).index("reflectivity")).all()
+    assert (found.dominant_cause(1e-7) == list(found.causes).index("reflectivity")).all()
 
 
 def test_all_causes_at_once(device: Device, rng: np.random.Generator) -> None:
@@ -143,13 +151,22 @@ def test_all_causes_at_once(device: Device, rng: np.random.Generator) -> None:
     u = rng.uniform(-1e-3, 1e-3, (4, view.samples))
     light = {
         name: gaussian(view, u + rng.normal(scale=2e-4, size=u.shape), rng.uniform(0.1, 1.0, u.shape) * 1e-6, 1e-4)
-        for name in ("direct", "specular", "diffuse-specular", "diffuse-diffuse", "bounces", EVEN, OPEN, EVEN_OPEN)
+        for name in (
+            "direct",
+            "specular",
+            "diffuse-specular",
+            "diffuse-diffuse",
+            "bounces",
+            UNIFORM,
+            UNOCCLUDED,
+            UNIFORM_UNOCCLUDED,
+        )
     }
-    g, h = sheet_point(view.triangulation, u, view.v_middles)
+    g, h = sheet_point(view.triangulation, u, view.v_centres)
     simulator = psd(view, ambient=1e-7, readout={"noise": PsdNoise(independent=1e-9)})
-    for split in SPLITS:
+    for method in METHODS:
         found = attribute_errors(
-            simulator, light, Truth(g, h, np.zeros(u.shape, np.uint8)), split=split, seed=3, device=device
+            simulator, light, GroundTruth(g, h, np.zeros(u.shape, np.uint8)), method=method, seed=3, device=device
         )
         check_sum(found)
         assert tuple(sorted(found.causes)) == tuple(sorted(CAUSES))
@@ -162,7 +179,7 @@ def test_a_camera_with_a_window(device: Device) -> None:
     """Secondary light beside the line moves a windowed reading only where it falls into the window."""
     view = camera_view()
     pixels = np.full(view.samples, 24.0)
-    u = view.u_middles[0] + PIXEL * pixels
+    u = view.u_centres[0] + PIXEL * pixels
     glow = u + PIXEL * np.array([3.0, 4.0, 5.0, 6.0, 20.0, 25.0, 30.0, 35.0])
     light = {"direct": gaussian(view, u, 1e-9, PIXEL), "diffuse-diffuse": gaussian(view, glow, 2e-11, PIXEL)}
     found = attribute_errors(
@@ -171,16 +188,16 @@ def test_a_camera_with_a_window(device: Device) -> None:
         truth_at(view, u),
         device=device,
     )
-    slope = height_secant(view.triangulation, u, u, view.v_middles)
+    slope = height_secant(view.triangulation, u, u, view.v_centres)
     expected = slope * 0.02 * (glow - u) / 1.02
     np.testing.assert_allclose(found.causes["secondary"][:4], expected[:4], rtol=0.05)
     np.testing.assert_allclose(found.causes["secondary"][4:], 0.0, atol=1e-8)
     check_sum(found)
-    with pytest.raises(ValueError, match="cameras take 'removal'"):
-        attribute_errors(camera(view), light, truth_at(view, u), split="moments", device=device)
+    with pytest.raises(ValueError, match="cameras take 'shapley'"):
+        attribute_errors(camera(view), light, truth_at(view, u), method="moments", device=device)
 
 
-def test_verdicts(device: Device) -> None:
+def test_categories(device: Device) -> None:
     """A surface without a reading, a reading without a surface, neither, and several surfaces."""
     view = psd_view()
     u = np.array([0.0, 0.0, np.nan, np.nan, np.nan])
@@ -191,21 +208,27 @@ def test_verdicts(device: Device) -> None:
     truth = truth_at(view, u)
     truth.status[4] = Status.AMBIGUOUS
     found = attribute_errors(psd(view), light, truth, device=device)
-    assert found.verdict.tolist() == [
-        Verdict.READ,
-        Verdict.MISSING,
-        Verdict.FALSE,
-        Verdict.NOTHING,
-        Verdict.AMBIGUOUS,
+    assert found.category.tolist() == [
+        ReadingCategory.VALID,
+        ReadingCategory.MISSING,
+        ReadingCategory.SPURIOUS,
+        ReadingCategory.NO_SURFACE,
+        ReadingCategory.AMBIGUOUS,
     ]
     assert np.isfinite(found.error).tolist() == [True, False, False, False, False]
     secondary = list(found.causes).index("secondary")
-    assert found.dominant(1e-9).tolist() == [-1, -1, secondary, -1, -1]
-    assert found.unread(1e-6) == 0.5
-    said = found.summary(1e-6)
-    assert (said["surface"], said["read"], said["missing"], said["false"], said["ambiguous"]) == (2, 1, 1, 1, 1)
-    assert said["causes"]["secondary"]["false"] == 1
-    assert said["beyond_limit"] == 0
+    assert found.dominant_cause(1e-9).tolist() == [-1, -1, secondary, -1, -1]
+    assert found.failed_fraction(1e-6) == 0.5
+    summary = found.summary(1e-6)
+    assert (summary["surface"], summary["valid"], summary["missing"], summary["spurious"], summary["ambiguous"]) == (
+        2,
+        1,
+        1,
+        1,
+        1,
+    )
+    assert summary["causes"]["secondary"]["spurious"] == 1
+    assert summary["beyond_limit"] == 0
 
 
 def test_summary_counts_causes(device: Device) -> None:
@@ -215,15 +238,18 @@ def test_summary_counts_causes(device: Device) -> None:
     light["specular"] = gaussian(view, u + 1e-3, [0.0, 1e-8, 2e-7, 0.0, 0.0], 4e-5)
     light["bounces"] = gaussian(view, u - 1e-3, [0.0, 0.0, 1e-8, 3e-7, 0.0], 4e-5)
     found = attribute_errors(
-        psd(view), stack([light] * 2), Truth(*(np.stack([each] * 2) for each in truth_at(view, u))), device=device
+        psd(view),
+        stack_profiles([light] * 2),
+        GroundTruth(*(np.stack([each] * 2) for each in truth_at(view, u))),
+        device=device,
     )
-    said = found.summary(1e-4)
-    assert said["causes"]["specular"]["dominant"] == 2
-    assert said["causes"]["secondary"]["dominant"] == 2
-    assert said["beyond_limit"] == 4
-    assert said["worst"] == pytest.approx(np.abs(found.error).max())
-    assert said["rms"] == pytest.approx(np.sqrt(np.mean(found.error**2)))
-    assert "occlusion" not in said["causes"]
+    summary = found.summary(1e-4)
+    assert summary["causes"]["specular"]["dominant"] == 2
+    assert summary["causes"]["secondary"]["dominant"] == 2
+    assert summary["beyond_limit"] == 4
+    assert summary["max"] == pytest.approx(np.abs(found.error).max())
+    assert summary["rms"] == pytest.approx(np.sqrt(np.mean(found.error**2)))
+    assert "occlusion" not in summary["causes"]
 
 
 def test_what_flags_take_out(device: Device) -> None:
@@ -233,21 +259,21 @@ def test_what_flags_take_out(device: Device) -> None:
     light = {"direct": gaussian(view, u, [1e-6, 1e-6, 2e-5, 1e-6, 1e-6], 4e-5)}
     found = attribute_errors(psd(view, ambient=1e-8), light, truth_at(view, u), device=device)
     found.reading.status[2] = Status.AMBIGUOUS
-    kept = found.without(Status.AMBIGUOUS)
+    kept = found.without_flagged(Status.AMBIGUOUS)
     assert np.isnan(kept.error).tolist() == [False, False, True, False, False]
-    assert kept.verdict.tolist() == [0, 0, Verdict.MISSING, 0, 0]
+    assert kept.category.tolist() == [0, 0, ReadingCategory.MISSING, 0, 0]
     assert np.isfinite(found.error).all()
-    assert kept.summary(1.0)["read"] == 4
+    assert kept.summary(1.0)["valid"] == 4
 
 
 def test_signals_add_up_to_the_reading(device: Device) -> None:
-    """What is split by removal is what is read."""
+    """The signals from which Shapley values are computed add up to the reading."""
     for simulator in (psd(ambient=1e-7), camera(gain=1e-4, offset=3.0, ambient=1e-12, readout={"threshold": 1.0})):
         view = simulator.view
-        u = np.broadcast_to(view.u_middles[view.bins // 3], view.samples)
+        u = np.broadcast_to(view.u_centres[view.bins // 3], view.samples)
         light = {"direct": gaussian(view, u, 1e-9, 2.0 * np.diff(view.u_edges)[0])}
         light["bounces"] = gaussian(view, u + 3.0 * np.diff(view.u_edges)[0], 1e-10, np.diff(view.u_edges)[0])
-        signals = [simulator.signal(each) for each in simulator.light(light).values()]
+        signals = [simulator.signal(each) for each in simulator.detected_light(light).values()]
         assert len(signals) == 3
         heights = simulator.heights(sum(signals[1:], start=signals[0]), device)
         np.testing.assert_allclose(heights, simulator.read(light, device=device).h, rtol=1e-5, atol=1e-8)
@@ -257,10 +283,10 @@ def test_a_part_in_shadow_says_nothing(device: Device) -> None:
     """No light at all: flagged, not zero, and a report can still be made."""
     view = psd_view()
     found = attribute_errors(psd(view), {"direct": view.dark()}, truth_at(view, np.nan), device=device)
-    assert (found.verdict == Verdict.NOTHING).all()
+    assert (found.category == ReadingCategory.NO_SURFACE).all()
     assert np.isnan(found.error).all()
-    said = found.summary(1e-6)
-    assert (said["rms"], said["worst"], said["median"], said["unread_share"]) == (None, None, None, 0.0)
+    summary = found.summary(1e-6)
+    assert (summary["rms"], summary["max"], summary["median"], summary["failed_fraction"]) == (None, None, None, 0.0)
 
 
 def test_what_is_refused(device: Device) -> None:
@@ -268,6 +294,6 @@ def test_what_is_refused(device: Device) -> None:
     light = {"direct": gaussian(view, [0.0], 1e-6, 1e-4)}
     truth = truth_at(view, 0.0)
     with pytest.raises(ValueError, match="or none of them"):
-        attribute_errors(psd(view), light | {EVEN: light["direct"]}, truth, device=device)
+        attribute_errors(psd(view), light | {UNIFORM: light["direct"]}, truth, device=device)
     with pytest.raises(ValueError, match="expected the same"):
-        attribute_errors(psd(view), light, Truth(*(each[:3] for each in truth)), device=device)
+        attribute_errors(psd(view), light, GroundTruth(*(each[:3] for each in truth)), device=device)

@@ -17,13 +17,17 @@ from gpuvision.simulation.errors.recommendations import (
     FIRST,
     NONE,
     SECOND,
-    DualSensor,
+    SensorFusion,
     attribute_pair_errors,
-    compare_peaks,
-    rank,
-    resampled,
+    compare_peak_selections,
+    rank_candidates,
+    resample_reading,
 )
-from gpuvision.simulation.sensors.readings import Reading, Truth, sheet_point
+from gpuvision.simulation.sensors.readings import (
+    GroundTruth,
+    Reading,
+    sheet_point,
+)
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.status import Status
 from lights import PITCH, camera, camera_view, gaussian, psd, psd_view
@@ -60,8 +64,8 @@ def thick_line(view: SensorView, sigma: float, factor: np.ndarray, across: np.nd
     points = np.stack(np.broadcast_arrays(0.0, across, 0.0), axis=-1)
     u, _ = np.moveaxis(view.project(points), -1, 0)
     light = view.dark()
-    for v in view.v_middles:
-        light = light + view.deposit(u, v, 1e-9 * weight)
+    for v in view.v_centres:
+        light = light + view.deposit_spots(u, v, 1e-9 * weight)
     return light
 
 
@@ -76,11 +80,11 @@ def phi(x: float) -> float:
 
 
 @pytest.fixture
-def level() -> Truth:
-    return Truth(np.zeros(5), np.zeros(5), np.zeros(5, np.uint8))
+def level() -> GroundTruth:
+    return GroundTruth(np.zeros(5), np.zeros(5), np.zeros(5, np.uint8))
 
 
-def test_reflectivity_step_seen_from_both_sides(level: Truth, device: Device) -> None:
+def test_reflectivity_step_seen_from_both_sides(level: GroundTruth, device: Device) -> None:
     """Each errs by shift / tan(theta), to its own side: the mean is right. Nothing else of the rules is."""
     view, k = psd_view(), 4.0
     factor = np.where(ACROSS > X * SIGMA, k, 1.0)
@@ -91,21 +95,21 @@ def test_reflectivity_step_seen_from_both_sides(level: Truth, device: Device) ->
     expected = shift * 0.15 / 0.08
     np.testing.assert_allclose(np.abs(readings[0].h), expected, rtol=2e-3)
     np.testing.assert_allclose(readings[1].h, -readings[0].h, rtol=4e-3)
-    flagged = DualSensor().join(*readings)
+    flagged = SensorFusion().fuse(*readings)
     assert np.isnan(flagged.h).all()
     assert (flagged.status == Status.AMBIGUOUS).all()
-    mean = DualSensor(rule="mean").join(*readings)
+    mean = SensorFusion(rule="mean").fuse(*readings)
     assert np.abs(mean.h).max() < 2e-3 * expected
     assert (mean.source == BOTH).all()
     errors = [
         attribute_errors(each, {"direct": thick_line(each.view, SIGMA, factor, ACROSS)}, level, device=device).error
         for each in sensors
     ]
-    predicted = DualSensor(rule="predicted").join(*readings, predicted=(errors[0], errors[1]))
+    predicted = SensorFusion(rule="predicted").fuse(*readings, predicted=(errors[0], errors[1]))
     assert (predicted.source == BOTH).all()
 
 
-def test_half_a_beam_hidden_from_one(level: Truth, device: Device) -> None:
+def test_half_a_beam_hidden_from_one(level: GroundTruth, device: Device) -> None:
     """The sensor that sees the whole beam is right and has more light; the mean is half wrong."""
     view = psd_view()
     hidden = (ACROSS < X * SIGMA).astype(float)
@@ -117,16 +121,16 @@ def test_half_a_beam_hidden_from_one(level: Truth, device: Device) -> None:
     error = SIGMA * phi(X) / share * 0.15 / 0.08
     np.testing.assert_allclose(np.abs(half.h), error, rtol=2e-3)
     for rule, predicted in (("stronger", None), ("predicted", (1e-9, error))):
-        joined = DualSensor(rule=rule, tolerance=1e-6).join(whole, half, predicted)
-        assert (joined.source == FIRST).all()
-        assert np.abs(joined.h).max() < 1e-3 * error
-        turned = DualSensor(rule=rule, tolerance=1e-6).join(half, whole, predicted and predicted[::-1])
+        fused = SensorFusion(rule=rule, tolerance=1e-6).fuse(whole, half, predicted)
+        assert (fused.source == FIRST).all()
+        assert np.abs(fused.h).max() < 1e-3 * error
+        turned = SensorFusion(rule=rule, tolerance=1e-6).fuse(half, whole, predicted and predicted[::-1])
         assert (turned.source == SECOND).all()
-    mean = DualSensor(rule="mean").join(whole, half)
+    mean = SensorFusion(rule="mean").fuse(whole, half)
     np.testing.assert_allclose(np.abs(mean.h), 0.5 * error, rtol=5e-3)
 
 
-def test_a_part_seen_by_two(level: Truth, device: Device) -> None:
+def test_a_part_seen_by_two(level: GroundTruth, device: Device) -> None:
     """A pair is ranked beside either sensor alone: half of a beam is hidden from one here, from the other there."""
     view = psd_view()
     hidden = (ACROSS < X * SIGMA).astype(float)
@@ -135,18 +139,23 @@ def test_a_part_seen_by_two(level: Truth, device: Device) -> None:
         whole, half = (thick_line(each, SIGMA, factor, ACROSS) for factor in (np.ones_like(ACROSS), hidden))
         seen = np.isin(np.arange(5), from_here)[:, None]
         light = Exposure(*(np.where(seen, one, other) for one, other in zip(half, whole, strict=True)))
-        variants = {"direct": light, "direct, even": light, "direct, open": whole, "direct, even, open": whole}
+        variants = {
+            "direct": light,
+            "direct, uniform": light,
+            "direct, unoccluded": whole,
+            "direct, uniform, unoccluded": whole,
+        }
         found.append(attribute_errors(psd(each), variants, level._replace(g=PLACES), device=device))
-    candidates = attribute_pair_errors(*found, DualSensor(rule="predicted"), gap=1.0, g=PLACES)
-    order = rank(candidates, 1e-6)
+    candidates = attribute_pair_errors(*found, SensorFusion(rule="predicted"), max_gap=1.0, g=PLACES)
+    order = rank_candidates(candidates, 1e-6)
     assert order[0].name == "both"
-    assert [each.unread for each in order] == [0.0, 0.4, 0.4]
+    assert [each.failed_fraction for each in order] == [0.0, 0.4, 0.4]
     for each in candidates.values():
         np.testing.assert_allclose(np.sum(list(each.causes.values()), axis=0), each.error, atol=1e-12)
-    flagged = attribute_pair_errors(*found, DualSensor(tolerance=1e-6), gap=1.0, g=PLACES)["both"]
+    flagged = attribute_pair_errors(*found, SensorFusion(tolerance=1e-6), max_gap=1.0, g=PLACES)["both"]
     assert np.isfinite(flagged.error).tolist() == [False, False, True, False, False]
     assert flagged.summary(1e-6)["missing"] == 4
-    mean = attribute_pair_errors(*found, DualSensor(rule="mean"), gap=1.0, g=PLACES)["both"]
+    mean = attribute_pair_errors(*found, SensorFusion(rule="mean"), max_gap=1.0, g=PLACES)["both"]
     np.testing.assert_allclose(mean.causes["occlusion"][:2], 0.5 * found[0].causes["occlusion"][:2], rtol=1e-3)
 
 
@@ -154,20 +163,22 @@ def test_what_one_does_not_see_the_other_does(device: Device) -> None:
     """Surfaces that are hidden from the first sensor count for it as missing, and the second one fills them."""
     view = psd_view()
     u = np.zeros(5)
-    truth = Truth(*sheet_point(view.triangulation, u, view.v_middles), np.zeros(5, np.uint8))
+    truth = GroundTruth(*sheet_point(view.triangulation, u, view.v_centres), np.zeros(5, np.uint8))
     found = []
     for each, hidden in ((view, [0, 1]), (facing(view), [4])):
         lost = np.isin(np.arange(5), hidden)
-        seen = Truth(truth.g, np.where(lost, np.nan, truth.h), np.where(lost, Status.LOW_SIGNAL, 0).astype(np.uint8))
+        seen = GroundTruth(
+            truth.g, np.where(lost, np.nan, truth.h), np.where(lost, Status.LOW_SIGNAL, 0).astype(np.uint8)
+        )
         found.append(
             attribute_errors(psd(each), {"direct": gaussian(each, u, ~lost * 1e-6, 5e-5)}, seen, device=device)
         )
-    pair = attribute_pair_errors(*found, DualSensor(tolerance=1e-6), gap=1.0)
-    assert [pair[name].unread(1e-6) for name in ("first", "second", "both")] == [0.4, 0.2, 0.0]
-    blind = found[0].without(Status.LOW_SIGNAL)
-    nothing = Truth(np.full(5, np.nan), np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL))
-    with pytest.raises(ValueError, match="give the places"):
-        attribute_pair_errors(replace(blind, truth=nothing), found[1], DualSensor(), gap=1.0)
+    pair = attribute_pair_errors(*found, SensorFusion(tolerance=1e-6), max_gap=1.0)
+    assert [pair[name].failed_fraction(1e-6) for name in ("first", "second", "both")] == [0.4, 0.2, 0.0]
+    blind = found[0].without_flagged(Status.LOW_SIGNAL)
+    nothing = GroundTruth(np.full(5, np.nan), np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL))
+    with pytest.raises(ValueError, match="give the positions"):
+        attribute_pair_errors(replace(blind, truth=nothing), found[1], SensorFusion(), max_gap=1.0)
 
 
 # ---- the rules -------------------------------------------------------------------------------------------------
@@ -175,22 +186,22 @@ def test_what_one_does_not_see_the_other_does(device: Device) -> None:
 
 def test_agreeing_readings_are_weighed_by_their_noise() -> None:
     one, other = reading([1e-3, 1e-3], sigma=[1e-6, 0.0]), reading([1.003e-3, 1e-3], sigma=[2e-6, 0.0])
-    joined = DualSensor(agree=3.0).join(one, other)
-    np.testing.assert_allclose(joined.h, [0.8e-3 + 0.2 * 1.003e-3, 1e-3], rtol=1e-12)
-    np.testing.assert_allclose(joined.sigma, [2e-6 / np.sqrt(5.0), 0.0], rtol=1e-12)
-    assert (joined.source == BOTH).all()
-    assert not joined.status.any()
-    assert np.isnan(DualSensor(agree=1.0).join(one, other).h).tolist() == [True, False]
-    assert np.isfinite(DualSensor(agree=0.0, tolerance=4e-6).join(one, other).h).all()
+    fused = SensorFusion(max_sigmas=3.0).fuse(one, other)
+    np.testing.assert_allclose(fused.h, [0.8e-3 + 0.2 * 1.003e-3, 1e-3], rtol=1e-12)
+    np.testing.assert_allclose(fused.sigma, [2e-6 / np.sqrt(5.0), 0.0], rtol=1e-12)
+    assert (fused.source == BOTH).all()
+    assert not fused.status.any()
+    assert np.isnan(SensorFusion(max_sigmas=1.0).fuse(one, other).h).tolist() == [True, False]
+    assert np.isfinite(SensorFusion(max_sigmas=0.0, tolerance=4e-6).fuse(one, other).h).all()
 
 
 def test_one_reading_alone() -> None:
     one, other = reading([1e-3, np.nan, np.nan]), reading([np.nan, 2e-3, np.nan])
-    joined = DualSensor().join(one, other)
-    assert joined.source.tolist() == [FIRST, SECOND, NONE]
-    np.testing.assert_array_equal(joined.h, [1e-3, 2e-3, np.nan])
-    assert joined.status.tolist() == [0, 0, Status.LOW_SIGNAL]
-    strict = DualSensor(lone=False).join(one, other)
+    fused = SensorFusion().fuse(one, other)
+    assert fused.source.tolist() == [FIRST, SECOND, NONE]
+    np.testing.assert_array_equal(fused.h, [1e-3, 2e-3, np.nan])
+    assert fused.status.tolist() == [0, 0, Status.LOW_SIGNAL]
+    strict = SensorFusion(accept_single=False).fuse(one, other)
     assert np.isnan(strict.h).all()
     assert (strict.status != 0).all()
 
@@ -199,31 +210,31 @@ def test_doubtful_readings_give_way() -> None:
     """Of two that disagree, a saturated or ambiguous one has no say."""
     one = reading([1e-3, 1e-3], status=[Status.SATURATED, 0])
     other = reading([2e-3, 2e-3], status=[0, Status.AMBIGUOUS])
-    assert DualSensor().join(one, other).source.tolist() == [SECOND, FIRST]
+    assert SensorFusion().fuse(one, other).source.tolist() == [SECOND, FIRST]
 
 
-def test_margin() -> None:
+def test_min_ratio() -> None:
     """Where neither is clearly better there is no value."""
     one, other = reading([1e-3] * 3, strength=[1.0, 1.4, 2.0]), reading([2e-3] * 3, strength=[2.0, 1.0, 1.0])
-    assert DualSensor(rule="stronger").join(one, other).source.tolist() == [SECOND, NONE, FIRST]
+    assert SensorFusion(rule="stronger").fuse(one, other).source.tolist() == [SECOND, NONE, FIRST]
     one, other = reading([1e-3] * 3, width=[3.0, 4.0, 9.0]), reading([2e-3] * 3, width=[6.0, 5.0, 3.0])
-    assert DualSensor(rule="narrower").join(one, other).source.tolist() == [FIRST, NONE, SECOND]
+    assert SensorFusion(rule="narrower").fuse(one, other).source.tolist() == [FIRST, NONE, SECOND]
     errors = ([1e-6, 9e-6, np.nan], [1e-3, -9e-6, 1e-6])
-    assert DualSensor(rule="predicted").join(one, other, errors).source.tolist() == [FIRST, BOTH, SECOND]
+    assert SensorFusion(rule="predicted").fuse(one, other, errors).source.tolist() == [FIRST, BOTH, SECOND]
 
 
-def test_what_joining_refuses() -> None:
+def test_what_fusion_refuses() -> None:
     one, other = reading([1e-3]), reading([2e-3], width=np.nan)
     with pytest.raises(ValueError, match="predicted=\\(a, b\\)"):
-        DualSensor(rule="predicted").join(one, other)
-    with pytest.raises(ValueError, match="only cameras know"):
-        DualSensor(rule="narrower").join(one, other)
+        SensorFusion(rule="predicted").fuse(one, other)
+    with pytest.raises(ValueError, match="only cameras measure"):
+        SensorFusion(rule="narrower").fuse(one, other)
     with pytest.raises(ValueError, match="expected the same"):
-        DualSensor().join(one, reading([1e-3, 1e-3]))
+        SensorFusion().fuse(one, reading([1e-3, 1e-3]))
     with pytest.raises(ValueError, match="rule is 'best'"):
-        DualSensor(rule="best")
-    with pytest.raises(ValueError, match=r"margin is 0\.5"):
-        DualSensor(margin=0.5)
+        SensorFusion(rule="best")
+    with pytest.raises(ValueError, match=r"min_ratio is 0\.5"):
+        SensorFusion(min_ratio=0.5)
 
 
 # ---- places along the sheet ------------------------------------------------------------------------------------
@@ -236,12 +247,12 @@ def test_resampling() -> None:
     h[3] = np.nan
     given = reading(h, g=g, status=[0, 0, 0, 0, Status.SATURATED, 0])
     at = np.array([0.0, 0.25, 1.0, 2.0, 2.5, 4.0, 7.0]) * 1e-4
-    said = resampled(given, at, gap=2.5e-4)
-    np.testing.assert_allclose(said.h, 2.0 * at + 1e-3, rtol=1e-12)
-    np.testing.assert_array_equal(said.g, at)
-    assert said.status.tolist() == [0, 0, 0, 0, Status.SATURATED, Status.SATURATED, 0]
+    made = resample_reading(given, at, max_gap=2.5e-4)
+    np.testing.assert_allclose(made.h, 2.0 * at + 1e-3, rtol=1e-12)
+    np.testing.assert_array_equal(made.g, at)
+    assert made.status.tolist() == [0, 0, 0, 0, Status.SATURATED, Status.SATURATED, 0]
     # Points are 0.15 mm apart in the median.
-    beside = resampled(given, np.array([-0.7, -0.8, 4.7, 4.8, 6.3, 7.8, np.nan]) * 1e-4, gap=2.5e-4)
+    beside = resample_reading(given, np.array([-0.7, -0.8, 4.7, 4.8, 6.3, 7.8, np.nan]) * 1e-4, max_gap=2.5e-4)
     np.testing.assert_array_equal(beside.h, [h[0], np.nan, h[4], np.nan, h[5], np.nan, np.nan])
     assert beside.status.tolist() == [
         0,
@@ -252,11 +263,11 @@ def test_resampling() -> None:
         Status.NO_DATA,
         Status.NO_DATA,
     ]
-    block = resampled(Reading(*(np.stack([each, each]) for each in given)), at, gap=2.5e-4)
-    np.testing.assert_array_equal(block.h, np.stack([said.h, said.h]))
-    alone = resampled(reading([np.nan, 1e-3]), np.array([0.0, 1e-3, 1.2e-3]), gap=3e-4)
+    block = resample_reading(Reading(*(np.stack([each, each]) for each in given)), at, max_gap=2.5e-4)
+    np.testing.assert_array_equal(block.h, np.stack([made.h, made.h]))
+    alone = resample_reading(reading([np.nan, 1e-3]), np.array([0.0, 1e-3, 1.2e-3]), max_gap=3e-4)
     np.testing.assert_array_equal(alone.h, [np.nan, 1e-3, np.nan])
-    assert (resampled(reading([np.nan, np.nan]), at, gap=1.0).status == Status.NO_DATA).all()
+    assert (resample_reading(reading([np.nan, np.nan]), at, max_gap=1.0).status == Status.NO_DATA).all()
 
 
 # ---- reflections -----------------------------------------------------------------------------------------------
@@ -265,40 +276,40 @@ def test_resampling() -> None:
 def test_choice_of_a_peak(device: Device) -> None:
     """A mirror image that outshines the line, always on the same side: the first peak is the line."""
     view = camera_view()
-    u = np.full(view.samples, view.u_middles[20])
+    u = np.full(view.samples, view.u_centres[20])
     light = {
         "direct": gaussian(view, u, 1e-9, PIXEL),
         "diffuse-specular": gaussian(view, u + 25 * PIXEL, 3e-9, PIXEL),
     }
-    g, h = sheet_point(view.triangulation, u, view.v_middles)
-    truth = Truth(g, h, np.zeros(u.shape, np.uint8))
-    found = compare_peaks(camera(view, readout={"threshold": 1.0}, gain=5e-5), light, truth, device=device)
-    order = rank(found, 1e-5)
+    g, h = sheet_point(view.triangulation, u, view.v_centres)
+    truth = GroundTruth(g, h, np.zeros(u.shape, np.uint8))
+    found = compare_peak_selections(camera(view, readout={"threshold": 1.0}, gain=5e-5), light, truth, device=device)
+    order = rank_candidates(found, 1e-5)
     assert order[0].name == "first"
-    assert [each.unread for each in order] == [0.0, 1.0, 1.0]
+    assert [each.failed_fraction for each in order] == [0.0, 1.0, 1.0]
     assert order[0].rms < 1e-6
-    assert (found["strongest"].dominant(1e-5) == list(found["strongest"].causes).index("secondary")).all()
+    assert (found["strongest"].dominant_cause(1e-5) == list(found["strongest"].causes).index("secondary")).all()
 
 
 def test_rank_of_directions(device: Device) -> None:
     """The place from which less gloss is seen comes first; false readings count as much as missing ones."""
     view = psd_view()
     u = np.zeros(view.samples)
-    truth = Truth(*sheet_point(view.triangulation, u, view.v_middles), np.zeros(5, np.uint8))
+    truth = GroundTruth(*sheet_point(view.triangulation, u, view.v_centres), np.zeros(5, np.uint8))
     direct = gaussian(view, u, 1e-6, 5e-5)
     gloss = {name: gaussian(view, u + 1e-3, power, 5e-5) for name, power in (("shiny", 1e-6), ("dull", 1e-9))}
     found = {
         name: attribute_errors(psd(view), {"direct": direct, "specular": each}, truth, device=device)
         for name, each in gloss.items()
     }
-    nothing = Truth(truth.g, np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL, np.uint8))
+    nothing = GroundTruth(truth.g, np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL, np.uint8))
     found["false"] = attribute_errors(psd(view), {"direct": direct}, nothing, device=device)
-    order = rank(found, 1e-4)
+    order = rank_candidates(found, 1e-4)
     assert order[0].name == "dull"
-    assert {each.name: (each.unread, each.false) for each in order} == {
+    assert {each.name: (each.failed_fraction, each.spurious_fraction) for each in order} == {
         "dull": (0.0, 0.0),
         "shiny": (1.0, 0.0),
         "false": (0.0, 1.0),
     }
     with pytest.raises(ValueError, match="one candidate"):
-        rank({}, 1e-4)
+        rank_candidates({}, 1e-4)

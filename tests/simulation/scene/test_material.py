@@ -25,7 +25,7 @@ def test_more_light_than_arrives_is_refused(gloss):
 def test_a_facet_lobe_of_full_fresnel_leaves_nothing_to_the_diffuse_part(alpha):
     with pytest.raises(ValueError, match="throws back"):
         Material(diffuse=Lambert(albedo=0.2), gloss=Ggx(alpha=alpha))
-    Material(diffuse=Lambert(albedo=0.2), gloss=Ggx(alpha=alpha, facing=0.75))
+    Material(diffuse=Lambert(albedo=0.2), gloss=Ggx(alpha=alpha, f0=0.75))
 
 
 def test_a_lobe_is_no_diffuse_part():

@@ -17,7 +17,7 @@ MODELS = {
     "lambert": Lambert(albedo=0.8),
     "phong": Phong(albedo=0.7, exponent=30.0),
     "oren-nayar": OrenNayar(albedo=0.9, roughness=0.6),
-    "ggx": Ggx(alpha=0.3, facing=0.5),
+    "ggx": Ggx(alpha=0.3, f0=0.5),
     "ward": Ward(albedo=0.6, alpha_x=0.1, alpha_y=0.4),
 }
 FULL = {
@@ -108,7 +108,7 @@ def test_slopes_as_oren_and_nayar_say(sigma: float, rng: np.random.Generator) ->
     level = 1.0 - 0.5 * sigma**2 / (sigma**2 + 0.33)
     slope = 0.45 * sigma**2 / (sigma**2 + 0.09)
     expected = 1.0 + slope / level * np.cos(azimuth) * np.sin(polar.max(axis=0)) * np.tan(polar.min(axis=0))
-    model = OrenNayar.of_slopes(albedo=0.7, sigma=sigma)
+    model = OrenNayar.from_slope_sigma(albedo=0.7, sigma=sigma)
     normal = model.value([0.0, 0.0, 1.0, 0.0, 0.0, 1.0])
     np.testing.assert_allclose(model.value(np.hstack([light, eye])) / normal, expected, rtol=1e-12)
     assert albedo(model, 0.5) <= 0.7 * (1.0 + 1e-9)
@@ -117,7 +117,7 @@ def test_slopes_as_oren_and_nayar_say(sigma: float, rng: np.random.Generator) ->
 def test_slopes_out_of_range() -> None:
     for sigma in (-0.1, 2.0):
         with pytest.raises(ValueError, match="expected radians"):
-            OrenNayar.of_slopes(albedo=0.5, sigma=sigma)
+            OrenNayar.from_slope_sigma(albedo=0.5, sigma=sigma)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.5, 1.0, 1.3])
@@ -128,7 +128,7 @@ def test_limits_to_the_mirror(angle: float) -> None:
         light = [math.sin(angle), 0.0, math.cos(angle)]
         mirror, aside = ([-math.sin(angle + tilt), 0.0, math.cos(angle + tilt)] for tilt in (0.0, 0.05))
         assert model.value([*light, *aside]) < 1e-4 * model.value([*light, *mirror])
-    half = Ggx(alpha=1e-3, facing=0.04)
+    half = Ggx(alpha=1e-3, f0=0.04)
     schlick = 0.04 + 0.96 * (1.0 - math.cos(angle)) ** 5
     assert abs(lobe(half, angle, 1e-3) / schlick - 1.0) < 1e-2
 

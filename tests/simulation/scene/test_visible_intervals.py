@@ -122,7 +122,7 @@ def test_more_parts_than_are_kept_and_numbers_that_are_none(device: Device, vari
     fans[1, 4], fans[2, 10] = np.nan, np.inf
     fans[3, 6:9] = -fans[3, :3] + 2 * fans[3, 3:6]  # end on
     for kept, expected in ((4, Status.AMBIGUOUS), (40, 0)):
-        result = VisibleIntervals(scene=Scene(bars), kept=kept, variant=variant)(fans, device=device)
+        result = VisibleIntervals(scene=Scene(bars), max_intervals=kept, variant=variant)(fans, device=device)
         np.testing.assert_array_equal(result.status, [expected, Status.NOT_FINITE, Status.NOT_FINITE, 0])
         np.testing.assert_array_equal(result.count, [0 if expected else 21, 0, 0, 0])
         assert np.isnan(result.intervals[result.count == 0]).all()
@@ -143,8 +143,8 @@ def test_writes_only_its_outputs(device: Device, rng: np.random.Generator) -> No
 def test_what_it_does_not_take(device: Device, rng: np.random.Generator) -> None:
     with pytest.raises(TypeError, match="Scene"):
         VisibleIntervals(scene=soup(rng, 1))
-    with pytest.raises(ValueError, match="kept"):
-        VisibleIntervals(scene=Scene(soup(rng, 1)), kept=0)
+    with pytest.raises(ValueError, match="max_intervals"):
+        VisibleIntervals(scene=Scene(soup(rng, 1)), max_intervals=0)
     with pytest.raises(ValueError, match=r"\(\.\.\., 11\)"):
         VisibleIntervals(scene=Scene(soup(rng, 1)))(np.zeros((4, 9)), device=device)
     with pytest.raises(TypeError, match="float32"):

@@ -9,7 +9,7 @@ from gpuvision.host import Device
 from gpuvision.ranging.psd import ELECTRON
 from gpuvision.ranging.triangulation import SampleAxes
 from gpuvision.simulation.sensors.masks import Mask
-from gpuvision.simulation.sensors.readings import height_secant, sheet_point, stack
+from gpuvision.simulation.sensors.readings import height_secant, sheet_point, stack_profiles
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
 from lights import camera, camera_view, gaussian, pixel_axes
@@ -23,7 +23,7 @@ def watts(electrons: float) -> float:
 
 
 def line(view, pixels=30.3, electrons: float = 1e5, sigma: float = 1.2) -> dict[str, Exposure]:
-    u = view.u_middles[0] + PIXEL * np.broadcast_to(np.asarray(pixels, float), view.samples)
+    u = view.u_centres[0] + PIXEL * np.broadcast_to(np.asarray(pixels, float), view.samples)
     return {"direct": gaussian(view, u, watts(electrons), sigma * PIXEL)}
 
 
@@ -48,11 +48,11 @@ def test_reading_of_a_clean_line(along: str, device: Device) -> None:
     if triangulation is None:
         rows = view.triangulation.to_dict() | {"along": "rows"}
         readout["triangulation"] = type(view.triangulation).from_dict(rows)
-    reading = camera(view, readout=readout, gain=1e-3).read(stack([line(view, pixels)] * 2), device=device)
-    u = view.u_middles[0] + PIXEL * pixels
+    reading = camera(view, readout=readout, gain=1e-3).read(stack_profiles([line(view, pixels)] * 2), device=device)
+    u = view.u_centres[0] + PIXEL * pixels
     # Frames are single precision: 64 pixels of 6e-8 each.
     np.testing.assert_allclose(reading.position, np.stack([u, u]), atol=2e-5 * PIXEL)
-    g, h = sheet_point(view.triangulation, u, view.v_middles)
+    g, h = sheet_point(view.triangulation, u, view.v_centres)
     np.testing.assert_allclose(reading.h[0], h, atol=1e-7)
     np.testing.assert_allclose(reading.g[1], g, atol=1e-7)
     assert not reading.status.any()
@@ -66,13 +66,13 @@ def test_photon_and_read_noise(device: Device) -> None:
         # The threshold lies below what noise leaves of the offset: nothing is cut.
         readout = {"method": "windowed", "window": 6, "threshold": 200.0 if read_noise else 300.0}
         simulator = camera(view, readout=readout, gain=0.5, bits=16, offset=300.0, read_noise=read_noise)
-        reading = simulator.read(stack([one] * 120), seed=5, device=device)
+        reading = simulator.read(stack_profiles([one] * 120), seed=5, device=device)
         sigma = simulator.read(one, device=device).sigma
         # 1920 samples: 1.6 % is one standard error.
         assert np.sqrt(np.mean((reading.h.std(axis=0, ddof=1) / sigma) ** 2)) == pytest.approx(1.0, abs=0.07)
         if read_noise == 0.0:
-            u = view.u_middles[0] + 30.3 * PIXEL
-            slope = height_secant(view.triangulation, u, u, view.v_middles)
+            u = view.u_centres[0] + 30.3 * PIXEL
+            slope = height_secant(view.triangulation, u, u, view.v_centres)
             # A pixel blurs by itself.
             blur = np.sqrt(1.2**2 + 1.0 / 12.0) * PIXEL
             np.testing.assert_allclose(sigma, slope * blur / np.sqrt(2e4), rtol=2e-3)
@@ -95,8 +95,10 @@ def test_saturation_and_rounding(device: Device) -> None:
 def test_noise_belongs_to_the_profile() -> None:
     view = camera_view()
     simulator = camera(view, gain=0.5, bits=12)
-    whole = simulator.frames(stack([line(view)] * 4), seed=9)
-    np.testing.assert_array_equal(simulator.frames(stack([line(view)] * 2), seed=9, first=2), whole[2:])
+    whole = simulator.frames(stack_profiles([line(view)] * 4), seed=9)
+    np.testing.assert_array_equal(
+        simulator.frames(stack_profiles([line(view)] * 2), seed=9, first_profile=2), whole[2:]
+    )
     assert not np.array_equal(whole[0], whole[1])
 
 
@@ -105,7 +107,7 @@ def test_mask_is_a_region_of_interest(device: Device) -> None:
     view = camera_view()
     light = line(view, 20.0) | {"diffuse-specular": line(view, 50.0, electrons=2e5)["direct"]}
     mask = Mask(windows=[view.u_edges[[10, 30]]] * view.samples)
-    first = view.u_middles[0]
+    first = view.u_centres[0]
     for given, pixel in ((None, 50.0), (mask, 20.0)):
         reading = camera(view, mask=given, gain=1e-3).read(light, device=device)
         np.testing.assert_allclose(reading.position, first + pixel * PIXEL, atol=1e-4 * PIXEL)
@@ -117,9 +119,9 @@ def test_axes_that_run_backwards(device: Device) -> None:
     light = line(view, 30.0 + np.arange(view.samples) * 0.37)
     axes = pixel_axes(view)
     turned = SampleAxes(
-        position_origin=float(view.u_middles[-1]),
+        position_origin=float(view.u_centres[-1]),
         position_pitch=-axes.position_pitch,
-        sample_origin=float(view.v_middles[-1]),
+        sample_origin=float(view.v_centres[-1]),
         sample_pitch=-axes.sample_pitch,
     )
     method = {"method": "windowed", "window": 6}

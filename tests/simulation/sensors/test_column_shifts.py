@@ -107,7 +107,7 @@ def groove(angle: float) -> tuple[Scene, LitSegments]:
 
 def secondary(one: SensorView, scene: Scene, lit: LitSegments) -> Exposure:
     lines = ViewRays(view=one, scene=scene, materials=[Material(diffuse=Lambert(albedo=ALBEDO))])
-    seen = lines.surface(0.0)
+    seen = lines.visible_surface(0.0)
     irradiance = LineIrradiance(segments=lit)(seen.receivers, device=Device.best()).irradiance
     return lines.exposure(seen, np.where(seen.triangle >= 0, irradiance, 0.0))
 
@@ -123,13 +123,20 @@ def direct(one: SensorView, lit: LitSegments) -> tuple[Exposure, np.ndarray]:
     towards = one.lens_at(0.0) - places
     cosine = np.sum(normals * towards, axis=1) / np.linalg.norm(towards, axis=1)
     # A metre of the sheet brings 1 W, on however much of the wall.
-    power = ALBEDO / math.pi * cosine * one.received(places) / np.gradient(v, places[:, 0]) * np.diff(one.v_edges)[0]
-    middle, spread, power = (np.interp(one.v_middles, v, each) for each in (u, spread, power))
+    power = (
+        ALBEDO
+        / math.pi
+        * cosine
+        * one.aperture_solid_angle(places)
+        / np.gradient(v, places[:, 0])
+        * np.diff(one.v_edges)[0]
+    )
+    middle, spread, power = (np.interp(one.v_centres, v, each) for each in (u, spread, power))
     x = (one.u_edges - middle[:, None]) / spread[:, None]
     share = np.where(x[:, :-1] > 0.0, -np.diff(ndtr(-x), axis=1), np.diff(ndtr(x), axis=1))
     first = -spread[:, None] * np.diff(np.exp(-0.5 * x**2) / math.sqrt(2.0 * math.pi), axis=1)
-    moment = first + (middle[:, None] - one.u_middles) * share
-    whole = (one.v_middles > v[0]) & (one.v_middles < v[-1]) & (np.abs(middle) < HALF - 16.5 * PIXEL)
+    moment = first + (middle[:, None] - one.u_centres) * share
+    whole = (one.v_centres > v[0]) & (one.v_centres < v[-1]) & (np.abs(middle) < HALF - 16.5 * PIXEL)
     return Exposure(power[:, None] * share, power[:, None] * moment), whole
 
 
@@ -150,7 +157,7 @@ def of_board(columns: int = PIXELS) -> Shifts:
     sheet = LightSheet(transport=one.transport, power=1.0, sigma=FWHM / 2.3548)
     line = DirectLight(view=one, scene=of.scene, materials=materials, sheet=sheet).exposures(at)["direct"]
     lines = ViewRays(view=one, scene=of.scene, materials=materials)
-    seen = lines.surface(at)
+    seen = lines.visible_surface(at)
     receivers = np.where((seen.triangle >= 0)[..., None], seen.receivers, 0.0)
     lit = sheet.lit(of.scene, at)
     rows = segment_rows(LitSegments(lit.ends, lit.normals, ALBEDO * lit.power))
@@ -167,9 +174,9 @@ def shifts(one: SensorView, line: Exposure, glow: Exposure, whole: np.ndarray) -
     alone, together = {"direct": line}, {"direct": line, "diffuse-diffuse": glow}
     electrons = (line.power + glow.power)[whole].max() * 0.4 * EXPOSED / ELECTRON
     axes = SampleAxes(
-        position_origin=float(one.u_middles[0]),
+        position_origin=float(one.u_centres[0]),
         position_pitch=PIXEL,
-        sample_origin=float(one.v_middles[0]),
+        sample_origin=float(one.v_centres[0]),
         sample_pitch=float(np.diff(one.v_edges)[0]),
     )
     strips = SampleAxes(sample_origin=axes.sample_origin, sample_pitch=axes.sample_pitch)
@@ -244,7 +251,7 @@ def test_the_direct_line_is_read_where_it_is():
     _, lit = groove(math.radians(90.0))
     line, whole = direct(one, lit)
     u = line.first_moment(one.u_edges) / line.total()
-    place = one.points_in_sheet(u, one.v_middles)
+    place = one.points_in_sheet(u, one.v_centres)
     np.testing.assert_allclose(place[whole, 2], np.abs(place[whole, 0]), atol=1e-6)
 
 

@@ -19,7 +19,7 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.camera_simulator import CameraSimulator
 from gpuvision.simulation.sensors.masks import Mask, optimise_mask
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
-from gpuvision.simulation.sensors.readings import Truth, stack
+from gpuvision.simulation.sensors.readings import GroundTruth, stack_profiles
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.sensors.view_rays import ViewRays
 from gpuvision.simulation.transport.direct import DirectLight
@@ -74,13 +74,15 @@ def columns(first: int, count: int) -> SensorView:
     )
 
 
-def light_of(scene: Scene, view: SensorView, device: Device, sigma: float = 0.0) -> tuple[dict[str, Exposure], Truth]:
+def light_of(
+    scene: Scene, view: SensorView, device: Device, sigma: float = 0.0
+) -> tuple[dict[str, Exposure], GroundTruth]:
     """Return the direct light and what is diffusely reflected once between the walls."""
     materials = (Material(diffuse=Lambert(albedo=ALBEDO)),)
     sheet = LightSheet(transport=view.transport, power=1.0, sigma=sigma)
     direct = DirectLight(view=view, scene=scene, materials=materials, sheet=sheet, device=device)
     lines = ViewRays(view=view, scene=scene, materials=materials, device=device)
-    seen, lit = lines.surface(0.0), sheet.lit(scene, 0.0)
+    seen, lit = lines.visible_surface(0.0), sheet.lit(scene, 0.0)
     segments = segment_rows(LitSegments(lit.ends, lit.normals, ALBEDO * lit.power))
     real = np.float64 if device.has_double else np.float32
     operation = OccludedIrradiance(scene=scene, segments=len(segments), precision="single")
@@ -169,10 +171,10 @@ def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
         np.testing.assert_allclose(simulator.read(light, device=device).position, own, atol=near)
     # Of the error next to all is the other wall's.
     found = attribute_errors(strips, light, truth, device=device)
-    assert (found.dominant() == list(found.causes).index("secondary")).all()
+    assert (found.dominant_cause() == list(found.causes).index("secondary")).all()
     np.testing.assert_allclose(found.causes["secondary"], found.error, rtol=0.01)
     masked = attribute_errors(
-        PsdSimulator(view=view, readout=strips.readout, mask=Mask.about(view, truth, 16.0 * PIXEL)),
+        PsdSimulator(view=view, readout=strips.readout, mask=Mask.around_profile(view, truth, 16.0 * PIXEL)),
         light,
         truth,
         device=device,
@@ -184,10 +186,10 @@ def test_mask_for_a_groove(device: Device) -> None:
     """The best fixed mask takes nearly all of the error, and nothing of the line."""
     view = columns(12, 24)
     light, truth = light_of(groove(90.0, 100.0 * MM, 43.0 * MM), view, device, sigma=0.15 * MM / 2.3548)
-    block = stack([light])
-    plan = optimise_mask(view, block, Truth(*(np.asarray(each)[None] for each in truth)))
-    assert np.all(plan.kept >= 0.999)
-    assert np.abs(plan.after).max() < 0.01 * np.abs(plan.before).max()
+    block = stack_profiles([light])
+    plan = optimise_mask(view, block, GroundTruth(*(np.asarray(each)[None] for each in truth)))
+    assert np.all(plan.passed_fraction >= 0.999)
+    assert np.abs(plan.error_after).max() < 0.01 * np.abs(plan.error_before).max()
 
 
 # Median and 95 % of the shift [pixel] by a full column, by windows of 16 and of 4 pixels either side; the line's share.

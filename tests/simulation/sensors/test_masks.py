@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gpuvision.camera.lens import Lens
 from gpuvision.simulation.sensors.masks import Mask, optimise_mask
-from gpuvision.simulation.sensors.readings import Truth, height_secant, sheet_point
+from gpuvision.simulation.sensors.readings import GroundTruth, height_secant, sheet_point
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from lights import LENGTH, gaussian, psd, psd_view
 
@@ -129,16 +129,16 @@ def test_mask_about_an_expected_profile(lens: Lens | None) -> None:
     view = psd_view()
     view = replace(view, triangulation=replace(view.triangulation, lens=lens))
     u = np.array([-2e-3, -1e-3, np.nan, 1e-3, 2.9e-3])
-    truth = Truth(*sheet_point(view.triangulation, u, view.v_middles), np.zeros(5, np.uint8))
-    windows = Mask.about(view, truth, 2e-3).windows
+    truth = GroundTruth(*sheet_point(view.triangulation, u, view.v_centres), np.zeros(5, np.uint8))
+    windows = Mask.around_profile(view, truth, 2e-3).windows
     assert windows[2, 0] == windows[2, 1]
     assert windows[4, 1] == 0.5 * LENGTH
     seen = [0, 1, 3]
     for end, rise in ((0, -2e-3), (1, 2e-3)):
-        _, h = sheet_point(view.triangulation, windows[:, end], view.v_middles)
+        _, h = sheet_point(view.triangulation, windows[:, end], view.v_centres)
         np.testing.assert_allclose(h[seen], truth.h[seen] + rise, atol=1e-12)
-    with pytest.raises(ValueError, match="reach is 0"):
-        Mask.about(view, truth, 0.0)
+    with pytest.raises(ValueError, match="half_height is 0"):
+        Mask.around_profile(view, truth, 0.0)
 
 
 # ---- the best mask -------------------------------------------------------------------------------------------
@@ -153,21 +153,21 @@ def part(profiles: int = 12) -> tuple:
         "direct": gaussian(view, u, 1e-6, 4e-5),
         "diffuse-diffuse": gaussian(view, np.full((profiles, view.samples), -2.0e-3), 2e-7, 3e-4),
     }
-    g, h = sheet_point(view.triangulation, u, view.v_middles)
-    return view, light, Truth(g, h, np.zeros(u.shape, np.uint8)), u
+    g, h = sheet_point(view.triangulation, u, view.v_centres)
+    return view, light, GroundTruth(g, h, np.zeros(u.shape, np.uint8)), u
 
 
-@pytest.mark.parametrize("objective", ["worst", "rms"])
+@pytest.mark.parametrize("objective", ["max", "rms"])
 def test_fixed_mask(objective: str) -> None:
     """No window of bins that cuts no more does better: all of them tried."""
     view, light, truth, u = part()
-    plan = optimise_mask(view, light, truth, objective=objective, keep=0.999)
-    assert np.all(plan.kept >= 0.999)
+    plan = optimise_mask(view, light, truth, objective=objective, min_passed_fraction=0.999)
+    assert np.all(plan.passed_fraction >= 0.999)
     assert plan.mask.windows.shape == (view.samples, 2)
-    slope = height_secant(view.triangulation, u, u, view.v_middles)
+    slope = height_secant(view.triangulation, u, u, view.v_centres)
     total = light["direct"] + light["diffuse-diffuse"]
-    judge = (lambda e: np.abs(e).max(axis=0)) if objective == "worst" else (lambda e: np.sqrt(np.mean(e**2, axis=0)))
-    np.testing.assert_allclose(judge(plan.before), judge((centre(total, view.u_edges) - u) * slope), rtol=1e-9)
+    judge = (lambda e: np.abs(e).max(axis=0)) if objective == "max" else (lambda e: np.sqrt(np.mean(e**2, axis=0)))
+    np.testing.assert_allclose(judge(plan.error_before), judge((centre(total, view.u_edges) - u) * slope), rtol=1e-9)
     best = np.full(view.samples, np.inf)
     for low, high in itertools.combinations(range(121), 2):
         allowed = (_tails(light["direct"], low, high) <= 0.0005).all(axis=0)
@@ -175,8 +175,8 @@ def test_fixed_mask(objective: str) -> None:
             mask = Mask(windows=np.broadcast_to(view.u_edges[[low, high]], (view.samples, 2)))
             cost = judge((centre(mask.apply(total, view.u_edges), view.u_edges) - u) * slope)
             best = np.where(allowed, np.minimum(best, cost), best)
-    np.testing.assert_allclose(judge(plan.after), best, rtol=1e-9)
-    assert np.all(judge(plan.after) < 0.5 * judge(plan.before))
+    np.testing.assert_allclose(judge(plan.error_after), best, rtol=1e-9)
+    assert np.all(judge(plan.error_after) < 0.5 * judge(plan.error_before))
 
 
 def _tails(direct: Exposure, low: int, high: int) -> np.ndarray:
@@ -191,14 +191,14 @@ def test_mask_that_follows_the_part() -> None:
     fixed = optimise_mask(view, light, truth)
     follows = optimise_mask(view, light, truth, fixed=False)
     assert follows.mask.windows.shape == (*u.shape, 2)
-    assert np.all(follows.kept >= 0.999)
-    assert np.abs(follows.after).max() < 0.05 * np.abs(fixed.after).max()
+    assert np.all(follows.passed_fraction >= 0.999)
+    assert np.abs(follows.error_after).max() < 0.05 * np.abs(fixed.error_after).max()
     assert np.all((follows.mask.windows[..., 0] < u) & (u < follows.mask.windows[..., 1]))
 
 
 def test_margin_keeps_away_from_valid_light() -> None:
     view, light, truth, u = part()
-    windows = optimise_mask(view, light, truth, keep=0.999, margin=3e-4).mask.windows
+    windows = optimise_mask(view, light, truth, min_passed_fraction=0.999, margin=3e-4).mask.windows
     # 99.95 % of a Gaussian on either side are 3.29 sigma; a bin is 50 um wide.
     assert np.all(windows[:, 0] <= u.min(axis=0) - 3e-4 - 3.29 * 4e-5 + 5e-5)
     assert np.all(windows[:, 1] >= u.max(axis=0) + 3e-4 + 3.29 * 4e-5 - 5e-5)
@@ -211,9 +211,9 @@ def test_samples_without_valid_light_are_closed() -> None:
     dark[:, 2] = dark[1, 3] = True
     direct = Exposure(*(np.where(dark[..., None], 0.0, each) for each in light["direct"]))
     light = light | {"direct": direct}
-    plan = optimise_mask(view, light, Truth(truth.g, np.where(dark, np.nan, truth.h), truth.status))
+    plan = optimise_mask(view, light, GroundTruth(truth.g, np.where(dark, np.nan, truth.h), truth.status))
     assert plan.mask.windows[2, 0] == plan.mask.windows[2, 1]
-    assert np.isfinite(plan.after).tolist() == (~dark).tolist()
+    assert np.isfinite(plan.error_after).tolist() == (~dark).tolist()
     masked = psd(view, mask=plan.mask).currents(light)
     assert not masked[:, 2].any()
     assert masked[:, [0, 1, 3, 4]].all()
@@ -227,16 +227,16 @@ def test_a_camera_of_many_pixels() -> None:
     u = np.array([[-1e-3, -5e-4, 0.0, 5e-4, 1e-3]])
     glow = np.broadcast_to(np.linspace(0.0, 1e-9, 1024), (1, 5, 1024))
     light = {"direct": gaussian(view, u, 1e-6, 4e-5), "bounces": Exposure(glow, np.zeros_like(glow))}
-    g, h = sheet_point(view.triangulation, u, view.v_middles)
-    plan = optimise_mask(view, light, Truth(g, h, np.zeros(u.shape, np.uint8)), keep=0.9999)
-    assert np.abs(plan.after).max() < 0.02 * np.abs(plan.before).max()
+    g, h = sheet_point(view.triangulation, u, view.v_centres)
+    plan = optimise_mask(view, light, GroundTruth(g, h, np.zeros(u.shape, np.uint8)), min_passed_fraction=0.9999)
+    assert np.abs(plan.error_after).max() < 0.02 * np.abs(plan.error_before).max()
 
 
 def test_what_optimising_refuses() -> None:
     view, light, truth, _ = part(2)
     with pytest.raises(ValueError, match="objective is 'best'"):
         optimise_mask(view, light, truth, objective="best")
-    with pytest.raises(ValueError, match="0 < keep <= 1"):
-        optimise_mask(view, light, truth, keep=0.0)
+    with pytest.raises(ValueError, match="0 < min_passed_fraction <= 1"):
+        optimise_mask(view, light, truth, min_passed_fraction=0.0)
     with pytest.raises(ValueError, match="profiles, samples, bins"):
         optimise_mask(view, {"direct": view.dark()}, truth)

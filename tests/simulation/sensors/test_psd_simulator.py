@@ -13,7 +13,7 @@ from gpuvision.ranging.psd import ELECTRON, PsdNoise
 from gpuvision.ranging.triangulation import SampleAxes
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
-from gpuvision.simulation.sensors.readings import height_secant, sheet_point, stack
+from gpuvision.simulation.sensors.readings import height_secant, sheet_point, stack_profiles
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
 from lights import LENGTH, PITCH, gaussian, psd, psd_view
@@ -56,7 +56,7 @@ def test_several_lights() -> None:
     for bins in (1, 7, 60):
         view = psd_view(bins)
         light = {
-            path: view.deposit(x, view.v_middles, power)
+            path: view.deposit_spots(x, view.v_centres, power)
             for path, x, power in zip(("direct", "diffuse-diffuse", "bounces"), places, powers, strict=True)
         }
         _, u = moments(psd(view), light)
@@ -99,13 +99,13 @@ def test_reading_undoes_the_electronics(device: Device) -> None:
         "precision": "single" if not device.has_double else "double",
     }
     places = np.array([-2.9e-3, -1e-3, 1e-6, 1.234e-3, 2.9e-3])
-    light = stack([{"direct": view.deposit(places, view.v_middles, 1e-6)}] * 3)
+    light = stack_profiles([{"direct": view.deposit_spots(places, view.v_centres, 1e-6)}] * 3)
     simulator = psd(view, readout=electronics)
     reading = simulator.read(light, device=device)
     rounding = 1e-12 if device.has_double else 1e-6
     np.testing.assert_allclose(reading.position, np.broadcast_to(places, (3, 5)), atol=LENGTH * rounding)
     np.testing.assert_allclose(reading.strength, 0.4e-6, rtol=2.0 * rounding)
-    g, h = sheet_point(view.triangulation, places, view.v_middles)
+    g, h = sheet_point(view.triangulation, places, view.v_centres)
     np.testing.assert_allclose(reading.h[1], h, atol=0.1 * rounding)
     np.testing.assert_allclose(reading.g[2], g, atol=0.1 * rounding)
     assert not reading.status.any()
@@ -113,7 +113,7 @@ def test_reading_undoes_the_electronics(device: Device) -> None:
 
 def test_no_light_is_no_reading(device: Device) -> None:
     view = psd_view()
-    reading = psd(view).read({"direct": view.deposit([0.0], [view.v_middles[1]], [1e-6])}, device=device)
+    reading = psd(view).read({"direct": view.deposit_spots([0.0], [view.v_centres[1]], [1e-6])}, device=device)
     assert np.isfinite(reading.h).tolist() == [False, True, False, False, False]
     assert (reading.status == Status.LOW_SIGNAL).tolist() == [True, False, True, True, True]
 
@@ -121,8 +121,8 @@ def test_no_light_is_no_reading(device: Device) -> None:
 def test_codes(device: Device) -> None:
     """Codes are within half a step of the currents; what is beyond the highest one is flagged."""
     view = psd_view()
-    light = {"direct": view.deposit([1e-3] * 3, view.v_middles[:3], [1e-6, 1e-7, 1e-2])}
-    coded = psd(view, readout={"ampere": 1e-11, "dark": (1e-9, 1e-9)}, codes=True)
+    light = {"direct": view.deposit_spots([1e-3] * 3, view.v_centres[:3], [1e-6, 1e-7, 1e-2])}
+    coded = psd(view, readout={"ampere": 1e-11, "dark": (1e-9, 1e-9)}, quantised=True)
     codes = coded.currents(light, seed=0)
     assert codes.dtype == np.uint16
     exact = psd(view, readout={"dark": (1e-9, 1e-9)}).currents(light)
@@ -142,14 +142,14 @@ def test_noise_is_what_the_readout_predicts(device: Device) -> None:
     view, spot, current = psd_view(), 2e-4, 0.4e-6
     places = np.linspace(-2e-3, 2e-3, view.samples)
     one = {"direct": gaussian(view, places, current / 0.4, spot)}
-    light = stack([one] * 600)
+    light = stack_profiles([one] * 600)
     for kinds in ({"independent": 2e-9}, {"opposed": 2e-9}, {"spot": spot, "bandwidth": 1e9}):
         simulator = psd(view, readout={"noise": PsdNoise(**kinds)})
         reading = simulator.read(light, seed=7, device=device)
         sigma = simulator.read(one, device=device).sigma
         # 3000 samples: 1.3 % is one standard error; shot noise knows the spot's bins only.
         assert np.sqrt(np.mean((reading.h.std(axis=0) / sigma) ** 2)) == pytest.approx(1.0, abs=0.06)
-        slope = height_secant(view.triangulation, places, places, view.v_middles)
+        slope = height_secant(view.triangulation, places, places, view.v_centres)
         electrons = current / (2.0 * ELECTRON * kinds.get("bandwidth", 1.0))
         if "spot" in kinds:
             np.testing.assert_allclose(sigma, slope * spot / np.sqrt(electrons), rtol=1e-4)
@@ -160,16 +160,16 @@ def test_noise_belongs_to_the_profile() -> None:
     view = psd_view()
     light = {"direct": gaussian(view, [0.0], 1e-6, 5e-5)}
     simulator = psd(view, readout={"noise": PsdNoise(independent=1e-9, bandwidth=1e6)})
-    whole = simulator.currents(stack([light] * 6), seed=3)
-    np.testing.assert_array_equal(simulator.currents(stack([light] * 2), seed=3, first=4), whole[4:])
-    np.testing.assert_array_equal(simulator.currents(light, seed=3, first=2), whole[2])
+    whole = simulator.currents(stack_profiles([light] * 6), seed=3)
+    np.testing.assert_array_equal(simulator.currents(stack_profiles([light] * 2), seed=3, first_profile=4), whole[4:])
+    np.testing.assert_array_equal(simulator.currents(light, seed=3, first_profile=2), whole[2])
     assert len(np.unique(whole)) == whole.size
     assert not np.array_equal(simulator.currents(light, seed=4), whole[0])
 
 
 def test_ambient_light_has_shot_noise_also_where_its_mean_is_gone() -> None:
     view = psd_view()
-    light = stack([{"direct": gaussian(view, [0.0], 1e-6, 5e-5)}] * 400)
+    light = stack_profiles([{"direct": gaussian(view, [0.0], 1e-6, 5e-5)}] * 400)
     quiet, loud = (
         psd(view, ambient=power, modulated=True, readout={"noise": PsdNoise(bandwidth=1e6)}).currents(light, seed=1)
         for power in (0.0, 99e-6)
@@ -181,7 +181,7 @@ def test_ambient_light_has_shot_noise_also_where_its_mean_is_gone() -> None:
 def test_axes_that_run_backwards(device: Device) -> None:
     """A readout whose axes point against the sensor's coordinates says the same of the light, in the view's order."""
     view = psd_view()
-    axes = SampleAxes(sample_origin=float(view.v_middles[-1]), sample_pitch=-PITCH, position_pitch=-1.0)
+    axes = SampleAxes(sample_origin=float(view.v_centres[-1]), sample_pitch=-PITCH, position_pitch=-1.0)
     table = tuple(tuple(1e-6 * np.arange(3) * strip) for strip in range(view.samples))
     light = {"direct": gaussian(view, np.linspace(-2e-3, 2e-3, 5), [1e-6, 2e-6, 3e-6, 4e-6, 5e-6], 5e-5)}
     ahead = psd(view, readout={"linearity": table[::-1]}).read(light, device=device)

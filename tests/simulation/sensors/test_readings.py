@@ -12,14 +12,14 @@ from gpuvision.host import Device
 from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.simulation.sensors.readings import (
     AMBIENT,
-    EVEN,
-    Truth,
+    UNIFORM,
+    GroundTruth,
+    add_ambient,
     height_secant,
     height_slope,
-    lit_by,
     sheet_point,
-    stack,
-    with_ambient,
+    stack_profiles,
+    total_exposure,
 )
 from lights import LENGTH, PITCH, gaussian, psd_view
 
@@ -59,13 +59,13 @@ def test_secants(lens: Lens | None, rng: np.random.Generator) -> None:
 def test_slope_at_the_truth() -> None:
     view = psd_view()
     u = np.linspace(-2e-3, 2e-3, view.samples)
-    g, h = sheet_point(view.triangulation, u, view.v_middles)
+    g, h = sheet_point(view.triangulation, u, view.v_centres)
     h[1] = np.nan
-    found, slope = height_slope(view, Truth(g, h, np.zeros(5, np.uint8)))
+    found, slope = height_slope(view, GroundTruth(g, h, np.zeros(5, np.uint8)))
     known = np.arange(5) != 1
     np.testing.assert_allclose(found[known], u[known], atol=1e-15)
     assert np.isnan(found[1])
-    np.testing.assert_allclose(slope[known], height_secant(view.triangulation, u, u, view.v_middles)[known], rtol=1e-10)
+    np.testing.assert_allclose(slope[known], height_secant(view.triangulation, u, u, view.v_centres)[known], rtol=1e-10)
 
 
 def test_beyond_the_horizon_there_is_no_point() -> None:
@@ -81,14 +81,14 @@ def test_light_of_profiles() -> None:
     """Paths add up, variants of the direct light do not; a path that a profile lacks is dark there."""
     view = psd_view()
     spots = [gaussian(view, [place], 1e-6, 1e-4) for place in (-1e-3, 0.0, 1e-3)]
-    block = stack([{"direct": spots[0], EVEN: spots[2]}, {"direct": spots[1], "bounces": spots[2]}])
+    block = stack_profiles([{"direct": spots[0], UNIFORM: spots[2]}, {"direct": spots[1], "bounces": spots[2]}])
     assert not block["bounces"].power[0].any()
-    np.testing.assert_array_equal(lit_by(block).power, [spots[0].power, spots[1].power + spots[2].power])
-    np.testing.assert_array_equal(lit_by(block).moment, [spots[0].moment, spots[1].moment + spots[2].moment])
-    bright = with_ambient(view, with_ambient(view, block, 1e-6), 2e-6)
+    np.testing.assert_array_equal(total_exposure(block).power, [spots[0].power, spots[1].power + spots[2].power])
+    np.testing.assert_array_equal(total_exposure(block).moment, [spots[0].moment, spots[1].moment + spots[2].moment])
+    bright = add_ambient(view, add_ambient(view, block, 1e-6), 2e-6)
     np.testing.assert_allclose(bright[AMBIENT].total(), 3e-6, rtol=1e-14)
     for wrong in ([], [{}]):
         with pytest.raises(ValueError, match="one or more profiles"):
-            stack(wrong)
+            stack_profiles(wrong)
     with pytest.raises(ValueError, match="different shapes"):
-        lit_by({"direct": spots[0], "bounces": block["bounces"]})
+        total_exposure({"direct": spots[0], "bounces": block["bounces"]})

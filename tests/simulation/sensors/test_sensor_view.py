@@ -38,7 +38,7 @@ def test_what_is_behind_the_lens_or_over_the_horizon_is_nowhere():
     one = sensor_view()
     # Behind the lens; beside it, on a ray that does not come to the sheet.
     assert np.isnan(one.project([[0.0, 2 * BASELINE, 2 * STAND_OFF], [0.0, 0.5, 0.2]])).all()
-    assert one.received([0.0, 2 * BASELINE, 2 * STAND_OFF]) == 0.0
+    assert one.aperture_solid_angle([0.0, 2 * BASELINE, 2 * STAND_OFF]) == 0.0
 
 
 def test_an_untilted_lens_loses_by_the_fourth_power_of_the_cosine():
@@ -58,7 +58,7 @@ def test_a_patch_gives_what_its_image_gets(tilt, lens):
     size = 1e-6
     normal = np.cross(e1, e2) * size**2
     towards = one.lens_at(0.0) - middle
-    sent = one.received(middle) * abs(normal @ towards) / np.linalg.norm(towards)
+    sent = one.aperture_solid_angle(middle) * abs(normal @ towards) / np.linalg.norm(towards)
     corner = one.project([middle, middle + size * e1, middle + size * e2])
     image = abs(np.linalg.det(corner[1:] - corner[0]))
     np.testing.assert_allclose(sent, one.etendue(*corner[0]) * image, rtol=1e-4)
@@ -68,7 +68,7 @@ def test_light_is_counted_once_and_its_moment_kept():
     one = sensor_view()
     rng = np.random.default_rng(5)
     u, v, power = rng.uniform(-4e-3, 4e-3, 500), rng.uniform(-7e-3, 7e-3, 500), rng.uniform(0.0, 1.0, 500)
-    got = one.deposit(u, v, power)
+    got = one.deposit_spots(u, v, power)
     inside = (np.abs(u) <= 3e-3) & (np.abs(v) <= 6e-3)
     for k in range(one.samples):
         here = inside & (v >= one.v_edges[k]) & (v < one.v_edges[k + 1])
@@ -105,7 +105,7 @@ def test_a_blurred_spot_is_a_gaussian(sigma):
     one = sensor_view(u_edges=np.linspace(-3e-3, 3e-3, 61))
     # In one bin each, off its middle; the last one loses light at the sensor's end.
     at, light = np.array([0.37e-3, -1.02e-3, 2.94e-3]), np.array([2.0, 1.0, 0.5])
-    got = one.blurred(one.deposit(at, [0.0, 0.0, 0.0], light), sigma)
+    got = one.blur(one.deposit_spots(at, [0.0, 0.0, 0.0], light), sigma)
     edge = (one.u_edges[:, None] - at) / sigma
     below = 0.5 * (1.0 + np.vectorize(math.erf)(edge / math.sqrt(2.0)))
     bell = np.exp(-0.5 * edge**2) / math.sqrt(math.tau)
@@ -118,6 +118,6 @@ def test_a_blurred_spot_is_a_gaussian(sigma):
 
 def test_no_blur_changes_nothing():
     one = sensor_view()
-    got = one.deposit([1e-3], [0.0], [1.0])
-    assert one.blurred(got, 0.0) is got
-    assert not one.blurred(one.dark(), 1e-4).power.any()
+    got = one.deposit_spots([1e-3], [0.0], [1.0])
+    assert one.blur(got, 0.0) is got
+    assert not one.blur(one.dark(), 1e-4).power.any()

@@ -25,7 +25,7 @@ def floor(z: float = 0.0, size: float = 0.2) -> trimesh.Trimesh:
 def test_elements_lie_on_what_is_seen_where_its_image_is(device, nodes):
     one = sensor_view(tilt=0.1)
     lines = ViewRays(view=one, scene=Scene.of(floor(1e-3)), materials=[GREY], nodes=nodes, device=device)
-    seen = lines.surface(0.02)
+    seen = lines.visible_surface(0.02)
     assert seen.receivers.shape == (one.samples, one.bins * nodes[0] * nodes[1], 6)
     np.testing.assert_allclose(seen.receivers[..., 2], 1e-3, atol=1e-15)
     np.testing.assert_allclose(seen.receivers[..., 3:], np.broadcast_to([0, 0, 1], seen.receivers[..., 3:].shape))
@@ -39,7 +39,7 @@ def test_elements_lie_on_what_is_seen_where_its_image_is(device, nodes):
 def test_uniform_light_gives_the_etendue_and_its_moment(device):
     one = sensor_view()
     lines = ViewRays(view=one, scene=Scene.of(floor()), materials=[GREY], nodes=(4, 4), device=device)
-    seen = lines.surface(0.0)
+    seen = lines.visible_surface(0.0)
     got = lines.exposure(seen, np.full(seen.weights.shape, 3.0))
     # Radiance 3 * 0.5 / pi everywhere: an independent sum over a fine grid of the sensor.
     u = -3e-3 + (np.arange(600) + 0.5) * 1e-5
@@ -56,7 +56,7 @@ def test_the_side_that_the_lens_sees_counts_and_the_nearer_surface(device):
     scene = Scene(np.concatenate([under.triangles, over.triangles]), np.array([0, 0, 1, 1], np.int32))
     one = sensor_view()
     lines = ViewRays(view=one, scene=scene, materials=[GREY, WHITE], device=device)
-    seen = lines.surface(0.0)
+    seen = lines.visible_surface(0.0)
     near = seen.receivers[..., 2] > 0.0
     assert near.any()
     assert not near.all()
@@ -68,7 +68,7 @@ def test_the_side_that_the_lens_sees_counts_and_the_nearer_surface(device):
 def test_where_nothing_is_seen_nothing_comes(device):
     one = sensor_view()
     lines = ViewRays(view=one, scene=Scene.of(floor(size=0.003)), materials=[GREY], device=device)
-    seen = lines.surface(0.0)
+    seen = lines.visible_surface(0.0)
     missed = seen.triangle < 0
     assert missed.any()
     assert not missed.all()

@@ -16,7 +16,7 @@ from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.rays import AnyHit
 from gpuvision.simulation.scene.reflectance import Ggx, Lambert, OrenNayar, Phong, Ward
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.readings import EVEN, EVEN_OPEN, OPEN
+from gpuvision.simulation.sensors.readings import UNIFORM, UNIFORM_UNOCCLUDED, UNOCCLUDED
 from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet
 from gpuvision.simulation.transport.specular_highlights import specular_highlights
@@ -42,7 +42,9 @@ def test_power_of_a_plate(device: Device, lens: Lens | None, sigma: float) -> No
         at = 0.5 * (start + end) + 0.5 * (end - start) * node
         points = np.stack([at, np.full_like(at, 0.02), np.full_like(at, 3e-3)], axis=-1)
         eye = seen_by.lens_at(0.02) - points
-        sent = 2.0 * 0.5 / math.pi * eye[:, 2] / np.linalg.norm(eye, axis=1) * seen_by.received(points, 0.02)
+        sent = (
+            2.0 * 0.5 / math.pi * eye[:, 2] / np.linalg.norm(eye, axis=1) * seen_by.aperture_solid_angle(points, 0.02)
+        )
         sent *= 0.5 * (end - start) * weight
         # The reference's own interpolation is good to 1e-8; a Gaussian is a curve in perspective.
         rough = 1e-7 if sigma == 0.0 else 1e-5
@@ -86,13 +88,13 @@ def test_as_rays_to_the_lens_say(device: Device, source: Any, lens: Lens | None,
     points = line.ends[:, :1] + share[:, None] * (line.ends[:, 1:] - line.ends[:, :1])
     eye = seen_by.lens_at(L) - points
     cosine = np.sum(line.normals[:, None] * eye, axis=-1) / np.linalg.norm(eye, axis=-1)
-    power = (line.power * line.lengths / count)[:, None] * 0.5 / math.pi * seen_by.received(points, L)
+    power = (line.power * line.lengths / count)[:, None] * 0.5 / math.pi * seen_by.aperture_solid_angle(points, L)
     power = power * np.maximum(cosine, 0.0)
     rays = np.concatenate([points, np.broadcast_to(seen_by.lens_at(L), points.shape)], axis=-1).reshape(-1, 6)
     hidden = AnyHit(scene=scene, clearance=1e-10)(rays, device=device).occluded != 0
     uv = seen_by.project(points, L).reshape(-1, 2)
-    for name, weight in (("direct", ~hidden), (OPEN, 1.0)):
-        expected = seen_by.deposit(uv[:, 0], uv[:, 1], power.ravel() * weight)
+    for name, weight in (("direct", ~hidden), (UNOCCLUDED, 1.0)):
+        expected = seen_by.deposit_spots(uv[:, 0], uv[:, 1], power.ravel() * weight)
         found = light.exposures(L, causes=True)[name]
         np.testing.assert_allclose(found.power, expected.power, atol=1e-3 * expected.power.max())
         np.testing.assert_allclose(found.moment, expected.moment, atol=1e-6 * expected.power.max())
@@ -101,7 +103,7 @@ def test_as_rays_to_the_lens_say(device: Device, source: Any, lens: Lens | None,
     assert known.sum() >= 4
     np.testing.assert_array_equal(truth.status[~known] & (Status.LOW_SIGNAL | Status.OUT_OF_RANGE) != 0, True)
     place = np.stack([truth.g, np.full(len(known), L), truth.h], axis=-1)[known]
-    np.testing.assert_allclose(seen_by.project(place, L)[:, 1], seen_by.v_middles[known], atol=1e-12)
+    np.testing.assert_allclose(seen_by.project(place, L)[:, 1], seen_by.v_centres[known], atol=1e-12)
     near = np.linalg.norm(place[:, None, None] - points, axis=-1).min(axis=(1, 2))
     assert near.max() < 1e-5
     to_lens = np.concatenate([place, np.broadcast_to(seen_by.lens_at(L), place.shape)], axis=-1)
@@ -119,7 +121,7 @@ def test_very_many_gaps() -> None:
     )
     light = light_of(np.concatenate([plate(), screen]), seen_by=sensor_view(samples=1))
     found = light.exposures(0.0, causes=True)
-    assert 0.3 < found["direct"].total()[0] / found[OPEN].total()[0] < 0.9
+    assert 0.3 < found["direct"].total()[0] / found[UNOCCLUDED].total()[0] < 0.9
     parts = light._line_of_sight.parts(light.sheet.lit(light.scene, 0.0), light.view.lens_at(0.0), hidden=True)
     assert parts.seen.sum() >= 100
     assert np.sum(parts.end - parts.start) == pytest.approx(parts.segment.max() + 1, rel=1e-12)
@@ -154,7 +156,7 @@ def test_grazing_light(lean: float) -> None:
     eye = seen_by.lens_at(0.0) - points
     normal = np.array([-math.sin(math.radians(lean)), 0.0, math.cos(math.radians(lean))])
     cosine = np.maximum(eye @ normal, 0.0) / np.linalg.norm(eye, axis=1)
-    expected = 0.5 / math.pi * (high - low) * 0.5 * share[1] @ (cosine * seen_by.received(points))
+    expected = 0.5 / math.pi * (high - low) * 0.5 * share[1] @ (cosine * seen_by.aperture_solid_angle(points))
     assert light.exposures(0.0)["direct"].total()[0] == pytest.approx(expected, rel=1e-4)
 
 
@@ -185,10 +187,17 @@ def test_out_of_view_behind_the_lens_and_beyond_the_fold(lens: Lens | None) -> N
     points = (line.ends[:, :1] + share[:, None] * (line.ends[:, 1:] - line.ends[:, :1])).reshape(-1, 3)
     eye = seen_by.lens_at(0.0) - points
     cosine = np.maximum(eye @ line.normals[0], 0.0) / np.linalg.norm(eye, axis=1)
-    sent = 0.5 / math.pi * cosine * seen_by.received(points) * np.repeat(line.power * line.lengths, 200_000) / 200_000
+    sent = (
+        0.5
+        / math.pi
+        * cosine
+        * seen_by.aperture_solid_angle(points)
+        * np.repeat(line.power * line.lengths, 200_000)
+        / 200_000
+    )
     uv = seen_by.project(points)
     assert 0.01 < np.isfinite(uv[:, 0]).mean() < 0.9
-    expected = seen_by.deposit(uv[:, 0], uv[:, 1], sent)
+    expected = seen_by.deposit_spots(uv[:, 0], uv[:, 1], sent)
     assert expected.power.max() > 0.0
     # A bin holds 1000 points.
     np.testing.assert_allclose(found.power, expected.power, atol=2e-3 * expected.power.max())
@@ -208,7 +217,7 @@ def test_truth_at_a_step() -> None:
         light = light_of(np.concatenate([plate(), tape]), seen_by=seen_by)
         truth = light.truth(0.0)
         ends = np.sort(seen_by.project([[at, 0.0, 5e-3], [at, 0.0, 0.0]])[:, 1])
-        between = (seen_by.v_middles > ends[0]) & (seen_by.v_middles < ends[1])
+        between = (seen_by.v_centres > ends[0]) & (seen_by.v_centres < ends[1])
         assert between.sum() > 3
         np.testing.assert_array_equal(truth.status, np.where(between, flag, 0))
         expected = np.where(truth.g < at, 5e-3, 0.0)
@@ -279,7 +288,7 @@ def test_in_a_slit_is_dark() -> None:
 
 @pytest.mark.parametrize(
     "lobe",
-    [Phong(albedo=0.4, exponent=2000.0), Ggx(alpha=0.02, facing=0.5), Ward(albedo=0.4, alpha_x=0.02, alpha_y=0.3)],
+    [Phong(albedo=0.4, exponent=2000.0), Ggx(alpha=0.02, f0=0.5), Ward(albedo=0.4, alpha_x=0.02, alpha_y=0.3)],
 )
 def test_lobes_are_resolved(lobe: Any) -> None:
     """A lobe narrower than a sample: as a sum over a million points of the line."""
@@ -297,9 +306,9 @@ def test_lobes_are_resolved(lobe: Any) -> None:
     normal, across = np.array([0.0, math.sin(tilt), math.cos(tilt)]), np.array([0.0, math.cos(tilt), -math.sin(tilt)])
     local = np.stack([eye[:, 0], eye @ across, eye @ normal], axis=-1)
     towards = np.broadcast_to([0.0, across[2], normal[2]], local.shape)
-    sent = lobe.value(np.concatenate([towards, local], axis=-1)) * local[:, 2] * seen_by.received(points)
+    sent = lobe.value(np.concatenate([towards, local], axis=-1)) * local[:, 2] * seen_by.aperture_solid_angle(points)
     uv = seen_by.project(points)
-    expected = seen_by.deposit(uv[:, 0], uv[:, 1], sent * (G[1] - G[0]))
+    expected = seen_by.deposit_spots(uv[:, 0], uv[:, 1], sent * (G[1] - G[0]))
     np.testing.assert_allclose(found["specular"].total(), expected.total(), rtol=1e-4)
     assert expected.total().min() > 0.0
 
@@ -384,10 +393,10 @@ def test_causes() -> None:
     scene, materials = two_plates(0.2, 0.8)
     light = light_of(scene, materials, seen_by=sensor_view(), sigma=1e-4, sub_sheets=[0.0])
     found = light.exposures(0.0, causes=True)
-    assert set(found) == {"direct", "specular", EVEN, OPEN, EVEN_OPEN}
-    np.testing.assert_array_equal(found[OPEN].power, found["direct"].power)
-    np.testing.assert_array_equal(found[EVEN].power, found[EVEN_OPEN].power)
-    ratio = found["direct"].total() / found[EVEN].total()
+    assert set(found) == {"direct", "specular", UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED}
+    np.testing.assert_array_equal(found[UNOCCLUDED].power, found["direct"].power)
+    np.testing.assert_array_equal(found[UNIFORM].power, found[UNIFORM_UNOCCLUDED].power)
+    ratio = found["direct"].total() / found[UNIFORM].total()
     np.testing.assert_allclose(ratio, 0.5, rtol=1e-3)
     assert not found["specular"].power.any()
 

@@ -12,7 +12,7 @@ from scipy.special import ndtr
 
 from gpuvision.host import Device
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.sensors.readings import OPEN
+from gpuvision.simulation.sensors.readings import UNOCCLUDED
 from gpuvision.simulation.sensors.sensor_view import SensorView
 from gpuvision.simulation.transport.direct import Slabs
 from gpuvision.simulation.transport.sheet_cut import SheetIndex
@@ -71,9 +71,9 @@ def test_half_of_the_beam_hidden(device: Device, x: float) -> None:
     shown = light.exposures(0.0, causes=True)
     shift = u_of(shown["direct"], seen_by)[0] / (SIGMA * u_per_metre(seen_by, (0.0, 1.0, 0.0)))
     assert shift == pytest.approx(-bell(x) / float(ndtr(x)), rel=1e-6)
-    share = shown["direct"].total()[0] / shown[OPEN].total()[0]
+    share = shown["direct"].total()[0] / shown[UNOCCLUDED].total()[0]
     assert share == pytest.approx(float(ndtr(x)), rel=1e-6)
-    assert u_of(shown[OPEN], seen_by)[0] == pytest.approx(0.0, abs=1e-11)
+    assert u_of(shown[UNOCCLUDED], seen_by)[0] == pytest.approx(0.0, abs=1e-11)
 
 
 @pytest.mark.parametrize(("one", "two"), [(0.0, 0.6), (0.5, -0.5), (-0.3, 0.7), (-0.6, 0.2)])
@@ -167,7 +167,7 @@ def test_a_plate_gives_a_gaussian(count: int) -> None:
     edges = (seen_by.u_edges - middle) / abs(width)
     np.testing.assert_allclose(direct.power[0] / direct.total()[0], np.diff(ndtr(edges)), atol=3e-7)
     spots = -np.diff(np.exp(-0.5 * edges**2)) / math.sqrt(2 * math.pi) * abs(width)
-    beside = spots + (middle - seen_by.u_middles) * np.diff(ndtr(edges))
+    beside = spots + (middle - seen_by.u_centres) * np.diff(ndtr(edges))
     np.testing.assert_allclose(direct.moment[0] / direct.total()[0], beside, atol=3e-7 * abs(width))
 
 

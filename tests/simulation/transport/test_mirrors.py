@@ -50,7 +50,7 @@ def expected_of_line(sensor: SensorView, y: float, power: float) -> np.ndarray:
     def density(x: float) -> float:
         place = np.array([x, y, 0.0])
         cosine = lens[2] / np.linalg.norm(lens - place)
-        return power / np.pi * cosine * float(sensor.received(place))
+        return power / np.pi * cosine * float(sensor.aperture_solid_angle(place))
 
     return np.array([integral(density, a, b, epsrel=1e-13)[0] for a, b in itertools.pairwise(edges)])
 
@@ -87,7 +87,7 @@ def test_a_mirror_of_micrometres_in_a_scene_of_metres(device: Device) -> None:
     def density(x: float) -> float:
         image = np.array([x, -2.0 * distance, 0.0])
         cosine = lens[2] / np.linalg.norm(lens - image)
-        return SHARE * ALBEDO * 3.0 / np.pi * cosine * float(sensor.received(image))
+        return SHARE * ALBEDO * 3.0 / np.pi * cosine * float(sensor.aperture_solid_angle(image))
 
     expected = integral(density, low / share, high / share)[0]
     seen = mirrors_of(scene, MATERIALS, device, view=sensor).seen(lit, 0.0)
@@ -116,7 +116,7 @@ def test_a_mirror_seen_at_89_99_degrees(device: Device) -> None:
         image = place - 2.0 * height * up
         spot = lens + 0.5 * (image - lens)
         cosine = normal @ (spot - place) / np.linalg.norm(spot - place)
-        return SHARE / 2.0 * ALBEDO * 3.0 / np.pi * cosine * float(sensor.received(image))
+        return SHARE / 2.0 * ALBEDO * 3.0 / np.pi * cosine * float(sensor.aperture_solid_angle(image))
 
     seen = mirrors_of(scene, materials, device, view=sensor).seen(line, 0.0)
     assert height / np.linalg.norm(lens - point) < 2e-4
@@ -161,9 +161,9 @@ def mirrored_points(scene: Scene, lit: LitLine, sensor: SensorView, device: Devi
         for end in (points, np.broadcast_to(lens, points.shape)):
             ways = np.ascontiguousarray(np.hstack([spot, end]))
             good &= AnyHit(scene=scene, clearance=1e-9)(ways, device=device).occluded == 0
-        power = SHARE * ALBEDO / np.pi * each * cosine * sensor.received(image)
+        power = SHARE * ALBEDO / np.pi * each * cosine * sensor.aperture_solid_angle(image)
         uv = sensor.project(image[good])
-        total = total + sensor.deposit(uv[:, 0], uv[:, 1], power[good])
+        total = total + sensor.deposit_spots(uv[:, 0], uv[:, 1], power[good])
     return total
 
 
@@ -211,9 +211,9 @@ def test_a_ball_shows_a_line_as_alhazen_says(device: Device) -> None:
         spots[n] = middle + radius * spot
         cosine = spots[n, 2] / np.linalg.norm(spots[n] - point)
         square = np.sum((lens - spots[n]) ** 2) * density / radius**2
-        power[n] = SHARE * ALBEDO * 3.0 / np.pi * cosine * 2e-5 * sensor.received(spots[n]) * square
+        power[n] = SHARE * ALBEDO * 3.0 / np.pi * cosine * 2e-5 * sensor.aperture_solid_angle(spots[n]) * square
     uv = sensor.project(spots)
-    expected = sensor.deposit(uv[:, 0], uv[:, 1], power)
+    expected = sensor.deposit_spots(uv[:, 0], uv[:, 1], power)
     middle_of_it = expected.first_moment(sensor.u_edges).sum() / expected.power.sum()
     for fineness in (3, 4):
         scene = ball_scene(fineness, radius, middle)
@@ -222,7 +222,7 @@ def test_a_ball_shows_a_line_as_alhazen_says(device: Device) -> None:
         ours = mirrors.seen(light.lit(scene, 0.0), 0.0)
         assert ours.power.sum() == pytest.approx(expected.power.sum(), rel=2e-2 / 4.0 ** (fineness - 3))
         assert abs(ours.first_moment(sensor.u_edges).sum() / ours.power.sum() - middle_of_it) < 1e-7
-        v = [each.total() @ sensor.v_middles / each.power.sum() for each in (ours, expected)]
+        v = [each.total() @ sensor.v_centres / each.power.sum() for each in (ours, expected)]
         assert abs(v[0] - v[1]) < 2e-6
 
 
@@ -333,7 +333,7 @@ def test_a_lens_that_looks_into_a_mirror_head_on(device: Device) -> None:
     image = place + 0.06 * axis
     towards = image - lens
     cosine = towards @ axis / np.linalg.norm(towards)
-    expected = SHARE / 2.0 * ALBEDO / np.pi * 3.0 * 2e-3 * cosine * float(sensor.received(image))
+    expected = SHARE / 2.0 * ALBEDO / np.pi * 3.0 * 2e-3 * cosine * float(sensor.aperture_solid_angle(image))
     assert seen.power.sum() == pytest.approx(expected, rel=1e-4)
 
 

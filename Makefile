@@ -1,10 +1,10 @@
-# `make demo` and `make test` set up what they need in .venv (setup.sh says how); a second call starts at once.
+# `make demo`, `make test` and `make docs` set up what they need in .venv (see setup.sh); a second call starts at once.
 
 SHELL := /bin/bash
 # CI empties it, to run the slow tests too.
 PYTEST_ARGS ?= -m "not slow"
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint docs clean
 
 demo: .venv/ready
 	.venv/bin/gpuvision demo
@@ -22,6 +22,12 @@ lint: .venv/ready-tests
 	ln -s "$(CURDIR)"/{gpuvision/*,host,kernels,profiling} build/lint/gpuvision
 	cd build/lint && "$(CURDIR)/.venv/bin/mypy" --config-file "$(CURDIR)/pyproject.toml"
 
+# Warnings are errors. Changed examples run, on the best device; the pages are in build/docs. Every page is read anew:
+# Sphinx drops the index entries of the others from the search index.
+docs: .venv/ready-docs
+	.venv/bin/python -m sphinx --fresh-env --fail-on-warning --keep-going --quiet -d build/doctrees docs build/docs
+	@echo "open build/docs/index.html"
+
 .venv/ready: pyproject.toml setup.sh
 	bash setup.sh
 	touch $@
@@ -30,6 +36,10 @@ lint: .venv/ready-tests
 	bash setup.sh tests
 	touch $@
 
+.venv/ready-docs: .venv/ready
+	bash setup.sh docs
+	touch $@
+
 clean:
-	rm -rf .venv build out *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv build out docs/gallery docs/reference/api docs/reference/commands docs/results/runs *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

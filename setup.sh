@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Set up .venv in this clone: `setup.sh` for the command, `setup.sh tests` for the tests and the lint beside it.
+# Set up .venv in this clone: `setup.sh` for the command, `setup.sh tests` for the tests and the lint as well,
+# `setup.sh docs` for the documentation as well.
 # Nothing outside .venv changes, except that root gets the Debian packages that are missing.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
@@ -76,5 +77,6 @@ case "${1:-}" in
     ensure_device
     ;;
   tests) install ".[test,cpu,profile]" ;; # both CPU runtimes are tested where both can run; benchmarks too
-  *) fail "expected no argument or 'tests', got '$1'" ;;
+  docs) install ".[docs]" ;;
+  *) fail "expected no argument, 'tests' or 'docs', got '$1'" ;;
 esac

@@ -306,3 +306,5 @@ from .simulation.transport.radiosity import (
 from .status import (
     Status as Status,
 )
+
+__version__: str

@@ -48,7 +48,7 @@ class Batch(Generic[R]):
     ----------
     number : int
         Of the first frame, counted by the source from 0.
-    frames : (count, *shape) array
+    frames : (count, ...) array
     result : Result of arrays
         As the operation returns it, with the frames along the first axis.
     arrived : (count,) int64 array

@@ -113,7 +113,7 @@ class Slot(Generic[R]):
 
     Attributes
     ----------
-    frames : (batch, *shape) array
+    frames : (batch, ...) array
         The source writes here.
     result : Result of arrays
         The consumer reads here when `wait` has returned.

@@ -61,7 +61,7 @@ class Source:
 
         Parameters
         ----------
-        out : (batch, *shape) array
+        out : (batch, ...) array
             Memory of the stream; the device may read it directly.
         arrived : (batch,) int64 array
             When each frame came [ns of `time.perf_counter_ns`].

@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+import gpuvision
 from gpuvision.status import Status
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -44,14 +46,18 @@ def _modules() -> Iterator[tuple[str, Path]]:
                 yield ".".join(part for part in parts if part != "__init__"), path
 
 
+def _copy_of_the_sources(folder: Path) -> Path:
+    for room in ROOMS:
+        shutil.copytree(ROOT / room, folder / room, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
+        shutil.copy(ROOT / name, folder)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]:
     """The wheel, built from a copy: what an earlier build left in the tree would get into it."""
-    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
-    for room in ROOMS:
-        shutil.copytree(ROOT / room, source / room, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
+    source, target = _copy_of_the_sources(tmp_path_factory.mktemp("source")), tmp_path_factory.mktemp("wheel")
     build = f"from setuptools.build_meta import build_wheel; build_wheel({os.fspath(target)!r})"
     subprocess.run([sys.executable, "-c", build], cwd=source, check=True, capture_output=True)
     (path,) = target.glob("*.whl")
@@ -70,6 +76,43 @@ def test_wheel_holds_everything(wheel: zipfile.ZipFile) -> None:
     assert expected - set(wheel.namelist()) == set()
     assert "gpuvision/py.typed" in expected
     assert any(name.endswith(".cl") for name in expected)
+
+
+def test_installed_wheel_runs_outside_the_tree(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    """The installed package finds its kernels, presets and version; the tree is not on the path."""
+    target = tmp_path / "site"
+    wheel.extractall(target)  # what `pip install --target` does with a wheel of pure Python
+    environment = os.environ | {"PYTHONPATH": os.fspath(target)}
+    code = "import gpuvision, gpuvision.host; print(gpuvision.__file__, gpuvision.host.__file__)"
+    code += "; from gpuvision import LineReadout; import numpy; LineReadout()(numpy.zeros((1, 16, 32), numpy.uint8))"
+    code += "; from gpuvision.sensor.sensor import Sensor; Sensor.load('psd_line')"
+
+    def output(*arguments: str) -> str:
+        command = [sys.executable, *arguments]
+        ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert ran.returncode == 0, ran.stderr
+        return ran.stdout
+
+    assert all(Path(each).is_relative_to(target) for each in output("-c", code).split())
+    assert output("-m", "gpuvision", "--version") == f"gpuvision {gpuvision.__version__}\n"
+    assert '"healthy": true' in output("-m", "gpuvision", "devices", "--json", "-")
+    (metadata,) = target.glob("*.dist-info/METADATA")
+    assert f"\nVersion: {gpuvision.__version__}\n" in metadata.read_text()
+
+
+def test_source_distribution_holds_what_a_build_needs(tmp_path: Path) -> None:
+    """Packages, kernels, presets, README and licence; tests and documentation stay in the repository."""
+    source = _copy_of_the_sources(tmp_path / "source")
+    (source / "tests").mkdir()
+    (source / "tests" / "test_something.py").write_text("")  # setuptools would take it by itself
+    build = f"from setuptools.build_meta import build_sdist; build_sdist({os.fspath(tmp_path)!r})"
+    subprocess.run([sys.executable, "-c", build], cwd=source, check=True, capture_output=True)
+    (path,) = tmp_path.glob("gpuvision-*.tar.gz")
+    with tarfile.open(path) as opened:
+        names = {name.partition("/")[2] for name in opened.getnames()}
+    expected = {path.relative_to(ROOT).as_posix() for room in ROOMS for path in _files(room) if path.suffix in SHIPPED}
+    assert expected | {"pyproject.toml", "README.md", "LICENSE"} <= names
+    assert not any(name.startswith(("tests", "docs", "examples")) for name in names)
 
 
 def test_wheel_installs_one_package(wheel: zipfile.ZipFile) -> None:
@@ -133,6 +176,7 @@ FLOORS = (
     ("workflows",),
     ("profiling",),
     ("cli",),
+    ("__main__",),
 )
 FLOOR = {package: number for number, packages in enumerate(FLOORS) for package in packages}
 

@@ -33,14 +33,16 @@ def application() -> typer.Typer:
     from gpuvision.cli.select import select
     from gpuvision.cli.simulate import simulate
     from gpuvision.cli.undistort import undistort
+    from gpuvision.cli.version import root
 
     app = typer.Typer(
-        help="Range imaging and visual servoing in OpenCL.",
         epilog=f"Set {TRACEBACK}=1 to see the traceback of an error.",
         no_args_is_help=True,
         add_completion=False,
+        rich_markup_mode="markdown",  # the default, "rich", takes units such as [m] for its markup
         pretty_exceptions_enable=False,
     )
+    app.callback()(root)
     for command in (scan, simulate, calibrate, undistort, select, locate, locate_robot, demo, devices, profile):
         app.command()(command)
     return app

@@ -135,8 +135,9 @@ class PolygonMirror:
     def limits(self) -> tuple[float, float]:
         """Smallest and largest phi [rad] of a scan.
 
-        The beam hits the facet, |facet_position| <= R tan(pi / facets); it is thrown down, |phi| < pi/4; and x grows
-        with phi, which at small drops it stops to do towards negative phi.
+        Three conditions hold within the limits. The beam hits the facet: ``|facet_position| <= R tan(pi / facets)``.
+        The beam is reflected downwards: ``|phi| < pi/4``. And x increases with phi, which ends towards negative phi
+        where the drop is small.
         """
         half = math.pi / self.facets
         middle = 0.25 * math.pi - math.asin(_HALF_ROOT * math.cos(half))

@@ -1,0 +1,237 @@
+"""Sphinx extension: one page for every public name of gpuvision, and one index page for every package.
+
+Documented are the names of ``gpuvision.__all__`` and ``gpuvision.host.__all__``, the modules of `MODULES`, and the
+types of gpuvision that their signatures mention, such as the results of functions. A name appears under the package
+that defines it. A package without a title in `PACKAGES` is an error: it would be missing from the index.
+
+A name in single backticks in a docstring links to its page, written in full or not.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import typing
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gpuvision
+import gpuvision.host
+from pages import table, title, toctree, write_pages
+
+FOLDER = "reference/api"
+
+# Packages in the order of the index: title, and what a user finds there.
+PACKAGES = {
+    "host": ("Devices, operations and streams", "Choose an OpenCL device, run an operation, stream frames through it."),
+    "status": ("Status flags", "Reasons why a value is missing or doubtful."),
+    "ranging": (
+        "Range imaging",
+        "Read the position of a laser line or a light spot, triangulate it, and assemble range images.",
+    ),
+    "camera": (
+        "Cameras and lenses",
+        "Detect calibration targets, calibrate lenses and tilted (Scheimpflug) cameras, undo distortion.",
+    ),
+    "matching": (
+        "Matching and pose estimation",
+        "Measure edges along calipers (rulers), find fiducials, fit lines, and solve for the pose of a board or robot.",
+    ),
+    "simulation": (
+        "Simulation",
+        "Predict what a sheet-of-light sensor measures over a part: occlusion, reflectance, interreflection, noise.",
+    ),
+    "sensor": ("Sensors", "A sensor as its description file states it: readout, light source, simulated twin."),
+    "formats": ("Files", "Read and write sensor, lens, field, feature and material files, and range images."),
+    "workflows": ("Workflows", "Whole jobs on files, called by the commands of ``gpuvision``."),
+    "operation": ("Operations of your own", "The kernel folder and the option types that the operations share."),
+}
+
+# Public modules beyond the exported names: one page each.
+MODULES = (
+    "gpuvision.operation",
+    "gpuvision.ranging.focus",
+    "gpuvision.ranging.polygon",
+    "gpuvision.camera.calibration",
+    "gpuvision.camera.ground_plane",
+    "gpuvision.camera.orthographic",
+    "gpuvision.simulation.errors.recommendations",
+    "gpuvision.sensor.light_source",
+    "gpuvision.sensor.sensor",
+    "gpuvision.formats.camera_file",
+    "gpuvision.formats.features_file",
+    "gpuvision.formats.field_file",
+    "gpuvision.formats.materials_file",
+    "gpuvision.formats.range_image",
+    "gpuvision.workflows.calibrating",
+    "gpuvision.workflows.locating_board",
+    "gpuvision.workflows.locating_robot",
+    "gpuvision.workflows.scanning",
+    "gpuvision.workflows.sensor_pair",
+    "gpuvision.workflows.simulating",
+    "gpuvision.workflows.undistorting",
+)
+
+
+def public_names() -> dict[str, Any]:
+    """Return the exported objects, by the name under which a user imports each."""
+    names = {f"gpuvision.{name}": getattr(gpuvision, name) for name in gpuvision.__all__}
+    host = {f"gpuvision.host.{name}": getattr(gpuvision.host, name) for name in gpuvision.host.__all__}
+    return names | {name: value for name, value in host.items() if name.rpartition(".")[2] not in gpuvision.__all__}
+
+
+def documented_names() -> dict[str, Any]:
+    """Return everything that has a page: exported objects, modules, and the types in their signatures."""
+    found = public_names() | {name: importlib.import_module(name) for name in MODULES}
+    known = {id(value) for value in found.values()}
+    waiting = list(found.values())
+    while waiting:
+        for each in _mentioned(waiting.pop()):
+            if id(each) not in known and each.__module__ not in MODULES:
+                known.add(id(each))
+                waiting.append(each)
+                found[f"{each.__module__}.{each.__qualname__}"] = each
+    return found
+
+
+def _mentioned(value: Any) -> Iterator[type]:
+    """Yield the public classes of gpuvision in the annotations of an object and of its public methods."""
+    parts = [value]
+    if inspect.ismodule(value):
+        parts = [each for each in vars(value).values() if getattr(each, "__module__", None) == value.__name__]
+    for part in parts:
+        members = [each for name, each in vars(part).items() if name[0] != "_"] if inspect.isclass(part) else []
+        for base in getattr(part, "__orig_bases__", ()):
+            yield from _classes_in(base)
+        for each in (part, *members):
+            for wrapper in ("__func__", "fget", "func"):  # class methods, properties, cached properties
+                each = getattr(each, wrapper, each)
+            try:
+                hints = typing.get_type_hints(each)
+            except (TypeError, NameError):  # no annotations, or annotations for type checkers only
+                continue
+            for name, hint in hints.items():
+                if not name.startswith("_"):
+                    yield from _classes_in(hint)
+
+
+def _classes_in(hint: Any) -> Iterator[type]:
+    if inspect.isclass(hint) and not typing.get_args(hint):
+        package, _, inside = hint.__module__.partition(".")
+        if package == "gpuvision" and inside.partition(".")[0] in PACKAGES and not hint.__name__.startswith("_"):
+            yield hint
+    for each in typing.get_args(hint):
+        yield from _classes_in(each)
+
+
+def _package_of(name: str, value: Any) -> str:
+    """Return the package, below ``gpuvision``, that defines an object."""
+    module = name if inspect.ismodule(value) else getattr(value, "__module__", "") or name.rpartition(".")[0]
+    if not module.startswith("gpuvision."):
+        module = name.rpartition(".")[0]  # an alias of a type of another library
+    package = module.split(".")[1]
+    if package not in PACKAGES:
+        raise ValueError(f"{name} is defined in gpuvision.{package}, which has no title in PACKAGES of {__file__}")
+    return package
+
+
+def _first_line(value: Any) -> str:
+    if not (inspect.ismodule(value) or inspect.isclass(value) or inspect.isroutine(value)):
+        return "Type alias."
+    return (inspect.getdoc(value) or "").partition("\n")[0]
+
+
+def _object_page(name: str, value: Any, documented: dict[str, Any]) -> str:
+    """Return the page of one object."""
+    if inspect.ismodule(value):
+        elsewhere = [each for each in vars(value) if any(name.endswith(f".{each}") for name in documented)]
+        without = f"   :exclude-members: {', '.join(elsewhere)}\n" if elsewhere else ""
+        return f"{title(name)}\n.. automodule:: {name}\n   :members:\n   :member-order: bysource\n{without}"
+    head = title(name.rpartition(".")[2])
+    if inspect.isclass(value):
+        options = "   :members:\n   :show-inheritance:\n   :member-order: bysource\n"
+        return f"{head}\n.. autoclass:: {name}\n{options}"
+    if inspect.isroutine(value):
+        return f"{head}\n.. autofunction:: {name}\n"
+    return f"{head}\n.. py:type:: {name}\n\n   ``{value}``\n"
+
+
+def api_pages() -> dict[str, str]:
+    """Return all pages by file name."""
+    documented, exported = documented_names(), public_names()
+    pages = {f"{name}.rst": _object_page(name, value, documented) for name, value in documented.items()}
+    groups: dict[str, list[str]] = defaultdict(list)
+    for name, value in documented.items():
+        groups[_package_of(name, value)].append(name)
+    for package, names in groups.items():
+        names.sort(key=str.lower)
+        parts = [title(PACKAGES[package][0]), f"{PACKAGES[package][1]}\n"]
+        kinds: dict[str, Callable[[str], bool]] = {
+            "Exported names": lambda name: name in exported,
+            "Modules": lambda name: name in MODULES,
+            "Types in signatures": lambda name: name not in exported and name not in MODULES,
+        }
+        for heading, belongs in kinds.items():
+            rows = [
+                (f":doc:`{name.removeprefix('gpuvision.')} <{name}>`", _first_line(documented[name]))
+                for name in names
+                if belongs(name)
+            ]
+            if rows:
+                parts += [title(heading, "-"), table(("name", "summary"), rows)]
+        pages[f"package-{package}.rst"] = "\n".join((*parts, toctree(names)))
+    listed = [package for package in PACKAGES if package in groups]
+    pages["index.rst"] = "\n".join(
+        (
+            title("API reference"),
+            "Import exported names as ``import gpuvision as gv``, and names of ``gpuvision.host`` from there.\n",
+            table(
+                ("package", "contents"),
+                [(f":doc:`{PACKAGES[each][0]} <package-{each}>`", PACKAGES[each][1]) for each in listed],
+            ),
+            toctree(f"package-{each}" for each in listed),
+        )
+    )
+    return pages
+
+
+class OtherNames:
+    """Links for names as docstrings and annotations use them: ``Lens``, ``Lens.undistort``, ``package.module.Lens``."""
+
+    def __init__(self) -> None:
+        self._full: dict[str, str] = {}
+
+    def _read(self, objects: Any) -> None:
+        """Index the documented objects by the end of their names; a name that ends alike twice is left out."""
+        ends: dict[str, set[str]] = defaultdict(set)
+        for name, entry in objects.items():
+            if not entry.aliased:
+                parts = name.split(".")
+                for start in range(1, len(parts)):
+                    ends[".".join(parts[start:])].add(name)
+        self._full = {end: next(iter(names)) for end, names in ends.items() if len(names) == 1}
+        for name, value in public_names().items():
+            if inspect.isroutine(value):
+                self._full[f"{value.__module__}.{value.__qualname__}"] = name
+
+    def resolve(self, app: Any, env: Any, node: Any, content: Any) -> Any:
+        """Return the link for a reference of the Python domain that Sphinx did not find, or None."""
+        if node.get("refdomain") != "py":
+            return None
+        domain = env.domains.python_domain
+        if not self._full:
+            self._read(domain.objects)
+        full = self._full.get(node["reftarget"])
+        if full is None:
+            return None
+        return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", full, node, content)
+
+
+def setup(app: Any) -> dict[str, Any]:
+    """Write the pages before Sphinx looks for documents."""
+    names = OtherNames()
+    app.connect("config-inited", lambda app, config: write_pages(Path(app.srcdir, FOLDER), api_pages()))
+    app.connect("missing-reference", names.resolve)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,113 @@
+"""Sphinx extension: one page for every file of ``profiling/results``, with all of its rows.
+
+Rows are neither chosen nor sorted by their outcome: rows in which a peer is faster are printed like the others, and
+counted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pages import table, title, toctree, write_pages
+
+FOLDER = "results/runs"
+SOURCE = Path(__file__).resolve().parents[2] / "profiling" / "results"
+
+_COLUMNS = (
+    "operation",
+    "case",
+    "device",
+    "seconds",
+    "peer",
+    "peer_version",
+    "peer_seconds",
+    "ratio",
+    "error",
+    "fraction",
+)
+
+
+def _time(seconds: float) -> str:
+    for unit, name in ((1.0, "s"), (1e-3, "ms")):
+        if seconds >= unit:
+            return f"{seconds / unit:.3g} {name}"
+    return f"{seconds / 1e-6:.3g} µs"
+
+
+def _value(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
+    fraction = row.get("fraction")
+    more = ", ".join(f"{key} {_value(value)}" for key, value in row.items() if key not in _COLUMNS)
+    ratio = f"{row['ratio']:.2f}"
+    return (
+        f"``{row['case']}``",
+        row["device"],
+        _time(row["seconds"]),
+        f"{row['peer']} {row['peer_version']}".strip(),
+        _time(row["peer_seconds"]),
+        f"**{ratio}**" if row["ratio"] < 1.0 else ratio,
+        f"{row['error']:.1e}",
+        "" if fraction is None else f"{100 * fraction:.0f} %",
+        more.replace("_", "\\_"),
+    )
+
+
+_HEADER = ("case", "device", "time", "peer", "peer's time", "ratio", "error", "of limit", "metadata")
+
+
+def _machine(machine: Mapping[str, Any]) -> str:
+    packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
+    lines = [f"- Processor: {machine['processor']}; {machine['system']}; Python {machine['python']}; {packages}."]
+    for label, device in machine["devices"].items():
+        lines.append(
+            f"- Device ``{label}``: {device['name']}, driver {device['driver']}, {device['units']} compute units, "
+            f"{device['gflops']:.0f} GFLOP/s (FMA, measured)."
+        )
+    return "\n".join(lines) + "\n"
+
+
+def run_page(name: str, run: Mapping[str, Any]) -> str:
+    """Return the page of one run."""
+    rows = run["rows"]
+    operations = list(dict.fromkeys(row["operation"] for row in rows))
+    slower = sum(row["ratio"] < 1.0 for row in rows)
+    date = f"- Date: {run['date']}.\n" if "date" in run else ""
+    command = run.get("command", f"gpuvision profile {' '.join(operations)} --json FILE")
+    parts = [
+        title(name),
+        _machine(run["machine"]),
+        f"{date}- Command: ``{command}``.",
+        f"- The machine held its speed during the run: {'yes' if run['valid'] else '**no**'}.",
+        f"- Rows: {len(rows)}; the peer is faster in {slower} of them (ratio in bold).\n",
+        "See :doc:`../index` for the meaning of the columns.\n",
+    ]
+    for operation in operations:
+        chosen = [_cells(row) for row in rows if row["operation"] == operation]
+        parts += [title(operation, "-"), table(_HEADER, chosen, css_class="results")]
+    return "\n".join(parts)
+
+
+def results_pages(source: Path = SOURCE) -> dict[str, str]:
+    """Return all pages by file name."""
+    runs = {path.stem: json.loads(path.read_text()) for path in sorted(source.glob("*.json"))}
+    pages = {f"{name}.rst": run_page(name, run) for name, run in runs.items()}
+    rows = []
+    for name, run in runs.items():
+        operations = dict.fromkeys(row["operation"] for row in run["rows"])
+        slower = sum(row["ratio"] < 1.0 for row in run["rows"])
+        rows.append((f":doc:`{name}`", ", ".join(operations), str(len(run["rows"])), str(slower)))
+    parts = [title("Runs"), table(("run", "operations", "rows", "rows with a faster peer"), rows), toctree(runs)]
+    pages["index.rst"] = "\n".join(parts)
+    return pages
+
+
+def setup(app: Any) -> dict[str, Any]:
+    """Write the pages before Sphinx looks for documents."""
+    app.connect("config-inited", lambda app, config: write_pages(Path(app.srcdir, FOLDER), results_pages()))
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,53 @@
+"""The documentation as HTML: the build of ``make docs`` where it is up to date, otherwise one without the examples."""
+
+from __future__ import annotations
+
+import fcntl
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = ("docs", "gpuvision", "host", "profiling/results", "examples")
+GENERATED = ("docs/gallery", "docs/reference/api", "docs/reference/commands", "docs/results/runs")
+
+
+def built_docs() -> Path:
+    """Return the folder of the HTML pages; build them if there are none, or if a source is newer."""
+    if importlib.util.find_spec("sphinx") is None:
+        pytest.skip("sphinx is missing; `bash setup.sh docs` installs it")
+    made = ROOT / "build" / "docs"
+    if _is_current(made):
+        return made
+    folder = ROOT / "build" / "docs-of-the-tests"
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "lock").open("w") as lock:  # several workers may want the pages
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not _is_current(folder):
+            _build(folder)
+    return folder
+
+
+def _is_current(folder: Path) -> bool:
+    index = folder / "searchindex.js"
+    if not index.exists():
+        return False
+    made = index.stat().st_mtime
+    generated = tuple(ROOT / each for each in GENERATED)
+    newest = max(
+        path.stat().st_mtime
+        for source in (*(ROOT / each for each in SOURCES), ROOT / "README.md", ROOT / "CHANGELOG.md")
+        for path in ([source] if source.is_file() else source.rglob("*"))
+        if path.is_file() and "__pycache__" not in path.parts and not any(each in path.parents for each in generated)
+    )
+    return made >= newest
+
+
+def _build(folder: Path) -> None:
+    command = [sys.executable, "-m", "sphinx", "--fresh-env", "--fail-on-warning", "--keep-going", "--quiet"]
+    command += ["-d", str(folder / ".doctrees"), "-D", "plot_gallery=0", "docs", str(folder)]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr

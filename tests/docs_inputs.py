@@ -1,0 +1,73 @@
+"""Files and variables that the code blocks of the documentation name but do not make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+
+import gpuvision as gv
+from boards import LAYERS, board_folder
+from floors import floor_image
+from reference import board_images, patterns
+from scanning import line_frames
+
+
+def _dots(tilt: float, towards: float) -> np.ndarray[Any, Any]:
+    """Image of 18 x 14 dots through a lens."""
+    camera = patterns.view((640, 480), 14, 18, 30.0, tilt=tilt, towards=towards, barrel=4.0)
+    covered = patterns.dots(camera, np.ones((14, 18), np.bool_))
+    return np.rint(220.0 - 180.0 * covered).astype(np.uint8)
+
+
+def _recording(folder: Path) -> dict[str, Any]:
+    rows = 40.0 + 3.0 * np.sin(np.arange(480) / 60.0)
+    np.save(folder / "recording.npy", line_frames(np.tile(rows, (32, 1))))
+    return {}
+
+
+def _one_image(folder: Path) -> dict[str, Any]:
+    cv2.imwrite(str(folder / "dots.png"), _dots(10.0, 0.3))
+    return {}
+
+
+def _images(folder: Path) -> dict[str, Any]:
+    return {"images": [_dots(25.0, towards) for towards in (0.2, 1.7, 3.3, 4.9)]}
+
+
+def _part(folder: Path) -> dict[str, Any]:
+    trimesh.creation.box((20.0, 10.0, 4.0)).export(folder / "part.stl")
+    return {}
+
+
+def _board(folder: Path) -> dict[str, Any]:
+    gerbers = folder / "gerbers"
+    gerbers.mkdir()
+    artwork = gv.read_artwork(board_folder(gerbers), layers=LAYERS)
+    corner = (10e-3 - 199.5 * 40e-6, 8e-3 + 149.5 * 40e-6)
+    view = board_images.View(corner=corner, pixel=40e-6, shape=(300, 400), noise=2.0)
+    image = board_images.BoardPicture(artwork, view).seen((20e-6, -30e-6, 1e-3), np.random.default_rng(1))
+    cv2.imwrite(str(folder / "board.png"), np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    return {}
+
+
+def _floor(folder: Path) -> dict[str, Any]:
+    field = gv.read_field("robocup_msl")
+    shape, rng = (400, 440), np.random.default_rng(1)
+    image = floor_image(field, (2.0, -1.5, 0.4), scale=0.03, shape=shape, line_width=0.125, rng=rng)
+    cv2.imwrite(str(folder / "top_view.png"), image)
+    return {}
+
+
+INPUTS: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "docs/guides/scan_recording.md": _recording,
+    "docs/guides/calibrate_lens.md": _one_image,
+    "docs/guides/calibrate_tilted_camera.md": _images,
+    "docs/guides/simulate_part.md": _part,
+    "docs/guides/locate_board.md": _board,
+    "docs/guides/locate_robot.md": _floor,
+}

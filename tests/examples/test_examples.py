@@ -1,0 +1,31 @@
+"""The examples run as a user runs them, and each draws its picture."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[2] / "examples"
+EXAMPLES = sorted(path.name for path in FOLDER.glob("*.py"))
+_SAVE = """
+import runpy, sys
+import matplotlib.pyplot
+runpy.run_path(sys.argv[1], run_name="__main__")
+assert matplotlib.pyplot.get_fignums(), "the example draws nothing"
+"""
+
+
+def test_examples_are_here() -> None:
+    assert len(EXAMPLES) >= 8
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_example_runs(name: str, tmp_path: Path) -> None:
+    environment = os.environ | {"MPLBACKEND": "Agg"}
+    command = [sys.executable, "-W", "error::DeprecationWarning:__main__", "-c", _SAVE, str(FOLDER / name)]
+    run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr

@@ -60,7 +60,7 @@ typedef struct {
 
 // How far an edge lies outside the shape. A round edge is seen nearer to the centre than it is: blurred and averaged
 // across by a variance v its mean place along the radius is that of sqrt(R^2 - u^2), u of that variance.
-inline blob_equation equation_of(private const blob_edges *edges, int i, blob_layout layout, blob_shape shape,
+static inline blob_equation equation_of(private const blob_edges *edges, int i, blob_layout layout, blob_shape shape,
                                  real cosine, real sine, real bent) {
     blob_equation equation;
     const reals x = READ(edges->x, i) - shape.x, y = READ(edges->y, i) - shape.y, height = FROM(layout.height, i);
@@ -89,7 +89,7 @@ inline blob_equation equation_of(private const blob_edges *edges, int i, blob_la
 #endif
 
 // Takes what a vector of rulers found.
-inline void take_edges(ruler_edge edge, int i, blob_layout layout, blob_shape shape, real cosine, real sine,
+static inline void take_edges(ruler_edge edge, int i, blob_layout layout, blob_shape shape, real cosine, real sine,
                        reals from_x, reals from_y, EDGE_SPACE blob_edges *edges) {
     const reals nx = FROM(layout.nx, i), ny = FROM(layout.ny, i);
     const masks counts = mask_of(FROM(layout.counts, i) > (reals)0);
@@ -112,7 +112,7 @@ inline void take_edges(ruler_edge edge, int i, blob_layout layout, blob_shape sh
 
 // Leaves out edges that lie further than `search` from the nominal contour, wherever the rulers were, and under EITHER
 // those of the polarity that there is less of.
-inline int keep_edges(private blob_edges *edges, blob_layout layout, blob_shape nominal, real cosine, real sine,
+static inline int keep_edges(private blob_edges *edges, blob_layout layout, blob_shape nominal, real cosine, real sine,
                       real search, private real *noise, private real *blur) {
 #ifdef EITHER
     reals sum = 0;
@@ -138,7 +138,7 @@ inline int keep_edges(private blob_edges *edges, blob_layout layout, blob_shape 
 }
 
 // The scale of the residuals within reach, by their median.
-inline real scale_of(private const blob_edges *edges, blob_layout layout, blob_shape shape, real bent, real reach) {
+static inline real scale_of(private const blob_edges *edges, blob_layout layout, blob_shape shape, real bent, real reach) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle);
     real distances[ROOM];
     masks inside = 0;
@@ -160,7 +160,7 @@ inline real scale_of(private const blob_edges *edges, blob_layout layout, blob_s
 }
 
 // A step of the fit; returns whether there is one.
-inline int fit_step(private const blob_edges *edges, blob_layout layout, real scale, private blob_shape *shape,
+static inline int fit_step(private const blob_edges *edges, blob_layout layout, real scale, private blob_shape *shape,
                     private real *blur, real across) {
     const real cosine = cos(shape->angle), sine = sin(shape->angle), per_scale = 1 / scale;
 #ifdef ROUND
@@ -210,7 +210,7 @@ typedef struct {
 #endif
 } blob_circuit;
 
-inline void wrap(private const blob_edges *edges, blob_layout layout, real cosine, real sine,
+static inline void wrap(private const blob_edges *edges, blob_layout layout, real cosine, real sine,
                  private blob_circuit *circuit) {
     for (int from = 0; from <= SPOKES; from += SPOKES)
         for (int i = 0; i < ROOM; i += LANES) {
@@ -246,7 +246,7 @@ typedef struct {
 #define FOR_ALL(from, i) ((reals)((from)[i]))
 
 // Through three edges each, the first of them i and on: Newton's steps.
-inline laned_shape shape_through(private const blob_circuit *circuit, int i, int j, int k, laned_shape shape) {
+static inline laned_shape shape_through(private const blob_circuit *circuit, int i, int j, int k, laned_shape shape) {
     for (int step = 0; step < START_STEPS; step++) {
         reals ux, uy, u, vx, vy, v, wx, wy, w;
         {
@@ -272,7 +272,7 @@ inline laned_shape shape_through(private const blob_circuit *circuit, int i, int
 }
 
 // The shape through three edges that most edges agree with: the least sum of squares, none more than within reach.
-inline blob_shape start_of(private const blob_edges *edges, blob_layout layout, blob_shape near, real reach) {
+static inline blob_shape start_of(private const blob_edges *edges, blob_layout layout, blob_shape near, real reach) {
     blob_circuit circuit;
     wrap(edges, layout, cos(near.angle), sin(near.angle), &circuit);
     const laned_shape from = {(reals)near.x, (reals)near.y, (reals)near.size};
@@ -305,7 +305,7 @@ inline blob_shape start_of(private const blob_edges *edges, blob_layout layout, 
 
 // From where it is to where most edges within reach agree, the reach halved from step to step; returns whether there is
 // such a place. `scale` is that of the residuals there.
-inline int fit_shape(private const blob_edges *edges, blob_layout layout, real reach, real noise, real across,
+static inline int fit_shape(private const blob_edges *edges, blob_layout layout, real reach, real noise, real across,
                      private blob_shape *shape, private real *blur, private real *scale) {
     const real predicted = fmax(sqrt(noise), LEAST_SCALE), least = fmax(LEAST_REACH / TUNING, predicted);
     *scale = fmax(reach / TUNING, least);
@@ -335,7 +335,7 @@ typedef struct {
     int inliers, saturated, regular;
 } blob_facts;
 
-inline blob_facts facts_of(private blob_edges *edges, blob_layout layout, blob_shape shape, real scale, real bent,
+static inline blob_facts facts_of(private blob_edges *edges, blob_layout layout, blob_shape shape, real scale, real bent,
                            real overlap) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale;
     blob_facts facts;
@@ -395,7 +395,7 @@ inline blob_facts facts_of(private blob_edges *edges, blob_layout layout, blob_s
 }
 
 // The grey level of the background, beyond the edges of the fit.
-inline real background_of(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
+static inline real background_of(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
                           private const blob_edges *edges, private const real *weights, blob_layout layout, real blur) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle), out = BEYOND * blur + (real)0.5f;
     real sum = 0, all = 0;
@@ -413,7 +413,7 @@ inline real background_of(global const CODE *image, int rows, int columns, real 
 }
 
 // Where the contour is not the mark's own, as wide as the rulers beside those that say so.
-inline void hide(blob_shape shape, private const real *weights, blob_layout layout, real spacing, real blur,
+static inline void hide(blob_shape shape, private const real *weights, blob_layout layout, real spacing, real blur,
                  private blob_hidden *hidden) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle);
     hidden->count = 0;
@@ -431,7 +431,7 @@ inline void hide(blob_shape shape, private const real *weights, blob_layout layo
 
 // The centre of gravity of what differs from the ring about the mark, relative to (x, y); false where the ring leaves
 // the image.
-inline int gravity_of(global const CODE *image, int rows, int columns, real x, real y, real reach, private real *to_x,
+static inline int gravity_of(global const CODE *image, int rows, int columns, real x, real y, real reach, private real *to_x,
                       private real *to_y) {
     const real outer = reach + RING;
     if (!(x - outer >= 0 && y - outer >= 0 && x + outer <= columns - 1 && y + outer <= rows - 1)) return 0;
@@ -465,7 +465,7 @@ inline int gravity_of(global const CODE *image, int rows, int columns, real x, r
 }
 
 // Lays the rulers of a mark and takes what they find.
-inline void measure(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape, real turned,
+static inline void measure(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape, real turned,
                     constant real *table, blob_layout layout, EDGE_SPACE blob_edges *edges
 #ifndef VECTOR_VARIANT
                     ,

@@ -38,7 +38,7 @@ typedef struct {
 // A step blurred by a Gaussian at t deviations, and its density; zero past 3.5. Odd polynomials, so that what they are
 // off by (2.4e-4 at most) moves no edge.
 #define STEP_END (real)3.5f
-inline reals blurred_step(reals t, private reals *density) {
+static inline reals blurred_step(reals t, private reals *density) {
     const reals end = (reals)STEP_END;
     const reals within = (t > end) ? end : ((t < -end) ? -end : t), v = within * (reals)(1 / STEP_END), q = v * v;
     const reals even =
@@ -51,7 +51,7 @@ inline reals blurred_step(reals t, private reals *density) {
 #ifdef ROUND
 // A disc of so much of the size. Its edge bends: to first order in the blur over the radius the level is lower by
 // density times half of that.
-inline void add_disc(reals r, real size, real share, real sign, real per_blur, private blob_model *model) {
+static inline void add_disc(reals r, real size, real share, real sign, real per_blur, private blob_model *model) {
     reals density;
     const reals t = (share * size - r) * per_blur;
     const reals step = blurred_step(t, &density);
@@ -62,7 +62,7 @@ inline void add_disc(reals r, real size, real share, real sign, real per_blur, p
     model->row[3] -= t * slope;
 }
 
-inline blob_model model_at(reals x, reals y, blob_shape shape, real cosine, real sine, real blur) {
+static inline blob_model model_at(reals x, reals y, blob_shape shape, real cosine, real sine, real blur) {
     const reals square = x * x + y * y + (reals)1e-12f, per = rsqrt(square), r = square * per;
     const real per_blur = 1 / blur;
     blob_model model = {0, {0, 0, 0, 0}};
@@ -80,7 +80,7 @@ typedef struct {
     reals level, place, half_, blur;
 } blob_band;
 
-inline blob_band band_at(reals u, real half_, real per_blur) {
+static inline blob_band band_at(reals u, real half_, real per_blur) {
     blob_band band;
     reals density;
     const reals t = ((reals)half_ - FABS(u)) * per_blur;
@@ -91,7 +91,7 @@ inline blob_band band_at(reals u, real half_, real per_blur) {
     return band;
 }
 
-inline blob_model model_at(reals x, reals y, blob_shape shape, real cosine, real sine, real blur) {
+static inline blob_model model_at(reals x, reals y, blob_shape shape, real cosine, real sine, real blur) {
     const reals u = cosine * x + sine * y, v = cosine * y - sine * x;
     const real per_blur = 1 / blur;
     const blob_band a = band_at(u, shape.size, per_blur), b = band_at(v, shape.size, per_blur);
@@ -125,7 +125,7 @@ typedef struct {
     int count;
 } blob_hidden;
 
-inline masks hidden_at(private const blob_hidden *hidden, reals dx, reals dy) {
+static inline masks hidden_at(private const blob_hidden *hidden, reals dx, reals dy) {
     masks in = 0;
     for (int i = 0; i < hidden->count; i++) {
         const reals x = dx - (reals)hidden->x[i], y = dy - (reals)hidden->y[i];
@@ -150,7 +150,7 @@ typedef struct {
 
 // The equations of the pixels about (x, y), as far as they are of this mark and its background; in units of its
 // contrast.
-inline void match_summed(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
+static inline void match_summed(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
                          blob_grey grey, real slope_x, real slope_y, real scale, real reach,
                          private const blob_hidden *hidden, private match_sums *sums) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale, per_size = 1 / shape.size;
@@ -199,7 +199,7 @@ inline void match_summed(global const CODE *image, int rows, int columns, real x
 
 // Moves the shape to where its pixels have it; returns whether there is such a place near by. `covariance` is what
 // their differences from the model make of it.
-inline int match(global const CODE *image, int rows, int columns, real x, real y, real noise, real extent,
+static inline int match(global const CODE *image, int rows, int columns, real x, real y, real noise, real extent,
                  private const blob_hidden *hidden, private blob_shape *shape, private blob_grey *grey,
                  real covariance[FREEDOMS][FREEDOMS]) {
     const blob_shape first = *shape;

@@ -27,7 +27,7 @@ typedef struct {
     SHARED real *certainty;
 } fix_places;
 
-inline void put_edge(real position, real sigma, global const real *ruler, int i, fix_places to) {
+static inline void put_edge(real position, real sigma, global const real *ruler, int i, fix_places to) {
     const real per = 1 / (1 + position * ruler[8]);
     const real at_u = (ruler[4] + position * ruler[6]) * per, at_v = (ruler[5] + position * ruler[7]) * per;
     // Along the ruler a pixel moves the place across the line by so much.
@@ -49,7 +49,7 @@ typedef struct {
     SHARED real *grows;
 } fix_rows;
 
-inline void put_row(fix_rows rows, int i, global const real *line, real u, real v, real variance) {
+static inline void put_row(fix_rows rows, int i, global const real *line, real u, real v, real variance) {
     const int good = variance > 0 && !not_finite(variance) && !not_finite(u + v);
     const real sigma = sqrt(variance + line[4] * line[4]);
     rows.nx[i] = good ? line[0] : 0;
@@ -64,7 +64,7 @@ inline void put_row(fix_rows rows, int i, global const real *line, real u, real 
 
 // A line is two rows: places either side of its middle whose offsets are uncorrelated carry its offset and its angle.
 // With one edge, or all in one place, it has no angle, and is one row.
-inline void put_line(fix_rows rows, int i, global const real *line, real x, real y, real c, real s, real of_offset,
+static inline void put_line(fix_rows rows, int i, global const real *line, real x, real y, real c, real s, real of_offset,
                      real of_angle, int has_angle) {
     const real reach = has_angle ? sqrt(of_offset / of_angle) : 0, side = c < 0 ? -reach : reach;
     put_row(rows, EACH_ROWS * i, line, x - side * c, y - side * s, has_angle ? 2 * of_offset : of_offset);
@@ -73,7 +73,7 @@ inline void put_line(fix_rows rows, int i, global const real *line, real x, real
 }
 
 // Lines `first` on of this item, LANES at once: rows of each, and a weight for each edge.
-inline void fit_lines(laned_points all, int first, int lines, global const real *line, constant int *pairs, int trials,
+static inline void fit_lines(laned_points all, int first, int lines, global const real *line, constant int *pairs, int trials,
                       int steps, fix_rows rows, global real *edge_weights) {
     reals reach = 0;
     for (int k = 0; k < all.count; k++) {

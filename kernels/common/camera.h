@@ -82,14 +82,14 @@
 
 // The stretch, and its derivative by q.
 #if CAMERA_RATIONAL
-inline reals LANED(camera_stretch)(reals q, constant real *k, reals *slope) {
+static inline reals LANED(camera_stretch)(reals q, constant real *k, reals *slope) {
     const reals under = CAMERA_UNDER(q, k), per = 1 / (1 + under);
     const reals stretch = (CAMERA_OVER(q, k) - under) * per;
     *slope = (CAMERA_OVER_SLOPE(q, k) - (1 + stretch) * CAMERA_UNDER_SLOPE(q, k)) * per;
     return stretch;
 }
 #else
-inline reals LANED(camera_stretch)(reals q, constant real *k, reals *slope) {
+static inline reals LANED(camera_stretch)(reals q, constant real *k, reals *slope) {
     *slope = CAMERA_OVER_SLOPE(q, k);
     return CAMERA_OVER(q, k);
 }
@@ -102,7 +102,7 @@ inline reals LANED(camera_stretch)(reals q, constant real *k, reals *slope) {
 #endif
 
 // How far the lens moves the ideal place (x, y); returns q.
-inline reals LANED(camera_bend)(reals x, reals y, constant real *camera, reals *move_x, reals *move_y) {
+static inline reals LANED(camera_bend)(reals x, reals y, constant real *camera, reals *move_x, reals *move_y) {
     const reals q = x * x + y * y;
     reals slope;
     reals e = LANED(camera_stretch)(q, camera + CAMERA_K, &slope);
@@ -118,7 +118,7 @@ inline reals LANED(camera_bend)(reals x, reals y, constant real *camera, reals *
 }
 
 // Jacobian of the bent place: xx, xy; yx, yy. Returns its determinant.
-inline reals LANED(camera_slopes)(reals x, reals y, constant real *camera, reals *xx, reals *xy, reals *yx,
+static inline reals LANED(camera_slopes)(reals x, reals y, constant real *camera, reals *xx, reals *xy, reals *yx,
                                   reals *yy) {
     const reals q = x * x + y * y;
     reals slope;
@@ -146,7 +146,7 @@ inline reals LANED(camera_slopes)(reals x, reals y, constant real *camera, reals
 
 // How far the tilt (or its inverse) moves (x, y); sets what lies behind the sensor's plane.
 #ifdef CAMERA_TILTED
-inline void LANED(camera_tilt)(reals x, reals y, constant real *tilt, reals *move_x, reals *move_y, masks *behind) {
+static inline void LANED(camera_tilt)(reals x, reals y, constant real *tilt, reals *move_x, reals *move_y, masks *behind) {
     const reals far = tilt[4] * x + tilt[5] * y, w = 1 + far, per = 1 / w;
     *move_x = (tilt[0] * x + tilt[1] * y - x * far) * per;
     *move_y = (tilt[2] * x + tilt[3] * y - y * far) * per;
@@ -155,7 +155,7 @@ inline void LANED(camera_tilt)(reals x, reals y, constant real *tilt, reals *mov
 #endif
 
 // Moves the pixels (column, row) by a normalised displacement, and to the other matrix if there is one.
-inline void LANED(camera_move)(reals *column, reals *row, reals move_x, reals move_y, constant real *camera) {
+static inline void LANED(camera_move)(reals *column, reals *row, reals move_x, reals move_y, constant real *camera) {
 #ifdef CAMERA_MATRICES
     move_x = camera[CAMERA_GROWTH_X] * (*column - camera[CAMERA_CENTRE_X]) + camera[CAMERA_FOCAL_X] * move_x;
     move_y = camera[CAMERA_GROWTH_Y] * (*row - camera[CAMERA_CENTRE_Y]) + camera[CAMERA_FOCAL_Y] * move_y;
@@ -168,7 +168,7 @@ inline void LANED(camera_move)(reals *column, reals *row, reals move_x, reals mo
 }
 
 // Moves the ideal pixel (column, row) to its measured one; returns where there is none, being past the fold.
-inline masks LANED(camera_distort)(reals *column, reals *row, constant real *camera) {
+static inline masks LANED(camera_distort)(reals *column, reals *row, constant real *camera) {
     const reals x = (*column - camera[CAMERA_CENTRE_X]) * camera[CAMERA_PER_X];
     const reals y = (*row - camera[CAMERA_CENTRE_Y]) * camera[CAMERA_PER_Y];
     reals move_x, move_y;
@@ -194,7 +194,7 @@ inline masks LANED(camera_distort)(reals *column, reals *row, constant real *cam
 }
 
 // As newton.h asks for it.
-inline masks LANED(camera_newton)(reals x, reals y, reals back_x, reals back_y, constant real *camera, reals *step_x,
+static inline masks LANED(camera_newton)(reals x, reals y, reals back_x, reals back_y, constant real *camera, reals *step_x,
                                   reals *step_y, reals *left) {
     const reals at_x = x + back_x, at_y = y + back_y;
     reals move_x, move_y, xx, xy, yx, yy;
@@ -218,7 +218,7 @@ inline masks LANED(camera_newton)(reals x, reals y, reals back_x, reals back_y, 
 // Their Jacobian is about the inverse of the lens' own: it turns what is left into a step, without a division. Returns
 // the places that a few steps do not settle. (PoCL neither inlines what is so long nor unrolls, unless it is told to:
 // it is half as fast then.)
-__attribute__((always_inline)) inline masks LANED(camera_approach)(reals x, reals y, constant real *camera,
+static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals x, reals y, constant real *camera,
                                                                    reals *back_x, reals *back_y) {
     constant real *c = camera + CAMERA_GUESS;
     const real per = camera[CAMERA_PER_REACH];
@@ -271,7 +271,7 @@ __attribute__((always_inline)) inline masks LANED(camera_approach)(reals x, real
 
 // Moves the measured pixel (column, row) to its ideal one; returns where there is none, being past the fold's image, a
 // million focal lengths away, or no pixel at all.
-__attribute__((always_inline)) inline masks LANED(camera_undistort)(reals *column, reals *row,
+static inline __attribute__((always_inline)) masks LANED(camera_undistort)(reals *column, reals *row,
                                                                     constant real *camera) {
     reals x = (*column - camera[CAMERA_CENTRE_X]) * camera[CAMERA_PER_X];
     reals y = (*row - camera[CAMERA_CENTRE_Y]) * camera[CAMERA_PER_Y];

@@ -6,6 +6,8 @@
 
 #include "common/real.h"
 
+#define INLINE static inline __attribute__((always_inline))
+
 #ifdef VECTOR_VARIANT
 #define LANES 16
 typedef real16 reals;
@@ -78,5 +80,87 @@ inline void store_bytes(bytes value, global uchar *to) {
 inline void store_reals(reals value, global real *to) { *(global reals_at *)to = value; }
 inline void store_bytes(bytes value, global uchar *to) { *(global bytes_at *)to = value; }
 #endif
+
+// ---- loads, stores and lane-wise operations of the tree and light kernels ---------------------------------------------
+
+// LANES consecutive numbers of global memory, or of private arrays; the address need not be aligned to a vector.
+INLINE reals load_reals(global const real *from) {
+    return *(global const reals_at *)from;
+}
+INLINE reals load_private(const real *from) { return *(const reals_at *)from; }
+INLINE void store_private(reals value, real *to) { *(reals_at *)to = value; }
+
+// Lane-wise by comparison: fmin() and fmax() may become function calls. If b is NaN, the result is b.
+INLINE reals lane_max(reals a, reals b) { return a > b ? a : b; }
+INLINE reals lane_min(reals a, reals b) { return a < b ? a : b; }
+
+// Fused multiply-add. PoCL expands the built-in fma() of vectors into scalars; clang's element-wise one stays a vector.
+#if defined(VECTOR_VARIANT) && __has_builtin(__builtin_elementwise_fma)
+#define lane_fma __builtin_elementwise_fma
+#else
+#define lane_fma fma
+#endif
+
+// The mask as an integer: bit n is lane n.
+#if !defined(VECTOR_VARIANT)
+INLINE uint lane_bits(masks mask) { return mask ? 1u : 0u; }
+#elif defined(__AVX512DQ__) && __has_builtin(__builtin_ia32_cvtd2mask512) && !defined(REAL_IS_DOUBLE)
+// One instruction (vpmovd2m) that compilers do not find by themselves.
+INLINE uint lane_bits(masks mask) {
+    return (ushort)__builtin_ia32_cvtd2mask512(mask);
+}
+#else
+// Each lane keeps the bit of its own number; a tree of "or" joins them.
+INLINE uint lane_bits(masks mask) {
+    const masks weights = {1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768};
+    const masks set = mask & weights;
+#ifdef REAL_IS_DOUBLE
+    const long8 half_of_it = set.lo | set.hi;
+    const long4 quarter = half_of_it.lo | half_of_it.hi;
+    return (uint)(quarter.x | quarter.y | quarter.z | quarter.w);
+#else
+    const int8 half_of_it = set.lo | set.hi;
+    const long2 quarter = as_long2(half_of_it.lo | half_of_it.hi);
+    const long both = quarter.x | quarter.y;
+    return (uint)both | (uint)(both >> 32);
+#endif
+}
+#endif
+
+// Position of the lowest set bit.
+INLINE int lowest_bit(uint set) { return (int)popcount((set & -set) - 1); }
+
+// Whether the mask of a comparison is set in any lane: a reduction, which is one instruction where the compiler knows
+// that the mask came from a comparison. (any_lane is faster for masks that were computed.)
+#if !defined(VECTOR_VARIANT)
+INLINE int any_compared(masks mask) { return mask != 0; }
+#elif __has_builtin(__builtin_reduce_or)
+INLINE int any_compared(masks mask) { return __builtin_reduce_or(mask) != 0; }
+#else
+INLINE int any_compared(masks mask) { return lane_bits(mask) != 0; }
+#endif
+
+// ---- samples of a work-item --------------------------------------------------------------------------------------------
+
+// Samples [begin, end) of a work-item, LANES at a time. Vector variant: `each` consecutive samples. Work-item variant:
+// one sample; the last group moves back to end with the last sample. `count` is at least LANES, or the group's size.
+typedef struct {
+    ulong begin, end;
+} sample_range;
+
+static inline sample_range samples_of_item(ulong each, ulong count) {
+    sample_range range;
+#ifdef VECTOR_VARIANT
+    range.begin = get_global_id(0) * each;
+    range.end = min(range.begin + each, count);
+#else
+    range.begin = min(get_group_id(0) * each, count - each) + get_local_id(0);
+    range.end = range.begin + 1;
+#endif
+    return range;
+}
+
+// First sample of the vector at `next`: the last vector moves back to end with the last sample.
+static inline ulong whole_vector(ulong next, ulong count) { return min(next, count - LANES); }
 
 #endif

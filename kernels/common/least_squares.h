@@ -8,14 +8,14 @@
 #define READ(from, i) (*(private const reals_at *)((from) + (i)))
 
 #ifdef VECTOR_VARIANT
-inline real sum_of(reals value) {
+static inline real sum_of(reals value) {
     const real8 a = value.lo + value.hi;
     const real4 b = a.lo + a.hi;
     return (b.x + b.y) + (b.z + b.w);
 }
 #define FIRST(value) (value).s0
 #else
-inline real sum_of(reals value) { return value; }
+static inline real sum_of(reals value) { return value; }
 #define FIRST(value) (value)
 #endif
 
@@ -24,7 +24,7 @@ inline real sum_of(reals value) { return value; }
 #define CELL(row, column) ((row) * ((row) + 1) / 2 + (column))
 
 // Cholesky: the matrix becomes its factor, with the diagonal's inverse on the diagonal. Returns where it has none.
-inline masks factored_of(const int unknowns, private reals *matrix) {
+static inline masks factored_of(const int unknowns, private reals *matrix) {
     masks bad = 0;
     for (int i = 0; i < unknowns; i++) {
         const reals diagonal = matrix[CELL(i, i)];
@@ -42,7 +42,7 @@ inline masks factored_of(const int unknowns, private reals *matrix) {
     return bad;
 }
 
-inline void solved_of(const int unknowns, private const reals *factor, private const reals *right,
+static inline void solved_of(const int unknowns, private const reals *factor, private const reals *right,
                       private reals *solution) {
     for (int i = 0; i < unknowns; i++) {
         reals sum = right[i];

@@ -16,7 +16,7 @@
 // nothing over the centre, where nothing is displaced, and whatever came after, is halved. The answer is where the
 // distance left, or the step ahead, is rounding; at the fold, where the search for a place past it ends, neither is.
 // Returns where there is none.
-inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant real *table, reals *back_x, reals *back_y) {
+static inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant real *table, reals *back_x, reals *back_y) {
     const reals own_x = zero_where(~wanted, x), own_y = zero_where(~wanted, y), square = own_x * own_x + own_y * own_y;
     reals at_x = -own_x, at_y = -own_y, left = square, ahead = square;
     // A guess may be no number, where it comes from a search that did not settle.

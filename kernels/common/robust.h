@@ -40,10 +40,10 @@
 #define LANE_BITS(values, lane) (values)
 #endif
 
-inline reals kept_where(masks mask, reals value) { return as_reals(as_masks(value) & mask); }
+static inline reals kept_where(masks mask, reals value) { return as_reals(as_masks(value) & mask); }
 
 // What a residual weighs in the next step of least squares.
-inline reals loss_weight(reals z) {
+static inline reals loss_weight(reals z) {
 #if defined(LOSS_HUBER)
     const reals size = FABS(z);
     return size <= (reals)TUNING ? (reals)1 : (reals)TUNING / size;
@@ -58,7 +58,7 @@ inline reals loss_weight(reals z) {
 }
 
 // The slope of what it weighs times it: how much the estimate gives way.
-inline reals loss_slope(reals z) {
+static inline reals loss_slope(reals z) {
 #if defined(LOSS_HUBER) || defined(LOSS_CUT)
     return FABS(z) <= (reals)TUNING ? (reals)1 : (reals)0;
 #elif defined(LOSS_TUKEY)
@@ -69,7 +69,7 @@ inline reals loss_slope(reals z) {
 #endif
 }
 
-inline reals loss_of(reals z) {
+static inline reals loss_of(reals z) {
     const reals square = z * z;
 #if defined(LOSS_HUBER)
     const reals size = FABS(z);
@@ -86,7 +86,7 @@ inline reals loss_of(reals z) {
 
 // Of each lane, the value with so many values at or below it, itself among them, built bit by bit from the top;
 // `lowest` bits stay zero. The values are not negative (bits order such reals); infinity where there is none.
-inline reals ranked_of(private const reals *values, int count, masks rank, int lowest) {
+static inline reals ranked_of(private const reals *values, int count, masks rank, int lowest) {
     masks found = 0;
     for (int bit = BITS_BELOW_SIGN - 1; bit >= lowest; bit--) {
         const masks next = found | (masks)((bits)1 << bit);

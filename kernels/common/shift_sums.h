@@ -9,13 +9,13 @@
 #define NO_KEY 0xffffffffu
 
 // Where a block begins: the last one moves back, so as to be whole, and does some positions twice.
-inline int block_from(int block, int columns) { return min(block * BLOCK, max(columns - BLOCK, 0)); }
+static inline int block_from(int block, int columns) { return min(block * BLOCK, max(columns - BLOCK, 0)); }
 
 // From a sum to a score: NaN where there is none.
-inline float score_scale(int used) { return used ? 1.0f / (float)(LEVELS * used) : NAN; }
+static inline float score_scale(int used) { return used ? 1.0f / (float)(LEVELS * used) : NAN; }
 
 // The least cost of a block and where it is, in one number.
-inline void store_least(uint key, float scale, global float *least, global int *column, size_t to, int from) {
+static inline void store_least(uint key, float scale, global float *least, global int *column, size_t to, int from) {
     least[to] = (float)(key / BLOCK) * scale;
     column[to] = from + (int)(key % BLOCK);
 }
@@ -26,7 +26,7 @@ typedef float16 floats_at __attribute__((aligned(4)));
 
 #define LOWER(a, b) ((a) < (b) ? (a) : (b))
 
-inline uint least_lane(uint16 of) {
+static inline uint least_lane(uint16 of) {
     const uint8 eight = LOWER(of.lo, of.hi);
     const uint4 four = LOWER(eight.lo, eight.hi);
     const uint2 two = LOWER(four.lo, four.hi);
@@ -34,7 +34,7 @@ inline uint least_lane(uint16 of) {
 }
 
 // All positions of the rows from `first` up to `end`, for the shifts of one heading.
-inline void sum_rows(global const ushort *restrict level, private const int *shifts, int used, int turn, int first,
+static inline void sum_rows(global const ushort *restrict level, private const int *shifts, int used, int turn, int first,
                      int end, int rows, int columns, int stride, global float *restrict scores,
                      global float *restrict least, global int *restrict column) {
     const int blocks = (columns + BLOCK - 1) / BLOCK;
@@ -92,7 +92,7 @@ inline void sum_rows(global const ushort *restrict level, private const int *shi
 }
 #else
 // One block of positions by a group of BLOCK items; `key` holds NO_KEY, and both it and the shifts stand for all items.
-inline void sum_block(global const ushort *restrict level, local const int *shifts, int used, local uint *key,
+static inline void sum_block(global const ushort *restrict level, local const int *shifts, int used, local uint *key,
                       int columns, int stride, global float *restrict scores, global float *restrict least,
                       global int *restrict column) {
     const int item = (int)get_local_id(0), block = (int)get_group_id(0), row = (int)get_group_id(1),

@@ -11,7 +11,7 @@ typedef inputs inputs_at __attribute__((aligned(sizeof(INPUT))));
                             first + 14, first + 16, first + 18, first + 20, first + 22, first + 24, first + 26,        \
                             first + 28, first + 30)
 // Of 48 numbers in three vectors, the 16 from `first` on, each third.
-__attribute__((always_inline)) inline places third(inputs a, inputs b, inputs c, int first) {
+static inline __attribute__((always_inline)) places third(inputs a, inputs b, inputs c, int first) {
     if (first == 0) {
         const inputs two = __builtin_shufflevector(a, b, 0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0);
         return convert_places(
@@ -25,7 +25,7 @@ __attribute__((always_inline)) inline places third(inputs a, inputs b, inputs c,
     const inputs two = __builtin_shufflevector(a, b, 2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0);
     return convert_places(__builtin_shufflevector(two, c, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31));
 }
-inline void load_columns(global const INPUT *at, places *columns) {
+static inline void load_columns(global const INPUT *at, places *columns) {
     global const inputs_at *from = (global const inputs_at *)at;
     const inputs a = from[0], b = from[1], c = from[2], d = from[3], e = from[4], f = from[5];
 #pragma unroll
@@ -38,7 +38,7 @@ inline void load_columns(global const INPUT *at, places *columns) {
     }
 }
 #elif defined(VECTOR_VARIANT)
-inline void load_columns(global const INPUT *from, places *columns) {
+static inline void load_columns(global const INPUT *from, places *columns) {
     for (int n = 0; n < 6; n++) {
         global const INPUT *at = from + n;
         columns[n] = (places)(at[0], at[6], at[12], at[18], at[24], at[30], at[36], at[42],
@@ -46,7 +46,7 @@ inline void load_columns(global const INPUT *from, places *columns) {
     }
 }
 #else
-inline void load_columns(global const INPUT *from, places *columns) {
+static inline void load_columns(global const INPUT *from, places *columns) {
     for (int n = 0; n < 6; n++) columns[n] = from[n];
 }
 #endif

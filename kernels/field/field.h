@@ -12,14 +12,14 @@ typedef struct {
     float away, x, y;
 } field_offset;
 
-inline field_offset field_from(float2 to, float c, float s) {
+static inline field_offset field_from(float2 to, float c, float s) {
     const float far = sqrt(to.x * to.x + to.y * to.y);
     const float2 unit = far > 0 ? to / far : (float2)(1, 0);
     const field_offset offset = {far, c * unit.x - s * unit.y, s * unit.x + c * unit.y};
     return offset;
 }
 
-inline field_offset field_away(constant float *shape, float x, float y) {
+static inline field_offset field_away(constant float *shape, float x, float y) {
     const float c = shape[2], s = shape[3], radius = shape[6], dx = x - shape[0], dy = y - shape[1];
     const float along = c * dx + s * dy, across = c * dy - s * dx;
     if (radius == 0) {

@@ -17,7 +17,7 @@ typedef struct {
     float r, x, y, t;
 } field_row;
 
-inline field_row row_of(float2 point, float3 pose, float2 turn, constant float *shapes, global const uchar *nearest,
+static inline field_row row_of(float2 point, float3 pose, float2 turn, constant float *shapes, global const uchar *nearest,
                         field_grid grid) {
     const float dx = turn.x * point.x - turn.y * point.y, dy = turn.y * point.x + turn.x * point.y;
     const float x = pose.x + dx, y = pose.y + dy;
@@ -35,9 +35,9 @@ inline field_row row_of(float2 point, float3 pose, float2 turn, constant float *
 }
 
 // Whether it is finite and within the reach, by squares.
-inline int point_counts(float2 point, float farthest) { return point.x * point.x + point.y * point.y <= farthest; }
+static inline int point_counts(float2 point, float farthest) { return point.x * point.x + point.y * point.y <= farthest; }
 
-inline normal_equations equations_at(global const float *points, int count, float3 pose, constant float *shapes,
+static inline normal_equations equations_at(global const float *points, int count, float3 pose, constant float *shapes,
                                      global const uchar *nearest, field_grid grid, float square, float farthest) {
     const float2 turn = (float2)(cos(pose.z), sin(pose.z));
     normal_equations sum = {0};
@@ -61,7 +61,7 @@ inline normal_equations equations_at(global const float *points, int count, floa
 }
 
 // Cofactors of a symmetric matrix (xx, xy, yy, xt, yt, tt), as its own fields.
-inline normal_equations cofactors(normal_equations of) {
+static inline normal_equations cofactors(normal_equations of) {
     normal_equations c = {0};
     c.xx = of.yy * of.tt - of.yt * of.yt;
     c.xy = of.xt * of.yt - of.xy * of.tt;
@@ -73,7 +73,7 @@ inline normal_equations cofactors(normal_equations of) {
 }
 
 // Solves (M + damping) step = -g; angles in units of 1 / lever, so that damping means the same for all three.
-inline float3 damped_step(normal_equations of, float damping, float lever) {
+static inline float3 damped_step(normal_equations of, float damping, float lever) {
     const float more = damping * (of.xx + of.yy + of.tt * lever * lever) + 1e-20f;
     of.xx += more;
     of.yy += more;
@@ -88,7 +88,7 @@ inline float3 damped_step(normal_equations of, float damping, float lever) {
                     (c.xt * of.x + c.yt * of.y + c.tt * of.t) * scale * lever);
 }
 
-inline void store_symmetric(global float *to, normal_equations of, float scale) {
+static inline void store_symmetric(global float *to, normal_equations of, float scale) {
     to[0] = of.xx * scale;
     to[1] = to[3] = of.xy * scale;
     to[2] = to[6] = of.xt * scale;

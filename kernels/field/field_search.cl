@@ -4,7 +4,7 @@
 #include "common/shift_sums.h"
 
 // The shift of a point for a heading; negative where it has none: not finite, or further than the reach.
-inline int shift_of(float2 point, float2 heading, float per_cell, float square, int border, int stride) {
+static inline int shift_of(float2 point, float2 heading, float per_cell, float square, int border, int stride) {
     // False for NaN, too.
     if (!(point.x * point.x + point.y * point.y <= square)) return -1;
     const float x = (heading.x * point.x - heading.y * point.y) * per_cell;

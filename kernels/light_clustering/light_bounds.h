@@ -47,20 +47,20 @@ typedef struct {
 } meeting;
 
 // A runtime may call a function for fmin and fmax. A second number that is NaN does not count.
-inline real lower(real a, real b) { return b < a ? b : a; }
-inline real higher(real a, real b) { return b > a ? b : a; }
+static inline real lower(real a, real b) { return b < a ? b : a; }
+static inline real higher(real a, real b) { return b > a ? b : a; }
 
-inline real dot3(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-inline real length3(const real *a) { return sqrt(dot3(a, a)); }
+static inline real dot3(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+static inline real length3(const real *a) { return sqrt(dot3(a, a)); }
 
-inline void cross3(const real *a, const real *b, real *c) {
+static inline void cross3(const real *a, const real *b, real *c) {
     c[0] = a[1] * b[2] - a[2] * b[1];
     c[1] = a[2] * b[0] - a[0] * b[2];
     c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
 // Those without cost have no part in the reading; a normal of zero is no receiver.
-inline receivers_block block_of(global const INPUT *receivers, global const real *costs, int count,
+static inline receivers_block block_of(global const INPUT *receivers, global const real *costs, int count,
                                 global const INPUT *middle) {
     receivers_block block;
     int kept = 0;
@@ -115,7 +115,7 @@ inline receivers_block block_of(global const INPUT *receivers, global const real
     return block;
 }
 
-inline meeting meeting_of(const receivers_block *block, global const real *row, int single, real rounding) {
+static inline meeting meeting_of(const receivers_block *block, global const real *row, int single, real rounding) {
     real to[3], side[3], reach = 0, back = 0, front = 0;
     const real normal[3] = {row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]};
     for (int k = 0; k < 3; k++) {
@@ -161,7 +161,7 @@ inline meeting meeting_of(const receivers_block *block, global const real *row, 
 }
 
 // What the cluster's own segment is off by at most, as irradiance by a watt.
-inline real error_of(const receivers_block *block, global const real *row, real rounding) {
+static inline real error_of(const receivers_block *block, global const real *row, real rounding) {
     real gap = 0;
     for (int k = 0; k < 3; k++) {
         const real apart =
@@ -177,38 +177,38 @@ inline real error_of(const receivers_block *block, global const real *row, real 
 }
 
 #ifdef VECTOR_VARIANT
-#define RECEIVER_LANE(from) (*(const bvh_reals_at *)(from))
+#define RECEIVER_LANE(from) (*(const reals_at *)(from))
 #else
 #define RECEIVER_LANE(from) (*(from))
 #endif
 
 // What a watt of a segment costs at most at a lane's receiver, times pi.
-BVH_INLINE bvh_reals most_of_lane(const real *lane, global const real *lit, real length, real rounding) {
-    const bvh_reals zero = (bvh_reals)0, one = (bvh_reals)1;
-    const bvh_reals nx = RECEIVER_LANE(lane + 3 * WIDTH), ny = RECEIVER_LANE(lane + 4 * WIDTH);
-    const bvh_reals nz = RECEIVER_LANE(lane + 5 * WIDTH), cost = RECEIVER_LANE(lane + 6 * WIDTH);
-    const bvh_reals x = RECEIVER_LANE(lane) - lit[4], y = RECEIVER_LANE(lane + WIDTH) - lit[5];
-    const bvh_reals z = RECEIVER_LANE(lane + 2 * WIDTH) - lit[6];
+INLINE reals most_of_lane(const real *lane, global const real *lit, real length, real rounding) {
+    const reals zero = (reals)0, one = (reals)1;
+    const reals nx = RECEIVER_LANE(lane + 3 * WIDTH), ny = RECEIVER_LANE(lane + 4 * WIDTH);
+    const reals nz = RECEIVER_LANE(lane + 5 * WIDTH), cost = RECEIVER_LANE(lane + 6 * WIDTH);
+    const reals x = RECEIVER_LANE(lane) - lit[4], y = RECEIVER_LANE(lane + WIDTH) - lit[5];
+    const reals z = RECEIVER_LANE(lane + 2 * WIDTH) - lit[6];
     const real dx = lit[7] - lit[4], dy = lit[8] - lit[5], dz = lit[9] - lit[6];
-    const bvh_reals up = x * lit[0] + y * lit[1] + z * lit[2];
-    const bvh_reals start = -(nx * x + ny * y + nz * z);
-    const bvh_reals ahead = start + bvh_max(nx * dx + ny * dy + nz * dz, zero);
-    const bvh_reals part = bvh_min(bvh_max((x * dx + y * dy + z * dz) / (length * length), zero), one);
-    const bvh_reals u = x - part * dx, v = y - part * dy, w = z - part * dz;
-    const bvh_reals distance = sqrt(u * u + v * v + w * w) - rounding, per = UP / distance;
-    const bvh_reals cosines = bvh_min((up + rounding) * per, one) * bvh_min((ahead + rounding) * per, one);
-    const bvh_reals light = cost * cosines * bvh_min(per * per, per * (PI / length));
-    const bvh_masks gets = BVH_MASK(up > 0) & BVH_MASK(ahead > 0) & BVH_MASK(cost > 0);
-    return gets ? (BVH_MASK(distance > 0) ? light : (bvh_reals)INFINITY) : zero;
+    const reals up = x * lit[0] + y * lit[1] + z * lit[2];
+    const reals start = -(nx * x + ny * y + nz * z);
+    const reals ahead = start + lane_max(nx * dx + ny * dy + nz * dz, zero);
+    const reals part = lane_min(lane_max((x * dx + y * dy + z * dz) / (length * length), zero), one);
+    const reals u = x - part * dx, v = y - part * dy, w = z - part * dz;
+    const reals distance = sqrt(u * u + v * v + w * w) - rounding, per = UP / distance;
+    const reals cosines = lane_min((up + rounding) * per, one) * lane_min((ahead + rounding) * per, one);
+    const reals light = cost * cosines * lane_min(per * per, per * (PI / length));
+    const masks gets = mask_of(up > 0) & mask_of(ahead > 0) & mask_of(cost > 0);
+    return gets ? (mask_of(distance > 0) ? light : (reals)INFINITY) : zero;
 }
 
 // What a segment costs at most, each receiver for itself: so that it stays finite where a block touches what is lit.
-inline real most_of_segment(const receivers_block *block, global const real *lit, real length, real power,
+static inline real most_of_segment(const receivers_block *block, global const real *lit, real length, real power,
                             real rounding) {
     real sum = 0;
 #ifdef VECTOR_VARIANT
     real each[WIDTH];
-    *(bvh_reals_at *)each = most_of_lane(block->lanes, lit, length, rounding);
+    *(reals_at *)each = most_of_lane(block->lanes, lit, length, rounding);
     for (int i = 0; i < WIDTH; i++) sum += each[i];
 #else
     for (int i = 0; i < WIDTH; i++) sum += most_of_lane(block->lanes + i, lit, length, rounding);

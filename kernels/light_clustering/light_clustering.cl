@@ -19,7 +19,7 @@
 
 #ifdef OCCLUDERS
 typedef struct {
-    bvh_reals x, y, z;
+    reals x, y, z;
 } vectors;
 
 // What stands for many points with normals: as far as they reach, as a box and as a disc, and their planes.
@@ -28,83 +28,83 @@ typedef struct {
     real radius, slab, spread, most_height;
 } extent;
 
-BVH_INLINE int any_of(bvh_masks mask) {
+INLINE int any_of(masks mask) {
 #ifdef VECTOR_VARIANT
-    return bvh_lanes(mask) != 0;
+    return lane_bits(mask) != 0;
 #else
     return mask != 0;
 #endif
 }
 
-BVH_INLINE vectors corner_of(global const real *leaf, int corner) {
+INLINE vectors corner_of(global const real *leaf, int corner) {
     global const real *at = leaf + 3 * corner * WIDTH;
-    const vectors v = {BVH_LOAD(at), BVH_LOAD(at + WIDTH), BVH_LOAD(at + 2 * WIDTH)};
+    const vectors v = {load_reals(at), load_reals(at + WIDTH), load_reals(at + 2 * WIDTH)};
     return v;
 }
 
-BVH_INLINE vectors from(vectors v, const real *place) {
+INLINE vectors from(vectors v, const real *place) {
     const vectors way = {v.x - place[0], v.y - place[1], v.z - place[2]};
     return way;
 }
 
-BVH_INLINE vectors cross(vectors p, vectors q) {
+INLINE vectors cross(vectors p, vectors q) {
     const vectors n = {p.y * q.z - p.z * q.y, p.z * q.x - p.x * q.z, p.x * q.y - p.y * q.x};
     return n;
 }
 
-BVH_INLINE bvh_reals along(vectors v, real x, real y, real z) { return v.x * x + v.y * y + v.z * z; }
-BVH_INLINE bvh_reals size_of(vectors v) { return sqrt(v.x * v.x + v.y * v.y + v.z * v.z); }
+INLINE reals along(vectors v, real x, real y, real z) { return v.x * x + v.y * y + v.z * z; }
+INLINE reals size_of(vectors v) { return sqrt(v.x * v.x + v.y * v.y + v.z * v.z); }
 
-BVH_INLINE bvh_reals highest(vectors a, vectors b, vectors c, const real *up) {
-    const bvh_reals u = along(a, up[0], up[1], up[2]), v = along(b, up[0], up[1], up[2]);
-    return bvh_max(bvh_max(u, v), along(c, up[0], up[1], up[2]));
+INLINE reals highest(vectors a, vectors b, vectors c, const real *up) {
+    const reals u = along(a, up[0], up[1], up[2]), v = along(b, up[0], up[1], up[2]);
+    return lane_max(lane_max(u, v), along(c, up[0], up[1], up[2]));
 }
 
 // How high a place is above any of the planes, at most.
-BVH_INLINE bvh_reals rise(const extent *many, vectors corner) {
+INLINE reals rise(const extent *many, vectors corner) {
     const vectors way = from(corner, many->centre);
     return along(way, many->normal[0], many->normal[1], many->normal[2]) + many->spread * size_of(way) +
            many->most_height;
 }
 
 // Between what the points lie along a direction, from a place.
-BVH_INLINE void between(const extent *many, vectors n, bvh_reals size, bvh_reals level, bvh_reals *low,
-                        bvh_reals *high) {
-    const bvh_reals middle = along(n, many->centre[0], many->centre[1], many->centre[2]) - level;
-    bvh_reals front = (bvh_reals)0, back = (bvh_reals)0;
-    const bvh_reals parts[3] = {n.x, n.y, n.z};
+INLINE void between(const extent *many, vectors n, reals size, reals level, reals *low,
+                        reals *high) {
+    const reals middle = along(n, many->centre[0], many->centre[1], many->centre[2]) - level;
+    reals front = (reals)0, back = (reals)0;
+    const reals parts[3] = {n.x, n.y, n.z};
     for (int k = 0; k < 3; k++) {
-        const bvh_reals one = parts[k] * (many->low[k] - many->centre[k]);
-        const bvh_reals two = parts[k] * (many->high[k] - many->centre[k]);
-        front += bvh_max(one, two), back += bvh_min(one, two);
+        const reals one = parts[k] * (many->low[k] - many->centre[k]);
+        const reals two = parts[k] * (many->high[k] - many->centre[k]);
+        front += lane_max(one, two), back += lane_min(one, two);
     }
-    const bvh_reals cosine = fabs(along(n, many->normal[0], many->normal[1], many->normal[2]));
-    const bvh_reals sine = sqrt(bvh_max(size * size - cosine * cosine, (bvh_reals)0));
-    const bvh_reals disc = cosine * many->slab + sine * many->radius;
-    *low = middle + bvh_max(back, -disc), *high = middle + bvh_min(front, disc);
+    const reals cosine = fabs(along(n, many->normal[0], many->normal[1], many->normal[2]));
+    const reals sine = sqrt(lane_max(size * size - cosine * cosine, (reals)0));
+    const reals disc = cosine * many->slab + sine * many->radius;
+    *low = middle + lane_max(back, -disc), *high = middle + lane_min(front, disc);
 }
 
 // Which triangles of a leaf may hide some of the lit from a receiver: they meet the hull of both; rise above a plane of
 // each; have the receiver on one side of their own plane and something lit on the other; and, seen from the receiver,
 // none of their edges has all that is lit on its outer side.
-BVH_INLINE int hides(const shaft *hull, const receivers_block *block, const extent *got, const extent *out,
+INLINE int hides(const shaft *hull, const receivers_block *block, const extent *got, const extent *out,
                      global const real *lit, int count, real margin, global const real *leaf) {
-    bvh_masks left = shaft_leaf(hull, leaf);
+    masks left = shaft_leaf(hull, leaf);
     if (!any_of(left)) return 0;
     const vectors a = corner_of(leaf, 0), b = corner_of(leaf, 1), c = corner_of(leaf, 2);
-    left &= BVH_MASK(bvh_max(rise(got, a), bvh_max(rise(got, b), rise(got, c))) > margin);
+    left &= mask_of(lane_max(rise(got, a), lane_max(rise(got, b), rise(got, c))) > margin);
     if (!any_of(left)) return 0;
     const vectors p = {b.x - a.x, b.y - a.y, b.z - a.z}, q = {c.x - a.x, c.y - a.y, c.z - a.z};
     const vectors n = cross(p, q);
-    const bvh_reals level = n.x * a.x + n.y * a.y + n.z * a.z, slack = margin * size_of(n);
-    bvh_masks above = (bvh_masks)(0), below = (bvh_masks)(0);
+    const reals level = n.x * a.x + n.y * a.y + n.z * a.z, slack = margin * size_of(n);
+    masks above = (masks)(0), below = (masks)(0);
     for (int i = 0; i < count; i++) {
         const real normal[3] = {lit[0], lit[1], lit[2]};
-        const bvh_masks over = left & BVH_MASK(highest(a, b, c, normal) > lit[3] + margin);
-        const bvh_reals start = along(n, lit[4], lit[5], lit[6]) - level;
-        const bvh_reals end = along(n, lit[7], lit[8], lit[9]) - level;
-        above |= over & BVH_MASK(bvh_max(start, end) > slack);
-        below |= over & BVH_MASK(bvh_min(start, end) < -slack);
+        const masks over = left & mask_of(highest(a, b, c, normal) > lit[3] + margin);
+        const reals start = along(n, lit[4], lit[5], lit[6]) - level;
+        const reals end = along(n, lit[7], lit[8], lit[9]) - level;
+        above |= over & mask_of(lane_max(start, end) > slack);
+        below |= over & mask_of(lane_min(start, end) < -slack);
         lit += PLACED;
     }
     left &= above | below;
@@ -112,18 +112,18 @@ BVH_INLINE int hides(const shaft *hull, const receivers_block *block, const exte
     for (int i = 0; i < block->count; i++) {
         const real *place = block->places + 3 * i, *normal = block->normals + 3 * i;
         const vectors u = from(a, place), v = from(b, place), w = from(c, place);
-        const bvh_reals top = highest(u, v, w, normal);
-        const bvh_reals side = along(n, place[0], place[1], place[2]) - level;
-        bvh_masks may = left & BVH_MASK(top > margin);
-        may &= (BVH_MASK(side > slack) & below) | (BVH_MASK(side < -slack) & above);
+        const reals top = highest(u, v, w, normal);
+        const reals side = along(n, place[0], place[1], place[2]) - level;
+        masks may = left & mask_of(top > margin);
+        may &= (mask_of(side > slack) & below) | (mask_of(side < -slack) & above);
         if (!any_of(may)) continue;
         // The cone from the receiver over the triangle: inside is where all edges have the sign of `side`, turned.
         const vectors edges[3] = {cross(u, v), cross(v, w), cross(w, u)};
         for (int edge = 0; edge < 3; edge++) {
             const vectors m = edges[edge];
-            bvh_reals first, last;
+            reals first, last;
             between(out, m, size_of(m), along(m, place[0], place[1], place[2]), &first, &last);
-            may &= (BVH_MASK(side < 0) & BVH_MASK(last > 0)) | (BVH_MASK(side > 0) & BVH_MASK(first < 0));
+            may &= (mask_of(side < 0) & mask_of(last > 0)) | (mask_of(side > 0) & mask_of(first < 0));
             if (!any_of(may)) break;
         }
         if (any_of(may)) return 1;
@@ -131,9 +131,9 @@ BVH_INLINE int hides(const shaft *hull, const receivers_block *block, const exte
     return 0;
 }
 
-BVH_INLINE uint shaft_met(const shaft *hull, global const real *node) {
+INLINE uint shaft_met(const shaft *hull, global const real *node) {
 #ifdef VECTOR_VARIANT
-    return bvh_lanes(shaft_node(hull, node));
+    return lane_bits(shaft_node(hull, node));
 #else
     uint met = 0;
     for (int lane = 0; lane < WIDTH; lane++) met |= shaft_node(hull, node + lane) ? 1u << lane : 0;
@@ -141,7 +141,7 @@ BVH_INLINE uint shaft_met(const shaft *hull, global const real *node) {
 #endif
 }
 
-inline int leaf_hides(const shaft *hull, const receivers_block *block, const extent *got, const extent *out,
+static inline int leaf_hides(const shaft *hull, const receivers_block *block, const extent *got, const extent *out,
                       global const real *lit, int count, real margin, global const real *leaf) {
 #ifdef VECTOR_VARIANT
     return hides(hull, block, got, out, lit, count, margin, leaf);
@@ -154,7 +154,7 @@ inline int leaf_hides(const shaft *hull, const receivers_block *block, const ext
 
 // Whether nothing can stand between a block and a cluster. A leaf that hides some of one cluster may hide some of the
 // next: it is tried first.
-inline int is_clear(const bvh_tree *tree, const receivers_block *block, global const real *row, global const real *lit,
+static inline int is_clear(const bvh_tree *tree, const receivers_block *block, global const real *row, global const real *lit,
                     int count, real margin, int *culprit) {
     extent got, out;
     for (int k = 0; k < 3; k++) {
@@ -182,7 +182,7 @@ inline int is_clear(const bvh_tree *tree, const receivers_block *block, global c
             met = left[depth];
             continue;
         }
-        const int lane = bvh_lowest(met);
+        const int lane = lowest_bit(met);
         met ^= 1u << lane;
         const int child = tree->children[node * WIDTH + lane];
         if (child < 0) {
@@ -202,7 +202,7 @@ inline int is_clear(const bvh_tree *tree, const receivers_block *block, global c
 #endif
 
 // The node after all of those below one, in the order of a heap: 0 after the last.
-inline uint after(uint node) {
+static inline uint after(uint node) {
     const uint next = node + 1;
     const uint at = next >> popcount((next & -next) - 1);
     return at == 1 ? 0 : at;

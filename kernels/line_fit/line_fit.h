@@ -29,12 +29,12 @@ typedef struct {
     masks coincide;        // no direction: all places are one
 } laned_fit;
 
-inline reals line_distance(laned_line line, reals x, reals y) {
+static inline reals line_distance(laned_line line, reals x, reals y) {
     return line.c * (y - line.y) - line.s * (x - line.x);
 }
 
 // Absolute distances in units of the points' sigma, infinite for missing points.
-inline void line_distances(laned_line line, laned_points all) {
+static inline void line_distances(laned_line line, laned_points all) {
     for (int i = 0; i < all.count; i++) {
         const reals w = all.certainty[i];
         const reals z = FABS(line_distance(line, all.x[i], all.y[i]) * w);
@@ -43,7 +43,7 @@ inline void line_distances(laned_line line, laned_points all) {
 }
 
 // How badly a line does: the loss at the scale that is known, or the median of the distances to a percent.
-inline reals line_score(laned_line line, laned_points all, masks rank) {
+static inline reals line_score(laned_line line, laned_points all, masks rank) {
 #ifdef SCALE
     reals sum = 0;
     for (int i = 0; i < all.count; i++)
@@ -56,7 +56,7 @@ inline reals line_score(laned_line line, laned_points all, masks rank) {
 }
 
 // The weighted middle of all points, and any direction.
-inline laned_line line_middle(laned_points all) {
+static inline laned_line line_middle(laned_points all) {
     reals sum = 0, sum_x = 0, sum_y = 0;
     for (int i = 0; i < all.count; i++) {
         const reals w = all.certainty[i] * all.certainty[i];
@@ -67,7 +67,7 @@ inline laned_line line_middle(laned_points all) {
 }
 
 // Of the lines through pairs of points the one that does best.
-inline laned_line line_start(laned_points all, constant const int *pairs, int trials, masks rank) {
+static inline laned_line line_start(laned_points all, constant const int *pairs, int trials, masks rank) {
     laned_line best = line_middle(all);
     reals least = INFINITY;
     for (int trial = 0; trial < trials; trial++) {
@@ -90,7 +90,7 @@ inline laned_line line_start(laned_points all, constant const int *pairs, int tr
 }
 
 // One step of weighted total least squares. The line is turned from where it is: half its angle needs no arctangent.
-inline laned_line line_step(laned_line line, laned_points all, reals per_scale, masks *coincide) {
+static inline laned_line line_step(laned_line line, laned_points all, reals per_scale, masks *coincide) {
     reals sum = 0, sum_u = 0, sum_v = 0, sum_uu = 0, sum_uv = 0, sum_vv = 0;
     for (int i = 0; i < all.count; i++) {
         const reals x = all.x[i] - line.x, y = all.y[i] - line.y;
@@ -121,7 +121,7 @@ inline laned_line line_step(laned_line line, laned_points all, reals per_scale, 
 }
 
 // By the median of the distances; of those only within `reach`, once a scale is known: outliers raise the median too.
-inline reals line_scale(laned_line line, laned_points all, reals reach, real few, reals smallest) {
+static inline reals line_scale(laned_line line, laned_points all, reals reach, real few, reals smallest) {
 #ifdef SCALE
     return (reals)SCALE;
 #else
@@ -136,7 +136,7 @@ inline reals line_scale(laned_line line, laned_points all, reals reach, real few
 }
 
 // Adds to the fit what its residuals say about it.
-inline void line_variances(laned_fit *fit, laned_points all) {
+static inline void line_variances(laned_fit *fit, laned_points all) {
     const reals per_scale = (reals)1 / fit->scale;
     reals sum = 0, sum_uu = 0, slopes = 0, squares = 0;
     masks inliers = 0;
@@ -164,7 +164,7 @@ inline void line_variances(laned_fit *fit, laned_points all) {
     fit->variance_of_angle = factor / sum_uu;
 }
 
-inline laned_fit line_fit(laned_points all, constant const int *pairs, int trials, int steps, reals smallest) {
+static inline laned_fit line_fit(laned_points all, constant const int *pairs, int trials, int steps, reals smallest) {
     laned_fit fit = {line_middle(all), smallest, 0, 0, 0, 0, 0};
     for (int i = 0; i < all.count; i++) fit.points -= mask_of(all.certainty[i] > (reals)0);
 #ifdef ROBUST

@@ -35,10 +35,10 @@ typedef float places;
 
 #include "common/six_columns.h"
 
-inline places placed(places x, places y, places z, global const place *row) {
+static inline places placed(places x, places y, places z, global const place *row) {
     return x * row[0] + (y * row[1] + (z * row[2] + row[3]));
 }
-inline reals turned(reals x, reals y, reals z, global const real *row) { return x * row[0] + y * row[1] + z * row[2]; }
+static inline reals turned(reals x, reals y, reals z, global const real *row) { return x * row[0] + y * row[1] + z * row[2]; }
 
 // `middle`: what is subtracted from places first. rows, for each frame: from a place to how far it lies before the
 // first segment's start along the line, above the surface, and aside (three factors and what is added each). axes: of

@@ -5,7 +5,7 @@
 #include "common/lanes.h"
 
 // Q of atan(z) = z - z^3 Q(z^2) on [0, 1], minimax: to 1.6e-8 in single, 8e-19 in double.
-__attribute__((always_inline)) inline reals LANED(arc_rest)(reals w) {
+static inline __attribute__((always_inline)) reals LANED(arc_rest)(reals w) {
 #ifdef REAL_IS_DOUBLE
     reals rest = (reals)-7.76762433028991855e-6;
     rest = rest * w + 0.0000937118634505262543;
@@ -43,7 +43,7 @@ __attribute__((always_inline)) inline reals LANED(arc_rest)(reals w) {
 }
 
 // R of 2 atan(t) - sin(2 atan(t)) = t^3 R(t^2) on [0, 1]: in single to 1e-8, minimax, and rounding.
-__attribute__((always_inline)) inline reals LANED(arc_less_sine)(reals w) {
+static inline __attribute__((always_inline)) reals LANED(arc_less_sine)(reals w) {
 #ifdef REAL_IS_DOUBLE
     return (real)2 * ((real)1 / ((real)1 + w) - LANED(arc_rest)(w));
 #else
@@ -70,7 +70,7 @@ __attribute__((always_inline)) inline reals LANED(arc_less_sine)(reals w) {
 // Neither term of the bracket is negative, and both are had without a difference: the first from tan(theta / 2), the
 // second beyond an end as sin^2 sigma / (1 - cos sigma). So one form holds near, far, and end-on. On the CPUs products
 // and sums are what it costs; divisions pass beside them.
-__attribute__((always_inline)) inline reals LANED(end_factor)(reals tau1, reals tau2, reals length, reals length2,
+static inline __attribute__((always_inline)) reals LANED(end_factor)(reals tau1, reals tau2, reals length, reals length2,
                                                              reals height, reals aside, reals by_u, reals foot) {
     const reals zero = (reals)0;
     masks lit = mask_of(height > zero);
@@ -113,7 +113,7 @@ __attribute__((always_inline)) inline reals LANED(end_factor)(reals tau1, reals 
 }
 
 // The same from where the receiver stands along the line from its start, and what is left from there to its end.
-__attribute__((always_inline)) inline reals LANED(line_factor)(reals along, reals height, reals aside, reals end,
+static inline __attribute__((always_inline)) reals LANED(line_factor)(reals along, reals height, reals aside, reals end,
                                                               reals whole, reals by_u, reals by_n, reals by_w) {
     return LANED(end_factor)(-along, end, whole, whole * whole, height, aside, by_u, -(by_n * height + by_w * aside));
 }

@@ -35,8 +35,6 @@
 #define EDGE ((real)1e-5)
 #endif
 
-#define INLINE __attribute__((always_inline)) inline
-
 typedef struct {
     reals x, y, z;
 } Vector;

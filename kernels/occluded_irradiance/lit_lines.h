@@ -18,7 +18,7 @@
 #define LOAD_LANES(from) (*(const reals_at *)(from))
 #define STORE_PLACES(value, to) (*(places_at *)(to) = (value))
 #define NARROW_MASK(comparison) convert_bits16(comparison)
-#define lanes_of bvh_lanes
+#define lanes_of lane_bits
 #else
 #define SEGMENTS 1
 #define LOAD_PLACES(from) (*(from))
@@ -109,17 +109,17 @@ uint on_line_of(const frames *each, int one, uint last) {
 // The line from the first to the last of its members.
 void add_line(chunk *all, uint members) {
     const frames *each = &all->each;
-    const int one = bvh_lowest(members), n = all->line_count++;
+    const int one = lowest_bit(members), n = all->line_count++;
     const place ux = each->along_x[one], uy = each->along_y[one], uz = each->along_z[one];
     place low = 0, high = each->length[one], at[SEGMENTS];
     for (uint left = members; left; left &= left - 1) {
-        const int k = bvh_lowest(left);
+        const int k = lowest_bit(left);
         at[k] = (each->x[k] - each->x[one]) * ux + (each->y[k] - each->y[one]) * uy + (each->z[k] - each->z[one]) * uz;
         low = fmin(low, at[k]), high = fmax(high, at[k] + each->length[k]);
     }
     const place length = high - low;
     for (uint left = members; left; left &= left - 1) {
-        const int k = bvh_lowest(left);
+        const int k = lowest_bit(left);
         all->begin[k] = (real)((at[k] - low) / length), all->end[k] = (real)((at[k] + each->length[k] - low) / length);
     }
     frames *to = &all->lines;
@@ -136,7 +136,7 @@ void load_chunk(global const INPUT *rows, const uint *numbers, uint count, const
     for (uint first = 0; first < count; first += LANES) load_frames(rows, numbers, count, first, middle, all);
     for (uint left = all->lit; left;) {
         const uint lowest = left & -left;
-        const uint alike = lowest & all->unseen ? 0 : on_line_of(&all->each, bvh_lowest(left), count) & ~all->unseen;
+        const uint alike = lowest & all->unseen ? 0 : on_line_of(&all->each, lowest_bit(left), count) & ~all->unseen;
         const uint members = (alike & left) | lowest;
         add_line(all, members);
         left &= ~members;

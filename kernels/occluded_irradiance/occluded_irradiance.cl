@@ -129,7 +129,7 @@ int add_visible(const bvh_tree *tree, const chunk *lit, int line, const before *
     while (from < end) {
         hidden_begin(&dark, from, to);
         view_trace(tree, v, &dark, hint);
-        if (dark.is_full && to - from > LEAST_WINDOW) {
+        if (dark.is_full && to - from > SMALLEST_WINDOW) {
             to = (real)0.5 * (from + to);
             continue;
         }
@@ -138,7 +138,7 @@ int add_visible(const bvh_tree *tree, const chunk *lit, int line, const before *
         // To a horizon and a little beyond, so that the end itself need not be rounded.
         const real first = dark.from == begin ? 0 : dark.from, last = dark.to == end ? 1 : dark.to;
         for (uint left = dark.from < dark.to ? lit->members[line] : 0; left; left &= left - 1) {
-            const int k = bvh_lowest(left);
+            const int k = lowest_bit(left);
             if (all->lanes[k] >> lane & 1) add_seen(&dark, first, last, lit, k, all->own + k, lane, waiting, sums);
         }
         from = to, to = end;
@@ -253,7 +253,7 @@ void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *a
     }
 #endif
     for (uint left = members; left; left &= left - 1) {
-        const int k = bvh_lowest(left);
+        const int k = lowest_bit(left);
         const facing *own = all->own + k;
         if (!(all->lanes[k] >> lane & 1)) continue;
 #if defined(RAYS)
@@ -274,15 +274,15 @@ void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearanc
     if (!lanes) return;
     const uint members = lit->members[line];
     for (uint left = members; left; left &= left - 1) {
-        const int k = bvh_lowest(left);
+        const int k = lowest_bit(left);
         if (members == (1u << k)) all.own[k] = all.whole, all.lanes[k] = lanes;
         else all.lanes[k] = face(here, &lit->each, k, all.own + k);
     }
     for (; lanes; lanes &= lanes - 1)
-        add_light(tree, lit, line, &all, bvh_lowest(lanes), clearance, samples, hint, here, waiting);
+        add_light(tree, lit, line, &all, lowest_bit(lanes), clearance, samples, hint, here, waiting);
 }
 
-inline int has_no_number(place value) { return not_finite((real)value); }
+static inline int has_no_number(place value) { return not_finite((real)value); }
 
 // A receiver's result; returns what is to be added to the currents for a unit of weight.
 place result_of(const block *here, int lane, uchar flag, global real *irradiance, global uchar *status) {

@@ -1,58 +1,58 @@
-// What of a segment is seen from a point: exactly, by intervals. The plane through both cuts every triangle in its way
-// along a line, and what lies behind that line, seen from the point, is hidden. One walk through the tree of bvh.h
-// finds them all, 16 boxes or 16 triangles at once.
+// Visible part of a segment from a point: exact, as intervals of the segment.
 //
-// In the plane a place has two coordinates, from the point: `deep`, towards the segment's line, and `along`, such that
-// along / deep is where on the segment (0 at its start, 1 at its end) the place is seen. So both may be multiples, and
-// a cut between two corners needs no division. It comes out the same for both triangles at an edge: they leave no
-// slit.
+// The plane through the point and the segment cuts every occluding triangle along a line. The part of the segment behind
+// that line is hidden. One traversal of the tree (common/bvh.h) finds all such lines, 16 boxes or 16 triangles at once.
+//
+// Coordinates in the plane, relative to the point: `deep` towards the segment's line, and `along`, such that along / deep
+// is the position on the segment (0 at its start, 1 at its end) at which a place is seen. Only the ratio matters: both may
+// be scaled by a common factor, so the cut between two corners needs no division. The cut of an edge is bit-equal for
+// both triangles that share the edge: adjacent triangles leave no gap.
 #ifndef VISIBLE_H
 #define VISIBLE_H
 
 #include "common/bvh.h"
 
-#define VIEW_HALVES 6
-// A node, where a leaf is to be.
-#define NO_HINT 0
-#define HIDDEN_MOST 32
-// Where more than that hides parts of a segment, it is taken by halves; down to this much of it.
-#define LEAST_WINDOW ((real)0.0001)
-// What separates two hidden intervals at least: less is rounding.
-#define HIDDEN_SLIT ((real)4 * (real)REAL_EPSILON)
+#define VIEW_HALVES 6 // half-spaces that bound the view: start and end of the window, both sides of the plane, both surfaces
+#define NO_HINT 0     // hints are leaves (negative child indices); 0 is the root node
+// Capacity for hidden intervals. A segment with more of them is traced in halves, down to this fraction of its length.
+#define MAX_HIDDEN 32
+#define SMALLEST_WINDOW ((real)0.0001)
+// Smallest gap between two hidden intervals; smaller gaps are rounding.
+#define SMALLEST_GAP ((real)4 * (real)REAL_EPSILON)
 
-// The places with x X + y Y + z Z >= least; (at_x, at_y, at_z) is where a node has the corners that go farthest.
+// Half-space x X + y Y + z Z >= least; at_x, at_y, at_z: offsets in a node of the box corner farthest along (x, y, z).
 typedef struct {
     real x, y, z, least;
     int at_x, at_y, at_z;
 } view_half;
 
 typedef struct {
-    real x, y, z;                      // the point
-    real across_x, across_y, across_z; // off the plane
-    real deep_x, deep_y, deep_z;       // unit
-    real along_x, along_y, along_z;    // of the length that makes `along` what it is
-    real near, far;                    // in `deep`: what hides lies between
-    real lift_deep, lift_along, lift;  // and where lift_deep deep + lift_along along > lift
-    real start_x, start_y, start_z;    // of the segment
-    real step_x, step_y, step_z;       // from there to its end
-    real from, to;                     // the window
-    real low_x, low_y, low_z, high_x, high_y, high_z; // around the point and the window
-    view_half halves[VIEW_HALVES];     // it lies in all of these: window's start and end, both sides of the plane, ...
+    real x, y, z;                                     // point
+    real across_x, across_y, across_z;                // unit normal of the plane
+    real deep_x, deep_y, deep_z;                      // unit vector from the point towards the segment's line
+    real along_x, along_y, along_z;                   // along the segment, scaled so that along / deep runs from 0 to 1
+    real near, far;                                   // occluders lie at depths between these
+    real lift_deep, lift_along, lift;                 // and where lift_deep deep + lift_along along > lift
+    real start_x, start_y, start_z;                   // start of the segment
+    real step_x, step_y, step_z;                      // from its start to its end
+    real from, to;                                    // window: part of the segment that is searched
+    real low_x, low_y, low_z, high_x, high_y, high_z; // bounding box of the point and the window
+    view_half halves[VIEW_HALVES];                    // occluders reach into all of these
 } view;
 
-// The part [from, to] of the segment that is still of interest, and what is hidden within, apart from its ends.
+// Part [from, to] of the segment that is not hidden at its ends, and the hidden intervals inside it (disjoint, unsorted).
 typedef struct {
     real from, to;
     int count, is_full;
-    real low[HIDDEN_MOST], high[HIDDEN_MOST];
+    real low[MAX_HIDDEN], high[MAX_HIDDEN];
 } hidden;
 
-BVH_INLINE view_half view_half_of(const view *view, real x, real y, real z, real beyond) {
+INLINE view_half view_half_of(const view *view, real x, real y, real z, real beyond) {
     const real size = fabs(x) + fabs(y) + fabs(z);
     const real reach = fmax(fabs(view->x), fmax(fabs(view->y), fabs(view->z)));
     view_half half_space;
     half_space.x = x, half_space.y = y, half_space.z = z;
-    // The roundings that boxes are not yet widened by.
+    // Rounding that the widening of the boxes does not cover.
     half_space.least = x * view->x + y * view->y + z * view->z + beyond - (real)4 * (real)REAL_EPSILON * size * reach;
     half_space.at_x = x < 0 ? 0 : 3 * WIDTH;
     half_space.at_y = (y < 0 ? 0 : 3 * WIDTH) + WIDTH;
@@ -60,8 +60,8 @@ BVH_INLINE view_half view_half_of(const view *view, real x, real y, real z, real
     return half_space;
 }
 
-// Sets the first two halves: what is seen between two places of the segment.
-BVH_INLINE void view_set_window(view *view, real from, real to) {
+// Set the first two half-spaces: rays to places between `from` and `to` of the segment.
+INLINE void view_set_window(view *view, real from, real to) {
     view->from = from, view->to = to;
     view->halves[0] = view_half_of(view, view->along_x - from * view->deep_x, view->along_y - from * view->deep_y,
                                    view->along_z - from * view->deep_z, 0);
@@ -69,50 +69,51 @@ BVH_INLINE void view_set_window(view *view, real from, real to) {
                                    to * view->deep_z - view->along_z, 0);
 }
 
-// Sets what is around the point and the window.
-BVH_INLINE void view_set_around(view *view) {
-#define VIEW_AROUND(x)                                                                                                 \
-    const real first_##x = view->start_##x + view->from * view->step_##x;                                              \
-    const real last_##x = view->start_##x + view->to * view->step_##x;                                                 \
-    const real slack_##x = (real)4 * (real)REAL_EPSILON * (fabs(first_##x) + fabs(last_##x) + fabs(view->x));         \
-    view->low_##x = fmin(view->x, fmin(first_##x, last_##x)) - slack_##x;                                              \
-    view->high_##x = fmax(view->x, fmax(first_##x, last_##x)) + slack_##x
-    VIEW_AROUND(x);
-    VIEW_AROUND(y);
-    VIEW_AROUND(z);
-#undef VIEW_AROUND
+// Smallest interval that holds the point and both ends of the window on one axis, widened by rounding.
+INLINE void view_interval(real point, real start, real step, real from, real to, real *low, real *high) {
+    const real first = start + from * step, last = start + to * step;
+    const real slack = (real)4 * (real)REAL_EPSILON * (fabs(first) + fabs(last) + fabs(point));
+    *low = fmin(point, fmin(first, last)) - slack;
+    *high = fmax(point, fmax(first, last)) + slack;
 }
 
-// Sets the next two: both sides of the plane.
-BVH_INLINE void view_set_plane(view *view) {
+// Set the bounding box of the point and the window.
+INLINE void view_set_box(view *view) {
+    view_interval(view->x, view->start_x, view->step_x, view->from, view->to, &view->low_x, &view->high_x);
+    view_interval(view->y, view->start_y, view->step_y, view->from, view->to, &view->low_y, &view->high_y);
+    view_interval(view->z, view->start_z, view->step_z, view->from, view->to, &view->low_z, &view->high_z);
+}
+
+// Set the next two half-spaces: both sides of the plane.
+INLINE void view_set_plane(view *view) {
     view->halves[2] = view_half_of(view, view->across_x, view->across_y, view->across_z, 0);
     view->halves[3] = view_half_of(view, -view->across_x, -view->across_y, -view->across_z, 0);
 }
 
-// How far a box reaches into a half.
-BVH_INLINE bvh_reals view_reach(const view_half *half_space, global const real *node) {
-    const bvh_reals x = half_space->x, y = half_space->y, z = half_space->z;
-    return bvh_fma(x, BVH_LOAD(node + half_space->at_x),
-                   bvh_fma(y, BVH_LOAD(node + half_space->at_y),
-                           bvh_fma(z, BVH_LOAD(node + half_space->at_z), -(bvh_reals)half_space->least)));
+// Largest distance by which a box reaches into a half-space.
+INLINE reals view_reach(const view_half *half_space, global const real *node) {
+    const reals x = half_space->x, y = half_space->y, z = half_space->z;
+    return lane_fma(x, load_reals(node + half_space->at_x),
+                   lane_fma(y, load_reals(node + half_space->at_y),
+                           lane_fma(z, load_reals(node + half_space->at_z), -(reals)half_space->least)));
 }
 
-// Which boxes reach into all halves; no child does, as its box is inside out.
-BVH_INLINE bvh_masks view_boxes(const view *view, global const real *node) {
+// Boxes that reach into all half-spaces. The box of a missing child is inverted and fails.
+INLINE masks view_boxes(const view *view, global const real *node) {
     const view_half *all = view->halves;
-    const bvh_reals window = bvh_min(view_reach(all, node), view_reach(all + 1, node));
-    const bvh_reals plane = bvh_min(view_reach(all + 2, node), view_reach(all + 3, node));
-    const bvh_reals beyond = bvh_min(view_reach(all + 4, node), view_reach(all + 5, node));
-    const bvh_masks around =
-        BVH_MASK(BVH_LOAD(node) <= view->high_x) & BVH_MASK(BVH_LOAD(node + WIDTH) <= view->high_y) &
-        BVH_MASK(BVH_LOAD(node + 2 * WIDTH) <= view->high_z) & BVH_MASK(BVH_LOAD(node + 3 * WIDTH) >= view->low_x) &
-        BVH_MASK(BVH_LOAD(node + 4 * WIDTH) >= view->low_y) & BVH_MASK(BVH_LOAD(node + 5 * WIDTH) >= view->low_z);
-    return around & BVH_MASK(bvh_min(bvh_min(window, plane), beyond) >= (bvh_reals)0);
+    const reals window = lane_min(view_reach(all, node), view_reach(all + 1, node));
+    const reals plane = lane_min(view_reach(all + 2, node), view_reach(all + 3, node));
+    const reals beyond = lane_min(view_reach(all + 4, node), view_reach(all + 5, node));
+    const masks around =
+        mask_of(load_reals(node) <= view->high_x) & mask_of(load_reals(node + WIDTH) <= view->high_y) &
+        mask_of(load_reals(node + 2 * WIDTH) <= view->high_z) & mask_of(load_reals(node + 3 * WIDTH) >= view->low_x) &
+        mask_of(load_reals(node + 4 * WIDTH) >= view->low_y) & mask_of(load_reals(node + 5 * WIDTH) >= view->low_z);
+    return around & mask_of(lane_min(lane_min(window, plane), beyond) >= (reals)0);
 }
 
-BVH_INLINE uint view_met(const view *view, global const real *node) {
+INLINE uint view_met(const view *view, global const real *node) {
 #ifdef VECTOR_VARIANT
-    return bvh_lanes(view_boxes(view, node));
+    return lane_bits(view_boxes(view, node));
 #else
     uint met = 0;
     for (int lane = 0; lane < WIDTH; lane++) met |= view_boxes(view, node + lane) ? 1u << lane : 0;
@@ -120,57 +121,47 @@ BVH_INLINE uint view_met(const view *view, global const real *node) {
 #endif
 }
 
-// Whether any lane is set. (An or over comparisons is one instruction, where the compiler sees that it is one.)
-#if !defined(VECTOR_VARIANT)
-BVH_INLINE int view_any(bvh_masks mask) { return mask != 0; }
-#elif __has_builtin(__builtin_reduce_or)
-BVH_INLINE int view_any(bvh_masks mask) { return __builtin_reduce_or(mask) != 0; }
-#else
-BVH_INLINE int view_any(bvh_masks mask) { return bvh_lanes(mask) != 0; }
-#endif
-
-// Where a linear function is negative at both of two places nothing is left of what lies between; else it begins, or
-// ends, where the function is zero.
-BVH_INLINE void view_cut(bvh_reals v1, bvh_reals v2, bvh_reals *enter, bvh_reals *leave) {
-    const bvh_reals cut = v1 / (v1 - v2);
-    *enter = v1 < (bvh_reals)0 ? bvh_max(*enter, cut) : *enter;
-    *leave = v2 < (bvh_reals)0 ? bvh_min(*leave, cut) : *leave;
+// Clip the interval [enter, leave] of a line to where a linear function, v1 at its start and v2 at its end, is positive.
+INLINE void view_cut(reals v1, reals v2, reals *enter, reals *leave) {
+    const reals cut = v1 / (v1 - v2);
+    *enter = v1 < (reals)0 ? lane_max(*enter, cut) : *enter;
+    *leave = v2 < (reals)0 ? lane_min(*leave, cut) : *leave;
 }
 
-// What a corner and one on the other side of the plane have, each times how far the other is from the plane. Both
-// products are rounded, so that it is the same whichever corner comes first.
-BVH_INLINE bvh_reals view_mix(bvh_reals one, bvh_reals off_one, bvh_reals two, bvh_reals off_two) {
+// Interpolate between two corners on either side of the plane, times the sum of their distances from it (no division).
+// Both products are rounded before they are added, so that the result does not depend on the order of the corners.
+INLINE reals view_mix(reals one, reals off_one, reals two, reals off_two) {
 #pragma OPENCL FP_CONTRACT OFF
-    const bvh_reals first = one * off_two;
-    const bvh_reals second = two * off_one;
+    const reals first = one * off_two;
+    const reals second = two * off_one;
     return first + second;
 }
 
-// The two ends of the line along which the plane cuts a triangle, each times its weight, which is positive; returns
-// which triangles it cuts.
-BVH_INLINE bvh_masks view_lines(const view *view, global const real *leaf, bvh_reals *deep, bvh_reals *along,
-                                bvh_reals *weight) {
-    const bvh_reals zero = (bvh_reals)0;
-    const bvh_reals x = view->x, y = view->y, z = view->z;
-    const bvh_reals ax = BVH_LOAD(leaf) - x, ay = BVH_LOAD(leaf + WIDTH) - y, az = BVH_LOAD(leaf + 2 * WIDTH) - z;
-    const bvh_reals bx = BVH_LOAD(leaf + 3 * WIDTH) - x, by = BVH_LOAD(leaf + 4 * WIDTH) - y;
-    const bvh_reals bz = BVH_LOAD(leaf + 5 * WIDTH) - z;
-    const bvh_reals cx = BVH_LOAD(leaf + 6 * WIDTH) - x, cy = BVH_LOAD(leaf + 7 * WIDTH) - y;
-    const bvh_reals cz = BVH_LOAD(leaf + 8 * WIDTH) - z;
-#define VIEW_DOT(name, corner)                                                                                         \
-    bvh_fma((bvh_reals)view->name##_x, corner##x,                                                                      \
-            bvh_fma((bvh_reals)view->name##_y, corner##y, (bvh_reals)view->name##_z * corner##z))
-    const bvh_reals off_a = VIEW_DOT(across, a), off_b = VIEW_DOT(across, b), off_c = VIEW_DOT(across, c);
-    const bvh_masks behind_a = BVH_MASK(off_a < zero), behind_b = BVH_MASK(off_b < zero);
-    const bvh_masks behind_c = BVH_MASK(off_c < zero);
-    const bvh_masks cuts_ab = behind_a ^ behind_b, cuts_ca = behind_a ^ behind_c, apart = cuts_ab | cuts_ca;
-    const bvh_reals deep_a = VIEW_DOT(deep, a), deep_b = VIEW_DOT(deep, b), deep_c = VIEW_DOT(deep, c);
-    const bvh_reals along_a = VIEW_DOT(along, a), along_b = VIEW_DOT(along, b), along_c = VIEW_DOT(along, c);
-#undef VIEW_DOT
-    const bvh_reals far_a = fabs(off_a), far_b = fabs(off_b), far_c = fabs(off_c);
-    // Two of the three edges are cut.
-    const bvh_reals deep_bc = view_mix(deep_b, far_b, deep_c, far_c);
-    const bvh_reals along_bc = view_mix(along_b, far_b, along_c, far_c);
+// Dot product of one vector with LANES vectors, by fused multiply-adds.
+INLINE reals lane_dot(real x, real y, real z, reals px, reals py, reals pz) {
+    return lane_fma((reals)x, px, lane_fma((reals)y, py, (reals)z * pz));
+}
+
+// Ends of the line along which the plane cuts each triangle, times a positive weight. Returns the triangles that are cut.
+INLINE masks view_lines(const view *view, global const real *leaf, reals *deep, reals *along,
+                                reals *weight) {
+    const reals zero = (reals)0;
+    const reals x = view->x, y = view->y, z = view->z;
+    const reals ax = load_reals(leaf) - x, ay = load_reals(leaf + WIDTH) - y, az = load_reals(leaf + 2 * WIDTH) - z;
+    const reals bx = load_reals(leaf + 3 * WIDTH) - x, by = load_reals(leaf + 4 * WIDTH) - y;
+    const reals bz = load_reals(leaf + 5 * WIDTH) - z;
+    const reals cx = load_reals(leaf + 6 * WIDTH) - x, cy = load_reals(leaf + 7 * WIDTH) - y;
+    const reals cz = load_reals(leaf + 8 * WIDTH) - z;
+    const reals off_a = lane_dot(view->across_x, view->across_y, view->across_z, ax, ay, az), off_b = lane_dot(view->across_x, view->across_y, view->across_z, bx, by, bz), off_c = lane_dot(view->across_x, view->across_y, view->across_z, cx, cy, cz);
+    const masks behind_a = mask_of(off_a < zero), behind_b = mask_of(off_b < zero);
+    const masks behind_c = mask_of(off_c < zero);
+    const masks cuts_ab = behind_a ^ behind_b, cuts_ca = behind_a ^ behind_c, apart = cuts_ab | cuts_ca;
+    const reals deep_a = lane_dot(view->deep_x, view->deep_y, view->deep_z, ax, ay, az), deep_b = lane_dot(view->deep_x, view->deep_y, view->deep_z, bx, by, bz), deep_c = lane_dot(view->deep_x, view->deep_y, view->deep_z, cx, cy, cz);
+    const reals along_a = lane_dot(view->along_x, view->along_y, view->along_z, ax, ay, az), along_b = lane_dot(view->along_x, view->along_y, view->along_z, bx, by, bz), along_c = lane_dot(view->along_x, view->along_y, view->along_z, cx, cy, cz);
+    const reals far_a = fabs(off_a), far_b = fabs(off_b), far_c = fabs(off_c);
+    // Exactly two of the three edges are cut.
+    const reals deep_bc = view_mix(deep_b, far_b, deep_c, far_c);
+    const reals along_bc = view_mix(along_b, far_b, along_c, far_c);
     deep[0] = cuts_ab ? view_mix(deep_a, far_a, deep_b, far_b) : deep_bc;
     deep[1] = cuts_ca ? view_mix(deep_a, far_a, deep_c, far_c) : deep_bc;
     along[0] = cuts_ab ? view_mix(along_a, far_a, along_b, far_b) : along_bc;
@@ -180,91 +171,91 @@ BVH_INLINE bvh_masks view_lines(const view *view, global const real *leaf, bvh_r
     return apart;
 }
 
-// What each of a leaf's triangles hides of the segment, from `low` to `high`; nothing where low is above high.
+// Interval of the segment hidden by each triangle of a leaf; empty where low > high.
 typedef struct {
-    bvh_reals low, high;
+    reals low, high;
 } shadows;
 
 #ifdef VECTOR_VARIANT
-// Joins every other shadow with the next one, where they touch: two triangles of a quadrangle often lie side by side.
-BVH_INLINE void shadows_join(shadows *cast) {
-    const bvh_masks is_even = {-1, 0, -1, 0, -1, 0, -1, 0, -1, 0, -1, 0, -1, 0, -1, 0};
-    const bvh_reals low = cast->low, high = cast->high;
-    const bvh_reals other_low = low.s1032547698badcfe, other_high = high.s1032547698badcfe;
-    const bvh_masks joins = BVH_MASK(low <= other_high + HIDDEN_SLIT) & BVH_MASK(other_low <= high + HIDDEN_SLIT);
-    const bvh_masks stays = joins & is_even, goes = joins & ~is_even;
-    cast->low = goes ? (bvh_reals)1 : stays ? bvh_min(low, other_low) : low;
-    cast->high = goes ? (bvh_reals)0 : stays ? bvh_max(high, other_high) : high;
+// Merge the shadows of neighbouring lanes (2n, 2n + 1) where they touch: the two triangles of a quadrangle often do.
+INLINE void shadows_join(shadows *cast) {
+    const masks is_even = {-1, 0, -1, 0, -1, 0, -1, 0, -1, 0, -1, 0, -1, 0, -1, 0};
+    const reals low = cast->low, high = cast->high;
+    const reals other_low = low.s1032547698badcfe, other_high = high.s1032547698badcfe;
+    const masks joins = mask_of(low <= other_high + SMALLEST_GAP) & mask_of(other_low <= high + SMALLEST_GAP);
+    const masks stays = joins & is_even, goes = joins & ~is_even;
+    cast->low = goes ? (reals)1 : stays ? lane_min(low, other_low) : low;
+    cast->high = goes ? (reals)0 : stays ? lane_max(high, other_high) : high;
 }
 #endif
 
-BVH_INLINE void view_shadows(const view *view, global const real *leaf, shadows *cast) {
-    bvh_reals deep[2], along[2], weight[2];
-    bvh_masks hides = view_lines(view, leaf, deep, along, weight);
-    const bvh_reals zero = (bvh_reals)0;
-    const bvh_reals deep1 = deep[0], deep2 = deep[1], along1 = along[0], along2 = along[1];
-    const bvh_reals weight1 = weight[0], weight2 = weight[1];
-    // Whether what lies between is before the segment's surface, before the point, above its surface, in the window.
-    const bvh_reals far1 = view->far * weight1 - deep1, far2 = view->far * weight2 - deep2;
-    const bvh_reals near1 = deep1 - view->near * weight1, near2 = deep2 - view->near * weight2;
-    const bvh_reals lift1 = view->lift_deep * deep1 + view->lift_along * along1 - view->lift * weight1;
-    const bvh_reals lift2 = view->lift_deep * deep2 + view->lift_along * along2 - view->lift * weight2;
-    hides &= BVH_MASK(bvh_max(far1, far2) >= zero) & BVH_MASK(bvh_max(near1, near2) >= zero) &
-             BVH_MASK(bvh_max(lift1, lift2) >= zero);
-    hides &= BVH_MASK(along1 >= view->from * deep1) | BVH_MASK(along2 >= view->from * deep2);
-    hides &= BVH_MASK(along1 <= view->to * deep1) | BVH_MASK(along2 <= view->to * deep2);
-    cast->low = (bvh_reals)1, cast->high = zero;
-    if (!view_any(hides)) return;
-    bvh_reals enter = zero, leave = (bvh_reals)1;
+INLINE void view_shadows(const view *view, global const real *leaf, shadows *cast) {
+    reals deep[2], along[2], weight[2];
+    masks hides = view_lines(view, leaf, deep, along, weight);
+    const reals zero = (reals)0;
+    const reals deep1 = deep[0], deep2 = deep[1], along1 = along[0], along2 = along[1];
+    const reals weight1 = weight[0], weight2 = weight[1];
+    // Keep triangles with a part before the segment's surface, beyond the near limit, above the receiver, in the window.
+    const reals far1 = view->far * weight1 - deep1, far2 = view->far * weight2 - deep2;
+    const reals near1 = deep1 - view->near * weight1, near2 = deep2 - view->near * weight2;
+    const reals lift1 = view->lift_deep * deep1 + view->lift_along * along1 - view->lift * weight1;
+    const reals lift2 = view->lift_deep * deep2 + view->lift_along * along2 - view->lift * weight2;
+    hides &= mask_of(lane_max(far1, far2) >= zero) & mask_of(lane_max(near1, near2) >= zero) &
+             mask_of(lane_max(lift1, lift2) >= zero);
+    hides &= mask_of(along1 >= view->from * deep1) | mask_of(along2 >= view->from * deep2);
+    hides &= mask_of(along1 <= view->to * deep1) | mask_of(along2 <= view->to * deep2);
+    cast->low = (reals)1, cast->high = zero;
+    if (!any_compared(hides)) return;
+    reals enter = zero, leave = (reals)1;
     view_cut(far1, far2, &enter, &leave);
-    const bvh_reals least = bvh_min(bvh_min(near1, near2), bvh_min(lift1, lift2));
-    if (view_any(hides & BVH_MASK(least < zero))) {
+    const reals least = lane_min(lane_min(near1, near2), lane_min(lift1, lift2));
+    if (any_compared(hides & mask_of(least < zero))) {
         view_cut(near1, near2, &enter, &leave);
         view_cut(lift1, lift2, &enter, &leave);
     }
-    hides &= BVH_MASK(enter < leave);
-    const bvh_masks is_cut1 = BVH_MASK(enter > zero), is_cut2 = BVH_MASK(leave < (bvh_reals)1);
-    const bvh_reals step_deep = deep2 - deep1, step_along = along2 - along1;
-    // By rounding a cut may come out nearer than the nearest.
-    const bvh_reals nearest = view->near * bvh_min(weight1, weight2);
-    const bvh_reals first = (is_cut1 ? bvh_fma(enter, step_along, along1) : along1) /
-                            bvh_max(is_cut1 ? bvh_fma(enter, step_deep, deep1) : deep1, nearest);
-    const bvh_reals last = (is_cut2 ? bvh_fma(leave, step_along, along1) : along2) /
-                           bvh_max(is_cut2 ? bvh_fma(leave, step_deep, deep1) : deep2, nearest);
-    cast->low = hides ? bvh_min(first, last) : cast->low, cast->high = hides ? bvh_max(first, last) : cast->high;
+    hides &= mask_of(enter < leave);
+    const masks is_cut1 = mask_of(enter > zero), is_cut2 = mask_of(leave < (reals)1);
+    const reals step_deep = deep2 - deep1, step_along = along2 - along1;
+    // Rounding can place a cut slightly before the near limit; clamp it.
+    const reals nearest = view->near * lane_min(weight1, weight2);
+    const reals first = (is_cut1 ? lane_fma(enter, step_along, along1) : along1) /
+                            lane_max(is_cut1 ? lane_fma(enter, step_deep, deep1) : deep1, nearest);
+    const reals last = (is_cut2 ? lane_fma(leave, step_along, along1) : along2) /
+                           lane_max(is_cut2 ? lane_fma(leave, step_deep, deep1) : deep2, nearest);
+    cast->low = hides ? lane_min(first, last) : cast->low, cast->high = hides ? lane_max(first, last) : cast->high;
 #ifdef VECTOR_VARIANT
     shadows_join(cast);
 #endif
 }
 
-BVH_INLINE void hidden_begin(hidden *all, real from, real to) {
+INLINE void hidden_begin(hidden *all, real from, real to) {
     all->from = from, all->to = to;
     all->count = 0, all->is_full = 0;
 }
 
-// Hides [low, high]. What is kept is apart from each other and from the ends: so a single pass finds all that join.
-BVH_INLINE void hidden_add(hidden *all, real low, real high) {
+// Add [low, high] to the hidden intervals. These are disjoint, so one pass merges every interval that it touches.
+INLINE void hidden_add(hidden *all, real low, real high) {
     if (!(low < high && low < all->to && high > all->from)) return;
     for (int n = 0; n < all->count;) {
-        if (low <= all->high[n] + HIDDEN_SLIT && all->low[n] <= high + HIDDEN_SLIT) {
+        if (low <= all->high[n] + SMALLEST_GAP && all->low[n] <= high + SMALLEST_GAP) {
             low = fmin(low, all->low[n]), high = fmax(high, all->high[n]);
             all->count--;
             all->low[n] = all->low[all->count], all->high[n] = all->high[all->count];
         } else n++;
     }
-    const int at_start = low <= all->from + HIDDEN_SLIT, at_end = high >= all->to - HIDDEN_SLIT;
+    const int at_start = low <= all->from + SMALLEST_GAP, at_end = high >= all->to - SMALLEST_GAP;
     if (at_start && at_end) all->from = all->to;
     else if (at_start) all->from = high;
     else if (at_end) all->to = low;
-    else if (all->count == HIDDEN_MOST) all->is_full = 1;
+    else if (all->count == MAX_HIDDEN) all->is_full = 1;
     else {
         all->low[all->count] = low, all->high[all->count] = high;
         all->count++;
     }
 }
 
-// Puts them in order along the segment.
-BVH_INLINE void hidden_sort(hidden *all) {
+// Sort the hidden intervals along the segment (insertion sort: few, nearly sorted).
+INLINE void hidden_sort(hidden *all) {
     for (int n = 1; n < all->count; n++) {
         const real low = all->low[n], high = all->high[n];
         int at = n;
@@ -275,19 +266,19 @@ BVH_INLINE void hidden_sort(hidden *all) {
     }
 }
 
-BVH_INLINE int hidden_is_done(const hidden *all) { return all->is_full || all->from >= all->to; }
+INLINE int hidden_is_done(const hidden *all) { return all->is_full || all->from >= all->to; }
 
-// Hides what a leaf's triangles do; returns how much that is of what was not hidden yet (twice where two do).
-BVH_INLINE real hidden_add_all(hidden *all, const shadows *cast) {
-    const bvh_reals low = cast->low, high = cast->high;
-    bvh_masks hides = BVH_MASK(low < high) & BVH_MASK(low < all->to) & BVH_MASK(high > all->from);
-    for (int n = 0; n < all->count; n++) hides &= BVH_MASK(low < all->low[n]) | BVH_MASK(high > all->high[n]);
+// Add the shadows of a leaf. Returns their total length (overlaps count twice): a measure of the leaf's usefulness.
+INLINE real hidden_add_all(hidden *all, const shadows *cast) {
+    const reals low = cast->low, high = cast->high;
+    masks hides = mask_of(low < high) & mask_of(low < all->to) & mask_of(high > all->from);
+    for (int n = 0; n < all->count; n++) hides &= mask_of(low < all->low[n]) | mask_of(high > all->high[n]);
     real gone = 0;
-    if (!view_any(hides)) return gone;
+    if (!any_compared(hides)) return gone;
 #ifdef VECTOR_VARIANT
     const real *lows = (const real *)&cast->low, *highs = (const real *)&cast->high;
-    for (uint left = bvh_lanes(hides); left; left &= left - 1) {
-        const int lane = bvh_lowest(left);
+    for (uint left = lane_bits(hides); left; left &= left - 1) {
+        const int lane = lowest_bit(left);
         gone += highs[lane] - lows[lane];
         hidden_add(all, lows[lane], highs[lane]);
     }
@@ -297,7 +288,7 @@ BVH_INLINE real hidden_add_all(hidden *all, const shadows *cast) {
     return gone;
 }
 
-BVH_INLINE real view_leaf(const bvh_tree *tree, const view *view, int child, hidden *all) {
+INLINE real view_leaf(const bvh_tree *tree, const view *view, int child, hidden *all) {
     global const real *leaf = tree->leaves + (size_t)~child * (9 * WIDTH);
     shadows cast;
     real gone = 0;
@@ -313,19 +304,19 @@ BVH_INLINE real view_leaf(const bvh_tree *tree, const view *view, int child, hid
     return gone;
 }
 
-// Hides what the leaves among a node's children do, but for `known`; returns those children that are nodes. `hint`
-// becomes the leaf that hides most, if that is more than `most`.
-BVH_INLINE uint view_leaves(const bvh_tree *tree, const view *view, int node, uint met, int known, hidden *all,
+// Add the shadows of the leaves among a node's children, except leaf `known`. Returns the children that are nodes.
+// `hint` becomes the leaf that hides most, if that is more than `most`.
+INLINE uint view_leaves(const bvh_tree *tree, const view *view, int node, uint met, int known, hidden *all,
                             real *most, int *hint) {
     uint inner = 0;
     int count = 0, leaves[WIDTH];
     for (; met; met &= met - 1) {
-        const int child = tree->children[node * WIDTH + bvh_lowest(met)];
+        const int child = tree->children[node * WIDTH + lowest_bit(met)];
         if (child >= 0) inner |= met & -met;
         else if (child != known) leaves[count++] = child;
     }
 #ifdef VECTOR_VARIANT
-    // All shadows first: to look at one would hold up the next, whose arithmetic a core begins meanwhile.
+    // Compute all shadows before any is merged: merging branches on the data and would stall the arithmetic of the next.
     shadows cast[WIDTH];
     for (int n = 0; n < count; n++) view_shadows(view, tree->leaves + (size_t)~leaves[n] * (9 * WIDTH), cast + n);
 #endif
@@ -340,16 +331,16 @@ BVH_INLINE uint view_leaves(const bvh_tree *tree, const view *view, int node, ui
     return inner;
 }
 
-// Finds what is hidden; stops when all is, or when more than can be kept is. Looks first into the leaf that hid most
-// from the last point: it often does again.
-BVH_INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all, int *hint) {
+// Find the hidden intervals of the window. Stop when all of it is hidden, or when they exceed the capacity. Visit first
+// the leaf that hid most from the previous point: it often does again.
+INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all, int *hint) {
     int nodes[BVH_DEPTH];
     uint left[BVH_DEPTH];
     int node = 0, depth = 0;
     const int known = *hint;
     real most = 0;
     view_set_window(view, all->from, all->to);
-    view_set_around(view);
+    view_set_box(view);
     if (known < 0) view_leaf(tree, view, known, all);
     while (!hidden_is_done(all)) {
         if (all->from > view->from || all->to < view->to) view_set_window(view, all->from, all->to);
@@ -357,7 +348,7 @@ BVH_INLINE void view_trace(const bvh_tree *tree, view *view, hidden *all, int *h
         const uint inner = view_leaves(tree, view, node, met, known, all, &most, hint);
         if (inner) nodes[depth] = node, left[depth++] = inner;
         if (!depth) return;
-        const uint lane = bvh_lowest(left[depth - 1]);
+        const uint lane = lowest_bit(left[depth - 1]);
         node = tree->children[nodes[depth - 1] * WIDTH + lane];
         left[depth - 1] &= left[depth - 1] - 1;
         if (!left[depth - 1]) depth--;

@@ -8,9 +8,9 @@
 // A triangle: first corner, two edges, unit normal.
 #define ROW 12
 
-PATCH_INLINE vector vector_at(global const real *row) { return (vector){(reals)row[0], (reals)row[1], (reals)row[2]}; }
+INLINE vector vector_at(global const real *row) { return (vector){(reals)row[0], (reals)row[1], (reals)row[2]}; }
 
-inline reals load_column(global const INPUT *receivers, int column, PLACE less) {
+static inline reals load_column(global const INPUT *receivers, int column, PLACE less) {
 #ifdef VECTOR_VARIANT
     global const INPUT *at = receivers + column;
     real values[LANES];
@@ -26,10 +26,10 @@ typedef struct {
     real place[3], normal[3], corner[4][3];
 } view;
 
-PATCH_INLINE real dot_of(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+INLINE real dot_of(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
 // Metres at either end do not count: the surfaces that the ends lie on.
-inline int is_free(const bvh_tree *tree, const real *place, const real *way, real after, real before) {
+static inline int is_free(const bvh_tree *tree, const real *place, const real *way, real after, real before) {
     const real per = after + before > 0 ? (real)1 / sqrt(dot_of(way, way)) : 0;
     const real start = after * per, end = 1 - before * per;
     if (!(start < end)) return 1;
@@ -61,16 +61,16 @@ __attribute__((noinline)) real free_part(const bvh_tree *tree, const view *own, 
 }
 
 // What large triangles send is asked with many rays: `rays` for one that fills the view.
-inline int side_of(real factor, real rays) { return clamp((int)ceil(sqrt(factor * rays)), 1, 16); }
+static inline int side_of(real factor, real rays) { return clamp((int)ceil(sqrt(factor * rays)), 1, 16); }
 
 #ifdef VECTOR_VARIANT
-PATCH_INLINE void spread(real (*to)[LANES], vector from) {
+INLINE void spread(real (*to)[LANES], vector from) {
     *(reals_at *)to[0] = from.x, *(reals_at *)to[1] = from.y, *(reals_at *)to[2] = from.z;
 }
 #endif
 
 // A factor without what is hidden.
-PATCH_INLINE reals seen_part(const bvh_tree *tree, reals factor, vector place, vector normal, const polygon *shape,
+INLINE reals seen_part(const bvh_tree *tree, reals factor, vector place, vector normal, const polygon *shape,
                              real rays, real after, real before) {
 #ifdef VECTOR_VARIANT
     real factors[LANES], all[18][LANES];

@@ -4,19 +4,17 @@
 #define PATCHES_H
 #include "line_irradiance/line_irradiance.h"
 
-#define PATCH_INLINE __attribute__((always_inline)) inline
-
 typedef struct {
     reals x, y, z;
 } vector;
 
-PATCH_INLINE vector patch_sum(vector a, vector b) { return (vector){a.x + b.x, a.y + b.y, a.z + b.z}; }
-PATCH_INLINE vector patch_times(reals s, vector a) { return (vector){s * a.x, s * a.y, s * a.z}; }
-PATCH_INLINE reals patch_dot(vector a, vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-PATCH_INLINE vector patch_cross(vector a, vector b) {
+INLINE vector patch_sum(vector a, vector b) { return (vector){a.x + b.x, a.y + b.y, a.z + b.z}; }
+INLINE vector patch_times(reals s, vector a) { return (vector){s * a.x, s * a.y, s * a.z}; }
+INLINE reals patch_dot(vector a, vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+INLINE vector patch_cross(vector a, vector b) {
     return (vector){a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
-PATCH_INLINE vector patch_choose(masks which, vector a, vector b) {
+INLINE vector patch_choose(masks which, vector a, vector b) {
     return (vector){which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z};
 }
 
@@ -27,7 +25,7 @@ typedef struct {
 } polygon;
 
 // What is left of a triangle above the receiver's plane, in the same sense; `height` is that of its corners.
-PATCH_INLINE polygon patch_cut(const vector *corner, const vector *edge, const reals *height) {
+INLINE polygon patch_cut(const vector *corner, const vector *edge, const reals *height) {
     const masks in0 = mask_of(height[0] > (reals)0), in1 = mask_of(height[1] > (reals)0);
     const masks in2 = mask_of(height[2] > (reals)0), all = in0 & in1 & in2;
     const vector none = {(reals)0, (reals)0, (reals)0};
@@ -69,7 +67,7 @@ PATCH_INLINE polygon patch_cut(const vector *corner, const vector *edge, const r
 }
 
 // The form factor of a polygon above the plane of a receiver with this unit normal; it turns left seen from there.
-PATCH_INLINE reals patch_factor(const polygon *shape, vector normal) {
+INLINE reals patch_factor(const polygon *shape, vector normal) {
     reals size[4], weight[4], excess[4];
     masks near_by = (masks)0;
 #pragma unroll

@@ -51,19 +51,19 @@ typedef struct {
     reals row[FREEDOMS], residual;
 } pose_equation;
 
-inline laned_row row_of(pose_rows all, int i) {
+static inline laned_row row_of(pose_rows all, int i) {
     return (laned_row){READ(all.nx, i), READ(all.ny, i), READ(all.px, i),       READ(all.py, i),
                        READ(all.ex, i), READ(all.ey, i), READ(all.certainty, i), ETCH_OF(all.grows, i)};
 }
 
 // The same one for all lanes.
-inline laned_row row_for_all(pose_rows all, int i) {
+static inline laned_row row_for_all(pose_rows all, int i) {
     return (laned_row){(reals)all.nx[i], (reals)all.ny[i], (reals)all.px[i],       (reals)all.py[i],
                        (reals)all.ex[i], (reals)all.ey[i], (reals)all.certainty[i],
                        ETCH_FOR_ALL(all.grows, i)};
 }
 
-inline pose_equation equation_of(laned_pose pose, laned_row at) {
+static inline pose_equation equation_of(laned_pose pose, laned_row at) {
     const reals wx = at.ex - pose.x - (pose.dxx * at.px + pose.dxy * at.py);
     const reals wy = at.ey - pose.y - (pose.dyx * at.px + pose.dyy * at.py);
     const reals axx = (reals)1 + pose.dxx, ayy = (reals)1 + pose.dyy;
@@ -88,10 +88,10 @@ inline pose_equation equation_of(laned_pose pose, laned_row at) {
     return equation;
 }
 
-inline reals residual_of(laned_pose pose, laned_row at) { return equation_of(pose, at).residual; }
+static inline reals residual_of(laned_pose pose, laned_row at) { return equation_of(pose, at).residual; }
 
 // T exp(step). The angle is taken for its tangent: at the end of the iteration it is zero.
-inline laned_pose pose_after(laned_pose pose, private const reals *step) {
+static inline laned_pose pose_after(laned_pose pose, private const reals *step) {
     const reals tangent = step[2], cosine = (reals)1 / sqrt((reals)1 + tangent * tangent), sine = tangent * cosine;
     const reals less = -sine * sine / ((reals)1 + cosine); // cosine - 1, to all its digits
     reals exx = less, exy = -sine, eyx = sine, eyy = less;
@@ -113,7 +113,7 @@ inline laned_pose pose_after(laned_pose pose, private const reals *step) {
     return next;
 }
 
-inline void add_equation(pose_equation equation, reals weight, private reals *matrix, private reals *right) {
+static inline void add_equation(pose_equation equation, reals weight, private reals *matrix, private reals *right) {
     for (int i = 0; i < FREEDOMS; i++) {
         const reals weighted = weight * equation.row[i];
         right[i] += weighted * equation.residual;
@@ -122,7 +122,7 @@ inline void add_equation(pose_equation equation, reals weight, private reals *ma
 }
 
 // Adds what is known of the etching before, as one more equation.
-inline void add_etch(laned_pose pose, real certainty, private reals *matrix, private reals *right) {
+static inline void add_etch(laned_pose pose, real certainty, private reals *matrix, private reals *right) {
 #ifdef ETCHED
     const reals square = (reals)(certainty * certainty);
     matrix[CELL(OF_POSE, OF_POSE)] += square;
@@ -140,7 +140,7 @@ inline void add_etch(laned_pose pose, real certainty, private reals *matrix, pri
 #endif
 
 // How badly each lane's pose does: the loss at the scale that is known, or the median of the residuals to a percent.
-inline reals pose_score(laned_pose pose, pose_rows all, private reals *distances, int present) {
+static inline reals pose_score(laned_pose pose, pose_rows all, private reals *distances, int present) {
 #ifdef ETCHED
     const reals off = pose.etch * (reals)all.etch;
     reals loss = (reals)0.5f * off * off;
@@ -163,7 +163,7 @@ inline reals pose_score(laned_pose pose, pose_rows all, private reals *distances
 
 // Of the poses that FREEDOMS equations each make, the one that does best; `subsets` has the equations of LANES poses
 // side by side: (trials / LANES, FREEDOMS, LANES).
-inline laned_pose pose_start(laned_pose near, pose_rows all, constant const int *subsets, int trials,
+static inline laned_pose pose_start(laned_pose near, pose_rows all, constant const int *subsets, int trials,
                              private reals *distances, int present) {
     laned_pose best = near;
     real least = INFINITY;
@@ -208,7 +208,7 @@ inline laned_pose pose_start(laned_pose near, pose_rows all, constant const int 
 
 // The scale of the residuals in sigmas: as it is known, or by their median; of those only within `reach`, once a scale
 // is known: outliers raise the median too.
-inline real pose_scale(laned_pose pose, pose_rows all, private reals *room, real reach, real few, real smallest) {
+static inline real pose_scale(laned_pose pose, pose_rows all, private reals *room, real reach, real few, real smallest) {
 #ifdef GIVEN_SCALE
     return (real)(GIVEN_SCALE);
 #else
@@ -245,7 +245,7 @@ typedef struct {
 #define EVENLY 1     // those that count at all count fully
 #define EVERY_ROW 2  // that there is
 
-inline void pose_summed(laned_pose pose, pose_rows all, real per_scale, int how, private pose_sums *sums) {
+static inline void pose_summed(laned_pose pose, pose_rows all, real per_scale, int how, private pose_sums *sums) {
     masks inliers = 0;
     reals slopes = 0, squares = 0;
     for (int i = 0; i < TRIANGLE; i++) sums->matrix[i] = 0;
@@ -274,7 +274,7 @@ typedef struct {
 } pose_matrix;
 
 // The pose's part of a matrix: what the etching takes is taken out.
-inline pose_matrix pose_part(private const reals *triangle) {
+static inline pose_matrix pose_part(private const reals *triangle) {
     pose_matrix of;
     for (int i = 0; i < OF_POSE; i++)
         for (int j = 0; j <= i; j++) {
@@ -290,7 +290,7 @@ inline pose_matrix pose_part(private const reals *triangle) {
 
 // Eigenvalues of a symmetric matrix by Jacobi's rotations: least and largest, and how many are over a share of the
 // largest.
-inline int eigenvalues(pose_matrix of, real share, private real *least, private real *largest) {
+static inline int eigenvalues(pose_matrix of, real share, private real *least, private real *largest) {
     for (int sweep = 0; sweep < 5; sweep++)
         for (int p = 0; p < OF_POSE - 1; p++)
             for (int q = p + 1; q < OF_POSE; q++) {
@@ -322,7 +322,7 @@ inline int eigenvalues(pose_matrix of, real share, private real *least, private 
 
 // Which share of all that the rows say of the pose agrees, of the combination of freedoms of which least does: the
 // least eigenvalue of L^-1 M L^-T, M of those that agree and L L^T of all.
-inline real least_agreement(pose_matrix agrees, pose_matrix all) {
+static inline real least_agreement(pose_matrix agrees, pose_matrix all) {
     real factor[OF_POSE][OF_POSE];
     for (int i = 0; i < OF_POSE; i++)
         for (int j = 0; j <= i; j++) {
@@ -354,7 +354,7 @@ typedef struct {
     int present, inliers, rank;
 } solved_pose;
 
-inline void pose_covariance(private solved_pose *fit, pose_rows all, private const pose_sums *sums) {
+static inline void pose_covariance(private solved_pose *fit, pose_rows all, private const pose_sums *sums) {
     reals factor[TRIANGLE];
     for (int i = 0; i < TRIANGLE; i++) factor[i] = sums->matrix[i];
     factored(factor);
@@ -388,7 +388,7 @@ inline void pose_covariance(private solved_pose *fit, pose_rows all, private con
 }
 
 // The places' unit must be about their distance from the origin. `room` has as many reals as there are rows.
-inline solved_pose pose_solved(laned_pose near, pose_rows all, constant const int *subsets, int trials, int steps,
+static inline solved_pose pose_solved(laned_pose near, pose_rows all, constant const int *subsets, int trials, int steps,
                                real smallest, real share, private reals *room) {
     solved_pose fit;
     real present = 0;

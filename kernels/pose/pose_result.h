@@ -35,7 +35,7 @@ typedef struct {
 
 // Takes rows to where their middle is zero and their size one: then a turn and a shift are alike, and the digits are
 // where they count. There are `sum` of them, and their places add up to (sum_x, sum_y).
-inline pose_frame framed(private pose_rows *all, real sum, real sum_x, real sum_y) {
+static inline pose_frame framed(private pose_rows *all, real sum, real sum_x, real sum_y) {
     private real *px = (private real *)all->px, *py = (private real *)all->py;
     private real *ex = (private real *)all->ex, *ey = (private real *)all->ey;
     private real *certainty = (private real *)all->certainty;
@@ -55,14 +55,14 @@ inline pose_frame framed(private pose_rows *all, real sum, real sum_x, real sum_
     return (pose_frame){x, y, size, per_size};
 }
 
-inline laned_pose pose_near(real x, real y, real turn, pose_frame frame) {
+static inline laned_pose pose_near(real x, real y, real turn, pose_frame frame) {
     const real half_sine = sin(turn / 2), less = -2 * half_sine * half_sine, sine = sin(turn);
     return (laned_pose){(reals)less, (reals)-sine, (reals)sine, (reals)less,
                         (reals)((x + less * frame.x - sine * frame.y) * frame.per_size),
                         (reals)((y + sine * frame.x + less * frame.y) * frame.per_size), 0};
 }
 
-inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, int all_finite, long item, int count,
+static inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, int all_finite, long item, int count,
                        pose_limits asked, real place_x, real place_y, pose_outputs to) {
     const int few = fit.present < OF_POSE;
     // Where many disagree two that agree may do so by chance: each must have two others.

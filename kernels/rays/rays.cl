@@ -14,10 +14,10 @@ typedef struct {
     place x, y, z;
 } spot;
 
-inline place dot_of(spot a, spot b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline spot moved(spot a, spot b, place by) { return (spot){a.x + b.x * by, a.y + b.y * by, a.z + b.z * by}; }
-inline spot load_spot(global const INPUT *three) { return (spot){three[0], three[1], three[2]}; }
-inline int finite_spot(spot a) {
+static inline place dot_of(spot a, spot b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+static inline spot moved(spot a, spot b, place by) { return (spot){a.x + b.x * by, a.y + b.y * by, a.z + b.z * by}; }
+static inline spot load_spot(global const INPUT *three) { return (spot){three[0], three[1], three[2]}; }
+static inline int finite_spot(spot a) {
     return !(not_finite((real)a.x) | not_finite((real)a.y) | not_finite((real)a.z));
 }
 
@@ -28,7 +28,7 @@ typedef struct {
     int misses;
 } part;
 
-inline part part_within(spot origin, spot direction, place radius) {
+static inline part part_within(spot origin, spot direction, place radius) {
     const place whole = dot_of(direction, direction), nearest = -dot_of(origin, direction) / whole;
     const spot middle = moved(origin, direction, nearest);
     const place left = radius * radius - dot_of(middle, middle);
@@ -37,7 +37,7 @@ inline part part_within(spot origin, spot direction, place radius) {
     return (part){moved(middle, direction, -half_of_it), nearest - half_of_it, 2 * half_of_it, 0};
 }
 
-inline int is_far(spot origin, place radius) { return fabs(origin.x) + fabs(origin.y) + fabs(origin.z) > 8 * radius; }
+static inline int is_far(spot origin, place radius) { return fabs(origin.x) + fabs(origin.y) + fabs(origin.z) > 8 * radius; }
 
 #ifdef SEGMENTS
 AS_IT_IS kernel void any_hit(global const INPUT *restrict rays, global uchar *restrict occluded,

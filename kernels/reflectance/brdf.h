@@ -10,21 +10,21 @@ typedef struct {
     reals x, y, z;
 } Direction;
 
-inline reals dot_of(Direction a, Direction b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline reals larger_of(reals a, reals b) { return a > b ? a : b; }
+static inline reals dot_of(Direction a, Direction b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+static inline reals larger_of(reals a, reals b) { return a > b ? a : b; }
 #if defined(BRDF_PHONG) && defined(VECTOR_VARIANT) && defined(REAL_IS_DOUBLE)
 // PoCL's pow of wide vectors of doubles makes infinities of some.
-inline reals power_of(reals base, real exponent) {
+static inline reals power_of(reals base, real exponent) {
     real lanes[LANES];
     *(reals_at *)lanes = base;
     for (int n = 0; n < LANES; n++) lanes[n] = pow(lanes[n], exponent);
     return *(const reals_at *)lanes;
 }
 #elif defined(BRDF_PHONG)
-inline reals power_of(reals base, real exponent) { return pow(base, (reals)exponent); }
+static inline reals power_of(reals base, real exponent) { return pow(base, (reals)exponent); }
 #endif
 
-inline reals brdf_above(Direction in, Direction out, constant real *model) {
+static inline reals brdf_above(Direction in, Direction out, constant real *model) {
 #if defined(BRDF_LAMBERT)
     return (reals)(model[0] / PI_REAL);
 #elif defined(BRDF_PHONG)
@@ -56,7 +56,7 @@ inline reals brdf_above(Direction in, Direction out, constant real *model) {
 }
 
 // Nothing where either direction lies below the surface.
-inline reals brdf(Direction in, Direction out, constant real *model) {
+static inline reals brdf(Direction in, Direction out, constant real *model) {
     const masks above = mask_of(in.z > (reals)0) & mask_of(out.z > (reals)0);
     return zero_where(~above, brdf_above(in, out, model));
 }

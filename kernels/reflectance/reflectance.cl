@@ -11,7 +11,7 @@ typedef reals places;
 #endif
 #include "common/six_columns.h"
 
-inline Direction direction_of(const reals *at) {
+static inline Direction direction_of(const reals *at) {
     const reals largest = larger_of(larger_of(fabs(at[0]), fabs(at[1])), fabs(at[2]));
     const Direction scaled = {at[0] / largest, at[1] / largest, at[2] / largest};
     const reals per = (real)1 / sqrt(dot_of(scaled, scaled));
@@ -19,7 +19,7 @@ inline Direction direction_of(const reals *at) {
     return unit;
 }
 
-inline masks no_direction(Direction a) {
+static inline masks no_direction(Direction a) {
     return mask_of(LANED(not_finite)(a.x)) | mask_of(LANED(not_finite)(a.y)) | mask_of(LANED(not_finite)(a.z));
 }
 

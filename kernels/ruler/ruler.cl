@@ -3,7 +3,7 @@
 #include "ruler/ruler.h"
 
 // Under VECTOR_VARIANT of the 16 rulers from `ruler` on, as far as there are any.
-inline void store_edges(private const ruler_edge *edges, uint ruler, uint count, global real *position,
+static inline void store_edges(private const ruler_edge *edges, uint ruler, uint count, global real *position,
                         global real *amplitude, global real *width, global real *sigma, global real *spacing,
                         global uchar *status) {
     for (int k = 0; k < MOST; k++) {

@@ -45,7 +45,7 @@ typedef struct {
 } ruler_place;
 
 // Lays rulers out; returns what is wrong with them. Those get a place all the same, where there is something to read.
-inline masks ruler_lay(int rows, int columns, reals x, reals y, reals cosine, reals sine, constant real *table,
+static inline masks ruler_lay(int rows, int columns, reals x, reals y, reals cosine, reals sine, constant real *table,
                        ruler_place *place) {
     const masks bad = mask_of((LANED(not_finite)(x) | LANED(not_finite)(y) | LANED(not_finite)(cosine) |
                                LANED(not_finite)(sine)) != 0);
@@ -79,7 +79,7 @@ inline masks ruler_lay(int rows, int columns, reals x, reals y, reals cosine, re
 
 // Takes (x, y) to the measured image; returns the flags of lanes that have no place in it, which it leaves at 0, 0.
 #if defined(LENS) || defined(CAMERA)
-inline masks ruler_distort(reals *x, reals *y, const ruler_place *place, constant real *model) {
+static inline masks ruler_distort(reals *x, reals *y, const ruler_place *place, constant real *model) {
 #ifdef CAMERA
     const masks folded = LANED(camera_distort)(x, y, model);
 #else
@@ -94,7 +94,7 @@ inline masks ruler_distort(reals *x, reals *y, const ruler_place *place, constan
 #endif
 
 // What is wrong with a sample itself, and with a sum of them.
-inline masks ruler_judge(reals sample, constant real *table) {
+static inline masks ruler_judge(reals sample, constant real *table) {
 #ifdef SATURATION
     return mask_of(sample >= table[RULER_SATURATION]) & STATUS_SATURATED;
 #else
@@ -102,7 +102,7 @@ inline masks ruler_judge(reals sample, constant real *table) {
 #endif
 }
 
-inline masks ruler_judge_sum(reals sum) {
+static inline masks ruler_judge_sum(reals sum) {
 #ifdef CODE_float
     return mask_of((LANED(not_finite)(sum) | mask_of(fabs(sum) > (real)RULER_LARGEST)) != 0) & STATUS_NOT_FINITE;
 #else
@@ -122,7 +122,7 @@ inline masks ruler_judge_sum(reals sum) {
 #include "ruler/ruler_refine.h"
 
 #ifdef VECTOR_VARIANT
-inline reals ruler_slope(private const reals *profile, int i, constant real *table) {
+static inline reals ruler_slope(private const reals *profile, int i, constant real *table) {
     reals slope = 0;
     for (int k = 1; k <= TAPS; k++)
         slope += table[RULER_TAPS + k - 1] * (profile[i + TAPS + k] - profile[i + TAPS - k]);
@@ -136,7 +136,7 @@ inline reals ruler_slope(private const reals *profile, int i, constant real *tab
 #endif
 #define RULER_SLOPE(i) ruler_slope(values, i, table)
 #else
-inline real ruler_slope(local const real *profile, int i, constant real *table) {
+static inline real ruler_slope(local const real *profile, int i, constant real *table) {
     real slope = 0;
     for (int k = 1; k <= TAPS; k++)
         slope += table[RULER_TAPS + k - 1] * (profile[i + TAPS + k] - profile[i + TAPS - k]);
@@ -149,7 +149,7 @@ inline real ruler_slope(local const real *profile, int i, constant real *table) 
 
 // The edges along profiles (in lanes) or gradients (of one ruler); what is wrong with the rulers themselves is in
 // `flags`.
-inline void ruler_find(RULER_SPACE const reals *values, const ruler_place *place, masks flags, constant real *table,
+static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place *place, masks flags, constant real *table,
                        private ruler_edge *edges) {
     const real threshold = table[RULER_THRESHOLD];
     masks found = 0, wins;
@@ -239,7 +239,7 @@ inline void ruler_find(RULER_SPACE const reals *values, const ruler_place *place
 #include "ruler/ruler_lanes.h"
 
 // 16 rulers, one in each lane: fills edges[MOST].
-inline void ruler_measure_lanes(global const CODE *image, int rows, int columns, reals x, reals y, reals cosine,
+static inline void ruler_measure_lanes(global const CODE *image, int rows, int columns, reals x, reals y, reals cosine,
                                 reals sine, constant real *table, constant real *model, private ruler_edge *edges) {
     ruler_place place;
     masks flags = ruler_lay(rows, columns, x, y, cosine, sine, table, &place);
@@ -249,7 +249,7 @@ inline void ruler_measure_lanes(global const CODE *image, int rows, int columns,
 }
 
 // 16 rulers from the one given on, `stride` numbers apart. There are `count`; lanes past them do the last one again.
-inline void ruler_measure(global const CODE *image, int rows, int columns, global const real *rulers, uint stride,
+static inline void ruler_measure(global const CODE *image, int rows, int columns, global const real *rulers, uint stride,
                           uint count, constant real *table, constant real *model, private ruler_edge *edges) {
     real given[4][LANES];
     for (uint lane = 0; lane < LANES; lane++) {
@@ -264,7 +264,7 @@ inline void ruler_measure(global const CODE *image, int rows, int columns, globa
 }
 #else
 // Splits (x, y) from the place's pixel into a pixel that has neighbours, and what is left.
-inline masks ruler_split(const ruler_place *place, int pitch, reals *x, reals *y) {
+static inline masks ruler_split(const ruler_place *place, int pitch, reals *x, reals *y) {
     masks column = LANED(convert_bits)(*x), row = LANED(convert_bits)(*y);
     column = column < place->last_column ? column : place->last_column;
     row = row < place->last_row ? row : place->last_row;
@@ -273,13 +273,13 @@ inline masks ruler_split(const ruler_place *place, int pitch, reals *x, reals *y
     return place->pixel + row * pitch + column;
 }
 
-inline reals ruler_between(reals a, reals b, reals c, reals d, reals x, reals y) {
+static inline reals ruler_between(reals a, reals b, reals c, reals d, reals x, reals y) {
     a += x * (b - a);
     c += x * (d - c);
     return a + y * (c - a);
 }
 
-inline real ruler_sum(global const CODE *image, const ruler_place *place, int pitch, int i, constant real *table,
+static inline real ruler_sum(global const CODE *image, const ruler_place *place, int pitch, int i, constant real *table,
                       constant real *model, int *flags) {
     real sum = 0;
     for (int line = 0; line < WIDTH; line++) {
@@ -298,7 +298,7 @@ inline real ruler_sum(global const CODE *image, const ruler_place *place, int pi
 }
 
 // One ruler by a work-group, in arrays of its own; edges[MOST] are for its first item.
-inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
+static inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
                           constant real *model, local real *profile, local real *slopes, local int *shared_flags,
                           private ruler_edge *edges) {
     const int item = get_local_id(0);

@@ -25,13 +25,13 @@ typedef masks ruler_levels;
 #define RULER_FOUR(row, k) \
     vload2(0, (row) + RULER_FIRST(k)), vload2(0, (row) + RULER_SECOND(k)), vload2(0, (row) + RULER_FIRST(k + 2)), \
         vload2(0, (row) + RULER_SECOND(k + 2))
-inline void ruler_row(global const CODE *row, private const ulong *at, ruler_levels *left, ruler_levels *right) {
+static inline void ruler_row(global const CODE *row, private const ulong *at, ruler_levels *left, ruler_levels *right) {
     const float16 low = (float16)(RULER_FOUR(row, 0), RULER_FOUR(row, 4));
     const float16 high = (float16)(RULER_FOUR(row, 8), RULER_FOUR(row, 12));
     *left = (float16)(low.even, high.even);
     *right = (float16)(low.odd, high.odd);
 }
-inline void ruler_fetch(global const CODE *above, global const CODE *below, private const ulong *at, ruler_levels *a,
+static inline void ruler_fetch(global const CODE *above, global const CODE *below, private const ulong *at, ruler_levels *a,
                         ruler_levels *b, ruler_levels *c, ruler_levels *d) {
     ruler_row(above, at, a, b);
     ruler_row(below, at, c, d);
@@ -47,10 +47,10 @@ typedef RULER_ONE_BY_ONE uint ruler_bits __attribute__((aligned(sizeof(CODE))));
 #define RULER_FOUR(k) \
     RULER_WORD(RULER_FIRST(k)), RULER_WORD(RULER_SECOND(k)), RULER_WORD(RULER_FIRST(k + 2)), \
         RULER_WORD(RULER_SECOND(k + 2))
-inline masks ruler_row(global const CODE *row, private const ulong *at) {
+static inline masks ruler_row(global const CODE *row, private const ulong *at) {
     return as_int16((uint16)(RULER_FOUR(0), RULER_FOUR(4), RULER_FOUR(8), RULER_FOUR(12)));
 }
-inline void ruler_fetch(global const CODE *above, global const CODE *below, private const ulong *at, ruler_levels *a,
+static inline void ruler_fetch(global const CODE *above, global const CODE *below, private const ulong *at, ruler_levels *a,
                         ruler_levels *b, ruler_levels *c, ruler_levels *d) {
 #ifdef CODE_uchar
     const masks first = ruler_row(above, at), second = ruler_row(below - 2, at);
@@ -68,18 +68,18 @@ inline void ruler_fetch(global const CODE *above, global const CODE *below, priv
 }
 #endif
 
-inline reals ruler_fraction(masks place) {
+static inline reals ruler_fraction(masks place) {
     return as_reals((place << (23 - RULER_BITS) & 0x7fffff) | 0x3f800000) - 1;
 }
 
 // The last place before the last neighbour, or so far away that no ruler reaches it.
-inline masks ruler_end(masks last) {
+static inline masks ruler_end(masks last) {
     const int room = 1 << (30 - RULER_BITS);
     return ((last < room ? last + 1 : (masks)room) << RULER_BITS) - 1;
 }
 
 // Where the lines of a sample begin; all of them between a pixel and its last neighbour, whatever the rounding.
-inline masks ruler_begin(reals from, masks last, masks across) {
+static inline masks ruler_begin(reals from, masks last, masks across) {
     const masks span = across * (WIDTH - 1), most = ruler_end(last);
     const masks low = span < 0 ? -span : (masks)0, high = span < 0 ? most : most - span;
     masks place = LANED(convert_bits)(from * (real)RULER_ONE);
@@ -92,7 +92,7 @@ typedef struct {
     masks column, row, across_x, across_y;
 } ruler_walk;
 
-inline void ruler_start(ruler_walk *walk, const ruler_place *place, int sample) {
+static inline void ruler_start(ruler_walk *walk, const ruler_place *place, int sample) {
 #if !defined(LENS) && !defined(CAMERA)
     // A little less than a pixel, so that lines across all of an image have room in it.
     const real less = RULER_ONE * (1 - (real)0x1p-20f);
@@ -105,7 +105,7 @@ inline void ruler_start(ruler_walk *walk, const ruler_place *place, int sample) 
 }
 
 // Puts down where the sample is on the next line; returns what is wrong with that.
-inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int pitch, int sample, int line,
+static inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int pitch, int sample, int line,
                         constant real *model, private reals *x, private reals *y, private uint16 *pixel) {
     masks flags = 0;
 #if defined(LENS) || defined(CAMERA)
@@ -130,7 +130,7 @@ inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int pitch, i
 
 // The sums over the lines; returns what is wrong. While pixels are on their way the places of the next sample's are
 // worked out: what is read from them in parts was written long before.
-__attribute__((always_inline)) inline masks ruler_sums(global const CODE *image, const ruler_place *place, int pitch,
+static inline __attribute__((always_inline)) masks ruler_sums(global const CODE *image, const ruler_place *place, int pitch,
                                                        constant real *table, constant real *model,
                                                        private reals *profile) {
     uint16 pixels[2 * WIDTH];

@@ -17,20 +17,20 @@ typedef struct {
     reals at, before, here, after;
 } ruler_peak;
 
-inline ruler_peak ruler_either(masks first, ruler_peak one, ruler_peak other) {
+static inline ruler_peak ruler_either(masks first, ruler_peak one, ruler_peak other) {
     const ruler_peak either = {first ? one.at : other.at, first ? one.before : other.before,
                                first ? one.here : other.here, first ? one.after : other.after};
     return either;
 }
 
 // To whole numbers, below 2^22: adding this leaves no bits for anything else. (PoCL's rint() is one lane at a time.)
-inline reals ruler_nearest(reals x) {
+static inline reals ruler_nearest(reals x) {
     const reals room = (reals)12582912.0f;
     return (x + room) - room;
 }
 
 // sin(2 pi x) to 0.001: two parabolas, and their squares.
-inline reals ruler_sine(reals x) {
+static inline reals ruler_sine(reals x) {
     x -= ruler_nearest(x);
     const reals arch = 8 * x - 16 * x * fabs(x);
     return arch * ((reals)0.775f + (reals)0.225f * fabs(arch));
@@ -44,7 +44,7 @@ inline reals ruler_sine(reals x) {
 //     along, across   of the axis from sample to sample, and from line to line [px]
 //     at              the edge [samples]
 //     edge, smoothing variances of the gradient's peak and of the smoothing [samples^2]
-inline reals ruler_pull(reals phase, reals along, reals across, reals at, reals edge, constant real *table) {
+static inline reals ruler_pull(reals phase, reals along, reals across, reals at, reals edge, constant real *table) {
     const real smoothing = table[RULER_SMOOTHING], per_step = 1 / (table[RULER_STEP] * table[RULER_STEP]);
     const reals extra = edge - smoothing, least = (reals)(smoothing * RULER_LEAST_BLUR);
     const reals blur = extra > least ? extra : least, variance = smoothing + blur, common = smoothing * blur / variance;
@@ -67,7 +67,7 @@ inline reals ruler_pull(reals phase, reals along, reals across, reals at, reals 
 // The edge at a peak: a parabola through the logarithms of the gradients there, which is exact for a Gaussian. An edge
 // that bends about a point ahead is seen ahead of where it is, by the variances of the blur and of the lines over twice
 // the radius.
-inline ruler_edge ruler_refine(ruler_peak peak, private const ruler_place *place, constant real *table) {
+static inline ruler_edge ruler_refine(ruler_peak peak, private const ruler_place *place, constant real *table) {
     const reals size = fabs(peak.here), sign = peak.here < 0 ? (reals)-1 : (reals)1, per = 1 / peak.here;
     // A neighbour of other sign is far below the peak: noise.
     const reals before = log(fmax(peak.before * per, (reals)1e-6f));
@@ -96,7 +96,7 @@ inline ruler_edge ruler_refine(ruler_peak peak, private const ruler_place *place
     return edge;
 }
 
-inline ruler_edge ruler_pair(ruler_peak first, ruler_peak second, private const ruler_place *place,
+static inline ruler_edge ruler_pair(ruler_peak first, ruler_peak second, private const ruler_place *place,
                              constant real *table) {
     ruler_edge edge = ruler_refine(first, place, table);
     const ruler_edge other = ruler_refine(second, place, table);
@@ -115,7 +115,7 @@ inline ruler_edge ruler_pair(ruler_peak first, ruler_peak second, private const 
 #endif
 
 // Puts what is not known yet, or wrong, into an edge.
-inline ruler_edge ruler_marked(ruler_edge edge, masks there, masks flags) {
+static inline ruler_edge ruler_marked(ruler_edge edge, masks there, masks flags) {
     const masks broken = there & mask_of(LANED(not_finite)(edge.position + edge.amplitude + edge.sigma) != 0);
     const masks useless = mask_of((flags & RULER_USELESS) != 0);
     const masks none = ~there | broken | useless;

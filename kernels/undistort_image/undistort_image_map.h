@@ -29,7 +29,7 @@ INLINED void in_window(const int spread, const int flat, global const CODE *imag
            HEAD_BANDS(head), HEAD_STARTS(head), made);
 }
 
-inline void at_points(global const CODE *image, global CODE *made, global uchar *status, int4 head, int lanes,
+static inline void at_points(global const CODE *image, global CODE *made, global uchar *status, int4 head, int lanes,
                       global const float2 *points, constant int *size, float fill) {
     global const float16 *places = (global const float16 *)(points + (size_t)RUN * head.w);
     const float16 x = (float16)(places[0].even, places[1].even), y = (float16)(places[0].odd, places[1].odd);
@@ -41,7 +41,7 @@ inline void at_points(global const CODE *image, global CODE *made, global uchar 
 }
 
 // Does a row's runs.
-inline void mapped_row(global const CODE *image, global CODE *made, global uchar *status, global const int4 *heads,
+static inline void mapped_row(global const CODE *image, global CODE *made, global uchar *status, global const int4 *heads,
                        global const float8 *curves, global const float2 *points, constant int *size, float fill) {
     const int columns = size[MADE_COLUMNS], lanes = min(RUN, columns), runs = RUNS(columns);
     for (int run = 0; run < runs; run++) {
@@ -65,7 +65,7 @@ inline void mapped_row(global const CODE *image, global CODE *made, global uchar
     }
 }
 #else
-inline uchar mapped_pixel(global const CODE *image, global CODE *made, int column, int row, global const int4 *heads,
+static inline uchar mapped_pixel(global const CODE *image, global CODE *made, int column, int row, global const int4 *heads,
                           global const float8 *curves, global const float2 *points, constant int *size, float fill) {
     const int columns = size[MADE_COLUMNS], run = column / RUN, lane = column - RUN_START(run, columns);
     const size_t index = (size_t)row * RUNS(columns) + run;

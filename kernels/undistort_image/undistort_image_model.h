@@ -4,7 +4,7 @@
 #include "undistort_image/undistort_image_run.h"
 
 // Moves ideal pixels to their measured place; returns where they have none.
-inline masks measured(reals *column, reals *row, constant real *model) {
+static inline masks measured(reals *column, reals *row, constant real *model) {
 #ifdef CAMERA
     return LANED(camera_distort)(column, row, model);
 #else
@@ -17,7 +17,7 @@ inline masks measured(reals *column, reals *row, constant real *model) {
 #define STEEPEST (CHANNELS == 3 ? (real)1.6 : (real)2)
 #define MOST_BANDS 8
 
-inline void computed_run(global const CODE *image, global CODE *made, global uchar *status, int row, int run,
+static inline void computed_run(global const CODE *image, global CODE *made, global uchar *status, int row, int run,
                          constant real *model, constant int *size, float fill) {
     const int columns = size[MADE_COLUMNS], start = RUN_START(run, columns);
     const int16 lanes = (int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
@@ -48,7 +48,7 @@ inline void computed_run(global const CODE *image, global CODE *made, global uch
     else window(NARROW, 0, image, pitch, convert_float16(x), convert_float16(y), bands, starts, made);
 }
 #else
-inline uchar computed_pixel(global const CODE *image, global CODE *made, int column, int row, constant real *model,
+static inline uchar computed_pixel(global const CODE *image, global CODE *made, int column, int row, constant real *model,
                             constant int *size, float fill) {
     real x = column + size[FIRST_COLUMN], y = row + size[FIRST_ROW];
     if (measured(&x, &y, model)) return blank(size[MISSING], fill, made);

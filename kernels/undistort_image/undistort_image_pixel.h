@@ -42,17 +42,17 @@ DEFINE_CUBIC(CubicWeights, float, cubic_weights)
 #define TO_WHOLE 12582912.0f
 
 #ifdef LARGEST
-inline CODE to_code(float value) {
+static inline CODE to_code(float value) {
     value = value > 0 ? value : 0;
     value = value < LARGEST ? value : LARGEST;
     return (CODE)as_int(value + TO_WHOLE);
 }
 #else
-inline CODE to_code(float value) { return value; }
+static inline CODE to_code(float value) { return value; }
 #endif
 
 // The place of a tap within the image, by the border's policy. (BORDER_CONSTANT asks before.)
-inline int settled(int place, int size) {
+static inline int settled(int place, int size) {
 #ifdef BORDER_REFLECT
     const int period = max(2 * (size - 1), 1), folded = abs(place) % period;
     return min(folded, period - folded);
@@ -61,7 +61,7 @@ inline int settled(int place, int size) {
 #endif
 }
 
-inline float tap(global const CODE *image, int column, int row, constant int *size, float fill) {
+static inline float tap(global const CODE *image, int column, int row, constant int *size, float fill) {
     const int columns = size[SOURCE_COLUMNS], rows = size[SOURCE_ROWS];
 #ifdef BORDER_CONSTANT
     if (column < 0 || column >= columns || row < 0 || row >= rows) return fill;
@@ -71,18 +71,18 @@ inline float tap(global const CODE *image, int column, int row, constant int *si
 
 // A weighted sum along a row. The difference of neighbours keeps a constant image constant.
 #ifdef BICUBIC
-inline float along_row(global const CODE *image, int column, int row, CubicWeights w, constant int *size, float fill) {
+static inline float along_row(global const CODE *image, int column, int row, CubicWeights w, constant int *size, float fill) {
     return w.before * tap(image, column - 1, row, size, fill) + w.at * tap(image, column, row, size, fill) +
            w.after * tap(image, column + 1, row, size, fill) + w.last * tap(image, column + 2, row, size, fill);
 }
 #else
-inline float along_row(global const CODE *image, int column, int row, float part, constant int *size, float fill) {
+static inline float along_row(global const CODE *image, int column, int row, float part, constant int *size, float fill) {
     const float left = tap(image, column, row, size, fill), right = tap(image, column + 1, row, size, fill);
     return left + part * (right - left);
 }
 #endif
 
-inline float at_place(global const CODE *image, int column, int row, float part_x, float part_y, constant int *size,
+static inline float at_place(global const CODE *image, int column, int row, float part_x, float part_y, constant int *size,
                       float fill) {
 #ifdef BICUBIC
     const CubicWeights x = cubic_weights(part_x), y = cubic_weights(part_y);
@@ -96,17 +96,17 @@ inline float at_place(global const CODE *image, int column, int row, float part_
 #endif
 }
 
-inline uchar blank(uchar status, float fill, global CODE *made) {
+static inline uchar blank(uchar status, float fill, global CODE *made) {
     for (int channel = 0; channel < CHANNELS; channel++) made[channel] = to_code(fill);
     return status;
 }
 
 // Whether no tap lies in the image.
-inline int beyond(int place, int size) { return place + TAPS_AFTER < 0 || place - TAPS_BEFORE >= size; }
+static inline int beyond(int place, int size) { return place + TAPS_AFTER < 0 || place - TAPS_BEFORE >= size; }
 
 // The pixel that a place counts from: within what a float holds, also where the place is none. (PoCL takes floor() of
 // a scalar apart.)
-inline int pixel_before(real place) {
+static inline int pixel_before(real place) {
     const real held = fmin(fmax(place, (real)-FARTHEST), (real)FARTHEST);
     const int whole = (int)held;
     return whole - (held < whole);
@@ -114,7 +114,7 @@ inline int pixel_before(real place) {
 
 // Writes the pixel seen at (column + x, row + y), and returns its status. Past the image's outermost half pixels lies
 // no source.
-inline uchar sample(global const CODE *image, int column, int row, float x, float y, constant int *size, float fill,
+static inline uchar sample(global const CODE *image, int column, int row, float x, float y, constant int *size, float fill,
                     global CODE *made) {
     if ((as_int(x) & 0x7f800000) == 0x7f800000 || (as_int(y) & 0x7f800000) == 0x7f800000)
         return blank(size[MISSING], fill, made);

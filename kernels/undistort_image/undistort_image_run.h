@@ -8,7 +8,7 @@
 
 #ifdef VECTOR_VARIANT
 // The pixels of a run one by one, at places (x, y) from the source pixel (column, row) on.
-inline void each_pixel(global const CODE *image, global CODE *made, global uchar *status, int column, int row,
+static inline void each_pixel(global const CODE *image, global CODE *made, global uchar *status, int column, int row,
                        int lanes, float16 x, float16 y, constant int *size, float fill) {
     float along[RUN], across[RUN];
     vstore16(x, 0, along);

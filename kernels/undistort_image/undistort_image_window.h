@@ -12,7 +12,7 @@
 typedef CODE16 codes;
 typedef CODE16 codes_at __attribute__((aligned(sizeof(CODE))));
 
-#define INLINED __attribute__((always_inline)) inline
+#define INLINED static inline __attribute__((always_inline))
 
 #ifdef BICUBIC
 DEFINE_CUBIC(CubicWeights16, float16, cubic_weights16)

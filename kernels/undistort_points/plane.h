@@ -27,21 +27,21 @@
 // No bending takes a place in the region as far as that.
 #define PLANE_FARTHEST ((real)1e3)
 
-inline masks LANED(plane_within)(reals x, reals y, real edge) {
+static inline masks LANED(plane_within)(reals x, reals y, real edge) {
     return mask_of(fabs(x) <= edge) & mask_of(fabs(y) <= edge);
 }
 
-inline reals LANED(plane_bend)(reals x, reals y, constant real *c) {
+static inline reals LANED(plane_bend)(reals x, reals y, constant real *c) {
     return x * x * (c[0] + c[3] * x + c[4] * y) + y * (x * c[1] + y * (c[2] + c[5] * x + c[6] * y));
 }
 
-inline void LANED(plane_slopes)(reals x, reals y, constant real *c, reals *by_x, reals *by_y) {
+static inline void LANED(plane_slopes)(reals x, reals y, constant real *c, reals *by_x, reals *by_y) {
     *by_x = x * (2 * c[0] + 3 * c[3] * x + 2 * c[4] * y) + y * (c[1] + c[5] * y);
     *by_y = x * (c[1] + c[4] * x) + y * (2 * c[2] + 2 * c[5] * x + 3 * c[6] * y);
 }
 
 // Moves sensor coordinates to the plane; returns which lie outside the region.
-inline masks LANED(plane_measure)(reals *u, reals *v, constant real *plane) {
+static inline masks LANED(plane_measure)(reals *u, reals *v, constant real *plane) {
     constant real *matrix = plane + PLANE_MATRIX;
     const reals x = (*u - plane[PLANE_ORIGIN]) * plane[PLANE_SCALE];
     const reals y = (*v - plane[PLANE_ORIGIN + 1]) * plane[PLANE_SCALE + 1];
@@ -53,7 +53,7 @@ inline masks LANED(plane_measure)(reals *u, reals *v, constant real *plane) {
 }
 
 // As newton.h asks for it.
-inline masks LANED(plane_newton)(reals x, reals y, reals back_x, reals back_y, constant real *plane, reals *step_x,
+static inline masks LANED(plane_newton)(reals x, reals y, reals back_x, reals back_y, constant real *plane, reals *step_x,
                                  reals *step_y, reals *left) {
     const reals at_x = x + back_x, at_y = y + back_y;
     reals xx, xy, yx, yy;
@@ -74,7 +74,7 @@ inline masks LANED(plane_newton)(reals x, reals y, reals back_x, reals back_y, c
 #include "common/newton.h"
 
 // Moves plane coordinates to the sensor; returns which are not seen within the region.
-inline masks LANED(plane_show)(reals *g, reals *h, constant real *plane) {
+static inline masks LANED(plane_show)(reals *g, reals *h, constant real *plane) {
     constant real *back = plane + PLANE_BACK;
     const reals along = *g - plane[PLANE_OFFSET], up = *h - plane[PLANE_OFFSET + 1];
     const reals x = back[0] * along + back[1] * up, y = back[2] * along + back[3] * up;

@@ -11,7 +11,7 @@ typedef INPUT16 inputs_at __attribute__((aligned(sizeof(INPUT))));
 #define LOAD(from) convert_real16(*(global const inputs_at *)(from))
 #endif
 
-inline void load_points(global const INPUT *points, ulong i, reals *x, reals *y) {
+static inline void load_points(global const INPUT *points, ulong i, reals *x, reals *y) {
 #ifdef VECTOR_VARIANT
     const reals low = LOAD(points + 2 * i), high = LOAD(points + 2 * i + LANES);
     *x = (reals)(low.even, high.even);
@@ -22,7 +22,7 @@ inline void load_points(global const INPUT *points, ulong i, reals *x, reals *y)
 #endif
 }
 
-inline void store_points(reals x, reals y, global real *points, ulong i) {
+static inline void store_points(reals x, reals y, global real *points, ulong i) {
 #ifdef VECTOR_VARIANT
     reals low, high;
     low.even = x.lo;
@@ -38,7 +38,7 @@ inline void store_points(reals x, reals y, global real *points, ulong i) {
 }
 
 // Moves (x, y); returns the flag of those that have no such place.
-__attribute__((always_inline)) inline masks LANED(moved)(reals *x, reals *y, constant real *model) {
+static inline __attribute__((always_inline)) masks LANED(moved)(reals *x, reals *y, constant real *model) {
 #if defined(PLANE) && defined(INVERSE)
     return LANED(plane_show)(x, y, model) & STATUS_OUT_OF_RANGE;
 #elif defined(PLANE)

@@ -22,18 +22,18 @@ typedef struct {
     real flat;                            // within this of the plane, a corner lies in it
 } Fan;
 
-inline Vector minus(Vector a, Vector b) { return (Vector){a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline real dot_of(Vector a, Vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Vector cross_of(Vector a, Vector b) {
+static inline Vector minus(Vector a, Vector b) { return (Vector){a.x - b.x, a.y - b.y, a.z - b.z}; }
+static inline real dot_of(Vector a, Vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+static inline Vector cross_of(Vector a, Vector b) {
     return (Vector){a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
-inline Vector scaled(Vector a, real by) { return (Vector){a.x * by, a.y * by, a.z * by}; }
-inline Vector combined(real a, Vector u, real b, Vector v) {
+static inline Vector scaled(Vector a, real by) { return (Vector){a.x * by, a.y * by, a.z * by}; }
+static inline Vector combined(real a, Vector u, real b, Vector v) {
     return (Vector){a * u.x + b * v.x, a * u.y + b * v.y, a * u.z + b * v.z};
 }
 
 // Returns 0 for a segment that is seen end on.
-inline int fan_of(const Vector *corners, real near_0, real near_1, real least_near, Fan *fan) {
+static inline int fan_of(const Vector *corners, real near_0, real near_1, real least_near, Fan *fan) {
     const Vector one = minus(corners[1], corners[0]), two = minus(corners[2], corners[0]);
     const Vector normal = cross_of(one, two);
     const real square = dot_of(normal, normal), reach = dot_of(one, one) + dot_of(two, two);
@@ -51,72 +51,72 @@ inline int fan_of(const Vector *corners, real near_0, real near_1, real least_ne
 }
 
 // The largest (sign 1) or smallest (-1) value of a linear function over boxes.
-BVH_INLINE bvh_reals extreme(Vector of, real sign, const bvh_reals *middle, const bvh_reals *half_size) {
+INLINE reals extreme(Vector of, real sign, const reals *middle, const reals *half_size) {
     return of.x * middle[0] + of.y * middle[1] + of.z * middle[2] +
            sign * (fabs(of.x) * half_size[0] + fabs(of.y) * half_size[1] + fabs(of.z) * half_size[2]);
 }
 
-BVH_INLINE bvh_masks fan_boxes(const Fan *fan, global const real *node) {
+INLINE masks fan_boxes(const Fan *fan, global const real *node) {
     const real apex[3] = {fan->apex.x, fan->apex.y, fan->apex.z};
-    bvh_reals middle[3], half_size[3];
+    reals middle[3], half_size[3];
     for (int k = 0; k < 3; k++) {
-        const bvh_reals low = BVH_LOAD(node + k * WIDTH), high = BVH_LOAD(node + (3 + k) * WIDTH);
+        const reals low = load_reals(node + k * WIDTH), high = load_reals(node + (3 + k) * WIDTH);
         middle[k] = (real)0.5 * (low + high) - apex[k];
         half_size[k] = (real)0.5 * (high - low);
     }
     const real slack = (real)16 * (real)REAL_EPSILON;
     // Where there is no box, low is infinity and the comparisons with NaN are false.
-    return BVH_MASK(extreme(fan->across, 1, middle, half_size) >= -fan->flat) &
-           BVH_MASK(extreme(fan->across, -1, middle, half_size) <= fan->flat) &
-           BVH_MASK(extreme(fan->a, 1, middle, half_size) >= -slack) &
-           BVH_MASK(extreme(fan->b, 1, middle, half_size) >= -slack) &
-           BVH_MASK(extreme(fan->far, -1, middle, half_size) <= (real)1 + slack) &
-           BVH_MASK(extreme(fan->near, 1, middle, half_size) >= (real)1 - slack);
+    return mask_of(extreme(fan->across, 1, middle, half_size) >= -fan->flat) &
+           mask_of(extreme(fan->across, -1, middle, half_size) <= fan->flat) &
+           mask_of(extreme(fan->a, 1, middle, half_size) >= -slack) &
+           mask_of(extreme(fan->b, 1, middle, half_size) >= -slack) &
+           mask_of(extreme(fan->far, -1, middle, half_size) <= (real)1 + slack) &
+           mask_of(extreme(fan->near, 1, middle, half_size) >= (real)1 - slack);
 }
 
 // Cuts [low, high] of a segment to where a function, linear on it, is positive.
-BVH_INLINE void cut(bvh_reals start, bvh_reals end, bvh_reals *low, bvh_reals *high) {
-    const bvh_reals zero = (real)0, place = start / (start - end);
-    *low = start < zero ? bvh_max(*low, place) : *low;
-    *high = end < zero ? bvh_min(*high, place) : *high;
-    *high = ((start < zero) & (end < zero)) ? (bvh_reals)(real)-1 : *high;
+INLINE void cut(reals start, reals end, reals *low, reals *high) {
+    const reals zero = (real)0, place = start / (start - end);
+    *low = start < zero ? lane_max(*low, place) : *low;
+    *high = end < zero ? lane_min(*high, place) : *high;
+    *high = ((start < zero) & (end < zero)) ? (reals)(real)-1 : *high;
 }
 
 // Which triangles hide something; from where to where.
-BVH_INLINE bvh_masks fan_triangles(const Fan *fan, real slack, global const real *leaf, bvh_reals *from, bvh_reals *to) {
-    bvh_reals d[3], a[3], b[3];
+INLINE masks fan_triangles(const Fan *fan, real slack, global const real *leaf, reals *from, reals *to) {
+    reals d[3], a[3], b[3];
     for (int n = 0; n < 3; n++) {
         global const real *at = leaf + 3 * n * WIDTH;
-        const bvh_reals x = BVH_LOAD(at) - fan->apex.x, y = BVH_LOAD(at + WIDTH) - fan->apex.y;
-        const bvh_reals z = BVH_LOAD(at + 2 * WIDTH) - fan->apex.z;
-        const bvh_reals off = fan->across.x * x + fan->across.y * y + fan->across.z * z;
-        d[n] = fabs(off) <= (bvh_reals)fan->flat ? (bvh_reals)(real)0 : off;
+        const reals x = load_reals(at) - fan->apex.x, y = load_reals(at + WIDTH) - fan->apex.y;
+        const reals z = load_reals(at + 2 * WIDTH) - fan->apex.z;
+        const reals off = fan->across.x * x + fan->across.y * y + fan->across.z * z;
+        d[n] = fabs(off) <= (reals)fan->flat ? (reals)(real)0 : off;
         a[n] = fan->a.x * x + fan->a.y * y + fan->a.z * z;
         b[n] = fan->b.x * x + fan->b.y * y + fan->b.z * z;
     }
-    const bvh_reals zero = (real)0, one = (real)1;
-    const bvh_masks s0 = BVH_MASK(d[0] < zero), s1 = BVH_MASK(d[1] < zero), s2 = BVH_MASK(d[2] < zero);
-    const bvh_masks lone_0 = (s0 ^ s1) & (s0 ^ s2), lone_1 = (s1 ^ s0) & (s1 ^ s2), crossed = (s0 ^ s1) | (s0 ^ s2);
+    const reals zero = (real)0, one = (real)1;
+    const masks s0 = mask_of(d[0] < zero), s1 = mask_of(d[1] < zero), s2 = mask_of(d[2] < zero);
+    const masks lone_0 = (s0 ^ s1) & (s0 ^ s2), lone_1 = (s1 ^ s0) & (s1 ^ s2), crossed = (s0 ^ s1) | (s0 ^ s2);
     // The corner alone on its side, and the other two.
-    const bvh_reals dk = lone_0 ? d[0] : lone_1 ? d[1] : d[2], di = lone_0 ? d[1] : d[0];
-    const bvh_reals ak = lone_0 ? a[0] : lone_1 ? a[1] : a[2], ai = lone_0 ? a[1] : a[0];
-    const bvh_reals bk = lone_0 ? b[0] : lone_1 ? b[1] : b[2], bi = lone_0 ? b[1] : b[0];
-    const bvh_masks early = lone_0 | lone_1;
-    const bvh_reals dj = early ? d[2] : d[1], aj = early ? a[2] : a[1], bj = early ? b[2] : b[1];
-    const bvh_reals i = dk / (dk - di), j = dk / (dk - dj);
-    const bvh_reals a0 = ak + i * (ai - ak), b0 = bk + i * (bi - bk), a1 = ak + j * (aj - ak), b1 = bk + j * (bj - bk);
-    bvh_reals low = zero, high = one;
+    const reals dk = lone_0 ? d[0] : lone_1 ? d[1] : d[2], di = lone_0 ? d[1] : d[0];
+    const reals ak = lone_0 ? a[0] : lone_1 ? a[1] : a[2], ai = lone_0 ? a[1] : a[0];
+    const reals bk = lone_0 ? b[0] : lone_1 ? b[1] : b[2], bi = lone_0 ? b[1] : b[0];
+    const masks early = lone_0 | lone_1;
+    const reals dj = early ? d[2] : d[1], aj = early ? a[2] : a[1], bj = early ? b[2] : b[1];
+    const reals i = dk / (dk - di), j = dk / (dk - dj);
+    const reals a0 = ak + i * (ai - ak), b0 = bk + i * (bi - bk), a1 = ak + j * (aj - ak), b1 = bk + j * (bj - bk);
+    reals low = zero, high = one;
     cut(a0, a1, &low, &high);
     cut(b0, b1, &low, &high);
     const real most = (real)1 - slack, least = (real)1 + slack;
     cut(most - a0 - b0, most - a1 - b1, &low, &high);
     cut(fan->per_0 * a0 + fan->per_1 * b0 - least, fan->per_0 * a1 + fan->per_1 * b1 - least, &low, &high);
-    const bvh_reals al = a0 + low * (a1 - a0), bl = b0 + low * (b1 - b0);
-    const bvh_reals ah = a0 + high * (a1 - a0), bh = b0 + high * (b1 - b0);
-    const bvh_reals start = bl / (al + bl), end = bh / (ah + bh);
-    *from = bvh_min(start, end);
-    *to = bvh_max(start, end);
-    return crossed & BVH_MASK(high > low);
+    const reals al = a0 + low * (a1 - a0), bl = b0 + low * (b1 - b0);
+    const reals ah = a0 + high * (a1 - a0), bh = b0 + high * (b1 - b0);
+    const reals start = bl / (al + bl), end = bh / (ah + bh);
+    *from = lane_min(start, end);
+    *to = lane_max(start, end);
+    return crossed & mask_of(high > low);
 }
 
 typedef struct {
@@ -125,7 +125,7 @@ typedef struct {
 } Hidden;
 
 // Adds an interval to those there, in order and apart.
-inline void hide(Hidden *hidden, real from, real to, real gap) {
+static inline void hide(Hidden *hidden, real from, real to, real gap) {
     int first = 0;
     while (first < hidden->count && hidden->to[first] < from - gap) first++;
     int behind = first;
@@ -148,23 +148,23 @@ inline void hide(Hidden *hidden, real from, real to, real gap) {
     hidden->count += 1 - joined;
 }
 
-BVH_INLINE void hide_leaf(const Fan *fan, real slack, global const real *leaf, Hidden *hidden) {
-    bvh_reals from, to;
+INLINE void hide_leaf(const Fan *fan, real slack, global const real *leaf, Hidden *hidden) {
+    reals from, to;
 #ifdef VECTOR_VARIANT
-    uint met = bvh_lanes(fan_triangles(fan, slack, leaf, &from, &to));
+    uint met = lane_bits(fan_triangles(fan, slack, leaf, &from, &to));
     if (!met) return;
     real starts[WIDTH], ends[WIDTH];
-    *(bvh_reals_at *)starts = from, *(bvh_reals_at *)ends = to;
-    for (; met; met &= met - 1) hide(hidden, starts[bvh_lowest(met)], ends[bvh_lowest(met)], slack);
+    *(reals_at *)starts = from, *(reals_at *)ends = to;
+    for (; met; met &= met - 1) hide(hidden, starts[lowest_bit(met)], ends[lowest_bit(met)], slack);
 #else
     for (int lane = 0; lane < WIDTH; lane++)
         if (fan_triangles(fan, slack, leaf + lane, &from, &to)) hide(hidden, from, to, slack);
 #endif
 }
 
-BVH_INLINE uint fan_met(const Fan *fan, global const real *node) {
+INLINE uint fan_met(const Fan *fan, global const real *node) {
 #ifdef VECTOR_VARIANT
-    return bvh_lanes(fan_boxes(fan, node));
+    return lane_bits(fan_boxes(fan, node));
 #else
     uint met = 0;
     for (int lane = 0; lane < WIDTH; lane++) met |= fan_boxes(fan, node + lane) ? 1u << lane : 0;
@@ -172,7 +172,7 @@ BVH_INLINE uint fan_met(const Fan *fan, global const real *node) {
 #endif
 }
 
-inline void hide_all(const bvh_tree *tree, const Fan *fan, real slack, Hidden *hidden) {
+static inline void hide_all(const bvh_tree *tree, const Fan *fan, real slack, Hidden *hidden) {
     int nodes[BVH_DEPTH];
     uint left[BVH_DEPTH];
     int node = 0, depth = 0;
@@ -183,7 +183,7 @@ inline void hide_all(const bvh_tree *tree, const Fan *fan, real slack, Hidden *h
             node = nodes[--depth];
             met = left[depth];
         }
-        const int lane = bvh_lowest(met);
+        const int lane = lowest_bit(met);
         met ^= 1u << lane;
         const int child = tree->children[node * WIDTH + lane];
         if (child < 0) {
@@ -201,7 +201,7 @@ inline void hide_all(const bvh_tree *tree, const Fan *fan, real slack, Hidden *h
 }
 
 // Writes what lies between the hidden ones; returns how many, or -1 if there are too many.
-inline int show(const Hidden *hidden, real slack, uint kept, global real *to) {
+static inline int show(const Hidden *hidden, real slack, uint kept, global real *to) {
     uint count = 0;
     real start = 0;
     for (int n = 0; n <= hidden->count; n++) {

@@ -1,25 +1,30 @@
-// The place (x + back) which a displacement takes to (x, y): Newton's method, for the way back. It is small beside the
-// place, so it keeps its digits in single precision.
+// Inverse of a displacement field by Newton's method: the point (x + back) that the displacement moves to (x, y).
 //
-// Who includes this defines NEWTON_STEP(x, y, back_x, back_y, table, &step_x, &step_y, &left): the Newton step from
-// (x, y) + back, and the squared distance `left` there; it returns where the place is in the part that is one-to-one.
+// `back` is small compared with the point, so it keeps its digits in single precision.
+//
+// The includer defines NEWTON_STEP(x, y, back_x, back_y, table, &step_x, &step_y, &left): the Newton step from
+// (x, y) + back and the squared remaining distance `left` there. It returns the mask of points at which the field is
+// invertible.
 #ifndef NEWTON_H
 #define NEWTON_H
 #include "common/lanes.h"
 
 #define NEWTON_STEPS 100
-// Squares, relative to the place's own: of a distance or step that is rounding, and of a step that leads nowhere.
+// Squared limits, relative to the squared distance from the centre: a distance or step that is rounding (64 eps^2), and a
+// step so small that halving it further is useless (eps^2 / 64).
 #define NEWTON_ROUNDING ((real)(64 * REAL_EPSILON * REAL_EPSILON))
 #define NEWTON_STUCK ((real)(REAL_EPSILON * REAL_EPSILON / 64))
 
-// The way back for the places that are wanted, from a guess of it. A step that leaves the one-to-one part or gains
-// nothing over the centre, where nothing is displaced, and whatever came after, is halved. The answer is where the
-// distance left, or the step ahead, is rounding; at the fold, where the search for a place past it ends, neither is.
-// Returns where there is none.
+// Find `back` for the wanted points, from a start value in *back_x, *back_y.
+//
+// The search starts at the centre, where the displacement is 0, with a step to the start value. A step that leaves the
+// invertible region, or does not reduce the distance, is halved. The search converges where the remaining distance or the
+// next step is rounding. For a point beyond the fold of the lens the search ends at the fold, where neither is.
+// Returns the mask of points without a solution.
 static inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant real *table, reals *back_x, reals *back_y) {
     const reals own_x = zero_where(~wanted, x), own_y = zero_where(~wanted, y), square = own_x * own_x + own_y * own_y;
     reals at_x = -own_x, at_y = -own_y, left = square, ahead = square;
-    // A guess may be no number, where it comes from a search that did not settle.
+    // A start value is NaN where it comes from a search that did not converge: the comparison rejects it.
     const masks guessed = wanted & mask_of(*back_x * *back_x + *back_y * *back_y < square);
     reals step_x = own_x + zero_where(~guessed, *back_x), step_y = own_y + zero_where(~guessed, *back_y);
     masks open = wanted;
@@ -38,7 +43,7 @@ static inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant 
         open = mask_of(left > NEWTON_ROUNDING * square) & mask_of(ahead > NEWTON_ROUNDING * square) &
                mask_of(size > NEWTON_STUCK * square);
     }
-    // The last step is still to come, or next to nothing.
+    // Apply the last step; it is rounding where the search converged.
     *back_x = wanted ? at_x + step_x : *back_x;
     *back_y = wanted ? at_y + step_y : *back_y;
     return wanted & mask_of(left > NEWTON_ROUNDING * square) & mask_of(ahead > NEWTON_ROUNDING * square);

@@ -176,19 +176,13 @@ static inline real error_of(const receivers_block *block, global const real *row
     return per * per * per * (row[FIRST_ORDER] + per * beyond) * PER_PI * UP;
 }
 
-#ifdef VECTOR_VARIANT
-#define RECEIVER_LANE(from) (*(const reals_at *)(from))
-#else
-#define RECEIVER_LANE(from) (*(from))
-#endif
-
 // What a watt of a segment costs at most at a lane's receiver, times pi.
 INLINE reals most_of_lane(const real *lane, global const real *lit, real length, real rounding) {
     const reals zero = (reals)0, one = (reals)1;
-    const reals nx = RECEIVER_LANE(lane + 3 * WIDTH), ny = RECEIVER_LANE(lane + 4 * WIDTH);
-    const reals nz = RECEIVER_LANE(lane + 5 * WIDTH), cost = RECEIVER_LANE(lane + 6 * WIDTH);
-    const reals x = RECEIVER_LANE(lane) - lit[4], y = RECEIVER_LANE(lane + WIDTH) - lit[5];
-    const reals z = RECEIVER_LANE(lane + 2 * WIDTH) - lit[6];
+    const reals nx = load_private(lane + 3 * WIDTH), ny = load_private(lane + 4 * WIDTH);
+    const reals nz = load_private(lane + 5 * WIDTH), cost = load_private(lane + 6 * WIDTH);
+    const reals x = load_private(lane) - lit[4], y = load_private(lane + WIDTH) - lit[5];
+    const reals z = load_private(lane + 2 * WIDTH) - lit[6];
     const real dx = lit[7] - lit[4], dy = lit[8] - lit[5], dz = lit[9] - lit[6];
     const reals up = x * lit[0] + y * lit[1] + z * lit[2];
     const reals start = -(nx * x + ny * y + nz * z);

@@ -28,14 +28,6 @@ typedef struct {
     real radius, slab, spread, most_height;
 } extent;
 
-INLINE int any_of(masks mask) {
-#ifdef VECTOR_VARIANT
-    return lane_bits(mask) != 0;
-#else
-    return mask != 0;
-#endif
-}
-
 INLINE vectors corner_of(global const real *leaf, int corner) {
     global const real *at = leaf + 3 * corner * WIDTH;
     const vectors v = {load_reals(at), load_reals(at + WIDTH), load_reals(at + 2 * WIDTH)};
@@ -90,10 +82,10 @@ INLINE void between(const extent *many, vectors n, reals size, reals level, real
 INLINE int hides(const shaft *hull, const receivers_block *block, const extent *got, const extent *out,
                      global const real *lit, int count, real margin, global const real *leaf) {
     masks left = shaft_leaf(hull, leaf);
-    if (!any_of(left)) return 0;
+    if (!any_compared(left)) return 0;
     const vectors a = corner_of(leaf, 0), b = corner_of(leaf, 1), c = corner_of(leaf, 2);
     left &= mask_of(lane_max(rise(got, a), lane_max(rise(got, b), rise(got, c))) > margin);
-    if (!any_of(left)) return 0;
+    if (!any_compared(left)) return 0;
     const vectors p = {b.x - a.x, b.y - a.y, b.z - a.z}, q = {c.x - a.x, c.y - a.y, c.z - a.z};
     const vectors n = cross(p, q);
     const reals level = n.x * a.x + n.y * a.y + n.z * a.z, slack = margin * size_of(n);
@@ -108,7 +100,7 @@ INLINE int hides(const shaft *hull, const receivers_block *block, const extent *
         lit += PLACED;
     }
     left &= above | below;
-    if (!any_of(left)) return 0;
+    if (!any_compared(left)) return 0;
     for (int i = 0; i < block->count; i++) {
         const real *place = block->places + 3 * i, *normal = block->normals + 3 * i;
         const vectors u = from(a, place), v = from(b, place), w = from(c, place);
@@ -116,7 +108,7 @@ INLINE int hides(const shaft *hull, const receivers_block *block, const extent *
         const reals side = along(n, place[0], place[1], place[2]) - level;
         masks may = left & mask_of(top > margin);
         may &= (mask_of(side > slack) & below) | (mask_of(side < -slack) & above);
-        if (!any_of(may)) continue;
+        if (!any_compared(may)) continue;
         // The cone from the receiver over the triangle: inside is where all edges have the sign of `side`, turned.
         const vectors edges[3] = {cross(u, v), cross(v, w), cross(w, u)};
         for (int edge = 0; edge < 3; edge++) {
@@ -124,9 +116,9 @@ INLINE int hides(const shaft *hull, const receivers_block *block, const extent *
             reals first, last;
             between(out, m, size_of(m), along(m, place[0], place[1], place[2]), &first, &last);
             may &= (mask_of(side < 0) & mask_of(last > 0)) | (mask_of(side > 0) & mask_of(first < 0));
-            if (!any_of(may)) break;
+            if (!any_compared(may)) break;
         }
-        if (any_of(may)) return 1;
+        if (any_compared(may)) return 1;
     }
     return 0;
 }

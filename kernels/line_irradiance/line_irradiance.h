@@ -1,10 +1,12 @@
-// Irradiance of a receiver from a diffuse line segment, in the segment's own frame: lengths along it (tau), and the
-// distance rho of the receiver from its line.
+// Irradiance of a differential receiver from a diffuse line segment, in closed form.
+//
+// Coordinates: tau along the segment's line from the foot of the receiver on it; rho, the receiver's distance from the
+// line.
 #ifndef LINE_IRRADIANCE_H
 #define LINE_IRRADIANCE_H
 #include "common/lanes.h"
 
-// Q of atan(z) = z - z^3 Q(z^2) on [0, 1], minimax: to 1.6e-8 in single, 8e-19 in double.
+// Polynomial Q in atan(z) = z - z^3 Q(z^2) on [0, 1]; minimax (Remez), error 1.6e-8 in single, 8e-19 in double.
 static inline __attribute__((always_inline)) reals LANED(arc_rest)(reals w) {
 #ifdef REAL_IS_DOUBLE
     reals rest = (reals)-7.76762433028991855e-6;
@@ -42,7 +44,7 @@ static inline __attribute__((always_inline)) reals LANED(arc_rest)(reals w) {
 #endif
 }
 
-// R of 2 atan(t) - sin(2 atan(t)) = t^3 R(t^2) on [0, 1]: in single to 1e-8, minimax, and rounding.
+// Function R in 2 atan(t) - sin(2 atan(t)) = t^3 R(t^2) on [0, 1]; single: rational minimax, error 1e-8 and rounding.
 static inline __attribute__((always_inline)) reals LANED(arc_less_sine)(reals w) {
 #ifdef REAL_IS_DOUBLE
     return (real)2 * ((real)1 / ((real)1 + w) - LANED(arc_rest)(w));
@@ -52,36 +54,31 @@ static inline __attribute__((always_inline)) reals LANED(arc_less_sine)(reals w)
 #endif
 }
 
-// Whether the mask is set in any lane. (An or over comparisons is one instruction, where the compiler sees that it is.)
-#if defined(VECTOR_VARIANT) && __has_builtin(__builtin_reduce_or)
-#define any_of(mask) (__builtin_reduce_or(mask) != 0)
-#else
-#define any_of any_lane
-#endif
-
-// Irradiance over exitance, times 2 pi. `tau1` and `tau2` are the ends of the segment along its line, from the foot of
-// the receiver on it, `length` is what is between them and `length2` its square; `height` and `aside` are where the
-// receiver stands above the lit surface and across it; `by_u` is its normal along the line, `foot` how far before its
-// plane the foot is.
+// Irradiance over exitance, times 2 pi.
 //
-// With theta the angle under which the receiver sees what lies before its plane, sigma the sum of the angles of both
-// ends from the foot, 2 int (foot + by_u tau) / (tau^2 + rho^2)^2 dtau is
-//     foot / rho^3 (theta - sin theta + sin theta (1 + cos sigma)) + by_u / rho^2 sin theta sin sigma.
-// Neither term of the bracket is negative, and both are had without a difference: the first from tan(theta / 2), the
-// second beyond an end as sin^2 sigma / (1 - cos sigma). So one form holds near, far, and end-on. On the CPUs products
-// and sums are what it costs; divisions pass beside them.
+// tau1, tau2: ends of the segment; length, length2: tau2 - tau1 and its square; height, aside: position of the receiver
+// above the lit surface and across the line; by_u: component of the receiver's normal along the line; foot: distance of
+// the foot in front of the receiver's plane.
+//
+// With theta, the angle under which the receiver sees the part of the segment in front of its plane, and sigma, the sum of
+// the angles of both ends from the foot,
+//     2 int (foot + by_u tau) / (tau^2 + rho^2)^2 dtau
+//         = foot / rho^3 (theta - sin theta + sin theta (1 + cos sigma)) + by_u / rho^2 sin theta sin sigma.
+// Both terms of the bracket are >= 0, and each is computed without a difference: the first from tan(theta / 2), the second
+// as sin^2 sigma / (1 - cos sigma) where cos sigma < 0. So one form is accurate near, far and end-on. The cost is products
+// and sums; divisions run beside them on current CPUs.
 static inline __attribute__((always_inline)) reals LANED(end_factor)(reals tau1, reals tau2, reals length, reals length2,
                                                              reals height, reals aside, reals by_u, reals foot) {
     const reals zero = (reals)0;
     masks lit = mask_of(height > zero);
-    // How far before the receiver's plane the segment's ends are.
+    // Distances of the segment's ends in front of the receiver's plane.
     const reals first = foot + by_u * tau1, last = foot + by_u * tau2;
     const reals least = first < last ? first : last;
-    if (any_of(mask_of(least < zero))) {
+    if (any_compared(mask_of(least < zero))) {
         const reals most = first < last ? last : first;
         lit &= mask_of(most > zero);
-        if (!any_of(lit)) return zero;
-        // The cut from the foot, where both are near; what is left from the end, where it is little.
+        if (!any_compared(lit)) return zero;
+        // Cut at the plane: its position from the foot, the remaining length from the far end; each without a difference.
         const reals cut = -foot / by_u, left = most / fabs(by_u);
         const masks cut_first = mask_of(first < zero), cut_last = mask_of(last < zero);
         const masks is_cut = mask_of(least < zero) & mask_of(left < length);
@@ -90,8 +87,8 @@ static inline __attribute__((always_inline)) reals LANED(end_factor)(reals tau1,
         tau1 = cut_first ? cut : tau1;
         tau2 = cut_last ? cut : tau2;
     }
-    // reach: the distances of both ends multiplied. Times it, sin theta, cos theta, sin sigma and cos sigma are
-    // length rho, cosine, sum rho and flat. Sines and tan(theta / 2) are had over rho: rho itself is not needed.
+    // reach: product of the distances of both ends. sin theta, cos theta, sin sigma, cos sigma times reach are length rho,
+    // cosine, sum rho, flat. Sines and tan(theta / 2) are computed over rho, so rho itself (a root) is not needed.
     const reals square = height * height + aside * aside, product = tau1 * tau2, sum = tau1 + tau2;
     const reals cosine = square + product, flat = square - product;
     const reals both = cosine * cosine + length2 * square, reach = sqrt(both);
@@ -100,7 +97,7 @@ static inline __attribute__((always_inline)) reals LANED(end_factor)(reals tau1,
     // reach (1 + cos sigma), and that of theta - sin theta
     const reals above = flat < zero ? sum * sum * square / wide : wide;
     reals cube = tangent * w, bracket = sine * above;
-    if (any_of(mask_of(cosine < zero))) {
+    if (any_compared(mask_of(cosine < zero))) {
         const masks obtuse = mask_of(cosine < zero);
         const reals turn = (real)3.14159265358979323846 / sqrt(square) - (real)2 * (reach * sine);
         bracket = obtuse ? bracket + turn : bracket;
@@ -108,11 +105,11 @@ static inline __attribute__((always_inline)) reals LANED(end_factor)(reals tau1,
     }
     bracket += cube * LANED(arc_less_sine)(w);
     const reals integral = by_u * sum * sine + foot / square * bracket;
-    // Rounding may leave less than nothing at the horizon.
+    // Rounding can make the result negative at the horizon; clamp it.
     return zero_where(~lit, (integral > zero ? integral : zero) * height);
 }
 
-// The same from where the receiver stands along the line from its start, and what is left from there to its end.
+// The same for the receiver's position along the line from its start, and the distance from there to its end.
 static inline __attribute__((always_inline)) reals LANED(line_factor)(reals along, reals height, reals aside, reals end,
                                                               reals whole, reals by_u, reals by_n, reals by_w) {
     return LANED(end_factor)(-along, end, whole, whole * whole, height, aside, by_u, -(by_n * height + by_w * aside));

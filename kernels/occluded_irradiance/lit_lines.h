@@ -1,55 +1,42 @@
-// Lit segments by columns, and the lines on which they lie: segments of one line, like those of a sheet of light on a
-// board between its parts, are looked at together.
+// Lit segments in structure-of-arrays form, grouped by the line on which they lie.
+//
+// Segments on one line, such as those of a sheet of light on a board between its parts, share one visibility traversal.
 #ifndef LIT_LINES_H
 #define LIT_LINES_H
-#include "occluded_irradiance/places.h"
+#include "common/places.h"
 #include "common/status.h"
 #include "occluded_irradiance/visible.h"
 
-// Of places, how far they may be off a line; of unit normals, by how much they may differ.
+// Relative tolerance of "on one line": distances from the line over coordinates, and differences of unit vectors.
 #define LINE_SLACK ((real)8 * (real)REAL_EPSILON)
 
+// Number of segments that are processed together.
 #ifdef VECTOR_VARIANT
-// Segments that are taken together.
 #define SEGMENTS 32
-#define LOAD_PLACES(from) (*(const places_at *)(from))
-#define narrow convert_real16
-#define STORE_LANES(value, to) (*(reals_at *)(to) = (value))
-#define LOAD_LANES(from) (*(const reals_at *)(from))
-#define STORE_PLACES(value, to) (*(places_at *)(to) = (value))
-#define NARROW_MASK(comparison) convert_bits16(comparison)
-#define lanes_of lane_bits
 #else
 #define SEGMENTS 1
-#define LOAD_PLACES(from) (*(from))
-#define narrow convert_real
-#define STORE_LANES(value, to) (*(to) = (value))
-#define LOAD_LANES(from) (*(from))
-#define STORE_PLACES(value, to) (*(to) = (value))
-#define NARROW_MASK(comparison) (-(bits)(comparison))
-#define lanes_of(mask) ((mask) ? 1u : 0u)
 #endif
 
-// Starts and frames of segments, `off` being the normals of their surfaces.
+// Starts and frames of segments: `along` the segment, `off` normal to its surface, `across` both.
 typedef struct {
     place x[SEGMENTS], y[SEGMENTS], z[SEGMENTS], along_x[SEGMENTS], along_y[SEGMENTS], along_z[SEGMENTS];
     place off_x[SEGMENTS], off_y[SEGMENTS], off_z[SEGMENTS], across_x[SEGMENTS], across_y[SEGMENTS], across_z[SEGMENTS];
     place length[SEGMENTS];
 } frames;
 
-// Segments that are taken together, and the lines on which they lie, each from the first to the last of its segments.
-// Sets are bits.
+// Segments that are processed together, and their lines, each from its first to its last segment. Sets of segments are
+// bit masks.
 typedef struct {
     frames each, lines;
-    real exitance[SEGMENTS];             // over 2 pi
-    real begin[SEGMENTS], end[SEGMENTS]; // of a segment, on its line from 0 to 1
-    uint members[SEGMENTS];              // of a line
-    uint lit, unseen, is_good;
+    real exitance[SEGMENTS];             // exitance / (2 pi)
+    real begin[SEGMENTS], end[SEGMENTS]; // position of a segment on its line, which runs from 0 to 1
+    uint members[SEGMENTS];              // set of segments of a line
+    uint lit, unseen, is_good; // segments that emit; that nothing can hide; whether all numbers are finite
     int line_count;
 } chunk;
 
-// Frames of LANES segments from `first` on, by their numbers; the last again where there are fewer.
-void load_frames(global const INPUT *rows, const uint *numbers, uint count, uint first, constant place *middle,
+// Load the frames of LANES segments from `first` on, by their indices; repeat the last one to fill the lanes.
+static void load_frames(global const INPUT *rows, const uint *numbers, uint count, uint first, constant place *middle,
                  chunk *all) {
     place at[10][LANES];
     for (uint lane = 0; lane < LANES; lane++) {
@@ -58,56 +45,62 @@ void load_frames(global const INPUT *rows, const uint *numbers, uint count, uint
         for (int k = 3; k < 6; k++) at[k][lane] = (place)row[k] - (place)row[k - 3];
         for (int k = 6; k < 10; k++) at[k][lane] = row[k];
     }
-    const places x = LOAD_PLACES(at[0]), y = LOAD_PLACES(at[1]), z = LOAD_PLACES(at[2]), zero = (places)0;
-    places ux = LOAD_PLACES(at[3]), uy = LOAD_PLACES(at[4]), uz = LOAD_PLACES(at[5]);
-    places nx = LOAD_PLACES(at[6]), ny = LOAD_PLACES(at[7]), nz = LOAD_PLACES(at[8]);
+    const places x = load_places(at[0]), y = load_places(at[1]), z = load_places(at[2]), zero = (places)0;
+    places ux = load_places(at[3]), uy = load_places(at[4]), uz = load_places(at[5]);
+    places nx = load_places(at[6]), ny = load_places(at[7]), nz = load_places(at[8]);
     const places square = ux * ux + uy * uy + uz * uz, lean = ux * nx + uy * ny + uz * nz;
     nx = square * nx - lean * ux, ny = square * ny - lean * uy, nz = square * nz - lean * uz;
     const places size = fabs(nx) + fabs(ny) + fabs(nz);
-    const reals exitance = narrow(LOAD_PLACES(at[9]) * (place)0.15915494309189533577);
-    const masks emits = mask_of(exitance > (reals)0) & NARROW_MASK(square > zero);
-    const masks bad = LANED(not_finite)(narrow(x + y + z)) | LANED(not_finite)(narrow(square + size)) |
-                      LANED(not_finite)(exitance) | (emits & NARROW_MASK(size == zero));
+    const reals exitance = convert_to_reals(load_places(at[9]) * (place)0.15915494309189533577);
+    const masks emits = mask_of(exitance > (reals)0) & mask_of_places(square > zero);
+    const masks bad = LANED(not_finite)(convert_to_reals(x + y + z)) | LANED(not_finite)(convert_to_reals(square + size)) |
+                      LANED(not_finite)(exitance) | (emits & mask_of_places(size == zero));
     const uint present = (uint)((1ul << min((uint)LANES, count - first)) - 1);
-    all->is_good &= !(lanes_of(bad) & present);
-    all->lit |= (lanes_of(emits & ~bad) & present) << first;
+    all->is_good &= !(lane_bits(bad) & present);
+    all->lit |= (lane_bits(emits & ~bad) & present) << first;
     const places length = sqrt(square), per = (place)1 / length;
     const places per_size = (place)1 / sqrt(nx * nx + ny * ny + nz * nz);
     ux *= per, uy *= per, uz *= per, nx *= per_size, ny *= per_size, nz *= per_size;
     frames *to = &all->each;
-    STORE_PLACES(x, to->x + first), STORE_PLACES(y, to->y + first), STORE_PLACES(z, to->z + first);
-    STORE_PLACES(ux, to->along_x + first), STORE_PLACES(uy, to->along_y + first), STORE_PLACES(uz, to->along_z + first);
-    STORE_PLACES(nx, to->off_x + first), STORE_PLACES(ny, to->off_y + first), STORE_PLACES(nz, to->off_z + first);
-    STORE_PLACES(uy * nz - uz * ny, to->across_x + first), STORE_PLACES(uz * nx - ux * nz, to->across_y + first);
-    STORE_PLACES(ux * ny - uy * nx, to->across_z + first), STORE_PLACES(length, to->length + first);
-    STORE_LANES(exitance, all->exitance + first);
+    store_places(x, to->x + first), store_places(y, to->y + first), store_places(z, to->z + first);
+    store_places(ux, to->along_x + first), store_places(uy, to->along_y + first), store_places(uz, to->along_z + first);
+    store_places(nx, to->off_x + first), store_places(ny, to->off_y + first), store_places(nz, to->off_z + first);
+    store_places(uy * nz - uz * ny, to->across_x + first), store_places(uz * nx - ux * nz, to->across_y + first);
+    store_places(ux * ny - uy * nx, to->across_z + first), store_places(length, to->length + first);
+    store_private(exitance, all->exitance + first);
 }
 
-// Which segments lie on the line of one, run the same way, and are lit on the same side.
-uint on_line_of(const frames *each, int one, uint last) {
+// Absolute difference of a component of LANES segments from that of segment `one`.
+static inline reals change_of(const place *component, uint first, int one) {
+    return fabs(convert_to_reals(load_places(component + first) - component[one]));
+}
+
+// Set of segments that lie on the line of segment `one`, have its direction, and emit on the same side.
+static uint on_line_of(const frames *each, int one, uint last) {
     const place x = each->x[one], y = each->y[one], z = each->z[one];
     const place ux = each->along_x[one], uy = each->along_y[one], uz = each->along_z[one];
     const real slack = LINE_SLACK * (real)(fabs(x) + fabs(y) + fabs(z) + each->length[one]);
     uint found = 0;
     for (uint first = 0; first < last; first += LANES) {
-        const places dx = LOAD_PLACES(each->x + first) - x, dy = LOAD_PLACES(each->y + first) - y;
-        const places dz = LOAD_PLACES(each->z + first) - z, at = dx * ux + dy * uy + dz * uz;
-        const reals off_x = fabs(narrow(dx - at * ux)), off_y = fabs(narrow(dy - at * uy));
-        const reals off_z = fabs(narrow(dz - at * uz));
+        const places dx = load_places(each->x + first) - x, dy = load_places(each->y + first) - y;
+        const places dz = load_places(each->z + first) - z, at = dx * ux + dy * uy + dz * uz;
+        const reals off_x = fabs(convert_to_reals(dx - at * ux)), off_y = fabs(convert_to_reals(dy - at * uy));
+        const reals off_z = fabs(convert_to_reals(dz - at * uz));
         masks is_on = mask_of(off_x <= slack) & mask_of(off_y <= slack) & mask_of(off_z <= slack);
-        const reals length = narrow(LOAD_PLACES(each->length + first));
-#define TURNED(name) fabs(narrow(LOAD_PLACES(each->name + first) - each->name[one]))
-        is_on &= mask_of(length * TURNED(along_x) <= slack) & mask_of(length * TURNED(along_y) <= slack) &
-                 mask_of(length * TURNED(along_z) <= slack) & mask_of(TURNED(off_x) <= LINE_SLACK) &
-                 mask_of(TURNED(off_y) <= LINE_SLACK) & mask_of(TURNED(off_z) <= LINE_SLACK);
-#undef TURNED
-        found |= lanes_of(is_on) << first;
+        const reals length = convert_to_reals(load_places(each->length + first));
+        is_on &= mask_of(length * change_of(each->along_x, first, one) <= slack) &
+                 mask_of(length * change_of(each->along_y, first, one) <= slack) &
+                 mask_of(length * change_of(each->along_z, first, one) <= slack) &
+                 mask_of(change_of(each->off_x, first, one) <= LINE_SLACK) &
+                 mask_of(change_of(each->off_y, first, one) <= LINE_SLACK) &
+                 mask_of(change_of(each->off_z, first, one) <= LINE_SLACK);
+        found |= lane_bits(is_on) << first;
     }
     return found;
 }
 
-// The line from the first to the last of its members.
-void add_line(chunk *all, uint members) {
+// Append the line from the first to the last of its member segments.
+static void add_line(chunk *all, uint members) {
     const frames *each = &all->each;
     const int one = lowest_bit(members), n = all->line_count++;
     const place ux = each->along_x[one], uy = each->along_y[one], uz = each->along_z[one];
@@ -131,7 +124,7 @@ void add_line(chunk *all, uint members) {
     all->members[n] = members;
 }
 
-void load_chunk(global const INPUT *rows, const uint *numbers, uint count, constant place *middle, chunk *all) {
+static void load_chunk(global const INPUT *rows, const uint *numbers, uint count, constant place *middle, chunk *all) {
     all->lit = 0, all->line_count = 0, all->is_good = 1;
     for (uint first = 0; first < count; first += LANES) load_frames(rows, numbers, count, first, middle, all);
     for (uint left = all->lit; left;) {
@@ -144,8 +137,8 @@ void load_chunk(global const INPUT *rows, const uint *numbers, uint count, const
 }
 
 #ifdef PICKED
-// Takes picks from `next` on; returns where to go on.
-int load_picked(global const INPUT *rows, global const int *picks, int next, int end, uint segment_count,
+// Load picked segments from pick `next` on; return the next pick.
+static int load_picked(global const INPUT *rows, global const int *picks, int next, int end, uint segment_count,
                 constant place *middle, chunk *all, uchar *flag) {
     uint numbers[SEGMENTS], count = 0;
     all->unseen = 0;
@@ -163,7 +156,7 @@ int load_picked(global const INPUT *rows, global const int *picks, int next, int
     return next;
 }
 #else
-void load_from(global const INPUT *rows, int first, int end, constant place *middle, chunk *all) {
+static void load_from(global const INPUT *rows, int first, int end, constant place *middle, chunk *all) {
     uint numbers[SEGMENTS];
     const uint count = (uint)min(SEGMENTS, end - first);
     for (uint n = 0; n < count; n++) numbers[n] = (uint)first + n;

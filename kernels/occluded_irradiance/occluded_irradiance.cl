@@ -1,37 +1,44 @@
-// Irradiance of a sensor strip's receivers from all lit segments, as far as each sees them, and what it adds to the
-// strip's two currents. A CPU's work-item has several strips and takes their receivers 16 at a time, a GPU's work-group
-// has one and takes an item per receiver.
+// Irradiance of the receivers of a sensor strip from all lit segments, with occlusion, and the strip's two currents.
 //
-// Segments on one line, like those of a sheet of light on a board between its parts, are looked at together. Facing
-// comes first: of the few pairs of receivers and lines left, what is seen is found one after another (visible.h, or
-// shadow rays to parts of each segment), and the pieces wait until 16 of them, of any receiver and segment, are worth
-// the closed form.
+// E = sum over segments of the closed form of line_irradiance.h, over the part of each segment that the receiver sees.
+// The currents are sums of E times two weights per receiver.
+//
+// Inputs:  receivers (strips, each, 6) position [m] and normal; weights (strips, each, 2); segments (n, 10) start, end,
+//          surface normal, exitance [W/m2]; with PICKED also starts (lists + 1) and picks, the segments of each list
+//          (list: PICK_BLOCK receivers; a pick ~k is segment k, which nothing can hide).
+// Outputs: irradiance (strips, each) [W/m2]; left, right (strips,); status (strips, each) flags.
+// Options: INPUT (type of the inputs), REAL_IS_DOUBLE, WIDE_PLACES, PICKED, GROUP (size of a work-group), BVH_DEPTH;
+//          INTERVALS (exact visibility, visible.h), RAYS (shadow rays to `samples` parts of a segment), or neither
+//          (no occlusion).
+// Variants: vector: a work-item per share of the strips, 16 receivers at a time; work-item: a work-group per strip, an
+//          item per receiver.
+//
+// Order of work: (1) facing tests of 16 receivers with a line reject most pairs; (2) the visible parts of the remaining
+// pairs are found one pair at a time; (3) the visible parts of any receivers and segments are collected until 16 of them
+// fill the vectors of the closed form.
 #include "line_irradiance/line_irradiance.h"
 #include "occluded_irradiance/lit_lines.h"
 #include "common/status.h"
 #include "occluded_irradiance/visible.h"
 
-// Receivers that share a list of picked segments.
+// Number of receivers that share a list of picked segments.
 #define PICK_BLOCK 16
-// Of how high either stands above the other's surface: a clearance takes no more of it.
-#define LEAST_SHARE ((real)0.5)
+// The clearance takes at most this fraction of the height of either end above the other's surface.
+#define CLEARANCE_SHARE ((real)0.5)
 
-// Which segments are loaded: those from so many on, or none.
-#define NONE_HELD (-1)
-
-// Receivers, in the frame of a segment: as line_irradiance.h takes them.
+// Receivers in the frame of a segment, as line_irradiance.h takes them.
 typedef struct {
     real along[LANES], height[LANES], aside[LANES], past[LANES], by_u[LANES], by_n[LANES], by_w[LANES];
-    real toward[LANES], toward_end[LANES]; // how far above the receiver's plane the segment's ends are
+    real toward[LANES], toward_end[LANES]; // height of the segment's ends above the receiver's plane
 } facing;
 
-// Receivers before a line, in its frame and those of its segments, and which of them see any of each.
+// Receivers in front of a line, in the line's frame and in those of its segments, and the lanes that face each segment.
 typedef struct {
     facing whole, own[SEGMENTS];
     uint lanes[SEGMENTS];
 } before;
 
-// What waits for the closed form: visible parts of segments, each with its lane's receiver.
+// Visible parts of segments that wait for the closed form, each with the lane of its receiver.
 typedef struct {
     real along[LANES], height[LANES], aside[LANES], past[LANES], length[LANES], by_u[LANES], by_n[LANES], by_w[LANES];
     real exitance[LANES];
@@ -39,21 +46,21 @@ typedef struct {
     int count;
 } pieces;
 
-// The closed form for what waits.
-__attribute__((noinline)) void finish(pieces *waiting, place *sums) {
+// Evaluate the closed form of the waiting parts; unused lanes have height 0, which gives 0.
+static __attribute__((noinline)) void finish(pieces *waiting, place *sums) {
     for (int n = waiting->count; n < LANES; n++) waiting->height[n] = 0;
-    const reals factor = LANED(line_factor)(LOAD_LANES(waiting->along), LOAD_LANES(waiting->height),
-                                            LOAD_LANES(waiting->aside), LOAD_LANES(waiting->past),
-                                            LOAD_LANES(waiting->length), LOAD_LANES(waiting->by_u),
-                                            LOAD_LANES(waiting->by_n), LOAD_LANES(waiting->by_w));
+    const reals factor = LANED(line_factor)(load_private(waiting->along), load_private(waiting->height),
+                                            load_private(waiting->aside), load_private(waiting->past),
+                                            load_private(waiting->length), load_private(waiting->by_u),
+                                            load_private(waiting->by_n), load_private(waiting->by_w));
     real light[LANES];
-    STORE_LANES(LOAD_LANES(waiting->exitance) * factor, light);
+    store_private(load_private(waiting->exitance) * factor, light);
     for (int n = 0; n < waiting->count; n++) sums[waiting->lane[n]] += light[n];
     waiting->count = 0;
 }
 
-// A lane's receiver sees segment k from `start` to `stop` of its length.
-__attribute__((noinline)) void add_piece(const chunk *lit, int k, const facing *all, int lane, real start, real stop,
+// Append the part of segment k from fraction `start` to `stop` that the receiver of a lane sees.
+static __attribute__((noinline)) void add_piece(const chunk *lit, int k, const facing *all, int lane, real start, real stop,
                                          pieces *waiting, place *sums) {
     if (!(start < stop)) return;
     const int n = waiting->count++;
@@ -70,8 +77,8 @@ __attribute__((noinline)) void add_piece(const chunk *lit, int k, const facing *
 }
 
 #ifdef INTERVALS
-// (x, y, z) is the receiver and (nx, ny, nz) its normal.
-view view_from(const frames *of, int n, const facing *all, int lane, real x, real y, real z, real nx, real ny, real nz,
+// View of a line from a receiver at (x, y, z) with normal (nx, ny, nz).
+static view view_from(const frames *of, int n, const facing *all, int lane, real x, real y, real z, real nx, real ny, real nz,
                real clearance) {
     view v;
     const real height = all->height[lane], aside = all->aside[lane], along = all->along[lane];
@@ -89,20 +96,20 @@ view view_from(const frames *of, int n, const facing *all, int lane, real x, rea
     v.along_x = (depth * ux + along * v.deep_x) * per_length;
     v.along_y = (depth * uy + along * v.deep_y) * per_length;
     v.along_z = (depth * uz + along * v.deep_z) * per_length;
-    const real over = fmin(clearance, LEAST_SHARE * height);
+    const real over = fmin(clearance, CLEARANCE_SHARE * height);
     v.far = depth - depth * (over / height);
-    v.lift = fmin(clearance, LEAST_SHARE * most);
+    v.lift = fmin(clearance, CLEARANCE_SHARE * most);
     v.lift_deep = toward * per, v.lift_along = (all->toward_end[lane] - toward) * per;
     v.near = fmax(depth * (v.lift / most), depth * (real)1e-12);
     view_set_plane(&v);
-    // Above the lit surface, and above the receiver's own.
+    // Occluders lie above the lit surface and above the receiver's surface.
     v.halves[4] = view_half_of(&v, ex, ey, ez, over - height);
     v.halves[5] = view_half_of(&v, nx, ny, nz, v.lift);
     return v;
 }
 
-// What a lane's receiver sees of segment k, if it sees the line from `from` to `to` but for what is hidden, in order.
-void add_seen(const hidden *dark, real from, real to, const chunk *lit, int k, const facing *own, int lane,
+// Append the visible parts of segment k: the part of the line from `from` to `to` without the sorted hidden intervals.
+static void add_seen(const hidden *dark, real from, real to, const chunk *lit, int k, const facing *own, int lane,
               pieces *waiting, place *sums) {
     const real begin = lit->begin[k], end = lit->end[k], per = (real)1 / (end - begin), stop = fmin(to, end);
     real start = fmax(from, begin);
@@ -114,11 +121,11 @@ void add_seen(const hidden *dark, real from, real to, const chunk *lit, int k, c
     }
 }
 
-// What a lane's receiver sees of a line's segments. Returns whether all is found: it is, unless there is more to keep
-// than fits even in a small part of the line.
-int add_visible(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, view *v, int *hint,
+// Append the visible parts of a line's segments for the receiver of a lane. Returns 0 if the hidden intervals exceed the
+// capacity even in the smallest window: the result is then incomplete (AMBIGUOUS).
+static int add_visible(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, view *v, int *hint,
                 pieces *waiting, place *sums) {
-    // What is above the receiver's plane; the closed form cuts it exactly.
+    // Part above the receiver's plane, widened by rounding; the closed form cuts it exactly.
     const real toward = all->whole.toward[lane], toward_end = all->whole.toward_end[lane];
     const real slack = (real)8 * (real)REAL_EPSILON, horizon = toward / (toward - toward_end);
     const real begin = toward < 0 ? fmax(horizon - slack, (real)0) : 0;
@@ -135,7 +142,7 @@ int add_visible(const bvh_tree *tree, const chunk *lit, int line, const before *
         }
         is_whole &= !dark.is_full;
         hidden_sort(&dark);
-        // To a horizon and a little beyond, so that the end itself need not be rounded.
+        // Extend an end that lies at the horizon to the end of the line: the closed form cuts there exactly.
         const real first = dark.from == begin ? 0 : dark.from, last = dark.to == end ? 1 : dark.to;
         for (uint left = dark.from < dark.to ? lit->members[line] : 0; left; left &= left - 1) {
             const int k = lowest_bit(left);
@@ -147,8 +154,8 @@ int add_visible(const bvh_tree *tree, const chunk *lit, int line, const before *
 }
 #endif
 
-// Receivers of a strip that are taken together, by columns: places from the scene's middle and normals of about unit
-// length, and both in real, the normals of unit length.
+// LANES receivers of a strip in structure-of-arrays form: positions from the scene's middle and normals, in place
+// (`wide`; normals scaled to about 1) and in real (`at`; unit normals).
 typedef struct {
     place wide[6][LANES];
     real at[6][LANES];
@@ -157,8 +164,8 @@ typedef struct {
     uint count;
 } block;
 
-// The last receiver again where there are fewer than lanes.
-void load_block(global const INPUT *receivers, constant place *middle, uint count, block *here) {
+// Load a block; repeat the last receiver to fill the lanes.
+static void load_block(global const INPUT *receivers, constant place *middle, uint count, block *here) {
     here->count = count;
     for (int lane = 0; lane < LANES; lane++) {
         global const INPUT *row = receivers + 6 * min((uint)lane, count - 1);
@@ -167,49 +174,49 @@ void load_block(global const INPUT *receivers, constant place *middle, uint coun
         here->is_none[lane] = row[3] == 0 && row[4] == 0 && row[5] == 0;
         here->sums[lane] = 0, here->flags[lane] = STATUS_OK;
     }
-    places nx = LOAD_PLACES(here->wide[3]), ny = LOAD_PLACES(here->wide[4]), nz = LOAD_PLACES(here->wide[5]);
+    places nx = load_places(here->wide[3]), ny = load_places(here->wide[4]), nz = load_places(here->wide[5]);
     const places longest = fmax(fmax(fabs(nx), fabs(ny)), fabs(nz));
     nx /= longest, ny /= longest, nz /= longest;
     const places per = (place)1 / sqrt(nx * nx + ny * ny + nz * nz);
     *(places_at *)here->wide[3] = nx, *(places_at *)here->wide[4] = ny, *(places_at *)here->wide[5] = nz;
-    for (int k = 0; k < 3; k++) STORE_LANES(narrow(LOAD_PLACES(here->wide[k])), here->at[k]);
-    STORE_LANES(narrow(nx * per), here->at[3]);
-    STORE_LANES(narrow(ny * per), here->at[4]);
-    STORE_LANES(narrow(nz * per), here->at[5]);
+    for (int k = 0; k < 3; k++) store_private(convert_to_reals(load_places(here->wide[k])), here->at[k]);
+    store_private(convert_to_reals(nx * per), here->at[3]);
+    store_private(convert_to_reals(ny * per), here->at[4]);
+    store_private(convert_to_reals(nz * per), here->at[5]);
 }
 
-// Which receivers and a segment face each other; where they are in its frame, if any do.
-uint face(const block *here, const frames *of, int n, facing *all) {
-    const places dx = LOAD_PLACES(here->wide[0]) - of->x[n], dy = LOAD_PLACES(here->wide[1]) - of->y[n];
-    const places dz = LOAD_PLACES(here->wide[2]) - of->z[n];
-    const reals zero = (reals)0, height = narrow(dx * of->off_x[n] + dy * of->off_y[n] + dz * of->off_z[n]);
+// Lanes whose receiver and a segment face each other; if any, the receivers' coordinates in the segment's frame.
+static uint face(const block *here, const frames *of, int n, facing *all) {
+    const places dx = load_places(here->wide[0]) - of->x[n], dy = load_places(here->wide[1]) - of->y[n];
+    const places dz = load_places(here->wide[2]) - of->z[n];
+    const reals zero = (reals)0, height = convert_to_reals(dx * of->off_x[n] + dy * of->off_y[n] + dz * of->off_z[n]);
     const masks above = mask_of(height > zero);
     if (!any_lane(above)) return 0;
     const places along = dx * of->along_x[n] + dy * of->along_y[n] + dz * of->along_z[n];
-    const reals aside = narrow(dx * of->across_x[n] + dy * of->across_y[n] + dz * of->across_z[n]);
+    const reals aside = convert_to_reals(dx * of->across_x[n] + dy * of->across_y[n] + dz * of->across_z[n]);
     const real ux = (real)of->along_x[n], uy = (real)of->along_y[n], uz = (real)of->along_z[n];
     const real ex = (real)of->off_x[n], ey = (real)of->off_y[n], ez = (real)of->off_z[n];
     const real wx = (real)of->across_x[n], wy = (real)of->across_y[n], wz = (real)of->across_z[n];
-    const reals nx = LOAD_LANES(here->at[3]), ny = LOAD_LANES(here->at[4]), nz = LOAD_LANES(here->at[5]);
+    const reals nx = load_private(here->at[3]), ny = load_private(here->at[4]), nz = load_private(here->at[5]);
     const reals by_u = nx * ux + ny * uy + nz * uz, by_n = nx * ex + ny * ey + nz * ez;
     const reals by_w = nx * wx + ny * wy + nz * wz;
-    const reals past = narrow(of->length[n] - along), foot = -(by_n * height + by_w * aside);
-    const reals toward = foot - by_u * narrow(along), toward_end = foot + by_u * past;
-    const uint found = lanes_of(above & (mask_of(toward > zero) | mask_of(toward_end > zero)));
+    const reals past = convert_to_reals(of->length[n] - along), foot = -(by_n * height + by_w * aside);
+    const reals toward = foot - by_u * convert_to_reals(along), toward_end = foot + by_u * past;
+    const uint found = lane_bits(above & (mask_of(toward > zero) | mask_of(toward_end > zero)));
     if (!found) return 0;
-    STORE_LANES(narrow(along), all->along), STORE_LANES(height, all->height), STORE_LANES(aside, all->aside);
-    STORE_LANES(past, all->past), STORE_LANES(by_u, all->by_u), STORE_LANES(by_n, all->by_n);
-    STORE_LANES(by_w, all->by_w), STORE_LANES(toward, all->toward), STORE_LANES(toward_end, all->toward_end);
+    store_private(convert_to_reals(along), all->along), store_private(height, all->height), store_private(aside, all->aside);
+    store_private(past, all->past), store_private(by_u, all->by_u), store_private(by_n, all->by_n);
+    store_private(by_w, all->by_w), store_private(toward, all->toward), store_private(toward_end, all->toward_end);
     return found & (uint)((1ul << here->count) - 1);
 }
 
 #ifdef RAYS
-// A ray from a lane's receiver to the middle of each of `samples` parts of segment k.
-void add_sampled(const bvh_tree *tree, const chunk *lit, int k, const facing *own, int lane, real clearance,
+// Visible parts of segment k by shadow rays: one ray from the receiver to the middle of each of `samples` parts.
+static void add_sampled(const bvh_tree *tree, const chunk *lit, int k, const facing *own, int lane, real clearance,
                  uint samples, block *here, pieces *waiting) {
     const frames *of = &lit->each;
-    const real over = fmin(clearance, LEAST_SHARE * own->height[lane]);
-    const real lift = fmin(clearance, LEAST_SHARE * fmax(own->toward[lane], own->toward_end[lane]));
+    const real over = fmin(clearance, CLEARANCE_SHARE * own->height[lane]);
+    const real lift = fmin(clearance, CLEARANCE_SHARE * fmax(own->toward[lane], own->toward_end[lane]));
     const real origin[3] = {here->at[0][lane] + lift * here->at[3][lane], here->at[1][lane] + lift * here->at[4][lane],
                             here->at[2][lane] + lift * here->at[5][lane]};
     const real start[3] = {(real)of->x[k] + over * (real)of->off_x[k], (real)of->y[k] + over * (real)of->off_y[k],
@@ -239,8 +246,8 @@ void add_sampled(const bvh_tree *tree, const chunk *lit, int k, const facing *ow
 }
 #endif
 
-// What a lane's receiver gets from a line that it faces.
-void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, real clearance,
+// Append what the receiver of a lane gets from a line that it faces.
+static void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, real clearance,
                uint samples, int *hint, block *here, pieces *waiting) {
     const uint members = lit->members[line];
 #if defined(INTERVALS)
@@ -266,8 +273,8 @@ void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *a
     }
 }
 
-// What all receivers of a block get from a line.
-void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearance, uint samples, int *hint, block *here,
+// Append what all receivers of a block get from a line.
+static void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearance, uint samples, int *hint, block *here,
                  pieces *waiting) {
     before all;
     uint lanes = face(here, &lit->lines, line, &all.whole);
@@ -284,8 +291,8 @@ void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearanc
 
 static inline int has_no_number(place value) { return not_finite((real)value); }
 
-// A receiver's result; returns what is to be added to the currents for a unit of weight.
-place result_of(const block *here, int lane, uchar flag, global real *irradiance, global uchar *status) {
+// Store the result of a receiver; return its contribution to the currents per unit of weight.
+static place result_of(const block *here, int lane, uchar flag, global real *irradiance, global uchar *status) {
     int is_bad = 0;
     for (int k = 0; k < 6; k++) is_bad |= not_finite(here->at[k][lane]) && !(k >= 3 && here->is_none[lane]);
     const uchar wrong = flag | (is_bad || has_no_number(here->sums[lane]) ? STATUS_NOT_FINITE : 0);
@@ -296,8 +303,8 @@ place result_of(const block *here, int lane, uchar flag, global real *irradiance
     return is_none ? 0 : light;
 }
 
-// The block's results; adds to the currents.
-void store_block(const block *here, uchar flag, global real *irradiance, global uchar *status,
+// Store the results of a block and add them to the currents.
+static void store_block(const block *here, uchar flag, global real *irradiance, global uchar *status,
                  global const INPUT *weights, place *to_left, place *to_right) {
     for (uint lane = 0; lane < here->count; lane++) {
         const place light = result_of(here, lane, flag, irradiance + lane, status + lane);
@@ -306,27 +313,54 @@ void store_block(const block *here, uchar flag, global real *irradiance, global 
     }
 }
 
-AS_IT_IS kernel void occluded_irradiance(global const INPUT *restrict receivers, global const INPUT *restrict weights,
-                                   global const INPUT *restrict segments,
 #ifdef PICKED
-                                   global const int *restrict starts, global const int *restrict picks,
+#define SEGMENT_LISTS global const int *restrict starts, global const int *restrict picks,
+#else
+#define SEGMENT_LISTS
 #endif
-                                   global real *restrict irradiance, global real *restrict left,
-                                   global real *restrict right, global uchar *restrict status,
-                                   global const real *nodes, global const int *children, global const int *axes,
-                                   global const real *leaves, global const int *triangles, constant place *middle,
-                                   const real clearance, const uint samples, const uint each,
-                                   const uint segment_count, const uint pick_count, const uint strips) {
+
+// Add the light of a chunk of segments to a block of receivers.
+static void light_chunk(const bvh_tree *tree, const chunk *lit, real clearance, uint samples, int *hint, block *here,
+                        pieces *waiting, uchar *flag) {
+    if (!lit->is_good) *flag |= STATUS_NOT_FINITE;
+    for (int line = 0; line < lit->line_count; line++)
+        light_block(tree, lit, line, clearance, samples, hint, here, waiting);
+}
+
+#ifndef VECTOR_VARIANT
+// Sum two values over the work-group, by halves; all items return the sums.
+static void sum_over_group(local place *both, place *to_left, place *to_right) {
+    const uint item = get_local_id(0);
+    both[2 * item] = *to_left, both[2 * item + 1] = *to_right;
+    for (uint half_size = GROUP / 2; half_size; half_size /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (item < half_size) {
+            both[2 * item] += both[2 * (item + half_size)];
+            both[2 * item + 1] += both[2 * (item + half_size) + 1];
+        }
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    *to_left = both[0], *to_right = both[1];
+    barrier(CLK_LOCAL_MEM_FENCE);
+}
+#endif
+
+AS_IT_IS kernel void occluded_irradiance(global const INPUT *restrict receivers, global const INPUT *restrict weights,
+                                         global const INPUT *restrict segments, SEGMENT_LISTS
+                                         global real *restrict irradiance, global real *restrict left,
+                                         global real *restrict right, global uchar *restrict status,
+                                         global const real *nodes, global const int *children, global const int *axes,
+                                         global const real *leaves, global const int *triangles,
+                                         constant place *middle, const real clearance, const uint samples,
+                                         const uint each, const uint segment_count, const uint pick_count,
+                                         const uint strips) {
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
     const ulong group = get_group_id(0), groups = get_num_groups(0);
 #ifndef VECTOR_VARIANT
     local place both[2 * GROUP];
 #endif
     chunk lit;
-    int hint = NO_HINT;
-#ifndef PICKED
-    int held = NONE_HELD;
-#endif
+    int hint = NO_HINT, loaded = -1; // first segment of the chunk that is loaded
     for (ulong strip = strips * group / groups; strip < strips * (group + 1) / groups; strip++) {
         place to_left = 0, to_right = 0;
         for (uint first = get_local_id(0) * LANES; first < each; first += get_local_size(0) * LANES) {
@@ -342,32 +376,22 @@ AS_IT_IS kernel void occluded_irradiance(global const INPUT *restrict receivers,
             const int end = min(starts[list + 1], (int)pick_count);
             for (int next = max(starts[list], 0); next < end;) {
                 next = load_picked(segments, picks, next, end, segment_count, middle, &lit, &flag);
+                light_chunk(&tree, &lit, clearance, samples, &hint, &here, &waiting, &flag);
+            }
 #else
             for (int next = 0; next < (int)segment_count; next += SEGMENTS) {
-                if (held != next) load_from(segments, next, (int)segment_count, middle, &lit);
-                held = next;
-#endif
-                if (!lit.is_good) flag |= STATUS_NOT_FINITE;
-                for (int line = 0; line < lit.line_count; line++)
-                    light_block(&tree, &lit, line, clearance, samples, &hint, &here, &waiting);
+                if (loaded != next) load_from(segments, next, (int)segment_count, middle, &lit);
+                loaded = next;
+                light_chunk(&tree, &lit, clearance, samples, &hint, &here, &waiting, &flag);
             }
+#endif
             finish(&waiting, here.sums);
             store_block(&here, flag, irradiance + row, status + row, weights + 2 * row, &to_left, &to_right);
         }
-#ifdef VECTOR_VARIANT
-        left[strip] = (real)to_left, right[strip] = (real)to_right;
-#else
-        const uint item = get_local_id(0);
-        both[2 * item] = to_left, both[2 * item + 1] = to_right;
-        for (uint half_size = GROUP / 2; half_size; half_size /= 2) {
-            barrier(CLK_LOCAL_MEM_FENCE);
-            if (item < half_size) {
-                both[2 * item] += both[2 * (item + half_size)];
-                both[2 * item + 1] += both[2 * (item + half_size) + 1];
-            }
-        }
-        if (item == 0) left[strip] = (real)both[0], right[strip] = (real)both[1];
-        barrier(CLK_LOCAL_MEM_FENCE);
+#ifndef VECTOR_VARIANT
+        sum_over_group(both, &to_left, &to_right);
+        if (get_local_id(0)) continue;
 #endif
+        left[strip] = (real)to_left, right[strip] = (real)to_right;
     }
 }

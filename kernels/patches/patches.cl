@@ -1,11 +1,18 @@
-// Diffuse light from patches of a scene, each a few triangles of one exitance, on receivers (place, normal): as form
-// factors, or summed. CPU runtimes take strips of 16 receivers, GPUs an item per receiver. Which part of a triangle is
-// hidden is asked with rays, more of them the larger it is in view.
+// Form factors of receivers and patches, or the irradiance of receivers from the exitance of patches.
+//
+// Inputs:  receivers (count, 6), position [m] and normal of any length, type INPUT; patch_light: exitance (patches,) [W/m2].
+// Outputs: form_factors: factors (count, patches); patch_light: irradiance (count,) [W/m2]; status (count,) flags.
+// Tables:  triangles (t, 12) first corner, two edges, unit normal; starts (patches + 1,) first triangle of each patch;
+//          slacks (patches,) [m] added to the clearance at the patch; the tree of common/bvh.h.
+// Options: FACTORS (form_factors), OCCLUSION (shadow rays), INPUT, PLACE (type of `middle`), REAL_IS_DOUBLE, BVH_DEPTH.
+// Variants: vector: 16 receivers at a time, `each` per work-item; work-item: one receiver per item.
+//
+// A triangle's hidden fraction is estimated with shadow rays; the larger its form factor, the more rays.
 #include "patches/patches.h"
 #include "common/bvh.h"
 #include "common/status.h"
 
-// A triangle: first corner, two edges, unit normal.
+// Numbers per triangle: first corner, two edges, unit normal.
 #define ROW 12
 
 INLINE vector vector_at(global const real *row) { return (vector){(reals)row[0], (reals)row[1], (reals)row[2]}; }
@@ -28,7 +35,7 @@ typedef struct {
 
 INLINE real dot_of(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-// Metres at either end do not count: the surfaces that the ends lie on.
+// Whether nothing is hit on the way; the first `after` and the last `before` metres are skipped (surfaces at the ends).
 static inline int is_free(const bvh_tree *tree, const real *place, const real *way, real after, real before) {
     const real per = after + before > 0 ? (real)1 / sqrt(dot_of(way, way)) : 0;
     const real start = after * per, end = 1 - before * per;
@@ -37,8 +44,8 @@ static inline int is_free(const bvh_tree *tree, const real *place, const real *w
     return !bvh_any(tree, &ray);
 }
 
-// The part of a polygon's light that gets through, by rays to the middles of side x side fields of it, each for what it
-// would send if it were small.
+// Visible fraction of a polygon's light: rays to the middles of side x side fields, each weighted by the light that a small
+// patch there would send.
 __attribute__((noinline)) real free_part(const bvh_tree *tree, const view *own, int side, real after, real before) {
     real through = 0, whole = 0;
     for (int field = 0; field < side * side; field++) {
@@ -60,7 +67,7 @@ __attribute__((noinline)) real free_part(const bvh_tree *tree, const view *own, 
     return whole > 0 ? through / whole : 0;
 }
 
-// What large triangles send is asked with many rays: `rays` for one that fills the view.
+// Fields along a side: `rays` rays for a form factor of 1, at most 16 x 16.
 static inline int side_of(real factor, real rays) { return clamp((int)ceil(sqrt(factor * rays)), 1, 16); }
 
 #ifdef VECTOR_VARIANT
@@ -69,7 +76,7 @@ INLINE void spread(real (*to)[LANES], vector from) {
 }
 #endif
 
-// A factor without what is hidden.
+// Form factor times the visible fraction.
 INLINE reals seen_part(const bvh_tree *tree, reals factor, vector place, vector normal, const polygon *shape,
                              real rays, real after, real before) {
 #ifdef VECTOR_VARIANT
@@ -97,86 +104,91 @@ INLINE reals seen_part(const bvh_tree *tree, reals factor, vector place, vector 
 }
 #endif
 
-#ifdef FACTORS
-kernel void form_factors(global const INPUT *restrict receivers, global real *restrict factors,
-#else
-kernel void patch_light(global const INPUT *restrict receivers, global const real *restrict exitance,
-                        global real *restrict irradiance,
-#endif
-                         global uchar *restrict status, global const real *restrict triangles,
-                         global const int *restrict starts, global const real *restrict slacks,
-                         global const real *nodes, global const int *children, global const int *axes,
-                         global const real *leaves, global const int *numbers,
-                         constant PLACE *middle, const real shallow, const real clearance, const real rays,
-                         const uint patches, const ulong count, const ulong each) {
+// Arguments that both kernels share.
+#define SCENE_TABLES                                                                                                   \
+    global uchar *restrict status, global const real *restrict triangles, global const int *restrict starts,           \
+        global const real *restrict slacks, global const real *nodes, global const int *children,                      \
+        global const int *axes, global const real *leaves, global const int *numbers, constant PLACE *middle,          \
+        const real shallow, const real clearance, const real rays, const uint patches, const ulong count,              \
+        const ulong each
+
+typedef struct {
+    vector place, normal; // position from the middle; unit normal
+    masks bad;            // a number is not finite
+} receiver;
+
+INLINE receiver load_receiver(global const INPUT *at, constant PLACE *middle) {
+    receiver one;
+    one.place = (vector){load_column(at, 0, middle[0]), load_column(at, 1, middle[1]), load_column(at, 2, middle[2])};
+    vector normal = {load_column(at, 3, 0), load_column(at, 4, 0), load_column(at, 5, 0)};
+    normal = patch_times((reals)1 / fmax(fmax(fabs(normal.x), fabs(normal.y)), fabs(normal.z)), normal);
+    one.normal = normal = patch_times((reals)1 / sqrt(patch_dot(normal, normal)), normal);
+    one.bad = mask_of(LANED(not_finite)(one.place.x)) | mask_of(LANED(not_finite)(one.place.y)) |
+              mask_of(LANED(not_finite)(one.place.z)) | mask_of(LANED(not_finite)(normal.x)) |
+              mask_of(LANED(not_finite)(normal.y)) | mask_of(LANED(not_finite)(normal.z));
+    return one;
+}
+
+// Form factor of a receiver and one triangle, with occlusion if `tree` is given.
+INLINE reals triangle_factor(const receiver *one, global const real *row, const bvh_tree *tree, real shallow, real rays,
+                             real clearance, real slack) {
+    const vector place = one->place, normal = one->normal;
+    const vector first = {row[0] - place.x, row[1] - place.y, row[2] - place.z};
+    // Most pairs do not face each other. `shallow`: heights within rounding count as in the plane.
+    const masks facing = mask_of(-patch_dot(first, vector_at(row + 9)) > (reals)shallow);
+    if (!any_lane(facing)) return (reals)0;
+    const vector edge_1 = vector_at(row + 3), edge_2 = vector_at(row + 6);
+    const vector back = {-edge_1.x - edge_2.x, -edge_1.y - edge_2.y, -edge_1.z - edge_2.z};
+    const vector corner[3] = {first, patch_sum(first, edge_1), patch_sum(patch_sum(first, edge_1), edge_2)};
+    const vector edge[3] = {edge_1, edge_2, back};
+    const reals height[3] = {patch_dot(corner[0], normal), patch_dot(corner[1], normal), patch_dot(corner[2], normal)};
+    const masks above = mask_of(height[0] > (reals)0) | mask_of(height[1] > (reals)0) | mask_of(height[2] > (reals)0);
+    if (!any_lane(facing & above)) return (reals)0;
+    const polygon shape = patch_cut(corner, edge, height);
+    const reals factor = zero_where(~(facing & above), patch_factor(&shape, normal));
 #ifdef OCCLUSION
+    return seen_part(tree, factor, place, normal, &shape, rays, clearance, max(clearance, slack));
+#else
+    return factor;
+#endif
+}
+
+#ifdef FACTORS
+kernel void form_factors(global const INPUT *restrict receivers, global real *restrict factors, SCENE_TABLES) {
     const bvh_tree tree = {nodes, children, axes, leaves, numbers};
-#endif
-    // The last vector, or work-group, moves back to end with the last receiver.
-#ifdef VECTOR_VARIANT
-    const ulong begin = get_global_id(0) * each, end = min(begin + each, count);
-    for (ulong following = begin; following < end; following += LANES) {
-        const ulong i = min(following, count - LANES);
-#else
-    {
-        const ulong i = min(get_group_id(0) * each, count - each) + get_local_id(0);
-#endif
-        global const INPUT *at = receivers + 6 * i;
-        const vector place = {load_column(at, 0, middle[0]), load_column(at, 1, middle[1]),
-                              load_column(at, 2, middle[2])};
-        vector normal = {load_column(at, 3, 0), load_column(at, 4, 0), load_column(at, 5, 0)};
-        normal = patch_times((reals)1 / fmax(fmax(fabs(normal.x), fabs(normal.y)), fabs(normal.z)), normal);
-        normal = patch_times((reals)1 / sqrt(patch_dot(normal, normal)), normal);
-        const masks bad = mask_of(LANED(not_finite)(place.x)) | mask_of(LANED(not_finite)(place.y)) |
-                          mask_of(LANED(not_finite)(place.z)) | mask_of(LANED(not_finite)(normal.x)) |
-                          mask_of(LANED(not_finite)(normal.y)) | mask_of(LANED(not_finite)(normal.z));
-        reals total = (reals)0;
+    const sample_range own = samples_of_item(each, count);
+    for (ulong next = own.begin; next < own.end; next += LANES) {
+        const ulong i = whole_vector(next, count);
+        const receiver one = load_receiver(receivers + 6 * i, middle);
         for (uint patch = 0; patch < patches; patch++) {
-#ifndef FACTORS
-            if (exitance[patch] == 0) continue;
-#endif
-            reals whole = (reals)0;
-            for (int t = starts[patch]; t < starts[patch + 1]; t++) {
-                global const real *row = triangles + (size_t)t * ROW;
-                const vector first = {row[0] - place.x, row[1] - place.y, row[2] - place.z};
-                // Most pairs do not face each other; what a surface adds to itself is rounding.
-                const masks facing = mask_of(-patch_dot(first, vector_at(row + 9)) > (reals)shallow);
-                if (!any_lane(facing)) continue;
-                const vector one = vector_at(row + 3), two = vector_at(row + 6);
-                const vector back = {-one.x - two.x, -one.y - two.y, -one.z - two.z};
-                const vector corner[3] = {first, patch_sum(first, one), patch_sum(patch_sum(first, one), two)};
-                const vector edge[3] = {one, two, back};
-                const reals height[3] = {patch_dot(corner[0], normal), patch_dot(corner[1], normal),
-                                         patch_dot(corner[2], normal)};
-                const masks above = mask_of(height[0] > (reals)0) | mask_of(height[1] > (reals)0) |
-                                    mask_of(height[2] > (reals)0);
-                if (!any_lane(facing & above)) continue;
-                const polygon shape = patch_cut(corner, edge, height);
-                reals factor = zero_where(~(facing & above), patch_factor(&shape, normal));
-#ifdef OCCLUSION
-                factor = seen_part(&tree, factor, place, normal, &shape, rays, clearance,
-                                   max(clearance, slacks[patch]));
-#endif
-                whole += factor;
-            }
-#ifdef FACTORS
-            whole = nan_where(bad, whole);
-#ifdef VECTOR_VARIANT
-            for (int lane = 0; lane < LANES; lane++)
-                factors[(i + lane) * patches + patch] = ((const real *)&whole)[lane];
-#else
-            factors[i * patches + patch] = whole;
-#endif
-#else
-            total += exitance[patch] * whole;
-#endif
+            reals sum = (reals)0;
+            for (int t = starts[patch]; t < starts[patch + 1]; t++)
+                sum += triangle_factor(&one, triangles + (size_t)t * ROW, &tree, shallow, rays, clearance, slacks[patch]);
+            sum = nan_where(one.bad, sum);
+            for (int lane = 0; lane < LANES; lane++) factors[(i + lane) * patches + patch] = ((const real *)&sum)[lane];
         }
-#ifndef FACTORS
-        const masks wrong = bad | mask_of(LANED(not_finite)(total));
-        store_reals(nan_where(wrong, total), irradiance + i);
-        store_bytes(convert_bytes(wrong & (masks)STATUS_NOT_FINITE), status + i);
-#else
-        store_bytes(convert_bytes(bad & (masks)STATUS_NOT_FINITE), status + i);
-#endif
+        store_bytes(convert_bytes(one.bad & (masks)STATUS_NOT_FINITE), status + i);
     }
 }
+#else
+kernel void patch_light(global const INPUT *restrict receivers, global const real *restrict exitance,
+                        global real *restrict irradiance, SCENE_TABLES) {
+    const bvh_tree tree = {nodes, children, axes, leaves, numbers};
+    const sample_range own = samples_of_item(each, count);
+    for (ulong next = own.begin; next < own.end; next += LANES) {
+        const ulong i = whole_vector(next, count);
+        const receiver one = load_receiver(receivers + 6 * i, middle);
+        reals total = (reals)0;
+        for (uint patch = 0; patch < patches; patch++) {
+            if (exitance[patch] == 0) continue;
+            reals sum = (reals)0;
+            for (int t = starts[patch]; t < starts[patch + 1]; t++)
+                sum += triangle_factor(&one, triangles + (size_t)t * ROW, &tree, shallow, rays, clearance, slacks[patch]);
+            total += exitance[patch] * sum;
+        }
+        const masks wrong = one.bad | mask_of(LANED(not_finite)(total));
+        store_reals(nan_where(wrong, total), irradiance + i);
+        store_bytes(convert_bytes(wrong & (masks)STATUS_NOT_FINITE), status + i);
+    }
+}
+#endif

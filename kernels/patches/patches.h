@@ -1,5 +1,5 @@
-// The form factor of a diffuse receiver and a triangle: which part of a triangle's exitance reaches it. Lambert's sum
-// over the edges, exact, after the triangle is cut by the receiver's plane. Vectors are from the receiver.
+// Form factor of a differential diffuse receiver and a triangle: Lambert's sum over the edges, exact, after the triangle is
+// clipped at the receiver's plane. Vectors are relative to the receiver.
 #ifndef PATCHES_H
 #define PATCHES_H
 #include "line_irradiance/line_irradiance.h"
@@ -18,20 +18,20 @@ INLINE vector patch_choose(masks which, vector a, vector b) {
     return (vector){which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z};
 }
 
-// Corners, and the edges that leave them: exact, where differences of corners that are far away would not be.
+// Corners and the edges that leave them. Edges are stored: differences of far corners would lose digits.
 typedef struct {
     vector corner[4], edge[4];
-    int is_whole; // the third edge is nothing
+    int is_whole; // not clipped: the third edge is zero
 } polygon;
 
-// What is left of a triangle above the receiver's plane, in the same sense; `height` is that of its corners.
+// Clip a triangle at the receiver's plane, keeping its orientation; `height`: heights of the corners above the plane.
 INLINE polygon patch_cut(const vector *corner, const vector *edge, const reals *height) {
     const masks in0 = mask_of(height[0] > (reals)0), in1 = mask_of(height[1] > (reals)0);
     const masks in2 = mask_of(height[2] > (reals)0), all = in0 & in1 & in2;
     const vector none = {(reals)0, (reals)0, (reals)0};
     const polygon whole = {{corner[0], corner[1], corner[2], corner[2]}, {edge[0], edge[1], none, edge[2]}, 1};
     if (!any_lane(~all)) return whole;
-    // Turned, so that the one corner on its side of the plane comes first.
+    // Rotate the corners so that the single corner on one side of the plane comes first.
     const masks second = (in0 ^ in1) & ~(in0 ^ in2), third = (in0 ^ in2) & ~(in0 ^ in1);
     const vector a = patch_choose(second, corner[1], patch_choose(third, corner[2], corner[0]));
     const vector b = patch_choose(second, corner[2], patch_choose(third, corner[0], corner[1]));
@@ -66,7 +66,7 @@ INLINE polygon patch_cut(const vector *corner, const vector *edge, const reals *
     return cut;
 }
 
-// The form factor of a polygon above the plane of a receiver with this unit normal; it turns left seen from there.
+// Form factor of a polygon above the plane of a receiver with this unit normal; counter-clockwise seen from the receiver.
 INLINE reals patch_factor(const polygon *shape, vector normal) {
     reals size[4], weight[4], excess[4];
     masks near_by = (masks)0;
@@ -88,7 +88,7 @@ INLINE reals patch_factor(const polygon *shape, vector normal) {
         const reals acute = steep ? (reals)(real)1.57079632679489661923 - low : low;
         const reals angle = cosine < (reals)0 ? (reals)(real)3.14159265358979323846 - acute : acute;
         weight[n] = patch_dot(normal, turn);
-        // A receiver on the line of an edge sees nothing of it.
+        // A receiver on the line of an edge gets nothing from it (0 / 0).
         sum += zero_where(~mask_of(sine > (reals)0), weight[n] * angle / sine);
         near_by |= steep | ~mask_of(cosine > (reals)0);
         // angle / sin(angle) - 1, for angles up to 45 degrees.
@@ -96,8 +96,9 @@ INLINE reals patch_factor(const polygon *shape, vector normal) {
         excess[n] = square * ((real)1 / ((real)1 + secant) - rest * secant);
     }
     if (any_lane(~near_by)) {
-        // Small polygons: each edge's factor is nearly the same, so sum that of the first times all edges, which is
-        // the area, and the differences between neighbours, which their common corner gives without cancelling.
+        // Small polygons: the factors of all edges are nearly equal and their sum cancels. Sum instead the first factor
+        // times all edges (the area), and the differences between neighbouring factors, which follow from their common
+        // corner without cancellation.
         const vector one = shape->edge[0], two = patch_sum(one, shape->edge[1]);
         const vector area = patch_sum(patch_cross(shape->edge[1], one), patch_cross(shape->edge[2], two));
         reals per[4], rest_of = weight[1] + weight[2] + weight[3];

@@ -1,14 +1,17 @@
-// Rays against the triangles of a scene: the closest, or whether there is any. CPU runtimes take a strip of rays per
-// work-item, one after another, each against 16 boxes at once; GPUs an item per ray.
+// Ray queries on the triangles of a scene: the closest hit of a ray, or any hit on a segment.
+//
+// Inputs:  rays (count, 6), closest_hit: origin [m] and direction of any length; any_hit: both ends of a segment [m].
+// Outputs: closest_hit: triangle (count,) index or -1, distance (count,) [m], barycentric (count, 2), status (count,);
+//          any_hit: occluded (count,) 0 or 1, status (count,).
+// Options: SEGMENTS (any_hit), INPUT, REAL_IS_DOUBLE, WIDE_PLACES, BVH_DEPTH.
+// Variants: vector: a strip of `each` rays per work-item, each ray against 16 boxes at once; work-item: a ray per item.
+//
+// Positions are relative to the scene's middle. A ray from far away is first cut to the sphere around the scene, so that
+// the numbers of the traversal keep their digits.
 #include "common/bvh.h"
 #include "common/status.h"
 
-#ifdef WIDE_PLACES
-#pragma OPENCL EXTENSION cl_khr_fp64 : enable
-typedef double place;
-#else
-typedef float place;
-#endif
+#include "common/places.h"
 
 typedef struct {
     place x, y, z;
@@ -21,10 +24,10 @@ static inline int finite_spot(spot a) {
     return !(not_finite((real)a.x) | not_finite((real)a.y) | not_finite((real)a.z));
 }
 
-// Of a ray that starts far from the scene: the part in the sphere about the scene, where its numbers have digits.
+// Part of a ray in the sphere around the scene.
 typedef struct {
     spot origin;
-    place ahead, across; // where it begins, and how long it is, in directions
+    place ahead, across; // its start and its length, in multiples of the direction
     int misses;
 } part;
 

@@ -1,5 +1,7 @@
-// Bidirectional reflectance, 1/sr, of unit directions away from the surface, whose normal is z. BRDF_LAMBERT, _PHONG,
-// _OREN_NAYAR, _GGX or _WARD says which; `model` holds its parameters as gpuvision/simulation/reflectance.py has them.
+// Bidirectional reflectance distribution functions [1/sr] of unit directions away from a surface with normal z.
+//
+// One of BRDF_LAMBERT, _PHONG, _OREN_NAYAR, _GGX, _WARD selects the function; `model` holds its parameters in the order
+// of gpuvision/simulation/scene/reflectance.py.
 #ifndef BRDF_H
 #define BRDF_H
 #include "common/lanes.h"
@@ -13,7 +15,7 @@ typedef struct {
 static inline reals dot_of(Direction a, Direction b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 static inline reals larger_of(reals a, reals b) { return a > b ? a : b; }
 #if defined(BRDF_PHONG) && defined(VECTOR_VARIANT) && defined(REAL_IS_DOUBLE)
-// PoCL's pow of wide vectors of doubles makes infinities of some.
+// pow() of double16 vectors returns infinity for some lanes on PoCL 3.1: compute lane by lane.
 static inline reals power_of(reals base, real exponent) {
     real lanes[LANES];
     *(reals_at *)lanes = base;
@@ -39,7 +41,7 @@ static inline reals brdf_above(Direction in, Direction out, constant real *model
     const real square = model[0] * model[0], rest = (real)1 - square;
     const Direction half_way = {in.x + out.x, in.y + out.y, in.z + out.z};
     const reals length = dot_of(half_way, half_way);
-    // sin^2 + alpha^2 cos^2: of the sine itself, which a smooth surface's lobe is all about.
+    // sin^2 + alpha^2 cos^2 from the sine itself: 1 - cos^2 would cancel in the narrow lobe of a smooth surface.
     const reals sine2 = half_way.x * half_way.x + half_way.y * half_way.y;
     const reals spread = (sine2 + square * half_way.z * half_way.z) / length;
     const reals masked = out.z * sqrt(square + rest * in.z * in.z) + in.z * sqrt(square + rest * out.z * out.z);
@@ -55,7 +57,7 @@ static inline reals brdf_above(Direction in, Direction out, constant real *model
 #endif
 }
 
-// Nothing where either direction lies below the surface.
+// The reflectance; 0 where a direction lies below the surface.
 static inline reals brdf(Direction in, Direction out, constant real *model) {
     const masks above = mask_of(in.z > (reals)0) & mask_of(out.z > (reals)0);
     return zero_where(~above, brdf_above(in, out, model));

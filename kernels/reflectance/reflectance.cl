@@ -1,14 +1,15 @@
-// Reflectance of pairs of directions (towards the light, towards the eye), each of any length, the normal being z. CPU
-// runtimes take strips, 16 pairs at once, GPUs an item per pair.
+// Reflectance (BRDF) of pairs of directions on a surface with normal z.
+//
+// Inputs:  directions (count, 6), to the light and to the eye, each of any length, type INPUT.
+// Outputs: value (count,) [1/sr], NaN where a direction is not finite or zero; status (count,) flags.
+// Tables:  model, the parameters of the BRDF (brdf.h).
+// Options: BRDF_LAMBERT, _PHONG, _OREN_NAYAR, _GGX or _WARD; INPUT; REAL_IS_DOUBLE.
+// Variants: vector: 16 pairs at a time, `each` per work-item; work-item: one pair per item.
 #include "reflectance/brdf.h"
 #include "common/status.h"
 
-typedef reals places;
-#ifdef VECTOR_VARIANT
-#define convert_places convert_real16
-#else
-#define convert_places convert_real
-#endif
+#define COLUMN_TYPE reals
+#define CONVERT_COLUMN LANED(convert_real)
 #include "common/six_columns.h"
 
 static inline Direction direction_of(const reals *at) {
@@ -26,15 +27,9 @@ static inline masks no_direction(Direction a) {
 AS_IT_IS kernel void reflectance(global const INPUT *restrict directions, global real *restrict value,
                                  global uchar *restrict status, constant real *model, const ulong count,
                                  const ulong each) {
-    // The last vector, or work-group, moves back to end with the last pair.
-#ifdef VECTOR_VARIANT
-    const ulong begin = get_global_id(0) * each, end = min(begin + each, count);
-    for (ulong next = begin; next < end; next += LANES) {
-        const ulong i = min(next, count - LANES);
-#else
-    {
-        const ulong i = min(get_group_id(0) * each, count - each) + get_local_id(0);
-#endif
+    const sample_range own = samples_of_item(each, count);
+    for (ulong next = own.begin; next < own.end; next += LANES) {
+        const ulong i = whole_vector(next, count);
         reals columns[6];
         load_columns(directions + 6 * i, columns);
         const Direction in = direction_of(columns), out = direction_of(columns + 3);

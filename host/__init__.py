@@ -11,7 +11,7 @@ from gpuvision.host.errors import (
     RecordingError,
     StreamError,
 )
-from gpuvision.host.launch import Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host.launch import Launch, Precision, Spec, Variant, real_defines, real_of, uses_vectors
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, type_defines
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Batch, Pipeline
@@ -57,6 +57,7 @@ __all__ = [
     "Precision",
     "RecordingError",
     "Source",
+    "Spec",
     "StatusArray",
     "Step",
     "StreamError",

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch
+from gpuvision.host import Device, Launch, LaunchBuilder, WorkSize
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite, numbers
 
@@ -164,20 +164,19 @@ class DistanceMapBuilder(VisionOperation[FieldCells]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype != np.float32 or len(shape) != 1 or not shape[0]:
-            raise TypeError(f"DistanceMapBuilder takes float32 of (columns,), got {dtype} of {shape}")
+        build = LaunchBuilder(self, device, shape, dtype)
+        build.check_dtype("float32", of="coordinates")
+        build.check_shape(len(shape) == 1 and shape[0] > 0, "coordinates (columns,)")
         shapes = self.field.shapes.astype(np.float32)
         cells = (self.rows, *shape)
-        return Launch(
-            source="field/distance_map.cl",
-            kernel="field_map",
+        return build.launch(
+            "field/distance_map.cl",
+            "field_map",
+            work=WorkSize((shape[0], self.rows), None),
+            outputs=build.outputs(
+                {"distance": cells, "nearest": (*cells, _NEAREST), "level": cells}, nearest=np.uint8, level=np.uint16
+            ),
             defines={"FIELD_LEVELS": LEVELS},
-            inputs=[(shape, dtype)],
-            outputs={
-                "distance": (cells, np.dtype(np.float32)),
-                "nearest": ((*cells, _NEAREST), np.dtype(np.uint8)),
-                "level": (cells, np.dtype(np.uint16)),
-            },
             arguments=[
                 np.float32(self.first_y),
                 np.float32(self.cell),
@@ -185,7 +184,6 @@ class DistanceMapBuilder(VisionOperation[FieldCells]):
                 np.int32(len(shapes)),
                 np.float32(self.scale**2),
             ],
-            global_size=(shape[0], self.rows),
         )
 
 

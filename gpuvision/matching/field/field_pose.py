@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Variant, uses_vectors
+from gpuvision.host import Device, Launch, LaunchBuilder, Spec, Variant, WorkSize, capacity, ceil_div, flags, round_up
 from gpuvision.matching.field.distance_map import LEVELS, DistanceMap
 from gpuvision.operation import VisionOperation
 from gpuvision.status import Status
@@ -24,7 +24,6 @@ from gpuvision.validation import finite
 _BLOCK, _MOST_POINTS = 64, 4096
 # Shares of the rows per core, so that the cores end together, and rows for which a point's shift is worth its work.
 _SHARES_PER_CORE, _FEWEST_ROWS = 4, 4
-_REAL, _FLAGS = np.dtype(np.float32), np.dtype(np.uint8)
 _WEAKEST = 1e-3
 
 
@@ -47,6 +46,25 @@ class PoseCosts(NamedTuple):
     least: Any
     column: Any
     seen: Any
+
+
+def pose_grid_work(build: LaunchBuilder, headings: int, rows: int, columns: int) -> WorkSize:
+    """Return the work size of a search over a grid of poses; a work-item of the vector variant takes ``each`` rows."""
+    shares = ceil_div(_SHARES_PER_CORE * build.device.compute_units, headings)
+    each = max(ceil_div(rows, shares), min(_FEWEST_ROWS, rows))
+    if build.uses_vectors:
+        return WorkSize((ceil_div(rows, each), headings), (1, 1), each, vectors=True)
+    return WorkSize((round_up(columns, _BLOCK), rows, headings), (_BLOCK, 1, 1), each)
+
+
+def pose_cost_outputs(
+    build: LaunchBuilder, headings: int, rows: int, columns: int, *, with_scores: bool
+) -> dict[str, Spec | None]:
+    """Return the outputs of a search over a grid of poses, the fields of `PoseCosts`."""
+    blocks = (headings, rows, ceil_div(columns, _BLOCK))
+    scores = (headings, rows, columns) if with_scores else None
+    shapes = {"scores": scores, "least": blocks, "column": blocks, "seen": (headings,)}
+    return build.outputs(shapes, column=np.int32, seen=np.int32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,25 +121,20 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        count = _checked_points(shape, dtype, "FieldPoseSearch")
+        build = LaunchBuilder(self, device, shape, dtype, variant=self.variant)
+        count = _checked_points(build)
         rows, columns = self.map.positions
-        blocks, angles = -(-columns // _BLOCK), self.angles
-        strip = uses_vectors(self.variant, device)
-        shares = -(-_SHARES_PER_CORE * device.handle.max_compute_units // len(angles))
-        each = max(-(-rows // shares), min(_FEWEST_ROWS, rows))
-        spec = (len(angles), rows, blocks)
-        defines: dict[str, Any] = {"CAPACITY": max(64, 1 << (count - 1).bit_length()), "FIELD_LEVELS": LEVELS}
-        present = {"VECTOR_VARIANT": strip, "WITH_SCORES": self.with_scores}
-        return Launch(
-            source="field/field_search.cl",
-            kernel="field_search",
-            defines=defines | {name: None for name, is_present in present.items() if is_present},
-            inputs=[(shape, dtype)],
-            outputs={
-                "scores": ((len(angles), rows, columns), _REAL) if self.with_scores else None,
-                "least": (spec, _REAL),
-                "column": (spec, np.dtype(np.int32)),
-                "seen": ((len(angles),), np.dtype(np.int32)),
+        angles = self.angles
+        work = pose_grid_work(build, len(angles), rows, columns)
+        return build.launch(
+            "field/field_search.cl",
+            "field_search",
+            work=work,
+            outputs=pose_cost_outputs(build, len(angles), rows, columns, with_scores=self.with_scores),
+            defines={
+                "CAPACITY": capacity(count, least=64),
+                "FIELD_LEVELS": LEVELS,
+                **flags(WITH_SCORES=self.with_scores),
             },
             arguments=[
                 self.map.cells.level,
@@ -129,10 +142,8 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
                 *map(np.int32, (count, rows, columns, self.map.border, self.map.cells.level.shape[1])),
                 np.float32(1.0 / self.map.cell),
                 np.float32(self.map.reach**2),
-                np.int32(each),
+                np.int32(work.each),
             ],
-            global_size=(-(-rows // each), len(angles)) if strip else (blocks * _BLOCK, rows, len(angles)),
-            local_size=(1, 1) if strip else (_BLOCK, 1, 1),
         )
 
     def best(self, costs: PoseCosts, most: int = 8, *, apart: tuple[float, float] | None = None) -> RoughPoses:
@@ -250,25 +261,19 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        points = _checked_points(shape, dtype, "FieldPoseRefinement")
+        build = LaunchBuilder(self, device, shape, dtype)
+        points = _checked_points(build)
         if self.count is None:
             raise ValueError("FieldPoseRefinement.count is None; to bind it say how many starts there will be")
-        cells = self.map.cells.nearest
-        spec, matrices = ((self.count,), _REAL), ((self.count, 3, 3), _REAL)
-        return Launch(
-            source="field/field_refine.cl",
-            kernel="field_refine",
+        cells, starts = self.map.cells.nearest, (self.count,)
+        shapes = {"poses": (*starts, 3), "covariance": (*starts, 3, 3), "information": (*starts, 3, 3)}
+        return build.launch(
+            "field/field_refine.cl",
+            "field_refine",
+            work=WorkSize(starts, (1,)),
+            more_inputs=[((self.count, 3), build.real)],
+            outputs=build.outputs(shapes | dict.fromkeys(("score", "scale", "share", "status"), starts)),
             defines={"WEAKEST": f"{_WEAKEST}f"},
-            inputs=[(shape, dtype), ((self.count, 3), _REAL)],
-            outputs={
-                "poses": ((self.count, 3), _REAL),
-                "covariance": matrices,
-                "information": matrices,
-                "score": spec,
-                "scale": spec,
-                "share": spec,
-                "status": ((self.count,), _FLAGS),
-            },
             arguments=[
                 self.map.field.shapes.astype(np.float32).ravel(),
                 cells,
@@ -276,8 +281,6 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
                 *map(np.float32, (*self.map.first, self.map.cell, self.map.scale**2, self.map.reach**2)),
                 np.int32(self.steps),
             ],
-            global_size=(self.count,),
-            local_size=(1,),
             passes_once=self.count == 1,
         )
 
@@ -400,9 +403,9 @@ def _wrapped(angle: Any) -> Any:
     return angle - 2.0 * math.pi * np.rint(angle / (2.0 * math.pi))
 
 
-def _checked_points(shape: tuple[int, ...], dtype: np.dtype[Any], what: str) -> int:
-    if dtype != np.float32:
-        raise TypeError(f"{what} takes float32 points, got {dtype}")
-    if len(shape) != 2 or shape[1] != 2 or not 1 <= shape[0] <= _MOST_POINTS:
-        raise ValueError(f"{what} takes points (1 to {_MOST_POINTS}, 2), got shape {shape}")
-    return shape[0]
+def _checked_points(build: LaunchBuilder) -> int:
+    """Check the points of a launch and return their number."""
+    build.check_dtype("float32", of="points")
+    is_valid = len(build.shape) == 2 and build.shape[1] == 2 and 1 <= build.shape[0] <= _MOST_POINTS
+    build.check_shape(is_valid, f"points (1 to {_MOST_POINTS}, 2)")
+    return build.shape[0]

@@ -12,9 +12,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, uses_vectors
+from gpuvision.host import Define, Device, Launch, LaunchBuilder, capacity
 from gpuvision.matching.features.ruler import RulerEdges
-from gpuvision.matching.pose.pose import FREEDOMS, SolvePose
+from gpuvision.matching.pose.pose import SolvePose
 from gpuvision.matching.robust import subsets
 from gpuvision.operation import VisionOperation
 
@@ -22,7 +22,6 @@ Float64 = npt.NDArray[np.float64]
 RULER = ("x_px", "y_px", "cosine", "sine", "u", "v", "u_per_px", "v_per_px", "bend")
 LINE = ("normal_x", "normal_y", "x", "y", "sigma", "grows")
 _GROUP, _MOST_RULERS = 64, 2048
-_REAL = np.dtype(np.float32)
 
 
 class Fix(NamedTuple):
@@ -177,43 +176,33 @@ class BoardPoseEstimator(VisionOperation[Fix]):
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         edges = self._edges(device, shape, dtype)
-        strip, count, solver = uses_vectors(self.ruler.variant, device), self._rows_of_line * self.lines, self.solver
-        freedoms = FREEDOMS[solver.freedom]
+        build = LaunchBuilder(self, device, shape, dtype, variant=self.ruler.variant)
+        work = build.work(1, each=1, group=_GROUP, grouping="per_element")
+        count, solver = self._rows_of_line * self.lines, self.solver
         pairs = subsets(max(self.each, 2), 2, solver.trials) if self.each > 1 else np.zeros((1, 2), np.int32)
-        of_rows = (self.lines, self._rows_of_line)
-        sizes: dict[str, tuple[int, ...]] = {"pose": (3,), "deformation": (3,), "placement": (2,)}
-        sizes |= {"covariance": (freedoms, freedoms), "residuals": of_rows, "weights": of_rows}
-        sizes |= dict.fromkeys(("scale", "spread", "condition"), ())
         found = (self.lines, self.each)
+        shapes = solver.shapes((), (self.lines, self._rows_of_line))
+        shapes |= dict.fromkeys(("edges", "edge_status", "edge_weights"), found)
         limits = (*solver.limits, *solver.placement, solver.certainty_of_etch)
-        return Launch(
-            source="board_pose/board_pose.cl",
-            kernel="board_pose",
-            defines=dict(edges.defines) | solver.defines(count, strip) | self._capacities(),
-            inputs=[(shape, dtype), ((*found, len(RULER)), _REAL), ((self.lines, len(LINE)), _REAL)],
-            outputs={
-                **{name: (size, _REAL) for name, size in sizes.items()},
-                **{name: ((), np.dtype(np.int32)) for name in ("rank", "inliers")},
-                "status": ((), np.dtype(np.uint8)),
-                **dict.fromkeys(("etch", "agreement", "leverage"), ((), _REAL)),
-                "edges": (found, _REAL),
-                "edge_status": (found, np.dtype(np.uint8)),
-                "edge_weights": (found, _REAL),
-            },
+        return build.launch(
+            "board_pose/board_pose.cl",
+            "board_pose",
+            work=work,
+            more_inputs=[((*found, len(RULER)), build.real), ((self.lines, len(LINE)), build.real)],
+            outputs=build.outputs(shapes, rank=np.int32, inliers=np.int32, edge_status=np.uint8),
+            defines={**edges.defines, **solver.defines(count), **self._capacities()},
             arguments=[
                 *edges.arguments[:4],
                 np.int32(self.lines),
                 np.int32(self.each),
                 pairs.ravel(),
                 np.int32(len(pairs)),
-                solver.starts(count, strip),
+                solver.starts(count, vectors=work.vectors),
                 np.int32(solver.trials),
                 np.int32(solver.steps),
                 *map(np.float32, limits),
             ],
-            global_size=(1,) if strip else (_GROUP,),
-            local_size=(1,) if strip else (_GROUP,),
-            passes_once=strip,
+            passes_once=work.vectors,
         )
 
     def _edges(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
@@ -224,6 +213,6 @@ class BoardPoseEstimator(VisionOperation[Fix]):
     def _rows_of_line(self) -> int:
         return 2 if self.each > 1 else 1
 
-    def _capacities(self) -> dict[str, int]:
-        """Return the sizes of the arrays; powers of two, so that there are few builds."""
-        return {"EACH": 1 << (self.each - 1).bit_length(), "ROOM": 1 << (self.lines * self.each - 1).bit_length()}
+    def _capacities(self) -> dict[str, Define]:
+        """Return the sizes of the arrays."""
+        return {"EACH": capacity(self.each), "ROOM": capacity(self.lines * self.each)}

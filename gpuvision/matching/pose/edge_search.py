@@ -14,17 +14,14 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Variant, uses_vectors
-from gpuvision.matching.field.field_pose import PoseCosts
+from gpuvision.host import Device, Launch, LaunchBuilder, Variant, WorkSize, capacity, flags, type_defines
+from gpuvision.matching.field.field_pose import PoseCosts, pose_cost_outputs, pose_grid_work
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite
 
 CHANNELS, LEVELS = 8, 1023
 """Directions of normals, pi / 8 apart, and steps of a cost."""
 _BLOCK, _MOST_POINTS, _MOST_CELLS = 64, 4096, 1 << 26
-_SHARES_PER_CORE, _FEWEST_ROWS = 4, 4  # as in `FieldPoseSearch`
-_CODES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
-_REAL, _WHOLE = np.dtype(np.float32), np.dtype(np.int32)
 
 
 class Means(NamedTuple):
@@ -63,19 +60,18 @@ class CellMeans(VisionOperation[Means]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype.name not in _CODES:
-            raise TypeError(f"CellMeans takes uint8, uint16 or float32 images, got {dtype}")
-        if len(shape) != 2 or min(shape) < 3 * self.cell_px:
-            raise ValueError(f"CellMeans takes images (rows, columns) of 3 cells or more each way, got shape {shape}")
+        build = LaunchBuilder(self, device, shape, dtype)
+        build.check_dtype("uint8", "uint16", "float32", of="images")
+        is_valid = len(shape) == 2 and min(shape) >= 3 * self.cell_px
+        build.check_shape(is_valid, "images (rows, columns) of 3 cells or more each way")
         cells = (shape[0] // self.cell_px, shape[1] // self.cell_px)
-        return Launch(
-            source="edge_search/edge_search.cl",
-            kernel="cell_means",
-            defines={"CODE": _CODES[dtype.name]},
-            inputs=[(shape, dtype)],
-            outputs={"means": (cells, _REAL)},
+        return build.launch(
+            "edge_search/edge_search.cl",
+            "cell_means",
+            work=WorkSize(cells[::-1], None),
+            outputs=build.outputs({"means": cells}),
+            defines=type_defines("CODE", dtype),
             arguments=[np.int32(shape[1]), np.int32(self.cell_px)],
-            global_size=cells[::-1],
         )
 
 
@@ -112,24 +108,24 @@ class EdgeLevels(VisionOperation[Levels]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype != _REAL or len(shape) != 2 or min(shape) < 3:
-            raise TypeError(f"EdgeLevels takes float32 means of 3 cells or more each way, got {dtype} of {shape}")
+        build = LaunchBuilder(self, device, shape, dtype)
+        build.check_dtype("float32", of="means")
+        build.check_shape(len(shape) == 2 and min(shape) >= 3, "means (rows, columns) of 3 cells or more each way")
         rows, columns = (each + 2 * self.border for each in shape)
         if CHANNELS * rows * columns > _MOST_CELLS:
             raise ValueError(f"EdgeLevels: {rows} x {columns} cells with the border are too many; make cells larger")
         angles = np.arange(CHANNELS) * (math.pi / CHANNELS)
-        return Launch(
-            source="edge_search/edge_search.cl",
-            kernel="edge_levels",
-            defines={"FROM_MEANS": None},
-            inputs=[(shape, dtype)],
-            outputs={"level": ((CHANNELS, rows, columns), np.dtype(np.uint16))},
+        return build.launch(
+            "edge_search/edge_search.cl",
+            "edge_levels",
+            work=WorkSize((columns, rows), None),
+            outputs=build.outputs({"level": (CHANNELS, rows, columns)}, level=np.uint16),
+            defines=flags(FROM_MEANS=True),
             arguments=[
                 *map(np.int32, (*shape, self.border)),
                 np.float32((0.25 * self.threshold) ** 2),
                 np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32),
             ],
-            global_size=(columns, rows),
         )
 
 
@@ -173,8 +169,9 @@ class SearchEdges(VisionOperation[PoseCosts]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype != np.uint16 or len(shape) != 3:
-            raise TypeError(f"SearchEdges takes uint16 levels (channels, rows, columns), got {dtype} of {shape}")
+        build = LaunchBuilder(self, device, shape, dtype, variant=self.variant)
+        build.check_dtype("uint16", of="levels")
+        build.check_shape(len(shape) == 3, "levels (channels, rows, columns)")
         # A whole block of positions is read.
         limit = math.prod(shape) - (self.rows - 1) * shape[2] - max(self.columns, _BLOCK) + 1
         if shape[1] < self.rows or shape[2] < self.columns or limit < 1:
@@ -182,28 +179,16 @@ class SearchEdges(VisionOperation[PoseCosts]):
                 f"SearchEdges takes levels of {self.rows} x {self.columns} cells or more, got shape {shape}; lay a "
                 f"wider border"
             )
-        blocks, strip = -(-self.columns // _BLOCK), uses_vectors(self.variant, device)
-        shares = -(-_SHARES_PER_CORE * device.handle.max_compute_units // self.headings)
-        each = max(-(-self.rows // shares), min(_FEWEST_ROWS, self.rows))
-        spec = (self.headings, self.rows, blocks)
-        present = {"VECTOR_VARIANT": strip, "WITH_SCORES": self.with_scores}
-        capacity = max(64, 1 << (self.points - 1).bit_length())
-        return Launch(
-            source="edge_search/edge_search.cl",
-            kernel="edge_search",
-            defines={"CAPACITY": capacity} | {name: None for name, is_present in present.items() if is_present},
-            inputs=[(shape, dtype), ((self.headings, self.points), _WHOLE)],
-            outputs={
-                "scores": ((self.headings, self.rows, self.columns), _REAL) if self.with_scores else None,
-                "least": (spec, _REAL),
-                "column": (spec, _WHOLE),
-                "seen": ((self.headings,), _WHOLE),
-            },
-            arguments=[*map(np.int32, (self.points, self.rows, self.columns, shape[2], limit, each))],
-            global_size=(-(-self.rows // each), self.headings)
-            if strip
-            else (blocks * _BLOCK, self.rows, self.headings),
-            local_size=(1, 1) if strip else (_BLOCK, 1, 1),
+        grid = (self.headings, self.rows, self.columns)
+        work = pose_grid_work(build, *grid)
+        return build.launch(
+            "edge_search/edge_search.cl",
+            "edge_search",
+            work=work,
+            more_inputs=[((self.headings, self.points), np.dtype(np.int32))],
+            outputs=pose_cost_outputs(build, *grid, with_scores=self.with_scores),
+            defines={"CAPACITY": capacity(self.points, least=64), **flags(WITH_SCORES=self.with_scores)},
+            arguments=[*map(np.int32, (self.points, self.rows, self.columns, shape[2], limit, work.each))],
         )
 
 

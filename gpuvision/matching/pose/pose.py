@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import Define, Device, Launch, LaunchBuilder, Precision, Variant, capacity, flags, type_defines
 from gpuvision.matching.robust import Loss, efficiency, loss_defines, subsets, tuning_constant_of
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite, numbers
@@ -272,42 +272,46 @@ class SolvePose(VisionOperation[BoardPose]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"SolvePose takes float32 or float64 rows, got {dtype}")
-        freedoms, numbers_of_row = FREEDOMS[self.freedom], len(ROW) + (self.etch is not None)
-        if len(shape) < 2 or shape[-1] != numbers_of_row or not self.unknowns <= shape[-2] <= _MOST_ROWS:
-            expected = f"(..., {self.unknowns} to {_MOST_ROWS}, {numbers_of_row})"
-            raise ValueError(f"SolvePose takes rows {expected}, got shape {shape}")
-        real, (*batch, count, _) = real_of(self.precision, dtype), shape
-        poses, strip = math.prod(batch), uses_vectors(self.variant, device)
-        sizes: dict[str, tuple[int, ...]] = {"pose": (3,), "deformation": (3,), "placement": (2,)}
-        sizes |= {"covariance": (freedoms, freedoms), "residuals": (count,), "weights": (count,)}
-        sizes |= dict.fromkeys(("scale", "spread", "condition"), ())
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
+        build.check_dtype("float32", "float64", of="rows")
+        numbers_of_row = len(ROW) + (self.etch is not None)
+        is_valid = len(shape) >= 2 and shape[-1] == numbers_of_row and self.unknowns <= shape[-2] <= _MOST_ROWS
+        build.check_shape(is_valid, f"rows (..., {self.unknowns} to {_MOST_ROWS}, {numbers_of_row})")
+        batch, count = shape[:-2], shape[-2]
+        poses = math.prod(batch)
+        work = build.work(poses, each=1, group=_GROUP)
         limits = (self.smallest_scale, *self.limits, *self.placement, self.certainty_of_etch)
-        return Launch(
-            source="pose/pose.cl",
-            kernel="pose_sets",
-            defines={**real_defines(device, real), **self.defines(count, strip), "INPUT": _code(dtype)}
-            | ({"WITH_NEAR": None} if self.near else {}),
-            inputs=[(shape, dtype), *([((*batch, 3), dtype)] if self.near else [])],
-            outputs={
-                **{name: ((*batch, *size), real) for name, size in sizes.items()},
-                **{name: (tuple(batch), np.dtype(np.int32)) for name in ("rank", "inliers")},
-                "status": (tuple(batch), np.dtype(np.uint8)),
-                **{name: (tuple(batch), real) for name in ("etch", "agreement", "leverage")},
-            },
+        return build.launch(
+            "pose/pose.cl",
+            "pose_sets",
+            work=work,
+            more_inputs=[((*batch, 3), dtype)] if self.near else [],
+            outputs=build.outputs(self.shapes(batch, (*batch, count)), rank=np.int32, inliers=np.int32),
+            defines={**self.defines(count), **type_defines("INPUT", dtype), **flags(WITH_NEAR=self.near)},
             arguments=[
                 np.int64(poses),
                 np.int32(count),
-                self.starts(count, strip),
+                self.starts(count, vectors=work.vectors),
                 np.int32(self.trials),
                 np.int32(self.steps),
-                *(real.type(each) for each in limits),
+                *map(build.real.type, limits),
             ],
-            global_size=(poses if strip else -(-poses // _GROUP) * _GROUP,),
-            local_size=(1,) if strip else (_GROUP,),
-            passes_once=strip and poses == 1,
+            passes_once=work.vectors and poses == 1,
         )
+
+    def shapes(self, batch: tuple[int, ...], rows: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of the fields of `BoardPose` for poses `batch` from rows `rows`, in the kernels' order."""
+        freedoms = FREEDOMS[self.freedom]
+        return {
+            "pose": (*batch, 3),
+            "deformation": (*batch, 3),
+            "placement": (*batch, 2),
+            "covariance": (*batch, freedoms, freedoms),
+            "residuals": rows,
+            "weights": rows,
+            **dict.fromkeys(("scale", "spread", "condition", "rank", "inliers", "status"), batch),
+            **dict.fromkeys(("etch", "agreement", "leverage"), batch),
+        }
 
     @property
     def unknowns(self) -> int:
@@ -325,28 +329,22 @@ class SolvePose(VisionOperation[BoardPose]):
         """One over the standard deviation of the etching [1/m], 0 where it is not asked for."""
         return 0.0 if self.etch is None else 1.0 / self.etch
 
-    def defines(self, count: int, strip: bool) -> dict[str, Any]:
+    def defines(self, count: int) -> dict[str, Define]:
         """Return what selects the code of ``pose.h`` for so many rows."""
         assert self.bend is not None
         return {
             **loss_defines(self.loss, self.bend),
-            **({"VECTOR_VARIANT": None} if strip else {}),
             **({} if self.scale is None else {"GIVEN_SCALE": self.scale}),
             "EFFICIENCY": efficiency(self.loss, self.bend),
-            **({} if self.etch is None else {"ETCHED": None}),
             "OF_POSE": FREEDOMS[self.freedom],
             "FREEDOMS": self.unknowns,
             "START_STEPS": _START_STEPS,
-            # Powers of two: few builds for many numbers of rows.
-            "CAPACITY": max(_LANES, 1 << (count - 1).bit_length()),
+            "CAPACITY": capacity(count, least=_LANES),
+            **flags(ETCHED=self.etch is not None),
         }
 
-    def starts(self, count: int, strip: bool) -> npt.NDArray[np.int32]:
+    def starts(self, count: int, *, vectors: bool) -> npt.NDArray[np.int32]:
         """Return the rows that the poses to start from go through, in the order of ``pose_start``."""
         chosen = subsets(count, self.unknowns, self.trials)
-        lanes = _LANES if strip else 1
+        lanes = _LANES if vectors else 1
         return np.ascontiguousarray(chosen.reshape(-1, lanes, chosen.shape[1]).swapaxes(1, 2)).ravel()
-
-
-def _code(dtype: np.dtype[Any]) -> str:
-    return "float" if dtype == np.float32 else "double"

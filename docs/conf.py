@@ -57,7 +57,7 @@ sphinx_gallery_conf = {
     "examples_dirs": [str(HERE.parent / "examples")],
     "gallery_dirs": ["gallery"],
     "filename_pattern": r"\.py$",
-    "within_subsection_order": "FileNameSortKey",
+    "within_subsection_order": "example_order.place",
     "abort_on_example_error": True,
     "download_all_examples": False,
     "show_signature": False,
@@ -66,6 +66,8 @@ sphinx_gallery_conf = {
     "min_reported_time": 1e9,
 }
 
+# Pages without pages below them have no navigation on the left.
+html_sidebars = {name: [] for name in ("install", "glossary", "changelog", "contributing")}
 html_theme = "pydata_sphinx_theme"
 html_title = f"gpuvision {release}"
 html_static_path = ["_static"]
@@ -74,6 +76,7 @@ html_copy_source = False
 html_show_sourcelink = False
 html_theme_options = {
     "show_prev_next": True,
+    "header_links_before_dropdown": 8,
     "navigation_with_keys": False,
     "show_toc_level": 2,
     "navbar_align": "left",

@@ -151,7 +151,7 @@ def _object_page(name: str, value: Any, documented: dict[str, Any]) -> str:
         return f"{title(name)}\n.. automodule:: {name}\n   :members:\n   :member-order: bysource\n{without}"
     head = title(name.rpartition(".")[2])
     if inspect.isclass(value):
-        options = "   :members:\n   :show-inheritance:\n   :member-order: bysource\n"
+        options = "   :members:\n   :exclude-members: Result\n   :show-inheritance:\n   :member-order: bysource\n"
         return f"{head}\n.. autoclass:: {name}\n{options}"
     if inspect.isroutine(value):
         return f"{head}\n.. autofunction:: {name}\n"

@@ -80,6 +80,7 @@ def run_page(name: str, run: Mapping[str, Any]) -> str:
     date = f"- Date: {run['date']}.\n" if "date" in run else ""
     command = run.get("command", f"gpuvision profile {' '.join(operations)} --json FILE")
     parts = [
+        ":html_theme.sidebar_secondary.remove:\n",  # the tables are wide
         title(name),
         _machine(run["machine"]),
         f"{date}- Command: ``{command}``.",

@@ -15,7 +15,7 @@ import trimesh
 
 from gpuvision import Lambert, Material, Scene
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.workflows.simulating import prepare, simulate
+from gpuvision.workflows.simulating import prepare_simulation, simulate
 
 # %%
 # A V-groove of 90 degrees, 20 mm deep: its walls light each other. The surface is a profile (x, z), drawn out along
@@ -30,7 +30,7 @@ material = Material(diffuse=Lambert(albedo=0.7), name="white paint")
 
 # %%
 # Simulate twice from the same light: without a mask, and with the mask that is made for this part.
-task = prepare(scene, [material], Sensor.load("psd_line"), paths=("direct", "diffuse-diffuse"), profiles=4)
+task = prepare_simulation(scene, [material], Sensor.load("psd_line"), paths=("direct", "diffuse-diffuse"), profiles=4)
 with tempfile.TemporaryDirectory() as folder:
     without = simulate(task, folder)
     masked = simulate(task, folder, mask="best")
@@ -40,8 +40,8 @@ print(masked.summary())
 # The errors of a profile, and the windows of the mask.
 figure, (top, bottom) = plt.subplots(2, 1, figsize=(9, 6), sharex=True, layout="constrained")
 strips = np.arange(96)
-top.plot(strips, 1e6 * without.artifacts.error[1], "r.", label="without a mask")
-top.plot(strips, 1e6 * masked.artifacts.error[1], "g.", label="with the mask")
+top.plot(strips, 1e6 * without.attribution.error[1], "r.", label="without a mask")
+top.plot(strips, 1e6 * masked.attribution.error[1], "g.", label="with the mask")
 top.set(ylabel="error [µm]", title="A V-groove: interreflection, and a mask against it")
 top.set_yscale("symlog", linthresh=10.0)
 top.legend()

@@ -1,8 +1,8 @@
 """Speed against accuracy of secondary light: ClusteredIrradiance at tolerances of the range, against all pairs.
 
-The peer is this library without a plan: `OccludedIrradiance` over all pairs, with its copies to and from the device;
-ours has the plan in its time. A row's error is the largest error of the range among the strips, metres, against all
-pairs in double; ``within`` is the part of the strips that keep the tolerance, ``bound`` what the plan proves. Strips
+The peer is this library without a cut: `OccludedIrradiance` over all pairs, with its copies to and from the device;
+ours has the cut in its time. A row's error is the largest error of the range among the strips, metres, against all
+pairs in double; ``within`` is the part of the strips that keep the tolerance, ``bound`` what the cut proves. Strips
 lie across the sheet and see what is lit and what is beside it; one metre of their reading is one metre of range. Where
 ``planned`` is false all is computed, as it is at tolerance 0: no tolerance takes longer than that one.
 
@@ -187,7 +187,9 @@ def cases(device: Device) -> Iterator[Case]:
     first: Case | None = None
     for times in _SIZES:
         part = Part.surface(_groove, 32 * times, 16, strips=32 * times)
-        grown = _case(device, f"growth/x{times}", part, _AT_GROWTH, part.exactly(device), since=first, least=None)
+        grown = _case(
+            device, f"growth/x{times}", part, _AT_GROWTH, part.exactly(device), since=first, min_facing_pairs=None
+        )
         first = first or grown
         yield grown
 
@@ -205,15 +207,15 @@ def _case(
     call = functools.partial(light, part.segments, part.receivers, part.weights, part.reading)
     result = call()
     off = np.abs(part.shifts(result.irradiance) - part.shifts(exact))
-    counts = result.plan.counts
+    counts = result.cut.counts
     pairs = max(counts["pairs"], 1)
     facts: dict[str, Any] = {
         "tolerance": tolerance,
-        "bound": float(result.plan.bound.max()),
+        "bound": float(result.cut.bound.max()),
         "within": float(np.mean(off <= max(tolerance, _ROUNDING))),
         "shift": float(np.median(np.abs(part.shifts(exact)))),
         "pairs": pairs,
-        "planned": result.plan.planned,
+        "traversed": result.cut.traversed,
         **{kind: counts[kind] / pairs for kind in ("exact", "clear", "clustered", "work")},
     }
     if since is not None:

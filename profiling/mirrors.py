@@ -20,7 +20,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.harness import Case
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.triangulation import Triangulation
@@ -31,7 +31,7 @@ from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
 from gpuvision.simulation.transport.mirror_points import MirrorPoints
 from gpuvision.simulation.transport.mirrors import Mirrors
-from gpuvision.simulation.transport.plane_mirrors import planes_of
+from gpuvision.simulation.transport.plane_mirrors import triangle_planes
 
 _BALLS, _POINTS, _BOXES, _LIFT = 20, 2048, 30, 1e-7
 _LENS = np.array([0.0, 0.08, 0.15])
@@ -66,7 +66,7 @@ def _balls(device: Device) -> Case:
     bound.inputs[0].set(points)
     bound.inputs[1].set(_LENS)
     bound.run()
-    triangle, place = bound.outputs.triangle.get(), bound.outputs.place.get()
+    triangle, place = to_numpy(bound.outputs.triangle), to_numpy(bound.outputs.place)
     found, theirs = np.zeros((_POINTS, 2 * _BALLS), np.int64), np.zeros((_POINTS, 2 * _BALLS, 3))
 
     def peer() -> None:
@@ -195,12 +195,17 @@ def _facets(device: Device, samples: int) -> Case:
     def peer() -> Exposure:
         return _by_samples(scene, view, lit, embree, samples)
 
-    ours, theirs = mirrors.seen(lit, 0.0).total(), peer().total()
+    ours, theirs = mirrors.mirrored_exposure(lit, 0.0).total(), peer().total()
     lit_up = ours > 0.0
     error = float(np.median(np.abs(theirs[lit_up] / ours[lit_up] - 1.0)))
     facts = {"triangles": len(scene.corners), "samples": samples * len(lit.power), "peer_error": error}
     return Case(
-        "mirrors", f"facets/{samples}", lambda: mirrors.seen(lit, 0.0), {"numpy+embreex": peer}, 0.0, facts=facts
+        "mirrors",
+        f"facets/{samples}",
+        lambda: mirrors.mirrored_exposure(lit, 0.0),
+        {"numpy+embreex": peer},
+        0.0,
+        facts=facts,
     )
 
 
@@ -217,7 +222,7 @@ def _box_scene() -> tuple[Scene, SensorView, LitLine]:
         place = (*rng.uniform((-0.02, -0.015), (0.02, 0.005)), 0.5 * size[2])
         parts.append(np.add(box.triangles, place))
     corners = np.concatenate(parts)
-    upright = np.abs(planes_of(corners)[:, 2]) < 0.5
+    upright = np.abs(triangle_planes(corners)[:, 2]) < 0.5
     transport = StraightTransport(step=1e-4)
     geometry = Triangulation.from_stand_off(
         baseline=_LENS[1], stand_off=_LENS[2], focal_distance=0.04, tilt=0.0, region=((-6e-3, 6e-3), (-6e-3, 6e-3))
@@ -226,7 +231,7 @@ def _box_scene() -> tuple[Scene, SensorView, LitLine]:
     lens = (float(_LENS[0]), float(_LENS[1]), float(_LENS[2]))
     view = SensorView(triangulation=geometry, transport=transport, lens=lens, u_edges=edges, v_edges=edges)
     scene = Scene(corners, upright.astype(np.int32))
-    return scene, view, LightSheet(transport=transport, g_limits=(-0.025, 0.025)).lit(scene, 0.0)
+    return scene, view, LightSheet(transport=transport, g_limits=(-0.025, 0.025)).illuminate(scene, 0.0)
 
 
 def _turned(angle: float) -> Array:
@@ -244,7 +249,7 @@ def _by_samples(scene: Scene, view: SensorView, lit: LitLine, embree: Any, sampl
     points = (lit.ends[dull, :1] + share * (lit.ends[dull, 1:] - lit.ends[dull, :1])).reshape(-1, 3)
     normals, each = np.repeat(lit.normals[dull], samples, axis=0), np.repeat((lit.power * lit.lengths)[dull], samples)
     mirrors = scene.corners[scene.material == 1]
-    planes, total = planes_of(mirrors), view.dark()
+    planes, total = triangle_planes(mirrors), view.dark()
     for corners, plane in zip(mirrors, planes, strict=True):
         normal, up, lens_up = plane[:3], points @ plane[:3] - plane[3], _LENS @ plane[:3] - plane[3]
         front = np.flatnonzero(up * lens_up > 0.0)

@@ -23,7 +23,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from gpuvision.host import Bound, Device
+from gpuvision.host import Bound, Device, to_numpy
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LitSegments
@@ -107,10 +107,10 @@ def _case(device: Device, board: Board, name: str, samples: int = 1024, **more: 
     bound = operation.bind(device, receivers.shape, receivers.dtype)
     for there, here in zip(bound.inputs, (receivers, weights, rows.astype(np.float32)), strict=True):
         there.set(here)
-    ours = bound.run().irradiance.get()
+    ours = to_numpy(bound.run().irradiance)
     truth = np.full(ours.shape, np.nan)
     if device.has_double:
-        truth = operation(receivers.astype(float), weights.astype(float), rows, device=device).irradiance
+        truth = to_numpy(operation(receivers.astype(float), weights.astype(float), rows, device=device).irradiance)
     peer = functools.partial(irradiance_by_samples, board, samples, embree_of(board.scene))
     facts = {
         "triangles": len(board.scene.corners),

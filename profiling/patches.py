@@ -19,7 +19,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.bvh import board
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.scene.scene import Scene
@@ -39,13 +39,13 @@ def cases(device: Device) -> Iterator[Case]:
 def _room(device: Device, receivers: int) -> Case:
     box = trimesh.creation.box((1.0, 0.8, 0.6))
     box.invert()
-    patches = Patches.of(Scene.of(box), size=0.1, both_sides=False)
-    points = patches.points[0]
+    patches = Patches.from_scene(Scene.of(box), size=0.1, both_sides=False)
+    points = patches.quadrature[0]
     chosen = np.linspace(0, len(points) - 1, receivers).astype(int)
     points = points[chosen]
     bound = FormFactors(patches=patches).bind(device, points.shape, np.float32)
     bound.inputs[0].set(points.astype(np.float32))
-    ours = bound.run().factors.get()
+    ours = to_numpy(bound.run().factors)
     # Its own wall lies in a receiver's plane.
     way = patches.corners[None] - points[:, None, None, :3]
     apart = np.abs(np.einsum("nmkd,nd->nmk", way, points[:, 3:])).max(axis=2) > 1e-9
@@ -75,18 +75,18 @@ def _lambert(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArr
 
 def _board(device: Device, size: float) -> Case:
     scene = Scene.of(board(0))
-    patches = Patches.of(scene, size=size)
-    points = np.resize(Patches.of(scene, size=0.004).points[0], (60_000, 6))[::20]
+    patches = Patches.from_scene(scene, size=size)
+    points = np.resize(Patches.from_scene(scene, size=0.004).quadrature[0], (60_000, 6))[::20]
     # Patches on top shine, as under a lamp.
     first = np.searchsorted(np.asarray(patches.patch), np.arange(patches.count))
     exitance = np.maximum(patches.normals[first, 2], 0.0)
     bound = PatchLight(patches=patches, scene=scene).bind(device, points.shape, np.float32)
     bound.inputs[0].set(points.astype(np.float32))
     bound.inputs[1].set(exitance.astype(np.float32))
-    ours = bound.run().irradiance.get()
+    ours = to_numpy(bound.run().irradiance)
     real = np.float64 if device.has_double else np.float32
     exact = PatchLight(patches=patches, scene=scene, rays=4096.0)
-    truth = exact(points.astype(real), exitance.astype(real), device=device).irradiance
+    truth = to_numpy(exact(points.astype(real), exitance.astype(real), device=device).irradiance)
     by_points = _PointByPoint(scene, patches, exitance, points)
     facts = {"patches": patches.count, "receivers": len(points), "peer_error": _error(by_points(), truth)}
     peers = {"numpy+embreex": by_points}

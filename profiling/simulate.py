@@ -12,13 +12,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.harness import Case
 from gpuvision.profiling.occluded_irradiance import Board, embree_of, error_of, irradiance_by_samples
 from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
 from gpuvision.workflows.demo import scanned_part
-from gpuvision.workflows.light_cache import light_paths
+from gpuvision.workflows.light_cache import make_light_paths
 
 _SAMPLES = 256
 _AT = 0.006  # m: over the cylinder's rim, the box and the ball
@@ -32,16 +32,16 @@ def cases(device: Device) -> Iterator[Case]:
 
 def _case(device: Device, name: str) -> Case:
     task = scanned_part(name)
-    model = light_paths(task, device)
-    seen = model.lines.visible_surface(_AT)
-    lit = model.sheet.lit(task.part, _AT)
+    model = make_light_paths(task, device)
+    seen = model.view_rays.visible_surface(_AT)
+    lit = model.sheet.illuminate(task.part, _AT)
     segments = LitSegments(lit.ends, lit.normals, task.materials[0].albedo * lit.power)
     board = Board(task.part, segments, seen.receivers.astype(np.float32))
     ours, truth = model.irradiance(seen, segments), np.full(seen.weights.shape, np.nan)
     if device.has_double:
         rows = segment_rows(segments)
         exact = OccludedIrradiance(scene=task.part, segments=len(rows), precision="double")
-        truth = exact(seen.receivers, np.zeros((*seen.weights.shape, 2)), rows, device=device).irradiance
+        truth = to_numpy(exact(seen.receivers, np.zeros((*seen.weights.shape, 2)), rows, device=device).irradiance)
     peer = functools.partial(irradiance_by_samples, board, _SAMPLES, embree_of(task.part))
     seen_at_all = seen.weights > 0.0
     facts = {

@@ -31,7 +31,7 @@ def demo(
     from gpuvision.host.files import check_folder, whole_folder
     from gpuvision.workflows.demo import SENSORS, part, scanned_part
     from gpuvision.workflows.scanning import scan
-    from gpuvision.workflows.simulating import recorded, simulate
+    from gpuvision.workflows.simulating import simulate, simulate_recording
 
     check_folder(out)
     chosen = Device.best() if device is None else Device.named(device)
@@ -43,7 +43,7 @@ def demo(
             task = scanned_part(name)
             with progress_bar(f"{name}: simulating") as progress:
                 known = simulate(task, light, seed=seed, device=chosen, progress=progress)
-            recording = recorded(task, light, seed=seed, device=chosen)
+            recording = simulate_recording(task, light, seed=seed, device=chosen)
             done = scan(recording, task.sensor, device=chosen)
             known.write(inside / name)
             done.write(inside / name)

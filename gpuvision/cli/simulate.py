@@ -20,7 +20,7 @@ from gpuvision.cli.scan import progress_bar
 
 if TYPE_CHECKING:
     from gpuvision.simulation.sensors.masks import Mask
-    from gpuvision.workflows.light_cache import Task
+    from gpuvision.workflows.light_cache import SimulationTask
 
 
 class Unit(StrEnum):
@@ -61,7 +61,9 @@ Albedo = Annotated[
 ]
 Paths = Annotated[
     str,
-    typer.Option(help="Light paths: all, or some of direct, specular, diffuse-specular, diffuse-diffuse, bounces."),
+    typer.Option(
+        help="Light paths: all, or some of direct, specular, diffuse-specular, diffuse-diffuse, multi-bounce."
+    ),
 ]
 Tolerance = Annotated[
     float, typer.Option(min=0.0, help="Range error [m] allowed for light that is left out; 0: nothing is left out.")
@@ -115,7 +117,7 @@ def simulate(
     from gpuvision.host import Device
     from gpuvision.host.files import check_folder
     from gpuvision.sensor.sensor import Sensor
-    from gpuvision.workflows.simulating import part_of, prepare
+    from gpuvision.workflows.simulating import load_part, prepare_simulation
 
     if materials is not None:
         reject_unused("with --materials", albedo=albedo)
@@ -129,14 +131,14 @@ def simulate(
     check_folder(out)
     before = _mask(mask)
     given = None if materials is None else read_materials(materials)
-    scene, made_of = part_of(part, _METRES[unit], given, 0.5 if albedo is None else albedo)
+    scene, made_of = load_part(part, _METRES[unit], given, 0.5 if albedo is None else albedo)
     if str(scene.defects) != "no defects":
         typer.echo(f"{part.name}: {'; '.join(str(scene.defects).splitlines())}", err=True)
     names = _names(paths)
-    task = prepare(scene, made_of, described, paths=names, tolerance=tolerance, profiles=profiles)
+    task = prepare_simulation(scene, made_of, described, paths=names, tolerance=tolerance, profiles=profiles)
     other = None
     if beside is not None:
-        other = prepare(scene, made_of, beside, paths=names, tolerance=tolerance, transports=task.transports)
+        other = prepare_simulation(scene, made_of, beside, paths=names, tolerance=tolerance, transports=task.transports)
     made: dict[str, Any] = {
         "mask": before,
         "seed": (1 if seed is None else seed) if noise else None,
@@ -168,7 +170,7 @@ def _mask(choice: str) -> Mask | str | None:
 
 
 def _run(
-    task: Task, other: Task | None, rule: Rule, out: Path, made: dict[str, Any], what: str
+    task: SimulationTask, other: SimulationTask | None, rule: Rule, out: Path, made: dict[str, Any], what: str
 ) -> tuple[str, dict[str, Any]]:
     """Simulate one sensor or two, write the results, and return the summary and the first sensor's report."""
     from gpuvision.simulation.errors.recommendations import SensorFusion

@@ -1,4 +1,4 @@
-"""All ways of the light from a sheet over a scene to a sensor, profile by profile."""
+"""Light paths of a simulation: all light that reaches a sensor from a sheet over a scene, profile by profile."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance
 from gpuvision.simulation.errors.range_error import StripErrorModel, interreflection_power_bound, select_paths
 from gpuvision.simulation.scene.material import Material
@@ -27,62 +27,76 @@ from gpuvision.simulation.transport.radiosity import Radiosity
 Float64 = npt.NDArray[np.float64]
 
 
-class Profile(NamedTuple):
-    """The light of one profile.
+class ProfileLight(NamedTuple):
+    """Light of one profile.
 
     Attributes
     ----------
     exposures
-        By path, (samples, bins).
+        `Exposure` (samples, bins) by name of the light path.
     truth
-        (samples,).
-    account
-        Numbers by name: how much was modelled.
+        True position of the lit line, (samples,).
+    statistics
+        Numbers by name: segments, power [W], and the pairs and paths that were modelled or left out, with their bounds.
     """
 
     exposures: dict[str, Exposure]
     truth: GroundTruth
-    account: dict[str, float]
+    statistics: dict[str, float]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LightPaths:
-    """What light comes to a sensor from a sheet on a scene; compared by identity.
+    """Light that reaches a sensor from a sheet over a scene; compared by identity.
 
     Parameters
     ----------
     view, sheet
-        The sensor, and its sheet of light, over the same transport.
+        Sensor and sheet of light, on the same transport.
     scene, materials
-        What is there; a material for every number in `Scene.material`.
+        Surfaces, and a material for every number in `Scene.material`.
     paths
-        Which of `gpuvision.simulation.sensors.readings.PATHS` are modelled; without "direct" there is no reading.
+        Light paths to model, out of `gpuvision.simulation.sensors.readings.PATHS`: "direct" (one diffuse reflection),
+        "specular" (one glossy reflection, or a mirror straight into the lens), "diffuse-specular" (a mirror before or
+        after a diffuse surface), "diffuse-diffuse" (two diffuse reflections), "multi-bounce" (three or more, by
+        radiosity). Without "direct" there is no reading.
     sub_sheets
-        Thin sheets that stand for a thick one, on the direct path. Secondary light comes from the middle one: it sees
-        the sheet from further away than the sheet is thick.
+        Number of thin sheets that represent a thick one on the direct path, 1 or more. Secondary light comes from the
+        middle of the sheet: the sheet is thin as seen from other surfaces.
     blur
-        Standard deviation of a point's image along u [sensor unit]; light by diffuse detours is even enough without.
+        Standard deviation of the image of a point along u [sensor unit]. It is not applied to diffuse secondary light,
+        which varies slowly.
     nodes
         Of `ViewRays`.
-    patch
-        Size of the patches between which light bounces on [m]; None: a sixteenth of the scene.
+    patch_size
+        Largest edge of the patches of the radiosity solution [m]; None: a sixteenth of the scene's diagonal.
     tolerance
-        Range error that may come from secondary light that is left out [m], as a centre of gravity reads it; 0:
-        nothing is left out.
+        Range error that the secondary light left out may make [m], 0 or more; 0: nothing is left out. See the notes.
     floor
         Power of a sample below which it is not read [W].
     device
-        None: `Device.best`.
+        Device of the kernels; None: `Device.best`.
 
     Raises
     ------
     ValueError
-        A path is unknown, or a material missing.
+        A path is unknown, or a material is missing.
 
     Attributes
     ----------
-    lines
-        What the sensor sees of the scene.
+    view_rays
+        Surface elements that the sensor sees.
+
+    Notes
+    -----
+    The tolerance holds for a reading that is the mean of u over the light of a sample (a PSD, or a centroid in a fixed
+    window), and covers pairs of a segment and a receiver that are left out or clustered (`LightClustering`) and
+    "multi-bounce" light that is left out. At most half of it is spent on the latter. It does not cover the
+    discretisation of the surface, of the sheet and of the patches, nor rounding, nor light paths that are not modelled.
+
+    The bound of multi-bounce light assumes diffuse reflection with the scene's largest albedo, and the solid angle of
+    the lens at the distance of the nearest *corner* of a triangle. Inner points of a large triangle can be nearer to
+    the lens, and then the bound is too small.
     """
 
     view: SensorView
@@ -93,15 +107,15 @@ class LightPaths:
     sub_sheets: int = 1
     blur: float = 0.0
     nodes: tuple[int, int] = (1, 1)
-    patch: float | None = None
+    patch_size: float | None = None
     tolerance: float = 0.0
     floor: float = 0.0
     device: Device | None = None
     _direct: DirectLight = field(init=False, repr=False)
     _mirrors: Mirrors = field(init=False, repr=False)
-    lines: ViewRays = field(init=False, repr=False)
-    _bounces: Radiosity | None = field(init=False, repr=False)
-    _planned: ClusteredIrradiance = field(init=False, repr=False)
+    view_rays: ViewRays = field(init=False, repr=False)
+    _radiosity: Radiosity | None = field(init=False, repr=False)
+    _clustered: ClusteredIrradiance = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for path in self.paths:
@@ -109,7 +123,9 @@ class LightPaths:
                 raise ValueError(f"unknown path {path!r}, expected some of {', '.join(PATHS)}")
         device = Device.best() if self.device is None else self.device
         object.__setattr__(self, "device", device)
-        lines = ViewRays(view=self.view, scene=self.scene, materials=self.materials, nodes=self.nodes, device=device)
+        view_rays = ViewRays(
+            view=self.view, scene=self.scene, materials=self.materials, nodes=self.nodes, device=device
+        )
         direct = DirectLight(
             view=self.view,
             scene=self.scene,
@@ -119,22 +135,25 @@ class LightPaths:
             device=device,
         )
         mirrors = Mirrors(view=self.view, scene=self.scene, materials=self.materials, device=device)
-        planned = ClusteredIrradiance(scene=self.scene, tolerance=self.tolerance, device=device)
-        object.__setattr__(self, "_planned", planned)
+        clustered = ClusteredIrradiance(scene=self.scene, tolerance=self.tolerance, device=device)
+        object.__setattr__(self, "_clustered", clustered)
         object.__setattr__(self, "_direct", direct)
         object.__setattr__(self, "_mirrors", mirrors)
-        object.__setattr__(self, "lines", lines)
-        object.__setattr__(self, "_bounces", self._between_patches() if "bounces" in self.paths else None)
+        object.__setattr__(self, "view_rays", view_rays)
+        object.__setattr__(self, "_radiosity", self._make_radiosity() if "multi-bounce" in self.paths else None)
 
-    def profile(self, L: float) -> Profile:
-        """Return the light at a transport [m]."""
+    def profile(self, L: float) -> ProfileLight:
+        """Return the light at a transport L [m]."""
         return self.profiles([L])[0]
 
-    def profiles(self, transports: npt.ArrayLike) -> list[Profile]:
-        """Return the light at several transports [m]: faster than one by one."""
+    def profiles(self, transports: npt.ArrayLike) -> list[ProfileLight]:
+        """Return the light at several transports [m]; faster than one by one."""
         places = np.atleast_1d(np.asarray(transports, np.float64))
-        straight, truths = self._direct.exposures_along(places, causes=True), self._direct.truths_along(places)
-        lit, first = self.sheet.lit_lines(self.scene, places)
+        straight, truths = (
+            self._direct.exposures_of_profiles(places, causes=True),
+            self._direct.truths_of_profiles(places),
+        )
+        lit, first = self.sheet.illuminate_all(self.scene, places)
         found = []
         for k, L in enumerate(places):
             exposures = {
@@ -143,44 +162,51 @@ class LightPaths:
                 if name in self.paths or name not in PATHS
             }
             truth = GroundTruth(truths.g[k], truths.h[k], truths.status[k])
-            found.append(self._profile(float(L), lit.those(slice(first[k], first[k + 1])), exposures, truth))
+            found.append(self._profile(float(L), lit.select(slice(first[k], first[k + 1])), exposures, truth))
         return found
 
-    def _profile(self, L: float, lit: LitLine, exposures: dict[str, Exposure], truth: GroundTruth) -> Profile:
-        """Return the direct light of a profile with the light by detours."""
-        account = {"segments": float(len(lit.power)), "power": lit.total()}
-        if "diffuse-specular" in self.paths and self._mirrors.there_are_any:
+    def _profile(self, L: float, lit: LitLine, exposures: dict[str, Exposure], truth: GroundTruth) -> ProfileLight:
+        """Return the light of a profile: the direct light and all secondary light."""
+        statistics = {"segments": float(len(lit.power)), "power": lit.total()}
+        if "diffuse-specular" in self.paths and self._mirrors.has_mirrors:
             mirrored = self._mirrors.exposure(lit, L, self.sheet)
             exposures["diffuse-specular"] = self.view.blur(mirrored, self.blur)
-        if {"diffuse-diffuse", "bounces"} & set(self.paths):
-            seen, segments = self.lines.visible_surface(L), self._diffuse(lit)
+        if {"diffuse-diffuse", "multi-bounce"} & set(self.paths):
+            seen, segments = self.view_rays.visible_surface(L), self._diffuse_segments(lit)
             reading = StripErrorModel.from_exposure(self.view, exposures["direct"], min_power=self.floor)
             remaining = self.tolerance
-            if self._bounces is not None:
-                choice = select_paths({"bounces": reading.error_bound(self._most_by_bounces(segments))}, self.tolerance)
+            if self._radiosity is not None:
+                choice = select_paths(
+                    {"multi-bounce": reading.error_bound(self._max_multi_bounce_power(segments))}, self.tolerance
+                )
                 remaining = choice.remaining_tolerance
-                if "bounces" in choice.modelled:
-                    exposures["bounces"] = self._bounced(seen, segments)
-                account |= {"bound of bounces left out [m]": sum(choice.omitted.values())}
+                if "multi-bounce" in choice.modelled:
+                    exposures["multi-bounce"] = self._multi_bounce_exposure(seen, segments)
+                statistics |= {"bound of multi-bounce left out [m]": sum(choice.omitted.values())}
             if "diffuse-diffuse" in self.paths:
-                irradiance, told = self._secondary(seen, segments, reading, remaining)
-                exposures["diffuse-diffuse"] = self.lines.exposure(seen, irradiance)
-                account |= told
-        return Profile(exposures, truth, account)
+                irradiance, counts = self._diffuse_irradiance(seen, segments, reading, remaining)
+                exposures["diffuse-diffuse"] = self.view_rays.exposure(seen, irradiance)
+                statistics |= counts
+        return ProfileLight(exposures, truth, statistics)
 
-    # ---- light by detours ------------------------------------------------------------------------------------
+    # ---- secondary light -------------------------------------------------------------------------------------
 
-    def _bounced(self, seen: VisibleSurface, segments: LitSegments) -> Exposure:
-        assert self._bounces is not None  # asked for
-        exitance = self._bounces.exitance(self._bounces.arrival(segments))
-        return self.lines.exposure(seen, self._bounces.light(seen.receivers, exitance).irradiance)
+    def _multi_bounce_exposure(self, seen: VisibleSurface, segments: LitSegments) -> Exposure:
+        assert self._radiosity is not None  # asked for
+        exitance = self._radiosity.solve(self._radiosity.direct_irradiance(segments))
+        light = self._radiosity.irradiance(seen.receivers, exitance)
+        return self.view_rays.exposure(seen, np.asarray(to_numpy(light.irradiance), np.float64))
 
-    def _most_by_bounces(self, segments: LitSegments) -> float:
-        """Return the most power that the sensor can get of light that went between surfaces more than once."""
+    def _max_multi_bounce_power(self, segments: LitSegments) -> float:
+        """Return an upper estimate of the power on the sensor by light with three or more diffuse reflections [W].
+
+        It is a bound if no point of the scene is nearer to the lens than the nearest corner (see the notes of
+        `LightPaths`).
+        """
         sent = float(segments.exitance @ np.linalg.norm(segments.ends[:, 1] - segments.ends[:, 0], axis=1))
         corners = self.scene.corners.reshape(-1, 3)
         lens = self.view.lens_at(0.0)
-        # The nearest that the part can come to the lens, wherever the sheet stands on it.
+        # Least distance of a corner from the line on which the lens moves over the scene.
         across = corners - lens
         across -= np.outer(across @ np.array(self.view.transport.direction), self.view.transport.direction)
         nearest = float(np.linalg.norm(across, axis=1).min(initial=np.inf))
@@ -190,35 +216,43 @@ class LightPaths:
             sent, max((each.albedo for each in self.materials), default=0.0), solid_angle
         )
 
-    def _secondary(
+    def _diffuse_irradiance(
         self, seen: VisibleSurface, segments: LitSegments, reading: StripErrorModel, tolerance: float
     ) -> tuple[Float64, dict[str, float]]:
-        """Return the irradiance by lit segments, and what of it was modelled."""
+        """Return the irradiance of the seen surface by lit segments, and numbers of the pairs that were modelled."""
         if tolerance == 0.0:
             pairs = float(len(segments.exitance) * np.count_nonzero(seen.weights))
             return self.irradiance(seen, segments), {"pairs": pairs, "pairs exact": pairs}
-        weights = reading.weights(seen.weights, self.lines.u)
+        weights = reading.weights(seen.weights, self.view_rays.u)
         rows = segment_rows(segments)
-        light, plan = self._planned(rows, seen.receivers, weights, reading, tolerance=tolerance)
-        told = {f"pairs {name}": float(plan.counts[name]) for name in ("exact", "clustered", "left out")}
-        told["profiles in full (cheaper than a plan)"] = float(not plan.planned)
-        bound = {"bound of pairs left out [m]": float(plan.bound.max(initial=0.0))}
-        return light, {"pairs": float(plan.counts["pairs"])} | told | bound
+        light, cut = self._clustered(rows, seen.receivers, weights, reading, tolerance=tolerance)
+        counts = {f"pairs {name}": float(cut.counts[name]) for name in ("exact", "clustered", "left out")}
+        counts["profiles without clustering (cheaper)"] = float(not cut.traversed)
+        bound = {"bound of pairs left out [m]": float(cut.bound.max(initial=0.0))}
+        return light, {"pairs": float(cut.counts["pairs"])} | counts | bound
 
     def irradiance(self, seen: VisibleSurface, segments: LitSegments) -> Float64:
-        """Return the irradiance [W/m^2] of what the sensor sees from lit segments, (samples, n)."""
-        return self._planned.exactly(segment_rows(segments), seen.receivers)
+        """Return the irradiance of the seen surface by all pairs with lit segments, (samples, n) [W/m^2].
 
-    def _diffuse(self, lit: LitLine) -> LitSegments:
+        Parameters
+        ----------
+        seen
+            Surface elements that the sensor sees, from `view_rays`.
+        segments
+            Lit segments.
+        """
+        return self._clustered.compute_all(segment_rows(segments), seen.receivers)
+
+    def _diffuse_segments(self, lit: LitLine) -> LitSegments:
         assert self.scene.material is not None  # set by Scene itself
-        lit = lit.joined(self.scene.material[lit.triangle])
+        lit = lit.merged(self.scene.material[lit.triangle])
         albedo = np.array([each.albedo for each in self.materials])[self.scene.material[lit.triangle]]
         return LitSegments(lit.ends, lit.normals, albedo * lit.power)
 
-    def _between_patches(self) -> Radiosity:
-        size = self.patch
+    def _make_radiosity(self) -> Radiosity:
+        size = self.patch_size
         if size is None:
             corners = self.scene.corners.reshape(-1, 3)
             size = float(np.linalg.norm(np.ptp(corners, axis=0))) / 16.0
         albedo = [each.albedo for each in self.materials]
-        return Radiosity.of(self.scene, albedo, size=size, device=self.device)
+        return Radiosity.from_scene(self.scene, albedo, size=size, device=self.device)

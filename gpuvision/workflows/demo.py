@@ -14,8 +14,8 @@ from gpuvision.sensor.sensor import Sensor
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.workflows.light_cache import Task
-from gpuvision.workflows.simulating import prepare
+from gpuvision.workflows.light_cache import SimulationTask
+from gpuvision.workflows.simulating import prepare_simulation
 
 SENSORS = ("camera_line", "psd_line")
 _ALBEDO = 0.5
@@ -44,8 +44,10 @@ def _placed(solid: trimesh.Trimesh, x_mm: float, y_mm: float, z_mm: float) -> tr
     return solid
 
 
-def scanned_part(sensor: str, profiles: int | None = None) -> Task:
+def scanned_part(sensor: str, profiles: int | None = None) -> SimulationTask:
     """Return the task of scanning the part with one of the `SENSORS`."""
     scene = Scene.of(part())
     material = Material(diffuse=Lambert(albedo=_ALBEDO), name="matt")
-    return prepare(scene, [material], Sensor.load(sensor), paths=("direct", "diffuse-diffuse"), profiles=profiles)
+    return prepare_simulation(
+        scene, [material], Sensor.load(sensor), paths=("direct", "diffuse-diffuse"), profiles=profiles
+    )

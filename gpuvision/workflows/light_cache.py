@@ -51,7 +51,7 @@ Progress = Callable[[int, int | None], object]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Task:
+class SimulationTask:
     """What light is to be simulated: all that a block depends on. It can go to another machine.
 
     Attributes
@@ -97,7 +97,7 @@ class Task:
         return [range(k, min(k + PROFILES_PER_BLOCK, count)) for k in range(0, count, PROFILES_PER_BLOCK)]
 
 
-class Block(NamedTuple):
+class LightBlock(NamedTuple):
     """Light of some profiles.
 
     Attributes
@@ -106,26 +106,26 @@ class Block(NamedTuple):
         By path, (profiles, samples, bins).
     truth
         (profiles, samples).
-    account
+    statistics
         What was modelled and what was left out: numbers by name, (profiles,) each.
     """
 
     exposures: dict[str, Exposure]
     truth: GroundTruth
-    account: dict[str, npt.NDArray[Any]]
+    statistics: dict[str, npt.NDArray[Any]]
 
     def to_bytes(self) -> bytes:
         """Return an NPZ file: powers and moments in single, which moves a reading by less than 1e-6 of its error."""
         arrays: dict[str, Any] = {f"truth/{name}": value for name, value in self.truth._asdict().items()}
         for path, exposure in self.exposures.items():
             arrays |= {f"{name}/{path}": value.astype(np.float32) for name, value in exposure._asdict().items()}
-        arrays |= {f"account/{name}": value for name, value in self.account.items()}
+        arrays |= {f"statistics/{name}": value for name, value in self.statistics.items()}
         file = io.BytesIO()
         np.savez_compressed(file, **arrays)
         return file.getvalue()
 
     @classmethod
-    def from_file(cls, path: Path) -> Block:
+    def from_file(cls, path: Path) -> LightBlock:
         """Read what `to_bytes` gave.
 
         Raises
@@ -133,7 +133,7 @@ class Block(NamedTuple):
         RecordingError
             The file holds something else.
         """
-        parts: dict[str, dict[str, Any]] = {"truth": {}, "account": {}, "power": {}, "moment": {}}
+        parts: dict[str, dict[str, Any]] = {"truth": {}, "statistics": {}, "power": {}, "moment": {}}
         try:
             with np.load(path) as file:
                 for name in file.files:
@@ -143,12 +143,12 @@ class Block(NamedTuple):
                 name: Exposure(power.astype(np.float64), parts["moment"][name].astype(np.float64))
                 for name, power in parts["power"].items()
             }
-            return cls(exposures, GroundTruth(**parts["truth"]), parts["account"])
+            return cls(exposures, GroundTruth(**parts["truth"]), parts["statistics"])
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(f"{path}: holds no simulated light; delete it, and it is computed again") from error
 
 
-class BlockStore:
+class LightStore:
     """The blocks of a task in a folder, each written whole or not at all.
 
     Parameters
@@ -159,7 +159,7 @@ class BlockStore:
         What they are blocks of.
     """
 
-    def __init__(self, folder: Path, task: Task) -> None:
+    def __init__(self, folder: Path, task: SimulationTask) -> None:
         self.task = task
         self.folder = folder / "light" / task.fingerprint
 
@@ -169,22 +169,22 @@ class BlockStore:
 
     def missing(self) -> list[int]:
         """Return the numbers of the blocks that are not there, or cannot be read."""
-        return [number for number in range(len(self.task.blocks())) if not _is_whole(self.path(number))]
+        return [number for number in range(len(self.task.blocks())) if not _is_intact(self.path(number))]
 
-    def keep(self, number: int, content: bytes) -> None:
+    def write(self, number: int, content: bytes) -> None:
         """Write a block."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with replacing(self.path(number)) as file:
             file.write(content)
 
-    def __iter__(self) -> Iterator[Block]:
+    def __iter__(self) -> Iterator[LightBlock]:
         """Read one block after the other."""
         for number in range(len(self.task.blocks())):
-            yield Block.from_file(self.path(number))
+            yield LightBlock.from_file(self.path(number))
 
 
-def compute_missing(
-    store: BlockStore,
+def compute_missing_blocks(
+    store: LightStore,
     *,
     device: Device | None = None,
     scheduler: str | None = None,
@@ -215,15 +215,15 @@ def compute_missing(
     blocks = task.blocks()
     done = len(task.transports) - sum(len(blocks[number]) for number in missing)
     progress(done, len(task.transports))
-    computed = _here(task, missing, device) if scheduler is None else _by_dask(task, missing, scheduler)
+    computed = _compute_here(task, missing, device) if scheduler is None else _compute_on_dask(task, missing, scheduler)
     for number, content in computed:
-        store.keep(number, content)
+        store.write(number, content)
         done += len(blocks[number])
         progress(done, len(task.transports))
     return len(missing)
 
 
-def light_paths(task: Task, device: Device) -> LightPaths:
+def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
     """Return what computes the light of a task's profiles."""
     light = light_of(task.sensor)
     return LightPaths(
@@ -241,10 +241,10 @@ def light_paths(task: Task, device: Device) -> LightPaths:
     )
 
 
-def compute_block(task: Task, number: int, device: Device | None = None) -> bytes:
+def compute_block(task: SimulationTask, number: int, device: Device | None = None) -> bytes:
     """Compute a block; the bytes of its file."""
-    with _BENCH_LOCK:
-        paths = _bench(task, device)
+    with _CACHE_LOCK:
+        paths = _cached_light_paths(task, device)
         profiles = paths.profiles(task.transports[list(task.blocks()[number])])
     names = profiles[0].exposures
     exposures = {
@@ -252,16 +252,16 @@ def compute_block(task: Task, number: int, device: Device | None = None) -> byte
         for name in names
     }
     truth = GroundTruth(*(np.stack(each) for each in zip(*(p.truth for p in profiles), strict=True)))
-    account = {name: np.array([p.account[name] for p in profiles]) for name in profiles[0].account}
-    return Block(exposures, truth, account).to_bytes()
+    statistics = {name: np.array([p.statistics[name] for p in profiles]) for name in profiles[0].statistics}
+    return LightBlock(exposures, truth, statistics).to_bytes()
 
 
-def _here(task: Task, numbers: list[int], device: Device | None) -> Iterator[tuple[int, bytes]]:
+def _compute_here(task: SimulationTask, numbers: list[int], device: Device | None) -> Iterator[tuple[int, bytes]]:
     for number in numbers:
         yield number, compute_block(task, number, device)
 
 
-def _by_dask(task: Task, numbers: list[int], address: str) -> Iterator[tuple[int, bytes]]:
+def _compute_on_dask(task: SimulationTask, numbers: list[int], address: str) -> Iterator[tuple[int, bytes]]:
     try:
         import distributed
     except ImportError:
@@ -279,20 +279,20 @@ def _by_dask(task: Task, numbers: list[int], address: str) -> Iterator[tuple[int
 
 
 # Kernels are built once for a task, and a bound kernel is one thread's at a time.
-_BENCH_LOCK = threading.Lock()
-_BENCH: dict[tuple[str, str], LightPaths] = {}
+_CACHE_LOCK = threading.Lock()
+_CACHE: dict[tuple[str, str], LightPaths] = {}
 
 
-def _bench(task: Task, device: Device | None) -> LightPaths:
+def _cached_light_paths(task: SimulationTask, device: Device | None) -> LightPaths:
     chosen = Device.best() if device is None else device
     key = (task.fingerprint, chosen.label)
-    if key not in _BENCH:
-        _BENCH.clear()
-        _BENCH[key] = light_paths(task, chosen)
-    return _BENCH[key]
+    if key not in _CACHE:
+        _CACHE.clear()
+        _CACHE[key] = make_light_paths(task, chosen)
+    return _CACHE[key]
 
 
-def _is_whole(path: Path) -> bool:
+def _is_intact(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as file:
             return file.testzip() is None

@@ -58,10 +58,12 @@ class SensorPair:
             The transports differ, or the first sensor sees no surface.
         """
         if not np.array_equal(first.task.transports, second.task.transports):
-            raise ValueError("the two sensors' profiles are not the same; give prepare the first one's transports")
-        steps = np.abs(np.diff(first.artifacts.truth.g, axis=-1))
+            raise ValueError(
+                "the two sensors' profiles are not the same; give prepare_simulation the first one's transports"
+            )
+        steps = np.abs(np.diff(first.attribution.truth.g, axis=-1))
         max_gap = _MAX_GAP * float(np.nanmedian(steps)) if np.isfinite(steps).any() else np.inf
-        errors = attribute_pair_errors(first.artifacts, second.artifacts, fusion, max_gap=max_gap)
+        errors = attribute_pair_errors(first.attribution, second.attribution, fusion, max_gap=max_gap)
         return cls(first=first, second=second, errors=errors, fusion=fusion, limit=max(first.limit, second.limit))
 
     def summary(self) -> str:

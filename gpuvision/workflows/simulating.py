@@ -36,12 +36,12 @@ from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
 from gpuvision.simulation.sensors.readings import PATHS, GroundTruth, Reading
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
-from gpuvision.workflows.light_cache import Block, BlockStore, Progress, Task, compute_missing
+from gpuvision.workflows.light_cache import LightBlock, LightStore, Progress, SimulationTask, compute_missing_blocks
 from gpuvision.workflows.scanning import assembled, resampled
 
-USUAL_PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse")
-_SIGMAS = 5.0
-_MOST_FOR_A_MASK = 1 << 26  # bins of all profiles that a mask is made from
+DEFAULT_PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse")
+_LIMIT_SIGMAS = 5.0
+_MAX_MASK_BINS = 1 << 26  # bins of all profiles that a mask is made from
 
 Array = npt.NDArray[Any]
 
@@ -54,7 +54,7 @@ class Simulation:
     ----------
     task
         What was simulated.
-    artifacts
+    attribution
         Readings, truth, errors and causes, (profiles, samples).
     points
         The range image that the sensor makes.
@@ -64,7 +64,7 @@ class Simulation:
         Error from which on a sample counts as wrong [m].
     mask
         What was found for it, where one was asked for.
-    account
+    statistics
         What was modelled, summed over the profiles.
     device
         Where readings were made.
@@ -74,21 +74,21 @@ class Simulation:
         Blocks of profiles that were not there yet.
     """
 
-    task: Task
-    artifacts: ErrorAttribution
+    task: SimulationTask
+    attribution: ErrorAttribution
     points: RangePoints
     heights: HeightMap
     grid: Grid
     limit: float
     mask: MaskOptimisation | None
-    account: dict[str, float]
+    statistics: dict[str, float]
     device: Device
     seconds: dict[str, float]
     computed: int
 
     def summary(self) -> str:
         """Return what came out, in a line or two."""
-        told = self.artifacts.summary(self.limit)
+        told = self.attribution.summary(self.limit)
         worst = max(told["causes"], key=lambda name: told["causes"][name]["dominant"])
         um = 1e6
         text = (
@@ -116,9 +116,9 @@ class Simulation:
             "defects": {each.name: len(getattr(task.part.defects, each.name)) for each in fields(task.part.defects)},
             "paths": list(task.paths),
             "tolerance": task.tolerance,
-            "errors": self.artifacts.summary(self.limit),
-            "mask": None if self.mask is None else _told_mask(self.mask),
-            "modelled": self.account,
+            "errors": self.attribution.summary(self.limit),
+            "mask": None if self.mask is None else _mask_report(self.mask),
+            "modelled": self.statistics,
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
             "light": task.fingerprint,
             "computed_blocks": self.computed,
@@ -137,7 +137,7 @@ class Simulation:
         OSError
             The folder cannot be written.
         """
-        told = self.artifacts
+        told = self.attribution
         title = self.task.sensor.name or "Simulation"
         with whole_folder(folder) as inside:
             write_tiff(inside / "range_image.tiff", self.heights.z, self.grid)
@@ -152,7 +152,7 @@ class Simulation:
             (inside / "report.json").write_text(json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
 
     def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
-        told = self.artifacts
+        told = self.attribution
         held: dict[str, tuple[Any, str]] = {
             **{name: (getattr(self.points, name), "m") for name in ("x", "y", "z")},
             "status": (self.points.status, "flags"),
@@ -167,16 +167,16 @@ class Simulation:
         return {name: array for name, (array, _) in held.items()}, {name: unit for name, (_, unit) in held.items()}
 
 
-def prepare(
+def prepare_simulation(
     part: Scene,
     materials: Sequence[Material],
     sensor: Sensor,
     *,
-    paths: Sequence[str] = USUAL_PATHS,
+    paths: Sequence[str] = DEFAULT_PATHS,
     tolerance: float = 0.0,
     profiles: int | None = None,
     transports: npt.ArrayLike | None = None,
-) -> Task:
+) -> SimulationTask:
     """Return the task of scanning a part from end to end.
 
     Parameters
@@ -209,18 +209,20 @@ def prepare(
             raise ValueError(f"unknown path '{path}', expected some of {', '.join(PATHS)}")
     if "direct" not in paths:
         raise ValueError("the paths lack 'direct': without it there is nothing to read")
-    return Task(
+    return SimulationTask(
         part=part,
         materials=tuple(materials),
         sensor=sensor,
-        transports=_over(part, transport, profiles) if transports is None else np.asarray(transports, np.float64),
+        transports=_transports_over(part, transport, profiles)
+        if transports is None
+        else np.asarray(transports, np.float64),
         paths=tuple(dict.fromkeys(paths)),
         tolerance=float(tolerance),
     )
 
 
 def simulate(
-    task: Task,
+    task: SimulationTask,
     folder: str | Path,
     *,
     mask: Mask | str | None = None,
@@ -235,7 +237,7 @@ def simulate(
     Parameters
     ----------
     task
-        From `prepare`.
+        From `prepare_simulation`.
     folder
         Where the light of the profiles is kept, in ``light``.
     mask
@@ -260,35 +262,40 @@ def simulate(
         The folder cannot be written.
     """
     device = Device.best() if device is None else device
-    store = BlockStore(Path(folder), task)
+    store = LightStore(Path(folder), task)
     start = time.perf_counter()
-    computed = compute_missing(store, device=device, scheduler=scheduler, progress=progress)
+    computed = compute_missing_blocks(store, device=device, scheduler=scheduler, progress=progress)
     lit = time.perf_counter()
     view = sensor_view_of(task.sensor)
-    found = optimise_mask(view, *_whole_light(store, view.samples * view.bins)) if mask == "best" else None
+    found = optimise_mask(view, *_all_light(store, view.samples * view.bins)) if mask == "best" else None
     before = found.mask if found is not None else mask if isinstance(mask, Mask) else None
-    artifacts, account = _explained(store, simulator_of(task.sensor, view, before), seed, device)
-    points = _points(task, artifacts.reading, device)
+    attribution, statistics = _attribute_errors(store, simulator_of(task.sensor, view, before), seed, device)
+    points = _points(task, attribution.reading, device)
     if task.sensor.output.ambiguous == "drop":
-        artifacts = artifacts.without_flagged(Status.AMBIGUOUS)
-    heights, grid = resampled(task.sensor, points, _strength(artifacts.reading), device)
+        attribution = attribution.without_flagged(Status.AMBIGUOUS)
+    heights, grid = resampled(task.sensor, points, _strength(attribution.reading), device)
     return Simulation(
         task=task,
-        artifacts=artifacts,
+        attribution=attribution,
         points=points,
         heights=heights,
         grid=grid,
-        limit=max(_usual_limit(artifacts.reading), task.tolerance) if limit is None else limit,
+        limit=max(_default_limit(attribution.reading), task.tolerance) if limit is None else limit,
         mask=found,
-        account=account,
+        statistics=statistics,
         device=device,
         seconds={"light": lit - start, "readings": time.perf_counter() - lit},
         computed=computed,
     )
 
 
-def recorded(
-    task: Task, folder: str | Path, *, mask: Mask | None = None, seed: int | None = 1, device: Device | None = None
+def simulate_recording(
+    task: SimulationTask,
+    folder: str | Path,
+    *,
+    mask: Mask | None = None,
+    seed: int | None = 1,
+    device: Device | None = None,
 ) -> Array:
     """Return the sensor's recording, in the form that `gpuvision.workflows.scanning.scan` takes.
 
@@ -304,8 +311,8 @@ def recorded(
     numpy.ndarray
         (profiles, rows, columns) grey levels of a camera, (profiles, strips, 2) currents or codes of a PSD.
     """
-    store = BlockStore(Path(folder), task)
-    compute_missing(store, device=device)
+    store = LightStore(Path(folder), task)
+    compute_missing_blocks(store, device=device)
     simulator = simulator_of(task.sensor, sensor_view_of(task.sensor), mask)
     record = simulator.currents if isinstance(simulator, PsdSimulator) else simulator.frames
     parts, first = [], 0
@@ -315,7 +322,7 @@ def recorded(
     return np.concatenate(parts)
 
 
-def part_of(
+def load_part(
     path: str | Path, metres: float, materials: Sequence[Material] | None, albedo: float
 ) -> tuple[Scene, tuple[Material, ...]]:
     """Read a part, and give it its materials, or one of an albedo.
@@ -335,7 +342,7 @@ def part_of(
     return scene, tuple(materials)
 
 
-def _over(part: Scene, transport: StraightTransport, profiles: int | None) -> Array:
+def _transports_over(part: Scene, transport: StraightTransport, profiles: int | None) -> Array:
     """Return where the sheet stands while it moves over a part."""
     if transport.step is None:
         raise ValueError("a simulation needs [transport] step: metres per profile")
@@ -355,9 +362,9 @@ def _over(part: Scene, transport: StraightTransport, profiles: int | None) -> Ar
     return transport.start + transport.step * np.arange(first, last + 1, dtype=np.float64)
 
 
-def _whole_light(store: BlockStore, bins: int) -> tuple[dict[str, Exposure], GroundTruth]:
+def _all_light(store: LightStore, bins: int) -> tuple[dict[str, Exposure], GroundTruth]:
     """Return the light of all profiles by path, or of every second, third, ... where that is much."""
-    every = -(-len(store.task.transports) * bins // _MOST_FOR_A_MASK)
+    every = -(-len(store.task.transports) * bins // _MAX_MASK_BINS)
     light: dict[str, list[Exposure]] = {}
     truths = []
     for block, profiles in zip(store, store.task.blocks(), strict=True):
@@ -371,8 +378,8 @@ def _whole_light(store: BlockStore, bins: int) -> tuple[dict[str, Exposure], Gro
     return whole, GroundTruth(*(np.concatenate(each) for each in zip(*truths, strict=True)))
 
 
-def _explained(
-    store: BlockStore, simulator: PsdSimulator | CameraSimulator, seed: int | None, device: Device
+def _attribute_errors(
+    store: LightStore, simulator: PsdSimulator | CameraSimulator, seed: int | None, device: Device
 ) -> tuple[ErrorAttribution, dict[str, float]]:
     """Return the artifacts of all profiles, and what was modelled of them.
 
@@ -382,46 +389,46 @@ def _explained(
         There is no profile in which the sensor sees a lit surface.
     """
     parts: list[ErrorAttribution] = []
-    account: dict[str, float] = {}
+    statistics: dict[str, float] = {}
     first = 0
     for block in store:
         parts.append(
             attribute_errors(simulator, block.exposures, block.truth, seed=seed, first_profile=first, device=device)
         )
-        account = _added(account, block)
+        statistics = _add_statistics(statistics, block)
         first += len(block.truth.h)
-    artifacts = _joined(parts)
-    if not np.isfinite(artifacts.truth.h).any():
+    attribution = _concatenate(parts)
+    if not np.isfinite(attribution.truth.h).any():
         raise ValueError(
-            f"the sensor sees nothing lit in any of {first} profiles: {_place(store.task.part)}; "
+            f"the sensor sees nothing lit in any of {first} profiles: {_describe_position(store.task.part)}; "
             "is that where sheet and sensor are, and the unit right?"
         )
-    return artifacts, account
+    return attribution, statistics
 
 
-def _points(task: Task, reading: Reading, device: Device) -> RangePoints:
+def _points(task: SimulationTask, reading: Reading, device: Device) -> RangePoints:
     """Return the organised range image of what a sensor reads."""
     place = [np.ascontiguousarray(each, np.float32) for each in (reading.g, reading.h)]
     return assembled(task.sensor, place, task.transports, reading.status, device)
 
 
-def _usual_limit(reading: Reading) -> float:
+def _default_limit(reading: Reading) -> float:
     """Return the error that noise alone hardly ever makes [m]."""
     sigma = reading.sigma[np.isfinite(reading.sigma)]
-    return _SIGMAS * float(np.median(sigma)) if sigma.size else 0.0
+    return _LIMIT_SIGMAS * float(np.median(sigma)) if sigma.size else 0.0
 
 
-def _added(account: Mapping[str, float], block: Block) -> dict[str, float]:
+def _add_statistics(statistics: Mapping[str, float], block: LightBlock) -> dict[str, float]:
     """Return sums, and of bounds the largest."""
     added = {}
-    for name, each in block.account.items():
-        before = account.get(name, 0.0)
+    for name, each in block.statistics.items():
+        before = statistics.get(name, 0.0)
         largest = name.startswith("bound")
         added[name] = max(before, float(np.max(each))) if largest else before + float(np.sum(each))
     return added
 
 
-def _joined(parts: Sequence[ErrorAttribution]) -> ErrorAttribution:
+def _concatenate(parts: Sequence[ErrorAttribution]) -> ErrorAttribution:
     """Return the artifacts of all blocks as one."""
 
     def joined(values: Sequence[Any]) -> Any:
@@ -436,7 +443,7 @@ def _joined(parts: Sequence[ErrorAttribution]) -> ErrorAttribution:
     )
 
 
-def _place(part: Scene) -> str:
+def _describe_position(part: Scene) -> str:
     """Say where a part lies."""
     corners = part.corners.reshape(-1, 3)
     low, high = (1e3 * bound(corners[np.isfinite(corners).all(axis=1)], axis=0) for bound in (np.min, np.max))
@@ -449,7 +456,7 @@ def _strength(reading: Reading) -> Array:
     return np.nan_to_num(reading.strength).astype(np.float32)
 
 
-def _told_mask(plan: MaskOptimisation) -> dict[str, Any]:
+def _mask_report(plan: MaskOptimisation) -> dict[str, Any]:
     def worst(values: Array) -> float | None:
         known = np.abs(values[np.isfinite(values)])
         return float(known.max()) if known.size else None

@@ -206,11 +206,11 @@ static inline uint after(uint node) {
 #define OPEN_LEVEL -1
 #endif
 
-kernel void plan_light(global const INPUT *restrict receivers, global const real *restrict costs,
+kernel void select_lights(global const INPUT *restrict receivers, global const real *restrict costs,
                        global const real *restrict shares, global const real *restrict rows,
                        global const int *restrict spans, global const real *restrict placed,
                        global const INPUT *restrict frame,
-                       global int *restrict picks, global float *restrict errors, global int *restrict counts,
+                       global int *restrict selected, global float *restrict errors, global int *restrict counts,
                        global real *restrict spent, global int *restrict tallies, global const real *nodes,
                        global const int *children, global const int *axes, global const real *leaves,
                        global const int *triangles, const real margin, const uint capacity,
@@ -227,7 +227,7 @@ kernel void plan_light(global const INPUT *restrict receivers, global const real
         const receivers_block block =
             block_of(receivers + 6 * at, costs + at, (int)min((uint)BLOCK, of_strip - first), frame);
         const real share = shares[strip];
-        global int *pick = picks + (size_t)b * capacity;
+        global int *pick = selected + (size_t)b * capacity;
         global float *error = errors + (size_t)b * capacity;
         uint found = 0;
         int out = 0, together = 0, culprit = -1, patience = PATIENCE;

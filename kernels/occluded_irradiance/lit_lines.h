@@ -136,15 +136,15 @@ static void load_chunk(global const INPUT *rows, const uint *numbers, uint count
     }
 }
 
-#ifdef PICKED
+#ifdef SELECTED
 // Load picked segments from pick `next` on; return the next pick.
-static int load_picked(global const INPUT *rows, global const int *picks, int next, int end, uint segment_count,
+static int load_selected(global const INPUT *rows, global const int *selected, int next, int end, uint segment_count,
                 constant place *middle, chunk *all, uchar *flag) {
     uint numbers[SEGMENTS], count = 0;
     all->unseen = 0;
     for (; next < end && count < SEGMENTS; next++) {
-        const int is_unseen = picks[next] < 0;
-        const uint number = is_unseen ? ~picks[next] : picks[next];
+        const int is_unseen = selected[next] < 0;
+        const uint number = is_unseen ? ~selected[next] : selected[next];
         if (number >= segment_count) {
             *flag |= STATUS_OUT_OF_RANGE;
             continue;

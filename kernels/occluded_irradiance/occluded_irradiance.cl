@@ -4,10 +4,10 @@
 // The currents are sums of E times two weights per receiver.
 //
 // Inputs:  receivers (strips, each, 6) position [m] and normal; weights (strips, each, 2); segments (n, 10) start, end,
-//          surface normal, exitance [W/m2]; with PICKED also starts (lists + 1) and picks, the segments of each list
-//          (list: PICK_BLOCK receivers; a pick ~k is segment k, which nothing can hide).
+//          surface normal, exitance [W/m2]; with SELECTED also starts (lists + 1) and selected, the segments of each list
+//          (list: SELECTION_BLOCK receivers; a pick ~k is segment k, which nothing can hide).
 // Outputs: irradiance (strips, each) [W/m2]; left, right (strips,); status (strips, each) flags.
-// Options: INPUT (type of the inputs), REAL_IS_DOUBLE, WIDE_PLACES, PICKED, GROUP (size of a work-group), BVH_DEPTH;
+// Options: INPUT (type of the inputs), REAL_IS_DOUBLE, WIDE_PLACES, SELECTED, GROUP (size of a work-group), BVH_DEPTH;
 //          INTERVALS (exact visibility, visible.h), RAYS (shadow rays to `samples` parts of a segment), or neither
 //          (no occlusion).
 // Variants: vector: a work-item per share of the strips, 16 receivers at a time; work-item: a work-group per strip, an
@@ -22,7 +22,7 @@
 #include "occluded_irradiance/visible.h"
 
 // Number of receivers that share a list of picked segments.
-#define PICK_BLOCK 16
+#define SELECTION_BLOCK 16
 // The clearance takes at most this fraction of the height of either end above the other's surface.
 #define CLEARANCE_SHARE ((real)0.5)
 
@@ -313,8 +313,8 @@ static void store_block(const block *here, uchar flag, global real *irradiance, 
     }
 }
 
-#ifdef PICKED
-#define SEGMENT_LISTS global const int *restrict starts, global const int *restrict picks,
+#ifdef SELECTED
+#define SEGMENT_LISTS global const int *restrict starts, global const int *restrict selected,
 #else
 #define SEGMENT_LISTS
 #endif
@@ -370,12 +370,12 @@ AS_IT_IS kernel void occluded_irradiance(global const INPUT *restrict receivers,
             uchar flag = STATUS_OK;
             pieces waiting;
             waiting.count = 0;
-#ifdef PICKED
-            const ulong list = strip * ((each + PICK_BLOCK - 1) / PICK_BLOCK) + first / PICK_BLOCK;
+#ifdef SELECTED
+            const ulong list = strip * ((each + SELECTION_BLOCK - 1) / SELECTION_BLOCK) + first / SELECTION_BLOCK;
             if (starts[list] < 0 || starts[list + 1] > (int)pick_count) flag |= STATUS_OUT_OF_RANGE;
             const int end = min(starts[list + 1], (int)pick_count);
             for (int next = max(starts[list], 0); next < end;) {
-                next = load_picked(segments, picks, next, end, segment_count, middle, &lit, &flag);
+                next = load_selected(segments, selected, next, end, segment_count, middle, &lit, &flag);
                 light_chunk(&tree, &lit, clearance, samples, &hint, &here, &waiting, &flag);
             }
 #else

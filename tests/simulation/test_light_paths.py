@@ -58,7 +58,7 @@ def glow(places, normal, length, power, x0):
 
 def test_a_wall_glows_as_the_line_before_it_says(device):
     model = paths(corner(), device)
-    lines = model.lines
+    lines = model.view_rays
     seen = lines.visible_surface(0.0)
     wall = np.argwhere((seen.triangle >= 2) & (seen.receivers[..., 2] > 1e-3))
     assert len(wall) >= 3
@@ -90,9 +90,9 @@ def test_light_is_proportional_to_power_and_albedo(device):
 
 
 def test_further_bounces_come_on_top(device):
-    model = paths(corner(), device, paths=(*PATHS, "bounces"), patch=0.02)
+    model = paths(corner(), device, paths=(*PATHS, "multi-bounce"), patch_size=0.02)
     light = model.profile(0.0).exposures
-    first, further = light["diffuse-diffuse"].power.sum(), light["bounces"].power.sum()
+    first, further = light["diffuse-diffuse"].power.sum(), light["multi-bounce"].power.sum()
     # The wall throws light back onto the floor, and so on; each bounce loses half and what leaves the corner.
     assert 0.05 * first < further < first
 
@@ -104,7 +104,7 @@ def test_nothing_lit_is_dark_and_not_zero(device):
     assert np.isnan(profile.truth.h).all()
     assert (profile.truth.status != 0).all()
     assert not any(each.power.any() for each in profile.exposures.values())
-    assert profile.account["segments"] == 0.0
+    assert profile.statistics["segments"] == 0.0
 
 
 def test_what_was_not_asked_for_is_not_there(device):
@@ -127,25 +127,25 @@ def test_a_tolerance_is_kept(device, tolerance):
     lit = exact.exposures["direct"].total() > 0.0
     error = np.abs(place(about) - place(exact))[lit] * slope[lit]
     # The kernel's rounding on top.
-    assert error.max() <= about.account["bound of pairs left out [m]"] * (1.0 + 1e-6) + 1e-9
-    assert about.account["bound of pairs left out [m]"] <= tolerance
-    assert about.account["profiles in full (cheaper than a plan)"] == 0.0
-    assert about.account["pairs left out"] + about.account["pairs clustered"] > 0.0
-    assert about.account["pairs exact"] < exact.account["pairs exact"]
+    assert error.max() <= about.statistics["bound of pairs left out [m]"] * (1.0 + 1e-6) + 1e-9
+    assert about.statistics["bound of pairs left out [m]"] <= tolerance
+    assert about.statistics["profiles without clustering (cheaper)"] == 0.0
+    assert about.statistics["pairs left out"] + about.statistics["pairs clustered"] > 0.0
+    assert about.statistics["pairs exact"] < exact.statistics["pairs exact"]
 
 
 def test_where_there_is_little_to_leave_out_all_is_computed(device):
     exact, about = (paths(corner(), device, tolerance=tolerance).profile(0.0) for tolerance in (0.0, 1e-3))
     for name in PATHS:
         np.testing.assert_array_equal(about.exposures[name].power, exact.exposures[name].power)
-    assert about.account["profiles in full (cheaper than a plan)"] == 1.0
-    assert about.account["pairs exact"] == about.account["pairs"] > 0.0
-    assert about.account["pairs left out"] == about.account["bound of pairs left out [m]"] == 0.0
+    assert about.statistics["profiles without clustering (cheaper)"] == 1.0
+    assert about.statistics["pairs exact"] == about.statistics["pairs"] > 0.0
+    assert about.statistics["pairs left out"] == about.statistics["bound of pairs left out [m]"] == 0.0
 
 
 def test_bounces_are_left_out_where_they_cannot_matter(device):
     dim = Material(diffuse=Lambert(albedo=1e-3))
-    model = paths(corner(), device, paths=(*PATHS, "bounces"), materials=[dim], patch=0.05, tolerance=1e-3)
+    model = paths(corner(), device, paths=(*PATHS, "multi-bounce"), materials=[dim], patch_size=0.05, tolerance=1e-3)
     profile = model.profile(0.0)
-    assert "bounces" not in profile.exposures
-    assert 0.0 < profile.account["bound of bounces left out [m]"] <= 0.5e-3
+    assert "multi-bounce" not in profile.exposures
+    assert 0.0 < profile.statistics["bound of multi-bounce left out [m]"] <= 0.5e-3

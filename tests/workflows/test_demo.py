@@ -14,7 +14,7 @@ from gpuvision.cli import main as cli
 from gpuvision.host import Device
 from gpuvision.workflows.demo import SENSORS, scanned_part
 from gpuvision.workflows.scanning import scan
-from gpuvision.workflows.simulating import recorded, simulate
+from gpuvision.workflows.simulating import simulate, simulate_recording
 
 PROFILES = 72  # the middle of the part: a half of the box, the cylinder and the steps
 
@@ -36,7 +36,7 @@ def away_from_edges(height: Any) -> Any:
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_scan_of_the_recording_is_what_was_predicted(name: str, light: Path, device: Device) -> None:
     task = scanned_part(name, PROFILES)
-    recording = recorded(task, light, seed=7)
+    recording = simulate_recording(task, light, seed=7)
     shape = {"camera_line": (PROFILES, 64, 480), "psd_line": (PROFILES, 96, 2)}[name]
     assert (recording.shape, recording.dtype) == (shape, np.uint8 if name == "camera_line" else np.uint16)
     done = scan(recording, task.sensor, device=device)
@@ -46,7 +46,7 @@ def test_a_scan_of_the_recording_is_what_was_predicted(name: str, light: Path, d
 
 
 def test_a_camera_finds_the_part_again(light: Path) -> None:
-    told = simulate(scanned_part("camera_line", PROFILES), light, seed=7).artifacts
+    told = simulate(scanned_part("camera_line", PROFILES), light, seed=7).attribution
     smooth = away_from_edges(told.truth.h) & np.isfinite(told.error)
     assert smooth.sum() > 15_000
     # 0.03 pixel at 0.24 mm a pixel; a windowed centre of gravity of this line reaches 0.01 to 0.02.
@@ -54,7 +54,7 @@ def test_a_camera_finds_the_part_again(light: Path) -> None:
 
 
 def test_the_noise_is_what_the_sensor_predicts(light: Path) -> None:
-    told = simulate(scanned_part("psd_line", PROFILES), light, seed=7).artifacts
+    told = simulate(scanned_part("psd_line", PROFILES), light, seed=7).attribution
     noise, sigma = told.causes["noise"], told.reading.sigma
     known = np.isfinite(noise) & np.isfinite(sigma) & away_from_edges(told.truth.h)
     assert known.sum() > 2000

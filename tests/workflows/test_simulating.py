@@ -21,8 +21,8 @@ from gpuvision.host.errors import RecordingError
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.readings import PATHS
-from gpuvision.workflows.light_cache import PROFILES_PER_BLOCK, BlockStore, compute_missing
-from gpuvision.workflows.simulating import part_of, prepare, simulate
+from gpuvision.workflows.light_cache import PROFILES_PER_BLOCK, LightStore, compute_missing_blocks
+from gpuvision.workflows.simulating import load_part, prepare_simulation, simulate
 
 MM = 1e-3
 
@@ -46,8 +46,8 @@ def part_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def task_of(part_file: Path, sensor: str = "psd_line", **more: Any) -> Any:
-    part, materials = part_of(part_file, 1.0, None, 0.5)
-    return prepare(part, materials, Sensor.load(sensor), **({"profiles": 40} | more))
+    part, materials = load_part(part_file, 1.0, None, 0.5)
+    return prepare_simulation(part, materials, Sensor.load(sensor), **({"profiles": 40} | more))
 
 
 def test_a_part_is_scanned_from_end_to_end(part_file: Path) -> None:
@@ -59,7 +59,7 @@ def test_a_part_is_scanned_from_end_to_end(part_file: Path) -> None:
 
 def test_what_is_read_is_told_apart_by_cause(part_file: Path, tmp_path: Path) -> None:
     done = simulate(task_of(part_file), tmp_path, seed=None)
-    told = done.artifacts
+    told = done.attribution
     assert told.error.shape == (40, 96)
     total = np.sum(list(told.causes.values()), axis=0)
     np.testing.assert_allclose(total, told.error, atol=1e-12)
@@ -84,11 +84,11 @@ def test_a_mask_made_for_the_part_helps(part_file: Path, tmp_path: Path) -> None
     found = simulate(task, tmp_path, seed=None, mask="best")
     assert found.computed == 0
     assert found.mask is not None
-    rms = [np.sqrt(np.nanmean(each.artifacts.error**2)) for each in (without, found)]
+    rms = [np.sqrt(np.nanmean(each.attribution.error**2)) for each in (without, found)]
     assert rms[1] < rms[0]
     found.write(tmp_path)
     again = simulate(task, tmp_path, seed=None, mask=Mask.load(tmp_path / "mask.txt"))
-    np.testing.assert_allclose(again.artifacts.error, found.artifacts.error, atol=1e-12)
+    np.testing.assert_allclose(again.attribution.error, found.attribution.error, atol=1e-12)
 
 
 def test_what_was_stopped_goes_on_where_it_was(part_file: Path, tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_what_was_stopped_goes_on_where_it_was(part_file: Path, tmp_path: Path) 
 
     with pytest.raises(KeyboardInterrupt):
         simulate(task, tmp_path, progress=stop)
-    store = BlockStore(tmp_path, task)
+    store = LightStore(tmp_path, task)
     assert store.missing() == [2]
     kept = [store.path(k).read_bytes() for k in (0, 1)]
     seen = []
@@ -109,19 +109,19 @@ def test_what_was_stopped_goes_on_where_it_was(part_file: Path, tmp_path: Path) 
     assert seen == [(32, 40), (40, 40)]
     assert [store.path(k).read_bytes() for k in (0, 1)] == kept
     whole = simulate(task, tmp_path / "whole")
-    np.testing.assert_array_equal(whole.artifacts.error, done.artifacts.error)
-    np.testing.assert_array_equal(whole.artifacts.category, done.artifacts.category)
+    np.testing.assert_array_equal(whole.attribution.error, done.attribution.error)
+    np.testing.assert_array_equal(whole.attribution.category, done.attribution.category)
 
 
 def test_half_a_block_counts_as_none(part_file: Path, tmp_path: Path) -> None:
     task = task_of(part_file, profiles=20)
-    store = BlockStore(tmp_path, task)
-    assert compute_missing(store) == 2
+    store = LightStore(tmp_path, task)
+    assert compute_missing_blocks(store) == 2
     whole = store.path(1).read_bytes()
     store.path(1).write_bytes(whole[: len(whole) // 2])
     assert store.missing() == [1]
-    assert compute_missing(store) == 1
-    assert compute_missing(store) == 0
+    assert compute_missing_blocks(store) == 1
+    assert compute_missing_blocks(store) == 0
     np.savez(store.path(1), light=np.zeros(3))
     with pytest.raises(RecordingError, match=r"block_00001\.npz: holds no simulated light; delete it"):
         list(store)
@@ -135,8 +135,8 @@ def test_another_task_has_other_light(part_file: Path) -> None:
         task_of(part_file, paths=("direct",)),
         task_of(part_file, profiles=39),
         task_of(part_file, sensor="camera_line"),
-        dataclasses.replace(one, materials=part_of(part_file, 1.0, None, 0.4)[1]),
-        dataclasses.replace(one, part=part_of(part_file, 1.001, None, 0.5)[0]),
+        dataclasses.replace(one, materials=load_part(part_file, 1.0, None, 0.4)[1]),
+        dataclasses.replace(one, part=load_part(part_file, 1.001, None, 0.5)[0]),
     ]
     assert len({each.fingerprint for each in (one, *others)}) == 1 + len(others)
     light = dataclasses.replace(one.sensor.light, responsivity=0.1)
@@ -147,7 +147,7 @@ def test_another_task_has_other_light(part_file: Path) -> None:
 def test_a_camera_beside_the_psd_is_hardly_moved_by_the_glow(part_file: Path, tmp_path: Path) -> None:
     worst = {}
     for name in ("psd_line", "camera_line"):
-        told = simulate(task_of(part_file, name), tmp_path / name, seed=None).artifacts
+        told = simulate(task_of(part_file, name), tmp_path / name, seed=None).attribution
         flat = np.abs(told.truth.h) < 1e-9
         worst[name] = np.nanmax(np.abs(told.causes["secondary"][flat]))
     assert worst["camera_line"] < 0.1 * worst["psd_line"]
@@ -155,7 +155,7 @@ def test_a_camera_beside_the_psd_is_hardly_moved_by_the_glow(part_file: Path, tm
 
 def test_noise_is_the_same_in_every_run(part_file: Path, tmp_path: Path) -> None:
     task = task_of(part_file, profiles=20)
-    one, two, other = (simulate(task, tmp_path, seed=each).artifacts.error for each in (3, 3, 4))
+    one, two, other = (simulate(task, tmp_path, seed=each).attribution.error for each in (3, 3, 4))
     np.testing.assert_array_equal(one, two)
     assert np.nanmax(np.abs(one - other)) > 0.0
 
@@ -186,7 +186,7 @@ def test_a_mesh_needs_its_materials(tmp_path: Path) -> None:
     scene = trimesh.Scene([mesh(), trimesh.creation.box((MM, MM, MM))])
     scene.export(tmp_path / "two.glb")
     with pytest.raises(ValueError, match="has 2 meshes, 1 materials"):
-        part_of(tmp_path / "two.glb", 1.0, part_of(tmp_path / "two.glb", 1.0, None, 0.5)[1][:1], 0.5)
+        load_part(tmp_path / "two.glb", 1.0, load_part(tmp_path / "two.glb", 1.0, None, 0.5)[1][:1], 0.5)
 
 
 def command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
@@ -246,7 +246,7 @@ def test_a_cluster_loses_a_worker_and_nothing_else(part_file: Path, tmp_path: Pa
         there = simulate(task, tmp_path / "there", scheduler=cluster.scheduler_address, progress=kill_one)
     assert there.computed == len(task.blocks())
     assert seen[-1] == len(task.transports)
-    np.testing.assert_array_equal(there.artifacts.error, here.artifacts.error)
+    np.testing.assert_array_equal(there.attribution.error, here.attribution.error)
 
 
 def test_a_second_sensor_sees_what_is_hidden_from_the_first(
@@ -257,7 +257,7 @@ def test_a_second_sensor_sees_what_is_hidden_from_the_first(
     across.write_text(text.replace("[light]", "[light]\nlens = [0.0, -0.08, 0.15]"))
     words = [str(part_file), "--sensor", "camera_line", "--second", str(across), "--out", str(tmp_path)]
     assert command(monkeypatch, *words, "--profiles", "48", "--paths", "direct") == 0
-    assert "surfaces read within" in capsys.readouterr().out
+    assert "surface samples read within" in capsys.readouterr().out
     report = json.loads((tmp_path / "both" / "report.json").read_text())
     ranked = {each["name"]: each["failed_fraction"] for each in report["ranking"]}
     assert report["ranking"][0]["name"] == "both"

@@ -1,4 +1,4 @@
-"""Light of lit segments on what a sensor sees, as much of it as a tolerance of the range requires."""
+"""Irradiance by lit segments, computed only as far as a tolerance of the range requires."""
 
 from __future__ import annotations
 
@@ -16,60 +16,73 @@ from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradianc
 
 Reals = npt.NDArray[np.float64]
 
-# Shapes go by powers of two, from these on, so that few of them are ever bound.
-_LEAST_SEGMENTS, _LEAST_PICKS = 64, 4096
-# A plan goes over all pairs, which takes about as long as to compute a quarter of them, and has its overhead; what does
-# not face each other costs next to nothing without one.
-_OF_ALL, _LEAST_FACING = 4, 1 << 16
-# Receivers and segments among which those that face each other are counted; primes, to meet no period of theirs.
-_RECEIVERS, _SEGMENTS = 127, 61
+# Smallest input sizes [rows]. Sizes are rounded up to powers of two from there, so that few kernels are bound.
+_MIN_SEGMENTS, _MIN_SELECTED = 64, 4096
+# Measured: the traversal of the tree takes as long as the exact computation of a quarter of all pairs, plus an overhead
+# of 2^16 pairs. Pairs that do not face each other cost next to nothing in the exact computation.
+_TRAVERSAL_COST, _MIN_FACING_PAIRS = 4, 1 << 16
+# Sample sizes of `estimate_facing_pairs`: primes, so that the samples do not follow a period of the data.
+_SAMPLED_RECEIVERS, _SAMPLED_SEGMENTS = 127, 61
 
 
 class BoundedIrradiance(NamedTuple):
-    """What receivers get, as far as the readings need it.
+    """Irradiance of receivers, and the cut of the light tree that it was computed with.
 
     Attributes
     ----------
     irradiance
-        (strips, n), W/m^2: readings made of it are off by the plan's bound at most; single values may be further off.
-    plan
-        What was modelled.
+        float64 (strips, n), W/m^2. The reading of a strip that is computed from it keeps the bound of the cut
+        (`LightCut.bound`); the irradiance of a single receiver may be further off.
+    cut
+        Pairs that were computed, and the bound of the error by all other pairs.
     """
 
     irradiance: Reals
-    plan: LightCut
+    cut: LightCut
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ClusteredIrradiance:
-    """Plans each profile where that pays, and computes what is left, by `OccludedIrradiance`; compared by identity.
+    """Irradiance by lit segments with error-bounded clustering (lightcuts) where it saves time.
+
+    Each profile is first cut by `LightClustering`; `OccludedIrradiance` computes the pairs that the cut keeps.
+    Instances are compared by identity.
 
     Parameters
     ----------
     scene
-        What may lie between.
+        Triangles that may occlude.
     tolerance
-        Metres of range; 0 leaves out only what is zero.
-    least
-        What is planned: profiles whose `facing_pairs`, less a quarter of all pairs, are so many at least. Others take
-        less time without a plan, and so does a tolerance of 0. None: every profile.
+        Range error that clustering may make [m], 0 or more; 0 omits only pairs without light.
+    min_facing_pairs
+        The tree is traversed for profiles whose `estimate_facing_pairs`, less a quarter of all pairs, reaches this
+        number. All pairs are computed for other profiles, and with a tolerance of 0, because that is faster. None:
+        the tree is traversed for every profile.
     clearance
-        As of `OccludedIrradiance`.
+        Distance from a surface within which nothing occludes [m], as in `OccludedIrradiance`.
     device
-        None: `Device.best`.
+        Device of both steps; None: `Device.best`.
+
+    Notes
+    -----
+    The pairs that are kept are computed in single precision; that rounding is not part of the bound.
+
+    References
+    ----------
+    B. Walter et al., *Lightcuts: a scalable approach to illumination*, ACM Transactions on Graphics 24(3), 2005.
     """
 
     scene: Scene
     tolerance: float
-    least: int | None = _LEAST_FACING
+    min_facing_pairs: int | None = _MIN_FACING_PAIRS
     clearance: float | None = None
     device: Device | None = None
-    _planner: LightClustering = field(init=False, repr=False)
+    _clustering: LightClustering = field(init=False, repr=False)
     _bound: dict[Any, Bound[Any]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "device", Device.best() if self.device is None else self.device)
-        object.__setattr__(self, "_planner", self._new_planner())
+        object.__setattr__(self, "_clustering", self._make_clustering())
 
     def __call__(
         self,
@@ -80,51 +93,67 @@ class ClusteredIrradiance:
         *,
         tolerance: float | None = None,
     ) -> BoundedIrradiance:
-        """Return the light of a profile; arguments as of `LightClustering`."""
-        asked = self._planner.asked(tolerance)
-        if not self._pays(asked, segments, receivers, weights):
-            plan = LightCut.of_all(segments, receivers.shape, reading, asked)
-            return BoundedIrradiance(self.exactly(segments, receivers), plan)
-        plan = self._planner(segments, receivers, weights, reading, tolerance=asked, device=self.device)
-        if not plan.modelled:
-            return BoundedIrradiance(np.zeros(receivers.shape[:2]), plan)
-        return BoundedIrradiance(self._light(receivers, *plan.tables(self._real, _LEAST_SEGMENTS, _LEAST_PICKS)), plan)
+        """Return the irradiance of a profile within the tolerance.
 
-    def exactly(self, segments: npt.NDArray[Any], receivers: npt.NDArray[Any]) -> Reals:
-        """Return the irradiance by all segments, (strips, n), W/m^2, without a plan."""
-        # Rows that are empty are read all the same: by eighths of a power of two, no more of them than that.
-        step = max(_LEAST_SEGMENTS // 2, (1 << max(len(segments) - 1, 0).bit_length()) // 8)
+        Parameters
+        ----------
+        segments, receivers, weights, reading, tolerance
+            As of `LightClustering.__call__`.
+        """
+        tolerance = self._clustering.tolerance_of(tolerance)
+        if not self._is_worthwhile(tolerance, segments, receivers, weights):
+            cut = LightCut.full(segments, receivers.shape, reading, tolerance)
+            return BoundedIrradiance(self.compute_all(segments, receivers), cut)
+        cut = self._clustering(segments, receivers, weights, reading, tolerance=tolerance, device=self.device)
+        if not cut.has_pairs:
+            return BoundedIrradiance(np.zeros(receivers.shape[:2]), cut)
+        return BoundedIrradiance(
+            self._light(receivers, *cut.padded_tables(self._real, _MIN_SEGMENTS, _MIN_SELECTED)), cut
+        )
+
+    def compute_all(self, segments: npt.NDArray[Any], receivers: npt.NDArray[Any]) -> Reals:
+        """Return the irradiance by all pairs of segments and receivers, (strips, n), W/m^2, without clustering.
+
+        Parameters
+        ----------
+        segments
+            (m, 10): start, end [m], normal, exitance [W/m], as `segment_rows` returns them.
+        receivers
+            (strips, n, 6): position [m] and normal.
+        """
+        # The kernel reads empty rows, too. Rounding up to eighths of a power of two limits them to an eighth.
+        step = max(_MIN_SEGMENTS // 2, (1 << max(len(segments) - 1, 0).bit_length()) // 8)
         rows = np.zeros((max(-(-len(segments) // step), 1) * step, 10), self._real)
         rows[: len(segments)] = segments
         return self._light(receivers, rows)
 
-    def _pays(
+    def _is_worthwhile(
         self, tolerance: float, segments: npt.NDArray[Any], receivers: npt.NDArray[Any], weights: npt.NDArray[Any]
     ) -> bool:
-        if self.least is None:
+        if self.min_facing_pairs is None:
             return True
-        pairs = len(segments) * len(_counting(weights))
-        # Not even if all of them faced each other.
-        if tolerance == 0.0 or pairs - pairs // _OF_ALL < self.least:
+        pairs = len(segments) * len(_weighted(weights))
+        # If even all pairs facing each other would not reach the limit, the estimate is not needed.
+        if tolerance == 0.0 or pairs - pairs // _TRAVERSAL_COST < self.min_facing_pairs:
             return False
-        return facing_pairs(segments, receivers, weights) - pairs // _OF_ALL >= self.least
+        return estimate_facing_pairs(segments, receivers, weights) - pairs // _TRAVERSAL_COST >= self.min_facing_pairs
 
-    def _light(self, receivers: npt.NDArray[Any], rows: npt.NDArray[Any], *picked: npt.NDArray[Any]) -> Reals:
-        """Return the irradiance by rows of segments; by those of starts and picks, if given."""
-        bound = self._bound_for(receivers.shape, len(rows), len(picked[1]) if picked else None)
-        # What would be summed up behind the receivers is not needed.
-        nothing = np.zeros((*receivers.shape[:2], 2), self._real)
-        light = bound.on_host([np.ascontiguousarray(receivers, self._real), nothing, rows, *picked])
+    def _light(self, receivers: npt.NDArray[Any], rows: npt.NDArray[Any], *lists: npt.NDArray[Any]) -> Reals:
+        """Return the irradiance by rows of segments; ``lists`` holds the starts and selected segments of a cut."""
+        bound = self._bound_for(receivers.shape, len(rows), len(lists[1]) if lists else None)
+        # The weighted sums of the kernel are not used.
+        weights = np.zeros((*receivers.shape[:2], 2), self._real)
+        light = bound.on_host([np.ascontiguousarray(receivers, self._real), weights, rows, *lists])
         return np.asarray(light.irradiance, np.float64)
 
-    def _new_planner(self) -> LightClustering:
+    def _make_clustering(self) -> LightClustering:
         return LightClustering(tolerance=self.tolerance, scene=self.scene, clearance=self.clearance or 0.0)
 
-    def _bound_for(self, shape: tuple[int, ...], segments: int, picks: int | None) -> Bound[Any]:
-        key = (shape, segments, picks)
+    def _bound_for(self, shape: tuple[int, ...], segments: int, selected: int | None) -> Bound[Any]:
+        key = (shape, segments, selected)
         if key not in self._bound:
             operation = OccludedIrradiance(
-                scene=self.scene, segments=segments, picks=picks, clearance=self.clearance, precision="single"
+                scene=self.scene, segments=segments, selected=selected, clearance=self.clearance, precision="single"
             )
             self._bound[key] = operation.bind(self.device, shape, self._real)
         return self._bound[key]
@@ -135,14 +164,24 @@ class ClusteredIrradiance:
         return np.dtype(np.float64 if self.device.has_double else np.float32)
 
 
-def facing_pairs(segments: npt.NDArray[Any], receivers: npt.NDArray[Any], weights: npt.NDArray[Any]) -> int:
-    """Return about how many pairs of a receiver with weight and a segment's middle face each other.
+def estimate_facing_pairs(segments: npt.NDArray[Any], receivers: npt.NDArray[Any], weights: npt.NDArray[Any]) -> int:
+    """Return an estimate of the number of pairs of a receiver with weight and a segment that face each other.
 
-    Counted among 127 receivers and 61 segments, evenly spread; among all where there are no more.
+    A segment is represented by its midpoint. The share of facing pairs is counted among 127 receivers and 61 segments
+    at even steps (all of them where there are fewer).
+
+    Parameters
+    ----------
+    segments
+        (m, 10): start, end, normal, exitance.
+    receivers
+        (strips, n, 6): position and normal.
+    weights
+        (strips, n, 2); receivers whose weights are both 0 are not counted.
     """
-    counting = _counting(weights)
-    got = receivers.reshape(-1, 6)[_spread(counting, _RECEIVERS)].astype(np.float64)
-    lit = _spread(np.asarray(segments, np.float64), _SEGMENTS)
+    counting = _weighted(weights)
+    got = receivers.reshape(-1, 6)[_evenly_spaced(counting, _SAMPLED_RECEIVERS)].astype(np.float64)
+    lit = _evenly_spaced(np.asarray(segments, np.float64), _SAMPLED_SEGMENTS)
     middle, normal = 0.5 * (lit[:, :3] + lit[:, 3:6]), lit[:, 6:9]
     arrives = got[:, 3:] @ middle.T > np.sum(got[:, 3:] * got[:, :3], axis=1)[:, None]
     leaves = got[:, :3] @ normal.T > np.sum(normal * middle, axis=1)
@@ -150,12 +189,12 @@ def facing_pairs(segments: npt.NDArray[Any], receivers: npt.NDArray[Any], weight
     return int(share * len(counting) * len(segments))
 
 
-def _counting(weights: npt.NDArray[Any]) -> npt.NDArray[np.intp]:
+def _weighted(weights: npt.NDArray[Any]) -> npt.NDArray[np.intp]:
     return np.flatnonzero((weights[..., 0] != 0.0) | (weights[..., 1] != 0.0))
 
 
-def _spread(values: npt.NDArray[Any], most: int) -> npt.NDArray[Any]:
-    """Return at most so many of them, evenly."""
+def _evenly_spaced(values: npt.NDArray[Any], most: int) -> npt.NDArray[Any]:
+    """Return at most ``most`` values at even steps."""
     if len(values) <= most:
         return values
     return values[(2 * np.arange(most) + 1) * len(values) // (2 * most)]

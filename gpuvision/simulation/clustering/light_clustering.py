@@ -1,4 +1,4 @@
-"""Model only what the scene requires: what may be left out of secondary light, to a proven error of the range."""
+"""Error-bounded clustering of lit segments: which pairs of segments and receivers a reading needs (lightcuts)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Variant, uses_vectors
+from gpuvision.host import Device, FloatArray, IntArray, Launch, Variant, to_numpy, uses_vectors
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.clustering.light_tree import COLUMNS, LightTree
 from gpuvision.simulation.errors.range_error import StripErrorModel
@@ -20,62 +20,81 @@ Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int32]
 
 BLOCK = 16
-# The kernel's reals, and of the scene's reach: what a place may be off by in them, and what rises less than it hides
-# nothing.
+"""Receivers of a strip that share a list of selected segments."""
+
+# The kernel computes in single. In parts of the scene's reach: how far a position may be rounded, and how high a
+# surface must rise above the planes of receiver and segment to occlude.
 _REAL = np.dtype(np.float32)
 _ROUNDING, _MARGIN = 4.0 * 2.0**-23, 32.0 * 2.0**-23
-# Of a row of placed segments in kernels/light_clustering/light_clustering.cl.
-_PLACED = 10
+# Columns of a segment in kernels/light_clustering/light_clustering.cl: normal, height of its plane, start, end.
+_SEGMENT_COLUMNS = 10
 _GROUP, _STRIPS_PER_CORE = 64, 8
+# Bit of a selected segment that nothing can occlude, as the kernel sets it.
 _CLEAR = 1 << 30
-# Picks of a block for which there is room at first; what needs more is planned again.
-_ROOM = 64
-# Bounds of zero leave most shares unspent: the others get so many times theirs, as long as the sum allows it.
-_GENEROSITY = 2.0
-# Twos by which the errors of picks are told apart when some of them are left out.
-_STEPS = 64
+# Selected segments of a block that fit at first. A block that needs more doubles the capacity; the kernel runs again.
+_FIRST_CAPACITY = 64
+# Many pairs have a bound of 0 and leave their share of the tolerance unused. All shares are multiplied by this factor;
+# a strip whose error sum then exceeds the tolerance is traversed again with the factor 1.
+_SHARE_FACTOR = 2.0
+# Classes of errors, in powers of two below the tolerance, by which the smallest errors are found without a sort.
+_ERROR_CLASSES = 64
 
 
 @dataclass(frozen=True, eq=False)
 class LightCut:
-    """What of the light from lit segments is to be modelled; compared by identity.
+    """Cut of the light tree for each block of receivers: the segments and clusters to compute; compared by identity.
 
     Attributes
     ----------
     segments
-        float64 (m + clusters, 10): those given, and one for each cluster that stands for its parts somewhere.
+        float64 (m + clusters, 10): the given segments, then the representative segment of each cluster in use.
     starts
-        int32 (blocks + 1,): where the picks of each block of 16 receivers begin, block by block and strip by strip.
-    picks
-        int32: the segments that each needs, as `gpuvision.simulation.transport.occluded_irradiance.OccludedIrradiance`
-        takes them: a number, or ~number of one that nothing can hide.
+        int32 (blocks + 1,): index into `selected` at which the list of each block of 16 receivers begins, block by
+        block and strip by strip; the last entry is the end of the last list.
+    selected
+        int32: lists of segments as `gpuvision.simulation.transport.occluded_irradiance.OccludedIrradiance` takes them:
+        an index into `segments`, or ~index of a segment that nothing can occlude.
     tolerance
-        Metres, as asked for.
+        Range error that was allowed [m].
     bound
-        (strips,), metres: what the plan may be off by in range, proven; 0 where nothing is left out.
-    worst
-        (strips,), metres: what leaving out all of it may be off by.
+        float64 (strips,), metres: bound of the range error by all pairs that are left out or clustered; 0 where there
+        are none. See the notes of `LightClustering` for the errors that it does not cover.
+    bound_if_omitted
+        float64 (strips,), metres: the same bound if the light of all segments were left out.
     counts
-        "segments", as given; "pairs" of receiver and segment, all, and by what becomes of them: "exact", "clear" (those
-        of them that nothing can hide), "clustered", "left out"; "work": pairs that are left to compute.
-    planned
-        False: all is to be computed, because that takes less time than to find out what need not be.
+        Number of "segments", of all "pairs" of a receiver and a segment, and of the pairs that are computed exactly
+        ("exact"; of these "clear" cannot be occluded), represented by a cluster ("clustered"), or "left out". "work" is
+        the number of pairs that remain to be computed.
+    traversed
+        Whether the tree was traversed. False: every pair is computed, because that is faster.
     """
 
     segments: Reals
     starts: Integers
-    picks: Integers
+    selected: Integers
     tolerance: float
     bound: Reals
-    worst: Reals
+    bound_if_omitted: Reals
     counts: Mapping[str, int]
-    planned: bool = True
+    traversed: bool = True
 
     @classmethod
-    def of_all(
-        cls, segments: npt.NDArray[Any], shape: tuple[int, ...], direct: StripErrorModel, tolerance: float
+    def full(
+        cls, segments: npt.NDArray[Any], shape: tuple[int, ...], reading: StripErrorModel, tolerance: float
     ) -> LightCut:
-        """Return the plan that leaves out nothing for receivers of a shape (strips, n, 6): every segment for all."""
+        """Return the cut that selects every segment for all receivers.
+
+        Parameters
+        ----------
+        segments
+            (m, 10), as of `LightClustering.__call__`.
+        shape
+            Shape of the receivers, (strips, n, 6).
+        reading
+            Gives `bound_if_omitted`.
+        tolerance
+            Recorded in the cut [m].
+        """
         strips, count = shape[:2]
         blocks, pairs = strips * -(-count // BLOCK), strips * count * len(segments)
         return cls(
@@ -84,7 +103,7 @@ class LightCut:
             np.tile(np.arange(len(segments), dtype=np.int32), blocks),
             tolerance,
             np.zeros(strips),
-            direct.max_error(),
+            reading.max_error(),
             {
                 "segments": len(segments),
                 "pairs": pairs,
@@ -94,83 +113,104 @@ class LightCut:
                 "left out": 0,
                 "work": pairs,
             },
-            planned=False,
+            traversed=False,
         )
 
     @property
-    def modelled(self) -> bool:
-        """Whether anything is left to compute."""
-        return bool(len(self.picks))
+    def has_pairs(self) -> bool:
+        """Whether any pair is left to compute."""
+        return bool(len(self.selected))
 
-    def tables(self, dtype: npt.DTypeLike, segments: int = 0, picks: int = 0) -> tuple[Any, Integers, Integers]:
-        """Return segments, starts and picks with room for so many, and up to a power of two, at least.
+    def padded_tables(
+        self, dtype: npt.DTypeLike, segments: int = 0, selected: int = 0
+    ) -> tuple[Any, Integers, Integers]:
+        """Return `segments`, `starts` and `selected`, padded to powers of two, so that few kernels are bound.
 
-        What is added has no exitance, and is picked by none: instances bound to few shapes serve many plans.
+        The added segments have no exitance, and no list holds them.
+
+        Parameters
+        ----------
+        dtype
+            Of the segments.
+        segments, selected
+            Least numbers of rows.
         """
-        rows = np.zeros((_room(max(segments, len(self.segments))), 10), dtype)
+        rows = np.zeros((_capacity(max(segments, len(self.segments))), 10), dtype)
         rows[: len(self.segments)] = self.segments
         rows[len(self.segments) :, 8] = 1.0
-        filled = np.zeros(_room(max(picks, len(self.picks))), np.int32)
-        filled[: len(self.picks)] = self.picks
+        filled = np.zeros(_capacity(max(selected, len(self.selected))), np.int32)
+        filled[: len(self.selected)] = self.selected
         return rows, self.starts, filled
 
     def report(self) -> dict[str, Any]:
-        """Return what was modelled and what was left out, with which bound, as JSON takes it; no bound is None."""
+        """Return the counts and bounds as a dictionary for JSON; an infinite bound is None."""
         return {
-            "modelled": self.modelled,
-            "planned": self.planned,
+            "has pairs": self.has_pairs,
+            "traversed": self.traversed,
             "tolerance": self.tolerance,
-            "bound": _largest(self.bound),
-            "bound if left out": _largest(self.worst),
+            "bound": _finite_max(self.bound),
+            "bound if all left out": _finite_max(self.bound_if_omitted),
             "clusters": len(self.segments) - self.counts["segments"],
             **self.counts,
         }
 
 
-def _room(count: int) -> int:
+def _capacity(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def _largest(values: Reals) -> float | None:
+def _finite_max(values: Reals) -> float | None:
     largest = float(values.max(initial=0.0))
     return largest if math.isfinite(largest) else None
 
 
 @dataclass(frozen=True, kw_only=True)
 class LightClustering:
-    """Leaves out of the light between surfaces what stays under a tolerance: ``planner(segments, ...) -> LightCut``.
+    """Error-bounded clustering of lights in the manner of lightcuts: ``clustering(segments, ...) -> LightCut``.
+
+    Each block of 16 receivers descends the tree of lit segments (`LightTree`) from its root. A node is left out where
+    the bound of its light stays below its share of the tolerance; it is replaced by its representative segment where
+    the bound of that error does and nothing can occlude it; otherwise its children are visited.
 
     Parameters
     ----------
     tolerance
-        Metres of range; 0 leaves out only what is zero.
+        Range error that omitted and clustered pairs may make together in a strip [m], 0 or more; 0 omits only pairs
+        without light.
     scene
-        What may stand between; None: nothing does.
+        Triangles that may occlude; None: nothing occludes.
     clearance
-        Metres: what rises less above a receiver's or a lit surface does not hide anything; at least 4e-6 of the
-        scene's reach from its middle.
+        Surfaces that rise less than this above a receiver's or a lit surface's plane do not occlude [m]; at least 4e-6
+        of the scene's reach from its middle.
     clusters
-        Whether one segment may stand for several.
+        Whether one segment may represent several. Default True.
     variant
         "vector" (16 boxes at a time, for CPU runtimes), "work_item" (a work-item per block, for GPUs), or "auto".
 
     Raises
     ------
     ValueError
-        The tolerance or the clearance is negative or no number.
+        The tolerance or the clearance is negative or not finite.
 
-    Notes
-    -----
-    A receiver's irradiance from a segment is at most W cos cos / (pi r^2), W its power, with the largest cosines and
-    the least distance of any two points, and never more than W / (L r) of length L. The error of a segment that stands
-    for a cluster is in `gpuvision.simulation.clustering.light_tree`. Visibility is between 0 and 1, and a cluster
-    stands only where nothing can hide any of it, so all this holds with occlusion. The tolerance is shared among
-    pairs by power times
-    cost; what the shares leave over is then spent on the pairs with the least bounds.
+    Notes ----- Bound of one pair: the irradiance of a receiver from a segment of power W and length L is at most W
+    cos_r cos_e / (pi r^2), with the largest cosines and the least distance r of any two points, and at most W / (L r).
+    Bound of a cluster: see `gpuvision.simulation.clustering.light_tree`. Both hold with occlusion, because visibility
+    lies between 0 and 1 and a cluster is used only where no triangle can occlude any part of it.
+    `StripErrorModel.error_per_irradiance` turns irradiance into metres of range; errors of pairs are added without
+    cancellation.
 
-    Places are rounded to single about the scene's middle, and the bounds take that into account, by 5e-7 of its reach;
-    only what lies in, or under, a surface's own plane to that is taken to get nothing from it. The rounding of the
-    kernel that computes the rest comes on top.
+    The tolerance is shared among pairs by power times cost. What the shares leave over is then spent on the pairs with
+    the least bounds.
+
+    Covered by the bound: omission, clustering, and the rounding of positions to single about the scene's middle (5e-7
+    of the reach). Not covered: the rounding of `OccludedIrradiance`, which computes the pairs that are kept; light that
+    arrives within that rounding of a surface's own plane, which is taken as none; the discretisation of the surface by
+    receivers; readings other than the mean of u in a fixed window (`StripErrorModel`).
+
+    References
+    ----------
+    B. Walter et al., *Lightcuts: a scalable approach to illumination*, ACM Transactions on Graphics 24(3), 2005. Their
+    cuts bound the error of each pixel by material, geometric and visibility terms; these bound the range of a strip.
     """
 
     tolerance: float
@@ -178,8 +218,8 @@ class LightClustering:
     clearance: float = 0.0
     clusters: bool = True
     variant: Variant = "auto"
-    # The room that the last profiles needed.
-    _room: list[int] = field(init=False, repr=False, compare=False, default_factory=lambda: [_ROOM])
+    # Capacity of the lists of blocks that the last profiles needed.
+    _capacity_used: list[int] = field(init=False, repr=False, compare=False, default_factory=lambda: [_FIRST_CAPACITY])
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "clearance"):
@@ -190,29 +230,35 @@ class LightClustering:
         segments: npt.NDArray[Any],
         receivers: npt.NDArray[Any],
         weights: npt.NDArray[Any],
-        direct: StripErrorModel,
+        reading: StripErrorModel,
         *,
         tolerance: float | None = None,
         device: Device | None = None,
     ) -> LightCut:
-        """Plan a profile.
+        """Return the cut of a profile.
 
         Parameters
         ----------
         segments
-            (m, 10): start, end [m], normal, exitance [W/m]; without exitance: none.
+            (m, 10): start, end [m], normal, exitance [W/m]; a row without exitance is no segment.
         receivers
-            (strips, n, 6), float32 or float64: place and normal. Those without weight have no part in it.
+            (strips, n, 6), float32 or float64: position [m] and normal. Receivers without weight are not considered.
         weights
-            (strips, n, 2): W, and W times sensor unit about u = 0, by 1 W/m^2.
-        direct
-            What else falls on the strips.
+            (strips, n, 2): power on the sensor [W], and power times u about u = 0 [W sensor unit], that 1 W/m^2 on a
+            receiver adds to its strip.
+        reading
+            Direct light on the strips, and how the range follows the reading.
         tolerance
-            Of this profile, if another one.
+            Tolerance of this profile [m]; None: `LightClustering.tolerance`.
         device
-            Where to plan; `Device.best` if left out.
+            Device of the kernel; None: `Device.best`.
+
+        Raises
+        ------
+        ValueError
+            Shapes do not agree, or the tolerance is negative or not finite.
         """
-        asked = self.asked(tolerance)
+        tolerance = self.tolerance_of(tolerance)
         segments = np.asarray(segments, np.float64)
         if (
             receivers.ndim != 3
@@ -224,15 +270,21 @@ class LightClustering:
                 f"expected receivers (strips, n, 6) and weights (strips, n, 2), got {receivers.shape}, {weights.shape}"
             )
         tree = LightTree.build(segments)
-        costs = direct.error_per_irradiance(weights)
-        places = np.ascontiguousarray(receivers)
-        return _planned(self, asked, tree, segments, places, costs, direct, device or Device.best())
+        costs = reading.error_per_irradiance(weights)
+        positions = np.ascontiguousarray(receivers)
+        return _cut_tree(self, tolerance, tree, segments, positions, costs, reading, device or Device.best())
 
-    def asked(self, tolerance: float | None) -> float:
-        """Return the tolerance of a profile, metres: the one given, or else the planner's."""
-        asked = self.tolerance if tolerance is None else tolerance
-        _check_metres(asked, "LightClustering.tolerance")
-        return asked
+    def tolerance_of(self, tolerance: float | None) -> float:
+        """Return the tolerance of a profile [m]: the given one, or `LightClustering.tolerance` for None.
+
+        Raises
+        ------
+        ValueError
+            The tolerance is negative or not finite.
+        """
+        chosen = self.tolerance if tolerance is None else tolerance
+        _check_metres(chosen, "LightClustering.tolerance")
+        return chosen
 
 
 def _check_metres(value: float, what: str) -> None:
@@ -240,25 +292,40 @@ def _check_metres(value: float, what: str) -> None:
         raise ValueError(f"{what} is {value!r}, expected metres, 0 or more")
 
 
-class _Found(NamedTuple):
-    """As kernels/light_clustering/light_clustering.cl writes it."""
+class _Selection(NamedTuple):
+    """Outputs of kernels/light_clustering/light_clustering.cl.
 
-    picks: Any
-    errors: Any
-    counts: Any
-    spent: Any
-    tallies: Any
+    Attributes
+    ----------
+    selected
+        int32 (blocks, capacity): position of a segment in the tree, with the bit `_CLEAR` if nothing can occlude it, or
+        ~node of a cluster.
+    errors
+        float32 (blocks, capacity): bound of the range error if that entry were left out [m].
+    counts
+        int32 (blocks,): entries that the block needs; more than the capacity are not written.
+    error_sums
+        float32 (blocks, 2): bound of the error by omitted and clustered nodes, and by omitting all segments [m].
+    pair_counts
+        int32 (blocks, 2): segments left out, and segments in clusters.
+    """
+
+    selected: IntArray
+    errors: FloatArray
+    counts: IntArray
+    error_sums: FloatArray
+    pair_counts: IntArray
 
 
 @dataclass(frozen=True, kw_only=True)
-class _PlanLight(VisionOperation[_Found]):
-    """Traverses the clusters for every block of receivers (strips, n, 6)."""
+class _SelectLights(VisionOperation[_Selection]):
+    """Traversal of the light tree for every block of receivers (strips, n, 6)."""
 
-    Result: ClassVar[type[Any]] = _Found
+    Result: ClassVar[type[Any]] = _Selection
 
     nodes: int
     segments: int
-    room: int
+    capacity: int
     scene: Scene | None
     clearance: float
     clusters: bool
@@ -282,11 +349,11 @@ class _PlanLight(VisionOperation[_Found]):
         if self.scene is not None:
             tables, depth = list(self.scene.bvh.tables(_REAL)), self.scene.bvh.depth
         present = {"VECTOR_VARIANT": strip, "OCCLUDERS": self.scene is not None, "CLUSTERS": self.clusters}
-        reach = 0.0 if self.scene is None else _reach(self.scene, dtype)
+        reach = 0.0 if self.scene is None else _scene_reach(self.scene, dtype)
         margin = max(self.clearance, _MARGIN * reach)
         return Launch(
             source="light_clustering/light_clustering.cl",
-            kernel="plan_light",
+            kernel="select_lights",
             defines={
                 **{name: None for name, is_present in present.items() if is_present},
                 "INPUT": "float" if dtype == np.float32 else "double",
@@ -299,20 +366,20 @@ class _PlanLight(VisionOperation[_Found]):
                 ((strips,), _REAL),
                 ((self.nodes, COLUMNS), _REAL),
                 ((self.nodes, 2), whole),
-                ((self.segments, _PLACED), _REAL),
+                ((self.segments, _SEGMENT_COLUMNS), _REAL),
                 ((4,), dtype),
             ],
             outputs={
-                "picks": ((blocks, self.room), whole),
-                "errors": ((blocks, self.room), np.dtype(np.float32)),
+                "selected": ((blocks, self.capacity), whole),
+                "errors": ((blocks, self.capacity), np.dtype(np.float32)),
                 "counts": ((blocks,), whole),
-                "spent": ((blocks, 2), _REAL),
-                "tallies": ((blocks, 2), whole),
+                "error_sums": ((blocks, 2), _REAL),
+                "pair_counts": ((blocks, 2), whole),
             },
             arguments=[
                 *tables,
                 _REAL.type(margin),
-                *(np.uint32(value) for value in (self.room, blocks, of_strip, count, each)),
+                *(np.uint32(value) for value in (self.capacity, blocks, of_strip, count, each)),
             ],
             global_size=(items,) if strip else (-(-items // _GROUP) * _GROUP,),
             local_size=(1,) if strip else (_GROUP,),
@@ -320,9 +387,9 @@ class _PlanLight(VisionOperation[_Found]):
 
 
 def _frame(scene: Scene | None, segments: Reals, receivers: npt.NDArray[Any]) -> Reals:
-    """Return the middle of all places, and by how much they may be rounded in single, metres."""
+    """Return (4,): the middle of all positions, and the bound of their rounding to single about it [m]."""
     if scene is not None:
-        middle, reach = scene.bvh.middle, _reach(scene, receivers.dtype)
+        middle, reach = scene.bvh.middle, _scene_reach(scene, receivers.dtype)
     else:
         places = np.concatenate([segments[:, :6].reshape(-1, 3), receivers[..., :3].reshape(-1, 3)])
         places = places[np.isfinite(places).all(axis=1)]
@@ -334,81 +401,88 @@ def _frame(scene: Scene | None, segments: Reals, receivers: npt.NDArray[Any]) ->
     return np.append(middle, _ROUNDING * reach)
 
 
-def _reach(scene: Scene, dtype: np.dtype[Any]) -> float:
-    """Return how far from its middle a scene goes; from the origin, where places come in single."""
+def _scene_reach(scene: Scene, dtype: np.dtype[Any]) -> float:
+    """Return the scene's reach from its middle [m]; plus the middle's from the origin for positions in single."""
     reach = float(np.abs(scene.bvh.corners).max(initial=0.0))
     return reach + (float(np.abs(scene.bvh.middle).max()) if dtype == np.float32 else 0.0)
 
 
-def _planned(
-    planner: LightClustering,
+def _cut_tree(
+    clustering: LightClustering,
     tolerance: float,
     tree: LightTree,
     segments: Reals,
     receivers: npt.NDArray[Any],
     costs: Reals,
-    direct: StripErrorModel,
+    reading: StripErrorModel,
     device: Device,
 ) -> LightCut:
     strips = len(costs)
     of_strip = -(-receivers.shape[1] // BLOCK)
-    found, spent = _traversed(planner, tolerance, tree, segments, receivers, costs, device)
+    found, error_sums = _traverse(clustering, tolerance, tree, segments, receivers, costs, device)
     owner = np.repeat(np.arange(strips), of_strip)
-    held = np.arange(found.picks.shape[1]) < found.counts[:, None]
-    picks, errors = found.picks[held], found.errors[held].astype(np.float64)
-    block = np.repeat(np.arange(len(found.counts)), found.counts)
-    receivers_of = np.minimum(BLOCK, receivers.shape[1] - BLOCK * (np.arange(len(found.counts)) % of_strip))
-    worst = np.minimum(spent[:, 1], direct.max_error())
-    kept, lost = _kept(picks, errors, owner[block], spent, worst, tolerance)
+    in_block = to_numpy(found.counts)
+    held = np.arange(found.selected.shape[1]) < in_block[:, None]
+    selected, errors = to_numpy(found.selected)[held], to_numpy(found.errors)[held].astype(np.float64)
+    block = np.repeat(np.arange(len(in_block)), in_block)
+    receivers_of = np.minimum(BLOCK, receivers.shape[1] - BLOCK * (np.arange(len(in_block)) % of_strip))
+    worst = np.minimum(error_sums[:, 1], reading.max_error())
+    kept, lost = _drop_smallest(selected, errors, owner[block], error_sums, worst, tolerance)
     bound = np.minimum(np.where(lost > 0.0, lost, 0.0), worst)
-    return _assembled(tolerance, tree, segments, picks[kept], block[kept], bound, worst, receivers_of)
+    return _assemble(tolerance, tree, segments, selected[kept], block[kept], bound, worst, receivers_of)
 
 
-def _kept(
-    picks: Integers, errors: Reals, strip: npt.NDArray[np.int64], spent: Reals, worst: Reals, tolerance: float
+def _drop_smallest(
+    selected: Integers, errors: Reals, strip: npt.NDArray[np.int64], error_sums: Reals, worst: Reals, tolerance: float
 ) -> tuple[npt.NDArray[np.bool_], Reals]:
-    """Return which picks stay when what is left of the tolerance is spent on the least, and all that is lost."""
-    strips = len(spent)
+    """Return which entries are kept after the rest of the tolerance is spent on the smallest, and the error sums.
+
+    Single segments are dropped from the smallest error on, as long as the error sum of their strip stays within the
+    tolerance. A strip whose light can be left out altogether keeps no entry.
+    """
+    strips = len(error_sums)
     out = worst <= tolerance
-    single = picks >= 0
-    # Errors in steps of two below the tolerance; a step is left out whole.
+    single = selected >= 0
+    # Classes of errors in powers of two below the tolerance; the entries of a class are dropped together.
     with np.errstate(divide="ignore"):
         below = np.floor(np.log2(tolerance) - np.log2(errors)) if tolerance > 0.0 else np.full(len(errors), -1.0)
-    step = np.clip(below, -1.0, _STEPS - 1.0).astype(np.int64)
+    step = np.clip(below, -1.0, _ERROR_CLASSES - 1.0).astype(np.int64)
     able = single & (step >= 0)
-    sums = np.bincount(strip[able] * _STEPS + step[able], errors[able], strips * _STEPS).reshape(strips, _STEPS)
-    # The smallest are in the last step.
+    sums = np.bincount(strip[able] * _ERROR_CLASSES + step[able], errors[able], strips * _ERROR_CLASSES).reshape(
+        strips, _ERROR_CLASSES
+    )
+    # The last class holds the smallest errors.
     running = np.cumsum(sums[:, ::-1], axis=1)[:, ::-1]
-    fits = running <= (tolerance - spent[:, 0])[:, None]
-    cut = np.where(fits.any(axis=1), np.argmax(fits, axis=1), _STEPS)
-    dropped = np.where(cut < _STEPS, running[np.arange(strips), np.minimum(cut, _STEPS - 1)], 0.0)
+    fits = running <= (tolerance - error_sums[:, 0])[:, None]
+    cut = np.where(fits.any(axis=1), np.argmax(fits, axis=1), _ERROR_CLASSES)
+    dropped = np.where(cut < _ERROR_CLASSES, running[np.arange(strips), np.minimum(cut, _ERROR_CLASSES - 1)], 0.0)
     kept = ~out[strip] & ~(able & (step >= cut[strip]))
-    return kept, np.where(out, worst, spent[:, 0] + dropped)
+    return kept, np.where(out, worst, error_sums[:, 0] + dropped)
 
 
-def _assembled(
+def _assemble(
     tolerance: float,
     tree: LightTree,
     segments: Reals,
-    picks: Integers,
+    selected: Integers,
     block: npt.NDArray[np.int64],
     bound: Reals,
     worst: Reals,
     receivers_of: npt.NDArray[np.int64],
 ) -> LightCut:
-    """Turn picks of the kernel, by places in the tree and by nodes, into numbers of segments."""
-    cluster = picks < 0
-    clear = cluster | (picks >= _CLEAR)
-    numbers = np.zeros(len(picks), np.int64)
-    numbers[~cluster] = tree.order[picks[~cluster] & (_CLEAR - 1)] if len(segments) else 0
-    nodes, place = np.unique(~picks[cluster], return_inverse=True)
+    """Make the cut from the kernel's entries: turn positions in the tree and nodes into indices of segments."""
+    cluster = selected < 0
+    clear = cluster | (selected >= _CLEAR)
+    numbers = np.zeros(len(selected), np.int64)
+    numbers[~cluster] = tree.order[selected[~cluster] & (_CLEAR - 1)] if len(segments) else 0
+    nodes, place = np.unique(~selected[cluster], return_inverse=True)
     numbers[cluster] = len(segments) + place
     starts = np.zeros(len(receivers_of) + 1, np.int32)
     np.cumsum(np.bincount(block, minlength=len(receivers_of)), out=starts[1:])
     each = receivers_of[block]
     pairs = int(receivers_of.sum()) * len(segments)
     exact = int(each[~cluster].sum())
-    clustered = int((each[cluster] * tree.spans[~picks[cluster], 1]).sum())
+    clustered = int((each[cluster] * tree.spans[~selected[cluster], 1]).sum())
     counts = {
         "segments": len(segments),
         "pairs": pairs,
@@ -419,7 +493,7 @@ def _assembled(
         "work": int(each.sum()),
     }
     return LightCut(
-        np.concatenate([segments, tree.aggregates[nodes]]),
+        np.concatenate([segments, tree.representatives[nodes]]),
         starts,
         np.where(clear, ~numbers, numbers).astype(np.int32),
         tolerance,
@@ -429,46 +503,48 @@ def _assembled(
     )
 
 
-def _traversed(
-    planner: LightClustering,
+def _traverse(
+    clustering: LightClustering,
     tolerance: float,
     tree: LightTree,
     segments: Reals,
     receivers: npt.NDArray[Any],
     costs: Reals,
     device: Device,
-) -> tuple[_Found, Reals]:
-    """Return what the kernel found, and what each strip has lost by it, and would lose by all of it, metres."""
-    frame = _frame(planner.scene, segments, receivers)
+) -> tuple[_Selection, Reals]:
+    """Return the kernel's outputs, and per strip (strips, 2) the error sums of the cut and of omitting all [m]."""
+    frame = _frame(clustering.scene, segments, receivers)
     middle = frame[:3]
     rows = tree.rows.copy()
     rows[:, :9] -= np.tile(middle, 3)
-    placed = np.zeros((len(tree.spans) // 2, _PLACED))
-    placed[: len(segments)] = _placed(segments[tree.order], middle)
+    placed = np.zeros((len(tree.spans) // 2, _SEGMENT_COLUMNS))
+    placed[: len(segments)] = _segment_rows(segments[tree.order], middle)
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = tolerance / (costs.sum(axis=1) * tree.power)
     shares = np.where(np.isnan(shares), 0.0, np.minimum(shares, float(np.finfo(np.float32).max)))
     given = costs.astype(_REAL), rows.astype(_REAL), placed.astype(_REAL), frame.astype(receivers.dtype)
     of_strip = -(-receivers.shape[1] // BLOCK)
-    generosity = np.full(len(costs), _GENEROSITY)
+    factor = np.full(len(costs), _SHARE_FACTOR)
     while True:
-        found = _run(
-            planner,
+        found = _select_lights(
+            clustering,
             receivers,
-            np.minimum(shares * generosity, np.finfo(np.float32).max).astype(_REAL),
+            np.minimum(shares * factor, np.finfo(np.float32).max).astype(_REAL),
             tree.spans,
             *given,
             device=device,
         )
-        spent = np.add.reduceat(found.spent.astype(np.float64), np.arange(len(costs)) * of_strip, axis=0)
-        over = (spent[:, 0] > tolerance) & (generosity > 1.0)
+        error_sums = np.add.reduceat(
+            to_numpy(found.error_sums).astype(np.float64), np.arange(len(costs)) * of_strip, axis=0
+        )
+        over = (error_sums[:, 0] > tolerance) & (factor > 1.0)
         if not over.any():
-            return found, spent
-        generosity[over] = 1.0
+            return found, error_sums
+        factor[over] = 1.0
 
 
-def _run(
-    planner: LightClustering,
+def _select_lights(
+    clustering: LightClustering,
     receivers: npt.NDArray[Any],
     shares: npt.NDArray[Any],
     spans: Integers,
@@ -477,25 +553,25 @@ def _run(
     placed: npt.NDArray[Any],
     frame: npt.NDArray[Any],
     device: Device,
-) -> _Found:
+) -> _Selection:
     while True:
-        operation = _PlanLight(
+        operation = _SelectLights(
             nodes=len(spans),
             segments=len(placed),
-            room=planner._room[0],
-            scene=planner.scene,
-            clearance=planner.clearance,
-            clusters=planner.clusters,
-            variant=planner.variant,
+            capacity=clustering._capacity_used[0],
+            scene=clustering.scene,
+            clearance=clustering.clearance,
+            clusters=clustering.clusters,
+            variant=clustering.variant,
         )
         found = operation(receivers, costs, shares, rows, spans, placed, frame, device=device)
-        most = int(found.counts.max(initial=0))
-        if most <= planner._room[0]:
+        most = int(to_numpy(found.counts).max(initial=0))
+        if most <= clustering._capacity_used[0]:
             return found
-        planner._room[0] = _room(most)
+        clustering._capacity_used[0] = _capacity(most)
 
 
-def _placed(segments: Reals, middle: Reals) -> Reals:
+def _segment_rows(segments: Reals, middle: Reals) -> Reals:
     """Return (m, 10): normal, the height of its plane, start and end, from the middle."""
     size = np.linalg.norm(segments[:, 6:9], axis=1, keepdims=True)
     normal = segments[:, 6:9] / np.where(size > 0.0, size, 1.0)

@@ -1,10 +1,18 @@
-"""LightTree of lit segments: a binary tree, and one segment that stands for each cluster, to a proven error.
+"""Light tree (lightcuts): a binary tree of lit segments with a representative segment and an error bound per node.
 
-The light of a cluster at a receiver is a sum over its pieces of n_r . T(P) n_e, T = d d' / |d|^4 of the vector d from a
-piece at P. In the plane of d and of a step s, d d' / |d|^4 = (1 / |z|^2 + R(1 / z*^2)) / 2, R a reflection, with the
-complex number z = |d| - |s| w, |w| = 1: so the k-th term of its series in s has the norm (k + 1) |s|^k / |d|^(k + 2) at
-most. A cluster is replaced by one segment of the same power times normal, the same first moment, and the largest part
-of its second moment; what is left of the series is the error.
+The irradiance of a receiver by a cluster is proportional to a sum over the points P of the cluster's segments of
+n_r . T(P) n_e, with the receiver's normal n_r, the segment's normal n_e, and T = d d' / |d|^4 of the vector d from P to
+the receiver. T is expanded in the step s from the cluster's centre to P. In the plane of d and s,
+d d' / |d|^4 = (1 / |z|^2 + R(1 / z*^2)) / 2 with a reflection R and the complex number z = |d| - |s| w, |w| = 1. So the
+k-th term of the series in s has a norm of at most (k + 1) |s|^k / |d|^(k + 2).
+
+The representative segment has the cluster's sum of power times normal, its first moment, and the largest part of its
+second moment. The error bound is the sum of the norms of the rest: first moments of the normals' parts aside of the
+mean normal, the rest of the second moment, and the remainders of third and fourth order. It holds where all of the
+cluster faces all receivers and nothing occludes; the traversal checks both.
+
+References: B. Walter et al., *Lightcuts: a scalable approach to illumination*, ACM Transactions on Graphics 24(3),
+2005. Their representative light is one light of the cluster, with a bound of zeroth order; this one matches moments.
 """
 
 from __future__ import annotations
@@ -18,45 +26,53 @@ import numpy.typing as npt
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Of a row of kernels/light_clustering/light_clustering.cl.
+# Columns of a node in kernels/light_clustering/light_clustering.cl.
 COLUMNS = 24
-# A normal turned by one is as far away as half of what is lit is long.
-_NORMALS_REACH = 0.5
-# A cluster of points becomes a segment as long as this part of its reach.
-_SHORTEST = 1e-3
-_MOST_LEAN = 0.1
+# Axes of a normal count, in the choice of the widest axis, as this part of the longest extent of what is lit.
+_NORMAL_SCALE = 0.5
+# Half length of a representative segment, in radii of the cluster, where all its points coincide: not 0, so that
+# its exitance stays finite.
+_MIN_LENGTH = 1e-3
+# Least cosine between a segment's normal and the mean normal at which a cluster has a representative.
+_MIN_COSINE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class LightTree:
-    """A tree over lit segments in the order of a heap: the children of node i are 2 i and 2 i + 1; 1 is the root.
+    """Binary tree over lit segments, stored as a heap: node 1 is the root, nodes 2 i and 2 i + 1 are children of i.
 
     Attributes
     ----------
     order
-        int64 (m,): the segments as they lie in the tree.
+        int64 (m,): indices of the segments in the order of the leaves.
     spans
-        int32 (nodes, 2): the first place in `order`, and how many; none where a node is empty.
+        int32 (nodes, 2): position in `order` of the node's first segment, and the number of its segments; 0 for an
+        empty node.
     rows
-        float64 (nodes, 24): what kernels/light_clustering/light_clustering.cl knows of each; bounds of errors are by a
-        watt.
-    aggregates
-        float64 (nodes, 10): the segment that stands for each: start, end, normal, exitance.
+        float64 (nodes, 24): extent, normals, power and error coefficients of each node, in the columns of
+        kernels/light_clustering/light_bounds.h; errors are per watt.
+    representatives
+        float64 (nodes, 10): representative segment of each node: start, end [m], normal, exitance [W/m].
     power
-        W, all of it.
+        Power of all segments [W].
     """
 
     order: Integers
     spans: npt.NDArray[np.int32]
     rows: Reals
-    aggregates: Reals
+    representatives: Reals
     power: float
 
     @classmethod
     def build(cls, segments: npt.NDArray[Any]) -> LightTree:
-        """Build the tree over segments (m, 10): start, end, normal, exitance (W/m); those without light count little.
+        """Build the tree over segments.
 
-        Halved by number along the widest of six axes, three of the place and three of the normal.
+        Each node is halved by number along the widest of six axes: three of the midpoint, three of the normal.
+
+        Parameters
+        ----------
+        segments
+            (m, 10): start, end [m], normal, exitance [W/m]. Segments without power do not move a cluster's centre.
 
         Raises
         ------
@@ -66,22 +82,22 @@ class LightTree:
         table = np.asarray(segments, np.float64)
         if table.ndim != 2 or table.shape[1] != 10:
             raise ValueError(f"LightTree.build takes segments (m, 10), got shape {table.shape}")
-        lit = _Lit(table)
+        lit = _SegmentTable(table)
         levels = max(len(table) - 1, 0).bit_length()
-        order = _sorted_by_place(lit, levels)
+        order = _build_order(lit, levels)
         spans = np.zeros((2 << levels, 2), np.int64)
         for level in range(levels + 1):
             edges = (np.arange((1 << level) + 1) * len(table)) >> level
             spans[1 << level : 2 << level] = np.column_stack([edges[:-1], np.diff(edges)])
-        rows, aggregates = np.zeros((len(spans), COLUMNS)), np.zeros((len(spans), 10))
+        rows, representatives = np.zeros((len(spans), COLUMNS)), np.zeros((len(spans), 10))
         full = np.flatnonzero(spans[:, 1])
         if len(full):
-            _describe(lit, order, full, spans, rows, aggregates)
-        return cls(order, spans.astype(np.int32), rows, aggregates, float(lit.power.sum()))
+            _fill_nodes(lit, order, full, spans, rows, representatives)
+        return cls(order, spans.astype(np.int32), rows, representatives, float(lit.power.sum()))
 
 
-class _Lit:
-    """The segments' numbers that the sums take."""
+class _SegmentTable:
+    """Segments as columns: start, end, half the way, midpoint, unit normal (m, 3), and power (m,) [W]."""
 
     def __init__(self, table: Reals) -> None:
         self.start, self.end = table[:, :3], table[:, 3:6]
@@ -92,13 +108,13 @@ class _Lit:
         self.power = np.maximum(table[:, 9], 0.0) * 2.0 * np.linalg.norm(self.half, axis=1)
 
 
-def _sorted_by_place(lit: _Lit, levels: int) -> Integers:
+def _build_order(lit: _SegmentTable, levels: int) -> Integers:
     count = len(lit.power)
     order: Integers = np.arange(count)
     if not count:
         return order
     reach = float(np.ptp(lit.middle, axis=0).max())
-    keys = np.column_stack([lit.middle, lit.normal * (_NORMALS_REACH * reach)])
+    keys = np.column_stack([lit.middle, lit.normal * (_NORMAL_SCALE * reach)])
     for level in range(levels):
         edges = (np.arange((1 << level) + 1) * count) >> level
         sizes = np.diff(edges)
@@ -110,8 +126,10 @@ def _sorted_by_place(lit: _Lit, levels: int) -> Integers:
     return order
 
 
-def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows: Reals, aggregates: Reals) -> None:
-    """Fill the rows and the aggregates of the nodes that hold segments, all levels at once."""
+def _fill_nodes(
+    lit: _SegmentTable, order: Integers, full: Integers, spans: Integers, rows: Reals, representatives: Reals
+) -> None:
+    """Fill the rows and the representatives of the nodes that hold segments, for all levels at once."""
     first, size = spans[full].T
     begin = np.cumsum(size) - size
     owner = np.repeat(np.arange(len(full)), size)
@@ -122,25 +140,26 @@ def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows:
 
     power, normal, middle, half = (each[members] for each in (lit.power, lit.normal, lit.middle, lit.half))
     total = sums(power)
-    # Where nothing shines any weights do.
+    # In a cluster without power all segments have the same weight, so that means exist.
     weight = np.where(total[owner] > 0.0, power, 1.0)
     mass = sums(weight)
-    facing, effective = _facing(sums(weight[:, None] * normal), normal[begin])
+    facing, effective = _mean_direction(sums(weight[:, None] * normal), normal[begin])
     face = facing[owner]
     cosine = _dot(normal, face)
-    # Left without a centre of its own where normals cancel; it has no aggregate there.
+    # The centre is the mean of positions weighted by power times cosine: the first moment of the representative is then
+    # that of the cluster. Where normals spread too far, the node has no representative and the centre is any mean.
     lean = np.minimum.reduceat(cosine, begin)
-    parallel = np.where(lean[owner] > _MOST_LEAN, weight * cosine, weight)
+    parallel = np.where(lean[owner] > _MIN_COSINE, weight * cosine, weight)
     centre = sums(parallel[:, None] * middle) / sums(parallel)[:, None]
     at = middle - centre[owner]
     aside = normal - cosine[:, None] * face
-    square, fourth = _powers(at, half)
+    square, fourth = _mean_distance_powers(at, half)
     tilt = np.sqrt(_dot(aside, aside))
     skew = sums((weight[:, None] * aside)[:, :, None] * at[:, None, :])
     spread = sums(parallel[:, None, None] * (at[:, :, None] * at[:, None, :] + half[:, :, None] * half[:, None, :] / 3))
     one, other = at - half, at + half
     reach = np.sqrt(np.maximum.reduceat(np.maximum(_dot(one, one), _dot(other, other)), begin))
-    arm, rest = _principal(spread, facing, effective, reach)
+    arm, rest = _principal_segment(spread, facing, effective, reach)
     arm_size = np.linalg.norm(arm, axis=1)
     height = -_dot(normal, at)
     slab = np.maximum.reduceat(np.maximum(np.abs(_dot(one, face)), np.abs(_dot(other, face))), begin)
@@ -164,36 +183,41 @@ def _describe(lit: _Lit, order: Integers, full: Integers, spans: Integers, rows:
             3.0 * (rest + sums(weight * tilt * square)) * each,
             sums(weight * np.sqrt(square * fourth)) * each,
             0.2 * effective * arm_size**4 * each,
-            np.where(lean > _MOST_LEAN, arm_size, np.inf),
+            np.where(lean > _MIN_COSINE, arm_size, np.inf),
             2.0 * np.linalg.norm(half, axis=1)[begin],
         ]
     )
     rows[full] = table
     exitance = effective * scale / np.where(arm_size > 0.0, 2.0 * arm_size, 1.0)
-    aggregates[full] = np.column_stack([centre - arm, centre + arm, facing, np.where(arm_size > 0.0, exitance, 0.0)])
+    representatives[full] = np.column_stack(
+        [centre - arm, centre + arm, facing, np.where(arm_size > 0.0, exitance, 0.0)]
+    )
 
 
 def _dot(a: Reals, b: Reals) -> Reals:
-    """Return the products of rows: several times as fast as a sum over so short an axis."""
+    """Return the dot products of rows; several times as fast as `np.sum` over an axis of 3."""
     return np.asarray(np.einsum("ni,ni->n", a, b))
 
 
-def _facing(summed: Reals, first: Reals) -> tuple[Reals, Reals]:
-    """Return the direction of summed normals, and their length; the first normal's direction where they cancel."""
+def _mean_direction(summed: Reals, first: Reals) -> tuple[Reals, Reals]:
+    """Return the unit direction of summed normals, and the length of the sum; the first normal where they cancel."""
     length = np.linalg.norm(summed, axis=1)
     facing = summed / np.where(length > 0.0, length, 1.0)[:, None]
     facing[length == 0.0] = first[length == 0.0]
     return facing, length
 
 
-def _powers(at: Reals, half: Reals) -> tuple[Reals, Reals]:
-    """Return the means over segments, from at - half to at + half, of the distance to the power of 2 and of 4."""
+def _mean_distance_powers(at: Reals, half: Reals) -> tuple[Reals, Reals]:
+    """Return the means of |s|^2 and |s|^4 over segments from ``at - half`` to ``at + half``."""
     far, across, along = (_dot(a, b) for a, b in ((at, at), (half, half), (at, half)))
     return far + across / 3.0, far * far + (4.0 * along * along + 2.0 * far * across) / 3.0 + across * across / 5.0
 
 
-def _principal(spread: Reals, facing: Reals, mass: Reals, reach: Reals) -> tuple[Reals, Reals]:
-    """Return the half of the segment whose second moment comes nearest, in the plane, and what it leaves (nuclear)."""
+def _principal_segment(spread: Reals, facing: Reals, mass: Reals, reach: Reals) -> tuple[Reals, Reals]:
+    """Return half of the representative segment, along the principal axis in the plane, and the rest.
+
+    The rest is the nuclear norm of the second moment that the segment does not represent.
+    """
     sign = np.copysign(1.0, facing[:, 2])
     a = -1.0 / (sign + facing[:, 2])
     b = facing[:, 0] * facing[:, 1] * a
@@ -208,6 +232,6 @@ def _principal(spread: Reals, facing: Reals, mass: Reals, reach: Reals) -> tuple
     up = _dot(facing, by_normal)
     lean = np.hypot(_dot(one, by_normal), _dot(two, by_normal))
     length = np.sqrt(3.0 * large / np.where(mass > 0.0, mass, np.inf))
-    length = np.maximum(length, _SHORTEST * reach)
+    length = np.maximum(length, _MIN_LENGTH * reach)
     rest = small + np.abs(up) + 2.0 * lean + np.abs(mass * length**2 / 3.0 - large)
     return axis * length[:, None], rest

@@ -61,7 +61,7 @@ CAUSES = ("shape", "occlusion", "reflectivity", "specular", "secondary", "ambien
 strip or of a light spot on a part that is not flat. Without the variants of the direct light, "shape" also holds the
 contributions of occlusion and reflectivity."""
 _VARIANTS = (UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED)
-_SECONDARY = ("diffuse-specular", "diffuse-diffuse", "bounces")
+_SECONDARY = ("diffuse-specular", "diffuse-diffuse", "multi-bounce")
 
 
 class ReadingCategory(enum.IntFlag):

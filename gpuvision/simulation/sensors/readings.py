@@ -16,7 +16,7 @@ from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]
 
-PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse", "bounces")
+PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse", "multi-bounce")
 """Ways of the light from the sheet to the lens; together they are what the sensor gets."""
 AMBIENT = "ambient"
 """Light that is not the sheet's; it arrives beside the paths."""

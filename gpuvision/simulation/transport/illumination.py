@@ -1,4 +1,4 @@
-"""A sheet of laser light on a scene: which line segments it lights, and with how much power."""
+"""Illumination of a scene by a sheet of laser light: the lit line segments and the power that arrives on them."""
 
 from __future__ import annotations
 
@@ -12,31 +12,32 @@ import numpy.typing as npt
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.envelope import Pieces, upper_envelope
-from gpuvision.simulation.transport.sheet_cut import Cuts, SheetIndex, ranges
+from gpuvision.simulation.transport.sheet_cut import Cuts, SheetIndex, concatenated_ranges
 from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# A fan's rays reach no farther from the source than a thousand times its height, on the level H = 0.
+# A fan lights points whose depth below the source exceeds this part of the source's height: its rays meet H = 0 within
+# a thousand heights, so that x stays finite.
 _FLATTEST = 1e-3
-# What counts as one place, beside its coordinates, and as one direction or power.
+# `LitLine.merged`: relative distance at which ends touch (some roundings), and at which normals and powers agree.
 _TOUCHING, _EVEN = 1e-14, 1e-9
 
 
 class LitLine(NamedTuple):
-    """Lit line segments, each in one triangle.
+    """Lit line segments, each on one triangle.
 
     Attributes
     ----------
     ends
-        (m, 2, 3), metres, in the scene.
+        float64 (m, 2, 3): start and end in the scene [m].
     normals
-        (m, 3), unit vectors on the side that the light comes from.
+        float64 (m, 3): unit normals on the side that the light comes from.
     triangle
-        (m,): the number of the triangle in the scene.
+        int64 (m,): index of the triangle in the scene.
     power
-        (m,), power that arrives on a metre of the line, W/m.
+        float64 (m,): power that arrives per metre of the line [W/m].
     """
 
     ends: Float64
@@ -46,24 +47,28 @@ class LitLine(NamedTuple):
 
     @property
     def lengths(self) -> Float64:
-        """Lengths of the segments, (m,), metres."""
+        """Lengths of the segments, (m,) [m]."""
         return np.asarray(np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1))
 
     def total(self) -> float:
-        """Return the power that arrives on all segments, W."""
+        """Return the power that arrives on all segments [W]."""
         return float(self.lengths @ self.power)
 
-    def those(self, which: npt.NDArray[Any] | slice) -> LitLine:
-        """Return some of the segments."""
+    def select(self, which: npt.NDArray[Any] | slice) -> LitLine:
+        """Return the segments of an index array, a mask or a slice."""
         return LitLine(self.ends[which], self.normals[which], self.triangle[which], self.power[which])
 
-    def joined(self, kind: npt.ArrayLike) -> LitLine:
-        """Return fewer segments: those that touch, one after another, in one plane, of one power and kind, as one.
+    def merged(self, kind: npt.ArrayLike) -> LitLine:
+        """Return the segments with neighbours merged that touch and lie in one plane, with the same power and kind.
 
         Parameters
         ----------
         kind
-            (m,) integers, such as the materials of the segments' triangles. A joined segment keeps the first triangle.
+            (m,) integers, such as the materials of the segments' triangles. A merged segment keeps its first triangle.
+
+        Notes
+        -----
+        Ends touch within 1e-14 of their coordinates; normals and powers agree within 1e-9.
         """
         kind = np.asarray(kind)
         gap = np.abs(self.ends[1:, 0] - self.ends[:-1, 1]).max(axis=1, initial=0.0)
@@ -79,33 +84,38 @@ class LitLine(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class LightSheet:
-    """A sheet of light in the plane of a `StraightTransport`, which shines against its ``h_axis``.
+    """Sheet of light in the plane of a `StraightTransport`. The light travels against the transport's ``h_axis``.
 
     Parameters
     ----------
     transport
-        Where the sheet stands, and how it moves over the scene.
+        Position of the sheet, and its motion over the scene.
     power
-        Power in a metre of the sheet, W per metre of G; of a fan, where it meets H = 0.
+        Power per metre of G [W/m], 0 or more; of a fan, at H = 0. Default 1.
     sigma
-        Standard deviation of the light across the sheet, metres along the transport; 0 is a thin sheet. The light of a
-        thick one stays in sheets side by side.
+        Standard deviation of the light across the sheet, along the transport [m]; 0 (default) is a thin sheet. A thick
+        sheet is modelled as parallel thin sheets side by side.
     source
-        (G, H) of the point that a fan comes from, H > 0: it lights what lies below, by more than a thousandth of H;
-        what is nearer to it does not stop its light. None: parallel light.
+        (G, H) of the point source of a fan [m], H > 0. The fan lights surfaces that lie below the source by more than a
+        thousandth of its H; surfaces nearer to the source do not occlude. None (default): parallel light.
     g_limits
-        Between which G there is light; of a fan, where it meets H = 0. None: everywhere.
+        Range of G [m] with light; of a fan, at H = 0. None (default): no limits.
     profile
-        Rows of G and a factor to the power there, G ascending, straight in between and zero beyond; of a fan, where it
-        meets H = 0. None: even light.
+        Rows (G [m], factor) of the power per metre, G ascending, interpolated linearly and 0 beyond the ends; of a fan,
+        at H = 0. None (default): even light.
     uniformity
-        A segment ends where its power has changed by this share of the most in its triangle: `LitLine.power` is
-        its mean, the energy is exact.
+        A segment is split where its power per metre changes by more than this share of the largest on it;
+        `LitLine.power` is its mean, so the energy is exact. At least 1e-4, default 0.05.
 
     Raises
     ------
     TypeError, ValueError
-        A parameter is not what is said here.
+        A parameter has a wrong type or lies outside its range.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008: sheet-of-light range
+    imaging.
     """
 
     transport: StraightTransport
@@ -139,43 +149,66 @@ class LightSheet:
                 raise ValueError("LightSheet.profile: expected two rows or more, G ascending, no factor below 0")
             object.__setattr__(self, "profile", rows)
 
-    def lit(self, scene: Scene, L: float, offset: float = 0.0) -> LitLine:
-        """Return what a thin sheet lights at a transport [m], moved by so much across [m].
+    def illuminate(self, scene: Scene, L: float, offset: float = 0.0) -> LitLine:
+        """Return the segments that a thin sheet lights.
 
-        Surfaces are lit on whichever side the light comes from, down to the first one that it meets. Error: some
-        roundings of the coordinates.
+        Surfaces are lit on the side that the light comes from. Each ray stops at the first surface that it meets.
+        Error: a few roundings of the coordinates.
+
+        Parameters
+        ----------
+        scene
+            Surfaces.
+        L
+            Transport [m].
+        offset
+            Distance across the sheet, along the transport, added to L [m].
         """
-        return self.lit_lines(scene, [L + offset])[0]
+        return self.illuminate_all(scene, [L + offset])[0]
 
-    def lit_lines(self, scene: Scene, places: npt.ArrayLike) -> tuple[LitLine, Integers]:
-        """Return what thin sheets light at several transports (k,) [m], and where each one's segments begin, (k + 1,).
+    def illuminate_all(self, scene: Scene, places: npt.ArrayLike) -> tuple[LitLine, Integers]:
+        """Return the segments that thin sheets light at several transports.
 
-        The segments of one sheet lie in the order in which the light's rays do.
+        Parameters
+        ----------
+        scene
+            Surfaces.
+        places
+            (k,): transports [m].
+
+        Returns
+        -------
+        line, first
+            All segments, those of one sheet in the order of its rays; and (k + 1,) indices of each sheet's first
+            segment, with the end of the last.
         """
         places = np.atleast_1d(np.asarray(places, np.float64))
         cuts = SheetIndex.of(scene, self.transport).cuts(places)
-        cuts, x, height = self._in_light(cuts)
-        lit = self._within_light(upper_envelope(cuts.sheet, x, height), x)
-        sheet_ends, arriving, lit = self._split(lit, cuts, x, height)
-        sheet, triangle = cuts.sheet[lit.member], cuts.triangle[lit.member]
-        ends = self._in_scene(sheet_ends, places[sheet])
+        cuts, x, height = self._to_light_coordinates(cuts)
+        lit = self._clip_to_limits(upper_envelope(cuts.sheet, x, height), x)
+        sheet_ends, arriving, lit = self._split_evenly(lit, cuts, x, height)
+        sheet, triangle = cuts.sheet[lit.segment], cuts.triangle[lit.segment]
+        ends = self._to_scene(sheet_ends, places[sheet])
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
         good = (length > 0.0) & (arriving > 0.0)
         sheet, triangle, ends = sheet[good], triangle[good], ends[good]
         line = LitLine(ends, self._normals(scene, triangle, ends), triangle, arriving[good] / length[good])
         return line, np.searchsorted(sheet, np.arange(len(places) + 1))
 
-    def towards(self, points: npt.ArrayLike) -> Float64:
-        """Return unit vectors from points towards the light, (..., 3); of a fan, the source in each point's sheet."""
+    def direction_to_light(self, points: npt.ArrayLike) -> Float64:
+        """Return unit vectors (..., 3) from points (..., 3) towards the light.
+
+        The light of a fan comes from its source in the sheet that the point lies in.
+        """
         points = np.asarray(points, np.float64)
         if self.source is None:
             up = np.array(self.transport.h_axis)
             return np.broadcast_to(up / np.linalg.norm(up), points.shape)
-        towards = self.source_of(points) - points
+        towards = self.source_positions(points) - points
         return np.asarray(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
 
-    def source_of(self, points: npt.ArrayLike) -> Float64:
-        """Return where a fan comes from, (..., 3), in the sheets that points lie in.
+    def source_positions(self, points: npt.ArrayLike) -> Float64:
+        """Return the positions (..., 3) [m] of the fan's source in the sheets that points (..., 3) lie in.
 
         Raises
         ------
@@ -189,16 +222,16 @@ class LightSheet:
         away = np.array([*self.source, 0.0]) - (points - move.origin) @ np.linalg.inv(axes)
         return np.asarray(points + away[..., :2] @ axes[:2])
 
-    # ---- the sheet's own coordinates: x, which does not change along a ray, and a height towards the light ------
+    # ---- light coordinates: x is constant along a ray, the height grows towards the light ----------------------
 
-    def _in_light(self, cuts: Cuts) -> tuple[Cuts, Float64, Float64]:
-        """Return what of the cuts the light can reach, from left to right, with x and heights (m, 2) of their ends.
+    def _to_light_coordinates(self, cuts: Cuts) -> tuple[Cuts, Float64, Float64]:
+        """Return the cuts that the light can reach, with x and heights (m, 2) of their ends, from left to right.
 
-        A fan becomes parallel by a projection that keeps lines straight: x is where a ray meets H = 0, the height
-        is one over the depth below the source.
+        A projective map that keeps lines straight turns a fan into parallel light: x is where a ray meets H = 0, and
+        the height is 1 / (depth below the source).
         """
         if self.source is not None:
-            cuts = _below(cuts, self.source[1] * (1.0 - _FLATTEST))
+            cuts = _clip_below(cuts, self.source[1] * (1.0 - _FLATTEST))
         G, H = cuts.ends[..., 0], cuts.ends[..., 1]
         if self.source is not None:
             above, depth = self.source[1], self.source[1] - H
@@ -211,55 +244,55 @@ class LightSheet:
             np.take_along_axis(H, order, axis=1),
         )
 
-    def _within_light(self, pieces: Pieces, x: Float64) -> Pieces:
-        """Cut pieces at the light's limits and at the knots of its profile."""
+    def _clip_to_limits(self, pieces: Pieces, x: Float64) -> Pieces:
+        """Clip pieces to the light's limits, and split them at the knots of its profile."""
         knots = self._knots
         if knots is None:
             return pieces
         low, high = np.maximum(pieces.left, knots[0]), np.minimum(pieces.right, knots[-1])
         kept = low < high
-        return _cut_at(Pieces(pieces.member[kept], low[kept], high[kept]), knots)
+        return _split_at_knots(Pieces(pieces.segment[kept], low[kept], high[kept]), knots)
 
-    def _split(self, pieces: Pieces, cuts: Cuts, x: Float64, height: Float64) -> tuple[Float64, Float64, Pieces]:
-        """Split pieces until each is lit evenly; return their ends (G, H) and the power that arrives on them [W]."""
+    def _split_evenly(self, pieces: Pieces, cuts: Cuts, x: Float64, height: Float64) -> tuple[Float64, Float64, Pieces]:
+        """Split pieces until the light on each is even; return their ends (G, H), their power [W], and the pieces."""
         if self.source is not None or self.profile is not None:
-            ratio = self._densities(pieces, x, height)
+            ratio = self._relative_densities(pieces, x, height)
             change = np.abs(ratio[:, 1] - ratio[:, 0]) / np.maximum(ratio.max(axis=1), 1e-300)
             count = np.maximum(np.ceil(change / self.uniformity * (1.0 - 1e-9)), 1.0).astype(np.int64)
-            member, part = np.repeat(np.arange(len(count)), count), ranges(np.zeros_like(count), count)
+            member, part = np.repeat(np.arange(len(count)), count), concatenated_ranges(np.zeros_like(count), count)
             width = (pieces.right - pieces.left)[member] / count[member]
             left = pieces.left[member] + part * width
             right = np.where(part + 1 == count[member], pieces.right[member], pieces.left[member] + (part + 1) * width)
-            pieces = Pieces(pieces.member[member], left, right)
-        ends = self._at(pieces, cuts, x, height)
-        return ends, self._power_up_to(pieces.right) - self._power_up_to(pieces.left), pieces
+            pieces = Pieces(pieces.segment[member], left, right)
+        ends = self._points_on_cuts(pieces, cuts, x, height)
+        return ends, self._cumulative_power(pieces.right) - self._cumulative_power(pieces.left), pieces
 
-    def _densities(self, pieces: Pieces, x: Float64, height: Float64) -> Float64:
-        """Return the power per metre of line at both ends of pieces, but for a factor of each piece, (k, 2)."""
+    def _relative_densities(self, pieces: Pieces, x: Float64, height: Float64) -> Float64:
+        """Return the power per metre of line at both ends of pieces, up to a factor per piece, (k, 2)."""
         places = np.stack([pieces.left, pieces.right], axis=1)
         density = np.ones(places.shape)
         if self.profile is not None:
             density = np.interp(places, *np.array(self.profile).T)
         if self.source is not None:
-            (a, b), (low, high) = x[pieces.member].T[..., None], height[pieces.member].T[..., None]
+            (a, b), (low, high) = x[pieces.segment].T[..., None], height[pieces.segment].T[..., None]
             density = density * (low + (places - a) / (b - a) * (high - low)) ** 2
         return density
 
-    def _at(self, pieces: Pieces, cuts: Cuts, x: Float64, height: Float64) -> Float64:
-        """Return (G, H) of both ends of pieces, (k, 2, 2), exact at the ends of the cuts."""
-        (a, b), whole = x[pieces.member].T, cuts.ends[pieces.member]
+    def _points_on_cuts(self, pieces: Pieces, cuts: Cuts, x: Float64, height: Float64) -> Float64:
+        """Return (G, H) of both ends of pieces, (k, 2, 2); exact at the ends of the cuts."""
+        (a, b), whole = x[pieces.segment].T, cuts.ends[pieces.segment]
         found = np.empty(whole.shape)
         for n, at in enumerate(pieces[1:]):
             share, rest = (at - a) / (b - a), (b - at) / (b - a)
             if self.source is not None:
-                share, rest = share * height[pieces.member, 1], rest * height[pieces.member, 0]
+                share, rest = share * height[pieces.segment, 1], rest * height[pieces.segment, 0]
                 share, rest = share / (share + rest), rest / (share + rest)
             near, way = share < 0.5, whole[:, 1] - whole[:, 0]
             found[:, n] = np.where(near[:, None], whole[:, 0] + share[:, None] * way, whole[:, 1] - rest[:, None] * way)
         return found
 
-    def _power_up_to(self, x: Float64) -> Float64:
-        """Return the power of the sheet left of x, but for a constant, W."""
+    def _cumulative_power(self, x: Float64) -> Float64:
+        """Return the power of the sheet between a fixed x and the given x [W]."""
         if self.profile is None:
             return self.power * x
         knots, factor = np.array(self.profile).T
@@ -271,7 +304,7 @@ class LightSheet:
 
     @property
     def _knots(self) -> Float64 | None:
-        """Places of x between which the power is a straight line, the light's ends included; None: no ends."""
+        """Breakpoints of x, ends included, between which the power is linear; None without limits."""
         if self.g_limits is None and self.profile is None:
             return None
         low, high = self.g_limits or (-math.inf, math.inf)
@@ -281,25 +314,25 @@ class LightSheet:
         low, high = max(low, float(places[0])), min(high, float(places[-1]))
         return np.concatenate([[low], places[(places > low) & (places < high)], [high]])
 
-    def _in_scene(self, ends: Float64, places: Float64) -> Float64:
+    def _to_scene(self, ends: Float64, places: Float64) -> Float64:
         move = self.transport
         flat = np.array(move.origin) + ends @ np.array([move.g_axis, move.h_axis])
         return np.asarray(flat + places[:, None, None] * np.array(move.direction))
 
     def _normals(self, scene: Scene, triangle: Integers, ends: Float64) -> Float64:
-        """Return unit normals on the side of the light, square to the line."""
+        """Return unit normals on the side of the light."""
         corners = scene.corners[triangle]
         one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        # Of whatever size: the cross product of micrometres is not to vanish.
+        # One edge is scaled to 1, so that the cross product of very short edges does not underflow.
         normal = np.cross(one, two / np.abs(two).max(axis=1, keepdims=True))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        towards = self.towards(0.5 * (ends[:, 0] + ends[:, 1]))
+        towards = self.direction_to_light(0.5 * (ends[:, 0] + ends[:, 1]))
         side = np.sum(normal * towards, axis=1, keepdims=True)
         return np.where(side < 0.0, -normal, normal)
 
 
-def _below(cuts: Cuts, highest: float) -> Cuts:
-    """Return what of the cuts lies below a height."""
+def _clip_below(cuts: Cuts, highest: float) -> Cuts:
+    """Return the parts of cuts below a height."""
     H = cuts.ends[..., 1]
     kept = H.min(axis=1) < highest
     cuts = Cuts(*(each[kept] for each in cuts))
@@ -313,12 +346,12 @@ def _below(cuts: Cuts, highest: float) -> Cuts:
     return cuts._replace(ends=ends)
 
 
-def _cut_at(pieces: Pieces, knots: Float64) -> Pieces:
-    """Cut pieces at ascending places."""
+def _split_at_knots(pieces: Pieces, knots: Float64) -> Pieces:
+    """Split pieces at ascending places."""
     first = np.searchsorted(knots, pieces.left, side="right")
     count = np.maximum(np.searchsorted(knots, pieces.right, side="left") - first, 0) + 1
-    member, part = np.repeat(np.arange(len(count)), count), ranges(np.zeros_like(count), count)
+    member, part = np.repeat(np.arange(len(count)), count), concatenated_ranges(np.zeros_like(count), count)
     knot = first[member] + part
     left = np.where(part == 0, pieces.left[member], knots[np.minimum(knot - 1, len(knots) - 1)])
     right = np.where(part + 1 == count[member], pieces.right[member], knots[np.minimum(knot, len(knots) - 1)])
-    return Pieces(pieces.member[member], left, right)
+    return Pieces(pieces.segment[member], left, right)

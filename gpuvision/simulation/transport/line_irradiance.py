@@ -1,4 +1,4 @@
-"""Irradiance of surfaces from lit lines on others: the closed form, for all pairs, without occlusion."""
+"""Irradiance of surfaces by lit lines on other surfaces: the closed form, for all pairs, without occlusion."""
 
 from __future__ import annotations
 
@@ -9,15 +9,25 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    Launch,
+    Precision,
+    StatusArray,
+    Variant,
+    real_defines,
+    real_of,
+    uses_vectors,
+)
 from gpuvision.operation import VisionOperation
 
 _LANES, _GROUP = 16, 64
-# Strips are to keep the cores even, and each is to be worth its start.
+# Strips of receivers: several per core balance the load, and each has enough pairs to outweigh its start.
 _STRIPS_PER_CORE, _PAIRS_PER_STRIP = 8, 8192
-# In single: what directions may differ and still be one.
+# In single, frames whose components differ by less than this share one frame (rounding of equal directions).
 _ALIKE = 1e-13
-# What a normal may lean along its line: a line lies in its surface.
+# Largest cosine between a segment and its normal that counts as rounding; a segment lies in its surface.
 _LEAN = 1e-5
 
 
@@ -28,18 +38,18 @@ class LitSegments:
     Parameters
     ----------
     ends
-        (m, 2, 3), metres. A segment of no length emits nothing.
+        (m, 2, 3): start and end [m]. A segment without length emits nothing.
     normals
-        (m, 3), of the lit surfaces, on the side that emits; of any length, square to the segment.
+        (m, 3): normals of the lit surfaces on the side that emits, of any length, perpendicular to the segment.
     exitance
-        (m,), power that leaves a metre of the line, W/m: albedo times the power that arrives on it.
+        (m,): power that leaves a metre of the line [W/m], 0 or more: albedo times the power that arrives on it.
 
     Raises
     ------
     TypeError
-        They are no numbers.
+        The values are not numbers.
     ValueError
-        Wrong shapes; not finite; a normal that is zero or leans along its line; a negative exitance.
+        A shape is wrong; a value is not finite; a normal is zero or leans along its segment; an exitance is negative.
     """
 
     ends: npt.NDArray[np.float64]
@@ -68,21 +78,22 @@ class LitSegments:
         length = np.linalg.norm(across, axis=1)
         emits = np.flatnonzero((length > 0.0) & (self.exitance > 0.0))
         if not len(emits):
-            # A runtime takes no table without rows.
+            # OpenCL has no buffers of size 0.
             shapes = (3,), (1, 12), (1, 9), (2,), (1, 4), (1, 3)
             types = place, place, real, np.uint32, place, real
             return tuple(np.zeros(shape, dtype) for shape, dtype in zip(shapes, types, strict=True))
         along, normals = _unit(across[emits]), self.normals[emits]
         frames = np.stack([along, normals, np.cross(along, normals)], axis=1)
-        # In single, what lies alike but for rounding is alike.
+        # In single, frames that differ by rounding share one frame.
         key = frames.reshape(-1, 9) if real == np.float64 else np.rint(frames.reshape(-1, 9) / _ALIKE)
         _, group, members = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-        # The kernel takes what is alone in its frame first.
+        # The kernel takes the segments that are alone in their frame first.
         order = np.lexsort((group, members[group] > 1))
         emits, frames, group = emits[order], frames[order], group[order]
         firsts = np.flatnonzero(np.diff(group, prepend=-1))
         segments = np.diff(firsts, append=len(emits))
-        # A frame stands where its first segment starts; along it, lengths are from the receiver.
+        # The origin of a frame is the start of its first segment; the first axis is reversed, so that lengths along the
+        # segment count from the receiver.
         frames = frames[firsts] * [[[-1.0], [1.0], [1.0]]]
         begin = self.ends[emits, 0]
         middle = begin.mean(axis=0)
@@ -99,57 +110,58 @@ class LitSegments:
 
 
 class Irradiance(NamedTuple):
-    """What receivers get from lit segments.
+    """Irradiance of receivers.
 
     Attributes
     ----------
     irradiance
-        (...,), W/m^2; NaN where the status is not OK.
+        float (...,): irradiance [W/m^2]; NaN where the status is not OK.
     status
-        uint8 `Status` flags, (...,): NOT_FINITE (a number of the receiver is not, or its normal is zero).
+        uint8 `Status` flags, (...,): NOT_FINITE (a component of the receiver is not finite, or its normal is zero).
     """
 
-    irradiance: Any
-    status: Any
+    irradiance: FloatArray
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineIrradiance(VisionOperation[Irradiance]):
-    """Diffuse light from lit segments: ``op(receivers) -> Irradiance``, receivers float32 or float64 (..., 6).
+    """Diffuse irradiance by lit segments: ``op(receivers) -> Irradiance``, receivers float32 or float64 (..., 6).
 
-    A receiver is a place in metres and a normal of any length, in the frame of the segments. What lies behind the
-    receiver's plane, or behind the lit surface, does not count; nothing occludes.
+    A receiver is a position [m] and a normal of any length, in the frame of the segments. Parts of a segment behind the
+    receiver's plane do not count, nor does a segment whose emitting side faces away. Nothing occludes.
 
     Parameters
     ----------
     segments
-        What is lit.
+        The emitters.
     precision
-        Of the arithmetic and the outputs; None follows the input. "single" takes float64 receivers too: places are
-        subtracted in double before single is used, so they keep their digits near a line and far from the origin.
+        Precision of arithmetic and outputs; None follows the input. "single" takes float64 receivers too: positions are
+        subtracted in double before they are rounded, so they keep their digits near a line and far from the origin.
     variant
         "vector" (16-wide vectors, for CPU runtimes), "work_item" (a work-item per receiver, for GPUs), or "auto".
 
     Raises
     ------
     TypeError
-        The segments are no `LitSegments`.
+        ``segments`` is not a `LitSegments`.
 
-    Notes
-    -----
-    The closed form of a differential receiver and a line in a diffuse surface, written so that nothing cancels
-    (kernels/line_irradiance/line_irradiance.h): one form holds near, far and end-on. With E0 = M h / pi * integral of
-    dt / r^3, what the receiver would get if all of the segment stood in its normal, the error is below 2e-6 E0 per
-    segment in single and 1e-14 (1 + D / h) E0 in double, at any distance, D being that of the segment's far end or of
-    the segments' middle, and h the height above the lit surface, where the places' own rounding shows; E <= E0. So the
-    error is relative except where the receiver sees the segment at a grazing angle. On a device without double, places
-    are single, and 1.2e-7 of the largest coordinate over h comes on top.
+    Notes ----- The closed form of a differential receiver and a line in a diffuse surface, in a form without
+    cancellation (kernels/line_irradiance/line_irradiance.h): one form serves near, far and end-on receivers. Let E0 = M
+    h / pi times the integral of dt / r^3, the irradiance if the whole segment stood in the receiver's normal; E <= E0.
+    The error per segment is below 2e-6 E0 in single and 1e-14 (1 + D / h) E0 in double, at any distance: h is the
+    receiver's height above the lit surface, D the distance of the segment's far end or of the middle of all segments.
+    So the error is relative except where the receiver sees the segment at a grazing angle. On a device without double,
+    positions are single, which adds 1.2e-7 of the largest coordinate over h. The tests hold these limits at random and
+    extreme configurations.
 
-    Receivers are turned into a frame once for all segments that lie alike (one direction, surfaces of one normal), as
-    on flat faces, which is what costs least. In single, directions that differ by 1e-13 are one, which adds up to
-    1e-13 D / h.
+    Receivers are transformed once into a frame for all segments of one direction on surfaces of one normal, as on flat
+    faces. In single, directions that differ by 1e-13 share a frame, which adds up to 1e-13 D / h.
 
-    A receiver in the plane of a lit surface, on the segment too, gets nothing from it.
+    A receiver in the plane of a lit surface, or on the segment, gets no light from it.
+
+    References ---------- M. F. Cohen and J. R. Wallace, *Radiosity and Realistic Image Synthesis*, Academic Press 1993,
+    chapter 4: form factors of differential receivers, here integrated over a line.
     """
 
     Result: ClassVar[type[Any]] = Irradiance
@@ -213,7 +225,7 @@ def _strip_of(count: int, segments: int, device: Device) -> int:
 
 
 def _checked(values: Any, shape: tuple[int, ...], what: str) -> npt.NDArray[np.float64]:
-    """Return a copy of such a shape; -1 is any length."""
+    """Return a copy of values as float64 of a shape, where -1 stands for any length."""
     try:
         array = np.array(values, np.float64)
     except (TypeError, ValueError):
@@ -232,13 +244,13 @@ def _refuse(wrong: Any, what: str) -> None:
 
 
 def _inside(frames: npt.NDArray[np.float64], vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the vectors, each in a frame."""
+    """Return vectors in the coordinates of frames, one frame per vector."""
     inside: npt.NDArray[np.float64] = np.einsum("nij,nj->ni", frames, vectors)
     return inside
 
 
 def _unit(vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return them with length 1, however short or long; zero stays zero."""
+    """Return vectors scaled to length 1 without overflow or underflow; zero vectors stay zero."""
     largest = np.abs(vectors).max(axis=1, keepdims=True, initial=0.0)
     scaled = vectors / np.where(largest > 0.0, largest, 1.0)
     length = np.linalg.norm(scaled, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Parts of lit segments: what a lens sees of them, and their division at the edges of a sensor's samples and bins."""
+"""Parts of lit segments: visibility from a lens, projection to the sensor, division at edges of samples and bins."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.scene.visible_intervals import VisibleIntervals
 from gpuvision.simulation.sensors.sensor_view import SensorView
 from gpuvision.simulation.transport.illumination import LitLine
-from gpuvision.simulation.transport.sheet_cut import ranges
+from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
 from gpuvision.status import Status
 
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Parts that a segment is seen in; of one that has more, its halves are looked at.
-_KEPT, _HALVINGS = 8, 20
-# Fans in one go: one kernel, and one copy of the tree on the device, whatever the number of segments.
-_FANS = 1024
-# What lies this near to a limit of the view, in shares of the farther end's distance, is beyond it.
-_LEAST = 1e-9
-# Newton's, for distortion.
-_STEPS = 3
+# Visible intervals of a segment that the kernel returns. A segment with more is halved, at most so many times, down to
+# a millionth of its length.
+_MAX_INTERVALS, _MAX_HALVINGS = 8, 20
+# Fans of rays in one launch: a fixed shape, so that one bound kernel and one copy of the tree serve any number.
+_FANS_PER_LAUNCH = 1024
+# Points nearer than this to a limit of the view, in parts of the farther end's distance, count as beyond it.
+_VIEW_MARGIN = 1e-9
+# Newton iterations that find an edge under lens distortion.
+_NEWTON_STEPS = 3
 
 
 class Parts(NamedTuple):
@@ -39,30 +40,30 @@ class Parts(NamedTuple):
     Attributes
     ----------
     segment
-        (n,): of which segment.
+        int64 (n,): index of the segment.
     start, end
-        (n,): from where to where, as shares of its length.
-    seen
-        (n,) bool: whether nothing is in the way to the lens.
+        float64 (n,): begin and end as fractions of the segment's length, 0 to 1.
+    visible
+        bool (n,): whether the lens sees the part.
     """
 
     segment: Integers
     start: Float64
     end: Float64
-    seen: npt.NDArray[np.bool_]
+    visible: npt.NDArray[np.bool_]
 
-    def those(self, which: npt.NDArray[Any]) -> Parts:
-        """Return some of them."""
-        return Parts(self.segment[which], self.start[which], self.end[which], self.seen[which])
+    def select(self, which: npt.NDArray[Any]) -> Parts:
+        """Return the parts of an index array or a mask."""
+        return Parts(self.segment[which], self.start[which], self.end[which], self.visible[which])
 
     def ends(self, line: LitLine) -> Float64:
-        """Return both ends, (n, 2, 3), metres."""
+        """Return both ends of the parts, (n, 2, 3) [m]."""
         at = np.stack([self.start, self.end], axis=1)
-        return along(line.ends[self.segment][:, None], at)
+        return points_on(line.ends[self.segment][:, None], at)
 
 
-def along(ends: Float64, share: Float64) -> Float64:
-    """Return places on segments (..., 2, 3) at shares of their lengths, exact at both ends."""
+def points_on(ends: Float64, share: Float64) -> Float64:
+    """Return the points at fractions of the lengths of segments (..., 2, 3), exact at both ends."""
     start, end = ends[..., 0, :], ends[..., 1, :]
     near = (share < 0.5)[..., None]
     share = share[..., None]
@@ -70,20 +71,18 @@ def along(ends: Float64, share: Float64) -> Float64:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LineOfSight:
-    """What a lens sees of segments; compared by identity.
+class LensVisibility:
+    """Visibility of segments from the lens; compared by identity.
 
     Parameters
     ----------
     scene
-        What may be in the way.
+        Triangles that may occlude.
     device
-        Where that is found.
+        Device of the `VisibleIntervals` kernel.
 
-    Notes
-    -----
-    Ends of parts are good to 1e-10 of a segment (1e-5 on a device without double). Where more parts lie within a
-    millionth of a segment than the kernel keeps, they are taken as hidden.
+    Notes ----- Ends of parts are accurate to 1e-10 of a segment (1e-5 on a device without double). Where more visible
+    parts lie within a millionth of a segment than the kernel returns, they count as hidden.
     """
 
     scene: Scene
@@ -92,47 +91,54 @@ class LineOfSight:
 
     def __post_init__(self) -> None:
         real = np.dtype(np.float64 if self.device.has_double else np.float32)
-        fans = VisibleIntervals(scene=self.scene, max_intervals=_KEPT)
-        object.__setattr__(self, "_bound", fans.bind(self.device, (_FANS, 11), real))
+        fans = VisibleIntervals(scene=self.scene, max_intervals=_MAX_INTERVALS)
+        object.__setattr__(self, "_bound", fans.bind(self.device, (_FANS_PER_LAUNCH, 11), real))
 
-    def parts(self, line: LitLine, lens: Float64, *, hidden: bool = False) -> Parts:
-        """Return the parts of segments that a lens sees, and those it does not if ``hidden``.
+    def visible_parts(self, line: LitLine, lens: Float64, *, with_hidden: bool = False) -> Parts:
+        """Return the parts of segments that the lens sees, and the hidden parts too if asked.
 
-        The lens is one for all, (3,), or each segment has its own, (m, 3).
+        Parameters
+        ----------
+        line
+            The segments (m).
+        lens
+            Position of the lens [m], (3,) for all segments or (m, 3).
+        with_hidden
+            Whether hidden parts are returned as well, with `Parts.visible` False.
         """
         count = len(line.power)
         lens = np.broadcast_to(lens, (count, 3))
         todo = Parts(np.arange(count), np.zeros(count), np.ones(count), np.ones(count, bool))
-        found = [todo.those(np.zeros(0, np.int64))]
-        for _ in range(_HALVINGS):
+        found = [todo.select(np.zeros(0, np.int64))]
+        for _ in range(_MAX_HALVINGS):
             if not len(todo.segment):
                 break
-            shown, many = self._seen(line, todo, lens)
+            shown, many = self._visible_once(line, todo, lens)
             found.append(shown)
-            todo = _halves(todo.those(many))
-        shown = together(found)
-        return together([shown, _between(shown, count)]) if hidden else shown
+            todo = _bisect(todo.select(many))
+        shown = concatenate_parts(found)
+        return concatenate_parts([shown, _hidden_parts(shown, count)]) if with_hidden else shown
 
-    def _seen(self, line: LitLine, parts: Parts, lens: Float64) -> tuple[Parts, npt.NDArray[np.bool_]]:
-        """Return the visible parts of parts, and which had too many of them."""
+    def _visible_once(self, line: LitLine, parts: Parts, lens: Float64) -> tuple[Parts, npt.NDArray[np.bool_]]:
+        """Return the visible parts of parts, and a mask of the parts with too many visible intervals."""
         count = len(parts.segment)
         fans = np.zeros((count, 11))
         fans[:, :3], fans[:, 3:9] = lens[parts.segment], parts.ends(line).reshape(-1, 6)
         many = np.zeros(count, bool)
-        found = [parts.those(np.zeros(0, np.int64))]
-        for first in range(0, count, _FANS):
-            intervals, status = self._intervals(fans[first : first + _FANS])
-            many[first : first + _FANS] = (status & Status.AMBIGUOUS) != 0
+        found = [parts.select(np.zeros(0, np.int64))]
+        for first in range(0, count, _FANS_PER_LAUNCH):
+            intervals, status = self._intervals(fans[first : first + _FANS_PER_LAUNCH])
+            many[first : first + _FANS_PER_LAUNCH] = (status & Status.AMBIGUOUS) != 0
             owner, which = np.nonzero(np.isfinite(intervals[..., 0]))
             low, high = intervals[owner, which].T.astype(np.float64)
             owner += first
             start, size = parts.start[owner], (parts.end - parts.start)[owner]
             end = np.where(high == 1.0, parts.end[owner], start + high * size)
             found.append(Parts(parts.segment[owner], start + low * size, end, np.ones(len(owner), bool)))
-        return together(found), many
+        return concatenate_parts(found), many
 
     def _intervals(self, fans: Float64) -> tuple[npt.NDArray[Any], npt.NDArray[np.uint8]]:
-        """Return visible intervals of up to so many fans, and status flags."""
+        """Return the visible intervals and status flags of at most `_FANS_PER_LAUNCH` fans."""
         count, bound = len(fans), self._bound
         given = np.full(bound.inputs[0].shape, np.nan, bound.inputs[0].dtype)
         given[:count] = fans
@@ -145,16 +151,21 @@ class LineOfSight:
         return result.intervals.get()[:count], result.status.get()[:count]
 
 
-def together(parts: list[Parts]) -> Parts:
-    """Return all parts as one."""
+def concatenate_parts(parts: list[Parts]) -> Parts:
+    """Concatenate lists of parts."""
     segment, start, end, seen = zip(*parts, strict=True)
     return Parts(np.concatenate(segment), np.concatenate(start), np.concatenate(end), np.concatenate(seen))
 
 
-def within_reach(start: Float64, end: Float64, low: Float64, high: Float64) -> Parts:
-    """Return the parts of segments on which a vector is shorter than its reach; both change evenly along a segment.
+def parts_within_radius(start: Float64, end: Float64, low: Float64, high: Float64) -> Parts:
+    """Return the parts of segments on which a vector is shorter than a radius; both vary linearly along a segment.
 
-    The vector goes from ``start`` to ``end``, (m, k), the reach from ``low`` to ``high``, (m,).
+    Parameters
+    ----------
+    start, end
+        (m, k): the vector at both ends.
+    low, high
+        (m,): the radius at both ends.
     """
     # |start + t way|^2 = (low + t growth)^2 is quadratic in t.
     way, growth = end - start, high - low
@@ -162,7 +173,7 @@ def within_reach(start: Float64, end: Float64, low: Float64, high: Float64) -> P
     half = np.sum(start * way, axis=1) - low * growth
     rest = np.sum(start * start, axis=1) - low**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Without cancellation; where there is no root, anywhere.
+        # The stable form of the quadratic formula; without a root the knots are arbitrary and the test below decides.
         both = -(half + np.copysign(np.sqrt(half * half - square * rest), half))
         places = np.nan_to_num(np.stack([both / square, rest / both]), nan=0.0)
     knots = np.pad(np.sort(np.clip(places, 0.0, 1.0), axis=0), ((1, 1), (0, 0)))
@@ -172,30 +183,30 @@ def within_reach(start: Float64, end: Float64, low: Float64, high: Float64) -> P
         middle = 0.5 * (first + last)
         length = np.linalg.norm(start + middle[:, None] * way, axis=1)
         inside = (length < low + middle * growth) & (first < last)
-        found.append(Parts(each, first, last, np.ones(len(each), bool)).those(inside))
-    return together(found)
+        found.append(Parts(each, first, last, np.ones(len(each), bool)).select(inside))
+    return concatenate_parts(found)
 
 
-def _halves(parts: Parts) -> Parts:
+def _bisect(parts: Parts) -> Parts:
     middle = 0.5 * (parts.start + parts.end)
-    return together([parts._replace(end=middle), parts._replace(start=middle)])
+    return concatenate_parts([parts._replace(end=middle), parts._replace(start=middle)])
 
 
-def _between(shown: Parts, count: int) -> Parts:
-    """Return what of whole segments is not among the parts."""
+def _hidden_parts(shown: Parts, count: int) -> Parts:
+    """Return the parts of whole segments that are not among the visible parts."""
     each = np.arange(count)
     first, start = np.append(each, shown.segment), np.append(np.zeros(count), shown.end)
     last, end = np.append(shown.segment, each), np.append(shown.start, np.ones(count))
     one, two = np.lexsort((start, first)), np.lexsort((end, last))
     rest = Parts(first[one], start[one], end[two], np.zeros(len(one), bool))
-    return rest.those(rest.start < rest.end)
+    return rest.select(rest.start < rest.end)
 
 
-class Images:
-    """Where a sensor images places on straight segments.
+class LineProjector:
+    """Projection of points on straight segments to a sensor.
 
-    Without distortion (u, v) is a ratio of two functions that are straight along a segment, so that it is known where
-    the image of a segment crosses an edge.
+    Without distortion (u, v) is a ratio of two functions that are linear along a segment, so the point where the image
+    of a segment crosses an edge has a closed form.
 
     Parameters
     ----------
@@ -208,7 +219,7 @@ class Images:
         axes = np.array([move.g_axis, move.h_axis])
         normal, to_sheet = np.cross(*axes), np.array(move.origin) - np.array(view.lens)
         off = float(to_sheet @ normal)
-        # From a ray to the sheet's (G, H, 1), and on to the sensor's (u, v, 1), but for factors.
+        # Maps a ray to homogeneous (G, H, 1) of the sheet, and that to homogeneous (u, v, 1) of the sensor.
         in_sheet = (off * np.eye(3) - np.outer(normal, to_sheet)) @ np.linalg.pinv(axes)
         homography = np.array(view.triangulation.homography)
         middle = np.append(np.mean(np.array(view.triangulation.region), axis=1), 1.0)
@@ -216,30 +227,31 @@ class Images:
         lifting = in_front * np.column_stack([in_sheet, normal]) @ np.linalg.inv(homography).T
         self._view, self._lens = view, view.triangulation.sensor_lens
         self._lifting = lifting
-        # In front of the lens, towards the sheet, this side of its horizon: all are positive.
+        # Linear functions of a ray that are positive where the point is in front of the lens, on the sheet's side, and
+        # on the near side of the sheet's horizon.
         self._limits = np.column_stack([np.array(view.axis), np.sign(off) * normal, lifting[:, 2]])
 
-    def of(self, ends: Float64, L: float) -> LineImages:
-        """Return the images of segments (m, 2, 3) at a transport [m]."""
+    def project(self, ends: Float64, L: float) -> ProjectedLines:
+        """Return the projections of segments (m, 2, 3) [m] at a transport L [m]."""
         rays = ends - self._view.lens_at(L)
         lifted = rays @ self._lifting
-        return LineImages(self._lens, self._lifting, rays @ self._limits, lifted[:, 0], lifted[:, 1] - lifted[:, 0])
+        return ProjectedLines(self._lens, self._lifting, rays @ self._limits, lifted[:, 0], lifted[:, 1] - lifted[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
-class LineImages:
-    """Images of lit segments; `Images` makes them.
+class ProjectedLines:
+    """Projections of segments to a sensor; made by `LineProjector`.
 
     Attributes
     ----------
     lens
-        The sensor's distortion.
+        Distortion of the sensor; None: none.
     lifting
-        (3, 3): from metres to (u, v, 1) but for a factor.
+        float64 (3, 3): maps metres to homogeneous (u, v, 1).
     limits
-        (m, 2, 3): of both ends of the segments; what is imaged has positive ones.
+        float64 (m, 2, 3): values of the view's limits at both ends; a point is in view where all are positive.
     start, way
-        (m, 3): the lifted start of a segment, and from there to its end.
+        float64 (m, 3): homogeneous (u, v, 1) of the start of a segment, and the difference from there to its end.
     """
 
     lens: Lens | None
@@ -248,14 +260,14 @@ class LineImages:
     start: Float64
     way: Float64
 
-    def at(self, segment: Integers, share: Float64) -> Float64:
-        """Return (u, v) of places on segments, (..., 2); NaN where the distortion folds."""
+    def image_points(self, segment: Integers, share: Float64) -> Float64:
+        """Return (u, v) of the points at fractions of segments, (..., 2); NaN beyond the fold of the distortion."""
         lifted = self.start[segment] + share[..., None] * self.way[segment]
         straight = np.asarray(lifted[..., :2] / lifted[..., 2:])
         return straight if self.lens is None else self.lens.distort(straight)
 
-    def speed(self, segment: Integers, share: Float64, uv: Float64, moved: Float64) -> Float64:
-        """Return how fast u of places imaged at (u, v) changes as they move, in metres, (n, 3)."""
+    def u_rates(self, segment: Integers, share: Float64, uv: Float64, moved: Float64) -> Float64:
+        """Return the derivative of u along vectors ``moved`` (n, 3) [m] at points that are imaged at ``uv``, (n,)."""
         lifted = self.start[segment] + share[:, None] * self.way[segment]
         straight, per = lifted[:, :2] / lifted[:, 2:], 1.0 / lifted[:, 2]
         change = moved @ self.lifting
@@ -265,81 +277,80 @@ class LineImages:
         (a, b), (c, d) = np.moveaxis(self.lens.jacobian(uv), 0, -1)
         return np.asarray((d * u - b * v) / (a * d - b * c))
 
-    def in_view(self, parts: Parts) -> Parts:
-        """Cut parts down to what lies in front of the lens, this side of the horizon, and before the lens' fold."""
+    def clip_to_view(self, parts: Parts) -> Parts:
+        """Clip parts to the points in front of the lens, on the near side of the horizon and within the fold."""
         for start, end in np.moveaxis(self.limits, -1, 0).transpose(0, 2, 1):
             if min(start.min(initial=1.0), end.min(initial=1.0)) > 0.0:
                 continue
-            least = _LEAST * np.maximum(np.abs(start), np.abs(end))
+            least = _VIEW_MARGIN * np.maximum(np.abs(start), np.abs(end))
             share = np.divide(least - start, end - start, out=np.zeros_like(start), where=start != end)
             low = np.where(start > least, 0.0, np.where(end > least, share, 1.0))[parts.segment]
             high = np.where(end > least, 1.0, np.where(start > least, share, 0.0))[parts.segment]
             parts = parts._replace(start=np.maximum(parts.start, low), end=np.minimum(parts.end, high))
-        parts = parts.those(parts.start < parts.end)
-        return (
-            parts if self.lens is None or math.isinf(self.lens.fold_radius) else self._before_the_fold(parts, self.lens)
-        )
+        parts = parts.select(parts.start < parts.end)
+        return parts if self.lens is None or math.isinf(self.lens.fold_radius) else self._clip_to_fold(parts, self.lens)
 
-    def _before_the_fold(self, parts: Parts, lens: Lens) -> Parts:
+    def _clip_to_fold(self, parts: Parts, lens: Lens) -> Parts:
         fold = lens.fold_radius
-        radius = (1.0 - _LEAST) * fold * (1.0 + fold**2 * (lens.k1 + lens.k2 * fold**2))
+        radius = (1.0 - _VIEW_MARGIN) * fold * (1.0 + fold**2 * (lens.k1 + lens.k2 * fold**2))
         start, way = self.start[parts.segment], self.way[parts.segment]
         ends = [start + share[:, None] * way for share in (parts.start, parts.end)]
         vectors = [each[:, :2] - each[:, 2:] * np.array(lens.centre) for each in ends]
-        found = within_reach(*vectors, *(radius * each[:, 2] for each in ends))
+        found = parts_within_radius(*vectors, *(radius * each[:, 2] for each in ends))
         size, begin = parts.end - parts.start, parts.start
-        parts = parts.those(found.segment)
+        parts = parts.select(found.segment)
         size, begin = size[found.segment], begin[found.segment]
         end = np.where(found.end == 1.0, parts.end, begin + found.end * size)
         return parts._replace(start=begin + found.start * size, end=end)
 
-    def split(self, parts: Parts, edges: Float64, axis: int) -> Parts:
-        """Split parts where they cross edges in u (axis 0) or v (axis 1); drop what lies beyond the outer ones."""
-        first, last = self.at(parts.segment, np.stack([parts.start, parts.end]))[..., axis]
+    def split_at_edges(self, parts: Parts, edges: Float64, axis: int) -> Parts:
+        """Split parts where they cross edges in u (axis 0) or v (axis 1); drop the parts beyond the outer edges."""
+        first, last = self.image_points(parts.segment, np.stack([parts.start, parts.end]))[..., axis]
         low, high = np.minimum(first, last), np.maximum(first, last)
         begin = np.searchsorted(edges, low, side="right")
         count = np.maximum(np.searchsorted(edges, high, side="left") - begin, 0)
         if count.any():
-            owner, edge = np.repeat(np.arange(len(count)), count), ranges(begin, count)
-            cuts = self.where(parts.those(owner), edges[edge], axis)
-            parts = _cut(parts, count, cuts, last < first)
-        middle = self.at(parts.segment, 0.5 * (parts.start + parts.end))[:, axis]
-        return parts.those((middle >= edges[0]) & (middle <= edges[-1]) & (parts.start < parts.end))
+            owner, edge = np.repeat(np.arange(len(count)), count), concatenated_ranges(begin, count)
+            cuts = self.fractions_at(parts.select(owner), edges[edge], axis)
+            parts = _split_parts(parts, count, cuts, last < first)
+        middle = self.image_points(parts.segment, 0.5 * (parts.start + parts.end))[:, axis]
+        return parts.select((middle >= edges[0]) & (middle <= edges[-1]) & (parts.start < parts.end))
 
-    def where(self, parts: Parts, value: Float64, axis: int) -> Float64:
-        """Return where on its segment each part has a coordinate u (axis 0) or v (1), which it has within the part.
+    def fractions_at(self, parts: Parts, value: Float64, axis: int) -> Float64:
+        """Return the fraction of each segment at which u (axis 0) or v (axis 1) has a value.
 
-        With distortion, Newton's steps from where it would be if the other coordinate were that of the part's middle.
+        The value must occur within the part. With distortion Newton's method starts from the solution with the other
+        coordinate of the part's middle.
         """
         straight = value
         if self.lens is not None:
-            middle = self.at(parts.segment, 0.5 * (parts.start + parts.end))
+            middle = self.image_points(parts.segment, 0.5 * (parts.start + parts.end))
             middle[:, axis] = value
             straight = self.lens.undistort(middle)[:, axis]
         start, way = self.start[parts.segment], self.way[parts.segment]
         with np.errstate(divide="ignore", invalid="ignore"):
             found = (straight * start[:, 2] - start[:, axis]) / (way[:, axis] - straight * way[:, 2])
-        found = self._within(parts, found)
-        for _ in range(0 if self.lens is None else _STEPS):
+        found = self._clamp(parts, found)
+        for _ in range(0 if self.lens is None else _NEWTON_STEPS):
             step = np.where(2.0 * found < parts.start + parts.end, 1e-4, -1e-4) * (parts.end - parts.start)
-            here, there = self.at(parts.segment, np.stack([found, found + step]))[..., axis]
+            here, there = self.image_points(parts.segment, np.stack([found, found + step]))[..., axis]
             with np.errstate(divide="ignore", invalid="ignore"):
-                found = self._within(parts, found + (value - here) * step / (there - here))
+                found = self._clamp(parts, found + (value - here) * step / (there - here))
         return found
 
-    def _within(self, parts: Parts, share: Float64) -> Float64:
+    def _clamp(self, parts: Parts, share: Float64) -> Float64:
         middle = 0.5 * (parts.start + parts.end)
         return np.clip(np.where(np.isfinite(share), share, middle), parts.start, parts.end)
 
 
-def _cut(parts: Parts, count: Integers, cuts: Float64, reverse: npt.NDArray[np.bool_]) -> Parts:
-    """Cut parts, each at some places; those of parts that are to be reversed lie in descending order."""
+def _split_parts(parts: Parts, count: Integers, cuts: Float64, reverse: npt.NDArray[np.bool_]) -> Parts:
+    """Split parts at given fractions, sorted ascending; descending for parts in ``reverse``."""
     before = np.cumsum(count) - count
-    owner, number = np.repeat(np.arange(len(count)), count + 1), ranges(np.zeros_like(count), count + 1)
+    owner, number = np.repeat(np.arange(len(count)), count + 1), concatenated_ranges(np.zeros_like(count), count + 1)
     last = count[owner]
     left = before[owner] + np.where(reverse[owner], last - number, number - 1)
     right = before[owner] + np.where(reverse[owner], last - 1 - number, number)
     most = len(cuts) - 1
     start = np.where(number == 0, parts.start[owner], cuts[np.clip(left, 0, most)])
     end = np.where(number == last, parts.end[owner], cuts[np.clip(right, 0, most)])
-    return parts.those(owner)._replace(start=start, end=end)
+    return parts.select(owner)._replace(start=start, end=end)

@@ -1,4 +1,4 @@
-"""Which plane mirrors may show which lines: facets in blocks, so that most are never looked at."""
+"""Conservative search for the plane mirrors that may show a line: facets are tested in blocks."""
 
 from __future__ import annotations
 
@@ -10,53 +10,53 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import Device, Launch, Precision, StatusArray, Variant, real_defines, real_of, uses_vectors
 from gpuvision.operation import VisionOperation
-from gpuvision.simulation.transport.mirror_points import Blocks
+from gpuvision.simulation.transport.mirror_points import TriangleBlocks
 
 Float64 = npt.NDArray[np.float64]
 
 _GROUP, _LANES = 64, 16
-# How far apart facets of other directions are put to be blocked, in sizes of all.
+# Facets of different directions are moved apart by this many extents before they are sorted into blocks, so that the
+# facets of a block have one direction as far as possible.
 _APART = 100.0
 
 
 class NearFacets(NamedTuple):
-    """Which blocks of plane mirrors may show lines.
+    """Blocks of plane mirrors that may show lines.
 
     Attributes
     ----------
     near
-        uint8 (..., blocks): 1 where the lens may see a part of the line in one of the block's mirrors, else 0.
+        uint8 (..., blocks): 1 where the lens may see a part of the line in a mirror of the block, else 0.
     """
 
-    near: Any
+    near: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MirrorFacets(VisionOperation[NearFacets]):
-    """Which blocks of plane mirrors may show lines: ``op(lines, lens) -> NearFacets``; compared by identity.
+    """Blocks of plane mirrors that may show lines: ``op(lines, lens) -> NearFacets``; compared by identity.
 
-    Lines are float32 or float64 (..., 6), two ends in metres; the lens is a place, (3,).
+    Lines are float32 or float64 (..., 6): two ends [m]. The lens is a position (3,) [m].
 
     Parameters
     ----------
     corners
-        (m, 3, 3): the mirrors [m], each with an area.
+        (m, 3, 3): mirrors [m], each with an area.
     precision
-        Of the arithmetic; None follows the input.
+        Precision of the arithmetic; None follows the input.
     variant
         "vector" (16 lines in a vector, for CPU runtimes), "work_item" (for GPUs), "auto".
 
     Raises
     ------
     ValueError
-        The corners are not what is said here.
+        The corners have a wrong shape or are not finite.
 
-    Notes
-    -----
-    No block is left out that shows something: a block is a ball and a cone of normals (`Blocks`), widened by some
-    roundings, and the line's way through the cone of what these may show is bounded by tangents.
+    Notes ----- The test is conservative: no block that shows a part of the line is left out. A block is represented by
+    a ball and a cone of normals (`TriangleBlocks`), widened by more than rounding; the line is tested against the cone
+    of all points that these may show, bounded by tangents. Occlusion is not considered.
     """
 
     Result: ClassVar[type[Any]] = NearFacets
@@ -72,15 +72,15 @@ class MirrorFacets(VisionOperation[NearFacets]):
         object.__setattr__(self, "corners", array)
 
     @functools.cached_property
-    def blocks(self) -> Blocks:
-        """The facets by blocks, each of one direction as far as that goes."""
+    def blocks(self) -> TriangleBlocks:
+        """Facets in blocks, each of one direction as far as possible."""
         corners = self.corners
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         reach = _APART * float(np.ptp(corners.reshape(-1, 3), axis=0).max())
         normals = np.repeat(normal[:, None], 3, axis=1)
-        # Put apart by direction, then measured where they are.
-        return Blocks.of(corners, normals, corners + reach * normals)
+        # Sorted at the moved positions, measured at the true ones.
+        return TriangleBlocks.of(corners, normals, corners + reach * normals)
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""

@@ -1,4 +1,4 @@
-"""Where curved mirrors show points, and how concentrated their light arrives."""
+"""Images of points in curved mirrors, and the concentration of light by the curvature (caustics)."""
 
 from __future__ import annotations
 
@@ -10,31 +10,48 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    IntArray,
+    Launch,
+    Precision,
+    StatusArray,
+    Variant,
+    real_defines,
+    real_of,
+    uses_vectors,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.bvh import Bvh
 from gpuvision.simulation.scene.closed_surfaces import vertex_numbers
 from gpuvision.simulation.scene.scene import Scene
-from gpuvision.simulation.transport.sheet_cut import ranges
+from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
 
 Float64 = npt.NDArray[np.float64]
+# Columns of a triangle and of a block in kernels/mirrors/mirrors.cl; work-items of a group; lanes of a vector.
 _ROW, _BLOCK, _GROUP, _LANES = 27, 11, 64, 16
+# Angle between neighbouring triangles above which their edge is sharp [rad].
 _CREASE = math.radians(40.0)
 
 
 def smooth_normals(scene: Scene, crease: float = _CREASE) -> Float64:
-    """Return a unit normal for every corner of every triangle, (n, 3, 3), as if the surface were smooth.
+    """Return unit normals of a smooth surface at the corners of triangles, (n, 3, 3).
 
-    At a corner the normals of all triangles that share it are joined, but for those that lean more than the crease
-    from the triangle's own: an edge stays an edge. With Max's weights (Weights for computing vertex normals, 1999)
-    the normals of a sphere are exact; of other smooth surfaces they are off by the square of the triangles' size.
+    The normal at a corner is the weighted mean over all triangles that share the corner, without those that lean more
+    than the crease angle from the triangle itself: a sharp edge stays sharp. With Max's weights the normals of a sphere
+    are exact; errors on other smooth surfaces are of second order in the triangles' size.
 
     Parameters
     ----------
     scene
-        Triangles that touch share corners, to the last digit. Of one without area the normals are zero.
+        Triangles; neighbours share corners bit for bit. The normals of a triangle without area are zero.
     crease
-        Radians.
+        Angle between triangles above which their edge is sharp [rad]. Default 40 degrees.
+
+    References
+    ----------
+    N. Max, *Weights for computing vertex normals from facet normals*, Journal of Graphics Tools 4(2), 1999.
     """
     corners = scene.corners
     ahead, back = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
@@ -45,12 +62,12 @@ def smooth_normals(scene: Scene, crease: float = _CREASE) -> Float64:
         flat = across[:, 0] / np.linalg.norm(across[:, 0], axis=1, keepdims=True)
     bad = ~(np.isfinite(weighted).all(axis=(1, 2)) & np.isfinite(flat).all(axis=1))
     weighted[bad], flat[bad] = 0.0, 0.0
-    # All pairs of corners in one place.
+    # All pairs of corners at one position.
     place = vertex_numbers(np.where(np.isfinite(corners), corners, 0.0)).ravel()
     order, counts = np.argsort(place, kind="stable"), np.bincount(place)
     partners = counts[place]
     own = np.repeat(np.arange(len(place)), partners)
-    other = order[ranges((np.cumsum(counts) - counts)[place], partners)]
+    other = order[concatenated_ranges((np.cumsum(counts) - counts)[place], partners)]
     smooth = np.sum(flat[own // 3] * flat[other // 3], axis=1) > math.cos(crease)
     own, share = own[smooth], weighted.reshape(-1, 3)[other[smooth]]
     total = np.stack([np.bincount(own, column, minlength=len(place)) for column in share.T], axis=1)
@@ -60,49 +77,51 @@ def smooth_normals(scene: Scene, crease: float = _CREASE) -> Float64:
     return np.asarray((total / length).reshape(-1, 3, 3))
 
 
-class MirroredPoints(NamedTuple):
+class MirrorImages(NamedTuple):
     """Images of points in curved mirrors.
 
     Attributes
     ----------
     place
-        (..., kept, 3), metres: where on the mirrors they are seen.
+        float (..., kept, 3): position on the mirror at which the point is seen [m].
     move
-        (..., kept, 3): how these places move with the points' steps.
+        float (..., kept, 3): displacement of that position as the point moves by its step [m].
     density
-        (..., kept), 1/m^2: the lens' solid angle per area across the rays at the point, or the point's per area at
-        the lens: 1 / (way to the mirror + way on) ** 2 where the mirror is flat.
+        float (..., kept), 1/m^2: solid angle of rays at the lens per area across the rays at the point, or at the point
+        per area at the lens (the two are equal). For a flat mirror it is 1 / (way to the mirror + way on)^2; near a
+        caustic it is unbounded.
     triangle
-        int32 (..., kept): number in the scene, -1 behind the last.
-    count
-        uint8 (...,): how many there are.
+        int32 (..., kept): index of the triangle in the scene; -1 behind the last image.
+    image_count
+        uint8 (...,): number of images.
     status
-        uint8 `Status` flags, (...,): NOT_FINITE (a number is not), AMBIGUOUS (there are more images than are kept).
+        uint8 `Status` flags, (...,): NOT_FINITE (a component of the input is not finite), AMBIGUOUS (there are more
+        images than are kept).
     """
 
-    place: Any
-    move: Any
-    density: Any
-    triangle: Any
-    count: Any
-    status: Any
+    place: FloatArray
+    move: FloatArray
+    density: FloatArray
+    triangle: IntArray
+    image_count: StatusArray
+    status: StatusArray
 
 
-class Blocks(NamedTuple):
-    """Triangles by the leaves of a tree, and what holds each leaf's: a ball, and a cone of normals.
+class TriangleBlocks(NamedTuple):
+    """Blocks of triangles (the leaves of a tree), each with a bounding ball and a cone of normals.
 
     Attributes
     ----------
     order
-        (m,): the triangles.
+        int64 (m,): indices of the triangles, block by block.
     start
-        (b + 1,): where blocks begin in it, and the end of the last.
+        int64 (b + 1,): index into `order` at which each block begins, and the end of the last.
     middle, radius
-        (b, 3), (b,): a ball about the triangles, as they bulge.
+        float64 (b, 3), (b,): bounding ball of the triangles and their bulge (`max_bulge`) [m].
     axis, cone
-        (b, 3), (b,): unit vector, and the angle to it within which all normals lie [rad].
+        float64 (b, 3), (b,): unit vector, and the largest angle to it of any normal at a corner [rad].
     outside
-        (b,): whether all reflect only on the side of their normals.
+        bool (b,): whether all triangles reflect only on the side of their normals.
     """
 
     order: npt.NDArray[np.int64]
@@ -118,29 +137,36 @@ class Blocks(NamedTuple):
         cls,
         corners: Float64,
         normals: Float64,
-        radix_argsort: Float64 | None = None,
+        sorted_by: Float64 | None = None,
         outside: npt.NDArray[np.bool_] | None = None,
-    ) -> Blocks:
-        """Return the blocks of triangles and the normals at their corners, each (m, 3, 3).
+    ) -> TriangleBlocks:
+        """Return the blocks of triangles and of the normals at their corners, each (m, 3, 3).
 
-        They are sorted as if they stood where ``radix_argsort`` says, (m, 3, 3); None: where they do.
+        Parameters
+        ----------
+        corners, normals
+            (m, 3, 3): corners [m] and unit normals.
+        sorted_by
+            (m, 3, 3): corners that the tree is built over; None: ``corners``.
+        outside
+            (m,) bool: triangles that reflect only on the side of their normals; None: none.
         """
         if not len(corners):
             none = np.zeros(0)
             return cls(
                 none.astype(int), np.zeros(1, int), none.reshape(0, 3), none, none.reshape(0, 3), none, none > 0.0
             )
-        members = Bvh.build(corners if radix_argsort is None else radix_argsort).members
+        members = Bvh.build(corners if sorted_by is None else sorted_by).members
         order, count = members[members >= 0], (members >= 0).sum(axis=1)
         start = np.append(0, np.cumsum(count))
         each = np.repeat(np.arange(len(count)), count)
         points, directions = corners[order], normals[order]
         low, high = (f.reduceat(g(points, axis=1), start[:-1]) for f, g in ((np.minimum, np.min), (np.maximum, np.max)))
         middle = 0.5 * (low + high)
-        away = np.linalg.norm(points - middle[each][:, None], axis=2).max(axis=1) + bulge_of(points, directions)
+        away = np.linalg.norm(points - middle[each][:, None], axis=2).max(axis=1) + max_bulge(points, directions)
         axis = np.add.reduceat(directions.sum(axis=1), start[:-1])
         length = np.linalg.norm(axis, axis=1, keepdims=True)
-        # Where all cancel, any will do: the cone is wide.
+        # Where the normals cancel any axis will do: the cone is wide.
         axis = np.where(length > 0.0, axis / np.where(length > 0.0, length, 1.0), (0.0, 0.0, 1.0))
         lean = np.arctan2(
             np.linalg.norm(np.cross(directions, axis[each][:, None]), axis=2),
@@ -151,7 +177,7 @@ class Blocks(NamedTuple):
         return cls(order, start, middle, radius, axis, cone, np.logical_and.reduceat(one_sided, start[:-1]))
 
     def table(self, middle: Float64) -> Float64:
-        """Return rows of kernels/mirrors/mirrors.cl, at least one; balls and cones hold what rounding moves."""
+        """Return rows of kernels/mirrors/mirrors.cl, at least one; balls and cones are widened beyond rounding."""
         if not len(self.radius):
             return np.zeros((1, _BLOCK))
         twice = np.minimum(2.0 * self.cone * (1.0 + 1e-5) + 1e-6, math.pi)
@@ -169,53 +195,64 @@ class Blocks(NamedTuple):
         return np.column_stack(columns)
 
 
-def bulge_of(corners: Float64, normals: Float64) -> Float64:
-    """Return how far smooth surfaces leave their triangles at most, (m, 3, 3) each to (m,) [m]."""
-    edges = np.roll(corners, -1, axis=1) - corners
-    rise = np.abs(np.sum(edges * normals, axis=2)) + np.abs(np.sum(edges * np.roll(normals, -1, axis=1), axis=2))
-    # Half the sum over pairs of corners of b_i b_j times what they rise above each other's tangents; b_i b_j <= 1 / 3.
-    return np.asarray(rise.max(axis=1, initial=0.0) / 6.0)
+def max_bulge(corners: Float64, normals: Float64) -> Float64:
+    """Return the bound of the distance between triangles and the smooth surface over them, (m,) [m].
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MirrorPoints(VisionOperation[MirroredPoints]):
-    """Where a lens sees points in curved mirrors: ``op(points, lens) -> MirroredPoints``; compared by identity.
-
-    Points are float32 or float64 (..., 6): a place and a step, any vector, in metres. The lens is a place, (3,). On
-    each triangle the place is found by Newton's method at which the direction half way between lens and point is along
-    the normal, interpolated from the corners; the place is lifted off the flat triangle as the normals say it bulges.
-    Nothing is in the way.
+    The smooth surface is the one that `MirrorPoints` uses: the point with barycentric weights b is lifted by half the
+    weighted sum of its depths below the tangent planes at the corners, along the corners' normals.
 
     Parameters
     ----------
     corners, normals
-        (m, 3, 3): the mirrors' triangles [m], and the normals at their corners.
+        (m, 3, 3): corners [m] and unit normals.
+    """
+    edges = np.roll(corners, -1, axis=1) - corners
+    rise = np.abs(np.sum(edges * normals, axis=2)) + np.abs(np.sum(edges * np.roll(normals, -1, axis=1), axis=2))
+    # The lift is at most half the sum over pairs of corners of b_i b_j times their heights over each other's tangent
+    # planes, and the sum of b_i b_j over the pairs is at most 1 / 3.
+    return np.asarray(rise.max(axis=1, initial=0.0) / 6.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MirrorPoints(VisionOperation[MirrorImages]):
+    """Images of points in curved mirrors: ``op(points, lens) -> MirrorImages``; compared by identity.
+
+    Points are float32 or float64 (..., 6): a position and a step (any vector) [m]. The lens is a position (3,) [m]. On
+    each triangle Newton's method finds the point at which the half vector between the directions to the lens and to the
+    point is parallel to the normal, interpolated from the corners. The point is lifted off the flat triangle by the
+    bulge that the normals imply. Nothing occludes.
+
+    Parameters
+    ----------
+    corners, normals
+        (m, 3, 3): triangles of the mirrors [m], and the normals at their corners.
     numbers
-        (m,): what the triangles are called.
+        (m,): index of each triangle in the scene.
     outside
-        (m,) bool: which reflect only on the side that their normals point to; None: all do on both.
+        (m,) bool: triangles that reflect only on the side of their normals; None: all reflect on both sides.
     kept
-        At most so many images of a point.
+        Largest number of images of a point, 1 to 255. Default 8.
     precision
-        Of the arithmetic and the outputs but places; None follows the input.
+        Precision of the arithmetic and of all outputs except `MirrorImages.place`; None follows the input.
     variant
         "vector" (16 points in a vector, for CPU runtimes), "work_item" (for GPUs), "auto".
 
     Raises
     ------
     ValueError
-        A parameter is not what is said here.
+        A parameter lies outside its range.
 
-    Notes
-    -----
-    Normal and surface are exact to the second degree, so images are off by the third power of the triangles' size over
-    the radius of curvature, their density by its first. One image per triangle is found: triangles must be small
-    beside the distances and radii, at least a few across each image. An image on the edge of two triangles is found on
-    both. At grazing incidence, within about what a triangle turns, an image may be missed (of a sphere of 1280
-    triangles, of 1 point in 300). Near a caustic the density is unbounded.
+    Notes ----- Normal and surface are exact to second degree, so the error of an image is of third power in the
+    triangles' size over the radius of curvature, that of its density of first. One image per triangle is found:
+    triangles must be small beside distances and radii, at least a few across each image. An image on the edge of two
+    triangles is found on both. At grazing incidence, within about the angle that a triangle turns, an image may be
+    missed (measured on a sphere of 1280 triangles: 1 point in 300). Near a caustic the density is unbounded.
+
+    References ---------- D. P. Mitchell and P. Hanrahan, *Illumination from curved reflectors*, SIGGRAPH 1992, for
+    images and caustics of smooth reflectors by Newton's method.
     """
 
-    Result: ClassVar[type[Any]] = MirroredPoints
+    Result: ClassVar[type[Any]] = MirrorImages
 
     corners: Float64
     normals: Float64
@@ -257,8 +294,8 @@ class MirrorPoints(VisionOperation[MirroredPoints]):
         return np.hstack(columns) if len(corners) else np.zeros((1, _ROW))
 
     @functools.cached_property
-    def _blocks(self) -> Blocks:
-        return Blocks.of(self.corners, self.normals, outside=self.outside)
+    def _blocks(self) -> TriangleBlocks:
+        return TriangleBlocks.of(self.corners, self.normals, outside=self.outside)
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -271,7 +308,7 @@ class MirrorPoints(VisionOperation[MirroredPoints]):
         count = math.prod(where)
         items = -(-count // _LANES) if strip else -(-count // _GROUP) * _GROUP
         middle = 0.5 * (self.corners.min((0, 1)) + self.corners.max((0, 1))) if len(self.corners) else np.zeros(3)
-        # The kernel subtracts the middle as its input's type holds it.
+        # The kernel subtracts the middle in the type of its input.
         middle = middle.astype(dtype)
         return Launch(
             source="mirrors/mirrors.cl",
@@ -287,7 +324,7 @@ class MirrorPoints(VisionOperation[MirroredPoints]):
                 "move": ((*where, self.kept, 3), real),
                 "density": ((*where, self.kept), real),
                 "triangle": ((*where, self.kept), np.dtype(np.int32)),
-                "count": (where, np.dtype(np.uint8)),
+                "image_count": (where, np.dtype(np.uint8)),
                 "status": (where, np.dtype(np.uint8)),
             },
             arguments=[

@@ -1,4 +1,4 @@
-"""Lit lines in mirrors: diffuse lines that the lens sees in them, and the light that they throw on other surfaces."""
+"""Specular interreflection of lit lines: lines seen in mirrors, and lines that mirrors light on other surfaces."""
 
 from __future__ import annotations
 
@@ -21,29 +21,44 @@ from gpuvision.simulation.scene.visible_intervals import VisibleIntervals
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.sensors.view_rays import check_materials
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
-from gpuvision.simulation.transport.line_exposure import line_exposure
+from gpuvision.simulation.transport.line_exposure import expose_lines
 from gpuvision.simulation.transport.mirror_facets import MirrorFacets
-from gpuvision.simulation.transport.mirror_points import MirrorPoints, bulge_of, smooth_normals
-from gpuvision.simulation.transport.plane_mirrors import heights, mirrored, planes_of, windows
-from gpuvision.simulation.transport.sheet_cut import ranges
-from gpuvision.simulation.transport.specular_interreflection import SpecularInterreflection, lines_of
+from gpuvision.simulation.transport.mirror_points import MirrorPoints, max_bulge, smooth_normals
+from gpuvision.simulation.transport.plane_mirrors import heights_above, mirror_windows, reflect_points, triangle_planes
+from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
+from gpuvision.simulation.transport.specular_interreflection import SpecularInterreflection
 from gpuvision.status import Status
 
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Corner normals that lean more than this from the triangle's make it curved [rad].
-_FLAT = 1e-6
-# Windows of which more parts are visible than are kept are halved so often.
-_HALVINGS = 12
-# Images of a point in curved mirrors that there is room for, at first and at last.
-_KEPT, _MOST_KEPT = 32, 255
-# Clearance of rays between surfaces, in sizes of the scene.
-_CLEARANCE = 1e-7
+# Images of a point in curved mirrors that the kernel has room for: at first, and at most (the count is one byte).
+_FIRST_IMAGES, _MAX_IMAGES = 32, 255
 
 
-class _Seen(NamedTuple):
-    """Parts of lines that are seen in mirrors: which line, in which mirror, from where to where."""
+@dataclass(frozen=True, kw_only=True)
+class MirrorLimits:
+    """Numerical limits of `Mirrors`.
+
+    Attributes
+    ----------
+    flat_angle
+        Sine of the angle between a corner's normal and the triangle's above which the triangle is part of a curved
+        mirror; rounding of normals with a wide margin.
+    max_halvings
+        Number of times that a segment with more visible parts than the kernel returns is halved.
+    clearance
+        Distance from a surface within which nothing occludes a ray, as part of the scene's reach; about one rounding in
+        single.
+    """
+
+    flat_angle: float = 1e-6
+    max_halvings: int = 12
+    clearance: float = 1e-7
+
+
+class _MirroredParts(NamedTuple):
+    """Parts of lines that are seen in mirrors: index of the line, of the mirror, and fractions of the line (k, 2)."""
 
     line: Integers
     mirror: Integers
@@ -52,55 +67,58 @@ class _Seen(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mirrors:
-    """The mirrors of a scene, before a sensor; compared by identity.
+    """Mirrors of a scene as a sensor sees them; compared by identity.
 
     A triangle whose material has a `mirror` share reflects on both sides. Where the normals at its corners agree with
-    its own it is a plane mirror, and its images are exact; else it is part of a curved one.
+    its own it is a plane mirror, and its images are exact. Otherwise it is part of a curved mirror.
 
     Parameters
     ----------
     view
         The sensor.
     scene, materials
-        The surfaces; a material for every number in `Scene.material`.
+        Surfaces, and a material for every number in `Scene.material`.
     normals
         (n, 3, 3): normals at the corners of all triangles; None: `smooth_normals` of the scene.
-    per_sample
-        Curved mirrors show a line in steps, so many in what a sample of the sensor sees of the sheet.
-    throws
-        How many mirrors the light of the sheet may meet one after another, 0 or more.
+    steps_per_sample
+        A line in a curved mirror is imaged in steps: so many per sample of the sensor, measured in the sheet. More than
+        0, default 2.
+    max_reflections
+        Largest number of mirrors that the light of the sheet meets one after another, 0 or more. Default 2.
     device
-        Where kernels run; None: `Device.best`.
+        Device of the kernels; None: `Device.best`.
+    limits
+        Numerical limits.
 
     Raises
     ------
     ValueError
-        A triangle has no material; a parameter is out of range.
+        A triangle has no material; a parameter lies outside its range.
 
-    Notes
-    -----
-    Plane mirrors: exact windows, visible intervals on both ways, images cut exactly at the sensor's bins; errors are
-    roundings. Curved ones: as `MirrorPoints` says for the place, and of second order in the step; of first order where
-    an image ends. Of the light that a point sends, the diffuse part is taken, as `Lambert`'s of the same albedo; one
-    mirror between line and lens. What a curved mirror throws on is found by rays, one step apart.
+    Notes ----- Plane mirrors: exact windows, visible intervals on both sides of the reflection, images divided exactly
+    at the sensor's bins; errors are roundings. Curved mirrors: positions as `MirrorPoints` says, of second order in the
+    step, and of first order where an image ends. Lines that the lens sees are diffuse reflectors of the material's
+    albedo (`Lambert`); glossy lobes are not included. There is one mirror between line and lens. Light that curved
+    mirrors reflect to other surfaces is traced by rays, one step apart.
     """
 
     view: SensorView
     scene: Scene
     materials: Sequence[Material]
     normals: Float64 | None = None
-    per_sample: float = 2.0
-    throws: int = 2
+    steps_per_sample: float = 2.0
+    max_reflections: int = 2
     device: Device | None = None
+    limits: MirrorLimits = MirrorLimits()
 
     def __post_init__(self) -> None:
         check_materials(self.scene, self.materials)
         if self.normals is not None and np.shape(self.normals) != self.scene.corners.shape:
             raise ValueError(f"Mirrors.normals has shape {np.shape(self.normals)}, expected {self.scene.corners.shape}")
-        if not self.per_sample > 0.0 or not math.isfinite(self.per_sample):
-            raise ValueError(f"Mirrors.per_sample is {self.per_sample}, expected a number > 0")
-        if self.throws < 0:
-            raise ValueError(f"Mirrors.throws is {self.throws}, expected 0 or more")
+        if not self.steps_per_sample > 0.0 or not math.isfinite(self.steps_per_sample):
+            raise ValueError(f"Mirrors.steps_per_sample is {self.steps_per_sample}, expected a number > 0")
+        if self.max_reflections < 0:
+            raise ValueError(f"Mirrors.max_reflections is {self.max_reflections}, expected 0 or more")
 
     def exposure(self, lit: LitLine, L: float, sheet: LightSheet | None = None, offset: float = 0.0) -> Exposure:
         """Return the light that reaches the sensor by way of a mirror, before or after a diffuse surface.
@@ -108,41 +126,44 @@ class Mirrors:
         Parameters
         ----------
         lit
-            What the sheet lights.
+            Lines that the sheet lights.
         L
             Transport of the sensor [m].
-        sheet, offset
-            Where the light comes from, for what mirrors throw on; None: only what is seen in mirrors is taken.
+        sheet
+            Sheet of light, for the lines that mirrors light on other surfaces; None: only lines seen in mirrors are
+            included.
+        offset
+            Distance of the sheet from the sensor's transport [m].
         """
-        if not self.there_are_any:
+        if not self.has_mirrors:
             return self.view.dark()
-        total = self.seen(lit, L)
+        total = self.mirrored_exposure(lit, L)
         if sheet is None:
             return total
-        thrown = self.thrown(lit, sheet, L + offset)
-        return total + self.direct(thrown, L) + self.seen(thrown, L)
+        thrown = self.reflected_lines(lit, sheet, L + offset)
+        return total + self.direct_exposure(thrown, L) + self.mirrored_exposure(thrown, L)
 
     @functools.cached_property
-    def there_are_any(self) -> bool:
+    def has_mirrors(self) -> bool:
         """Whether any triangle reflects."""
         return bool(self._reflects.any())
 
     # ---- diffuse lines ---------------------------------------------------------------------------------------
 
-    def seen(self, lit: LitLine, L: float) -> Exposure:
-        """Return what the sensor sees of lit lines in mirrors, as they are diffuse."""
+    def mirrored_exposure(self, lit: LitLine, L: float) -> Exposure:
+        """Return the exposure by lit lines that the sensor sees in mirrors, as diffuse lines."""
         exitance = self._exitance(lit)
         shining = np.flatnonzero(exitance > 0.0)
-        lit, exitance = lines_of(lit, shining), exitance[shining]
+        lit, exitance = lit.select(shining), exitance[shining]
         if not len(exitance):
             return self.view.dark()
-        return self._in_planes(lit, exitance, L) + self._in_curves(lit, exitance, L)
+        return self._plane_exposure(lit, exitance, L) + self._curved_exposure(lit, exitance, L)
 
-    def direct(self, lit: LitLine, L: float) -> Exposure:
-        """Return what the sensor sees of lit lines without a mirror, as they are diffuse."""
+    def direct_exposure(self, lit: LitLine, L: float) -> Exposure:
+        """Return the exposure by lit lines that the sensor sees without a mirror, as diffuse lines."""
         exitance = self._exitance(lit)
         shining = np.flatnonzero(exitance > 0.0)
-        lit, exitance = lines_of(lit, shining), exitance[shining]
+        lit, exitance = lit.select(shining), exitance[shining]
         if not len(exitance):
             return self.view.dark()
         lens = self.view.lens_at(L)
@@ -150,56 +171,58 @@ class Mirrors:
         apex = np.broadcast_to(lens, (len(exitance), 3))
         row, share = self._visible(apex, lit.ends, np.zeros((len(exitance), 2)), whole)
         ends = _between(lit.ends[row], share)
-        return self._exposed(ends, lit.normals[row], exitance[row], L)
+        return self._expose(ends, lit.normals[row], exitance[row], L)
 
     def _exitance(self, lit: LitLine) -> Float64:
-        """Return the power that leaves a metre of the lines diffusely [W/m]."""
+        """Return the diffuse exitance of the lines [W/m]."""
         albedos = np.array([each.albedo for each in self.materials])
         return np.asarray(lit.power * albedos[self._material[lit.triangle]])
 
-    def _exposed(self, ends: Float64, normals: Float64, exitance: Float64, L: float) -> Exposure:
-        """Return the exposure by diffuse lines, or their images, seen from end to end."""
+    def _expose(self, ends: Float64, normals: Float64, exitance: Float64, L: float) -> Exposure:
+        """Return the exposure by diffuse lines, or their mirror images, that are visible from end to end."""
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
         lens = self.view.lens_at(L)
 
-        def strength(line: Integers, at: Float64) -> Float64:
+        def power_on_line(line: Integers, at: Float64) -> Float64:
             place = ends[line, 0] + at[:, None] * (ends[line, 1] - ends[line, 0])
             towards = lens - place
             cosine = np.sum(towards * normals[line], axis=1) / np.linalg.norm(towards, axis=1)
             intensity = exitance[line] / math.pi * np.maximum(cosine, 0.0) * length[line]
             return np.asarray(intensity * self.view.aperture_solid_angle(place, L))
 
-        return line_exposure(self.view, L, ends, strength)
+        return expose_lines(self.view, L, ends, power_on_line)
 
     # ---- plane mirrors ---------------------------------------------------------------------------------------
 
-    def _in_planes(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
+    def _plane_exposure(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
         if not len(self._flat):
             return self.view.dark()
-        seen = self._through_windows(lit, L)
+        seen = self._visible_in_planes(lit, L)
         if not len(seen.line):
             return self.view.dark()
         planes = self._planes[seen.mirror]
-        ends = mirrored(_between(lit.ends[seen.line], seen.share), planes[:, None])
+        ends = reflect_points(_between(lit.ends[seen.line], seen.share), planes[:, None])
         normals = lit.normals[seen.line]
         turned = normals - 2.0 * np.sum(normals * planes[:, :3], axis=1, keepdims=True) * planes[:, :3]
-        return self._exposed(ends, turned, exitance[seen.line] * self._share_of(self._flat[seen.mirror]), L)
+        return self._expose(ends, turned, exitance[seen.line] * self._reflectance_of(self._flat[seen.mirror]), L)
 
-    def _through_windows(self, lit: LitLine, L: float) -> _Seen:
-        """Return the parts of lines that the lens sees in plane mirrors, nothing in the way before or behind them."""
+    def _visible_in_planes(self, lit: LitLine, L: float) -> _MirroredParts:
+        """Return the parts of lines that the lens sees in plane mirrors, unoccluded before and after the reflection."""
         lens = self.view.lens_at(L)
-        line, mirror, share = windows(lens, lit.ends, self._facets.corners, self._planes, *self._pairs(lit, lens))
-        # The side that the light comes from faces the mirror image of the lens.
-        apex = mirrored(lens, self._planes[mirror])
+        line, mirror, share = mirror_windows(
+            lens, lit.ends, self._facets.corners, self._planes, *self._candidate_pairs(lit, lens)
+        )
+        # The lit side of the line must face the mirror image of the lens.
+        apex = reflect_points(lens, self._planes[mirror])
         facing = np.sum((apex - lit.ends[line].mean(axis=1)) * lit.normals[line], axis=1) > 0.0
         line, mirror, share, apex = line[facing], mirror[facing], share[facing], apex[facing]
-        up = np.abs(heights(lens, self._planes[mirror]))
+        up = np.abs(heights_above(lens, self._planes[mirror]))
         ends = _between(lit.ends[line], share)
-        away = np.abs(heights(ends, self._planes[mirror][:, None]))
+        away = np.abs(heights_above(ends, self._planes[mirror][:, None]))
         near = up[:, None] / (up[:, None] + away)
         row, behind = self._visible(apex, ends, near, np.tile([0.0, 1.0], (len(line), 1)))
         line, mirror, share, apex, near = line[row], mirror[row], share[row], apex[row], near[row]
-        # Where the parts are on the mirror: as seen from the apex, on the way to their ends.
+        # Points of the mirror through which the ends are seen from the lens' mirror image (the apex).
         ends = _between(ends[row], behind)
         near = 1.0 / ((1.0 - behind) / near[:, :1] + behind / near[:, 1:])
         on_mirror = apex[:, None] + near[..., None] * (ends - apex[:, None])
@@ -207,26 +230,26 @@ class Mirrors:
         share = low + width * behind
         lenses = np.broadcast_to(lens, apex.shape)
         row, before = self._visible(lenses, on_mirror, np.zeros(share.shape), np.tile([0.0, 1.0], (len(row), 1)))
-        # What is even on the mirror is not on the line.
+        # Equal fractions on the mirror are not equal on the line: a perspective map converts them.
         near, share = near[row], share[row]
         weight = np.stack([1.0 - before, before], axis=-1) * near[:, None, :]
         before = weight[..., 1] / weight.sum(axis=-1)
-        return _Seen(line[row], mirror[row], share[:, :1] + np.diff(share) * before)
+        return _MirroredParts(line[row], mirror[row], share[:, :1] + np.diff(share) * before)
 
-    def _pairs(self, lit: LitLine, lens: Float64) -> tuple[Integers, Integers]:
-        """Return which lines may be seen in which plane mirrors."""
+    def _candidate_pairs(self, lit: LitLine, lens: Float64) -> tuple[Integers, Integers]:
+        """Return the pairs of a line and a plane mirror in which it may be seen."""
         blocks = self._facets.blocks
         line, block = np.nonzero(self._run(self._facets, lit.ends.reshape(-1, 6), lens).near)
         count = np.diff(blocks.start)[block]
-        line, mirror = np.repeat(line, count), blocks.order[ranges(blocks.start[block], count)]
-        seen = heights(lens, self._planes) * self._sides[self._flat] >= 0.0
+        line, mirror = np.repeat(line, count), blocks.order[concatenated_ranges(blocks.start[block], count)]
+        seen = heights_above(lens, self._planes) * self._sides[self._flat] >= 0.0
         return line[seen[mirror]], mirror[seen[mirror]]
 
     def _visible(self, apex: Float64, ends: Float64, near: Float64, share: Float64) -> tuple[Integers, Float64]:
-        """Return visible parts of segments (k, 2, 3): which segment, from where to where."""
+        """Return the visible parts of segments (k, 2, 3): index of the segment, and fractions of its length."""
         rows, parts = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
         row = np.arange(len(apex))
-        for _ in range(_HALVINGS):
+        for _ in range(self.limits.max_halvings):
             if not len(row):
                 break
             some = _between(ends[row], share)
@@ -245,7 +268,7 @@ class Mirrors:
 
     # ---- curved mirrors --------------------------------------------------------------------------------------
 
-    def _in_curves(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
+    def _curved_exposure(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
         if not len(self._curved):
             return self.view.dark()
         line, share = _steps(lit.lengths, self.step)
@@ -258,40 +281,42 @@ class Mirrors:
         way = np.linalg.norm(towards, axis=1)
         cosine = np.sum(towards * lit.normals[line[point]], axis=1) / way
         good = (cosine > 0.0) & np.isfinite(density)
-        good[good] = self._free(origin[good], spot[good], lens, triangle[good])
+        good[good] = self._is_unobstructed(origin[good], spot[good], lens, triangle[good])
         point, spot, spot_move, density, triangle, cosine = (
             each[good] for each in (point, spot, spot_move, density, triangle, cosine)
         )
         source = line[point]
         intensity = exitance[source] / math.pi * cosine * np.linalg.norm(move[point], axis=1)
-        # Aperture and cosine at the lens are those of the spot; the solid angle is the mirror's doing.
+        # Aperture and cosine at the lens follow from the spot's direction; the mirror changes the solid angle.
         square = np.sum((spot - lens) ** 2, axis=1) * density
-        power = intensity * self._share_of(triangle) * self.view.aperture_solid_angle(spot, L) * square
+        power = intensity * self._reflectance_of(triangle) * self.view.aperture_solid_angle(spot, L) * square
         ends = np.stack([spot - 0.5 * spot_move, spot + 0.5 * spot_move], axis=1)
-        return line_exposure(self.view, L, ends, lambda line, at: power[line])
+        return expose_lines(self.view, L, ends, lambda line, at: power[line])
 
     def _images(self, points: Float64, lens: Float64) -> tuple[Integers, Float64, Float64, Float64, Integers]:
-        """Return images of points: of which point, where, how they move, their density, on which triangle."""
+        """Return images of points in curved mirrors: index of the point, position, motion, density, triangle."""
         found: list[tuple[Any, ...]] = []
-        row, kept = np.arange(len(points)), _KEPT
+        row, kept = np.arange(len(points)), _FIRST_IMAGES
         while len(row):
             images = self._run(self._points(kept), points[row], lens)
-            # Where there may be more, all are sought again.
-            more = (images.status & Status.AMBIGUOUS != 0) & (kept < _MOST_KEPT)
+            # Points with more images than the kernel has room for are searched again with more room.
+            more = (images.status & Status.AMBIGUOUS != 0) & (kept < _MAX_IMAGES)
             which, slot = np.nonzero((images.triangle >= 0) & ~more[:, None])
             found.append((row[which], *(each[which, slot] for each in images[:4])))
-            row, kept = row[more], min(4 * kept, _MOST_KEPT)
+            row, kept = row[more], min(4 * kept, _MAX_IMAGES)
         point, spot, move, density, triangle = (np.concatenate(each) for each in zip(*found, strict=True))
-        # One on the edge of two triangles is found on both.
+        # An image on the edge of two triangles is found on both; one is kept.
         order = np.lexsort((*spot.T, point))
         near = np.abs(np.diff(spot[order], axis=0)).max(axis=1, initial=0.0) <= self._clearance
         once = order[np.append(True, ~near | (np.diff(point[order]) != 0))[: len(order)]]
         return point[once], spot[once], move[once], density[once], triangle[once]
 
-    def _free(self, origin: Float64, spot: Float64, lens: Float64, triangle: Integers) -> npt.NDArray[np.bool_]:
-        """Return whether nothing is in the way from points to spots on curved mirrors and on to the lens.
+    def _is_unobstructed(
+        self, origin: Float64, spot: Float64, lens: Float64, triangle: Integers
+    ) -> npt.NDArray[np.bool_]:
+        """Return whether nothing occludes the ways from points to spots on curved mirrors and on to the lens.
 
-        The smooth surface bulges out of its triangle: that much of the way at the mirror does not count.
+        The smooth surface bulges out of its triangle: that part of the way at the mirror is not tested.
         """
         bulge = self._bulge[triangle]
         free = np.ones(len(spot), bool)
@@ -305,35 +330,35 @@ class Mirrors:
             free &= self._run(self._any_hit, np.hstack([start, other])).occluded == 0
         return free
 
-    # ---- light thrown on ---------------------------------------------------------------------------------------
+    # ---- light that mirrors reflect to other surfaces ----------------------------------------------------------
 
-    def thrown(self, lit: LitLine, sheet: LightSheet, place: float) -> LitLine:
-        """Return what lit lines on mirrors throw on other surfaces, up to `throws` mirrors on the way.
+    def reflected_lines(self, lit: LitLine, sheet: LightSheet, place: float) -> LitLine:
+        """Return the lines that mirrors light on other surfaces, after 1 to `max_reflections` reflections.
 
         Parameters
         ----------
         lit
-            What the sheet lights.
-        sheet, place
-            Where the light comes from: the sheet, at its transport [m].
+            Lines that the sheet lights.
+        sheet
+            Sheet of light.
+        place
+            Transport of the sheet [m].
 
-        Notes
-        -----
-        Plane mirrors: the mirrored sheet cuts the scene, exactly, and the energy is; `LitLine.power` is a mean, as the
-        sheet's `uniformity` says. Curved mirrors: as even between rays that are a step apart, to second order; a lit
-        piece ends within 2^-12 of a step.
+        Notes ----- Plane mirrors: the mirrored sheet cuts the scene exactly, and the energy is exact; `LitLine.power`
+        is a mean, as the sheet's `uniformity` says. Curved mirrors: the light is taken as even between rays that are a
+        step apart, of second order in the step; the end of a lit piece is located to 2^-12 of a step.
         """
-        return self._thrown_light.after(lit, sheet, place, self.throws)
+        return self._interreflection.reflected_lines(lit, sheet, place, self.max_reflections)
 
-    # ---- what follows from the parameters ----------------------------------------------------------------------
+    # ---- derived from the parameters ---------------------------------------------------------------------------
 
     @functools.cached_property
     def step(self) -> float:
-        """How far apart points of a line are that curved mirrors show [m]."""
+        """Distance between the points of a line that curved mirrors image [m]."""
         middle = float(np.mean(self.view.u_edges[[0, -1]]))
         first, last = self.view.points_in_sheet(middle, self.view.v_edges[[0, -1]])
         length = float(np.linalg.norm(last - first))
-        return length / self.view.samples / self.per_sample
+        return length / self.view.samples / self.steps_per_sample
 
     @functools.cached_property
     def _device(self) -> Device:
@@ -353,7 +378,7 @@ class Mirrors:
 
     @functools.cached_property
     def _normals(self) -> Float64:
-        """Return normals at the corners, of closed surfaces outwards; those of what does not reflect are not used."""
+        """Return normals at the corners, of closed surfaces outwards; only those of mirrors are used."""
         if self.normals is not None:
             found = np.array(self.normals, np.float64)
         else:
@@ -373,12 +398,12 @@ class Mirrors:
     @functools.cached_property
     def _is_curved(self) -> npt.NDArray[np.bool_]:
         lean = np.linalg.norm(np.cross(self._normals, self._normal_of[:, None]), axis=2).max(axis=1, initial=0.0)
-        return np.asarray(self._reflects & (lean > _FLAT))
+        return np.asarray(self._reflects & (lean > self.limits.flat_angle))
 
     @functools.cached_property
     def _normal_of(self) -> Float64:
         with np.errstate(all="ignore"):
-            return planes_of(self.scene.corners)[:, :3]
+            return triangle_planes(self.scene.corners)[:, :3]
 
     @functools.cached_property
     def _flat(self) -> Integers:
@@ -390,22 +415,22 @@ class Mirrors:
 
     @functools.cached_property
     def _planes(self) -> Float64:
-        return planes_of(self._facets.corners)
+        return triangle_planes(self._facets.corners)
 
     @functools.cached_property
     def _bulge(self) -> Float64:
-        return bulge_of(self.scene.corners, self._normals)
+        return max_bulge(self.scene.corners, self._normals)
 
     @functools.cached_property
     def _clearance(self) -> float:
         corners = self.scene.bvh.corners
-        return _CLEARANCE * float(np.abs(corners).max(initial=0.0))
+        return self.limits.clearance * float(np.abs(corners).max(initial=0.0))
 
-    def _share_of(self, triangle: Integers) -> Float64:
+    def _reflectance_of(self, triangle: Integers) -> Float64:
         return np.array([each.mirror for each in self.materials])[self._material[triangle]]
 
     @functools.cached_property
-    def _thrown_light(self) -> SpecularInterreflection:
+    def _interreflection(self) -> SpecularInterreflection:
         return SpecularInterreflection(
             scene=self.scene,
             reflectance=np.array([each.mirror for each in self.materials])[self._material],
@@ -449,12 +474,12 @@ class Mirrors:
 
 
 def _between(ends: Float64, share: Float64) -> Float64:
-    """Return the parts of segments (k, 2, 3) from share to share (k, 2)."""
+    """Return the parts of segments (k, 2, 3) between fractions of their lengths (k, 2)."""
     return np.asarray(ends[:, :1] + share[..., None] * (ends[:, 1:] - ends[:, :1]))
 
 
 def _steps(lengths: Float64, step: float) -> tuple[Integers, Float64]:
-    """Cut lines into even steps: which line, from where to where."""
+    """Divide lines into equal steps of at most ``step``; return the index of the line, and fractions (k, 2)."""
     count = np.maximum(np.ceil(lengths / step), 1).astype(np.int64)
     line = np.repeat(np.arange(len(lengths)), count)
     number = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)

@@ -1,4 +1,4 @@
-"""Light of lit segments on receivers, as far as they see each other."""
+"""Diffuse irradiance of receivers by lit segments with occlusion."""
 
 from __future__ import annotations
 
@@ -9,7 +9,17 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    Launch,
+    Precision,
+    StatusArray,
+    Variant,
+    real_defines,
+    real_of,
+    uses_vectors,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LitSegments
@@ -18,102 +28,102 @@ from gpuvision.validation import integer
 Spec = tuple[tuple[int, ...], np.dtype[Any]]
 Visibility = Literal["intervals", "rays", "none"]
 
-PICK_BLOCK = 16
-"""Receivers of a strip that share a list of picked segments."""
+SELECTION_BLOCK = 16
+"""Receivers of a strip that share a list of selected segments."""
 
 _GROUP = 64
-# Of work for a CPU: enough that none waits for another, few, as each looks for lines among the segments anew.
+# Parts of the work per CPU core: enough to balance the load; few, because each groups the segments into lines anew.
 _SHARES_PER_CORE = 8
-# Small scenes share a build.
+# Least stack depth in the build options, so that all small scenes share one build.
 _LEAST_DEPTH = 4
-# Of the scene's size: within this of a surface rounding, the caller's too, decides what lies before it.
+# Default clearance in parts of the scene's reach, by bytes of the type: below it, the rounding of positions (of the
+# caller's, too) decides on which side of a surface a point lies.
 _CLEARANCE = {4: 4e-6, 8: 1e-12}
 
 
-class ReceivedLight(NamedTuple):
-    """Light that strips' receivers get.
+class StripIrradiance(NamedTuple):
+    """Irradiance of the receivers of strips.
 
     Attributes
     ----------
     irradiance
-        (strips, n), W/m^2; NaN where the status says so.
+        float (strips, n): irradiance [W/m^2]; NaN where the status says so.
     left, right
-        (strips,): sums of irradiance times weight; NaN if one of the irradiances is that is to be added.
+        float (strips,): sums of irradiance times the first and the second weight (currents of a PSD's two electrodes,
+        for example); NaN where an irradiance that is to be added is NaN.
     status
-        uint8 `Status` flags, (strips, n): NO_DATA (no receiver: its normal is zero; adds nothing), NOT_FINITE (a number
-        of the receiver, or of any segment that it was to see, is not), OUT_OF_RANGE (a pick is no segment, or stands
-        beyond the list's end), AMBIGUOUS (too many things hide parts of one segment: light is missing or too much by
-        less than 1e-4 of that segment's; with a value).
+        uint8 `Status` flags, (strips, n): NO_DATA (no receiver: its normal is zero; adds nothing), NOT_FINITE (a
+        component of the receiver, or of a segment that is not left out for it, is not finite), OUT_OF_RANGE (a selected
+        index is no segment, or a list reaches beyond the input's end), AMBIGUOUS (too many triangles occlude parts of
+        one segment: the light is wrong by less than 1e-4 of that segment's; the value is given).
     """
 
-    irradiance: Any
-    left: Any
-    right: Any
-    status: Any
+    irradiance: FloatArray
+    left: FloatArray
+    right: FloatArray
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
-class OccludedIrradiance(VisionOperation[ReceivedLight]):
-    """Diffuse light of lit segments on strips of receivers: ``op(receivers, weights, segments) -> ReceivedLight``.
+class OccludedIrradiance(VisionOperation[StripIrradiance]):
+    """Diffuse irradiance by lit segments with occlusion: ``op(receivers, weights, segments) -> StripIrradiance``.
 
-    All inputs are float32 or float64, alike, and change from call to call: one bound instance serves all profiles.
+    All real inputs are float32 or float64, of one type. They change from call to call: one bound instance serves all
+    profiles.
 
     receivers (strips, n, 6)
-        Place in metres, normal of any length; a normal of zero: no receiver.
+        Position [m] and normal of any length; a normal of zero marks an entry without receiver.
     weights (strips, n, 2)
-        What a unit of irradiance adds to `left` and `right`.
+        What 1 W/m^2 adds to `left` and `right`.
     segments (segments, 10)
-        Start, end, normal of the lit surface on the side that emits, exitance in W/m (`segment_rows`). An exitance of
-        zero or less: no segment.
-    starts (strips * ceil(n / 16) + 1,), picks (picks,), int32
-        With ``picks`` only: `starts` says where in `picks` the segments of each block of 16 receivers begin, block by
-        block and strip by strip, the end of the last one behind them; a pick is a segment's number, or ~number for one
-        that is taken without looking whether anything is in the way.
+        Start, end [m], normal of the lit surface on the side that emits, exitance [W/m] (`segment_rows`). A row with an
+        exitance of 0 or less is no segment.
+    starts (strips * ceil(n / 16) + 1,), selected (selected,), int32
+        Only with ``selected``: lists of segments for each block of 16 receivers, block by block and strip by strip.
+        `starts` holds the index into `selected` at which each list begins, and the end of the last. An entry is a
+        segment's index, or ~index of a segment whose visibility is not tested.
 
     Parameters
     ----------
     scene
-        What may lie between; both sides of a triangle hide. In the frame of receivers and segments.
+        Triangles that may occlude, on both sides, in the frame of receivers and segments.
     segments
-        Rows of `segments`.
-    picks
-        Room in `picks`; None: every receiver gets light from all segments.
+        Number of rows of `segments`, 1 or more.
+    selected
+        Length of the input `selected`; None: every receiver gets light from all segments.
     visibility
-        "intervals" (exact: what each triangle hides of a segment is projected on it from the receiver, in one walk
-        through the tree), "rays" (shadow rays to the middles of ``samples`` parts of each segment: an independent,
-        slower way, of first order in the length of a part), "none" (nothing hides).
+        "intervals" (exact: the triangles' shadows on each segment, projected from the receiver in one traversal of the
+        tree), "rays" (shadow rays to the middles of ``samples`` parts of each segment: an independent, slower method,
+        of first order in the length of a part), "none" (nothing occludes).
     samples
-        Parts of a segment for "rays".
+        Parts of a segment for "rays", 1 or more. Default 64.
     clearance
-        Metres: what is less high above the lit surface, or above the receiver's own plane, hides nothing: the surfaces
-        on which both lie, as far as they are flat. None: 4e-6 of the scene's reach from the origin where places are in
-        single, 1e-12 in double; with less than that, surfaces may hide what lies on them. So a scene of metres with
-        details of micrometres wants double.
+        Height above the lit surface, or above the receiver's plane, below which nothing occludes [m]: this excludes the
+        surfaces on which both lie, as far as they are flat. None: 4e-6 of the scene's reach from the origin with
+        positions in single, 1e-12 in double. A smaller clearance lets surfaces occlude points on themselves; so a scene
+        of metres with details of micrometres needs double.
     precision
-        Of the arithmetic and the outputs; None follows the input. "single" takes float64 places, too: they are
+        Precision of arithmetic and outputs; None follows the input. "single" takes float64 positions, too: they are
         subtracted before they are rounded.
     variant
-        "vector" (a work-item for some strips, 16 boxes at once, for CPU runtimes), "work_item" (a work-group per strip,
-        an item per receiver, for GPUs), or "auto".
+        "vector" (a work-item for several strips, 16 boxes at once, for CPU runtimes), "work_item" (a work-group per
+        strip, a work-item per receiver, for GPUs), or "auto".
 
     Raises
     ------
     TypeError, ValueError
-        A parameter is not what is said here.
+        A parameter has a wrong type or lies outside its range.
 
-    Notes
-    -----
-    Light of the visible parts by the closed form, with the errors of `LineIrradiance`. An edge of a shadow is right to
-    some roundings of places (relative to the scene's size, 1e-7 or 2e-16) seen from the receiver over the edge's
-    distance from it: it moves along a segment by e D / d, if the place of an edge at distance d is off by e and the
-    segment is D away.
+    Notes ----- The visible parts are summed by the closed form, with the errors of `LineIrradiance`. The edge of a
+    shadow moves along a segment by e D / d, if the occluding edge at distance d from the receiver is off by e and the
+    segment is D away; e is a few roundings of positions, 1e-7 or 2e-16 of the scene's size.
     """
 
-    Result: ClassVar[type[Any]] = ReceivedLight
+    Result: ClassVar[type[Any]] = StripIrradiance
 
     scene: Scene
     segments: int
-    picks: int | None = None
+    selected: int | None = None
     visibility: Visibility = "intervals"
     samples: int = 64
     clearance: float | None = None
@@ -122,8 +132,8 @@ class OccludedIrradiance(VisionOperation[ReceivedLight]):
 
     def __post_init__(self) -> None:
         _check_scene(self.scene, self.clearance)
-        for name in ("segments", "samples", "picks"):
-            if name != "picks" or self.picks is not None:
+        for name in ("segments", "samples", "selected"):
+            if name != "selected" or self.selected is not None:
                 integer(getattr(self, name), f"OccludedIrradiance.{name}", minimum=1, maximum=2**31 - 1)
         if self.visibility not in ("intervals", "rays", "none"):
             raise ValueError(
@@ -147,12 +157,12 @@ class OccludedIrradiance(VisionOperation[ReceivedLight]):
             "WIDE_PLACES": device.has_double,
             "INTERVALS": self.visibility == "intervals",
             "RAYS": self.visibility == "rays",
-            "PICKED": self.picks is not None,
+            "SELECTED": self.selected is not None,
         }
         inputs: list[Spec] = [(shape, dtype), ((strips, each, 2), dtype), ((self.segments, 10), dtype)]
-        if self.picks is not None:
+        if self.selected is not None:
             integers = np.dtype(np.int32)
-            inputs += [((strips * -(-each // PICK_BLOCK) + 1,), integers), ((self.picks,), integers)]
+            inputs += [((strips * -(-each // SELECTION_BLOCK) + 1,), integers), ((self.selected,), integers)]
         return Launch(
             source="occluded_irradiance/occluded_irradiance.cl",
             kernel="occluded_irradiance",
@@ -177,7 +187,7 @@ class OccludedIrradiance(VisionOperation[ReceivedLight]):
                 np.uint32(self.samples),
                 np.uint32(each),
                 np.uint32(self.segments),
-                np.uint32(self.picks or 0),
+                np.uint32(self.selected or 0),
                 np.uint32(strips),
             ],
             global_size=(shares if strip else strips * _GROUP,),
@@ -186,19 +196,19 @@ class OccludedIrradiance(VisionOperation[ReceivedLight]):
 
 
 def segment_rows(segments: LitSegments, room: int | None = None) -> npt.NDArray[np.float64]:
-    """Return segments as `OccludedIrradiance` takes them, (room, 10); rows of no exitance behind them.
+    """Return segments as rows for `OccludedIrradiance`, (room, 10): start, end, normal, exitance.
 
     Parameters
     ----------
     segments
-        What is lit.
+        The emitters.
     room
-        How many rows; None: as many as there are segments.
+        Number of rows; rows behind the segments have no exitance. None: as many rows as segments.
 
     Raises
     ------
     ValueError
-        There are more segments than that.
+        There are more segments than rows.
     """
     count = len(segments.exitance)
     rows = np.zeros((count if room is None else room, 10))

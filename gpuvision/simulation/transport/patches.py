@@ -1,4 +1,4 @@
-"""Patches of a scene, each of one exitance, and the light from them: exact form factors of points and polygons."""
+"""Patches of a scene with constant exitance, and exact form factors from points to their triangles."""
 
 from __future__ import annotations
 
@@ -10,53 +10,65 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    Launch,
+    Precision,
+    StatusArray,
+    Variant,
+    real_defines,
+    real_of,
+    uses_vectors,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import Irradiance
-from gpuvision.simulation.transport.patch_meshing import cut, in_two
+from gpuvision.simulation.transport.patch_meshing import bisect_triangles, mesh_scene
 
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 R = TypeVar("R", bound=tuple[Any, ...])
 _LANES, _GROUP = 16, 64
-# What rounding may lift a surface above itself, in units in the last place of the largest coordinate.
+# In roundings of the largest coordinate: height up to which a receiver counts as in a triangle's plane, and default
+# clearance of rays.
 _LIFT, _CLEARANCE = 16.0, 64.0
-# Of patches of many triangles, so many of the largest say what arrives; a few give three points each.
+# Quadrature: a patch of fewer triangles gets three nodes on each, a larger one the centroids of so many of its largest.
 _TRIANGLES_PER_PATCH = 4
+# Nodes of Gauss' rule of second degree on a triangle, in barycentric coordinates.
 _THREE_POINTS = np.array([[4.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 4.0]]) / 6.0
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Triangles that send diffuse light from their front, some to a patch; compared by identity.
+    """Patches of one or more triangles that emit diffuse light from their front; compared by identity.
 
     Parameters
     ----------
     corners
-        (m, 3, 3), metres; they turn left seen from the front.
+        (m, 3, 3): triangles [m], corners counter-clockwise seen from the front.
     patch
-        (m,) integers, ascending from 0 without a gap: which patch each triangle belongs to; each its own if left out.
+        (m,) integers, ascending from 0 without a gap: patch of each triangle. Default: one patch per triangle.
     origin
-        (m,) integers: which triangle of a scene each is a part of; the triangles themselves if left out.
+        (m,) integers: triangle of a scene that each triangle is a part of. Default: the triangle's own index.
     slack
-        (count,), metres: how far before a patch nothing occludes it, because it stands for a surface there; 0 if left
-        out.
-    looked_at
-        Receivers (r, 6), their patches, and their weights (r,), 1 together for a patch: where to look at what arrives
-        on some patches, instead of on their own triangles (`points`).
+        (count,) metres: distance before a patch within which nothing occludes it, because the patch stands for a
+        surface there. Default 0.
+    nodes
+        Receivers (r, 6), their patches (r,), and weights (r,) that add up to 1 for each patch: quadrature nodes for the
+        light that arrives on some patches, in place of the nodes on their own triangles (`quadrature`).
 
     Raises
     ------
     ValueError
-        Wrong shapes; corners that are not finite; a triangle without area; patches that are not numbered so.
+        A shape is wrong; a corner is not finite; a triangle has no area; the patches are not numbered as required.
     """
 
     corners: Reals
     patch: npt.NDArray[Any] | None = None
     origin: npt.NDArray[Any] | None = None
     slack: npt.NDArray[Any] | None = None
-    looked_at: tuple[Reals, Integers, Reals] | None = None
+    nodes: tuple[Reals, Integers, Reals] | None = None
 
     def __post_init__(self) -> None:
         corners = np.array(self.corners, np.float64)
@@ -87,53 +99,54 @@ class Patches:
             raise ValueError(f"Patches: triangle {int(np.argmax(flat))} has no area")
 
     @classmethod
-    def of(cls, scene: Scene, *, size: float, both_sides: bool | None = None) -> Patches:
-        """Cut a scene's triangles until no edge is longer than ``size``, and join small ones.
+    def from_scene(cls, scene: Scene, *, size: float, both_sides: bool | None = None) -> Patches:
+        """Divide a scene's triangles until no edge is longer than ``size``, and join small triangles.
 
-        Triangles are halved at their longest edge, so that long thin ones give few patches. What is less than half the
-        size is joined where it hangs together, of one material, in one cell of that size, and faces roughly one way.
-        More than eight triangles so joined, if they are nearly flat, are replaced by an octagon of their area, so that
-        a fine mesh costs no more than a coarse one; light on it is still looked at on the triangles themselves.
+        Triangles are halved at their longest edge, so that long thin ones give few patches. Triangles smaller than half
+        the size are joined where they are connected, have one material, lie in one cell of that size, and face roughly
+        one way. More than eight triangles joined so are replaced by an octagon of the same area if they are nearly
+        flat, so that a fine mesh costs no more than a coarse one; the light that arrives is still sampled on the
+        triangles.
 
         Parameters
         ----------
         scene
-            Its degenerate triangles are left out.
+            Surfaces; degenerate triangles are left out.
         size
-            Metres.
+            Largest edge of a patch [m], more than 0.
         both_sides
-            Whether the back of every triangle is a surface, too. None: but for closed surfaces that have their front
-            outside, seen from outside.
+            Whether the back of every triangle is a surface, too. None: all backs except those of closed surfaces whose
+            front is outside.
 
         Raises
         ------
         ValueError
-            The size is no length.
+            The size is not a positive number, or the scene has no triangles.
         """
         if not (math.isfinite(size) and size > 0.0):
-            raise ValueError(f"Patches.of: size is {size!r}, expected metres, more than 0")
+            raise ValueError(f"Patches.from_scene: size is {size!r}, expected metres, more than 0")
         if not len(scene.bvh.numbers):
-            raise ValueError("Patches.of: the scene has no triangles")
-        return cls(*cut(scene, size, both_sides))
+            raise ValueError("Patches.from_scene: the scene has no triangles")
+        return cls(*mesh_scene(scene, size, both_sides))
 
     @property
     def count(self) -> int:
-        """How many patches."""
+        """Number of patches."""
         return int(self._patch[-1]) + 1
 
     @functools.cached_property
     def area(self) -> Reals:
-        """(count,), m^2."""
+        """Areas of the patches, (count,) [m^2]."""
         return np.asarray(np.bincount(self._patch, self._areas), np.float64)
 
     @functools.cached_property
-    def points(self) -> tuple[Reals, Integers, Reals]:
-        """Where the light that arrives on patches is looked at: receivers (r, 6), their patches, their weights (r,).
+    def quadrature(self) -> tuple[Reals, Integers, Reals]:
+        """Quadrature nodes for the light that arrives on patches: receivers (r, 6), their patches (r,), weights (r,).
 
-        As given; else three points of each triangle, by Gauss, or of patches of more than three triangles the centroids
-        of the largest.
+        The given `nodes`; else Gauss' three nodes on each triangle, or the centroids of the largest triangles for
+        patches of more than three.
         """
-        given = (np.zeros((0, 6)), np.zeros(0, np.int64), np.zeros(0)) if self.looked_at is None else self.looked_at
+        given = (np.zeros((0, 6)), np.zeros(0, np.int64), np.zeros(0)) if self.nodes is None else self.nodes
         has_own = np.isin(self._patch, given[1])
         order = np.lexsort((-self._areas, self._patch))
         rank = np.arange(len(order)) - np.searchsorted(self._patch, self._patch)
@@ -151,13 +164,18 @@ class Patches:
 
     @functools.cached_property
     def normals(self) -> Reals:
-        """(m, 3), of unit length, to the triangles' front."""
+        """Unit normals on the front of the triangles, (m, 3)."""
         return self._area_vectors / (2.0 * self._areas[:, None])
 
-    def halved(self, wanted: npt.NDArray[np.bool_]) -> Patches:
-        """Cut the triangles of some patches (count,) in two at their longest edge, each half a patch of its own.
+    def bisected(self, wanted: npt.NDArray[np.bool_]) -> Patches:
+        """Return the patches with the triangles of chosen patches halved at their longest edge.
 
-        Patches that stand for others' triangles (`looked_at`) stay as they are.
+        Each half becomes a patch of its own. Patches with given `nodes` stay as they are.
+
+        Parameters
+        ----------
+        wanted
+            (count,) bool: patches to halve.
 
         Raises
         ------
@@ -165,21 +183,21 @@ class Patches:
             ``wanted`` has another shape.
         """
         if np.shape(wanted) != (self.count,):
-            raise ValueError(f"Patches.halved takes which patches, ({self.count},), got shape {np.shape(wanted)}")
+            raise ValueError(f"Patches.bisected takes which patches, ({self.count},), got shape {np.shape(wanted)}")
         apart = np.array(wanted, bool)
-        if self.looked_at is not None:
-            apart[self.looked_at[1]] = False
-        cut_up = apart[self._patch]
-        halves = in_two(self.corners[cut_up])
+        if self.nodes is not None:
+            apart[self.nodes[1]] = False
+        is_bisected = apart[self._patch]
+        halves = bisect_triangles(self.corners[is_bisected])
         number = np.cumsum(~apart) - 1
         first = int(np.count_nonzero(~apart))
-        looked_at = self.looked_at
+        nodes = self.nodes
         return Patches(
-            np.concatenate([self.corners[~cut_up], halves]),
-            np.concatenate([number[self._patch[~cut_up]], first + np.arange(len(halves))]),
-            np.concatenate([self._origin[~cut_up], np.tile(self._origin[cut_up], 2)]),
-            np.concatenate([self._slack[~apart], np.repeat(self._slack[self._patch[cut_up]], 2)]),
-            None if looked_at is None else (looked_at[0], number[looked_at[1]], looked_at[2]),
+            np.concatenate([self.corners[~is_bisected], halves]),
+            np.concatenate([number[self._patch[~is_bisected]], first + np.arange(len(halves))]),
+            np.concatenate([self._origin[~is_bisected], np.tile(self._origin[is_bisected], 2)]),
+            np.concatenate([self._slack[~apart], np.repeat(self._slack[self._patch[is_bisected]], 2)]),
+            None if nodes is None else (nodes[0], number[nodes[1]], nodes[2]),
         )
 
     @property
@@ -211,22 +229,22 @@ class Patches:
 
 
 class Factors(NamedTuple):
-    """Which parts of the patches' exitances reach receivers.
+    """Form factors from receivers to patches.
 
     Attributes
     ----------
     factors
-        (..., count): irradiance over exitance; NaN where the status is not OK.
+        float (..., count): irradiance of the receiver over exitance of the patch; NaN where the status is not OK.
     status
-        uint8 `Status` flags, (...,): NOT_FINITE (a number of the receiver is not, or its normal is zero).
+        uint8 `Status` flags, (...,): NOT_FINITE (a component of the receiver is not finite, or its normal is zero).
     """
 
-    factors: Any
-    status: Any
+    factors: FloatArray
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
-class _FromPatches(VisionOperation[R]):
+class _PatchOperation(VisionOperation[R]):
     patches: Patches
     scene: Scene | None = None
     rays: float = 256.0
@@ -302,45 +320,47 @@ class _FromPatches(VisionOperation[R]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FormFactors(_FromPatches[Factors]):
-    """Form factors of receivers and patches: ``op(receivers) -> Factors``, receivers float32 or float64 (..., 6).
+class FormFactors(_PatchOperation[Factors]):
+    """Form factors from receivers to patches: ``op(receivers) -> Factors``, receivers float32 or float64 (..., 6).
 
-    A receiver is a place in metres and a normal of any length. What lies behind its plane does not count, nor does a
-    patch from behind.
+    A receiver is a position [m] and a normal of any length. Parts of a patch behind the receiver's plane do not count,
+    nor does the back of a patch.
 
     Parameters
     ----------
     patches
-        What shines.
+        Emitters.
     scene
-        What may stand between; None: nothing does (the inside of a convex room).
+        Triangles that may occlude; None: nothing occludes (the inside of a convex room).
     rays
-        To a triangle of form factor F go ceil(sqrt(rays F))^2 rays, 1 to 256, so a receiver casts few more than it sees
-        triangles.
+        Rays per unit of form factor: a triangle of form factor F gets ceil(sqrt(rays F))^2 rays, 1 to 256. Default 256.
     clearance
-        Metres from either end of a ray within which nothing occludes; None: 64 roundings of the largest coordinate.
+        Distance from either end of a ray within which nothing occludes [m]; None: 64 roundings of the largest
+        coordinate.
     precision
-        Of the arithmetic and the outputs; None follows the input.
+        Precision of arithmetic and outputs; None follows the input.
     variant
         "vector" (16-wide vectors, for CPU runtimes), "work_item" (a work-item per receiver, for GPUs), or "auto".
 
     Raises
     ------
     TypeError, ValueError
-        A parameter is not what is said here.
+        A parameter has a wrong type or lies outside its range.
 
-    Notes
-    -----
-    Lambert's sum over the edges of each triangle, cut at the receiver's plane, in a form that does not cancel for
-    triangles that are small beside their distance (kernels/patches/patches.h). The error is below 32 f (s + c / d + c /
-    h) roundings: f is the factor that a receiver in that place would have if it faced the triangle best, s the longest
-    edge over the smallest altitude, c the distance of the farthest corner, d that of the nearest line through an edge,
-    h the height above the triangle. Heights of less than 16 roundings of the largest coordinate count as in its plane,
-    where the factor is 0.
+    Notes ----- Lambert's sum over the edges of each triangle, clipped at the receiver's plane, in a form without
+    cancellation for triangles that are small beside their distance (kernels/patches/patches.h). The error is below 32 f
+    (s + c / d + c / h) roundings: f is the factor that a receiver in that position would have if it faced the triangle
+    best, s the longest edge over the smallest altitude, c the distance of the farthest corner, d that of the nearest
+    line through an edge, h the height above the triangle. Below a height of 16 roundings of the largest coordinate the
+    receiver counts as in the triangle's plane, where the factor is 0. The tests hold these limits.
 
-    Rays go to the middles of equal fields of what of a triangle lies above the receiver's plane; the part of them that
-    get through, weighted by what they carry, times the exact factor is the answer. A triangle that is seen whole or not
-    at all is exact; half-hidden ones are off by about F / sqrt(rays F) each, either way.
+    Rays go to the middles of equal cells of the part of a triangle above the receiver's plane. The share of them that
+    reach it, weighted by the cells' factors, times the exact factor is the result. A triangle that is entirely visible
+    or entirely hidden is exact; the error of a partly hidden one is about F / sqrt(rays F), an estimate and not a
+    bound.
+
+    References ---------- D. R. Baum, H. E. Rushmeier and J. M. Winget, *Improving radiosity solutions through the use
+    of analytically determined form-factors*, SIGGRAPH 1989, for the sum over edges (Lambert 1760).
     """
 
     Result: ClassVar[type[Any]] = Factors
@@ -353,11 +373,11 @@ class FormFactors(_FromPatches[Factors]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PatchLight(_FromPatches[Irradiance]):
-    """Light from patches: ``op(receivers, exitance) -> Irradiance``, receivers (..., 6), exitance (count,) in W/m^2.
+class PatchLight(_PatchOperation[Irradiance]):
+    """Irradiance by patches: ``op(receivers, exitance) -> Irradiance``, receivers (..., 6), exitance (count,) [W/m^2].
 
-    The sum of `FormFactors` times exitances, without the matrix; the exitance is of the type of the arithmetic.
-    Parameters, what is raised and errors are those of `FormFactors`.
+    The sum of `FormFactors` times exitances without the matrix. The exitance has the type of the arithmetic.
+    Parameters, exceptions and errors are those of `FormFactors`.
     """
 
     Result: ClassVar[type[Any]] = Irradiance

@@ -1,4 +1,4 @@
-"""Light that went from surface to surface more than once: all bounces at once, solved for, not summed."""
+"""Radiosity: diffuse interreflection between patches of a scene, all bounces in one linear solve."""
 
 from __future__ import annotations
 
@@ -19,57 +19,93 @@ from gpuvision.simulation.transport.patches import FormFactors, Patches, PatchLi
 
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
-# Receivers whose rows of the matrix stand in memory at a time; quadratures come in multiples of the smaller number, so
-# that few shapes are bound.
-_ROWS, _ROUND = 2048, 128
+# Receivers whose form factors are in memory at a time. Batches are padded to multiples of the second number, so that
+# few kernels are bound.
+_ROWS_PER_BATCH, _ROW_MULTIPLE = 2048, 128
+# Gauss-Legendre nodes of a segment: a base number, and more per patch size of its length.
 _NODES_PER_SEGMENT, _NODES_PER_PATCH = 8, 2.0
-# Of patches: segments below that are points, and points within that are one.
-_SHORT = 0.0625
-_TOLERANCE, _ROUNDS = 3e-6, 400
-# Roundings of the scene's extent around a place within which nothing covers it, and which part of a view is none.
-_CLEARANCE, _NOTHING = 64.0, 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class RadiosityLimits:
+    """Numerical limits of `Radiosity`.
+
+    Attributes
+    ----------
+    short_segment
+        Segments shorter than this part of a patch's size count as points, and points within it as one; chosen.
+    tolerance
+        Relative residual at which GMRES stops; measured: the exitances then agree with the factored solution within
+        3e-5 (tests).
+    max_iterations
+        Largest number of GMRES iterations.
+    least_condition
+        Reciprocal condition number of the matrix, in roundings, below which there is no steady state.
+    clearance
+        Distance from a point within which nothing covers it, in roundings of the scene's extent.
+    covered_view
+        Part of a point's view below which fronts of surfaces count as not seen: the point is inside a body.
+    close_factor
+        Form factor from which on `refine_corners` halves a patch: the light on it is not nearly that in its middle.
+    """
+
+    short_segment: float = 0.0625
+    tolerance: float = 3e-6
+    max_iterations: int = 400
+    least_condition: float = 1e3
+    clearance: float = 64.0
+    covered_view: float = 0.01
+    close_factor: float = 0.15
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Radiosity:
-    """Diffuse light between the patches of a scene, every bounce of it; compared by identity.
+    """Radiosity solution between the patches of a scene; compared by identity.
 
-    The irradiances E and exitances B of patches satisfy B = albedo (E0 + F B), E0 being what arrives straight from the
-    light. This is solved, not summed: albedos up to 1 are no harder than others as long as light can get out.
+    The irradiance E and the exitance B of the patches satisfy B = albedo (E0 + F B), with the form factors F and the
+    irradiance E0 that arrives straight from the light. The linear system is solved, the bounces are not summed: an
+    albedo of 1 is no harder than others as long as light can leave the scene.
 
     Parameters
     ----------
     patches
-        The surfaces that light goes between.
+        Surfaces that exchange light.
     albedo
-        (count,), of each patch, 0 to 1.
+        (count,): albedo of each patch, 0 to 1.
     scene
-        What may stand between; None: nothing does (the inside of a convex room).
+        Triangles that may occlude; None: nothing occludes (the inside of a convex room).
     device
-        Where form factors are computed, in double where it can; None takes `Device.best`.
-    dense
-        Up to so many patches the matrix is kept in double and factored, once for all lights; beyond, in single, four
-        bytes for a pair of patches, and each light is solved for by iteration (GMRES, to 3e-6).
+        Device of the form factors, in double where it has it; None: `Device.best`.
+    max_dense
+        Up to this number of patches the matrix is kept in double and factored once for all lights. With more patches it
+        is kept in single, four bytes per pair of patches, and each light is solved iteratively (GMRES). Default 4096.
+    limits
+        Numerical limits.
 
     Raises
     ------
     TypeError, ValueError
-        A parameter is not what is said here.
+        A parameter has a wrong type or lies outside its range.
 
-    Notes
-    -----
-    Exitances that are constant on a patch, arriving light that is averaged over three points of it, and exact form
-    factors: in a closed convex room each point's factors add to 1 to rounding, so that no light appears or is lost
-    however often it bounces. Errors are of second order in the patches' size where the light is smooth, of first order
-    at shadow edges. Beside a lit line that runs into a wall light goes as 1 / distance: `arrival` is the exact mean
-    over each patch, and `graded` patches follow what is in corners.
+    Notes ----- Exitance is constant on a patch, arriving light is averaged over three nodes of it, form factors are
+    exact apart from partly hidden triangles (`FormFactors`). In a closed convex room the factors of each point add up
+    to 1 to rounding, so that energy is conserved for any number of bounces. Errors are of second order in the patches'
+    size where the light is smooth, of first order at shadow edges. Beside a lit line that runs into a wall light grows
+    as 1 / distance: `direct_irradiance` is the exact mean over each patch, and `refine_corners` makes the patches in
+    corners smaller.
+
+    References
+    ----------
+    C. M. Goral et al., *Modeling the interaction of light between diffuse surfaces*, SIGGRAPH 1984.
+    M. F. Cohen and J. R. Wallace, *Radiosity and Realistic Image Synthesis*, Academic Press 1993.
     """
 
     patches: Patches
     albedo: npt.NDArray[Any]
     scene: Scene | None = None
     device: Device | None = None
-    dense: int = 4096
+    max_dense: int = 4096
+    limits: RadiosityLimits = RadiosityLimits()
 
     def __post_init__(self) -> None:
         if not isinstance(self.patches, Patches):
@@ -85,111 +121,132 @@ class Radiosity:
         object.__setattr__(self, "device", Device.best() if self.device is None else self.device)
 
     @classmethod
-    def of(
+    def from_scene(
         cls,
         scene: Scene,
         albedo: Sequence[float],
         *,
         size: float,
-        grades: int = 0,
+        refinements: int = 0,
         both_sides: bool | None = None,
         device: Device | None = None,
-        dense: int = 4096,
+        max_dense: int = 4096,
+        limits: RadiosityLimits = RadiosityLimits(),
     ) -> Radiosity:
-        """Cut a scene into patches of such a size, albedos being those of its materials.
+        """Divide a scene into patches of a size, with the albedos of its materials.
 
         Parameters
         ----------
         scene, albedo
             The scene, and an albedo for every number in `Scene.material`.
         size, both_sides
-            As of `Patches.of`; metres.
-        grades
-            How often patches that stand close to each other for their size are halved: in corners (`graded`).
-        device, dense
+            As of `Patches.from_scene`; size in metres.
+        refinements
+            Number of times that patches close to others are halved (`refine_corners`). Default 0.
+        device, max_dense, limits
             As of `Radiosity`.
 
         Raises
         ------
         ValueError
-            A parameter is not what is said here.
+            A parameter lies outside its range, or an albedo is missing.
         """
-        patches = Patches.of(scene, size=size, both_sides=both_sides)
-        if grades:
-            patches = graded(patches, grades, scene, device=device)
+        patches = Patches.from_scene(scene, size=size, both_sides=both_sides)
+        if refinements:
+            patches = refine_corners(patches, refinements, scene, device=device, limits=limits)
         of_material = np.asarray(albedo, np.float64)
         first = np.searchsorted(np.asarray(patches.patch), np.arange(patches.count))
         material = np.asarray(scene.material)[np.asarray(patches.origin)[first]]
         if of_material.ndim != 1 or len(of_material) <= material.max():
-            raise ValueError(f"Radiosity.of: {of_material.size} albedos for {material.max() + 1} materials")
-        return cls(patches=patches, albedo=of_material[material], scene=scene, device=device, dense=dense)
+            raise ValueError(f"Radiosity.from_scene: {of_material.size} albedos for {material.max() + 1} materials")
+        return cls(
+            patches=patches,
+            albedo=of_material[material],
+            scene=scene,
+            device=device,
+            max_dense=max_dense,
+            limits=limits,
+        )
 
-    def arrival(self, lit: LitSegments) -> Reals:
-        """Return (count,) W/m^2: the mean irradiance of what is free of each patch, straight from lit segments.
+    def direct_irradiance(self, lit: LitSegments) -> Reals:
+        """Return the mean irradiance of the free area of each patch by lit segments, (count,) [W/m^2].
 
-        What a patch gets from a point of a line is the point's form factor with the patch, so the mean over the patch
-        needs no samples on it: only along the line.
+        The power that a patch gets from a point of a line is the point's power times its form factor to the patch. So
+        the mean over the patch needs no nodes on it, only along the line.
         """
-        receivers, power = _samples(lit, math.sqrt(float(np.median(self.patches.area))))
+        size = math.sqrt(float(np.median(self.patches.area)))
+        receivers, power = _line_samples(lit, size, self.limits.short_segment)
         got = np.zeros(self.patches.count)
-        for rows, begin in self._rows(receivers):
+        for rows, begin in self._form_factor_rows(receivers):
             got += power[begin : begin + len(rows)] @ rows
         area = self._surface.area
         return np.where(area > 0.0, got / np.where(area > 0.0, area, 1.0), 0.0)
 
-    def exitance(self, arrival: npt.ArrayLike) -> Reals:
-        """Return (count,) W/m^2: what leaves each patch of the light that arrives first as ``arrival``, all bounces.
+    def solve(self, arrival: npt.ArrayLike) -> Reals:
+        """Return the exitance of each patch after all bounces, (count,) [W/m^2].
+
+        Parameters
+        ----------
+        arrival
+            (count,): irradiance straight from the light [W/m^2].
 
         Raises
         ------
         ValueError
-            Wrong shape; or no steady state is near: no light gets out of the scene, and none is absorbed.
+            The shape is wrong; or there is no steady state: no light leaves the scene and hardly any is absorbed.
         """
         first = np.asarray(arrival, np.float64)
         if first.shape != (self.patches.count,) or not np.isfinite(first).all():
             raise ValueError(f"Radiosity.exitance takes finite irradiances ({self.patches.count},), got {first.shape}")
-        return self._solved(self.albedo * first)
+        return self._solve_system(self.albedo * first)
 
-    def light(self, receivers: npt.NDArray[Any], exitance: npt.NDArray[Any], *, leave_out: float = 0.0) -> Irradiance:
-        """Return what receivers (..., 6), float32 or float64, get from patches of such exitances, by `PatchLight`.
+    def irradiance(
+        self, receivers: npt.NDArray[Any], exitance: npt.NDArray[Any], *, min_exitance: float = 0.0
+    ) -> Irradiance:
+        """Return the irradiance of receivers by the patches, as `PatchLight` does.
 
         Parameters
         ----------
-        leave_out
-            Patches of less exitance are left out [W/m^2]. No receiver gets less by more than that: form factors add to
-            1 at most.
+        receivers
+            (..., 6), float32 or float64: position [m] and normal.
+        exitance
+            (count,): exitance of the patches [W/m^2].
+        min_exitance
+            Patches of less exitance are left out [W/m^2]. With exact visibility no receiver loses more than this,
+            because its form factors to patches that do not overlap add up to at most 1; sampled visibility
+            (`FormFactors`) may exceed that.
         """
         operation = PatchLight(patches=self.patches, scene=self.scene)
         real = np.float64 if receivers.dtype == np.float64 else np.float32
-        strong = np.where(exitance >= leave_out, exitance, 0.0).astype(real)
+        strong = np.where(exitance >= min_exitance, exitance, 0.0).astype(real)
         return operation(receivers, strong, device=self.device)
 
     @functools.cached_property
-    def factors(self) -> Reals:
-        """(count, count): which part of each column's exitance arrives on the row's patch."""
+    def form_factors(self) -> Reals:
+        """Form factors (count, count): share of the column's exitance that arrives on the row's patch."""
         return self._matrix(np.float64)
 
     def _matrix(self, kind: Any) -> npt.NDArray[Any]:
         points, owner, weight, _ = self._surface
         matrix = np.zeros((self.patches.count, self.patches.count), kind)
-        for rows, begin in self._rows(points):
+        for rows, begin in self._form_factor_rows(points):
             own, share = owner[begin : begin + len(rows)], weight[begin : begin + len(rows), None]
             starts = np.flatnonzero(np.diff(own, prepend=-1))
             matrix[own[starts]] += np.add.reduceat(share * rows, starts, axis=0)
         return matrix
 
-    def _rows(self, receivers: Reals) -> Iterator[tuple[Reals, int]]:
-        """Yield form factors of some receivers after others, and the number of their first."""
+    def _form_factor_rows(self, receivers: Reals) -> Iterator[tuple[Reals, int]]:
+        """Yield form factors of batches of receivers, and the index of each batch's first receiver."""
         operation, real = FormFactors(patches=self.patches, scene=self.scene), self._real
-        for begin in range(0, len(receivers), _ROWS):
-            some = receivers[begin : begin + _ROWS]
-            padded = np.resize(some, (-(-len(some) // _ROUND) * _ROUND, 6)).astype(real)
+        for begin in range(0, len(receivers), _ROWS_PER_BATCH):
+            some = receivers[begin : begin + _ROWS_PER_BATCH]
+            padded = np.resize(some, (-(-len(some) // _ROW_MULTIPLE) * _ROW_MULTIPLE, 6)).astype(real)
             yield operation(padded, device=self.device).factors[: len(some)].astype(np.float64), begin
 
     @functools.cached_property
     def _surface(self) -> _Surface:
-        """What of the patches can be lit: not where a body stands on them."""
-        points, owner, weight = self.patches.points
+        """Quadrature nodes and areas of the patches without the parts that another body covers."""
+        points, owner, weight = self.patches.quadrature
         if self.scene is None:
             return _Surface(points, owner, weight, self.patches.area)
         covered = self._is_covered(self.scene, points)
@@ -198,8 +255,9 @@ class Radiosity:
         return _Surface(points, owner, weight / part[owner], self.patches.area * part)
 
     def _is_covered(self, scene: Scene, points: Reals) -> npt.NDArray[np.bool_]:
-        """Whether all that places see is backs of surfaces: they are inside of something."""
-        clearance = _CLEARANCE * float(np.finfo(self._real).eps) * float(np.ptp(scene.bvh.corners, axis=(0, 1)).max())
+        """Return whether points see only backs of surfaces: such points are inside a body."""
+        extent = float(np.ptp(scene.bvh.corners, axis=(0, 1)).max())
+        clearance = self.limits.clearance * float(np.finfo(self._real).eps) * extent
         hit = ClosestHit(scene=scene, clearance=clearance)(points.astype(self._real), device=self.device).triangle
         a, b, c = np.moveaxis(scene.corners[hit], 1, 0)
         behind = np.flatnonzero((hit >= 0) & (np.sum(np.cross(b - a, c - a) * points[:, 3:], axis=1) > 0.0))
@@ -207,7 +265,7 @@ class Radiosity:
         light = PatchLight(patches=self.patches, scene=scene)
         seen = light(np.ascontiguousarray(points[behind], self._real), everything, device=self.device).irradiance
         covered = np.zeros(len(points), bool)
-        covered[behind] = seen < _NOTHING
+        covered[behind] = seen < self.limits.covered_view
         return covered
 
     @property
@@ -215,32 +273,32 @@ class Radiosity:
         assert self.device is not None
         return np.float64 if self.device.has_double else np.float32
 
-    def _solved(self, emitted: Reals) -> Reals:
-        if self.patches.count > self.dense:
-            return self._iterated(emitted)
+    def _solve_system(self, emitted: Reals) -> Reals:
+        if self.patches.count > self.max_dense:
+            return self._solve_iteratively(emitted)
         from scipy.linalg import lu_solve
 
         factored, condition = self._factored
-        if condition < 1e3 * float(np.finfo(self._real).eps):
-            raise ValueError(_NO_WAY_OUT)
+        if condition < self.limits.least_condition * float(np.finfo(self._real).eps):
+            raise ValueError(_NO_STEADY_STATE)
         return np.asarray(lu_solve(factored, emitted))
 
     @functools.cached_property
     def _factored(self) -> tuple[Any, float]:
-        """The factored matrix, and one over its condition."""
+        """Factored matrix I - albedo F, and the reciprocal of its condition number."""
         from scipy.linalg import lapack, lu_factor
 
-        matrix = np.eye(self.patches.count) - self.albedo[:, None] * self.factors
+        matrix = np.eye(self.patches.count) - self.albedo[:, None] * self.form_factors
         norm = float(np.abs(matrix).sum(axis=0).max())
         factored = lu_factor(matrix, overwrite_a=True, check_finite=False)
         return factored, float(lapack.dgecon(factored[0], norm)[0])
 
     @functools.cached_property
     def _compact(self) -> npt.NDArray[np.float32]:
-        """The factors in single precision: half of the memory, for scenes of many patches."""
+        """Form factors in single precision: half of the memory, for scenes of many patches."""
         return self._matrix(np.float32)
 
-    def _iterated(self, emitted: Reals) -> Reals:
+    def _solve_iteratively(self, emitted: Reals) -> Reals:
         from scipy.sparse.linalg import LinearOperator, gmres
 
         size, factors = self.patches.count, self._compact
@@ -249,14 +307,15 @@ class Radiosity:
             return np.asarray(exitance - self.albedo * (factors @ exitance.astype(np.float32)))
 
         operator = LinearOperator((size, size), without_bounced, dtype=np.float64)
-        solution, failed = gmres(operator, emitted, rtol=_TOLERANCE, restart=_ROUNDS, maxiter=1)
+        limits = self.limits
+        solution, failed = gmres(operator, emitted, rtol=limits.tolerance, restart=limits.max_iterations, maxiter=1)
         if failed:
-            raise ValueError(_NO_WAY_OUT)
+            raise ValueError(_NO_STEADY_STATE)
         return np.asarray(solution)
 
 
 class _Surface(NamedTuple):
-    """Receivers on patches, whose they are, their weights, and the patches' free areas (count,)."""
+    """Nodes on patches (r, 6), their patches and weights (r,), and the patches' free areas (count,)."""
 
     points: Reals
     owner: Integers
@@ -264,48 +323,56 @@ class _Surface(NamedTuple):
     area: Reals
 
 
-_NO_WAY_OUT = (
+_NO_STEADY_STATE = (
     "Radiosity: no steady state: hardly any light gets out of the scene or is absorbed; "
     "expected an opening, or an albedo below 1"
 )
-# From here on a patch sees another one too large: the light on it is not nearly that in its middle.
-_CLOSE = 0.15
 
 
-def graded(patches: Patches, times: int, scene: Scene | None = None, *, device: Device | None = None) -> Patches:
-    """Halve patches that see others close by, ``times`` times: in corners, where light changes fastest.
+def refine_corners(
+    patches: Patches,
+    times: int,
+    scene: Scene | None = None,
+    *,
+    device: Device | None = None,
+    limits: RadiosityLimits = RadiosityLimits(),
+) -> Patches:
+    """Halve patches that see others close by, ``times`` times: in corners, where the light changes fastest.
 
-    A patch is halved where a single other one fills more than 0.15 of its view, or has it fill so much of its own.
+    A patch is halved where a single other patch fills more than 0.15 of its view (`RadiosityLimits.close_factor`), or
+    where it fills as much of the other's.
 
     Parameters
     ----------
     patches
-        To begin with.
+        Patches to start from.
     times
-        How often; each computes all form factors anew.
+        Number of passes, 0 or more; each computes all form factors anew.
     scene
-        What may stand between; None: nothing does.
+        Triangles that may occlude; None: nothing occludes.
     device
-        Where; None: `Device.best`.
+        Device of the form factors; None: `Device.best`.
+    limits
+        Numerical limits.
     """
     for _ in range(times):
-        every = Radiosity(patches=patches, albedo=np.zeros(patches.count), scene=scene, device=device).factors
-        close = every > _CLOSE
-        patches = patches.halved(np.asarray(close.any(axis=1) | close.any(axis=0)))
+        every = Radiosity(patches=patches, albedo=np.zeros(patches.count), scene=scene, device=device).form_factors
+        close = every > limits.close_factor
+        patches = patches.bisected(np.asarray(close.any(axis=1) | close.any(axis=0)))
     return patches
 
 
-def _samples(lit: LitSegments, size: float) -> tuple[Reals, Reals]:
-    """Return points along segments as receivers (n, 6), and the power in W that each stands for.
+def _line_samples(lit: LitSegments, size: float, short_segment: float) -> tuple[Reals, Reals]:
+    """Return points along segments as receivers (n, 6), and the power that each stands for [W].
 
-    Long segments get the nodes of Gauss and Legendre, closer to each other towards the ends. Of those that are short
-    beside the patches, one stands for all in its neighbourhood that face roughly the same way.
+    Long segments get Gauss-Legendre nodes that are denser towards the ends. Of segments that are short beside the
+    patches, one stands for all in its neighbourhood that face roughly the same way.
     """
     length = np.linalg.norm(lit.ends[:, 1] - lit.ends[:, 0], axis=1)
     power = lit.exitance * length
-    short = (length < _SHORT * size) & (power > 0.0)
+    short = (length < short_segment * size) & (power > 0.0)
     middles = lit.ends[short].mean(axis=1)
-    keys = np.column_stack([np.floor(middles / (_SHORT * size)), np.rint(1.5 * lit.normals[short])])
+    keys = np.column_stack([np.floor(middles / (short_segment * size)), np.rint(1.5 * lit.normals[short])])
     group = np.asarray(np.unique(keys, axis=0, return_inverse=True)[1]).reshape(-1)
     powers = [np.bincount(group, power[short])]
     mean = np.column_stack([np.bincount(group, power[short] * each) for each in middles.T]) / powers[0][:, None]

@@ -1,7 +1,7 @@
-"""A sheet of light through the triangles of a scene: where it cuts them, at any transport.
+"""Cuts of a sheet of light through the triangles of a scene, at any transport.
 
-A point of the scene is ``origin + G g_axis + H h_axis + L direction``: in these coordinates the sheet at a transport L
-is a plane of constant L, and what it cuts are segments in (G, H).
+A point of the scene is ``origin + G g_axis + H h_axis + L direction``. In these coordinates the sheet at a transport L
+is the plane of constant L, and a cut through a triangle is a segment in (G, H).
 """
 
 from __future__ import annotations
@@ -22,24 +22,26 @@ from gpuvision.simulation.scene.scene import Scene
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Triangles as long as 2^-n of the longest one are sought together; the shortest with all that are shorter.
-_LEVELS = 24
-# Edges that lean out of a sheet by no more lie in it; a surface that turns by less than 0.2 rad does not end.
+# Triangles are sorted into levels of lengths along the transport, 2^-n of the longest; the last level holds all shorter
+# ones. A search then looks only a short way back in each level.
+_MAX_LEVELS = 24
+# `parallel_edges`: slope out of the sheet up to which an edge lies in it, and cosine of the angle between two triangles
+# below which their common edge is sharp (0.2 rad).
 _PARALLEL, _SMOOTH = 1e-9, math.cos(0.2)
-_known: WeakKeyDictionary[Scene, dict[tuple[object, ...], SheetIndex]] = WeakKeyDictionary()
+_INDEX_CACHE: WeakKeyDictionary[Scene, dict[tuple[object, ...], SheetIndex]] = WeakKeyDictionary()
 
 
 class Cuts(NamedTuple):
-    """Where sheets cut triangles.
+    """Segments in which sheets cut triangles.
 
     Attributes
     ----------
     sheet
-        (m,): which of the sheets.
+        int64 (m,): index of the sheet.
     triangle
-        (m,): its number in the scene.
+        int64 (m,): index of the triangle in the scene.
     ends
-        (m, 2, 2): G and H of both ends [m]. Two triangles that share an edge share the point on it to the last bit.
+        float64 (m, 2, 2): (G, H) of both ends [m]. Two triangles that share an edge get bit-equal points on it.
     """
 
     sheet: Integers
@@ -49,25 +51,25 @@ class Cuts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SheetIndex:
-    """The triangles of a scene, sorted so that those are found which a sheet cuts; compared by identity.
+    """Triangles of a scene in the transport's coordinates, sorted for the search of those that a sheet cuts.
 
-    A triangle of which a corner lies in the sheet is cut as if the sheet stood just before it; one that lies in the
-    sheet altogether is not cut.
+    A triangle with a corner in the sheet is cut as if the sheet stood just before the corner. A triangle that lies in
+    the sheet is not cut. Instances are compared by identity.
 
     Attributes
     ----------
     triangle
-        (n,): numbers in the scene, those of one length along the transport together, each such level by its start.
+        int64 (n,): indices in the scene, level by level, in a level by `start`.
     corners
-        (n, 3, 3): G, H, L of the corners.
+        float64 (n, 3, 3): (G, H, L) of the corners [m].
     start
-        (n,): the least L.
+        float64 (n,): least L of each triangle [m].
     levels
-        (levels + 1,): where each level begins.
+        int64 (levels + 1,): index of the first triangle of each level.
     length
-        (levels,): how long the triangles of a level are along the transport at most.
+        float64 (levels,): largest length along the transport of a level's triangles [m].
     material
-        (n,): of the triangles.
+        int32 (n,): material of each triangle.
     """
 
     triangle: Integers
@@ -79,41 +81,43 @@ class SheetIndex:
 
     @classmethod
     def of(cls, scene: Scene, transport: StraightTransport) -> SheetIndex:
-        """Return the index of a scene, built at the first use for every transport."""
-        mine = _known.setdefault(scene, {})
+        """Return the index of a scene for a transport. It is built at the first use and kept as long as the scene."""
+        mine = _INDEX_CACHE.setdefault(scene, {})
         key = (transport.origin, transport.g_axis, transport.h_axis, transport.direction)
         if key not in mine:
-            mine[key] = cls._built(scene, transport)
+            mine[key] = cls._build(scene, transport)
         return mine[key]
 
     @classmethod
-    def _built(cls, scene: Scene, transport: StraightTransport) -> SheetIndex:
+    def _build(cls, scene: Scene, transport: StraightTransport) -> SheetIndex:
         good = np.ones(len(scene.corners), bool)
         good[[*scene.defects.not_finite, *scene.defects.degenerate]] = False
         axes = np.linalg.inv(np.array([transport.g_axis, transport.h_axis, transport.direction]))
         x, y, z = np.moveaxis(np.where(good[:, None, None], scene.corners, 0.0) - transport.origin, -1, 0)
-        # Not as a product of matrices: what a corner becomes must not hang on where it stands in the array.
+        # Not a matrix product: its rounding can depend on the position in the array, and shared corners must stay
+        # equal.
         corners = np.stack([x * a + y * b + z * c for a, b, c in axes.T], axis=-1)
         start, end = corners[..., 2].min(axis=1), corners[..., 2].max(axis=1)
         length = end - start
         chosen = np.flatnonzero(good & (length > 0.0))
         longest = float(length[chosen].max(initial=0.0)) or 1.0
-        level = np.clip(-np.floor(np.log2(length[chosen] / longest)), 0, _LEVELS - 1).astype(np.int64)
+        level = np.clip(-np.floor(np.log2(length[chosen] / longest)), 0, _MAX_LEVELS - 1).astype(np.int64)
         order = np.lexsort((start[chosen], level))
         chosen, level = chosen[order], level[order]
-        bounds = np.searchsorted(level, np.arange(_LEVELS + 1))
+        bounds = np.searchsorted(level, np.arange(_MAX_LEVELS + 1))
         longest_of = [float(length[chosen[a:b]].max(initial=0.0)) for a, b in itertools.pairwise(bounds)]
         assert scene.material is not None  # set by Scene itself
         material = scene.material[chosen]
         return cls(chosen, corners[chosen], start[chosen], bounds, np.array(longest_of), material)
 
     @functools.cached_property
-    def steps(self) -> tuple[Float64, Float64]:
-        """Transports at which what a sheet lights changes at once, ascending, and how long the edges there are [m].
+    def parallel_edges(self) -> tuple[Float64, Float64]:
+        """Transports, ascending, and lengths [m] of edges in a sheet at which the lit surface changes at once.
 
-        Edges that lie in a sheet from end to end, where a surface ends, turns sharply, or changes its material.
+        An edge counts where a surface ends, turns by more than 0.2 rad, or changes its material. Edges at one transport
+        are added up.
         """
-        edges, rows = self._in_a_sheet()
+        edges, rows = self._edges_in_sheets()
         order = np.lexsort(edges.reshape(-1, 6).T)
         edges, rows = edges[order], rows[order]
         new = np.ones(len(edges), bool)
@@ -133,8 +137,11 @@ class SheetIndex:
         begin = np.flatnonzero(apart)
         return places[begin], np.add.reduceat(lengths, begin) if len(begin) else lengths
 
-    def _in_a_sheet(self) -> tuple[Float64, Integers]:
-        """Return edges that lie in a sheet, (k, 2, 3), each as often as it is used and always alike, and the rows."""
+    def _edges_in_sheets(self) -> tuple[Float64, Integers]:
+        """Return edges that lie in a sheet, (k, 2, 3), and their triangles, (k,).
+
+        An edge of two triangles is listed twice, both times in the same direction.
+        """
         edges, rows = [], []
         for n in range(3):
             both = self.corners[:, [n, (n + 1) % 3]]
@@ -148,15 +155,15 @@ class SheetIndex:
         return np.where(backward[:, None, None], whole[:, ::-1], whole), np.concatenate(rows)
 
     def cuts(self, places: npt.ArrayLike) -> Cuts:
-        """Return what the sheets at some transports (k,) [m] cut, in the order of the sheets."""
+        """Return the cuts of the sheets at transports (k,) [m], sheet by sheet."""
         places = np.atleast_1d(np.asarray(places, np.float64))
-        rows, sheet = self._near(places)
+        rows, sheet = self._candidates(places)
         corners, at = self.corners[rows], places[sheet]
         below = corners[..., 2] < at[:, None]
         count = below.sum(axis=1)
         cut = (count == 1) | (count == 2)
         rows, sheet, corners, at, below, count = (each[cut] for each in (rows, sheet, corners, at, below, count))
-        # One corner stands alone on its side; the sheet cuts the two edges from it.
+        # One corner is alone on its side of the sheet; the sheet cuts the two edges that meet in it.
         alone_below = count == 1
         alone = np.where(alone_below, np.argmax(below, axis=1), np.argmin(below, axis=1))
         each = np.arange(len(rows))
@@ -165,31 +172,31 @@ class SheetIndex:
         for n in (0, 1):
             other = corners[each, (alone + 1 + n) % 3]
             low, high = np.where(alone_below[:, None], tip, other), np.where(alone_below[:, None], other, tip)
-            ends[:, n] = _between(low, high, at)
+            ends[:, n] = _interpolate(low, high, at)
         return Cuts(sheet, self.triangle[rows], ends)
 
-    def _near(self, places: Float64) -> tuple[Integers, Integers]:
-        """Return rows that may be cut, and by which sheets."""
+    def _candidates(self, places: Float64) -> tuple[Integers, Integers]:
+        """Return indices of triangles that sheets may cut, and the index of the sheet for each."""
         first, last = [], []
         for n, length in enumerate(self.length):
             start = self.start[self.levels[n] : self.levels[n + 1]]
-            # Beyond rounding of the difference.
+            # A margin for the rounding of the difference.
             reach = length + 4.0 * np.finfo(np.float64).eps * (np.abs(places) + length)
             first.append(self.levels[n] + np.searchsorted(start, places - reach, side="left"))
             last.append(self.levels[n] + np.searchsorted(start, places, side="left"))
         begin, count = np.array(first).T.ravel(), (np.array(last) - np.array(first)).T.ravel()
-        sheet = np.repeat(np.arange(len(places)), _LEVELS)
-        return ranges(begin, count), np.repeat(sheet, count)
+        sheet = np.repeat(np.arange(len(places)), _MAX_LEVELS)
+        return concatenated_ranges(begin, count), np.repeat(sheet, count)
 
 
-def ranges(begin: Integers, count: Integers) -> Integers:
-    """Return begin[0], begin[0] + 1, ... (count[0] numbers), begin[1], ..."""
+def concatenated_ranges(begin: Integers, count: Integers) -> Integers:
+    """Return the integers ``begin[0], begin[0] + 1, ...`` (``count[0]`` of them), then from ``begin[1]``, and so on."""
     before = np.cumsum(count) - count
     return np.asarray(np.arange(int(count.sum())) + np.repeat(begin - before, count))
 
 
-def _between(low: Float64, high: Float64, at: Float64) -> Float64:
-    """Return G and H where L is ``at``, between corners of which it lies not below the first; exact in either."""
+def _interpolate(low: Float64, high: Float64, at: Float64) -> Float64:
+    """Return (G, H) where L is ``at``, between corners ``low`` and ``high``; exact at either corner."""
     whole = high[:, 2] - low[:, 2]
     up, down = (at - low[:, 2]) / whole, (high[:, 2] - at) / whole
     way = high[:, :2] - low[:, :2]

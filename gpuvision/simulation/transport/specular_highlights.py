@@ -1,4 +1,4 @@
-"""Glints: where a sheet of light falls on plane mirrors so that they throw it right into a lens."""
+"""Specular highlights: parts of the lit line whose light plane mirrors reflect straight into the lens."""
 
 from __future__ import annotations
 
@@ -7,36 +7,48 @@ import numpy.typing as npt
 
 from gpuvision.simulation.sensors.sensor_view import SensorView
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
-from gpuvision.simulation.transport.line_parts import Parts, within_reach
+from gpuvision.simulation.transport.line_parts import Parts, parts_within_radius
 
 Float64 = npt.NDArray[np.float64]
 
 
-def specular_highlights(line: LitLine, sheet: LightSheet, view: SensorView, L: float) -> Parts:
-    """Return the parts of lit segments whose light, mirrored by the triangles, goes through the lens' opening.
+def find_specular_highlights(line: LitLine, sheet: LightSheet, view: SensorView, L: float) -> Parts:
+    """Return the parts of lit segments whose light, mirrored by their triangles, passes through the lens' aperture.
 
-    The opening is a disc about the lens, square to its axis. Where mirrored rays meet its plane is a ratio of straight
-    functions along a segment, so that the ends of the parts are known: exact for a thin sheet. What is in the way is
-    not asked.
+    The aperture is a disc about the lens, perpendicular to its axis. The points in which mirrored rays meet its plane
+    are ratios of linear functions along a segment, so the ends of the parts have a closed form: exact for a thin sheet.
+    Occlusion is not considered.
+
+    Parameters
+    ----------
+    line
+        Lit segments.
+    sheet
+        Sheet of light.
+    view
+        The sensor.
+    L
+        Transport [m].
     """
     plane, weight = _crossings(line, sheet, view, L)
-    return within_reach(plane[:, 0], plane[:, 1], *(0.5 * view.aperture * weight.T))
+    return parts_within_radius(plane[:, 0], plane[:, 1], *(0.5 * view.aperture * weight.T))
 
 
 def _crossings(line: LitLine, sheet: LightSheet, view: SensorView, L: float) -> tuple[Float64, Float64]:
-    """Return where mirrored rays from both ends meet the lens' plane, from the lens, times a weight, and the weights.
+    """Return homogeneous points in which mirrored rays from both ends meet the lens' plane, and their weights.
 
-    (m, 2, 3) and (m, 2); the weight is positive where the light goes forward to the plane.
+    Points (m, 2, 3) from the lens times the weights (m, 2); a weight is positive where the light travels towards the
+    plane.
     """
     axis, normal = np.array(view.axis), line.normals[:, None]
     ends = line.ends - view.lens_at(L)
     if sheet.source is None:
-        light = -sheet.towards(line.ends)
+        light = -sheet.direction_to_light(line.ends)
         mirrored = light - 2.0 * np.sum(light * normal, axis=-1, keepdims=True) * normal
         weight = -(mirrored @ axis)
         return weight[..., None] * ends + (ends @ axis)[..., None] * mirrored, weight
-    # As if from the source's image behind the mirror.
-    source = sheet.source_of(line.ends) - view.lens_at(L)
+    # The mirrored light comes from the source's mirror image.
+    source = sheet.source_positions(line.ends) - view.lens_at(L)
     source = source + 2.0 * np.sum((ends - source) * normal, axis=-1, keepdims=True) * normal
     mirrored = ends - source
     weight = -(mirrored @ axis)

@@ -1,4 +1,4 @@
-"""Light that lit lines on mirrors throw on other surfaces: further lit lines."""
+"""Specular interreflection: lines that mirrors light on other surfaces."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ from gpuvision.simulation.scene.row_padding import run_with_row_padding
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.envelope import upper_envelope
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
-from gpuvision.simulation.transport.mirror_points import Blocks
-from gpuvision.simulation.transport.sheet_cut import ranges
+from gpuvision.simulation.transport.mirror_points import TriangleBlocks
+from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
 
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Pairs of a sheet and a block of triangles that are looked at in one go.
-_PAIRS = 2_000_000
-# Mirrored sheets that agree to so many digits, in sizes of the scene, are one.
+# Pairs of a sheet and a block of triangles in memory at once.
+_MAX_PAIRS = 2_000_000
+# Decimals, in units of the scene's reach, to which mirrored sheets agree that are one sheet (rounding with a margin).
 _DIGITS = 11
-# What is as near to the mirror, in distances of the source or sizes of the scene, lies on it.
-_ON_IT = 1e-12
-_HALVINGS = 12
+# Points nearer to a mirror than this part of the source's distance, or of the scene's reach, lie on it (rounding).
+_ON_MIRROR = 1e-12
+# Halvings of a step between two rays off a curved mirror that meet different triangles: 2^-12 of a step.
+_MAX_HALVINGS = 12
 
 
 class _Beam(NamedTuple):
-    """Lit lines, and where each one's light comes from: a source (w = 1), or a direction towards it (w = 0)."""
+    """Lit lines, and the origin of each line's light: a source (w = 1), or a direction towards the light (w = 0)."""
 
     line: LitLine
     light: Float64  # (m, 4)
@@ -39,24 +40,24 @@ class _Beam(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SpecularInterreflection:
-    """The mirrors of a scene as they throw light on; see `Mirrors.thrown`.
+    """Mirrors of a scene as reflectors of the sheet's light; used by `Mirrors.reflected_lines`.
 
     Parameters
     ----------
     scene
         All surfaces.
     reflectance
-        (n,): share that a triangle throws on.
+        (n,): share of the light that each triangle reflects specularly.
     normals
         (n, 3, 3): normals at the corners of curved triangles.
     is_curved
-        (n,): which are.
+        (n,) bool: triangles that belong to curved mirrors.
     step
-        How far apart the rays are that a curved mirror throws on, on the lit line [m].
+        Distance on the lit line of the rays that are traced off a curved mirror [m].
     clearance
-        Of rays from surfaces [m].
+        Distance from a surface within which a ray meets nothing [m].
     device
-        Where rays are traced.
+        Device of the ray queries.
     """
 
     scene: Scene
@@ -67,63 +68,81 @@ class SpecularInterreflection:
     clearance: float
     device: Device
 
-    def after(self, lit: LitLine, sheet: LightSheet, place: float, throws: int) -> LitLine:
-        """Return what is lit after one mirror, two, ... up to so many, of light from a sheet at a transport [m]."""
-        beam, found = _Beam(lit, np.tile(_light_of(sheet, place), (len(lit.power), 1))), []
-        for _ in range(throws):
+    def reflected_lines(self, lit: LitLine, sheet: LightSheet, place: float, max_reflections: int) -> LitLine:
+        """Return the lines that are lit after 1 to ``max_reflections`` reflections.
+
+        Parameters
+        ----------
+        lit
+            Lines that the sheet lights.
+        sheet
+            Sheet of light.
+        place
+            Transport of the sheet [m].
+        max_reflections
+            Largest number of mirrors one after another.
+        """
+        beam, found = _Beam(lit, np.tile(_light_position(sheet, place), (len(lit.power), 1))), []
+        for _ in range(max_reflections):
             share = self.reflectance[beam.line.triangle]
-            beam = _those(beam, np.flatnonzero(share > 0.0))
+            beam = _select(beam, np.flatnonzero(share > 0.0))
             if not len(beam.light):
                 break
             curved = self.is_curved[beam.line.triangle]
-            beam = _joined(
-                [self._by_planes(_those(beam, ~curved), sheet.uniformity), self._by_curves(_those(beam, curved))]
+            beam = _concatenate(
+                [
+                    self._reflect_by_planes(_select(beam, ~curved), sheet.uniformity),
+                    self._reflect_by_curves(_select(beam, curved)),
+                ]
             )
             found.append(beam)
-        return _joined([_Beam(_no_line(), np.zeros((0, 4))), *found]).line
+        return _concatenate([_Beam(_empty_line(), np.zeros((0, 4))), *found]).line
 
     # ---- plane mirrors: the mirrored sheet cuts the scene ------------------------------------------------------
 
-    def _by_planes(self, beam: _Beam, uniformity: float) -> _Beam:
-        """Throw on what falls on plane mirrors: together what falls on one plane in one sheet from one place."""
+    def _reflect_by_planes(self, beam: _Beam, uniformity: float) -> _Beam:
+        """Return the lines lit by plane mirrors.
+
+        Lines on one plane, in one sheet and from one source are computed together.
+        """
         if not len(beam.light):
             return beam
-        group = np.unique(self._keys(beam), axis=0, return_inverse=True)[1].ravel()
+        group = np.unique(self._sheet_keys(beam), axis=0, return_inverse=True)[1].ravel()
         order = np.argsort(group, kind="stable")
-        beam, group = _those(beam, order), group[order]
+        beam, group = _select(beam, order), group[order]
         first = np.flatnonzero(np.diff(group, prepend=-1))
-        fans, at = _fans_of(beam, first, group, self._planes)
+        fans, at = _mirrored_sheets(beam, first, group, self._planes)
         cuts = self._cuts(fans)
         pieces = upper_envelope(cuts.fan, cuts.x, cuts.height)
-        # Each piece, with each lit line of its mirror whose light falls on it.
-        fan = cuts.fan[pieces.member]
+        # Each piece is paired with each lit line of its mirror whose light falls on it.
+        fan = cuts.fan[pieces.segment]
         begin, count = first[fan], np.diff(first, append=len(group))[fan]
         member = np.repeat(np.arange(len(fan)), count)
         line = np.arange(len(member)) + np.repeat(begin - (np.cumsum(count) - count), count)
         left = np.maximum(pieces.left[member], at[line].min(axis=1))
         right = np.minimum(pieces.right[member], at[line].max(axis=1))
         kept = left < right
-        member, line, left, right = pieces.member[member][kept], line[kept], left[kept], right[kept]
-        return self._landed(beam, fans, cuts, (member, line, left, right), uniformity)
+        member, line, left, right = pieces.segment[member][kept], line[kept], left[kept], right[kept]
+        return self._lines_on_surfaces(beam, fans, cuts, (member, line, left, right), uniformity)
 
-    def _landed(
+    def _lines_on_surfaces(
         self,
         beam: _Beam,
-        fans: _Fans,
-        cuts: _Cuts,
+        fans: _MirroredSheets,
+        cuts: _SheetCuts,
         pieces: tuple[Integers, Integers, Float64, Float64],
         uniformity: float,
     ) -> _Beam:
-        """Turn pieces (of which cut, lit by which line, from x to x) into lit lines."""
+        """Turn pieces (index of the cut, index of the line that lights it, x at both ends) into lit lines."""
         member, line, left, right = pieces
         (a, b), (low, high) = cuts.x[member].T, cuts.height[member].T
 
         def height(x: Float64) -> Float64:
             return np.asarray(low + (x - a) / (b - a) * (high - low))
 
-        dense = np.stack([height(left), height(right)]) ** 2 if fans.is_point.any() else np.ones((2, len(member)))
-        dense[:, ~fans.is_point[cuts.fan[member]]] = 1.0
-        change = np.abs(dense[1] - dense[0]) / dense.max(axis=0, initial=1e-300)
+        density = np.stack([height(left), height(right)]) ** 2 if fans.is_point.any() else np.ones((2, len(member)))
+        density[:, ~fans.is_point[cuts.fan[member]]] = 1.0
+        change = np.abs(density[1] - density[0]) / density.max(axis=0, initial=1e-300)
         count = np.maximum(np.ceil(change / uniformity * (1.0 - 1e-9)), 1.0).astype(np.int64)
         row = np.repeat(np.arange(len(count)), count)
         number = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
@@ -139,10 +158,10 @@ class SpecularInterreflection:
         good = length > 0.0
         light = fans.light[fan][good]
         triangle = cuts.triangle[member][good]
-        return _Beam(_lit(self._planes, ends[good], triangle, (arriving[good] / length[good]), light), light)
+        return _Beam(_lit_lines(self._planes, ends[good], triangle, (arriving[good] / length[good]), light), light)
 
-    def _keys(self, beam: _Beam) -> Float64:
-        """Return rows that are equal for lines which one mirrored sheet stands for."""
+    def _sheet_keys(self, beam: _Beam) -> Float64:
+        """Return rows that are equal for lines with the same mirrored sheet."""
         line, light = beam.line, beam.light.copy()
         start, mirror = line.ends[:, 0], self._planes[line.triangle]
         across = np.cross(line.ends[:, 1] - start, light[:, :3] - light[:, 3:] * start)
@@ -155,24 +174,24 @@ class SpecularInterreflection:
         light[:, :3] /= np.where(light[:, 3:] != 0.0, self._reach, 1.0)
         return np.round(np.hstack([*planes, light]), _DIGITS) + 0.0
 
-    def _cuts(self, fans: _Fans) -> _Cuts:
-        """Return where mirrored sheets cut the scene's triangles beyond their mirrors."""
+    def _cuts(self, fans: _MirroredSheets) -> _SheetCuts:
+        """Return the cuts of mirrored sheets through the scene's triangles beyond their mirrors."""
         blocks, found = self._blocks, []
-        step = max(_PAIRS // max(len(blocks.radius), 1), 1)
+        step = max(_MAX_PAIRS // max(len(blocks.radius), 1), 1)
         for first in range(0, len(fans.length), step):
             some = slice(first, first + step)
             off = fans.across[some] @ blocks.middle.T - np.sum(fans.across * fans.start, axis=1)[some, None]
-            fan, block = np.nonzero(np.abs(off) <= blocks.radius * (1.0 + 1e-9) + _ON_IT * self._reach)
-            fan, block = fans.reached(fan + first, block, blocks)
+            fan, block = np.nonzero(np.abs(off) <= blocks.radius * (1.0 + 1e-9) + _ON_MIRROR * self._reach)
+            fan, block = fans.reachable(fan + first, block, blocks)
             count = np.diff(blocks.start)[block]
-            triangle = blocks.order[ranges(blocks.start[block], count)]
-            found.append(_cut(fans, np.repeat(fan, count), self.scene.corners, triangle, self._reach))
-        return _Cuts(*(np.concatenate(column) for column in zip(*found, strict=True)))
+            triangle = blocks.order[concatenated_ranges(blocks.start[block], count)]
+            found.append(_cut_triangles(fans, np.repeat(fan, count), self.scene.corners, triangle, self._reach))
+        return _SheetCuts(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
     # ---- curved mirrors: rays ----------------------------------------------------------------------------------
 
-    def _by_curves(self, beam: _Beam) -> _Beam:
-        """Throw on what falls on curved mirrors, as even between rays a step apart."""
+    def _reflect_by_curves(self, beam: _Beam) -> _Beam:
+        """Return the lines lit by curved mirrors; the light is even between two neighbouring rays."""
         if not len(beam.light):
             return beam
         count = np.maximum(np.ceil(beam.line.lengths / self.step), 1).astype(np.int64)
@@ -180,7 +199,7 @@ class SpecularInterreflection:
         number = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
         share = np.stack([number, number + 1], axis=1) / count[row, None]
         found = []
-        for left in range(_HALVINGS, -1, -1):
+        for left in range(_MAX_HALVINGS, -1, -1):
             if not len(row):
                 break
             spots, towards, triangle = self._reflected(beam, row, share)
@@ -195,7 +214,7 @@ class SpecularInterreflection:
             share = np.concatenate(
                 [np.column_stack([share[apart, 0], middle]), np.column_stack([middle, share[apart, 1]])]
             )
-        return _joined([_those(beam, np.zeros(0, np.int64)), *found])
+        return _concatenate([_select(beam, np.zeros(0, np.int64)), *found])
 
     def _between_rays(
         self, beam: _Beam, row: Integers, share: Float64, spots: Float64, towards: Float64, triangle: Integers
@@ -204,13 +223,13 @@ class SpecularInterreflection:
         arriving = beam.line.power * beam.line.lengths * self.reflectance[beam.line.triangle]
         arriving = arriving[row] * (share[:, 1] - share[:, 0])
         good = length > 0.0
-        # The light of so short a piece is parallel.
+        # The piece is short: its light counts as parallel.
         light = np.column_stack([-towards.mean(axis=1), np.zeros(len(row))])[good]
         power = arriving[good] / length[good]
-        return _Beam(_lit(self._planes, spots[good], triangle[good, 0], power, light), light)
+        return _Beam(_lit_lines(self._planes, spots[good], triangle[good, 0], power, light), light)
 
     def _reflected(self, beam: _Beam, row: Integers, share: Float64) -> tuple[Float64, Float64, Integers]:
-        """Return where the light of places on lit lines arrives, its direction, and the triangle (-1: none)."""
+        """Return the points that the light of fractions of lines meets, its directions, and the triangles (or -1)."""
         mirror = beam.line.triangle[row]
         ends = beam.line.ends[row]
         flat = ends[:, :1] + share[..., None] * (ends[:, 1:] - ends[:, :1])
@@ -228,7 +247,7 @@ class SpecularInterreflection:
         return spots.reshape(-1, 2, 3), towards, hits.triangle.reshape(-1, 2).astype(np.int64)
 
     def _on_smooth(self, flat: Float64, triangle: Integers) -> tuple[Float64, Float64, Float64]:
-        """Return the smooth surface's place and unit normal above places (k, 2, 3) of triangles, and its bulge."""
+        """Return the points and normals of the smooth surface over points (k, 2, 3) of triangles, and the bulge."""
         corners, normals = self.scene.corners[triangle], self.normals[triangle]
         weights = _barycentric(corners, flat)
         below = np.sum((flat[:, :, None] - corners[:, None]) * normals[:, None], axis=-1)
@@ -241,10 +260,10 @@ class SpecularInterreflection:
         return float(np.abs(self.scene.corners[self.scene.bvh.numbers]).max(initial=0.0)) or 1.0
 
     @functools.cached_property
-    def _blocks(self) -> Blocks:
+    def _blocks(self) -> TriangleBlocks:
         there = self.scene.bvh.numbers
         corners = self.scene.corners[there]
-        blocks = Blocks.of(corners, np.broadcast_to((0.0, 0.0, 1.0), corners.shape))
+        blocks = TriangleBlocks.of(corners, np.broadcast_to((0.0, 0.0, 1.0), corners.shape))
         return blocks._replace(order=there[blocks.order])
 
     @functools.cached_property
@@ -255,30 +274,30 @@ class SpecularInterreflection:
             return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
-class _Fans(NamedTuple):
-    """Mirrored sheets: x is the share of the lit line, from 0 to 1, whose light a place gets."""
+class _MirroredSheets(NamedTuple):
+    """Mirrored sheets. The coordinate x, 0 to 1, is the fraction of the lit line whose light a point gets."""
 
     start: Float64  # (f, 3): one end of the lit line
     along: Float64  # (f, 3): to the other end
-    light: Float64  # (f, 4): where the light seems to come from
+    light: Float64  # (f, 4): mirror image of the source, or of the direction
     length: Float64  # (f,) of the lit line
 
     @property
     def back(self) -> Float64:
-        """From the start towards the light, (f, 3)."""
+        """Vectors from the start towards the light, (f, 3)."""
         return np.asarray(self.light[:, :3] - self.light[:, 3:] * self.start)
 
     @property
     def basis(self) -> Float64:
-        """What turns a place from the start into multiples of along and back, (f, 2, 3)."""
+        """Matrices that turn a vector from the start into multiples of along and back, (f, 2, 3)."""
         return np.linalg.pinv(np.stack([self.along, self.back], axis=2))
 
-    def reached(self, fan: Integers, block: Integers, blocks: Blocks) -> tuple[Integers, Integers]:
-        """Return those pairs of a sheet and a block, cut by its plane, that the light may reach."""
+    def reachable(self, fan: Integers, block: Integers, blocks: TriangleBlocks) -> tuple[Integers, Integers]:
+        """Return the pairs of a sheet and a block in its plane that the light may reach."""
         p, q = np.moveaxis(self.basis[fan], 1, 0)
         away, radius = blocks.middle[block] - self.start[fan], blocks.radius[block] * (1.0 + 1e-9)
         spread = np.where(self.is_point[fan], 1.0, 0.0)[:, None]
-        # The way beyond the mirror, x from 0, and x to 1, each positive there and linear in the place.
+        # Depth beyond the mirror, distance of x from 0, and of x from 1: linear functions, positive where light can be.
         inside = np.ones(len(fan), bool)
         for offset, slope in ((0.0, -q), (0.0, p), (1.0, -p - spread * q)):
             inside &= offset + np.sum(slope * away, axis=1) >= -radius * np.linalg.norm(slope, axis=1)
@@ -292,10 +311,11 @@ class _Fans(NamedTuple):
 
     @property
     def is_point(self) -> npt.NDArray[np.bool_]:
+        """Whether the light comes from a point source, (f,)."""
         return np.asarray(self.light[:, 3] != 0.0)
 
     def places(self, fan: Integers, x: Float64, height: Float64) -> Float64:
-        """Return the place at x and a height: minus the way from the mirror, or one over the ways from the source."""
+        """Return the points at x and a height: minus the depth beyond the mirror, or 1 / (distance from the source)."""
         on_line = self.start[fan] + x[:, None] * self.along[fan]
         light = self.light[fan]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -304,8 +324,8 @@ class _Fans(NamedTuple):
         return np.asarray(np.where(self.is_point[fan][:, None], from_point, parallel))
 
 
-class _Cuts(NamedTuple):
-    """Where mirrored sheets cut triangles: which sheet and triangle, x and height of both ends, from left to right."""
+class _SheetCuts(NamedTuple):
+    """Cuts of mirrored sheets through triangles: index of the sheet and the triangle, x and height of both ends."""
 
     fan: Integers
     triangle: Integers
@@ -313,8 +333,8 @@ class _Cuts(NamedTuple):
     height: Float64
 
 
-def _fans_of(beam: _Beam, first: Integers, group: Integers, planes: Float64) -> tuple[_Fans, Float64]:
-    """Return the mirrored sheet of each group of lines, which lie on one line, and the lines' own ends in its x."""
+def _mirrored_sheets(beam: _Beam, first: Integers, group: Integers, planes: Float64) -> tuple[_MirroredSheets, Float64]:
+    """Return the mirrored sheet of each group of lines on one line, and x of the lines' own ends."""
     line = beam.line
     along = line.ends[first, 1] - line.ends[first, 0]
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -325,25 +345,29 @@ def _fans_of(beam: _Beam, first: Integers, group: Integers, planes: Float64) -> 
     normal, light = planes[line.triangle[first]], beam.light[first].copy()
     above = np.sum(normal * (light[:, :3] - light[:, 3:] * start), axis=1, keepdims=True)
     light[:, :3] -= 2.0 * above * normal
-    return _Fans(start, along * length[:, None], light, length), (at - low[group][:, None]) / length[group][:, None]
+    return _MirroredSheets(start, along * length[:, None], light, length), (at - low[group][:, None]) / length[group][
+        :, None
+    ]
 
 
-def _cut(fans: _Fans, fan: Integers, corners: Float64, triangle: Integers, reach: float) -> _Cuts:
-    """Cut triangles with sheets, pair by pair, and keep what lies beyond the mirror and within the light."""
+def _cut_triangles(
+    fans: _MirroredSheets, fan: Integers, corners: Float64, triangle: Integers, reach: float
+) -> _SheetCuts:
+    """Cut triangles with sheets, pair by pair, and keep the parts beyond the mirror and within the light."""
     points = corners[triangle] - fans.start[fan][:, None]
     across = fans.across[fan][:, None]
-    # Each product by itself: neighbours find the same for the corner that they share.
+    # Explicit products and not a matrix product: neighbours get the same rounding for a corner that they share.
     off = points[..., 0] * across[..., 0] + points[..., 1] * across[..., 1] + points[..., 2] * across[..., 2]
     below = off < 0.0
     crossing = below.any(axis=1) & ~below.all(axis=1)
     fan, triangle, below = fan[crossing], triangle[crossing], below[crossing]
     points, off = points[crossing], off[crossing]
-    # Of each triangle the corner alone on its side, and the other two.
+    # The corner that is alone on its side of the sheet, and the other two.
     lone = np.where(below.sum(axis=1) == 1, np.argmax(below, axis=1), np.argmin(below, axis=1))
     row, ends = np.arange(len(fan)), []
     for step in (1, 2):
         other = (lone + step) % 3
-        # The edge that two share is cut in one place: from below upwards.
+        # An edge is cut from its lower to its upper corner, so that both of its triangles get the same point.
         swap = off[row, lone] > off[row, other]
         low, high = np.where(swap, other, lone), np.where(swap, lone, other)
         share = (off[row, low] / (off[row, low] - off[row, high]))[:, None]
@@ -351,20 +375,20 @@ def _cut(fans: _Fans, fan: Integers, corners: Float64, triangle: Integers, reach
     place, light = np.stack(ends, axis=1), fans.light[fan]
     # place = p along + q back, in the plane of the two.
     p, q = np.moveaxis(np.einsum("fij,fpj->fpi", fans.basis[fan], place), -1, 0)
-    # Beyond the mirror q is negative; rays from a source are 1 - q times as far apart as there.
+    # Beyond the mirror q is negative. Rays from a source are 1 - q times as far apart as at the mirror.
     is_point = light[:, 3] != 0.0
-    p, depth, kept = _beyond(p, -q, _ON_IT * np.where(is_point, 1.0, reach))
+    p, depth, kept = _clip_beyond(p, -q, _ON_MIRROR * np.where(is_point, 1.0, reach))
     fan, triangle, is_point = fan[kept], triangle[kept], is_point[kept, None]
     wide = np.where(is_point, 1.0 + depth, 1.0)
     x, height = p / wide, np.where(is_point, 1.0 / wide, -depth)
     order = np.argsort(x, axis=1, kind="stable")
     x, height = np.take_along_axis(x, order, axis=1), np.take_along_axis(height, order, axis=1)
     inside = (x[:, 1] > 0.0) & (x[:, 0] < 1.0)
-    return _Cuts(fan[inside], triangle[inside], x[inside], height[inside])
+    return _SheetCuts(fan[inside], triangle[inside], x[inside], height[inside])
 
 
-def _beyond(p: Float64, depth: Float64, least: Float64) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:
-    """Cut segments to where their depth is beyond the least; the last says which there are."""
+def _clip_beyond(p: Float64, depth: Float64, least: Float64) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:
+    """Clip segments to depths beyond the least one; the last result is the mask of segments that remain."""
     under = depth < least[:, None]
     kept = np.asarray(~under.all(axis=1))
     p, depth, least, under = p[kept].copy(), depth[kept].copy(), least[kept], under[kept]
@@ -376,14 +400,14 @@ def _beyond(p: Float64, depth: Float64, least: Float64) -> tuple[Float64, Float6
 
 
 def _barycentric(corners: Float64, places: Float64) -> Float64:
-    """Return the weights of corners (k, 3, 3) that make up places (k, p, 3) in their triangles, (k, p, 3)."""
+    """Return the barycentric weights of points (k, p, 3) in triangles (k, 3, 3), (k, p, 3)."""
     edges = corners[:, 1:] - corners[:, :1]
     weights = np.einsum("kij,kpj->kpi", np.swapaxes(np.linalg.pinv(edges), 1, 2), places - corners[:, :1])
     return np.concatenate([1.0 - weights.sum(axis=-1, keepdims=True), weights], axis=-1)
 
 
-def _light_of(sheet: LightSheet, place: float) -> Float64:
-    """Return where the light of a sheet at a transport comes from, (4,)."""
+def _light_position(sheet: LightSheet, place: float) -> Float64:
+    """Return the source or the direction of a sheet's light at a transport, (4,), as in `_Beam`."""
     move = sheet.transport
     axes = np.array([move.g_axis, move.h_axis])
     if sheet.source is None:
@@ -392,27 +416,22 @@ def _light_of(sheet: LightSheet, place: float) -> Float64:
     return np.append(source, 1.0)
 
 
-def _lit(normals: Float64, ends: Float64, triangle: Integers, power: Float64, light: Float64) -> LitLine:
-    """Return lit lines, their normals on the side of the light."""
+def _lit_lines(normals: Float64, ends: Float64, triangle: Integers, power: Float64, light: Float64) -> LitLine:
+    """Return lit lines with normals on the side of the light."""
     normal = normals[triangle]
     towards = light[:, :3] - light[:, 3:] * ends.mean(axis=1)
     side = np.sum(normal * towards, axis=1, keepdims=True)
     return LitLine(ends, np.where(side < 0.0, -normal, normal), triangle, power)
 
 
-def _no_line() -> LitLine:
+def _empty_line() -> LitLine:
     return LitLine(np.zeros((0, 2, 3)), np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0))
 
 
-def lines_of(line: LitLine, which: npt.NDArray[Any]) -> LitLine:
-    """Return some of the lines."""
-    return LitLine(line.ends[which], line.normals[which], line.triangle[which], line.power[which])
+def _select(beam: _Beam, which: npt.NDArray[Any]) -> _Beam:
+    return _Beam(beam.line.select(which), beam.light[which])
 
 
-def _those(beam: _Beam, which: npt.NDArray[Any]) -> _Beam:
-    return _Beam(lines_of(beam.line, which), beam.light[which])
-
-
-def _joined(beams: list[_Beam]) -> _Beam:
+def _concatenate(beams: list[_Beam]) -> _Beam:
     lines = LitLine(*(np.concatenate(each) for each in zip(*(beam.line for beam in beams), strict=True)))
     return _Beam(lines, np.concatenate([beam.light for beam in beams]))

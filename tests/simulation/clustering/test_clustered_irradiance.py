@@ -1,4 +1,4 @@
-"""ClusteredIrradiance: what the plan leaves is computed, and readings keep the tolerance, with everything in the
+"""ClusteredIrradiance: what the cut leaves is computed, and readings keep the tolerance, with everything in the
 way."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import pytest
 
 from gpuvision.host import Device
 from gpuvision.ranging.range_image import StraightTransport
-from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance, facing_pairs
+from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance, estimate_facing_pairs
 from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.sensor_view import Exposure
@@ -60,15 +60,15 @@ def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
     weights = np.stack([power, power * u], axis=2)
     direct = np.full(6, 0.01)
     reading = StripErrorModel(power=direct, moment=0.005 * direct, slope=np.ones(6), limits=(-0.03, 0.03))
-    light = ClusteredIrradiance(scene=scene, tolerance=tolerance, least=None, device=device)
+    light = ClusteredIrradiance(scene=scene, tolerance=tolerance, min_facing_pairs=None, device=device)
     ours = light(segments, receivers, weights, reading)
     exact = OccludedIrradiance(scene=scene, segments=len(segments), precision="single")(
         receivers, np.zeros_like(weights), segments, device=device
     ).irradiance
     shift = [reference.reading(direct, 0.005 * direct, weights, light) for light in (ours.irradiance, exact)]
     # The kernel's own rounding on top.
-    assert np.all(np.abs(shift[0] - shift[1]) <= ours.plan.bound + 1e-9)
-    assert np.all(ours.plan.bound <= tolerance)
+    assert np.all(np.abs(shift[0] - shift[1]) <= ours.cut.bound + 1e-9)
+    assert np.all(ours.cut.bound <= tolerance)
     if tolerance == 0.0:
         np.testing.assert_allclose(ours.irradiance, exact, rtol=2e-5, atol=1e-6 * exact.max())
 
@@ -78,9 +78,9 @@ def test_what_is_not_modelled_is_dark(device: Device) -> None:
     receivers = strips(triangles, 2, 16)
     weights = np.full((2, 16, 2), 1e-9)
     reading = StripErrorModel(power=np.ones(2), moment=np.zeros(2), slope=np.ones(2), limits=(-0.03, 0.03))
-    light = ClusteredIrradiance(scene=Scene(triangles), tolerance=1e-3, least=None, device=device)
+    light = ClusteredIrradiance(scene=Scene(triangles), tolerance=1e-3, min_facing_pairs=None, device=device)
     result = light(segments, receivers, weights, reading)
-    assert not result.plan.modelled
+    assert not result.cut.has_pairs
     assert not result.irradiance.any()
 
 
@@ -114,40 +114,40 @@ def test_what_is_not_worth_a_plan_is_computed_in_full(device: Device) -> None:
     ours = light(segments, receivers, weights, reading)
     # Rows without exitance behind the last segment add nothing at all.
     np.testing.assert_array_equal(ours.irradiance, exact)
-    np.testing.assert_array_equal(light.exactly(segments, receivers), exact)
-    report = ours.plan.report()
-    assert not report["planned"]
-    assert report["modelled"]
+    np.testing.assert_array_equal(light.compute_all(segments, receivers), exact)
+    report = ours.cut.report()
+    assert not report["traversed"]
+    assert report["has pairs"]
     assert report["bound"] == report["left out"] == report["clustered"] == 0
     assert report["exact"] == report["work"] == report["pairs"] == receivers[..., 0].size * len(segments)
-    # What the plan says is what was computed.
-    rows, starts, picks = ours.plan.tables(np.float64)
-    picked = OccludedIrradiance(scene=scene, segments=len(rows), picks=len(picks), precision="single")
-    by_plan = picked(receivers, np.zeros_like(weights), rows, starts, picks, device=device).irradiance
+    # What the cut says is what was computed.
+    rows, starts, selected = ours.cut.padded_tables(np.float64)
+    selected_of = OccludedIrradiance(scene=scene, segments=len(rows), selected=len(selected), precision="single")
+    by_cut = selected_of(receivers, np.zeros_like(weights), rows, starts, selected, device=device).irradiance
     # The same sums in another order.
-    np.testing.assert_allclose(by_plan, exact, rtol=2e-5, atol=1e-6 * exact.max())
+    np.testing.assert_allclose(by_cut, exact, rtol=2e-5, atol=1e-6 * exact.max())
 
 
 def test_what_faces_each_other_decides_whether_there_is_a_plan(device: Device) -> None:
     scene, segments, receivers, weights, reading = groove(8, 40, 50)
     pairs = receivers[..., 0].size * len(segments)
-    gain = facing_pairs(segments, receivers, weights) - pairs // 4
+    gain = estimate_facing_pairs(segments, receivers, weights) - pairs // 4
     assert 0 < gain < pairs // 2
     results = [
-        ClusteredIrradiance(scene=scene, tolerance=1e-4, least=least, device=device)(
+        ClusteredIrradiance(scene=scene, tolerance=1e-4, min_facing_pairs=least, device=device)(
             segments, receivers, weights, reading
         )
         for least in (gain, gain + 1)
     ]
-    assert [each.plan.planned for each in results] == [True, False]
-    assert results[0].plan.counts["work"] < pairs // 2
+    assert [each.cut.traversed for each in results] == [True, False]
+    assert results[0].cut.counts["work"] < pairs // 2
     shift = [reference.reading(reading.power, reading.moment, weights, each.irradiance) for each in results]
     # Both ways agree to the bound; the kernel's own rounding on top.
-    assert np.all(np.abs(shift[0] - shift[1]) <= results[0].plan.bound + 1e-9)
-    assert np.all(results[0].plan.bound <= 1e-4)
-    nothing = ClusteredIrradiance(scene=scene, tolerance=0.0, least=gain, device=device)
-    assert not nothing(segments, receivers, weights, reading).plan.planned
-    assert nothing(segments, receivers, weights, reading, tolerance=1e-4).plan.planned
+    assert np.all(np.abs(shift[0] - shift[1]) <= results[0].cut.bound + 1e-9)
+    assert np.all(results[0].cut.bound <= 1e-4)
+    nothing = ClusteredIrradiance(scene=scene, tolerance=0.0, min_facing_pairs=gain, device=device)
+    assert not nothing(segments, receivers, weights, reading).cut.traversed
+    assert nothing(segments, receivers, weights, reading, tolerance=1e-4).cut.traversed
 
 
 def test_few_pairs_face_each_other_on_a_board() -> None:
@@ -162,7 +162,7 @@ def test_few_pairs_face_each_other_on_a_board() -> None:
     expected = int(np.count_nonzero(faces[:100]))
     weights[2:] = 0.0
     # Of 100 receivers and 23 segments each is looked at.
-    assert facing_pairs(segments, receivers, weights) == expected
+    assert estimate_facing_pairs(segments, receivers, weights) == expected
     assert 0 < expected < faces[:100].size // 4
 
 
@@ -170,15 +170,15 @@ def test_facing_pairs_are_estimated_where_there_are_many() -> None:
     _, segments, receivers, weights, _ = groove(40, 40, 200)
     pairs = receivers[..., 0].size * len(segments)
     # Half of them, and each side's receivers and segments are counted to one.
-    assert abs(facing_pairs(segments, receivers, weights) - pairs / 2) <= pairs * (1 / 127 + 1 / 61)
+    assert abs(estimate_facing_pairs(segments, receivers, weights) - pairs / 2) <= pairs * (1 / 127 + 1 / 61)
 
 
 def test_without_light_or_receivers_nothing_is_lit(device: Device) -> None:
     scene, segments, receivers, weights, reading = groove(2, 16, 20)
     light = ClusteredIrradiance(scene=scene, tolerance=1e-4, device=device)
     assert not light(segments[:0], receivers, weights, reading).irradiance.any()
-    assert facing_pairs(segments[:0], receivers, weights) == 0
-    assert facing_pairs(segments, receivers, 0.0 * weights) == 0
+    assert estimate_facing_pairs(segments[:0], receivers, weights) == 0
+    assert estimate_facing_pairs(segments, receivers, 0.0 * weights) == 0
 
 
 def test_a_sensor_says_how_its_readings_follow_light() -> None:

@@ -53,33 +53,33 @@ def reading_of(rng: np.random.Generator, **more: Any) -> StripErrorModel:
     return StripErrorModel(power=power, moment=moment, slope=np.full(STRIPS, SLOPE), limits=(-1.0, 1.0), **more)
 
 
-def picked(plan: LightCut, block: int) -> Any:
-    return plan.picks[plan.starts[block] : plan.starts[block + 1]]
+def selected_of(cut: LightCut, block: int) -> Any:
+    return cut.selected[cut.starts[block] : cut.starts[block + 1]]
 
 
-def by_plan(plan: LightCut, receivers: NDArray[Any], triangles: Any = None) -> Any:
+def by_cut(cut: LightCut, receivers: NDArray[Any], triangles: Any = None) -> Any:
     """Irradiance (strips, n) from what each block is to get."""
     strips, count, _ = receivers.shape
     irradiance = np.zeros((strips, count))
     of_strip = -(-count // BLOCK)
     for block in range(strips * of_strip):
-        picks = picked(plan, block)
-        segments = plan.segments[np.where(picks < 0, ~picks, picks)]
+        selected = selected_of(cut, block)
+        segments = cut.segments[np.where(selected < 0, ~selected, selected)]
         here = block // of_strip, slice(block % of_strip * BLOCK, block % of_strip * BLOCK + BLOCK)
-        if len(picks):
+        if len(selected):
             light = reference.pair_irradiance(receivers[here], segments)
             if triangles is not None:
                 seen = reference.visibility(receivers[here], segments, triangles)
-                light = light * np.where(picks < 0, 1.0, seen)
+                light = light * np.where(selected < 0, 1.0, seen)
             irradiance[here] = light.sum(axis=1)
     return irradiance
 
 
-def off_by(plan: LightCut, receivers: Any, weights: Any, reading: StripErrorModel, segments: Any) -> Any:
+def off_by(cut: LightCut, receivers: Any, weights: Any, reading: StripErrorModel, segments: Any) -> Any:
     everything = reference.pair_irradiance(receivers.reshape(-1, 6), segments).sum(axis=1).reshape(receivers.shape[:2])
     readings = [
         reference.reading(reading.power, reading.moment, weights, light)
-        for light in (everything, by_plan(plan, receivers))
+        for light in (everything, by_cut(cut, receivers))
     ]
     return SLOPE * np.abs(readings[0] - readings[1])
 
@@ -95,12 +95,12 @@ def test_bounds_hold(device: Device, variant: Any, rng: Any, exponent: float, co
         reading_of(rng),
     )
     tolerance = 10.0**exponent
-    plan = LightClustering(tolerance=tolerance, variant=variant)(segments, receivers, weights, reading, device=device)
-    error = off_by(plan, receivers, weights, reading, segments)
-    assert np.all(error <= plan.bound + 1e-15)
-    assert np.all(plan.bound <= tolerance)
-    everything = dataclasses.replace(plan, picks=plan.picks[:0], starts=0 * plan.starts)
-    assert np.all(off_by(everything, receivers, weights, reading, segments) <= plan.worst + 1e-15)
+    cut = LightClustering(tolerance=tolerance, variant=variant)(segments, receivers, weights, reading, device=device)
+    error = off_by(cut, receivers, weights, reading, segments)
+    assert np.all(error <= cut.bound + 1e-15)
+    assert np.all(cut.bound <= tolerance)
+    everything = dataclasses.replace(cut, selected=cut.selected[:0], starts=0 * cut.starts)
+    assert np.all(off_by(everything, receivers, weights, reading, segments) <= cut.bound_if_omitted + 1e-15)
 
 
 @given(rng=PLACES, count=st.integers(2, 24), distance=st.floats(1.2, 20.0), turned=st.floats(0.0, 0.7))
@@ -112,7 +112,7 @@ def test_a_cluster_is_off_by_its_bound_at_most(rng: Any, count: int, distance: f
     normal = np.array([0.0, 0.0, 1.0]) + turned * rng.uniform(-1.0, 1.0, (count, 3))
     segments[:, 6:9] = normal - along * (np.sum(normal * along, axis=1) / np.sum(along * along, axis=1))[:, None]
     tree = LightTree.build(segments)
-    row, aggregate = tree.rows[1], tree.aggregates[1:2]
+    row, aggregate = tree.rows[1], tree.representatives[1:2]
     if not np.isfinite(row[22]):
         return
     way = rng.normal(size=(50, 3))
@@ -139,7 +139,7 @@ def test_a_cluster_keeps_the_power_of_segments_side_by_side() -> None:
     ends[:, 0, 0], ends[:, 1, 0] = x[:-1], x[1:]
     segments = np.hstack([ends.reshape(8, 6), np.tile([0.0, 0.0, 3.0], (8, 1)), np.full((8, 1), 2.0)])
     tree = LightTree.build(segments)
-    np.testing.assert_allclose(tree.aggregates[1], [0, 0, 0, 0.1, 0, 0, 0, 0, 1, 2.0], atol=1e-12)
+    np.testing.assert_allclose(tree.representatives[1], [0, 0, 0, 0.1, 0, 0, 0, 0, 1, 2.0], atol=1e-12)
     assert tree.power == pytest.approx(0.2)
 
 
@@ -147,12 +147,12 @@ def test_a_cluster_keeps_the_power_of_segments_side_by_side() -> None:
 def test_tolerance_zero_leaves_out_nothing_that_shines(device: Device, variant: Any) -> None:
     rng = np.random.default_rng(3)
     segments, receivers, weights = random_segments(rng, 30), random_strips(rng), weights_of(rng)
-    plan = LightClustering(tolerance=0.0, variant=variant)(segments, receivers, weights, reading_of(rng), device=device)
-    assert plan.counts["clustered"] == 0
-    assert not plan.bound.any()
+    cut = LightClustering(tolerance=0.0, variant=variant)(segments, receivers, weights, reading_of(rng), device=device)
+    assert cut.counts["clustered"] == 0
+    assert not cut.bound.any()
     used = weights.any(axis=2)
     everything = reference.pair_irradiance(receivers.reshape(-1, 6), segments).sum(axis=1).reshape(used.shape)
-    np.testing.assert_allclose(by_plan(plan, receivers)[used], everything[used], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(by_cut(cut, receivers)[used], everything[used], rtol=1e-12, atol=1e-15)
 
 
 def valley(count: int, strips: int, each: int) -> tuple[Any, Any, Any, StripErrorModel]:
@@ -186,17 +186,17 @@ def planes(*, wall: bool = False) -> Scene:
 @TWO_WAYS
 def test_work_falls_as_the_tolerance_rises(device: Device, variant: Any) -> None:
     segments, receivers, weights, reading = valley(64, 8, 64)
-    planner, works = LightClustering(tolerance=1.0, scene=planes(), variant=variant), []
+    clustering, works = LightClustering(tolerance=1.0, scene=planes(), variant=variant), []
     for tolerance in (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 0.1):
-        plan = planner(segments, receivers, weights, reading, tolerance=tolerance, device=device)
-        works.append(plan.counts["work"])
-        assert np.all(plan.bound <= tolerance)
-        assert plan.counts["exact"] + plan.counts["clustered"] + plan.counts["left out"] == plan.counts["pairs"]
-        assert plan.tolerance == tolerance
+        cut = clustering(segments, receivers, weights, reading, tolerance=tolerance, device=device)
+        works.append(cut.counts["work"])
+        assert np.all(cut.bound <= tolerance)
+        assert cut.counts["exact"] + cut.counts["clustered"] + cut.counts["left out"] == cut.counts["pairs"]
+        assert cut.tolerance == tolerance
     assert works == sorted(works, reverse=True)
     assert works[0] > 4 * works[3]
     assert works[-1] == 0
-    assert not plan.modelled
+    assert not cut.has_pairs
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -216,19 +216,19 @@ def test_bounds_hold_far_from_the_origin(device: Device, dtype: Any, with_scene:
     # Far below all: it hides nothing.
     scene = Scene(np.array([[[0.0, 0.0, 0.0], [14.0, 0.0, 0.0], [14.0, 14.0, 0.0]]])) if with_scene else None
     given = receivers.astype(dtype)
-    plan = LightClustering(tolerance=1e-8, scene=scene)(segments, given, weights, reading, device=device)
-    assert 0 < plan.counts["work"] < plan.counts["pairs"]
-    assert np.all(plan.bound <= 1e-8)
-    assert np.all(off_by(plan, given.astype(float), weights, reading, segments) <= plan.bound + 1e-13)
+    cut = LightClustering(tolerance=1e-8, scene=scene)(segments, given, weights, reading, device=device)
+    assert 0 < cut.counts["work"] < cut.counts["pairs"]
+    assert np.all(cut.bound <= 1e-8)
+    assert np.all(off_by(cut, given.astype(float), weights, reading, segments) <= cut.bound + 1e-13)
 
 
 @TWO_WAYS
 def test_nothing_hides_in_an_empty_groove(device: Device, variant: Any) -> None:
     """Its own walls stand in the hulls, but between no receiver and no lit line."""
     segments, receivers, weights, reading = valley(32, 4, 32)
-    planner = LightClustering(tolerance=0.0, scene=planes(), variant=variant)
-    plan = planner(segments, receivers, weights, reading, device=device)
-    assert plan.counts["exact"] == plan.counts["clear"] > 0
+    clustering = LightClustering(tolerance=0.0, scene=planes(), variant=variant)
+    cut = clustering(segments, receivers, weights, reading, device=device)
+    assert cut.counts["exact"] == cut.counts["clear"] > 0
 
 
 def pyramids(rng: np.random.Generator, count: int) -> Any:
@@ -262,29 +262,29 @@ def test_what_is_clear_is_seen(device: Device, variant: Any, rng: Any, exponent:
     place = first[:, :1] + part * (first[:, 1:] - first[:, :1])
     receivers = np.concatenate([place, np.broadcast_to(up[:, None], place.shape)], axis=2)
     weights, reading = weights_of(rng), reading_of(rng)
-    planner = LightClustering(tolerance=10.0**exponent, scene=Scene(triangles), variant=variant)
-    plan = planner(segments, receivers, weights, reading, device=device)
+    clustering = LightClustering(tolerance=10.0**exponent, scene=Scene(triangles), variant=variant)
+    cut = clustering(segments, receivers, weights, reading, device=device)
     seen = reference.visibility(receivers.reshape(-1, 6), segments, triangles).reshape(STRIPS, COUNT, -1)
     light = reference.pair_irradiance(receivers.reshape(-1, 6), segments).reshape(seen.shape)
     of_strip = -(-COUNT // BLOCK)
     for block in range(STRIPS * of_strip):
-        picks = picked(plan, block)
-        clear = [~pick for pick in picks if pick < 0 and ~pick < len(segments)]
+        selected = selected_of(cut, block)
+        clear = [~pick for pick in selected if pick < 0 and ~pick < len(segments)]
         here = block // of_strip, slice(block % of_strip * BLOCK, block % of_strip * BLOCK + BLOCK)
         used = weights[here].any(axis=1)
         hidden = (seen[here] < 1.0) & (light[here] > 1e-9 * light.max())
         assert not np.any(hidden[used][:, clear])
     exact = reference.reading(reading.power, reading.moment, weights, np.sum(seen * light, axis=2))
-    ours = reference.reading(reading.power, reading.moment, weights, by_plan(plan, receivers, triangles))
-    assert np.all(SLOPE * np.abs(exact - ours) <= plan.bound + 1e-15)
+    ours = reference.reading(reading.power, reading.moment, weights, by_cut(cut, receivers, triangles))
+    assert np.all(SLOPE * np.abs(exact - ours) <= cut.bound + 1e-15)
 
 
 @TWO_WAYS
 def test_a_wall_in_the_groove_is_seen(device: Device, variant: Any) -> None:
     segments, receivers, weights, reading = valley(32, 4, 32)
-    planner = LightClustering(tolerance=1e-5, scene=planes(wall=True), variant=variant)
-    plan = planner(segments, receivers, weights, reading, device=device)
-    assert plan.counts["exact"] > plan.counts["clear"]
+    clustering = LightClustering(tolerance=1e-5, scene=planes(wall=True), variant=variant)
+    cut = clustering(segments, receivers, weights, reading, device=device)
+    assert cut.counts["exact"] > cut.counts["clear"]
 
 
 def test_dark_strips_get_all_and_those_below_the_floor_what_they_need() -> None:
@@ -293,12 +293,12 @@ def test_dark_strips_get_all_and_those_below_the_floor_what_they_need() -> None:
     dark = StripErrorModel(
         power=np.array([0.0, 1.0, 1.0]), moment=np.zeros(3), slope=np.full(3, SLOPE), limits=(-1.0, 1.0)
     )
-    plan = LightClustering(tolerance=1e-4)(segments, receivers, weights, dark)
+    cut = LightClustering(tolerance=1e-4)(segments, receivers, weights, dark)
     exact = LightClustering(tolerance=0.0)(segments, receivers, weights, dark)
     of_strip = -(-COUNT // BLOCK)
-    assert plan.starts[of_strip] == exact.starts[of_strip]
-    assert plan.starts[-1] < exact.starts[-1]
-    assert plan.bound[0] == 0.0
+    assert cut.starts[of_strip] == exact.starts[of_strip]
+    assert cut.starts[-1] < exact.starts[-1]
+    assert cut.bound[0] == 0.0
     floored = LightClustering(tolerance=1e-4)(segments, receivers, weights, dataclasses.replace(dark, min_power=1.0))
     assert floored.starts[of_strip] < exact.starts[of_strip]
 
@@ -312,28 +312,28 @@ def test_receivers_without_weight_and_no_receivers_do_not_count() -> None:
         reading_of(rng),
     )
     weights[0], receivers[1, :, 3:], receivers[0, 3] = 0.0, 0.0, np.nan
-    plan = LightClustering(tolerance=0.0)(segments, receivers, weights, reading)
+    cut = LightClustering(tolerance=0.0)(segments, receivers, weights, reading)
     of_strip = -(-COUNT // BLOCK)
-    assert plan.starts[2 * of_strip] == 0
-    assert plan.starts[-1] > 0
+    assert cut.starts[2 * of_strip] == 0
+    assert cut.starts[-1] > 0
 
 
 def test_tables_have_room() -> None:
     segments, receivers, weights, reading = valley(40, 4, 32)
-    plan = LightClustering(tolerance=1e-5)(segments, receivers, weights, reading)
-    rows, starts, picks = plan.tables(np.float32, segments=100, picks=10)
+    cut = LightClustering(tolerance=1e-5)(segments, receivers, weights, reading)
+    rows, starts, selected = cut.padded_tables(np.float32, segments=100, selected=10)
     assert rows.shape == (128, 10)
     assert rows.dtype == np.float32
-    assert len(picks) >= len(plan.picks)
-    assert len(picks).bit_count() == 1
-    assert starts[-1] == len(plan.picks)
-    assert not rows[len(plan.segments) :, 9].any()
-    used = np.where(plan.picks < 0, ~plan.picks, plan.picks)
-    assert used.max() < len(plan.segments)
-    report = plan.report()
-    assert report["clusters"] == len(plan.segments) - 40
+    assert len(selected) >= len(cut.selected)
+    assert len(selected).bit_count() == 1
+    assert starts[-1] == len(cut.selected)
+    assert not rows[len(cut.segments) :, 9].any()
+    used = np.where(cut.selected < 0, ~cut.selected, cut.selected)
+    assert used.max() < len(cut.segments)
+    report = cut.report()
+    assert report["clusters"] == len(cut.segments) - 40
     assert report["bound"] <= 1e-5
-    assert report["modelled"] is True
+    assert report["has pairs"] is True
 
 
 def test_worst_is_reached_by_light_at_the_other_limit() -> None:
@@ -344,11 +344,11 @@ def test_worst_is_reached_by_light_at_the_other_limit() -> None:
 
 
 def test_paths_with_the_least_bounds_are_left_out() -> None:
-    choice = select_paths({"specular": 0.0, "mirrors": [1e-7, 2e-7], "bounces": 1.5e-6, "diffuse": np.inf}, 4e-6)
-    assert choice.omitted == {"specular": 0.0, "mirrors": 2e-7, "bounces": 1.5e-6}
+    choice = select_paths({"specular": 0.0, "mirrors": [1e-7, 2e-7], "multi-bounce": 1.5e-6, "diffuse": np.inf}, 4e-6)
+    assert choice.omitted == {"specular": 0.0, "mirrors": 2e-7, "multi-bounce": 1.5e-6}
     assert choice.modelled == {"diffuse": None}
     assert choice.remaining_tolerance == pytest.approx(2.3e-6)
-    assert select_paths({"specular": 0.0, "bounces": 1e-9}, 0.0).omitted == {"specular": 0.0}
+    assert select_paths({"specular": 0.0, "multi-bounce": 1e-9}, 0.0).omitted == {"specular": 0.0}
 
 
 def test_bounces_sum_to_a_geometric_series() -> None:
@@ -377,6 +377,6 @@ def test_wrong_input_is_refused() -> None:
 
 def test_no_segments_need_nothing() -> None:
     _, receivers, weights, reading = valley(4, 2, 16)
-    plan = LightClustering(tolerance=0.0)(np.zeros((0, 10)), receivers, weights, reading)
-    assert not plan.modelled
-    assert plan.counts["pairs"] == 0
+    cut = LightClustering(tolerance=0.0)(np.zeros((0, 10)), receivers, weights, reading)
+    assert not cut.has_pairs
+    assert cut.counts["pairs"] == 0

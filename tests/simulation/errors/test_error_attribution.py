@@ -51,7 +51,7 @@ def test_secondary_light(method: str, device: Device) -> None:
     """One secondary spot of ratio q at distance D: error q D / (1 + q), all of it secondary."""
     view, q, distance = psd_view(), 0.05, 1.2e-3
     u = np.linspace(-2e-3, 1e-3, view.samples)
-    light = {"direct": gaussian(view, u, 1e-6, 5e-5), "bounces": gaussian(view, u + distance, q * 1e-6, 5e-5)}
+    light = {"direct": gaussian(view, u, 1e-6, 5e-5), "multi-bounce": gaussian(view, u + distance, q * 1e-6, 5e-5)}
     found = attribute_errors(psd(view), light, truth_at(view, u), method=method, device=device)
     moved = q * distance / (1.0 + q)
     slope = height_secant(view.triangulation, u, u + moved, view.v_centres)
@@ -156,7 +156,7 @@ def test_all_causes_at_once(device: Device, rng: np.random.Generator) -> None:
             "specular",
             "diffuse-specular",
             "diffuse-diffuse",
-            "bounces",
+            "multi-bounce",
             UNIFORM,
             UNOCCLUDED,
             UNIFORM_UNOCCLUDED,
@@ -236,7 +236,7 @@ def test_summary_counts_causes(device: Device) -> None:
     u = np.zeros(view.samples)
     light = {"direct": gaussian(view, u, 1e-6, 4e-5)}
     light["specular"] = gaussian(view, u + 1e-3, [0.0, 1e-8, 2e-7, 0.0, 0.0], 4e-5)
-    light["bounces"] = gaussian(view, u - 1e-3, [0.0, 0.0, 1e-8, 3e-7, 0.0], 4e-5)
+    light["multi-bounce"] = gaussian(view, u - 1e-3, [0.0, 0.0, 1e-8, 3e-7, 0.0], 4e-5)
     found = attribute_errors(
         psd(view),
         stack_profiles([light] * 2),
@@ -272,7 +272,7 @@ def test_signals_add_up_to_the_reading(device: Device) -> None:
         view = simulator.view
         u = np.broadcast_to(view.u_centres[view.bins // 3], view.samples)
         light = {"direct": gaussian(view, u, 1e-9, 2.0 * np.diff(view.u_edges)[0])}
-        light["bounces"] = gaussian(view, u + 3.0 * np.diff(view.u_edges)[0], 1e-10, np.diff(view.u_edges)[0])
+        light["multi-bounce"] = gaussian(view, u + 3.0 * np.diff(view.u_edges)[0], 1e-10, np.diff(view.u_edges)[0])
         signals = [simulator.signal(each) for each in simulator.detected_light(light).values()]
         assert len(signals) == 3
         heights = simulator.heights(sum(signals[1:], start=signals[0]), device)

@@ -159,7 +159,7 @@ def of_board(columns: int = PIXELS) -> Shifts:
     lines = ViewRays(view=one, scene=of.scene, materials=materials)
     seen = lines.visible_surface(at)
     receivers = np.where((seen.triangle >= 0)[..., None], seen.receivers, 0.0)
-    lit = sheet.lit(of.scene, at)
+    lit = sheet.illuminate(of.scene, at)
     rows = segment_rows(LitSegments(lit.ends, lit.normals, ALBEDO * lit.power))
     light = OccludedIrradiance(scene=of.scene, segments=len(rows), precision="single")
     irradiance = light(receivers, np.zeros((*receivers.shape[:2], 2)), rows).irradiance

@@ -82,7 +82,7 @@ def light_of(
     sheet = LightSheet(transport=view.transport, power=1.0, sigma=sigma)
     direct = DirectLight(view=view, scene=scene, materials=materials, sheet=sheet, device=device)
     lines = ViewRays(view=view, scene=scene, materials=materials, device=device)
-    seen, lit = lines.visible_surface(0.0), sheet.lit(scene, 0.0)
+    seen, lit = lines.visible_surface(0.0), sheet.illuminate(scene, 0.0)
     segments = segment_rows(LitSegments(lit.ends, lit.normals, ALBEDO * lit.power))
     real = np.float64 if device.has_double else np.float32
     operation = OccludedIrradiance(scene=scene, segments=len(segments), precision="single")

@@ -226,7 +226,7 @@ def test_a_camera_of_many_pixels() -> None:
     np.testing.assert_array_equal(edges, view.u_edges)
     u = np.array([[-1e-3, -5e-4, 0.0, 5e-4, 1e-3]])
     glow = np.broadcast_to(np.linspace(0.0, 1e-9, 1024), (1, 5, 1024))
-    light = {"direct": gaussian(view, u, 1e-6, 4e-5), "bounces": Exposure(glow, np.zeros_like(glow))}
+    light = {"direct": gaussian(view, u, 1e-6, 4e-5), "multi-bounce": Exposure(glow, np.zeros_like(glow))}
     g, h = sheet_point(view.triangulation, u, view.v_centres)
     plan = optimise_mask(view, light, GroundTruth(g, h, np.zeros(u.shape, np.uint8)), min_passed_fraction=0.9999)
     assert np.abs(plan.error_after).max() < 0.02 * np.abs(plan.error_before).max()

@@ -57,7 +57,7 @@ def test_several_lights() -> None:
         view = psd_view(bins)
         light = {
             path: view.deposit_spots(x, view.v_centres, power)
-            for path, x, power in zip(("direct", "diffuse-diffuse", "bounces"), places, powers, strict=True)
+            for path, x, power in zip(("direct", "diffuse-diffuse", "multi-bounce"), places, powers, strict=True)
         }
         _, u = moments(psd(view), light)
         np.testing.assert_allclose(u, places @ powers / powers.sum(), rtol=1e-13)

@@ -81,8 +81,8 @@ def test_light_of_profiles() -> None:
     """Paths add up, variants of the direct light do not; a path that a profile lacks is dark there."""
     view = psd_view()
     spots = [gaussian(view, [place], 1e-6, 1e-4) for place in (-1e-3, 0.0, 1e-3)]
-    block = stack_profiles([{"direct": spots[0], UNIFORM: spots[2]}, {"direct": spots[1], "bounces": spots[2]}])
-    assert not block["bounces"].power[0].any()
+    block = stack_profiles([{"direct": spots[0], UNIFORM: spots[2]}, {"direct": spots[1], "multi-bounce": spots[2]}])
+    assert not block["multi-bounce"].power[0].any()
     np.testing.assert_array_equal(total_exposure(block).power, [spots[0].power, spots[1].power + spots[2].power])
     np.testing.assert_array_equal(total_exposure(block).moment, [spots[0].moment, spots[1].moment + spots[2].moment])
     bright = add_ambient(view, add_ambient(view, block, 1e-6), 2e-6)
@@ -91,4 +91,4 @@ def test_light_of_profiles() -> None:
         with pytest.raises(ValueError, match="one or more profiles"):
             stack_profiles(wrong)
     with pytest.raises(ValueError, match="different shapes"):
-        total_exposure({"direct": spots[0], "bounces": block["bounces"]})
+        total_exposure({"direct": spots[0], "multi-bounce": block["multi-bounce"]})

@@ -183,7 +183,7 @@ def between_walls(edges: np.ndarray, walls: Any, first: np.ndarray, albedo: floa
     count = len(edges) - 1
     patches = Patches(np.concatenate(triangles), np.repeat(np.arange(2 * count), 2))
     solved = Radiosity(patches=patches, albedo=np.full(2 * count, albedo), device=device)
-    return solved, solved.exitance(np.concatenate([np.zeros(count), np.diff(first) / np.diff(edges)]))
+    return solved, solved.solve(np.concatenate([np.zeros(count), np.diff(first) / np.diff(edges)]))
 
 
 def plates(count: int, albedo: float, device: Device) -> tuple[np.ndarray, float]:
@@ -193,7 +193,7 @@ def plates(count: int, albedo: float, device: Device) -> tuple[np.ndarray, float
     solved, exitance = between_walls(edges, walls, edges / (2 * np.sqrt(1 + edges**2)), albedo, 1e5, device)
     receivers = np.zeros((5, 6))
     receivers[:, 0], receivers[:, 2], receivers[:, 5] = AT_PLATES, 1.0, -1.0
-    light = 0.5 / (1.0 + AT_PLATES**2) ** 1.5 + solved.light(receivers, exitance).irradiance
+    light = 0.5 / (1.0 + AT_PLATES**2) ** 1.5 + solved.irradiance(receivers, exitance).irradiance
     return light, float(exitance[count:] @ np.diff(edges)) / albedo
 
 
@@ -203,7 +203,7 @@ def corner(count: int, albedo: float, device: Device) -> np.ndarray:
     walls = [((1, 0, 0), (0, 0, 1), (0, 0, 0)), ((0, 0, 1), (1, 0, 0), (0, 0, 0))]
     solved, exitance = between_walls(edges, walls, -0.5 / np.sqrt(1 + edges**2), albedo, 1e7, device)
     first = AT_CORNER / (2.0 * (1.0 + AT_CORNER**2) ** 1.5)
-    return np.asarray(first + solved.light(on_wall(AT_CORNER, math.pi / 2.0), exitance).irradiance)
+    return np.asarray(first + solved.irradiance(on_wall(AT_CORNER, math.pi / 2.0), exitance).irradiance)
 
 
 def extrapolated(values: list[np.ndarray]) -> np.ndarray:
@@ -272,10 +272,10 @@ def test_integrating_sphere(device: Device, height: float) -> None:
         middle, normal = patches.corners[start].mean(axis=0), patches.normals[start]
         along = 1e-3 * np.cross(normal, [0.0, 1.0, 0.0])
         lit = LitSegments([[middle - along, middle + along]], [normal], [albedo / (2.0 * np.linalg.norm(along))])
-        one = solved.arrival(lit)
+        one = solved.direct_irradiance(lit)
         area = 4.0 * math.pi
         away = np.linalg.norm(patches.corners.mean(axis=1) - middle, axis=1) > 1.0
-        exitance = solved.exitance(one)
+        exitance = solved.solve(one)
         closed = patches.area.sum() / trimesh.creation.icosphere(finer).area
         every = albedo / (area * (1.0 - albedo * closed))
         errors.append(

@@ -19,7 +19,7 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.readings import UNIFORM, UNIFORM_UNOCCLUDED, UNOCCLUDED
 from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet
-from gpuvision.simulation.transport.specular_highlights import specular_highlights
+from gpuvision.simulation.transport.specular_highlights import find_specular_highlights
 from gpuvision.status import Status
 from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sensor_view, two_plates, u_of
 from reference.rays import occluded
@@ -82,7 +82,7 @@ def test_as_rays_to_the_lens_say(device: Device, source: Any, lens: Lens | None,
     tips = rng.uniform(-0.02, 0.02, (150, 1, 3)) + rng.normal(0.0, 4e-3, (150, 3, 3))
     scene, seen_by, L = Scene(np.concatenate([tips, plate(0.03, 0.03, -0.02)])), sensor_view(lens=lens, bins=6), 1e-3
     light = light_of(scene, seen_by=seen_by, source=source, device=device)
-    line = light.sheet.lit(scene, L)
+    line = light.sheet.illuminate(scene, L)
     count = 2000
     share = (np.arange(count) + 0.5) / count
     points = line.ends[:, :1] + share[:, None] * (line.ends[:, 1:] - line.ends[:, :1])
@@ -122,11 +122,13 @@ def test_very_many_gaps() -> None:
     light = light_of(np.concatenate([plate(), screen]), seen_by=sensor_view(samples=1))
     found = light.exposures(0.0, causes=True)
     assert 0.3 < found["direct"].total()[0] / found[UNOCCLUDED].total()[0] < 0.9
-    parts = light._line_of_sight.parts(light.sheet.lit(light.scene, 0.0), light.view.lens_at(0.0), hidden=True)
-    assert parts.seen.sum() >= 100
+    parts = light._visibility.visible_parts(
+        light.sheet.illuminate(light.scene, 0.0), light.view.lens_at(0.0), with_hidden=True
+    )
+    assert parts.visible.sum() >= 100
     assert np.sum(parts.end - parts.start) == pytest.approx(parts.segment.max() + 1, rel=1e-12)
     # The plate is 2 m wide, and the lit line is two segments of 1 m; the shadows are the teeth's, from the lens.
-    hidden = np.sum((parts.end - parts.start)[~parts.seen])
+    hidden = np.sum((parts.end - parts.start)[~parts.visible])
     assert hidden == pytest.approx(100 * (teeth[1] - teeth[0]) * 0.15 / 0.14, rel=1e-9)
 
 
@@ -150,7 +152,7 @@ def test_grazing_light(lean: float) -> None:
     wall = quad((low, -1, -2e-3), (high, -1, 2e-3), (high, 1, 2e-3), (low, 1, -2e-3))
     seen_by = sensor_view(samples=1, bins=1, lens=None)
     light = light_of(wall, seen_by=seen_by)
-    assert light.sheet.lit(light.scene, 0.0).total() == pytest.approx(high - low, rel=1e-12)
+    assert light.sheet.illuminate(light.scene, 0.0).total() == pytest.approx(high - low, rel=1e-12)
     share = np.polynomial.legendre.leggauss(30)
     points = np.stack([0.5 * (high - low) * share[0], 0.0 * share[0], 2e-3 * share[0]], axis=-1)
     eye = seen_by.lens_at(0.0) - points
@@ -182,7 +184,7 @@ def test_out_of_view_behind_the_lens_and_beyond_the_fold(lens: Lens | None) -> N
         lens=lens, bins=30, u_edges=np.linspace(-9e-3, 9e-3, 31), v_edges=np.linspace(-9e-3, 9e-3, 10)
     )
     found = light_of(ramp, seen_by=seen_by).exposures(0.0)["direct"]
-    line = LightSheet(transport=TRANSPORT).lit(Scene(ramp), 0.0)
+    line = LightSheet(transport=TRANSPORT).illuminate(Scene(ramp), 0.0)
     share = (np.arange(200_000) + 0.5) / 200_000
     points = (line.ends[:, :1] + share[:, None] * (line.ends[:, 1:] - line.ends[:, :1])).reshape(-1, 3)
     eye = seen_by.lens_at(0.0) - points
@@ -262,7 +264,7 @@ def test_several_profiles_at_once(device: Device, sigma: float) -> None:
     seen_by = sensor_view(bins=5, aperture=0.02)
     light = light_of(Scene.of(ball), (made_of,), seen_by=seen_by, sigma=sigma, source=(0.01, 0.2), device=device)
     places = np.array([3e-3, -0.5, 1e-2, *np.linspace(-4e-3, 4e-3, 9), 0.0])
-    together, truths = light.exposures_along(places, causes=True), light.truths_along(places)
+    together, truths = light.exposures_of_profiles(places, causes=True), light.truths_of_profiles(places)
     for k, L in enumerate(places):
         for name, alone in light.exposures(float(L), causes=True).items():
             np.testing.assert_allclose(together[name].power[k], alone.power, rtol=1e-9, atol=1e-20)
@@ -270,8 +272,8 @@ def test_several_profiles_at_once(device: Device, sigma: float) -> None:
         for both, one in zip(truths, light.truth(float(L)), strict=True):
             np.testing.assert_array_equal(both[k], one)
     assert (together["specular"].total().sum(axis=1) > 0.0).sum() > 5
-    assert light.exposures_along([])["direct"].power.shape == (0, 8, 5)
-    assert light.truths_along([]).h.shape == (0, 8)
+    assert light.exposures_of_profiles([])["direct"].power.shape == (0, 8, 5)
+    assert light.truths_of_profiles([]).h.shape == (0, 8)
 
 
 def test_in_a_slit_is_dark() -> None:
@@ -372,12 +374,12 @@ def test_glints_as_rays_say(source: Any, rng: np.random.Generator) -> None:
             )
         )
     light = light_of(np.concatenate(facets), (made_of,), seen_by=seen_by, source=source)
-    line = light.sheet.lit(light.scene, 0.0)
-    parts = specular_highlights(line, light.sheet, seen_by, 0.0)
+    line = light.sheet.illuminate(light.scene, 0.0)
+    parts = find_specular_highlights(line, light.sheet, seen_by, 0.0)
     share = np.bincount(parts.segment, parts.end - parts.start, minlength=len(line.power))
     at = (np.arange(2000) + 0.5) / 2000
     points = line.ends[:, :1] + at[:, None] * (line.ends[:, 1:] - line.ends[:, :1])
-    arrives = -light.sheet.towards(points)
+    arrives = -light.sheet.direction_to_light(points)
     normal = line.normals[:, None]
     goes = arrives - 2.0 * np.sum(arrives * normal, axis=-1, keepdims=True) * normal
     to_lens, axis = np.array(seen_by.lens) - points, np.array(seen_by.axis)

@@ -104,7 +104,7 @@ def test_order_of_convergence_in_slabs() -> None:
     for count in counts:
         shifts = []
         for x in np.linspace(-0.61, 0.67, 7):
-            cuts = Slabs.of(int(count)).low[1:]
+            cuts = Slabs.uniform(int(count)).low[1:]
             light = light_of(scene, materials, seen_by=seen_by, sigma=SIGMA, sub_sheets=cuts)
             direct = light.exposures(-x * SIGMA)["direct"]
             u = u_of(direct, seen_by)[0] - seen_by.project([0.0, -x * SIGMA, 0.0], -x * SIGMA)[0]
@@ -136,7 +136,9 @@ def test_slabs_end_where_edges_lie_in_the_sheet() -> None:
         ]
     )
     light = light_of(Scene(corners), sigma=0.05, sub_sheets=1)
-    np.testing.assert_allclose(SheetIndex.of(light.scene, TRANSPORT).steps, [[-1.0, 1.0, 2.0], [2.0, 2.0, 2.0]])
+    np.testing.assert_allclose(
+        SheetIndex.of(light.scene, TRANSPORT).parallel_edges, [[-1.0, 1.0, 2.0], [2.0, 2.0, 2.0]]
+    )
     assert len(light.slabs(0.0).share) == 1
     np.testing.assert_allclose(light.slabs(1.02).high, [-0.4, np.inf])
     painted = light_of(Scene(corners, np.repeat([0, 1, 1, 1], 2)), (GREY, GREY), sigma=0.05, sub_sheets=2)
@@ -149,11 +151,11 @@ def test_slabs_end_where_edges_lie_in_the_sheet() -> None:
 
 
 def test_slabs() -> None:
-    for slabs in (Slabs.of(1), Slabs.of(2), Slabs.of(9), Slabs.between([-1.0, 3.0, 9.0])):
+    for slabs in (Slabs.uniform(1), Slabs.uniform(2), Slabs.uniform(9), Slabs.from_cuts([-1.0, 3.0, 9.0])):
         assert slabs.share.sum() == pytest.approx(1.0, rel=1e-15)
         assert slabs.share @ slabs.middle == pytest.approx(0.0, abs=1e-15)
         assert np.all((slabs.low < slabs.middle) & (slabs.middle < slabs.high))
-    assert len(Slabs.of(9).share) == 9
+    assert len(Slabs.uniform(9).share) == 9
 
 
 @pytest.mark.parametrize("count", [1, 2, 9])

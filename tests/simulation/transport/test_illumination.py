@@ -87,11 +87,11 @@ def assert_as_rays(sheet: LightSheet, scene: Scene, L: float, lit: LitLine, rng:
 def test_as_rays_of_light_say(sheet: LightSheet, count: int, rng: np.random.Generator) -> None:
     scene = Scene(soup(rng, count))
     places = rng.uniform(-1.0, 1.0, 4)
-    lit, first = sheet.lit_lines(scene, places)
+    lit, first = sheet.illuminate_all(scene, places)
     for n, L in enumerate(places):
         mine = LitLine(*(each[first[n] : first[n + 1]] for each in lit))
         assert_as_rays(sheet, scene, L, mine, rng)
-        for both, alone in zip(mine, sheet.lit(scene, L - 0.25, 0.25), strict=True):
+        for both, alone in zip(mine, sheet.illuminate(scene, L - 0.25, 0.25), strict=True):
             np.testing.assert_array_equal(both, alone)
 
 
@@ -108,7 +108,7 @@ def test_soup(seed: int, count: int, size: float, name: str) -> None:
     rng = np.random.default_rng(seed)
     scene, sheet = Scene(soup(rng, count, size)), SHEETS[name]
     L = float(rng.uniform(-0.5, 0.5))
-    assert_as_rays(sheet, scene, L, sheet.lit(scene, L), rng)
+    assert_as_rays(sheet, scene, L, sheet.illuminate(scene, L), rng)
 
 
 @settings(max_examples=60, deadline=None)
@@ -121,7 +121,7 @@ def test_envelope_on_a_lattice(seed: int, groups: int, count: int) -> None:
     pieces = upper_envelope(group, x, height)
     assert np.all(pieces.left < pieces.right)
     for n in range(groups):
-        mine = np.flatnonzero(group[pieces.member] == n)
+        mine = np.flatnonzero(group[pieces.segment] == n)
         assert np.all(pieces.right[mine[:-1]] <= pieces.left[mine[1:]])
         at = rng.uniform(-0.5, 6.5, 50)
         of = (group == n)[:, None] & (x[:, :1] < at) & (at < x[:, 1:])
@@ -131,7 +131,7 @@ def test_envelope_on_a_lattice(seed: int, groups: int, count: int) -> None:
         inside = (pieces.left[mine, None] < at) & (at < pieces.right[mine, None])
         assert np.all(inside.sum(axis=0) == np.isfinite(best))
         piece, k = np.nonzero(inside)
-        np.testing.assert_allclose(level[pieces.member[mine][piece], k], best[k], atol=1e-12)
+        np.testing.assert_allclose(level[pieces.segment[mine][piece], k], best[k], atol=1e-12)
 
 
 def test_envelope_of_many_long_segments(rng: np.random.Generator) -> None:
@@ -143,8 +143,8 @@ def test_envelope_of_many_long_segments(rng: np.random.Generator) -> None:
     at = np.linspace(-0.95, 0.95, 777)
     level = np.stack([np.interp(at, *pair, left=-9.0, right=-9.0) for pair in zip(x, height, strict=True)])
     of = np.searchsorted(pieces.left, at, side="right") - 1
-    np.testing.assert_array_equal(pieces.member[of], np.argmax(level, axis=0))
-    assert len(pieces.member) < 60
+    np.testing.assert_array_equal(pieces.segment[of], np.argmax(level, axis=0))
+    assert len(pieces.segment) < 60
 
 
 @BOTH
@@ -156,7 +156,7 @@ def test_no_power_is_lost(sheet: LightSheet, rng: np.random.Generator) -> None:
     solids[2].apply_translation((0.35, 0.1, 0.1))
     scene = Scene.of(solids)
     limited = LightSheet(transport=sheet.transport, power=7.0, source=sheet.source, g_limits=(-0.7, 0.6))
-    lit = limited.lit(scene, 0.05)
+    lit = limited.illuminate(scene, 0.05)
     assert len(lit.power) > 30
     np.testing.assert_allclose(lit.total(), 7.0 * 1.3, rtol=1e-13)
     assert len(np.unique(scene.material[lit.triangle])) == 3
@@ -165,10 +165,10 @@ def test_no_power_is_lost(sheet: LightSheet, rng: np.random.Generator) -> None:
 def test_shadow_of_a_step() -> None:
     """A fan from the left behind a step of 10 mm: the shadow ends where the ray over its edge meets the ground."""
     sheet = LightSheet(transport=UPRIGHT, source=(-0.5, 0.2))
-    lit = sheet.lit(Scene(step(0.01)), 0.1)
+    lit = sheet.illuminate(Scene(step(0.01)), 0.1)
     right = lit.ends[lit.ends[:, :, 0].min(axis=1) > 1e-6]
     assert right[:, :, 0].min() == pytest.approx(0.5 * 0.01 / 0.19, rel=1e-13)
-    upright = LightSheet(transport=UPRIGHT).lit(Scene(step(0.01)), 0.1)
+    upright = LightSheet(transport=UPRIGHT).illuminate(Scene(step(0.01)), 0.1)
     assert not np.isin(upright.triangle, (2, 3)).any()
     assert upright.total() == pytest.approx(2.0, rel=1e-14)
 
@@ -178,7 +178,7 @@ def test_power_falls_with_the_cosine() -> None:
     slope = quad(
         (0.0, -1.0, 0.0), (math.cos(tilt), -1.0, math.sin(tilt)), (math.cos(tilt), 1.0, math.sin(tilt)), (0.0, 1.0, 0.0)
     )
-    lit = LightSheet(transport=UPRIGHT, power=3.0).lit(Scene(slope), 0.3)
+    lit = LightSheet(transport=UPRIGHT, power=3.0).illuminate(Scene(slope), 0.3)
     np.testing.assert_allclose(lit.power, 3.0 * math.cos(tilt), rtol=1e-14)
     normals = np.tile([-math.sin(tilt), 0.0, math.cos(tilt)], (len(lit.power), 1))
     np.testing.assert_allclose(lit.normals, normals, atol=1e-15)
@@ -186,7 +186,7 @@ def test_power_falls_with_the_cosine() -> None:
 
 def test_open_meshes_are_lit_on_the_side_of_the_light() -> None:
     for corners in (plate(1.0, 1.0), plate(1.0, 1.0)[:, ::-1]):
-        lit = LightSheet(transport=UPRIGHT).lit(Scene(corners), 0.2)
+        lit = LightSheet(transport=UPRIGHT).illuminate(Scene(corners), 0.2)
         np.testing.assert_array_equal(lit.normals, np.tile([0.0, 0.0, 1.0], (len(lit.power), 1)))
         assert lit.total() == pytest.approx(2.0, rel=1e-15)
 
@@ -195,7 +195,7 @@ def test_normals_of_a_fan_face_the_source(rng: np.random.Generator) -> None:
     for name in ("fan", "tilted fan"):
         sheet, scene = SHEETS[name], Scene(soup(rng, 300))
         move, L = sheet.transport, 0.2
-        lit = sheet.lit(scene, L)
+        lit = sheet.illuminate(scene, L)
         source = np.array(move.origin) + L * np.array(move.direction)
         source = source + np.array(sheet.source) @ np.array([move.g_axis, move.h_axis])
         assert np.all(np.sum(lit.normals * (source - lit.ends.mean(axis=1)), axis=1) > 0.0)
@@ -209,7 +209,7 @@ def test_profile_along_the_sheet() -> None:
     bell = np.linspace(-0.8, 0.8, 41)
     table = np.stack([bell, np.exp(-0.5 * (bell / 0.25) ** 2)], axis=1)
     sheet = LightSheet(transport=UPRIGHT, power=2.0, profile=tuple(map(tuple, table)), g_limits=(-0.5, 0.9))
-    lit = sheet.lit(Scene(plate(1.0, 1.0)), 0.1)
+    lit = sheet.illuminate(Scene(plate(1.0, 1.0)), 0.1)
     G = lit.ends[:, :, 0]
     assert G.min() == -0.5
     assert G.max() == 0.8
@@ -225,7 +225,7 @@ def test_uniformity_of_a_fan() -> None:
     """A steep slope below a fan: power per metre follows the inverse square of the depth, within 2 %."""
     slope = quad((0.0, -1.0, 0.0), (0.1, -1.0, 0.6), (0.1, 1.0, 0.6), (0.0, 1.0, 0.0))
     sheet = LightSheet(transport=UPRIGHT, source=(-1.0, 1.0), uniformity=0.02)
-    lit = sheet.lit(Scene(slope), 0.0)
+    lit = sheet.illuminate(Scene(slope), 0.0)
     s = lit.ends.mean(axis=1) @ np.array([0.1, 0.0, 0.6]) / 0.37
     # x = -1 + (1 + 0.1 s) / (1 - 0.6 s): its slope over the length of the slope.
     exact = (0.1 + 0.6) / (1.0 - 0.6 * s) ** 2 / math.sqrt(0.37)
@@ -240,26 +240,26 @@ def test_joined(rng: np.random.Generator) -> None:
     for _ in range(4):
         ground, box = ground.subdivide(), box.subdivide()
     scene = Scene.of([ground, box])
-    lit = LightSheet(transport=TILTED).lit(scene, 0.013)
-    joined = lit.joined(scene.material[lit.triangle])
+    lit = LightSheet(transport=TILTED).illuminate(scene, 0.013)
+    joined = lit.merged(scene.material[lit.triangle])
     assert len(lit.power) > 40
     assert 3 <= len(joined.power) <= 6
     assert joined.total() == pytest.approx(lit.total(), rel=1e-13)
     lengths, at = np.cumsum(lit.lengths), np.cumsum(joined.lengths)
     np.testing.assert_allclose(np.abs(lengths[:, None] - at).min(axis=0), 0.0, atol=1e-12)
-    apart = lit.joined(np.arange(len(lit.power)))
+    apart = lit.merged(np.arange(len(lit.power)))
     for both, alone in zip(apart, lit, strict=True):
         np.testing.assert_array_equal(both, alone)
-    nothing = LightSheet(transport=UPRIGHT).lit(scene, 9.0).joined(np.zeros(0, int))
+    nothing = LightSheet(transport=UPRIGHT).illuminate(scene, 9.0).merged(np.zeros(0, int))
     assert nothing.ends.shape == (0, 2, 3)
     bent = Scene.of(trimesh.creation.icosphere(3, 0.5))
-    curve = LightSheet(transport=UPRIGHT).lit(bent, 0.1)
-    assert len(curve.joined(np.zeros(len(curve.power), int)).power) == len(curve.power)
+    curve = LightSheet(transport=UPRIGHT).illuminate(bent, 0.1)
+    assert len(curve.merged(np.zeros(len(curve.power), int)).power) == len(curve.power)
 
 
 def test_coincident_faces_share_nothing() -> None:
     """Of two faces in one place the first one gets all the light."""
-    lit = LightSheet(transport=UPRIGHT).lit(Scene(np.concatenate([plate(1.0, 1.0), plate(1.0, 1.0)])), 0.3)
+    lit = LightSheet(transport=UPRIGHT).illuminate(Scene(np.concatenate([plate(1.0, 1.0), plate(1.0, 1.0)])), 0.3)
     np.testing.assert_array_equal(np.sort(lit.triangle), [0, 1])
     assert lit.total() == 2.0
 
@@ -268,7 +268,7 @@ def test_solids_that_stand_in_each_other() -> None:
     """A ball sunk into a plate: its segments end on the circle in which they meet."""
     ball, ground = trimesh.creation.icosphere(5, 0.3), trimesh.creation.box((2.0, 2.0, 0.2))
     scene = Scene.of([ball, ground])
-    lit = LightSheet(transport=UPRIGHT).lit(scene, 0.05)
+    lit = LightSheet(transport=UPRIGHT).illuminate(scene, 0.05)
     on_ball = scene.material[lit.triangle] == 0
     edge = np.abs(lit.ends[on_ball][:, :, 0]).max()
     height = lit.ends[on_ball][:, :, 2].min()
@@ -281,7 +281,7 @@ def test_edge_in_the_sheet_and_face_in_the_sheet() -> None:
     """At the plane of a wall the sheet lights what lies before it, and the wall itself not at all."""
     scene = Scene(_step_across(0.01))
     sheet = LightSheet(transport=UPRIGHT)
-    before, at, behind = (sheet.lit(scene, L) for L in (-1e-9, 0.0, 1e-9))
+    before, at, behind = (sheet.illuminate(scene, L) for L in (-1e-9, 0.0, 1e-9))
     assert np.isin(at.triangle, before.triangle).all()
     for lit, height in ((before, 0.01), (at, 0.01), (behind, 0.0)):
         np.testing.assert_allclose(lit.ends[:, :, 2], height, atol=1e-17)
@@ -298,7 +298,7 @@ def test_long_thin_triangles(rng: np.random.Generator) -> None:
     start = rng.uniform(-1.0, 1.0, (200, 3)) * (1.0, 0.1, 0.1)
     needles = start[:, None] + np.array([[0.0, -5.0, 0.0], [1e-6, 5.0, 0.0], [-1e-6, 5.0, 1e-6]])
     scene = Scene(np.concatenate([needles, plate(2.0, 2.0, -1.0)]))
-    lit = LightSheet(transport=UPRIGHT).lit(scene, 0.5)
+    lit = LightSheet(transport=UPRIGHT).illuminate(scene, 0.5)
     assert lit.total() == pytest.approx(4.0, rel=1e-12)
     assert (lit.triangle < 200).sum() > 150
 
@@ -316,7 +316,7 @@ def test_index_finds_all_that_is_cut(rng: np.random.Generator) -> None:
 
 def test_nothing_there() -> None:
     for scene in (Scene(np.zeros((0, 3, 3))), Scene(plate(1.0, 1.0)), Scene(np.full((2, 3, 3), np.nan))):
-        lit, first = LightSheet(transport=UPRIGHT).lit_lines(scene, [5.0, 6.0])
+        lit, first = LightSheet(transport=UPRIGHT).illuminate_all(scene, [5.0, 6.0])
         assert lit.ends.shape == (0, 2, 3)
         assert lit.normals.shape == (0, 3)
         assert lit.total() == 0.0
@@ -330,12 +330,14 @@ def test_where_a_fan_comes_from() -> None:
     axes = np.array([move.g_axis, move.h_axis])
     source = place + np.array(sheet.source) @ axes
     point = place + np.array([0.2, -0.1]) @ axes
-    np.testing.assert_allclose(sheet.source_of(point), source, atol=1e-14)
-    np.testing.assert_allclose(sheet.towards(point), (source - point) / np.linalg.norm(source - point), atol=1e-14)
+    np.testing.assert_allclose(sheet.source_positions(point), source, atol=1e-14)
+    np.testing.assert_allclose(
+        sheet.direction_to_light(point), (source - point) / np.linalg.norm(source - point), atol=1e-14
+    )
     upright = SHEETS["tilted"]
-    np.testing.assert_allclose(np.cross(upright.towards(np.zeros((4, 3))), move.h_axis), 0.0, atol=1e-15)
+    np.testing.assert_allclose(np.cross(upright.direction_to_light(np.zeros((4, 3))), move.h_axis), 0.0, atol=1e-15)
     with pytest.raises(ValueError, match=r"parallel light comes from nowhere"):
-        upright.source_of(point)
+        upright.source_positions(point)
 
 
 @pytest.mark.parametrize(
@@ -369,7 +371,7 @@ def test_a_million_triangles() -> None:
     scene, sheet = Scene(np.concatenate(halves)), LightSheet(transport=UPRIGHT)
     places = np.linspace(-0.0499, 0.0499, 1000)
     for L in places:
-        lit = sheet.lit(scene, float(L))
+        lit = sheet.illuminate(scene, float(L))
         assert lit.total() == pytest.approx(0.1, rel=1e-12)
         assert len(lit.power) >= 1414
     assert len(scene.corners) > 999_000

@@ -11,7 +11,7 @@ import trimesh
 from canary import Guarded
 from gpuvision.host import Device
 from gpuvision.simulation.transport.mirror_facets import MirrorFacets
-from gpuvision.simulation.transport.plane_mirrors import planes_of, windows
+from gpuvision.simulation.transport.plane_mirrors import mirror_windows, triangle_planes
 
 WAYS = pytest.mark.parametrize(
     ("variant", "dtype"),
@@ -38,7 +38,7 @@ def mirrors(kind: str, rng: np.random.Generator) -> np.ndarray:
 
 def all_windows(corners: np.ndarray, lines: np.ndarray) -> Any:
     line, mirror = (each.ravel() for each in np.indices((len(lines), len(corners))))
-    return windows(LENS, lines.reshape(-1, 2, 3), corners, planes_of(corners), line, mirror)
+    return mirror_windows(LENS, lines.reshape(-1, 2, 3), corners, triangle_planes(corners), line, mirror)
 
 
 @WAYS
@@ -58,7 +58,7 @@ def test_no_block_is_left_out_that_shows_a_line(
     assert near[found.line, block_of[found.mirror]].all()
     assert len(found.line) > (0 if kind == "one" else 50)
     if kind == "boxes":
-        # Blocks of one face each: few that are looked at show nothing.
+        # TriangleBlocks of one face each: few that are looked at show nothing.
         assert near.mean() < 0.1
 
 
@@ -67,7 +67,7 @@ def test_rays_reflect_at_the_ends_of_windows_as_they_should(rng: np.random.Gener
     found = all_windows(corners, lines)
     ends = lines.reshape(-1, 2, 3)[found.line]
     place = ends[:, :1] + found.share[..., None] * (ends[:, 1:] - ends[:, :1])
-    planes = planes_of(corners)[found.mirror][:, None]
+    planes = triangle_planes(corners)[found.mirror][:, None]
     normal, offset = planes[..., :3], planes[..., 3]
     up, lens_up = np.sum(place * normal, axis=-1) - offset, LENS @ normal[:, 0].T - offset[:, 0]
     assert np.all(up * lens_up[:, None] > -1e-9)

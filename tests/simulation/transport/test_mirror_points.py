@@ -60,7 +60,7 @@ def test_a_sphere_shows_points_where_alhazen_says(
         assert np.linalg.norm(place[n] - expected) < 2e-4
         assert abs(density[n] / concentration - 1.0) < 1.5e-2
     assert not result.status.any()
-    assert ((result.triangle >= 7) == (np.arange(8) < result.count[:, None])).all()
+    assert ((result.triangle >= 7) == (np.arange(8) < result.image_count[:, None])).all()
     assert place.dtype == dtype
 
 
@@ -104,12 +104,12 @@ def test_a_hollow_mirror_concentrates_as_its_focal_length_says(device: Device, p
     op = MirrorPoints(corners=corners[bottom], normals=normals[bottom], numbers=np.flatnonzero(bottom))
     points = np.array([[0.0, 0.0, point_height, 1.0, 0.0, 0.0]])
     result = op(points, np.array([0.0, 0.0, lens_height]), device=device)
-    axial = np.linalg.norm(result.place[0, : result.count[0], :2], axis=1) < 1e-5
+    axial = np.linalg.norm(result.place[0, : result.image_count[0], :2], axis=1) < 1e-5
     assert axial.sum() == 1
     spread = lens_height + point_height - 2.0 * lens_height * point_height / radius
-    assert np.abs(result.place[0, : result.count[0], 2][axial]) < 1e-6
-    assert result.density[0, : result.count[0]][axial] == pytest.approx(spread**-2, rel=2e-2)
-    move = result.move[0, : result.count[0], 0][axial]
+    assert np.abs(result.place[0, : result.image_count[0], 2][axial]) < 1e-6
+    assert result.density[0, : result.image_count[0]][axial] == pytest.approx(spread**-2, rel=2e-2)
+    move = result.move[0, : result.image_count[0], 0][axial]
     # Of the place as the point moves aside: the lens is at e / (e - f) times its image's way.
     assert move == pytest.approx(lens_height / spread, rel=1e-2)
 
@@ -143,7 +143,7 @@ def test_a_ball_shows_all_that_it_does_not_hide(device: Device, rng: np.random.G
     result = mirrors(3, outside=np.ones(1280, bool))(points, LENS, device=device)
     # Within the bulge of a triangle of the silhouette, rounding of the surface says whether.
     sure = np.abs(near - 1.0) > 3e-3
-    missed = sure & (result.count != (near > 1.0))
+    missed = sure & (result.image_count != (near > 1.0))
     assert missed.mean() < 5e-3
     assert np.all(near[missed] < 1.2)
     assert sure.mean() > 0.98
@@ -156,8 +156,8 @@ def test_the_inside_of_a_ball_may_be_left_out(
     points, lens = some_points(rng).astype(dtype), LENS.astype(dtype)
     both = mirrors(3, variant=variant)(points, lens, device=device)
     one = mirrors(3, variant=variant, outside=np.ones(1280, bool))(points, lens, device=device)
-    np.testing.assert_array_equal(both.count, 2)
-    np.testing.assert_array_equal(one.count, 1)
+    np.testing.assert_array_equal(both.image_count, 2)
+    np.testing.assert_array_equal(one.image_count, 1)
     np.testing.assert_array_equal(one.place[:, 0], outside(both)[0])
 
 
@@ -171,7 +171,7 @@ def test_a_flat_mirror_shows_the_mirror_image(
     points[0, 2] = 0.4  # behind
     lens = np.array([0.2, 0.3, 1.5])
     result = op(points.astype(dtype), lens.astype(dtype), device=device)
-    np.testing.assert_array_equal(result.count, np.arange(33) > 0)
+    np.testing.assert_array_equal(result.image_count, np.arange(33) > 0)
     up = points[1:, 2] - 0.5
     share = (1.0 / (1.0 + up))[:, None]
     image = points[1:, :3] * [1, 1, -1] + [0, 0, 1]
@@ -211,9 +211,9 @@ def test_more_images_than_are_kept_and_numbers_that_are_none(
     expected[[3, 5]] = Status.NOT_FINITE
     result = mirrors(2, kept=1, variant=variant)(points, LENS.astype(dtype), device=device)
     np.testing.assert_array_equal(result.status, expected)
-    np.testing.assert_array_equal(result.count, expected == Status.AMBIGUOUS)
+    np.testing.assert_array_equal(result.image_count, expected == Status.AMBIGUOUS)
     none = MirrorPoints(corners=np.zeros((0, 3, 3)), normals=np.zeros((0, 3, 3)), numbers=[], variant=variant)
-    assert not none(points, LENS.astype(dtype), device=device).count.any()
+    assert not none(points, LENS.astype(dtype), device=device).image_count.any()
 
 
 def test_writes_only_its_outputs(device: Device, rng: np.random.Generator) -> None:

@@ -60,8 +60,8 @@ def test_a_plane_mirror_shows_a_second_line_at_twice_its_distance(device: Device
     sensor, distance = sensor_view(12, 480), 0.004
     scene = before_a_wall(distance)
     mirrors = mirrors_of(scene, MATERIALS, device, view=sensor)
-    lit = sheet().lit(scene, 0.0)
-    seen, direct = mirrors.seen(lit, 0.0), mirrors.direct(lit, 0.0)
+    lit = sheet().illuminate(scene, 0.0)
+    seen, direct = mirrors.mirrored_exposure(lit, 0.0), mirrors.direct_exposure(lit, 0.0)
     image = expected_of_line(sensor, -2.0 * distance, SHARE * ALBEDO * 3.0)
     line = expected_of_line(sensor, 0.0, ALBEDO * 3.0)
     rounding = 1e-11 if device.has_double else 1e-4
@@ -80,7 +80,7 @@ def test_a_mirror_of_micrometres_in_a_scene_of_metres(device: Device) -> None:
     sensor, distance, low, high = sensor_view(), 0.004, 3e-3, 3.02e-3
     wall = quad([low, -distance, 0], [high, -distance, 0], [high, -distance, 0.1], [low, -distance, 0.1])
     scene = Scene(np.concatenate([10.0 * np.array(FLOOR), wall]), np.array([0, 0, 1, 1]))
-    lit = sheet(g_limits=(-0.05, 0.05)).lit(scene, 0.0)
+    lit = sheet(g_limits=(-0.05, 0.05)).illuminate(scene, 0.0)
     lens = np.array(sensor.lens)
     share = (lens[1] + distance) / (lens[1] + 2.0 * distance)
 
@@ -90,7 +90,7 @@ def test_a_mirror_of_micrometres_in_a_scene_of_metres(device: Device) -> None:
         return SHARE * ALBEDO * 3.0 / np.pi * cosine * float(sensor.aperture_solid_angle(image))
 
     expected = integral(density, low / share, high / share)[0]
-    seen = mirrors_of(scene, MATERIALS, device, view=sensor).seen(lit, 0.0)
+    seen = mirrors_of(scene, MATERIALS, device, view=sensor).mirrored_exposure(lit, 0.0)
     # The corners are rounded in units of 1 m where there is single only.
     assert seen.power.sum() == pytest.approx(expected, rel=1e-9 if device.has_double else 0.05)
 
@@ -118,7 +118,7 @@ def test_a_mirror_seen_at_89_99_degrees(device: Device) -> None:
         cosine = normal @ (spot - place) / np.linalg.norm(spot - place)
         return SHARE / 2.0 * ALBEDO * 3.0 / np.pi * cosine * float(sensor.aperture_solid_angle(image))
 
-    seen = mirrors_of(scene, materials, device, view=sensor).seen(line, 0.0)
+    seen = mirrors_of(scene, materials, device, view=sensor).mirrored_exposure(line, 0.0)
     assert height / np.linalg.norm(lens - point) < 2e-4
     assert seen.power.sum() == pytest.approx(integral(density, -5e-3, 5e-3)[0], rel=1e-8 if device.has_double else 1e-2)
 
@@ -134,7 +134,7 @@ def test_direct_light_is_what_the_direct_path_says(device: Device, rng: np.rando
     # The line on the floor is not imaged onto the edge of a bin.
     sensor, light = sensor_view(120, 241), sheet(source=(0.0, 0.2))
     theirs = DirectLight(view=sensor, scene=scene, materials=MATERIALS, sheet=light, device=device).exposures(1e-4)
-    ours = mirrors_of(scene, MATERIALS, device, view=sensor).direct(light.lit(scene, 1e-4), 1e-4)
+    ours = mirrors_of(scene, MATERIALS, device, view=sensor).direct_exposure(light.illuminate(scene, 1e-4), 1e-4)
     np.testing.assert_allclose(ours.power, theirs["direct"].power, atol=1e-6 * ours.power.max())
     np.testing.assert_allclose(ours.moment, theirs["direct"].moment, atol=1e-6 * np.abs(ours.moment).max())
 
@@ -182,8 +182,8 @@ def test_plane_mirrors_show_what_points_by_brute_force_say(device: Device, seed:
     dull = np.concatenate([FLOOR, *(np.array(box.triangles) for box in boxes)])
     scene = Scene(np.concatenate([facets, dull]), np.r_[np.ones(len(facets), int), np.zeros(len(dull), int)])
     sensor = sensor_view(40, 60)
-    lit = sheet(g_limits=(-0.022, 0.022)).lit(scene, 0.0)
-    ours = mirrors_of(scene, MATERIALS, device, view=sensor).seen(lit, 0.0)
+    lit = sheet(g_limits=(-0.022, 0.022)).illuminate(scene, 0.0)
+    ours = mirrors_of(scene, MATERIALS, device, view=sensor).mirrored_exposure(lit, 0.0)
     theirs = mirrored_points(scene, lit, sensor, device, 3000)
     assert ours.power.sum() > 0.0
     assert ours.power.sum() == pytest.approx(theirs.power.sum(), rel=2e-3)
@@ -217,9 +217,9 @@ def test_a_ball_shows_a_line_as_alhazen_says(device: Device) -> None:
     middle_of_it = expected.first_moment(sensor.u_edges).sum() / expected.power.sum()
     for fineness in (3, 4):
         scene = ball_scene(fineness, radius, middle)
-        mirrors = mirrors_of(scene, MATERIALS, device, view=sensor, per_sample=4.0)
+        mirrors = mirrors_of(scene, MATERIALS, device, view=sensor, steps_per_sample=4.0)
         # The line's own light: the ball must not shade it.
-        ours = mirrors.seen(light.lit(scene, 0.0), 0.0)
+        ours = mirrors.mirrored_exposure(light.illuminate(scene, 0.0), 0.0)
         assert ours.power.sum() == pytest.approx(expected.power.sum(), rel=2e-2 / 4.0 ** (fineness - 3))
         assert abs(ours.first_moment(sensor.u_edges).sum() / ours.power.sum() - middle_of_it) < 1e-7
         v = [each.total() @ sensor.v_centres / each.power.sum() for each in (ours, expected)]
@@ -228,9 +228,11 @@ def test_a_ball_shows_a_line_as_alhazen_says(device: Device) -> None:
 
 def test_a_curved_mirror_in_steps_converges_to_the_second_order(device: Device) -> None:
     scene = ball_scene(3, 5e-3, np.array([0.0, -0.007, 5.0e-3]))
-    lit = sheet(g_limits=(-0.015, 0.015)).lit(scene, 0.0)
+    lit = sheet(g_limits=(-0.015, 0.015)).illuminate(scene, 0.0)
     totals = [
-        mirrors_of(scene, MATERIALS, device, view=sensor_view(24, 24), per_sample=steps).seen(lit, 0.0).power.sum()
+        mirrors_of(scene, MATERIALS, device, view=sensor_view(24, 24), steps_per_sample=steps)
+        .mirrored_exposure(lit, 0.0)
+        .power.sum()
         for steps in (1.0, 2.0, 64.0)
     ]
     assert abs(totals[0] - totals[2]) / abs(totals[1] - totals[2]) > 3.0
@@ -249,21 +251,21 @@ def test_a_hollow_mirror_does_not_hide_itself(device: Device) -> None:
         scene = Scene(np.concatenate([plate, bowl]), np.r_[0, np.ones(len(bowl), int)])
         ends = np.array([[[-5e-3, 0.0, 0.012], [5e-3, 0.0, 0.012]]])
         line = LitLine(ends, np.array([[0.0, 0.0, -1.0]]), np.zeros(1, int), np.array([3.0]))
-        totals.append(mirrors_of(scene, MATERIALS, device, normals=normals).seen(line, 0.0).power.sum())
+        totals.append(mirrors_of(scene, MATERIALS, device, normals=normals).mirrored_exposure(line, 0.0).power.sum())
     assert totals[0] == pytest.approx(totals[1], rel=2e-3)
     assert totals[0] > 0.0
 
 
 def test_what_stands_before_a_curved_mirror_hides_its_image(device: Device) -> None:
     scene = ball_scene(3, 5e-3, np.array([0.0, -0.007, 5.0e-3]))
-    lit = sheet(g_limits=(-0.015, 0.015)).lit(scene, 0.0)
-    whole = mirrors_of(scene, MATERIALS, device).seen(lit, 0.0).power.sum()
+    lit = sheet(g_limits=(-0.015, 0.015)).illuminate(scene, 0.0)
+    whole = mirrors_of(scene, MATERIALS, device).mirrored_exposure(lit, 0.0).power.sum()
     for screen in (
         quad([-0.05, -0.0005, 0], [0.05, -0.0005, 0], [0.05, -0.0005, 0.003], [-0.05, -0.0005, 0.003]),
         quad([-0.05, 0.03, 0.03], [0.05, 0.03, 0.03], [0.05, 0.03, 0.09], [-0.05, 0.03, 0.09]),
     ):
         hidden = Scene(np.concatenate([scene.corners, screen]), np.append(scene.material, [0, 0]))
-        assert mirrors_of(hidden, MATERIALS, device).seen(lit, 0.0).power.sum() < 1e-3 * whole
+        assert mirrors_of(hidden, MATERIALS, device).mirrored_exposure(lit, 0.0).power.sum() < 1e-3 * whole
 
 
 def test_an_image_on_an_edge_counts_once(device: Device) -> None:
@@ -294,10 +296,12 @@ def test_more_images_than_there_is_room_for_are_sought_again(device: Device, mon
     balls = [np.array(trimesh.creation.icosphere(2).triangles) * 1e-3 + [x, -0.007, 2e-3] for x in np.arange(9) * 3e-3]
     corners = np.concatenate([FLOOR, *balls])
     scene = Scene(corners, np.r_[0, 0, np.ones(len(corners) - 2, int)])
-    lit = sheet(g_limits=(-0.005, 0.03)).lit(scene, 0.0)
-    plenty = mirrors_of(scene, MATERIALS, device).seen(lit, 0.0)
-    monkeypatch.setattr("gpuvision.simulation.transport.mirrors._KEPT", 2)
-    np.testing.assert_allclose(mirrors_of(scene, MATERIALS, device).seen(lit, 0.0).power, plenty.power, rtol=1e-12)
+    lit = sheet(g_limits=(-0.005, 0.03)).illuminate(scene, 0.0)
+    plenty = mirrors_of(scene, MATERIALS, device).mirrored_exposure(lit, 0.0)
+    monkeypatch.setattr("gpuvision.simulation.transport.mirrors._FIRST_IMAGES", 2)
+    np.testing.assert_allclose(
+        mirrors_of(scene, MATERIALS, device).mirrored_exposure(lit, 0.0).power, plenty.power, rtol=1e-12
+    )
     assert plenty.power.sum() > 0.0
 
 
@@ -307,8 +311,8 @@ def test_light_that_meets_a_mirror_head_on_comes_back_and_is_lost(device: Device
     scene = Scene(np.array(mirror), np.array([1, 1]))
     both = (MATERIALS[0], Material(diffuse=Lambert(albedo=0.2), mirror=0.7))
     mirrors, light = mirrors_of(scene, both, device), sheet()
-    lit = light.lit(scene, 0.0)
-    assert not len(mirrors.thrown(lit, light, 0.0).power)
+    lit = light.illuminate(scene, 0.0)
+    assert not len(mirrors.reflected_lines(lit, light, 0.0).power)
     exposure = mirrors.exposure(lit, 0.0, light)
     assert not exposure.power.any()
     assert np.isfinite(exposure.moment).all()
@@ -329,7 +333,7 @@ def test_a_lens_that_looks_into_a_mirror_head_on(device: Device) -> None:
         np.stack([place - 1e-3 * one, place + 1e-3 * one])[None], axis[None], np.zeros(1, int), np.array([3.0])
     )
     materials = (MATERIALS[0], Material(diffuse=Lambert(albedo=ALBEDO), mirror=SHARE / 2.0))
-    seen = mirrors_of(scene, materials, device, view=sensor).seen(line, 0.0)
+    seen = mirrors_of(scene, materials, device, view=sensor).mirrored_exposure(line, 0.0)
     image = place + 0.06 * axis
     towards = image - lens
     cosine = towards @ axis / np.linalg.norm(towards)
@@ -342,16 +346,20 @@ def test_exposure_is_the_sum_of_its_ways(device: Device) -> None:
     wall = quad([-0.05, -0.012, 0], [0.05, -0.012, 0], [0.05, -0.012, 0.05], [-0.05, -0.012, 0.05])
     scene = Scene(np.array(slope + wall), np.array([1, 1, 0, 0]))
     mirrors, light = mirrors_of(scene, MATERIALS, device), sheet()
-    lit = light.lit(scene, 0.0)
-    thrown = mirrors.thrown(lit, light, 0.0)
-    parts = mirrors.seen(lit, 0.0) + mirrors.direct(thrown, 0.0) + mirrors.seen(thrown, 0.0)
+    lit = light.illuminate(scene, 0.0)
+    thrown = mirrors.reflected_lines(lit, light, 0.0)
+    parts = (
+        mirrors.mirrored_exposure(lit, 0.0)
+        + mirrors.direct_exposure(thrown, 0.0)
+        + mirrors.mirrored_exposure(thrown, 0.0)
+    )
     whole = mirrors.exposure(lit, 0.0, sheet=light)
-    assert mirrors.direct(thrown, 0.0).power.sum() > 0.0
+    assert mirrors.direct_exposure(thrown, 0.0).power.sum() > 0.0
     np.testing.assert_array_equal(whole.power, parts.power)
     matt = mirrors_of(scene, (MATERIALS[0],) * 2, device)
-    assert not matt.there_are_any
+    assert not matt.has_mirrors
     assert not matt.exposure(lit, 0.0, sheet=light).power.any()
-    assert mirrors_of(scene, MATERIALS, device).there_are_any
+    assert mirrors_of(scene, MATERIALS, device).has_mirrors
 
 
 def test_what_it_does_not_take() -> None:
@@ -360,5 +368,5 @@ def test_what_it_does_not_take() -> None:
         Mirrors(view=sensor_view(), scene=scene, materials=MATERIALS[:1])
     with pytest.raises(ValueError, match="normals"):
         Mirrors(view=sensor_view(), scene=scene, materials=MATERIALS, normals=np.zeros((2, 3, 3)))
-    with pytest.raises(ValueError, match="per_sample"):
-        Mirrors(view=sensor_view(), scene=scene, materials=MATERIALS, per_sample=0.0)
+    with pytest.raises(ValueError, match="steps_per_sample"):
+        Mirrors(view=sensor_view(), scene=scene, materials=MATERIALS, steps_per_sample=0.0)

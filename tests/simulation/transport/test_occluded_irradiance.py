@@ -18,9 +18,9 @@ from gpuvision.host import Device
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import (
-    PICK_BLOCK,
+    SELECTION_BLOCK,
     OccludedIrradiance,
-    ReceivedLight,
+    StripIrradiance,
     segment_rows,
 )
 from gpuvision.status import Status
@@ -334,16 +334,20 @@ def test_segments_on_one_line(device: Device, variant: Any, dtype: Any, count: i
     assert np.mean(np.abs(result - free) > 0.01 * free) > 0.2
 
 
-# ---- picks -----------------------------------------------------------------------------------------------------
+# ---- selected -----------------------------------------------------------------------------------------------------
 
 
-def picked(corners: Any, receivers: Any, segments: Any, lists: Any, device: Device, variant: Any, room: int = 0) -> Any:
+def selected_of(
+    corners: Any, receivers: Any, segments: Any, lists: Any, device: Device, variant: Any, room: int = 0
+) -> Any:
     starts = np.cumsum([0, *map(len, lists)]).astype(np.int32)
-    picks = np.concatenate([*lists, np.zeros(room)]).astype(np.int32)
-    operation = OccludedIrradiance(scene=Scene(corners), segments=len(segments), picks=len(picks), variant=variant)
+    selected = np.concatenate([*lists, np.zeros(room)]).astype(np.int32)
+    operation = OccludedIrradiance(
+        scene=Scene(corners), segments=len(segments), selected=len(selected), variant=variant
+    )
     dtype = receivers.dtype
     weights = np.ones((*receivers.shape[:2], 2), dtype)
-    return operation(receivers, weights, segments.astype(dtype), starts, picks, device=device)
+    return operation(receivers, weights, segments.astype(dtype), starts, selected, device=device)
 
 
 @pytest.mark.parametrize("variant", ["vector", "work_item"])
@@ -357,10 +361,10 @@ def test_picks(device: Device, variant: Any, rng: np.random.Generator) -> None:
     ]
     lists = [rng.permutation(6)[: rng.integers(0, 7)] for _ in range(6)]
     lists = [np.where(rng.random(len(some)) < 0.3, ~some, some) for some in lists]
-    result = picked(corners, receivers, segments, lists, device, variant, room=5)
+    result = selected_of(corners, receivers, segments, lists, device, variant, room=5)
     for number, some in enumerate(lists):
         strip, block = divmod(number, 3)
-        part = np.s_[strip, PICK_BLOCK * block : PICK_BLOCK * (block + 1)]
+        part = np.s_[strip, SELECTION_BLOCK * block : SELECTION_BLOCK * (block + 1)]
         expected = sum((seen[k][part] if k >= 0 else free[~k][part] for k in some), np.zeros_like(seen[0][part]))
         np.testing.assert_allclose(result.irradiance[part], expected, rtol=1e-5, atol=1e-9)
     assert not result.status.any()
@@ -370,10 +374,10 @@ def test_picks(device: Device, variant: Any, rng: np.random.Generator) -> None:
 def test_picks_that_are_no_segments(device: Device, variant: Any, rng: np.random.Generator) -> None:
     segments, receivers = segments_of(rng, 3), receivers_of(rng, 1, 64).astype(np.float32)
     lists = [[0, 1], [2, 3], [~5], [2]]
-    result = picked(soup(rng, 3), receivers, segments, lists, device, variant)
+    result = selected_of(soup(rng, 3), receivers, segments, lists, device, variant)
     np.testing.assert_array_equal(result.status[0], np.repeat([0, Status.OUT_OF_RANGE, Status.OUT_OF_RANGE, 0], 16))
     np.testing.assert_array_equal(np.isnan(result.irradiance), result.status != 0)
-    operation = OccludedIrradiance(scene=Scene(NO_TRIANGLES), segments=3, picks=1, variant=variant)
+    operation = OccludedIrradiance(scene=Scene(NO_TRIANGLES), segments=3, selected=1, variant=variant)
     weights, starts = np.ones((1, 64, 2), np.float32), np.array([-1, 1, 1, 1, 7], np.int32)
     beyond = operation(receivers, weights, segments.astype(np.float32), starts, np.zeros(1, np.int32), device=device)
     np.testing.assert_array_equal(beyond.status[0] != 0, np.repeat([True, False, False, True], 16))
@@ -415,7 +419,7 @@ def test_sizes_and_canaries(device: Device, variant: Any, strips: int, each: int
     receivers, weights = receivers_of(rng, strips, each).astype(np.float32), np.ones((strips, each, 2), np.float32)
     operation = OccludedIrradiance(scene=Scene(corners), segments=3, variant=variant)
     size = np.zeros((strips, each), np.float32)
-    like = ReceivedLight(size, np.empty(strips, np.float32), np.empty(strips, np.float32), size.astype(np.uint8))
+    like = StripIrradiance(size, np.empty(strips, np.float32), np.empty(strips, np.float32), size.astype(np.uint8))
     guarded = Guarded(like)
     operation(receivers, weights, segments, device=device, out=guarded.out)
     guarded.assert_intact()

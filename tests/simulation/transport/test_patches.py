@@ -96,7 +96,7 @@ def test_pieces_add_up_to_the_whole(device: Device) -> None:
     receivers = rng.normal(size=(64, 6))
     pieces = Patches(triangle)
     for _ in range(4):
-        pieces = pieces.halved(np.ones(pieces.count, bool))
+        pieces = pieces.bisected(np.ones(pieces.count, bool))
     together = Patches(pieces.corners, np.zeros(len(pieces.corners), int))
     whole = FormFactors(patches=Patches(triangle))(receivers, device=device).factors
     assert whole.any()
@@ -109,7 +109,7 @@ def test_a_closed_room_fills_the_view(device: Device, seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = 10.0 ** (rng.uniform(-6.0, 3.0) + rng.uniform(-1.0, 1.0, 3))
     scene = room(*size)
-    patches = Patches.of(scene, size=float(size.max()), both_sides=False)
+    patches = Patches.from_scene(scene, size=float(size.max()), both_sides=False)
     receivers = np.concatenate([rng.uniform(-0.5, 0.5, (16, 3)) * size, rng.normal(size=(16, 3))], axis=1)
     factors = FormFactors(patches=patches)(receivers, device=device).factors
     np.testing.assert_allclose(factors.sum(axis=1), 1.0, rtol=1e-12)
@@ -149,7 +149,7 @@ def test_at_an_edge_the_factor_is_that_of_the_angle(device: Device) -> None:
 @TWO_WAYS
 def test_light_is_the_sum_of_factors(device: Device, variant: Any) -> None:
     rng = np.random.default_rng(11)
-    patches = Patches.of(room(1.0, 2.0, 3.0), size=1.0, both_sides=False)
+    patches = Patches.from_scene(room(1.0, 2.0, 3.0), size=1.0, both_sides=False)
     receivers = np.concatenate([rng.uniform(-0.5, 0.5, (3, 7, 3)), rng.normal(size=(3, 7, 3))], axis=2)
     exitance = rng.uniform(0.0, 2.0, patches.count)
     exitance[::3] = 0.0
@@ -192,8 +192,8 @@ def test_one_ray_agrees_with_any_hit(device: Device, rng: np.random.Generator) -
         for at in rng.uniform(-0.04, 0.04, (6, 2))
     ]
     scene = Scene.of(trimesh.util.concatenate([plate.apply_translation((0.0, 0.0, -0.001)), *parts]))
-    patches = Patches.of(scene, size=0.05)
-    points = patches.points[0]
+    patches = Patches.from_scene(scene, size=0.05)
+    points = patches.quadrature[0]
     single = Patches(patches.corners)
     free = FormFactors(patches=single)(points, device=device).factors
     seen = FormFactors(patches=single, scene=scene, rays=0.0)(points, device=device).factors
@@ -212,7 +212,7 @@ def test_one_ray_agrees_with_any_hit(device: Device, rng: np.random.Generator) -
 
 @TWO_WAYS
 def test_receivers_that_are_not_finite_are_flagged(device: Device, variant: Any) -> None:
-    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
+    patches = Patches.from_scene(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
     receivers = np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 1.0], (RECEIVERS, 1)).astype(np.float32)
     receivers[3, 0], receivers[5, 4], receivers[7, 3:] = np.nan, np.inf, 0.0
     wrong = np.isin(np.arange(RECEIVERS), (3, 5, 7))
@@ -224,7 +224,7 @@ def test_receivers_that_are_not_finite_are_flagged(device: Device, variant: Any)
 
 
 def test_it_writes_nothing_but_its_outputs(device: Device) -> None:
-    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
+    patches = Patches.from_scene(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
     receivers = np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 1.0], (RECEIVERS, 1)).astype(np.float32)
     operation = FormFactors(patches=patches)
     plain = operation(receivers, device=device)
@@ -259,11 +259,11 @@ def test_what_is_refused() -> None:
     with pytest.raises(ValueError, match="expected integers"):
         Patches(np.eye(3)[None], np.zeros(1))
     with pytest.raises(ValueError, match="more than 0"):
-        Patches.of(room(1.0, 1.0, 1.0), size=0.0)
+        Patches.from_scene(room(1.0, 1.0, 1.0), size=0.0)
     with pytest.raises(ValueError, match="no triangles"):
-        Patches.of(Scene(np.zeros((0, 3, 3))), size=1.0)
+        Patches.from_scene(Scene(np.zeros((0, 3, 3))), size=1.0)
     with pytest.raises(ValueError, match="which patches"):
-        patches.halved(np.zeros(2, bool))
+        patches.bisected(np.zeros(2, bool))
 
 
 def test_patches_of_a_scene_cover_it() -> None:
@@ -272,7 +272,7 @@ def test_patches_of_a_scene_cover_it() -> None:
     flat = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]])
     scene = Scene(np.concatenate([bar.triangles, ball.triangles, flat]))
     size = 0.05
-    patches = Patches.of(scene, size=size)
+    patches = Patches.from_scene(scene, size=size)
     of_ball = np.asarray(patches.origin) >= 12
     edges = np.linalg.norm(np.roll(patches.corners, -1, axis=1) - patches.corners, axis=2)
     assert edges[~of_ball].max() <= size * (1.0 + 1e-12)
@@ -282,7 +282,7 @@ def test_patches_of_a_scene_cover_it() -> None:
     assert patches._areas[of_ball].sum() == pytest.approx(ball.area, rel=1e-12)
     assert np.count_nonzero(of_ball) < 2000
     assert np.count_nonzero(~of_ball) < 2500
-    points, owner, weight = patches.points
+    points, owner, weight = patches.quadrature
     np.testing.assert_allclose(np.bincount(owner, weight), 1.0, rtol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(points[:, 3:], axis=1), 1.0, rtol=1e-12)
     assert np.all(np.diff(owner) >= 0)
@@ -296,13 +296,13 @@ def test_backs_of_open_surfaces() -> None:
     box = np.asarray(trimesh.creation.box((1.0, 1.0, 1.0)).triangles)
     sheet = np.array([[[3.0, 0.0, 0.0], [4.0, 0.0, 0.0], [3.0, 1.0, 0.0]]])
     scene = Scene(np.concatenate([box, sheet]))
-    assert Patches.of(scene, size=2.0, both_sides=False).count == 13
-    assert Patches.of(scene, size=2.0).count == 14
-    assert Patches.of(scene, size=2.0, both_sides=True).count == 26
-    assert Patches.of(Scene(box[1:]), size=2.0).count == 22
-    assert Patches.of(Scene(box[:, ::-1]), size=2.0).count == 24
+    assert Patches.from_scene(scene, size=2.0, both_sides=False).count == 13
+    assert Patches.from_scene(scene, size=2.0).count == 14
+    assert Patches.from_scene(scene, size=2.0, both_sides=True).count == 26
+    assert Patches.from_scene(Scene(box[1:]), size=2.0).count == 22
+    assert Patches.from_scene(Scene(box[:, ::-1]), size=2.0).count == 24
     fine = trimesh.creation.icosphere(4, 0.1)
-    both = Patches.of(Scene(np.asarray(fine.triangles)), size=0.05, both_sides=True)
+    both = Patches.from_scene(Scene(np.asarray(fine.triangles)), size=0.05, both_sides=True)
     assert both.area.sum() == pytest.approx(2.0 * fine.area, rel=1e-12)
     np.testing.assert_allclose((both.normals * both._areas[:, None]).sum(axis=0), 0.0, atol=1e-3)
 
@@ -314,7 +314,7 @@ def test_a_fine_mesh_shines_as_a_coarse_one(device: Device) -> None:
     both = trimesh.util.concatenate([plate, ball])
     fine = both.subdivide_to_size(0.06)
     scene = Scene.of(fine)
-    patches = Patches.of(scene, size=0.2)
+    patches = Patches.from_scene(scene, size=0.2)
     exact = Patches(np.asarray(fine.triangles))
     assert len(patches.corners) < 0.7 * len(exact.corners)
     receivers = np.array([[0.5, 0.5, 0.4, -1, -1, -0.5], [0.3, -0.1, 0.06, 0, 0, 1], [0, 0, 1.5, 0.1, 0, -1]])
@@ -325,10 +325,10 @@ def test_a_fine_mesh_shines_as_a_coarse_one(device: Device) -> None:
 
 
 def test_halving_leaves_the_rest_alone() -> None:
-    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
+    patches = Patches.from_scene(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
     wanted = np.zeros(patches.count, bool)
     wanted[[1, 4]] = True
-    finer = patches.halved(wanted)
+    finer = patches.bisected(wanted)
     assert finer.count == patches.count + 2
     assert finer.area.sum() == pytest.approx(6.0, rel=1e-12)
     np.testing.assert_allclose(finer.area[-4:], 0.5 * patches.area[1], rtol=1e-12)

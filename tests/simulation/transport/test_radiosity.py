@@ -13,7 +13,7 @@ from gpuvision.host import Device
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 from gpuvision.simulation.transport.patches import Patches
-from gpuvision.simulation.transport.radiosity import Radiosity, graded
+from gpuvision.simulation.transport.radiosity import Radiosity, refine_corners
 
 
 def room(*extents: float, lid: bool = False) -> Scene:
@@ -31,7 +31,7 @@ def stripe(*, power: float = 1.0) -> LitSegments:
 
 def solved(size: float, albedo: Any, device: Device, *, lid: bool = False) -> Radiosity:
     scene = room(1.0, 0.8, 0.6, lid=lid)
-    whole = Radiosity.of(scene, albedo, size=size, both_sides=False, device=device)
+    whole = Radiosity.from_scene(scene, albedo, size=size, both_sides=False, device=device)
     return Radiosity(patches=whole.patches, albedo=whole.albedo, device=device)
 
 
@@ -40,12 +40,12 @@ def test_no_light_is_lost_in_a_closed_box(device: Device) -> None:
     albedo, errors = 0.9, []
     for size in (0.5, 0.25, 0.125):
         box = solved(size, [albedo], device)
-        arrival = box.arrival(stripe(power=2.0))
+        arrival = box.direct_irradiance(stripe(power=2.0))
         assert arrival @ box.patches.area == pytest.approx(2.0, rel=1e-12)
-        exitance = box.exitance(arrival)
+        exitance = box.solve(arrival)
         absorbed = exitance @ box.patches.area * (1.0 - albedo) / albedo
         errors.append(abs(absorbed / 2.0 - 1.0))
-        np.testing.assert_allclose(box.factors.sum(axis=1), 1.0, rtol=1e-12)
+        np.testing.assert_allclose(box.form_factors.sum(axis=1), 1.0, rtol=1e-12)
     assert errors[0] < 4e-3
     assert errors[-1] < 1e-3
 
@@ -55,9 +55,9 @@ def test_white_walls_send_everything_out(device: Device) -> None:
     errors = []
     for size in (0.5, 0.25):
         box = solved(size, [1.0, 0.0], device, lid=True)
-        arrival = box.arrival(stripe())
-        exitance = box.exitance(arrival)
-        on_the_lid = (arrival + box.factors @ exitance)[box.albedo == 0.0] @ box.patches.area[box.albedo == 0.0]
+        arrival = box.direct_irradiance(stripe())
+        exitance = box.solve(arrival)
+        on_the_lid = (arrival + box.form_factors @ exitance)[box.albedo == 0.0] @ box.patches.area[box.albedo == 0.0]
         errors.append(abs(on_the_lid - 1.0))
         assert np.all(exitance[box.albedo == 0.0] == 0.0)
     assert errors[0] < 5e-3
@@ -67,25 +67,25 @@ def test_white_walls_send_everything_out(device: Device) -> None:
 def test_white_walls_without_a_way_out_are_refused(device: Device) -> None:
     for dense in (4096, 0):
         box = solved(0.5, [1.0], device)
-        closed = Radiosity(patches=box.patches, albedo=box.albedo, device=device, dense=dense)
+        closed = Radiosity(patches=box.patches, albedo=box.albedo, device=device, max_dense=dense)
         with pytest.raises(ValueError, match="no steady state"):
-            closed.exitance(np.ones(box.patches.count))
+            closed.solve(np.ones(box.patches.count))
 
 
 def test_solved_is_what_the_series_tends_to(device: Device) -> None:
     box = solved(0.5, [0.6], device)
-    arrival = box.arrival(stripe())
+    arrival = box.direct_irradiance(stripe())
     series, bounce = np.zeros_like(arrival), 0.6 * arrival
     for _ in range(80):
-        series, bounce = series + bounce, 0.6 * (box.factors @ bounce)
-    np.testing.assert_allclose(box.exitance(arrival), series, rtol=1e-12)
+        series, bounce = series + bounce, 0.6 * (box.form_factors @ bounce)
+    np.testing.assert_allclose(box.solve(arrival), series, rtol=1e-12)
 
 
 def test_both_ways_of_solving_agree(device: Device) -> None:
     box = solved(0.3, [0.95], device)
-    iterated = Radiosity(patches=box.patches, albedo=box.albedo, device=device, dense=0)
-    arrival = box.arrival(stripe())
-    np.testing.assert_allclose(iterated.exitance(arrival), box.exitance(arrival), rtol=3e-5)
+    iterated = Radiosity(patches=box.patches, albedo=box.albedo, device=device, max_dense=0)
+    arrival = box.direct_irradiance(stripe())
+    np.testing.assert_allclose(iterated.solve(arrival), box.solve(arrival), rtol=3e-5)
 
 
 def test_arrival_is_the_mean_over_patches(device: Device) -> None:
@@ -93,14 +93,14 @@ def test_arrival_is_the_mean_over_patches(device: Device) -> None:
     box, lit = solved(0.5, [0.5], device), stripe()
     inside = box.patches
     for _ in range(8):
-        inside = inside.halved(np.ones(inside.count, bool))
+        inside = inside.bisected(np.ones(inside.count, bool))
     places = np.concatenate([inside.corners.mean(axis=1), inside.normals], axis=1)
     light = LineIrradiance(segments=lit)(places, device=device).irradiance
     # Which patch a piece lies in: the one in whose plane and corners it is.
     owner = _owners(box.patches.corners, places[:, :3])
     mean = np.bincount(owner, light * inside.area) / box.patches.area
     beside = np.abs(np.abs(box.patches.corners[:, :, 0]).min(axis=1) - 0.5) < 1e-9
-    arrival = box.arrival(lit)
+    arrival = box.direct_irradiance(lit)
     np.testing.assert_allclose(arrival[~beside], mean[~beside], rtol=2e-3, atol=1e-4)
     np.testing.assert_allclose(arrival[beside], mean[beside], rtol=0.05, atol=1e-4)
 
@@ -112,7 +112,7 @@ def test_many_short_segments_are_as_one(device: Device) -> None:
     ends = np.zeros((2000, 2, 3))
     ends[:, 0, 0], ends[:, 1, 0], ends[:, :, 1], ends[:, :, 2] = cuts[:-1], cuts[1:], 0.1, -0.3
     pieces = LitSegments(ends, np.tile([0.0, 0.0, 1.0], (2000, 1)), np.ones(2000))
-    whole, arrived = box.arrival(stripe()), box.arrival(pieces)
+    whole, arrived = box.direct_irradiance(stripe()), box.direct_irradiance(pieces)
     assert arrived @ box.patches.area == pytest.approx(1.0, rel=1e-12)
     np.testing.assert_allclose(arrived, whole, atol=0.02 * whole.max())
 
@@ -123,12 +123,12 @@ def test_single_precision_serves_where_there_is_no_double(device: Device) -> Non
 
     double = solved(0.3, [0.9], device)
     single = Single(patches=double.patches, albedo=double.albedo, device=device)
-    iterated = Single(patches=double.patches, albedo=double.albedo, device=device, dense=0)
-    arrival = double.arrival(stripe())
-    np.testing.assert_allclose(single.arrival(stripe()), arrival, atol=1e-5 * arrival.max())
-    exact = double.exitance(arrival)
-    np.testing.assert_allclose(single.exitance(arrival), exact, rtol=1e-4)
-    np.testing.assert_allclose(iterated.exitance(arrival), exact, rtol=1e-4)
+    iterated = Single(patches=double.patches, albedo=double.albedo, device=device, max_dense=0)
+    arrival = double.direct_irradiance(stripe())
+    np.testing.assert_allclose(single.direct_irradiance(stripe()), arrival, atol=1e-5 * arrival.max())
+    exact = double.solve(arrival)
+    np.testing.assert_allclose(single.solve(arrival), exact, rtol=1e-4)
+    np.testing.assert_allclose(iterated.solve(arrival), exact, rtol=1e-4)
 
 
 def _owners(corners: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -149,8 +149,8 @@ def test_light_beside_a_screen(device: Device) -> None:
     screen = np.array([[0.0, -0.4, -0.3], [0.0, 0.4, -0.3], [0.0, 0.4, 0.3], [0.0, -0.4, 0.3]])
     both = np.concatenate([screen[[[0, 1, 2], [0, 2, 3]]], screen[[[0, 2, 1], [0, 3, 2]]] + [1e-6, 0.0, 0.0]])
     lit = LitSegments([[[0.1, 0.1, -0.3], [0.5, 0.1, -0.3]]], [[0.0, 0.0, 1.0]], [1.0])
-    shut = Radiosity.of(Scene(np.concatenate([scene.corners, both])), [0.8], size=0.4, device=device)
-    exitance = shut.exitance(shut.arrival(lit))
+    shut = Radiosity.from_scene(Scene(np.concatenate([scene.corners, both])), [0.8], size=0.4, device=device)
+    exitance = shut.solve(shut.direct_irradiance(lit))
     left = shut.patches.corners[:, :, 0].max(axis=1) <= 0.0
     right = shut.patches.corners[:, :, 0].min(axis=1) >= 0.0
     assert exitance[left].max() < 1e-6 * exitance[right].max()
@@ -161,18 +161,18 @@ def test_what_a_body_stands_on_is_not_lit(device: Device) -> None:
     part = trimesh.creation.box((0.3, 0.3, 0.3)).apply_translation((0.05, -0.1, -0.15))
     scene = Scene(np.concatenate([room(1.0, 0.8, 0.6).corners, part.triangles]))
     albedo = 0.9
-    box = Radiosity.of(scene, [albedo], size=0.2, both_sides=False, device=device)
-    arrival = box.arrival(stripe())
+    box = Radiosity.from_scene(scene, [albedo], size=0.2, both_sides=False, device=device)
+    arrival = box.direct_irradiance(stripe())
     free = box._surface.area
     assert arrival @ free == pytest.approx(1.0, rel=3e-3)
-    absorbed = box.exitance(arrival) @ free * (1.0 - albedo) / albedo
+    absorbed = box.solve(arrival) @ free * (1.0 - albedo) / albedo
     assert absorbed == pytest.approx(1.0, rel=1e-2)
     assert box.patches.area.sum() - free.sum() == pytest.approx(0.3 * 0.3, rel=0.3)
 
 
 def test_patches_in_corners_are_graded(device: Device) -> None:
-    patches = Patches.of(room(1.0, 0.8, 0.6), size=0.5, both_sides=False)
-    finer = graded(patches, 3, device=device)
+    patches = Patches.from_scene(room(1.0, 0.8, 0.6), size=0.5, both_sides=False)
+    finer = refine_corners(patches, 3, device=device)
     assert finer.area.sum() == pytest.approx(patches.area.sum(), rel=1e-12)
     assert patches.count < finer.count < 8 * patches.count
     small = finer.area < 0.3 * patches.area.min()
@@ -184,21 +184,21 @@ def test_patches_in_corners_are_graded(device: Device) -> None:
 
 def test_materials_and_receivers(device: Device) -> None:
     scene = room(1.0, 0.8, 0.6, lid=True)
-    box = Radiosity.of(scene, [0.7, 0.2], size=0.5, grades=1, both_sides=True, device=device)
+    box = Radiosity.from_scene(scene, [0.7, 0.2], size=0.5, refinements=1, both_sides=True, device=device)
     assert set(box.albedo) == {0.7, 0.2}
     outside = np.sum(box.patches.normals * box.patches.corners.mean(axis=1), axis=1) > 0.0
     assert outside.mean() == pytest.approx(0.5, abs=0.2)
-    exitance = box.exitance(box.arrival(stripe()))
+    exitance = box.solve(box.direct_irradiance(stripe()))
     # Light stays inside.
     np.testing.assert_allclose(exitance[outside], 0.0, atol=1e-12)
     receivers = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, -1.0], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
-    twice = box.light(receivers, exitance)
-    single = box.light(receivers.astype(np.float32), exitance)
+    twice = box.irradiance(receivers, exitance)
+    single = box.irradiance(receivers.astype(np.float32), exitance)
     assert twice.irradiance[0] != twice.irradiance[1]
     np.testing.assert_allclose(single.irradiance, twice.irradiance, rtol=1e-4)
     assert single.irradiance.dtype == np.float32
     least = 0.5 * float(exitance.max())
-    some = box.light(receivers, exitance, leave_out=least)
+    some = box.irradiance(receivers, exitance, min_exitance=least)
     assert np.all(some.irradiance < twice.irradiance)
     assert np.all(some.irradiance > twice.irradiance - least)
 
@@ -206,11 +206,11 @@ def test_materials_and_receivers(device: Device) -> None:
 def test_no_light_at_all(device: Device) -> None:
     box = solved(0.5, [0.5], device)
     dark = LitSegments(np.zeros((1, 2, 3)), [[0.0, 0.0, 1.0]], [1.0])
-    np.testing.assert_array_equal(box.exitance(box.arrival(dark)), 0.0)
+    np.testing.assert_array_equal(box.solve(box.direct_irradiance(dark)), 0.0)
 
 
 def test_what_is_refused() -> None:
-    patches = Patches.of(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
+    patches = Patches.from_scene(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
     with pytest.raises(TypeError, match="expected Patches"):
         Radiosity(patches=None, albedo=[0.5])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"expected \(\d+,\)"):
@@ -218,9 +218,9 @@ def test_what_is_refused() -> None:
     with pytest.raises(ValueError, match="outside 0 to 1"):
         Radiosity(patches=patches, albedo=np.full(patches.count, 1.1))
     with pytest.raises(ValueError, match="takes finite irradiances"):
-        Radiosity(patches=patches, albedo=np.zeros(patches.count)).exitance(np.zeros(2))
+        Radiosity(patches=patches, albedo=np.zeros(patches.count)).solve(np.zeros(2))
     with pytest.raises(ValueError, match="1 albedos for 2 materials"):
-        Radiosity.of(room(1.0, 1.0, 1.0, lid=True), [0.5], size=1.0)
+        Radiosity.from_scene(room(1.0, 1.0, 1.0, lid=True), [0.5], size=1.0)
 
 
 def test_convergence_of_light_in_a_room(device: Device) -> None:
@@ -229,7 +229,7 @@ def test_convergence_of_light_in_a_room(device: Device) -> None:
     values = []
     for size in (0.5, 0.25, 0.125):
         box = solved(size, [0.5], device)
-        values.append(box.light(receivers, box.exitance(box.arrival(stripe()))).irradiance)
+        values.append(box.irradiance(receivers, box.solve(box.direct_irradiance(stripe()))).irradiance)
     steps = [np.abs(fine - coarse).max() for coarse, fine in pairwise(values)]
     assert steps[0] > 2.0 * steps[1]
     assert steps[1] < 5e-3 * values[-1].min()

@@ -88,8 +88,8 @@ def test_all_bounces_are_what_mitsuba_finds() -> None:
     device = Device.best()
     scene = Scene.of([room(), body()])
     lit = LitSegments([[[-0.5, 0.2, -0.3], [0.5, 0.2, -0.3]]], [[0.0, 0.0, 1.0]], [1.0])
-    box = Radiosity.of(scene, [ALBEDO_OF_ROOM, ALBEDO_OF_BODY], size=0.1, both_sides=False, device=device)
-    bounced = box.light(METERS, box.exitance(box.arrival(lit))).irradiance
+    box = Radiosity.from_scene(scene, [ALBEDO_OF_ROOM, ALBEDO_OF_BODY], size=0.1, both_sides=False, device=device)
+    bounced = box.irradiance(METERS, box.solve(box.direct_irradiance(lit))).irradiance
     found = measured()
     noise = found.std(axis=0, ddof=1) / math.sqrt(SEEDS)
     assert np.all(noise < 5e-3 * found.mean(axis=0))

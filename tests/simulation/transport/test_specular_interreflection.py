@@ -43,8 +43,8 @@ def test_a_mirror_at_45_degrees_throws_the_sheet_onto_a_wall(
     device: Device, source: tuple[float, float] | None
 ) -> None:
     scene, sheet = slanted(), sheet_of(source)
-    lit = sheet.lit(scene, 0.0)
-    thrown = mirrors_of(scene, (DULL, MIRROR), device).thrown(lit, sheet, 0.0)
+    lit = sheet.illuminate(scene, 0.0)
+    thrown = mirrors_of(scene, (DULL, MIRROR), device).reflected_lines(lit, sheet, 0.0)
     assert (scene.material[thrown.triangle] == 0).all()
     np.testing.assert_allclose(thrown.ends[..., 1:], np.broadcast_to([-0.03, 0.005], (*thrown.ends.shape[:2], 2)))
     np.testing.assert_allclose(thrown.normals, np.tile([0.0, 1.0, 0.0], (len(thrown.power), 1)), atol=1e-15)
@@ -73,8 +73,8 @@ def test_plane_mirrors_throw_where_rays_say(
     corners = np.concatenate([mirror, heap, wall])
     scene = Scene(corners, np.r_[1, 1, np.zeros(len(corners) - 2, int)])
     sheet = sheet_of(source)
-    lit = sheet.lit(scene, 0.0)
-    thrown = mirrors_of(scene, (DULL, MIRROR), device).thrown(lit, sheet, 0.0)
+    lit = sheet.illuminate(scene, 0.0)
+    thrown = mirrors_of(scene, (DULL, MIRROR), device).reflected_lines(lit, sheet, 0.0)
     assert len(np.unique(thrown.triangle)) > 10
     onto = scene.material[lit.triangle] == 1
     share = (np.arange(400) + 0.5) / 400
@@ -117,11 +117,11 @@ def test_in_a_closed_box_no_light_is_lost(device: Device, source: tuple[float, f
     # What light is within the box comes from within: a line on a wall, lit from the sheet's side.
     entered = LightSheet(transport=TRANSPORT, g_limits=(-0.004, 0.004), source=source, power=3.0)
     through = Scene(np.array(box.triangles)[box.face_normals[:, 2] < 0.0])
-    lit = entered.lit(through, 0.0)
+    lit = entered.illuminate(through, 0.0)
     numbers = np.flatnonzero(box.face_normals[:, 2] < 0.0)
     lit = lit._replace(triangle=numbers[lit.triangle])
     for throws in (1, 2, 3, 6):
-        thrown = mirrors_of(scene, (DULL, MIRROR), device, throws=throws).thrown(lit, sheet, 0.0)
+        thrown = mirrors_of(scene, (DULL, MIRROR), device, max_reflections=throws).reflected_lines(lit, sheet, 0.0)
         expected = lit.total() * sum(0.8**k for k in range(1, throws + 1))
         assert thrown.total() == pytest.approx(expected, rel=1e-9)
 
@@ -135,8 +135,8 @@ def test_a_round_mirror_throws_light_as_it_is_round(device: Device) -> None:
     corners = np.concatenate([np.array(cylinder.triangles), np.array(wall)])
     scene = Scene(corners, np.r_[np.ones(len(cylinder.faces), int), 0, 0])
     sheet = LightSheet(transport=TRANSPORT, g_limits=(1e-4, 4.9e-3), power=3.0)
-    lit = sheet.lit(scene, 0.0)
-    thrown = mirrors_of(scene, (DULL, MIRROR), device, per_sample=8.0).thrown(lit, sheet, 0.0)
+    lit = sheet.illuminate(scene, 0.0)
+    thrown = mirrors_of(scene, (DULL, MIRROR), device, steps_per_sample=8.0).reflected_lines(lit, sheet, 0.0)
     assert (thrown.triangle >= len(corners) - 2).all()
 
     def lands(angle: np.ndarray) -> np.ndarray:
@@ -159,11 +159,16 @@ def _between(lines: LitLine, low: float, high: float) -> float:
 
 def test_without_mirrors_or_throws_there_is_none(device: Device) -> None:
     scene, sheet = slanted(), sheet_of(None)
-    lit = sheet.lit(scene, 0.0)
-    assert not len(mirrors_of(scene, (DULL, MIRROR), device, throws=0).thrown(lit, sheet, 0.0).power)
-    assert not len(mirrors_of(scene, (DULL, DULL), device).thrown(lit, sheet, 0.0).power)
+    lit = sheet.illuminate(scene, 0.0)
+    assert not len(mirrors_of(scene, (DULL, MIRROR), device, max_reflections=0).reflected_lines(lit, sheet, 0.0).power)
+    assert not len(mirrors_of(scene, (DULL, DULL), device).reflected_lines(lit, sheet, 0.0).power)
     # The other way round there is nothing that the light falls on.
-    away = sheet.lit(scene, 0.02)
-    assert not len(mirrors_of(scene, (DULL, MIRROR), device).thrown(away, sheet, 0.02).power)
-    with pytest.raises(ValueError, match="throws"):
-        Mirrors(view=mirrors_of(scene, (DULL, MIRROR), device).view, scene=scene, materials=(DULL, MIRROR), throws=-1)
+    away = sheet.illuminate(scene, 0.02)
+    assert not len(mirrors_of(scene, (DULL, MIRROR), device).reflected_lines(away, sheet, 0.02).power)
+    with pytest.raises(ValueError, match="max_reflections"):
+        Mirrors(
+            view=mirrors_of(scene, (DULL, MIRROR), device).view,
+            scene=scene,
+            materials=(DULL, MIRROR),
+            max_reflections=-1,
+        )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.undistort_points import UndistortPoints
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.harness import Case
 
 SIZE = (1280, 1024)
@@ -95,7 +95,7 @@ def _points(camera: Camera, count: int, inverse: bool) -> NDArray[np.float64]:
     ideal = rng.uniform(0.0, 1.0, (2 * count, 2)) * SIZE
     middle, focal = np.array(camera.matrix)[:2, 2], camera.matrix[0][0]
     radius = np.hypot(*(ideal - middle).T) / focal
-    ideal = ideal[radius < 0.99 * camera.one_to_one_radius][:count]
+    ideal = ideal[radius < 0.99 * camera.invertible_radius][:count]
     return ideal if inverse else camera.distort(ideal)
 
 
@@ -131,10 +131,10 @@ def _case(
     facts = {"peer_error": _worst(opencv()[:, 0], exact)}
     if camera is STANDARD:
         peers["numba"] = _newton(points, camera)
-    if np.any(bound.outputs.status.get()):
+    if np.any(to_numpy(bound.outputs.status)):
         raise AssertionError("a point that has a counterpart was flagged")
     traffic = (points.nbytes, points.nbytes + len(points))
-    return Case("points", name, bound.run, peers, _worst(bound.outputs.points.get(), exact), traffic, facts=facts)
+    return Case("points", name, bound.run, peers, _worst(to_numpy(bound.outputs.points), exact), traffic, facts=facts)
 
 
 def _newton(points: NDArray[Any], camera: Camera) -> Callable[[], object]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.undistort_image import Interpolation, UndistortImage
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.harness import Case
 
 _CORNER_SHIFT = 20.0  # px
@@ -70,12 +70,12 @@ def _case(device: Device, name: str, camera: Camera, dtype: str, size: int, **op
     bound = operation.bind(device, image.shape, dtype)
     bound.inputs[0].set(image)
     bound.run()
-    places = operation.places((size, size))
+    places = operation.source_positions((size, size))
     made = np.empty_like(image)
     peer = _peer(camera, operation, image, places, made)
     peer()
     exact, inner = _exact(image, places, interpolation)
-    ours, theirs = (np.abs(each[inner] - exact[inner]) for each in (bound.outputs.image.get(), made))
+    ours, theirs = (np.abs(each[inner] - exact[inner]) for each in (to_numpy(bound.outputs.image), made))
     numbers = {"rms": _rms(ours), "peer_error": theirs.max(), "peer_rms": _rms(theirs)}
     facts = {name: float(f"{number:.5g}") for name, number in numbers.items()}
     traffic = (image.nbytes, image.nbytes + bound.outputs.status.nbytes)

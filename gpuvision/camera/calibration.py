@@ -1,4 +1,4 @@
-"""Result of a camera calibration from images of a flat pattern."""
+"""Result of a camera calibration from images of a flat target pattern."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ from gpuvision.camera.lines.lens_fit import LensFit
 from gpuvision.camera.patterns.pattern import LineFamilies
 from gpuvision.camera.views.camera_fit import CameraFit
 
-Pattern = Literal["dots", "chessboard", "lines"]
+TargetPattern = Literal["dots", "chessboard", "lines"]
 Float64: TypeAlias = npt.NDArray[np.float64]
 
 
-class Other(NamedTuple):
-    """A model that was fitted too.
+class AlternativeModel(NamedTuple):
+    """Camera or lens model fitted to the same points as the chosen one.
 
     Attributes
     ----------
-    model
-        Its name.
-    rms_px
-        Root mean square residual.
-    p_value
-        Probability of so much a worse fit than the largest model's, were this one true (F test).
-    aic
-        Akaike's criterion; only differences tell.
-    centre
-        (column, row) of its centre; None without a lens.
-    apart_px
-        How far that lies from the chosen model's; NaN without a lens.
+    model : str
+        Name of the model.
+    rms_px : float
+        Root mean square residual [px].
+    p_value : float
+        p-value of the F test of this model against the largest one: the probability of at least this increase of the
+        residual if this model is true.
+    aic : float
+        Akaike information criterion; only differences between models are meaningful.
+    centre : (float, float) or None
+        Column and row of the distortion centre [px]; None for a model without a lens.
+    centre_distance_px : float
+        Distance of `centre` from the chosen model's centre [px]; NaN for a model without a lens.
     """
 
     model: str
@@ -43,20 +44,21 @@ class Other(NamedTuple):
     p_value: float
     aic: float
     centre: tuple[float, float] | None
-    apart_px: float
+    centre_distance_px: float
 
 
-class Seen(NamedTuple):
-    """The pattern in one image.
+class DetectedTarget(NamedTuple):
+    """Target pattern detected in one image.
 
     Attributes
     ----------
-    image
-        Its file.
-    grid
-        (rows, columns, 2) [px], NaN where missing; None for a pattern of lines.
-    families
-        Its straight lines.
+    image : Path
+        File of the image.
+    grid : numpy.ndarray or None
+        (rows, columns, 2) float64: measured (column, row) of the grid points [px], NaN where missing; None for a line
+        pattern.
+    families : tuple
+        Families of measured lines that are straight and parallel on the target.
     """
 
     image: Path
@@ -65,7 +67,7 @@ class Seen(NamedTuple):
 
     @property
     def points(self) -> int:
-        """Number of points."""
+        """Number of measured points."""
         if self.grid is None:
             return sum(len(line) for family in self.families for line in family)
         return int(np.count_nonzero(np.isfinite(self.grid[..., 0])))
@@ -73,39 +75,40 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """A camera model and what it was found from.
+    """Calibrated camera model with its detected target patterns.
 
     Attributes
     ----------
-    fit
-        The fit, with parameters, covariance, alternatives and warnings.
-    pattern
-        What was looked for.
-    image_size
-        (columns, rows) of the images.
-    seen
-        The pattern in each image where it was found.
-    passed_over
-        Images without it, and why.
-    straightness_px
-        Root mean square distance of the points from straight lines: as measured, and corrected by the model.
+    fit : LensFit or CameraFit
+        Fit with parameters, covariance, alternative models and warnings.
+    pattern : {"dots", "chessboard", "lines"}
+        Target pattern.
+    image_size : (int, int)
+        Columns and rows of the images.
+    detected_targets : tuple of DetectedTarget
+        Detected target pattern of each image used.
+    skipped_images : tuple of (Path, str)
+        Images without a detected target pattern, each with the reason.
+    straightness_px : (float, float)
+        Root mean square distance of the points from straight lines [px]: of the measured points, and of the points
+        corrected by the model.
     """
 
     fit: LensFit | CameraFit
-    pattern: Pattern
+    pattern: TargetPattern
     image_size: tuple[int, int]
-    seen: tuple[Seen, ...]
-    passed_over: tuple[tuple[Path, str], ...]
+    detected_targets: tuple[DetectedTarget, ...]
+    skipped_images: tuple[tuple[Path, str], ...]
     straightness_px: tuple[float, float]
 
     @property
     def model(self) -> Lens | Camera | None:
-        """What corrects images and points; None where lines are straight without."""
+        """Model that corrects images and points; None if the lines are straight without a lens."""
         return self.fit.lens if isinstance(self.fit, LensFit) else self.fit.camera
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """Value and standard deviation of every parameter of the camera, by its name."""
+        """Value and standard deviation of every camera parameter, by name."""
         if isinstance(self.fit, LensFit):
             errors, values = self.fit.uncertainties, dict(zip(self.fit.names, self.fit.values, strict=True))
             return {name: (float(values[name]), error) for name, error in errors.items() if not name.startswith("v")}
@@ -122,15 +125,15 @@ class Calibration:
         return {name: (known[name], error) for name, error in self.fit.uncertainties.items()}
 
     @property
-    def alternatives(self) -> tuple[Other, ...]:
-        """Other models, fitted to the same points."""
+    def alternatives(self) -> tuple[AlternativeModel, ...]:
+        """Alternative models, fitted to the same points."""
         if isinstance(self.fit, CameraFit):
             return tuple(
-                Other(each.model, each.rms_px, each.p_value, each.aic, each.centre, each.apart_px)
+                AlternativeModel(each.model, each.rms_px, each.p_value, each.aic, each.centre, each.centre_distance_px)
                 for each in self.fit.alternatives
             )
         return tuple(
-            Other(
+            AlternativeModel(
                 f"{each.model} (lines {each.lines})",
                 each.rms_px,
                 each.p_value,
@@ -143,29 +146,30 @@ class Calibration:
 
     @property
     def residuals(self) -> tuple[tuple[Float64, Float64], ...]:
-        """Per image the measured points (n, 2), and how far each lies off: (n, 2), or (n,) from its line [px]."""
+        """Per image the measured points (n, 2) and residuals: vectors (n, 2), or distances (n,) from the line [px]."""
         if isinstance(self.fit, CameraFit):
-            grids = [each.grid for each in self.seen if each.grid is not None]
-            return tuple((grid.reshape(-1, 2), off) for grid, off in zip(grids, self.fit.residuals, strict=True))
-        left, parts = list(self.fit.residuals_px), []
-        for each in self.seen:
-            mine = [left.pop(0) for _ in each.families]
+            grids = [each.grid for each in self.detected_targets if each.grid is not None]
+            return tuple((grid.reshape(-1, 2), error) for grid, error in zip(grids, self.fit.residuals, strict=True))
+        remaining, images = list(self.fit.residuals_px), []
+        for each in self.detected_targets:
+            distances = [remaining.pop(0) for _ in each.families]
             points = [line for family in each.families for line in family]
-            parts.append((np.concatenate(points), np.concatenate([off for family in mine for off in family])))
-        return tuple(parts)
+            images.append((np.concatenate(points), np.concatenate([line for family in distances for line in family])))
+        return tuple(images)
 
     def summary(self) -> str:
-        """Return a line: what was found, how well."""
-        points = sum(each.points for each in self.seen)
+        """Return one line: images and points used, model, residual and straightness."""
+        points = sum(each.points for each in self.detected_targets)
+        used = len(self.detected_targets)
         before, after = self.straightness_px
         return (
-            f"{self.pattern} in {len(self.seen)} of {len(self.seen) + len(self.passed_over)} images, {points} points; "
-            f"model {self.fit.model}: residual {self.fit.rms_px:.3g} px rms; lines bent by {before:.3g} px, "
-            f"corrected {after:.3g} px"
+            f"{self.pattern} in {used} of {used + len(self.skipped_images)} images, {points} points; "
+            f"model {self.fit.model}: residual {self.fit.rms_px:.3g} px rms; deviation from straight lines "
+            f"{before:.3g} px, corrected {after:.3g} px"
         )
 
     def report(self) -> dict[str, Any]:
-        """Everything in plain numbers and strings, as JSON holds them."""
+        """Return the calibration as a tree of numbers and strings for JSON."""
         fit = self.fit
         table: dict[str, Any] = {
             "pattern": self.pattern,
@@ -178,10 +182,10 @@ class Calibration:
             "alternatives": [each._asdict() for each in self.alternatives],
             "warnings": list(fit.warnings),
             "images": [
-                {"name": each.image.name, "rms_px": _rms(off)}
-                for each, (_, off) in zip(self.seen, self.residuals, strict=True)
+                {"name": each.image.name, "rms_px": _rms(errors)}
+                for each, (_, errors) in zip(self.detected_targets, self.residuals, strict=True)
             ],
-            "passed_over": {path.name: why for path, why in self.passed_over},
+            "skipped_images": {path.name: reason for path, reason in self.skipped_images},
         }
         if isinstance(fit, LensFit):
             return table | {"sigma_px": fit.sigma_px, "lines": fit.lines}
@@ -190,6 +194,6 @@ class Calibration:
         return table | {"sigma_px": fit.sigma, "tilt": tilt, "poses": poses}
 
 
-def _rms(off: Float64) -> float:
-    """Root mean square size of residuals (n, 2) or (n,)."""
-    return float(np.sqrt(np.nanmean(np.sum(off.reshape(len(off), -1) ** 2, axis=1))))
+def _rms(errors: Float64) -> float:
+    """Return the root mean square length of residuals (n, 2) or (n,)."""
+    return float(np.sqrt(np.nanmean(np.sum(errors.reshape(len(errors), -1) ** 2, axis=1))))

@@ -1,4 +1,4 @@
-"""How far OpenCV's lens terms stay one-to-one: where the determinant of their Jacobian first vanishes."""
+"""Invertible region of OpenCV's lens model: up to where the determinant of its Jacobian first vanishes (the fold)."""
 
 from __future__ import annotations
 
@@ -10,22 +10,28 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import polynomial
 
+# Directions in which the fold is searched, and the factor on the nearest fold found that covers the directions between.
 _DIRECTIONS = 64
-# Between two of them the fold is hardly nearer than at either.
 _MARGIN = 0.98
-# Powers of the radius that k1 .. k6, p1, p2 and s1 .. s4 come with, and the radius at which nothing is looked for.
+# Powers of the radius of the terms k1 .. k6, p1, p2 and s1 .. s4; largest normalised radius of the search.
 _ORDERS = np.array([2.0, 4.0, 6.0, 2.0, 4.0, 6.0, 1.0, 1.0, 1.0, 3.0, 1.0, 3.0])
 _FARTHEST = 1e6
 
 Float64 = npt.NDArray[np.float64]
 
 
-class OneToOne(NamedTuple):
-    """The part of the normalised ideal plane where a lens is one-to-one, as squared radii.
+class InvertibleRegion(NamedTuple):
+    """Region of the normalised ideal plane where a lens model is invertible.
 
-    It is where the determinant of the Jacobian is positive, within ``limit``: up to there every ray from the centre
-    meets it vanish once at most. Within ``safe`` it is positive everywhere, so need not be looked at. ``edge`` are
-    places (directions, 2) all around where it first vanishes, infinite where it never does.
+    Attributes
+    ----------
+    safe : float
+        Squared radius within which the determinant of the Jacobian is positive everywhere.
+    limit : float
+        Squared radius within which the determinant changes its sign at most once along every ray from the centre. The
+        region is the set of points within it with a positive determinant.
+    edge : numpy.ndarray
+        (directions, 2): points around the centre where the determinant first vanishes; infinite where it never does.
     """
 
     safe: float
@@ -33,12 +39,13 @@ class OneToOne(NamedTuple):
     edge: Float64
 
 
-def one_to_one(radial: Sequence[float], tangential: Sequence[float], prism: Sequence[float]) -> OneToOne:
-    """Find it for the radial coefficients k1 .. k6, the tangential p1, p2 and the thin prism's s1 .. s4."""
+def invertible_region(radial: Sequence[float], tangential: Sequence[float], prism: Sequence[float]) -> InvertibleRegion:
+    """Find the invertible region for radial terms k1 .. k6, tangential terms p1, p2 and prism terms s1 .. s4."""
     terms = np.array([*radial, *tangential, *prism])
     with np.errstate(divide="ignore", over="ignore"):
         radii = np.abs(terms) ** (-1.0 / _ORDERS)
-    # Terms too weak to matter anywhere would only spoil the numbers. The unit: where the first of the others reaches 1.
+    # Drop terms that reach 1 beyond the search radius only: they would spoil the polynomials' conditioning. The unit of
+    # length is the smallest radius at which one of the other terms reaches 1.
     terms = np.where(radii < _FARTHEST, terms, 0.0)
     unit = min(float(radii.min()), _FARTHEST)
     k, p, s = np.split(terms * unit**_ORDERS, [6, 8])
@@ -47,11 +54,11 @@ def one_to_one(radial: Sequence[float], tangential: Sequence[float], prism: Sequ
     if not p.any() and not s.any():
         slope = polynomial.polyadd(polynomial.polymul(over, under), _twice_square_times(_wronskian(over, under)))
         square = min(*_sign_changes(slope), pole, math.inf) * unit**2
-        return OneToOne(square, square, math.sqrt(square) * _directions())
+        return InvertibleRegion(square, square, math.sqrt(square) * _directions())
     return _decentred(over, under, p, s, pole, unit)
 
 
-def _decentred(over: Float64, under: Float64, p: Float64, s: Float64, pole: float, unit: float) -> OneToOne:
+def _decentred(over: Float64, under: Float64, p: Float64, s: Float64, pole: float, unit: float) -> InvertibleRegion:
     directions = _directions()
     rays = [_sign_changes(_along_ray(over, under, p, s, c, d)) for c, d in directions]
     first = [ray[0] if ray else math.inf for ray in rays]
@@ -64,7 +71,7 @@ def _decentred(over: Float64, under: Float64, p: Float64, s: Float64, pole: floa
     else:
         limit = min((_MARGIN * again) ** 2, pole)
     edge = np.minimum(first, math.sqrt(pole))[:, None] * unit * directions
-    return OneToOne(min((_MARGIN * min(first)) ** 2, limit) * unit**2, limit * unit**2, edge)
+    return InvertibleRegion(min((_MARGIN * min(first)) ** 2, limit) * unit**2, limit * unit**2, edge)
 
 
 def _directions() -> Float64:
@@ -82,16 +89,16 @@ def _twice_square_times(terms: Any) -> Any:
 
 
 def _in_radius(terms: Any) -> Float64:
-    """Rewrite a polynomial in the squared radius as one in the radius."""
+    """Convert a polynomial in the squared radius to one in the radius."""
     spread = np.zeros(2 * len(terms) - 1)
     spread[::2] = terms
     return spread
 
 
 def _along_ray(over: Float64, under: Float64, p: Float64, s: Float64, c: float, d: float) -> Any:
-    """Return the determinant along the ray (c, d), times the fourth power of the denominator; by powers of radius.
+    """Return the determinant along the ray (c, d), times the denominator to the power 4, as a polynomial in the radius.
 
-    Written as in kernels/common/camera.h, every term times the squared denominator.
+    The terms are those of kernels/common/camera.h, each multiplied by the squared denominator.
     """
     add, mul = polynomial.polyadd, polynomial.polymul
     square = _in_radius(mul(under, under))
@@ -106,9 +113,10 @@ def _along_ray(over: Float64, under: Float64, p: Float64, s: Float64, c: float, 
 
 
 def _sign_changes(terms: Iterable[float]) -> list[float]:
-    """Return the positive places where a polynomial that is 1 at 0 changes its sign, ascending."""
+    """Return the positive arguments, ascending, where a polynomial that is 1 at 0 changes its sign."""
     roots = polynomial.polyroots(np.trim_zeros(np.asarray(terms, dtype=np.float64), "b"))
-    # Roots that rounding made complex, or that only touch 0, are told apart by the signs between them.
+    # Rounding can make a real root complex, and a double root does not change the sign: compare signs between the
+    # roots.
     near = roots[(roots.real > 0.0) & (np.abs(roots.imag) <= 1e-3 * roots.real) & (roots.real < _FARTHEST**2)]
     places = np.sort(near.real)
     if not len(places):

@@ -1,4 +1,4 @@
-"""Where kernels begin to undo a lens: fitted polynomials, and how many steps from them settle the rest."""
+"""Starting point of the kernels' lens inversion: fitted polynomials, and the number of Newton steps from there."""
 
 from __future__ import annotations
 
@@ -10,71 +10,77 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import polynomial
 
-from gpuvision.camera.newton import Displacement, undo
+from gpuvision.camera.newton import Displacement, invert_displacement
 
 Float64 = npt.NDArray[np.float64]
 
-# CAMERA_GUESS_TERMS of camera.h, and the terms of either vector.
+# CAMERA_GUESS_TERMS of camera.h, and the terms of each vector polynomial.
 _TERMS, _VECTOR_TERMS = 8, 3
+# Polar grid of the points of the fit.
 _RADII, _DIRECTIONS = 32, 16
-# Of the sensor's farthest corner, and of the fold's image: towards the fold polynomials fail, the inverse having a root
-# there.
-_BEYOND, _SHORT = 1.1, 0.95
-# As in camera.h: CAMERA_MOST_STEPS, and CAMERA_LEFT and CAMERA_NOISE of either precision.
-_MOST_STEPS = 8
+# Radius of the fit: the first factor on the sensor's farthest corner, at most the second on the fold's distorted
+# radius. The inverse has a square-root singularity at the fold, which polynomials do not fit.
+_CORNER_FACTOR, _FOLD_FACTOR = 1.1, 0.95
+# As in camera.h: CAMERA_MOST_STEPS, and CAMERA_LEFT and CAMERA_NOISE of both precisions.
+_MAX_STEPS = 8
 _LEFT = {np.dtype(np.float32): (1e-15, 1e-13), np.dtype(np.float64): (1e-31, 1e-28)}
-_MOST_PLACES = 0.97
+# Share of the points of the fit that have to converge within CAMERA_STEPS; the kernel iterates the others further.
+_CONVERGED_SHARE = 0.97
 
 
-class Guess:
-    """What ``camera_approach`` of kernels/common/camera.h begins with.
+class InverseStart:
+    """Starting polynomials of ``camera_approach`` in kernels/common/camera.h.
 
     Parameters
     ----------
-    lens
-        The displacement of ideal places to bent ones.
-    radial
-        The same without decentred terms, if there are any.
-    fold
-        Squared radius at which the radial part folds.
-    farthest
-        Squared radius of the sensor's farthest point, bent.
+    lens : callable
+        Displacement from ideal to distorted points.
+    radial : callable or None
+        The same without decentred terms; None if the lens has no decentred terms.
+    fold : float
+        Squared radius of the radial part's fold, normalised ideal coordinates.
+    farthest : float
+        Squared radius of the sensor's farthest point, normalised distorted coordinates.
     """
 
     def __init__(self, lens: Displacement, radial: Displacement | None, fold: float, farthest: float) -> None:
         self._lens = lens
-        self._reach = _BEYOND**2 * farthest or 1.0
+        self._reach = _CORNER_FACTOR**2 * farthest or 1.0
         if math.isfinite(fold):
             edge = np.array([[math.sqrt(fold), 0.0]])
             with np.errstate(all="ignore"):
-                bent = np.sum((edge + (radial or lens)(edge)[0]) ** 2)
-            self._reach = min(self._reach, float(bent) * _SHORT**2) if np.isfinite(bent) else self._reach
+                distorted = np.sum((edge + (radial or lens)(edge)[0]) ** 2)
+            self._reach = (
+                min(self._reach, float(distorted) * _FOLD_FACTOR**2) if np.isfinite(distorted) else self._reach
+            )
         # Chebyshev's nodes in the squared radius.
         z = 0.5 - 0.5 * np.cos((np.arange(_RADII) + 0.5) * (math.pi / _RADII))
         angles = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
         radii, directions = np.sqrt(self._reach * z), np.stack([np.cos(angles), np.sin(angles)], -1)
-        self._places = (radii[:, None, None] * directions).reshape(-1, 2)
-        self._exact = undo(lens, self._places) - self._places
-        self._terms = self._fit(radial is not None)
+        self._points = (radii[:, None, None] * directions).reshape(-1, 2)
+        self._exact = invert_displacement(lens, self._points) - self._points
+        self._coefficients = self._fit(radial is not None)
 
     def packed(self, real: npt.DTypeLike) -> Float64:
-        """Return the table of camera.h from CAMERA_PER_REACH on, for float32 or float64."""
+        """Return the entries of camera.h's table from CAMERA_PER_REACH on, for float32 or float64."""
         left, _ = _LEFT[np.dtype(real)]
         by_v, by_w = self._slopes
-        return np.concatenate([[1.0 / self._reach, left / self._shrinkage**4], self._terms, by_v.ravel(), by_w.ravel()])
+        return np.concatenate(
+            [[1.0 / self._reach, left / self._shrinkage**4], self._coefficients, by_v.ravel(), by_w.ravel()]
+        )
 
-    def steps(self, real: npt.DTypeLike) -> int:
-        """Return CAMERA_STEPS: how many steps settle most of the places that ever settle."""
+    def newton_steps(self, real: npt.DTypeLike) -> int:
+        """Return CAMERA_STEPS: the number of Newton steps after which most of the converging points have converged."""
         left, noise = _LEFT[np.dtype(real)]
         sizes = self._steps[0]
         before = np.concatenate([np.full_like(sizes[:1], left / self._shrinkage**4), sizes[:-1]]) + noise
         with np.errstate(over="ignore", invalid="ignore"):
-            settled = np.sum(sizes**2 <= left * before, axis=1)
-        return 1 + int(np.argmax(settled >= _MOST_PLACES * settled.max()))
+            converged = np.sum(sizes**2 <= left * before, axis=1)
+        return 1 + int(np.argmax(converged >= _CONVERGED_SHARE * converged.max()))
 
     def _fit(self, is_decentred: bool) -> Float64:
-        """Fit the coefficients of g, v and w to the exact way back, relative to the places' radius."""
-        m = self._places
+        """Fit the coefficients of g, v and w to the exact inverse displacement, weighted by 1 / radius."""
+        m = self._points
         z = np.sum(m**2, axis=-1, keepdims=True) / self._reach
         columns = [m * z**k for k in range(1, _TERMS + 1)]
         if is_decentred:
@@ -90,7 +96,7 @@ class Guess:
     @property
     def _vectors(self) -> Float64:
         """Coefficients of v and of w, (2, terms, 2)."""
-        return self._terms[_TERMS:].reshape(2, _VECTOR_TERMS, 2)
+        return self._coefficients[_TERMS:].reshape(2, _VECTOR_TERMS, 2)
 
     @property
     def _slopes(self) -> tuple[Float64, Float64]:
@@ -101,37 +107,37 @@ class Guess:
 
     @cached_property
     def _steps(self) -> tuple[Float64, Float64]:
-        """Squares over the places' own of the steps that the kernel takes and of what they leave, (steps, places)."""
-        m = self._places
+        """Squared lengths of the kernel's steps and of the errors after them over the points' own, (steps, points)."""
+        m = self._points
         square = np.sum(m**2, axis=-1, keepdims=True)
         z = square / self._reach
-        terms, by_v, by_w = self._terms[:_TERMS], *self._slopes
+        terms, by_v, by_w = self._coefficients[:_TERMS], *self._slopes
         at_v, at_w = (_values(z, each) for each in self._vectors)
         g = z * polynomial.polyval(z, terms) + _dot(m, at_v)
         slope = polynomial.polyval(z, terms * np.arange(1, _TERMS + 1)) + _dot(m, _values(z, by_v))
         turn = _values(z, by_w)
-        back, sizes, rests = m * g + square * at_w, [], []
+        back, sizes, errors = m * g + square * at_w, [], []
         with np.errstate(all="ignore"):
-            for _ in range(_MOST_STEPS):
+            for _ in range(_MAX_STEPS):
                 left = self._lens(m + back)[0] + back
                 along = _dot(m, left)
                 step = left + g * left + m * (2.0 / self._reach * slope * along + _dot(at_v, left)) + turn * along
                 back = back - step
                 sizes.append(_dot(step, step)[:, 0] / square[:, 0])
-                rests.append(np.sum((back - self._exact) ** 2, axis=-1) / square[:, 0])
-        return np.array(sizes), np.array(rests)
+                errors.append(np.sum((back - self._exact) ** 2, axis=-1) / square[:, 0])
+        return np.array(sizes), np.array(errors)
 
     @cached_property
     def _shrinkage(self) -> float:
-        """How much is left of a first step, for most places."""
-        sizes, rests = self._steps
+        """Ratio of the error after the first step to that step, met by most points."""
+        sizes, errors = self._steps
         with np.errstate(all="ignore"):
-            ratios = np.sqrt(rests[0] / np.maximum(sizes[0], np.finfo(np.float64).tiny))
-        return float(np.clip(np.nanquantile(ratios, _MOST_PLACES), 1e-4, 1.0))
+            ratios = np.sqrt(errors[0] / np.maximum(sizes[0], np.finfo(np.float64).tiny))
+        return float(np.clip(np.nanquantile(ratios, _CONVERGED_SHARE), 1e-4, 1.0))
 
 
 def _values(z: Float64, terms: Any) -> Float64:
-    """Vector polynomials with coefficients (terms, 2) at z, (places, 1)."""
+    """Evaluate vector polynomials with coefficients (terms, 2) at z (points, 1)."""
     return np.asarray(sum(z**k * term for k, term in enumerate(terms)))
 
 

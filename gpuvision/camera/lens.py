@@ -1,4 +1,4 @@
-"""The radial lens model which the readouts undo in the coordinates they measure."""
+"""Radial lens model from measured to undistorted sensor coordinates; PSD and camera readouts apply it."""
 
 from __future__ import annotations
 
@@ -12,34 +12,37 @@ import numpy.typing as npt
 
 from gpuvision.validation import check_keys, finite, numbers
 
-_NEWTON_STEPS = 64
-# No lens comes near them in any unit, and they keep the powers of fold radius and table within single precision.
-_LARGEST = {"k1": 1e10, "k2": 1e20}
-_FARTHEST = 1e9
+_MAX_NEWTON_STEPS = 64
+# Derived: with these bounds the powers of the fold radius and the kernel table stay within single precision. No lens
+# reaches them, in pixels or in metres.
+_MAX_COEFFICIENT = {"k1": 1e10, "k2": 1e20}
+_MAX_CENTRE = 1e9
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
-    """Radial distortion about a centre, as a direct polynomial from measured to undistorted coordinates.
+    """Radial distortion about a centre, as a polynomial from measured to undistorted coordinates.
 
-    ``C = C_c + (C' - C_c)(1 + k1 r^2 + k2 r^4)``, the same for R, ``r^2 = (R' - R_c)^2 + (C' - C_c)^2``
-    (F. de Jong, eq. 3.11-3.13). The model is isotropic, so it holds in any square sensor coordinate: pixels,
-    or metres on a PSD.
+    ``C = C_c + (C' - C_c)(1 + k1 r^2 + k2 r^4)``, the same for R, with ``r^2 = (R' - R_c)^2 + (C' - C_c)^2``. The model
+    is isotropic: it holds in any square sensor coordinates, such as pixels, or metres on a PSD.
 
     Parameters
     ----------
-    k1, k2
-        Distortion coefficients, in coordinate units to the power -2 and -4 (pixel^-2, pixel^-4; or metre^-2,
-        metre^-4).
-    centre
-        (C_c, R_c): column and row of the optical axis, in coordinate units.
+    k1, k2 : float
+        Distortion coefficients [unit^-2] and [unit^-4] of the sensor coordinates (pixels or metres). Default of k2: 0.
+    centre : (float, float)
+        (C_c, R_c): column and row of the distortion centre, in sensor coordinates. Default (0, 0).
 
     Raises
     ------
     ValueError
-        If a number is not finite, or beyond any lens.
+        A number is not finite, or its magnitude exceeds the bound named in the message.
     TypeError
-        If something is no number.
+        An argument is no number.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, eq. 3.11-3.13.
     """
 
     k1: float
@@ -49,35 +52,36 @@ class Lens:
     def __post_init__(self) -> None:
         for name in ("k1", "k2"):
             object.__setattr__(self, name, finite(getattr(self, name), f"Lens.{name}"))
-            if abs(getattr(self, name)) > _LARGEST[name]:
+            if abs(getattr(self, name)) > _MAX_COEFFICIENT[name]:
                 raise ValueError(
-                    f"Lens.{name} is {getattr(self, name):g}, expected a size of at most {_LARGEST[name]:g}"
+                    f"Lens.{name} is {getattr(self, name):g}, expected a size of at most {_MAX_COEFFICIENT[name]:g}"
                 )
         object.__setattr__(self, "centre", numbers(self.centre, (2,), "Lens.centre (column, row)"))
-        if max(map(abs, self.centre)) > _FARTHEST:
-            raise ValueError(f"Lens.centre is {self.centre}, expected coordinates of at most {_FARTHEST:g}")
+        if max(map(abs, self.centre)) > _MAX_CENTRE:
+            raise ValueError(f"Lens.centre is {self.centre}, expected coordinates of at most {_MAX_CENTRE:g}")
 
     @property
     def defines(self) -> dict[str, None]:
-        """What ``kernels/common/lens.h`` has to compile: ``LENS`` always, ``LENS_K2`` only where k2 is not 0."""
+        """Defines of ``kernels/common/lens.h``: ``LENS``, and ``LENS_K2`` only if k2 is not 0."""
         return {"LENS": None, "LENS_K2": None} if self.k2 != 0.0 else {"LENS": None}
 
     def packed(self, origin: Sequence[float], scale: float, *, inverse: bool = False) -> npt.NDArray[np.float64]:
-        """Return the table of ``kernels/common/lens.h`` for a kernel which works in (point - origin) scale.
+        """Return the parameter table of ``kernels/common/lens.h`` for kernel coordinates (point - origin) * scale.
 
         Parameters
         ----------
-        origin, scale
-            About 1 at the sensor's border keeps single precision sharp; ``origin`` in the order of
-            ``centre``.
-        inverse
-            Also for ``lens_distort``.
+        origin : sequence of 2 floats
+            Origin of the kernel coordinates, in the order of ``centre``.
+        scale : float
+            Scale of the kernel coordinates. Coordinates of about 1 at the sensor's border minimise rounding errors.
+        inverse : bool
+            Add the entry that ``lens_distort`` needs. Default False.
 
         Returns
         -------
         numpy.ndarray
-            Both coordinates of the centre, k1, k2 and the squared fold radius, in the kernel's units; for the inverse
-            the squared undistorted radius of the fold as well.
+            Both coordinates of the centre, k1, k2 and the squared fold radius, in kernel units; with ``inverse`` also
+            the squared undistorted radius of the fold.
         """
         centre = [(c - o) * scale for c, o in zip(self.centre, origin, strict=True)]
         fold = self.fold_radius
@@ -90,7 +94,7 @@ class Lens:
 
     @property
     def fold_radius(self) -> float:
-        """Measured radius at which the polynomial turns back: no scene point lies beyond it (inf: never)."""
+        """Measured radius up to which the polynomial increases; no scene point lies beyond it (inf: no limit)."""
         # d/dr of r (1 + k1 r^2 + k2 r^4) is 1 + 3 k1 s + 5 k2 s^2 in s = r^2; no 0/0 where k2 is 0.
         discriminant = 9.0 * self.k1**2 - 20.0 * self.k2
         if discriminant < 0.0:
@@ -103,18 +107,18 @@ class Lens:
         return math.sqrt(min(positive)) if positive else math.inf
 
     def undistort(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Undistorted (column, row) of measured points, shape (..., 2); NaN beyond the fold."""
+        """Return the undistorted (column, row) of measured points (..., 2); NaN beyond the fold."""
         offset = np.asarray(points, dtype=np.float64) - self.centre
         square = np.sum(offset**2, axis=-1, keepdims=True)
         inside = square < self.fold_radius**2
-        # Displacement form: adding the small stretch to the point itself keeps its digits.
+        # Add the small displacement to the point instead of scaling the offset: the rounding error is smaller.
         with np.errstate(invalid="ignore", over="ignore"):
-            stretched = offset * (square * (self.k1 + self.k2 * square))
-        straight: npt.NDArray[np.float64] = np.where(inside, np.asarray(points) + stretched, np.nan)
-        return straight
+            displacement = offset * (square * (self.k1 + self.k2 * square))
+        undistorted: npt.NDArray[np.float64] = np.where(inside, np.asarray(points) + displacement, np.nan)
+        return undistorted
 
     def jacobian(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """d(undistorted column, row) / d(measured column, row), shape (..., 2, 2)."""
+        """Return d(undistorted) / d(measured), (..., 2, 2), at measured points (..., 2)."""
         offset = np.asarray(points, dtype=np.float64) - self.centre
         square = np.sum(offset**2, axis=-1)[..., None, None]
         growth = 1.0 + square * (self.k1 + self.k2 * square)
@@ -122,9 +126,9 @@ class Lens:
         return np.asarray(growth * np.eye(2) + slope * offset[..., :, None] * offset[..., None, :])
 
     def distort(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Measured (column, row) of undistorted points, shape (..., 2): the inverse, by Newton steps.
+        """Return the measured (column, row) of undistorted points (..., 2): the inverse of `undistort`.
 
-        NaN where no measured point inside the fold has this undistorted position.
+        Computed by safeguarded Newton steps. NaN where no measured point inside the fold has this undistorted position.
         """
         offset = np.asarray(points, dtype=np.float64) - self.centre
         target = np.hypot(offset[..., 0], offset[..., 1])
@@ -134,26 +138,26 @@ class Lens:
         return self.centre + offset * np.where(np.isfinite(target), shrink, np.nan)[..., None]
 
     def _undistorted_radius(self, radius: float) -> float:
-        """Undistorted radius of a measured one; infinite for an infinite one: then there is no fold."""
+        """Return the undistorted radius of a measured radius; infinite for an infinite one (no fold)."""
         if math.isinf(radius):
             return math.inf
         return radius * (1.0 + radius**2 * (self.k1 + self.k2 * radius**2))
 
     def _measured_radius(self, target: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Solve r (1 + k1 r^2 + k2 r^4) = target on the monotone stretch [0, fold)."""
+        """Solve r (1 + k1 r^2 + k2 r^4) = target on the monotonic interval [0, fold)."""
         fold = self.fold_radius
         if math.isfinite(fold):
             high = np.full_like(target, fold)
             reachable = target < self._undistorted_radius(fold)
         else:
-            # Without a fold the slope is at least this, so the root is at most target / slope.
-            # (A k1 below 0 alone folds, but too far out for a float where it is all but 0.)
+            # Without a fold the slope has this lower bound, so the root is at most target / slope. (With k2 = 0, any k1
+            # below 0 folds; the fold radius of a tiny one overflows to infinity.)
             least_slope = 1.0 - 9.0 * self.k1**2 / (20.0 * self.k2) if self.k1 < 0.0 < self.k2 else 1.0
             high = target / least_slope
             reachable = np.isfinite(target)
         low = np.zeros_like(target)
         radius = np.where(reachable, np.minimum(target, high), np.nan)
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(_MAX_NEWTON_STEPS):
             square = radius**2
             excess = radius * (1.0 + square * (self.k1 + self.k2 * square)) - target
             if not np.any(np.abs(excess) > 2e-16 * target):
@@ -166,7 +170,7 @@ class Lens:
         return radius
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, as TOML holds them."""
+        """Return the lens as a table of numbers and lists for TOML."""
         return {"k1": self.k1, "k2": self.k2, "centre": list(self.centre)}
 
     @classmethod
@@ -176,6 +180,6 @@ class Lens:
         Raises
         ------
         ValueError
-            If a key is unknown or missing, or a value is no finite number.
+            A key is unknown or missing, or a value is no finite number.
         """
         return cls(**check_keys(table, ("k1", "k2", "centre"), ("k1",), "lens"))

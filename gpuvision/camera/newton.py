@@ -1,4 +1,4 @@
-"""Newton's method for the inverse of a displacement field, as in ``kernels/common/newton.h``."""
+"""Newton's method for the inverse of a displacement field; the kernels use ``kernels/common/newton.h``."""
 
 from __future__ import annotations
 
@@ -8,51 +8,66 @@ import numpy as np
 import numpy.typing as npt
 
 Float64 = npt.NDArray[np.float64]
-# Takes places (n, 2); returns how far they are moved, the Jacobian of the moved places, and which lie in the part that
-# is one-to-one.
+# Takes points (n, 2); returns their displacements (n, 2), the Jacobian (n, 2, 2) of the displaced points, and whether
+# each point lies in the region where the displacement is invertible (n,).
 Displacement = Callable[[Float64], tuple[Float64, Float64, npt.NDArray[np.bool_]]]
 
-_STEPS = 100
+_MAX_ITERATIONS = 100
 _EPSILON = float(np.finfo(np.float64).eps)
-# Squares, relative to the place's own: of a distance or step that is rounding, of a step that leads nowhere.
-_ROUNDING, _STUCK = 64.0 * _EPSILON**2, _EPSILON**2 / 64.0
+# Derived from double precision: squared residual or step, relative to the point's squared norm, below which it is
+# rounding (8 eps), and below which a step changes nothing (eps / 8).
+_ROUNDING, _NO_CHANGE = 64.0 * _EPSILON**2, _EPSILON**2 / 64.0
 
 
-def undo(displacement: Displacement, moved: Float64) -> Float64:
-    """Places (..., 2) that the displacement takes to those given; NaN where there are none in the one-to-one part.
+def invert_displacement(displacement: Displacement, moved: Float64) -> Float64:
+    """Invert a displacement field: return the points that it moves to the given ones.
 
-    The start is the centre, which is not moved and where the Jacobian is 1: the first step leads to the given place
-    itself. A step which leaves the one-to-one part or gains nothing is halved. The way back is the unknown: it is small
-    beside the place, so it keeps its digits. It is found where the distance left, or the step ahead, is rounding; at
-    the fold, where the search for a place past it ends, neither is.
+    Parameters
+    ----------
+    displacement : callable
+        Displacement field with its Jacobian; zero, with identity Jacobian, at the origin.
+    moved : numpy.ndarray
+        (..., 2): displaced points.
+
+    Returns
+    -------
+    numpy.ndarray
+        (..., 2): original points; NaN where none exists in the invertible region.
+
+    Notes
+    -----
+    The iteration starts at the origin, so that the first step leads to the given point itself. A step that leaves the
+    invertible region or does not reduce the residual is halved. The unknown is the negative displacement: it is small
+    against the point, so its rounding error is small. A point is found if its residual or its next step is at rounding
+    level. For points past the fold the iteration ends at the fold, where neither holds.
     """
-    wanted = moved.reshape(-1, 2)
-    back, step = -wanted, wanted.copy()
+    target = moved.reshape(-1, 2)
+    correction, step = -target, target.copy()
     with np.errstate(all="ignore"):
-        square = np.sum(wanted**2, axis=-1)
-        left, ahead = square.copy(), square.copy()
-        going = np.flatnonzero(np.isfinite(square))
-        for _ in range(_STEPS):
-            if not len(going):
+        square = np.sum(target**2, axis=-1)
+        residual_square, step_square = square.copy(), square.copy()
+        active = np.flatnonzero(np.isfinite(square))
+        for _ in range(_MAX_ITERATIONS):
+            if not len(active):
                 break
-            trial = back[going] + step[going]
-            move, jacobian, inside = displacement(wanted[going] + trial)
-            rest = move + trial
-            distance = np.sum(rest**2, axis=-1)
-            better = inside & (distance < left[going])
-            taken = going[better]
-            back[taken], left[taken] = trial[better], distance[better]
-            step[taken] = -np.linalg.solve(jacobian[better], rest[better][..., None])[..., 0]
-            step[going[~better]] *= 0.5
-            sizes = np.sum(step[going] ** 2, axis=-1)
-            ahead[taken] = sizes[better]
-            least = np.minimum(left[going], ahead[going])
-            going = going[(least > _ROUNDING * square[going]) & (sizes > _STUCK * square[going])]
-        found = np.minimum(left, ahead) <= _ROUNDING * square
-    # The last step is still to come, or next to nothing.
-    return np.asarray(np.where(found[:, None], wanted + (back + step), np.nan).reshape(moved.shape))
+            trial = correction[active] + step[active]
+            move, jacobian, inside = displacement(target[active] + trial)
+            residual = move + trial
+            distance = np.sum(residual**2, axis=-1)
+            better = inside & (distance < residual_square[active])
+            accepted = active[better]
+            correction[accepted], residual_square[accepted] = trial[better], distance[better]
+            step[accepted] = -np.linalg.solve(jacobian[better], residual[better][..., None])[..., 0]
+            step[active[~better]] *= 0.5
+            sizes = np.sum(step[active] ** 2, axis=-1)
+            step_square[accepted] = sizes[better]
+            least = np.minimum(residual_square[active], step_square[active])
+            active = active[(least > _ROUNDING * square[active]) & (sizes > _NO_CHANGE * square[active])]
+        found = np.minimum(residual_square, step_square) <= _ROUNDING * square
+    # The last step computed has not been applied yet; apply it.
+    return np.asarray(np.where(found[:, None], target + (correction + step), np.nan).reshape(moved.shape))
 
 
 def determinant(jacobian: Float64) -> Float64:
-    """Of matrices (..., 2, 2)."""
+    """Return the determinants (...) of matrices (..., 2, 2)."""
     return np.asarray(jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0])

@@ -1,4 +1,4 @@
-"""The measurement-plane polynomial: sensor coordinates straight to metres in one plane, without a camera in between."""
+"""Measurement-plane polynomial: direct map from sensor coordinates to metres in one plane, without a camera model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.newton import determinant, undo
+from gpuvision.camera.newton import determinant, invert_displacement
 from gpuvision.validation import check_keys, numbers
 
 Float64 = npt.NDArray[np.float64]
@@ -19,50 +19,60 @@ Region = tuple[tuple[float, float], tuple[float, float]]
 
 # Powers (of c, of r) of the terms, in the order of eq. 3.6; eq. 3.7 is the same with c and r exchanged.
 _TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (1, 2), (3, 0))
-# The powers of what displaces, in the order of plane.h.
-_BENDING = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
-# The region's edge, given and found: as in plane.h.
-_EDGE, _FOUND_EDGE = (1.0 + ulps * float(np.finfo(np.float64).eps) for ulps in (4.0, 64.0))
-_OUTSKIRTS = 1.25
-_TRIED = 33
-_WORST_CONDITION = 1e6
+# Powers (of c, of r) of the terms beyond the linear ones, in the order of plane.h.
+_DISPLACEMENT_TERMS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+# Border of the region in conditioned coordinates, for given points and for points found by inversion; as in plane.h.
+_BORDER, _INVERSE_BORDER = (1.0 + ulps * float(np.finfo(np.float64).eps) for ulps in (4.0, 64.0))
+# Border, in conditioned coordinates, that the iteration of the inverse may not leave.
+_ITERATION_BORDER = 1.25
+# Points along each side of the grid on which the sign of the Jacobian's determinant is tested.
+_TEST_POINTS = 33
+# Largest accepted condition number of the linear terms, and of the least-squares design.
+_MAX_CONDITION = 1e6
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanePolynomial:
-    """Cubic polynomials from sensor to measurement plane (F. de Jong, eq. 3.6 and 3.7).
+    """Cubic polynomials from sensor coordinates to a measurement plane.
 
     ::
 
         G = p0 + p1 c + p2 r + p3 c^2 + p4 r c + p5 r^2 + p6 r^2 c + p7 c^3
         H = q0 + q1 r + q2 c + q3 r^2 + q4 c r + q5 c^2 + q6 c^2 r + q7 r^3
 
-    with c and r the sensor's coordinates, in its unit, and G and H metres in the plane. They take magnification,
-    rotation, the weaker perspective and radial distortion in one, for a sensor about perpendicular to the plane.
-
-    Limits: the numbers are no physical ones, so a lens, a tilt or a pose cannot be read from them, and they hold for
-    this one plane only. The terms are not complete: G has to run about along c, and H along r, and what is left out
-    stays as an error. On 1280 x 1024 pixels at a focal length of 1700 it is 0.04 pixels for a lens with k1 = -0.05 and
-    0.6 for -0.2; 0.05 for a sensor turned by 10 degrees about one axis, 0.4 for 20, and 3 for 10 about both. Beyond the
-    points that they were fitted to cubic terms run away, so points outside ``region`` are NaN. For triangulation take
-    `Triangulation` with a `Lens`.
+    where c and r are sensor coordinates (any unit), and G and H are metres in the plane. The polynomials model
+    magnification, rotation, weak perspective and radial distortion together, for a sensor about perpendicular to the
+    plane.
 
     Parameters
     ----------
-    p, q
-        The eight coefficients of either.
-    region
-        ((c_min, c_max), (r_min, r_max)) of the sensor within which they hold.
-    covariance
-        (2, 8, 8): of the coefficients of G and of H, over sensor coordinates shifted and scaled to -1 .. 1 within the
-        region.
+    p, q : sequence of 8 floats
+        Coefficients of G and of H.
+    region : ((float, float), (float, float))
+        ((c_min, c_max), (r_min, r_max)): region of the sensor in which the polynomials are valid.
+    covariance : (2, 8, 8), optional
+        Covariances of the coefficients of G and of H [m^2], over sensor coordinates shifted and scaled to -1 .. 1
+        within the region.
 
     Raises
     ------
     ValueError
-        The polynomials are not one-to-one within the region, or a number or shape is wrong.
+        The polynomials are not invertible within the region, or a number or shape is wrong.
     TypeError
-        Something is no number.
+        An entry is no number.
+
+    Notes
+    -----
+    The coefficients have no physical meaning: they give no lens, tilt or pose, and are valid for one plane only. The
+    terms are not complete: G has to run approximately along c, and H along r; omitted terms remain as a model error. On
+    1280 x 1024 pixels at a focal length of 1700 px this error is 0.04 px for a lens with k1 = -0.05 and 0.6 px for
+    -0.2; 0.05 px for a sensor rotated by 10 degrees about one axis, 0.4 px for 20, and 3 px for 10 about both. Outside
+    the fitted points the cubic terms diverge, so results outside ``region`` are NaN. For triangulation use
+    `Triangulation` with a `Lens`.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, eq. 3.6 and 3.7.
     """
 
     p: tuple[float, ...]
@@ -81,71 +91,81 @@ class PlanePolynomial:
             if len(parts) != 2:
                 raise ValueError(f"PlanePolynomial.covariance has {len(parts)} parts, expected one of p and one of q")
             object.__setattr__(self, "covariance", parts)
-        self._check_one_to_one()
+        self._check_invertible()
 
-    def _check_one_to_one(self) -> None:
+    def _check_invertible(self) -> None:
         _, matrix, _ = self._parts
-        if not np.linalg.cond(matrix) < _WORST_CONDITION:
+        if not np.linalg.cond(matrix) < _MAX_CONDITION:
             raise ValueError(
                 "PlanePolynomial: its linear terms are not one-to-one, expected a plane seen from its front"
             )
-        line = np.linspace(-1.0, 1.0, _TRIED)
-        _, jacobian, _ = self._bend(np.stack(np.meshgrid(line, line), -1).reshape(-1, 2))
+        line = np.linspace(-1.0, 1.0, _TEST_POINTS)
+        _, jacobian, _ = self._displacement(np.stack(np.meshgrid(line, line), -1).reshape(-1, 2))
         if not np.all(determinant(jacobian) > 0.0):
             raise ValueError("PlanePolynomial folds within its region; fit it to more points, or to a smaller region")
 
-    # ---- both ways on the host -----------------------------------------------------------------------------
+    # ---- host computation in float64 -----------------------------------------------------------------------
 
     def to_plane(self, points: npt.ArrayLike) -> Float64:
-        """(G, H) of sensor points, shape (..., 2) [m]; NaN outside the region."""
-        places = self._conditioned(points)
+        """Return (G, H) [m] of sensor points (..., 2); NaN outside the region."""
+        points = self._to_conditioned(points)
         offset, matrix, _ = self._parts
         with np.errstate(all="ignore"):
-            move, _, _ = self._bend(places)
-        return np.asarray(offset + np.where(_within(places, _EDGE)[..., None], places + move, np.nan) @ matrix.T)
+            move, _, _ = self._displacement(points)
+        return np.asarray(offset + np.where(_is_within(points, _BORDER)[..., None], points + move, np.nan) @ matrix.T)
 
     def to_sensor(self, points: npt.ArrayLike) -> Float64:
-        """Sensor coordinates of points (G, H) in the plane, shape (..., 2): the inverse; NaN outside the region."""
+        """Return the sensor coordinates of plane points (G, H) [m] (..., 2), the inverse; NaN outside the region."""
         offset, matrix, _ = self._parts
         moved = (np.asarray(points, dtype=np.float64) - offset) @ np.linalg.inv(matrix).T
-        places = undo(self._bend, moved)
+        points = invert_displacement(self._displacement, moved)
         middle, half = self._middle_and_half
-        return np.asarray(middle + half * np.where(_within(places, _FOUND_EDGE)[..., None], places, np.nan))
+        return np.asarray(middle + half * np.where(_is_within(points, _INVERSE_BORDER)[..., None], points, np.nan))
 
     def covariance_at(self, points: npt.ArrayLike) -> Float64:
-        """Covariance of (G, H) at sensor points that the coefficients' own brings, (..., 2) to (..., 2, 2) [m^2].
+        """Propagate the covariance of the coefficients to (G, H) at sensor points.
+
+        Parameters
+        ----------
+        points : array_like
+            (..., 2): sensor coordinates.
+
+        Returns
+        -------
+        numpy.ndarray
+            (..., 2, 2) float64: covariance of (G, H) [m^2]; NaN outside the region.
 
         Raises
         ------
         ValueError
-            The covariance is not known.
+            The polynomial has no covariance.
         """
         if self.covariance is None:
             raise ValueError("PlanePolynomial.covariance is not known; fit the polynomial to more than eight points")
-        places = self._conditioned(points)
-        designs = _designs(np.where(_within(places, _EDGE)[..., None], places, np.nan))
+        points = self._to_conditioned(points)
+        designs = _designs(np.where(_is_within(points, _BORDER)[..., None], points, np.nan))
         variances = [
             np.einsum("...i,ij,...j->...", design, np.array(part), design)
             for design, part in zip(designs, self.covariance, strict=True)
         ]
         return np.asarray(np.stack(variances, -1)[..., None] * np.eye(2))
 
-    # ---- what the kernels take -----------------------------------------------------------------------------
+    # ---- kernel tables and defines -------------------------------------------------------------------------
 
     @property
     def defines(self) -> dict[str, None]:
-        """What ``kernels/undistort_points/plane.h`` needs to be told."""
+        """Defines of ``kernels/undistort_points/plane.h``."""
         return {"PLANE": None}
 
     def packed(self, real: npt.DTypeLike) -> npt.NDArray[Any]:
-        """Return the table of ``kernels/undistort_points/plane.h`` for float32 or float64."""
+        """Return the parameter table of ``kernels/undistort_points/plane.h`` for float32 or float64."""
         middle, half = self._middle_and_half
-        # Origin and scale are rounded before the rest is computed from them.
+        # Round origin and scale first and compute the other entries from the rounded values, so that they compensate.
         origin = middle.astype(real).astype(np.float64)
         scale = (1.0 / half).astype(real).astype(np.float64)
-        offset, matrix, bending = _taken_apart(self._powers, origin, 1.0 / scale)
-        back = np.linalg.inv(matrix)
-        table = [origin, scale, 1.0 / scale, offset, matrix.ravel(), back.ravel(), bending.ravel()]
+        offset, matrix, displacement = _decompose(self._powers, origin, 1.0 / scale)
+        inverse = np.linalg.inv(matrix)
+        table = [origin, scale, 1.0 / scale, offset, matrix.ravel(), inverse.ravel(), displacement.ravel()]
         return np.concatenate(table).astype(real)
 
     # ---- parts ---------------------------------------------------------------------------------------------
@@ -155,7 +175,7 @@ class PlanePolynomial:
         low, high = np.array(self.region).T
         return 0.5 * (low + high), 0.5 * (high - low)
 
-    def _conditioned(self, points: npt.ArrayLike) -> Float64:
+    def _to_conditioned(self, points: npt.ArrayLike) -> Float64:
         middle, half = self._middle_and_half
         return np.asarray((np.asarray(points, dtype=np.float64) - middle) / half)
 
@@ -169,20 +189,20 @@ class PlanePolynomial:
 
     @cached_property
     def _parts(self) -> tuple[Float64, Float64, Float64]:
-        return _taken_apart(self._powers, *self._middle_and_half)
+        return _decompose(self._powers, *self._middle_and_half)
 
-    def _bend(self, places: Float64) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:
-        """Return how far the higher terms move conditioned places (n, 2), as `newton.undo` asks for it."""
-        _, _, bending = self._parts
-        x, y = places[..., 0], places[..., 1]
+    def _displacement(self, points: Float64) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:
+        """Return displacement by the higher terms, Jacobian and invertibility, as `newton.Displacement`."""
+        _, _, displacement = self._parts
+        x, y = points[..., 0], points[..., 1]
         ones = np.ones_like(x)
-        terms = np.stack([x**i * y**j for i, j in _BENDING], -1)
-        by_x = np.stack([i * x ** max(i - 1, 0) * y**j * ones for i, j in _BENDING], -1)
-        by_y = np.stack([j * x**i * y ** max(j - 1, 0) * ones for i, j in _BENDING], -1)
-        jacobian = np.eye(2) + np.stack([by_x @ bending.T, by_y @ bending.T], -1)
-        return terms @ bending.T, jacobian, _within(places, _OUTSKIRTS) & (determinant(jacobian) > 0.0)
+        terms = np.stack([x**i * y**j for i, j in _DISPLACEMENT_TERMS], -1)
+        by_x = np.stack([i * x ** max(i - 1, 0) * y**j * ones for i, j in _DISPLACEMENT_TERMS], -1)
+        by_y = np.stack([j * x**i * y ** max(j - 1, 0) * ones for i, j in _DISPLACEMENT_TERMS], -1)
+        jacobian = np.eye(2) + np.stack([by_x @ displacement.T, by_y @ displacement.T], -1)
+        return terms @ displacement.T, jacobian, _is_within(points, _ITERATION_BORDER) & (determinant(jacobian) > 0.0)
 
-    # ---- where one comes from ------------------------------------------------------------------------------
+    # ---- construction --------------------------------------------------------------------------------------
 
     @classmethod
     def fit(
@@ -193,21 +213,25 @@ class PlanePolynomial:
         region: Region | None = None,
         sigma: float | None = None,
     ) -> PlanePolynomial:
-        """Fit known points of the plane by linear least squares.
+        """Fit the polynomials to known points of the plane by linear least squares.
 
         Parameters
         ----------
-        sensor_points, plane_points
-            Measured (c, r) and known (G, H) [m], each (..., 2); pairs with NaN are left out.
-        region
-            Where it shall hold; None: the box around the points.
-        sigma
-            Standard deviation of either coordinate in the plane [m], for the covariance; None: from the residuals.
+        sensor_points, plane_points : array_like
+            (..., 2): measured (c, r) and known (G, H) [m]. Pairs with NaN are ignored.
+        region : optional
+            Region of validity. Default: the bounding box of the sensor points.
+        sigma : float, optional
+            Standard deviation of one plane coordinate [m], for the covariance. Default: estimated from the residuals.
+
+        Returns
+        -------
+        PlanePolynomial
 
         Raises
         ------
         ValueError
-            Shapes differ, the points do not fix the terms, or G does not run along c.
+            The shapes differ, the points do not determine the terms, or G does not run along c.
         """
         sensor, plane = (np.asarray(each, dtype=np.float64) for each in (sensor_points, plane_points))
         if sensor.shape != plane.shape or sensor.shape[-1:] != (2,):
@@ -232,7 +256,7 @@ class PlanePolynomial:
         return cls(p=values[0], q=values[1], region=box, covariance=parts if len(parts) == 2 else None)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, as TOML holds them; what is None is left out."""
+        """Return the polynomial as a table of numbers and lists for TOML, without entries that are None."""
         table: dict[str, Any] = {"p": list(self.p), "q": list(self.q), "region": [list(each) for each in self.region]}
         if self.covariance is not None:
             table["covariance"] = [[list(row) for row in part] for part in self.covariance]
@@ -240,30 +264,31 @@ class PlanePolynomial:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> PlanePolynomial:
-        """Build a polynomial from such a table; all but ``covariance`` are needed.
+        """Build a polynomial from the table of `to_dict`; all keys but ``covariance`` are required.
 
         Raises
         ------
         ValueError, TypeError
-            A key is unknown or missing, or a value is not what it must be.
+            A key is unknown or missing, or a value has a wrong type or range.
         """
-        needed = ("p", "q", "region")
-        return cls(**check_keys(table, (*needed, "covariance"), needed, "plane polynomial"))
+        required = ("p", "q", "region")
+        return cls(**check_keys(table, (*required, "covariance"), required, "plane polynomial"))
 
 
-def _within(places: Float64, edge: float) -> npt.NDArray[np.bool_]:
-    return np.asarray(np.all(np.abs(places) <= edge, axis=-1))
+def _is_within(points: Float64, edge: float) -> npt.NDArray[np.bool_]:
+    return np.asarray(np.all(np.abs(points) <= edge, axis=-1))
 
 
-def _designs(places: Float64) -> tuple[Float64, Float64]:
-    """Terms of eq. 3.6 and of eq. 3.7 at places (..., 2): each (..., 8)."""
-    x, y = places[..., 0], places[..., 1]
+def _designs(points: Float64) -> tuple[Float64, Float64]:
+    """Return the terms of eq. 3.6 and of eq. 3.7 at points (..., 2): each (..., 8)."""
+    x, y = points[..., 0], points[..., 1]
     return np.stack([x**i * y**j for i, j in _TERMS], -1), np.stack([x**j * y**i for i, j in _TERMS], -1)
 
 
 def _least_squares(design: Float64, values: Float64, sigma: float | None) -> tuple[Float64, Float64 | None]:
+    """Return coefficients and covariance; no covariance if no residual is left to estimate it from."""
     orthogonal, triangle = np.linalg.qr(design)
-    if not np.linalg.cond(triangle) < _WORST_CONDITION:
+    if not np.linalg.cond(triangle) < _MAX_CONDITION:
         raise ValueError("the points do not fix eight terms, expected four columns and four rows of points at least")
     found = np.linalg.solve(triangle, orthogonal.T @ values)
     spare = len(values) - len(_TERMS)
@@ -274,7 +299,7 @@ def _least_squares(design: Float64, values: Float64, sigma: float | None) -> tup
     return found, variance * inverse @ inverse.T
 
 
-def _substituted(powers: Float64, origin: Float64, unit: Float64) -> Float64:
+def _substitute(powers: Float64, origin: Float64, unit: Float64) -> Float64:
     """Rewrite coefficients (..., 4, 4) of c^i r^j for c = origin + unit x, r likewise."""
     along, across = (
         np.array([[comb(i, k) * o ** (i - k) * u**k if k <= i else 0.0 for k in range(4)] for i in range(4)])
@@ -284,19 +309,19 @@ def _substituted(powers: Float64, origin: Float64, unit: Float64) -> Float64:
 
 
 def _in_sensor_units(values: Float64, middle: Float64, half: Float64, axis: int) -> tuple[float, ...]:
-    """Return eq. 3.6's (axis 0) or 3.7's coefficients of those over the conditioned coordinates."""
+    """Convert coefficients over conditioned coordinates to those of eq. 3.6 (axis 0) or 3.7 (axis 1)."""
     powers = np.zeros((4, 4))
     order = [(i, j) if axis == 0 else (j, i) for i, j in _TERMS]
     for place, value in zip(order, values, strict=True):
         powers[place] = value
-    powers = _substituted(powers, -middle / half, 1.0 / half)
+    powers = _substitute(powers, -middle / half, 1.0 / half)
     return tuple(float(powers[place]) for place in order)
 
 
-def _taken_apart(powers: Float64, origin: Float64, unit: Float64) -> tuple[Float64, Float64, Float64]:
-    """Return offset (2,), matrix (2, 2) and bending terms (2, 7) of plane.h for c = origin + unit x."""
-    terms = _substituted(powers, origin, unit)
+def _decompose(powers: Float64, origin: Float64, unit: Float64) -> tuple[Float64, Float64, Float64]:
+    """Return offset (2,), matrix (2, 2) and displacement terms (2, 7) of plane.h for c = origin + unit x."""
+    terms = _substitute(powers, origin, unit)
     matrix = np.stack([terms[:, 1, 0], terms[:, 0, 1]], -1)
-    higher = np.stack([terms[:, i, j] for i, j in _BENDING], -1)
-    bending = np.linalg.solve(matrix, higher) if np.linalg.cond(matrix) < _WORST_CONDITION else higher
-    return terms[:, 0, 0], matrix, np.asarray(bending, dtype=np.float64)
+    higher = np.stack([terms[:, i, j] for i, j in _DISPLACEMENT_TERMS], -1)
+    displacement = np.linalg.solve(matrix, higher) if np.linalg.cond(matrix) < _MAX_CONDITION else higher
+    return terms[:, 0, 0], matrix, np.asarray(displacement, dtype=np.float64)

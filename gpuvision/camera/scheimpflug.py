@@ -1,8 +1,9 @@
-"""The tilted sensor of a Scheimpflug camera: its geometry, and the condition that it is tilted for.
+"""Tilted sensor of a Scheimpflug camera: geometry, virtual camera, and the Scheimpflug condition.
 
-A sensor tilted by alpha about the point where the optical axis meets it sees, without distortion, what an untilted
-pinhole camera sees that is turned by alpha about the pinhole (F. de Jong, fig. 3.3): its focal length is
-f = f' cos(alpha) (eq. 3.1), and its principal point lies f' sin(alpha) aside in the sensor.
+A sensor tilted by alpha about the intersection of the optical axis records, without distortion, the same image as an
+untilted pinhole camera rotated by alpha about the pinhole (the virtual camera S' of F. de Jong, fig. 3.3). The virtual
+camera has the focal length f = f' cos(alpha) (eq. 3.1); its principal point lies at a distance f' sin(alpha) from the
+optical axis in the sensor plane.
 """
 
 from __future__ import annotations
@@ -22,24 +23,30 @@ _RIGHT_ANGLE = 0.5 * math.pi
 
 @dataclass(frozen=True, kw_only=True)
 class TiltedSensor:
-    """A sensor with square pixels, tilted against the plane of its lens.
+    """Sensor with square pixels, tilted against the plane of the lens (Scheimpflug).
 
     Parameters
     ----------
-    focal_length
-        f': from the pinhole to the sensor along the optical axis, pixels.
-    centre
-        (C_c, R_c): where the optical axis meets the sensor, pixels.
-    alpha
-        Angle between the optical axis and the sensor's normal, radians, at least 0 and less than a right angle.
-    direction
-        In which direction of the image the optical axis leans away from the sensor's normal: radians from the
-        columns' axis (x) towards the rows' (y).
+    focal_length : float
+        f': distance from the pinhole to the sensor along the optical axis [px], above 0.
+    centre : (float, float)
+        (C_c, R_c): column and row of the optical axis on the sensor [px].
+    alpha : float
+        Angle between the optical axis and the sensor's normal [rad], 0 to below pi/2.
+    direction : float
+        Image direction in which the optical axis leans away from the sensor's normal [rad], from the columns' axis (x)
+        towards the rows' axis (y). Default 0.
 
     Raises
     ------
     ValueError, TypeError
-        A number is out of these bounds, or is none.
+        A number is out of its range, or an argument is no number.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 3.3.1. C.
+    Steger, A comprehensive and versatile camera model for cameras with tilt lenses, Int. J. Computer Vision 123 (2017)
+    121.
     """
 
     focal_length: float
@@ -58,32 +65,32 @@ class TiltedSensor:
 
     @property
     def axis(self) -> Floats:
-        """Unit vector of the optical axis in the sensor's frame (columns, rows, normal)."""
+        """Unit vector (3,) of the optical axis in the sensor's frame (columns, rows, normal)."""
         flat = math.sin(self.alpha)
         return np.array([flat * math.cos(self.direction), flat * math.sin(self.direction), math.cos(self.alpha)])
 
     @property
     def tau(self) -> tuple[float, float]:
-        """OpenCV's (tauX, tauY), radians."""
+        """OpenCV's tilt angles (tauX, tauY) [rad]."""
         x, y, z = self.axis.tolist()
         return math.asin(y), math.atan2(-x, z)
 
     @classmethod
     def from_tau(cls, focal_length: float, centre: tuple[float, float], tau_x: float, tau_y: float) -> TiltedSensor:
-        """Build it from OpenCV's angles: cos(alpha) = cos(tauX) cos(tauY)."""
+        """Build the sensor from OpenCV's tilt angles [rad]: cos(alpha) = cos(tauX) cos(tauY)."""
         x, y, z = tilt_matrix(tau_x, tau_y)[:, 2].tolist()
         return cls(
             focal_length=focal_length, centre=centre, alpha=math.atan2(math.hypot(x, y), z), direction=math.atan2(y, x)
         )
 
     @classmethod
-    def of(cls, camera: Camera) -> TiltedSensor:
-        """Return the sensor of a camera with fx = fy.
+    def from_camera(cls, camera: Camera) -> TiltedSensor:
+        """Build the sensor of a camera with fx = fy.
 
         Raises
         ------
         ValueError
-            Its pixels are not square.
+            The pixels are not square.
         """
         matrix, distortion = camera.to_opencv()
         if not math.isclose(matrix[0, 0], matrix[1, 1], rel_tol=1e-9):
@@ -92,40 +99,40 @@ class TiltedSensor:
 
     @property
     def virtual_focal_length(self) -> float:
-        """From the pinhole square to the sensor, pixels: f = f' cos(alpha) (eq. 3.1)."""
+        """Distance from the pinhole to the sensor plane [px]: f = f' cos(alpha) (eq. 3.1)."""
         return self.focal_length * math.cos(self.alpha)
 
     @property
     def virtual_centre(self) -> tuple[float, float]:
-        """Where the sensor's normal through the pinhole meets it: f' sin(alpha) from the centre, pixels."""
+        """Foot of the perpendicular from the pinhole to the sensor [px]; f' sin(alpha) from the centre."""
         x, y, _ = self.axis.tolist()
         return self.centre[0] - self.focal_length * x, self.centre[1] - self.focal_length * y
 
     @property
     def virtual_camera(self) -> Camera:
-        """The untilted camera that sees the same, once distortion is undone (fig. 3.3, S')."""
+        """Untilted camera that records the same undistorted image (fig. 3.3, S')."""
         (column, row), f = self.virtual_centre, self.virtual_focal_length
         return Camera(matrix=((f, 0.0, column), (0.0, f, row), (0.0, 0.0, 1.0)))
 
     @property
-    def turn(self) -> Floats:
-        """Rotation (3, 3) from the lens' frame, in which a tilted `Camera` has its poses, to the virtual camera's."""
+    def rotation(self) -> Floats:
+        """Rotation (3, 3) from the lens' frame (the frame of a tilted `Camera`'s poses) to the virtual camera's."""
         return tilt_matrix(*self.tau)
 
     @classmethod
     def from_virtual(
         cls, focal_length: float, virtual_centre: tuple[float, float], centre: tuple[float, float]
     ) -> TiltedSensor:
-        """Build it from the virtual camera (f, v) and the centre that distortion shows: the inverse of fig. 3.3.
+        """Build the sensor from its virtual camera and the distortion centre: the inverse of fig. 3.3.
 
         Parameters
         ----------
-        focal_length
-            f of the virtual camera, pixels.
-        virtual_centre
-            Its principal point.
-        centre
-            Where the optical axis meets the sensor.
+        focal_length : float
+            f of the virtual camera [px].
+        virtual_centre : (float, float)
+            Principal point of the virtual camera [px].
+        centre : (float, float)
+            Column and row of the optical axis on the sensor [px].
         """
         x, y = centre[0] - virtual_centre[0], centre[1] - virtual_centre[1]
         return cls(
@@ -136,60 +143,67 @@ class TiltedSensor:
         )
 
 
-def sharp_plane(sensor: TiltedSensor, lens_focal_length: float, pixel_pitch: float) -> tuple[Floats, float]:
-    """Plane of sharp focus of a thin lens before a tilted sensor: the Scheimpflug condition.
+def plane_of_focus(sensor: TiltedSensor, lens_focal_length: float, pixel_pitch: float) -> tuple[Floats, float]:
+    """Return the plane of sharp focus of a thin lens before a tilted sensor: the Scheimpflug condition.
 
-    Object plane, plane of the lens and plane of the sensor meet in one line (fig. 3.1).
+    Object plane, lens plane and sensor plane intersect in one line.
 
     Parameters
     ----------
-    sensor
-        The sensor; its f' is the distance of the image.
-    lens_focal_length
-        Focal length of the lens as such, metres; less than f' for a real object.
-    pixel_pitch
-        Metres per pixel.
+    sensor : TiltedSensor
+        Sensor; its f' is the image distance.
+    lens_focal_length : float
+        Focal length of the thin lens [m]; below f' for a real object.
+    pixel_pitch : float
+        Pixel pitch [m/px].
 
     Returns
     -------
     tuple
-        Unit normal n in the lens' frame (columns, rows, optical axis) and distance d [m]: n . X = d is sharp.
+        Unit normal n (3,) in the lens' frame (columns, rows, optical axis) and distance d [m]: points X with n . X = d
+        are in focus.
 
     Raises
     ------
     ValueError
-        The lens cannot image anything before it on that sensor.
+        The lens focuses no plane before it onto the sensor.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, fig. 3.1.
     """
     image = sensor.focal_length * pixel_pitch
     if not 0.0 < lens_focal_length < image:
         raise ValueError(f"lens_focal_length is {lens_focal_length:g} m, expected above 0 and below f' ({image:g} m)")
-    # The sensor, mirrored through the pinhole, is the plane m . q = f with its normal m. A point P = q Z / z is sharp
-    # where 1/Z + 1/z = 1/F, so that Z/F - m . P / f = 1.
+    # The sensor plane, reflected through the pinhole, is m . q = f with its normal m. A point P = q Z / z is in focus
+    # if 1/Z + 1/z = 1/F (thin lens), hence Z/F - m . P / f = 1.
     f = sensor.virtual_focal_length * pixel_pitch
-    plane = np.array([0.0, 0.0, 1.0 / lens_focal_length]) - sensor.turn[2] / f
+    plane = np.array([0.0, 0.0, 1.0 / lens_focal_length]) - sensor.rotation[2] / f
     length = float(np.linalg.norm(plane))
     return plane / length, 1.0 / length
 
 
 def tilt_for_plane(normal: npt.ArrayLike, distance: float, lens_focal_length: float) -> tuple[float, float, float]:
-    """Tilt of the sensor that sees a plane sharply: the Scheimpflug condition solved for the sensor.
+    """Return the sensor tilt that focuses a plane: the Scheimpflug condition solved for the sensor.
 
     Parameters
     ----------
-    normal, distance
-        The plane n . X = d in the lens' frame (columns, rows, optical axis), metres.
-    lens_focal_length
-        Focal length of the lens as such, metres.
+    normal : array_like
+        Normal n (3,) of the plane n . X = d, in the lens' frame (columns, rows, optical axis).
+    distance : float
+        d [m], for a unit normal.
+    lens_focal_length : float
+        Focal length of the thin lens [m], above 0.
 
     Returns
     -------
-    tuple
-        f' [m], tauX and tauY [rad] (`TiltedSensor.from_tau` takes them, f' in pixels).
+    tuple of float
+        f' [m], tauX and tauY [rad], the arguments of `TiltedSensor.from_tau` (which takes f' in pixels).
 
     Raises
     ------
     ValueError
-        The plane passes through the lens, or lies nearer than its focal length on the axis.
+        The plane passes through the lens, or meets the optical axis nearer than the focal length.
     """
     n = np.asarray(normal, dtype=np.float64)
     if lens_focal_length <= 0.0:
@@ -198,8 +212,8 @@ def tilt_for_plane(normal: npt.ArrayLike, distance: float, lens_focal_length: fl
         raise ValueError(f"normal is {n.tolist()}, expected three finite numbers, not all 0")
     if distance == 0.0 or n[2] / distance * lens_focal_length >= 1.0 or n[2] / distance <= 0.0:
         raise ValueError("the plane meets the optical axis nearer than the focal length: no sensor sees it sharply")
-    # As in `sharp_plane`, solved for the sensor's normal over f.
+    # As in `plane_of_focus`, solved for the sensor's normal over f.
     normal_over_f = np.array([0.0, 0.0, 1.0 / lens_focal_length]) - n / distance
     x, y, z = (normal_over_f / np.linalg.norm(normal_over_f)).tolist()
-    # The normal is the last row of `turn`: (sin tauY, -cos tauY sin tauX, cos tauY cos tauX).
+    # The normal is the last row of `TiltedSensor.rotation`: (sin tauY, -cos tauY sin tauX, cos tauY cos tauX).
     return float(1.0 / normal_over_f[2]), math.atan2(-y, z), math.asin(x)

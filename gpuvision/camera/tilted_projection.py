@@ -1,10 +1,10 @@
-"""Projection through a tilted camera, with derivatives, for many views at once: what the fits iterate on.
+"""Projection of many views through a camera with a tilted sensor, with derivatives, for bundle adjustment.
 
-The sensor's own frame is the camera here: z along the sensor's normal, so that without distortion the camera is the
-pinhole S' of fig. 3.3, its focal length f = f' cos(alpha) (eq. 3.1) and its principal point v where the sensor's
-normal meets the sensor. The lens lies rotated behind it and acts through its distortion alone. In these coordinates
-data without distortion fix f and v and say nothing at all about the tilt; in f', centre and tilt the same data fix a
-bent valley, in which optimisers get stuck.
+The camera frame is the sensor's frame: z is the sensor's normal. Without distortion the camera is the virtual pinhole
+S' of F. de Jong, fig. 3.3, with focal length f = f' cos(alpha) (eq. 3.1) and principal point v at the foot of the
+perpendicular from the pinhole. The lens is rotated against this frame; the rotation acts through the distortion only.
+Data without distortion determine f and v and leave the tilt free in these coordinates. In f', centre and tilt the same
+data form a curved valley, which slows down or stops an optimiser.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ Floats = npt.NDArray[np.float64]
 
 INTERNAL = ("f", "aspect", "v_column", "v_row", "tauX", "tauY", "k1", "k2", "p1", "p2", "k3")
 COLUMNS = len(INTERNAL) + 6
-"""Columns of the Jacobian: `INTERNAL`, then the pose (a rotation vector applied from the left, a translation)."""
+"""Number of Jacobian columns: `INTERNAL`, then the pose (a rotation vector applied from the left, a translation)."""
 
 
 class Projection(NamedTuple):
-    """Projected points of all views, in pixels.
+    """Projected points of all views.
 
     Attributes
     ----------
-    points
-        (views, 2, n): columns and rows.
-    in_front
-        Whether every point lies before the pinhole, on the side that the lens and the sensor see.
-    jacobian
-        (views, COLUMNS, 2, n), or None where it was not asked for.
+    points : numpy.ndarray
+        (views, 2, n): columns and rows [px].
+    in_front : bool
+        Every point lies before the pinhole, on the visible side of lens and sensor.
+    jacobian : numpy.ndarray or None
+        (views, COLUMNS, 2, n); None if not requested, or if a point is not in front.
     """
 
     points: Floats
@@ -40,19 +40,19 @@ class Projection(NamedTuple):
 
 
 def tilt_matrix(tau_x: float, tau_y: float) -> Floats:
-    """Rotation from the lens' frame to the sensor's, as OpenCV's tauX and tauY define it (R_y R_x)."""
+    """Return the rotation (3, 3) from the lens' frame to the sensor's of OpenCV's tauX and tauY [rad] (R_y R_x)."""
     cx, sx, cy, sy = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
     return np.array([[cy, sy * sx, -sy * cx], [0.0, cx, sx], [sy, -cy * sx, cy * cx]])
 
 
-def rotation_of(vector: npt.ArrayLike) -> Floats:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3): Rodrigues' formula, exact to rounding near zero."""
+def rotation_matrix(vector: npt.ArrayLike) -> Floats:
+    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]: Rodrigues' formula, exact near zero."""
     w = np.asarray(vector, dtype=np.float64)
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
     cross = np.zeros((*w.shape[:-1], 3, 3))
     cross[..., 0, 1], cross[..., 0, 2], cross[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
     cross -= np.swapaxes(cross, -1, -2)
-    # sinc keeps both coefficients regular at angle 0.
+    # sinc keeps both coefficients finite at angle 0.
     half = np.sinc(angle / (2.0 * np.pi))
     rotation: Floats = np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * half**2 * (cross @ cross)
     return rotation
@@ -61,23 +61,27 @@ def rotation_of(vector: npt.ArrayLike) -> Floats:
 def project(
     internal: Floats, rotations: Floats, translations: Floats, target: Floats, derivatives: bool = False
 ) -> Projection:
-    """Project target points through poses and a tilted camera.
+    """Project target points through the poses of all views and a tilted camera.
 
     Parameters
     ----------
-    internal
-        The numbers named in `INTERNAL`: pixels, radians, OpenCV's distortion coefficients.
-    rotations, translations
+    internal : numpy.ndarray
+        (11,): the parameters named in `INTERNAL` [px], [rad], and OpenCV's distortion coefficients.
+    rotations, translations : numpy.ndarray
         (views, 3, 3) and (views, 3): from the target to the *sensor's* frame.
-    target
-        (views, 3, n): target points.
-    derivatives
-        Whether to compute the Jacobian too.
+    target : numpy.ndarray
+        (views, 3, n): target points, in the unit of the translations.
+    derivatives : bool
+        Compute the Jacobian as well. Default False.
+
+    Returns
+    -------
+    Projection
     """
     f, aspect, v_column, v_row, tau_x, tau_y, k1, k2, p1, p2, k3 = internal.tolist()
     m = tilt_matrix(tau_x, tau_y)
-    turned = rotations @ target
-    p = turned + translations[:, :, None]
+    rotated = rotations @ target
+    p = rotated + translations[:, :, None]
     q = m.T @ p
     with np.errstate(all="ignore"):
         depth = 1.0 / q[:, 2]
@@ -97,10 +101,10 @@ def project(
 
     jacobian = np.zeros((len(target), COLUMNS, 2, target.shape[-1]))
     slope = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2)
-    # Distortion's own 2x2 derivative is symmetric.
-    bend_xx = radial + 2.0 * xx * slope + 2.0 * p1 * y + 6.0 * p2 * x
-    bend_yy = radial + 2.0 * yy * slope + 6.0 * p1 * y + 2.0 * p2 * x
-    bend_xy = 2.0 * (xy * slope + p1 * x + p2 * y)
+    # The 2 x 2 Jacobian of the distortion is symmetric.
+    lens_xx = radial + 2.0 * xx * slope + 2.0 * p1 * y + 6.0 * p2 * x
+    lens_yy = radial + 2.0 * yy * slope + 6.0 * p1 * y + 2.0 * p2 * x
+    lens_xy = 2.0 * (xy * slope + p1 * x + p2 * y)
     r4 = r2 * r2
     p1_x, p1_y, p2_x, p2_y = 2.0 * xy, r2 + 2.0 * yy, r2 + 2.0 * xx, 2.0 * xy
     for row, (seen, focal) in enumerate(((u, f), (w, aspect * f))):
@@ -113,11 +117,11 @@ def project(
         out[:, 8] = by_xd * p1_x + by_yd * p1_y
         out[:, 9] = by_xd * p2_x + by_yd * p2_y
         out[:, 10] = out[:, 7] * r2
-        by_x, by_y = (by_xd * bend_xx + by_yd * bend_xy) * depth, (by_xd * bend_xy + by_yd * bend_yy) * depth
+        by_x, by_y = (by_xd * lens_xx + by_yd * lens_xy) * depth, (by_xd * lens_xy + by_yd * lens_yy) * depth
         g = m @ np.stack([by_x, by_y, -(by_x * x + by_y * y)], axis=1)
         out[:, 14:] = g
-        _cross(turned, g, out[:, 11:14])
-        _tilt_columns(m, focal * _turned_seen(row, u, w), p, g, out[:, 4:6])
+        _cross(rotated, g, out[:, 11:14])
+        _tilt_columns(m, focal * _by_ray_rotation(row, u, w), p, g, out[:, 4:6])
     jacobian[:, 0, 0], jacobian[:, 0, 1] = u, aspect * w
     jacobian[:, 1, 1] = f * w
     jacobian[:, 2, 0] = jacobian[:, 3, 1] = 1.0
@@ -130,18 +134,18 @@ def _cross(a: Floats, b: Floats, out: Floats) -> None:
     out[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
-def _turned_seen(row: int, u: Floats, w: Floats) -> Floats:
-    """How a turn of the outgoing ray (u, w, 1), by a rotation vector, moves u (row 0) or w (row 1)."""
+def _by_ray_rotation(row: int, u: Floats, w: Floats) -> Floats:
+    """Return the derivative of u (row 0) or w (row 1) by a rotation vector applied to the outgoing ray (u, w, 1)."""
     if row == 0:
         return np.stack([-u * w, 1.0 + u * u, -w], axis=1)
     return np.stack([-1.0 - w * w, u * w, u], axis=1)
 
 
 def _tilt_columns(m: Floats, turn: Floats, p: Floats, g: Floats, out: Floats) -> None:
-    """Write derivatives by tauX and tauY: a turn of the lens moves the ray in it as well as the point it leaves by."""
+    """Write the derivatives by tauX and tauY: both the incoming ray in the lens' frame and the outgoing ray rotate."""
     about_x = turn[:, 0] - (p[:, 1] * g[:, 2] - p[:, 2] * g[:, 1])
     about_y = turn[:, 1] - (p[:, 2] * g[:, 0] - p[:, 0] * g[:, 2])
     about_z = turn[:, 2] - (p[:, 0] * g[:, 1] - p[:, 1] * g[:, 0])
-    # tauX turns about the x axis that tauY has turned already; both turn against the sense of a rotation vector.
+    # tauX rotates about the x axis that tauY has rotated already; both have the opposite sense of a rotation vector.
     out[:, 0] = -(m[0, 0] * about_x + m[2, 0] * about_z)
     out[:, 1] = -about_y

@@ -1,4 +1,4 @@
-"""Undistorted images: what an ideal camera would have seen, interpolated in what the real one saw."""
+"""Image undistortion (remap): interpolate a measured image at the measured positions of ideal pixels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,19 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.image_map import Packer, PixelMap, Taps
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Define, Device, Launch, LaunchBuilder, Precision, Variant, WorkSize, round_up, type_defines
+from gpuvision.host import (
+    Array,
+    Define,
+    Device,
+    Launch,
+    LaunchBuilder,
+    Precision,
+    StatusArray,
+    Variant,
+    WorkSize,
+    round_up,
+    type_defines,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.status import Status
 from gpuvision.validation import finite, numbers
@@ -29,94 +41,100 @@ _BORDERS = {
     "reflect": "BORDER_REFLECT",
     "replicate": "BORDER_REPLICATE",
 }
-# An index into a frame, and one into a map, is an int on the device.
+# Samples of a frame: indices into frames and maps are 32-bit int on the device.
 _LARGEST_FRAME = 2**30
-# What a model computes at once stays in the caches.
+# Rows of a map computed at a time: the intermediate arrays of a camera model then fit into the caches.
 _ROWS_AT_ONCE = 32
-# Columns and rows of a work-group with an item per pixel.
+# Columns and rows of a work-group; one work-item computes one pixel.
 _GROUP = (32, 4)
 
 
 @runtime_checkable
-class Distorts(Protocol):
-    """A camera model: anything that says where an ideal pixel lies in the measured image."""
+class DistortionModel(Protocol):
+    """Camera model that returns the measured position of an ideal pixel."""
 
     def distort(self, points: npt.ArrayLike, /) -> npt.NDArray[np.float64]:
-        """Measured (column, row) of ideal ones, shape (..., 2); NaN where there is none."""
+        """Return measured (column, row) of ideal points (..., 2); NaN where none exists."""
         ...
 
 
 class UndistortedImage(NamedTuple):
-    """Images as an ideal camera sees them.
+    """Undistorted images.
 
     Attributes
     ----------
-    image
+    image : array
         (..., rows, columns[, 3]), in the input's dtype.
-    status
-        (rows, columns) uint8 `Status` flags, the same for every image of a batch. NO_DATA: the place lies outside the
-        source image's pixels. NOT_INVERTIBLE: past the fold of the camera model no place exists.
+    status : array of uint8
+        (rows, columns) `Status` flags, the same for every image of a batch. NO_DATA: the source position lies outside
+        the source image. NOT_INVERTIBLE: the ideal pixel lies past the fold of the camera model and has no source
+        position.
     """
 
-    image: Any
-    status: Any
+    image: Array
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
 class UndistortImage(VisionOperation[UndistortedImage]):
-    """Measured images -> ideal images.
+    """Image undistortion: measured images to ideal images (OpenCV: ``remap``, ``undistort``).
 
-    ``op(image)`` with uint8, uint16 or float32 of shape (..., rows, columns), or (..., rows, columns, 3) for three
-    channels; NumPy or device arrays; returns an `UndistortedImage`.
+    ``op(image)`` takes uint8, uint16 or float32 images (..., rows, columns), or (..., rows, columns, 3) for three
+    channels, as NumPy or device arrays, and returns an `UndistortedImage`.
 
     Parameters
     ----------
-    model
-        A camera model (`Lens`, `Camera`, anything with ``distort``), or the map itself: an array (rows, columns, 2)
-        or a `PixelMap` of the (column, row) in the source image that each output pixel shows; NaN where none.
-    interpolation
-        ``"bilinear"``, or ``"bicubic"``: the cubic convolution with a = -0.75, as OpenCV's.
-    channels
-        1, or 3: the last axis.
-    border
-        What lies outside the source image. ``"mask"``: nothing; such pixels are NaN, or 0 in whole numbers.
-        ``"constant"``: `value`. ``"replicate"``: the outermost pixel. ``"reflect"``: the image, mirrored about the
-        centre of its outermost pixels. The status tells of such pixels in all cases.
-    value
-        Of the constant border.
-    size
-        (columns, rows) of the ideal image; None: those of the input, or of the map.
-    region
-        (column, row, columns, rows): the part of the ideal image to compute; None: all of it.
-    matrix
-        ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) of the ideal image [px], for a `Camera`; None: the camera's own.
-    coordinates
-        ``"map"``: places are computed once in double, and packed. ``"computed"``: the kernel computes them for every
-        image, from a `Lens` or a `Camera`; it needs no memory and no time to begin with.
-    precision
-        Of computed places. ``"single"`` (and None) keeps them to a rounding of the coordinate.
-    variant
-        ``"vector"`` for CPU runtimes, ``"work_item"`` for GPUs, ``"auto"`` by the device.
+    model : Lens, Camera, DistortionModel, PixelMap or numpy.ndarray
+        Camera model, or the map itself: for each output pixel the (column, row) in the source image [px], (rows,
+        columns, 2), NaN where none exists.
+    interpolation : {"bilinear", "bicubic"}
+        "bicubic" is the cubic convolution with a = -0.75, as in OpenCV. Default "bilinear".
+    channels : {1, 3}
+        Number of channels; 3 channels are the last axis. Default 1.
+    border : {"mask", "constant", "replicate", "reflect"}
+        Value of pixels outside the source image. "mask" (default): NaN, or 0 in integer images. "constant":
+        `border_value`. "replicate": the outermost pixel. "reflect": the image mirrored about the centres of its
+        outermost pixels. The status flags these pixels in every case.
+    border_value : float
+        Value of the constant border [grey levels]. Default 0.
+    size : (int, int), optional
+        Columns and rows of the ideal image. Default: those of the input, or of the map.
+    region : (int, int, int, int), optional
+        (column, row, columns, rows): part of the ideal image to compute [px]. Default: all of it.
+    matrix : 3 x 3, optional
+        ((fx, 0, cx), (0, fy, cy), (0, 0, 1)): camera matrix of the ideal image [px], for a `Camera`. Default: the
+        matrix of ``model``.
+    coordinates : {"map", "computed"}
+        "map" (default): source positions are computed once in double precision and packed. "computed": the kernel
+        computes them for every image from a `Lens` or a `Camera`; this needs no memory and no preparation.
+    precision : {"single", "double"}, optional
+        Precision of computed source positions. Default "single": exact to the rounding of the coordinate.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: 16-wide vectors for CPU runtimes, a work-item per pixel for GPUs, or by the device (default).
 
     Raises
     ------
     TypeError, ValueError
-        The model cannot do what is asked, or a number is not in its range.
+        The model does not support an option, or a number is out of its range.
 
     Notes
     -----
-    Places of a map are good to 1e-5 px, beside the rounding to whole numbers and that of single precision (about
-    1e-7 of the largest value). Pixels without any place (NOT_INVERTIBLE) are as the border's policy says for ``"mask"``
-    and ``"constant"``; for the others as for ``"mask"``.
+    Error: source positions of a map are exact to 1e-5 px. Integer outputs are rounded to nearest; single precision
+    adds about 1e-7 of the largest value. Pixels without a source position (NOT_INVERTIBLE) get `border_value` under
+    ``border="constant"``, otherwise NaN, or 0 in integer images.
+
+    References
+    ----------
+    R. Keys, Cubic convolution interpolation for digital image processing, IEEE Trans. ASSP 29 (1981) 1153.
     """
 
     Result: ClassVar[type[Any]] = UndistortedImage
 
-    model: Any
+    model: Any  # a PixelMap or a DistortionModel; arrays are converted to PixelMap
     interpolation: Interpolation = "bilinear"
     channels: int = 1
     border: Border = "mask"
-    value: float = 0.0
+    border_value: float = 0.0
     size: tuple[int, int] | None = None
     region: tuple[int, int, int, int] | None = None
     matrix: Matrix | None = None
@@ -129,7 +147,7 @@ class UndistortImage(VisionOperation[UndistortedImage]):
             object.__setattr__(self, "model", PixelMap(self.model))
         self._check_choices()
         self._check_model()
-        object.__setattr__(self, "value", finite(self.value, "UndistortImage.value"))
+        object.__setattr__(self, "value", finite(self.border_value, "UndistortImage.border_value"))
         for name, length in (("size", 2), ("region", 4)):
             given = getattr(self, name)
             if given is None:
@@ -155,7 +173,7 @@ class UndistortImage(VisionOperation[UndistortedImage]):
                 raise ValueError(f"UndistortImage.{name} is {getattr(self, name)!r}, expected one of {expected}")
 
     def _check_model(self) -> None:
-        if not isinstance(self.model, PixelMap | Distorts):
+        if not isinstance(self.model, PixelMap | DistortionModel):
             kind = type(self.model).__name__
             raise TypeError(f"UndistortImage.model is a {kind}, expected a map or a model with distort(points)")
         if isinstance(self.model, PixelMap) and self.size is not None:
@@ -167,30 +185,42 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         if self.coordinates == "map" and self.precision is not None:
             raise ValueError("UndistortImage.precision is that of computed coordinates; a map is made in double")
 
-    def places(self, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
-        """Return the (column, row) in a source image of a shape that each output pixel shows, (rows, columns, 2)."""
+    def source_positions(self, shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+        """Return the source position of every output pixel.
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Rows and columns of the source image.
+
+        Returns
+        -------
+        numpy.ndarray
+            (rows, columns, 2) float64: column and row in the source image [px]; NaN where none exists.
+        """
         first_column, first_row, columns, rows = self._region(shape)
         part = slice(first_row, first_row + rows), slice(first_column, first_column + columns)
         if isinstance(self.model, PixelMap):
-            return self.model.places[part]
+            return self.model.positions[part]
         options = {} if self.matrix is None else {"matrix": self.matrix}
-        places = np.empty((rows, columns, 2))
+        positions = np.empty((rows, columns, 2))
         for first in range(0, rows, _ROWS_AT_ONCE):
-            some = places[first : first + _ROWS_AT_ONCE]
-            some[..., 0] = np.arange(columns) + first_column
-            some[..., 1] = (np.arange(first, first + len(some)) + first_row)[:, None]
-            some[:] = self.model.distort(some, **options)
-        return places
+            block = positions[first : first + _ROWS_AT_ONCE]
+            block[..., 0] = np.arange(columns) + first_column
+            block[..., 1] = (np.arange(first, first + len(block)) + first_row)[:, None]
+            block[:] = self.model.distort(block, **options)
+        return positions
 
     def _region(self, shape: tuple[int, int]) -> tuple[int, int, int, int]:
-        own = self.model.places.shape[:2] if isinstance(self.model, PixelMap) else shape
-        columns, rows = self.size or own[::-1]
+        """Return column, row, columns, rows of the output within the ideal image."""
+        full_shape = self.model.positions.shape[:2] if isinstance(self.model, PixelMap) else shape
+        columns, rows = self.size or full_shape[::-1]
         if self.region is None:
             return 0, 0, columns, rows
-        left, top, wide, high = self.region
-        if isinstance(self.model, PixelMap) and not (0 <= left <= columns - wide and 0 <= top <= rows - high):
+        left, top, width, height = self.region
+        if isinstance(self.model, PixelMap) and not (0 <= left <= columns - width and 0 <= top <= rows - height):
             raise ValueError(f"UndistortImage.region {self.region} leaves the map of {columns} x {rows} pixels")
-        return left, top, wide, high
+        return left, top, width, height
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -204,7 +234,7 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         made = (*batch, made_rows, made_columns, *((3,) if self.channels == 3 else ()))
         computed = self.coordinates == "computed"
         tables = (None, None, None, self._table(build.real)) if computed else (*self._packed(rows, columns), None)
-        fill = self.value if self.border == "constant" else math.nan if dtype.kind == "f" else 0.0
+        fill = self.border_value if self.border == "constant" else math.nan if dtype.kind == "f" else 0.0
         if build.uses_vectors:
             work = WorkSize((made_rows, frames), (1, 1), vectors=True)
         else:
@@ -225,33 +255,35 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         )
 
     def _checked(self, build: LaunchBuilder) -> tuple[int, ...]:
-        """Check the input and return its shape without the channels."""
+        """Check type and shape of the input; return the shape without the channels."""
         build.check_dtype("uint8", "uint16", "float32", of="images")
         shape, dtype = build.shape, build.dtype
         expected = "(..., rows, columns, 3)" if self.channels == 3 else "(..., rows, columns)"
         pixels = shape if self.channels == 1 else shape[:-1]
         is_valid = len(pixels) >= 2 and 0 not in pixels[-2:] and (self.channels == 1 or shape[-1] == 3)
         build.check_shape(is_valid, f"images {expected} with one pixel at least")
-        if dtype.kind == "u" and not 0.0 <= self.value <= np.iinfo(dtype).max:
-            raise ValueError(f"UndistortImage.value is {self.value:g}, expected what {dtype} holds")
+        if dtype.kind == "u" and not 0.0 <= self.border_value <= np.iinfo(dtype).max:
+            raise ValueError(
+                f"UndistortImage.border_value is {self.border_value:g}, expected a value in the range of {dtype}"
+            )
         return pixels
 
     def _packed(self, rows: int, columns: int) -> tuple[Any, ...]:
         taps = _TAPS[self.interpolation]
-        known = self.border in ("mask", "constant")
+        has_constant_border = self.border in ("mask", "constant")
         packer = Packer(
             source=(rows, columns),
             taps=taps,
             channels=self.channels,
             missing=int(self._missing),
-            outside=int(Status.NO_DATA) if known else None,
+            outside=int(Status.NO_DATA) if has_constant_border else None,
             margin=(0.5, 0.5) if self.border == "mask" else (float(taps.after), float(taps.before + 1)),
         )
-        return tuple(packer.pack(self.places((rows, columns))))
+        return tuple(packer.pack(self.source_positions((rows, columns))))
 
     @property
     def _missing(self) -> Status:
-        """What it means that a pixel has no place."""
+        """Status of a pixel without a source position."""
         return Status.NO_DATA if isinstance(self.model, PixelMap) else Status.NOT_INVERTIBLE
 
     def _table(self, real: np.dtype[Any]) -> npt.NDArray[Any]:

@@ -1,4 +1,4 @@
-"""Points through a calibrated camera or lens: measured to ideal, and back."""
+"""Undistortion and distortion of points with a calibrated camera or lens (OpenCV: ``undistortPoints``)."""
 
 from __future__ import annotations
 
@@ -12,62 +12,72 @@ import numpy.typing as npt
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.polynomial import PlanePolynomial
-from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, flags, type_defines
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    Launch,
+    LaunchBuilder,
+    Precision,
+    StatusArray,
+    Variant,
+    flags,
+    type_defines,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import numbers
 
 _LANES, _GROUP = 16, 256
-# Points of a strip: several strips per core keep the cores even.
+# Points of a strip (a work-item's share, vector variant); several strips per core balance the load.
 _SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
 
 
 class UndistortedPoints(NamedTuple):
-    """Points and whether they are to be trusted.
+    """Undistorted (or distorted) points.
 
     Attributes
     ----------
-    points
-        (..., 2), as the input; NaN where the status is not OK.
-    status
-        uint8 `Status` flags, (...): NOT_FINITE (a coordinate is not, or lies so far away that its place is not),
-        NOT_INVERTIBLE (past the fold of the lens, or behind the tilted sensor: no such point), OUT_OF_RANGE (outside
-        the region of a `PlanePolynomial`).
+    points : array
+        (..., 2): column, row [px]; [m] for a `PlanePolynomial`. NaN where the status is not OK.
+    status : array of uint8
+        (...) `Status` flags. NOT_FINITE: an input coordinate is not finite, or the result overflows. NOT_INVERTIBLE:
+        the point lies past the fold of the lens or behind the tilted sensor. OUT_OF_RANGE: the point lies outside the
+        region of a `PlanePolynomial`.
     """
 
-    points: Any
-    status: Any
+    points: FloatArray
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
 class UndistortPoints(VisionOperation[UndistortedPoints]):
-    """Measured pixels to ideal ones: ``op(points) -> UndistortedPoints``, points float32 or float64 (..., 2).
+    """Undistortion of points: ``op(points) -> UndistortedPoints`` with float32 or float64 points (..., 2).
 
     Parameters
     ----------
-    model
-        `Camera`, `Lens`, or `PlanePolynomial` (sensor coordinates to metres in the plane).
-    inverse
-        From ideal points to measured ones.
-    matrix
-        3 x 3, of the ideal pixels of a `Camera`; None: its own.
-    precision
-        Of the arithmetic and the outputs; None follows the input.
-    variant
-        "vector" (16-wide vectors, for CPU runtimes), "work_item" (a work-item per point, for GPUs), or "auto".
+    model : Camera, Lens or PlanePolynomial
+        Camera model. A `PlanePolynomial` maps sensor coordinates to metres in the measurement plane.
+    inverse : bool
+        Compute measured points from ideal ones. Default False.
+    matrix : 3 x 3, optional
+        Camera matrix of the ideal pixels, for a `Camera`. Default: the matrix of ``model``.
+    precision : {"single", "double"}, optional
+        Precision of the arithmetic and the outputs. Default: that of the input.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: 16-wide vectors for CPU runtimes, a work-item per point for GPUs, or by the device (default).
 
     Raises
     ------
     TypeError
-        The model is none of these.
+        The model has another type.
     ValueError
-        There is a matrix, but no `Camera`.
+        ``matrix`` is given for a model other than a `Camera`.
 
     Notes
     -----
-    Error: the correction is computed, not the point, so the result is the exact one to 1e-6 of the correction (4e-15
-    in double) plus its own rounding: half a float's spacing is 1.2e-4 px beyond 2048 px and 2.4e-4 px beyond 4096 px.
-    The correction's part is below 1e-4 px for corrections up to 100 px. Near the fold the inverse magnifies both by
-    1/det of the model's Jacobian.
+    Error: the kernel computes the correction and adds it to the point. The relative error of the correction is 1e-6
+    (4e-15 in double), below 1e-4 px for corrections up to 100 px. The rounding of the result adds half a float spacing:
+    1.2e-4 px above 2048 px, 2.4e-4 px above 4096 px. Near the fold the inverse magnifies both by 1 / det of the model's
+    Jacobian.
     """
 
     Result: ClassVar[type[Any]] = UndistortedPoints
@@ -111,12 +121,12 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
 
     def _model_defines(self, real: np.dtype[Any]) -> dict[str, int | None]:
         if isinstance(self.model, Camera):
-            steps = {} if self.inverse else {"CAMERA_STEPS": self.model.steps(real)}
+            steps = {} if self.inverse else {"CAMERA_STEPS": self.model.newton_steps(real)}
             return {**self.model.defines(self.matrix), **steps}
         return dict(self.model.defines)
 
     def _packed(self, real: np.dtype[Any]) -> npt.NDArray[Any]:
-        """Return the table of the model's header, of ``real``."""
+        """Return the parameter table of the model's header, of type ``real``."""
         if isinstance(self.model, Camera):
             return self.model.packed(real, "distort" if self.inverse else "undistort", self.matrix)
         if isinstance(self.model, PlanePolynomial):

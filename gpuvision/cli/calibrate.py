@@ -1,4 +1,4 @@
-"""``gpuvision calibrate``: calibrate a lens or a camera from images of a flat target."""
+"""``gpuvision calibrate``: calibrate a lens or a camera from images of a flat target pattern."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ Model = Annotated[
         "views: some of k1,k2,p1,p2,k3,tilt."
     ),
 ]
-Inner = Annotated[
+InnerCorners = Annotated[
     str | None, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the chessboard, such as 9x6.")
 ]
 Pitch = Annotated[
@@ -89,13 +89,13 @@ def calibrate(
     pattern: Pattern = TargetPattern.dots,
     method: Method = CalibrationMethod.auto,
     model: Model = "auto",
-    inner: Inner = None,
+    inner_corners: InnerCorners = None,
     pitch: Pitch = None,
     focal_length: FocalLength = None,
     loss: Loss = RobustLoss.squared,
     as_json: ReportFile = None,
 ) -> None:
-    """Calibrate a lens, or a camera with a tilted (Scheimpflug) sensor, from images of a flat target.
+    """Calibrate a lens, or a camera with a tilted (Scheimpflug) sensor, from images of a flat target pattern.
 
     Every parameter comes with its standard deviation. The report lists other models that fit equally well and warns of
     parameters that the images do not determine.
@@ -106,24 +106,22 @@ def calibrate(
     from gpuvision.workflows.calibrating import write_calibration
 
     if pattern is not TargetPattern.chessboard:
-        reject_unused(f"with --pattern {pattern.value}, only with chessboard", inner=inner)
+        reject_unused(f"with --pattern {pattern.value}, only with chessboard", inner_corners=inner_corners)
     if method is CalibrationMethod.lines:
         reject_unused("with --method lines, which finds no poses", pitch=pitch, focal_length=focal_length)
-    corners = None if inner is None else _corners(inner)
+    corners = None if inner_corners is None else _corners(inner_corners)
     check_report_file(as_json)
     if out.suffix in (".json", ".png"):
-        raise ValueError(
-            f"--out is {out}, where the report and the picture go beside it; give a name such as lens.toml"
-        )
+        raise ValueError(f"--out is {out}, a name that the report or the plot takes; give a name such as lens.toml")
     for place in (out, out.with_suffix(".json"), out.with_suffix(".png")):
         check_file(place)
-    with progress_bar(f"finding {pattern.value}") as progress:
+    with progress_bar(f"detecting {pattern.value}") as progress:
         done = run(
             images,
             pattern=pattern.value,
             method=method.value,
             model=model,
-            inner=corners,
+            inner_corners=corners,
             pitch=1.0 if pitch is None else pitch,
             focal_length=focal_length,
             loss=loss.value,
@@ -133,22 +131,22 @@ def calibrate(
     write_calibration(done, out)
     write_report(as_json, done.report())
     typer.echo(
-        f"look at {out.with_suffix('.png')}; correct images with: gpuvision undistort IMAGES --lens {out} --out DIR"
+        f"next: check {out.with_suffix('.png')}; correct images with gpuvision undistort IMAGES --lens {out} --out DIR"
     )
 
 
 def _corners(text: str) -> tuple[int, int]:
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.strip().isdigit() for part in parts):
-        raise ValueError(f"--inner is {text!r}, expected the inner corners along both sides, such as 9x6")
+        raise ValueError(f"--inner-corners is {text!r}, expected the inner corners along both sides, such as 9x6")
     return int(parts[0]), int(parts[1])
 
 
 def _show(done: Calibration) -> None:
     console = Console()
     typer.echo(done.summary())
-    for path, why in done.passed_over:
-        typer.echo(f"passed over {path}: {why}")
+    for path, reason in done.skipped_images:
+        typer.echo(f"skipped {path}: {reason}")
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("parameter")
     table.add_column("value", justify="right")
@@ -163,7 +161,7 @@ def _show(done: Calibration) -> None:
 
 
 def _digits(value: float, error: float) -> int:
-    """Return how many digits of a value its uncertainty leaves, and one more."""
+    """Return the number of significant digits to print: those above the uncertainty, and one more."""
     if not 0.0 < error < math.inf or value == 0.0:
         return 6
     return min(max(math.ceil(math.log10(abs(value) / error)) + 2, 2), 10)
@@ -171,9 +169,9 @@ def _digits(value: float, error: float) -> int:
 
 def _alternatives(done: Calibration) -> Table:
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("other models")
-    for heading in ("residual, px", "p (F test)", "centre apart, px"):
+    table.add_column("alternative models")
+    for heading in ("residual [px]", "p (F test)", "centre distance [px]"):
         table.add_column(heading, justify="right")
     for each in done.alternatives:
-        table.add_row(each.model, f"{each.rms_px:.4g}", f"{each.p_value:.2g}", f"{each.apart_px:.3g}")
+        table.add_row(each.model, f"{each.rms_px:.4g}", f"{each.p_value:.2g}", f"{each.centre_distance_px:.3g}")
     return table

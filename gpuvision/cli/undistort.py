@@ -33,14 +33,14 @@ def undistort(
     inputs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="INPUTS...", parser=named_path, help="Images; and points: NPY arrays (..., 2) of (column, row)."
+            metavar="INPUTS...", parser=named_path, help="Images, and NPY arrays (..., 2) of points (column, row) [px]."
         ),
     ],
     lens: Annotated[
         Path, typer.Option(metavar="FILE.toml", parser=named_path, help="Camera file of `gpuvision calibrate`.")
     ],
     out: Annotated[
-        Path, typer.Option(metavar="DIR", parser=named_path, help="Folder for the results, under the inputs' names.")
+        Path, typer.Option(metavar="DIR", parser=named_path, help="Output folder; files keep the names of the inputs.")
     ],
     interpolation: Annotated[
         Interpolation | None, typer.Option(help="Interpolation between pixels. Default: bilinear.")
@@ -49,7 +49,7 @@ def undistort(
         Border | None,
         typer.Option(help="Pixels outside the image: mask (0 or NaN; default), a constant, or border pixels."),
     ] = None,
-    value: Annotated[float | None, typer.Option(help="Grey level of --border constant. Default: 0.")] = None,
+    border_value: Annotated[float | None, typer.Option(help="Grey level of --border constant. Default: 0.")] = None,
     region: Annotated[
         str | None,
         typer.Option(metavar="COLUMN,ROW,COLUMNS,ROWS", help="Part of the corrected images to compute. Default: all."),
@@ -68,7 +68,7 @@ def undistort(
     from gpuvision.workflows.undistorting import undistort_files
 
     if border is not Border.constant:
-        reject_unused("without --border constant", value=value)
+        reject_unused("without --border constant", border_value=border_value)
     if all(each.suffix.lower() == ".npy" for each in inputs):
         reason = "for points, only for images"
         reject_unused(reason, interpolation=interpolation, border=border, region=region)
@@ -84,11 +84,11 @@ def undistort(
             device=chosen,
             interpolation=(interpolation or Interpolation.bilinear).value,
             border=(border or Border.mask).value,
-            value=value or 0.0,
+            border_value=border_value or 0.0,
             region=part,
             progress=progress,
         )
-    typer.echo(f"{len(done)} files in {out}; the first: {done[0]}")
+    typer.echo(f"{len(done)} files written to {out}; the first: {done[0]}")
 
 
 def _region(text: str) -> tuple[int, int, int, int]:

@@ -1,4 +1,4 @@
-"""A picture of a calibration: where the points lie off, and what the lens does to the image."""
+"""Plot of a calibration: residuals of the points, and the distortion over the image."""
 
 from __future__ import annotations
 
@@ -14,14 +14,26 @@ from gpuvision.camera.calibration import Calibration
 from gpuvision.host.files import replacing
 
 _DPI = 150
-# An arrow of the largest usual residual is so long, in parts of the image's width.
-_ARROW = 0.02
-_ARROWS = 21
-_MOST_POINTS = 20_000
+# Length of the arrow of a 98th percentile residual, as a fraction of the image's width.
+_ARROW_LENGTH = 0.02
+# Distortion arrows along an image side.
+_ARROW_COUNT = 21
+# Above this count, every n-th residual is drawn.
+_MAX_POINTS = 20_000
+# Percentile of the residuals at the upper end of the colour scale.
+_SCALE_PERCENTILE = 98
 
 
 def draw_calibration(path: str | Path, calibration: Calibration) -> None:
-    """Draw residuals and distortion beside each other, as PNG, whole or not at all."""
+    """Draw residuals and distortion side by side as PNG. On an error no file is left behind.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    calibration : Calibration
+        Calibration to draw.
+    """
     figure = Figure(figsize=(13.0, 5.6), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
@@ -38,27 +50,26 @@ def draw_calibration(path: str | Path, calibration: Calibration) -> None:
 
 def _draw_residuals(axes: Axes, calibration: Calibration) -> None:
     points = np.concatenate([each for each, _ in calibration.residuals])
-    off = np.concatenate([each for _, each in calibration.residuals])
-    size = np.abs(off) if off.ndim == 1 else np.hypot(off[:, 0], off[:, 1])
+    errors = np.concatenate([each for _, each in calibration.residuals])
+    size = np.abs(errors) if errors.ndim == 1 else np.hypot(errors[:, 0], errors[:, 1])
     known = np.flatnonzero(np.isfinite(size))
-    known = known[:: max(len(known) // _MOST_POINTS, 1)]
-    usual = max(float(np.percentile(size[known], 98)), float(np.finfo(np.float32).tiny))
-    # The largest last, on top.
+    known = known[:: max(len(known) // _MAX_POINTS, 1)]
+    largest = max(float(np.percentile(size[known], _SCALE_PERCENTILE)), float(np.finfo(np.float32).tiny))
+    # Draw the largest residuals last, on top.
     known = known[np.argsort(size[known])]
     x, y = points[known].T
     shown: Any
-    if off.ndim == 1:
-        shown = axes.scatter(x, y, c=size[known], s=5.0, cmap="viridis", vmin=0.0, vmax=usual, linewidths=0.0)
+    if errors.ndim == 1:
+        shown = axes.scatter(x, y, c=size[known], s=5.0, cmap="viridis", vmin=0.0, vmax=largest, linewidths=0.0)
         axes.set_title("distance of the points from their lines", fontsize=9)
     else:
-        u, v = off[known].T * (_ARROW * calibration.image_size[0] / usual)
+        magnification = _ARROW_LENGTH * calibration.image_size[0] / largest
+        u, v = errors[known].T * magnification
         shown = axes.quiver(
-            x, y, u, v, size[known], cmap="viridis", clim=(0.0, usual), angles="xy", scale_units="xy", scale=1.0,
+            x, y, u, v, size[known], cmap="viridis", clim=(0.0, largest), angles="xy", scale_units="xy", scale=1.0,
             width=1.5e-3,
         )  # fmt: skip
-        axes.set_title(
-            f"seen less projected, {_ARROW * calibration.image_size[0] / usual:.3g} times as long", fontsize=9
-        )
+        axes.set_title(f"measured minus projected, magnified {magnification:.3g} times", fontsize=9)
     axes.figure.colorbar(shown, ax=axes, label="residual [px]", extend="max", shrink=0.8)
 
 
@@ -72,17 +83,17 @@ def _draw_distortion(axes: Axes, calibration: Calibration) -> None:
     if np.nanmax(size) > 0.0:
         shown = axes.contourf(x, y, size, levels=12, cmap="cividis")
         axes.figure.colorbar(shown, ax=axes, label="correction [px]", shrink=0.8)
-        some = (slice(None, None, -(-120 // _ARROWS)), slice(None, None, -(-160 // _ARROWS)))
+        some = (slice(None, None, -(-120 // _ARROW_COUNT)), slice(None, None, -(-160 // _ARROW_COUNT)))
         axes.quiver(
             x[some], y[some], moved[(*some, 0)], moved[(*some, 1)], angles="xy", scale_units="xy", color="white",
             width=1.8e-3,
         )  # fmt: skip
     _mark_centre(axes, calibration)
-    axes.set_title("what the model corrects: from measured to ideal places", fontsize=9)
+    axes.set_title("correction by the model: from measured to ideal positions", fontsize=9)
 
 
 def _mark_centre(axes: Axes, calibration: Calibration) -> None:
-    """Mark the centre of distortion with its standard deviations."""
+    """Draw the distortion centre with its standard deviations as error bars."""
     parameters = calibration.parameters
     for names in (("C_c", "R_c"), ("cx", "cy")):
         if names[0] in parameters and names[1] in parameters:

@@ -1,7 +1,7 @@
-"""Images of a flat pattern become a camera model, with uncertainties, alternatives and warnings.
+"""Camera calibration from image files of a flat target pattern, with uncertainties, alternatives and warnings.
 
-From straight lines (`fit_lens`) the lens alone follows, from one image on; from three views of a grid, or one and the
-focal length, the whole camera with a tilted sensor (`fit_camera`).
+`fit_lens` finds the lens distortion from straight lines; one image is enough. `fit_camera` finds focal length, centre,
+distortion and sensor tilt from three views of a grid, or from one view and a known focal length.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from typing import Any, Literal
 
 import numpy.typing as npt
 
-from gpuvision.camera.calibration import Calibration, Pattern, Seen
+from gpuvision.camera.calibration import Calibration, DetectedTarget, TargetPattern
+from gpuvision.camera.camera import Camera
+from gpuvision.camera.lens import Lens
 from gpuvision.camera.lines.lens_fit import LensFit
 from gpuvision.camera.lines.line_families import grid_lines
 from gpuvision.camera.lines.line_statistics import Loss
@@ -22,7 +24,7 @@ from gpuvision.camera.patterns.chessboard import find_chessboard
 from gpuvision.camera.patterns.dots import find_dots
 from gpuvision.camera.patterns.line_pattern import find_lines
 from gpuvision.camera.views.camera_fit import CameraFit
-from gpuvision.camera.views.planar_calibration import LossName, fit_camera
+from gpuvision.camera.views.planar_calibration import fit_camera
 from gpuvision.camera.views.target_views import make_view
 from gpuvision.formats.camera_file import write_lens
 from gpuvision.formats.json import json_tree
@@ -34,129 +36,152 @@ from gpuvision.plots.calibration import draw_calibration
 Method = Literal["auto", "lines", "views"]
 Progress = Callable[[int, int | None], object]
 
-_FEWEST_VIEWS = 3
+# Views of a plane that fix focal length and centre without a starting value (Zhang's closed form).
+_MIN_VIEWS = 3
 
 
 def calibrate(
     images: Sequence[str | Path],
     *,
-    pattern: Pattern = "dots",
+    pattern: TargetPattern = "dots",
     method: Method = "auto",
     model: str = "auto",
-    inner: tuple[int, int] | None = None,
+    inner_corners: tuple[int, int] | None = None,
     pitch: float = 1.0,
     focal_length: float | None = None,
     loss: Loss = "squared",
     progress: Progress = lambda done, of: None,
 ) -> Calibration:
-    """Calibrate a camera from images of a flat pattern.
+    """Calibrate a camera from images of a flat target pattern.
 
     Parameters
     ----------
-    images
-        Files, all of one size and from one camera.
-    pattern
-        "dots", "chessboard" (its inner corners) or "lines" (a grid of crossing ones).
-    method
-        "lines": the lens alone, from what should be straight; "views": focal length, centre, lens and tilt of the
-        sensor; "auto": views where a grid is seen in three images or the focal length is known, else lines.
-    model
-        "auto", or what `fit_lens` ("k1", "k1,k2") or `fit_camera` ("k1,k2", "tilt", ...) takes.
-    inner
-        Inner corners of the chessboard, along both sides; None: what is found.
-    pitch
-        Distance of neighbours on the pattern, metres; it scales nothing but the poses.
-    focal_length
-        f' in pixels where it is known.
-    loss
-        "squared"; or "huber" or "tukey", which give outliers less weight, or none.
-    progress
-        Told how many images are done, of how many.
+    images : sequence of path
+        Image files of one camera, all of one size.
+    pattern : {"dots", "chessboard", "lines"}
+        Target pattern: a grid of dots (default), a chessboard, or a grid of crossing lines.
+    method : {"auto", "lines", "views"}
+        "lines": lens distortion only, from straight lines. "views": focal length, centre, lens and sensor tilt from
+        views of a grid. "auto" (default): views if a grid is detected in three images or more, or in one image and
+        ``focal_length`` is given; otherwise lines.
+    model : str
+        "auto" (default): the smallest model that an F test accepts. Otherwise a model of `fit_lens` ("none", "k1",
+        "k1,k2") or of `fit_camera` ("k1,k2", "tilt", ...).
+    inner_corners : (int, int), optional
+        Inner corners of the chessboard along its two sides, in any order. Default: accept any number.
+    pitch : float
+        Distance between neighbouring points on the target [m]. It scales the poses only. Default 1.
+    focal_length : float, optional
+        Known focal length f' [px]. Default: estimated.
+    loss : {"squared", "huber", "tukey"}
+        Loss of a residual. "huber" and "tukey" reduce the weight of outliers. Default "squared".
+    progress : callable
+        Called with the number of processed images and the number of images.
+
+    Returns
+    -------
+    Calibration
 
     Raises
     ------
+    FileNotFoundError
+        A file does not exist.
     ValueError
-        Nothing was found, sizes differ, or the data lack something; the message names it.
+        No target pattern was detected, or the points do not fix the model; the message says what is missing.
     RecordingError
-        A file is no image.
+        A file is no image, or the images differ in size.
     """
-    seen, passed_over, size = _look([Path(each) for each in images], pattern, inner, progress)
-    grids = [each.grid for each in seen if each.grid is not None]
+    detected, skipped_images, size = _detect_targets([Path(each) for each in images], pattern, inner_corners, progress)
+    grids = [each.grid for each in detected if each.grid is not None]
     if method == "auto":
-        method = "views" if len(grids) >= _FEWEST_VIEWS or (grids and focal_length is not None) else "lines"
-    families = tuple(family for each in seen for family in each.families)
+        method = "views" if len(grids) >= _MIN_VIEWS or (grids and focal_length is not None) else "lines"
+    families = tuple(family for each in detected for family in each.families)
     fit: LensFit | CameraFit
     if method == "views":
         if not grids:
-            raise ValueError("lines have no points to tell views by; use --pattern dots or chessboard, or method lines")
+            raise ValueError(
+                "method 'views' needs a grid of points, a line pattern has none; use pattern 'dots' or 'chessboard', "
+                "or method 'lines'"
+            )
         views = [make_view(grid, pitch) for grid in grids]
-        for_views: LossName = "linear" if loss == "squared" else loss
-        fit = fit_camera(views, size, model=model, focal_length=focal_length, loss=for_views)
-        corrects: Any = fit.camera
+        fit = fit_camera(views, size, model=model, focal_length=focal_length, loss=loss)
+        correction: Lens | Camera | None = fit.camera
     else:
-        chosen: Any = model
-        fit = fit_lens(families, model=chosen, loss=loss)
-        corrects = fit.lens
+        lens_model: Any = model
+        fit = fit_lens(families, model=lens_model, loss=loss)
+        correction = fit.lens
     return Calibration(
         fit=fit,
         pattern=pattern,
         image_size=size,
-        seen=tuple(seen),
-        passed_over=tuple(passed_over),
-        straightness_px=(straightness_px(families), straightness_px(families, corrects)),
+        detected_targets=tuple(detected),
+        skipped_images=tuple(skipped_images),
+        straightness_px=(straightness_px(families), straightness_px(families, correction)),
     )
 
 
-def _look(
-    files: Sequence[Path], pattern: Pattern, inner: tuple[int, int] | None, progress: Progress
-) -> tuple[list[Seen], list[tuple[Path, str]], tuple[int, int]]:
-    """Find the pattern in every image; return where it was found, where not and why, and the images' size."""
-    seen: list[Seen] = []
-    passed_over: list[tuple[Path, str]] = []
+def _detect_targets(
+    files: Sequence[Path], pattern: TargetPattern, inner_corners: tuple[int, int] | None, progress: Progress
+) -> tuple[list[DetectedTarget], list[tuple[Path, str]], tuple[int, int]]:
+    """Detect the target pattern in every image; return detections, skipped images with reasons, and the image size."""
+    detected: list[DetectedTarget] = []
+    skipped_images: list[tuple[Path, str]] = []
     size: tuple[int, int] | None = None
     for number, file in enumerate(files):
         progress(number, len(files))
         if not file.exists():
-            raise FileNotFoundError(f"{file}: there is no such file")
+            raise FileNotFoundError(f"{file}: no such file")
         image = read_image(file)
-        mine = (image.shape[1], image.shape[0])
-        if size is not None and mine != size:
+        image_size = (image.shape[1], image.shape[0])
+        if size is not None and image_size != size:
             raise RecordingError(
-                f"{file}: {mine[0]} x {mine[1]} pixels, {files[0]} has {size[0]} x {size[1]}; one camera, one size"
+                f"{file}: {image_size[0]} x {image_size[1]} pixels, {files[0]} has {size[0]} x {size[1]}; give images "
+                "of one camera, all of one size"
             )
-        size = mine
+        size = image_size
         try:
-            seen.append(_seen(file, image[..., :3] if image.ndim == 3 else image, pattern, inner))
+            detected.append(_detect(file, image[..., :3] if image.ndim == 3 else image, pattern, inner_corners))
         except ValueError as error:
-            passed_over.append((file, str(error)))
+            skipped_images.append((file, str(error)))
     progress(len(files), len(files))
     if size is None:
         raise ValueError("no images given, expected at least one")
-    if not seen:
-        file, why = passed_over[0]
-        more = f" (and {len(passed_over) - 1} more images)" if len(passed_over) > 1 else ""
-        raise ValueError(f"{file}{more}: {why}")
-    return seen, passed_over, size
+    if not detected:
+        file, reason = skipped_images[0]
+        more = f" (and {len(skipped_images) - 1} more images)" if len(skipped_images) > 1 else ""
+        raise ValueError(f"{file}{more}: {reason}")
+    return detected, skipped_images, size
 
 
-def _seen(file: Path, image: npt.NDArray[Any], pattern: Pattern, inner: tuple[int, int] | None) -> Seen:
+def _detect(
+    file: Path, image: npt.NDArray[Any], pattern: TargetPattern, inner_corners: tuple[int, int] | None
+) -> DetectedTarget:
+    """Detect the target pattern in one image."""
     if pattern == "lines":
-        return Seen(file, None, find_lines(image))
-    found = find_dots(image) if pattern == "dots" else find_chessboard(image, inner)
-    return Seen(file, found.points, grid_lines(found.points))
+        return DetectedTarget(file, None, find_lines(image))
+    found = find_dots(image) if pattern == "dots" else find_chessboard(image, inner_corners)
+    return DetectedTarget(file, found.points, grid_lines(found.points))
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:
-    """Write the model (TOML) to `path`, and beside it the report (JSON) and the picture (PNG).
+    """Write the camera file (TOML), and beside it the report (.json) and the plot (.png).
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Result of `calibrate`.
+    path : Path
+        Camera file to write.
 
     Raises
     ------
     ValueError
-        There is no model to write: the lines are straight without one.
+        The calibration has no model: the lines are straight without a lens.
     """
     if calibration.model is None:
-        raise ValueError("the lines are straight without a lens: there is nothing to correct, nothing was written")
-    # Numbers that nothing fixes are infinite in the covariance; JSON and its readers know no such word.
+        raise ValueError("the lines are straight without a lens; no correction is needed, nothing was written")
+    # The covariance of parameters that the data do not fix is infinite; json_tree replaces it, since JSON has no
+    # infinity.
     write_whole(path.with_suffix(".json"), json.dumps(json_tree(calibration.report()), indent=1) + "\n")
     draw_calibration(path.with_suffix(".png"), calibration)
     write_lens(
@@ -169,7 +194,7 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
                 "model": calibration.fit.model,
                 "pattern": calibration.pattern,
                 "rms_px": calibration.fit.rms_px,
-                "images": [each.image.name for each in calibration.seen],
+                "images": [each.image.name for each in calibration.detected_targets],
                 "warnings": list(calibration.fit.warnings),
             },
         },

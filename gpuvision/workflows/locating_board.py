@@ -20,7 +20,7 @@ from gpuvision.camera.image import estimate_pixel_noise, grey_image
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.camera.undistort_image import UndistortImage
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.board.edge_measurement import Copper, Fix, Looking, features_in_view, moved
 from gpuvision.matching.board.located_board import LocatedBoard
@@ -197,7 +197,8 @@ class _Job:
         self.clock.told("search prepared")
         straight = self.grey
         if view.model is not None:
-            straight = UndistortImage(model=view.model, border="replicate")(self.grey, device=self.device).image
+            undistort = UndistortImage(model=view.model, border="replicate")
+            straight = to_numpy(undistort(self.grey, device=self.device).image)
         found = search(straight, device=self.device)
         self.clock.told("search")
         left = (max(_AFTER_SEARCH[0], 3 * view.scale), _AFTER_SEARCH[1])

@@ -1,4 +1,4 @@
-"""Files of images and points, undistorted."""
+"""Undistortion of image files and files of points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.undistort_image import Border, Interpolation, UndistortImage
 from gpuvision.camera.undistort_points import UndistortPoints
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import whole_folder
 from gpuvision.host.recordings import read_image
@@ -31,49 +31,54 @@ def undistort_files(
     device: Device,
     interpolation: Interpolation = "bilinear",
     border: Border = "mask",
-    value: float = 0.0,
+    border_value: float = 0.0,
     region: tuple[int, int, int, int] | None = None,
     progress: Progress = lambda done, of: None,
 ) -> tuple[Path, ...]:
-    """Undistort images and NPY arrays of points into a folder, all or none of them.
+    """Undistort images and NPY arrays of points into a folder. On an error no file is left behind.
 
     Parameters
     ----------
-    inputs
-        Images (uint8, uint16, float32; grey or colour), and NPY arrays (..., 2) of (column, row) [px].
-    model, device
-        The camera model; where to run.
-    out
-        The folder; files keep their names, images with the ending of what they are written as.
-    interpolation, border, value, region
-        Of images, as `UndistortImage` has them.
-    progress
-        Told how many files are done, of how many.
+    inputs : sequence of Path
+        Images (uint8, uint16 or float32; grey or colour) and NPY arrays (..., 2) of measured (column, row) [px].
+    model : Lens or Camera
+        Camera model.
+    out : Path
+        Output folder. Files keep their names; images get the suffix of the format written (.png or .tif).
+    device : Device
+        Device to run on.
+    interpolation, border, border_value, region
+        See `UndistortImage`; they apply to images.
+    progress : callable
+        Called with the number of processed files and the number of files.
 
     Returns
     -------
     tuple of Path
-        What was written.
+        Files written, in the order of the inputs.
 
     Raises
     ------
+    FileNotFoundError
+        An input does not exist.
     RecordingError
-        A file is neither an image nor points, or two inputs have one name.
+        An input is neither an image nor an array of points, or two inputs have the same name.
     ValueError, TypeError
-        An image or array is of a kind that cannot be undistorted.
+        The shape or the pixel type of an image is not supported.
     """
-    twins = {name for name in (each.stem for each in inputs) if [each.stem for each in inputs].count(name) > 1}
-    if twins:
-        raise RecordingError(f"several inputs are called {min(twins)}; undistort them into folders of their own")
+    stems = [each.stem for each in inputs]
+    duplicates = {name for name in stems if stems.count(name) > 1}
+    if duplicates:
+        raise RecordingError(f"several inputs have the name {min(duplicates)}; undistort them into separate folders")
     written = []
-    with whole_folder(out) as inside:
+    with whole_folder(out) as folder:
         for number, file in enumerate(inputs):
             progress(number, len(inputs))
             if not file.exists():
-                raise FileNotFoundError(f"{file}: there is no such file")
+                raise FileNotFoundError(f"{file}: no such file")
             if file.suffix.lower() == ".npy":
                 name = file.name
-                np.save(inside / name, _points(file, model, device))
+                np.save(folder / name, _undistorted_points(file, model, device))
             else:
                 image = read_image(file)
                 image = image[..., :3] if image.ndim == 3 else image
@@ -82,16 +87,17 @@ def undistort_files(
                     interpolation=interpolation,
                     channels=3 if image.ndim == 3 else 1,
                     border=border,
-                    value=value,
+                    border_value=border_value,
                     region=region,
                 )
-                name = _write(inside, file, operation(np.ascontiguousarray(image), device=device).image)
+                name = _write(folder, file, to_numpy(operation(np.ascontiguousarray(image), device=device).image))
             written.append(out / name)
         progress(len(inputs), len(inputs))
     return tuple(written)
 
 
-def _points(file: Path, model: Lens | Camera, device: Device) -> npt.NDArray[Any]:
+def _undistorted_points(file: Path, model: Lens | Camera, device: Device) -> npt.NDArray[Any]:
+    """Read points of an NPY file and undistort them."""
     try:
         points = np.load(file, allow_pickle=False)
     except (EOFError, ValueError) as error:
@@ -101,17 +107,17 @@ def _points(file: Path, model: Lens | Camera, device: Device) -> npt.NDArray[Any
             f"{file}: {points.dtype} of shape {points.shape}, expected float32 or float64 points of shape (..., 2)"
         )
     flat = np.ascontiguousarray(points.reshape(-1, 2))
-    straight: npt.NDArray[Any] = UndistortPoints(model=model)(flat, device=device).points
-    return straight.reshape(points.shape)
+    undistorted = UndistortPoints(model=model)(flat, device=device).points
+    return to_numpy(undistorted).reshape(points.shape)
 
 
 def _write(folder: Path, source: Path, image: npt.NDArray[Any]) -> str:
-    """Write an image without loss, and return its name."""
+    """Write an image in a lossless format and return its file name."""
     if image.dtype == np.float32:
         name = f"{source.stem}.tif"
-        coloured = image.ndim == 3
+        is_colour = image.ndim == 3
         tifffile.imwrite(
-            folder / name, image[..., ::-1] if coloured else image, photometric="rgb" if coloured else "minisblack"
+            folder / name, image[..., ::-1] if is_colour else image, photometric="rgb" if is_colour else "minisblack"
         )
         return name
     name = f"{source.stem}.png"

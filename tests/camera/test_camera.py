@@ -114,7 +114,7 @@ def test_any_camera_inverts_before_its_fold(radial, decentred, tilt, part, turn)
     """At a place before the fold and in front of the sensor; 1e-9 px where the inverse does not magnify."""
     (k1, k2, k3, k4, k5, k6), (p1, p2, *s) = radial, decentred
     given_ = camera(k1, k2, p1, p2, k3, k4, k5, k6, *s, tilt=tilt)
-    radius = part * min(given_.one_to_one_radius, 0.6)
+    radius = part * min(given_.invertible_radius, 0.6)
     point = np.array([642.5 + 1700.0 * radius * math.cos(turn), 509.25 + 1650.0 * radius * math.sin(turn)])
     measured = given_.distort(point)
     if np.isnan(measured).any():  # behind a sensor so tilted
@@ -147,7 +147,7 @@ def test_where_opencv_fails() -> None:
 def test_fold_in_closed_form() -> None:
     unit = camera(-0.4, matrix=np.eye(3))
     fold = 1.0 / math.sqrt(1.2)
-    assert unit.one_to_one_radius == pytest.approx(fold, rel=1e-14)
+    assert unit.invertible_radius == pytest.approx(fold, rel=1e-14)
     inside, outside = np.array([[fold * (1.0 - 1e-9), 0.0]]), np.array([[fold * (1.0 + 1e-9), 0.0]])
     assert np.isfinite(unit.distort(inside)).all()
     assert np.isnan(unit.distort(outside)).all()
@@ -179,7 +179,7 @@ def test_fold_along_rays(coefficients: tuple[float, ...]) -> None:
             continue
         finite += 1
         before, behind = (fold - 1e-3) * direction, (fold + 1e-3) * direction
-        assert unit.one_to_one_radius < fold
+        assert unit.invertible_radius < fold
         assert np.isfinite(unit.distort(before)).all()
         assert np.isnan(unit.distort(behind)).all()
         np.testing.assert_allclose(unit.undistort(unit.distort(before)), before, rtol=0, atol=1e-11)
@@ -189,15 +189,15 @@ def test_fold_along_rays(coefficients: tuple[float, ...]) -> None:
 
 def test_a_pole_is_a_fold() -> None:
     unit = camera(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, matrix=np.eye(3))
-    assert unit.one_to_one_radius == pytest.approx(1.0)
+    assert unit.invertible_radius == pytest.approx(1.0)
     points = np.array([[0.999, 0.0], [1.001, 0.0], [0.0, 3.0]])
     np.testing.assert_array_equal(np.isnan(unit.distort(points)[:, 0]), [False, True, True])
     np.testing.assert_allclose(unit.undistort(unit.distort(points[:1])), points[:1], rtol=1e-12)
 
 
 def test_no_fold() -> None:
-    assert camera().one_to_one_radius == math.inf
-    assert camera(0.1, 0.02).one_to_one_radius == math.inf
+    assert camera().invertible_radius == math.inf
+    assert camera(0.1, 0.02).invertible_radius == math.inf
     far = np.array([[4e3, -4e3]])
     np.testing.assert_allclose(camera(0.1, 0.02).undistort(camera(0.1, 0.02).distort(far)), far, rtol=1e-12)
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpuvision.camera.camera import Camera
-from gpuvision.camera.scheimpflug import TiltedSensor, sharp_plane, tilt_for_plane
+from gpuvision.camera.scheimpflug import TiltedSensor, plane_of_focus, tilt_for_plane
 
 ANGLES = {"alpha": st.floats(0.0, 1.3), "direction": st.floats(-math.pi, math.pi)}
 
@@ -42,14 +42,14 @@ def test_without_distortion_the_virtual_camera_sees_the_same(alpha, direction):
     sensor = TiltedSensor(focal_length=1700.0, centre=(640.0, 512.0), alpha=alpha, direction=direction)
     matrix = ((1700.0, 0.0, 640.0), (0.0, 1700.0, 512.0), (0.0, 0.0, 1.0))
     camera = Camera(matrix=matrix, distortion=(*(0.0,) * 12, *sensor.tau))
-    assert TiltedSensor.of(camera).alpha == pytest.approx(alpha, abs=1e-7)
+    assert TiltedSensor.from_camera(camera).alpha == pytest.approx(alpha, abs=1e-7)
     points = np.random.default_rng(1).uniform((-0.1, -0.1, 0.9), (0.1, 0.1, 1.1), (20, 3))
-    seen, turned = camera.project(points), sensor.virtual_camera.project(points, sensor.turn)
+    seen, turned = camera.project(points), sensor.virtual_camera.project(points, sensor.rotation)
     there = np.isfinite(seen[:, 0])
     np.testing.assert_allclose(seen[there], turned[there], rtol=1e-9, atol=1e-7)
     assert there.any()
     # The turn takes the optical axis alpha away from the normal.
-    assert sensor.turn[2, 2] == pytest.approx(math.cos(alpha), abs=1e-15)
+    assert sensor.rotation[2, 2] == pytest.approx(math.cos(alpha), abs=1e-15)
 
 
 @given(**ANGLES, pitch=st.floats(1e-6, 2e-5))
@@ -58,9 +58,9 @@ def test_object_lens_and_sensor_planes_meet_in_one_line(alpha, direction, pitch)
     sensor = TiltedSensor(focal_length=5000.0, centre=(640.0, 512.0), alpha=alpha, direction=direction)
     image = 5000.0 * pitch
     lens = 0.8 * image
-    normal, distance = sharp_plane(sensor, lens, pitch)
+    normal, distance = plane_of_focus(sensor, lens, pitch)
     # The sensor behind the pinhole: its plane is m . q = -f.
-    sensor_plane = np.array([*sensor.turn[2], sensor.virtual_focal_length * pitch]) / image
+    sensor_plane = np.array([*sensor.rotation[2], sensor.virtual_focal_length * pitch]) / image
     planes = np.array([[*normal, -distance], [0.0, 0.0, 1.0, 0.0], sensor_plane])
     planes[:, 3] /= image
     sizes = np.linalg.svd(planes, compute_uv=False)
@@ -68,7 +68,7 @@ def test_object_lens_and_sensor_planes_meet_in_one_line(alpha, direction, pitch)
     for place in ((0.0, 0.0), (1000.0, -400.0), (-500.0, 900.0)):
         # A sensor point, mirrored through the pinhole, in the lens' frame; the object point on its ray.
         on_sensor = np.array([*place, 0.0]) * pitch + sensor.focal_length * pitch * sensor.axis
-        q = sensor.turn.T @ on_sensor
+        q = sensor.rotation.T @ on_sensor
         if q[2] <= lens:
             continue
         sharp = q * (distance / (normal @ q))
@@ -78,7 +78,7 @@ def test_object_lens_and_sensor_planes_meet_in_one_line(alpha, direction, pitch)
 @given(**ANGLES)
 def test_the_condition_solved_for_the_sensor(alpha, direction):
     sensor = TiltedSensor(focal_length=5000.0, centre=(0.0, 0.0), alpha=alpha, direction=direction)
-    normal, distance = sharp_plane(sensor, 0.02, 5e-6)
+    normal, distance = plane_of_focus(sensor, 0.02, 5e-6)
     image, tau_x, tau_y = tilt_for_plane(normal, distance, 0.02)
     assert image == pytest.approx(0.025, rel=1e-9)
     np.testing.assert_allclose(TiltedSensor.from_tau(5000.0, (0.0, 0.0), tau_x, tau_y).axis, sensor.axis, atol=1e-9)
@@ -102,7 +102,7 @@ def test_numbers_out_of_bounds(change, message):
 def test_what_cannot_be_sharp_and_what_is_not_square():
     sensor = TiltedSensor(focal_length=5000.0, centre=(0.0, 0.0), alpha=0.1)
     with pytest.raises(ValueError, match="below f'"):
-        sharp_plane(sensor, 0.03, 5e-6)
+        plane_of_focus(sensor, 0.03, 5e-6)
     with pytest.raises(ValueError, match="nearer than the focal length"):
         tilt_for_plane((0.0, 0.0, 1.0), 0.01, 0.02)
     with pytest.raises(ValueError, match="nearer than the focal length"):
@@ -112,4 +112,4 @@ def test_what_cannot_be_sharp_and_what_is_not_square():
     with pytest.raises(ValueError, match="above 0"):
         tilt_for_plane((0.0, 0.0, 1.0), 0.1, -0.02)
     with pytest.raises(ValueError, match="square"):
-        TiltedSensor.of(Camera(matrix=((1700.0, 0.0, 0.0), (0.0, 1600.0, 0.0), (0.0, 0.0, 1.0))))
+        TiltedSensor.from_camera(Camera(matrix=((1700.0, 0.0, 0.0), (0.0, 1600.0, 0.0), (0.0, 0.0, 1.0))))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gpuvision.camera.tilted_projection import COLUMNS, INTERNAL, project, rotation_of, tilt_matrix
+from gpuvision.camera.tilted_projection import COLUMNS, INTERNAL, project, rotation_matrix, tilt_matrix
 from gpuvision.camera.views.parameters import NUMBERS, OPENCV, Chart, internal_of, opencv_of
 from reference.tilted_camera import project_virtual, tilt
 
@@ -23,7 +23,7 @@ CAMERAS = {
 def scene(rng):
     target = np.zeros((VIEWS, 3, POINTS))
     target[:, :2] = rng.uniform(-0.2, 0.2, (VIEWS, 2, POINTS))
-    return rotation_of(rng.normal(0.0, 0.3, (VIEWS, 3))), rng.normal((0.0, 0.0, 1.0), 0.05, (VIEWS, 3)), target
+    return rotation_matrix(rng.normal(0.0, 0.3, (VIEWS, 3))), rng.normal((0.0, 0.0, 1.0), 0.05, (VIEWS, 3)), target
 
 
 @pytest.mark.parametrize("name", CAMERAS)

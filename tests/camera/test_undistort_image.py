@@ -97,11 +97,21 @@ def test_a_batch_against_the_oracle(
     # Borders are the same code for every type.
     for border in BORDERS if dtype == np.float32 else ["mask", "constant"]:
         op = UndistortImage(
-            model=lens, interpolation=interpolation, channels=channels, border=border, value=0.75, variant=variant
+            model=lens,
+            interpolation=interpolation,
+            channels=channels,
+            border=border,
+            border_value=0.75,
+            variant=variant,
         )
         image = pixels(rng, (2, 83, 117, 3)[: 3 + channels // 3], dtype)
-        places = op.places((83, 117))
-        options = {"interpolation": interpolation, "border": border, "value": 0.75, "missing": Status.NOT_INVERTIBLE}
+        places = op.source_positions((83, 117))
+        options = {
+            "interpolation": interpolation,
+            "border": border,
+            "border_value": 0.75,
+            "missing": Status.NOT_INVERTIBLE,
+        }
         assert_right(op(image, device=device), image, places, channels=channels, **options)
 
 
@@ -211,7 +221,7 @@ def test_whole_shifts_are_exact(
     grid = np.stack(np.meshgrid(np.arange(129.0), np.arange(37.0)), -1)
     for shift in ((0, 0), (3, -2), (-17, 5)):
         op = UndistortImage(
-            model=grid + shift, interpolation=interpolation, border="constant", value=1.0, variant=variant
+            model=grid + shift, interpolation=interpolation, border="constant", border_value=1.0, variant=variant
         )
         expected = np.ones_like(image)
         inner = [slice(max(-s, 0), size - max(s, 0)) for s, size in zip(shift[::-1], image.shape, strict=True)]
@@ -233,7 +243,7 @@ def test_against_opencv(device: Device, border: str, dtype: Any, interpolation: 
     theirs = cv2.remap(
         image, places[..., 0], places[..., 1], filters[interpolation], borderMode=flags[border], borderValue=1.0
     )
-    op = UndistortImage(model=places, interpolation=interpolation, border=border, value=1.0)
+    op = UndistortImage(model=places, interpolation=interpolation, border=border, border_value=1.0)
     ours = op(image, device=device).image
     # OpenCV may round a half to the other side; its coordinates are floats up to 144.
     atol = 1.0 if dtype != np.float32 else 2 * 2 * (PLACE_ERROR + 1e-5)
@@ -250,10 +260,10 @@ def test_places_that_are_none_or_far_away(device: Device, border: Any, variant: 
     places[2, 5:] = 1e12
     places[3] = (-3e9, 4.0)
     places[4, :, 0] = np.geomspace(1.0, 1e300, 64)
-    op = UndistortImage(model=places, border=border, value=0.5, variant=variant)
+    op = UndistortImage(model=places, border=border, border_value=0.5, variant=variant)
     result = op(image, device=device)
     if border != "reflect":
-        assert_right(result, image, places, border=border, value=0.5)
+        assert_right(result, image, places, border=border, border_value=0.5)
     lost = ~np.isfinite(places).all(-1)
     assert (result.status[lost | (np.abs(places) > 1e3).any(-1)] == Status.NO_DATA).all()
     expected = 0.5 if border == "constant" else math.nan
@@ -268,7 +278,7 @@ def test_past_the_fold(device: Device, coordinates: Any, variant: Any, rng: np.r
     op = UndistortImage(model=lens, coordinates=coordinates, variant=variant)
     image = pixels(rng, (61, 101), np.uint8)
     result = op(image, device=device)
-    folded = np.isnan(op.places(image.shape)).any(-1)
+    folded = np.isnan(op.source_positions(image.shape)).any(-1)
     # In single precision the fold itself is known to a rounding.
     reach = np.hypot(*np.moveaxis(np.argwhere(np.ones_like(folded)) - (30.0, 50.0), -1, 0)).reshape(folded.shape)
     clear = np.abs(reach - lens.undistort([50.0 + 0.999999 * lens.fold_radius, 30.0])[0] + 50.0) > 0.01
@@ -311,7 +321,7 @@ def test_computed_places(
     options: dict[str, Any] = {"model": model, "matrix": matrix, "channels": channels, "variant": variant}
     op = UndistortImage(**options, coordinates="computed", precision=precision, size=(140, 100), border="replicate")
     result = op(image, device=device)
-    places = op.places((83, 117))
+    places = op.source_positions((83, 117))
     expected, status = reference.undistort(
         image.reshape(83, 117, channels).astype(np.float64), places, border="replicate"
     )
@@ -384,7 +394,7 @@ def test_wrong_arguments(device: Device) -> None:
         ({"border": "wrap"}, "replicate"),
         ({"region": (0, 0, 0, 5)}, "region"),
         ({"size": (0, 5)}, "size"),
-        ({"value": math.nan}, "value"),
+        ({"border_value": math.nan}, "border_value"),
         ({"model": CAMERA, "matrix": np.zeros((3, 3))}, "focal"),
         ({"precision": "double"}, "precision"),
         ({"model": np.zeros((4, 4))}, "map"),
@@ -409,6 +419,6 @@ def test_wrong_arguments(device: Device) -> None:
     with pytest.raises(ValueError, match="3"):
         UndistortImage(model=lens, channels=3)(np.zeros((4, 4), np.uint8), device=device)
     with pytest.raises(ValueError, match="uint8"):
-        UndistortImage(model=lens, border="constant", value=300.0)(np.zeros((4, 4), np.uint8), device=device)
+        UndistortImage(model=lens, border="constant", border_value=300.0)(np.zeros((4, 4), np.uint8), device=device)
     with pytest.raises(ValueError, match="leaves the map"):
         UndistortImage(model=np.zeros((4, 4, 2)), region=(2, 2, 3, 3))(np.zeros((4, 4), np.uint8), device=device)

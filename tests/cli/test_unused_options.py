@@ -14,11 +14,14 @@ from gpuvision.cli.main import application
 @pytest.mark.parametrize(
     ("words", "option"),
     [
-        (("calibrate", "a.png", "--out", "l.toml", "--inner", "9x6"), "--inner"),
+        (("calibrate", "a.png", "--out", "l.toml", "--inner-corners", "9x6"), "--inner-corners"),
         (("calibrate", "a.png", "--out", "l.toml", "--method", "lines", "--pitch", "0.01"), "--pitch"),
         (("calibrate", "a.png", "--out", "l.toml", "--method", "lines", "--focal-length", "900"), "--focal-length"),
-        (("undistort", "a.png", "--lens", "l.toml", "--out", "d", "--value", "7"), "--value"),
-        (("undistort", "a.png", "--lens", "l.toml", "--out", "d", "--border", "mask", "--value", "7"), "--value"),
+        (("undistort", "a.png", "--lens", "l.toml", "--out", "d", "--border-value", "7"), "--border-value"),
+        (
+            ("undistort", "a.png", "--lens", "l.toml", "--out", "d", "--border", "mask", "--border-value", "7"),
+            "--border-value",
+        ),
         (("undistort", "a.npy", "--lens", "l.toml", "--out", "d", "--region", "0,0,8,8"), "--region"),
         (("undistort", "a.npy", "--lens", "l.toml", "--out", "d", "--border", "reflect"), "--border"),
         (("undistort", "a.npy", "--lens", "l.toml", "--out", "d", "--interpolation", "bicubic"), "--interpolation"),

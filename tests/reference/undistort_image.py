@@ -27,7 +27,9 @@ def border_place(place: np.ndarray, size: int, border: str) -> np.ndarray:
     return np.minimum(folded, period - folded)
 
 
-def interpolate(image: np.ndarray, places: np.ndarray, *, interpolation: str, border: str, value: float) -> np.ndarray:
+def interpolate(
+    image: np.ndarray, places: np.ndarray, *, interpolation: str, border: str, border_value: float
+) -> np.ndarray:
     """Values of one image (rows, columns, channels) at places (..., 2), wherever these are finite."""
     kernel, taps = (cubic, range(-1, 3)) if interpolation == "bicubic" else (linear, range(2))
     rows, columns = image.shape[:2]
@@ -42,7 +44,7 @@ def interpolate(image: np.ndarray, places: np.ndarray, *, interpolation: str, bo
             seen = image[border_place(row, rows, border), border_place(column, columns, border)]
             if border == "constant":
                 outside = (column < 0) | (column >= columns) | (row < 0) | (row >= rows)
-                seen = np.where(outside[..., None], value, seen)
+                seen = np.where(outside[..., None], border_value, seen)
             result += weight[..., None] * seen
     return result
 
@@ -53,7 +55,7 @@ def undistort(
     *,
     interpolation: str = "bilinear",
     border: str = "mask",
-    value: float = 0.0,
+    border_value: float = 0.0,
     missing: int = NO_DATA,
 ) -> tuple[np.ndarray, np.ndarray]:
     """One image (rows, columns, channels) at places (r, c, 2): values, NaN where there are none, and status."""
@@ -63,7 +65,7 @@ def undistort(
         hole = (x < -0.5) | (x > columns - 0.5) | (y < -0.5) | (y > rows - 0.5)
     lost = ~np.isfinite(x + y)
     status = np.where(lost, missing, np.where(hole, NO_DATA, 0)).astype(np.uint8)
-    result = interpolate(image, places, interpolation=interpolation, border=border, value=value)
+    result = interpolate(image, places, interpolation=interpolation, border=border, border_value=border_value)
     blank = lost | hole if border == "mask" else lost
-    result[blank] = value if border == "constant" else np.nan
+    result[blank] = border_value if border == "constant" else np.nan
     return result, status

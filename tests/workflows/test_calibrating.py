@@ -176,7 +176,7 @@ def test_image_without_a_pattern(image: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"empty\.png: no dots found; expected"):
         calibrate([tmp_path / "empty.png"])
     done = calibrate([tmp_path / "empty.png", image])
-    assert [path.name for path, _ in done.passed_over] == ["empty.png"]
+    assert [path.name for path, _ in done.skipped_images] == ["empty.png"]
     assert "1 of 2 images" in done.summary()
 
 
@@ -192,7 +192,7 @@ def test_images_of_two_sizes(image: Path, tmp_path: Path) -> None:
 
 
 def test_missing_and_unreadable_files(tmp_path: Path, device: Device) -> None:
-    with pytest.raises(FileNotFoundError, match="there is no such file"):
+    with pytest.raises(FileNotFoundError, match="no such file"):
         calibrate([tmp_path / "none.png"])
     (tmp_path / "text.png").write_text("no image")
     with pytest.raises(RecordingError, match=r"text\.png: not a readable image"):
@@ -219,7 +219,7 @@ def test_inputs_of_one_name(tmp_path: Path, device: Device) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--inner", "nine"), "--inner is 'nine', expected"),
+        (("--inner-corners", "nine"), "--inner-corners is 'nine', expected"),
         (("--out", "lens.json"), "where the report and the picture go"),
         (("--model", "k7"), "k7"),
         (("--method", "views"), "focal"),
@@ -254,6 +254,6 @@ def test_real_patterns_are_straighter_than_known(name: str, pattern: str, best: 
 def test_real_chessboards(data: Path) -> None:
     files = sorted((data / "calibration" / "chessboard").glob("left*.jpg"))
     done = calibrate(files, pattern="chessboard", model="k1,k2", pitch=0.025)
-    assert len(done.seen) == len(files) == 13
+    assert len(done.detected_targets) == len(files) == 13
     # OpenCV's corners and calibration with the same model: 0.4183 px.
     assert done.fit.rms_px < 0.4183

@@ -1,101 +1,133 @@
-"""Dot grids: thousands of dots, found sub-pixel and told apart, whatever the lens."""
+"""Dot grids: sub-pixel detection of the dots and their grid index, also under strong lens distortion."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.camera.patterns.blobs import find_pattern_blobs
-from gpuvision.camera.patterns.centroids import Centroids, disc_shift, measure_dots
-from gpuvision.camera.patterns.grid_polynomial import GridPolynomial, cross, on_grid
-from gpuvision.camera.patterns.lattice import whole_grid
+from gpuvision.camera.patterns.blobs import BlobLimits, find_pattern_blobs
+from gpuvision.camera.patterns.centroids import Centroids, disc_centre_offset, measure_dots
+from gpuvision.camera.patterns.grid_polynomial import GridPolynomial, agrees_with_grid, cross
+from gpuvision.camera.patterns.lattice import index_grid
 from gpuvision.camera.patterns.pattern import (
     Float64,
     PatternGrid,
+    estimate_localisation_noise,
     finder_image,
-    localisation_noise,
     nan_median,
-    trimmed,
+    trim_empty_border,
 )
 
 Bool = npt.NDArray[np.bool_]
 
-_FEWEST = 9
-# Dots cover at most this part of the grid; squares of a chessboard cover half.
-_MOST_COVER = 0.48
-# Limits of what a dot may differ from its neighbours. In place and shape: as many times what is usual in this image,
-# but a small part of the pitch (of the size) always; in contrast; and its ground from a plane, in units of contrast.
-_OFF_USUAL = 7.0
-_OFF_PITCH = 0.003
-_OFF_SHAPE = 0.06
-_LEAST_CONTRAST = 0.25
-_UNEVEN = 0.5
+
+@dataclass(frozen=True, kw_only=True)
+class DotLimits:
+    """Thresholds of `find_dots`.
+
+    Attributes
+    ----------
+    min_dots : int
+        Least number of dots in a grid.
+    max_coverage : float
+        Largest fraction of the grid that dots cover. Derived: squares of a chessboard cover 0.5.
+    max_deviation_medians : float
+        Largest deviation of a dot from its neighbours, in position and in shape, as a multiple of the median deviation
+        in the image.
+    min_position_tolerance : float
+        Deviation in position that is always accepted [pitches].
+    min_shape_tolerance : float
+        Deviation of area, width and height that is always accepted (logarithm of the ratio).
+    min_contrast : float
+        Least contrast relative to the median contrast of the neighbouring dots.
+    max_background_residual : float
+        Largest deviation of the background from a plane [contrasts].
+    blobs : BlobLimits
+        Thresholds of the blob detection.
+    """
+
+    min_dots: int = 9
+    max_coverage: float = 0.48
+    max_deviation_medians: float = 7.0
+    min_position_tolerance: float = 0.003
+    min_shape_tolerance: float = 0.06
+    min_contrast: float = 0.25
+    max_background_residual: float = 0.5
+    blobs: BlobLimits = BlobLimits()  # noqa: RUF009
 
 
-def find_dots(image: npt.NDArray[Any]) -> PatternGrid:
+def find_dots(image: npt.NDArray[Any], *, limits: DotLimits = DotLimits()) -> PatternGrid:
     """Find the dots of a regular grid, dark on light or light on dark.
 
-    Dots are told from the ground by a threshold that follows the illumination, indexed by walking from neighbour to
-    neighbour, and measured by the centre of gravity of their grey levels; a step of the grid may vary as lenses and
-    perspective make it. Missing and hidden dots are NaN, as are those that lie off their neighbours' grid, are cut
-    by something, or touch the border. The centre of gravity of a disc that is seen askew is not its centre: the
-    difference follows from the grid's own curvature, and is taken off.
+    A local threshold separates the dots from the background. Their grid index grows from neighbour to neighbour, so
+    that lens distortion and perspective may change the steps across the image. Positions are grey-level centres of
+    gravity. The centre of gravity of a disc's image differs from the image of its centre under perspective and
+    distortion; the difference follows from the curvature of the grid and is subtracted.
 
     Parameters
     ----------
-    image
-        (height, width) or (height, width, 3; blue, green, red) of uint8, uint16 or float32, 9 dots or more, of at
-        least 4 pixels across and 2 pixels apart, the grid turned by at most 45 degrees.
+    image : numpy.ndarray
+        (height, width) or (height, width, 3; blue, green, red) of uint8, uint16 or float32, with 9 dots or more of at
+        least 4 px diameter and 2 px distance, the grid rotated by at most 45 degrees.
+    limits : DotLimits
+        Thresholds of the detection.
 
     Returns
     -------
     PatternGrid
-        Noise and bias are about 0.01 px where dots are 10 px across and the noise is 1 % of their contrast.
+        Missing and hidden dots are NaN, as are dots that deviate from the grid of their neighbours, are partly covered,
+        or touch the image's border. Noise and bias are about 0.01 px for dots of 10 px diameter and noise of 1 % of
+        their contrast.
 
     Raises
     ------
     ValueError
-        If there is no grid, or it falls into parts; says how many dots were found.
+        No grid was found, or it consists of separate parts; the message gives the number of dots found.
     TypeError
-        If the image is of another type.
+        The image has another type.
     """
     grey = finder_image(image)
-    blobs = find_pattern_blobs(grey)
-    if blobs.cover > _MOST_COVER:
+    blobs = find_pattern_blobs(grey, limits.blobs)
+    if blobs.coverage > limits.max_coverage:
         raise ValueError(
-            f"what was found covers {blobs.cover:.0%} of the grid, dots cover at most {_MOST_COVER:.0%}: "
+            f"the blobs found cover {blobs.coverage:.0%} of the grid, dots cover at most {limits.max_coverage:.0%}: "
             "use find_lines for cells between lines, find_chessboard for squares"
         )
-    grid = whole_grid(blobs.points, _FEWEST, "dots")
+    grid = index_grid(blobs.points, limits.min_dots, "dots")
     place, size = (np.where(grid[..., None] < 0, np.nan, each[grid]) for each in (blobs.points, blobs.size))
     found = measure_dots(grey, place, size)
-    bent = GridPolynomial(found.points)
-    points = found.points - disc_shift(bent, found.mass)
-    points[~_sound(found, bent)] = np.nan
+    model = GridPolynomial(found.points)
+    points = found.points - disc_centre_offset(model, found.mass)
+    points[~_agrees_with_neighbours(found, model, limits)] = np.nan
     count = np.count_nonzero(np.isfinite(points[..., 0]))
-    if count < _FEWEST:
-        raise ValueError(f"only {count} of {grid.size} dots are whole and lie on a grid, expected at least {_FEWEST}")
-    points = trimmed(points)
-    return PatternGrid(points, localisation_noise(points))
+    if count < limits.min_dots:
+        raise ValueError(
+            f"only {count} of {grid.size} dots are whole and lie on a grid, expected at least {limits.min_dots}"
+        )
+    points = trim_empty_border(points)
+    return PatternGrid(points, estimate_localisation_noise(points))
 
 
-def _sound(found: Centroids, bent: GridPolynomial) -> Bool:
-    """Which dots lie, look and stand out as their neighbours do."""
-    u, v = bent.derivative(1, 0), bent.derivative(0, 1)
+def _agrees_with_neighbours(found: Centroids, model: GridPolynomial, limits: DotLimits) -> Bool:
+    """Return which dots agree with their neighbours in position, shape and contrast."""
+    u, v = model.derivative(1, 0), model.derivative(0, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        sound = on_grid(found.points, _OFF_USUAL, _OFF_PITCH)
-        # A disc's area, width and height, but for how the grid is bent: about the same everywhere.
+        sound = agrees_with_grid(found.points, limits.max_deviation_medians, limits.min_position_tolerance)
+        # Area, width and height of a disc over those of its grid cell are about the same everywhere.
         disc = np.stack([found.mass / np.abs(cross(u, v)), *np.moveaxis(found.spread / (u**2 + v**2), -1, 0)])
         for each in disc:
-            change = np.abs(np.log(each / _around(each)))
-            sound &= change < max(_OFF_SHAPE, _OFF_USUAL * float(np.nanmedian(change)))
-        return sound & (found.contrast / _around(found.contrast) > _LEAST_CONTRAST) & (found.unevenness < _UNEVEN)
+            change = np.abs(np.log(each / _neighbourhood_median(each)))
+            tolerance = limits.max_deviation_medians * float(np.nanmedian(change))
+            sound &= change < max(limits.min_shape_tolerance, tolerance)
+        has_contrast = found.contrast / _neighbourhood_median(found.contrast) > limits.min_contrast
+        return sound & has_contrast & (found.background_residual < limits.max_background_residual)
 
 
-def _around(values: Float64) -> Float64:
-    """Median of a node and of the 24 around it."""
+def _neighbourhood_median(values: Float64) -> Float64:
+    """Return the median over the 5 x 5 neighbourhood of every node."""
     padded = np.pad(values, 2, constant_values=np.nan)
     rows, columns = values.shape
     return nan_median(np.stack([padded[i : i + rows, j : j + columns] for i in range(5) for j in range(5)]))

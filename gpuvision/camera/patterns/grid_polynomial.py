@@ -1,4 +1,4 @@
-"""A polynomial through the points of a grid: how lens and perspective bend it."""
+"""Polynomial model of a grid under lens distortion and perspective, and its outliers."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from scipy.ndimage import maximum_filter
 
 from gpuvision.camera.patterns.pattern import Float64, nan_median
 
-_DEGREE = 4
-# Points for every coefficient, so that one that is off does not bend it much.
+_MAX_DEGREE = 4
+# Least number of points per coefficient; limits the influence of a single outlier.
 _POINTS_PER_TERM = 2
-# Rounds that look for points that are off, and how far a point bears on others.
+# Rounds of the outlier search, and the side of the neighbourhood (nodes) in which a round removes the worst point only.
 _ROUNDS = 5
-_REACH = 7
+_NEIGHBOURHOOD = 7
 
 
 class GridPolynomial:
-    """Place in the image as a polynomial of column and row, by least squares.
+    """Least-squares polynomial from grid index (column, row) to image position.
 
-    The degree is 4 along columns and along rows, less where few points are known.
+    The degree is 4 along columns and along rows, lower if few points are known.
 
     Parameters
     ----------
-    points
-        (rows, columns, 2), NaN where missing; at least one known.
+    points : numpy.ndarray
+        (rows, columns, 2): positions [px], NaN where missing; at least one known.
     """
 
     def __init__(self, points: Float64) -> None:
         rows, columns = points.shape[:2]
         known = np.isfinite(points[..., 0])
-        degree = min(_DEGREE, int(np.sqrt(np.count_nonzero(known) / _POINTS_PER_TERM)) - 1)
+        degree = min(_MAX_DEGREE, int(np.sqrt(np.count_nonzero(known) / _POINTS_PER_TERM)) - 1)
         degrees = tuple(max(0, min(degree, count - 2)) for count in (columns, rows))
         i, j = np.indices((rows, columns))
-        # From -1 to 1 Legendre polynomials are near enough to orthogonal for the normal equations.
+        # Legendre polynomials on -1 to 1 are nearly orthogonal: the normal equations are well conditioned.
         self._u, self._v = (2.0 * each / max(count - 1, 1) - 1.0 for each, count in ((j, columns), (i, rows)))
         self._per_node = 2.0 / max(columns - 1, 1), 2.0 / max(rows - 1, 1)
         design = legendre.legvander2d(self._u[known], self._v[known], degrees)
@@ -42,42 +42,42 @@ class GridPolynomial:
         self._terms = terms.reshape(degrees[0] + 1, degrees[1] + 1, 2)
 
     def derivative(self, by_column: int, by_row: int) -> Float64:
-        """Return the derivative of these orders (0 and 0: the place) at every node, (rows, columns, 2)."""
+        """Return the derivative of the given orders (0, 0: the position) at every node, (rows, columns, 2)."""
         terms = legendre.legder(self._terms, by_column, self._per_node[0], 0)
         terms = legendre.legder(terms, by_row, self._per_node[1], 1)
         return np.asarray(np.moveaxis(legendre.legval2d(self._u, self._v, terms), 0, -1))
 
 
-def on_grid(points: Float64, usual: float, least: float) -> npt.NDArray[np.bool_]:
-    """Which points lie where their neighbours have them, in grids that lens and perspective bend.
+def agrees_with_grid(points: Float64, max_medians: float, min_tolerance: float) -> npt.NDArray[np.bool_]:
+    """Return which points agree with the positions that their neighbours predict.
 
     Parameters
     ----------
-    points
+    points : numpy.ndarray
         (rows, columns, 2); NaN where missing.
-    usual
-        They may be off by so many times what is usual in this grid,
-    least
-        or by this part of a step.
+    max_medians : float
+        Accepted deviation as a multiple of the grid's median deviation.
+    min_tolerance : float
+        Deviation that is always accepted [grid steps].
 
     Returns
     -------
     numpy.ndarray
-        (rows, columns); also where nothing predicts a point that stands alone.
+        (rows, columns) bool; True also for isolated points, which no neighbour predicts.
     """
     if not np.isfinite(points).any():
         return np.zeros(points.shape[:2], dtype=np.bool_)
-    bent = GridPolynomial(points)
-    cell = np.abs(cross(bent.derivative(1, 0), bent.derivative(0, 1)))
-    limit = least * float(np.sqrt(np.median(cell)))
-    rest = points - bent.derivative(0, 0)
+    model = GridPolynomial(points)
+    cell = np.abs(cross(model.derivative(1, 0), model.derivative(0, 1)))
+    limit = min_tolerance * float(np.sqrt(np.median(cell)))
+    rest = points - model.derivative(0, 0)
     good = np.ones(points.shape[:2], dtype=np.bool_)
     for last in (*[False] * (_ROUNDS - 1), True):
-        off = np.nan_to_num(_off_neighbours(rest))
+        off = np.nan_to_num(_distance_from_prediction(rest))
         if off.any():
-            limit = max(limit, usual * float(np.median(off[off > 0.0])))
-        # A point that is off makes its neighbours look so: the worst goes first.
-        worst = (off > limit) & (last | (off == maximum_filter(off, _REACH)))
+            limit = max(limit, max_medians * float(np.median(off[off > 0.0])))
+        # An outlier spoils the predictions of its neighbours: remove the worst point of a neighbourhood first.
+        worst = (off > limit) & (last | (off == maximum_filter(off, _NEIGHBOURHOOD)))
         good &= ~worst
         rest[worst] = np.nan
         if not worst.any():
@@ -86,15 +86,15 @@ def on_grid(points: Float64, usual: float, least: float) -> npt.NDArray[np.bool_
 
 
 def cross(a: Float64, b: Float64) -> Float64:
-    """Area that two steps span, with its sign."""
+    """Return the signed area that two steps (..., 2) span."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-def _off_neighbours(points: Float64) -> Float64:
-    """How far (rows, columns) every point lies from where its neighbours in its row and its column would have it.
+def _distance_from_prediction(points: Float64) -> Float64:
+    """Return the distance (rows, columns) of every point from the prediction of its row and column neighbours.
 
-    A cubic through two neighbours on either side, or a line through one, predicts the point. At a border there are
-    only parabolas through three neighbours on one side, with more noise: what they tell counts half.
+    A cubic through two neighbours on each side, or a line through one on each side, predicts the point. At a border a
+    parabola through three neighbours on one side predicts it; its noise is larger, so the distance counts half.
     """
     rows, columns = points.shape[:2]
     padded = np.pad(points, ((3, 3), (3, 3), (0, 0)), constant_values=np.nan)

@@ -1,4 +1,4 @@
-"""Calibration patterns in images: what a finder takes and what it returns."""
+"""Inputs and results of the target pattern finders, and helpers that they share."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ Float32: TypeAlias = npt.NDArray[np.float32]
 LineFamilies: TypeAlias = tuple[tuple[Float64, ...], ...]
 """Families of lines that are parallel in the world; a line is an array (n, 2) of measured (column, row), in order."""
 
-# A normal distribution's sigma in units of its median absolute deviation.
+# Standard deviation of a normal distribution over its median absolute deviation.
 _SIGMA_OF_MAD = 1.4826
-_HIGHEST_DIFFERENCE = 6
-_FEWEST_DIFFERENCES = 12
+# Highest order of differences, and least number of differences of an order, for the noise estimate.
+_MAX_ORDER = 6
+_MIN_DIFFERENCES = 12
 
 
 class PatternGrid(NamedTuple):
-    """The points of a flat, regular pattern, found in an image.
+    """Points of a flat, regular target pattern, detected in an image.
 
-    The index is the place on the pattern: ``points[i, j]`` lies at (j, i) pitches from ``points[0, 0]``. Columns
-    grow with x and rows with y in the image; which point of the pattern is the first is not known.
+    The index is the position on the target: ``points[i, j]`` lies at (j, i) pitches from ``points[0, 0]``. Columns
+    increase with x and rows with y in the image. The position of ``points[0, 0]`` on the target is unknown.
     """
 
     points: Float64
-    """(rows, columns, 2): measured (column, row) in pixels, NaN where none was found."""
+    """(rows, columns, 2): measured (column, row) [px], NaN where missing."""
     sigma: float
-    """Noise of one coordinate in pixels, as `localisation_noise` estimates it from the points."""
+    """Standard deviation of one coordinate [px], estimated by `estimate_localisation_noise`."""
 
 
 def finder_image(image: npt.NDArray[Any]) -> Float32:
@@ -58,64 +59,64 @@ def finder_image(image: npt.NDArray[Any]) -> Float32:
     return grey
 
 
-def localisation_noise(points: npt.ArrayLike) -> float:
-    """Estimate the noise of a grid's points from the grid itself: what is not smooth along rows and columns.
+def estimate_localisation_noise(points: npt.ArrayLike) -> float:
+    """Estimate the noise of grid points from n-th differences along rows and columns.
 
-    The n-th differences of neighbours hold little but noise, binomial(2n, n) times its variance. Third differences
-    serve where a grid is fine; in a coarse one a lens shows in them, so that the smallest estimate of the third to
-    the sixth counts. The median makes it robust.
+    The n-th difference of independent noise has binomial(2n, n) times its variance, and suppresses smooth variation.
+    Third differences suffice in a fine grid. In a coarse grid lens distortion contributes to them, so the smallest
+    estimate of the third to the sixth differences is used. The median makes the estimate robust.
 
     Parameters
     ----------
-    points
+    points : array_like
         (rows, columns, 2); NaN where missing.
 
     Returns
     -------
     float
-        Standard deviation of one coordinate, in the points' units; NaN where too few neighbours are there.
+        Standard deviation of one coordinate, in the unit of the points; NaN if too few neighbours are known.
     """
     grid = np.asarray(points, dtype=np.float64)
     estimates = [math.nan]
-    for order in range(3, _HIGHEST_DIFFERENCE + 1):
+    for order in range(3, _MAX_ORDER + 1):
         steps = [np.diff(grid, order, axis).ravel() for axis in (0, 1)]
         known = np.abs(np.concatenate(steps))
         known = known[np.isfinite(known)]
-        if known.size >= _FEWEST_DIFFERENCES:
+        if known.size >= _MIN_DIFFERENCES:
             estimates.append(float(np.median(known)) * _SIGMA_OF_MAD / math.sqrt(math.comb(2 * order, order)))
     return float(np.fmin.reduce(estimates))
 
 
-def shrunk(grey: Float32, step: int) -> Float32:
-    """Mean over cells of so many pixels, the last ones stretched to fit."""
+def downsample(grey: Float32, step: int) -> Float32:
+    """Downsample by averaging cells of ``step`` x ``step`` pixels; the cells are stretched to cover the image."""
     rows, columns = grey.shape
     size = (-(-columns // step), -(-rows // step))
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def boxed(grey: Float32, side: int) -> Float32:
-    """Mean over a box about every pixel; the side is odd."""
+def box_mean(grey: Float32, side: int) -> Float32:
+    """Average over a box of odd side [px] about every pixel."""
     return np.asarray(cv2.blur(grey, (side, side)) if side > 1 else grey, dtype=np.float32)
 
 
 def nan_mean(values: Float64) -> Float64:
-    """Mean over the first axis of what is finite; NaN where nothing is."""
+    """Return the mean of the finite values over the first axis; NaN if none is finite."""
     known = np.isfinite(values)
     count = known.sum(axis=0)
     return np.asarray(np.where(known, values, 0.0).sum(axis=0) / np.where(count, count, np.nan))
 
 
 def nan_median(values: Float64) -> Float64:
-    """Median over the first axis of what is not NaN; NaN where nothing is left."""
+    """Return the median of the values that are not NaN over the first axis; NaN if all are."""
     ordered = np.sort(values, axis=0)  # NaN last
     count = np.isfinite(values).sum(axis=0)
     middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2])
-    # Where there is nothing, the first is NaN itself.
+    # If all values are NaN, the first one is NaN and is the result.
     return np.asarray(np.take_along_axis(ordered, np.minimum(middle, len(values) - 1), 0).mean(axis=0))
 
 
-def trimmed(points: Float64) -> Float64:
-    """Cut rows and columns at the border that hold nothing."""
+def trim_empty_border(points: Float64) -> Float64:
+    """Remove empty rows and columns at the border of a grid (rows, columns, 2)."""
     known = np.isfinite(points[..., 0])
     if not known.any():
         return points[:0, :0]

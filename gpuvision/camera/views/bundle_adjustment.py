@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpuvision.camera.tilted_projection import COLUMNS, INTERNAL, Floats, project, rotation_of
+from gpuvision.camera.tilted_projection import COLUMNS, INTERNAL, Floats, project, rotation_matrix
 from gpuvision.camera.views.parameters import Chart, internal_of
 
 # The fewer views, the more bent is the valley that the target's pose and the camera share, and the cheaper a step.
@@ -47,14 +47,14 @@ class Views(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """A robust loss on the length of a residual: 'linear', 'huber' or 'tukey', at a scale in pixels."""
+    """A robust loss on the length of a residual: 'squared', 'huber' or 'tukey', at a scale in pixels."""
 
-    kind: str = "linear"
+    kind: str = "squared"
     scale: float = 1.0
 
     def cost(self, length: Floats) -> Floats:
         """Twice the loss: the square, for small residuals."""
-        if self.kind == "linear":
+        if self.kind == "squared":
             return length**2
         if self.kind == "huber":
             edge = _HUBER * self.scale
@@ -64,7 +64,7 @@ class Loss(NamedTuple):
 
     def weight(self, length: Floats) -> Floats:
         """Weight of a residual in the iterated least squares."""
-        if self.kind == "linear":
+        if self.kind == "squared":
             return np.ones_like(length)
         if self.kind == "huber":
             edge = _HUBER * self.scale
@@ -73,7 +73,7 @@ class Loss(NamedTuple):
 
     def slope(self, length: Floats) -> Floats:
         """Mean over directions of the derivative of weight times residual: how stiffly the loss holds a point."""
-        if self.kind == "linear":
+        if self.kind == "squared":
             return np.ones_like(length)
         if self.kind == "huber":
             edge = _HUBER * self.scale
@@ -186,7 +186,7 @@ def moved(chart: Chart, state: State, camera: Floats, poses: Floats) -> State:
     return replace(
         state,
         numbers=chart.settled(numbers),
-        rotations=rotation_of(poses[:, :3]) @ state.rotations,
+        rotations=rotation_matrix(poses[:, :3]) @ state.rotations,
         translations=state.translations + poses[:, 3:],
     )
 

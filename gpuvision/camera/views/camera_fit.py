@@ -57,7 +57,7 @@ class Alternative(NamedTuple):
         Akaike's criterion.
     centre
         (C_c, R_c).
-    apart_px
+    centre_distance_px
         How far this centre lies from the chosen model's.
     """
 
@@ -67,7 +67,7 @@ class Alternative(NamedTuple):
     p_value: float
     aic: float
     centre: tuple[float, float]
-    apart_px: float
+    centre_distance_px: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ class CameraFit:
     @property
     def sensor(self) -> TiltedSensor:
         """alpha, f' and the virtual camera of eq. 3.1, for square pixels; alpha is 0 in a model without tilt."""
-        return TiltedSensor.of(self.camera)
+        return TiltedSensor.from_camera(self.camera)
 
     @property
     def alpha_sigma(self) -> float:
@@ -164,7 +164,7 @@ def lens_poses(state: State) -> tuple[Pose, ...]:
 
 def noise_of(views: Views, chart: Chart, state: State, loss: Loss) -> float:
     """Estimate the noise of one coordinate from the residual, pixels."""
-    if loss.kind != "linear":
+    if loss.kind != "squared":
         return robust_scale(views, state)
     free = views.coordinates - chart.free - 6 * len(views.seen)
     return math.sqrt(state.cost / free) if free > 0 else math.nan
@@ -192,7 +192,7 @@ def covariances(
 
 def variance_of(views: Views, chart: Chart, state: State, loss: Loss, sigma: float | None = None) -> float:
     """Return what the inverse of the (stiffness) normal equations is multiplied by: the noise squared, if normal."""
-    if loss.kind == "linear":
+    if loss.kind == "squared":
         return (noise_of(views, chart, state, loss) if sigma is None else sigma) ** 2
     length = np.linalg.norm(residuals(views, state), axis=1)[views.weight > 0.0]
     free = views.coordinates - chart.free - 6 * len(views.seen)

@@ -126,11 +126,11 @@ def _tilt_instead(fit: CameraFit, size: tuple[int, int]) -> str:
 
 def _as_good(fit: CameraFit, other: Alternative) -> str:
     """Say which model fits as well, and lies elsewhere."""
-    if other.p_value < _LEVEL or other.apart_px < _LOOSE_CENTRE_PX:
+    if other.p_value < _LEVEL or other.centre_distance_px < _LOOSE_CENTRE_PX:
         return ""
     return (
         f"model {other.model!r} fits as well (rms {other.rms_px:.4f} px, p = {other.p_value:.2g}) "
-        f"with its centre {other.apart_px:.1f} px away"
+        f"with its centre {other.centre_distance_px:.1f} px away"
     )
 
 

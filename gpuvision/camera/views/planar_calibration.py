@@ -28,7 +28,7 @@ from gpuvision.camera.views.parameters import COEFFICIENTS, Chart, internal_of
 from gpuvision.camera.views.target_views import Mask, pack
 from gpuvision.validation import finite, numbers
 
-LossName = Literal["linear", "huber", "tukey"]
+LossName = Literal["squared", "huber", "tukey"]
 
 AUTOMATIC = ("none", "k1", "k1,k2", "tilt,k1", "tilt")
 """What ``model="auto"`` chooses from, smallest first; "tilt" is "tilt,k1,k2"."""
@@ -90,7 +90,7 @@ def fit_camera(
     focal_length: float | None = None,
     centre: tuple[float, float] | None = None,
     free_aspect: bool = False,
-    loss: LossName = "linear",
+    loss: LossName = "squared",
     sigma: float | None = None,
 ) -> CameraFit:
     """Calibrate a camera from views of a flat target. It needs no first guess.
@@ -113,7 +113,7 @@ def fit_camera(
     free_aspect
         Whether fy is free beside fx.
     loss
-        "linear" (least squares), "huber", or "tukey" (which gives outliers no weight).
+        "squared" (least squares), "huber", or "tukey" (which gives outliers no weight).
     sigma
         Noise of one image coordinate, pixels, where it is known; else the residual tells.
 
@@ -167,7 +167,7 @@ def _prepared(
     known = None if centre is None else numbers(centre, (2,), "centre (column, row)")
     origin = 0.5 * (np.array(size) - 1.0) if known is None else np.array(known)
     radius = 0.5 * math.hypot(*size)
-    flat = flatten(packed, origin, radius, robust=loss != "linear")
+    flat = flatten(packed, origin, radius, robust=loss != "squared")
     return _Task(
         views=packed,
         masks=masks,
@@ -176,7 +176,7 @@ def _prepared(
         origin=origin,
         radius=radius,
         # Tukey's loss has many minima, Huber's one near the start: models are searched and compared under that.
-        loss=Loss("linear" if loss == "linear" else "huber", flat.noise if sigma is None else sigma),
+        loss=Loss("squared" if loss == "squared" else "huber", flat.noise if sigma is None else sigma),
         sigma=sigma,
         aspect=free_aspect,
         focal_length=None if focal_length is None else _positive(focal_length, "focal_length"),
@@ -288,10 +288,10 @@ def _searched(task: _Task, model: str) -> _Candidate:
 def _fitted(task: _Task, candidate: _Candidate) -> _Candidate:
     """Minimise the loss; a robust one at the scale that its own residuals have."""
     state, loss = candidate.state, candidate.loss
-    for _ in range(1 if loss.kind == "linear" or task.sigma is not None else _RESCALINGS):
+    for _ in range(1 if loss.kind == "squared" or task.sigma is not None else _RESCALINGS):
         used = loss
         state = adjust(task.views, candidate.chart, state, used)
-        if not np.isfinite(state.cost) or loss.kind == "linear":
+        if not np.isfinite(state.cost) or loss.kind == "squared":
             break
         loss = loss._replace(scale=robust_scale(task.views, state))
         if abs(loss.scale - used.scale) <= _SAME_SCALE * used.scale:
@@ -367,7 +367,7 @@ def _result(task: _Task, chosen: _Candidate, alternatives: tuple[Alternative, ..
         focus=focus,
         settled=state.settled,
         noise=noise,
-        outliers=int(doubtful.sum()) if chosen.loss.kind == "linear" else 0,
+        outliers=int(doubtful.sum()) if chosen.loss.kind == "squared" else 0,
         mirrored=bool((np.linalg.det(task.flat.homographies) < 0.0).all()),
     )
     return replace(fit, warnings=warnings)
@@ -411,5 +411,5 @@ def _alternative(task: _Task, other: _Candidate, p_value: float, chosen: State) 
         p_value=p_value,
         aic=task.views.coordinates * math.log(cost) + 2.0 * parameters,
         centre=(float(centre[0]), float(centre[1])),
-        apart_px=float(np.linalg.norm(centre - chosen.numbers[4:6])),
+        centre_distance_px=float(np.linalg.norm(centre - chosen.numbers[4:6])),
     )

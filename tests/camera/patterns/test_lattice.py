@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from gpuvision.camera.patterns.grid_polynomial import on_grid
-from gpuvision.camera.patterns.lattice import charts, whole_grid
+from gpuvision.camera.patterns.grid_polynomial import agrees_with_grid
+from gpuvision.camera.patterns.lattice import index_grid, index_patches
 from reference.patterns import view
 
 
@@ -66,9 +66,9 @@ def test_every_point_has_its_place(
     spurious = rng.uniform(0, 1000, (15, 2))
     far = np.linalg.norm(spurious[:, None] - nodes.reshape(-1, 2), axis=-1).min(axis=1) > 12.0
     points = np.concatenate([points, spurious[far]])
-    grid = whole_grid(points, 9, "points")
+    grid = index_grid(points, 9, "points")
     # What a spurious point leads astray lies off the grid, as it does itself; so finders tell it.
-    grid[~on_grid(np.where(grid[..., None] < 0, np.nan, points[grid]), 7.0, 0.02)] = -1
+    grid[~agrees_with_grid(np.where(grid[..., None] < 0, np.nan, points[grid]), 7.0, 0.02)] = -1
     grid[grid >= len(names)] = -1
     assert np.count_nonzero(grid >= 0) > 0.9 * len(names)
     assert _consistent(grid, names)
@@ -77,7 +77,7 @@ def test_every_point_has_its_place(
 @pytest.mark.parametrize("turn", [-170, -80, -44, 0, 44, 100])
 def test_columns_grow_with_x_and_rows_with_y(turn: int, rng: np.random.Generator) -> None:
     points = rng.permutation(view((1000, 1000), 12, 15, 50.0, turn=turn).nodes(12, 15).reshape(-1, 2))
-    grid = whole_grid(points, 9, "points")
+    grid = index_grid(points, 9, "points")
     across, down = points[grid[0, -1]] - points[grid[0, 0]], points[grid[-1, 0]] - points[grid[0, 0]]
     assert across[0] > abs(across[1])
     assert down[1] > abs(down[0])
@@ -88,8 +88,8 @@ def test_parts_are_joined_over_a_gap(rng: np.random.Generator) -> None:
     names = np.argwhere(np.ones((20, 24), bool))
     names = rng.permutation(names[(names[:, 1] < 9) | (names[:, 1] > 12)])
     points = nodes[tuple(names.T)]
-    assert len(charts(points, 9)) == 2
-    grid = whole_grid(points, 9, "points")
+    assert len(index_patches(points, 9)) == 2
+    grid = index_grid(points, 9, "points")
     assert grid.shape == (20, 24)
     assert _consistent(grid, names)
 
@@ -98,20 +98,20 @@ def test_parts_that_do_not_fit_together_are_told() -> None:
     left = view((1000, 1000), 12, 12, 35.0).nodes(12, 12).reshape(-1, 2)
     right = view((2400, 1000), 10, 10, 35.0, turn=20).nodes(10, 10).reshape(-1, 2)
     with pytest.raises(ValueError, match="broke into 2 parts of 144 and 100 points"):
-        whole_grid(np.concatenate([left, right]), 9, "points")
+        index_grid(np.concatenate([left, right]), 9, "points")
 
 
 @pytest.mark.parametrize("count", [0, 1, 8])
 def test_too_few_points(count: int) -> None:
     with pytest.raises(ValueError, match=f"{count or 'no'} points found; expected at least 9"):
-        whole_grid(np.arange(2.0 * count).reshape(-1, 2), 9, "points")
+        index_grid(np.arange(2.0 * count).reshape(-1, 2), 9, "points")
 
 
 def test_points_on_no_grid(rng: np.random.Generator) -> None:
     with pytest.raises(ValueError, match="30 points found, but they lie on no grid"):
-        whole_grid(np.cumsum(rng.uniform(5, 50, (30, 2)), axis=0), 9, "points")
+        index_grid(np.cumsum(rng.uniform(5, 50, (30, 2)), axis=0), 9, "points")
 
 
 def test_points_in_a_row_are_no_grid() -> None:
     with pytest.raises(ValueError, match="no grid"):
-        whole_grid(np.stack([np.arange(30.0) * 10, np.zeros(30)], axis=1), 9, "points")
+        index_grid(np.stack([np.arange(30.0) * 10, np.zeros(30)], axis=1), 9, "points")

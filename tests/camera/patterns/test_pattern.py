@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gpuvision.camera.patterns.grid_polynomial import GridPolynomial, on_grid
-from gpuvision.camera.patterns.pattern import finder_image, localisation_noise, nan_median, trimmed
+from gpuvision.camera.patterns.grid_polynomial import GridPolynomial, agrees_with_grid
+from gpuvision.camera.patterns.pattern import estimate_localisation_noise, finder_image, nan_median, trim_empty_border
 from reference.patterns import view
 
 
@@ -52,12 +52,12 @@ def test_noise_is_found_whatever_the_lens(
     points = view((1000, 1000), rows, columns, 800 / columns, barrel=barrel, tilt=20).nodes(rows, columns)
     points += rng.normal(0.0, 0.1, points.shape)
     points[rng.random((rows, columns)) < 0.05] = np.nan
-    assert localisation_noise(points) == pytest.approx(0.1, rel=within)
+    assert estimate_localisation_noise(points) == pytest.approx(0.1, rel=within)
 
 
 def test_noise_of_too_few_points_is_not_a_number() -> None:
-    assert math.isnan(localisation_noise(np.zeros((1, 4, 2))))
-    assert math.isnan(localisation_noise(np.full((9, 9, 2), np.nan)))
+    assert math.isnan(estimate_localisation_noise(np.zeros((1, 4, 2))))
+    assert math.isnan(estimate_localisation_noise(np.full((9, 9, 2), np.nan)))
 
 
 @given(st.lists(st.floats(-10, 10) | st.just(math.nan), min_size=1, max_size=8))
@@ -70,8 +70,8 @@ def test_nan_median_is_numpys(values: list[float]) -> None:
 def test_trimmed_cuts_the_border_only() -> None:
     points = np.full((5, 6, 2), np.nan)
     points[1, 2] = points[3, 4] = 0.0
-    assert trimmed(points).shape == (3, 3, 2)
-    assert trimmed(points[:1]).shape == (0, 0, 2)
+    assert trim_empty_border(points).shape == (3, 3, 2)
+    assert trim_empty_border(points[:1]).shape == (0, 0, 2)
 
 
 @settings(deadline=None)
@@ -95,8 +95,8 @@ def test_points_off_the_grid_are_told_also_at_its_border(rng: np.random.Generato
     for node in off:
         points[node] += 0.8, -0.6
     points[4, 4] = np.nan
-    told = {(int(i), int(j)) for i, j in np.argwhere(~on_grid(points, 7.0, 0.003))}
+    told = {(int(i), int(j)) for i, j in np.argwhere(~agrees_with_grid(points, 7.0, 0.003))}
     # In a corner, what is off is as likely one point as its neighbour.
     assert told >= set(off)
     assert len(told) <= len(off) + 3
-    assert not on_grid(np.full((3, 3, 2), np.nan), 7.0, 0.003).any()
+    assert not agrees_with_grid(np.full((3, 3, 2), np.nan), 7.0, 0.003).any()

@@ -75,13 +75,13 @@ def case_of(name: str, file: str, shape: tuple[int, int]) -> Case:
     theirs = discorpy_fit(families)
     start = time.perf_counter()
     chosen = fit_lens(families)
-    taken = time.perf_counter() - start
+    line_coefficients = time.perf_counter() - start
     facts |= {
         "points": sum(len(line) for family in families for line in family),
         "error_raw": straightness_px(families),
         "error_discorpy": straightness_px(families, theirs()),
         "model": f"{chosen.model}, {chosen.lines}",
-        "seconds_with_choice": taken,
+        "seconds_with_choice": line_coefficients,
     }
     return Case("calibration", name, ours, {"discorpy": theirs}, straightness_px(families, ours()), facts=facts)
 

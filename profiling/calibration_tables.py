@@ -11,9 +11,9 @@ import numpy as np
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
-from gpuvision.camera.lines.alternating_minimisation import STRATEGIES, alternate
+from gpuvision.camera.lines.alternating_minimisation import ALTERNATING_SOLVERS, minimise_alternating
 from gpuvision.camera.lines.line_families import grid_lines, pack
-from gpuvision.camera.lines.vanishing_points import Strategy, fit_lens, straightness_px
+from gpuvision.camera.lines.vanishing_points import Solver, fit_lens, straightness_px
 from gpuvision.profiling.calibration import Families, Float64, Radial, discorpy_fit, tilted_grid
 
 _SIZE = (1024, 1024)
@@ -27,27 +27,27 @@ def radial_lens(border: float) -> Lens:
     return Lens(k1=1.15 * border / _CORNER**3, k2=-0.15 * border / _CORNER**5, centre=_CENTRE)
 
 
-def strategies(noise: float = 0.05) -> Iterator[str]:
-    """Compare the thesis' strategies with ours: 10 px at the border, tilted by 20 degrees, k1 and k2."""
+def solvers(noise: float = 0.05) -> Iterator[str]:
+    """Compare the thesis' solvers with variable projection: 10 px at the border, tilt 20 degrees, k1 and k2."""
     lens = radial_lens(10.0)
-    yield from _head(
-        "points", "strategy", "rounds", "evaluations", "ms", "rms px", "centre off px", "correction off px"
-    )
+    yield from _head("points", "solver", "rounds", "evaluations", "ms", "rms px", "centre off px", "correction off px")
     for shape in ((5, 9), (23, 31)):
         ideal = tilted_grid(shape, 20.0, _SIZE)
         points = lens.distort(ideal) + np.random.default_rng(1).normal(0.0, noise, ideal.shape)
         families = grid_lines(points)
-        for strategy in get_args(Strategy):
+        for solver in get_args(Solver):
             start = time.perf_counter()
-            fit = fit_lens(families, model="k1,k2", lines="vanishing", strategy=strategy)
-            taken = 1e3 * (time.perf_counter() - start)
+            fit = fit_lens(families, model="k1,k2", lines="vanishing", solver=solver)
+            line_coefficients = 1e3 * (time.perf_counter() - start)
             assert fit.lens is not None
             rounds = fit.iterations
-            count = alternate(pack(families), 2, strategy).evaluations if strategy in STRATEGIES else rounds
+            count = (
+                minimise_alternating(pack(families), 2, solver).evaluations if solver in ALTERNATING_SOLVERS else rounds
+            )
             away = float(np.hypot(*np.subtract(fit.lens.centre, _CENTRE)))
             error = correction_error(fit.lens, lens, points)
-            words = (f"{shape[0]} x {shape[1]}", strategy.replace("_", " "), f"{rounds}", f"{count}")
-            yield _row(*words, f"{taken:.3g}", f"{fit.rms_px:.4f}", f"{away:.2g}", f"{error:.2g}")
+            words = (f"{shape[0]} x {shape[1]}", solver.replace("_", " "), f"{rounds}", f"{count}")
+            yield _row(*words, f"{line_coefficients:.3g}", f"{fit.rms_px:.4f}", f"{away:.2g}", f"{error:.2g}")
 
 
 def accuracy() -> Iterator[str]:
@@ -123,7 +123,7 @@ def _row(*words: str) -> str:
 
 
 if __name__ == "__main__":
-    for table in (strategies, accuracy, tilted_sensor):
+    for table in (solvers, accuracy, tilted_sensor):
         print(f"\n{table.__doc__}\n")
         for line in table():
             print(line, flush=True)

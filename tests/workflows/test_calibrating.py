@@ -212,7 +212,7 @@ def test_missing_and_unreadable_files(tmp_path: Path, device: Device) -> None:
 
 
 def test_inputs_of_one_name(tmp_path: Path, device: Device) -> None:
-    with pytest.raises(RecordingError, match="several inputs are called a"):
+    with pytest.raises(RecordingError, match="several inputs have the name a"):
         undistort_files([tmp_path / "a.png", tmp_path / "b" / "a.tif"], LENS, tmp_path / "out", device=device)
 
 

@@ -1,8 +1,14 @@
-"""The thesis' alternating minimisation (F. de Jong, 3.3.6), to compare `gpuvision.camera.lines.vanishing_points` with.
+"""Alternating minimisation over lens and vanishing points, the thesis' method, for comparison.
 
-Distances are those of the undistorted image from lines through the vanishing points (eq. 3.10, 3.14, 3.15). In turn the
-vanishing points are sought for a fixed lens, by Nelder and Mead's simplex, and the lens for fixed vanishing points, by
-one of three strategies. All work in packed coordinates: in pixels k1 and the centre differ by ten orders of magnitude.
+The residuals are distances, in the undistorted image, of points from lines through the vanishing points. Each round
+estimates the vanishing points for a fixed lens by the Nelder-Mead simplex, then the lens for fixed vanishing points by
+one of three solvers. All work in packed coordinates: in pixels, k1 and the centre differ by ten orders of magnitude.
+`gpuvision.camera.lines.vanishing_points` has the faster method.
+
+References
+----------
+F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 3.3.6, eq. 3.10,
+3.14 and 3.15.
 """
 
 from __future__ import annotations
@@ -18,31 +24,32 @@ from gpuvision.camera.lines.straightness import (
     LineSet,
     Parameters,
     Undistorted,
-    best_lines,
-    columns,
     evaluate,
-    inner,
+    fit_lines,
+    inner_products,
     moments,
     normal_equations,
+    residual_jacobian,
     undistort,
 )
 from gpuvision.camera.lines.variable_projection import Minimum
 
 _SETTLED = 1e-6
-"""Part of the sum of squares that a round has to gain to be followed by another."""
-_DESCENTS = 50
+"""Least relative decrease of the sum of squares by a round or a descent step that is followed by another one."""
+_MAX_DESCENTS = 50
+# Options of scipy's Nelder-Mead, in packed coordinates.
 _SIMPLEX = {"xatol": 1e-6, "fatol": 1e-11, "maxfev": 2000}
 
 
-class Alternation(NamedTuple):
-    """How an alternating minimisation went.
+class AlternatingMinimum(NamedTuple):
+    """Result of an alternating minimisation.
 
     Attributes
     ----------
-    minimum
-        Where it ended; ``steps`` are its rounds.
-    evaluations
-        Sums of squares and gradients computed.
+    minimum : Minimum
+        Final parameters; ``iterations`` counts the rounds.
+    evaluations : int
+        Number of evaluations of the sum of squares or its gradient.
     """
 
     minimum: Minimum
@@ -50,7 +57,7 @@ class Alternation(NamedTuple):
 
 
 class _Objective:
-    """Sum of squared distances in the undistorted image, lines in closed form; counts how often it is asked for."""
+    """Sum of squared distances in the undistorted image, with lines in closed form; counts its evaluations."""
 
     def __init__(self, packed: PackedLines, order: int) -> None:
         self.packed, self.order, self.evaluations = packed, order, 0
@@ -61,17 +68,17 @@ class _Objective:
         packed = self.packed
         moved = undistort(packed, lens[: self.order], lens[self.order :])
         at = Parameters(lens[: self.order], lens[self.order :], _homogeneous(points))
-        lines = best_lines(packed, at, moments(packed, moved.x, moved.y, None))
+        lines = fit_lines(packed, at, moments(packed, moved.x, moved.y, None))
         nx, ny = lines.nx[packed.line], lines.ny[packed.line]
         return moved, lines, nx * moved.x + ny * moved.y + lines.offset[packed.line]
 
     def cost(self, lens: Float64, points: Float64) -> float:
-        """Sum of squares."""
+        """Return the sum of squares."""
         distance = self.distances(lens, points)[2]
-        return float(inner(distance, distance))
+        return float(inner_products(distance, distance))
 
     def slopes(self, lens: Float64, points: Float64) -> tuple[Float64, Float64]:
-        """Distances (n,) and their derivatives (parameters, n) by the lens, the lines where they are."""
+        """Return distances (n,) and their derivatives by the lens (parameters, n) for fixed lines."""
         moved, lines, distance = self.distances(lens, points)
         nx, ny = lines.nx[self.packed.line], lines.ny[self.packed.line]
         along = nx * moved.dx + ny * moved.dy
@@ -87,7 +94,7 @@ def _homogeneous(points: Float64) -> Float64:
     return np.asarray(lifted / np.linalg.norm(lifted, axis=1, keepdims=True))
 
 
-def _nelder_mead(objective: _Objective, lens: Float64, points: Float64) -> Float64:
+def _fit_nelder_mead(objective: _Objective, lens: Float64, points: Float64) -> Float64:
     simplex = lens + np.vstack([np.zeros(len(lens)), np.diag(np.r_[np.full(objective.order, 0.05), 0.1, 0.1])])
     found = scipy.optimize.minimize(
         objective.cost, lens, args=(points,), method="Nelder-Mead", options=_SIMPLEX | {"initial_simplex": simplex}
@@ -95,12 +102,12 @@ def _nelder_mead(objective: _Objective, lens: Float64, points: Float64) -> Float
     return np.asarray(found.x)
 
 
-def _steepest_descent(objective: _Objective, lens: Float64, points: Float64) -> Float64:
-    """Go down the gradient, as far as a halved or doubled step still gains."""
+def _fit_steepest_descent(objective: _Objective, lens: Float64, points: Float64) -> Float64:
+    """Follow the negative gradient; halve or double the step length as long as the cost decreases."""
     reach = 1e-3
-    for _ in range(_DESCENTS):
+    for _ in range(_MAX_DESCENTS):
         distance, slopes = objective.slopes(lens, points)
-        gradient, here = inner(slopes, distance[None])[:, 0], float(inner(distance, distance))
+        gradient, here = inner_products(slopes, distance[None])[:, 0], float(inner_products(distance, distance))
         length = float(np.linalg.norm(gradient))
         if length == 0.0:
             break
@@ -114,14 +121,19 @@ def _steepest_descent(objective: _Objective, lens: Float64, points: Float64) -> 
     return lens
 
 
-def _gauss_newton(objective: _Objective, lens: Float64, points: Float64) -> Float64:
-    """Take linear steps, halved until they gain; lines are fitted again after each."""
-    for _ in range(_DESCENTS):
+def _fit_gauss_newton(objective: _Objective, lens: Float64, points: Float64) -> Float64:
+    """Take Gauss-Newton steps, halved until the cost decreases; the lines are fitted again after each step."""
+    for _ in range(_MAX_DESCENTS):
         distance, slopes = objective.slopes(lens, points)
-        here = float(inner(distance, distance))
+        here = float(inner_products(distance, distance))
         scale = 1.0 / np.sqrt(np.maximum(np.einsum("in,in->i", slopes, slopes), 1e-30))
         slopes *= scale[:, None]
-        step = -scale * np.linalg.lstsq(inner(slopes, slopes), inner(slopes, distance[None])[:, 0], rcond=1e-12)[0]
+        step = (
+            -scale
+            * np.linalg.lstsq(
+                inner_products(slopes, slopes), inner_products(slopes, distance[None])[:, 0], rcond=1e-12
+            )[0]
+        )
         after = objective.cost(lens + step, points)
         while after >= here and np.max(np.abs(step)) > 1e-12:
             step = 0.5 * step
@@ -132,48 +144,52 @@ def _gauss_newton(objective: _Objective, lens: Float64, points: Float64) -> Floa
     return lens
 
 
-STRATEGIES: Mapping[str, Callable[[_Objective, Float64, Float64], Float64]] = {
-    "nelder_mead": _nelder_mead,
-    "steepest_descent": _steepest_descent,
-    "gauss_newton": _gauss_newton,
+ALTERNATING_SOLVERS: Mapping[str, Callable[[_Objective, Float64, Float64], Float64]] = {
+    "nelder_mead": _fit_nelder_mead,
+    "steepest_descent": _fit_steepest_descent,
+    "gauss_newton": _fit_gauss_newton,
 }
 
 
-def alternate(packed: PackedLines, order: int, strategy: str, *, rounds: int = 100) -> Alternation:
-    """Alternate between vanishing points and lens until neither gains.
+def minimise_alternating(packed: PackedLines, order: int, solver: str, *, max_rounds: int = 100) -> AlternatingMinimum:
+    """Alternate between vanishing points and lens until the cost no longer decreases.
 
     Parameters
     ----------
-    packed
-        The measured points; each family needs two lines.
-    order
-        Coefficients of the lens.
-    strategy
-        How the lens is sought: "nelder_mead", "steepest_descent" or "gauss_newton".
-    rounds
-        At most.
+    packed : PackedLines
+        Measured points; each family needs two lines.
+    order : int
+        Number of distortion coefficients, 1 or 2.
+    solver : {"nelder_mead", "steepest_descent", "gauss_newton"}
+        Solver of the lens.
+    max_rounds : int
+        Largest number of rounds. Default 100.
+
+    Returns
+    -------
+    AlternatingMinimum
     """
     objective = _Objective(packed, order)
     lens = np.concatenate([np.zeros(order), centre_from_curvature(packed)])
-    points = points_from_intersections(packed)
+    points = mean_intersections(packed)
     before, done = objective.cost(lens, points), 0
-    while done < rounds:
+    while done < max_rounds:
         done += 1
-        points = _best_points(objective, lens, points)
-        lens = STRATEGIES[strategy](objective, lens, points)
+        points = _fit_vanishing_points(objective, lens, points)
+        lens = ALTERNATING_SOLVERS[solver](objective, lens, points)
         after = objective.cost(lens, points)
         if before - after <= _SETTLED * before:
             break
         before = after
     at = Parameters(lens[:order], lens[order:], _homogeneous(points))
     here = evaluate(packed, at)
-    slopes = columns(order, here)
+    slopes = residual_jacobian(order, here)
     normal = normal_equations(packed, at, here, slopes)
-    return Alternation(Minimum(at, here, slopes, normal, done, ""), objective.evaluations)
+    return AlternatingMinimum(Minimum(at, here, slopes, normal, done, ""), objective.evaluations)
 
 
-def _best_points(objective: _Objective, lens: Float64, points: Float64) -> Float64:
-    """Seek the vanishing points one after the other: a family's distances depend on its own alone."""
+def _fit_vanishing_points(objective: _Objective, lens: Float64, points: Float64) -> Float64:
+    """Estimate the vanishing points one by one: the distances of a family depend on its own point only."""
     points = points.copy()
     for number in range(len(points)):
 
@@ -184,8 +200,8 @@ def _best_points(objective: _Objective, lens: Float64, points: Float64) -> Float
     return points
 
 
-def points_from_intersections(packed: PackedLines) -> Float64:
-    """Mean intersection (families, 2) of each family's pairs of lines, as they are measured."""
+def mean_intersections(packed: PackedLines) -> Float64:
+    """Return the mean intersection (families, 2) of all pairs of measured lines of each family."""
     none = Parameters(np.empty(0), np.zeros(2), None)
     lines = np.stack(evaluate(packed, none).lines, axis=-1)
     points = np.zeros((packed.families, 2))
@@ -200,10 +216,12 @@ def points_from_intersections(packed: PackedLines) -> Float64:
 
 
 def centre_from_curvature(packed: PackedLines) -> Float64:
-    """Return the point nearest to the normals at the lines' points of extreme curvature: (sum t t')c = sum t t'p.
+    """Estimate the distortion centre from the lines' points of extreme curvature.
 
-    A distorted line is symmetric about its perpendicular through the centre, so its curvature is extreme there. Along
-    a chord it is a quartic in the distance; the middle of the data where no line shows an extreme.
+    A distorted line is symmetric about its perpendicular through the centre, so its curvature is extreme there. A
+    quartic along the chord approximates the line. The centre is the point nearest to the normals at these points:
+    (sum t t') c = sum t t' p with tangents t and points p. The result is the middle of the data if the lines show no
+    extreme curvature.
     """
     matrix, right = np.zeros((2, 2)), np.zeros(2)
     for start, count in zip(packed.starts, packed.counts, strict=True):

@@ -1,4 +1,4 @@
-"""A lens from straight lines as its user sees it: in pixels, with uncertainties, alternatives and warnings."""
+"""Result of a lens fit to straight lines: parameters in pixels, uncertainties, alternatives and warnings."""
 
 from __future__ import annotations
 
@@ -15,50 +15,67 @@ from gpuvision.camera.lines.straightness import pencil_basis
 from gpuvision.camera.lines.variable_projection import Minimum, vanishing_start
 
 LensModel = Literal["none", "k1", "k1,k2"]
-Meeting = Literal["auto", "vanishing", "free"]
+LineConstraint = Literal["auto", "vanishing", "free"]
 
 MODELS: tuple[LensModel, ...] = ("none", "k1", "k1,k2")
-"""By the number of their coefficients."""
-REJECTED = 0.05
-"""Probability below which a smaller model does not suffice."""
-_AS_WELL = 1.01
-"""Ratio of rms up to which an alternative fits as well."""
-_VAGUE = 0.1
-"""Standard deviation of the centre, in half-diagonals, from which the data are said not to fix it."""
-
+"""Lens models by number of distortion coefficients."""
+# Standard deviation of a normal distribution over its median absolute deviation.
 _NORMAL_MAD = 1.4826
+# Residual [half-diagonals] at rounding level.
 _ROUNDING = 1e-9
-_TAILED = 2.0
-"""Ratio of rms to what half of the points suggest, from which errors are not normal."""
-_FAINT = 100.0
-"""Variances that bends have to explain for linear uncertainties of k1 beside k2 to hold."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensFitLimits:
+    """Thresholds of the model choice and of the warnings of `fit_lens`.
+
+    Attributes
+    ----------
+    significance : float
+        p-value below which an F test rejects the smaller model.
+    max_rms_ratio : float
+        Ratio of the rms of an alternative to that of the chosen model, up to which the warnings treat it as equally
+        good.
+    max_centre_sigma : float
+        Standard deviation of the centre [half-diagonals] above which a warning says that the data do not determine it.
+    max_tail_ratio : float
+        Ratio of the rms to the standard deviation estimated from the median, above which outliers are reported.
+    min_bend_variances : float
+        Decrease of the sum of squares [variances] below which the linear uncertainties of k1 and k2 together are rough.
+    """
+
+    significance: float = 0.05
+    max_rms_ratio: float = 1.01
+    max_centre_sigma: float = 0.1
+    max_tail_ratio: float = 2.0
+    min_bend_variances: float = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class LensAlternative:
-    """A model that was fitted too.
+    """Alternative lens model, fitted to the same points.
 
     Attributes
     ----------
-    model
-        Its distortion coefficients.
-    lines
-        "vanishing" where the lines of a family meet in one point.
-    rms_px
-        As in `LensFit`.
-    p_value
-        Probability that the largest model fits that much better though this one is true: it is rejected below 0.05.
-        Against vanishing points where both this one and the chosen one have them, otherwise against free lines.
-    aic
-        Akaike's criterion, less that of the chosen model: negative where this one would be preferred.
-    centre
-        (column, row); None for "none".
-    centre_distance_px
-        From the chosen model's centre; NaN where one of them has none.
+    model : {"none", "k1", "k1,k2"}
+        Distortion coefficients.
+    lines : {"vanishing", "free"}
+        "vanishing": the lines of a family meet in one point. "free": no constraint.
+    rms_px : float
+        Root mean square residual [px], as in `LensFit`.
+    p_value : float
+        p-value of the F test against the largest model; below 0.05 this model is rejected. The largest model has
+        vanishing points if both this one and the chosen one have them.
+    aic : float
+        Akaike information criterion minus that of the chosen model; negative favours this one.
+    centre : (float, float) or None
+        Column and row of the distortion centre [px]; None for "none".
+    centre_distance_px : float
+        Distance from the chosen model's centre [px]; NaN if one of them has no centre.
     """
 
     model: LensModel
-    lines: Meeting
+    lines: LineConstraint
     rms_px: float
     p_value: float
     aic: float
@@ -68,42 +85,42 @@ class LensAlternative:
 
 @dataclass(frozen=True, kw_only=True)
 class LensFit:
-    """A lens from straight lines.
+    """Lens fitted to straight lines.
 
     Attributes
     ----------
-    lens
-        Measured -> undistorted, in pixels; None where the data ask for none.
-    model
-        Its coefficients.
-    lines
-        "vanishing" where the lines of each family were asked to meet in one point, or "free".
-    vanishing_points
-        (families, 3), unit homogeneous (column, row, 1), undistorted; the one at infinity has a last component of 0.
+    lens : Lens or None
+        Lens from measured to undistorted pixels; None if the data need no lens.
+    model : {"none", "k1", "k1,k2"}
+        Distortion coefficients.
+    lines : {"vanishing", "free"}
+        "vanishing": the lines of each family were constrained to meet in one point. "free": no constraint.
+    vanishing_points : numpy.ndarray
+        (families, 3): unit homogeneous (column, row, 1), undistorted; the last component of a point at infinity is 0.
         NaN for a family of fewer than two lines.
     names, values, covariance
-        Of the parameters: k1 [px^-2], k2 [px^-4], C_c, R_c [px] and, where lines meet, the three components of
-        each vanishing point.
-    residuals_px
-        Per family, for each line in turn an array of distances from the line in the measured image; NaN where a
-        point or its line was not used.
-    rms_px
-        Root mean square of these distances; of weighted ones where outliers were given less weight.
-    sigma_px
-        Error of a coordinate: given, or estimated from the residuals and the degrees of freedom.
-    degrees_of_freedom
-        Residuals less parameters, those of the lines among them.
-    iterations
-        Steps of the minimisation.
-    alternatives
-        Other models, where there was a choice.
-    warnings
-        What the data cannot fix.
+        Names, values (m,) and covariance (m, m) of the parameters: k1 [px^-2], k2 [px^-4], C_c, R_c [px] and, with
+        vanishing points, the three components of each.
+    residuals_px : tuple
+        Per family and line an array (n,) of signed distances from the line in the measured image [px]; NaN for points
+        that were not used.
+    rms_px : float
+        Root mean square of these distances [px], weighted under a robust loss.
+    sigma_px : float
+        Standard deviation of a coordinate [px]: given, or estimated from the residuals and the degrees of freedom.
+    degrees_of_freedom : int
+        Residuals minus parameters, including those of the lines.
+    iterations : int
+        Number of steps of the minimisation.
+    alternatives : tuple of LensAlternative
+        Alternative models, if the model was chosen automatically.
+    warnings : tuple of str
+        Parameters that the data do not determine, and other doubts.
     """
 
     lens: Lens | None
     model: LensModel
-    lines: Meeting
+    lines: LineConstraint
     vanishing_points: Float64
     names: tuple[str, ...]
     values: Float64
@@ -118,29 +135,29 @@ class LensFit:
 
     @property
     def uncertainties(self) -> dict[str, float]:
-        """Standard deviation of each parameter by its name."""
+        """Standard deviation of each parameter, by name."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
 def centre_px(packed: PackedLines, found: Minimum) -> tuple[float, float]:
-    """Column and row of the centre."""
+    """Return column and row of the centre [px]."""
     column, row = (packed.origin + packed.unit * found.at.centre).tolist()
     return column, row
 
 
 def rms_px(packed: PackedLines, found: Minimum, weight: Float64 | None) -> float:
-    """Root mean square distance."""
+    """Return the root mean square distance [px]."""
     return packed.unit * math.sqrt(float(np.average(found.here.distance**2, weights=weight)))
 
 
 def _pixel_matrix(packed: PackedLines) -> Float64:
-    """Packed -> pixel coordinates, of homogeneous points."""
+    """Return the matrix (3, 3) from packed to pixel coordinates of homogeneous points."""
     x, y = packed.origin
     return np.array([[packed.unit, 0.0, x], [0.0, packed.unit, y], [0.0, 0.0, 1.0]])
 
 
-def points_px(packed: PackedLines, found: Minimum) -> Float64:
-    """Vanishing points as in `LensFit`; where lines were free, the points nearest to them."""
+def vanishing_points_px(packed: PackedLines, found: Minimum) -> Float64:
+    """Return the vanishing points of `LensFit`; for free lines the points nearest to the lines of each family."""
     points = found.at.vanishing
     if points is None:
         points = vanishing_start(packed, found.here.lines)
@@ -151,7 +168,7 @@ def points_px(packed: PackedLines, found: Minimum) -> Float64:
 
 
 def parameters_px(packed: PackedLines, found: Minimum, spread: Float64) -> tuple[tuple[str, ...], Float64, Float64]:
-    """Return names, values and covariance of the parameters."""
+    """Return names, values and covariance of the parameters in pixels."""
     at = found.at
     order = len(at.k)
     powers = packed.unit ** (-2.0 * np.arange(1, order + 1))
@@ -165,7 +182,7 @@ def parameters_px(packed: PackedLines, found: Minimum, spread: Float64) -> tuple
     if at.vanishing is None:
         return tuple(names), values, spread * np.outer(scale, scale)
     matrix = _pixel_matrix(packed)
-    slopes, points = [], points_px(packed, found)
+    slopes, points = [], vanishing_points_px(packed, found)
     for number, (point, tangents) in enumerate(zip(points, pencil_basis(at.vanishing), strict=True)):
         if np.all(np.isfinite(point)):
             length = point @ (matrix @ at.vanishing[number])
@@ -186,7 +203,7 @@ def parameters_px(packed: PackedLines, found: Minimum, spread: Float64) -> tuple
 
 
 def residuals_px(packed: PackedLines, found: Minimum, families: LineFamilies) -> tuple[tuple[Float64, ...], ...]:
-    """Distances as in `LensFit`."""
+    """Return the residuals of `LensFit`."""
     every = np.full(len(packed.used), np.nan)
     every[packed.used] = found.here.distance * packed.unit
     start, sorted_out = 0, []
@@ -200,44 +217,48 @@ def residuals_px(packed: PackedLines, found: Minimum, families: LineFamilies) ->
     return tuple(sorted_out)
 
 
-def warnings_of(fit: LensFit, packed: PackedLines, found: Minimum, straight: float, bends: float) -> Iterator[str]:
-    """Say what the data cannot fix.
+def fit_warnings(
+    fit: LensFit, packed: PackedLines, found: Minimum, straight: float, bends: float, limits: LensFitLimits
+) -> Iterator[str]:
+    """Yield a warning for every parameter that the data do not determine.
 
     Parameters
     ----------
     fit, packed, found
-        The fit, its points, and the minimum that it is.
-    straight
-        Probability of such bends of the lines without any lens.
-    bends
-        By how many variances the bends lower the sum of squares.
+        Fit, packed points and minimum.
+    straight : float
+        p-value of the test that the lines are straight without a lens.
+    bends : float
+        Decrease of the sum of squares by the first-order bends [variances].
+    limits : LensFitLimits
+        Thresholds.
     """
     single = np.bincount(packed.family, minlength=packed.families) < 2
     if fit.lines == "vanishing" and single.any():
         yield f"families {np.flatnonzero(single).tolist()} have fewer than two lines, hence no vanishing point"
-    usual = _NORMAL_MAD * packed.unit * float(np.median(np.abs(found.here.distance)))
-    if fit.rms_px > max(_TAILED * usual, _ROUNDING * packed.unit):
+    robust_sigma = _NORMAL_MAD * packed.unit * float(np.median(np.abs(found.here.distance)))
+    if fit.rms_px > max(limits.max_tail_ratio * robust_sigma, _ROUNDING * packed.unit):
         yield (
-            f"half of the points lie within {usual / _NORMAL_MAD:.3g} pixels, but the rms is {fit.rms_px:.3g}: "
+            f"half of the points lie within {robust_sigma / _NORMAL_MAD:.3g} pixels, but the rms is {fit.rms_px:.3g}: "
             "there are outliers; use loss='tukey'"
         )
     if fit.lens is None:
         return
     if found.at_bound == "fold":
-        yield "the best lens would fold the image inside the data; it was kept just from that: the model does not suit"
+        yield "the best lens would fold inside the data; it was constrained to stay invertible: the model does not suit"
     if found.at_bound == "centre":
-        yield "the data pull the centre out of sight: there is too little distortion to find it"
-    if straight > REJECTED:
+        yield "the centre moved to its bound, far outside the data: the distortion is too small to determine it"
+    if straight > limits.significance:
         yield f"the lines are as straight without a lens (p = {straight:.2g}): its parameters are noise"
-    elif fit.model == "k1,k2" and bends < _FAINT:
-        yield "the distortion is faint for two coefficients: their uncertainties are rough; expected more data, or k1"
+    elif fit.model == "k1,k2" and bends < limits.min_bend_variances:
+        yield "the distortion is faint for two coefficients: their uncertainties are rough; use more data, or model k1"
     row = fit.names.index("C_c")
     values, vectors = _axes(fit.covariance[row : row + 2, row : row + 2])
-    if values[1] > _VAGUE * packed.unit:
+    if values[1] > limits.max_centre_sigma * packed.unit:
         x, y = vectors[:, 1]
         yield f"the data fix the centre only to {values[1]:.3g} pixels along ({x:.2f}, {y:.2f})"
     for other in fit.alternatives:
-        if other.rms_px <= _AS_WELL * fit.rms_px and other.centre_distance_px > 3.0 * values[1]:
+        if other.rms_px <= limits.max_rms_ratio * fit.rms_px and other.centre_distance_px > 3.0 * values[1]:
             yield (
                 f"{other.model} with lines {other.lines} fits as well ({other.rms_px:.4g} to {fit.rms_px:.4g} pixels), "
                 f"but has its centre {other.centre_distance_px:.3g} pixels away"
@@ -245,7 +266,7 @@ def warnings_of(fit: LensFit, packed: PackedLines, found: Minimum, straight: flo
 
 
 def _axes(covariance: Float64) -> tuple[Float64, Float64]:
-    """Return standard deviations along the axes of an ellipse, the longer one last, and the axes as columns."""
+    """Return the standard deviations along the principal axes, the larger one last, and the axes as columns."""
     if not np.all(np.isfinite(covariance)):
         unknown = np.isinf(np.diag(covariance))
         return np.array([0.0, math.inf]), np.eye(2)[:, [1, 0]] if unknown[0] else np.eye(2)

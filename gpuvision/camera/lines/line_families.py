@@ -1,7 +1,8 @@
-"""Families of measured lines: what a straight-line calibration is made from.
+"""Families of measured lines, the input of a straight-line calibration.
 
-A family is a set of lines that are parallel in the scene, so that their images, once undistorted, meet in one
-vanishing point (F. de Jong, 3.3.5). A line is an array of measured points (column, row), in order along the line.
+A family is a set of lines that are parallel in the scene: their undistorted images meet in one vanishing point (F. de
+Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 3.3.5). A line is an array
+of measured points (column, row), in order along the line.
 """
 
 from __future__ import annotations
@@ -16,32 +17,31 @@ Float64 = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 LineFamilies = Sequence[Sequence[npt.ArrayLike]]
 
-_FEWEST = 3
-"""Points of a line that say something about its straightness."""
-_SPREAD = 1e-7
-"""Half-diagonals below which points of a line lie on one place."""
+_MIN_POINTS = 3
+"""Least number of points of a line. Derived: two points are always straight."""
+_MIN_EXTENT = 1e-7
+"""Standard deviation [half-diagonals] of the points of a line, below which they coincide. Derived: above rounding."""
 
 
 def grid_lines(points: npt.ArrayLike, *, diagonals: bool = False) -> tuple[tuple[Float64, ...], ...]:
-    """Lines of a grid of measured points, without the missing ones.
+    """Return the lines of a grid of measured points, without missing points.
 
     Parameters
     ----------
-    points
-        Shape (rows, columns, 2), (column, row) coordinates; NaN where a point is missing.
-    diagonals
-        Both diagonals too: they are parallel in the scene as well.
+    points : array_like
+        (rows, columns, 2): measured (column, row) [px]; NaN where missing.
+    diagonals : bool
+        Include both families of diagonals, which are parallel in the scene as well. Default False.
 
     Returns
     -------
     tuple
-        Families: the rows, the columns and, if asked for, both diagonals. A line that has fewer than three points
-        is left out.
+        Families: the rows, the columns and, if requested, both diagonals. Lines of fewer than three points are omitted.
 
     Raises
     ------
     ValueError
-        If the shape is another one.
+        The array has another shape.
     """
     grid = np.asarray(points, dtype=np.float64)
     if grid.ndim != 3 or grid.shape[2] != 2:
@@ -53,7 +53,7 @@ def grid_lines(points: npt.ArrayLike, *, diagonals: bool = False) -> tuple[tuple
 
 
 def _diagonals(grid: Float64) -> Float64:
-    """Return diagonals as rows, filled up with NaN."""
+    """Return the diagonals as rows, padded with NaN."""
     rows, columns = grid.shape[:2]
     sheared = np.full((rows + columns - 1, rows, 2), np.nan)
     row, column = np.indices((rows, columns))
@@ -63,28 +63,28 @@ def _diagonals(grid: Float64) -> Float64:
 
 def _family(sheet: Float64) -> tuple[Float64, ...]:
     there = np.isfinite(sheet[..., 0] + sheet[..., 1])
-    return tuple(line[kept] for line, kept in zip(sheet, there, strict=True) if np.count_nonzero(kept) >= _FEWEST)
+    return tuple(line[kept] for line, kept in zip(sheet, there, strict=True) if np.count_nonzero(kept) >= _MIN_POINTS)
 
 
-def families(points: npt.ArrayLike, family: npt.ArrayLike, line: npt.ArrayLike) -> tuple[tuple[Float64, ...], ...]:
-    """Sort a list of points into families of lines.
+def group_lines(points: npt.ArrayLike, family: npt.ArrayLike, line: npt.ArrayLike) -> tuple[tuple[Float64, ...], ...]:
+    """Group labelled points into families of lines.
 
     Parameters
     ----------
-    points
-        Shape (n, 2), in order along their lines.
-    family, line
-        Shape (n,): which family a point belongs to, and which line of it; any whole numbers.
+    points : array_like
+        (n, 2): measured (column, row) [px], in order along their lines.
+    family, line : array_like of int
+        (n,): labels of each point's family, and of its line in the family.
 
     Returns
     -------
     tuple
-        Families in the order of their numbers, of lines in the order of theirs.
+        Families in ascending order of their labels, with lines in ascending order of theirs.
 
     Raises
     ------
     ValueError
-        The shapes do not go together.
+        The shapes do not match.
     """
     places = np.asarray(points, dtype=np.float64)
     labels = np.stack([np.asarray(family), np.asarray(line)])
@@ -99,28 +99,28 @@ def families(points: npt.ArrayLike, family: npt.ArrayLike, line: npt.ArrayLike) 
 
 @dataclass(frozen=True)
 class PackedLines:
-    """All points of all lines in one array, in coordinates of about 1.
+    """Points of all lines in one array, in normalised coordinates.
 
     Attributes
     ----------
     x, y
-        Coordinates (n,): (pixel - origin) / unit, points of a line side by side.
+        Coordinates (n,): (pixel - origin) / unit; the points of a line are contiguous.
     line
         Index of each point's line (n,).
     starts, counts
-        First point of each line, and how many it has (lines,).
+        Index of the first point and number of points of each line (lines,).
     family
-        Index of each line's family (lines,); lines of a family lie side by side.
+        Index of each line's family (lines,); the lines of a family are contiguous.
     family_starts
-        First line of each family that has any.
+        Index of the first line of each family that is not empty.
     families
-        How many there are.
+        Number of families.
     origin, unit
-        Middle of the points, and half the diagonal of their extent, in pixels.
+        Centre of the points' bounding box (2,) and half its diagonal [px].
     corner
-        Half their extent (2,), in units.
+        Half the size of the bounding box (2,), in units.
     used
-        Which of all the points given, one line after the other, these are.
+        Mask over all input points, line by line: the points that are packed.
     """
 
     x: Float64
@@ -137,19 +137,19 @@ class PackedLines:
     used: npt.NDArray[np.bool_]
 
     def sums(self, values: Float64) -> Float64:
-        """Sum of values (..., n) over each line, shape (..., lines)."""
+        """Return the sums of values (..., n) over each line, (..., lines)."""
         return np.asarray(np.add.reduceat(values, self.starts, axis=-1))
 
 
 def pack(given: LineFamilies) -> PackedLines:
-    """Check families and pack them.
+    """Check families of lines and pack their points.
 
     Raises
     ------
     TypeError
-        If they are no arrays of numbers.
+        A line is no array of numbers.
     ValueError
-        If nothing in them can say how straight a line is.
+        No line has three finite points, or the points of a line coincide.
     """
     lines = [np.asarray(line, dtype=np.float64) for family in given for line in family]
     owner = np.repeat(np.arange(len(given)), [len(family) for family in given])
@@ -165,8 +165,8 @@ def pack(given: LineFamilies) -> PackedLines:
     if not there.all():
         places, line = places[there], line[there]
         counts = np.bincount(line, minlength=len(lines))
-    if counts.min() < _FEWEST:
-        kept = counts >= _FEWEST
+    if counts.min() < _MIN_POINTS:
+        kept = counts >= _MIN_POINTS
         chosen = kept[line]
         there[there] = chosen
         places, line = places[chosen], (np.cumsum(kept) - 1)[line[chosen]]
@@ -191,6 +191,6 @@ def _normalised(
     corner = 0.5 * (high - low) / unit
     packed = PackedLines(x, y, line, starts, counts, family, family_starts, families, origin, unit, corner, used)
     spread = packed.sums(x * x + y * y) / counts - (packed.sums(x) / counts) ** 2 - (packed.sums(y) / counts) ** 2
-    if spread.min() < _SPREAD**2:
+    if spread.min() < _MIN_EXTENT**2:
         raise ValueError(f"all points of line {int(np.argmin(spread))} lie on one place; expected points along it")
     return packed

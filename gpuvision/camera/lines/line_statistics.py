@@ -1,4 +1,4 @@
-"""What a fit to straight lines is worth: degrees of freedom, covariance, nested models, weights against outliers."""
+"""Statistics of a fit to straight lines: degrees of freedom, covariance, nested models, robust weights."""
 
 from __future__ import annotations
 
@@ -10,23 +10,30 @@ import numpy.typing as npt
 import scipy.special
 
 from gpuvision.camera.lines.line_families import Float64, PackedLines
-from gpuvision.camera.lines.straightness import Parameters, bound_lines, inner, projected_columns
+from gpuvision.camera.lines.straightness import Parameters, constrained_lines, inner_products, projected_columns
 from gpuvision.camera.lines.variable_projection import Minimum, linear_start, minimise
 
 Loss = Literal["squared", "huber", "tukey"]
 
-_TUNING = {"huber": 1.345, "tukey": 4.685}
-_ROUNDS = 20
-_SINGULAR = 1e-13
+# Tuning constants of Huber's and Tukey's loss [standard deviations]: 95 % efficiency for normal errors (P. Huber,
+# Robust Statistics, 1981).
+_TUNING_CONSTANTS = {"huber": 1.345, "tukey": 4.685}
+# Reweighting: largest number of rounds, and largest change of a weight that ends them.
+_MAX_ROUNDS = 20
 _SETTLED = 1e-3
+# Relative eigenvalue below which the data do not determine a parameter. Derived: above double rounding.
+_SINGULAR = 1e-13
+# Standard deviation of a normal distribution over its median absolute deviation.
 _NORMAL_MAD = 1.4826
+# Square root of Tukey's least weight.
 _LEAST_ROOT = 1e-4
-# Residuals below this part of the image are rounding; to test them against each other would be noise.
+# Residuals [half-diagonals] at rounding level, which no test may compare. Derived from double precision.
 _ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 
 
-def same_points(packed: PackedLines) -> npt.NDArray[np.intp]:
-    """Return the number (n,) of each measured point: a point of a grid lies on several lines."""
+def point_identifiers(packed: PackedLines) -> npt.NDArray[np.intp]:
+    """Return an identifier (n,) of each measured point; a grid point on several lines has one identifier."""
+    # The second coordinate gets an irrational factor, so that different points have different keys.
     key = packed.x + packed.y * 0.7548776662466927
     order = np.argsort(key)
     number = np.empty(len(key), dtype=np.intp)
@@ -34,34 +41,37 @@ def same_points(packed: PackedLines) -> npt.NDArray[np.intp]:
     return number
 
 
-def line_parameters(packed: PackedLines, at: Parameters) -> int:
-    """How many numbers say where the lines and their vanishing points are."""
-    bound = bound_lines(packed, at)
+def count_line_parameters(packed: PackedLines, at: Parameters) -> int:
+    """Return the number of parameters of the lines and their vanishing points."""
+    bound = constrained_lines(packed, at)
     return 2 * len(bound) - int(np.count_nonzero(bound)) + 2 * len(set(packed.family[bound].tolist()))
 
 
-def noise_dimensions(owner: npt.NDArray[np.intp]) -> int:
-    """Independent errors among the residuals: a measured point has two, on however many lines it lies."""
+def count_independent_errors(owner: npt.NDArray[np.intp]) -> int:
+    """Return the number of independent errors among the residuals: at most two per measured point."""
     return int(np.sum(np.minimum(np.bincount(owner), 2)))
 
 
-def chance(
+def p_value_of_gain(
     worse: float, better: float, more: int, residuals: tuple[int, int], freedom: int, variance: float | None
 ) -> float:
-    """Probability that ``more`` parameters lower the sum of squares this far although they are not needed.
+    """Return the p-value of the test of a smaller model against a larger one that contains it.
+
+    F test, or chi-square test if the variance is known: the probability of at least this decrease of the sum of squares
+    if the smaller model is true.
 
     Parameters
     ----------
-    worse, better
+    worse, better : float
         Sums of squares of the smaller and of the larger model.
-    more
-        Parameters that the larger one has in addition.
-    residuals
-        How many there are, and how many of them are independent.
-    freedom
-        Residuals less parameters of the larger model.
-    variance
-        Of a residual, if it is known.
+    more : int
+        Number of additional parameters of the larger model.
+    residuals : (int, int)
+        Number of residuals, and number of independent ones.
+    freedom : int
+        Degrees of freedom of the larger model: residuals minus parameters.
+    variance : float or None
+        Variance of a residual, if known.
     """
     if more == 0:
         return 1.0
@@ -77,12 +87,12 @@ def chance(
 def covariance(
     packed: PackedLines, found: Minimum, owner: npt.NDArray[np.intp], variance: float, *, keep_centre: bool
 ) -> Float64:
-    """Covariance of (k..., centre, two tangents per vanishing point) in packed coordinates.
+    """Return the covariance of (k..., centre, two tangents per vanishing point) in packed coordinates.
 
-    A point's error is one vector of two equal, independent components; what it does to each of the lines that the
-    point lies on is counted together. Parameters that the data do not fix have infinite variance.
+    A point's error is a vector with two independent components of equal variance. Its effects on all lines through the
+    point are summed. Parameters that the data do not determine have infinite variance.
     """
-    columns = projected_columns(packed, found.at, found.here, found.slopes, found.normal.taken)
+    columns = projected_columns(packed, found.at, found.here, found.slopes, found.normal.line_coefficients)
     points = found.here.points
     outward = 2.0 * points.slope * found.here.along
     normals = np.stack(
@@ -91,7 +101,7 @@ def covariance(
     normals *= found.here.inverse
     return (
         _sandwich(
-            inner(columns, columns),
+            inner_products(columns, columns),
             [_per_point(columns * normal, owner) for normal in normals],
             len(found.at.k),
             keep_centre,
@@ -110,23 +120,23 @@ def robust_covariance(
     *,
     keep_centre: bool,
 ) -> Float64:
-    """Covariance of an M-estimate, in the order of `covariance`, from the spread of its own equations."""
-    columns = projected_columns(packed, found.at, found.here, found.slopes, found.normal.taken)
+    """Return the covariance of an M-estimate, ordered as in `covariance`, by the sandwich estimator."""
+    columns = projected_columns(packed, found.at, found.here, found.slopes, found.normal.line_coefficients)
     bread = columns / np.sqrt(weight)
     slope = influence_slope(found.here.distance / scale, loss)
     spread = _per_point(columns * found.here.residual, owner)
-    enlarged = len(weight) / max(len(weight) - line_parameters(packed, found.at) - len(columns), 1)
-    return enlarged * _sandwich(inner(bread * slope, bread), [spread], len(found.at.k), keep_centre)
+    enlarged = len(weight) / max(len(weight) - count_line_parameters(packed, found.at) - len(columns), 1)
+    return enlarged * _sandwich(inner_products(bread * slope, bread), [spread], len(found.at.k), keep_centre)
 
 
 def _per_point(values: Float64, owner: npt.NDArray[np.intp]) -> Float64:
-    """Sum of values (rows, n) over the occurrences of each measured point."""
+    """Sum values (rows, n) over the occurrences of each measured point."""
     return np.stack([np.bincount(owner, each) for each in values]) if len(values) else np.empty((0, 1))
 
 
 def _sandwich(bread: Float64, spreads: list[Float64], order: int, keep_centre: bool) -> Float64:
-    """Return bread^-1 (sum of spread spread') bread^-1; infinite for what the data do not fix, 0 for what is known."""
-    meat = sum((inner(each, each) for each in spreads), np.zeros_like(bread))
+    """Return bread^-1 (sum of s s') bread^-1; infinite for undetermined parameters, 0 for known ones."""
+    meat = sum((inner_products(each, each) for each in spreads), np.zeros_like(bread))
     kept = np.flatnonzero(bread.diagonal() > 0.0)
     if keep_centre:
         kept = kept[(kept < order) | (kept >= order + 2)]
@@ -145,8 +155,8 @@ def _sandwich(bread: Float64, spreads: list[Float64], order: int, keep_centre: b
 
 
 def influence_slope(ratio: Float64, loss: Loss) -> Float64:
-    """Return the derivative of weight(x) x at residuals in scales."""
-    limit = _TUNING[loss]
+    """Return the derivative of weight(x) x at residuals x [standard deviations]."""
+    limit = _TUNING_CONSTANTS[loss]
     inside = np.abs(ratio) < limit
     if loss == "huber":
         return inside.astype(np.float64)
@@ -154,41 +164,41 @@ def influence_slope(ratio: Float64, loss: Loss) -> Float64:
     return np.where(inside, (1.0 - square) * (1.0 - 5.0 * square), 0.0)
 
 
-def weights(residual: Float64, scale: float, loss: Loss) -> Float64:
-    """Weights of the squares of residuals."""
-    limit = _TUNING[loss] * scale
+def robust_weights(residual: Float64, scale: float, loss: Loss) -> Float64:
+    """Return the weights of the squared residuals."""
+    limit = _TUNING_CONSTANTS[loss] * scale
     if loss == "huber":
         return np.asarray(limit / np.maximum(np.abs(residual), limit))
-    # Not quite 0: a line of outliers alone is still a line.
+    # The weight stays above 0, so that a line of outliers alone remains defined.
     return np.maximum(1.0 - (residual / limit) ** 2, _LEAST_ROOT) ** 2
 
 
 def robust_start(packed: PackedLines, centre: Float64 | None) -> tuple[Parameters, Float64]:
-    """Return `linear_start` where outliers weigh little, and the weights (n,)."""
+    """Return the parameters of a robust `linear_start` with Huber weights, and the weights (n,)."""
     weight = np.ones(len(packed.x))
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         start = linear_start(packed, centre, weight)
         distance = start.distances(packed, weight)
-        weight = weights(distance, max(_NORMAL_MAD * float(np.median(np.abs(distance))), _ROUNDING), "huber")
+        weight = robust_weights(distance, max(_NORMAL_MAD * float(np.median(np.abs(distance))), _ROUNDING), "huber")
     return start.at, weight
 
 
-def reweighted(
+def fit_reweighted(
     packed: PackedLines, found: Minimum, loss: Loss, sigma: float | None, *, keep_centre: bool
 ) -> tuple[Minimum, Float64, float]:
-    """Lower the weight of outliers until it settles; return the fit, the weights (n,) and the scale of the errors.
+    """Minimise a robust loss by iterative reweighting; return the fit, the weights (n,) and the scale of the errors.
 
-    Tukey's weights, which have several minima, start from Huber's.
+    Tukey's loss has several minima; its minimisation starts from Huber's minimum.
     """
     weight, scale = np.ones(len(packed.x)), 0.0
-    left = np.sqrt(len(packed.x) / max(len(packed.x) - line_parameters(packed, found.at), 1))
+    left = np.sqrt(len(packed.x) / max(len(packed.x) - count_line_parameters(packed, found.at), 1))
     stages: tuple[Loss, ...] = ("huber", "tukey") if loss == "tukey" else ("huber",)
     for stage in stages:
-        for _ in range(_ROUNDS):
+        for _ in range(_MAX_ROUNDS):
             distance, before = found.here.distance, weight
             scale = sigma if sigma is not None else float(_NORMAL_MAD * left * np.median(np.abs(distance)))
             scale = max(scale, _ROUNDING)
-            weight = weights(distance, scale, stage)
+            weight = robust_weights(distance, scale, stage)
             found = minimise(packed, found.at, weight=weight, keep_centre=keep_centre)
             if np.max(np.abs(weight - before)) <= _SETTLED:
                 break

@@ -1,12 +1,17 @@
-"""How far lines are from straight once a lens is undone, and how that changes with the lens.
+"""Distances of measured points from straight lines under a lens model, and their derivatives.
 
-The lens takes a measured point p to ``u = c + d g(s)``, ``d = p - c``, ``s = |d|^2``, ``g = 1 + k1 s + k2 s^2 + ...``
-(F. de Jong, eq. 3.11-3.13). A line ``n.u + rho = 0``, |n| = 1, is in the measured image a curve, and a point's distance
-from that curve is to first order ``r = (n.u + rho)/|J'n|`` with ``J = du/dp = g I + 2 g' d d'``. Distances in the
-undistorted image (eq. 3.10) would shrink to 0 with g; those in the measured image cannot.
+The lens maps a measured point p to ``u = c + d g(s)`` with ``d = p - c``, ``s = |d|^2``, ``g = 1 + k1 s + k2 s^2 +
+...`` (F. de Jong, eq. 3.11-3.13). A line ``n.u + rho = 0``, |n| = 1, is a curve in the measured image. To first order
+the distance of a point from this curve is ``r = (n.u + rho)/|J'n|`` with ``J = du/dp = g I + 2 g' d d'``. Distances in
+the undistorted image (eq. 3.10) would shrink to 0 with g; distances in the measured image do not.
 
-Lines are eliminated: for a given lens each follows in closed form, and the normal equations are those of the lens (and
-of the vanishing points) alone, the lines' own columns projected out (variable projection, Kaufman's variant).
+The lines are eliminated. For a given lens each line follows in closed form. The normal equations contain the lens and
+the vanishing points only; the columns of the lines are projected out (variable projection, Kaufman's variant).
+
+References
+----------
+F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 3.3.5-3.3.6.
+L. Kaufman, A variable projection method for solving separable nonlinear least squares problems, BIT 15 (1975) 49.
 """
 
 from __future__ import annotations
@@ -21,16 +26,16 @@ from gpuvision.camera.lines.line_families import Float64, PackedLines
 
 
 class Parameters(NamedTuple):
-    """What is sought, in packed coordinates.
+    """Lens and vanishing points, in packed coordinates.
 
     Attributes
     ----------
-    k
-        Coefficients (order,) of s, s^2, ...; none for order 0.
-    centre
-        (2,).
-    vanishing
-        Unit homogeneous vanishing points (families, 3), or None where lines need not meet.
+    k : numpy.ndarray
+        (order,) coefficients of s, s^2, ...; empty for order 0.
+    centre : numpy.ndarray
+        (2,) distortion centre.
+    vanishing : numpy.ndarray or None
+        (families, 3) unit homogeneous vanishing points; None if the lines are not constrained to meet.
     """
 
     k: Float64
@@ -39,16 +44,16 @@ class Parameters(NamedTuple):
 
 
 class Undistorted(NamedTuple):
-    """Points with the lens undone, and what its slopes need.
+    """Undistorted points, with the terms that their derivatives need.
 
     Attributes
     ----------
     dx, dy, square
-        From the centre, and their squared distance (n,).
+        Offsets of the measured points from the centre (n,), and their squared length (n,).
     growth, slope, bend
-        g(s) (n,), its derivative, and its second derivative.
+        g(s) (n,), its first derivative, and its second derivative.
     x, y
-        Undistorted (n,).
+        Undistorted coordinates (n,).
     """
 
     dx: Float64
@@ -71,24 +76,24 @@ class LineSet(NamedTuple):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Distances from straight lines at some parameters.
+    """Distances of the points from straight lines for given parameters.
 
     Attributes
     ----------
     points, lines
-        Undistorted points, and the lines through them in closed form.
+        Undistorted points, and the best lines through them in closed form.
     nx, ny, along
-        Each point's line's normal, and its distance from the centre along it (n,).
+        Normal of each point's line, and the point's offset from the centre along it (n,).
     spread
         Squared local scale |J'n|^2 (n,).
     inverse
-        Root of the weight over the local scale (n,).
+        Square root of the weight over the local scale (n,).
     distance
         Signed distances (n,) in the measured image.
     residual
-        Distances times the root of the weights.
+        Distances times the square root of the weights (n,).
     cost
-        Sum of the residuals' squares.
+        Sum of the squared residuals.
     """
 
     points: Undistorted
@@ -103,10 +108,11 @@ class Evaluation:
     cost: float
 
 
-def inner(first: Float64, second: Float64) -> Float64:
-    """Sum products over the last axis, of each with each: ``first @ second.T``.
+def inner_products(first: Float64, second: Float64) -> Float64:
+    """Return the matrix of inner products over the last axis: ``first @ second.T``.
 
-    Not by BLAS, whose threads wait for each other longer than the sums take, above all beside an OpenCL runtime's.
+    einsum instead of BLAS: for these sizes the synchronisation of the BLAS threads takes longer than the sums, above
+    all next to the threads of an OpenCL runtime.
     """
     if first.ndim == 1:
         return np.asarray(np.einsum("n,n->", first, second))
@@ -114,7 +120,7 @@ def inner(first: Float64, second: Float64) -> Float64:
 
 
 def undistort(packed: PackedLines, k: Float64, centre: Float64) -> Undistorted:
-    """Undo a lens of at most k1 and k2."""
+    """Undistort the points with a lens of order 0, 1 or 2."""
     k1, k2 = (*k.tolist(), 0.0, 0.0)[:2]
     dx, dy = packed.x - centre[0], packed.y - centre[1]
     square = dx * dx + dy * dy
@@ -132,8 +138,8 @@ def undistort(packed: PackedLines, k: Float64, centre: Float64) -> Undistorted:
     return Undistorted(dx, dy, square, stretch, slope, 2.0 * k2, x, y)
 
 
-def monotone(k: Float64, square: float, *, least: float = 0.0) -> bool:
-    """Whether the slope of ``r (1 + k1 r^2 + k2 r^4)`` exceeds ``least`` for all r^2 up to ``square``."""
+def is_monotonic(k: Float64, square: float, *, least: float = 0.0) -> bool:
+    """Return whether the slope of ``r (1 + k1 r^2 + k2 r^4)`` exceeds ``least`` for all r^2 up to ``square``."""
     k1, k2 = (*k.tolist(), 0.0, 0.0)[:2]
     places = [square]
     if k2 != 0.0 and 0.0 < -0.3 * k1 / k2 < square:
@@ -142,7 +148,7 @@ def monotone(k: Float64, square: float, *, least: float = 0.0) -> bool:
 
 
 def moments(packed: PackedLines, x: Float64, y: Float64, weight: Float64 | None) -> Float64:
-    """Weighted sums (6, lines) of 1, x, y, xx, xy, yy over each line."""
+    """Return the weighted sums (6, lines) of 1, x, y, xx, xy, yy over each line."""
     terms = np.empty((6, len(x)))
     terms[0] = 1.0 if weight is None else weight
     np.multiply(x, terms[0], out=terms[1])
@@ -154,7 +160,7 @@ def moments(packed: PackedLines, x: Float64, y: Float64, weight: Float64 | None)
 
 
 def free_lines(moments: Float64) -> LineSet:
-    """Lines of least squared distance: through the centre of gravity, along the scatter's longer axis."""
+    """Return the lines of least squared distance: through the centre of gravity, along the scatter's longer axis."""
     total, x, y, xx, xy, yy = moments
     x, y = x / total, y / total
     turn = 0.5 * np.arctan2(2.0 * (xy - total * x * y), (xx - total * x * x) - (yy - total * y * y))
@@ -163,7 +169,7 @@ def free_lines(moments: Float64) -> LineSet:
 
 
 def pencil_basis(vanishing: Float64) -> Float64:
-    """Orthonormal pairs (points, 2, 3) that span all lines through points (points, 3)."""
+    """Return orthonormal pairs (points, 2, 3) that span all lines through homogeneous points (points, 3)."""
     least = np.eye(3)[np.argmin(np.abs(vanishing), axis=-1)]
     first = np.cross(vanishing, least)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
@@ -171,10 +177,11 @@ def pencil_basis(vanishing: Float64) -> Float64:
 
 
 def pencil_lines(moments: Float64, basis: Float64) -> LineSet:
-    """Lines of least squared distance in each line's pencil (lines, 2, 3): the smaller of two eigenvectors.
+    """Return the line of least squared distance within each line's pencil (lines, 2, 3).
 
-    Among ``l = cos(phi) b1 + sin(phi) b2`` that of least ``l'S l / (l1^2 + l2^2)``, S the 3 x 3 scatter: regular for
-    pencils of parallel lines as well.
+    Among the lines ``l = cos(phi) b1 + sin(phi) b2`` of a pencil, the best one minimises ``l'S l / (l1^2 + l2^2)`` with
+    the 3 x 3 scatter S: the eigenvector of the smaller eigenvalue of a 2 x 2 problem. This also holds for pencils of
+    parallel lines.
     """
     total, x, y, xx, xy, yy = moments
     scatter = np.array([[xx, xy, x], [xy, yy, y], [x, y, total]])
@@ -183,9 +190,9 @@ def pencil_lines(moments: Float64, basis: Float64) -> LineSet:
     a = n[0, 0] * n[1, 1] - n[0, 1] ** 2
     b = m[0, 0] * n[1, 1] + m[1, 1] * n[0, 0] - 2.0 * m[0, 1] * n[0, 1]
     c = m[0, 0] * m[1, 1] - m[0, 1] ** 2
-    # The smaller root in the form that holds for a = 0.
+    # Smaller root of a t^2 - b t + c = 0, in the form that is also valid for a = 0.
     m = m - 2.0 * c / (b + np.sqrt(np.maximum(b * b - 4.0 * a * c, 0.0))) * n
-    # Of the two rows, which ought to be parallel, the longer one is the better conditioned.
+    # Both rows give the eigenvector; the longer row is better conditioned.
     top = m[0, 0] ** 2 >= m[1, 1] ** 2
     mix = np.where(top, np.stack([-m[0, 1], m[0, 0]]), np.stack([-m[1, 1], m[0, 1]]))
     line = mix[0, :, None] * basis[:, 0] + mix[1, :, None] * basis[:, 1]
@@ -196,29 +203,29 @@ def pencil_lines(moments: Float64, basis: Float64) -> LineSet:
 def evaluate(
     packed: PackedLines, at: Parameters, before: Evaluation | None = None, weight: Float64 | None = None
 ) -> Evaluation:
-    """Return distances from the best lines.
+    """Return the distances of the points from the best lines.
 
     Parameters
     ----------
-    packed
-        The measured points.
-    at
+    packed : PackedLines
+        Measured points.
+    at : Parameters
         Lens and vanishing points.
-    before
-        An evaluation nearby, whose lines' directions give the local scale; none: two passes.
-    weight
-        Weights (n,) of the squares.
+    before : Evaluation, optional
+        Evaluation for nearby parameters; its line directions give the local scale. Default: a first pass without scale.
+    weight : numpy.ndarray, optional
+        (n,) weights of the squared distances. Default: 1.
     """
     points = undistort(packed, at.k, at.centre)
     inverse = weight
     if len(at.k):
         if before is None:
-            lines = best_lines(packed, at, moments(packed, points.x, points.y, weight))
+            lines = fit_lines(packed, at, moments(packed, points.x, points.y, weight))
             nx, ny = lines.nx[packed.line], lines.ny[packed.line]
         else:
             nx, ny = before.nx, before.ny
         inverse = (1.0 if weight is None else weight) / _spread(points, nx, ny)[1]
-    lines = best_lines(packed, at, moments(packed, points.x, points.y, inverse))
+    lines = fit_lines(packed, at, moments(packed, points.x, points.y, inverse))
     nx, ny, distance = lines.nx[packed.line], lines.ny[packed.line], lines.offset[packed.line]
     along, spread = _spread(points, nx, ny)
     inverse = 1.0 / np.sqrt(spread)
@@ -231,14 +238,14 @@ def evaluate(
         inverse *= root
         residual = distance * root
     return Evaluation(
-        points, lines, nx, ny, along, spread, inverse, distance, residual, float(inner(residual, residual))
+        points, lines, nx, ny, along, spread, inverse, distance, residual, float(inner_products(residual, residual))
     )
 
 
-def best_lines(packed: PackedLines, at: Parameters, moments: Float64) -> LineSet:
-    """Return lines of least squared distance, through their vanishing points if there are any."""
+def fit_lines(packed: PackedLines, at: Parameters, moments: Float64) -> LineSet:
+    """Return the lines of least squared distance, through the vanishing points if the parameters have any."""
     lines = free_lines(moments)
-    bound = bound_lines(packed, at)
+    bound = constrained_lines(packed, at)
     if at.vanishing is None or not bound.any():
         return lines
     basis = pencil_basis(at.vanishing)[packed.family[bound]]
@@ -248,15 +255,15 @@ def best_lines(packed: PackedLines, at: Parameters, moments: Float64) -> LineSet
     return lines
 
 
-def bound_lines(packed: PackedLines, at: Parameters) -> npt.NDArray[np.bool_]:
-    """Which lines (lines,) go through a vanishing point: one without any other in its family need not."""
+def constrained_lines(packed: PackedLines, at: Parameters) -> npt.NDArray[np.bool_]:
+    """Return which lines (lines,) are constrained to a vanishing point; a family of one line is not constrained."""
     if at.vanishing is None:
         return np.zeros(len(packed.counts), dtype=bool)
     return np.bincount(packed.family, minlength=packed.families)[packed.family] > 1
 
 
 def _spread(points: Undistorted, nx: Float64, ny: Float64) -> tuple[Float64, Float64]:
-    """Return n.d, and the squared local scale along the normal."""
+    """Return n.d and the squared local scale |J'n|^2."""
     along = nx * points.dx
     along += ny * points.dy
     spread = points.slope * points.square
@@ -268,31 +275,32 @@ def _spread(points: Undistorted, nx: Float64, ny: Float64) -> tuple[Float64, Flo
     return along, spread
 
 
-class Columns(NamedTuple):
+class ResidualJacobian(NamedTuple):
     """Derivatives of the residuals.
 
     Attributes
     ----------
     lens
-        By k1, k2, ..., both coordinates of the centre; below them the residuals (order + 3, n). Order 0: residuals.
+        (order + 3, n): derivatives by k1, k2, ... and both coordinates of the centre; the last row holds the residuals.
+        For order 0: the residuals only.
     line
-        By the line's offset and direction (2, n).
+        (2, n): derivatives by the offset and the direction of the point's line.
     """
 
     lens: Float64
     line: Float64
 
 
-def columns(order: int, here: Evaluation) -> Columns:
-    """Differentiate the residuals; the local scale's own slopes are in it, so that the estimate has no bias."""
+def residual_jacobian(order: int, here: Evaluation) -> ResidualJacobian:
+    """Differentiate the residuals. The derivatives of the local scale are included, so the estimate is unbiased."""
     points, q, nx, ny, each = here.points, here.along, here.nx, here.ny, here.inverse
     square, growth, slope = points.square, points.growth, points.slope
     line = np.empty((2, len(q)))
     line[0] = each
     np.multiply(each, nx * points.y - ny * points.x, out=line[1])
     if order == 0:
-        return Columns(here.residual[None], line)
-    # With W the squared scale: dr = dF/sqrt(W) - half dW, and what of half dW goes with dq and ds.
+        return ResidualJacobian(here.residual[None], line)
+    # W is the squared scale, F = n.u + rho. dr = dF/sqrt(W) - (r / 2W) dW, split into the terms with dq and with ds.
     half = 0.5 * here.residual / here.spread
     outward, four = half * q, 4.0 * q
     by_q = 8.0 * slope * (growth + slope * square) * outward
@@ -321,11 +329,11 @@ def columns(order: int, here: Evaluation) -> Columns:
         np.multiply(normal, by_q, out=lens[row])
         lens[row] += offset * outward
     lens[order + 2] = here.residual
-    return Columns(lens, line)
+    return ResidualJacobian(lens, line)
 
 
 class NormalEquations(NamedTuple):
-    """Lines projected out.
+    """Normal equations of lens and vanishing points, with the lines projected out.
 
     Attributes
     ----------
@@ -333,31 +341,36 @@ class NormalEquations(NamedTuple):
         J'J of (k..., centre, two tangents per vanishing point).
     gradient
         J'r.
-    taken
-        (2, order + 3, lines): how much of a line's own two columns each column of `Columns.lens` holds.
+    line_coefficients
+        (2, order + 3, lines): coefficients of the projection of each row of `ResidualJacobian.lens` onto the line's two
+        columns.
     """
 
     matrix: Float64
     gradient: Float64
-    taken: Float64
+    line_coefficients: Float64
 
 
-def normal_equations(packed: PackedLines, at: Parameters, here: Evaluation, slopes: Columns) -> NormalEquations:
-    """Return the normal equations of what is sought, the lines' columns projected out."""
+def normal_equations(
+    packed: PackedLines, at: Parameters, here: Evaluation, slopes: ResidualJacobian
+) -> NormalEquations:
+    """Return the normal equations of lens and vanishing points, with the lines' columns projected out."""
     cross = np.array([packed.sums(line * slopes.lens) for line in slopes.line])
     own = packed.sums(np.array([slopes.line[i] * slopes.line[j] for i, j in ((0, 0), (0, 1), (1, 1))]))
-    taken = np.empty_like(cross)
-    np.subtract(own[2] * cross[0], own[1] * cross[1], out=taken[0])
-    np.subtract(own[0] * cross[1], own[1] * cross[0], out=taken[1])
-    taken /= own[0] * own[2] - own[1] ** 2
-    bound = bound_lines(packed, at)
+    line_coefficients = np.empty_like(cross)
+    np.subtract(own[2] * cross[0], own[1] * cross[1], out=line_coefficients[0])
+    np.subtract(own[0] * cross[1], own[1] * cross[0], out=line_coefficients[1])
+    line_coefficients /= own[0] * own[2] - own[1] ** 2
+    bound = constrained_lines(packed, at)
     sideways = None
     if at.vanishing is not None and bound.any():
         sideways = _pencils(packed, at.vanishing, here.lines, own, cross, bound)
-        taken[..., bound] = sideways.taken
-    product = inner(slopes.lens, slopes.lens) - sum(inner(a, b) for a, b in zip(taken, cross, strict=True))
+        line_coefficients[..., bound] = sideways.line_coefficients
+    product = inner_products(slopes.lens, slopes.lens) - sum(
+        inner_products(a, b) for a, b in zip(line_coefficients, cross, strict=True)
+    )
     if at.vanishing is None:
-        return NormalEquations(product[:-1, :-1], product[:-1, -1], taken)
+        return NormalEquations(product[:-1, :-1], product[:-1, -1], line_coefficients)
     lens, tangents = len(product) - 1, 2 * packed.families
     matrix, gradient = np.zeros((lens + tangents,) * 2), np.zeros(lens + tangents)
     matrix[:lens, :lens], gradient[:lens] = product[:-1, :-1], product[:-1, -1]
@@ -369,24 +382,25 @@ def normal_equations(packed: PackedLines, at: Parameters, here: Evaluation, slop
             matrix[inside, :lens] = with_lens[:, :-1]
             matrix[:lens, inside] = with_lens[:, :-1].T
             matrix[inside, inside], gradient[inside] = square, with_lens[:, -1]
-    return NormalEquations(matrix, gradient, taken)
+    return NormalEquations(matrix, gradient, line_coefficients)
 
 
 class _Pencils(NamedTuple):
-    """What vanishing points add to the normal equations, for the families (found,) that have one.
+    """Blocks of the normal equations for the families (found,) that have a vanishing point.
 
     Attributes
     ----------
     family
-        Their numbers.
-    taken
-        As in `NormalEquations`, of their lines: a line has one direction of its own in a pencil.
+        Indices of the families.
+    line_coefficients
+        As in `NormalEquations`, for lines of a pencil, which have one free parameter.
     with_lens, square
-        Products of the point's tangents with `Columns.lens` (found, 2, order + 3), and with each other (found, 2, 2).
+        Products of the point's tangents with `ResidualJacobian.lens` (found, 2, order + 3), and with each other (found,
+        2, 2).
     """
 
     family: npt.NDArray[np.intp]
-    taken: Float64
+    line_coefficients: Float64
     with_lens: Float64
     square: Float64
 
@@ -401,7 +415,7 @@ def _pencils(
     moved = np.einsum("ial,ijl,jbl->abl", change, gram, change)
     crossed = np.einsum("ial,ikl->akl", change, cross)
     turned = crossed[0] / moved[0, 0]
-    # Lines of a family lie side by side.
+    # The lines of a family are contiguous.
     starts = np.flatnonzero(np.diff(family, prepend=-1))
     with_lens = np.add.reduceat(crossed[1:] - moved[0, 1:, None] * turned, starts, axis=-1)
     square = np.add.reduceat(moved[1:, 1:] - moved[0, 1:, None] * (moved[0, 1:] / moved[0, 0]), starts, axis=-1)
@@ -409,13 +423,15 @@ def _pencils(
 
 
 def projected_columns(
-    packed: PackedLines, at: Parameters, here: Evaluation, slopes: Columns, taken: Float64
+    packed: PackedLines, at: Parameters, here: Evaluation, slopes: ResidualJacobian, line_coefficients: Float64
 ) -> Float64:
-    """Return the columns (parameters, n) themselves, the lines' columns projected out."""
-    found = slopes.lens[:-1] - sum(line * part[:-1, packed.line] for line, part in zip(slopes.line, taken, strict=True))
+    """Return the Jacobian (parameters, n), with the lines' columns projected out."""
+    found = slopes.lens[:-1] - sum(
+        line * part[:-1, packed.line] for line, part in zip(slopes.line, line_coefficients, strict=True)
+    )
     if at.vanishing is None:
         return np.asarray(found)
-    bound = bound_lines(packed, at)
+    bound = constrained_lines(packed, at)
     change = np.zeros((2, 3, len(bound)))
     change[..., bound] = pencil_changes(at.vanishing, packed.family[bound], LineSet(*(n[bound] for n in here.lines)))
     turn, *moves = (np.sum(slopes.line * change[:, part, packed.line], axis=0) for part in range(3))
@@ -430,14 +446,14 @@ def projected_columns(
 
 
 def pencil_changes(vanishing: Float64, family: npt.NDArray[np.intp], lines: LineSet) -> Float64:
-    """Change (2, 3, lines) of lines' (offset, direction) by a turn in their pencil and by the point's two tangents.
+    """Return derivatives (2, 3, lines) of lines' (offset, direction) by a rotation in their pencil and by two tangents.
 
-    The tangents are those of `pencil_basis`; a line moves with its point so that it turns least.
+    The tangents of the vanishing point are those of `pencil_basis`; a line follows its point with the least rotation.
     """
     nx, ny, offset = lines
     x, y, w = vanishing[family].T
     along = np.einsum("lia,al->il", pencil_basis(vanishing)[family], np.stack(lines))
-    # A turn moves a line by v x l, a tangent by -(l.b) v; then it is normalised again.
+    # A rotation changes a line l by v x l, a tangent b of the point by -(l.b) v; then l is normalised again.
     moves = [(y * offset - w * ny, w * nx - x * offset, x * ny - y * nx), *((-q * x, -q * y, -q * w) for q in along)]
     return np.array(
         [

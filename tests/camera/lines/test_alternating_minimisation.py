@@ -7,10 +7,10 @@ import pytest
 
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.lines.alternating_minimisation import (
-    STRATEGIES,
-    alternate,
+    ALTERNATING_SOLVERS,
     centre_from_curvature,
-    points_from_intersections,
+    mean_intersections,
+    minimise_alternating,
 )
 from gpuvision.camera.lines.line_families import PackedLines, grid_lines, pack
 from gpuvision.camera.lines.vanishing_points import fit_lens
@@ -43,7 +43,7 @@ def test_points_from_intersections(rng: np.random.Generator) -> None:
     ideal = plane_grid(rng, 40.0)
     packed = pack(grid_lines(ideal))
     exact = fit_lens(grid_lines(ideal), model="none", lines="vanishing").vanishing_points
-    found = packed.origin + packed.unit * points_from_intersections(packed)
+    found = packed.origin + packed.unit * mean_intersections(packed)
     np.testing.assert_allclose(found, exact[:, :2] / exact[:, 2:], rtol=1e-6)
 
 
@@ -60,24 +60,24 @@ def distance_sum(packed: PackedLines, lens: np.ndarray, points: np.ndarray) -> f
     return total
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
-def test_strategies_minimise_what_the_thesis_says(points: np.ndarray, strategy: str) -> None:
+@pytest.mark.parametrize("solver", ALTERNATING_SOLVERS)
+def test_solvers_minimise_what_the_thesis_says(points: np.ndarray, solver: str) -> None:
     packed = pack(grid_lines(points))
-    found = alternate(packed, 2, strategy, rounds=3)
+    found = minimise_alternating(packed, 2, solver, max_rounds=3)
     at = found.minimum.at
     lens, places = np.concatenate([at.k, at.centre]), at.vanishing[:, :2] / at.vanishing[:, 2:]
     start = np.concatenate([np.zeros(2), centre_from_curvature(packed)])
-    before = distance_sum(packed, start, points_from_intersections(packed))
+    before = distance_sum(packed, start, mean_intersections(packed))
     # Alternating, three rounds are far from the end.
     assert distance_sum(packed, lens, places) < 0.5 * before
     assert found.evaluations > found.minimum.steps == 3
 
 
-def test_fit_by_a_strategy(points: np.ndarray) -> None:
-    """A fit says what the strategy reached, in its own rounds; ours is never worse."""
+def test_fit_by_a_solver(points: np.ndarray) -> None:
+    """A fit reports what the solver reached, in its own rounds; variable projection is never worse."""
     families = grid_lines(points)
     ours, theirs = (
-        fit_lens(families, model="k1", lines="vanishing", strategy=each)
+        fit_lens(families, model="k1", lines="vanishing", solver=each)
         for each in ("variable_projection", "gauss_newton")
     )
     assert theirs.rms_px > ours.rms_px * (1.0 - 1e-6)
@@ -88,7 +88,7 @@ def test_fit_by_a_strategy(points: np.ndarray) -> None:
 def test_the_simplex_ends_where_ours_does(points: np.ndarray) -> None:
     families = grid_lines(points)
     ours = fit_lens(families, model="k1", lines="vanishing")
-    theirs = fit_lens(families, model="k1", lines="vanishing", strategy="nelder_mead")
+    theirs = fit_lens(families, model="k1", lines="vanishing", solver="nelder_mead")
     # The thesis' distances shrink with the lens, which pulls it off by less than its uncertainty.
     sigma = np.sqrt(np.diag(ours.covariance))
     assert np.all(np.abs(theirs.values - ours.values)[:3] < 0.5 * sigma[:3])

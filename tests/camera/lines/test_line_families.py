@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gpuvision.camera.lines.line_families import families, grid_lines, pack
+from gpuvision.camera.lines.line_families import grid_lines, group_lines, pack
 
 
 def numbered(rows: int, columns: int) -> np.ndarray:
@@ -44,13 +44,13 @@ def test_missing_points_are_left_out() -> None:
     assert [len(line) for line in columns] == [3, 4, 3, 3, 3, 3]
 
 
-def test_labels_make_families(rng: np.random.Generator) -> None:
+def test_labels_make_group_lines(rng: np.random.Generator) -> None:
     points = rng.normal(size=(12, 2))
-    found = families(points, [7] * 6 + [3] * 6, [0, 0, 0, 1, 1, 1] * 2)
+    found = group_lines(points, [7] * 6 + [3] * 6, [0, 0, 0, 1, 1, 1] * 2)
     np.testing.assert_array_equal(found[0][1], points[9:])
     np.testing.assert_array_equal(found[1][0], points[:3])
     with pytest.raises(ValueError, match=r"points have shape \(12, 2\) and labels \(11,\)"):
-        families(points, [0] * 11, [0] * 11)
+        group_lines(points, [0] * 11, [0] * 11)
 
 
 def test_packed_lines_keep_what_is_finite(rng: np.random.Generator) -> None:

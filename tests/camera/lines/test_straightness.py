@@ -1,4 +1,4 @@
-"""Distances from straight lines: their slopes, the lines taken out of them, pencils at infinity."""
+"""Distances from straight lines: their slopes, the lines line_coefficients out of them, pencils at infinity."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from gpuvision.camera.lines import straightness
 from gpuvision.camera.lines.line_families import PackedLines, grid_lines, pack
 from gpuvision.camera.lines.straightness import LineSet, Parameters
-from gpuvision.camera.lines.variable_projection import reach, stepped
+from gpuvision.camera.lines.variable_projection import apply_step, farthest_corner_square
 from reference.straight_lines import plane_grid, radial_lens
 
 STEP = 1e-6
@@ -47,7 +47,7 @@ def distances(packed: PackedLines, k: np.ndarray, centre: np.ndarray, lines: Lin
 def test_slopes_are_those_of_the_distances(packed: PackedLines, anywhere: Parameters, free: bool) -> None:
     at = anywhere._replace(vanishing=None) if free else anywhere
     here = straightness.evaluate(packed, at)
-    slopes = straightness.columns(2, here)
+    slopes = straightness.residual_jacobian(2, here)
     np.testing.assert_allclose(here.residual, distances(packed, at.k, at.centre, here.lines), atol=1e-14)
     turn = np.arctan2(here.lines.ny, here.lines.nx)
 
@@ -67,7 +67,7 @@ def test_lines_move_with_their_points(packed: PackedLines, anywhere: Parameters)
     for axis in (0, 1):
         step = np.zeros(2 + 2 + 8)
         step[4 + axis :: 2] = STEP
-        there, _ = stepped(packed, anywhere, step)
+        there, _ = apply_step(packed, anywhere, step)
         point = there.vanishing[packed.family]
         offset, turn = change[:, 1 + axis] * STEP
         nx, ny = lines.nx - turn * lines.ny, lines.ny + turn * lines.nx
@@ -82,27 +82,27 @@ def test_lines_are_projected_out(packed: PackedLines, anywhere: Parameters, free
     """The small normal equations are those of the whole Jacobian, a column for each line's own parameters."""
     at = anywhere._replace(vanishing=None) if free else anywhere
     here = straightness.evaluate(packed, at)
-    slopes = straightness.columns(2, here)
+    slopes = straightness.residual_jacobian(2, here)
     normal = straightness.normal_equations(packed, at, here, slopes)
-    sought, own = list(slopes.lens[:4]), []
+    count_lens_parameters, own = list(slopes.lens[:4]), []
     change = np.zeros((2, 3, len(packed.counts)))
     if not free:
         change = straightness.pencil_changes(at.vanishing, packed.family, here.lines)
         for family in range(4):
             inside = packed.family[packed.line] == family
             for axis in (1, 2):
-                sought.append(inside * np.sum(slopes.line * change[:, axis, packed.line], axis=0))
+                count_lens_parameters.append(inside * np.sum(slopes.line * change[:, axis, packed.line], axis=0))
     for line in range(len(packed.counts)):
         inside = packed.line == line
         columns = slopes.line if free else [np.sum(slopes.line * change[:, 0, packed.line], axis=0)]
         own += [inside * column for column in columns]
     basis = np.linalg.qr(np.array(own).T)[0]
-    wanted = np.array(sought).T
+    wanted = np.array(count_lens_parameters).T
     wanted = wanted - basis @ (basis.T @ wanted)
     scale = np.max(np.abs(normal.matrix))
     np.testing.assert_allclose(normal.matrix, wanted.T @ wanted, atol=1e-13 * scale)
     np.testing.assert_allclose(normal.gradient, wanted.T @ here.residual, atol=1e-13 * scale)
-    columns = straightness.projected_columns(packed, at, here, slopes, normal.taken)
+    columns = straightness.projected_columns(packed, at, here, slopes, normal.line_coefficients)
     np.testing.assert_allclose(columns, wanted.T, atol=1e-12 * np.sqrt(scale))
 
 
@@ -130,10 +130,10 @@ def test_monotone(k: tuple[float, ...], square: float, holds: bool) -> None:
     radius = np.linspace(0.0, np.sqrt(square), 2001)
     powers = sum(each * radius ** (2 * power) for power, each in enumerate(k, 1))
     assert bool(np.all(np.diff(radius * (1.0 + powers)) > 0.0)) is holds
-    assert straightness.monotone(np.array(k), square) is holds
+    assert straightness.is_monotonic(np.array(k), square) is holds
 
 
 def test_reach_covers_every_point(packed: PackedLines) -> None:
     for centre in np.array([[0.0, 0.0], [0.7, -0.2], [-3.0, 1.0]]):
         farthest = np.max((packed.x - centre[0]) ** 2 + (packed.y - centre[1]) ** 2)
-        assert farthest <= reach(packed, centre) * (1.0 + 1e-12)
+        assert farthest <= farthest_corner_square(packed, centre) * (1.0 + 1e-12)

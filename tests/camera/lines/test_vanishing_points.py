@@ -372,9 +372,9 @@ def test_one_line_is_not_enough(rng: np.random.Generator, model: str, count: int
         ({"model": "k3"}, "model is 'k3', expected 'auto' or one of"),
         ({"lines": "straight"}, "lines is 'straight', expected one of"),
         ({"loss": "l1"}, "loss is 'l1', expected one of"),
-        ({"strategy": "simplex"}, "strategy is 'simplex', expected one of"),
+        ({"solver": "simplex"}, "solver is 'simplex', expected one of"),
         ({"sigma": 0.0}, "sigma is 0.0, expected more than 0 pixels"),
-        ({"strategy": "gauss_newton"}, "needs lines='vanishing'"),
+        ({"solver": "gauss_newton"}, "needs lines='vanishing'"),
     ],
 )
 def test_wrong_words_are_refused(rng: np.random.Generator, wrong: dict[str, object], message: str) -> None:

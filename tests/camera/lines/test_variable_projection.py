@@ -7,8 +7,8 @@ import pytest
 
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.lines.line_families import grid_lines, pack
-from gpuvision.camera.lines.straightness import Parameters, evaluate, monotone
-from gpuvision.camera.lines.variable_projection import linear_start, minimise, reach, vanishing_start
+from gpuvision.camera.lines.straightness import Parameters, evaluate, is_monotonic
+from gpuvision.camera.lines.variable_projection import farthest_corner_square, linear_start, minimise, vanishing_start
 from reference.straight_lines import plane_grid, radial_lens
 
 
@@ -53,7 +53,7 @@ def test_a_wide_valley_leads_to_the_minimum(rng: np.random.Generator) -> None:
     for _ in range(30):
         centre = rng.uniform(-0.25, 0.25, 2)
         k = rng.uniform(-0.2, 0.2, 2)
-        while not monotone(k, reach(packed, centre), least=1e-3):
+        while not is_monotonic(k, farthest_corner_square(packed, centre), least=1e-3):
             k *= 0.5
         found = minimise(packed, Parameters(k, centre, None))
         # Both stop within some hundredths of a standard deviation.
@@ -80,4 +80,4 @@ def test_a_lens_that_would_fold_stays_just_inside(rng: np.random.Generator) -> N
     packed = pack(grid_lines(lens.distort(512.0 + (plane_grid(rng, 0.0) - 512.0) * 0.8)))
     found = minimise(packed, linear_start(packed).at)
     square = np.max((packed.x - found.at.centre[0]) ** 2 + (packed.y - found.at.centre[1]) ** 2)
-    assert monotone(found.at.k, square)
+    assert is_monotonic(found.at.k, square)

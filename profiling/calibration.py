@@ -1,8 +1,8 @@
-"""Lenses from straight lines against discorpy's best functions, on its own real targets where they are at hand.
+"""Lens fits to straight lines against discorpy's best functions, on discorpy's real target images if available.
 
-discorpy's chain is ``find_cod_bailey``, ``correct_perspective_effect`` and ``calc_coef_backward`` with five
-coefficients, on float64 points (in single precision it does nothing under NumPy 2). Both sides get the same points;
-errors are straightness: root mean square distance of the corrected points from straight lines, free of scale.
+discorpy's functions are ``find_cod_bailey``, ``correct_perspective_effect`` and ``calc_coef_backward`` with five
+coefficients, on float64 points (single precision has no effect under NumPy 2). Both libraries get the same points. The
+error is the straightness: root mean square distance of the corrected points from straight lines, independent of scale.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Families = tuple[tuple[Float64, ...], ...]
 _DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "calibration"
 _COEFFICIENTS = 5
 _IMAGE = (2560, 2160)
-# Name of the case, its file, and rows and columns of the synthetic grid that stands in for it.
+# Case name, image file, and rows and columns of the synthetic grid that replaces a missing image.
 _TARGETS = (
     ("fit/66x96", "dot_pattern_01.jpg", (66, 96)),
     ("fit/33x39", "dot_pattern_02.jpg", (33, 39)),
@@ -41,32 +41,32 @@ _TARGETS = (
 
 
 class Radial(NamedTuple):
-    """discorpy's result, as a model that undoes a lens."""
+    """discorpy's radial model, as a model with ``undistort``."""
 
     column: float
     row: float
     coefficients: Float64
 
     def undistort(self, points: Float64) -> Float64:
-        """Undistorted (column, row): its backward polynomial, inverted by Newton steps."""
+        """Return undistorted (column, row) by inverting the backward polynomial with Newton steps."""
         offset = np.asarray(points, dtype=np.float64) - (self.column, self.row)
         radius = np.hypot(offset[..., 0], offset[..., 1])
-        seen = np.polynomial.Polynomial([0.0, *self.coefficients])
+        backward = np.polynomial.Polynomial([0.0, *self.coefficients])
         found = radius.copy()
         for _ in range(30):
-            found -= (seen(found) - radius) / seen.deriv()(found)
+            found -= (backward(found) - radius) / backward.deriv()(found)
         return np.asarray((self.column, self.row) + offset * (found / np.maximum(radius, 1e-12))[..., None])
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a fit of k1 and k2 to the lines of each target: two of dots, one of lines."""
+    """Yield a fit of k1 and k2 to the lines of each target: two dot grids and one line grid."""
     for name, file, shape in _TARGETS:
         yield case_of(name, file, shape)
 
 
 @functools.lru_cache(maxsize=len(_TARGETS))
 def case_of(name: str, file: str, shape: tuple[int, int]) -> Case:
-    """Return a target's case, or that of a synthetic grid where the recording is missing."""
+    """Return the case of a target, or of a synthetic grid if the image is missing."""
     families, facts = _measured(file) if (_DATA / file).is_file() else _synthetic(shape)
 
     def ours() -> Lens | None:
@@ -87,7 +87,7 @@ def case_of(name: str, file: str, shape: tuple[int, int]) -> Case:
 
 
 def discorpy_fit(families: Families) -> Callable[[], Radial]:
-    """Return discorpy's fit to rows and columns; it takes points as (row, column)."""
+    """Return a function that runs discorpy's fit to rows and columns; discorpy takes points as (row, column)."""
     from discorpy.proc import processing
 
     horizontal, vertical = ([np.ascontiguousarray(line[:, ::-1]) for line in family] for family in families)
@@ -104,7 +104,7 @@ def discorpy_fit(families: Families) -> Callable[[], Radial]:
 
 
 def _measured(file: str) -> tuple[Families, dict[str, Any]]:
-    """Lines of a real target, by our own finders; what finding takes, and what it takes discorpy (once: seconds)."""
+    """Return the lines of a real target found by our finders, and the times of both libraries (discorpy: one run)."""
     image = cv2.imread(str(_DATA / file), cv2.IMREAD_GRAYSCALE)
     assert image is not None
     finds = _discorpy_lines if file.startswith("line") else _discorpy_dots
@@ -122,7 +122,7 @@ def _found(image: NDArray[Any], file: str) -> Families:
 
 
 def _discorpy_dots(image: Float64) -> Any:
-    """Find dots as discorpy's demonstrations do."""
+    """Find dots as in discorpy's demonstrations."""
     from discorpy.prep import preprocessing
 
     with warnings.catch_warnings():
@@ -137,7 +137,7 @@ def _discorpy_dots(image: Float64) -> Any:
 
 
 def _discorpy_lines(image: Float64) -> Any:
-    """Find points on lines as discorpy's demonstration does."""
+    """Find points on lines as in discorpy's demonstration."""
     from discorpy.prep import linepattern, preprocessing
 
     found = {"radius": 15, "sensitive": 0.5}
@@ -154,7 +154,7 @@ def _discorpy_lines(image: Float64) -> Any:
 
 
 def _synthetic(shape: tuple[int, int]) -> tuple[Families, dict[str, Any]]:
-    """Lines of a tilted grid of points, with the noise of a good finder."""
+    """Return the lines of a tilted grid of points with noise of 0.05 px."""
     rng = np.random.default_rng(1)
     points = tilted_grid(shape, 5.0, _IMAGE)
     lens = Lens(k1=1.6e-8, k2=6e-16, centre=(1257.0, 1020.0))
@@ -164,7 +164,7 @@ def _synthetic(shape: tuple[int, int]) -> tuple[Families, dict[str, Any]]:
 def tilted_grid(
     shape: tuple[int, int], degrees: float, size: tuple[int, int], *, direction: float = 0.8, focal: float = 3000.0
 ) -> Float64:
-    """Ideal image (rows, columns, 2) of a plane grid, tilted, that fills 0.85 of an image."""
+    """Return ideal image points (rows, columns, 2) of a tilted plane grid that fills 0.85 of an image."""
     v, u = np.meshgrid(*(np.linspace(-0.5, 0.5, count) for count in shape), indexing="ij")
     flat = (size[0] * u + 1j * size[1] * v) * np.exp(-1j * direction)
     depth = 1.0 + np.sin(np.radians(degrees)) * flat.imag / focal

@@ -1,4 +1,4 @@
-"""The comparisons in docs/calibration.md: ``python -m gpuvision.profiling.calibration_tables`` prints them anew."""
+"""Comparison tables of docs/concepts/lens_calibration.md; ``python -m gpuvision.profiling.calibration_tables`` prints them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _DRAWS = 20
 
 
 def radial_lens(border: float) -> Lens:
-    """Lens that moves the corner of the image by ``border`` pixels, 15 % of it back by k2."""
+    """Return a lens that moves the image corner by ``border`` pixels: k1 by 115 %, k2 by -15 % of it."""
     return Lens(k1=1.15 * border / _CORNER**3, k2=-0.15 * border / _CORNER**5, centre=_CENTRE)
 
 
@@ -51,7 +51,7 @@ def solvers(noise: float = 0.05) -> Iterator[str]:
 
 
 def accuracy() -> Iterator[str]:
-    """Compare with discorpy on synthetic grids of 23 x 31 points: medians over draws."""
+    """Compare with discorpy on synthetic grids of 23 x 31 points: medians over random draws."""
     names = ("straightness px", "centre off px", "correction off px")
     heads = [f"{name}, {whose}" for name in names for whose in ("ours", "discorpy")]
     yield from _head("tilt deg", "border px", "noise px", *heads, "discorpy fails")
@@ -66,7 +66,7 @@ def accuracy() -> Iterator[str]:
 
 
 def tilted_sensor() -> Iterator[str]:
-    """Give the model error where the sensor itself is tilted: distortion lies before the tilt; no noise."""
+    """Show the model error with a tilted sensor, whose distortion precedes the tilt; no noise."""
     yield from _head("tilt of the sensor deg", "border px", "uncorrected px", "left px", "centre off px")
     for border in (3.0, 10.0, 20.0):
         for tilt in (0.0, 10.0, 20.0, 45.0):
@@ -83,7 +83,7 @@ def tilted_sensor() -> Iterator[str]:
 
 
 def correction_error(found: Lens | Radial, true: Lens, points: Float64) -> float:
-    """Largest distance between points corrected by two lenses, after the best homography between them."""
+    """Return the largest distance between points corrected by two lenses, after the best homography between them."""
     ours, theirs = (each.undistort(points).reshape(-1, 2) for each in (found, true))
     matrix, _ = cv2.findHomography(ours, theirs)
     moved = cv2.perspectiveTransform(ours[None], matrix)[0]
@@ -91,7 +91,7 @@ def correction_error(found: Lens | Radial, true: Lens, points: Float64) -> float
 
 
 def draw(seed: int, tilt: float, border: float, noise: float) -> tuple[tuple[float, ...], tuple[float, ...] | None]:
-    """Errors of both sides on one grid; None where discorpy finds nothing or its polynomial turns over."""
+    """Return the errors of both libraries on one grid; None if discorpy fails or its polynomial folds."""
     rng, lens = np.random.default_rng(seed), radial_lens(border)
     ideal = tilted_grid((23, 31), tilt, _SIZE, direction=rng.uniform(0.0, 2.0 * np.pi))
     points = lens.distort(ideal) + rng.normal(0.0, noise, ideal.shape)

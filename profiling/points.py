@@ -1,7 +1,7 @@
-"""Points through a camera against OpenCV's undistortPoints, and against Newton's method in Numba.
+"""Undistortion of points against OpenCV's undistortPoints, and against Newton's method in Numba.
 
-OpenCV's default is five fixed-point steps, which do not converge for every camera: its error on the case's own points
-stands in the column ``peer_error``. Case names say what the camera has; ``converged`` asks OpenCV for 200 steps.
+OpenCV's default of five fixed-point steps does not converge for every camera; the column ``peer_error`` has its error
+on the points of the case. Case names name the camera; in ``converged`` cases OpenCV runs up to 200 steps.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ STANDARD = Camera(
     matrix=((1000.0, 0.0, 640.0), (0.0, 1000.0, 512.0), (0.0, 0.0, 1.0)),
     distortion=(-0.28, 0.11, 5e-4, -3e-4, -0.02, *(0.0,) * 9),
 )
-# A Scheimpflug camera.
+# Scheimpflug camera.
 TILTED = Camera(
     matrix=((1200.0, 0.0, 640.0), (0.0, 1200.0, 512.0), (0.0, 0.0, 1.0)),
     distortion=(-0.25, 0.05, *(0.0,) * 10, TWENTY_DEGREES, 0.0),
 )
-# A wide one that folds within its image.
+# Wide-angle camera whose lens model folds within the image.
 FOLDING = Camera(
     matrix=((800.0, 0.0, 640.0), (0.0, 800.0, 512.0), (0.0, 0.0, 1.0)),
     distortion=(-0.4, *(0.0,) * 11, TWENTY_DEGREES, 0.0),
@@ -58,9 +58,9 @@ def _newton_step(x, y, at_x, at_y, one, k1, k2, p1, p2, k3):  # type: ignore[no-
 
 @numba.njit(parallel=True, error_model="numpy")
 def _numba(columns, rows, table, ideal_columns, ideal_rows):  # type: ignore[no-untyped-def]
-    """Take four Newton steps from the measured place, on all cores.
+    """Take four Newton steps from the measured point, on all cores.
 
-    Written out, with columns and rows apart (ours takes pairs), so that LLVM vectorises it.
+    The loop is unrolled, with separate arrays of columns and rows (ours takes pairs), so that LLVM vectorises it.
     """
     one = table.dtype.type(1)
     cx, cy, f, k1, k2, p1, p2, k3 = table[0], table[1], table[2], table[3], table[4], table[5], table[6], table[7]
@@ -76,7 +76,7 @@ def _numba(columns, rows, table, ideal_columns, ideal_rows):  # type: ignore[no-
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield 1e5 and 1e6 points in single precision of several cameras; double, converged, and the way there at 1e6."""
+    """Yield cases of 1e5 and 1e6 points for several cameras; also double precision, converged OpenCV and distortion."""
     for count, size in ((100_000, "1e5"), (1_000_000, "1e6")):
         yield _case(device, STANDARD, count, f"opencv/{size}")
         yield _case(device, TILTED, count, f"tilted/{size}")
@@ -90,7 +90,7 @@ def cases(device: Device) -> Iterator[Case]:
 
 
 def _points(camera: Camera, count: int, inverse: bool) -> NDArray[np.float64]:
-    """Measured points all over the image, or ideal ones: such as have a counterpart, a little before the fold."""
+    """Return measured points, or ideal ones, all over the image and within 0.99 of the fold radius."""
     rng = np.random.default_rng(1)
     ideal = rng.uniform(0.0, 1.0, (2 * count, 2)) * SIZE
     middle, focal = np.array(camera.matrix)[:2, 2], camera.matrix[0][0]
@@ -132,7 +132,7 @@ def _case(
     if camera is STANDARD:
         peers["numba"] = _newton(points, camera)
     if np.any(to_numpy(bound.outputs.status)):
-        raise AssertionError("a point that has a counterpart was flagged")
+        raise AssertionError("a point within the invertible region was flagged")
     traffic = (points.nbytes, points.nbytes + len(points))
     return Case("points", name, bound.run, peers, _worst(to_numpy(bound.outputs.points), exact), traffic, facts=facts)
 

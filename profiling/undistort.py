@@ -1,8 +1,8 @@
-"""Image undistortion against OpenCV's remap with maps of floats: its exact path, and from version 5 on its fastest.
+"""Image undistortion against OpenCV's remap with float maps: its exact path, and its fastest one since version 5.
 
-Errors are those of an output pixel against float64 at the exact place, the rounding to whole numbers included; both
-sides' stand in the row. Images computed without a map have ``cv2.undistort`` beside them, which makes its maps anew
-each time and takes places to 1/32 px.
+Errors are output pixels minus the float64 value at the exact source position, including the rounding to integers; each
+row has the errors of both libraries. Cases without a map compare with ``cv2.undistort``, which computes its maps in
+every call and rounds source positions to 1/32 px.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gpuvision.profiling.harness import Case
 _CORNER_SHIFT = 20.0  # px
 _FILTERS = {"bilinear": cv2.INTER_LINEAR, "bicubic": cv2.INTER_CUBIC}
 _LARGEST = {"uint8": 255.0, "uint16": 65535.0, "float32": 255.0}
-# Errors are taken where every tap lies within the image.
+# Margin [px]: errors are evaluated where all taps lie within the image.
 _BORDER = 8
 _ROWS_AT_ONCE = 256
 
@@ -31,7 +31,7 @@ Float64 = NDArray[np.float64]
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield both interpolations of one channel at 1024 and 2048; three channels, a pincushion lens, computed places."""
+    """Yield both interpolations at 1024 and 2048 pixels; pincushion lens, three channels, computed positions."""
     for dtype in ("uint8", "float32"):
         for interpolation in _FILTERS:
             for size in (1024, 2048):
@@ -45,7 +45,7 @@ def cases(device: Device) -> Iterator[Case]:
 
 
 def _camera(size: int, corner_shift: float) -> Camera:
-    """Return a camera of square images whose lens moves the corners by so many pixels."""
+    """Return a camera of square images whose lens moves the corners by ``corner_shift`` pixels."""
     middle, focal = 0.5 * (size - 1), 1.2 * size
     corner = np.hypot(middle, middle) / focal
     k1 = corner_shift / (focal * corner**3)
@@ -70,12 +70,12 @@ def _case(device: Device, name: str, camera: Camera, dtype: str, size: int, **op
     bound = operation.bind(device, image.shape, dtype)
     bound.inputs[0].set(image)
     bound.run()
-    places = operation.source_positions((size, size))
-    made = np.empty_like(image)
-    peer = _peer(camera, operation, image, places, made)
+    positions = operation.source_positions((size, size))
+    undistorted = np.empty_like(image)
+    peer = _peer(camera, operation, image, positions, undistorted)
     peer()
-    exact, inner = _exact(image, places, interpolation)
-    ours, theirs = (np.abs(each[inner] - exact[inner]) for each in (to_numpy(bound.outputs.image), made))
+    exact, inner = _exact(image, positions, interpolation)
+    ours, theirs = (np.abs(each[inner] - exact[inner]) for each in (to_numpy(bound.outputs.image), undistorted))
     numbers = {"rms": _rms(ours), "peer_error": theirs.max(), "peer_rms": _rms(theirs)}
     facts = {name: float(f"{number:.5g}") for name, number in numbers.items()}
     traffic = (image.nbytes, image.nbytes + bound.outputs.status.nbytes)
@@ -87,22 +87,22 @@ def _rms(values: Float64) -> float:
 
 
 def _peer(
-    camera: Camera, operation: UndistortImage, image: NDArray[Any], places: Float64, made: NDArray[Any]
+    camera: Camera, operation: UndistortImage, image: NDArray[Any], positions: Float64, undistorted: NDArray[Any]
 ) -> Callable[[], object]:
     if operation.coordinates == "computed":
         matrix, distortion = camera.to_opencv()
-        return lambda: cv2.undistort(image, matrix, distortion, dst=made)
-    x, y = (np.ascontiguousarray(places[..., axis], dtype=np.float32) for axis in (0, 1))
-    return lambda: cv2.remap(image, x, y, _FILTERS[operation.interpolation], dst=made)
+        return lambda: cv2.undistort(image, matrix, distortion, dst=undistorted)
+    x, y = (np.ascontiguousarray(positions[..., axis], dtype=np.float32) for axis in (0, 1))
+    return lambda: cv2.remap(image, x, y, _FILTERS[operation.interpolation], dst=undistorted)
 
 
-def _exact(image: NDArray[Any], places: Float64, interpolation: Interpolation) -> tuple[Float64, NDArray[np.bool_]]:
-    """Return values in float64, as far as the image's type reaches, and where they need no border."""
+def _exact(image: NDArray[Any], positions: Float64, interpolation: Interpolation) -> tuple[Float64, NDArray[np.bool_]]:
+    """Return exact values in float64, clipped to the range of the pixel type, and where they need no border."""
     rows, columns = image.shape[:2]
-    x, y = np.moveaxis(places, -1, 0)
+    x, y = np.moveaxis(positions, -1, 0)
     inner = (x > _BORDER) & (x < columns - 1 - _BORDER) & (y > _BORDER) & (y < rows - 1 - _BORDER)
     exact = np.zeros(image.shape)
-    for first in range(0, len(places), _ROWS_AT_ONCE):
+    for first in range(0, len(positions), _ROWS_AT_ONCE):
         part = slice(first, first + _ROWS_AT_ONCE)
         exact[part] = _interpolated(image, x[part], y[part], interpolation)
     return exact if image.dtype.kind == "f" else np.clip(exact, 0.0, _LARGEST[image.dtype.name]), inner

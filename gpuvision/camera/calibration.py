@@ -191,7 +191,7 @@ class Calibration:
             return table | {"sigma_px": fit.sigma_px, "lines": fit.lines}
         tilt = {"alpha_rad": fit.sensor.alpha, "alpha_sigma_rad": fit.alpha_sigma}
         poses = [{"rotation": p.rotation.tolist(), "translation": p.translation.tolist()} for p in fit.poses]
-        return table | {"sigma_px": fit.sigma, "tilt": tilt, "poses": poses}
+        return table | {"sigma_px": fit.sigma_px, "tilt": tilt, "poses": poses}
 
 
 def _rms(errors: Float64) -> float:

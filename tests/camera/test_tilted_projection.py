@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.tilted_projection import COLUMNS, INTERNAL, project, rotation_matrix, tilt_matrix
-from gpuvision.camera.views.parameters import NUMBERS, OPENCV, Chart, internal_of, opencv_of
+from gpuvision.camera.views.parameters import NUMBERS, OPENCV, FreeParameters, internal_parameters, opencv_parameters
 from reference.tilted_camera import project_virtual, tilt
 
 VIEWS, POINTS = 3, 7
@@ -77,7 +77,7 @@ def _numbers(rng):
     return np.array([1500.0, 1.1, 700.0, -300.0, 650.0, 480.0, *rng.normal(0.0, 0.1, 5)])
 
 
-@pytest.mark.parametrize(("function", "names"), [(internal_of, INTERNAL), (opencv_of, OPENCV)])
+@pytest.mark.parametrize(("function", "names"), [(internal_parameters, INTERNAL), (opencv_parameters, OPENCV)])
 def test_derivatives_of_the_coordinates(function, names, rng):
     numbers = _numbers(rng)
     values, derivative = function(numbers)
@@ -91,27 +91,30 @@ def test_derivatives_of_the_coordinates(function, names, rng):
 
 
 @pytest.mark.parametrize(
-    "chart",
+    "free_parameters",
     [
-        Chart(coefficients=("k1", "k2"), tilt=True),
-        Chart(coefficients=("k1", "p1", "p2", "k3"), tilt=False, aspect=True),
-        Chart(coefficients=("k1",), tilt=True, focal_length=1800.0),
-        Chart(coefficients=(), tilt=True, centre=False, direction=0.7),
-        Chart(coefficients=(), tilt=True, aspect=True, focal_length=1800.0, direction=0.7),
+        FreeParameters(coefficients=("k1", "k2"), tilt=True),
+        FreeParameters(coefficients=("k1", "p1", "p2", "k3"), tilt=False, aspect=True),
+        FreeParameters(coefficients=("k1",), tilt=True, focal_length=1800.0),
+        FreeParameters(coefficients=(), tilt=True, centre=False, direction=0.7),
+        FreeParameters(coefficients=(), tilt=True, aspect=True, focal_length=1800.0, direction=0.7),
     ],
     ids=["tilt", "brown", "f known", "along", "along, f known"],
 )
-def test_spread_is_what_a_step_does(chart, rng):
-    numbers = chart.settled(_numbers(rng))
-    if chart.focal_length is not None:
-        assert opencv_of(numbers)[0][0] == pytest.approx(chart.focal_length, rel=1e-14)
-    spread = chart.spread(numbers)
-    for column in range(chart.free):
+def test_spread_is_what_a_step_does(free_parameters, rng):
+    numbers = free_parameters.with_dependent(_numbers(rng))
+    if free_parameters.focal_length is not None:
+        assert opencv_parameters(numbers)[0][0] == pytest.approx(free_parameters.focal_length, rel=1e-14)
+    spread = free_parameters.derivative(numbers)
+    for column in range(free_parameters.count):
         step = 1e-5
-        ends = [chart.settled(numbers + sign * step * chart.basis[:, column]) for sign in (1.0, -1.0)]
+        ends = [
+            free_parameters.with_dependent(numbers + sign * step * free_parameters.basis[:, column])
+            for sign in (1.0, -1.0)
+        ]
         np.testing.assert_allclose(spread[:, column], (ends[0] - ends[1]) / (2.0 * step), rtol=1e-6, atol=1e-6)
 
 
 def test_a_known_focal_length_is_the_longest_way_from_centre_to_v(rng):
-    chart = Chart(coefficients=(), tilt=True, focal_length=500.0)
-    assert np.isnan(chart.settled(_numbers(rng))[0])
+    free_parameters = FreeParameters(coefficients=(), tilt=True, focal_length=500.0)
+    assert np.isnan(free_parameters.with_dependent(_numbers(rng))[0])

@@ -53,31 +53,31 @@ def map_of(
     return np.stack([c * x - s * y + (source[1] - 1) / 2 + 0.3, s * x + c * y + (source[0] - 1) / 2 - 0.2], -1)
 
 
-def near_edge(places: np.ndarray, source: tuple[int, ...]) -> np.ndarray:
+def near_edge(positions: np.ndarray, source: tuple[int, ...]) -> np.ndarray:
     sides = np.array([[-0.5, source[1] - 0.5], [-0.5, source[0] - 0.5]])
-    return (np.abs(places[..., None] - sides) < EDGE).any((-1, -2))
+    return (np.abs(positions[..., None] - sides) < EDGE).any((-1, -2))
 
 
 def assert_right(
     result: Any,
     image: np.ndarray,
-    places: np.ndarray,
+    positions: np.ndarray,
     *,
     missing: int = Status.NO_DATA,
     channels: int = 1,
     **options: Any,
 ) -> None:
-    """Compare with the oracle: every value within what places and rounding allow, whole numbers rounded to nearest."""
+    """Compare with the oracle: values within the errors of positions and rounding, integers rounded to nearest."""
     source = image.shape[-3:-1] if channels == 3 else image.shape[-2:]
-    made = places.shape[:2]
-    clear = ~near_edge(places, source)
+    made = positions.shape[:2]
+    clear = ~near_edge(positions, source)
     frames = image.astype(np.float64).reshape(-1, *source, channels)
     outcome = result.image.reshape(len(frames), *made, channels)
     largest = LARGEST[image.dtype]
     # A place's error in x and y times the steepest slope (twice the range for a cubic), and ten roundings.
     slack = largest * (2 * 2 * PLACE_ERROR + 10 * 6e-8)
     for frame, values in zip(frames, outcome, strict=True):
-        expected, status = reference.undistort(frame, places, missing=missing, **options)
+        expected, status = reference.undistort(frame, positions, missing=missing, **options)
         np.testing.assert_array_equal(result.status[clear], status[clear])
         if image.dtype == np.float32:
             np.testing.assert_allclose(values[clear], expected[clear], rtol=0, atol=slack)
@@ -105,14 +105,14 @@ def test_a_batch_against_the_oracle(
             variant=variant,
         )
         image = pixels(rng, (2, 83, 117, 3)[: 3 + channels // 3], dtype)
-        places = op.source_positions((83, 117))
+        positions = op.source_positions((83, 117))
         options = {
             "interpolation": interpolation,
             "border": border,
             "border_value": 0.75,
             "missing": Status.NOT_INVERTIBLE,
         }
-        assert_right(op(image, device=device), image, places, channels=channels, **options)
+        assert_right(op(image, device=device), image, positions, channels=channels, **options)
 
 
 # name: (map options, what the packer must make of the runs in the middle)
@@ -134,14 +134,14 @@ def test_every_window(device: Device, name: str, channels: int, interpolation: A
     options, what = WINDOWS[name]
     source = (300, 310)
     image = pixels(rng, (*source, 3)[: 2 + channels // 3], np.float32)
-    places = map_of((80, 80), source, **options)
+    positions = map_of((80, 80), source, **options)
     taps = Taps(1, 2) if interpolation == "bicubic" else Taps(0, 1)
-    heads = Packer(source, taps, channels, Status.NO_DATA, Status.NO_DATA, (0.5, 0.5)).pack(places).heads
+    heads = Packer(source, taps, channels, Status.NO_DATA, Status.NO_DATA, (0.5, 0.5)).pack(positions).heads
     found = set(np.unique(heads[..., 2] & 255))
     # Three channels need three times the width.
     assert found & {what, what | (channels == 3 and what < 6)}
-    op = UndistortImage(model=places, interpolation=interpolation, channels=channels, variant="vector")
-    assert_right(op(image, device=device), image, places, channels=channels, interpolation=interpolation)
+    op = UndistortImage(model=positions, interpolation=interpolation, channels=channels, variant="vector")
+    assert_right(op(image, device=device), image, positions, channels=channels, interpolation=interpolation)
 
 
 @ON_DEVICES
@@ -171,12 +171,12 @@ def test_any_shape_and_map(
     rng = np.random.default_rng(1)
     channels = options.pop("channels")
     image = pixels(rng, (*source, 3)[: 2 + channels // 3], dtype)
-    places = map_of(shape, source, turn=turn, scale=scale) + shift
-    op = UndistortImage(model=places, channels=channels, variant=variant, **options)
+    positions = map_of(shape, source, turn=turn, scale=scale) + shift
+    op = UndistortImage(model=positions, channels=channels, variant=variant, **options)
     guarded = Guarded(op(image, device=device))
     result = op(image, device=device, out=guarded.out)
     guarded.assert_intact()
-    assert_right(result, image, places, channels=channels, **options)
+    assert_right(result, image, positions, channels=channels, **options)
 
 
 @given(
@@ -197,9 +197,9 @@ def test_no_window_reads_outside_the_image(
     )
     what = packed.heads[..., 2] & 255
     scattered = packed.heads[what == 6]
-    places = packed.points[scattered[:, 3]] + scattered[:, None, :2]
-    assert (places >= taps.before).all()
-    assert (np.floor(places) + taps.after < source[::-1]).all()
+    positions = packed.points[scattered[:, 3]] + scattered[:, None, :2]
+    assert (positions >= taps.before).all()
+    assert (np.floor(positions) + taps.after < source[::-1]).all()
     windows = (what >= 2) & (what < 6)
     column, row, bits, _ = np.moveaxis(packed.heads[windows], -1, 0)
     starts = [bits >> shift & 63 for shift in ((13, 19, 25) if channels == 3 else (31,))]
@@ -237,13 +237,13 @@ def test_whole_shifts_are_exact(
 @pytest.mark.parametrize("border", ["constant", "replicate", "reflect"])
 def test_against_opencv(device: Device, border: str, dtype: Any, interpolation: Any, rng: np.random.Generator) -> None:
     image = pixels(rng, (90, 123), dtype)
-    places = map_of((70, 144), image.shape, turn=3.0, scale=1.1).astype(np.float32)
+    positions = map_of((70, 144), image.shape, turn=3.0, scale=1.1).astype(np.float32)
     flags = {"constant": cv2.BORDER_CONSTANT, "replicate": cv2.BORDER_REPLICATE, "reflect": cv2.BORDER_REFLECT_101}
     filters = {"bilinear": cv2.INTER_LINEAR, "bicubic": cv2.INTER_CUBIC}
     theirs = cv2.remap(
-        image, places[..., 0], places[..., 1], filters[interpolation], borderMode=flags[border], borderValue=1.0
+        image, positions[..., 0], positions[..., 1], filters[interpolation], borderMode=flags[border], borderValue=1.0
     )
-    op = UndistortImage(model=places, interpolation=interpolation, border=border, border_value=1.0)
+    op = UndistortImage(model=positions, interpolation=interpolation, border=border, border_value=1.0)
     ours = op(image, device=device).image
     # OpenCV may round a half to the other side; its coordinates are floats up to 144.
     atol = 1.0 if dtype != np.float32 else 2 * 2 * (PLACE_ERROR + 1e-5)
@@ -254,18 +254,18 @@ def test_against_opencv(device: Device, border: str, dtype: Any, interpolation: 
 @pytest.mark.parametrize("border", BORDERS)
 def test_places_that_are_none_or_far_away(device: Device, border: Any, variant: Any, rng: np.random.Generator) -> None:
     image = pixels(rng, (20, 40), np.float32)
-    places = map_of((6, 64), image.shape)
-    places[0, ::3] = math.nan
-    places[1, :, 1] = math.inf
-    places[2, 5:] = 1e12
-    places[3] = (-3e9, 4.0)
-    places[4, :, 0] = np.geomspace(1.0, 1e300, 64)
-    op = UndistortImage(model=places, border=border, border_value=0.5, variant=variant)
+    positions = map_of((6, 64), image.shape)
+    positions[0, ::3] = math.nan
+    positions[1, :, 1] = math.inf
+    positions[2, 5:] = 1e12
+    positions[3] = (-3e9, 4.0)
+    positions[4, :, 0] = np.geomspace(1.0, 1e300, 64)
+    op = UndistortImage(model=positions, border=border, border_value=0.5, variant=variant)
     result = op(image, device=device)
     if border != "reflect":
-        assert_right(result, image, places, border=border, border_value=0.5)
-    lost = ~np.isfinite(places).all(-1)
-    assert (result.status[lost | (np.abs(places) > 1e3).any(-1)] == Status.NO_DATA).all()
+        assert_right(result, image, positions, border=border, border_value=0.5)
+    lost = ~np.isfinite(positions).all(-1)
+    assert (result.status[lost | (np.abs(positions) > 1e3).any(-1)] == Status.NO_DATA).all()
     expected = 0.5 if border == "constant" else math.nan
     np.testing.assert_array_equal(result.image[lost], expected)
     assert np.isfinite(result.image[~lost]).all() or border == "mask"
@@ -295,9 +295,9 @@ def test_a_missing_pixel_spoils_only_what_looks_at_it(
     image = pixels(rng, (60, 100), np.float32)
     image[rng.integers(0, 60, 9), rng.integers(0, 100, 9)] = math.nan
     for turn in (0.3, 8.0):
-        places = map_of((50, 96), image.shape, turn=turn, scale=0.9)
-        result = UndistortImage(model=places, interpolation=interpolation, variant=variant)(image, device=device)
-        expected, _ = reference.undistort(image[..., None].astype(np.float64), places, interpolation=interpolation)
+        positions = map_of((50, 96), image.shape, turn=turn, scale=0.9)
+        result = UndistortImage(model=positions, interpolation=interpolation, variant=variant)(image, device=device)
+        expected, _ = reference.undistort(image[..., None].astype(np.float64), positions, interpolation=interpolation)
         np.testing.assert_array_equal(np.isnan(result.image), np.isnan(expected[..., 0]))
 
 
@@ -321,11 +321,11 @@ def test_computed_places(
     options: dict[str, Any] = {"model": model, "matrix": matrix, "channels": channels, "variant": variant}
     op = UndistortImage(**options, coordinates="computed", precision=precision, size=(140, 100), border="replicate")
     result = op(image, device=device)
-    places = op.source_positions((83, 117))
+    positions = op.source_positions((83, 117))
     expected, status = reference.undistort(
-        image.reshape(83, 117, channels).astype(np.float64), places, border="replicate"
+        image.reshape(83, 117, channels).astype(np.float64), positions, border="replicate"
     )
-    clear = ~near_edge(places, (83, 117))
+    clear = ~near_edge(positions, (83, 117))
     np.testing.assert_array_equal(result.status[clear], status[clear])
     # Single precision keeps a coordinate near 128 to 8e-6 px, and the model's terms to a few of these.
     error = 4e-5 if precision == "single" else 2e-6
@@ -344,10 +344,10 @@ def test_region_size_and_matrix(device: Device, rng: np.random.Generator) -> Non
         np.testing.assert_allclose(part.image, whole.image[20:53, 31:81], atol=4 * 4e-5)
     beyond = UndistortImage(model=CAMERA, region=(-60, -60, 20, 20))(image, device=device)
     assert (beyond.status == Status.NO_DATA).all()
-    places = PixelMap(map_of((40, 60), image.shape))
-    part = UndistortImage(model=places, region=(7, 3, 30, 20))(image, device=device)
+    positions = PixelMap(map_of((40, 60), image.shape))
+    part = UndistortImage(model=positions, region=(7, 3, 30, 20))(image, device=device)
     np.testing.assert_allclose(
-        part.image, UndistortImage(model=places)(image, device=device).image[3:23, 7:37], atol=1e-4
+        part.image, UndistortImage(model=positions)(image, device=device).image[3:23, 7:37], atol=1e-4
     )
 
 
@@ -374,10 +374,10 @@ def test_batches_beyond_the_caches_are_the_same(device: Device, columns: int, rn
 
 def test_wide_maps_are_kept_exactly_where_cubics_do_not_do(device: Device, rng: np.random.Generator) -> None:
     image = pixels(rng, (50, 60), np.float32)
-    places = map_of((30, 50), image.shape) + rng.uniform(-0.5, 0.5, (30, 50, 2))
-    packed = Packer(image.shape, Taps(0, 1), 1, Status.NO_DATA, Status.NO_DATA, (0.5, 0.5)).pack(places)
+    positions = map_of((30, 50), image.shape) + rng.uniform(-0.5, 0.5, (30, 50, 2))
+    packed = Packer(image.shape, Taps(0, 1), 1, Status.NO_DATA, Status.NO_DATA, (0.5, 0.5)).pack(positions)
     assert len(packed.points) == 30 * math.ceil(50 / RUN)
-    assert_right(UndistortImage(model=places)(image, device=device), image, places)
+    assert_right(UndistortImage(model=positions)(image, device=device), image, positions)
 
 
 def test_a_map_is_small() -> None:

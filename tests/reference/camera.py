@@ -9,7 +9,7 @@ import numpy as np
 
 
 def bent(x, y, distortion):
-    """(x', y') of normalised ideal coordinates, before the tilt."""
+    """Return (x', y') of normalised ideal coordinates, before the tilt."""
     k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = (np.longdouble(c) for c in distortion[:12])
     r2 = x * x + y * y
     radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
@@ -20,7 +20,7 @@ def bent(x, y, distortion):
 
 
 def tilted(x, y, tau_x, tau_y):
-    """(x'', y''): projection of the turned (x, y, 1) along the new axis; written out element by element."""
+    """Return (x'', y''): projection of the rotated (x, y, 1) along the new axis, element by element."""
     cx, sx, cy, sy = (f(np.longdouble(t)) for t in (tau_x, tau_y) for f in (np.cos, np.sin))
     # R = Ry(tauY) Rx(tauX).
     r = [[cy, sy * sx, -sy * cx], [0, cx, sx], [sy, -cy * sx, cy * cx]]
@@ -29,7 +29,7 @@ def tilted(x, y, tau_x, tau_y):
 
 
 def measured(points, matrix, distortion, ideal_matrix=None):
-    """Measured pixels (n, 2) of ideal ones under ``ideal_matrix``."""
+    """Return measured pixels (n, 2) of ideal ones under ``ideal_matrix``."""
     (fx, _, cx), (_, fy, cy), _ = np.asarray(matrix, np.longdouble)
     (gx, _, dx), (_, gy, dy), _ = np.asarray(matrix if ideal_matrix is None else ideal_matrix, np.longdouble)
     points = np.asarray(points, np.longdouble)
@@ -38,14 +38,14 @@ def measured(points, matrix, distortion, ideal_matrix=None):
 
 
 def determinant(x, y, distortion):
-    """Of d(x', y') / d(x, y), by complex steps."""
+    """Return the determinant of d(x', y') / d(x, y), by complex steps."""
     tiny = np.longdouble(1e-30)
     by_x, by_y = bent(x + 1j * tiny, y + 0j, distortion), bent(x + 0j, y + 1j * tiny, distortion)
     return (by_x[0].imag * by_y[1].imag - by_y[0].imag * by_x[1].imag) / tiny**2
 
 
 def fold_radius(angle, distortion, farthest, steps=20_000):
-    """Where the determinant first turns negative along a ray from the centre; inf if not before ``farthest``."""
+    """Return the radius at which the determinant first turns negative along a ray; inf if not before ``farthest``."""
     radii = np.linspace(0.0, farthest, steps).astype(np.longdouble)
     negative = determinant(radii * np.cos(angle), radii * np.sin(angle), distortion) <= 0
     return float(radii[np.argmax(negative)]) if negative.any() else np.inf

@@ -1,4 +1,4 @@
-"""Calibration patterns seen through a lens: dot grids, chessboards and line grids, rendered with their true points."""
+"""Rendered target patterns behind a lens (dot grids, chessboards, line grids), with their true points."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SUPERSAMPLING = 4
 
 @dataclass(frozen=True)
 class View:
-    """A camera before a pattern: ``homography`` leads from the pattern, in pitches, to undistorted pixels."""
+    """Camera in front of a target; ``homography`` maps target coordinates [pitches] to undistorted pixels."""
 
     width: int
     height: int
@@ -25,14 +25,14 @@ class View:
     lens: Lens
 
     def pixels(self, pattern: Float64) -> Float64:
-        """Measured (column, row) of points (..., 2) on the pattern."""
+        """Return measured (column, row) of points (..., 2) on the target."""
         return self.lens.distort(_mapped(self.homography, pattern))
 
     def pattern(self, pixels: Float64) -> Float64:
         return _mapped(np.linalg.inv(self.homography), self.lens.undistort(pixels))
 
     def nodes(self, rows: int, columns: int) -> Float64:
-        """True points (rows, columns, 2) of a grid whose first node is (0, 0)."""
+        """Return the true points (rows, columns, 2) of a grid whose first node is (0, 0)."""
         return self.pixels(np.stack(np.meshgrid(np.arange(float(columns)), np.arange(float(rows))), axis=-1))
 
 
@@ -54,7 +54,8 @@ def view(
     barrel: float = 0.0,
     mirrored: bool = False,
 ) -> View:
-    """A grid in the middle of the image: turned in the plane, tilted about an axis in it, through a lens.
+    """Return a view of a grid in the middle of the image: rotated in the plane, tilted about an axis in it, with a
+    lens.
 
     ``pitch`` in pixels, angles in degrees (``towards`` in radians), ``focal`` in widths, ``barrel`` in pixels that a
     point at the corner moves.
@@ -66,7 +67,7 @@ def view(
     plane = np.diag([-1.0 if mirrored else 1.0, 1.0])
     plane = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ plane * pitch
     axis = np.array([np.cos(towards), np.sin(towards)])
-    # A tilt shortens what lies along the direction and makes the far side smaller.
+    # A tilt shortens lengths along the direction and reduces the scale of the far side.
     shorten = np.eye(2) + (np.cos(slope) - 1.0) * np.outer(axis, axis)
     perspective = np.eye(3)
     perspective[:2, :2] = shorten
@@ -80,7 +81,7 @@ def view(
 
 
 def _rendered(camera: View, inside: Callable[[Float64], Float64]) -> Float64:
-    """Part of every pixel that lies inside, where ``inside`` is a signed distance (below 0: inside), in pitches."""
+    """Return the covered fraction of every pixel; ``inside`` is a signed distance in pitches (below 0: inside)."""
     cover = np.empty((camera.height, camera.width))
     block = max(1, 2_000_000 // camera.width)
     for start in range(0, camera.height, block):
@@ -103,7 +104,7 @@ def _rendered(camera: View, inside: Callable[[Float64], Float64]) -> Float64:
 
 
 def dots(camera: View, present: npt.NDArray[np.bool_], radius: float = 0.25) -> Float64:
-    """Part of every pixel that dots cover, (height, width); ``present`` (rows, columns) says which there are."""
+    """Return the fraction of every pixel that dots cover; ``present`` (rows, columns) selects the dots drawn."""
     rows, columns = present.shape
 
     def inside(at: Float64) -> Float64:
@@ -116,7 +117,7 @@ def dots(camera: View, present: npt.NDArray[np.bool_], radius: float = 0.25) -> 
 
 
 def chessboard(camera: View, inner: tuple[int, int]) -> Float64:
-    """Part of every pixel that dark squares cover; inner corners (columns, rows) lie at whole numbers."""
+    """Return the fraction of every pixel that dark squares cover; inner corners (columns, rows) lie at integers."""
     columns, rows = inner
 
     def inside(at: Float64) -> Float64:
@@ -133,7 +134,7 @@ def chessboard(camera: View, inner: tuple[int, int]) -> Float64:
 
 
 def line_grid(camera: View, rows: int, columns: int, width: float = 0.15, end: float = 0.5) -> Float64:
-    """Part of every pixel that lines cover: at whole numbers, ``end`` pitches longer than the grid."""
+    """Return the fraction of every pixel that lines cover: at integers, ending ``end`` pitches off the grid."""
 
     def inside(at: Float64) -> Float64:
         at = np.nan_to_num(at, nan=-99.0)
@@ -157,7 +158,7 @@ def photo(
     shade: float = 0.0,
     dtype: type = np.uint8,
 ) -> npt.NDArray[np.generic]:
-    """Make an image of a pattern: illumination that falls by ``shade`` towards a corner, blur, noise, grey levels."""
+    """Return an image of a pattern: illumination falling by ``shade`` towards a corner, blur, noise, grey levels."""
     height, width = cover.shape
     y, x = np.mgrid[0:height, 0:width]
     light = 1.0 - shade * (x / width + y / height) / 2
@@ -172,9 +173,9 @@ def photo(
 
 
 def matched(found: Float64, truth: Float64) -> tuple[tuple[int, int], Float64]:
-    """Index (row, column) in the truth of the first point found, and the errors (rows, columns, 2) at that shift.
+    """Return the true index (row, column) of the first point found, and the errors (rows, columns, 2) at that shift.
 
-    A point of no place in the truth has the error infinity.
+    A point outside the true grid has an infinite error.
     """
     i, j = np.argwhere(np.isfinite(found[..., 0]))[len(found) // 2]
     distance = np.linalg.norm(truth - found[i, j], axis=-1)

@@ -1,4 +1,4 @@
-"""F. de Jong, eq. 3.6 and 3.7, term by term in extended precision."""
+"""Measurement-plane polynomials (F. de Jong, eq. 3.6 and 3.7), term by term in extended precision."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def to_plane(points, p, q):
-    """(G, H) of sensor points (n, 2)."""
+    """Return (G, H) of sensor points (n, 2)."""
     c, r = np.asarray(points, np.longdouble).T
     p, q = np.asarray(p, np.longdouble), np.asarray(q, np.longdouble)
     g = p[0] + p[1] * c + p[2] * r + p[3] * c**2 + p[4] * r * c + p[5] * r**2 + p[6] * r**2 * c + p[7] * c**3

@@ -1,4 +1,4 @@
-"""Grids seen through a lens, how straight lines are, and what any estimator could know of the lens: plain float64."""
+"""Grids behind a lens, straightness of lines, and the Cramer-Rao bound of the lens, in plain float64."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ HALF = 512.0 * np.sqrt(2.0)
 
 
 def radial_lens(border: float, *, k2_part: float = -0.15, centre: tuple[float, float] = (530.0, 500.0)) -> Lens:
-    """Lens that moves a point at the corner of a 1024 x 1024 image by ``border`` pixels, a part of it by k2."""
+    """Return a lens that moves the corner of a 1024 x 1024 image by ``border`` pixels, a part of it by k2."""
     return Lens(k1=(1.0 - k2_part) * border / HALF**3, k2=k2_part * border / HALF**5, centre=centre)
 
 
 def plane_grid(
     rng: np.random.Generator, tilt: float, *, rows: int = 23, columns: int = 31, focal: float = 3000.0
 ) -> np.ndarray:
-    """Ideal image points (rows, columns, 2) of a plane grid tilted by ``tilt`` degrees in a random direction."""
+    """Return ideal image points (rows, columns, 2) of a plane grid tilted by ``tilt`` degrees in a random direction."""
     direction, twist = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-0.1, 0.1)
     x, y = np.meshgrid(np.arange(columns) - (columns - 1) / 2, np.arange(rows) - (rows - 1) / 2)
     flat = (x + 1j * y) * np.exp(1j * (twist - direction))
@@ -37,16 +37,16 @@ def plane_grid(
 
 
 def straightness(lines: list[np.ndarray]) -> float:
-    """Root mean square distance of points from the best straight line of each line."""
+    """Return the root mean square distance of points from the best straight line through each line."""
     squares = [np.linalg.svd(line - line.mean(axis=0), compute_uv=False)[1] ** 2 for line in lines]
     return float(np.sqrt(np.sum(squares) / sum(map(len, lines))))
 
 
 def bound(ideal: np.ndarray, lens: Lens, sigma: float, *, meet: bool) -> np.ndarray:
-    """Cramer-Rao bound (4,): standard deviations of k1, k2, C_c, R_c from a grid whose rows and columns are straight.
+    """Return the Cramer-Rao bound (4,) of the standard deviations of k1, k2, C_c, R_c from a grid of straight lines.
 
-    The model is that which makes the points: each is the intersection of its row and its column, seen through the lens;
-    with ``meet`` all rows go through one point, all columns through another.
+    Each point is the intersection of its row and its column, distorted by the lens. With ``meet`` all rows pass through
+    one vanishing point, all columns through another.
     """
     rows, columns = ideal.shape[:2]
     lines = np.array([_line(each) for each in [*ideal, *ideal.swapaxes(0, 1)]])
@@ -75,14 +75,14 @@ def bound(ideal: np.ndarray, lens: Lens, sigma: float, *, meet: bool) -> np.ndar
     size = 4 + (rows + columns + 4 if meet else 2 * (rows + columns))
     step = 0.5
     slopes = np.stack([points(step * unit) - points(-step * unit) for unit in np.eye(size)], axis=1) / (2.0 * step)
-    # Columns of one length: the bound is on the first four whatever the others are called.
+    # Normalise the columns; the bound of the first four parameters does not depend on the scale of the others.
     length = np.linalg.norm(slopes, axis=0)
     information = (slopes / length).T @ (slopes / length)
     return np.asarray(sigma * scale * np.sqrt(np.diag(np.linalg.inv(information)))[:4] / length[:4])
 
 
 def _line(points: np.ndarray) -> np.ndarray:
-    """Line through points, in coordinates of a thousand pixels."""
+    """Return the line through points, in units of 1000 pixels."""
     places = points / 1000.0
     middle = places.mean(axis=0)
     normal = np.linalg.svd(places - middle)[2][1]

@@ -1,4 +1,4 @@
-"""A tilted camera written out plainly, scenes of flat targets before it, and the best that a fit can do."""
+"""Plain model of a camera with a tilted sensor, scenes of flat targets, and the Cramer-Rao bound of a fit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def tilt(tau_x, tau_y):
-    """R of OpenCV's documentation, term by term; complex numbers pass through."""
+    """Return R of OpenCV's documentation, term by term; also for complex arguments."""
     cx, sx, cy, sy = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
     about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
     about_x = np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
@@ -18,7 +18,7 @@ def tilt(tau_x, tau_y):
 
 
 def project_virtual(internal, rotation, translation, points):
-    """Project (n, 3) points from poses in the *sensor's* frame; complex numbers pass through.
+    """Project points (n, 3) with a pose in the *sensor's* frame; also for complex arguments.
 
     ``internal``: f and aspect of the virtual camera, v, tauX, tauY, k1, k2, p1, p2, k3.
     """
@@ -36,7 +36,7 @@ def project_virtual(internal, rotation, translation, points):
 
 @dataclass
 class Scene:
-    """Views of a flat target through a known camera."""
+    """Views of a flat target by a known camera."""
 
     size: tuple[int, int]
     matrix: np.ndarray
@@ -47,17 +47,17 @@ class Scene:
     translations: list[np.ndarray]
 
     def views(self, rng, sigma):
-        """Noisy views."""
+        """Return the views with normal noise."""
         return [(t, e + rng.normal(0.0, sigma, e.shape)) for t, e in zip(self.targets, self.exact, strict=True)]
 
     @property
     def truth(self):
-        """Numbers in the order f, cx, cy, k1, k2, tauX, tauY."""
+        """True parameters f, cx, cy, k1, k2, tauX, tauY."""
         d = self.distortion
         return np.array([self.matrix[0, 0], self.matrix[0, 2], self.matrix[1, 2], d[0], d[1], d[12], d[13]])
 
     def bound(self, sigma):
-        """Cramer-Rao: the least covariance of f, cx, cy, k1, k2, tauX, tauY, by OpenCV's own derivatives."""
+        """Return the Cramer-Rao bound of the covariance of f, cx, cy, k1, k2, tauX, tauY, with OpenCV's derivatives."""
         blocks, rest = [], []
         for target, rotation, translation in zip(self.targets, self.rotations, self.translations, strict=True):
             vector = cv2.Rodrigues(rotation)[0]
@@ -80,7 +80,7 @@ PITCH = 0.01
 
 
 def scene(rng, kind, tilt_degrees, corner_px=None, views=10, weakest=0.0, steepest=30.0, direction=None):
-    """Random views: distortion k1 = -.12, k2 = .08, or so that the corner of an untilted sensor moves by corner_px."""
+    """Return random views; k1 = -.12, k2 = .08, or a lens that moves the corner of an untilted sensor by corner_px."""
     given = KINDS[kind]
     size, f = given["size"], given["f"]
     centre = np.array(given["centre"]) + rng.uniform(-15.0, 15.0, 2)
@@ -102,14 +102,14 @@ def scene(rng, kind, tilt_degrees, corner_px=None, views=10, weakest=0.0, steepe
 
 
 def _add_view(rng, made, shape, axis, angles):
-    """Add a view that shows most of its target."""
+    """Add a random view if the image shows at least 60 % of the target."""
     f, centre = made.matrix[0, 0], made.matrix[:2, 2]
     row, column = np.indices(shape[::-1]).reshape(2, -1) * PITCH
     target = np.stack([column, row, np.zeros_like(row)], axis=1)
     lean = np.radians(rng.uniform(*angles, 2)) * rng.choice([-1.0, 1.0], 2)
     turns = np.diag([*lean, rng.uniform(-0.3, 0.3)])
     rotation = np.linalg.multi_dot([cv2.Rodrigues(turn)[0] for turn in turns])
-    # The ray through a random place in the image, the lens left aside.
+    # Ray through a random point of the image, without distortion.
     place = np.array(made.size) * rng.uniform(0.3, 0.7, 2)
     ray = tilt(*made.distortion[12:]).T @ np.array([*(place - centre + f * axis[:2]) / (f * axis[2]), 1.0])
     distance = f * shape[0] * PITCH / (rng.uniform(0.5, 0.95) * made.size[0])
@@ -128,7 +128,7 @@ TILTED = cv2.CALIB_TILTED_MODEL | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
 
 
 def calibrate_with_opencv(views, size, flags=TILTED):
-    """Return rms, matrix and coefficients by OpenCV, which takes points in single precision."""
+    """Return rms, matrix and coefficients of OpenCV's calibration, which takes points in single precision."""
     targets = [np.ascontiguousarray(target, dtype=np.float32) for target, _ in views]
     images = [np.ascontiguousarray(image, dtype=np.float32) for _, image in views]
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-14)
@@ -137,5 +137,5 @@ def calibrate_with_opencv(views, size, flags=TILTED):
 
 
 def through_float32(views):
-    """Views as OpenCV takes them."""
+    """Return the views in single precision, as OpenCV takes them."""
     return [(target.astype(np.float32), image.astype(np.float32)) for target, image in views]

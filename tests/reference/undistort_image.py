@@ -1,4 +1,4 @@
-"""Interpolation in an image by definition: taps, weights and borders in float64, nothing else."""
+"""Interpolation in an image by its definition: taps, weights and borders in float64."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ NO_DATA, NOT_INVERTIBLE = 64, 128
 
 
 def cubic(distance: np.ndarray) -> np.ndarray:
-    """Weight of a tap at a distance: cubic convolution with slope -0.75 at 1."""
+    """Return the weight of a tap at a distance: cubic convolution with slope -0.75 at 1."""
     a, d = -0.75, np.abs(distance)
     near = (a + 2) * d**3 - (a + 3) * d**2 + 1
     far = a * d**3 - 5 * a * d**2 + 8 * a * d - 4 * a
@@ -19,7 +19,7 @@ def linear(distance: np.ndarray) -> np.ndarray:
     return np.maximum(1.0 - np.abs(distance), 0.0)
 
 
-def border_place(place: np.ndarray, size: int, border: str) -> np.ndarray:
+def border_index(place: np.ndarray, size: int, border: str) -> np.ndarray:
     if border != "reflect":
         return np.clip(place, 0, size - 1)
     period = max(2 * (size - 1), 1)
@@ -28,20 +28,20 @@ def border_place(place: np.ndarray, size: int, border: str) -> np.ndarray:
 
 
 def interpolate(
-    image: np.ndarray, places: np.ndarray, *, interpolation: str, border: str, border_value: float
+    image: np.ndarray, positions: np.ndarray, *, interpolation: str, border: str, border_value: float
 ) -> np.ndarray:
-    """Values of one image (rows, columns, channels) at places (..., 2), wherever these are finite."""
+    """Return the values of one image (rows, columns, channels) at positions (..., 2) that are finite."""
     kernel, taps = (cubic, range(-1, 3)) if interpolation == "bicubic" else (linear, range(2))
     rows, columns = image.shape[:2]
-    # Beyond 1e9 all places are alike but for a reflected border, and stay whole numbers here.
-    x, y = np.moveaxis(np.clip(np.nan_to_num(places), -1e9, 1e9), -1, 0)
+    # Clip to 1e9: farther positions differ for a reflected border only, and integers stay exact.
+    x, y = np.moveaxis(np.clip(np.nan_to_num(positions), -1e9, 1e9), -1, 0)
     whole_x, whole_y = np.floor(x).astype(int), np.floor(y).astype(int)
     result = np.zeros((*x.shape, image.shape[2]))
     for j in taps:
         for i in taps:
             column, row = whole_x + i, whole_y + j
             weight = kernel(x - column) * kernel(y - row)
-            seen = image[border_place(row, rows, border), border_place(column, columns, border)]
+            seen = image[border_index(row, rows, border), border_index(column, columns, border)]
             if border == "constant":
                 outside = (column < 0) | (column >= columns) | (row < 0) | (row >= rows)
                 seen = np.where(outside[..., None], border_value, seen)
@@ -51,21 +51,21 @@ def interpolate(
 
 def undistort(
     image: np.ndarray,
-    places: np.ndarray,
+    positions: np.ndarray,
     *,
     interpolation: str = "bilinear",
     border: str = "mask",
     border_value: float = 0.0,
     missing: int = NO_DATA,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One image (rows, columns, channels) at places (r, c, 2): values, NaN where there are none, and status."""
+    """Return values of one image (rows, columns, channels) at positions (r, c, 2), NaN where undefined, and status."""
     rows, columns = image.shape[:2]
-    x, y = np.moveaxis(places, -1, 0)
+    x, y = np.moveaxis(positions, -1, 0)
     with np.errstate(invalid="ignore"):
         hole = (x < -0.5) | (x > columns - 0.5) | (y < -0.5) | (y > rows - 0.5)
     lost = ~np.isfinite(x + y)
     status = np.where(lost, missing, np.where(hole, NO_DATA, 0)).astype(np.uint8)
-    result = interpolate(image, places, interpolation=interpolation, border=border, border_value=border_value)
+    result = interpolate(image, positions, interpolation=interpolation, border=border, border_value=border_value)
     blank = lost | hole if border == "mask" else lost
     result[blank] = border_value if border == "constant" else np.nan
     return result, status

@@ -1,4 +1,4 @@
-"""Least squares over one camera and the pose of every view: Levenberg-Marquardt, poses eliminated (Schur)."""
+"""Bundle adjustment of one camera and the pose of every view: Levenberg-Marquardt with a Schur complement."""
 
 from __future__ import annotations
 
@@ -8,32 +8,34 @@ from typing import NamedTuple
 import numpy as np
 
 from gpuvision.camera.tilted_projection import COLUMNS, INTERNAL, Floats, project, rotation_matrix
-from gpuvision.camera.views.parameters import Chart, internal_of
+from gpuvision.camera.views.parameters import FreeParameters, internal_parameters
 
-# The fewer views, the more bent is the valley that the target's pose and the camera share, and the cheaper a step.
-_FEWEST_STEPS, _STEPS_OF_A_VIEW = 100, 1000
-# A fit ends where a step moves the numbers by less than this many of their standard deviations ...
-_SETTLED = 1e-4
-# ... or the residual is down to the rounding of pixel coordinates.
-_EXACT_PX = 1e-9
-# Damping that holds back nothing, and damping at which no step leads down.
-_UNDAMPED, _STUCK = 1e-11, 1e16
-MEDIAN_OF_NORM = 1.1774  # of two normal deviates
-# 95 % efficiency for normal noise on two coordinates.
+# Largest number of steps: max(first, second / views). With few views pose and camera are strongly coupled, so more
+# steps are needed, and a step is cheaper.
+_MIN_STEPS, _STEPS_TIMES_VIEWS = 100, 1000
+# The fit has converged if a step changes the parameters by less than this many standard deviations, or if the residual
+# is at the rounding level of pixel coordinates [px].
+_CONVERGED, _EXACT_PX = 1e-4, 1e-9
+# Damping without effect, and damping above which no step decreases the cost.
+_UNDAMPED, _MAX_DAMPING = 1e-11, 1e16
+# Median length of a vector of two standard normal deviates: sqrt(2 ln 2).
+MEDIAN_OF_NORM = 1.1774
+# Tuning constants of Huber's and Tukey's loss [standard deviations of a coordinate]: 95 % efficiency for normal noise
+# on two coordinates.
 _HUBER, _TUKEY = 1.5, 5.123
 
 
-class Views(NamedTuple):
-    """Points of all views, missing ones with weight 0.
+class PackedViews(NamedTuple):
+    """Points of all views, padded to one length.
 
     Attributes
     ----------
     target
-        (views, 3, n), on Z = 0.
+        (views, 3, n): points on the target, Z = 0 [m].
     seen
-        (views, 2, n): columns and rows, pixels.
+        (views, 2, n): measured columns and rows [px].
     weight
-        (views, n): 1 or 0.
+        (views, n): 1, or 0 for padding.
     """
 
     target: Floats
@@ -42,18 +44,18 @@ class Views(NamedTuple):
 
     @property
     def coordinates(self) -> int:
-        """Measured coordinates: two a point."""
+        """Number of measured coordinates: two per point."""
         return 2 * int(np.count_nonzero(self.weight))
 
 
-class Loss(NamedTuple):
-    """A robust loss on the length of a residual: 'squared', 'huber' or 'tukey', at a scale in pixels."""
+class RobustLoss(NamedTuple):
+    """RobustLoss of the length of a residual vector: 'squared', 'huber' or 'tukey', with the noise scale [px]."""
 
     kind: str = "squared"
     scale: float = 1.0
 
     def cost(self, length: Floats) -> Floats:
-        """Twice the loss: the square, for small residuals."""
+        """Return twice the loss; for small residuals the squared length."""
         if self.kind == "squared":
             return length**2
         if self.kind == "huber":
@@ -63,7 +65,7 @@ class Loss(NamedTuple):
         return edge**2 / 3.0 * (1.0 - np.clip(1.0 - (length / edge) ** 2, 0.0, None) ** 3)
 
     def weight(self, length: Floats) -> Floats:
-        """Weight of a residual in the iterated least squares."""
+        """Return the weight of a residual in iteratively reweighted least squares."""
         if self.kind == "squared":
             return np.ones_like(length)
         if self.kind == "huber":
@@ -72,7 +74,7 @@ class Loss(NamedTuple):
         return np.clip(1.0 - (length / (_TUKEY * self.scale)) ** 2, 0.0, None) ** 2
 
     def slope(self, length: Floats) -> Floats:
-        """Mean over directions of the derivative of weight times residual: how stiffly the loss holds a point."""
+        """Return the derivative of weight times residual, averaged over directions: the curvature of the loss."""
         if self.kind == "squared":
             return np.ones_like(length)
         if self.kind == "huber":
@@ -82,8 +84,8 @@ class Loss(NamedTuple):
         return np.clip(1.0 - square, 0.0, None) * (1.0 - 3.0 * square) * (square < 1.0)
 
 
-class System(NamedTuple):
-    """Normal equations: cameras (m, m), (views, m, 6), poses (views, 6, 6), right-hand sides; the loss beside."""
+class NormalEquations(NamedTuple):
+    """Normal equations: blocks (m, m), (views, m, 6) and (views, 6, 6), right-hand sides, and the cost."""
 
     camera: Floats
     mixed: Floats
@@ -94,68 +96,71 @@ class System(NamedTuple):
 
 
 @dataclass(frozen=True)
-class State:
-    """A camera with poses, and how well it fits.
+class FitState:
+    """Camera parameters and poses during a fit.
 
     Attributes
     ----------
     numbers
-        `chart.NUMBERS`.
+        (11,): the parameters named in `parameters.NUMBERS`.
     rotations, translations
-        From the target to the sensor's frame.
+        (views, 3, 3) and (views, 3): from the target to the sensor's frame.
     cost
-        Sum of the loss over all points.
-    steps
-        Steps tried.
-    settled
-        Whether the last step was below the noise.
+        Sum of the loss over all points [px^2].
+    iterations
+        Number of steps tried.
+    converged
+        Whether the fit has converged.
     """
 
     numbers: Floats
     rotations: Floats
     translations: Floats
     cost: float = np.inf
-    steps: int = 0
-    settled: bool = False
+    iterations: int = 0
+    converged: bool = False
 
 
-def residuals(views: Views, state: State) -> Floats:
-    """Seen minus projected, (views, 2, n); 0 where missing."""
-    projected = project(internal_of(state.numbers)[0], state.rotations, state.translations, views.target)
+def residuals(views: PackedViews, state: FitState) -> Floats:
+    """Return measured minus projected points, (views, 2, n) [px]; 0 for padding."""
+    projected = project(internal_parameters(state.numbers)[0], state.rotations, state.translations, views.target)
     return np.where(views.weight[:, None] > 0.0, views.seen - projected.points, 0.0)
 
 
-def robust_scale(views: Views, state: State) -> float:
-    """Noise per coordinate from the median length of the residuals, pixels."""
+def robust_scale(views: PackedViews, state: FitState) -> float:
+    """Estimate the noise of a coordinate [px] from the median length of the residuals."""
     length = np.linalg.norm(residuals(views, state), axis=1)[views.weight > 0.0]
     return max(float(np.median(length)) / MEDIAN_OF_NORM, _EXACT_PX)
 
 
-def solve(system: System, damping: float) -> tuple[Floats, Floats, Floats]:
-    """Step of camera and poses at a relative damping of the diagonal, and the reduced camera matrix."""
-    grow = 1.0 + damping
+def solve_step(system: NormalEquations, damping: float) -> tuple[Floats, Floats, Floats]:
+    """Return the steps of camera and poses for a relative damping of the diagonal, and the reduced camera matrix."""
+    damped = 1.0 + damping
     six, m = np.arange(6), np.arange(len(system.camera))
     pose, camera = system.pose.copy(), system.camera.copy()
-    pose[:, six, six] *= grow
-    camera[m, m] *= grow
+    pose[:, six, six] *= damped
+    camera[m, m] *= damped
     right = np.concatenate([np.swapaxes(system.mixed, 1, 2), system.pose_side[..., None]], axis=2)
     eliminated = np.linalg.solve(pose, right)
     reduced = camera - np.sum(system.mixed @ eliminated[..., :-1], axis=0)
     side = system.camera_side - np.sum(system.mixed @ eliminated[..., -1:], axis=0)[:, 0]
-    # Scaled to a unit diagonal: focal lengths and k3 are 1e8 apart.
+    # Scale to a unit diagonal: the magnitudes of focal length and k3 differ by 1e8.
     unit = 1.0 / np.sqrt(np.maximum(np.diag(camera), np.finfo(float).tiny))
     step = unit * np.linalg.lstsq(reduced * np.outer(unit, unit), unit * side, rcond=1e-15)[0]
     return step, eliminated[..., -1] - (eliminated[..., :-1] @ step), reduced
 
 
-def linearise(views: Views, chart: Chart, state: State, loss: Loss, stiffness: bool = False) -> System | None:
-    """Return the normal equations at a state, or None where a point lies behind the camera.
+def linearise(
+    views: PackedViews, free_parameters: FreeParameters, state: FitState, loss: RobustLoss, stiffness: bool = False
+) -> NormalEquations | None:
+    """Return the normal equations at a state; None if a point lies behind the camera.
 
-    With ``stiffness`` points weigh by the loss' second derivative (for covariances), else by its weight (for steps).
+    With ``stiffness`` the points are weighted by the second derivative of the loss (for covariances), otherwise by its
+    weight (for steps).
     """
     if not (np.isfinite(state.numbers).all() and min(state.numbers[:2]) > 0.0):
         return None
-    internal, to_internal = internal_of(state.numbers)
+    internal, to_internal = internal_parameters(state.numbers)
     projected = project(internal, state.rotations, state.translations, views.target, derivatives=True)
     if projected.jacobian is None:
         return None
@@ -169,8 +174,8 @@ def linearise(views: Views, chart: Chart, state: State, loss: Loss, stiffness: b
     hessian = weighted @ np.swapaxes(jacobian, 1, 2)
     side = (weighted @ residual.reshape(count, -1, 1))[..., 0]
     split = len(INTERNAL)
-    free = to_internal @ chart.spread(state.numbers)
-    return System(
+    free = to_internal @ free_parameters.derivative(state.numbers)
+    return NormalEquations(
         camera=free.T @ hessian[:, :split, :split].sum(axis=0) @ free,
         mixed=free.T @ hessian[:, :split, split:],
         pose=hessian[:, split:, split:],
@@ -180,47 +185,53 @@ def linearise(views: Views, chart: Chart, state: State, loss: Loss, stiffness: b
     )
 
 
-def moved(chart: Chart, state: State, camera: Floats, poses: Floats) -> State:
-    """Return the state after a step."""
-    numbers = state.numbers + chart.basis @ camera
+def apply_step(free_parameters: FreeParameters, state: FitState, camera: Floats, poses: Floats) -> FitState:
+    """Return the state after a step of camera and poses."""
+    numbers = state.numbers + free_parameters.basis @ camera
     return replace(
         state,
-        numbers=chart.settled(numbers),
+        numbers=free_parameters.with_dependent(numbers),
         rotations=rotation_matrix(poses[:, :3]) @ state.rotations,
         translations=state.translations + poses[:, 3:],
     )
 
 
-def adjust(views: Views, chart: Chart, start: State, loss: Loss) -> State:
-    """Move camera and poses to the nearest minimum of the loss.
+def adjust(views: PackedViews, free_parameters: FreeParameters, start: FitState, loss: RobustLoss) -> FitState:
+    """Minimise the loss over camera and poses from a starting state.
 
-    Levenberg-Marquardt with Nielsen's damping. It ends when a step would move nothing by more than 1e-4 of its
-    standard deviation.
+    Levenberg-Marquardt with Nielsen's damping. The iteration ends when a step changes no parameter by more than 1e-4 of
+    its standard deviation.
+
+    References
+    ----------
+    K. Madsen, H. B. Nielsen and O. Tingleff, Methods for non-linear least squares problems, TU Denmark 2004.
     """
-    state = replace(start, numbers=chart.settled(start.numbers), cost=np.inf, steps=0, settled=False)
-    system = linearise(views, chart, state, loss)
+    state = replace(
+        start, numbers=free_parameters.with_dependent(start.numbers), cost=np.inf, iterations=0, converged=False
+    )
+    system = linearise(views, free_parameters, state, loss)
     if system is None:
         return state
     state = replace(state, cost=system.cost)
     damping, growth, polished = 1e-4, 2.0, False
-    for count in range(1, max(_FEWEST_STEPS, _STEPS_OF_A_VIEW // len(views.seen)) + 1):
-        camera, poses, _ = solve(system, damping)
-        tried = moved(chart, state, camera, poses)
-        next_system = linearise(views, chart, tried, loss)
+    for count in range(1, max(_MIN_STEPS, _STEPS_TIMES_VIEWS // len(views.seen)) + 1):
+        camera, poses, _ = solve_step(system, damping)
+        tried = apply_step(free_parameters, state, camera, poses)
+        next_system = linearise(views, free_parameters, tried, loss)
         gain = float(camera @ system.camera_side + np.sum(poses * system.pose_side))
-        small = gain < _SETTLED**2 * state.cost / views.coordinates
+        small = gain < _CONVERGED**2 * state.cost / views.coordinates
         if next_system is not None and next_system.cost < state.cost:
-            # 1 where the linear prediction came true.
-            truth = (state.cost - next_system.cost) / gain
-            damping, growth = damping * max(0.1, 1.0 - (2.0 * truth - 1.0) ** 3), 2.0
-            state, system = replace(tried, cost=next_system.cost, steps=count), next_system
+            # Ratio of actual to predicted decrease; 1 for an exactly quadratic cost.
+            ratio = (state.cost - next_system.cost) / gain
+            damping, growth = damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3), 2.0
+            state, system = replace(tried, cost=next_system.cost, iterations=count), next_system
         else:
             damping, growth = damping * growth, 2.0 * growth
         if (small and (polished or damping <= _UNDAMPED)) or state.cost < _EXACT_PX**2 * views.coordinates:
-            return replace(state, settled=True, steps=count)
+            return replace(state, converged=True, iterations=count)
         if small:
-            # Damping may hide what is left in a direction that the data hardly fix.
+            # Damping can hide a remaining step along a weakly determined direction: repeat the step without damping.
             damping, growth, polished = _UNDAMPED, 2.0, True
-        if damping > _STUCK:
+        if damping > _MAX_DAMPING:
             break
-    return replace(state, steps=count)
+    return replace(state, iterations=count)

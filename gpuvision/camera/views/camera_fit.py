@@ -1,4 +1,4 @@
-"""What a calibration returns: the camera, its uncertainty, and what else would have fitted."""
+"""Result of a calibration from views: camera, uncertainties and alternative models."""
 
 from __future__ import annotations
 
@@ -13,52 +13,53 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.scheimpflug import TiltedSensor
 from gpuvision.camera.tilted_projection import Floats, tilt_matrix
 from gpuvision.camera.views.bundle_adjustment import (
-    Loss,
-    State,
-    System,
-    Views,
+    FitState,
+    NormalEquations,
+    PackedViews,
+    RobustLoss,
     linearise,
     residuals,
     robust_scale,
-    solve,
+    solve_step,
 )
-from gpuvision.camera.views.parameters import OPENCV, Chart, internal_of, opencv_of
+from gpuvision.camera.views.parameters import OPENCV, FreeParameters, internal_parameters, opencv_parameters
 
 
 class Pose(NamedTuple):
-    """From a target to the camera: ``rotation @ point + translation``.
+    """Pose of a target in the camera's frame: ``rotation @ point + translation``.
 
     Attributes
     ----------
-    rotation
-        (3, 3).
-    translation
-        (3,), in the target's unit (metres).
+    rotation : numpy.ndarray
+        (3, 3) float64.
+    translation : numpy.ndarray
+        (3,) float64 [m], the unit of the target points.
     """
 
     rotation: Floats
     translation: Floats
 
 
-class Alternative(NamedTuple):
-    """Another model, fitted to the same points.
+class CameraAlternative(NamedTuple):
+    """CameraAlternative camera model, fitted to the same points.
 
     Attributes
     ----------
-    model
-        Its name, as `fit_camera` takes it.
-    rms_px
-        Root mean square distance between seen and projected points.
-    parameters
-        Free numbers of the camera.
-    p_value
-        Probability of as large a rise of the residual over the largest model's, were this model true (F test).
-    aic
-        Akaike's criterion.
-    centre
-        (C_c, R_c).
-    centre_distance_px
-        How far this centre lies from the chosen model's.
+    model : str
+        Name of the model, as in `fit_camera`.
+    rms_px : float
+        Root mean square distance between measured and projected points [px].
+    parameters : int
+        Number of free camera parameters.
+    p_value : float
+        p-value of the F test against the largest model: the probability of at least this increase of the residual if
+        this model is true.
+    aic : float
+        Akaike information criterion.
+    centre : (float, float)
+        Column and row of the distortion centre [px].
+    centre_distance_px : float
+        Distance from the chosen model's centre [px].
     """
 
     model: str
@@ -72,34 +73,35 @@ class Alternative(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class CameraFit:
-    """A calibrated camera.
+    """Calibrated camera.
 
     Attributes
     ----------
-    camera
-        The camera, lens and tilt included.
-    model
-        Name of the model, as `fit_camera` takes it.
-    poses
-        One per view.
-    names
-        What was free in the camera, in OpenCV's names; ``f`` is fx = fy.
-    covariance
-        Of these, (m, m): pixels, radians.
-    pose_covariance
-        (views, 6, 6): a rotation vector [rad], applied from the left in the camera's frame, and the translation.
-    rms_px
-        Root mean square distance between seen and projected points, as OpenCV reports it.
-    sigma
-        Noise of one coordinate, pixels: what was given, else estimated from the residual.
-    residuals
-        Per view (n, 2): seen minus projected, pixels; NaN where a point was missing.
-    iterations
-        Steps of the final fit.
-    alternatives
-        The other models, smallest first.
-    warnings
-        What these data cannot tell.
+    camera : Camera
+        Camera with lens and sensor tilt.
+    model : str
+        Name of the model, as in `fit_camera`.
+    poses : tuple of Pose
+        Pose of the target in each view.
+    names : tuple of str
+        Names of the free camera parameters, as in OpenCV; ``f`` is fx = fy.
+    covariance : numpy.ndarray
+        (m, m): covariance of these parameters [px], [rad].
+    pose_covariance : numpy.ndarray
+        (views, 6, 6): covariance of a rotation vector [rad], applied from the left in the camera's frame, and of the
+        translation [m].
+    rms_px : float
+        Root mean square distance between measured and projected points [px], as OpenCV reports it.
+    sigma_px : float
+        Standard deviation of one coordinate [px]: given, or estimated from the residuals.
+    residuals : tuple of numpy.ndarray
+        Per view (n, 2): measured minus projected points [px]; NaN for missing points.
+    iterations : int
+        Number of steps of the final fit.
+    alternatives : tuple of CameraAlternative
+        CameraAlternative models, smallest first.
+    warnings : tuple of str
+        Parameters that the data do not determine, and other doubts.
     """
 
     camera: Camera
@@ -109,32 +111,32 @@ class CameraFit:
     covariance: Floats
     pose_covariance: Floats
     rms_px: float
-    sigma: float
+    sigma_px: float
     residuals: tuple[Floats, ...]
     iterations: int
-    alternatives: tuple[Alternative, ...] = ()
+    alternatives: tuple[CameraAlternative, ...] = ()
     warnings: tuple[str, ...] = ()
 
     @property
     def uncertainties(self) -> Mapping[str, float]:
-        """Standard deviation of every free number by its name."""
+        """Standard deviation of every free parameter, by name."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
     def sensor(self) -> TiltedSensor:
-        """alpha, f' and the virtual camera of eq. 3.1, for square pixels; alpha is 0 in a model without tilt."""
+        """Tilted sensor (alpha, f', virtual camera), for square pixels; alpha is 0 in a model without tilt."""
         return TiltedSensor.from_camera(self.camera)
 
     @property
     def alpha_sigma(self) -> float:
-        """Standard deviation of alpha, radians (to first order; where alpha itself is near 0, an upper bound)."""
+        """Standard deviation of alpha [rad], to first order; an upper bound if alpha is near 0."""
         if "tauX" not in self.names:
             return 0.0
-        return deviation_of_alpha(self.camera.distortion[12:], self.covariance[-2:, -2:])
+        return alpha_standard_deviation(self.camera.distortion[12:], self.covariance[-2:, -2:])
 
 
-def deviation_of_alpha(tau: Sequence[float], covariance: Floats) -> float:
-    """Return the standard deviation of alpha from the covariance (2, 2) of tauX and tauY, radians."""
+def alpha_standard_deviation(tau: Sequence[float], covariance: Floats) -> float:
+    """Return the standard deviation of alpha [rad] from the covariance (2, 2) of tauX and tauY."""
     tau_x, tau_y = tau
     sine = math.sqrt(1.0 - (math.cos(tau_x) * math.cos(tau_y)) ** 2)
     if sine**2 <= covariance.max():
@@ -143,87 +145,92 @@ def deviation_of_alpha(tau: Sequence[float], covariance: Floats) -> float:
     return float(math.sqrt(slope @ covariance @ slope))
 
 
-def camera_of(numbers: Floats) -> Camera:
-    """Return the camera of `chart.NUMBERS`."""
-    fx, fy, cx, cy, *coefficients, tau_x, tau_y = opencv_of(numbers)[0].tolist()
-    # Without a tilt, rounding of the virtual camera is no tilt either.
+def camera_from_parameters(numbers: Floats) -> Camera:
+    """Return the camera of parameters in the order of `parameters.NUMBERS`."""
+    fx, fy, cx, cy, *coefficients, tau_x, tau_y = opencv_parameters(numbers)[0].tolist()
+    # Adding 0.0 turns -0.0 into 0.0.
     return Camera(
         matrix=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)),
         distortion=(*coefficients, *(0.0,) * 7, tau_x + 0.0, tau_y + 0.0),
     )
 
 
-def lens_poses(state: State) -> tuple[Pose, ...]:
-    """Poses in the lens' frame, as `Camera` and OpenCV have them."""
-    back = tilt_matrix(*internal_of(state.numbers)[0][4:6]).T
+def poses_in_lens_frame(state: FitState) -> tuple[Pose, ...]:
+    """Return the poses in the lens' frame, the frame of `Camera` and OpenCV."""
+    back = tilt_matrix(*internal_parameters(state.numbers)[0][4:6]).T
     return tuple(
         Pose(back @ rotation, back @ translation)
         for rotation, translation in zip(state.rotations, state.translations, strict=True)
     )
 
 
-def noise_of(views: Views, chart: Chart, state: State, loss: Loss) -> float:
-    """Estimate the noise of one coordinate from the residual, pixels."""
+def residual_sigma(views: PackedViews, free_parameters: FreeParameters, state: FitState, loss: RobustLoss) -> float:
+    """Estimate the standard deviation of one coordinate [px] from the residuals."""
     if loss.kind != "squared":
         return robust_scale(views, state)
-    free = views.coordinates - chart.free - 6 * len(views.seen)
+    free = views.coordinates - free_parameters.count - 6 * len(views.seen)
     return math.sqrt(state.cost / free) if free > 0 else math.nan
 
 
 def covariances(
-    views: Views, chart: Chart, state: State, loss: Loss, sigma: float | None
+    views: PackedViews, free_parameters: FreeParameters, state: FitState, loss: RobustLoss, sigma: float | None
 ) -> tuple[Floats, Floats, float]:
-    """Covariances of the camera's numbers (in OpenCV's names) and of the poses (in the lens' frame), deviation of f.
+    """Return the covariances of camera parameters and poses, and the relative standard deviation of f.
 
-    To first order; under a robust loss Huber's, for equal points. What the data do not fix at all comes out as a
-    number far beyond any camera's. The deviation is relative, of the virtual camera's f: that is fixed even where
-    tilt and centre, and with them f', are not.
+    The camera parameters are those named `names` in OpenCV's order; the poses are in the lens' frame. The covariances
+    are valid to first order; under a robust loss they are Huber's, for points of equal noise. Parameters that the data
+    do not determine have a very large, finite variance. f is the virtual camera's focal length: the data can determine
+    it even if they do not determine tilt, centre and f'.
     """
-    system = linearise(views, chart, state, loss, stiffness=True)
-    assert system is not None, "the fit ended where every point is seen"
-    variance = variance_of(views, chart, state, loss, sigma)
+    system = linearise(views, free_parameters, state, loss, stiffness=True)
+    assert system is not None, "the fit ended with every point in front of the camera"
+    variance = residual_variance_factor(views, free_parameters, state, loss, sigma)
     inverse, on_poses, own = _inverted(system)
-    to_names = _names_by_numbers(chart, state)
+    to_names = _derivative_of_names(free_parameters, state)
     camera = variance * to_names @ inverse @ to_names.T
-    by_f = chart.spread(state.numbers)[0]
+    by_f = free_parameters.derivative(state.numbers)[0]
     focus = math.sqrt(max(variance * by_f @ inverse @ by_f, 0.0)) / float(state.numbers[0])
-    return camera, variance * _lens_pose_covariance(chart, state, inverse, on_poses, own), focus
+    return camera, variance * _lens_pose_covariance(free_parameters, state, inverse, on_poses, own), focus
 
 
-def variance_of(views: Views, chart: Chart, state: State, loss: Loss, sigma: float | None = None) -> float:
-    """Return what the inverse of the (stiffness) normal equations is multiplied by: the noise squared, if normal."""
+def residual_variance_factor(
+    views: PackedViews, free_parameters: FreeParameters, state: FitState, loss: RobustLoss, sigma: float | None = None
+) -> float:
+    """Return the factor from the inverse normal equations to the covariance; for normal noise its variance [px^2]."""
     if loss.kind == "squared":
-        return (noise_of(views, chart, state, loss) if sigma is None else sigma) ** 2
+        return (residual_sigma(views, free_parameters, state, loss) if sigma is None else sigma) ** 2
     length = np.linalg.norm(residuals(views, state), axis=1)[views.weight > 0.0]
-    free = views.coordinates - chart.free - 6 * len(views.seen)
-    pull = float(np.sum((loss.weight(length) * length) ** 2))
-    return pull / free / float(np.mean(loss.slope(length)))
+    free = views.coordinates - free_parameters.count - 6 * len(views.seen)
+    squared_influence = float(np.sum((loss.weight(length) * length) ** 2))
+    return squared_influence / free / float(np.mean(loss.slope(length)))
 
 
-def _inverted(system: System) -> tuple[Floats, Floats, Floats]:
-    """Inverse of the normal equations: the camera's block, -(pose by camera) maps, the poses' own inverses."""
-    reduced = solve(system, 0.0)[2]
+def _inverted(system: NormalEquations) -> tuple[Floats, Floats, Floats]:
+    """Invert the normal equations: return the camera's block, -(pose by camera) maps, and the poses' own inverses."""
+    reduced = solve_step(system, 0.0)[2]
     unit = 1.0 / np.sqrt(np.diag(system.camera))
     values, vectors = np.linalg.eigh(reduced * np.outer(unit, unit))
-    # A direction that nothing fixes keeps a variance far beyond any camera's, but a finite one.
+    # Clamp the eigenvalues: an undetermined direction gets a very large, but finite variance.
     values = np.maximum(values, values[-1] * len(values) * np.finfo(float).eps)
     inverse = (vectors / values) @ vectors.T
     own = np.linalg.inv(system.pose).astype(np.float64)
     return inverse * np.outer(unit, unit), own @ np.swapaxes(system.mixed, 1, 2), own
 
 
-def _names_by_numbers(chart: Chart, state: State) -> Floats:
-    """d(names) / d(free numbers)."""
-    rows = [OPENCV.index("fx" if name == "f" else name) for name in chart.names]
-    return (opencv_of(state.numbers)[1] @ chart.spread(state.numbers))[rows]
+def _derivative_of_names(free_parameters: FreeParameters, state: FitState) -> Floats:
+    """Return d(named parameters) / d(free parameters)."""
+    rows = [OPENCV.index("fx" if name == "f" else name) for name in free_parameters.names]
+    return (opencv_parameters(state.numbers)[1] @ free_parameters.derivative(state.numbers))[rows]
 
 
-def _lens_pose_covariance(chart: Chart, state: State, inverse: Floats, on_poses: Floats, own: Floats) -> Floats:
-    """Covariance of the poses in the lens' frame, which turns with the tilt."""
-    internal, turned = internal_of(state.numbers)
-    tau = (turned @ chart.spread(state.numbers))[4:6]
+def _lens_pose_covariance(
+    free_parameters: FreeParameters, state: FitState, inverse: Floats, on_poses: Floats, own: Floats
+) -> Floats:
+    """Return the covariance of the poses in the lens' frame, which rotates with the tilt."""
+    internal, turned = internal_parameters(state.numbers)
+    tau = (turned @ free_parameters.derivative(state.numbers))[4:6]
     m = tilt_matrix(*internal[4:6])
-    # The lens' frame turns by minus this rotation vector when the free numbers move.
+    # Rotation vector of the lens' frame, with negative sign, by the free parameters.
     turn = -np.outer(m[:, 0], tau[0]) - np.outer([0.0, 1.0, 0.0], tau[1])
     count = len(state.rotations)
     by_camera = np.zeros((count, 6, len(inverse)))

@@ -1,132 +1,194 @@
-"""What a calibration's data cannot tell, in words: a small residual does not prove a camera."""
+"""Warnings of a calibration about undetermined parameters; a small residual alone does not prove a model."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from gpuvision.camera.views.camera_fit import Alternative, CameraFit
+from gpuvision.camera.views.camera_fit import CameraAlternative, CameraFit
 
-# Points are seldom measured better, however well a simulation may fit: below, uncertainties are no diagnosis.
-_BEST_NOISE_PX = 0.01
-_LOOSE_FOCUS = 0.02
-_LOOSE_CENTRE_PX = 3.0
-_NO_FOCUS = 0.3
-_FAR_CENTRE = 0.1
-_LEVEL = 0.001
-_TOO_NOISY = 1.2
-_SIGNIFICANT = 3.0
+# Points tested along each side of the image's border.
 _BORDER_POINTS = 17
-# Lenses are assembled no better, and sensors not tilted by so little on purpose.
-_ASSEMBLY_DEGREES = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationLimits:
+    """Thresholds of the model choice, of the warnings and of the acceptance of `fit_camera`.
+
+    Attributes
+    ----------
+    significance : float
+        p-value below which an F test rejects the smaller model.
+    min_noise_px : float
+        Least noise of a coordinate [px] assumed for the warnings: real points are seldom measured better.
+    max_focal_sigma : float
+        Relative standard deviation of f above which a warning says that the views do not determine it.
+    undetermined_focal_sigma : float
+        Relative standard deviation of f above which the calibration is refused.
+    max_centre_sigma_px : float
+        Standard deviation of the centre [px] above which a warning says that the views do not determine it; also the
+        distance of an alternative's centre that is reported.
+    max_centre_offset : float
+        Distance of the centre from the image's middle [image diagonals] above which a tilted sensor is suspected.
+    max_noise_ratio : float
+        Ratio of the estimated to the given noise above which the model is reported as insufficient.
+    significant_sigmas : float
+        Standard deviations from which a tilt is significant.
+    min_tilt_degrees : float
+        Tilt [degree] below which decentred lenses look the same. Typical assembly tolerance of lenses.
+    outlier_sigmas : float
+        Length of a residual [standard deviations] of an outlier. Derived: one of 1e5 points at normal noise.
+    min_view_share : float
+        Least share of a view's points that must have a weight above 0 under Tukey's loss.
+    max_outside_share : float
+        Largest share of points outside the image; a larger one indicates a wrong ``image_size``.
+    sufficient_noise_ratio : float
+        Ratio of the residual to that of free homographies, up to which no other start is tried.
+    """
+
+    significance: float = 0.001
+    min_noise_px: float = 0.01
+    max_focal_sigma: float = 0.02
+    undetermined_focal_sigma: float = 0.3
+    max_centre_sigma_px: float = 3.0
+    max_centre_offset: float = 0.1
+    max_noise_ratio: float = 1.2
+    significant_sigmas: float = 3.0
+    min_tilt_degrees: float = 1.0
+    outlier_sigmas: float = 5.0
+    min_view_share: float = 0.25
+    max_outside_share: float = 0.05
+    sufficient_noise_ratio: float = 1.3
+
+
+DEFAULT_LIMITS = CalibrationLimits()
 
 
 def diagnose(
-    fit: CameraFit, size: tuple[int, int], *, focus: float, settled: bool, noise: float, outliers: int, mirrored: bool
+    fit: CameraFit,
+    size: tuple[int, int],
+    *,
+    focus: float,
+    converged: bool,
+    noise: float,
+    outliers: int,
+    mirrored: bool,
+    limits: CalibrationLimits = DEFAULT_LIMITS,
 ) -> tuple[str, ...]:
-    """Return one sentence for each thing that the data leave open.
+    """Return a warning for every parameter that the data do not determine.
 
     Parameters
     ----------
-    fit
-        The calibration, its warnings yet empty.
-    size
-        (columns, rows) of the images.
-    focus
-        Relative deviation of the virtual camera's f.
-    settled
-        Whether the fit found its end.
-    noise
-        What the residual says of the noise of one coordinate, pixels.
-    outliers
-        Points farther from their place than noise leads, in a fit that trusts every point.
-    mirrored
-        Whether the target is seen from its other side in every view.
+    fit : CameraFit
+        Calibration without warnings.
+    size : (int, int)
+        Columns and rows of the images.
+    focus : float
+        Relative standard deviation of the virtual camera's f.
+    converged : bool
+        Whether the fit has converged.
+    noise : float
+        Standard deviation of one coordinate estimated from the residuals [px].
+    outliers : int
+        Number of outliers in a fit with the squared loss.
+    mirrored : bool
+        Whether every view shows the target from behind.
+    limits : CalibrationLimits
+        Thresholds.
     """
-    said = [
-        _focus(focus * _floor(fit)),
-        _centre(fit),
-        _tilt_instead(fit, size),
-        *(_as_good(fit, each) for each in fit.alternatives),
-        _small_tilt(fit),
+    warnings = [
+        _focus(focus * _noise_factor(fit, limits), limits),
+        _centre(fit, limits),
+        _possible_tilt(fit, size, limits),
+        *(_equal_alternative(fit, each, limits) for each in fit.alternatives),
+        _small_tilt(fit, limits),
     ]
     if _folds(fit, size):
-        said.append("the lens polynomial folds within the image: points beyond the fold cannot be undistorted")
-    if not settled:
-        said.append("the fit had not settled when it was stopped: the uncertainties are those of where it stood")
-    if noise > _TOO_NOISY * fit.sigma:
-        said.append(f"the residual is {noise / fit.sigma:.1f} times the noise given: the model does not suffice")
+        warnings.append("the lens polynomial folds within the image: points beyond the fold cannot be undistorted")
+    if not converged:
+        warnings.append("the fit stopped before it converged: the uncertainties are those of the last step")
+    if noise > limits.max_noise_ratio * fit.sigma_px:
+        warnings.append(f"the residual is {noise / fit.sigma_px:.1f} times the given noise: the model does not suffice")
     if outliers:
-        said.append(f"{outliers} points lie farther off than noise leads: look at the residuals, or take loss='tukey'")
+        warnings.append(f"{outliers} points are outliers: check the residuals, or use loss='tukey'")
     if mirrored:
-        said.append(
-            "the target is seen from behind (its Z axis points at the camera): y runs upwards on it, or the images are "
-            "mirrored and the camera found is the mirrored one"
+        warnings.append(
+            "the views show the target from behind (its Z axis points at the camera): its y axis points upwards, or "
+            "the images are mirrored, and so is the calibrated camera"
         )
-    return tuple(each for each in said if each)
+    return tuple(each for each in warnings if each)
 
 
-def fixes_focus(fit: CameraFit, focus: float, *, settled: bool) -> bool:
-    """Whether the data fix the focal length at all. A fit that found no end had better know it well."""
-    return focus * _floor(fit) < (_NO_FOCUS if settled else _LOOSE_FOCUS)
+def determines_focal_length(
+    fit: CameraFit, focus: float, *, converged: bool, limits: CalibrationLimits = DEFAULT_LIMITS
+) -> bool:
+    """Return whether the data determine the focal length; a fit that has not converged must determine it well."""
+    limit = limits.undetermined_focal_sigma if converged else limits.max_focal_sigma
+    return focus * _noise_factor(fit, limits) < limit
 
 
-def _floor(fit: CameraFit) -> float:
-    """Return by how much deviations grow at the noise that is to be expected at the best."""
-    return max(1.0, _BEST_NOISE_PX / max(fit.sigma, np.finfo(float).tiny))
+def _noise_factor(fit: CameraFit, limits: CalibrationLimits) -> float:
+    """Return the factor on standard deviations if the noise is below the least noise assumed."""
+    return max(1.0, limits.min_noise_px / max(fit.sigma_px, np.finfo(float).tiny))
 
 
-def _focus(loose: float) -> str:
-    if loose < _LOOSE_FOCUS:
+def _focus(deviation: float, limits: CalibrationLimits) -> str:
+    """Warn of a weakly determined focal length."""
+    if deviation < limits.max_focal_sigma:
         return ""
-    return f"the views fix the focal length to {100 * loose:.1f} % only: add views at other angles, or focal_length="
+    return (
+        f"the views determine the focal length to {100 * deviation:.1f} % only: add views at other angles, or give "
+        "focal_length="
+    )
 
 
-def _loose_centre(fit: CameraFit) -> float:
-    """Return the standard deviation of the centre in the direction in which it is known least, pixels."""
+def _centre_deviation(fit: CameraFit, limits: CalibrationLimits) -> float:
+    """Return the standard deviation of the centre in its least determined direction [px]."""
     if "cx" not in fit.names:
         return 0.0
     first = fit.names.index("cx")
     largest = np.linalg.eigvalsh(fit.covariance[first : first + 2, first : first + 2])[-1]
-    return float(math.sqrt(largest)) * _floor(fit)
+    return float(math.sqrt(largest)) * _noise_factor(fit, limits)
 
 
-def _centre(fit: CameraFit) -> str:
-    loose = _loose_centre(fit)
-    if loose < _LOOSE_CENTRE_PX:
+def _centre(fit: CameraFit, limits: CalibrationLimits) -> str:
+    """Warn of a weakly determined centre."""
+    deviation = _centre_deviation(fit, limits)
+    if deviation < limits.max_centre_sigma_px:
         return ""
     if "tauX" not in fit.names:
-        return f"the centre is known to {_pixels(loose, fit)} only: add views at other angles"
+        return f"the centre is known to {_pixels(deviation, fit)} only: add views at other angles"
     tilt = math.degrees(fit.alpha_sigma)
     return (
-        f"the lens bends too little to tell tilt from centre: the centre is known to {_pixels(loose, fit)}, "
-        f"the tilt to {min(tilt, 90.0):.2g} degrees, one trading for the other: give centre= if it is known"
+        f"the distortion is too small to tell tilt from centre: the centre is known to {_pixels(deviation, fit)}, "
+        f"the tilt to {min(tilt, 90.0):.2g} degrees, and their errors are correlated: give centre= if it is known"
     )
 
 
-def _pixels(loose: float, fit: CameraFit) -> str:
-    return f"{loose:.2g} px" if loose < 2.0 * fit.camera.matrix[0][0] else "no pixel"
+def _pixels(deviation: float, fit: CameraFit) -> str:
+    return f"{deviation:.2g} px" if deviation < 2.0 * fit.camera.matrix[0][0] else "no pixel"
 
 
-def _tilt_instead(fit: CameraFit, size: tuple[int, int]) -> str:
-    """Say that a centre far from the image's middle is what a tilted sensor looks like."""
+def _possible_tilt(fit: CameraFit, size: tuple[int, int], limits: CalibrationLimits) -> str:
+    """Warn that a centre far from the image's middle can be the effect of a tilted sensor."""
     if "tauX" in fit.names or "cx" not in fit.names:
         return ""
     f, (column, row) = fit.camera.matrix[0][0], (fit.camera.matrix[0][2], fit.camera.matrix[1][2])
     aside = math.hypot(column - 0.5 * (size[0] - 1), row - 0.5 * (size[1] - 1))
-    if aside < _FAR_CENTRE * math.hypot(*size) + 3.0 * _loose_centre(fit):
+    if aside < limits.max_centre_offset * math.hypot(*size) + 3.0 * _centre_deviation(fit, limits):
         return ""
     tilt = math.degrees(math.atan2(aside, f))
     return (
         f"the centre lies {aside:.0f} px from the image's middle: a sensor tilted by {tilt:.1f} degrees looks the same "
-        "where the lens bends too little; if it is tilted, give model='tilt' and centre="
+        "if the distortion is small; for a tilted sensor give model='tilt' and centre="
     )
 
 
-def _as_good(fit: CameraFit, other: Alternative) -> str:
-    """Say which model fits as well, and lies elsewhere."""
-    if other.p_value < _LEVEL or other.centre_distance_px < _LOOSE_CENTRE_PX:
+def _equal_alternative(fit: CameraFit, other: CameraAlternative, limits: CalibrationLimits) -> str:
+    """Warn of an alternative model that fits equally well with another centre."""
+    if other.p_value < limits.significance or other.centre_distance_px < limits.max_centre_sigma_px:
         return ""
     return (
         f"model {other.model!r} fits as well (rms {other.rms_px:.4f} px, p = {other.p_value:.2g}) "
@@ -135,20 +197,21 @@ def _as_good(fit: CameraFit, other: Alternative) -> str:
 
 
 def _folds(fit: CameraFit, size: tuple[int, int]) -> bool:
-    """Whether the lens folds before the image's border: tried at the corners and some points between."""
+    """Return whether the lens folds within the image; tested at points along the border."""
     across, down = (np.linspace(0.0, last - 1.0, _BORDER_POINTS) for last in size)
     border = [(x, y) for x in across for y in down[[0, -1]]] + [(x, y) for x in across[[0, -1]] for y in down]
     return not np.isfinite(fit.camera.undistort(np.array(border))).all()
 
 
-def _small_tilt(fit: CameraFit) -> str:
+def _small_tilt(fit: CameraFit, limits: CalibrationLimits) -> str:
+    """Warn of a tilt that is not significant, or too small to prove a tilted sensor."""
     if "tauX" not in fit.names:
         return ""
     block = fit.covariance[-2:, -2:]
     tau = np.array(fit.camera.distortion[12:])
-    if tau @ np.linalg.solve(block, tau) > _SIGNIFICANT**2:
+    if tau @ np.linalg.solve(block, tau) > limits.significant_sigmas**2:
         alpha = math.degrees(math.hypot(*tau))
-        if alpha > _ASSEMBLY_DEGREES:
+        if alpha > limits.min_tilt_degrees:
             return ""
         return f"a tilt of {alpha:.2g} degrees is no proof of a tilted sensor: decentred lenses (p1, p2) look the same"
     return (

@@ -1,8 +1,12 @@
-"""Where a calibration from views of a plane starts: homographies with the lens in them, and Zhang's closed form.
+"""Starting values of a calibration from views of a plane: homographies with distortion, and Zhang's closed form.
 
-A camera with a tilted sensor and no distortion is a pinhole camera with square pixels (fig. 3.3), so Zhang's closed
-form gives f and v of the virtual camera whatever the tilt. Distortion bends the homographies; one radial term about
-the image's centre, common to all views, takes most of it out.
+A camera with a tilted sensor and no distortion is a pinhole camera with square pixels (F. de Jong, fig. 3.3). Zhang's
+closed form therefore gives f and v of the virtual camera for any tilt. Lens distortion biases the homographies; radial
+terms about the image's centre, common to all views, remove most of it.
+
+References
+----------
+Z. Zhang, A flexible new technique for camera calibration, IEEE Trans. PAMI 22 (2000) 1330.
 """
 
 from __future__ import annotations
@@ -13,23 +17,28 @@ from typing import NamedTuple
 import numpy as np
 
 from gpuvision.camera.tilted_projection import Floats
-from gpuvision.camera.views.bundle_adjustment import MEDIAN_OF_NORM, Views
+from gpuvision.camera.views.bundle_adjustment import MEDIAN_OF_NORM, PackedViews
 
+# Gauss-Newton rounds of the homographies: with the squared loss, and with reweighting against outliers.
 _ROUNDS = 4
 _ROBUST_ROUNDS = 15
+# Reweighting, in medians of a view's residual lengths: length below which the weight is constant; length from which a
+# point is rejected in the last rounds.
+_FULL_WEIGHT = 0.3
+_REJECTED = 6.0
 
 
-class Flat(NamedTuple):
-    """Homographies of all views, undistorted about a centre.
+class UndistortedHomographies(NamedTuple):
+    """Homographies of all views to undistorted image coordinates.
 
     Attributes
     ----------
     homographies
-        (views, 3, 3): target's plane to (pixel - centre) / radius.
+        (views, 3, 3): from the target's plane to (pixel - centre) / radius.
     radial
-        The two coefficients, at that radius.
+        (2,): radial distortion coefficients in these coordinates.
     noise
-        What they leave, pixels per coordinate.
+        Standard deviation of a coordinate of the residuals [px].
     """
 
     homographies: Floats
@@ -37,37 +46,41 @@ class Flat(NamedTuple):
     noise: float
 
 
-def flatten(views: Views, centre: Floats, radius: float, *, robust: bool = False, straight: bool = False) -> Flat:
-    """Fit a homography per view and two radial terms for all, by Gauss-Newton from the linear solution.
+def fit_homographies(
+    views: PackedViews, centre: Floats, radius: float, *, robust: bool = False, undistorted: bool = False
+) -> UndistortedHomographies:
+    """Fit a homography per view and two common radial terms, by Gauss-Newton from the linear solution.
 
     Parameters
     ----------
-    views
-        Points of a flat target, and where they were seen.
-    centre, radius
-        Where the radial terms have their centre, and the pixels that are 1 in their unit.
-    robust
-        Whether there may be outliers.
-    straight
-        Whether the points are undistorted already: no radial terms then.
+    views : PackedViews
+        Points of a flat target, and their measured image points.
+    centre : numpy.ndarray
+        (2,): centre of the radial terms [px].
+    radius : float
+        Unit of the radial terms [px].
+    robust : bool
+        Reweight against outliers. Default False.
+    undistorted : bool
+        The points are undistorted: omit the radial terms. Default False.
     """
     seen = (views.seen - centre[:, None]) / radius
-    # Targets in units of their own extent, about their own middle.
-    plane, back = _plane_units(views)
+    # Normalise each target to zero mean and unit size.
+    plane, normalisation = _plane_units(views)
     weight = views.weight.copy()
     homographies = _direct_linear(plane, seen, weight)
     radial = np.zeros(2)
     rounds = _ROBUST_ROUNDS if robust else _ROUNDS
     for round_ in range(rounds):
         residual, by_radial, by_homography = _bent(plane, seen, homographies, radial)
-        by_radial *= not straight
+        by_radial *= not undistorted
         if robust:
             length = np.linalg.norm(residual, axis=1)
-            # Of each view: one that is all wrong shall not lose all its points here.
+            # The median of each view: a view that is wrong as a whole keeps its points here.
             middle = np.nanmedian(np.where(views.weight > 0.0, length, np.nan), axis=1)[:, None]
-            weight = views.weight / np.maximum(length, 0.3 * middle + 1e-12) * middle
-            if round_ > _ROBUST_ROUNDS - 4:  # beyond doubt an outlier by now
-                weight *= length < 6.0 * middle + 1e-12
+            weight = views.weight / np.maximum(length, _FULL_WEIGHT * middle + 1e-12) * middle
+            if round_ > _ROBUST_ROUNDS - 4:
+                weight *= length < _REJECTED * middle + 1e-12
         step, steps = _eliminated(residual, by_radial, by_homography, weight)
         radial = radial + step
         homographies = homographies + np.concatenate([steps, np.zeros((len(steps), 1))], axis=1).reshape(-1, 3, 3)
@@ -78,24 +91,24 @@ def flatten(views: Views, centre: Floats, radius: float, *, robust: bool = False
     else:
         spare = max(views.coordinates - 8 * len(homographies) - 2, 1)
         noise = math.sqrt(float(np.sum(length**2)) / spare)
-    return Flat(homographies @ back, radial, noise * radius)
+    return UndistortedHomographies(homographies @ normalisation, radial, noise * radius)
 
 
-def _plane_units(views: Views) -> tuple[Floats, Floats]:
-    """Target points (views, 3, n) as (x, y, 1) of unit size, and the matrices (views, 3, 3) that took them there."""
+def _plane_units(views: PackedViews) -> tuple[Floats, Floats]:
+    """Return the target points as (x, y, 1) of unit size (views, 3, n), and the normalising matrices (views, 3, 3)."""
     total = np.sum(views.weight, axis=1)
     middle = np.sum(views.weight[:, None] * views.target[:, :2], axis=2) / total[:, None]
     offset = (views.target[:, :2] - middle[..., None]) * views.weight[:, None]
     size = np.sqrt(np.sum(offset**2, axis=(1, 2)) / total)
-    back = np.zeros((len(total), 3, 3))
-    back[:, 0, 0] = back[:, 1, 1] = 1.0 / size
-    back[:, :2, 2] = -middle / size[:, None]
-    back[:, 2, 2] = 1.0
-    return np.concatenate([offset / size[:, None, None], np.ones_like(offset[:, :1])], axis=1), back
+    normalisation = np.zeros((len(total), 3, 3))
+    normalisation[:, 0, 0] = normalisation[:, 1, 1] = 1.0 / size
+    normalisation[:, :2, 2] = -middle / size[:, None]
+    normalisation[:, 2, 2] = 1.0
+    return np.concatenate([offset / size[:, None, None], np.ones_like(offset[:, :1])], axis=1), normalisation
 
 
 def _direct_linear(plane: Floats, seen: Floats, weight: Floats) -> Floats:
-    """Homographies of least algebraic error, element (2, 2) equal to 1."""
+    """Return the homographies of least algebraic error (DLT), with element (2, 2) equal to 1."""
     x = plane * weight[:, None]
     zero = np.zeros_like(x)
     rows = [
@@ -108,7 +121,7 @@ def _direct_linear(plane: Floats, seen: Floats, weight: Floats) -> Floats:
 
 
 def _bent(plane: Floats, seen: Floats, homographies: Floats, radial: Floats) -> tuple[Floats, Floats, Floats]:
-    """Residuals (views, 2, n), derivatives by the radial terms (views, 2, 2, n) and homographies (views, 8, 2, n)."""
+    """Return residuals (views, 2, n), derivatives by radials (views, 2, 2, n) and by homographies (views, 8, 2, n)."""
     mapped = homographies @ plane
     inverse = 1.0 / mapped[:, 2]
     x, y = mapped[:, 0] * inverse, mapped[:, 1] * inverse
@@ -126,7 +139,7 @@ def _bent(plane: Floats, seen: Floats, homographies: Floats, radial: Floats) -> 
 
 
 def _eliminated(residual: Floats, by_radial: Floats, by_homography: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Gauss-Newton step: radial terms with the homographies eliminated, then the homographies."""
+    """Return the Gauss-Newton steps of the radial terms, homographies eliminated, and of the homographies."""
     count = len(residual)
     jacobian = np.concatenate([by_radial, by_homography], axis=1).reshape(count, 10, -1)
     weighted = jacobian * np.repeat(weight[:, None], 2, axis=1).reshape(count, 1, -1)
@@ -140,15 +153,15 @@ def _eliminated(residual: Floats, by_radial: Floats, by_homography: Floats, weig
     return step, solved[..., 2] - solved[..., :2] @ step
 
 
-def closed_form(homographies: Floats, aspect: bool) -> tuple[float, float, Floats] | None:
-    """Zhang's closed form without skew: (f, fy / fx, v) in the homographies' units, or None where it has none.
+def zhang_closed_form(homographies: Floats, aspect: bool) -> tuple[float, float, Floats] | None:
+    """Return (f, fy / fx, v) by Zhang's closed form without skew, in the homographies' units; None without solution.
 
     Parameters
     ----------
-    homographies
-        Of two views or more.
-    aspect
-        Whether fy / fx is sought; 1 otherwise.
+    homographies : numpy.ndarray
+        (views, 3, 3), two views or more.
+    aspect : bool
+        Estimate fy / fx; otherwise it is 1.
     """
     first, second = homographies[:, :, 0], homographies[:, :, 1]
     scale = 1.0 / np.sqrt(np.sum(first**2, axis=1) * np.sum(second**2, axis=1))[:, None]
@@ -169,7 +182,7 @@ def closed_form(homographies: Floats, aspect: bool) -> tuple[float, float, Float
 
 
 def _conic_row(a: Floats, b: Floats) -> Floats:
-    """Coefficients of a^T omega b in omega's elements (xx, yy, x, y, 1)."""
+    """Return the coefficients of a^T omega b in the elements (xx, yy, x, y, 1) of omega."""
     return np.stack(
         [
             a[:, 0] * b[:, 0],
@@ -182,21 +195,21 @@ def _conic_row(a: Floats, b: Floats) -> Floats:
     )
 
 
-def closed_form_of_tilt(
+def tilt_closed_form(
     homographies: Floats, direction: float | None, focal_length: float | None
 ) -> tuple[float, Floats] | None:
-    """Return f and v in closed form where the centre is known, in the homographies' units about it, or None.
+    """Return f and v in closed form for a known centre, in the homographies' units about it; None without solution.
 
     Every view gives two equations on the image of the absolute conic, linear in v and f'^2 = f^2 + v^2.
 
     Parameters
     ----------
-    homographies
-        Of one view or more, about the centre.
-    direction
-        In which v lies from the centre (or opposite), where that is known, radians.
-    focal_length
-        f' where it is known. One view fixes two numbers of f' and v.
+    homographies : numpy.ndarray
+        (views, 3, 3) about the centre, one view or more.
+    direction : float or None
+        Known direction from the centre to v, or its opposite [rad].
+    focal_length : float or None
+        Known f'. One view determines two of the three parameters f' and v.
     """
     h1, h2 = homographies[:, :, 0], homographies[:, :, 1]
     scale = 1.0 / np.sqrt(np.sum(h1**2, axis=1) * np.sum(h2**2, axis=1))
@@ -218,12 +231,12 @@ def closed_form_of_tilt(
     return (math.sqrt(f2), v) if f2 > 0.0 else None
 
 
-def poses(homographies: Floats, f: float, aspect: float, v: Floats) -> tuple[Floats, Floats]:
-    """Rotations and translations of planes whose homographies a pinhole camera saw."""
+def poses_from_homographies(homographies: Floats, f: float, aspect: float, v: Floats) -> tuple[Floats, Floats]:
+    """Return rotations and translations of the planes from their homographies and a pinhole camera."""
     inverse = np.array([[1.0 / f, 0.0, -v[0] / f], [0.0, 1.0 / (aspect * f), -v[1] / (aspect * f)], [0.0, 0.0, 1.0]])
     columns = inverse @ homographies
     lengths = np.linalg.norm(columns[:, :, :2], axis=1)
-    # The middle of each target has the weight 1: in front, whatever the scale.
+    # The mean of each target has the homogeneous weight 1: the target lies in front of the camera for any scale.
     scale = 2.0 / lengths.sum(axis=1)
     columns = columns * scale[:, None, None]
     third = np.cross(columns[:, :, 0], columns[:, :, 1])

@@ -1,12 +1,17 @@
-"""Tilt and focal length of a Scheimpflug camera whose lens is known (F. de Jong, section 3.3.7).
+"""Tilt and focal length of a Scheimpflug camera with a known lens.
 
-Vanishing points gave the lens: its distortion and the centre, where the optical axis meets the sensor. Points that it
-has straightened come from the virtual pinhole camera of fig. 3.3, whose principal point lies f' sin(alpha) from the
-centre in the direction of the tilt. A view of a flat target then fixes alpha and f' where that direction is known, by
-linear equations in f' sin(alpha) and f'^2; the pose is Tsai's first stage; both are refined together.
+The lens (distortion and centre) is known, for example from vanishing points. Undistorted points are those of the
+virtual pinhole camera (fig. 3.3), whose principal point lies at a distance f' sin(alpha) from the centre, in the
+direction of the tilt. For a known direction one view of a flat target determines alpha and f' by linear equations in f'
+sin(alpha) and f'^2. The pose comes from the first stage of Tsai's method. Both are refined together.
 
-Limits. The lens model is radial in the sensor; behind a real lens distortion is radial in the plane of the lens, which
-differs the more, the larger tilt and distortion are. `fit_camera` with ``model="tilt"`` has the true order.
+Limits: The lens model is radial in the sensor plane. The distortion of a real lens is radial in the plane of the lens;
+the difference increases with tilt and distortion. `fit_camera` with ``model="tilt"`` applies distortion and tilt in the
+right order.
+
+References
+----------
+F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 3.3.7.
 """
 
 from __future__ import annotations
@@ -21,37 +26,44 @@ import numpy.typing as npt
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.scheimpflug import TiltedSensor
 from gpuvision.camera.tilted_projection import Floats
-from gpuvision.camera.views.bundle_adjustment import Loss, State, Views, adjust
-from gpuvision.camera.views.camera_fit import Pose, covariances, deviation_of_alpha, lens_poses, noise_of
-from gpuvision.camera.views.initialization import closed_form_of_tilt, flatten
-from gpuvision.camera.views.parameters import Chart
+from gpuvision.camera.views.bundle_adjustment import FitState, PackedViews, RobustLoss, adjust
+from gpuvision.camera.views.camera_fit import (
+    Pose,
+    alpha_standard_deviation,
+    covariances,
+    poses_in_lens_frame,
+    residual_sigma,
+)
+from gpuvision.camera.views.initialization import fit_homographies, tilt_closed_form
+from gpuvision.camera.views.parameters import FreeParameters
 from gpuvision.camera.views.target_views import pack
 from gpuvision.camera.views.tsai import fit_tsai
 
-_NO_FOCUS = 0.3
-_BEST_NOISE_PX = 0.01
+# Relative standard deviation of f above which the views do not determine it, and least noise [px] assumed for it.
+_UNDETERMINED = 0.3
+_MIN_NOISE_PX = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class TiltFit:
-    """The tilt of a sensor behind a known lens.
+    """Tilt of a sensor behind a known lens.
 
     Attributes
     ----------
-    sensor
-        alpha, its direction, f' and the virtual camera.
-    lens
-        The lens that was given.
-    poses
-        Of the targets, in the frame of the lens.
-    names
-        "f" (that is f'), "tauX", "tauY": what the covariance is of; without "f" where f' was given.
-    covariance
-        Pixels and radians.
-    alpha_sigma
-        Standard deviation of alpha, radians.
-    rms_px
-        Root mean square distance between straightened and projected points.
+    sensor : TiltedSensor
+        Sensor with alpha, direction, f' and the virtual camera.
+    lens : Lens
+        Known lens.
+    poses : tuple of Pose
+        Poses of the targets in the lens' frame.
+    names : tuple of str
+        Names of the estimated parameters: "f" (f'), "tauX", "tauY"; without "f" if f' was given.
+    covariance : numpy.ndarray
+        (m, m): covariance of these parameters [px], [rad].
+    alpha_sigma : float
+        Standard deviation of alpha [rad].
+    rms_px : float
+        Root mean square distance between undistorted and projected points [px].
     """
 
     sensor: TiltedSensor
@@ -70,62 +82,76 @@ def fit_tilt(
     direction: float | None = None,
     focal_length: float | None = None,
 ) -> TiltFit:
-    """Find alpha, f' and the poses of flat targets once the lens is known.
+    """Estimate alpha, f' and the poses of flat targets for a known lens.
 
     Parameters
     ----------
-    views
-        Per image (points on the target [m], points in the image [px]).
-    lens
-        From measured to undistorted pixels, its centre where the optical axis meets the sensor.
-    direction
-        Direction of the tilt in the image, radians from the columns' axis towards the rows' (or its opposite: alpha
-        comes with the sign that the data have); None: to be found.
-    focal_length
-        f' where it is known, pixels. One view then suffices for the direction too.
+    views : sequence of View or pairs of array_like
+        Per image: points on the target [m], and their image points [px].
+    lens : Lens
+        Lens from measured to undistorted pixels; its centre is the optical axis on the sensor.
+    direction : float, optional
+        Known direction of the tilt in the image, or its opposite [rad], from the columns' axis towards the rows'.
+        Default: estimated.
+    focal_length : float, optional
+        Known f' [px]; one view then determines the direction as well. Default: estimated.
+
+    Returns
+    -------
+    TiltFit
 
     Raises
     ------
     ValueError
-        The views do not fix what is sought.
+        The views do not determine the parameters; the message says what is missing.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 3.3.7.
     """
     if len(views) == 1 and direction is None and focal_length is None:
         raise ValueError("one view fixes two numbers of alpha, its direction and f': give direction=, or focal_length=")
-    straight = [(target, lens.undistort(np.asarray(image).reshape(-1, 2))) for target, image in views]
-    packed, _ = pack(straight)
+    undistorted = [(target, lens.undistort(np.asarray(image).reshape(-1, 2))) for target, image in views]
+    packed, _ = pack(undistorted)
     centre = np.array(lens.centre)
     radius = float(np.sqrt(np.max(np.sum((packed.seen - centre[:, None]) ** 2, axis=1))))
-    homographies = flatten(packed, centre, radius, straight=True).homographies
-    closed = closed_form_of_tilt(homographies, direction, None if focal_length is None else focal_length / radius)
+    homographies = fit_homographies(packed, centre, radius, undistorted=True).homographies
+    closed = tilt_closed_form(homographies, direction, None if focal_length is None else focal_length / radius)
     if closed is None:
-        raise ValueError("no tilt and f' explain these views: are lens and direction right, and the target oblique?")
+        raise ValueError(
+            "no tilt and f' fit these views: check lens and direction; the target must be oblique to the sensor"
+        )
     f = radius * closed[0]
     values = np.zeros(11)
     values[:6] = [f, 1.0, *(centre + radius * closed[1]), *centre]
-    chart = Chart(coefficients=(), tilt=True, centre=False, direction=direction, focal_length=focal_length)
+    free_parameters = FreeParameters(
+        coefficients=(), tilt=True, centre=False, direction=direction, focal_length=focal_length
+    )
     poses = [
         fit_tsai(target, seen, (values[2], values[3]), focal_length=f, distorted=False).pose
-        for target, seen in straight
+        for target, seen in undistorted
     ]
-    state = State(values, np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
-    state = adjust(packed, chart, state, Loss())
-    return _described(packed, chart, state, lens)
+    state = FitState(
+        values, np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses])
+    )
+    state = adjust(packed, free_parameters, state, RobustLoss())
+    return _described(packed, free_parameters, state, lens)
 
 
-def _described(views: Views, chart: Chart, state: State, lens: Lens) -> TiltFit:
-    covariance, _, focus = covariances(views, chart, state, Loss(), None)
-    noise = noise_of(views, chart, state, Loss())
-    if not focus * max(1.0, _BEST_NOISE_PX / max(noise, np.finfo(float).tiny)) < _NO_FOCUS:
-        raise ValueError("the views do not fix f': a target oblique to the sensor, or focal_length=, is needed")
+def _described(views: PackedViews, free_parameters: FreeParameters, state: FitState, lens: Lens) -> TiltFit:
+    covariance, _, focus = covariances(views, free_parameters, state, RobustLoss(), None)
+    noise = residual_sigma(views, free_parameters, state, RobustLoss())
+    if not focus * max(1.0, _MIN_NOISE_PX / max(noise, np.finfo(float).tiny)) < _UNDETERMINED:
+        raise ValueError("the views do not determine f': use a target oblique to the sensor, or give focal_length=")
     sensor = TiltedSensor.from_virtual(
         float(state.numbers[0]), (state.numbers[2], state.numbers[3]), (state.numbers[4], state.numbers[5])
     )
     return TiltFit(
         sensor=sensor,
         lens=lens,
-        poses=lens_poses(state),
-        names=chart.names,
+        poses=poses_in_lens_frame(state),
+        names=free_parameters.names,
         covariance=covariance,
-        alpha_sigma=deviation_of_alpha(sensor.tau, covariance[-2:, -2:]),
+        alpha_sigma=alpha_standard_deviation(sensor.tau, covariance[-2:, -2:]),
         rms_px=math.sqrt(2.0 * state.cost / views.coordinates),
     )

@@ -1,8 +1,9 @@
-"""Which numbers of a tilted camera a fit may move, and in which coordinates it moves them.
+"""Free parameters of a tilted camera in a fit, and the coordinates in which the fit works.
 
-Between f', centre c and tilt data with little distortion leave a bent valley. Its coordinates are the virtual camera
-(f, v) and the centre c: the optical axis leaves the sensor's pinhole along g = (c - v, f), so that alpha is the angle
-between g and the sensor's normal, f' = |g| and f = f' cos(alpha) (eq. 3.1).
+In f', centre c and tilt, data with little distortion form a curved valley. The fit works in the virtual camera (f, v)
+and the centre c instead: the optical axis has the direction g = (c - v, f) in the sensor's frame, so that alpha is the
+angle between g and the sensor's normal, f' = |g| and f = f' cos(alpha) (F. de Jong, *Range Imaging and Visual Servoing
+for industrial applications*, TU Delft 2008, eq. 3.1).
 """
 
 from __future__ import annotations
@@ -14,30 +15,29 @@ import numpy as np
 from gpuvision.camera.tilted_projection import INTERNAL, Floats
 
 NUMBERS = ("f", "aspect", "v_column", "v_row", "c_column", "c_row", "k1", "k2", "p1", "p2", "k3")
-"""The coordinates in which a fit moves."""
+"""Coordinates of the fit."""
 OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "tauX", "tauY")
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Chart:
-    """The free numbers of one camera model.
+class FreeParameters:
+    """Free parameters of one camera model.
 
     Parameters
     ----------
-    coefficients
-        Distortion coefficients that are free, out of `COEFFICIENTS`; the others keep their values.
-    tilt
-        Whether the sensor is tilted: the centre c is then free beside v, else it *is* v.
-    aspect
-        Whether fy / fx is free.
-    focal_length
-        f' where it is known, pixels.
-    centre
-        Whether the centre is free; else it keeps its value.
-    direction
-        Where the sensor's direction of tilt is known, radians from the columns' axis towards the rows': v then moves
-        along it alone.
+    coefficients : tuple of str
+        Free distortion coefficients, from `COEFFICIENTS`; the others keep their values.
+    tilt : bool
+        The sensor is tilted: c and v are independent. Otherwise c equals v.
+    aspect : bool
+        fy / fx is free. Default False.
+    focal_length : float, optional
+        Known f' [px]. Default: free.
+    centre : bool
+        The centre is free; otherwise it keeps its value. Default True.
+    direction : float, optional
+        Known direction of the tilt [rad], from the columns' axis towards the rows': v then moves along it only.
     """
 
     coefficients: tuple[str, ...]
@@ -49,7 +49,7 @@ class Chart:
 
     @property
     def basis(self) -> Floats:
-        """How the free numbers move `NUMBERS`, shape (11, free). Without a tilt the centre moves, and v with it."""
+        """Linear map (11, free) from free parameters to `NUMBERS`. Without a tilt v depends on the free centre."""
         names = [] if self.focal_length is not None else ["f"]
         names += ["aspect"] if self.aspect else []
         names += ["v_column"] if self.tilt else []
@@ -62,23 +62,23 @@ class Chart:
         return basis
 
     @property
-    def free(self) -> int:
-        """How many numbers are free."""
+    def count(self) -> int:
+        """Number of free parameters."""
         return len(self.basis.T)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """OpenCV's names of what is free; `f` where fx and fy share one."""
+        """OpenCV's names of the free parameters; ``f`` for fx = fy."""
         names = [] if self.focal_length is not None else ["fx", "fy"] if self.aspect else ["f"]
         names += ["fy"] if self.aspect and self.focal_length is not None else []
         names += ["cx", "cy"] if self.centre else []
         names += [*self.coefficients, *(("tauX", "tauY") if self.tilt else ())]
         return tuple(names)
 
-    def settled(self, numbers: Floats) -> Floats:
-        """Return the numbers with those that others fix brought in line: v without a tilt, f where f' is known.
+    def with_dependent(self, numbers: Floats) -> Floats:
+        """Return the parameters with the dependent ones recomputed: v without a tilt, f if f' is known.
 
-        f is NaN where no tilt brings the axis from v to c at this f'.
+        f is NaN if no tilt leads the axis from v to c with this f'.
         """
         result = numbers.copy()
         if not self.tilt:
@@ -88,8 +88,8 @@ class Chart:
             result[0] = np.sqrt(reach) if reach > 0.0 else np.nan
         return result
 
-    def spread(self, numbers: Floats) -> Floats:
-        """d(`NUMBERS`) / d(free numbers), shape (11, free)."""
+    def derivative(self, numbers: Floats) -> Floats:
+        """Return d(`NUMBERS`) / d(free parameters), (11, free)."""
         derivative = self.basis
         if not self.tilt:
             derivative[2:4] = derivative[4:6]
@@ -101,15 +101,15 @@ class Chart:
         return derivative
 
 
-def internal_of(numbers: Floats) -> tuple[Floats, Floats]:
-    """Return what `tilted_projection.project` takes, and its derivative (11, 11) by the numbers."""
+def internal_parameters(numbers: Floats) -> tuple[Floats, Floats]:
+    """Return the internal parameters of `tilted_projection.project`, and their derivative (11, 11) by `NUMBERS`."""
     f, aspect, v_column, v_row, c_column, c_row = numbers[:6].tolist()
     g = np.array([c_column - v_column, (c_row - v_row) / aspect, f])
     by_numbers = np.zeros((3, len(NUMBERS)))
     by_numbers[0, 4], by_numbers[0, 2] = 1.0, -1.0
     by_numbers[1, 5], by_numbers[1, 3], by_numbers[1, 1] = 1.0 / aspect, -1.0 / aspect, -g[1] / aspect
     by_numbers[2, 0] = 1.0
-    # g leads along (-sin tauY cos tauX, sin tauX, cos tauY cos tauX).
+    # g is parallel to (-sin tauY cos tauX, sin tauX, cos tauY cos tauX).
     flat2, whole2 = g[0] ** 2 + g[2] ** 2, g @ g
     flat = np.sqrt(flat2)
     tau_x, tau_y = np.arctan2(g[1], flat), np.arctan2(-g[0], g[2])
@@ -122,9 +122,9 @@ def internal_of(numbers: Floats) -> tuple[Floats, Floats]:
     return internal, derivative
 
 
-def opencv_of(numbers: Floats) -> tuple[Floats, Floats]:
-    """Return the numbers named in `OPENCV`, and their derivative (11, 11) by `NUMBERS`."""
-    internal, turned = internal_of(numbers)
+def opencv_parameters(numbers: Floats) -> tuple[Floats, Floats]:
+    """Return the parameters named in `OPENCV`, and their derivative (11, 11) by `NUMBERS`."""
+    internal, turned = internal_parameters(numbers)
     f, aspect, v_column, v_row, c_column, c_row = numbers[:6].tolist()
     g = np.array([c_column - v_column, (c_row - v_row) / aspect, f])
     fx = float(np.linalg.norm(g))

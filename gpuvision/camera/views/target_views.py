@@ -1,4 +1,4 @@
-"""Views of a flat target: points on it and where they were seen, checked and packed for the fits."""
+"""PackedViews of a flat target: target points with their image points, checked and packed for the fits."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ import numpy.typing as npt
 
 from gpuvision.camera.patterns.pattern import PatternGrid
 from gpuvision.camera.tilted_projection import Floats
-from gpuvision.camera.views.bundle_adjustment import Views
+from gpuvision.camera.views.bundle_adjustment import PackedViews
 from gpuvision.validation import finite
 
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
-_FEWEST_POINTS = 4
-# Spread across a line over that along it, at which points lie on the line.
-_FLAT_TARGET = 1e-9
+# Points that determine a homography.
+_MIN_POINTS = 4
+# Ratio of the singular values of centred points, below which the points are collinear. Derived: above double rounding.
+_COLLINEAR = 1e-9
 
 
 class View(NamedTuple):
-    """One image of a flat target.
+    """Points of a flat target in one image.
 
     Attributes
     ----------
-    target
-        (n, 2) or (n, 3): points on the target, metres; the third coordinate 0.
-    image
-        (n, 2): where they were seen, (column, row) pixels; NaN where missing.
+    target : numpy.ndarray
+        (n, 2) or (n, 3): points on the target [m]; the third coordinate is 0.
+    image : numpy.ndarray
+        (n, 2): measured (column, row) [px]; NaN where missing.
     """
 
     target: npt.NDArray[np.float64]
@@ -36,14 +37,18 @@ class View(NamedTuple):
 
 
 def make_view(grid: PatternGrid | npt.ArrayLike, pitch: float) -> View:
-    """Return the view of a regular grid, as the pattern finders return it.
+    """Return the view of a regular grid, such as `find_dots` and `find_chessboard` return.
 
     Parameters
     ----------
-    grid
-        The grid, or its points (rows, columns, 2): pixels, NaN where missing.
-    pitch
-        Distance of neighbours on the target, metres.
+    grid : PatternGrid or array_like
+        Grid, or its points (rows, columns, 2) [px], NaN where missing.
+    pitch : float
+        Distance between neighbouring points on the target [m].
+
+    Returns
+    -------
+    View
 
     Raises
     ------
@@ -57,13 +62,13 @@ def make_view(grid: PatternGrid | npt.ArrayLike, pitch: float) -> View:
     return View(np.stack([column, row, np.zeros_like(row)], axis=-1).reshape(-1, 3), points.reshape(-1, 2))
 
 
-def pack(views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]) -> tuple[Views, tuple[Mask, ...]]:
-    """Bring views of different lengths into arrays.
+def pack(views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]) -> tuple[PackedViews, tuple[Mask, ...]]:
+    """Pack views of different lengths into arrays; return them with the mask of known points of each view.
 
     Raises
     ------
     ValueError
-        There is none, or one is no view of a flat target: says which, and what is wrong with it.
+        No view is given, or a view shows no flat target; the message names the view.
     """
     if not len(views):
         raise ValueError("no views given, expected at least one")
@@ -82,29 +87,31 @@ def pack(views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]) -> tuple[Views, t
         _check_spread(f"view {index}", pairs[-1][0])
         _check_spread(f"view {index}, image", pairs[-1][1])
     longest = max(len(target) for target, _ in pairs)
-    packed = Views(
+    packed = PackedViews(
         np.zeros((len(pairs), 3, longest)), np.zeros((len(pairs), 2, longest)), np.zeros((len(pairs), longest))
     )
     for index, (target, seen) in enumerate(pairs):
         packed.target[index, :2, : len(target)] = target.T
-        # What is missing repeats a point, at weight 0: it is as regular as the others.
+        # Pad with a copy of the first point at weight 0, so that all derivatives stay finite.
         packed.target[index, :2, len(target) :] = target[:1].T
         packed.seen[index, :, : len(seen)] = seen.T
         packed.weight[index, : len(seen)] = 1.0
     return packed, tuple(masks)
 
 
-def _check_spread(what: str, target: Floats) -> None:
-    if len(target) < _FEWEST_POINTS:
-        raise ValueError(f"{what}: {len(target)} measured points, expected at least {_FEWEST_POINTS}")
-    # One point beside a line does not fix a homography either: the farthest from the line is left out.
+def _check_spread(name: str, target: Floats) -> None:
+    """Refuse too few points, and points that lie on one line, all or all but one."""
+    if len(target) < _MIN_POINTS:
+        raise ValueError(f"{name}: {len(target)} measured points, expected at least {_MIN_POINTS}")
+    # A single point off a line does not determine a homography either: test without the farthest point as well.
     for points in (target, _without_farthest(target)):
         sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if sizes[1] <= _FLAT_TARGET * sizes[0]:
-            raise ValueError(f"{what}: all points lie on one line, points beside it are needed")
+        if sizes[1] <= _COLLINEAR * sizes[0]:
+            raise ValueError(f"{name}: all points lie on one line, points beside it are needed")
 
 
 def _without_farthest(points: Floats) -> Floats:
+    """Remove the point farthest from the best line."""
     offset = points - points.mean(axis=0)
     aside = offset @ np.linalg.svd(offset, full_matrices=False)[2][1]
     return np.delete(points, np.argmax(np.abs(aside)), axis=0)

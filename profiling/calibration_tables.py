@@ -1,4 +1,4 @@
-"""Comparison tables of docs/concepts/lens_calibration.md; ``python -m gpuvision.profiling.calibration_tables`` prints them."""
+"""Comparison tables of docs/concepts/lens_calibration.md, printed by this module run with ``python -m``."""
 
 from __future__ import annotations
 

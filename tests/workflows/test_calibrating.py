@@ -219,13 +219,13 @@ def test_inputs_of_one_name(tmp_path: Path, device: Device) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--inner-corners", "nine"), "--inner-corners is 'nine', expected"),
-        (("--out", "lens.json"), "where the report and the picture go"),
+        (("--pattern", "chessboard", "--inner-corners", "nine"), "--inner-corners is 'nine', expected"),
+        (("--out", "lens.json"), "a name that the report or the plot takes"),
         (("--model", "k7"), "k7"),
         (("--method", "views"), "focal"),
     ],
 )
-def test_wrong_arguments(image: Path, arguments: tuple[str, str], said: str, tmp_path: Path) -> None:
+def test_wrong_arguments(image: Path, arguments: tuple[str, ...], said: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=said):
         run("calibrate", image, "--out", tmp_path / "lens.toml", *arguments)
     assert list(tmp_path.iterdir()) == []

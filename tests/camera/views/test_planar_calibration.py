@@ -357,7 +357,7 @@ def test_what_the_views_lack(message, rng):
     [
         ({"model": "tilt,p1"}, "cannot be separated"),
         ({"model": "k9"}, "unknown term"),
-        ({"loss": "cauchy"}, "expected one of linear, huber, tukey"),
+        ({"loss": "cauchy"}, "expected one of squared, huber, tukey"),
         ({"sigma": 0.0}, "above 0"),
         ({"focal_length": -1.0}, "above 0"),
         ({"centre": (1.0, 2.0, 3.0)}, "shape"),

@@ -1,8 +1,12 @@
-// Edges along rulers (ruler.h). On CPU runtimes an item takes `each` rulers, 16 at a time, on GPUs a group of
-// RULER_GROUP items takes one.
+// Edges along calipers (rulers): position, amplitude, width, sigma, spacing and status of each ruler.
+//
+// Inputs:  image (rows, columns), type CODE; rulers (count, 4): x, y [px], cos, sin of the direction.
+// Outputs: position, width, sigma, spacing [px], amplitude [grey levels], status: (count,) or (count, MOST).
+// Tables:  table, parameters (ruler.h); model, lens or camera (LENS, CAMERA).
+// Variants: vector: a work-item takes `each` rulers, 16 at a time; work-item: a group of RULER_GROUP items per ruler.
 #include "ruler/ruler.h"
 
-// Under VECTOR_VARIANT of the 16 rulers from `ruler` on, as far as there are any.
+// Store the edges of LANES rulers from `ruler` on, as far as they exist.
 static inline void store_edges(private const ruler_edge *edges, uint ruler, uint count, global real *position,
                         global real *amplitude, global real *width, global real *sigma, global real *spacing,
                         global uchar *status) {

@@ -1,51 +1,56 @@
-// Rulers: short lines of samples in an image, along which edges are looked for. A ruler (x, y, cos, sin) has LENGTH
-// samples along its direction, each the sum over WIDTH lines a pixel apart, bilinear between pixels. Its gradient is
-// taken with the derivative of a Gaussian (TAPS either side), an edge is a peak of that.
+// Calipers (rulers): 1-D edge measurement along short lines of samples in an image.
 //
-//     VECTOR_VARIANT      one work-item takes 16 rulers at a time, one in each lane (for CPU runtimes)
-//     else       a work-group of RULER_GROUP items takes a ruler, its arrays are local
-//     CODE       type of the pixels, CODE_uchar, CODE_ushort or CODE_float
-//     RISING, FALLING     what edges count, of pairs the first one; neither: both
-//     PAIRS      an edge is a pair of opposite edges: a stripe
-//     CHOOSE_STRONGEST, CHOOSE_FIRST, CHOOSE_LAST, CHOOSE_ALL (up to MOST)
-//     SATURATION, AMBIGUITY, CURVED     what else is looked at
-//     LENS or CAMERA      rulers are straight in the undistorted image, the image is as measured
+// A ruler (x, y, cos, sin) has LENGTH samples along its direction; each sample is the sum over WIDTH parallel lines one
+// pixel apart, interpolated bilinearly. The gradient of the profile is its convolution with the derivative of a Gaussian
+// (TAPS taps on either side). An edge is a local maximum of the gradient above the threshold.
 //
-// The table is RulerEdges._packed in ruler.py.
+// Variants: VECTOR_VARIANT: one work-item takes 16 rulers, one in each lane; else a work-group of RULER_GROUP items takes
+//           one ruler, with its arrays in local memory.
+// Options:
+//     CODE, and CODE_uchar, CODE_ushort or CODE_float   type of the pixels
+//     RISING, FALLING    polarity of the edges (of the first edge of a pair); neither: both
+//     PAIRS              an edge is a pair of edges of opposite polarity: a stripe
+//     CHOOSE_STRONGEST, CHOOSE_FIRST, CHOOSE_LAST, CHOOSE_ALL (up to MOST edges)   edge selection
+//     SATURATION, AMBIGUITY   flag saturated samples, and edges with a comparable second edge
+//     CURVED             correct the position for a curved edge
+//     LENS or CAMERA     rulers are straight in the undistorted image; pixels are read from the distorted image
+//
+// The parameter table is packed by RulerEdges in gpuvision/matching/features/ruler.py.
 #ifndef RULER_H
 #define RULER_H
 #include "common/camera.h"
 #include "common/lens.h"
 #include "common/status.h"
 
-#define RULER_THRESHOLD 0   // least gradient of an edge, of sums over the lines
-#define RULER_SATURATION 1  // of a sample
+#define RULER_THRESHOLD 0   // smallest gradient of an edge, of sums over the lines [grey levels]
+#define RULER_SATURATION 1  // smallest saturated sample [grey levels]
 #define RULER_NOISE 2       // standard deviation of half the difference of the gradients beside a peak
 #define RULER_SMOOTHING 3   // variance of the smoothing [samples^2]
-#define RULER_AMBIGUITY 4
-#define RULER_NEAREST 5     // edges of a pair [samples]
-#define RULER_FARTHEST 6
+#define RULER_AMBIGUITY 4   // ratio of the second strongest edge to the strongest from which on an edge is ambiguous
+#define RULER_NEAREST 5     // smallest spacing of the edges of a pair [samples]
+#define RULER_FARTHEST 6    // largest spacing
 #define RULER_BEND 7        // 1 / (2 radius) of the edge [1/px]
-#define RULER_ACROSS 8      // variance of the lines about the middle one [px^2]
-#define RULER_STEP 9        // [px]
+#define RULER_ACROSS 8      // variance of the line positions across the ruler [px^2]
+#define RULER_STEP 9        // distance of samples [px]
 #define RULER_PER_LINE 10   // 1 / WIDTH
-#define RULER_TAPS 11
+#define RULER_TAPS 11       // taps of the gradient filter on one side
 
 #define RULER_SLOPES (LENGTH - 2 * TAPS)
 #define RULER_MIDDLE ((real)0.5f * (LENGTH - 1))
-#define RULER_LARGEST 1e37f  // of sums over lines: gradients of them are numbers
-// What leaves no edge to look for.
+#define RULER_LARGEST 1e37f  // largest sum over lines; gradients of larger ones could overflow
+// Flags of a ruler on which no edge can be measured.
 #define RULER_USELESS (STATUS_NOT_FINITE | STATUS_OUT_OF_RANGE | STATUS_NOT_INVERTIBLE)
 
-// Where a ruler lies: the first sample of its first line, relative to a pixel near it, which keeps the digits.
+// Layout of a ruler. Positions are relative to a pixel near the ruler: small numbers keep more digits.
 typedef struct {
     masks pixel;
-    reals x, y, along_x, along_y, across_x, across_y;  // of the next sample, and of the next line
-    masks last_column, last_row;                       // that have a neighbour, from the pixel on
+    reals x, y;                               // first sample of the first line, from `pixel`
+    reals along_x, along_y, across_x, across_y; // steps to the next sample and to the next line
+    masks last_column, last_row;              // last column and row that have a right and a lower neighbour, from `pixel`
 } ruler_place;
 
-// Lays rulers out; returns what is wrong with them. Those get a place all the same, where there is something to read.
-static inline masks ruler_lay(int rows, int columns, reals x, reals y, reals cosine, reals sine, constant real *table,
+// Compute the layout of rulers; return their flags. Flagged rulers get a valid place at the first pixel.
+static inline masks ruler_layout(int rows, int columns, reals x, reals y, reals cosine, reals sine, constant real *table,
                        ruler_place *place) {
     const masks bad = mask_of((LANED(not_finite)(x) | LANED(not_finite)(y) | LANED(not_finite)(cosine) |
                                LANED(not_finite)(sine)) != 0);
@@ -77,7 +82,7 @@ static inline masks ruler_lay(int rows, int columns, reals x, reals y, reals cos
     return bad ? (masks)STATUS_NOT_FINITE : away & STATUS_OUT_OF_RANGE;
 }
 
-// Takes (x, y) to the measured image; returns the flags of lanes that have no place in it, which it leaves at 0, 0.
+// Map (x, y) from the undistorted to the distorted image. Return the flags of lanes outside it; their position becomes 0.
 #if defined(LENS) || defined(CAMERA)
 static inline masks ruler_distort(reals *x, reals *y, const ruler_place *place, constant real *model) {
 #ifdef CAMERA
@@ -93,8 +98,8 @@ static inline masks ruler_distort(reals *x, reals *y, const ruler_place *place, 
 }
 #endif
 
-// What is wrong with a sample itself, and with a sum of them.
-static inline masks ruler_judge(reals sample, constant real *table) {
+// Flags of a sample, and of a sum of samples.
+static inline masks ruler_sample_flags(reals sample, constant real *table) {
 #ifdef SATURATION
     return mask_of(sample >= table[RULER_SATURATION]) & STATUS_SATURATED;
 #else
@@ -102,7 +107,7 @@ static inline masks ruler_judge(reals sample, constant real *table) {
 #endif
 }
 
-static inline masks ruler_judge_sum(reals sum) {
+static inline masks ruler_sum_flags(reals sum) {
 #ifdef CODE_float
     return mask_of((LANED(not_finite)(sum) | mask_of(fabs(sum) > (real)RULER_LARGEST)) != 0) & STATUS_NOT_FINITE;
 #else
@@ -110,13 +115,13 @@ static inline masks ruler_judge_sum(reals sum) {
 #endif
 }
 
-// How much of an edge of the wanted polarity a gradient is; of pairs the polarity is looked at later.
+// Strength of an edge of the wanted polarity; the polarity of pairs is checked later.
 #if defined(RISING) && !defined(PAIRS)
-#define RULER_STRENGTH(slope) (slope)
+static inline reals ruler_strength(reals slope) { return slope; }
 #elif defined(FALLING) && !defined(PAIRS)
-#define RULER_STRENGTH(slope) (-(slope))
+static inline reals ruler_strength(reals slope) { return -slope; }
 #else
-#define RULER_STRENGTH(slope) fabs(slope)
+static inline reals ruler_strength(reals slope) { return fabs(slope); }
 #endif
 
 #include "ruler/ruler_refine.h"
@@ -129,12 +134,10 @@ static inline reals ruler_slope(private const reals *profile, int i, constant re
     return slope;
 }
 #define RULER_SPACE private
-#if __has_builtin(__builtin_reduce_or)
-#define RULER_ANY(mask) (__builtin_reduce_or(mask) != 0)
-#else
-#define RULER_ANY(mask) any_lane(mask)
-#endif
-#define RULER_SLOPE(i) ruler_slope(values, i, table)
+// Gradient i of the profiles; computed when it is needed: no array of gradients.
+static inline reals ruler_gradient(private const reals *profile, int i, constant real *table) {
+    return ruler_slope(profile, i, table);
+}
 #else
 static inline real ruler_slope(local const real *profile, int i, constant real *table) {
     real slope = 0;
@@ -143,12 +146,12 @@ static inline real ruler_slope(local const real *profile, int i, constant real *
     return slope;
 }
 #define RULER_SPACE local
-#define RULER_ANY(mask) (mask)
-#define RULER_SLOPE(i) values[i]
+// Gradient i; the work-group has computed all gradients.
+static inline real ruler_gradient(local const real *gradients, int i, constant real *table) { return gradients[i]; }
 #endif
 
-// The edges along profiles (in lanes) or gradients (of one ruler); what is wrong with the rulers themselves is in
-// `flags`.
+// Find the edges along the profiles of 16 rulers (vector), or the gradients of one ruler (work-item). `flags`: flags of the
+// rulers.
 static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place *place, masks flags, constant real *table,
                        private ruler_edge *edges) {
     const real threshold = table[RULER_THRESHOLD];
@@ -158,22 +161,22 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
     ruler_peak first = peak, second = peak;
 #ifdef CHOOSE_ALL
     masks count = 0;
-    edges[0] = RULER_TAKEN(peak, peak);
+    edges[0] = ruler_edge_at(peak, peak, place, table);
     for (int k = 1; k < MOST; k++) edges[k] = edges[0];
 #endif
 #ifdef PAIRS
     ruler_peak other = peak;
     masks has_other = 0;
 #endif
-    peak.before = RULER_SLOPE(0);
-    peak.here = RULER_SLOPE(1);
+    peak.before = ruler_gradient(values, 0, table);
+    peak.here = ruler_gradient(values, 1, table);
     for (int i = 1; i < RULER_SLOPES - 1; i++) {
-        peak.after = RULER_SLOPE(i + 1);
+        peak.after = ruler_gradient(values, i + 1, table);
         peak.at = i;
-        reals strength = RULER_STRENGTH(peak.here);
-        const masks is_peak = mask_of(strength >= threshold) & mask_of(strength > RULER_STRENGTH(peak.before)) &
-                              mask_of(strength >= RULER_STRENGTH(peak.after));
-        if (RULER_ANY(is_peak)) {
+        reals strength = ruler_strength(peak.here);
+        const masks is_peak = mask_of(strength >= threshold) & mask_of(strength > ruler_strength(peak.before)) &
+                              mask_of(strength >= ruler_strength(peak.after));
+        if (any_compared(is_peak)) {
             masks candidate = is_peak;
 #ifdef PAIRS
             const reals gap = peak.at - other.at;
@@ -193,7 +196,7 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
             const ruler_peak from = peak;
 #endif
 #ifdef CHOOSE_ALL
-            const ruler_edge edge = RULER_TAKEN(from, peak);
+            const ruler_edge edge = ruler_edge_at(from, peak, place, table);
             for (int k = 0; k < MOST; k++) {
                 wins = candidate & mask_of(count == k);
                 edges[k].position = wins ? edge.position : edges[k].position;
@@ -225,30 +228,30 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
         peak.here = peak.after;
     }
 #ifdef CHOOSE_ALL
-    for (int k = 0; k < MOST; k++) edges[k] = ruler_marked(edges[k], mask_of(count > k), flags);
+    for (int k = 0; k < MOST; k++) edges[k] = ruler_flagged(edges[k], mask_of(count > k), flags);
 #else
-    edges[0] = RULER_TAKEN(first, second);
+    edges[0] = ruler_edge_at(first, second, place, table);
 #ifdef AMBIGUITY
     edges[0].status |= mask_of(rival >= table[RULER_AMBIGUITY] * best) & STATUS_AMBIGUOUS;
 #endif
-    edges[0] = ruler_marked(edges[0], found, flags);
+    edges[0] = ruler_flagged(edges[0], found, flags);
 #endif
 }
 
 #ifdef VECTOR_VARIANT
 #include "ruler/ruler_lanes.h"
 
-// 16 rulers, one in each lane: fills edges[MOST].
+// Measure 16 rulers, one in each lane; fills edges[MOST].
 static inline void ruler_measure_lanes(global const CODE *image, int rows, int columns, reals x, reals y, reals cosine,
                                 reals sine, constant real *table, constant real *model, private ruler_edge *edges) {
     ruler_place place;
-    masks flags = ruler_lay(rows, columns, x, y, cosine, sine, table, &place);
+    masks flags = ruler_layout(rows, columns, x, y, cosine, sine, table, &place);
     reals profile[LENGTH];
     flags |= ruler_sums(image, &place, columns, table, model, profile);
     ruler_find(profile, &place, flags, table, edges);
 }
 
-// 16 rulers from the one given on, `stride` numbers apart. There are `count`; lanes past them do the last one again.
+// Measure up to 16 rulers in memory, `stride` numbers apart; lanes beyond `count` repeat the last ruler.
 static inline void ruler_measure(global const CODE *image, int rows, int columns, global const real *rulers, uint stride,
                           uint count, constant real *table, constant real *model, private ruler_edge *edges) {
     real given[4][LANES];
@@ -263,7 +266,7 @@ static inline void ruler_measure(global const CODE *image, int rows, int columns
                         vload16(0, given[3]), table, model, edges);
 }
 #else
-// Splits (x, y) from the place's pixel into a pixel that has neighbours, and what is left.
+// Split (x, y) into a pixel that has neighbours and the fraction within it.
 static inline masks ruler_split(const ruler_place *place, int pitch, reals *x, reals *y) {
     masks column = LANED(convert_bits)(*x), row = LANED(convert_bits)(*y);
     column = column < place->last_column ? column : place->last_column;
@@ -273,7 +276,7 @@ static inline masks ruler_split(const ruler_place *place, int pitch, reals *x, r
     return place->pixel + row * pitch + column;
 }
 
-static inline reals ruler_between(reals a, reals b, reals c, reals d, reals x, reals y) {
+static inline reals ruler_bilinear(reals a, reals b, reals c, reals d, reals x, reals y) {
     a += x * (b - a);
     c += x * (d - c);
     return a + y * (c - a);
@@ -289,21 +292,21 @@ static inline real ruler_sum(global const CODE *image, const ruler_place *place,
         *flags |= ruler_distort(&x, &y, place, model);
 #endif
         global const CODE *pixel = image + ruler_split(place, pitch, &x, &y);
-        const real sample = ruler_between(pixel[0], pixel[1], pixel[pitch], pixel[pitch + 1], x, y);
-        *flags |= ruler_judge(sample, table);
+        const real sample = ruler_bilinear(pixel[0], pixel[1], pixel[pitch], pixel[pitch + 1], x, y);
+        *flags |= ruler_sample_flags(sample, table);
         sum += sample;
     }
-    *flags |= ruler_judge_sum(sum);
+    *flags |= ruler_sum_flags(sum);
     return sum;
 }
 
-// One ruler by a work-group, in arrays of its own; edges[MOST] are for its first item.
+// Measure one ruler by a work-group; edges[MOST] are valid for its first item.
 static inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
                           constant real *model, local real *profile, local real *slopes, local int *shared_flags,
                           private ruler_edge *edges) {
     const int item = get_local_id(0);
     ruler_place place;
-    int flags = ruler_lay(rows, columns, ruler.x, ruler.y, ruler.z, ruler.w, table, &place);
+    int flags = ruler_layout(rows, columns, ruler.x, ruler.y, ruler.z, ruler.w, table, &place);
     if (item == 0) *shared_flags = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int i = item; i < LENGTH; i += RULER_GROUP)

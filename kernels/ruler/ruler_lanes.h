@@ -1,8 +1,8 @@
-// Samples of 16 rulers at once, one in each lane (ruler.h, under VECTOR_VARIANT).
+// Sampling of 16 rulers at once, one in each lane (ruler.h, vector variant).
 //
-// Places are fixed-point numbers of RULER_BITS binary places, from a pixel of the ruler's own: their fraction is the
-// mantissa of a number from 1 to 2. Pixels are inserted into vectors one after the other, which takes less time than the
-// processor's gathers.
+// Positions are fixed-point numbers with RULER_BITS fractional bits, relative to the ruler's pixel. Shifted into the
+// mantissa of a float in [1, 2), the fraction needs no conversion. Pixels are inserted into vectors one by one: measured
+// faster than the processor's gather instructions.
 #ifndef RULER_LANES_H
 #define RULER_LANES_H
 
@@ -72,13 +72,13 @@ static inline reals ruler_fraction(masks place) {
     return as_reals((place << (23 - RULER_BITS) & 0x7fffff) | 0x3f800000) - 1;
 }
 
-// The last place before the last neighbour, or so far away that no ruler reaches it.
+// Largest position with a neighbour; clamped to the range of the fixed-point numbers, which no ruler exceeds.
 static inline masks ruler_end(masks last) {
     const int room = 1 << (30 - RULER_BITS);
     return ((last < room ? last + 1 : (masks)room) << RULER_BITS) - 1;
 }
 
-// Where the lines of a sample begin; all of them between a pixel and its last neighbour, whatever the rounding.
+// Position of the first line of a sample, clamped so that all lines lie inside the image in spite of rounding.
 static inline masks ruler_begin(reals from, masks last, masks across) {
     const masks span = across * (WIDTH - 1), most = ruler_end(last);
     const masks low = span < 0 ? -span : (masks)0, high = span < 0 ? most : most - span;
@@ -87,14 +87,14 @@ static inline masks ruler_begin(reals from, masks last, masks across) {
     return place > high ? high : place;
 }
 
-// A sample on one line after the other.
+// Position of a sample on the current line, and the step to the next line.
 typedef struct {
     masks column, row, across_x, across_y;
 } ruler_walk;
 
 static inline void ruler_start(ruler_walk *walk, const ruler_place *place, int sample) {
 #if !defined(LENS) && !defined(CAMERA)
-    // A little less than a pixel, so that lines across all of an image have room in it.
+    // Slightly less than a pixel, so that rounding cannot push lines over the border of an image that they span.
     const real less = RULER_ONE * (1 - (real)0x1p-20f);
     walk->across_x = LANED(convert_bits)(place->across_x * less);
     walk->across_y = LANED(convert_bits)(place->across_y * less);
@@ -104,7 +104,7 @@ static inline void ruler_start(ruler_walk *walk, const ruler_place *place, int s
 #endif
 }
 
-// Puts down where the sample is on the next line; returns what is wrong with that.
+// Store fractions and pixel of the sample on the current line and advance to the next line; return flags.
 static inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int pitch, int sample, int line,
                         constant real *model, private reals *x, private reals *y, private uint16 *pixel) {
     masks flags = 0;
@@ -128,8 +128,10 @@ static inline masks ruler_next(ruler_walk *walk, const ruler_place *place, int p
     return flags;
 }
 
-// The sums over the lines; returns what is wrong. While pixels are on their way the places of the next sample's are
-// worked out: what is read from them in parts was written long before.
+// Sum the samples over the lines; return flags.
+//
+// Software pipelining: the positions of the next sample are computed while the pixels of this one are loaded. The loads
+// read single elements of vectors that were stored one sample before, so that no store is forwarded to a smaller load.
 static inline __attribute__((always_inline)) masks ruler_sums(global const CODE *image, const ruler_place *place, int pitch,
                                                        constant real *table, constant real *model,
                                                        private reals *profile) {
@@ -154,14 +156,14 @@ static inline __attribute__((always_inline)) masks ruler_sums(global const CODE 
             c -= a;
             const reals step_x = RULER_REAL(b), step_y = RULER_REAL(c) + x[now + j] * RULER_REAL(d);
 #ifdef SATURATION
-            flags |= ruler_judge(RULER_REAL(a) + (x[now + j] * step_x + y[now + j] * step_y), table);
+            flags |= ruler_sample_flags(RULER_REAL(a) + (x[now + j] * step_x + y[now + j] * step_y), table);
 #endif
             whole += a;
             rest += x[now + j] * step_x;
             rest += y[now + j] * step_y;
         }
         profile[i] = RULER_REAL(whole) + rest;
-        flags |= ruler_judge_sum(profile[i]);
+        flags |= ruler_sum_flags(profile[i]);
     }
     return flags;
 }

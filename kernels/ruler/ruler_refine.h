@@ -1,18 +1,18 @@
-// Edges of rulers from the peaks of their gradients (ruler.h).
+// Sub-pixel edge parameters from the peaks of the gradient (ruler.h).
 #ifndef RULER_REFINE_H
 #define RULER_REFINE_H
 
 #define RULER_ROOT_TWO_PI 2.5066282746310002f
 #define RULER_PI 3.1415926535897931f
 #define RULER_HARMONICS 2
-#define RULER_LEAST_BLUR 0.05f // variance, of the smoothing's: what noise makes of a sharp edge
+#define RULER_LEAST_BLUR 0.05f // smallest blur variance, as a fraction of the smoothing variance: noise on a sharp edge
 
 typedef struct {
     reals position, amplitude, width, sigma, spacing;
     masks status;
 } ruler_edge;
 
-// A peak of the gradient, and its neighbours.
+// A peak of the gradient: its index and value, and the values beside it.
 typedef struct {
     reals at, before, here, after;
 } ruler_peak;
@@ -23,28 +23,31 @@ static inline ruler_peak ruler_either(masks first, ruler_peak one, ruler_peak ot
     return either;
 }
 
-// To whole numbers, below 2^22: adding this leaves no bits for anything else. (PoCL's rint() is one lane at a time.)
+// Round to integers, |x| < 2^22: 1.5 * 2^23 has no bits for fractions, so the sum is rounded and the difference is exact.
+// (rint() of vectors is computed lane by lane on PoCL.)
 static inline reals ruler_nearest(reals x) {
     const reals room = (reals)12582912.0f;
     return (x + room) - room;
 }
 
-// sin(2 pi x) to 0.001: two parabolas, and their squares.
+// sin(2 pi x), error 0.001: a parabola per half period, corrected by its square.
 static inline reals ruler_sine(reals x) {
     x -= ruler_nearest(x);
     const reals arch = 8 * x - 16 * x * fabs(x);
     return arch * ((reals)0.775f + (reals)0.225f * fabs(arch));
 }
 
-// What linear interpolation between the pixels of one axis moves an edge by [samples]. A sample a fraction f beyond a
-// pixel sees the edge by a kernel of variance f (1 - f) and third moment f (1 - f) (1 - 2 f): of their Fourier series
-// in f the terms that the smoothing leaves, taken where the smoothed curvature of a Gaussian edge is zero.
+// Bias of an edge position from linear interpolation along one image axis [samples].
 //
-//     phase           along the axis of the edge on the middle line [px]
-//     along, across   of the axis from sample to sample, and from line to line [px]
-//     at              the edge [samples]
-//     edge, smoothing variances of the gradient's peak and of the smoothing [samples^2]
-static inline reals ruler_pull(reals phase, reals along, reals across, reals at, reals edge, constant real *table) {
+// A sample at fraction f beyond a pixel sees the edge through a kernel of variance f (1 - f) and third moment
+// f (1 - f) (1 - 2 f). The bias is the displacement of the zero of the smoothed second derivative of a Gaussian edge; the
+// moments enter by their Fourier series in f, of which the smoothing leaves RULER_HARMONICS terms.
+//
+//     phase           position of the edge on the middle line along the axis [px]
+//     along, across   steps along the axis from sample to sample and from line to line [px]
+//     at              position of the edge [samples]
+//     edge            variance of the gradient's peak [samples^2]
+static inline reals ruler_interpolation_bias(reals phase, reals along, reals across, reals at, reals edge, constant real *table) {
     const real smoothing = table[RULER_SMOOTHING], per_step = 1 / (table[RULER_STEP] * table[RULER_STEP]);
     const reals extra = edge - smoothing, least = (reals)(smoothing * RULER_LEAST_BLUR);
     const reals blur = extra > least ? extra : least, variance = smoothing + blur, common = smoothing * blur / variance;
@@ -64,12 +67,12 @@ static inline reals ruler_pull(reals phase, reals along, reals across, reals at,
     return (reals)(0.5f * table[RULER_PER_LINE]) * share * share * pull;
 }
 
-// The edge at a peak: a parabola through the logarithms of the gradients there, which is exact for a Gaussian. An edge
-// that bends about a point ahead is seen ahead of where it is, by the variances of the blur and of the lines over twice
-// the radius.
+// Edge parameters at a peak: a parabola through the logarithms of three gradients, which is exact for a Gaussian.
+//
+// A curved edge appears displaced towards its centre of curvature by (blur variance + variance of the lines) / (2 radius).
 static inline ruler_edge ruler_refine(ruler_peak peak, private const ruler_place *place, constant real *table) {
     const reals size = fabs(peak.here), sign = peak.here < 0 ? (reals)-1 : (reals)1, per = 1 / peak.here;
-    // A neighbour of other sign is far below the peak: noise.
+    // A neighbour of opposite sign is noise: clamp its ratio.
     const reals before = log(fmax(peak.before * per, (reals)1e-6f));
     const reals after = log(fmax(peak.after * per, (reals)1e-6f));
     const reals variance = -1 / (before + after), tilt = (real)0.5f * (after - before), shift = tilt * variance;
@@ -78,15 +81,15 @@ static inline ruler_edge ruler_refine(ruler_peak peak, private const ruler_place
     const real middle = (real)0.5f * (WIDTH - 1);
     const reals x = place->x + middle * place->across_x + at * place->along_x;
     const reals y = place->y + middle * place->across_y + at * place->along_y;
-    const reals pull = ruler_pull(x, place->along_x, place->across_x, at, variance, table);
-    at -= pull + ruler_pull(y, place->along_y, place->across_y, at, variance, table);
+    const reals pull = ruler_interpolation_bias(x, place->along_x, place->across_x, at, variance, table);
+    at -= pull + ruler_interpolation_bias(y, place->along_y, place->across_y, at, variance, table);
 #endif
     ruler_edge edge;
     edge.position = (at - RULER_MIDDLE) * table[RULER_STEP];
     edge.amplitude = peak.here * exp((real)0.5f * tilt * shift) *
                      ((real)RULER_ROOT_TWO_PI * table[RULER_PER_LINE]) * sqrt(variance);
     edge.width = sqrt(fmax(variance - table[RULER_SMOOTHING], (reals)0)) * table[RULER_STEP];
-    // The logarithms beside the peak have the noise over the gradients there, which are smaller.
+    // Noise of the logarithms beside the peak: the noise over the gradients there, exp(-1 / (2 variance)) of the peak.
     edge.sigma = table[RULER_NOISE] * table[RULER_STEP] * variance * exp((real)0.5f / variance) / size;
     edge.spacing = REAL_NAN;
     edge.status = 0;
@@ -108,14 +111,18 @@ static inline ruler_edge ruler_pair(ruler_peak first, ruler_peak second, private
     return edge;
 }
 
+// Edge, or pair of edges, at a peak.
+static inline ruler_edge ruler_edge_at(ruler_peak first, ruler_peak second, private const ruler_place *place,
+                                       constant real *table) {
 #ifdef PAIRS
-#define RULER_TAKEN(first, second) ruler_pair(first, second, place, table)
+    return ruler_pair(first, second, place, table);
 #else
-#define RULER_TAKEN(first, second) ruler_refine(second, place, table)
+    return ruler_refine(second, place, table);
 #endif
+}
 
-// Puts what is not known yet, or wrong, into an edge.
-static inline ruler_edge ruler_marked(ruler_edge edge, masks there, masks flags) {
+// Set the flags of an edge, and NaN where there is no edge.
+static inline ruler_edge ruler_flagged(ruler_edge edge, masks there, masks flags) {
     const masks broken = there & mask_of(LANED(not_finite)(edge.position + edge.amplitude + edge.sigma) != 0);
     const masks useless = mask_of((flags & RULER_USELESS) != 0);
     const masks none = ~there | broken | useless;

@@ -90,7 +90,7 @@ def test_currents_that_are_no_numbers_are_flagged(device: Device) -> None:
     np.testing.assert_array_equal(bad, ~np.isfinite(done.points.z))
     counts = done.counts()
     assert counts["OK"] == 8 * 96 - 12
-    assert counts["DARK"] >= 10
+    assert counts["LOW_SIGNAL"] >= 10
     assert done.report()["valid_fraction"] == pytest.approx(1 - 12 / (8 * 96))
 
 

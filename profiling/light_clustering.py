@@ -1,15 +1,16 @@
 """Speed against accuracy of secondary light: ClusteredIrradiance at tolerances of the range, against all pairs.
 
-The peer is this library without a cut: `OccludedIrradiance` over all pairs, with its copies to and from the device;
-ours has the cut in its time. A row's error is the largest error of the range among the strips, metres, against all
-pairs in double; ``within`` is the part of the strips that keep the tolerance, ``bound`` what the cut proves. Strips
-lie across the sheet and see what is lit and what is beside it; one metre of their reading is one metre of range. Where
-``planned`` is false all is computed, as it is at tolerance 0: no tolerance takes longer than that one.
+The peer is this library without clustering: `OccludedIrradiance` over all pairs, with its copies to and from the
+device. Our time includes the traversal of the light tree. `error` is the largest error of the range among the strips
+[m], against all pairs in double; ``within`` is the share of strips that keep the tolerance, ``bound`` the largest bound
+of a strip. Strips lie across the sheet and see the lit line and its surroundings; one metre of their reading is one
+metre of range. Where ``traversed`` is false all pairs are computed, as at tolerance 0: no tolerance takes longer than
+that.
 
-``groove``: a line through a groove of 90 degrees, whose sides light each other and hide nothing. ``valley``: a curved
-surface, which hides some of itself. ``board``: a board with parts. ``small-...``, ``large-...``: these with fewer and
-with more segments and receivers. ``growth/...``: the groove with twice and four times the segments and receivers,
-planned whether that pays or not; ``exponent`` is that of the work over the pairs since the smallest, 1 for all pairs.
+``groove``: a line through a groove of 90 degrees, whose sides light each other without occlusion. ``valley``: a curved
+surface that occludes parts of itself. ``board``: a board with parts. ``small-...``, ``large-...``: the same with fewer
+and with more segments and receivers. ``growth/...``: the groove with two and four times the segments and receivers,
+always traversed; ``exponent`` is the growth of the work with the number of pairs since the smallest, 1 for all pairs.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _OFF_BOARD = 1e-6  # metres: receivers on the board are in single
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A scene, what is lit of it, and what strips see of it."""
+    """Scene with its lit segments and the receivers of its strips."""
 
     scene: Scene
     segments: Reals
@@ -58,9 +59,10 @@ class Part:
 
     @classmethod
     def of(cls, scene: Scene, segments: Reals, receivers: Reals, area: float, width: float, *more: float) -> Part:
-        """Return it with strips of so many metres, which read y; ``area`` is what a receiver stands for, m^2.
+        """Return a part with strips of a width [m] that read y.
 
-        What of the light gets into the lens is the same for all: it does not matter.
+        ``area`` is the area that a receiver stands for [m^2]. The solid angle of the lens is the same for all
+        receivers, so it cancels.
         """
         seen = np.full(receivers.shape[:2], area * _ALBEDO / math.pi)
         limits = receivers[..., 1].min(), receivers[..., 1].max()
@@ -99,12 +101,12 @@ class Part:
         return cls.of(board.scene, rows, board.receivers.astype(float), area, width, _OFF_BOARD)
 
     def shifts(self, irradiance: NDArray[Any]) -> Reals:
-        """Return what the strips read, (strips,), metres."""
+        """Return the readings of the strips, (strips,) [m]."""
         power, moment = (np.sum(self.weights[..., k] * irradiance, axis=1) for k in range(2))
         return np.asarray((self.reading.moment + moment) / (self.reading.power + power))
 
     def all_pairs(self, device: Device) -> Callable[[], NDArray[Any]]:
-        """Return a call that computes all of it in single, from host to host."""
+        """Return a function that computes all pairs in single, from host to host."""
         real = np.dtype(np.float64 if device.has_double else np.float32)
         operation = OccludedIrradiance(
             scene=self.scene, segments=len(self.segments), clearance=self.clearance, precision="single"

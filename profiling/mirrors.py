@@ -1,11 +1,11 @@
-"""Lit lines in mirrors: balls against Numba, facets against NumPy with Embree.
+"""Lit lines in mirrors: curved mirrors against Numba, plane mirrors against NumPy with Embree.
 
-``balls``: where 20 balls of 1280 triangles show points of a line. The peer tries all triangles, with the same equations
-and in double like ours, compiled by Numba on all cores, what does not depend on the point worked out before; `error` is
-how far apart its images are from ours [m]. ``facets/N``: the light of a line on a floor in the sides of boxes, as a
-sensor sees it. The peer takes N samples of each lit segment, finds their mirror images in all facets, and traces both
-ways of each through Embree. Ours is the exact form; the peer's error, of the power in the median sample of the sensor,
-stands in `peer_error`.
+``balls``: images of the points of a line in 20 balls of 1280 triangles. The peer tests all triangles with the same
+equations, in double like ours, compiled by Numba on all cores; quantities that do not depend on the point are computed
+before. `error` is the distance between its images and ours [m]. ``facets/N``: light of a line on a floor, seen in the
+sides of boxes. The peer takes N samples of each lit segment, finds their mirror images in all facets, and traces both
+ways of each through Embree. Ours is the exact form; `peer_error` is the peer's error in the median sample of the
+sensor.
 """
 
 from __future__ import annotations

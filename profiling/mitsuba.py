@@ -1,10 +1,10 @@
 """Light of lit strips by Monte Carlo against the closed forms: Mitsuba's time for a median error of 1 % in a picture.
 
-Mitsuba runs as fast as it does on this machine (LLVM where it works, else scalar) with next-event estimation, which
-suits it best. Its time is that of ``samples`` per pixel times (its median error / 1 %)^2: its error falls as one over
-the root of the number of samples. Ours is the time for the centres of all pixels and strips as lines, in single.
-Errors are relative to the closed form in double with strips 0.1 mm wide, averaged over each pixel; ``error`` is our
-median, as ``peer_error`` is Mitsuba's, both over the pixels that see one plane, and light.
+Mitsuba runs in its fastest variant on the machine (LLVM where it works, else scalar) with next-event estimation, which
+suits these scenes best. Its time is that of ``samples`` per pixel times (its median error / 1 %)^2, because its error
+is inversely proportional to the root of the number of samples. Ours is the time for the centres of all pixels and
+strips as lines, in single. Errors are relative to the closed form in double with strips 0.1 mm wide, averaged over each
+pixel; ``error`` is our median and ``peer_error`` Mitsuba's, over the pixels that see one plane and get light.
 """
 
 from __future__ import annotations

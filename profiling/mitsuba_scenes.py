@@ -1,8 +1,8 @@
-"""Scenes with lit strips that Mitsuba renders and our closed forms compute: irradiance in the pixels of a picture.
+"""Scenes with lit strips for Mitsuba and for the closed forms: irradiance in the pixels of a picture.
 
-A strip lies on the surface and emits; Mitsuba samples it (next-event estimation), with one sample of the light per path
-and none of the surface. Its rays keep off surfaces by 1e-4 of the coordinates, but at least 1e-4 of the unit: it gets
-the scenes in millimetres.
+A strip lies on the surface and emits. Mitsuba samples it by next-event estimation, with one sample of the light per
+path and none of the surface. Its rays start 1e-4 of the coordinates, at least 1e-4 units, off a surface; so it gets the
+scenes in millimetres.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ _TRY = "import mitsuba as mi; mi.set_variant({0!r}); mi.render(mi.load_dict(mi.c
 
 
 class Receivers(NamedTuple):
-    """Where pixels look.
+    """Receivers of the pixels.
 
     Attributes
     ----------
     rows
-        (rows, columns, nodes squared, 6): place and normal.
+        (rows, columns, nodes squared, 6): position [m] and normal.
     weights
-        (nodes squared,), of the mean over a pixel.
+        (nodes squared,): weights of the mean over a pixel.
     whole
-        bool (rows, columns): the pixel sees one plane, and is some pixels off every strip.
+        bool (rows, columns): the pixel sees one plane and is some pixels away from every strip.
     """
 
     rows: Float64

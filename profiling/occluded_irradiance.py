@@ -1,10 +1,10 @@
-"""Light of a lit line on a board with parts, as far as it is seen: OccludedIrradiance against NumPy with Embree.
+"""Light of a lit line on a board with parts, with occlusion: OccludedIrradiance against NumPy with Embree.
 
 The peer takes samples of the line, keeps the pairs that face each other (by matrix products, in blocks), traces a
-shadow ray for each through Embree, on all cores, and sums, a profile at a time; ours are eight profiles in a row. Its
-error and ours are medians over the receivers that get light, relative to OccludedIrradiance in double (which the tests
-hold to rays in float64); NaN on a device without double. Cases ``growth/...`` have four times the segments or receivers
-of the board, or four and sixteen times its triangles.
+shadow ray for each through Embree on all cores, and sums, one profile at a time; ours are eight profiles in a row. Both
+errors are medians over the receivers that get light, relative to OccludedIrradiance in double, which the tests compare
+with rays in float64; NaN on a device without double. Cases ``growth/...`` have four times the segments or receivers of
+the board, or four and sixteen times its triangles.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Light from patches on points: exact form factors in a room, and a board with what hides, against NumPy and Embree.
+"""Light of patches on points: exact form factors in a room, and a board with occlusion, against NumPy and Embree.
 
-The peer in the room is Lambert's sum over edges in NumPy, float64; nothing there stands in the way and no wall crosses
-a receiver's horizon, so neither of them cuts or casts rays. On the board the peer is what is usually done: a patch is
-the point in its middle, and Embree says whether it is seen. Errors are over the largest irradiance, against double with
-sixteen times as many rays; the peer's stands in ``peer_error``.
+In the room the peer is Lambert's sum over edges in NumPy, float64. Nothing occludes there and no wall crosses a
+receiver's horizon, so neither side clips or casts rays. On the board the peer is the usual approximation: a patch is
+the point in its middle, and Embree tests its visibility. Errors are over the largest irradiance, against double with
+sixteen times as many rays; `peer_error` is the peer's.
 """
 
 from __future__ import annotations

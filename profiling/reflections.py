@@ -1,10 +1,10 @@
-"""Light from lit lines on surfaces, all pairs and no occlusion, against the same closed form in Numba.
+"""Light of lit lines on surfaces, all pairs without occlusion, against the same closed form in Numba.
 
-The peer is branch-free and vectorised by LLVM over receivers, with a polynomial arc tangent, in single throughout; its
-error, like ours over the largest irradiance of the case and NaN on a device without double, stands in the column
-``peer_error``. ``wall``: lines that run into a wall, all pairs face each other. ``board``: patches of boxes on a board.
-In these, segments lie alike, as on flat faces, and we make use of it; ``closed-form-slopes`` has none that does, each
-line on a slope of its own, which is our worst case and nothing to the peer.
+The peer is branch-free and vectorised by LLVM over receivers, with a polynomial arc tangent, in single throughout.
+`peer_error` is its error over the largest irradiance of the case, as `error` is ours (NaN on a device without double).
+``wall``: lines that run into a wall; all pairs face each other. ``board``: patches of boxes on a board. In these,
+segments have few directions and surfaces, as on flat faces, which our kernel uses. In ``closed-form-slopes`` each line
+lies on a slope of its own: our worst case, and no difference to the peer.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _numba(receivers, table, out):  # type: ignore[no-untyped-def]
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a wall over many lines and over few, a board with boxes, light from patches, and visible light."""
+    """Yield a wall over many lines and over few, a board with boxes, light of patches, and light with occlusion."""
     yield _case(device, *_wall(64, 20_000), "closed-form/wall/64x20000")
     yield _case(device, *_wall(16, 100_000), "closed-form/wall/16x1e5")
     yield _case(device, *_board(20_000), "closed-form/board/64x20000")

@@ -1,8 +1,8 @@
-"""A whole profile of a simulated scan, against what NumPy and Embree need for its secondary light alone.
+"""A whole profile of a simulated scan, against the time of NumPy and Embree for its secondary light alone.
 
-Ours: lit segments, shadows, what the lens sees of them, the causes of errors, what every bin sees, secondary light with
-exact visibility, truth. The peer: 256 samples of the line, rays to the same elements of the surface
-(`occluded_irradiance`). The errors are those of the secondary light, medians relative to the same in double.
+Ours: lit segments, shadows, parts that the lens sees, causes of errors, the surface seen by every bin, secondary light
+with exact visibility, true positions. The peer: 256 samples of the line, rays to the same elements of the surface
+(`occluded_irradiance`). Errors are those of the secondary light, medians relative to the same in double.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Blocks of simulated profiles: computed here or by Dask, each kept as a file, so that nothing is computed twice.
+"""Store of simulated light in blocks of profiles, computed here or by Dask; each block is a file.
 
-A block depends on its task and its profiles alone: it may be computed again, or on another machine, and is the same.
+A block depends only on its task and its profiles: computed again, or on another machine, it is the same.
 """
 
 from __future__ import annotations
@@ -32,6 +32,9 @@ from gpuvision.simulation.sensors.readings import GroundTruth
 from gpuvision.simulation.sensors.sensor_view import Exposure
 
 PROFILES_PER_BLOCK = 16
+"""Profiles in a file: some seconds of work, so that little is lost when a run stops."""
+
+# Fields of the sensor's light source that the simulated light depends on.
 _OPTICAL = (
     "lens",
     "aperture",
@@ -52,20 +55,20 @@ Progress = Callable[[int, int | None], object]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SimulationTask:
-    """What light is to be simulated: all that a block depends on. It can go to another machine.
+    """Everything that the simulated light depends on; can be sent to another machine. Compared by identity.
 
     Attributes
     ----------
     part, materials
-        The scene, and a material for every number in `Scene.material`.
+        Scene, and a material for every number in `Scene.material`.
     sensor
-        With a light and a straight transport.
+        Sensor with a light and a straight transport.
     transports
-        (profiles,) where the sheet stands [m].
+        (profiles,): positions of the sheet [m].
     paths
-        Which ways of the light are modelled, out of `gpuvision.simulation.sensors.readings.PATHS`.
+        Light paths, out of `gpuvision.simulation.sensors.readings.PATHS`.
     tolerance
-        Range error that may come from what is left out [m]; 0: nothing is left out.
+        Range error that light which is left out may make [m]; 0: nothing is left out.
     """
 
     part: Scene
@@ -77,13 +80,13 @@ class SimulationTask:
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """A name for the light: the same for the same task, whatever the electronics make of it."""
+        """Name of the light: equal for equal tasks, independent of the electronics."""
         sensor, readout = self.sensor, self.sensor.readout
         assert self.part.material is not None  # set by Scene itself
         length = readout.strip_length if isinstance(readout, PsdReadout) else readout.along
         optics = [readout.triangulation, readout.axes, length, sensor.transport, sensor.frame]
         light = [getattr(sensor.light, name) for name in _OPTICAL]
-        # What is read depends on the electronics, and so does what may be left out.
+        # The light that may be left out depends on the least readable power, and so on the electronics.
         least = floor_of(sensor) if self.tolerance > 0.0 else None
         words = repr([version("gpuvision"), self.materials, optics, light, self.paths, self.tolerance, least])
         digest = hashlib.sha256(words.encode())
@@ -92,7 +95,7 @@ class SimulationTask:
         return digest.hexdigest()[:16]
 
     def blocks(self) -> list[range]:
-        """Return which profiles each block has."""
+        """Return the profiles of each block."""
         count = len(self.transports)
         return [range(k, min(k + PROFILES_PER_BLOCK, count)) for k in range(0, count, PROFILES_PER_BLOCK)]
 
@@ -103,11 +106,11 @@ class LightBlock(NamedTuple):
     Attributes
     ----------
     exposures
-        By path, (profiles, samples, bins).
+        `Exposure` (profiles, samples, bins) by name of the light path.
     truth
-        (profiles, samples).
+        True positions, (profiles, samples).
     statistics
-        What was modelled and what was left out: numbers by name, (profiles,) each.
+        `ProfileLight.statistics` by name, (profiles,) each.
     """
 
     exposures: dict[str, Exposure]
@@ -115,7 +118,10 @@ class LightBlock(NamedTuple):
     statistics: dict[str, npt.NDArray[Any]]
 
     def to_bytes(self) -> bytes:
-        """Return an NPZ file: powers and moments in single, which moves a reading by less than 1e-6 of its error."""
+        """Return the block as an NPZ file.
+
+        Powers and moments are stored in single, which changes a reading by less than 1e-6 of its error.
+        """
         arrays: dict[str, Any] = {f"truth/{name}": value for name, value in self.truth._asdict().items()}
         for path, exposure in self.exposures.items():
             arrays |= {f"{name}/{path}": value.astype(np.float32) for name, value in exposure._asdict().items()}
@@ -126,12 +132,12 @@ class LightBlock(NamedTuple):
 
     @classmethod
     def from_file(cls, path: Path) -> LightBlock:
-        """Read what `to_bytes` gave.
+        """Read a file that `to_bytes` made.
 
         Raises
         ------
         RecordingError
-            The file holds something else.
+            The file has other content.
         """
         parts: dict[str, dict[str, Any]] = {"truth": {}, "statistics": {}, "power": {}, "moment": {}}
         try:
@@ -149,14 +155,14 @@ class LightBlock(NamedTuple):
 
 
 class LightStore:
-    """The blocks of a task in a folder, each written whole or not at all.
+    """Blocks of a task in a folder; each file is written completely or not at all.
 
     Parameters
     ----------
     folder
-        Where simulations are kept; the task's blocks lie in a folder of its own within.
+        Folder of the simulation; the blocks of a task lie in ``light/<fingerprint>``.
     task
-        What they are blocks of.
+        Task whose blocks are stored.
     """
 
     def __init__(self, folder: Path, task: SimulationTask) -> None:
@@ -164,21 +170,21 @@ class LightStore:
         self.folder = folder / "light" / task.fingerprint
 
     def path(self, number: int) -> Path:
-        """Return where a block is kept."""
+        """Return the file of a block."""
         return self.folder / f"block_{number:05d}.npz"
 
     def missing(self) -> list[int]:
-        """Return the numbers of the blocks that are not there, or cannot be read."""
+        """Return the numbers of the blocks that are missing or cannot be read."""
         return [number for number in range(len(self.task.blocks())) if not _is_intact(self.path(number))]
 
     def write(self, number: int, content: bytes) -> None:
-        """Write a block."""
+        """Write the file of a block."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with replacing(self.path(number)) as file:
             file.write(content)
 
     def __iter__(self) -> Iterator[LightBlock]:
-        """Read one block after the other."""
+        """Read the blocks one after the other."""
         for number in range(len(self.task.blocks())):
             yield LightBlock.from_file(self.path(number))
 
@@ -190,19 +196,19 @@ def compute_missing_blocks(
     scheduler: str | None = None,
     progress: Progress = lambda done, of: None,
 ) -> int:
-    """Compute the blocks that are not there yet; return how many those were.
+    """Compute the blocks that are not in the store, and return their number.
 
     Parameters
     ----------
     store
-        Where they are kept.
+        Store of the task's blocks.
     device
-        Where to compute here; None: `Device.best`.
+        Device for a computation here; None: `Device.best`.
     scheduler
-        Address of a Dask scheduler, whose workers compute instead, each on its own `Device.best`. A worker that dies
-        costs the blocks it was at: others compute them again.
+        Address of a Dask scheduler whose workers compute, each on its own `Device.best`; None: compute here. The blocks
+        of a worker that dies are computed again by others.
     progress
-        Called with the profiles done, and of how many.
+        Called with the number of profiles done and the number of all profiles.
 
     Raises
     ------
@@ -224,7 +230,7 @@ def compute_missing_blocks(
 
 
 def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
-    """Return what computes the light of a task's profiles."""
+    """Return the `LightPaths` of a task."""
     light = light_of(task.sensor)
     return LightPaths(
         view=sensor_view_of(task.sensor),
@@ -242,7 +248,7 @@ def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
 
 
 def compute_block(task: SimulationTask, number: int, device: Device | None = None) -> bytes:
-    """Compute a block; the bytes of its file."""
+    """Compute a block; return the bytes of its file."""
     with _CACHE_LOCK:
         paths = _cached_light_paths(task, device)
         profiles = paths.profiles(task.transports[list(task.blocks()[number])])
@@ -269,7 +275,7 @@ def _compute_on_dask(task: SimulationTask, numbers: list[int], address: str) -> 
     dask: Any = distributed
     with dask.Client(address, timeout="10s", set_as_default=False) as client, client.as_current():
         everywhere = client.scatter(task, broadcast=True)
-        # Not pure: the same block asked for twice is computed twice, and written over itself.
+        # A block that is requested twice is computed twice; the second file replaces an equal one.
         futures = {
             client.submit(compute_block, everywhere, number, key=f"{task.fingerprint}-{number}"): number
             for number in numbers
@@ -278,7 +284,7 @@ def _compute_on_dask(task: SimulationTask, numbers: list[int], address: str) -> 
             yield futures[future], content
 
 
-# Kernels are built once for a task, and a bound kernel is one thread's at a time.
+# Kernels are built once per task. A bound kernel may be used by one thread at a time.
 _CACHE_LOCK = threading.Lock()
 _CACHE: dict[tuple[str, str], LightPaths] = {}
 

@@ -1,7 +1,7 @@
-"""A part and the description of a sensor become the range image that the sensor will make, its errors and their causes.
+"""Simulation of a scan: the range image that a sensor makes of a part, its errors and their causes.
 
-The light of every profile is simulated once and kept (`gpuvision.workflows.light_cache`); what the electronics make of
-it, behind which mask, is computed from there.
+The light of every profile is simulated once and stored (`gpuvision.workflows.light_cache`). The readings of the
+sensor's electronics, with or without a mask, are computed from the stored light.
 """
 
 from __future__ import annotations
@@ -40,38 +40,41 @@ from gpuvision.workflows.light_cache import LightBlock, LightStore, Progress, Si
 from gpuvision.workflows.scanning import assembled, resampled
 
 DEFAULT_PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse")
+# Default error limit in predicted standard deviations: noise alone exceeds it in less than one of a million samples.
 _LIMIT_SIGMAS = 5.0
-_MAX_MASK_BINS = 1 << 26  # bins of all profiles that a mask is made from
+# Bins of all profiles that a mask is optimised on: bounds the memory (512 MB per array).
+_MAX_MASK_BINS = 1 << 26
 
 Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """What a sensor will make of a part.
+    """Simulated scan of a part.
 
     Attributes
     ----------
     task
-        What was simulated.
+        Part, sensor and light paths.
     attribution
-        Readings, truth, errors and causes, (profiles, samples).
+        Readings, truth, errors and their causes, (profiles, samples).
     points
-        The range image that the sensor makes.
+        Organised range image that the sensor makes.
     heights, grid
-        Its height map over regular cells, and where they lie.
+        Height map over regular cells, and the position of the cells.
     limit
-        Error from which on a sample counts as wrong [m].
+        Smallest error that counts as wrong [m].
     mask
-        What was found for it, where one was asked for.
+        Optimised mask, if one was requested; else None.
     statistics
-        What was modelled, summed over the profiles.
+        Numbers of segments, pairs and bounds (`ProfileLight.statistics`), summed over the profiles; of bounds the
+        largest.
     device
-        Where readings were made.
+        Device on which the readings were computed.
     seconds
-        Time of the steps, by name.
-    computed
-        Blocks of profiles that were not there yet.
+        Duration of the steps by name [s].
+    computed_blocks
+        Number of blocks of profiles that were computed, and not read from the store.
     """
 
     task: SimulationTask
@@ -84,17 +87,17 @@ class Simulation:
     statistics: dict[str, float]
     device: Device
     seconds: dict[str, float]
-    computed: int
+    computed_blocks: int
 
     def summary(self) -> str:
-        """Return what came out, in a line or two."""
-        told = self.attribution.summary(self.limit)
-        worst = max(told["causes"], key=lambda name: told["causes"][name]["dominant"])
+        """Return a summary of errors in one line, and one more line for a mask."""
+        errors = self.attribution.summary(self.limit)
+        worst = max(errors["causes"], key=lambda name: errors["causes"][name]["dominant"])
         um = 1e6
         text = (
-            f"{len(self.task.transports)} profiles, {told['valid']} of {told['surface']} samples read, errors "
-            f"{um * (told['median'] or 0.0):.1f} µm median, {um * (told['p95'] or 0.0):.0f} µm p95, "
-            f"{told['beyond_limit']} beyond {um * self.limit:.1f} µm (mostly {worst}), {told['spurious']} spurious "
+            f"{len(self.task.transports)} profiles, {errors['valid']} of {errors['surface']} samples read, errors "
+            f"{um * (errors['median'] or 0.0):.1f} µm median, {um * (errors['p95'] or 0.0):.0f} µm p95, "
+            f"{errors['beyond_limit']} beyond {um * self.limit:.1f} µm (mostly {worst}), {errors['spurious']} spurious "
             "(a reading, but no lit surface in view)"
         )
         if self.mask is None:
@@ -105,7 +108,7 @@ class Simulation:
         )
 
     def report(self) -> dict[str, Any]:
-        """Return what `write` puts into ``report.json``; lengths in metres, times in seconds."""
+        """Return the content of ``report.json``: lengths in metres, times in seconds."""
         task = self.task
         return {
             "gpuvision": version("gpuvision"),
@@ -118,50 +121,50 @@ class Simulation:
             "tolerance": task.tolerance,
             "errors": self.attribution.summary(self.limit),
             "mask": None if self.mask is None else _mask_report(self.mask),
-            "modelled": self.statistics,
+            "light_statistics": self.statistics,
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
-            "light": task.fingerprint,
-            "computed_blocks": self.computed,
+            "light_fingerprint": task.fingerprint,
+            "computed_blocks": self.computed_blocks,
             "seconds": self.seconds,
         }
 
     def write(self, folder: str | Path) -> None:
         """Write the range image, pictures and the report into a folder, all or nothing.
 
-        ``range_image.tiff``, ``.png`` (16 bit) and ``picture.png`` show the height map as it will be measured,
-        ``range_image.ply`` the organised points, ``errors.png`` and ``causes.png`` how far off they are and why;
-        ``simulation.npz`` holds the arrays.
+        ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` hold the height map as it will be
+        measured, ``range_image.ply`` the organised points, ``errors.png`` and ``causes.png`` the errors and their
+        causes, ``simulation.npz`` the arrays, ``report.json`` the report.
 
         Raises
         ------
         OSError
             The folder cannot be written.
         """
-        told = self.attribution
+        attribution = self.attribution
         title = self.task.sensor.name or "Simulation"
         with whole_folder(folder) as inside:
             write_tiff(inside / "range_image.tiff", self.heights.z, self.grid)
             write_png16(inside / "range_image.png", self.heights.z, self.grid)
-            write_ply(inside / "range_image.ply", *self.points[:3], _strength(told.reading), self.points.status)
+            write_ply(inside / "range_image.ply", *self.points[:3], _strength(attribution.reading), self.points.status)
             write_npz(inside / "simulation.npz", *self._arrays())
             draw_height_map(inside / "picture.png", self.heights, self.grid, title=f"{title}: as measured")
-            draw_errors(inside / "errors.png", told, title)
-            draw_causes(inside / "causes.png", told, self.limit, title)
+            draw_errors(inside / "errors.png", attribution, title)
+            draw_causes(inside / "causes.png", attribution, self.limit, title)
             if self.mask is not None:
                 self.mask.mask.save(inside / "mask.txt")
             (inside / "report.json").write_text(json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
 
     def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
-        told = self.attribution
+        attribution = self.attribution
         held: dict[str, tuple[Any, str]] = {
             **{name: (getattr(self.points, name), "m") for name in ("x", "y", "z")},
             "status": (self.points.status, "flags"),
-            "true_g": (told.truth.g, "m"),
-            "true_h": (told.truth.h, "m"),
-            "error": (told.error, "m"),
-            "category": (told.category, "flags"),
-            **{f"cause_{name}": (part, "m") for name, part in told.causes.items()},
-            "sigma": (told.reading.sigma, "m"),
+            "true_g": (attribution.truth.g, "m"),
+            "true_h": (attribution.truth.h, "m"),
+            "error": (attribution.error, "m"),
+            "category": (attribution.category, "flags"),
+            **{f"cause_{name}": (part, "m") for name, part in attribution.causes.items()},
+            "sigma": (attribution.reading.sigma, "m"),
             "transport": (self.task.transports, "m"),
         }
         return {name: array for name, (array, _) in held.items()}, {name: unit for name, (_, unit) in held.items()}
@@ -182,22 +185,23 @@ def prepare_simulation(
     Parameters
     ----------
     part, materials
-        The scene, in the sensor's coordinates, and a material for every number in `Scene.material`.
+        Scene in the sensor's coordinates, and a material for every number in `Scene.material`.
     sensor
-        With a light and a straight transport of even steps.
+        Sensor with a light and a straight transport of even steps.
     paths
-        Out of `gpuvision.simulation.sensors.readings.PATHS`.
+        Light paths, out of `gpuvision.simulation.sensors.readings.PATHS`; "direct" is required.
     tolerance
-        Range error that may come from what is left out [m]; 0: nothing is left out.
+        Range error that light which is left out may make [m], 0 or more; 0: nothing is left out. See `LightPaths` for
+        the errors that it covers.
     profiles
-        How many, about the middle; None: all that meet the part.
+        Number of profiles, about the middle of the part; None: all profiles that meet the part.
     transports
-        Where the sheet is to stand instead [m]: for a second sensor beside a first one.
+        Positions of the sheet [m], in place of the sensor's own: for a second sensor on the same sheet.
 
     Raises
     ------
     ValueError
-        The sensor cannot be simulated, or no profile meets the part.
+        The sensor cannot be simulated, a parameter lies outside its range, or no profile meets the part.
     """
     light_of(sensor)
     transport = sensor.transport
@@ -232,32 +236,32 @@ def simulate(
     scheduler: str | None = None,
     progress: Progress = lambda done, of: None,
 ) -> Simulation:
-    """Simulate a scan; what a folder already holds of its light is not computed again.
+    """Simulate a scan. Light that the folder already holds is not computed again.
 
     Parameters
     ----------
     task
         From `prepare_simulation`.
     folder
-        Where the light of the profiles is kept, in ``light``.
+        Folder of the results; the light of the profiles is stored in its subfolder ``light``.
     mask
-        Before the sensor; "best": a window for every sample, made for this part.
+        Mask before the sensor; "best": a window for every sample, optimised for this part; None: no mask.
     seed
-        Of the noise; None: there is none.
+        Seed of the noise; None: no noise.
     limit
-        Error from which on a sample counts as wrong [m]; None: five times the median of the predicted standard
-        deviation, or the task's tolerance if that is more.
+        Smallest error that counts as wrong [m]. None: five times the median of the predicted standard deviation, or the
+        task's tolerance if that is larger.
     device
         None: `Device.best`.
     scheduler
-        Address of a Dask scheduler whose workers compute the light.
+        Address of a Dask scheduler whose workers compute the light; None: compute here.
     progress
-        Called with the profiles done, and of how many.
+        Called with the number of profiles done and the number of all profiles.
 
     Raises
     ------
     ValueError
-        The mask is not one for this sensor, or nothing can be read.
+        The mask does not fit the sensor, or nothing can be read.
     OSError
         The folder cannot be written.
     """
@@ -285,7 +289,7 @@ def simulate(
         statistics=statistics,
         device=device,
         seconds={"light": lit - start, "readings": time.perf_counter() - lit},
-        computed=computed,
+        computed_blocks=computed,
     )
 
 
@@ -297,9 +301,9 @@ def simulate_recording(
     seed: int | None = 1,
     device: Device | None = None,
 ) -> Array:
-    """Return the sensor's recording, in the form that `gpuvision.workflows.scanning.scan` takes.
+    """Return the sensor's simulated recording, in the form that `gpuvision.workflows.scanning.scan` takes.
 
-    Light that `folder` already holds is not computed again.
+    Light that ``folder`` already holds is not computed again.
 
     Parameters
     ----------
@@ -309,7 +313,7 @@ def simulate_recording(
     Returns
     -------
     numpy.ndarray
-        (profiles, rows, columns) grey levels of a camera, (profiles, strips, 2) currents or codes of a PSD.
+        Camera: grey levels (profiles, rows, columns). PSD: currents or codes (profiles, strips, 2).
     """
     store = LightStore(Path(folder), task)
     compute_missing_blocks(store, device=device)
@@ -325,7 +329,18 @@ def simulate_recording(
 def load_part(
     path: str | Path, metres: float, materials: Sequence[Material] | None, albedo: float
 ) -> tuple[Scene, tuple[Material, ...]]:
-    """Read a part, and give it its materials, or one of an albedo.
+    """Load a part and its materials.
+
+    Parameters
+    ----------
+    path
+        Mesh file.
+    metres
+        Metres per unit of length of the file.
+    materials
+        A material for each mesh of the file; None: all meshes are Lambertian with ``albedo``.
+    albedo
+        Albedo without materials, 0 to 1.
 
     Raises
     ------
@@ -343,7 +358,7 @@ def load_part(
 
 
 def _transports_over(part: Scene, transport: StraightTransport, profiles: int | None) -> Array:
-    """Return where the sheet stands while it moves over a part."""
+    """Return the transports [m] at which the sheet meets a part."""
     if transport.step is None:
         raise ValueError("a simulation needs [transport] step: metres per profile")
     corners = part.corners.reshape(-1, 3)
@@ -363,7 +378,7 @@ def _transports_over(part: Scene, transport: StraightTransport, profiles: int | 
 
 
 def _all_light(store: LightStore, bins: int) -> tuple[dict[str, Exposure], GroundTruth]:
-    """Return the light of all profiles by path, or of every second, third, ... where that is much."""
+    """Return the light of all profiles by path; of every n-th profile where all would exceed `_MAX_MASK_BINS`."""
     every = -(-len(store.task.transports) * bins // _MAX_MASK_BINS)
     light: dict[str, list[Exposure]] = {}
     truths = []
@@ -381,12 +396,12 @@ def _all_light(store: LightStore, bins: int) -> tuple[dict[str, Exposure], Groun
 def _attribute_errors(
     store: LightStore, simulator: PsdSimulator | CameraSimulator, seed: int | None, device: Device
 ) -> tuple[ErrorAttribution, dict[str, float]]:
-    """Return the artifacts of all profiles, and what was modelled of them.
+    """Return readings, errors and causes of all profiles, and the statistics of their light.
 
     Raises
     ------
     ValueError
-        There is no profile in which the sensor sees a lit surface.
+        The sensor sees a lit surface in no profile.
     """
     parts: list[ErrorAttribution] = []
     statistics: dict[str, float] = {}
@@ -407,19 +422,19 @@ def _attribute_errors(
 
 
 def _points(task: SimulationTask, reading: Reading, device: Device) -> RangePoints:
-    """Return the organised range image of what a sensor reads."""
+    """Return the organised range image of a reading."""
     place = [np.ascontiguousarray(each, np.float32) for each in (reading.g, reading.h)]
     return assembled(task.sensor, place, task.transports, reading.status, device)
 
 
 def _default_limit(reading: Reading) -> float:
-    """Return the error that noise alone hardly ever makes [m]."""
+    """Return the error that noise alone hardly ever exceeds [m]."""
     sigma = reading.sigma[np.isfinite(reading.sigma)]
     return _LIMIT_SIGMAS * float(np.median(sigma)) if sigma.size else 0.0
 
 
 def _add_statistics(statistics: Mapping[str, float], block: LightBlock) -> dict[str, float]:
-    """Return sums, and of bounds the largest."""
+    """Return the statistics with those of a block added; of bounds the larger one."""
     added = {}
     for name, each in block.statistics.items():
         before = statistics.get(name, 0.0)
@@ -429,7 +444,7 @@ def _add_statistics(statistics: Mapping[str, float], block: LightBlock) -> dict[
 
 
 def _concatenate(parts: Sequence[ErrorAttribution]) -> ErrorAttribution:
-    """Return the artifacts of all blocks as one."""
+    """Return the attributions of all blocks as one."""
 
     def joined(values: Sequence[Any]) -> Any:
         if isinstance(values[0], dict):
@@ -444,7 +459,7 @@ def _concatenate(parts: Sequence[ErrorAttribution]) -> ErrorAttribution:
 
 
 def _describe_position(part: Scene) -> str:
-    """Say where a part lies."""
+    """Return a text with the extent of a part."""
     corners = part.corners.reshape(-1, 3)
     low, high = (1e3 * bound(corners[np.isfinite(corners).all(axis=1)], axis=0) for bound in (np.min, np.max))
     return "the part lies at " + ", ".join(

@@ -1,4 +1,4 @@
-"""Light between pairs of segments and receivers by quadrature, and readings of strips, in NumPy."""
+"""Reference light between pairs of segments and receivers by quadrature, and readings of strips, in NumPy."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ _PANELS = 24
 
 
 def pair_irradiance(receivers: NDArray[Any], segments: NDArray[Any]) -> NDArray[np.float64]:
-    """Return (n, m): what each receiver (n, 6) gets from each segment (m, 10), nothing between them.
+    """Return the irradiance (n, m) of receivers (n, 6) by segments (m, 10) without occlusion.
 
-    Gauss and Legendre on panels even in asinh of the distance along the line from its foot over that from the line.
+    Gauss-Legendre on panels of equal width in asinh(t / rho), with t along the line from the receiver's foot and its
+    distance rho from the line.
     """
     place, normal = receivers[:, None, :3].astype(float), receivers[:, None, 3:].astype(float)
     normal = normal / np.linalg.norm(normal, axis=2, keepdims=True)
@@ -38,7 +39,7 @@ def pair_irradiance(receivers: NDArray[Any], segments: NDArray[Any]) -> NDArray[
 
 
 def hidden(origins: NDArray[Any], targets: NDArray[Any], triangles: NDArray[Any], clearance: float) -> NDArray[Any]:
-    """Return (k,): whether any triangle (t, 3, 3) lies between points (k, 3), ends excluded (Moeller, Trumbore)."""
+    """Return whether any triangle (t, 3, 3) lies between points (k, 3), ends excluded (Moeller and Trumbore)."""
     way = targets - origins
     length = np.linalg.norm(way, axis=1)
     one, two = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
@@ -58,9 +59,9 @@ def hidden(origins: NDArray[Any], targets: NDArray[Any], triangles: NDArray[Any]
 def visibility(
     receivers: NDArray[Any], segments: NDArray[Any], triangles: NDArray[Any], points: int = 16
 ) -> NDArray[np.float64]:
-    """Return (n, m): which part of each segment is not hidden, by rays to the middles of its parts.
+    """Return the visible part (n, m) of each segment, by rays to the middles of its parts.
 
-    What lies under the receiver's plane is not hidden: it sends no light anyway.
+    Parts under the receiver's plane count as visible: they send no light anyway.
     """
     n, m = len(receivers), len(segments)
     at = (np.arange(points) + 0.5) / points
@@ -75,6 +76,6 @@ def visibility(
 
 
 def reading(power: Any, moment: Any, weights: NDArray[Any], irradiance: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the mean u of strips: their direct light, and what receivers (strips, n) add."""
+    """Return the mean u of strips from their direct light and the light that receivers (strips, n) add."""
     more = np.sum(weights * irradiance[..., None], axis=1)
     return np.asarray((moment + more[:, 1]) / (power + more[:, 0]))

@@ -1,4 +1,4 @@
-"""Irradiance from a lit segment: by quadrature in NumPy, and by the closed form in mpmath, to 60 digits."""
+"""Reference irradiance by lit segments: quadrature in NumPy, and the closed form in mpmath with 60 digits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _PANELS = 32
 
 
 def irradiance(receivers: NDArray[Any], ends: Any, normals: Any, exitance: Any) -> tuple[Any, Any]:
-    """Return (n,) irradiance and the sum of E0 = M h / pi * integral of dt / r^3, of receivers (n, 6)."""
+    """Return the irradiance (n,) of receivers (n, 6), and the sum of E0 = M h / pi * integral of dt / r^3."""
     total, largest = np.zeros(len(receivers)), np.zeros(len(receivers))
     place, normal = receivers[:, :3].astype(float), receivers[:, 3:].astype(float)
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -35,13 +35,13 @@ def irradiance(receivers: NDArray[Any], ends: Any, normals: Any, exitance: Any) 
 
 
 def _integrals(tau: Any, length: Any, rho: Any, foot: Any, slope: Any) -> tuple[Any, Any]:
-    """Integrals of max(foot + slope tau, 0) / r^4, and of 1 / r^3 over all of the segment."""
+    """Return the integrals of max(foot + slope tau, 0) / r^4, and of 1 / r^3 over the whole segment."""
     low, high = tau, tau + length
     cut = -foot / slope
     left = np.where((slope > 0) & (cut > low), cut, low)
     right = np.where((slope < 0) & (cut < high), cut, high)
     seen = np.maximum(right - left, 0.0)
-    # What is left of a sliver, from its own end.
+    # The length of a short visible part is computed from its own end, without cancellation.
     seen = np.where((slope > 0) & (cut > low), np.clip((foot + slope * high) / slope, 0.0, length), seen)
     seen = np.where((slope < 0) & (cut < high), np.clip(-(foot + slope * low) / slope, 0.0, length), seen)
     cosine = _over(
@@ -51,7 +51,7 @@ def _integrals(tau: Any, length: Any, rho: Any, foot: Any, slope: Any) -> tuple[
 
 
 def _over(start: Any, length: Any, rho: Any, of: Any, power: int) -> Any:
-    """Gauss and Legendre on panels of equal width in asinh(tau / rho); on one panel where the piece is short."""
+    """Integrate by Gauss-Legendre on panels of equal width in asinh(tau / rho); on one panel for a short piece."""
     nodes, weights = np.polynomial.legendre.leggauss(16)
     nearest = np.hypot(rho, np.maximum(np.maximum(start, -start - length), 0.0))
     first, last = np.arcsinh(start / rho), np.arcsinh((start + length) / rho)
@@ -69,7 +69,7 @@ def _over(start: Any, length: Any, rho: Any, of: Any, power: int) -> Any:
 
 
 def exact(receiver: Any, ends: Any, normal: Any, exitance: float) -> tuple[float, float]:
-    """Return irradiance and E0 of one receiver and one segment, from the closed form in 60 digits."""
+    """Return irradiance and E0 of one receiver and one segment by the closed form with 60 digits."""
     with mpmath.workdps(DIGITS):
         place, start, stop, lit, facing = (
             mpmath.matrix([mpmath.mpf(float(v)) for v in each])
@@ -111,7 +111,7 @@ def _dot(a: Any, b: Any) -> Any:
 
 
 def by_definition(receiver: Any, ends: Any, normal: Any, exitance: float) -> float:
-    """Return M / pi * integral of cos cos / r^2 dt as it stands, by mpmath's quadrature."""
+    """Return M / pi * integral of cos cos / r^2 dt by mpmath's quadrature, straight from the definition."""
     with mpmath.workdps(25):
         place, start, stop, lit, facing = (
             mpmath.matrix([mpmath.mpf(float(v)) for v in each])

@@ -1,4 +1,4 @@
-"""Images in a unit sphere and an ellipsoid about the origin, in float64."""
+"""Reference images in a unit sphere and in an ellipsoid about the origin, in float64."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from scipy.optimize import brentq
 
 
 def in_sphere(point: np.ndarray, lens: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return where the outside of the sphere shows a point (Alhazen's problem), and how concentrated its light is.
+    """Return the reflection point of a point on the outside of the unit sphere (Alhazen's problem), and its density.
 
-    That is one over the product of the ways apart of rays in the plane of incidence and across it, d and e being the
-    distances and i the angle of incidence: (d + e + 2 d e / cos i) (d + e + 2 d e cos i).
+    The density is 1 / ((d + e + 2 d e / cos i) (d + e + 2 d e cos i)), with the distances d and e of the reflection
+    point from lens and point, and the angle of incidence i: the product of the spreads of rays in and across the plane
+    of incidence.
     """
     one = lens / np.linalg.norm(lens)
     two = point - (point @ one) * one
@@ -35,7 +36,7 @@ def in_sphere(point: np.ndarray, lens: np.ndarray) -> tuple[np.ndarray, float]:
 def past_ellipsoid(
     shape: tuple[float, ...], lens: np.ndarray, place: np.ndarray, point: np.ndarray, apart: float = 1e-5
 ) -> tuple[float, float]:
-    """Return how far a ray to a place passes a point, after an ellipsoid, and the area of a bundle there per angle."""
+    """Return the distance at which a ray off an ellipsoid passes a point, and its bundle's area per solid angle."""
     middle = place - lens
     middle /= np.linalg.norm(middle)
     one = np.cross(middle, [0.0, 0.0, 1.0])

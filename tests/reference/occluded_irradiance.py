@@ -1,4 +1,4 @@
-"""What is visible of a segment from a point: all places where that can change, and a ray into each part between."""
+"""Reference visibility of a segment from a point: all critical points, and a ray into each part between them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from reference import line_irradiance, rays
 
 
 def intervals(corners: np.ndarray, ray_of: object, points: tuple[np.ndarray, ...], planes: list[tuple]) -> np.ndarray:
-    """Return visible (k, 2), from 0 to 1, of the segment from ``points[1]`` to ``points[2]`` seen from ``points[0]``.
+    """Return the visible intervals (k, 2), 0 to 1, of a segment seen from a point.
 
-    ``ray_of(t)`` gives the ends (n, 3) of rays to places t within which triangles hide; ``planes`` (place, normal) are
-    those at which that begins or ends.
+    The segment goes from ``points[1]`` to ``points[2]``, the point is ``points[0]``. ``ray_of(t)`` gives the ends (n,
+    3) of the rays to t between which triangles occlude; ``planes`` (point, normal) are the planes at which that range
+    begins or ends.
     """
     point, start, stop = points
     along = stop - start
@@ -51,7 +52,7 @@ def intervals(corners: np.ndarray, ray_of: object, points: tuple[np.ndarray, ...
 
 
 def from_receiver(corners: np.ndarray, receiver: np.ndarray, segment: np.ndarray, clearance: float) -> np.ndarray:
-    """Return the visible intervals of a segment (10,) from a receiver (6,): what is above both their planes hides."""
+    """Return the visible intervals of a segment (10,) from a receiver (6,); triangles above both planes occlude."""
     point, facing = receiver[:3].astype(float), receiver[3:].astype(float)
     start, stop, lit = segment[:9].astype(float).reshape(3, 3)
     along = (stop - start) / np.linalg.norm(stop - start)
@@ -70,7 +71,7 @@ def from_receiver(corners: np.ndarray, receiver: np.ndarray, segment: np.ndarray
 
 
 def light(corners: np.ndarray, receivers: np.ndarray, segments: np.ndarray, clearance: float) -> tuple:
-    """Return irradiance (n,) of receivers (n, 6) and the sum of E0 of what faces them, from segments (m, 10)."""
+    """Return the irradiance (n,) of receivers (n, 6) by segments (m, 10), and the sum of E0 of those that face them."""
     total, largest = np.zeros(len(receivers)), np.zeros(len(receivers))
     for number, receiver in enumerate(receivers):
         for segment in segments:
@@ -86,7 +87,7 @@ def light(corners: np.ndarray, receivers: np.ndarray, segments: np.ndarray, clea
 
 
 def difference(some: np.ndarray, others: np.ndarray) -> float:
-    """Return the length of what is in one of two sets of intervals only."""
+    """Return the length of the points that are in only one of two sets of intervals."""
     edges = np.unique(np.concatenate([some.ravel(), others.ravel(), [0.0, 1.0]]))
     middles = 0.5 * (edges[1:] + edges[:-1])
     inside = [
@@ -96,17 +97,17 @@ def difference(some: np.ndarray, others: np.ndarray) -> float:
 
 
 def single(values: Any) -> np.ndarray:
-    """Numbers that a float holds exactly, so that both precisions see the same scene."""
+    """Return numbers rounded to float32, so that both precisions see the same scene."""
     return np.asarray(values).astype(np.float32).astype(np.float64)
 
 
 def soup(rng: np.random.Generator, count: int, size: float = 0.2) -> np.ndarray:
-    """Triangles anywhere in a cube."""
+    """Return random triangles in a cube."""
     return single(rng.uniform(-1.0, 1.0, (count, 1, 3)) + rng.normal(0.0, size, (count, 3, 3)))
 
 
 def comb(teeth: int) -> np.ndarray:
-    """Thin triangles side by side, and how much of a unit segment each hides from twice their distance: a half."""
+    """Return thin triangles side by side that hide half of a unit segment at twice their distance."""
     at = (np.arange(teeth) + 0.25) / teeth - 0.5
     x = 0.5 * np.stack([at, at + 0.5 / teeth, at], axis=1)
     x[:, 2] = x[:, :2].mean(axis=1)

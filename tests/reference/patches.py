@@ -1,4 +1,4 @@
-"""Form factors of receivers and triangles: Lambert's sum in mpmath, to 60 digits."""
+"""Reference form factors of receivers and triangles: Lambert's sum over edges in mpmath with 60 digits."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ DIGITS = 60
 
 
 def factor(receiver: Any, corners: Any) -> tuple[float, float]:
-    """Return the form factor of a receiver (place, normal) and a triangle, and that of a receiver that faces it."""
+    """Return the form factor of a receiver (position, normal) to a triangle, and the factor if it faced it best."""
     with mpmath.workdps(DIGITS):
         place, normal = _vector(receiver[:3]), _vector(receiver[3:])
         normal /= mpmath.norm(normal)
@@ -25,7 +25,7 @@ def factor(receiver: Any, corners: Any) -> tuple[float, float]:
 
 
 def _light(shape: list[Any]) -> Any:
-    """Sum of each edge's angle times its plane's normal, over 2 pi."""
+    """Return the sum over edges of the edge's angle times the normal of its plane, over 2 pi."""
     total = mpmath.matrix(3, 1)
     for a, b in zip(shape, [*shape[1:], shape[0]], strict=True):
         turn = _cross(a, b)
@@ -36,7 +36,7 @@ def _light(shape: list[Any]) -> Any:
 
 
 def _cut(shape: list[Any], normal: Any) -> list[Any]:
-    """Sutherland and Hodgman's cut by the plane through the origin."""
+    """Clip a polygon at the plane through the origin (Sutherland and Hodgman)."""
     kept = []
     for a, b in zip(shape, [*shape[1:], shape[0]], strict=True):
         one, two = _dot(a, normal), _dot(b, normal)

@@ -1,4 +1,4 @@
-"""All bounces between long surfaces by convolution, solved by Fourier transform; and triangles to build them of."""
+"""Reference radiosity between long surfaces: a convolution solved by Fourier transform; and strips of triangles."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 
 def corner(albedo: float, where: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return E a / M at b / a, on the other wall of a corner of 90 degrees from a line of diffuse power M.
+    """Return E a / M at b / a on the other wall of a right-angled corner with a line of diffuse power M.
 
-    In t = ln b the light times b is convolved with exp(2 t) / (2 (1 + exp(2 t))^1.5) at each bounce.
+    The line lies at the distance a from the corner. In t = ln b each bounce convolves the light times b with
+    exp(2 t) / (2 (1 + exp(2 t))^1.5).
     """
     count, half = 1 << 17, 80.0
     step = 2.0 * half / count
@@ -25,7 +26,7 @@ def corner(albedo: float, where: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def strips(edges: NDArray[np.float64], across: Any, front: Any, length: float) -> NDArray[np.float64]:
-    """Return triangles (2 n, 3, 3) of n strips along y, between edges along ``across`` from the y axis."""
+    """Return the triangles (2 n, 3, 3) of n strips along y, between ``edges`` along the direction ``across``."""
     across, along = np.asarray(across, float), np.array([0.0, length, 0.0])
     low, high = edges[:-1, None] * across, edges[1:, None] * across
     quads = np.stack([low - along, high - along, high + along, low + along], axis=1)

@@ -82,7 +82,7 @@ def test_a_mask_made_for_the_part_helps(part_file: Path, tmp_path: Path) -> None
     task = task_of(part_file)
     without = simulate(task, tmp_path, seed=None)
     found = simulate(task, tmp_path, seed=None, mask="best")
-    assert found.computed == 0
+    assert found.computed_blocks == 0
     assert found.mask is not None
     rms = [np.sqrt(np.nanmean(each.attribution.error**2)) for each in (without, found)]
     assert rms[1] < rms[0]
@@ -105,7 +105,7 @@ def test_what_was_stopped_goes_on_where_it_was(part_file: Path, tmp_path: Path) 
     kept = [store.path(k).read_bytes() for k in (0, 1)]
     seen = []
     done = simulate(task, tmp_path, progress=lambda done, of: seen.append((done, of)))
-    assert done.computed == 1
+    assert done.computed_blocks == 1
     assert seen == [(32, 40), (40, 40)]
     assert [store.path(k).read_bytes() for k in (0, 1)] == kept
     whole = simulate(task, tmp_path / "whole")
@@ -244,7 +244,7 @@ def test_a_cluster_loses_a_worker_and_nothing_else(part_file: Path, tmp_path: Pa
                 os.kill(pids[0], signal.SIGKILL)
 
         there = simulate(task, tmp_path / "there", scheduler=cluster.scheduler_address, progress=kill_one)
-    assert there.computed == len(task.blocks())
+    assert there.computed_blocks == len(task.blocks())
     assert seen[-1] == len(task.transports)
     np.testing.assert_array_equal(there.attribution.error, here.attribution.error)
 

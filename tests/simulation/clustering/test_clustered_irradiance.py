@@ -73,7 +73,7 @@ def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
         np.testing.assert_allclose(ours.irradiance, exact, rtol=2e-5, atol=1e-6 * exact.max())
 
 
-def test_what_is_not_modelled_is_dark(device: Device) -> None:
+def test_pairs_that_are_left_out_are_dark(device: Device) -> None:
     triangles, segments = boxes(np.random.default_rng(0), 3)
     receivers = strips(triangles, 2, 16)
     weights = np.full((2, 16, 2), 1e-9)
@@ -105,7 +105,7 @@ def groove(strips: int, each: int, segments: int) -> Any:
     return Scene(triangles), rows, receivers, np.stack([power, power * Y], axis=2), reading
 
 
-def test_what_is_not_worth_a_plan_is_computed_in_full(device: Device) -> None:
+def test_where_clustering_costs_more_all_pairs_are_computed(device: Device) -> None:
     scene, segments, receivers, weights, reading = groove(8, 40, 50)
     exact = OccludedIrradiance(scene=scene, segments=len(segments), precision="single")(
         receivers, np.zeros_like(weights), segments, device=device

@@ -318,7 +318,7 @@ def test_receivers_without_weight_and_no_receivers_do_not_count() -> None:
     assert cut.starts[-1] > 0
 
 
-def test_tables_have_room() -> None:
+def test_tables_are_padded() -> None:
     segments, receivers, weights, reading = valley(40, 4, 32)
     cut = LightClustering(tolerance=1e-5)(segments, receivers, weights, reading)
     rows, starts, selected = cut.padded_tables(np.float32, segments=100, selected=10)

@@ -351,7 +351,7 @@ def selected_of(
 
 
 @pytest.mark.parametrize("variant", ["vector", "work_item"])
-def test_picks(device: Device, variant: Any, rng: np.random.Generator) -> None:
+def test_selected_segments(device: Device, variant: Any, rng: np.random.Generator) -> None:
     """Each block gets its own: some seen, some taken as they are, some left out."""
     corners, segments, receivers = soup(rng, 40, 0.3), segments_of(rng, 6), receivers_of(rng, 2, 37).astype(np.float32)
     seen = [light_of(corners, receivers, segments[[k]], device, variant=variant).irradiance for k in range(6)]
@@ -371,7 +371,7 @@ def test_picks(device: Device, variant: Any, rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize("variant", ["vector", "work_item"])
-def test_picks_that_are_no_segments(device: Device, variant: Any, rng: np.random.Generator) -> None:
+def test_selected_indices_without_a_segment(device: Device, variant: Any, rng: np.random.Generator) -> None:
     segments, receivers = segments_of(rng, 3), receivers_of(rng, 1, 64).astype(np.float32)
     lists = [[0, 1], [2, 3], [~5], [2]]
     result = selected_of(soup(rng, 3), receivers, segments, lists, device, variant)

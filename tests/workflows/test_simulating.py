@@ -59,21 +59,21 @@ def test_a_part_is_scanned_from_end_to_end(part_file: Path) -> None:
 
 def test_what_is_read_is_told_apart_by_cause(part_file: Path, tmp_path: Path) -> None:
     done = simulate(task_of(part_file), tmp_path, seed=None)
-    told = done.attribution
-    assert told.error.shape == (40, 96)
-    total = np.sum(list(told.causes.values()), axis=0)
-    np.testing.assert_allclose(total, told.error, atol=1e-12)
+    attribution = done.attribution
+    assert attribution.error.shape == (40, 96)
+    total = np.sum(list(attribution.causes.values()), axis=0)
+    np.testing.assert_allclose(total, attribution.error, atol=1e-12)
     # Before the lit block's wall the plate's reading is pulled up by the glow, on the side that the lens sees.
-    flat = np.abs(told.truth.h) < 1e-9
-    assert np.nanmax(np.abs(told.causes["secondary"][flat])) > 20e-6
-    away = flat & (np.abs(told.truth.g + 15 * MM) < 2 * MM)
-    assert np.nanmax(np.abs(told.error[away])) < 20e-6
+    flat = np.abs(attribution.truth.h) < 1e-9
+    assert np.nanmax(np.abs(attribution.causes["secondary"][flat])) > 20e-6
+    away = flat & (np.abs(attribution.truth.g + 15 * MM) < 2 * MM)
+    assert np.nanmax(np.abs(attribution.error[away])) < 20e-6
     done.write(tmp_path)
     arrays, units = read_npz(tmp_path / "simulation.npz")
-    np.testing.assert_array_equal(arrays["error"], told.error)
+    np.testing.assert_array_equal(arrays["error"], attribution.error)
     assert units["cause_secondary"] == "m"
     report = json.loads((tmp_path / "report.json").read_text())
-    assert report["errors"]["valid"] == np.isfinite(told.error).sum()
+    assert report["errors"]["valid"] == np.isfinite(attribution.error).sum()
     for name in ("errors.png", "causes.png", "picture.png", "range_image.tiff", "range_image.ply"):
         assert (tmp_path / name).stat().st_size > 1000
 
@@ -147,9 +147,9 @@ def test_another_task_has_other_light(part_file: Path) -> None:
 def test_a_camera_beside_the_psd_is_hardly_moved_by_the_glow(part_file: Path, tmp_path: Path) -> None:
     worst = {}
     for name in ("psd_line", "camera_line"):
-        told = simulate(task_of(part_file, name), tmp_path / name, seed=None).attribution
-        flat = np.abs(told.truth.h) < 1e-9
-        worst[name] = np.nanmax(np.abs(told.causes["secondary"][flat]))
+        attribution = simulate(task_of(part_file, name), tmp_path / name, seed=None).attribution
+        flat = np.abs(attribution.truth.h) < 1e-9
+        worst[name] = np.nanmax(np.abs(attribution.causes["secondary"][flat]))
     assert worst["camera_line"] < 0.1 * worst["psd_line"]
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Bound, Device
-from gpuvision.simulation.clustering.light_clustering import LightClustering, LightCut
+from gpuvision.simulation.clustering.light_clustering import LightClustering
+from gpuvision.simulation.clustering.light_cut import LightCut
 from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, FloatArray, IntArray, Launch, Variant, to_numpy, uses_vectors
+from gpuvision.host import Device, FloatArray, IntArray, Launch, Variant, capacity, to_numpy, uses_vectors
 from gpuvision.operation import VisionOperation
+from gpuvision.simulation.clustering.light_cut import BLOCK, LightCut
 from gpuvision.simulation.clustering.light_tree import COLUMNS, LightTree
 from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int32]
-
-BLOCK = 16
-"""Receivers of a strip that share a list of selected segments."""
 
 # The kernel computes in single. In parts of the scene's reach: how far a position may be rounded, and how high a
 # surface must rise above the planes of receiver and segment to occlude.
@@ -31,137 +28,14 @@ _SEGMENT_COLUMNS = 10
 _GROUP, _STRIPS_PER_CORE = 64, 8
 # Bit of a selected segment that nothing can occlude, as the kernel sets it.
 _CLEAR = 1 << 30
-# Selected segments of a block that fit at first. A block that needs more doubles the capacity; the kernel runs again.
+# Entries of a block that fit at first. If a block needs more, the capacity grows to the next power of two and the kernel
+# runs again.
 _FIRST_CAPACITY = 64
 # Many pairs have a bound of 0 and leave their share of the tolerance unused. All shares are multiplied by this factor;
 # a strip whose error sum then exceeds the tolerance is traversed again with the factor 1.
 _SHARE_FACTOR = 2.0
 # Classes of errors, in powers of two below the tolerance, by which the smallest errors are found without a sort.
 _ERROR_CLASSES = 64
-
-
-@dataclass(frozen=True, eq=False)
-class LightCut:
-    """Cut of the light tree for each block of receivers: the segments and clusters to compute; compared by identity.
-
-    Attributes
-    ----------
-    segments
-        float64 (m + clusters, 10): the given segments, then the representative segment of each cluster in use.
-    starts
-        int32 (blocks + 1,): index into `selected` at which the list of each block of 16 receivers begins, block by
-        block and strip by strip; the last entry is the end of the last list.
-    selected
-        int32: lists of segments as `gpuvision.simulation.transport.occluded_irradiance.OccludedIrradiance` takes them:
-        an index into `segments`, or ~index of a segment that nothing can occlude.
-    tolerance
-        Range error that was allowed [m].
-    bound
-        float64 (strips,), metres: bound of the range error by all pairs that are left out or clustered; 0 where there
-        are none. See the notes of `LightClustering` for the errors that it does not cover.
-    bound_if_omitted
-        float64 (strips,), metres: the same bound if the light of all segments were left out.
-    counts
-        Number of "segments", of all "pairs" of a receiver and a segment, and of the pairs that are computed exactly
-        ("exact"; of these "clear" cannot be occluded), represented by a cluster ("clustered"), or "left out". "work" is
-        the number of pairs that remain to be computed.
-    traversed
-        Whether the tree was traversed. False: every pair is computed, because that is faster.
-    """
-
-    segments: Reals
-    starts: Integers
-    selected: Integers
-    tolerance: float
-    bound: Reals
-    bound_if_omitted: Reals
-    counts: Mapping[str, int]
-    traversed: bool = True
-
-    @classmethod
-    def full(
-        cls, segments: npt.NDArray[Any], shape: tuple[int, ...], reading: StripErrorModel, tolerance: float
-    ) -> LightCut:
-        """Return the cut that selects every segment for all receivers.
-
-        Parameters
-        ----------
-        segments
-            (m, 10), as of `LightClustering.__call__`.
-        shape
-            Shape of the receivers, (strips, n, 6).
-        reading
-            Gives `bound_if_omitted`.
-        tolerance
-            Recorded in the cut [m].
-        """
-        strips, count = shape[:2]
-        blocks, pairs = strips * -(-count // BLOCK), strips * count * len(segments)
-        return cls(
-            np.asarray(segments, np.float64),
-            np.arange(blocks + 1, dtype=np.int32) * np.int32(len(segments)),
-            np.tile(np.arange(len(segments), dtype=np.int32), blocks),
-            tolerance,
-            np.zeros(strips),
-            reading.max_error(),
-            {
-                "segments": len(segments),
-                "pairs": pairs,
-                "exact": pairs,
-                "clear": 0,
-                "clustered": 0,
-                "left out": 0,
-                "work": pairs,
-            },
-            traversed=False,
-        )
-
-    @property
-    def has_pairs(self) -> bool:
-        """Whether any pair is left to compute."""
-        return bool(len(self.selected))
-
-    def padded_tables(
-        self, dtype: npt.DTypeLike, segments: int = 0, selected: int = 0
-    ) -> tuple[Any, Integers, Integers]:
-        """Return `segments`, `starts` and `selected`, padded to powers of two, so that few kernels are bound.
-
-        The added segments have no exitance, and no list holds them.
-
-        Parameters
-        ----------
-        dtype
-            Of the segments.
-        segments, selected
-            Least numbers of rows.
-        """
-        rows = np.zeros((_capacity(max(segments, len(self.segments))), 10), dtype)
-        rows[: len(self.segments)] = self.segments
-        rows[len(self.segments) :, 8] = 1.0
-        filled = np.zeros(_capacity(max(selected, len(self.selected))), np.int32)
-        filled[: len(self.selected)] = self.selected
-        return rows, self.starts, filled
-
-    def report(self) -> dict[str, Any]:
-        """Return the counts and bounds as a dictionary for JSON; an infinite bound is None."""
-        return {
-            "has pairs": self.has_pairs,
-            "traversed": self.traversed,
-            "tolerance": self.tolerance,
-            "bound": _finite_max(self.bound),
-            "bound if all left out": _finite_max(self.bound_if_omitted),
-            "clusters": len(self.segments) - self.counts["segments"],
-            **self.counts,
-        }
-
-
-def _capacity(count: int) -> int:
-    return 1 << max(count - 1, 0).bit_length()
-
-
-def _finite_max(values: Reals) -> float | None:
-    largest = float(values.max(initial=0.0))
-    return largest if math.isfinite(largest) else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -568,7 +442,7 @@ def _select_lights(
         most = int(to_numpy(found.counts).max(initial=0))
         if most <= clustering._capacity_used[0]:
             return found
-        clustering._capacity_used[0] = _capacity(most)
+        clustering._capacity_used[0] = capacity(most)
 
 
 def _segment_rows(segments: Reals, middle: Reals) -> Reals:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,13 +13,39 @@ from gpuvision.simulation.scene.scene import Scene
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-# More joined triangles than `_FEW` are replaced by an outline with `_CORNERS` corners.
-_FEW, _CORNERS = 8, 8
-# An outline is used where the triangles lie within this part of the patch size of its plane, and where the vector sum
-# of their areas is at least this part of their area (they face one way).
-_THICK, _ONE_WAY = 0.25, 0.7
-# Slack of an outline, in units of its largest distance from the triangles: a grazing ray meets the surface earlier.
-_BEFORE = 4.0
+# Corners of an outline.
+_CORNERS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshingLimits:
+    """Limits of the division of a scene into patches; all of them are chosen.
+
+    The tests compare the light of scenes with and without outlines.
+
+    Attributes
+    ----------
+    small
+        Triangles whose longest edge is below this part of the patch size are joined.
+    max_triangles
+        More joined triangles than this are replaced by an outline.
+    thickness
+        Largest distance of the joined triangles from the outline's plane, as part of the patch size.
+    one_way
+        Least length of the vector sum of the triangles' areas, as part of their area: they face roughly one way.
+    least_fill
+        Least area of the outline before it is scaled, as part of the triangles' area.
+    slack
+        Distance before an outline within which nothing occludes it, in units of the triangles' largest distance from
+        its plane: a grazing ray meets the surface earlier.
+    """
+
+    small: float = 0.5
+    max_triangles: int = 8
+    thickness: float = 0.25
+    one_way: float = 0.7
+    least_fill: float = 0.2
+    slack: float = 4.0
 
 
 class PatchMesh(NamedTuple):
@@ -39,7 +66,9 @@ class _Outlines(NamedTuple):
     receivers: Reals
 
 
-def mesh_scene(scene: Scene, size: float, both_sides: bool | None) -> PatchMesh:
+def mesh_scene(
+    scene: Scene, size: float, both_sides: bool | None, limits: MeshingLimits = MeshingLimits()
+) -> PatchMesh:
     """Divide a scene into patches, as `gpuvision.simulation.transport.patches.Patches.from_scene` says."""
     numbers = scene.bvh.numbers
     corners = scene.corners[numbers]
@@ -47,13 +76,13 @@ def mesh_scene(scene: Scene, size: float, both_sides: bool | None) -> PatchMesh:
         back = ~_faces_outwards(corners) if both_sides is None else np.ones(len(corners), bool)
         corners = np.concatenate([corners, corners[back][:, ::-1]])
         numbers = np.concatenate([numbers, numbers[back]])
-    small = longest_edges(corners)[0] < 0.5 * size
+    small = longest_edges(corners)[0] < limits.small * size
     large, of_large = subdivide_to(corners[~small], numbers[~small], size)
     corners, numbers = corners[small], numbers[small]
     group = _group_small(corners, np.asarray(scene.material)[numbers], size)
     order = np.argsort(group, kind="stable")
     corners, numbers, group = corners[order], numbers[order], group[order]
-    outlined, outlines = _outline_groups(corners, group, size)
+    outlined, outlines = _outline_groups(corners, group, size, limits)
     kept = ~outlined[group]
     first = len(outlined)
     fans, of_fan = _triangulate(outlines.corners)
@@ -153,10 +182,10 @@ def _group_small(corners: Reals, material: npt.NDArray[np.int32], size: float) -
     return _connected_components(len(corners), face[same], face[same + 1])
 
 
-def _outline_groups(corners: Reals, group: Integers, size: float) -> tuple[Flags, _Outlines]:
+def _outline_groups(corners: Reals, group: Integers, size: float, limits: MeshingLimits) -> tuple[Flags, _Outlines]:
     """Return the groups (ascending numbers) that an outline replaces, as a mask, and the outlines."""
     count = int(group.max(initial=-1)) + 1
-    many = np.bincount(group, minlength=count) > _FEW
+    many = np.bincount(group, minlength=count) > limits.max_triangles
     if not many.any():
         return many, _Outlines(np.zeros((0, _CORNERS, 3)), np.zeros(0), np.zeros((0, 4, 6)))
     mine = many[group]
@@ -177,14 +206,15 @@ def _outline_groups(corners: Reals, group: Integers, size: float) -> tuple[Flags
     flat = _octagons(local[:, :, :2], own, starts)
     ring = np.roll(flat, -1, axis=1)
     inside = 0.5 * np.sum(flat[:, :, 0] * ring[:, :, 1] - flat[:, :, 1] * ring[:, :, 0], axis=1)
-    good = (thick <= _THICK * size) & (one_way >= _ONE_WAY * area) & (inside >= 0.2 * area)
+    good = (thick <= limits.thickness * size) & (one_way >= limits.one_way * area)
+    good &= inside >= limits.least_fill * area
     # Scaled to the area of the triangles that it replaces.
     flat *= np.sqrt(area / np.where(good, inside, area))[:, None, None]
     outline = middle[:, None] + np.einsum("gkc,gcd->gkd", flat, frame[:, :2])
     picked = _nearest_to_quarters(local.mean(axis=1)[:, :2], flat, own, starts)
     places = np.concatenate([corners[picked].mean(axis=2), (vectors / areas[:, None])[picked]], axis=2)
     many[many] = good
-    return many, _Outlines(outline[good], _BEFORE * thick[good], places[good])
+    return many, _Outlines(outline[good], limits.slack * thick[good], places[good])
 
 
 def _octagons(places: Reals, own: Integers, starts: Integers) -> Reals:

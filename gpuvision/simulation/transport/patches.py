@@ -24,7 +24,7 @@ from gpuvision.host import (
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import Irradiance
-from gpuvision.simulation.transport.patch_meshing import bisect_triangles, mesh_scene
+from gpuvision.simulation.transport.patch_meshing import MeshingLimits, bisect_triangles, mesh_scene
 
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -35,6 +35,7 @@ _LANES, _GROUP = 16, 64
 _LIFT, _CLEARANCE = 16.0, 64.0
 # Quadrature: a patch of fewer triangles gets three nodes on each, a larger one the centroids of so many of its largest.
 _TRIANGLES_PER_PATCH = 4
+_MESHING_LIMITS = MeshingLimits()
 # Nodes of Gauss' rule of second degree on a triangle, in barycentric coordinates.
 _THREE_POINTS = np.array([[4.0, 1.0, 1.0], [1.0, 4.0, 1.0], [1.0, 1.0, 4.0]]) / 6.0
 
@@ -99,7 +100,14 @@ class Patches:
             raise ValueError(f"Patches: triangle {int(np.argmax(flat))} has no area")
 
     @classmethod
-    def from_scene(cls, scene: Scene, *, size: float, both_sides: bool | None = None) -> Patches:
+    def from_scene(
+        cls,
+        scene: Scene,
+        *,
+        size: float,
+        both_sides: bool | None = None,
+        limits: MeshingLimits = _MESHING_LIMITS,
+    ) -> Patches:
         """Divide a scene's triangles until no edge is longer than ``size``, and join small triangles.
 
         Triangles are halved at their longest edge, so that long thin ones give few patches. Triangles smaller than half
@@ -117,6 +125,8 @@ class Patches:
         both_sides
             Whether the back of every triangle is a surface, too. None: all backs except those of closed surfaces whose
             front is outside.
+        limits
+            Limits of joining and outlining.
 
         Raises
         ------
@@ -127,7 +137,7 @@ class Patches:
             raise ValueError(f"Patches.from_scene: size is {size!r}, expected metres, more than 0")
         if not len(scene.bvh.numbers):
             raise ValueError("Patches.from_scene: the scene has no triangles")
-        return cls(*mesh_scene(scene, size, both_sides))
+        return cls(*mesh_scene(scene, size, both_sides, limits))
 
     @property
     def count(self) -> int:

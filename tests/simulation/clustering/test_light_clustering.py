@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
-from gpuvision.simulation.clustering.light_clustering import BLOCK, LightClustering, LightCut
+from gpuvision.simulation.clustering.light_clustering import LightClustering
+from gpuvision.simulation.clustering.light_cut import BLOCK, LightCut
 from gpuvision.simulation.clustering.light_tree import LightTree
 from gpuvision.simulation.errors.range_error import StripErrorModel, interreflection_power_bound, select_paths
 from gpuvision.simulation.scene.scene import Scene

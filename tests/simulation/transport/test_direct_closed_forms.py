@@ -21,7 +21,7 @@ from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sensor_view
 FAR, SIGMA = 1e4, 1e-4
 
 
-def far_sight() -> SensorView:
+def far_view() -> SensorView:
     return sensor_view(scale=FAR, bins=3, samples=1)
 
 
@@ -48,7 +48,7 @@ def test_step_of_reflectivity(k: float, largest: float) -> None:
     found = minimize_scalar(lambda x: -step_shift(k, x), bounds=(0.0, 4.0), method="bounded", options={"xatol": 1e-12})
     assert found.x == pytest.approx(largest, abs=6e-4)
     assert -found.fun == pytest.approx(found.x, abs=1e-7)
-    seen_by = far_sight()
+    seen_by = far_view()
     scene, materials = two_plates(1.0 / 1024.0, k / 1024.0)
     per_sigma = SIGMA * u_per_metre(seen_by, (0.0, 1.0, 0.0))
     for x in (found.x, -0.7, 2.5):
@@ -62,7 +62,7 @@ def test_step_of_reflectivity(k: float, largest: float) -> None:
 @pytest.mark.parametrize("x", [-2.0, -1.0, 0.0, 0.5, 2.0])
 def test_half_of_the_beam_hidden(device: Device, x: float) -> None:
     """A screen in the way to the lens hides what lies beyond x sigmas: the shift is that of a step to 0."""
-    seen_by = far_sight()
+    seen_by = far_view()
     lens, height = np.array(seen_by.lens), 0.01
     edge = x * SIGMA + (lens[1] - x * SIGMA) * height / lens[2]
     screen = quad((-1, edge, height), (1, edge, height), (1, 1, height), (-1, 1, height))
@@ -80,7 +80,7 @@ def test_half_of_the_beam_hidden(device: Device, x: float) -> None:
 @pytest.mark.parametrize("x", [-1.0, 0.0, 0.4])
 def test_corner_between_slopes(one: float, two: float, x: float) -> None:
     """Either side of a ridge or valley sends its part of the Gaussian, as it is turned to the lens."""
-    seen_by = far_sight()
+    seen_by = far_view()
     before = quad((-1, -1, -one), (1, -1, -one), (1, 0, 0), (-1, 0, 0))
     behind = quad((-1, 0, 0), (1, 0, 0), (1, 1, two), (-1, 1, two))
     scene, at = Scene(np.concatenate([before, behind])), -x * SIGMA
@@ -97,7 +97,7 @@ def test_corner_between_slopes(one: float, two: float, x: float) -> None:
 
 def test_order_of_convergence_in_slabs() -> None:
     """First order where a step lies within a slab; second on a surface that bends."""
-    seen_by = far_sight()
+    seen_by = far_view()
     scene, materials = two_plates(0.1, 0.5)
     counts = np.array([8, 16, 32, 64, 128])
     errors = []

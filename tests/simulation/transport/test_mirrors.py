@@ -306,7 +306,7 @@ def test_more_images_than_there_is_room_for_are_sought_again(device: Device, mon
 
 
 def test_light_that_meets_a_mirror_head_on_comes_back_and_is_lost(device: Device) -> None:
-    """The thrown light runs into the sheet itself; there is nothing on its way, and no number that is none."""
+    """The reflected light runs into the sheet itself; there is nothing on its way, and no number that is none."""
     mirror = quad([-0.1, -0.05, 0], [0.1, -0.05, 0], [0.1, 0.05, 0], [-0.1, 0.05, 0])
     scene = Scene(np.array(mirror), np.array([1, 1]))
     both = (MATERIALS[0], Material(diffuse=Lambert(albedo=0.2), mirror=0.7))
@@ -347,14 +347,14 @@ def test_exposure_is_the_sum_of_its_ways(device: Device) -> None:
     scene = Scene(np.array(slope + wall), np.array([1, 1, 0, 0]))
     mirrors, light = mirrors_of(scene, MATERIALS, device), sheet()
     lit = light.illuminate(scene, 0.0)
-    thrown = mirrors.reflected_lines(lit, light, 0.0)
+    reflected = mirrors.reflected_lines(lit, light, 0.0)
     parts = (
         mirrors.mirrored_exposure(lit, 0.0)
-        + mirrors.direct_exposure(thrown, 0.0)
-        + mirrors.mirrored_exposure(thrown, 0.0)
+        + mirrors.direct_exposure(reflected, 0.0)
+        + mirrors.mirrored_exposure(reflected, 0.0)
     )
     whole = mirrors.exposure(lit, 0.0, sheet=light)
-    assert mirrors.direct_exposure(thrown, 0.0).power.sum() > 0.0
+    assert mirrors.direct_exposure(reflected, 0.0).power.sum() > 0.0
     np.testing.assert_array_equal(whole.power, parts.power)
     matt = mirrors_of(scene, (MATERIALS[0],) * 2, device)
     assert not matt.has_mirrors

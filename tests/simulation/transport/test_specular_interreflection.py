@@ -44,18 +44,18 @@ def test_a_mirror_at_45_degrees_throws_the_sheet_onto_a_wall(
 ) -> None:
     scene, sheet = slanted(), sheet_of(source)
     lit = sheet.illuminate(scene, 0.0)
-    thrown = mirrors_of(scene, (DULL, MIRROR), device).reflected_lines(lit, sheet, 0.0)
-    assert (scene.material[thrown.triangle] == 0).all()
-    np.testing.assert_allclose(thrown.ends[..., 1:], np.broadcast_to([-0.03, 0.005], (*thrown.ends.shape[:2], 2)))
-    np.testing.assert_allclose(thrown.normals, np.tile([0.0, 1.0, 0.0], (len(thrown.power), 1)), atol=1e-15)
-    assert thrown.total() == pytest.approx(0.8 * on_mirrors(lit, scene), rel=1e-12)
-    ends = np.sort(thrown.ends[..., 0].ravel())
+    reflected = mirrors_of(scene, (DULL, MIRROR), device).reflected_lines(lit, sheet, 0.0)
+    assert (scene.material[reflected.triangle] == 0).all()
+    np.testing.assert_allclose(reflected.ends[..., 1:], np.broadcast_to([-0.03, 0.005], (*reflected.ends.shape[:2], 2)))
+    np.testing.assert_allclose(reflected.normals, np.tile([0.0, 1.0, 0.0], (len(reflected.power), 1)), atol=1e-15)
+    assert reflected.total() == pytest.approx(0.8 * on_mirrors(lit, scene), rel=1e-12)
+    ends = np.sort(reflected.ends[..., 0].ravel())
     # The light of the fan has gone 0.195 m down to the mirror, and 0.03 m on.
     expected = np.array([-0.01, 0.01])
     if source:
         expected = source[0] + (expected - source[0]) * (0.195 + 0.03) / 0.195
     np.testing.assert_allclose(ends[[0, -1]], expected, rtol=1e-9)
-    covered = np.sum(np.abs(np.diff(thrown.ends[..., 0], axis=1)))
+    covered = np.sum(np.abs(np.diff(reflected.ends[..., 0], axis=1)))
     assert covered == pytest.approx(expected[1] - expected[0], rel=1e-9)
 
 
@@ -74,8 +74,8 @@ def test_plane_mirrors_throw_where_rays_say(
     scene = Scene(corners, np.r_[1, 1, np.zeros(len(corners) - 2, int)])
     sheet = sheet_of(source)
     lit = sheet.illuminate(scene, 0.0)
-    thrown = mirrors_of(scene, (DULL, MIRROR), device).reflected_lines(lit, sheet, 0.0)
-    assert len(np.unique(thrown.triangle)) > 10
+    reflected = mirrors_of(scene, (DULL, MIRROR), device).reflected_lines(lit, sheet, 0.0)
+    assert len(np.unique(reflected.triangle)) > 10
     onto = scene.material[lit.triangle] == 1
     share = (np.arange(400) + 0.5) / 400
     places = lit.ends[onto, :1] + share[:, None] * (lit.ends[onto, 1:] - lit.ends[onto, :1])
@@ -87,13 +87,13 @@ def test_plane_mirrors_throw_where_rays_say(
     hits = ClosestHit(scene=scene, clearance=1e-9)(rays, device=device)
     power = np.repeat((lit.power * lit.lengths)[onto] / 400 * 0.8, 400)
     by_rays = np.bincount(hits.triangle[hits.triangle >= 0], power[hits.triangle >= 0], minlength=len(corners))
-    ours = np.bincount(thrown.triangle, thrown.power * thrown.lengths, minlength=len(corners))
+    ours = np.bincount(reflected.triangle, reflected.power * reflected.lengths, minlength=len(corners))
     # A ray more or less at either end of each of a triangle's pieces.
-    pieces = np.bincount(thrown.triangle, minlength=len(corners))
+    pieces = np.bincount(reflected.triangle, minlength=len(corners))
     assert np.all(np.abs(ours - by_rays) <= 2.0 * pieces * power.max())
-    assert thrown.total() == pytest.approx(power[hits.triangle >= 0].sum(), rel=5e-3)
+    assert reflected.total() == pytest.approx(power[hits.triangle >= 0].sum(), rel=5e-3)
     spots = rays[:, :3] + hits.distance[:, None] * rays[:, 3:]
-    away = [_distance(thrown, spot, triangle) for spot, triangle in zip(spots, hits.triangle, strict=True)]
+    away = [_distance(reflected, spot, triangle) for spot, triangle in zip(spots, hits.triangle, strict=True)]
     assert np.mean(np.array(away) > 1e-9) < 0.01
 
 
@@ -121,9 +121,9 @@ def test_in_a_closed_box_no_light_is_lost(device: Device, source: tuple[float, f
     numbers = np.flatnonzero(box.face_normals[:, 2] < 0.0)
     lit = lit._replace(triangle=numbers[lit.triangle])
     for throws in (1, 2, 3, 6):
-        thrown = mirrors_of(scene, (DULL, MIRROR), device, max_reflections=throws).reflected_lines(lit, sheet, 0.0)
+        reflected = mirrors_of(scene, (DULL, MIRROR), device, max_reflections=throws).reflected_lines(lit, sheet, 0.0)
         expected = lit.total() * sum(0.8**k for k in range(1, throws + 1))
-        assert thrown.total() == pytest.approx(expected, rel=1e-9)
+        assert reflected.total() == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_round_mirror_throws_light_as_it_is_round(device: Device) -> None:
@@ -136,8 +136,8 @@ def test_a_round_mirror_throws_light_as_it_is_round(device: Device) -> None:
     scene = Scene(corners, np.r_[np.ones(len(cylinder.faces), int), 0, 0])
     sheet = LightSheet(transport=TRANSPORT, g_limits=(1e-4, 4.9e-3), power=3.0)
     lit = sheet.illuminate(scene, 0.0)
-    thrown = mirrors_of(scene, (DULL, MIRROR), device, steps_per_sample=8.0).reflected_lines(lit, sheet, 0.0)
-    assert (thrown.triangle >= len(corners) - 2).all()
+    reflected = mirrors_of(scene, (DULL, MIRROR), device, steps_per_sample=8.0).reflected_lines(lit, sheet, 0.0)
+    assert (reflected.triangle >= len(corners) - 2).all()
 
     def lands(angle: np.ndarray) -> np.ndarray:
         return radius * np.cos(angle) + (0.02 - radius * np.sin(angle)) / np.tan(2.0 * angle)
@@ -147,7 +147,7 @@ def test_a_round_mirror_throws_light_as_it_is_round(device: Device) -> None:
     middle = 0.5 * (at[1:] + at[:-1])
     for low, high in ((-0.012, -0.005), (-0.005, 0.0), (0.0, 0.003), (0.003, 0.01), (0.01, 0.028)):
         expected = power[(middle > low) & (middle < high)].sum()
-        assert _between(thrown, low, high) == pytest.approx(expected, rel=4e-3)
+        assert _between(reflected, low, high) == pytest.approx(expected, rel=4e-3)
 
 
 def _between(lines: LitLine, low: float, high: float) -> float:

@@ -28,8 +28,8 @@ _SEGMENT_COLUMNS = 10
 _GROUP, _STRIPS_PER_CORE = 64, 8
 # Bit of a selected segment that nothing can occlude, as the kernel sets it.
 _CLEAR = 1 << 30
-# Entries of a block that fit at first. If a block needs more, the capacity grows to the next power of two and the kernel
-# runs again.
+# Entries of a block that fit at first. If a block needs more, the capacity grows to the next power of two and the
+# kernel runs again.
 _FIRST_CAPACITY = 64
 # Many pairs have a bound of 0 and leave their share of the tolerance unused. All shares are multiplied by this factor;
 # a strip whose error sum then exceeds the tolerance is traversed again with the factor 1.

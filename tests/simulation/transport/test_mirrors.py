@@ -289,7 +289,7 @@ def test_an_image_on_an_edge_counts_once(device: Device) -> None:
     np.testing.assert_array_equal(row, np.arange(40))
     np.testing.assert_allclose((spot - middle) @ back, 5e-3, rtol=1e-6)
     raw = images._points(8)(points, lens, device=device) if device.has_double else None
-    assert raw is None or np.all(raw.count == 2)
+    assert raw is None or np.all(raw.image_count == 2)
 
 
 def test_more_images_than_there_is_room_for_are_sought_again(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

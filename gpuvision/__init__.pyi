@@ -12,6 +12,9 @@ from .camera.lens import (
 from .camera.lines.lens_fit import (
     LensFit as LensFit,
 )
+from .camera.lines.lens_fit import (
+    LensFitLimits as LensFitLimits,
+)
 from .camera.lines.line_families import (
     grid_lines as grid_lines,
 )
@@ -21,11 +24,23 @@ from .camera.lines.vanishing_points import (
 from .camera.lines.vanishing_points import (
     straightness_px as straightness_px,
 )
+from .camera.patterns.blobs import (
+    BlobLimits as BlobLimits,
+)
+from .camera.patterns.chessboard import (
+    ChessboardLimits as ChessboardLimits,
+)
 from .camera.patterns.chessboard import (
     find_chessboard as find_chessboard,
 )
 from .camera.patterns.dots import (
+    DotLimits as DotLimits,
+)
+from .camera.patterns.dots import (
     find_dots as find_dots,
+)
+from .camera.patterns.line_pattern import (
+    LinePatternLimits as LinePatternLimits,
 )
 from .camera.patterns.line_pattern import (
     find_lines as find_lines,
@@ -53,6 +68,9 @@ from .camera.undistort_points import (
 )
 from .camera.views.camera_fit import (
     CameraFit as CameraFit,
+)
+from .camera.views.diagnosis import (
+    CalibrationLimits as CalibrationLimits,
 )
 from .camera.views.known_lens import (
     fit_tilt as fit_tilt,

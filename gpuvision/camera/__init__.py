@@ -1,1 +1,1 @@
-"""Cameras: lenses and sensors."""
+"""Camera and lens models, undistortion, target patterns and calibration."""

@@ -19,7 +19,7 @@ FULL = (-0.12, 0.08, 1e-3, -2e-3, 0.01, 0.02, 0.03, 0.001, 1e-3, 2e-3, -1e-3, 3e
 
 
 def camera(*coefficients: float, tilt: tuple[float, float] = (0.0, 0.0), matrix: object = MATRIX) -> Camera:
-    """A camera with the first so many coefficients, tilted by degrees."""
+    """Return a camera with the given leading coefficients, tilted by degrees."""
     distortion = (*coefficients, *(0.0,) * (12 - len(coefficients)), *np.radians(tilt))
     return Camera(matrix=matrix, distortion=distortion)
 
@@ -52,7 +52,7 @@ def image_points() -> np.ndarray:
 
 
 def by_opencv(points: np.ndarray, given_: Camera) -> np.ndarray:
-    """What projectPoints says of ideal pixels."""
+    """Return OpenCV's projectPoints of ideal pixels."""
     matrix, coefficients = given_.to_opencv()
     rays = np.concatenate([points, np.ones((len(points), 1))], 1) @ np.linalg.inv(matrix).T
     return cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.tilted_projection import COLUMNS, INTERNAL, project, rotation_matrix, tilt_matrix
-from gpuvision.camera.views.parameters import NUMBERS, OPENCV, FreeParameters, internal_parameters, opencv_parameters
+from gpuvision.camera.views.parameters import (
+    FIT_PARAMETERS,
+    OPENCV,
+    FreeParameters,
+    internal_parameters,
+    opencv_parameters,
+)
 from reference.tilted_camera import project_virtual, tilt
 
 VIEWS, POINTS = 3, 7
@@ -81,10 +87,10 @@ def _numbers(rng):
 def test_derivatives_of_the_coordinates(function, names, rng):
     numbers = _numbers(rng)
     values, derivative = function(numbers)
-    assert derivative.shape == (len(names), len(NUMBERS))
-    for column in range(len(NUMBERS)):
+    assert derivative.shape == (len(names), len(FIT_PARAMETERS))
+    for column in range(len(FIT_PARAMETERS)):
         step = 1e-6 * max(abs(numbers[column]), 1.0)
-        ends = [function(numbers + sign * step * np.eye(len(NUMBERS))[column])[0] for sign in (1.0, -1.0)]
+        ends = [function(numbers + sign * step * np.eye(len(FIT_PARAMETERS))[column])[0] for sign in (1.0, -1.0)]
         # Central differences: step^2, and rounding of 1e3 pixels over the step.
         np.testing.assert_allclose(derivative[:, column], (ends[0] - ends[1]) / (2.0 * step), rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(values, function(numbers)[0])

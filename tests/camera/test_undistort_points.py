@@ -66,14 +66,14 @@ def image_points(rng: np.random.Generator, count: int = 5003) -> np.ndarray:
 
 
 def expected_of(operation: UndistortPoints, points: np.ndarray) -> np.ndarray:
-    """What the model on the host says, which its own tests hold to its equations."""
+    """Return the results of the host model, which other tests compare with its equations."""
     function = operation.model.distort if operation.inverse else operation.model.undistort
     more = {} if operation.matrix is None else {"matrix": operation.matrix}
     return function(points.astype(np.float64), **more)
 
 
 def half_spacing(values: np.ndarray) -> np.ndarray:
-    """What a float's own rounding may do."""
+    """Return the allowed rounding error of a float."""
     return 0.5 * np.spacing(np.abs(values).astype(np.float32))
 
 
@@ -327,7 +327,7 @@ def test_bound_and_device_arrays_say_the_same(device: Device, rng: np.random.Gen
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_neighbours_do_not_matter(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    """A point's result is the same to the bit beside points that need the careful search, and beside none."""
+    """A point's result is bit-equal with and without neighbours that need the safeguarded search."""
     wide = camera(-0.28, 0.11, 5e-4, -3e-4, -0.02)
     points = image_points(rng, 160).astype(np.float32)
     alone = UndistortPoints(model=wide, variant=variant)(points, device=device)

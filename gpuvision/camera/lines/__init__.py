@@ -1,1 +1,1 @@
-"""What the lens calibration from straight lines is made of."""
+"""Lens calibration from straight lines."""

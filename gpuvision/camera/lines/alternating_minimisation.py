@@ -67,8 +67,8 @@ class _Objective:
         self.evaluations += 1
         packed = self.packed
         moved = undistort(packed, lens[: self.order], lens[self.order :])
-        at = Parameters(lens[: self.order], lens[self.order :], _homogeneous(points))
-        lines = fit_lines(packed, at, moments(packed, moved.x, moved.y, None))
+        parameters = Parameters(lens[: self.order], lens[self.order :], _homogeneous(points))
+        lines = fit_lines(packed, parameters, moments(packed, moved.x, moved.y, None))
         nx, ny = lines.nx[packed.line], lines.ny[packed.line]
         return moved, lines, nx * moved.x + ny * moved.y + lines.offset[packed.line]
 
@@ -104,20 +104,22 @@ def _fit_nelder_mead(objective: _Objective, lens: Float64, points: Float64) -> F
 
 def _fit_steepest_descent(objective: _Objective, lens: Float64, points: Float64) -> Float64:
     """Follow the negative gradient; halve or double the step length as long as the cost decreases."""
-    reach = 1e-3
+    length_of_step = 1e-3
     for _ in range(_MAX_DESCENTS):
         distance, slopes = objective.slopes(lens, points)
-        gradient, here = inner_products(slopes, distance[None])[:, 0], float(inner_products(distance, distance))
+        gradient, evaluation = inner_products(slopes, distance[None])[:, 0], float(inner_products(distance, distance))
         length = float(np.linalg.norm(gradient))
         if length == 0.0:
             break
-        while objective.cost(lens - reach * gradient / length, points) >= here and reach > 1e-12:
-            reach *= 0.5
-        trial = lens - reach * gradient / length
-        gained = here - objective.cost(trial, points)
-        if gained <= _SETTLED * here:
+        while (
+            objective.cost(lens - length_of_step * gradient / length, points) >= evaluation and length_of_step > 1e-12
+        ):
+            length_of_step *= 0.5
+        trial = lens - length_of_step * gradient / length
+        gained = evaluation - objective.cost(trial, points)
+        if gained <= _SETTLED * evaluation:
             break
-        lens, reach = trial, 2.0 * reach
+        lens, length_of_step = trial, 2.0 * length_of_step
     return lens
 
 
@@ -125,7 +127,7 @@ def _fit_gauss_newton(objective: _Objective, lens: Float64, points: Float64) -> 
     """Take Gauss-Newton steps, halved until the cost decreases; the lines are fitted again after each step."""
     for _ in range(_MAX_DESCENTS):
         distance, slopes = objective.slopes(lens, points)
-        here = float(inner_products(distance, distance))
+        evaluation = float(inner_products(distance, distance))
         scale = 1.0 / np.sqrt(np.maximum(np.einsum("in,in->i", slopes, slopes), 1e-30))
         slopes *= scale[:, None]
         step = (
@@ -135,10 +137,10 @@ def _fit_gauss_newton(objective: _Objective, lens: Float64, points: Float64) -> 
             )[0]
         )
         after = objective.cost(lens + step, points)
-        while after >= here and np.max(np.abs(step)) > 1e-12:
+        while after >= evaluation and np.max(np.abs(step)) > 1e-12:
             step = 0.5 * step
             after = objective.cost(lens + step, points)
-        if here - after <= _SETTLED * here:
+        if evaluation - after <= _SETTLED * evaluation:
             break
         lens = lens + step
     return lens
@@ -181,11 +183,11 @@ def minimise_alternating(packed: PackedLines, order: int, solver: str, *, max_ro
         if before - after <= _SETTLED * before:
             break
         before = after
-    at = Parameters(lens[:order], lens[order:], _homogeneous(points))
-    here = evaluate(packed, at)
-    slopes = residual_jacobian(order, here)
-    normal = normal_equations(packed, at, here, slopes)
-    return AlternatingMinimum(Minimum(at, here, slopes, normal, done, ""), objective.evaluations)
+    parameters = Parameters(lens[:order], lens[order:], _homogeneous(points))
+    evaluation = evaluate(packed, parameters)
+    slopes = residual_jacobian(order, evaluation)
+    normal = normal_equations(packed, parameters, evaluation, slopes)
+    return AlternatingMinimum(Minimum(parameters, evaluation, slopes, normal, done, ""), objective.evaluations)
 
 
 def _fit_vanishing_points(objective: _Objective, lens: Float64, points: Float64) -> Float64:

@@ -141,13 +141,13 @@ class LensFit:
 
 def centre_px(packed: PackedLines, found: Minimum) -> tuple[float, float]:
     """Return column and row of the centre [px]."""
-    column, row = (packed.origin + packed.unit * found.at.centre).tolist()
+    column, row = (packed.origin + packed.unit * found.parameters.centre).tolist()
     return column, row
 
 
 def rms_px(packed: PackedLines, found: Minimum, weight: Float64 | None) -> float:
     """Return the root mean square distance [px]."""
-    return packed.unit * math.sqrt(float(np.average(found.here.distance**2, weights=weight)))
+    return packed.unit * math.sqrt(float(np.average(found.evaluation.distance**2, weights=weight)))
 
 
 def _pixel_matrix(packed: PackedLines) -> Float64:
@@ -158,34 +158,36 @@ def _pixel_matrix(packed: PackedLines) -> Float64:
 
 def vanishing_points_px(packed: PackedLines, found: Minimum) -> Float64:
     """Return the vanishing points of `LensFit`; for free lines the points nearest to the lines of each family."""
-    points = found.at.vanishing
+    points = found.parameters.vanishing
     if points is None:
-        points = vanishing_start(packed, found.here.lines)
+        points = vanishing_start(packed, found.evaluation.lines)
     moved = points @ _pixel_matrix(packed).T
     moved /= np.linalg.norm(moved, axis=1, keepdims=True) * np.where(moved[:, 2:] < 0.0, -1.0, 1.0)
     moved[np.bincount(packed.family, minlength=packed.families) < 2] = np.nan
     return np.asarray(moved)
 
 
-def parameters_px(packed: PackedLines, found: Minimum, spread: Float64) -> tuple[tuple[str, ...], Float64, Float64]:
+def parameters_px(
+    packed: PackedLines, found: Minimum, covariance_matrix: Float64
+) -> tuple[tuple[str, ...], Float64, Float64]:
     """Return names, values and covariance of the parameters in pixels."""
-    at = found.at
-    order = len(at.k)
+    parameters = found.parameters
+    order = len(parameters.k)
     powers = packed.unit ** (-2.0 * np.arange(1, order + 1))
     names = [f"k{power}" for power in range(1, order + 1)]
-    values, scale = at.k * powers, powers
+    values, scale = parameters.k * powers, powers
     if order:
         names += ["C_c", "R_c"]
         values = np.concatenate([values, centre_px(packed, found)])
         scale = np.concatenate([scale, [packed.unit, packed.unit]])
     lens = len(scale)
-    if at.vanishing is None:
-        return tuple(names), values, spread * np.outer(scale, scale)
+    if parameters.vanishing is None:
+        return tuple(names), values, covariance_matrix * np.outer(scale, scale)
     matrix = _pixel_matrix(packed)
     slopes, points = [], vanishing_points_px(packed, found)
-    for number, (point, tangents) in enumerate(zip(points, pencil_basis(at.vanishing), strict=True)):
+    for number, (point, tangents) in enumerate(zip(points, pencil_basis(parameters.vanishing), strict=True)):
         if np.all(np.isfinite(point)):
-            length = point @ (matrix @ at.vanishing[number])
+            length = point @ (matrix @ parameters.vanishing[number])
             turned = (np.eye(3) - np.outer(point, point)) @ matrix @ tangents.T / length
             row = np.zeros((3, 2 * packed.families))
             row[:, 2 * number : 2 * number + 2] = turned
@@ -193,19 +195,19 @@ def parameters_px(packed: PackedLines, found: Minimum, spread: Float64) -> tuple
             names += [f"v{number}_{part}" for part in "CRw"]
             values = np.concatenate([values, point])
     slope = np.concatenate(slopes)
-    tangent = np.where(np.isinf(spread[lens:, lens:]), 0.0, spread[lens:, lens:])
-    found_spread = np.empty((len(names), len(names)))
-    found_spread[:lens, :lens] = spread[:lens, :lens] * np.outer(scale, scale)
-    found_spread[lens:, :lens] = slope @ spread[lens:, :lens] * scale
-    found_spread[:lens, lens:] = found_spread[lens:, :lens].T
-    found_spread[lens:, lens:] = slope @ tangent @ slope.T
-    return tuple(names), values, found_spread
+    tangent = np.where(np.isinf(covariance_matrix[lens:, lens:]), 0.0, covariance_matrix[lens:, lens:])
+    scaled_covariance = np.empty((len(names), len(names)))
+    scaled_covariance[:lens, :lens] = covariance_matrix[:lens, :lens] * np.outer(scale, scale)
+    scaled_covariance[lens:, :lens] = slope @ covariance_matrix[lens:, :lens] * scale
+    scaled_covariance[:lens, lens:] = scaled_covariance[lens:, :lens].T
+    scaled_covariance[lens:, lens:] = slope @ tangent @ slope.T
+    return tuple(names), values, scaled_covariance
 
 
 def residuals_px(packed: PackedLines, found: Minimum, families: LineFamilies) -> tuple[tuple[Float64, ...], ...]:
     """Return the residuals of `LensFit`."""
     every = np.full(len(packed.used), np.nan)
-    every[packed.used] = found.here.distance * packed.unit
+    every[packed.used] = found.evaluation.distance * packed.unit
     start, sorted_out = 0, []
     for family in families:
         pieces = []
@@ -236,7 +238,7 @@ def fit_warnings(
     single = np.bincount(packed.family, minlength=packed.families) < 2
     if fit.lines == "vanishing" and single.any():
         yield f"families {np.flatnonzero(single).tolist()} have fewer than two lines, hence no vanishing point"
-    robust_sigma = _NORMAL_MAD * packed.unit * float(np.median(np.abs(found.here.distance)))
+    robust_sigma = _NORMAL_MAD * packed.unit * float(np.median(np.abs(found.evaluation.distance)))
     if fit.rms_px > max(limits.max_tail_ratio * robust_sigma, _ROUNDING * packed.unit):
         yield (
             f"half of the points lie within {robust_sigma / _NORMAL_MAD:.3g} pixels, but the rms is {fit.rms_px:.3g}: "

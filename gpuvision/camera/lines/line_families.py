@@ -46,10 +46,10 @@ def grid_lines(points: npt.ArrayLike, *, diagonals: bool = False) -> tuple[tuple
     grid = np.asarray(points, dtype=np.float64)
     if grid.ndim != 3 or grid.shape[2] != 2:
         raise ValueError(f"grid points have shape {grid.shape}, expected (rows, columns, 2)")
-    sheets = [grid, grid.swapaxes(0, 1)]
+    arrays = [grid, grid.swapaxes(0, 1)]
     if diagonals:
-        sheets += [_diagonals(grid), _diagonals(grid[::-1])]
-    return tuple(_family(sheet) for sheet in sheets)
+        arrays += [_diagonals(grid), _diagonals(grid[::-1])]
+    return tuple(_family(array) for array in arrays)
 
 
 def _diagonals(grid: Float64) -> Float64:
@@ -61,9 +61,9 @@ def _diagonals(grid: Float64) -> Float64:
     return sheared
 
 
-def _family(sheet: Float64) -> tuple[Float64, ...]:
-    there = np.isfinite(sheet[..., 0] + sheet[..., 1])
-    return tuple(line[kept] for line, kept in zip(sheet, there, strict=True) if np.count_nonzero(kept) >= _MIN_POINTS)
+def _family(array: Float64) -> tuple[Float64, ...]:
+    finite = np.isfinite(array[..., 0] + array[..., 1])
+    return tuple(line[kept] for line, kept in zip(array, finite, strict=True) if np.count_nonzero(kept) >= _MIN_POINTS)
 
 
 def group_lines(points: npt.ArrayLike, family: npt.ArrayLike, line: npt.ArrayLike) -> tuple[tuple[Float64, ...], ...]:
@@ -160,20 +160,20 @@ def pack(given: LineFamilies) -> PackedLines:
         raise ValueError(f"a line has shape {shape}, expected (points, 2)")
     counts = np.array([len(line) for line in lines])
     places = np.concatenate(lines)
-    there = np.isfinite(places[:, 0] + places[:, 1])
+    finite = np.isfinite(places[:, 0] + places[:, 1])
     line = np.repeat(np.arange(len(lines)), counts)
-    if not there.all():
-        places, line = places[there], line[there]
+    if not finite.all():
+        places, line = places[finite], line[finite]
         counts = np.bincount(line, minlength=len(lines))
     if counts.min() < _MIN_POINTS:
         kept = counts >= _MIN_POINTS
         chosen = kept[line]
-        there[there] = chosen
+        finite[finite] = chosen
         places, line = places[chosen], (np.cumsum(kept) - 1)[line[chosen]]
         counts, owner = counts[kept], owner[kept]
     if not len(places):
         raise ValueError("no line has three finite points; two points are straight however the lens bends")
-    return _normalised(places, line, counts, owner, len(given), there)
+    return _normalised(places, line, counts, owner, len(given), finite)
 
 
 def _normalised(

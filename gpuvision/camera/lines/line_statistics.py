@@ -41,9 +41,9 @@ def point_identifiers(packed: PackedLines) -> npt.NDArray[np.intp]:
     return number
 
 
-def count_line_parameters(packed: PackedLines, at: Parameters) -> int:
+def count_line_parameters(packed: PackedLines, parameters: Parameters) -> int:
     """Return the number of parameters of the lines and their vanishing points."""
-    bound = constrained_lines(packed, at)
+    bound = constrained_lines(packed, parameters)
     return 2 * len(bound) - int(np.count_nonzero(bound)) + 2 * len(set(packed.family[bound].tolist()))
 
 
@@ -53,7 +53,7 @@ def count_independent_errors(owner: npt.NDArray[np.intp]) -> int:
 
 
 def p_value_of_gain(
-    worse: float, better: float, more: int, residuals: tuple[int, int], freedom: int, variance: float | None
+    worse: float, better: float, more: int, residuals: tuple[int, int], degrees_of_freedom: int, variance: float | None
 ) -> float:
     """Return the p-value of the test of a smaller model against a larger one that contains it.
 
@@ -68,7 +68,7 @@ def p_value_of_gain(
         Number of additional parameters of the larger model.
     residuals : (int, int)
         Number of residuals, and number of independent ones.
-    freedom : int
+    degrees_of_freedom : int
         Degrees of freedom of the larger model: residuals minus parameters.
     variance : float or None
         Variance of a residual, if known.
@@ -79,9 +79,11 @@ def p_value_of_gain(
     gain = max(worse - better, 0.0) / (more * repeated)
     if variance is not None:
         return float(scipy.special.chdtrc(more, more * gain / max(variance, _ROUNDING**2)))
-    if freedom <= 0:
+    if degrees_of_freedom <= 0:
         return 1.0
-    return float(scipy.special.fdtrc(more, freedom / repeated, gain / max(better / freedom, _ROUNDING**2)))
+    return float(
+        scipy.special.fdtrc(more, degrees_of_freedom / repeated, gain / max(better / degrees_of_freedom, _ROUNDING**2))
+    )
 
 
 def covariance(
@@ -92,18 +94,23 @@ def covariance(
     A point's error is a vector with two independent components of equal variance. Its effects on all lines through the
     point are summed. Parameters that the data do not determine have infinite variance.
     """
-    columns = projected_columns(packed, found.at, found.here, found.slopes, found.normal.line_coefficients)
-    points = found.here.points
-    outward = 2.0 * points.slope * found.here.along
-    normals = np.stack(
-        [points.growth * found.here.nx + outward * points.dx, points.growth * found.here.ny + outward * points.dy]
+    columns = projected_columns(
+        packed, found.parameters, found.evaluation, found.slopes, found.normal.line_coefficients
     )
-    normals *= found.here.inverse
+    points = found.evaluation.points
+    outward = 2.0 * points.slope * found.evaluation.along
+    normals = np.stack(
+        [
+            points.growth * found.evaluation.nx + outward * points.dx,
+            points.growth * found.evaluation.ny + outward * points.dy,
+        ]
+    )
+    normals *= found.evaluation.inverse
     return (
         _sandwich(
             inner_products(columns, columns),
             [_per_point(columns * normal, owner) for normal in normals],
-            len(found.at.k),
+            len(found.parameters.k),
             keep_centre,
         )
         * variance
@@ -121,12 +128,14 @@ def robust_covariance(
     keep_centre: bool,
 ) -> Float64:
     """Return the covariance of an M-estimate, ordered as in `covariance`, by the sandwich estimator."""
-    columns = projected_columns(packed, found.at, found.here, found.slopes, found.normal.line_coefficients)
+    columns = projected_columns(
+        packed, found.parameters, found.evaluation, found.slopes, found.normal.line_coefficients
+    )
     bread = columns / np.sqrt(weight)
-    slope = influence_slope(found.here.distance / scale, loss)
-    spread = _per_point(columns * found.here.residual, owner)
-    enlarged = len(weight) / max(len(weight) - count_line_parameters(packed, found.at) - len(columns), 1)
-    return enlarged * _sandwich(inner_products(bread * slope, bread), [spread], len(found.at.k), keep_centre)
+    slope = influence_slope(found.evaluation.distance / scale, loss)
+    spread = _per_point(columns * found.evaluation.residual, owner)
+    enlarged = len(weight) / max(len(weight) - count_line_parameters(packed, found.parameters) - len(columns), 1)
+    return enlarged * _sandwich(inner_products(bread * slope, bread), [spread], len(found.parameters.k), keep_centre)
 
 
 def _per_point(values: Float64, owner: npt.NDArray[np.intp]) -> Float64:
@@ -143,13 +152,13 @@ def _sandwich(bread: Float64, spreads: list[Float64], order: int, keep_centre: b
     fixed = np.ix_(kept, kept)
     scale = 1.0 / np.sqrt(bread.diagonal()[kept])
     values, vectors = np.linalg.eigh(bread[fixed] * np.outer(scale, scale))
-    seen = values > _SINGULAR
-    turned = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T * np.outer(scale, scale)
+    determined = values > _SINGULAR
+    turned = (vectors[:, determined] / values[determined]) @ vectors[:, determined].T * np.outer(scale, scale)
     found = np.diag(np.full(len(bread), np.inf))
     if keep_centre and order:
         found[[order, order + 1], [order, order + 1]] = 0.0
     found[fixed] = turned @ meat[fixed] @ turned
-    lost = kept[np.any(np.abs(vectors[:, ~seen]) > math.sqrt(_SINGULAR), axis=1)]
+    lost = kept[np.any(np.abs(vectors[:, ~determined]) > math.sqrt(_SINGULAR), axis=1)]
     found[lost, lost] = np.inf
     return found
 
@@ -180,7 +189,7 @@ def robust_start(packed: PackedLines, centre: Float64 | None) -> tuple[Parameter
         start = linear_start(packed, centre, weight)
         distance = start.distances(packed, weight)
         weight = robust_weights(distance, max(_NORMAL_MAD * float(np.median(np.abs(distance))), _ROUNDING), "huber")
-    return start.at, weight
+    return start.parameters, weight
 
 
 def fit_reweighted(
@@ -191,15 +200,15 @@ def fit_reweighted(
     Tukey's loss has several minima; its minimisation starts from Huber's minimum.
     """
     weight, scale = np.ones(len(packed.x)), 0.0
-    left = np.sqrt(len(packed.x) / max(len(packed.x) - count_line_parameters(packed, found.at), 1))
+    left = np.sqrt(len(packed.x) / max(len(packed.x) - count_line_parameters(packed, found.parameters), 1))
     stages: tuple[Loss, ...] = ("huber", "tukey") if loss == "tukey" else ("huber",)
     for stage in stages:
         for _ in range(_MAX_ROUNDS):
-            distance, before = found.here.distance, weight
+            distance, before = found.evaluation.distance, weight
             scale = sigma if sigma is not None else float(_NORMAL_MAD * left * np.median(np.abs(distance)))
             scale = max(scale, _ROUNDING)
             weight = robust_weights(distance, scale, stage)
-            found = minimise(packed, found.at, weight=weight, keep_centre=keep_centre)
+            found = minimise(packed, found.parameters, weight=weight, keep_centre=keep_centre)
             if np.max(np.abs(weight - before)) <= _SETTLED:
                 break
     return found, weight, scale

@@ -84,7 +84,7 @@ class Evaluation:
         Undistorted points, and the best lines through them in closed form.
     nx, ny, along
         Normal of each point's line, and the point's offset from the centre along it (n,).
-    spread
+    squared_scale
         Squared local scale |J'n|^2 (n,).
     inverse
         Square root of the weight over the local scale (n,).
@@ -101,7 +101,7 @@ class Evaluation:
     nx: Float64
     ny: Float64
     along: Float64
-    spread: Float64
+    squared_scale: Float64
     inverse: Float64
     distance: Float64
     residual: Float64
@@ -201,7 +201,7 @@ def pencil_lines(moments: Float64, basis: Float64) -> LineSet:
 
 
 def evaluate(
-    packed: PackedLines, at: Parameters, before: Evaluation | None = None, weight: Float64 | None = None
+    packed: PackedLines, parameters: Parameters, before: Evaluation | None = None, weight: Float64 | None = None
 ) -> Evaluation:
     """Return the distances of the points from the best lines.
 
@@ -209,26 +209,26 @@ def evaluate(
     ----------
     packed : PackedLines
         Measured points.
-    at : Parameters
+    parameters : Parameters
         Lens and vanishing points.
     before : Evaluation, optional
         Evaluation for nearby parameters; its line directions give the local scale. Default: a first pass without scale.
     weight : numpy.ndarray, optional
         (n,) weights of the squared distances. Default: 1.
     """
-    points = undistort(packed, at.k, at.centre)
+    points = undistort(packed, parameters.k, parameters.centre)
     inverse = weight
-    if len(at.k):
+    if len(parameters.k):
         if before is None:
-            lines = fit_lines(packed, at, moments(packed, points.x, points.y, weight))
+            lines = fit_lines(packed, parameters, moments(packed, points.x, points.y, weight))
             nx, ny = lines.nx[packed.line], lines.ny[packed.line]
         else:
             nx, ny = before.nx, before.ny
-        inverse = (1.0 if weight is None else weight) / _spread(points, nx, ny)[1]
-    lines = fit_lines(packed, at, moments(packed, points.x, points.y, inverse))
+        inverse = (1.0 if weight is None else weight) / _squared_scale(points, nx, ny)[1]
+    lines = fit_lines(packed, parameters, moments(packed, points.x, points.y, inverse))
     nx, ny, distance = lines.nx[packed.line], lines.ny[packed.line], lines.offset[packed.line]
-    along, spread = _spread(points, nx, ny)
-    inverse = 1.0 / np.sqrt(spread)
+    along, squared_scale = _squared_scale(points, nx, ny)
+    inverse = 1.0 / np.sqrt(squared_scale)
     distance += nx * points.x
     distance += ny * points.y
     distance *= inverse
@@ -238,41 +238,50 @@ def evaluate(
         inverse *= root
         residual = distance * root
     return Evaluation(
-        points, lines, nx, ny, along, spread, inverse, distance, residual, float(inner_products(residual, residual))
+        points,
+        lines,
+        nx,
+        ny,
+        along,
+        squared_scale,
+        inverse,
+        distance,
+        residual,
+        float(inner_products(residual, residual)),
     )
 
 
-def fit_lines(packed: PackedLines, at: Parameters, moments: Float64) -> LineSet:
+def fit_lines(packed: PackedLines, parameters: Parameters, moments: Float64) -> LineSet:
     """Return the lines of least squared distance, through the vanishing points if the parameters have any."""
     lines = free_lines(moments)
-    bound = constrained_lines(packed, at)
-    if at.vanishing is None or not bound.any():
+    bound = constrained_lines(packed, parameters)
+    if parameters.vanishing is None or not bound.any():
         return lines
-    basis = pencil_basis(at.vanishing)[packed.family[bound]]
+    basis = pencil_basis(parameters.vanishing)[packed.family[bound]]
     inside = pencil_lines(moments[:, bound], basis)
     for all_lines, some in zip(lines, inside, strict=True):
         all_lines[bound] = some
     return lines
 
 
-def constrained_lines(packed: PackedLines, at: Parameters) -> npt.NDArray[np.bool_]:
+def constrained_lines(packed: PackedLines, parameters: Parameters) -> npt.NDArray[np.bool_]:
     """Return which lines (lines,) are constrained to a vanishing point; a family of one line is not constrained."""
-    if at.vanishing is None:
+    if parameters.vanishing is None:
         return np.zeros(len(packed.counts), dtype=bool)
     return np.bincount(packed.family, minlength=packed.families)[packed.family] > 1
 
 
-def _spread(points: Undistorted, nx: Float64, ny: Float64) -> tuple[Float64, Float64]:
+def _squared_scale(points: Undistorted, nx: Float64, ny: Float64) -> tuple[Float64, Float64]:
     """Return n.d and the squared local scale |J'n|^2."""
     along = nx * points.dx
     along += ny * points.dy
-    spread = points.slope * points.square
-    spread += points.growth
-    spread *= along
-    spread *= along
-    spread *= 4.0 * points.slope
-    spread += points.growth * points.growth
-    return along, spread
+    squared_scale = points.slope * points.square
+    squared_scale += points.growth
+    squared_scale *= along
+    squared_scale *= along
+    squared_scale *= 4.0 * points.slope
+    squared_scale += points.growth * points.growth
+    return along, squared_scale
 
 
 class ResidualJacobian(NamedTuple):
@@ -291,17 +300,17 @@ class ResidualJacobian(NamedTuple):
     line: Float64
 
 
-def residual_jacobian(order: int, here: Evaluation) -> ResidualJacobian:
+def residual_jacobian(order: int, evaluation: Evaluation) -> ResidualJacobian:
     """Differentiate the residuals. The derivatives of the local scale are included, so the estimate is unbiased."""
-    points, q, nx, ny, each = here.points, here.along, here.nx, here.ny, here.inverse
+    points, q, nx, ny, each = evaluation.points, evaluation.along, evaluation.nx, evaluation.ny, evaluation.inverse
     square, growth, slope = points.square, points.growth, points.slope
     line = np.empty((2, len(q)))
     line[0] = each
     np.multiply(each, nx * points.y - ny * points.x, out=line[1])
     if order == 0:
-        return ResidualJacobian(here.residual[None], line)
+        return ResidualJacobian(evaluation.residual[None], line)
     # W is the squared scale, F = n.u + rho. dr = dF/sqrt(W) - (r / 2W) dW, split into the terms with dq and with ds.
-    half = 0.5 * here.residual / here.spread
+    half = 0.5 * evaluation.residual / evaluation.squared_scale
     outward, four = half * q, 4.0 * q
     by_q = 8.0 * slope * (growth + slope * square) * outward
     line[1] -= by_q * (nx * points.dy - ny * points.dx)
@@ -328,7 +337,7 @@ def residual_jacobian(order: int, here: Evaluation) -> ResidualJacobian:
     for row, (normal, offset) in enumerate(((nx, points.dx), (ny, points.dy)), order):
         np.multiply(normal, by_q, out=lens[row])
         lens[row] += offset * outward
-    lens[order + 2] = here.residual
+    lens[order + 2] = evaluation.residual
     return ResidualJacobian(lens, line)
 
 
@@ -352,7 +361,7 @@ class NormalEquations(NamedTuple):
 
 
 def normal_equations(
-    packed: PackedLines, at: Parameters, here: Evaluation, slopes: ResidualJacobian
+    packed: PackedLines, parameters: Parameters, evaluation: Evaluation, slopes: ResidualJacobian
 ) -> NormalEquations:
     """Return the normal equations of lens and vanishing points, with the lines' columns projected out."""
     cross = np.array([packed.sums(line * slopes.lens) for line in slopes.line])
@@ -361,15 +370,15 @@ def normal_equations(
     np.subtract(own[2] * cross[0], own[1] * cross[1], out=line_coefficients[0])
     np.subtract(own[0] * cross[1], own[1] * cross[0], out=line_coefficients[1])
     line_coefficients /= own[0] * own[2] - own[1] ** 2
-    bound = constrained_lines(packed, at)
+    bound = constrained_lines(packed, parameters)
     sideways = None
-    if at.vanishing is not None and bound.any():
-        sideways = _pencils(packed, at.vanishing, here.lines, own, cross, bound)
+    if parameters.vanishing is not None and bound.any():
+        sideways = _pencils(packed, parameters.vanishing, evaluation.lines, own, cross, bound)
         line_coefficients[..., bound] = sideways.line_coefficients
     product = inner_products(slopes.lens, slopes.lens) - sum(
         inner_products(a, b) for a, b in zip(line_coefficients, cross, strict=True)
     )
-    if at.vanishing is None:
+    if parameters.vanishing is None:
         return NormalEquations(product[:-1, :-1], product[:-1, -1], line_coefficients)
     lens, tangents = len(product) - 1, 2 * packed.families
     matrix, gradient = np.zeros((lens + tangents,) * 2), np.zeros(lens + tangents)
@@ -423,17 +432,23 @@ def _pencils(
 
 
 def projected_columns(
-    packed: PackedLines, at: Parameters, here: Evaluation, slopes: ResidualJacobian, line_coefficients: Float64
+    packed: PackedLines,
+    parameters: Parameters,
+    evaluation: Evaluation,
+    slopes: ResidualJacobian,
+    line_coefficients: Float64,
 ) -> Float64:
     """Return the Jacobian (parameters, n), with the lines' columns projected out."""
     found = slopes.lens[:-1] - sum(
         line * part[:-1, packed.line] for line, part in zip(slopes.line, line_coefficients, strict=True)
     )
-    if at.vanishing is None:
+    if parameters.vanishing is None:
         return np.asarray(found)
-    bound = constrained_lines(packed, at)
+    bound = constrained_lines(packed, parameters)
     change = np.zeros((2, 3, len(bound)))
-    change[..., bound] = pencil_changes(at.vanishing, packed.family[bound], LineSet(*(n[bound] for n in here.lines)))
+    change[..., bound] = pencil_changes(
+        parameters.vanishing, packed.family[bound], LineSet(*(n[bound] for n in evaluation.lines))
+    )
     turn, *moves = (np.sum(slopes.line * change[:, part, packed.line], axis=0) for part in range(3))
     length = np.where(bound, packed.sums(turn * turn), 1.0)
     tangents = np.zeros((packed.families, 2, len(packed.x)))

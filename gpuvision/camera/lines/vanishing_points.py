@@ -75,8 +75,8 @@ def straightness_px(lines: LineFamilies, model: Any = None) -> float:
     after = before if model is None else np.asarray(model.undistort(before))
     scale = math.sqrt(np.sum(np.var(after, axis=0)) / np.sum(np.var(before, axis=0))) * packed.unit
     x, y = ((after - np.mean(after, axis=0)) / scale).T
-    here = evaluate(replace(packed, x=x, y=y), Parameters(np.empty(0), np.zeros(2), None))
-    return math.sqrt(here.cost / len(x)) * packed.unit
+    evaluation = evaluate(replace(packed, x=x, y=y), Parameters(np.empty(0), np.zeros(2), None))
+    return math.sqrt(evaluation.cost / len(x)) * packed.unit
 
 
 def fit_lens(
@@ -185,9 +185,11 @@ class _ModelSearch:
 
     def parameters(self, order: int, concurrent: bool) -> int:
         """Return the number of parameters, including those of the lines."""
-        return self.count_lens_parameters(order) + count_line_parameters(self.packed, self.fits[order, concurrent].at)
+        return self.count_lens_parameters(order) + count_line_parameters(
+            self.packed, self.fits[order, concurrent].parameters
+        )
 
-    def freedom(self, order: int, concurrent: bool) -> int:
+    def degrees_of_freedom(self, order: int, concurrent: bool) -> int:
         """Return the degrees of freedom: residuals minus parameters."""
         return len(self.packed.x) - self.parameters(order, concurrent)
 
@@ -232,10 +234,10 @@ class _ModelSearch:
         robust = self.loss != "squared" and self.weight is None
         if robust:
             start, self.weight = robust_start(self.packed, self.centre if self.keep_centre else None)
-            self.linear = self.linear._replace(at=start)
-        start, here = self._starting_point(order, concurrent)
-        found = minimise(self.packed, start, here, weight=self.weight, keep_centre=self.keep_centre)
-        if order and not self.keep_centre and np.hypot(*found.at.centre) > 1.0:
+            self.linear = self.linear._replace(parameters=start)
+        start, evaluation = self._starting_point(order, concurrent)
+        found = minimise(self.packed, start, evaluation, weight=self.weight, keep_centre=self.keep_centre)
+        if order and not self.keep_centre and np.hypot(*found.parameters.centre) > 1.0:
             found = self._fit_from_middle(found, order, concurrent)
         if robust:
             found, self.weight, self.scale = fit_reweighted(
@@ -247,27 +249,27 @@ class _ModelSearch:
 
     def _fit_from_middle(self, found: Minimum, order: int, concurrent: bool) -> Minimum:
         """Search for a better minimum if the centre left the data (k1 then tends to 0)."""
-        about = linear_start(self.packed, np.zeros(2), self.weight).at
+        about = linear_start(self.packed, np.zeros(2), self.weight).parameters
         start = about._replace(k=np.append(about.k, np.zeros(order - 1)))
         if concurrent:
             lines = evaluate(self.packed, start, weight=self.weight).lines
             start = start._replace(vanishing=vanishing_start(self.packed, lines))
         other = minimise(self.packed, start, weight=self.weight)
-        return min(found, other, key=lambda each: each.here.cost)
+        return min(found, other, key=lambda each: each.evaluation.cost)
 
     def _starting_point(self, order: int, concurrent: bool) -> tuple[Parameters, Evaluation | None]:
         if concurrent:
-            at, here = self._starting_point(order, False)
+            parameters, evaluation = self._starting_point(order, False)
             if self.free_dimensions > self.count_lens_parameters(order):
-                at, here = self.fit(order, False).at, self.fit(order, False).here
-            lines = (here or evaluate(self.packed, at, weight=self.weight)).lines
-            return at._replace(vanishing=vanishing_start(self.packed, lines)), None
+                parameters, evaluation = self.fit(order, False).parameters, self.fit(order, False).evaluation
+            lines = (evaluation or evaluate(self.packed, parameters, weight=self.weight)).lines
+            return parameters._replace(vanishing=vanishing_start(self.packed, lines)), None
         if order == 0:
             return Parameters(np.empty(0), self.centre, None), None
         smaller = self.fits.get((order - 1, False))
         if order == 2 and smaller is not None:
-            return smaller.at._replace(k=np.append(smaller.at.k, 0.0)), smaller.here
-        start = self.linear.at
+            return smaller.parameters._replace(k=np.append(smaller.parameters.k, 0.0)), smaller.evaluation
+        start = self.linear.parameters
         return start._replace(k=np.append(start.k, np.zeros(order - 1))), None
 
     def p_value_of_gain(self, smaller: tuple[int, bool], larger: tuple[int, bool]) -> float:
@@ -276,7 +278,9 @@ class _ModelSearch:
         more = self.parameters(*larger) - self.parameters(*smaller)
         residuals = (len(self.packed.x), self.independent)
         variance = None if self.sigma is None else self.sigma**2
-        return p_value_of_gain(worse.here.cost, better.here.cost, more, residuals, self.freedom(*larger), variance)
+        return p_value_of_gain(
+            worse.evaluation.cost, better.evaluation.cost, more, residuals, self.degrees_of_freedom(*larger), variance
+        )
 
     def choose(self, orders: list[int], lines: LineConstraint) -> tuple[int, bool]:
         """Fit the requested models and return the smallest one that the F test accepts."""
@@ -297,13 +301,13 @@ class _ModelSearch:
 
 def _report(search: _ModelSearch, order: int, concurrent: bool, families: LineFamilies) -> LensFit:
     packed, found = search.packed, search.fit(order, concurrent)
-    freedom = search.freedom(order, concurrent)
-    if freedom <= 0:
+    degrees_of_freedom = search.degrees_of_freedom(order, concurrent)
+    if degrees_of_freedom <= 0:
         raise ValueError(
             f"{len(packed.x)} points on {len(packed.counts)} lines leave nothing to estimate the errors from; "
             "expected more points on the lines"
         )
-    sigma = search.sigma or search.scale or math.sqrt(found.here.cost / freedom)
+    sigma = search.sigma or search.scale or math.sqrt(found.evaluation.cost / degrees_of_freedom)
     if search.weight is None:
         spread = covariance(packed, found, search.owner, sigma**2, keep_centre=search.keep_centre)
     else:
@@ -325,8 +329,8 @@ def _report(search: _ModelSearch, order: int, concurrent: bool, families: LineFa
         residuals_px=residuals_px(packed, found, families),
         rms_px=rms_px(packed, found, search.weight),
         sigma_px=sigma * packed.unit,
-        degrees_of_freedom=freedom,
-        iterations=sum(each.steps for each in search.fits.values()),
+        degrees_of_freedom=degrees_of_freedom,
+        iterations=sum(each.iterations for each in search.fits.values()),
         alternatives=_alternatives(search, order, concurrent),
         warnings=(),
     )
@@ -344,11 +348,11 @@ def _alternatives(search: _ModelSearch, order: int, concurrent: bool) -> tuple[L
         if (number, with_points) == (order, concurrent):
             continue
         other = search.fits[number, with_points]
-        apart = math.nan
+        distance = math.nan
         if number and order:
-            apart = search.packed.unit * float(np.hypot(*(other.at.centre - chosen.at.centre)))
+            distance = search.packed.unit * float(np.hypot(*(other.parameters.centre - chosen.parameters.centre)))
         more = search.parameters(number, with_points) - search.parameters(order, concurrent)
-        ratio = other.here.cost / chosen.here.cost if chosen.here.cost > 0.0 else 1.0
+        ratio = other.evaluation.cost / chosen.evaluation.cost if chosen.evaluation.cost > 0.0 else 1.0
         found.append(
             LensAlternative(
                 model=MODELS[number],
@@ -357,7 +361,7 @@ def _alternatives(search: _ModelSearch, order: int, concurrent: bool) -> tuple[L
                 p_value=search.p_value_of_gain((number, with_points), (largest, concurrent and with_points)),
                 aic=search.independent * math.log(ratio) + 2.0 * more if ratio > 0.0 else -math.inf,
                 centre=centre_px(search.packed, other) if number else None,
-                centre_distance_px=apart,
+                centre_distance_px=distance,
             )
         )
     return tuple(found)

@@ -70,28 +70,28 @@ class Minimum:
 
     Attributes
     ----------
-    at, here
+    parameters, evaluation
         Final parameters and their evaluation.
     slopes, normal
         Residual Jacobian and normal equations of the last step.
-    steps
+    iterations
         Number of steps tried.
     at_bound
         Active bound: "", "centre" or "fold".
     """
 
-    at: Parameters
-    here: Evaluation
+    parameters: Parameters
+    evaluation: Evaluation
     slopes: ResidualJacobian
     normal: NormalEquations
-    steps: int
+    iterations: int
     at_bound: str
 
 
 def minimise(
     packed: PackedLines,
     start: Parameters,
-    here: Evaluation | None = None,
+    evaluation: Evaluation | None = None,
     *,
     weight: Float64 | None = None,
     keep_centre: bool = False,
@@ -105,7 +105,7 @@ def minimise(
         Measured points.
     start : Parameters
         Starting parameters.
-    here : Evaluation, optional
+    evaluation : Evaluation, optional
         Evaluation of the starting parameters, if known.
     weight : numpy.ndarray, optional
         (n,) weights of the squared distances. Default: 1.
@@ -118,37 +118,41 @@ def minimise(
     -------
     Minimum
     """
-    at, damping, steps, gained = start, _DAMPING[0], 0, 0.0
-    here = evaluate(packed, at, weight=weight) if here is None else here
+    parameters, damping, iterations, gained = start, _DAMPING[0], 0, 0.0
+    evaluation = evaluate(packed, parameters, weight=weight) if evaluation is None else evaluation
     rounding = _ROUNDING * len(packed.x)
     variance = limits.min_gain / max(len(packed.x) - 2 * len(packed.counts), 1)
     while True:
-        slopes = residual_jacobian(len(at.k), here)
-        normal = normal_equations(packed, at, here, slopes)
+        slopes = residual_jacobian(len(parameters.k), evaluation)
+        normal = normal_equations(packed, parameters, evaluation, slopes)
         if keep_centre:
-            normal = without_centre(normal, len(at.k))
-        found = Minimum(at, here, slopes, normal, steps, "")
+            normal = without_centre(normal, len(parameters.k))
+        found = Minimum(parameters, evaluation, slopes, normal, iterations, "")
         if not len(normal.gradient):
             return found
         bounds: set[str] = set()
         while True:
-            steps += 1
+            iterations += 1
             step = _damped_step(normal, damping)
             gain = -float(step @ normal.gradient)
-            trial, bound = apply_step(packed, at, step, keep_centre, limits)
+            trial, bound = apply_step(packed, parameters, step, keep_centre, limits)
             bounds.add(bound)
-            there = None if bound == "fold" else evaluate(packed, trial, here, weight)
-            if there is not None and there.cost <= here.cost + rounding:
+            next_evaluation = None if bound == "fold" else evaluate(packed, trial, evaluation, weight)
+            if next_evaluation is not None and next_evaluation.cost <= evaluation.cost + rounding:
                 break
             damping = max(10.0 * damping, _DAMPING[1])
-            if damping > _DAMPING[2] or gain < variance * here.cost or steps >= limits.max_iterations:
-                return replace(found, steps=steps, at_bound=max(bounds))
-        at, here, damping = trial, there, 0.1 * damping if damping > _DAMPING[1] else _DAMPING[0]
+            if damping > _DAMPING[2] or gain < variance * evaluation.cost or iterations >= limits.max_iterations:
+                return replace(found, iterations=iterations, at_bound=max(bounds))
+        parameters, evaluation, damping = (
+            trial,
+            next_evaluation,
+            0.1 * damping if damping > _DAMPING[1] else _DAMPING[0],
+        )
         # Predict the next gain: gains decrease at least by the last ratio.
         coming = gain * min(gain / gained, 1.0) if gained > 0.0 else gain
         gained = gain
-        if coming <= max(variance * here.cost, rounding) or steps >= limits.max_iterations:
-            return Minimum(at, here, slopes, normal, steps, max(bounds))
+        if coming <= max(variance * evaluation.cost, rounding) or iterations >= limits.max_iterations:
+            return Minimum(parameters, evaluation, slopes, normal, iterations, max(bounds))
 
 
 def _damped_step(normal: NormalEquations, damping: float) -> Float64:
@@ -168,14 +172,14 @@ def without_centre(normal: NormalEquations, order: int) -> NormalEquations:
 
 def apply_step(
     packed: PackedLines,
-    at: Parameters,
+    parameters: Parameters,
     step: Float64,
     keep_centre: bool = False,
     limits: MinimisationLimits = DEFAULT_LIMITS,
 ) -> tuple[Parameters, str]:
     """Return the parameters after a step, with the centre clamped to its bound, and the bound that is active."""
-    order = len(at.k)
-    k, centre, bound = at.k + step[:order], at.centre, ""
+    order = len(parameters.k)
+    k, centre, bound = parameters.k + step[:order], parameters.centre, ""
     if order and not keep_centre:
         centre = centre + step[order : order + 2]
         distance = math.hypot(*centre)
@@ -185,7 +189,7 @@ def apply_step(
         # The bounding box violates the bound: test the farthest point itself.
         farthest = float(np.max((packed.x - centre[0]) ** 2 + (packed.y - centre[1]) ** 2))
         bound = bound if is_monotonic(k, farthest, least=limits.min_slope) else "fold"
-    vanishing = at.vanishing
+    vanishing = parameters.vanishing
     if vanishing is not None:
         tangent = step[len(step) - 2 * packed.families :].reshape(-1, 2)
         vanishing = vanishing + np.sum(tangent[:, :, None] * pencil_basis(vanishing), axis=1)
@@ -203,7 +207,7 @@ class LinearStart(NamedTuple):
 
     Attributes
     ----------
-    at
+    parameters
         k1 and the centre.
     rank
         Number of independent bends of the lines: 3 determine k1 and the centre; 1 determines k1 about a known centre.
@@ -213,7 +217,7 @@ class LinearStart(NamedTuple):
         Residual Jacobian, its projection onto the lines, and the coefficients of its rows in the remaining distances.
     """
 
-    at: Parameters
+    parameters: Parameters
     rank: int
     gain: float
     slopes: ResidualJacobian
@@ -239,26 +243,31 @@ def linear_start(
     function along the line, which the line itself absorbs. The bend is linear in k1 and k1 c.
     """
     known = np.zeros(2) if centre is None else centre
-    here = evaluate(packed, Parameters(np.empty(0), known, None), weight=weight)
-    points, nx, ny = here.points, here.nx, here.ny
+    evaluation = evaluate(packed, Parameters(np.empty(0), known, None), weight=weight)
+    points, nx, ny = evaluation.points, evaluation.nx, evaluation.ny
     # Project the points onto their lines, so that measurement errors do not act as bends.
-    x, y, q = points.dx - nx * here.distance, points.dy - ny * here.distance, here.along - here.distance
+    x, y, q = (
+        points.dx - nx * evaluation.distance,
+        points.dy - ny * evaluation.distance,
+        evaluation.along - evaluation.distance,
+    )
     square = x * x + y * y
     bends = [q * square]
     if centre is None:
         bends += [-square * nx - 2.0 * q * x, -square * ny - 2.0 * q * y]
     slopes = ResidualJacobian(
-        np.stack([*(here.inverse * bend for bend in bends), here.residual]), residual_jacobian(0, here).line
+        np.stack([*(evaluation.inverse * bend for bend in bends), evaluation.residual]),
+        residual_jacobian(0, evaluation).line,
     )
-    normal = normal_equations(packed, Parameters(np.zeros(1), known, None), here, slopes)
+    normal = normal_equations(packed, Parameters(np.zeros(1), known, None), evaluation, slopes)
     values, vectors = np.linalg.eigh(normal.matrix)
-    seen = values > limits.min_curvature * len(q)
-    vectors = vectors[:, seen]
-    step = -vectors @ (vectors.T @ normal.gradient / values[seen])
+    determined = values > limits.min_curvature * len(q)
+    vectors = vectors[:, determined]
+    step = -vectors @ (vectors.T @ normal.gradient / values[determined])
     k1, *moved = step.tolist()
     if centre is None and math.hypot(*moved) < abs(k1):
         known = np.array(moved) / k1
-    elif seen.any():
+    elif determined.any():
         # A centre outside the image is noise, and so is its k1: estimate k1 about the middle.
         k1 = -float(normal.gradient[0] / normal.matrix[0, 0])
     k = np.array([k1])
@@ -267,7 +276,7 @@ def linear_start(
     gain = -float(step @ normal.gradient)
     return LinearStart(
         Parameters(k, known, None),
-        int(np.count_nonzero(seen)),
+        int(np.count_nonzero(determined)),
         gain,
         slopes,
         normal.line_coefficients,

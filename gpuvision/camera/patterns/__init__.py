@@ -1,1 +1,1 @@
-"""Dot grids, chessboards and line grids in images, found sub-pixel."""
+"""Sub-pixel detection of target patterns: dot grids, chessboards and line grids."""

@@ -105,7 +105,7 @@ def find_chessboard(
         8 px, the board rotated by at most 45 degrees.
     inner_corners
         Number of inner corners along both sides of the board, in any order; every row and column of them must be
-        seen in part. Without, what is found is the board.
+        visible in part. Default: accept the board that is found.
 
     Returns
     -------

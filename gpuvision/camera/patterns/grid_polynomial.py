@@ -73,11 +73,11 @@ def agrees_with_grid(points: Float64, max_medians: float, min_tolerance: float) 
     rest = points - model.derivative(0, 0)
     good = np.ones(points.shape[:2], dtype=np.bool_)
     for last in (*[False] * (_ROUNDS - 1), True):
-        off = np.nan_to_num(_distance_from_prediction(rest))
-        if off.any():
-            limit = max(limit, max_medians * float(np.median(off[off > 0.0])))
+        distance = np.nan_to_num(_distance_from_prediction(rest))
+        if distance.any():
+            limit = max(limit, max_medians * float(np.median(distance[distance > 0.0])))
         # An outlier spoils the predictions of its neighbours: remove the worst point of a neighbourhood first.
-        worst = (off > limit) & (last | (off == maximum_filter(off, _NEIGHBOURHOOD)))
+        worst = (distance > limit) & (last | (distance == maximum_filter(distance, _NEIGHBOURHOOD)))
         good &= ~worst
         rest[worst] = np.nan
         if not worst.any():
@@ -98,7 +98,7 @@ def _distance_from_prediction(points: Float64) -> Float64:
     """
     rows, columns = points.shape[:2]
     padded = np.pad(points, ((3, 3), (3, 3), (0, 0)), constant_values=np.nan)
-    amid, beyond = [], []
+    central, one_sided = [], []
     for down, right in ((0, 1), (1, 0)):
         at = {
             k: padded[3 + k * down : 3 + k * down + rows, 3 + k * right : 3 + k * right + columns]
@@ -106,7 +106,9 @@ def _distance_from_prediction(points: Float64) -> Float64:
         }
         line = 0.5 * (at[-1] + at[1])
         cubic = (4.0 * (at[-1] + at[1]) - at[-2] - at[2]) / 6.0
-        amid.append(np.where(np.isfinite(cubic), cubic, line))
-        beyond += [3.0 * (at[k] - at[2 * k]) + at[3 * k] for k in (-1, 1)]
-    off, off_beyond = (np.linalg.norm(points - nan_median(np.stack(each)), axis=-1) for each in (amid, beyond))
-    return np.asarray(np.where(np.isfinite(off), off, 0.5 * off_beyond))
+        central.append(np.where(np.isfinite(cubic), cubic, line))
+        one_sided += [3.0 * (at[k] - at[2 * k]) + at[3 * k] for k in (-1, 1)]
+    distance, one_sided_distance = (
+        np.linalg.norm(points - nan_median(np.stack(each)), axis=-1) for each in (central, one_sided)
+    )
+    return np.asarray(np.where(np.isfinite(distance), distance, 0.5 * one_sided_distance))

@@ -1,1 +1,1 @@
-"""What the calibration from views of a flat target is made of."""
+"""Camera calibration from views of a flat target."""

@@ -32,14 +32,14 @@ class PackedViews(NamedTuple):
     ----------
     target
         (views, 3, n): points on the target, Z = 0 [m].
-    seen
+    image
         (views, 2, n): measured columns and rows [px].
     weight
         (views, n): 1, or 0 for padding.
     """
 
     target: Floats
-    seen: Floats
+    image: Floats
     weight: Floats
 
     @property
@@ -101,8 +101,8 @@ class FitState:
 
     Attributes
     ----------
-    numbers
-        (11,): the parameters named in `parameters.NUMBERS`.
+    values
+        (11,): the parameters named in `parameters.FIT_PARAMETERS`.
     rotations, translations
         (views, 3, 3) and (views, 3): from the target to the sensor's frame.
     cost
@@ -113,7 +113,7 @@ class FitState:
         Whether the fit has converged.
     """
 
-    numbers: Floats
+    values: Floats
     rotations: Floats
     translations: Floats
     cost: float = np.inf
@@ -123,8 +123,8 @@ class FitState:
 
 def residuals(views: PackedViews, state: FitState) -> Floats:
     """Return measured minus projected points, (views, 2, n) [px]; 0 for padding."""
-    projected = project(internal_parameters(state.numbers)[0], state.rotations, state.translations, views.target)
-    return np.where(views.weight[:, None] > 0.0, views.seen - projected.points, 0.0)
+    projected = project(internal_parameters(state.values)[0], state.rotations, state.translations, views.target)
+    return np.where(views.weight[:, None] > 0.0, views.image - projected.points, 0.0)
 
 
 def robust_scale(views: PackedViews, state: FitState) -> float:
@@ -158,23 +158,23 @@ def linearise(
     With ``stiffness`` the points are weighted by the second derivative of the loss (for covariances), otherwise by its
     weight (for steps).
     """
-    if not (np.isfinite(state.numbers).all() and min(state.numbers[:2]) > 0.0):
+    if not (np.isfinite(state.values).all() and min(state.values[:2]) > 0.0):
         return None
-    internal, to_internal = internal_parameters(state.numbers)
+    internal, to_internal = internal_parameters(state.values)
     projected = project(internal, state.rotations, state.translations, views.target, derivatives=True)
     if projected.jacobian is None:
         return None
-    residual = views.seen - projected.points
+    residual = views.image - projected.points
     length = np.sqrt(np.sum(residual**2, axis=1))
     weight = views.weight * (loss.slope(length) if stiffness else loss.weight(length))
-    count = len(views.seen)
+    count = len(views.image)
     jacobian = projected.jacobian.reshape(count, COLUMNS, -1)
     doubled = np.repeat(weight[:, None], 2, axis=1).reshape(count, 1, -1)
     weighted = jacobian * doubled
     hessian = weighted @ np.swapaxes(jacobian, 1, 2)
     side = (weighted @ residual.reshape(count, -1, 1))[..., 0]
     split = len(INTERNAL)
-    free = to_internal @ free_parameters.derivative(state.numbers)
+    free = to_internal @ free_parameters.derivative(state.values)
     return NormalEquations(
         camera=free.T @ hessian[:, :split, :split].sum(axis=0) @ free,
         mixed=free.T @ hessian[:, :split, split:],
@@ -187,10 +187,10 @@ def linearise(
 
 def apply_step(free_parameters: FreeParameters, state: FitState, camera: Floats, poses: Floats) -> FitState:
     """Return the state after a step of camera and poses."""
-    numbers = state.numbers + free_parameters.basis @ camera
+    values = state.values + free_parameters.basis @ camera
     return replace(
         state,
-        numbers=free_parameters.with_dependent(numbers),
+        values=free_parameters.with_dependent(values),
         rotations=rotation_matrix(poses[:, :3]) @ state.rotations,
         translations=state.translations + poses[:, 3:],
     )
@@ -207,14 +207,14 @@ def adjust(views: PackedViews, free_parameters: FreeParameters, start: FitState,
     K. Madsen, H. B. Nielsen and O. Tingleff, Methods for non-linear least squares problems, TU Denmark 2004.
     """
     state = replace(
-        start, numbers=free_parameters.with_dependent(start.numbers), cost=np.inf, iterations=0, converged=False
+        start, values=free_parameters.with_dependent(start.values), cost=np.inf, iterations=0, converged=False
     )
     system = linearise(views, free_parameters, state, loss)
     if system is None:
         return state
     state = replace(state, cost=system.cost)
     damping, growth, polished = 1e-4, 2.0, False
-    for count in range(1, max(_MIN_STEPS, _STEPS_TIMES_VIEWS // len(views.seen)) + 1):
+    for count in range(1, max(_MIN_STEPS, _STEPS_TIMES_VIEWS // len(views.image)) + 1):
         camera, poses, _ = solve_step(system, damping)
         tried = apply_step(free_parameters, state, camera, poses)
         next_system = linearise(views, free_parameters, tried, loss)

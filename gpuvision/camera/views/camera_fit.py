@@ -145,9 +145,9 @@ def alpha_standard_deviation(tau: Sequence[float], covariance: Floats) -> float:
     return float(math.sqrt(slope @ covariance @ slope))
 
 
-def camera_from_parameters(numbers: Floats) -> Camera:
-    """Return the camera of parameters in the order of `parameters.NUMBERS`."""
-    fx, fy, cx, cy, *coefficients, tau_x, tau_y = opencv_parameters(numbers)[0].tolist()
+def camera_from_parameters(values: Floats) -> Camera:
+    """Return the camera of parameters in the order of `parameters.FIT_PARAMETERS`."""
+    fx, fy, cx, cy, *coefficients, tau_x, tau_y = opencv_parameters(values)[0].tolist()
     # Adding 0.0 turns -0.0 into 0.0.
     return Camera(
         matrix=((fx, 0.0, cx), (0.0, fy, cy), (0.0, 0.0, 1.0)),
@@ -157,7 +157,7 @@ def camera_from_parameters(numbers: Floats) -> Camera:
 
 def poses_in_lens_frame(state: FitState) -> tuple[Pose, ...]:
     """Return the poses in the lens' frame, the frame of `Camera` and OpenCV."""
-    back = tilt_matrix(*internal_parameters(state.numbers)[0][4:6]).T
+    back = tilt_matrix(*internal_parameters(state.values)[0][4:6]).T
     return tuple(
         Pose(back @ rotation, back @ translation)
         for rotation, translation in zip(state.rotations, state.translations, strict=True)
@@ -168,7 +168,7 @@ def residual_sigma(views: PackedViews, free_parameters: FreeParameters, state: F
     """Estimate the standard deviation of one coordinate [px] from the residuals."""
     if loss.kind != "squared":
         return robust_scale(views, state)
-    free = views.coordinates - free_parameters.count - 6 * len(views.seen)
+    free = views.coordinates - free_parameters.count - 6 * len(views.image)
     return math.sqrt(state.cost / free) if free > 0 else math.nan
 
 
@@ -185,11 +185,11 @@ def covariances(
     system = linearise(views, free_parameters, state, loss, stiffness=True)
     assert system is not None, "the fit ended with every point in front of the camera"
     variance = residual_variance_factor(views, free_parameters, state, loss, sigma)
-    inverse, on_poses, own = _inverted(system)
+    inverse, on_poses, own = _invert(system)
     to_names = _derivative_of_names(free_parameters, state)
     camera = variance * to_names @ inverse @ to_names.T
-    by_f = free_parameters.derivative(state.numbers)[0]
-    focus = math.sqrt(max(variance * by_f @ inverse @ by_f, 0.0)) / float(state.numbers[0])
+    by_f = free_parameters.derivative(state.values)[0]
+    focus = math.sqrt(max(variance * by_f @ inverse @ by_f, 0.0)) / float(state.values[0])
     return camera, variance * _lens_pose_covariance(free_parameters, state, inverse, on_poses, own), focus
 
 
@@ -200,12 +200,12 @@ def residual_variance_factor(
     if loss.kind == "squared":
         return (residual_sigma(views, free_parameters, state, loss) if sigma is None else sigma) ** 2
     length = np.linalg.norm(residuals(views, state), axis=1)[views.weight > 0.0]
-    free = views.coordinates - free_parameters.count - 6 * len(views.seen)
+    free = views.coordinates - free_parameters.count - 6 * len(views.image)
     squared_influence = float(np.sum((loss.weight(length) * length) ** 2))
     return squared_influence / free / float(np.mean(loss.slope(length)))
 
 
-def _inverted(system: NormalEquations) -> tuple[Floats, Floats, Floats]:
+def _invert(system: NormalEquations) -> tuple[Floats, Floats, Floats]:
     """Invert the normal equations: return the camera's block, -(pose by camera) maps, and the poses' own inverses."""
     reduced = solve_step(system, 0.0)[2]
     unit = 1.0 / np.sqrt(np.diag(system.camera))
@@ -220,15 +220,15 @@ def _inverted(system: NormalEquations) -> tuple[Floats, Floats, Floats]:
 def _derivative_of_names(free_parameters: FreeParameters, state: FitState) -> Floats:
     """Return d(named parameters) / d(free parameters)."""
     rows = [OPENCV.index("fx" if name == "f" else name) for name in free_parameters.names]
-    return (opencv_parameters(state.numbers)[1] @ free_parameters.derivative(state.numbers))[rows]
+    return (opencv_parameters(state.values)[1] @ free_parameters.derivative(state.values))[rows]
 
 
 def _lens_pose_covariance(
     free_parameters: FreeParameters, state: FitState, inverse: Floats, on_poses: Floats, own: Floats
 ) -> Floats:
     """Return the covariance of the poses in the lens' frame, which rotates with the tilt."""
-    internal, turned = internal_parameters(state.numbers)
-    tau = (turned @ free_parameters.derivative(state.numbers))[4:6]
+    internal, turned = internal_parameters(state.values)
+    tau = (turned @ free_parameters.derivative(state.values))[4:6]
     m = tilt_matrix(*internal[4:6])
     # Rotation vector of the lens' frame, with negative sign, by the free parameters.
     turn = -np.outer(m[:, 0], tau[0]) - np.outer([0.0, 1.0, 0.0], tau[1])

@@ -64,15 +64,15 @@ def fit_homographies(
     undistorted : bool
         The points are undistorted: omit the radial terms. Default False.
     """
-    seen = (views.seen - centre[:, None]) / radius
+    measured = (views.image - centre[:, None]) / radius
     # Normalise each target to zero mean and unit size.
-    plane, normalisation = _plane_units(views)
+    plane, normalisation = _normalise_targets(views)
     weight = views.weight.copy()
-    homographies = _direct_linear(plane, seen, weight)
+    homographies = _direct_linear(plane, measured, weight)
     radial = np.zeros(2)
     rounds = _ROBUST_ROUNDS if robust else _ROUNDS
     for round_ in range(rounds):
-        residual, by_radial, by_homography = _bent(plane, seen, homographies, radial)
+        residual, by_radial, by_homography = _linearise(plane, measured, homographies, radial)
         by_radial *= not undistorted
         if robust:
             length = np.linalg.norm(residual, axis=1)
@@ -81,10 +81,10 @@ def fit_homographies(
             weight = views.weight / np.maximum(length, _FULL_WEIGHT * middle + 1e-12) * middle
             if round_ > _ROBUST_ROUNDS - 4:
                 weight *= length < _REJECTED * middle + 1e-12
-        step, steps = _eliminated(residual, by_radial, by_homography, weight)
+        step, steps = _gauss_newton_step(residual, by_radial, by_homography, weight)
         radial = radial + step
         homographies = homographies + np.concatenate([steps, np.zeros((len(steps), 1))], axis=1).reshape(-1, 3, 3)
-    residual, _, _ = _bent(plane, seen, homographies, radial)
+    residual, _, _ = _linearise(plane, measured, homographies, radial)
     length = np.linalg.norm(residual, axis=1)[views.weight > 0.0]
     if robust:
         noise = float(np.median(length)) / MEDIAN_OF_NORM
@@ -94,7 +94,7 @@ def fit_homographies(
     return UndistortedHomographies(homographies @ normalisation, radial, noise * radius)
 
 
-def _plane_units(views: PackedViews) -> tuple[Floats, Floats]:
+def _normalise_targets(views: PackedViews) -> tuple[Floats, Floats]:
     """Return the target points as (x, y, 1) of unit size (views, 3, n), and the normalising matrices (views, 3, 3)."""
     total = np.sum(views.weight, axis=1)
     middle = np.sum(views.weight[:, None] * views.target[:, :2], axis=2) / total[:, None]
@@ -107,20 +107,20 @@ def _plane_units(views: PackedViews) -> tuple[Floats, Floats]:
     return np.concatenate([offset / size[:, None, None], np.ones_like(offset[:, :1])], axis=1), normalisation
 
 
-def _direct_linear(plane: Floats, seen: Floats, weight: Floats) -> Floats:
+def _direct_linear(plane: Floats, measured: Floats, weight: Floats) -> Floats:
     """Return the homographies of least algebraic error (DLT), with element (2, 2) equal to 1."""
     x = plane * weight[:, None]
     zero = np.zeros_like(x)
     rows = [
-        np.concatenate([x, zero, -seen[:, :1] * x], axis=1),
-        np.concatenate([zero, x, -seen[:, 1:] * x], axis=1),
+        np.concatenate([x, zero, -measured[:, :1] * x], axis=1),
+        np.concatenate([zero, x, -measured[:, 1:] * x], axis=1),
     ]
     scatter = sum(row @ np.swapaxes(row, 1, 2) for row in rows)
     smallest: Floats = np.linalg.eigh(scatter)[1][:, :, 0]
     return (smallest / smallest[:, -1:]).reshape(-1, 3, 3)
 
 
-def _bent(plane: Floats, seen: Floats, homographies: Floats, radial: Floats) -> tuple[Floats, Floats, Floats]:
+def _linearise(plane: Floats, measured: Floats, homographies: Floats, radial: Floats) -> tuple[Floats, Floats, Floats]:
     """Return residuals (views, 2, n), derivatives by radials (views, 2, 2, n) and by homographies (views, 8, 2, n)."""
     mapped = homographies @ plane
     inverse = 1.0 / mapped[:, 2]
@@ -128,7 +128,7 @@ def _bent(plane: Floats, seen: Floats, homographies: Floats, radial: Floats) -> 
     r2 = x * x + y * y
     growth = 1.0 + r2 * (radial[0] + radial[1] * r2)
     slope = 2.0 * (radial[0] + 2.0 * radial[1] * r2)
-    residual = seen - np.stack([x * growth, y * growth], axis=1)
+    residual = measured - np.stack([x * growth, y * growth], axis=1)
     point = np.stack([x, y], axis=1)
     by_radial = np.stack([point * r2[:, None], point * (r2 * r2)[:, None]], axis=1)
     by_x = np.stack([growth + slope * x * x, slope * x * y], axis=1) * inverse[:, None]
@@ -138,7 +138,9 @@ def _bent(plane: Floats, seen: Floats, homographies: Floats, radial: Floats) -> 
     return residual, by_radial, np.stack(by_homography[:8], axis=1)
 
 
-def _eliminated(residual: Floats, by_radial: Floats, by_homography: Floats, weight: Floats) -> tuple[Floats, Floats]:
+def _gauss_newton_step(
+    residual: Floats, by_radial: Floats, by_homography: Floats, weight: Floats
+) -> tuple[Floats, Floats]:
     """Return the Gauss-Newton steps of the radial terms, homographies eliminated, and of the homographies."""
     count = len(residual)
     jacobian = np.concatenate([by_radial, by_homography], axis=1).reshape(count, 10, -1)

@@ -114,7 +114,7 @@ def fit_tilt(
     undistorted = [(target, lens.undistort(np.asarray(image).reshape(-1, 2))) for target, image in views]
     packed, _ = pack(undistorted)
     centre = np.array(lens.centre)
-    radius = float(np.sqrt(np.max(np.sum((packed.seen - centre[:, None]) ** 2, axis=1))))
+    radius = float(np.sqrt(np.max(np.sum((packed.image - centre[:, None]) ** 2, axis=1))))
     homographies = fit_homographies(packed, centre, radius, undistorted=True).homographies
     closed = tilt_closed_form(homographies, direction, None if focal_length is None else focal_length / radius)
     if closed is None:
@@ -128,23 +128,23 @@ def fit_tilt(
         coefficients=(), tilt=True, centre=False, direction=direction, focal_length=focal_length
     )
     poses = [
-        fit_tsai(target, seen, (values[2], values[3]), focal_length=f, distorted=False).pose
-        for target, seen in undistorted
+        fit_tsai(target, measured, (values[2], values[3]), focal_length=f, distorted=False).pose
+        for target, measured in undistorted
     ]
     state = FitState(
         values, np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses])
     )
     state = adjust(packed, free_parameters, state, RobustLoss())
-    return _described(packed, free_parameters, state, lens)
+    return _result(packed, free_parameters, state, lens)
 
 
-def _described(views: PackedViews, free_parameters: FreeParameters, state: FitState, lens: Lens) -> TiltFit:
+def _result(views: PackedViews, free_parameters: FreeParameters, state: FitState, lens: Lens) -> TiltFit:
     covariance, _, focus = covariances(views, free_parameters, state, RobustLoss(), None)
     noise = residual_sigma(views, free_parameters, state, RobustLoss())
     if not focus * max(1.0, _MIN_NOISE_PX / max(noise, np.finfo(float).tiny)) < _UNDETERMINED:
         raise ValueError("the views do not determine f': use a target oblique to the sensor, or give focal_length=")
     sensor = TiltedSensor.from_virtual(
-        float(state.numbers[0]), (state.numbers[2], state.numbers[3]), (state.numbers[4], state.numbers[5])
+        float(state.values[0]), (state.values[2], state.values[3]), (state.values[4], state.values[5])
     )
     return TiltFit(
         sensor=sensor,

@@ -14,7 +14,7 @@ import numpy as np
 
 from gpuvision.camera.tilted_projection import INTERNAL, Floats
 
-NUMBERS = ("f", "aspect", "v_column", "v_row", "c_column", "c_row", "k1", "k2", "p1", "p2", "k3")
+FIT_PARAMETERS = ("f", "aspect", "v_column", "v_row", "c_column", "c_row", "k1", "k2", "p1", "p2", "k3")
 """Coordinates of the fit."""
 OPENCV = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "tauX", "tauY")
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
@@ -49,14 +49,14 @@ class FreeParameters:
 
     @property
     def basis(self) -> Floats:
-        """Linear map (11, free) from free parameters to `NUMBERS`. Without a tilt v depends on the free centre."""
+        """Linear map (11, free) from free parameters to `FIT_PARAMETERS`. Without a tilt v follows the centre."""
         names = [] if self.focal_length is not None else ["f"]
         names += ["aspect"] if self.aspect else []
         names += ["v_column"] if self.tilt else []
         names += ["v_row"] if self.tilt and self.direction is None else []
         names += ["c_column", "c_row"] if self.centre else []
         names += self.coefficients
-        basis = np.eye(len(NUMBERS))[:, [NUMBERS.index(name) for name in names]]
+        basis = np.eye(len(FIT_PARAMETERS))[:, [FIT_PARAMETERS.index(name) for name in names]]
         if self.tilt and self.direction is not None:
             basis[2:4, names.index("v_column")] = np.cos(self.direction), np.sin(self.direction)
         return basis
@@ -75,12 +75,12 @@ class FreeParameters:
         names += [*self.coefficients, *(("tauX", "tauY") if self.tilt else ())]
         return tuple(names)
 
-    def with_dependent(self, numbers: Floats) -> Floats:
+    def with_dependent(self, values: Floats) -> Floats:
         """Return the parameters with the dependent ones recomputed: v without a tilt, f if f' is known.
 
         f is NaN if no tilt leads the axis from v to c with this f'.
         """
-        result = numbers.copy()
+        result = values.copy()
         if not self.tilt:
             result[2:4] = result[4:6]
         if self.focal_length is not None:
@@ -88,48 +88,48 @@ class FreeParameters:
             result[0] = np.sqrt(reach) if reach > 0.0 else np.nan
         return result
 
-    def derivative(self, numbers: Floats) -> Floats:
-        """Return d(`NUMBERS`) / d(free parameters), (11, free)."""
+    def derivative(self, values: Floats) -> Floats:
+        """Return d(`FIT_PARAMETERS`) / d(free parameters), (11, free)."""
         derivative = self.basis
         if not self.tilt:
             derivative[2:4] = derivative[4:6]
         elif self.focal_length is not None:
-            f, aspect, v_column, v_row, c_column, c_row = numbers[:6]
+            f, aspect, v_column, v_row, c_column, c_row = values[:6]
             across, down = c_column - v_column, (c_row - v_row) / aspect
             moves_down = (derivative[5] - derivative[3] - down * derivative[1]) / aspect
             derivative[0] = -(across * (derivative[4] - derivative[2]) + down * moves_down) / f
         return derivative
 
 
-def internal_parameters(numbers: Floats) -> tuple[Floats, Floats]:
-    """Return the internal parameters of `tilted_projection.project`, and their derivative (11, 11) by `NUMBERS`."""
-    f, aspect, v_column, v_row, c_column, c_row = numbers[:6].tolist()
+def internal_parameters(values: Floats) -> tuple[Floats, Floats]:
+    """Return the parameters of `tilted_projection.project`, and their derivative (11, 11) by `FIT_PARAMETERS`."""
+    f, aspect, v_column, v_row, c_column, c_row = values[:6].tolist()
     g = np.array([c_column - v_column, (c_row - v_row) / aspect, f])
-    by_numbers = np.zeros((3, len(NUMBERS)))
-    by_numbers[0, 4], by_numbers[0, 2] = 1.0, -1.0
-    by_numbers[1, 5], by_numbers[1, 3], by_numbers[1, 1] = 1.0 / aspect, -1.0 / aspect, -g[1] / aspect
-    by_numbers[2, 0] = 1.0
+    by_parameters = np.zeros((3, len(FIT_PARAMETERS)))
+    by_parameters[0, 4], by_parameters[0, 2] = 1.0, -1.0
+    by_parameters[1, 5], by_parameters[1, 3], by_parameters[1, 1] = 1.0 / aspect, -1.0 / aspect, -g[1] / aspect
+    by_parameters[2, 0] = 1.0
     # g is parallel to (-sin tauY cos tauX, sin tauX, cos tauY cos tauX).
     flat2, whole2 = g[0] ** 2 + g[2] ** 2, g @ g
     flat = np.sqrt(flat2)
     tau_x, tau_y = np.arctan2(g[1], flat), np.arctan2(-g[0], g[2])
     by_g_x = np.array([-g[0] * g[1] / flat, flat, -g[2] * g[1] / flat]) / whole2
     by_g_y = np.array([-g[2], 0.0, g[0]]) / flat2
-    internal = numbers.copy()
+    internal = values.copy()
     internal[4], internal[5] = tau_x, tau_y
     derivative = np.eye(len(INTERNAL))
-    derivative[4], derivative[5] = by_g_x @ by_numbers, by_g_y @ by_numbers
+    derivative[4], derivative[5] = by_g_x @ by_parameters, by_g_y @ by_parameters
     return internal, derivative
 
 
-def opencv_parameters(numbers: Floats) -> tuple[Floats, Floats]:
-    """Return the parameters named in `OPENCV`, and their derivative (11, 11) by `NUMBERS`."""
-    internal, turned = internal_parameters(numbers)
-    f, aspect, v_column, v_row, c_column, c_row = numbers[:6].tolist()
+def opencv_parameters(values: Floats) -> tuple[Floats, Floats]:
+    """Return the parameters named in `OPENCV`, and their derivative (11, 11) by `FIT_PARAMETERS`."""
+    internal, to_internal = internal_parameters(values)
+    f, aspect, v_column, v_row, c_column, c_row = values[:6].tolist()
     g = np.array([c_column - v_column, (c_row - v_row) / aspect, f])
     fx = float(np.linalg.norm(g))
-    values = np.array([fx, aspect * fx, c_column, c_row, *numbers[6:], internal[4], internal[5]])
-    derivative = np.zeros((len(OPENCV), len(NUMBERS)))
+    result = np.array([fx, aspect * fx, c_column, c_row, *values[6:], internal[4], internal[5]])
+    derivative = np.zeros((len(OPENCV), len(FIT_PARAMETERS)))
     by_g = g / fx
     derivative[0, [4, 2, 0]] = by_g[0], -by_g[0], by_g[2]
     derivative[0, [5, 3, 1]] = by_g[1] / aspect, -by_g[1] / aspect, -by_g[1] * g[1] / aspect
@@ -137,5 +137,5 @@ def opencv_parameters(numbers: Floats) -> tuple[Floats, Floats]:
     derivative[1, 1] += fx
     derivative[2, 4] = derivative[3, 5] = 1.0
     derivative[4:9, 6:] = np.eye(5)
-    derivative[9:] = turned[4:6]
-    return values, derivative
+    derivative[9:] = to_internal[4:6]
+    return result, derivative

@@ -52,7 +52,7 @@ class _Task:
     views: PackedViews
     masks: tuple[Mask, ...]
     size: tuple[int, int]
-    flat: UndistortedHomographies
+    homography_fit: UndistortedHomographies
     origin: Floats
     radius: float
     loss: RobustLoss
@@ -152,7 +152,7 @@ def fit_camera(
     compared = next(
         each
         for each, p in zip(candidates, p_values, strict=True)
-        if each is largest or (p >= limits.significance and _is_physical(task, each.state))
+        if each is largest or (p >= limits.significance and _is_invertible(task, each.state))
     )
     chosen = _fit_tukey(task, compared) if loss == "tukey" else compared
     alternatives = tuple(
@@ -180,16 +180,16 @@ def _prepare(
     known = None if centre is None else numbers(centre, (2,), "centre (column, row)")
     origin = 0.5 * (np.array(size) - 1.0) if known is None else np.array(known)
     radius = 0.5 * math.hypot(*size)
-    flat = fit_homographies(packed, origin, radius, robust=loss != "squared")
+    homography_fit = fit_homographies(packed, origin, radius, robust=loss != "squared")
     return _Task(
         views=packed,
         masks=masks,
         size=size,
-        flat=flat,
+        homography_fit=homography_fit,
         origin=origin,
         radius=radius,
         # Huber's loss has one minimum near the start, Tukey's has many: fit and compare the models under Huber's.
-        loss=RobustLoss("squared" if loss == "squared" else "huber", flat.noise if sigma is None else sigma),
+        loss=RobustLoss("squared" if loss == "squared" else "huber", homography_fit.noise if sigma is None else sigma),
         sigma=sigma,
         aspect=free_aspect,
         focal_length=None if focal_length is None else _positive(focal_length, "focal_length"),
@@ -200,7 +200,7 @@ def _prepare(
 
 def _check_inside(views: PackedViews, size: tuple[int, int], limits: CalibrationLimits) -> None:
     """Refuse views with many points outside the image; outliers may lie anywhere."""
-    outside = ((views.seen < -0.5) | (views.seen > np.array(size)[:, None] - 0.5)).any(axis=1) & (views.weight > 0.0)
+    outside = ((views.image < -0.5) | (views.image > np.array(size)[:, None] - 0.5)).any(axis=1) & (views.weight > 0.0)
     count = np.count_nonzero(outside)
     if count > limits.max_outside_share * np.sum(views.weight):
         raise ValueError(
@@ -243,23 +243,23 @@ def _check_enough(task: _Task, models: Sequence[str]) -> list[str]:
         )
     if len(task.masks) == 1 and task.focal_length is None:
         raise ValueError("one view of a plane does not fix the focal length: give focal_length= or more views")
-    sides = np.linalg.det(task.flat.homographies) > 0.0
+    sides = np.linalg.det(task.homography_fit.homographies) > 0.0
     if sides.any() and not sides.all():
         few = np.flatnonzero(sides == (sides.sum() < sides.size / 2)).tolist()
         raise ValueError(f"views {few} show the target from its other side: their point order or image is mirrored")
     return enough
 
 
-def _starts(task: _Task, free_parameters: FreeParameters) -> Iterator[FitState]:
+def _starting_states(task: _Task, free_parameters: FreeParameters) -> Iterator[FitState]:
     """Yield starting states, the most likely first."""
-    flat = task.flat
+    homography_fit = task.homography_fit
     if free_parameters.tilt and task.focal_length is not None:
-        oblique = tilt_closed_form(flat.homographies, None, task.focal_length / task.radius)
+        oblique = tilt_closed_form(homography_fit.homographies, None, task.focal_length / task.radius)
         if oblique is not None:
-            yield _start(task, free_parameters, oblique[0], 1.0, oblique[1])
-    closed = zhang_closed_form(flat.homographies, task.aspect) if len(task.masks) > 1 else None
+            yield _starting_state(task, free_parameters, oblique[0], 1.0, oblique[1])
+    closed = zhang_closed_form(homography_fit.homographies, task.aspect) if len(task.masks) > 1 else None
     if closed is not None:
-        yield _start(task, free_parameters, *closed)
+        yield _starting_state(task, free_parameters, *closed)
     # Grid search: three tilts, v = f tan(alpha) from the centre in eight directions, f' as given or over the usual
     # range.
     scales = [0.6, 1.2, 2.5, 5.0, 10.0] if task.focal_length is None else [task.focal_length / task.radius]
@@ -267,12 +267,12 @@ def _starts(task: _Task, free_parameters: FreeParameters) -> Iterator[FitState]:
         for scale in scales:
             for direction in np.arange(8.0 if alpha else 1.0) * math.pi / 4.0:
                 v = -scale * math.sin(alpha) * np.array([math.cos(direction), math.sin(direction)])
-                yield _start(task, free_parameters, scale * math.cos(alpha), 1.0, v)
+                yield _starting_state(task, free_parameters, scale * math.cos(alpha), 1.0, v)
 
 
-def _start(task: _Task, free_parameters: FreeParameters, f: float, aspect: float, v: Floats) -> FitState:
+def _starting_state(task: _Task, free_parameters: FreeParameters, f: float, aspect: float, v: Floats) -> FitState:
     """Return the state of a virtual camera in units of the image's radius, about its middle or the known centre."""
-    rotations, translations = poses_from_homographies(task.flat.homographies, f, aspect, v)
+    rotations, translations = poses_from_homographies(task.homography_fit.homographies, f, aspect, v)
     square = f * f + float(v @ v)
     values = np.zeros(11)
     values[:6] = [f * task.radius, aspect, *(v * task.radius + task.origin), *task.origin]
@@ -280,9 +280,9 @@ def _start(task: _Task, free_parameters: FreeParameters, f: float, aspect: float
         values[4:6] = values[2:4]
         square = f * f
     if "k1" in free_parameters.coefficients:
-        values[6] = task.flat.radial[0] * square
+        values[6] = task.homography_fit.radial[0] * square
     if "k2" in free_parameters.coefficients:
-        values[7] = task.flat.radial[1] * square**2
+        values[7] = task.homography_fit.radial[1] * square**2
     return FitState(values, rotations, translations)
 
 
@@ -290,15 +290,15 @@ def _fit_from_starts(task: _Task, model: str) -> _Candidate:
     """Fit a model; try further starts until the residual is close to that of free homographies."""
     free_parameters = task.free_parameters(model)
     best: _Candidate | None = None
-    for start in _starts(task, free_parameters):
+    for start in _starting_states(task, free_parameters):
         tried = _minimise_loss(task, _Candidate(model, free_parameters, start, task.loss))
-        if not np.isfinite(tried.state.cost) or not _is_physical(task, tried.state):
+        if not np.isfinite(tried.state.cost) or not _is_invertible(task, tried.state):
             continue
         if best is None or tried.state.cost < best.state.cost:
             best = tried
         if (
             residual_sigma(task.views, free_parameters, best.state, best.loss)
-            < task.limits.sufficient_noise_ratio * task.flat.noise
+            < task.limits.sufficient_noise_ratio * task.homography_fit.noise
         ):
             break
     if best is None:
@@ -333,26 +333,26 @@ def _fit_tukey(task: _Task, candidate: _Candidate) -> _Candidate:
     return _minimise_loss(task, replace(candidate, loss=loss))
 
 
-def _is_physical(task: _Task, state: FitState) -> bool:
+def _is_invertible(task: _Task, state: FitState) -> bool:
     """Return whether every target point lies within the invertible region of the lens."""
-    back = tilt_matrix(*internal_parameters(state.numbers)[0][4:6]).T
+    back = tilt_matrix(*internal_parameters(state.values)[0][4:6]).T
     before = back @ (state.rotations @ task.views.target + state.translations[..., None])
-    return bool(np.isfinite(camera_from_parameters(state.numbers).project(np.swapaxes(before, 1, 2))).all())
+    return bool(np.isfinite(camera_from_parameters(state.values).project(np.swapaxes(before, 1, 2))).all())
 
 
 def _fit_smaller_model(task: _Task, model: str, largest: _Candidate) -> _Candidate:
     """Fit a smaller model, starting from the largest one; if that does not converge, from the closed form."""
     free_parameters = task.free_parameters(model)
-    reduced = largest.state.numbers.copy()
+    reduced = largest.state.values.copy()
     for place, name in enumerate(COEFFICIENTS, 6):
         reduced[place] *= name in free_parameters.coefficients
     if not free_parameters.tilt and free_parameters.centre:
         reduced[4:6] = reduced[2:4]
-    warm = replace(largest.state, numbers=reduced)
+    warm = replace(largest.state, values=reduced)
     # Keep the loss scale of the largest model: costs at different scales are not comparable.
     state = adjust(task.views, free_parameters, warm, largest.loss)
     if not state.converged:
-        cold = adjust(task.views, free_parameters, next(_starts(task, free_parameters)), largest.loss)
+        cold = adjust(task.views, free_parameters, next(_starting_states(task, free_parameters)), largest.loss)
         state = min(state, cold, key=lambda end: end.cost)
     return _Candidate(model, free_parameters, state, largest.loss)
 
@@ -366,7 +366,7 @@ def _result(task: _Task, chosen: _Candidate, alternatives: tuple[CameraAlternati
         focus = 0.0
     errors = residuals(task.views, state)
     fit = CameraFit(
-        camera=camera_from_parameters(state.numbers),
+        camera=camera_from_parameters(state.values),
         model=chosen.model,
         poses=poses_in_lens_frame(state),
         names=free_parameters.names,
@@ -391,7 +391,7 @@ def _result(task: _Task, chosen: _Candidate, alternatives: tuple[CameraAlternati
         converged=state.converged,
         noise=noise,
         outliers=int(doubtful.sum()) if chosen.loss.kind == "squared" else 0,
-        mirrored=bool((np.linalg.det(task.flat.homographies) < 0.0).all()),
+        mirrored=bool((np.linalg.det(task.homography_fit.homographies) < 0.0).all()),
         limits=task.limits,
     )
     return replace(fit, warnings=warnings)
@@ -428,7 +428,7 @@ def _p_value(task: _Task, small: _Candidate, large: _Candidate) -> float:
 def _alternative(task: _Task, other: _Candidate, p_value: float, chosen: FitState) -> CameraAlternative:
     parameters = other.free_parameters.count + 6 * len(task.masks)
     cost = max(other.state.cost / task.views.coordinates, _EXACT_PX**2)
-    centre = other.state.numbers[4:6]
+    centre = other.state.values[4:6]
     return CameraAlternative(
         model=other.model,
         rms_px=_rms(task, other.state),
@@ -436,5 +436,5 @@ def _alternative(task: _Task, other: _Candidate, p_value: float, chosen: FitStat
         p_value=p_value,
         aic=task.views.coordinates * math.log(cost) + 2.0 * parameters,
         centre=(float(centre[0]), float(centre[1])),
-        centre_distance_px=float(np.linalg.norm(centre - chosen.numbers[4:6])),
+        centre_distance_px=float(np.linalg.norm(centre - chosen.values[4:6])),
     )

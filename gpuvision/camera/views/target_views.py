@@ -74,15 +74,16 @@ def pack(views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]) -> tuple[PackedVi
         raise ValueError("no views given, expected at least one")
     pairs, masks = [], []
     for index, (target, image) in enumerate(views):
-        points, seen = np.asarray(target, dtype=np.float64), np.asarray(image, dtype=np.float64).reshape(-1, 2)
-        if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) != len(seen):
+        points, measured = np.asarray(target, dtype=np.float64), np.asarray(image, dtype=np.float64).reshape(-1, 2)
+        if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) != len(measured):
             raise ValueError(
-                f"view {index}: target points have shape {points.shape} for {len(seen)} image points, expected (n, 2|3)"
+                f"view {index}: target points have shape {points.shape} for {len(measured)} image points, "
+                "expected (n, 2|3)"
             )
         if points.shape[1] == 3 and np.any(np.abs(points[:, 2]) > 0.0):
             raise ValueError(f"view {index}: target points leave the plane Z = 0, expected a flat target")
-        mask = np.isfinite(np.concatenate([seen, points], axis=1)).all(axis=1)
-        pairs.append((points[mask, :2], seen[mask]))
+        mask = np.isfinite(np.concatenate([measured, points], axis=1)).all(axis=1)
+        pairs.append((points[mask, :2], measured[mask]))
         masks.append(mask)
         _check_spread(f"view {index}", pairs[-1][0])
         _check_spread(f"view {index}, image", pairs[-1][1])
@@ -90,12 +91,12 @@ def pack(views: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]) -> tuple[PackedVi
     packed = PackedViews(
         np.zeros((len(pairs), 3, longest)), np.zeros((len(pairs), 2, longest)), np.zeros((len(pairs), longest))
     )
-    for index, (target, seen) in enumerate(pairs):
+    for index, (target, measured) in enumerate(pairs):
         packed.target[index, :2, : len(target)] = target.T
         # Pad with a copy of the first point at weight 0, so that all derivatives stay finite.
         packed.target[index, :2, len(target) :] = target[:1].T
-        packed.seen[index, :, : len(seen)] = seen.T
-        packed.weight[index, : len(seen)] = 1.0
+        packed.image[index, :, : len(measured)] = measured.T
+        packed.weight[index, : len(measured)] = 1.0
     return packed, tuple(masks)
 
 

@@ -110,7 +110,7 @@ def radial_alignment(target: npt.ArrayLike, image: npt.ArrayLike, centre: tuple[
     ValueError
         The points are too few, or do not determine the pose (all on one line, or most on one through the centre).
     """
-    plane, offset = _paired(target, image, centre)
+    plane, offset = _known_pairs(target, image, centre)
     size = math.sqrt(float(np.mean(plane**2))) or 1.0
     x, y = (plane / size).T
     column, row = (offset / math.sqrt(float(np.mean(offset**2)))).T
@@ -129,7 +129,7 @@ def radial_alignment(target: npt.ArrayLike, image: npt.ArrayLike, centre: tuple[
     cosine = min(small / large, 1.0)
     upper = u @ np.diag([1.0, cosine]) @ vt
     lower = math.sqrt(1.0 - cosine**2) * vt[1]
-    rotations = [_completed(np.vstack([upper, side * lower])) for side in (1.0, -1.0)]
+    rotations = [_complete_rotation(np.vstack([upper, side * lower])) for side in (1.0, -1.0)]
     return Alignment(np.array(rotations), sign * np.array([tx, ty]) * size / large)
 
 
@@ -165,7 +165,7 @@ def fit_tsai(
     ----------
     R. Tsai, IEEE J. Robotics and Automation 3 (1987) 323.
     """
-    plane, offset = _paired(target, image, centre)
+    plane, offset = _known_pairs(target, image, centre)
     alignment = radial_alignment(target, image, centre)
     shift = alignment.shift
     fits = [_second_stage(plane, offset, each, shift, focal_length, distorted) for each in alignment.rotations]
@@ -185,7 +185,7 @@ def fit_tsai(
     )
 
 
-def _paired(target: npt.ArrayLike, image: npt.ArrayLike, centre: tuple[float, float]) -> tuple[Floats, Floats]:
+def _known_pairs(target: npt.ArrayLike, image: npt.ArrayLike, centre: tuple[float, float]) -> tuple[Floats, Floats]:
     """Return the target points, and the image points relative to the centre, of the points that are not missing."""
     plane = np.asarray(target, dtype=np.float64)[..., :2].reshape(-1, 2)
     offset = np.asarray(image, dtype=np.float64).reshape(-1, 2) - numbers(centre, (2,), "centre (column, row)")
@@ -197,7 +197,7 @@ def _paired(target: npt.ArrayLike, image: npt.ArrayLike, centre: tuple[float, fl
     return plane[known], offset[known]
 
 
-def _completed(columns: Floats) -> Floats:
+def _complete_rotation(columns: Floats) -> Floats:
     """Return the rotation (3, 3) of its first two columns (3, 2)."""
     return np.column_stack([columns, np.cross(columns[:, 0], columns[:, 1])])
 

@@ -45,15 +45,17 @@ def distances(packed: PackedLines, k: np.ndarray, centre: np.ndarray, lines: Lin
 
 @pytest.mark.parametrize("free", [False, True])
 def test_slopes_are_those_of_the_distances(packed: PackedLines, anywhere: Parameters, free: bool) -> None:
-    at = anywhere._replace(vanishing=None) if free else anywhere
-    here = straightness.evaluate(packed, at)
-    slopes = straightness.residual_jacobian(2, here)
-    np.testing.assert_allclose(here.residual, distances(packed, at.k, at.centre, here.lines), atol=1e-14)
-    turn = np.arctan2(here.lines.ny, here.lines.nx)
+    parameters = anywhere._replace(vanishing=None) if free else anywhere
+    evaluation = straightness.evaluate(packed, parameters)
+    slopes = straightness.residual_jacobian(2, evaluation)
+    np.testing.assert_allclose(
+        evaluation.residual, distances(packed, parameters.k, parameters.centre, evaluation.lines), atol=1e-14
+    )
+    turn = np.arctan2(evaluation.lines.ny, evaluation.lines.nx)
 
     def moved(change: np.ndarray) -> np.ndarray:
-        lines = LineSet(np.cos(turn + change[5]), np.sin(turn + change[5]), here.lines.offset + change[4])
-        return distances(packed, at.k + change[:2], at.centre + change[2:4], lines)
+        lines = LineSet(np.cos(turn + change[5]), np.sin(turn + change[5]), evaluation.lines.offset + change[4])
+        return distances(packed, parameters.k + change[:2], parameters.centre + change[2:4], lines)
 
     for number, column in enumerate([*slopes.lens[:4], *slopes.line]):
         change = STEP * np.eye(6)[number]
@@ -80,14 +82,14 @@ def test_lines_move_with_their_points(packed: PackedLines, anywhere: Parameters)
 @pytest.mark.parametrize("free", [False, True])
 def test_lines_are_projected_out(packed: PackedLines, anywhere: Parameters, free: bool) -> None:
     """The small normal equations are those of the whole Jacobian, a column for each line's own parameters."""
-    at = anywhere._replace(vanishing=None) if free else anywhere
-    here = straightness.evaluate(packed, at)
-    slopes = straightness.residual_jacobian(2, here)
-    normal = straightness.normal_equations(packed, at, here, slopes)
+    parameters = anywhere._replace(vanishing=None) if free else anywhere
+    evaluation = straightness.evaluate(packed, parameters)
+    slopes = straightness.residual_jacobian(2, evaluation)
+    normal = straightness.normal_equations(packed, parameters, evaluation, slopes)
     count_lens_parameters, own = list(slopes.lens[:4]), []
     change = np.zeros((2, 3, len(packed.counts)))
     if not free:
-        change = straightness.pencil_changes(at.vanishing, packed.family, here.lines)
+        change = straightness.pencil_changes(parameters.vanishing, packed.family, evaluation.lines)
         for family in range(4):
             inside = packed.family[packed.line] == family
             for axis in (1, 2):
@@ -101,8 +103,8 @@ def test_lines_are_projected_out(packed: PackedLines, anywhere: Parameters, free
     wanted = wanted - basis @ (basis.T @ wanted)
     scale = np.max(np.abs(normal.matrix))
     np.testing.assert_allclose(normal.matrix, wanted.T @ wanted, atol=1e-13 * scale)
-    np.testing.assert_allclose(normal.gradient, wanted.T @ here.residual, atol=1e-13 * scale)
-    columns = straightness.projected_columns(packed, at, here, slopes, normal.line_coefficients)
+    np.testing.assert_allclose(normal.gradient, wanted.T @ evaluation.residual, atol=1e-13 * scale)
+    columns = straightness.projected_columns(packed, parameters, evaluation, slopes, normal.line_coefficients)
     np.testing.assert_allclose(columns, wanted.T, atol=1e-12 * np.sqrt(scale))
 
 

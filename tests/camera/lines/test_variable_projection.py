@@ -19,8 +19,8 @@ def test_start_is_right_to_first_order(rng: np.random.Generator, border: float) 
     start = linear_start(packed)
     assert start.rank == 3
     # What is left out is of second order: the distortion, 0.1 of 600 pixels, times itself.
-    assert start.at.k[0] == pytest.approx(lens.k1 * packed.unit**2, rel=1e-3)
-    assert packed.origin + packed.unit * start.at.centre == pytest.approx(lens.centre, abs=0.3)
+    assert start.parameters.k[0] == pytest.approx(lens.k1 * packed.unit**2, rel=1e-3)
+    assert packed.origin + packed.unit * start.parameters.centre == pytest.approx(lens.centre, abs=0.3)
 
 
 def test_gain_and_distances_are_those_of_the_linear_model(rng: np.random.Generator) -> None:
@@ -30,7 +30,7 @@ def test_gain_and_distances_are_those_of_the_linear_model(rng: np.random.Generat
     before = evaluate(packed, Parameters(np.empty(0), np.zeros(2), None)).cost
     left = start.distances(packed, np.ones(len(packed.x)))
     assert np.sum(left**2) == pytest.approx(before - start.gain, rel=1e-9)
-    assert np.sum(left**2) == pytest.approx(evaluate(packed, start.at).cost, rel=1e-2)
+    assert np.sum(left**2) == pytest.approx(evaluate(packed, start.parameters).cost, rel=1e-2)
 
 
 @pytest.mark.parametrize(("rows", "rank"), [([5], 1), ([5, 5], 1), ([2, 9], 2), ([0, 4, 8, 12], 2)])
@@ -47,9 +47,9 @@ def test_a_wide_valley_leads_to_the_minimum(rng: np.random.Generator) -> None:
     lens = radial_lens(20.0)
     ideal = plane_grid(rng, 30.0)
     packed = pack(grid_lines(lens.distort(ideal) + rng.normal(0.0, 0.1, ideal.shape)))
-    at = linear_start(packed).at
-    best = minimise(packed, at._replace(k=np.append(at.k, 0.0)))
-    assert best.steps < 8
+    parameters = linear_start(packed).parameters
+    best = minimise(packed, parameters._replace(k=np.append(parameters.k, 0.0)))
+    assert best.iterations < 8
     for _ in range(30):
         centre = rng.uniform(-0.25, 0.25, 2)
         k = rng.uniform(-0.2, 0.2, 2)
@@ -57,7 +57,7 @@ def test_a_wide_valley_leads_to_the_minimum(rng: np.random.Generator) -> None:
             k *= 0.5
         found = minimise(packed, Parameters(k, centre, None))
         # Both stop within some hundredths of a standard deviation.
-        assert found.here.cost == pytest.approx(best.here.cost, rel=1e-5)
+        assert found.evaluation.cost == pytest.approx(best.evaluation.cost, rel=1e-5)
         assert found.at_bound == ""
 
 
@@ -66,9 +66,9 @@ def test_vanishing_points_of_straight_lines(rng: np.random.Generator) -> None:
     ideal = plane_grid(rng, 40.0)
     flat = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1) * 90.0 + 100.0
     packed = pack([grid_lines(ideal)[0], [], grid_lines(flat)[1]])
-    here = evaluate(packed, Parameters(np.empty(0), np.zeros(2), None))
-    points = vanishing_start(packed, here.lines)
-    lines = np.stack(here.lines, axis=-1)
+    evaluation = evaluate(packed, Parameters(np.empty(0), np.zeros(2), None))
+    points = vanishing_start(packed, evaluation.lines)
+    lines = np.stack(evaluation.lines, axis=-1)
     for family in (0, 2):
         np.testing.assert_allclose(lines[packed.family == family] @ points[family], 0.0, atol=1e-7)
     np.testing.assert_allclose(np.abs(points[2]), [0.0, 1.0, 0.0], atol=1e-7)
@@ -78,6 +78,6 @@ def test_a_lens_that_would_fold_stays_just_inside(rng: np.random.Generator) -> N
     """The lens of the points turns back inside them where one coefficient has to do for two."""
     lens = Lens(k1=-9e-7, k2=4e-13, centre=(512.0, 512.0))
     packed = pack(grid_lines(lens.distort(512.0 + (plane_grid(rng, 0.0) - 512.0) * 0.8)))
-    found = minimise(packed, linear_start(packed).at)
-    square = np.max((packed.x - found.at.centre[0]) ** 2 + (packed.y - found.at.centre[1]) ** 2)
-    assert is_monotonic(found.at.k, square)
+    found = minimise(packed, linear_start(packed).parameters)
+    square = np.max((packed.x - found.parameters.centre[0]) ** 2 + (packed.y - found.parameters.centre[1]) ** 2)
+    assert is_monotonic(found.parameters.k, square)

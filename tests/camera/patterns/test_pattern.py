@@ -1,4 +1,4 @@
-"""What all pattern finders share: grey images, the noise of a grid, where a point's neighbours have it."""
+"""Helpers of the pattern finders: grey images, noise of a grid, agreement of a point with its neighbours."""
 
 from __future__ import annotations
 

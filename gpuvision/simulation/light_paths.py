@@ -72,7 +72,7 @@ class LightPaths:
         Largest edge of the patches of the radiosity solution [m]; None: a sixteenth of the scene's diagonal.
     tolerance
         Range error that the secondary light left out may make [m], 0 or more; 0: nothing is left out. See the notes.
-    floor
+    min_power
         Power of a sample below which it is not read [W].
     device
         Device of the kernels; None: `Device.best`.
@@ -109,7 +109,7 @@ class LightPaths:
     nodes: tuple[int, int] = (1, 1)
     patch_size: float | None = None
     tolerance: float = 0.0
-    floor: float = 0.0
+    min_power: float = 0.0
     device: Device | None = None
     _direct: DirectLight = field(init=False, repr=False)
     _mirrors: Mirrors = field(init=False, repr=False)
@@ -173,7 +173,7 @@ class LightPaths:
             exposures["diffuse-specular"] = self.view.blur(mirrored, self.blur)
         if {"diffuse-diffuse", "multi-bounce"} & set(self.paths):
             seen, segments = self.view_rays.visible_surface(L), self._diffuse_segments(lit)
-            reading = StripErrorModel.from_exposure(self.view, exposures["direct"], min_power=self.floor)
+            reading = StripErrorModel.from_exposure(self.view, exposures["direct"], min_power=self.min_power)
             remaining = self.tolerance
             if self._radiosity is not None:
                 choice = select_paths(

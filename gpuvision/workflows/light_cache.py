@@ -242,7 +242,7 @@ def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
         blur=light.blur,
         nodes=light.nodes,
         tolerance=task.tolerance,
-        floor=floor_of(task.sensor),
+        min_power=floor_of(task.sensor),
         device=device,
     )
 

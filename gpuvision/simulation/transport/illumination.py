@@ -166,14 +166,14 @@ class LightSheet:
         """
         return self.illuminate_all(scene, [L + offset])[0]
 
-    def illuminate_all(self, scene: Scene, places: npt.ArrayLike) -> tuple[LitLine, Integers]:
+    def illuminate_all(self, scene: Scene, transports: npt.ArrayLike) -> tuple[LitLine, Integers]:
         """Return the segments that thin sheets light at several transports.
 
         Parameters
         ----------
         scene
             Surfaces.
-        places
+        transports
             (k,): transports [m].
 
         Returns
@@ -182,18 +182,18 @@ class LightSheet:
             All segments, those of one sheet in the order of its rays; and (k + 1,) indices of each sheet's first
             segment, with the end of the last.
         """
-        places = np.atleast_1d(np.asarray(places, np.float64))
-        cuts = SheetIndex.of(scene, self.transport).cuts(places)
+        transports = np.atleast_1d(np.asarray(transports, np.float64))
+        cuts = SheetIndex.of(scene, self.transport).cuts(transports)
         cuts, x, height = self._to_light_coordinates(cuts)
         lit = self._clip_to_limits(upper_envelope(cuts.sheet, x, height), x)
         sheet_ends, arriving, lit = self._split_evenly(lit, cuts, x, height)
         sheet, triangle = cuts.sheet[lit.segment], cuts.triangle[lit.segment]
-        ends = self._to_scene(sheet_ends, places[sheet])
+        ends = self._to_scene(sheet_ends, transports[sheet])
         length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
         good = (length > 0.0) & (arriving > 0.0)
         sheet, triangle, ends = sheet[good], triangle[good], ends[good]
         line = LitLine(ends, self._normals(scene, triangle, ends), triangle, arriving[good] / length[good])
-        return line, np.searchsorted(sheet, np.arange(len(places) + 1))
+        return line, np.searchsorted(sheet, np.arange(len(transports) + 1))
 
     def direction_to_light(self, points: npt.ArrayLike) -> Float64:
         """Return unit vectors (..., 3) from points (..., 3) towards the light.
@@ -314,10 +314,10 @@ class LightSheet:
         low, high = max(low, float(places[0])), min(high, float(places[-1]))
         return np.concatenate([[low], places[(places > low) & (places < high)], [high]])
 
-    def _to_scene(self, ends: Float64, places: Float64) -> Float64:
+    def _to_scene(self, ends: Float64, transports: Float64) -> Float64:
         move = self.transport
         flat = np.array(move.origin) + ends @ np.array([move.g_axis, move.h_axis])
-        return np.asarray(flat + places[:, None, None] * np.array(move.direction))
+        return np.asarray(flat + transports[:, None, None] * np.array(move.direction))
 
     def _normals(self, scene: Scene, triangle: Integers, ends: Float64) -> Float64:
         """Return unit normals on the side of the light."""

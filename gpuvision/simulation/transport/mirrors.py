@@ -332,7 +332,7 @@ class Mirrors:
 
     # ---- light that mirrors reflect to other surfaces ----------------------------------------------------------
 
-    def reflected_lines(self, lit: LitLine, sheet: LightSheet, place: float) -> LitLine:
+    def reflected_lines(self, lit: LitLine, sheet: LightSheet, L: float) -> LitLine:
         """Return the lines that mirrors light on other surfaces, after 1 to `max_reflections` reflections.
 
         Parameters
@@ -341,14 +341,14 @@ class Mirrors:
             Lines that the sheet lights.
         sheet
             Sheet of light.
-        place
+        L
             Transport of the sheet [m].
 
         Notes ----- Plane mirrors: the mirrored sheet cuts the scene exactly, and the energy is exact; `LitLine.power`
         is a mean, as the sheet's `uniformity` says. Curved mirrors: the light is taken as even between rays that are a
         step apart, of second order in the step; the end of a lit piece is located to 2^-12 of a step.
         """
-        return self._interreflection.reflected_lines(lit, sheet, place, self.max_reflections)
+        return self._interreflection.reflected_lines(lit, sheet, L, self.max_reflections)
 
     # ---- derived from the parameters ---------------------------------------------------------------------------
 

@@ -154,11 +154,11 @@ class SheetIndex:
         backward = (way[:, 0] < 0.0) | ((way[:, 0] == 0.0) & (way[:, 1] < 0.0))
         return np.where(backward[:, None, None], whole[:, ::-1], whole), np.concatenate(rows)
 
-    def cuts(self, places: npt.ArrayLike) -> Cuts:
+    def cuts(self, transports: npt.ArrayLike) -> Cuts:
         """Return the cuts of the sheets at transports (k,) [m], sheet by sheet."""
-        places = np.atleast_1d(np.asarray(places, np.float64))
-        rows, sheet = self._candidates(places)
-        corners, at = self.corners[rows], places[sheet]
+        transports = np.atleast_1d(np.asarray(transports, np.float64))
+        rows, sheet = self._candidates(transports)
+        corners, at = self.corners[rows], transports[sheet]
         below = corners[..., 2] < at[:, None]
         count = below.sum(axis=1)
         cut = (count == 1) | (count == 2)
@@ -175,17 +175,17 @@ class SheetIndex:
             ends[:, n] = _interpolate(low, high, at)
         return Cuts(sheet, self.triangle[rows], ends)
 
-    def _candidates(self, places: Float64) -> tuple[Integers, Integers]:
+    def _candidates(self, transports: Float64) -> tuple[Integers, Integers]:
         """Return indices of triangles that sheets may cut, and the index of the sheet for each."""
         first, last = [], []
         for n, length in enumerate(self.length):
             start = self.start[self.levels[n] : self.levels[n + 1]]
             # A margin for the rounding of the difference.
-            reach = length + 4.0 * np.finfo(np.float64).eps * (np.abs(places) + length)
-            first.append(self.levels[n] + np.searchsorted(start, places - reach, side="left"))
-            last.append(self.levels[n] + np.searchsorted(start, places, side="left"))
+            reach = length + 4.0 * np.finfo(np.float64).eps * (np.abs(transports) + length)
+            first.append(self.levels[n] + np.searchsorted(start, transports - reach, side="left"))
+            last.append(self.levels[n] + np.searchsorted(start, transports, side="left"))
         begin, count = np.array(first).T.ravel(), (np.array(last) - np.array(first)).T.ravel()
-        sheet = np.repeat(np.arange(len(places)), _MAX_LEVELS)
+        sheet = np.repeat(np.arange(len(transports)), _MAX_LEVELS)
         return concatenated_ranges(begin, count), np.repeat(sheet, count)
 
 

@@ -68,7 +68,7 @@ class SpecularInterreflection:
     clearance: float
     device: Device
 
-    def reflected_lines(self, lit: LitLine, sheet: LightSheet, place: float, max_reflections: int) -> LitLine:
+    def reflected_lines(self, lit: LitLine, sheet: LightSheet, L: float, max_reflections: int) -> LitLine:
         """Return the lines that are lit after 1 to ``max_reflections`` reflections.
 
         Parameters
@@ -77,12 +77,12 @@ class SpecularInterreflection:
             Lines that the sheet lights.
         sheet
             Sheet of light.
-        place
+        L
             Transport of the sheet [m].
         max_reflections
             Largest number of mirrors one after another.
         """
-        beam, found = _Beam(lit, np.tile(_light_position(sheet, place), (len(lit.power), 1))), []
+        beam, found = _Beam(lit, np.tile(_light_position(sheet, L), (len(lit.power), 1))), []
         for _ in range(max_reflections):
             share = self.reflectance[beam.line.triangle]
             beam = _select(beam, np.flatnonzero(share > 0.0))
@@ -406,13 +406,13 @@ def _barycentric(corners: Float64, places: Float64) -> Float64:
     return np.concatenate([1.0 - weights.sum(axis=-1, keepdims=True), weights], axis=-1)
 
 
-def _light_position(sheet: LightSheet, place: float) -> Float64:
+def _light_position(sheet: LightSheet, L: float) -> Float64:
     """Return the source or the direction of a sheet's light at a transport, (4,), as in `_Beam`."""
     move = sheet.transport
     axes = np.array([move.g_axis, move.h_axis])
     if sheet.source is None:
         return np.append(axes[1] / np.linalg.norm(axes[1]), 0.0)
-    source = np.array(move.origin) + np.array(sheet.source) @ axes + place * np.array(move.direction)
+    source = np.array(move.origin) + np.array(sheet.source) @ axes + L * np.array(move.direction)
     return np.append(source, 1.0)
 
 

@@ -11,8 +11,29 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = ("docs", "gpuvision", "host", "profiling/results", "examples")
+LIBRARY = ("gpuvision", "host", "kernels")
+SOURCES = (*LIBRARY, "docs", "profiling/results", "examples", "README.md", "CHANGELOG.md", "CONTRIBUTING.md")
 GENERATED = ("docs/gallery", "docs/reference/api", "docs/reference/commands", "docs/results/runs")
+
+
+def newest(*sources: str) -> float:
+    """Return the time of the last change in files and folders of the repository, without generated pages."""
+    generated = {ROOT / each for each in GENERATED}
+    files = (
+        path
+        for source in (ROOT / each for each in sources)
+        for path in ([source] if source.is_file() else source.rglob("*"))
+    )
+    return max(
+        path.stat().st_mtime
+        for path in files
+        if path.is_file() and "__pycache__" not in path.parts and not generated & set(path.parents)
+    )
+
+
+def gallery_picture(example: str) -> Path:
+    """Return where ``make docs`` puts the picture of an example."""
+    return ROOT / "docs" / "gallery" / "images" / f"sphx_glr_{Path(example).stem}_001.png"
 
 
 def built_docs() -> Path:
@@ -33,17 +54,7 @@ def built_docs() -> Path:
 
 def _is_current(folder: Path) -> bool:
     index = folder / "searchindex.js"
-    if not index.exists():
-        return False
-    made = index.stat().st_mtime
-    generated = tuple(ROOT / each for each in GENERATED)
-    newest = max(
-        path.stat().st_mtime
-        for source in (*(ROOT / each for each in SOURCES), ROOT / "README.md", ROOT / "CHANGELOG.md")
-        for path in ([source] if source.is_file() else source.rglob("*"))
-        if path.is_file() and "__pycache__" not in path.parts and not any(each in path.parents for each in generated)
-    )
-    return made >= newest
+    return index.exists() and index.stat().st_mtime >= newest(*SOURCES)
 
 
 def _build(folder: Path) -> None:

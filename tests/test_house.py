@@ -256,7 +256,8 @@ def test_no_file_knows_a_machine() -> None:
     """Neither a path of somebody's machine nor a package registry: pip and apt are configured outside."""
     known = re.compile(r"(?<![\w.~}])/(work|root|home|Users)/|\bpypi\.org\b|--(extra-)?index-url")
     kinds = SHIPPED | {".md", ".sh"}
-    texts = [path for path in _files(*ROOMS, "tests", ".ci") if path.suffix in kinds or path.parent.name == ".ci"]
+    folders = (*ROOMS, "tests", "docs", "examples", ".ci")
+    texts = [path for path in _files(*folders) if path.suffix in kinds or path.parent.name == ".ci"]
     texts += [path for path in ROOT.iterdir() if path.suffix in kinds or path.name == "Makefile"]
     found = [
         f"{path.relative_to(ROOT)}:{number}: {line.strip()}"

@@ -1,4 +1,11 @@
-"""A tree of boxes over triangles with 16 children a node, built with NumPy, and rays through it on devices."""
+"""Bounding volume hierarchy (BVH) over triangles with 16 children per node, built with NumPy, traversed on devices.
+
+References
+----------
+I. Wald, "On fast construction of SAH-based bounding volume hierarchies", IEEE Symp. Interactive Ray Tracing 2007.
+I. Wald, C. Benthin and S. Boulos, "Getting rid of packets: efficient SIMD single-ray traversal using multi-branching
+BVHs", IEEE Symp. Interactive Ray Tracing 2008.
+"""
 
 from __future__ import annotations
 
@@ -11,40 +18,44 @@ import numpy.typing as npt
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
+# Children of a node and triangles of a leaf: lanes of the kernels' vectors.
 WIDTH = 16
-# Bins of a cut; of few triangles all are split on their own, into more bins, as that takes no time to speak of.
-_BINS, _FINE_BINS, _FEW = 16, 64, 8192
-# From here on halves by number, so that the tree stays shallow whatever the triangles.
-_DEEP = 48
-_UNITS_IN_LAST_PLACE = 4.0
-# Neighbours stay together where their box has at most so many times the area of theirs.
-_LOOSE = 0.8
-# Steps and masks that put two zeros between the bits of a number (16 bits).
-_SPREAD = ((16, 0xFF0000FF), (8, 0xF00F00F00F), (4, 0xC30C30C30C3), (2, 0x249249249249))
+# Bins of the surface-area heuristic. Scenes of up to _FEW_TRIANGLES are split triangle by triangle with the finer bins:
+# their build time is small anyway.
+_BINS, _FINE_BINS, _FEW_TRIANGLES = 16, 64, 8192
+# Levels after which nodes are halved by count: bounds the depth of the tree for any distribution of triangles.
+_MAX_HEURISTIC_DEPTH = 48
+# Boxes grow by this many roundings of the largest coordinate: the conversion to the real type moves their corners.
+_BOX_PADDING_ULPS = 4.0
+# Neighbours are bundled if their common box has at most this fraction of the area of their boxes together.
+_MAX_BUNDLE_AREA = 0.8
+# Shifts and masks that insert two zero bits between the bits of a 16-bit number (Morton code).
+_MORTON_STEPS = ((16, 0xFF0000FF), (8, 0xF00F00F00F), (4, 0xC30C30C30C3), (2, 0x249249249249))
 
 
 @dataclass(frozen=True, eq=False)
 class Bvh:
-    """The tree of kernels/common/bvh.h over some triangles; compared by identity.
+    """BVH over triangles for kernels/common/bvh.h; compared by identity.
 
     Attributes
     ----------
     corners
-        float64 (n, 3, 3), metres: the triangles, from the scene's `middle`.
+        float64 (n, 3, 3), corners of the triangles relative to `middle` [m].
     middle
-        float64 (3,), metres.
+        float64 (3,), centre of the triangles' bounding box [m].
     numbers
-        int64 (n,): what they are called.
+        int64 (n,), numbers of the triangles in the scene.
     members
-        int64 (m, 16): the triangles of each leaf by their place in `corners`, -1 where it has fewer.
+        int64 (m, 16), triangles of each leaf as indices of `corners`; -1: an empty place.
     children
-        int32 (k, 16): a node, or ~leaf; -1 behind the last (`boxes` says that nothing is there).
+        int32 (k, 16), children of each node: a node, or ~leaf. -1 after the last child; its box is empty.
     axes
-        int32 (k,): along which a node's children lie in order.
+        int32 (k,), axis along which the children of a node are sorted.
     boxes
-        float64 (k, 6, 16): low corners, then high ones; of no child: low is infinity, high minus infinity.
+        float64 (k, 6, 16), lower corners, then upper corners of the children's boxes [m]. The box of an empty place is
+        +infinity, -infinity.
     depth
-        How many nodes lie above each other at most.
+        Number of levels of nodes.
     """
 
     corners: Reals
@@ -58,18 +69,29 @@ class Bvh:
 
     @classmethod
     def build(cls, corners: npt.NDArray[Any], wanted: npt.NDArray[np.bool_] | None = None) -> Bvh:
-        """Build the tree over triangles (n, 3, 3), finite, those that are ``wanted`` (n,); there may be none.
+        """Build a BVH.
 
-        Binary splits by the surface-area heuristic in 16 bins along the widest axis of the centroids, a level at a
-        time for all nodes (Wald 2007), where a box costs its triangles and its leaves, in equal parts; to leaves of
-        at most 16; then the largest nodes are opened until 16 children stand side by side. What is split are bundles
-        of up to four neighbours along Morton's curve, where they lie close: half the time, and a tree as good to 2 %
-        (by the areas of its boxes). Up to 8192 triangles are split one by one, in 64 bins.
+        Parameters
+        ----------
+        corners
+            (n, 3, 3), triangles with finite corners [m]; n may be 0.
+        wanted
+            bool (n,), triangles that belong to the tree; None: all.
 
         Raises
         ------
         ValueError
             The corners have another shape.
+
+        Notes
+        -----
+        1. Triangles are bundled, up to four neighbours along the Morton curve whose boxes are close. This halves the
+           build time, at a cost of 2 % in the summed area of the boxes. Up to 8192 triangles are not bundled.
+        2. A binary tree is built level by level by the surface-area heuristic in bins along the widest axis of the
+           centroids (Wald 2007), to leaves of at most 16 triangles. There are 16 bins, 64 for up to 8192 triangles. The
+           cost of a box counts its triangles and its leaves in equal parts.
+        3. The binary tree is collapsed: the child with the largest area is replaced by its two children until a node
+           has 16 (Wald, Benthin and Boulos 2008).
         """
         if corners.ndim != 3 or corners.shape[1:] != (3, 3):
             raise ValueError(f"Bvh.build takes triangles (n, 3, 3), got shape {corners.shape}")
@@ -77,17 +99,17 @@ class Bvh:
         if not len(numbers):
             return cls._empty()
         corners = corners[numbers]
-        # Numbers side by side: NumPy is slow along short axes.
+        # Coordinates as rows of a contiguous array: NumPy is slow along short axes.
         rows = np.ascontiguousarray(corners.reshape(-1, 9).T, np.float64).reshape(3, 3, -1)
         middle = 0.5 * (rows.min(axis=2).min(axis=0) + rows.max(axis=2).max(axis=0))
         rows -= middle[:, None]
         extents = np.concatenate([rows.min(axis=0), -rows.max(axis=0)])
         moved = rows.reshape(9, -1).T.reshape(-1, 3, 3)
         binary = _binary_tree(extents)
-        children, depth = _opened(binary)
+        children, depth = _collapse(binary)
         boxes = binary.extents.T[children].transpose(0, 2, 1)
         boxes[:, 3:] *= -1.0
-        # In order along the widest axis of what each node holds.
+        # Sort the children of each node by their centres along the widest axis of the node.
         boxes = np.where(children[:, None] < 0, np.repeat([np.inf, -np.inf], 3)[:, None], boxes)
         axes = np.argmax(boxes[:, 3:].max(axis=2) - boxes[:, :3].min(axis=2), axis=1)
         each = np.arange(len(children))
@@ -100,7 +122,7 @@ class Bvh:
         members = _members(binary, children[leaf])
         inner = np.flatnonzero((children >= 0) & ~leaf)
         links = np.full(children.size, -1, np.int32)
-        # Nodes were numbered as they were opened: level by level, in the order of their parents' lanes before sorting.
+        # Nodes were numbered when they were collapsed: level by level, by the places in their parents before sorting.
         links[inner] = binary.number[children.flat[inner]]
         links[np.flatnonzero(leaf)] = ~np.arange(len(members), dtype=np.int32)
         return cls(moved, middle, numbers, members, links.reshape(children.shape), axes.astype(np.int32), boxes, depth)
@@ -122,14 +144,14 @@ class Bvh:
 
     @property
     def radius(self) -> float:
-        """Of a sphere about the middle that the triangles lie well within, metres."""
+        """Radius of a sphere about `middle` that contains all triangles, with 1 % margin [m]; 0 without triangles."""
         low, high = self.boxes[0, :3].min(axis=1), self.boxes[0, 3:].max(axis=1)
         return 1.01 * float(np.linalg.norm(np.maximum(high, -low))) if len(self.corners) else 0.0
 
     def tables(self, real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
-        """Return nodes, children, axes, leaves, triangles as kernels/common/bvh.h takes them."""
+        """Return nodes, children, axes, leaves and triangle numbers for kernels/common/bvh.h, in a real type."""
         reach = float(np.abs(self.corners).max(initial=0.0))
-        pad = _UNITS_IN_LAST_PLACE * float(np.finfo(real).eps) * reach
+        pad = _BOX_PADDING_ULPS * float(np.finfo(real).eps) * reach
         nodes = self.boxes.copy()
         nodes[:, :3] -= pad
         nodes[:, 3:] += pad
@@ -145,20 +167,20 @@ class Bvh:
 
 
 class _Bundles(NamedTuple):
-    """Triangles that go together into a leaf, whatever the tree: up to four neighbours."""
+    """Groups of one to four neighbouring triangles that stay together in a leaf."""
 
-    order: Integers  # triangles, bundle by bundle
-    first: Integers  # where each bundle begins there
-    size: Integers
-    extents: npt.NDArray[np.float32]  # (6, n)
+    order: Integers  # triangles, sorted by bundle
+    first: Integers  # index in `order` at which each bundle begins
+    size: Integers  # triangles of each bundle
+    extents: npt.NDArray[np.float32]  # (6, n): lower corners, negated upper corners
 
 
 def _bundles(extents: Reals) -> _Bundles:
-    """Take neighbours along a space-filling curve as one where their box is not much more than theirs together."""
-    if extents.shape[1] <= _FEW:
+    """Bundle neighbours along the Morton curve whose common box is not much larger than their boxes together."""
+    if extents.shape[1] <= _FEW_TRIANGLES:
         each = np.arange(extents.shape[1])
         return _Bundles(each, each, np.ones_like(each), extents.astype(np.float32))
-    order = _along_the_curve(extents)
+    order = _morton_order(extents)
     one = extents.astype(np.float32)[:, order]
     count = -(-len(order) // 4) * 4
     padded = np.full((6, count), np.inf, np.float32)
@@ -167,8 +189,8 @@ def _bundles(extents: Reals) -> _Bundles:
     fours = np.minimum(pairs[:, ::2], pairs[:, 1::2])
     area = _areas(padded)
     both = area[::2] + area[1::2]
-    is_pair = _areas(pairs) <= _LOOSE * both
-    is_four = np.repeat(_areas(fours) <= _LOOSE * (both[::2] + both[1::2]), 4)
+    is_pair = _areas(pairs) <= _MAX_BUNDLE_AREA * both
+    is_four = np.repeat(_areas(fours) <= _MAX_BUNDLE_AREA * (both[::2] + both[1::2]), 4)
     begins = np.ones(count, bool)
     begins[1::2] = ~is_pair
     begins[is_four] = False
@@ -179,21 +201,21 @@ def _bundles(extents: Reals) -> _Bundles:
     return _Bundles(order, first, size, whole)
 
 
-def _along_the_curve(extents: Reals) -> Integers:
-    """Return triangles in the order of Morton's curve through the middles of their boxes."""
+def _morton_order(extents: Reals) -> Integers:
+    """Return the order of the triangles along the Morton curve through the centres of their boxes."""
     centre = extents[:3] - extents[3:]
     low = centre.min(axis=1, keepdims=True)
     span = float((centre.max(axis=1, keepdims=True) - low).max())
     cells = ((centre - low) * (65535.0 / span if span > 0.0 else 0.0)).astype(np.int64)
-    for shift, mask in _SPREAD:
+    for shift, mask in _MORTON_STEPS:
         cells = (cells | (cells << shift)) & mask
     return radix_argsort(cells[0] | (cells[1] << 1) | (cells[2] << 2))
 
 
 def radix_argsort(key: Integers) -> Integers:
-    """Return in which order keys, none below 0, ascend, equal ones as they stand.
+    """Return the stable ascending order of keys >= 0, by a radix sort with digits of 16 bits.
 
-    By digits of 16 bits: those NumPy sorts many times faster than whole numbers.
+    NumPy's stable sort of 16-bit integers is many times faster than that of 64-bit integers.
     """
     order = np.argsort(key.astype(np.uint16), kind="stable")
     for shift in range(16, int(key.max(initial=0)).bit_length(), 16):
@@ -201,10 +223,11 @@ def radix_argsort(key: Integers) -> Integers:
     return order
 
 
-class _Binary:
-    """The binary tree over bundles while it grows: arrays over its nodes.
+class _BinaryTree:
+    """Binary tree over bundles during its construction: arrays over its nodes.
 
-    ``left`` is -1 for a leaf, the right child is left + 1; ``count`` is of bundles, ``load`` of triangles.
+    ``left`` is the left child of a node, -1 for a leaf; the right child is left + 1. ``count`` is the number of bundles
+    of a node, ``load`` its number of triangles, ``start`` its first bundle in ``order``.
     """
 
     def __init__(self, size: Integers) -> None:
@@ -218,27 +241,27 @@ class _Binary:
         self.extents: Reals = np.zeros((6, 0))
         self.number: Integers = np.zeros(0, np.int64)
 
-    def split(self, nodes: Integers, on_the_left: Integers, load: Integers) -> Integers:
-        """Give nodes their two children, the first with so many bundles and triangles; return the new ones."""
+    def split(self, nodes: Integers, left_count: Integers, load: Integers) -> Integers:
+        """Give nodes two children, the left one with `left_count` bundles and `load` triangles; return the children."""
         first = len(self.start)
         fresh = first + np.arange(2 * len(nodes))
         self.left[nodes] = fresh[::2]
         begin, number, whole = self.start[nodes], self.count[nodes], self.load[nodes]
-        self.start = np.append(self.start, np.column_stack([begin, begin + on_the_left]))
-        self.count = np.append(self.count, np.column_stack([on_the_left, number - on_the_left]))
+        self.start = np.append(self.start, np.column_stack([begin, begin + left_count]))
+        self.count = np.append(self.count, np.column_stack([left_count, number - left_count]))
         self.load = np.append(self.load, np.column_stack([load, whole - load]))
         self.left = np.append(self.left, np.full(len(fresh), -1))
         return fresh
 
     def unbundle(self, bundles: _Bundles) -> None:
-        """Set the order of triangles, and where each node begins in it."""
+        """Set the order of the triangles, and the first triangle of each node."""
         size = bundles.size[self.order]
         ends = np.cumsum(size)
         self.triangles = bundles.order[np.repeat(bundles.first[self.order] - ends + size, size) + np.arange(ends[-1])]
         self.begins = np.append(0, ends)[self.start]
 
     def measure(self, extents: Reals, levels: list[Integers]) -> None:
-        """Set the nodes' extents from their triangles', the leaves first and then what was split, level by level."""
+        """Compute the extents of all nodes: leaves from their triangles, then inner nodes from the last level up."""
         leaves = np.flatnonzero(self.left < 0)
         leaves = leaves[np.argsort(self.start[leaves])]
         self.extents = np.empty((6, len(self.start)))
@@ -248,22 +271,23 @@ class _Binary:
             self.extents[:, nodes] = np.minimum(self.extents[:, left], self.extents[:, left + 1])
 
 
-def _binary_tree(extents: Reals) -> _Binary:
+def _binary_tree(extents: Reals) -> _BinaryTree:
+    """Build the binary tree over triangles with the given extents, (6, n)."""
     bundles = _bundles(extents)
-    tree, levels = _Binary(bundles.size), []
+    tree, levels = _BinaryTree(bundles.size), []
     active = np.flatnonzero(tree.load > WIDTH)
-    bins = _FINE_BINS if extents.shape[1] <= _FEW else _BINS
+    bins = _FINE_BINS if extents.shape[1] <= _FEW_TRIANGLES else _BINS
     while len(active):
         levels.append(active)
-        fresh = _split_level(tree, active, bundles, bins, halve=len(levels) > _DEEP)
+        fresh = _split_level(tree, active, bundles, bins, halve=len(levels) > _MAX_HEURISTIC_DEPTH)
         active = fresh[tree.load[fresh] > WIDTH]
     tree.unbundle(bundles)
     tree.measure(extents, levels)
     return tree
 
 
-def _split_level(tree: _Binary, active: Integers, bundles: _Bundles, bins: int, *, halve: bool) -> Integers:
-    """Split each active node once and put the bundles in order; return the children."""
+def _split_level(tree: _BinaryTree, active: Integers, bundles: _Bundles, bins: int, *, halve: bool) -> Integers:
+    """Split each active node once and sort its bundles by child; return the children."""
     start, count = tree.start[active], tree.count[active]
     owner = np.repeat(np.arange(len(active)), count)
     first = np.cumsum(count) - count
@@ -277,7 +301,7 @@ def _split_level(tree: _Binary, active: Integers, bundles: _Bundles, bins: int, 
     scale = np.where(span > 0.0, bins * (1.0 - 1e-6) / np.maximum(span, 1e-36), 0.0).astype(np.float32)
     value = centre[axis[owner], np.arange(len(owner))]
     at = np.clip(((value - bottom[owner]) * scale[owner]).astype(np.int64), 0, bins - 1)
-    # Sorting by node and bin also puts the two sides of every cut side by side.
+    # Sorted by node and bin: both sides of every cut between bins are contiguous.
     key = owner * bins + at
     order = radix_argsort(key)
     members, key = members[order], key[order]
@@ -290,15 +314,15 @@ def _split_level(tree: _Binary, active: Integers, bundles: _Bundles, bins: int, 
     sums = np.append(0, np.cumsum(bundles.size[members]))
     held[0, cells] = np.diff(cuts, append=len(key))
     held[1, cells] = np.diff(sums[cuts], append=sums[-1])
-    on_the_left = _best_cuts(grid.reshape(6, -1, bins), *held.reshape(2, -1, bins))
-    on_the_left = np.where((on_the_left <= 0) | (on_the_left >= count) | halve, count // 2, on_the_left)
-    return tree.split(active, on_the_left, sums[first + on_the_left] - sums[first])
+    left_count = _best_cuts(grid.reshape(6, -1, bins), *held.reshape(2, -1, bins))
+    left_count = np.where((left_count <= 0) | (left_count >= count) | halve, count // 2, left_count)
+    return tree.split(active, left_count, sums[first + left_count] - sums[first])
 
 
 def _best_cuts(grid: npt.NDArray[Any], filled: Integers, load: Integers) -> Integers:
-    """Return how many bundles go to the left of the best cut between bins.
+    """Return the number of bundles to the left of the cut with the least cost, for each node.
 
-    Of bins (n, bins): extents (6, n, bins), and how many bundles and triangles they hold.
+    Parameters are the extents of the bins, (6, n, bins), and the number of bundles and triangles in each, (n, bins).
     """
     left = _areas(np.minimum.accumulate(grid, axis=2))[:, :-1]
     right = _areas(np.minimum.accumulate(grid[:, :, ::-1], axis=2))[:, ::-1][:, 1:]
@@ -310,26 +334,31 @@ def _best_cuts(grid: npt.NDArray[Any], filled: Integers, load: Integers) -> Inte
 
 
 def _work(triangles: Integers) -> Integers:
-    """Return what a box of so many triangles costs: leaves are looked at whole, and full ones are fewer."""
+    """Return the cost of a box by its number of triangles: triangles plus 16 for each leaf, with full leaves."""
     return triangles - (-triangles // WIDTH) * WIDTH
 
 
 def _areas(extents: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return half the surface areas of boxes with extents (6, ...); 0 for empty boxes."""
     with np.errstate(invalid="ignore"):
         x, y, z = np.where(np.isinf(extents[:3]), 0.0, -extents[3:] - extents[:3])
     return np.asarray(x * y + y * z + z * x)
 
 
-def _members(tree: _Binary, leaves: Integers) -> Integers:
-    """Return the triangles of leaves (n, 16), -1 where they have fewer."""
+def _members(tree: _BinaryTree, leaves: Integers) -> Integers:
+    """Return the triangles of leaves, (n, 16); -1 in empty places."""
     places = tree.begins[leaves, None] + np.arange(WIDTH)
     members: Integers = tree.triangles[np.minimum(places, len(tree.triangles) - 1)]
     members[np.arange(WIDTH) >= tree.load[leaves, None]] = -1
     return members
 
 
-def _opened(tree: _Binary) -> tuple[Integers, int]:
-    """Return the 16 children of every wide node, as binary nodes (-1: none), and the depth; sets ``tree.number``."""
+def _collapse(tree: _BinaryTree) -> tuple[Integers, int]:
+    """Collapse the binary tree to nodes of 16 children.
+
+    Returns the children of every wide node as nodes of the binary tree, (k, 16) (-1: none), and the depth. Sets
+    ``tree.number``, the number of the wide node of a binary node.
+    """
     area = np.where(tree.left >= 0, _areas(tree.extents), -1.0)
     tree.number = np.full(len(tree.start), -1)
     roots, levels, numbered, depth = np.zeros(1, np.int64), [], 0, 0

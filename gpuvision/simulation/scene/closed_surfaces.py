@@ -1,4 +1,4 @@
-"""Closed surfaces of a scene: their inside is not seen from outside."""
+"""Closed surfaces of a scene: a view point outside sees their outer sides only."""
 
 from __future__ import annotations
 
@@ -8,50 +8,50 @@ import numpy.typing as npt
 from gpuvision.simulation.scene.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
-# A surface that holds less of its box's volume has no inside to speak of.
-_LEAST_VOLUME = 1e-9
+# Smallest volume of a closed surface, as a fraction of its bounding box: below, the sign of the volume is rounding.
+_MIN_VOLUME_FRACTION = 1e-9
 
 
 def visible_sides(scene: Scene, eye: npt.ArrayLike, direction: npt.ArrayLike) -> npt.NDArray[np.int8]:
-    """Return which side of triangles an eye may see that moves along a straight line.
+    """Return the side of each triangle that is visible from a view point that moves along a straight line.
 
-    Of a closed surface (triangles that hang together, every edge between two of them) it sees the outside only, if its
-    line does not meet the surface's box.
+    A closed surface is a set of connected triangles in which every edge belongs to exactly two of them. Only its outer
+    side is visible from a line that does not meet the bounding box of the surface.
 
     Parameters
     ----------
     scene
-        Triangles that touch share corners, to the last digit.
+        Triangles. Connected triangles share corners with identical coordinates.
     eye, direction
-        (3,): a place [m], and how it moves.
+        A point of the line [m] and its direction, (3,) each.
 
     Returns
     -------
     numpy.ndarray
-        int8 (n,): 1 or -1, the side that the triangle's normal, as it is wound, points to or the other; 0: both.
+        int8 (n,): 1, the side to which the triangle's normal (by its winding) points; -1, the other side; 0, both.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     sides = np.zeros(len(scene.corners), np.int8)
-    there = scene.bvh.numbers
-    if not len(there):
+    triangles = scene.bvh.numbers
+    if not len(triangles):
         return sides
-    corners = scene.corners[there]
+    corners = scene.corners[triangles]
     points = vertex_numbers(corners)
     tail, head = points.ravel(), np.roll(points, -1, axis=1).ravel()
     forward = tail < head
     edge = np.minimum(tail, head) * (points.max() + 1) + np.maximum(tail, head)
     _, number, uses = np.unique(edge, return_inverse=True, return_counts=True)
     number = number.ravel()
-    face = np.repeat(np.arange(len(there)), 3)
-    # Each edge once forward and once back.
+    face = np.repeat(np.arange(len(triangles)), 3)
+    # An edge is closed if it has two triangles and they run along it in opposite directions.
     closed = (uses == 2) & (np.bincount(number, np.where(forward, 1.0, -1.0)) == 0.0)
     order = np.argsort(number, kind="stable")
     first, second = order[:-1], order[1:]
     joined = number[first] == number[second]
     one, two = face[first[joined]], face[second[joined]]
-    links = coo_array((np.ones(len(one), np.int8), (one, two)), shape=(len(there), len(there)))
+    links = coo_array((np.ones(len(one), np.int8), (one, two)), shape=(len(triangles), len(triangles)))
     count, part = connected_components(links, directed=False)
     whole = np.bincount(part, ~closed[number].reshape(-1, 3).all(axis=1), minlength=count) == 0
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
@@ -59,15 +59,15 @@ def visible_sides(scene: Scene, eye: npt.ArrayLike, direction: npt.ArrayLike) ->
     np.maximum.at(high, part, corners.max(axis=1))
     from_low = corners - low[part][:, None]
     volume = np.bincount(part, np.linalg.det(from_low) / 6.0, minlength=count)
-    whole &= np.abs(volume) > _LEAST_VOLUME * np.prod(high - low, axis=1)
-    whole &= ~_meets(np.asarray(eye, np.float64), np.asarray(direction, np.float64), low, high)
-    sides[there] = np.where(whole, np.sign(volume), 0.0)[part]
+    whole &= np.abs(volume) > _MIN_VOLUME_FRACTION * np.prod(high - low, axis=1)
+    whole &= ~_line_meets_boxes(np.asarray(eye, np.float64), np.asarray(direction, np.float64), low, high)
+    sides[triangles] = np.where(whole, np.sign(volume), 0.0)[part]
     return sides
 
 
 def vertex_numbers(corners: Float64) -> npt.NDArray[np.int64]:
-    """Return a number for every corner (n, 3, 3) to (n, 3), the same where the place is to the last digit."""
-    # Zero has one sign here.
+    """Return vertex numbers (n, 3) of corners (n, 3, 3): corners with identical coordinates have the same number."""
+    # Adding 0.0 turns -0.0 into 0.0.
     points = corners.reshape(-1, 3) + 0.0
     order = np.lexsort(points.T)
     in_order = points[order]
@@ -77,8 +77,8 @@ def vertex_numbers(corners: Float64) -> npt.NDArray[np.int64]:
     return number.reshape(-1, 3)
 
 
-def _meets(eye: Float64, direction: Float64, low: Float64, high: Float64) -> npt.NDArray[np.bool_]:
-    """Return whether a line meets boxes (k, 3), (k, 3)."""
+def _line_meets_boxes(eye: Float64, direction: Float64, low: Float64, high: Float64) -> npt.NDArray[np.bool_]:
+    """Return whether a line meets boxes with lower and upper corners (k, 3), by the slab method."""
     moves = direction != 0.0
     beside = ((eye < low) | (eye > high))[:, ~moves].any(axis=1)
     one, two = ((each[:, moves] - eye[moves]) / direction[moves] for each in (low, high))

@@ -1,4 +1,4 @@
-"""Materials: what the triangles of a scene are made of."""
+"""Materials of the triangles of a scene."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ import numpy as np
 from gpuvision.simulation.scene.reflectance import Brdf, Lambert, OrenNayar
 from gpuvision.validation import finite
 
-# A lobe's albedo is integrated to about this.
-_EXCESS = 1e-2
+# Allowed excess of the total albedo over 1: error of the numerical integration of a lobe's albedo.
+_ALBEDO_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """A surface: a diffuse part, and beside it a glossy lobe, a mirror, or neither.
+    """Reflectance of a surface: a diffuse component, and optionally a glossy lobe and a mirror component.
 
     Parameters
     ----------
     diffuse
-        `Lambert` or `OrenNayar`: what lights other surfaces, and what a sensor is meant to see.
+        `Lambert` or `OrenNayar`. Only this component sends secondary light to other surfaces.
     gloss
-        A lobe beside it (`Phong`, `Ggx`, `Ward`); None: there is none.
+        Glossy lobe (`Phong`, `Ggx`, `Ward`), or None.
     mirror
-        Share of the light that an ideal mirror in the surface throws on, at any angle.
+        Reflectance of an ideal mirror in the surface, for all angles, 0 to 1.
     name
-        For reports.
+        Name for reports.
 
     Raises
     ------
     TypeError
-        A part is no model of reflectance.
+        A component is not a reflectance model.
     ValueError
-        The surface throws back more than arrives: the parts' albedos (of a lobe, at normal incidence) exceed 1.
+        The albedos of the components add up to more than 1 (the albedo of a lobe is that at normal incidence).
     """
 
     diffuse: Lambert | OrenNayar
@@ -49,19 +49,20 @@ class Material:
         object.__setattr__(self, "mirror", finite(self.mirror, "Material.mirror"))
         if not 0.0 <= self.mirror <= 1.0:
             raise ValueError(f"Material.mirror is {self.mirror:g}, expected 0 to 1")
-        total = self.diffuse.albedo + self.mirror + (0.0 if self.gloss is None else _facing_albedo(self.gloss))
-        if total > 1.0 + _EXCESS:
-            raise ValueError(f"Material throws back {total:.2f} of the light that arrives, expected 1 at most")
+        total = self.diffuse.albedo + self.mirror + (0.0 if self.gloss is None else _normal_albedo(self.gloss))
+        if total > 1.0 + _ALBEDO_TOLERANCE:
+            raise ValueError(f"Material reflects {total:.2f} of the incident light, expected 1 at most")
 
     @property
     def albedo(self) -> float:
-        """Share of the light that leaves diffusely: what secondary light is made of."""
+        """Albedo of the diffuse component, 0 to 1."""
         return self.diffuse.albedo
 
 
-def _facing_albedo(lobe: Brdf, rings: int = 400, spokes: int = 32) -> float:
-    """Integrate a lobe over the half space, for light along the normal; narrow ones are near it."""
-    # Half way angles are where lobes are narrow: the tangent of half the angle, spaced by its logarithm.
+def _normal_albedo(lobe: Brdf, rings: int = 400, spokes: int = 32) -> float:
+    """Return the albedo of a lobe for normal incidence: its value times the cosine, integrated over the half space."""
+    # At normal incidence the half-way angle is theta / 2. Nodes are evenly spaced in log(tan(theta / 2)), because
+    # narrow lobes are near theta = 0.
     step = np.linspace(-14.0, 0.0, rings + 1)
     angle = 2.0 * np.arctan(np.exp(0.5 * (step[1:] + step[:-1])))
     around = (np.arange(spokes) + 0.5) * (2.0 * np.pi / spokes)

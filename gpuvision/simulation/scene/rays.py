@@ -1,4 +1,4 @@
-"""Rays and segments against the triangles of a scene."""
+"""Intersection of rays and segments with the triangles of a scene."""
 
 from __future__ import annotations
 
@@ -8,54 +8,69 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    IntArray,
+    Launch,
+    Precision,
+    StatusArray,
+    Variant,
+    real_defines,
+    real_of,
+    uses_vectors,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.scene import Scene
 
+# Rays of a work-item of the vector variant, and work-items of a group of the other variant: both tuned for speed.
 _RAYS_PER_STRIP, _GROUP = 256, 64
 Spec = tuple[tuple[int, ...], np.dtype[Any]]
 R = TypeVar("R", bound=tuple[Any, ...])
 
 
 class Hits(NamedTuple):
-    """Where rays meet a scene first.
+    """Closest intersections of rays with a scene.
 
     Attributes
     ----------
     triangle
-        int32 (...,): its number in the scene, -1 where there is none.
+        int32 (...,), number of the triangle in the scene; -1 without an intersection.
     distance
-        (...,), metres along the ray; NaN where the status is not OK.
+        Real (...,), distance along the ray [m]; NaN where the status is not OK.
     barycentric
-        (..., 2): weights u, v of the triangle's second and third corner; NaN where the status is not OK.
+        Real (..., 2), barycentric weights u, v of the triangle's second and third corner; NaN where the status is not
+        OK.
     status
-        uint8 `Status` flags, (...,): NO_DATA (the ray meets nothing), NOT_FINITE (a number of the ray is not, or its
+        uint8 `Status` flags, (...,): NO_DATA (no intersection), NOT_FINITE (a number of the ray is not finite, or its
         direction is zero).
     """
 
-    triangle: Any
-    distance: Any
-    barycentric: Any
-    status: Any
+    triangle: IntArray
+    distance: FloatArray
+    barycentric: FloatArray
+    status: StatusArray
 
 
 class Occlusion(NamedTuple):
-    """Whether segments are interrupted.
+    """Occlusion of segments.
 
     Attributes
     ----------
     occluded
-        uint8 (...,): 1 where a triangle lies between the ends, else 0.
+        uint8 (...,), 1 where a triangle lies between the two ends, else 0.
     status
-        uint8 `Status` flags, (...,): NOT_FINITE (a number of the segment is not; it is not occluded).
+        uint8 `Status` flags, (...,): NOT_FINITE (a number of the segment is not finite; it counts as not occluded).
     """
 
-    occluded: Any
-    status: Any
+    occluded: StatusArray
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Rays(VisionOperation[R]):
+    """Common part of the operations on rays and segments."""
+
     scene: Scene
     clearance: float = 0.0
     precision: Precision = None
@@ -109,34 +124,34 @@ class _Rays(VisionOperation[R]):
 
 @dataclass(frozen=True, kw_only=True)
 class ClosestHit(_Rays[Hits]):
-    """The first triangle on each ray: ``op(rays) -> Hits``, rays float32 or float64 (..., 6).
+    """Closest hit of each ray: ``op(rays) -> Hits``, with rays float32 or float64 (..., 6).
 
-    A ray is an origin in metres and a direction of any length. Both sides of a triangle count; a ray in its plane
-    passes it, and no ray passes between two triangles at the edge they share.
+    A ray is its origin [m] and a direction of any length. Both sides of a triangle are hit. A ray in the plane of a
+    triangle misses it. No ray passes between two triangles at their common edge.
 
     Parameters
     ----------
     scene
-        What the rays meet.
+        Scene that the rays intersect.
     clearance
-        Metres from the origin within which nothing counts; what lies in the origin never does.
+        Intersections closer to the origin are ignored [m], 0 or more. Triangles through the origin are always ignored.
     precision
-        Of the arithmetic and the outputs; None follows the input. "single" takes float64 rays too: the scene's middle
-        is subtracted in double, and of a ray from afar only the part about the scene is traced.
+        "single" or "double" arithmetic and outputs; None: the type of the input. "single" takes float64 rays too: the
+        centre of the scene is subtracted in double, and a distant ray is clipped to the scene.
     variant
-        "vector" (a ray against 16 boxes in a vector, for CPU runtimes), "work_item" (a work-item per ray, for GPUs),
-        "auto".
+        "vector" (one ray against 16 boxes per vector, for CPU runtimes), "work_item" (one work-item per ray, for GPUs)
+        or "auto".
 
     Raises
     ------
     TypeError, ValueError
-        A parameter is not what is said here.
+        A parameter has the wrong type or is out of its range.
 
     Notes
     -----
-    Error: places are rounded to the real type once, relative to the scene's middle, so the distance is off by some
-    roundings of the scene's size and of the distance, over the cosine of incidence; however far the origin is, on
-    devices with double.
+    Error: coordinates are rounded once to the real type, relative to the centre of the scene. The error of the distance
+    is a few roundings of the scene's size and of the distance, divided by the cosine of incidence. On devices with
+    doubles it does not depend on the distance of the origin.
     """
 
     Result: ClassVar[type[Any]] = Hits
@@ -156,24 +171,25 @@ class ClosestHit(_Rays[Hits]):
 
 @dataclass(frozen=True, kw_only=True)
 class AnyHit(_Rays[Occlusion]):
-    """Whether a triangle lies between two points: ``op(segments) -> Occlusion``, float32 or float64 (..., 6).
+    """Occlusion of segments by a scene: ``op(segments) -> Occlusion``, with segments float32 or float64 (..., 6).
 
-    A segment is two points in metres. Both sides of a triangle occlude; one in whose plane the segment lies does not.
+    A segment is its two end points [m]. Both sides of a triangle occlude. A triangle whose plane contains the segment
+    does not occlude it.
 
     Parameters
     ----------
     scene
-        What may lie between.
+        Scene that can occlude the segments.
     clearance
-        Metres from either end within which nothing occludes: the surfaces that the ends lie on. What lies in an end
-        itself never does, but for rounding.
+        Intersections closer to either end are ignored [m], 0 or more: the surfaces on which the ends lie. Triangles
+        through an end are ignored up to rounding.
     precision, variant
-        As of `ClosestHit`.
+        As for `ClosestHit`.
 
     Raises
     ------
     TypeError, ValueError
-        A parameter is not what is said here.
+        A parameter has the wrong type or is out of its range.
     """
 
     Result: ClassVar[type[Any]] = Occlusion
@@ -186,6 +202,7 @@ class AnyHit(_Rays[Occlusion]):
 
 
 def _shape_of(name: str, what: str, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Check the shape (..., 6) of an input and return its leading dimensions."""
     if not shape or shape[-1] != 6:
         raise ValueError(f"{name} takes {what} (..., 6), got shape {shape}")
     return shape[:-1]

@@ -1,4 +1,4 @@
-"""Scenes: triangles with materials, from files or trimesh, and what is wrong with them."""
+"""Scenes: triangles with materials, from files or trimesh, and their defects."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import numpy.typing as npt
 
 from gpuvision.simulation.scene.bvh import Bvh, radix_argsort
 
-# An odd number of 64 bits that looks like noise (of the golden ratio).
+# Multiplier of the hash: 2^64 over the golden ratio, made odd (Fibonacci hashing, Knuth).
 _MIXER = 0x9E3779B97F4A7C15
 
-# What trimesh's readers raise where a file breaks off or is garbled; some look for a package that guesses encodings.
-_DAMAGED = (
+# Exceptions of trimesh's readers for damaged or truncated files (ImportError: of an optional encoding detector).
+_READ_ERRORS = (
     ArithmeticError,
     AttributeError,
     ImportError,
@@ -33,19 +33,20 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Defects:
-    """Triangles of a scene that are not as they should be, by their numbers, and what was done about them.
+    """Defective triangles of a scene, by their numbers.
 
     Attributes
     ----------
     not_finite
-        A corner is NaN or infinite: left out of the tree.
+        Triangles with a corner that is NaN or infinite. They are left out of the BVH.
     degenerate
-        Two corners are the same, or the three lie on a line (no area): left out.
+        Triangles without area: two corners coincide, or all three are collinear. They are left out of the BVH.
     non_manifold
-        On an edge that three or more share, or that cannot be wound like their neighbours at all (a Moebius strip):
-        kept as they are.
+        Triangles on an edge of three or more triangles, or on a surface that cannot be oriented (a Moebius strip). They
+        are kept unchanged.
     inverted
-        Wound against most of those they hang together with: turned, so that `Scene.corners` are wound alike.
+        Triangles with the opposite winding to most of their connected neighbours. They are flipped, so that the
+        winding of `Scene.corners` is consistent.
     """
 
     not_finite: tuple[int, ...]
@@ -54,7 +55,7 @@ class Defects:
     inverted: tuple[int, ...]
 
     def __str__(self) -> str:
-        """Return a line for each kind that occurs."""
+        """Return one line for each kind of defect that occurs."""
         lines = []
         for name, numbers in vars(self).items():
             if numbers:
@@ -65,24 +66,24 @@ class Defects:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Triangles, each with a material; compared by identity.
+    """Triangles with materials; compared by identity.
 
     Parameters
     ----------
     corners
-        (n, 3, 3), metres; n may be 0.
+        (n, 3, 3), corners of the triangles [m]; n may be 0.
     material
-        (n,) integers: the index of each triangle's material; all 0 if left out.
+        Integers (n,), index of the material of each triangle, 0 or more; None: all 0.
 
     Attributes
     ----------
     defects
-        What was wrong. Numbers of triangles stay what they were in the input.
+        Defective triangles. Their numbers are indices of the given triangles.
 
     Raises
     ------
     ValueError
-        Wrong shapes; a material below 0.
+        A shape is wrong, or a material index is negative.
     """
 
     corners: npt.NDArray[np.float64]
@@ -97,10 +98,12 @@ class Scene:
         if given.shape != (len(corners),) or given.dtype.kind not in "iu":
             raise ValueError(f"Scene.material is {given.dtype} {given.shape}, expected integers ({len(corners)},)")
         if np.any(given < 0):
-            raise ValueError("Scene.material has an index below 0; expected 0 for the first material, and on")
+            raise ValueError(
+                "Scene.material has a negative index; expected 0 for the first material, 1 for the second, ..."
+            )
         defects = _defects(corners)
-        turned = list(defects.inverted)
-        corners[turned] = corners[turned][:, ::-1]
+        inverted = list(defects.inverted)
+        corners[inverted] = corners[inverted][:, ::-1]
         corners.flags.writeable = False
         object.__setattr__(self, "corners", corners)
         object.__setattr__(self, "material", given.astype(np.int32))
@@ -108,23 +111,29 @@ class Scene:
 
     @functools.cached_property
     def bvh(self) -> Bvh:
-        """The tree over the triangles that can be met, built at the first use."""
+        """BVH over the triangles that are finite and not degenerate, built at the first use."""
         good = np.ones(len(self.corners), bool)
         good[[*self.defects.not_finite, *self.defects.degenerate]] = False
         return Bvh.build(self.corners, good)
 
     @classmethod
     def of(cls, meshes: Any, *, metres: float = 1.0) -> Scene:
-        """Take a `trimesh.Trimesh`, a `trimesh.Scene`, or several meshes.
+        """Make a scene of a `trimesh.Trimesh`, a `trimesh.Scene`, or several meshes.
 
-        Each mesh is one material, in their order; what stands in a `trimesh.Scene` several times is one.
+        Each mesh has its own material, numbered in the order of the meshes. All instances of a mesh in a
+        `trimesh.Scene` share its material.
 
         Parameters
         ----------
         meshes
-            What trimesh loaded or made.
+            Meshes of trimesh.
         metres
-            How long the meshes' unit is: 1e-3 for millimetres.
+            Length unit of the meshes [m]: 1e-3 for millimetres.
+
+        Raises
+        ------
+        TypeError
+            An element is not a `trimesh.Trimesh`.
         """
         parts = sorted(_parts(meshes), key=lambda part: part[0])
         if not parts:
@@ -135,16 +144,23 @@ class Scene:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, metres: float = 1.0) -> Scene:
-        """Read STL, PLY, OBJ or GLB; each of a file's meshes is one material.
+        """Read a scene from an STL, PLY, OBJ or GLB file; each mesh of the file has its own material.
+
+        Parameters
+        ----------
+        path
+            The file.
+        metres
+            Length unit of the file [m]: 1e-3 for millimetres.
 
         Raises
         ------
         FileNotFoundError
-            There is no such file.
+            The file does not exist.
         IsADirectoryError
-            It is a folder.
+            The path is a folder.
         ValueError
-            It is of another kind, damaged, or holds no triangles.
+            The file has another format, is damaged, or contains no triangles.
         """
         import trimesh
 
@@ -156,15 +172,17 @@ class Scene:
             raise ValueError(f"{os.fspath(path)}: expected a mesh as .stl, .ply, .obj or .glb")
         try:
             scene = cls.of(trimesh.load(os.fspath(path), process=False), metres=metres)
-        except _DAMAGED as error:
-            raise ValueError(f"{os.fspath(path)}: not a readable mesh: damaged, cut short or no mesh at all") from error
+        except _READ_ERRORS as error:
+            raise ValueError(
+                f"{os.fspath(path)}: not a readable mesh; the file is damaged, truncated, or not a mesh"
+            ) from error
         if not len(scene.corners):
-            raise ValueError(f"{os.fspath(path)}: holds no triangles")
+            raise ValueError(f"{os.fspath(path)}: contains no triangles")
         return scene
 
 
 def _parts(meshes: Any) -> list[tuple[int, Any]]:
-    """Return meshes where they stand in the scene, with the numbers of their materials."""
+    """Return the meshes in scene coordinates, with their material numbers."""
     import trimesh
 
     if isinstance(meshes, trimesh.Scene):
@@ -182,18 +200,19 @@ def _parts(meshes: Any) -> list[tuple[int, Any]]:
 
 
 def _defects(corners: npt.NDArray[np.float64]) -> Defects:
+    """Find the defective triangles among (n, 3, 3)."""
     finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(corners).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], corners, 0.0)
-    flat = finite & _is_flat(safe)
+    flat = finite & _is_degenerate(safe)
     good = np.flatnonzero(finite & ~flat)
     if not len(good):
         return Defects(_numbers(np.flatnonzero(~finite)), _numbers(np.flatnonzero(flat)), (), ())
-    points = _numbered(safe[good].reshape(-1, 3)).reshape(-1, 3)
-    crowded, inverted = _winding(points)
+    points = _vertex_numbers(safe[good].reshape(-1, 3)).reshape(-1, 3)
+    non_manifold, inverted = _winding(points)
     return Defects(
         _numbers(np.flatnonzero(~finite)),
         _numbers(np.flatnonzero(flat)),
-        _numbers(good[crowded]),
+        _numbers(good[non_manifold]),
         _numbers(good[inverted]),
     )
 
@@ -202,22 +221,22 @@ def _numbers(values: Iterable[Any]) -> tuple[int, ...]:
     return tuple(int(each) for each in values)
 
 
-def _is_flat(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Whether triangles have no area: none beyond the rounding of their own corners."""
+def _is_degenerate(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Return whether the areas of triangles are zero up to the rounding of their corners."""
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.linalg.norm(np.cross(one, two), axis=1)
     rounding = 4.0 * np.finfo(np.float64).eps * np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
     return np.asarray(area <= rounding)
 
 
-def _numbered(points: npt.NDArray[np.float64]) -> Integers:
-    """Return a number for each point (n, 3), the same for the same."""
+def _vertex_numbers(points: npt.NDArray[np.float64]) -> Integers:
+    """Return vertex numbers (n,) of points (n, 3): points with identical coordinates have the same number."""
     columns = np.ascontiguousarray(points.T) + 0.0
     mixed = np.zeros(len(points), np.uint64)
     for column in columns.view(np.uint64):
         mixed = (mixed ^ column) * np.uint64(_MIXER)
         mixed ^= mixed >> np.uint64(32)
-    # A number of 63 bits for each; the places say whether two have the same one by chance.
+    # Points are grouped by a 63-bit hash; a comparison of the coordinates within each group finds hash collisions.
     order = radix_argsort((mixed >> np.uint64(1)).astype(np.int64))
     mixed, columns = mixed[order] >> np.uint64(1), columns[:, order]
     is_new = np.append(True, mixed[1:] != mixed[:-1])
@@ -229,7 +248,7 @@ def _numbered(points: npt.NDArray[np.float64]) -> Integers:
 
 
 def _winding(points: Integers) -> tuple[Integers, Integers]:
-    """Return which triangles hang on a crowded edge (or cannot be wound), and which are wound against the most."""
+    """Return the non-manifold and the inverted triangles, by vertex numbers (n, 3)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -241,19 +260,20 @@ def _winding(points: Integers) -> tuple[Integers, Integers]:
     edge, face, forward = edge[order], face[order], (tail < head)[order]
     first = np.append(0, np.flatnonzero(edge[1:] != edge[:-1]) + 1)
     uses = np.diff(first, append=len(edge))
-    crowded = np.unique(face[np.repeat(uses > 2, uses)])
+    non_manifold = np.unique(face[np.repeat(uses > 2, uses)])
     one = first[uses == 2]
-    against = forward[one] == forward[one + 1]
-    if not against.any():
-        return crowded, np.zeros(0, np.int64)
-    # Every triangle twice, as it is and turned: neighbours join the sheets in which they are wound alike.
+    opposed = forward[one] == forward[one + 1]
+    if not opposed.any():
+        return non_manifold, np.zeros(0, np.int64)
+    # Graph with two nodes per triangle, as given and flipped. Neighbours are linked where their windings agree. A
+    # surface that can be oriented has two components, one for each orientation.
     a, b = face[one], face[one + 1]
-    rows, columns = np.concatenate([a, a + count]), np.concatenate([b + count * against, b + count * ~against])
+    rows, columns = np.concatenate([a, a + count]), np.concatenate([b + count * opposed, b + count * ~opposed])
     links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(2 * count, 2 * count))
     label = connected_components(links, directed=False)[1]
     size = np.bincount(label[:count], minlength=label.max() + 1)
-    as_is, turned = size[label[:count]], size[label[count:]]
-    # At a tie the sheet of the lower label stays.
-    inverted = (as_is < turned) | ((as_is == turned) & (label[:count] > label[count:]))
-    one_sided = np.flatnonzero(label[:count] == label[count:])
-    return np.union1d(crowded, one_sided), np.flatnonzero(inverted)
+    given, flipped = size[label[:count]], size[label[count:]]
+    # The orientation of the majority is kept; at a tie, the component with the lower label.
+    inverted = (given < flipped) | ((given == flipped) & (label[:count] > label[count:]))
+    not_orientable = np.flatnonzero(label[:count] == label[count:])
+    return np.union1d(non_manifold, not_orientable), np.flatnonzero(inverted)

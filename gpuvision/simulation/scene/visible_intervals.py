@@ -1,4 +1,4 @@
-"""What of a segment is visible from a point, exactly, also by way of a plane mirror."""
+"""Exact visible parts of a segment from a point, directly or in a plane mirror."""
 
 from __future__ import annotations
 
@@ -8,63 +8,77 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, Precision, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    Launch,
+    Precision,
+    StatusArray,
+    Variant,
+    real_defines,
+    real_of,
+    uses_vectors,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.scene import Scene
 
+# Numbers of a fan; work-items of a group, tuned for speed.
 _NUMBERS, _GROUP = 11, 64
-_SLACK = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 1e-10}
+# Shortest part that counts, as a fraction of the segment: about 100 roundings of single, 4e5 of double precision.
+_MIN_FRACTION = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 1e-10}
 
 
 class Intervals(NamedTuple):
-    """Parts of segments, as shares of their lengths.
+    """Visible parts of segments, as fractions of their lengths.
 
     Attributes
     ----------
     intervals
-        (..., kept, 2), from 0 to 1, in order; NaN behind the last.
+        Real (..., max_intervals, 2), start and end of each part, 0 to 1, in ascending order; NaN after the last part.
     count
-        uint8 (...,): how many there are.
+        uint8 (...,), number of parts.
     status
-        uint8 `Status` flags, (...,): NOT_FINITE (a number is not), AMBIGUOUS (there are more parts than are kept: none
-        is given).
+        uint8 `Status` flags, (...,): NOT_FINITE (a number of the input is not finite), AMBIGUOUS (there are more than
+        ``max_intervals`` parts; none is returned).
     """
 
-    intervals: Any
-    count: Any
-    status: Any
+    intervals: FloatArray
+    count: StatusArray
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
 class VisibleIntervals(VisionOperation[Intervals]):
-    """Which parts of segments are visible from points: ``op(fans) -> Intervals``, float32 or float64 (..., 11).
+    """Visible parts of segments from points: ``op(fans) -> Intervals``, with fans float32 or float64 (..., 11).
 
-    A fan is the rays from an apex to a segment: the apex, the two ends, in metres, and the shares of the ways to the
-    two ends from which on something may be in the way. 0 and 0: the apex sees the segment itself. A lens that sees it
-    in a plane mirror is an apex behind the mirror, at its mirror image; there the ways begin at the mirror.
+    A fan is the set of rays from an apex to the points of a segment. Its 11 numbers are the apex, the two ends of the
+    segment [m], and for each end the fraction of the ray, 0 to 1, from which on triangles can occlude. Fractions of 0
+    describe a direct view. A view in a plane mirror has its apex at the mirror image of the lens, behind the mirror;
+    the fractions are then those at which the rays pass the mirror.
 
     Parameters
     ----------
     scene
-        What may be in the way; both sides of a triangle are. What lies in the segment itself is not, nor is the
-        mirror, nor a triangle in the plane of the fan.
+        Scene that can occlude the segments; both sides of a triangle occlude. Triangles that contain the segment, the
+        mirror itself, and triangles in the plane of the fan do not occlude.
     max_intervals
-        At most so many parts.
+        Largest number of visible parts of a segment, 1 to 49.
     precision
-        Of the arithmetic and the outputs; None follows the input.
+        "single" or "double" arithmetic and outputs; None: the type of the input.
     variant
-        "vector" (16 boxes or triangles in a vector, for CPU runtimes), "work_item" (for GPUs), "auto".
+        "vector" (16 boxes or triangles per vector, for CPU runtimes), "work_item" (for GPUs) or "auto".
 
     Raises
     ------
     TypeError, ValueError
-        A parameter is not what is said here.
+        A parameter has the wrong type or is out of its range.
 
     Notes
     -----
-    Every triangle that cuts the fan hides an interval, so the ends of the parts are exact to rounding: 1e-10 of the
-    segment in double, 1e-5 in single; what is shorter, or as near to the segment or the mirror in shares of the way,
-    does not count. Of a segment seen end on nothing is visible.
+    Each triangle that intersects the fan occludes an interval of the segment; the visible parts are the complement of
+    their union. The ends of the parts are exact to rounding: 1e-10 of the segment in double, 1e-5 in single precision.
+    Shorter parts, and occluders closer to the segment or the mirror than this fraction of the ray, are ignored. A
+    segment that is collinear with the apex has no visible part.
     """
 
     Result: ClassVar[type[Any]] = Intervals
@@ -107,7 +121,7 @@ class VisibleIntervals(VisionOperation[Intervals]):
             arguments=[
                 *tree.tables(real),
                 tree.middle.astype(dtype),
-                real.type(_SLACK[real]),
+                real.type(_MIN_FRACTION[real]),
                 np.uint32(self.max_intervals),
                 np.uint64(count),
             ],

@@ -1,4 +1,4 @@
-"""What simulated sensors share: light by path, the truth, and how a place on the sensor becomes a height."""
+"""Common part of simulated sensors: light by path, ground truth, and heights of positions on the sensor."""
 
 from __future__ import annotations
 
@@ -17,47 +17,50 @@ from gpuvision.validation import finite
 Float64 = npt.NDArray[np.float64]
 
 PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse", "multi-bounce")
-"""Ways of the light from the sheet to the lens; together they are what the sensor gets."""
+"""Light paths from the sheet of light to the lens. The sensor receives the sum of all paths."""
 AMBIENT = "ambient"
-"""Light that is not the sheet's; it arrives beside the paths."""
+"""Light of other sources than the sheet."""
 UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED = "direct, uniform", "direct, unoccluded", "direct, uniform, unoccluded"
-"""The direct light if all surfaces reflected evenly, if nothing hid them from the lens, and both; never part of what
-the sensor gets."""
-_SAME = 1e-6  # of a sample's pitch
-_LIT, _KNOWN = (*PATHS, AMBIENT), (*PATHS, AMBIENT, UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED)
+"""Hypothetical variants of the direct light: with uniform reflectivity of all surfaces, without occlusion between
+surfaces and lens, and both. They serve to attribute errors; the sensor never receives them."""
+# Allowed difference between the samples of view and readout, as a fraction of the pitch: rounding of descriptions.
+_PITCH_TOLERANCE = 1e-6
+# A lens' derivative replaces the secant for positions closer than this fraction of the region.
+_MIN_SECANT = 1e-6
+_RECEIVED, _KNOWN = (*PATHS, AMBIENT), (*PATHS, AMBIENT, UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED)
 
 
 class GroundTruth(NamedTuple):
-    """Where the sheet's light truly is, each array (..., samples).
+    """True position of the lit surface in each sample, arrays (..., samples).
 
     Attributes
     ----------
     g, h
-        In the sheet of light [m]; NaN where no lit surface is seen.
+        float64, point in the sheet of light [m]; NaN where no lit surface is visible.
     status
-        uint8 `Status` flags: LOW_SIGNAL (there is none), AMBIGUOUS (there are several).
+        uint8 `Status` flags: LOW_SIGNAL (no lit surface is visible), AMBIGUOUS (several are).
     """
 
-    g: Any
-    h: Any
-    status: Any
+    g: npt.NDArray[Any]
+    h: npt.NDArray[Any]
+    status: npt.NDArray[Any]
 
 
 class Reading(NamedTuple):
-    """What a simulated sensor says, each array (..., samples).
+    """Reading of a simulated sensor, arrays (..., samples).
 
     Attributes
     ----------
     position
-        Along u [sensor unit]; NaN where the status does not allow a value.
+        float64, position along u [sensor unit]; NaN where the status allows no value.
     g, h
-        The point in the sheet of light [m].
+        float64, point in the sheet of light [m].
     sigma
-        Standard deviation of h that the sensor's noise makes [m].
+        float64, standard deviation of h from the sensor's noise [m].
     strength
-        Light that was read, in the sensor's own unit (ampere; grey levels).
+        float64, light of the reading in the unit of the readout (A for PSDs, grey levels for cameras).
     width
-        Samples of the light's run over the threshold; NaN on a PSD, which does not know.
+        float64, number of pixels of the line over the threshold; NaN for PSDs.
     status
         uint8 `Status` flags.
     """
@@ -72,19 +75,19 @@ class Reading(NamedTuple):
 
 
 class Simulator(Protocol):
-    """A sensor that reads exposures: `PsdSimulator`, `CameraSimulator`."""
+    """A simulated sensor: `PsdSimulator` or `CameraSimulator`."""
 
     @property
     def view(self) -> SensorView:
-        """What it sees."""
+        """View of the sensor."""
         ...
 
     def detected_light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
-        """Return the light by path that moves a reading: behind the mask, ambient light among it."""
+        """Return the light by path that contributes to readings: behind the mask, with the ambient light."""
         ...
 
     def signal(self, light: Exposure) -> npt.NDArray[Any]:
-        """Return what light behind the mask adds to what is read; signals add."""
+        """Return the signal of light behind the mask. The signal of a sum of exposures is the sum of their signals."""
         ...
 
     def heights(self, signal: npt.NDArray[Any], device: Device | None = None) -> Float64:
@@ -99,19 +102,19 @@ class Simulator(Protocol):
         first_profile: int = 0,
         device: Device | None = None,
     ) -> Reading:
-        """Read a block of profiles."""
+        """Simulate and read a block of profiles."""
         ...
 
 
 def stack_profiles(profiles: Sequence[Mapping[str, Exposure]]) -> dict[str, Exposure]:
-    """Join the light of profiles, each (samples, bins) by path, to blocks (profiles, samples, bins).
+    """Stack the light of profiles, (samples, bins) by path, to a block (profiles, samples, bins) by path.
 
-    A path that a profile lacks is dark there.
+    A path that a profile lacks is dark in that profile.
 
     Raises
     ------
     ValueError
-        There is no profile, or a profile has no light at all.
+        There is no profile, or a profile has no path.
     """
     names = list(dict.fromkeys(name for each in profiles for name in each))
     if not names or not all(profiles):
@@ -125,12 +128,12 @@ def stack_profiles(profiles: Sequence[Mapping[str, Exposure]]) -> dict[str, Expo
 
 
 def dark_exposure(exposures: Mapping[str, Exposure]) -> Exposure:
-    """Return no light, of the shape of the others'.
+    """Return an exposure without light, of the shape of the given ones.
 
     Raises
     ------
     ValueError
-        There are no others.
+        There is no exposure.
     """
     if not exposures:
         raise ValueError(f"expected light of one path or more; paths are {', '.join(PATHS)}")
@@ -139,19 +142,19 @@ def dark_exposure(exposures: Mapping[str, Exposure]) -> Exposure:
 
 
 def total_exposure(exposures: Mapping[str, Exposure]) -> Exposure:
-    """Return the light of all paths and what is ambient together.
+    """Return the sum of the light of all paths and the ambient light. Hypothetical variants are not added.
 
     Raises
     ------
     ValueError
-        A name is unknown, or shapes differ.
+        A path is unknown, or shapes differ.
     """
     for name in exposures:
         if name not in _KNOWN:
             raise ValueError(f"unknown path {name!r}, expected some of {', '.join(_KNOWN)}")
     if len({each.power.shape for each in exposures.values()}) > 1:
         raise ValueError("the paths' light has different shapes, expected one (..., samples, bins)")
-    lit = [exposures[name] for name in _LIT if name in exposures] or [dark_exposure(exposures)]
+    lit = [exposures[name] for name in _RECEIVED if name in exposures] or [dark_exposure(exposures)]
     return Exposure(_sum([each.power for each in lit]), _sum([each.moment for each in lit]))
 
 
@@ -163,12 +166,21 @@ def _sum(parts: Sequence[Float64]) -> Float64:
 
 
 def add_ambient(view: SensorView, exposures: Mapping[str, Exposure], power: float) -> dict[str, Exposure]:
-    """Return the light and, beside its paths, ambient light that is even along every sample: a power a sample [W].
+    """Return the light with added ambient light, uniform along u.
+
+    Parameters
+    ----------
+    view
+        View of the sensor.
+    exposures
+        Light by path, (..., samples, bins).
+    power
+        Ambient power of each sample [W].
 
     Raises
     ------
     ValueError
-        There is no path's light, or it is not of the view's samples and bins.
+        There is no light path, or a shape does not fit the view.
     """
     if exposures.keys().isdisjoint(PATHS):
         raise ValueError(
@@ -186,17 +198,17 @@ def add_ambient(view: SensorView, exposures: Mapping[str, Exposure], power: floa
 
 
 def profile_generators(seed: int, first_profile: int, profiles: tuple[int, ...]) -> list[np.random.Generator]:
-    """Return random numbers for profiles `first`, `first` + 1, ...: each profile's depend on its number alone."""
+    """Return a random generator for each profile; its state depends only on the seed and the profile's number."""
     return [np.random.default_rng([seed, first_profile + each]) for each in range(math.prod(profiles))]
 
 
 def check_not_negative(simulator: Any, *names: str) -> None:
-    """Check parameters.
+    """Check that parameters of a simulator are finite numbers, 0 or more.
 
     Raises
     ------
     TypeError, ValueError
-        One is not a finite number of 0 or more.
+        A parameter is not.
     """
     for name in names:
         if finite(getattr(simulator, name), f"{type(simulator).__name__}.{name}") < 0.0:
@@ -204,45 +216,45 @@ def check_not_negative(simulator: Any, *names: str) -> None:
 
 
 def check_sample_axes(view: SensorView, origin: float, pitch: float) -> None:
-    """Check that a readout's axes place the samples where the view has them.
+    """Check that the axes of a readout have the samples of the view.
 
     Raises
     ------
     ValueError
-        They do not.
+        The positions differ.
     """
     expected = np.sort(origin + pitch * np.arange(view.samples))
-    if np.any(np.abs(view.v_centres - expected) > _SAME * abs(pitch)):
+    if np.any(np.abs(view.v_centres - expected) > _PITCH_TOLERANCE * abs(pitch)):
         raise ValueError(
-            f"the view's samples lie about v = {view.v_centres[0]:g} ... {view.v_centres[-1]:g}, the readout's axes "
+            f"the view's samples are at v = {view.v_centres[0]:g} ... {view.v_centres[-1]:g}, the readout's axes "
             f"place them at {expected[0]:g} ... {expected[-1]:g}; expected the same"
         )
 
 
-def make_reading(view: SensorView, said: Any, u: Float64, sigma_u: Float64, *, backward: bool) -> Reading:
-    """Return what a readout says as a simulator's reading.
+def make_reading(view: SensorView, readout: Any, u: Float64, sigma_u: Float64, *, backward: bool) -> Reading:
+    """Convert the result of a readout to a `Reading`.
 
     Parameters
     ----------
     view
-        Of the sensor.
-    said
+        View of the sensor.
+    readout
         `PsdReading` or `LineReading`.
     u, sigma_u
-        Its position and the standard deviation of that [sensor unit].
+        Position and its standard deviation [sensor unit].
     backward
-        The readout's samples run against the view's.
+        True: the samples of the readout are in the opposite order to those of the view.
     """
     step = -1 if backward else 1
-    width = getattr(said, "width", np.full(u.shape, np.nan))
-    numbers = (u, said.g, said.h, sigma_u, said.total, width)
+    width = getattr(readout, "width", np.full(u.shape, np.nan))
+    numbers = (u, readout.g, readout.h, sigma_u, readout.total, width)
     u, g, h, sigma_u, strength, width = (np.asarray(each, np.float64)[..., ::step] for each in numbers)
     slope = height_secant(view.triangulation, u, u, view.v_centres)
-    return Reading(u, g, h, np.abs(slope) * sigma_u, strength, width, np.asarray(said.status)[..., ::step])
+    return Reading(u, g, h, np.abs(slope) * sigma_u, strength, width, np.asarray(readout.status)[..., ::step])
 
 
 def sheet_point(triangulation: Triangulation, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Float64, Float64]:
-    """Return (G, H) [m] of places on the sensor; NaN beyond the horizon and the lens' fold."""
+    """Return (G, H) [m] of positions on the sensor; NaN beyond the horizon and where the lens is not invertible."""
     lifted = _lifted(triangulation, u, v)[0] @ np.array(triangulation.homography).T
     with np.errstate(divide="ignore", invalid="ignore"):
         seen = lifted[..., 2] * _front(triangulation) > 0.0
@@ -251,10 +263,20 @@ def sheet_point(triangulation: Triangulation, u: npt.ArrayLike, v: npt.ArrayLike
 
 
 def height_secant(triangulation: Triangulation, u: npt.ArrayLike, other_u: npt.ArrayLike, v: npt.ArrayLike) -> Float64:
-    """Return the difference of the heights at two places over that of the places [m per sensor unit].
+    """Return the slope of the secant of the height between two positions u: Delta H / Delta u [m / sensor unit].
 
-    Exact without a lens, also where the places fall together; with one, places nearer than 1e-6 of the region use
-    the lens' derivative.
+    Parameters
+    ----------
+    triangulation
+        From the sensor to the sheet.
+    u, other_u, v
+        Positions (u, v) and (other_u, v) on the sensor [sensor unit]; broadcastable.
+
+    Notes
+    -----
+    Exact without a lens, also for coinciding positions, where it is the derivative: the difference of the two heights
+    is a product with Delta u as a factor, which cancels. With a lens, positions closer than 1e-6 of the region use the
+    derivative of the lens.
     """
     u, other_u, v = np.broadcast_arrays(*(np.asarray(each, np.float64) for each in (u, other_u, v)))
     matrix = np.array(triangulation.homography)
@@ -267,7 +289,7 @@ def height_secant(triangulation: Triangulation, u: npt.ArrayLike, other_u: npt.A
         move[..., 0] = 1.0
     else:
         (low, high), _ = triangulation.region
-        near = np.abs(apart) < 1e-6 * (high - low)
+        near = np.abs(apart) < _MIN_SECANT * (high - low)
         safe = np.where(near, 1.0, apart)[..., None]
         move = np.where(near[..., None], lens.jacobian(sensor)[..., 0], (other - one)[..., :2] / safe)
     turned = np.stack([move[..., 1], -move[..., 0], move[..., 0] * one[..., 1] - move[..., 1] * one[..., 0]], axis=-1)
@@ -277,14 +299,14 @@ def height_secant(triangulation: Triangulation, u: npt.ArrayLike, other_u: npt.A
 
 
 def height_slope(view: SensorView, truth: GroundTruth) -> tuple[Float64, Float64]:
-    """Return where true points are imaged, u, and how their height grows with it, dH/du: each (..., samples)."""
+    """Return the image positions u of true points, and dH/du there, (..., samples) each."""
     sensor = view.triangulation.to_sensor(np.stack([truth.g, truth.h], axis=-1))
     u, v = sensor[..., 0], sensor[..., 1]
     return u, height_secant(view.triangulation, u, u, v)
 
 
 def _lifted(triangulation: Triangulation, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[Float64, Float64]:
-    """Return undistorted places as (..., 3), and the measured ones (..., 2)."""
+    """Return undistorted positions in homogeneous coordinates, (..., 3), and the distorted ones, (..., 2)."""
     sensor = np.stack(np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64)), axis=-1)
     lens = triangulation.sensor_lens
     straight = sensor if lens is None else lens.undistort(sensor)

@@ -1,9 +1,9 @@
-"""A sensor's view of a scene: rays from its pixels or strips, images of points, and the light that they get.
+"""View of a sensor on a scene: rays through its pixels or strips, images of points, and exposures.
 
-Sheet and sensor move together along the transport; everything here takes the transport L of a profile. A point is
-imaged along the ray from the lens through it: where that ray meets the sheet of light, at (G, H), is the point which
-the sensor takes it for, and the triangulation says where on the sensor that is. This holds for every pinhole sensor,
-tilted or not, as the sheet and the sensor are planes.
+The sheet of light and the sensor move together along the transport; methods take the transport L of a profile. The
+image of a point is found in two steps. The ray from the lens through the point meets the sheet of light at (G, H). The
+triangulation gives the position on the sensor that sees (G, H). This holds for every pinhole sensor, tilted or not,
+because the sheet and the sensor are planes.
 """
 
 from __future__ import annotations
@@ -21,20 +21,22 @@ from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
-# Sigmas: beyond, a Gaussian has less than 3e-12 of its light.
-_SPOT = 7.0
+# Radius of a blurred spot in standard deviations: less than 3e-12 of a Gaussian is farther away.
+_SPOT_RADIUS = 7.0
+# Smallest distance of the lens from the sheet, as a fraction of its distance from the sheet's origin.
+_MIN_OFF_SHEET = 1e-9
 
 
 class Exposure(NamedTuple):
-    """Light on a sensor, in bins along u for every sample along v; exposures add.
+    """Light on a sensor, in bins along u for each sample along v. Exposures can be added.
 
     Attributes
     ----------
     power
-        (samples, bins), W.
+        float64 (samples, bins) [W].
     moment
-        (samples, bins), W times sensor unit: the sum of power times its distance from the middle of its bin, so that
-        the first moment of a strip does not depend on how fine the bins are.
+        float64 (samples, bins), power times the distance of its centroid from the bin's centre [W sensor unit]. With it
+        the first moment of a strip does not depend on the size of the bins.
     """
 
     power: Float64
@@ -46,40 +48,41 @@ class Exposure(NamedTuple):
         return Exposure(self.power + other.power, self.moment + other.moment)
 
     def total(self) -> Float64:
-        """Return the power of every sample, (samples,), W."""
+        """Return the power of each sample, (samples,) [W]."""
         return np.asarray(self.power.sum(axis=-1))
 
     def first_moment(self, u_edges: Float64) -> Float64:
-        """Return the sum of power times u of every sample, (samples,), W times sensor unit."""
+        """Return the first moment of each sample, the sum of power times u, (samples,) [W sensor unit]."""
         return np.asarray(self.moment.sum(axis=-1) + self.power @ (0.5 * (u_edges[1:] + u_edges[:-1])))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SensorView:
-    """What a pinhole sensor beside a sheet of light sees; compared by identity.
+    """View of a pinhole sensor on a sheet of light and a scene; compared by identity.
 
     Parameters
     ----------
     triangulation
-        From the sensor to the sheet, its lens distortion included.
+        Triangulation from the sensor to the sheet, with the lens distortion.
     transport
-        How sheet and sensor move over the scene.
+        Motion of sheet and sensor over the scene.
     lens
-        Where the pinhole is, in the scene, at transport 0 [m].
+        Position of the pinhole in the scene at transport 0, (3,) [m].
     u_edges
-        (bins + 1,) sensor units, ascending: in what bins along u a sample's light is kept. A PSD's strip ends at the
-        first and the last one; a camera has a bin for every pixel.
+        Edges of the bins along u, (bins + 1,), ascending [sensor unit]. For a PSD, the first and the last edge are the
+        ends of the strips; for a camera, each bin is a pixel.
     v_edges
-        (samples + 1,) sensor units, ascending: where strips or columns begin and end.
+        Edges of the strips or columns along v, (samples + 1,), ascending [sensor unit].
     aperture
-        Diameter of the lens' opening [m].
+        Diameter of the lens' aperture [m], > 0.
     axis
-        Where the lens points, in the scene; None: at what the middle of the sensor sees of the sheet.
+        Direction of the lens' optical axis in the scene, (3,). None: towards the point of the sheet that the centre of
+        the sensor sees.
 
     Raises
     ------
     TypeError, ValueError
-        A parameter is not what is said here; the lens lies in the sheet.
+        A parameter has the wrong type or is out of its range, or the lens lies in the sheet.
     """
 
     triangulation: Triangulation
@@ -96,7 +99,7 @@ class SensorView:
         object.__setattr__(self, "v_edges", _edges(self.v_edges, "SensorView.v_edges"))
         if finite(self.aperture, "SensorView.aperture") <= 0.0:
             raise ValueError(f"SensorView.aperture is {self.aperture:g} m, expected a diameter > 0")
-        if abs(self._off_sheet) <= 1e-9 * float(np.linalg.norm(self._to_sheet)):
+        if abs(self._off_sheet) <= _MIN_OFF_SHEET * float(np.linalg.norm(self._to_sheet)):
             raise ValueError("SensorView.lens lies in the sheet of light: nothing can be triangulated")
         if self.axis is not None:
             towards: npt.ArrayLike = numbers(self.axis, (3,), "SensorView.axis")
@@ -115,29 +118,29 @@ class SensorView:
 
     @property
     def bins(self) -> int:
-        """Number of bins along each of them."""
+        """Number of bins of a sample."""
         return len(self.u_edges) - 1
 
     @property
     def u_centres(self) -> Float64:
-        """Middles of the bins, (bins,)."""
+        """Centres of the bins, (bins,) [sensor unit]."""
         return 0.5 * (self.u_edges[1:] + self.u_edges[:-1])
 
     @property
     def v_centres(self) -> Float64:
-        """Middles of the samples, (samples,)."""
+        """Centres of the samples, (samples,) [sensor unit]."""
         return 0.5 * (self.v_edges[1:] + self.v_edges[:-1])
 
     def lens_at(self, L: float) -> Float64:
-        """Return where the lens is, (3,), at a transport L [m]."""
+        """Return the position of the lens, (3,) [m], at a transport L [m]."""
         return np.asarray(np.array(self.lens) + L * np.array(self.transport.direction))
 
-    # ---- where things are seen -----------------------------------------------------------------------------
+    # ---- projection and rays -------------------------------------------------------------------------------
 
     def sheet_coordinates(self, points: npt.ArrayLike, L: float = 0.0) -> Float64:
-        """Return where in the sheet a point is taken to be: (..., 3) to (G, H), (..., 2) [m].
+        """Return the apparent positions of points in the sheet: (..., 3) to (G, H), (..., 2) [m].
 
-        NaN for points that are not in front of the lens, or whose ray does not meet the sheet in front of it.
+        NaN for points that are not in front of the lens, or whose ray does not meet the sheet in front of the lens.
         """
         rays = np.asarray(points, np.float64) - self.lens_at(L)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -146,11 +149,11 @@ class SensorView:
         return self._in_sheet(met)
 
     def project(self, points: npt.ArrayLike, L: float = 0.0) -> Float64:
-        """Return where points are imaged: (..., 3) to (u, v), (..., 2); NaN as in `sheet_coordinates`."""
+        """Return the images of points: (..., 3) [m] to (u, v), (..., 2) [sensor unit]; NaN as for `sheet_coordinates`."""
         return self.triangulation.to_sensor(self.sheet_coordinates(points, L))
 
     def points_in_sheet(self, u: npt.ArrayLike, v: npt.ArrayLike, L: float = 0.0) -> Float64:
-        """Return which point of the sheet is imaged at (u, v), (..., 3) in the scene [m]; NaN beyond the horizon."""
+        """Return the points of the sheet that are imaged at (u, v), (..., 3) in the scene [m]; NaN beyond the horizon."""
         sensor = np.stack(np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64)), axis=-1)
         lens = self.triangulation.sensor_lens
         straight = sensor if lens is None else lens.undistort(sensor)
@@ -162,9 +165,9 @@ class SensorView:
         return np.asarray(place + sheet @ np.array([move.g_axis, move.h_axis]))
 
     def rays(self, u: npt.ArrayLike, v: npt.ArrayLike, L: float = 0.0) -> Float64:
-        """Return the rays on which (u, v) lies, (..., 6): the lens, and a unit vector into the scene.
+        """Return the rays through (u, v), (..., 6): position of the lens [m] and unit vector into the scene.
 
-        NaN for what looks over the horizon of the sheet.
+        NaN for positions beyond the horizon of the sheet.
         """
         lens = self.lens_at(L)
         towards = self.points_in_sheet(u, v, L) - lens
@@ -172,10 +175,11 @@ class SensorView:
         return np.concatenate([np.broadcast_to(lens, towards.shape), towards], axis=-1)
 
     def etendue(self, u: npt.ArrayLike, v: npt.ArrayLike) -> Float64:
-        """Return power over radiance of a sensor element per its area, m^2 sr per squared sensor unit.
+        """Return the etendue per area of the sensor, power over radiance [m^2 sr / sensor unit^2].
 
-        Aperture times the cosine to the lens' axis times the solid angle that the element sees; behind an untilted
-        lens this is the law of cos^4. Zero where the element looks over the horizon or away from the lens' axis.
+        It is the area of the aperture, times the cosine of the angle to the optical axis, times the solid angle that an
+        element of the sensor sees. Behind an untilted lens this is the cos^4 law. Zero for positions beyond the horizon
+        and for directions away from the optical axis.
         """
         sensor = np.stack(np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64)), axis=-1)
         lens = self.triangulation.sensor_lens
@@ -193,9 +197,9 @@ class SensorView:
         return np.where(np.isfinite(value), value, 0.0)
 
     def aperture_solid_angle(self, points: npt.ArrayLike, L: float = 0.0) -> Float64:
-        """Return power on the sensor over intensity (W/sr) of points seen, (..., 3) to (...,): the lens' solid angle.
+        """Return the solid angle of the aperture seen from points, (..., 3) to (...) [sr]; 0 behind the lens.
 
-        Zero behind the lens.
+        It is the power on the sensor [W] over the radiant intensity [W/sr] of the points.
         """
         towards = np.asarray(points, np.float64) - self.lens_at(L)
         square = np.sum(towards * towards, axis=-1)
@@ -203,22 +207,30 @@ class SensorView:
             value = self._opening * np.maximum(towards @ np.array(self.axis), 0.0) / square**1.5
         return np.where(np.isfinite(value), value, 0.0)
 
-    # ---- the light that arrives ----------------------------------------------------------------------------
+    # ---- exposures -----------------------------------------------------------------------------------------
 
     def sample_of(self, v: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """Return the samples that places v belong to; -1 where they belong to none."""
-        return _slot(self.v_edges, v)
+        """Return the samples that contain positions v; -1: none."""
+        return _interval_of(self.v_edges, v)
 
     def bin_of(self, u: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """Return the bins that places u belong to; -1 where they belong to none."""
-        return _slot(self.u_edges, u)
+        """Return the bins that contain positions u; -1: none."""
+        return _interval_of(self.u_edges, u)
 
     def dark(self) -> Exposure:
         """Return an exposure without light."""
         return Exposure(np.zeros((self.samples, self.bins)), np.zeros((self.samples, self.bins)))
 
     def deposit_spots(self, u: npt.ArrayLike, v: npt.ArrayLike, power: npt.ArrayLike) -> Exposure:
-        """Return the exposure by spots of light at (u, v) of some power [W]; what falls off the sensor is lost."""
+        """Return the exposure by point-like spots of light; light beside the sensor is lost.
+
+        Parameters
+        ----------
+        u, v
+            Positions of the spots [sensor unit].
+        power
+            Power of the spots [W]; all three are broadcast.
+        """
         u, v, power = (np.ravel(each) for each in np.broadcast_arrays(u, v, power))
         sample, place = self.sample_of(v), self.bin_of(u)
         on = (sample >= 0) & (place >= 0)
@@ -230,18 +242,26 @@ class SensorView:
         return Exposure(np.asarray(total.reshape(shape), np.float64), np.asarray(moment.reshape(shape), np.float64))
 
     def blur(self, exposure: Exposure, sigma: float) -> Exposure:
-        """Return the exposure behind a lens that images a point as a Gaussian along u, sigma in sensor units.
+        """Return an exposure blurred along u by a Gaussian point spread function.
 
-        The light of a bin is taken as a spot at its centre of gravity. What comes to lie beyond the sensor's ends, and
-        what is more than 7 sigma away, is lost.
+        Parameters
+        ----------
+        exposure
+            (samples, bins). The light of a bin is treated as a spot at its centroid.
+        sigma
+            Standard deviation of the image of a point [sensor unit], 0 or more.
+
+        Notes
+        -----
+        Light beyond the ends of the sensor, or more than 7 sigma from its spot (3e-12 of it), is lost.
         """
         if sigma == 0.0:
             return exposure
         sample, place = np.nonzero(exposure.power)
         light = exposure.power[sample, place]
         at = self.u_centres[place] + exposure.moment[sample, place] / light
-        first = np.maximum(np.searchsorted(self.u_edges, at - _SPOT * sigma) - 1, 0)
-        last = np.minimum(np.searchsorted(self.u_edges, at + _SPOT * sigma), self.bins)
+        first = np.maximum(np.searchsorted(self.u_edges, at - _SPOT_RADIUS * sigma) - 1, 0)
+        last = np.minimum(np.searchsorted(self.u_edges, at + _SPOT_RADIUS * sigma), self.bins)
         widest = int(np.max(last - first, initial=0))
         bins = np.minimum(first[:, None] + np.arange(widest + 1), self.bins)
         edges = (self.u_edges[bins] - at[:, None]) / sigma
@@ -250,12 +270,12 @@ class SensorView:
         bins = np.minimum(bins[:, :-1], self.bins - 1)
         first_moment = -sigma * light[:, None] * np.diff(bell, axis=1)
         moment = first_moment + (at[:, None] - self.u_centres[bins]) * power
-        slot = (sample[:, None] * self.bins + bins).ravel()
+        index = (sample[:, None] * self.bins + bins).ravel()
         shape, size = (self.samples, self.bins), self.samples * self.bins
-        whole = (np.bincount(slot, each.ravel(), minlength=size).reshape(shape) for each in (power, moment))
-        return Exposure(*(np.asarray(each, np.float64) for each in whole))
+        sums = (np.bincount(index, each.ravel(), minlength=size).reshape(shape) for each in (power, moment))
+        return Exposure(*(np.asarray(each, np.float64) for each in sums))
 
-    # ---- what follows from the parameters ------------------------------------------------------------------
+    # ---- derived quantities --------------------------------------------------------------------------------
 
     @property
     def _matrix(self) -> Float64:
@@ -263,7 +283,7 @@ class SensorView:
 
     @property
     def _front(self) -> float:
-        """The sign of the homography's third coordinate in front of the sensor."""
+        """Sign of the homography's third coordinate for points in front of the sensor."""
         middle = np.mean(np.array(self.triangulation.region), axis=1)
         return float(np.sign(self._matrix[2] @ [*middle, 1.0]))
 
@@ -274,7 +294,7 @@ class SensorView:
 
     @property
     def _metric(self) -> float:
-        """Area in the scene per unit of G and H."""
+        """Area in the scene per unit area of (G, H)."""
         return float(np.linalg.norm(np.cross(self.transport.g_axis, self.transport.h_axis)))
 
     @property
@@ -290,7 +310,7 @@ class SensorView:
         return 0.25 * math.pi * self.aperture**2
 
     def _in_sheet(self, from_lens: Float64) -> Float64:
-        """Return (G, H) of points of the sheet, given from the lens."""
+        """Return (G, H) of points of the sheet, given relative to the lens."""
         axes = np.array([self.transport.g_axis, self.transport.h_axis])
         return np.asarray((from_lens - self._to_sheet) @ np.linalg.pinv(axes))
 
@@ -298,13 +318,13 @@ class SensorView:
 def _edges(values: npt.ArrayLike, what: str) -> Float64:
     edges = np.array(values, np.float64)
     if edges.ndim != 1 or len(edges) < 2 or not np.isfinite(edges).all() or np.any(np.diff(edges) <= 0.0):
-        raise ValueError(f"{what}: expected two or more numbers, each larger than the one before")
+        raise ValueError(f"{what}: expected two or more numbers in ascending order")
     edges.flags.writeable = False
     return edges
 
 
-def _slot(edges: Float64, values: npt.ArrayLike) -> npt.NDArray[np.int64]:
-    """Return between which edges values lie; the last edge belongs to the last slot."""
+def _interval_of(edges: Float64, values: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """Return the intervals between edges that contain values, -1: none; the last edge belongs to the last interval."""
     values = np.asarray(values, np.float64)
     at = np.searchsorted(edges, values, side="right") - 1
     at = np.where(values == edges[-1], len(edges) - 2, at)

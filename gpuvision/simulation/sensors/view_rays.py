@@ -1,4 +1,4 @@
-"""What surface every bin of a sensor sees: the receivers of secondary light, and what each sends to the sensor."""
+"""Surfaces visible in each bin of a sensor: receivers of secondary light, and their weights on the sensor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.rays import ClosestHit
 from gpuvision.simulation.scene.scene import Scene
@@ -20,17 +20,17 @@ Float64 = npt.NDArray[np.float64]
 
 
 class VisibleSurface(NamedTuple):
-    """Surface elements that a sensor sees; n = bins times nodes of a bin, those of a bin side by side.
+    """Surface elements that a sensor sees; n is bins times nodes per bin, the nodes of a bin contiguous.
 
     Attributes
     ----------
     receivers
-        (samples, n, 6): places on the surface [m] and its unit normals, on the side that the lens sees; zero where
-        nothing is seen.
+        float64 (samples, n, 6), positions on the surface [m] and unit normals on the side of the lens; 0 where nothing
+        is visible.
     weights
-        (samples, n): power on the sensor [W] per irradiance [W/m^2] of the element; 0 where nothing is seen.
+        float64 (samples, n), power on the sensor [W] per irradiance [W/m^2] of the element; 0 where nothing is visible.
     triangle
-        int32 (samples, n): number in the scene, -1 where nothing is seen.
+        int32 (samples, n), number of the triangle in the scene; -1 where nothing is visible.
     """
 
     receivers: Float64
@@ -40,29 +40,29 @@ class VisibleSurface(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ViewRays:
-    """Rays through the bins of a sensor, Gauss and Legendre's nodes in each; compared by identity.
+    """Rays through the bins of a sensor, at the nodes of a Gauss-Legendre quadrature; compared by identity.
 
     Parameters
     ----------
     view
-        The sensor.
+        View of the sensor.
     scene, materials
-        What it sees; a material for every number in `Scene.material`.
+        The scene, and a material for every index in `Scene.material`.
     nodes
-        Rays per bin along u and along v. What is smooth across a bin is integrated to order 2 n; the rim of a surface
-        within a bin to first order.
+        Nodes per bin along u and along v, 1 or more each. The quadrature of n nodes is exact to order 2 n for smooth
+        light in a bin, and of first order at the edge of a surface within a bin.
     device
-        Where rays are traced; None: `Device.best`.
+        Device on which rays are traced; None: `Device.best`.
 
     Raises
     ------
     ValueError
-        A triangle's material is missing.
+        The material of a triangle is missing.
 
     Notes
     -----
-    An element sends albedo / pi of its irradiance towards the lens: that light comes from all around, so a rough
-    surface (`OrenNayar`) is taken for `Lambert`'s of the same albedo.
+    An element sends albedo / pi times its irradiance towards the lens. Secondary light arrives from all directions, so a
+    rough diffuse surface (`OrenNayar`) is treated as `Lambert` with the same albedo.
     """
 
     view: SensorView
@@ -81,32 +81,32 @@ class ViewRays:
         view, (along_u, along_v) = self.view, self.nodes
         u, by_u = _nodes(view.u_edges, along_u)
         v, by_v = _nodes(view.v_edges, along_v)
-        # (samples, nodes along v, bins, nodes along u) to (samples, bins * nodes).
+        # Broadcast to (samples, nodes along v, bins, nodes along u), then reorder to (samples, bins * nodes).
         v, by_v = (each.reshape(view.samples, along_v, 1, 1) for each in (v, by_v))
         u, by_u = (each.reshape(1, 1, view.bins, along_u) for each in (u, by_u))
         weights = view.etendue(u, v) * by_u * by_v / math.pi
         rays = view.rays(u, v)
         n = view.bins * along_u * along_v
-        object.__setattr__(self, "u", np.ascontiguousarray(_side_by_side(np.broadcast_to(u, weights.shape))[0].ravel()))
-        object.__setattr__(self, "_weights", _side_by_side(weights).reshape(view.samples, n))
-        object.__setattr__(self, "_rays", _side_by_side(rays).reshape(view.samples, n, 6))
-        object.__setattr__(self, "_table", _table_of(self.scene, self.materials))
+        object.__setattr__(self, "u", np.ascontiguousarray(_nodes_last(np.broadcast_to(u, weights.shape))[0].ravel()))
+        object.__setattr__(self, "_weights", _nodes_last(weights).reshape(view.samples, n))
+        object.__setattr__(self, "_rays", _nodes_last(rays).reshape(view.samples, n, 6))
+        object.__setattr__(self, "_table", _triangle_table(self.scene, self.materials))
         device = Device.best() if self.device is None else self.device
         real = np.dtype(np.float64 if device.has_double else np.float32)
         cast = ClosestHit(scene=self.scene, precision="single")
         object.__setattr__(self, "_closest", cast.bind(device, (view.samples, n, 6), real))
 
     def visible_surface(self, L: float) -> VisibleSurface:
-        """Return what is seen at a transport L [m]."""
+        """Trace the rays at a transport L [m], and return the visible surface elements."""
         rays = self._rays + np.concatenate([L * np.array(self.view.transport.direction), np.zeros(3)])
         self._closest.inputs[0].set(rays.astype(self._closest.inputs[0].dtype))
         hits = self._closest.run()
-        triangle = hits.triangle.get()
+        triangle = to_numpy(hits.triangle)
         seen = triangle >= 0
         at = np.where(seen, triangle, 0)
         corner, normal, albedo = (each[at] for each in self._table)
         origin, towards = rays[..., :3], rays[..., 3:]
-        # On the ray and on the triangle in double, however single the ray that found it was.
+        # The position is computed again in double: the tracing in single precision only selects the triangle.
         slope = np.sum(normal * towards, axis=-1)
         way = np.sum(normal * (corner - origin), axis=-1) / np.where(seen, slope, 1.0)
         places = origin + np.where(seen, way, 0.0)[..., None] * towards
@@ -115,7 +115,15 @@ class ViewRays:
         return VisibleSurface(receivers, np.where(seen, self._weights * albedo, 0.0), triangle)
 
     def exposure(self, seen: VisibleSurface, irradiance: Float64) -> Exposure:
-        """Return what the sensor gets from the irradiance [W/m^2] of what it sees, (samples, n)."""
+        """Return the exposure of the sensor by irradiated surface elements.
+
+        Parameters
+        ----------
+        seen
+            Result of `visible_surface`.
+        irradiance
+            float64 (samples, n), irradiance of the elements [W/m^2].
+        """
         power = np.where(seen.weights > 0.0, seen.weights * irradiance, 0.0)
         shape = (self.view.samples, self.view.bins, -1)
         beside = self.u.reshape(self.view.bins, -1) - self.view.u_centres[:, None]
@@ -123,8 +131,8 @@ class ViewRays:
         return Exposure(held.sum(axis=-1), np.sum(held * beside, axis=-1))
 
 
-def _table_of(scene: Scene, materials: Sequence[Material]) -> tuple[Float64, Float64, Float64]:
-    """Return a corner, the normal and the albedo of every triangle; of one without area where there is none."""
+def _triangle_table(scene: Scene, materials: Sequence[Material]) -> tuple[Float64, Float64, Float64]:
+    """Return a corner, the normal and the albedo of each triangle; one row of zeros for an empty scene."""
     if not len(scene.corners):
         return np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1)
     assert scene.material is not None  # set by Scene itself
@@ -137,16 +145,18 @@ def check_materials(scene: Scene, materials: Sequence[Material]) -> None:
     Raises
     ------
     ValueError
-        One has none.
+        The material of a triangle is missing.
     """
     assert scene.material is not None  # set by Scene itself
     highest = int(scene.material.max(initial=-1))
     if highest >= len(materials):
-        raise ValueError(f"the scene has materials 0 to {highest}, {len(materials)} are given; expected one for each")
+        raise ValueError(
+            f"the scene has materials 0 to {highest}, but {len(materials)} are given; expected one for each"
+        )
 
 
 def unit_normals(scene: Scene) -> Float64:
-    """Return the normals of a scene's triangles as they are wound, (n, 3); zero where one has no area."""
+    """Return the unit normals of a scene's triangles by their winding, (n, 3); 0 for triangles without area."""
     one, two = scene.corners[:, 1] - scene.corners[:, 0], scene.corners[:, 2] - scene.corners[:, 0]
     normal = np.cross(one, two)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -154,12 +164,12 @@ def unit_normals(scene: Scene) -> Float64:
 
 
 def _nodes(edges: Float64, count: int) -> tuple[Float64, Float64]:
-    """Return Gauss and Legendre's nodes between edges, and their weights, (slots, count)."""
+    """Return Gauss-Legendre nodes and weights for each interval between edges, (intervals, count) each."""
     node, weight = np.polynomial.legendre.leggauss(count)
     half = 0.5 * np.diff(edges)[:, None]
     return 0.5 * (edges[1:] + edges[:-1])[:, None] + half * node, half * weight
 
 
-def _side_by_side(array: Float64) -> Float64:
-    """Turn (samples, nodes along v, bins, nodes along u, ...): both nodes of a bin last."""
+def _nodes_last(array: Float64) -> Float64:
+    """Reorder (samples, nodes along v, bins, nodes along u, ...) to (samples, bins, nodes along v, nodes along u, ...)."""
     return np.ascontiguousarray(array.swapaxes(1, 2))

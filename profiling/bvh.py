@@ -19,7 +19,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.scene.bvh import Bvh
 from gpuvision.simulation.scene.rays import AnyHit
@@ -82,7 +82,7 @@ def _any_hit(device: Device, name: str, mesh: Any, shuffled: bool) -> Case:
         return list(pool.map(query, queries))
 
     bound.run()
-    occluded = bound.outputs.occluded.get() != 0
+    occluded = to_numpy(bound.outputs.occluded) != 0
     disagree = float(np.mean((np.concatenate(embree()) == 0) != occluded))
     facts = {"triangles": len(mesh.faces), "segments": len(segments), "occluded": float(np.mean(occluded))}
     return Case("bvh", f"any-hit/{name}", bound.run, {"embreex": embree}, disagree, facts=facts)

@@ -22,7 +22,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from gpuvision.host import Device, Precision
+from gpuvision.host import Device, Precision, to_numpy
 from gpuvision.profiling.occluded_irradiance import Board
 from gpuvision.ranging.range_image import Vector
 from gpuvision.simulation.scene.rays import ClosestHit
@@ -133,7 +133,7 @@ class LitScene:
 
     def _seen(self, film: Float64) -> tuple[Float64, Float64, NDArray[np.bool_]]:
         rays = np.concatenate([film, np.broadcast_to(self.towards, film.shape)], axis=-1)
-        triangle = ClosestHit(scene=self.scene)(rays).triangle
+        triangle = to_numpy(ClosestHit(scene=self.scene)(rays).triangle)
         seen = triangle >= 0
         normal, corner = unit_normals(self.scene)[triangle], self.scene.corners[triangle, 0]
         slope = np.where(seen, normal @ self.towards, -1.0)

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.scene.reflectance import Brdf, Ggx, Reflectance, Ward
 
@@ -82,7 +82,7 @@ def _case(device: Device, name: str, model: Brdf, peer: Callable[..., None]) -> 
     directions[:, [2, 5]] = np.abs(directions[:, [2, 5]])
     bound = Reflectance(model=model).bind(device, directions.shape, directions.dtype)
     bound.inputs[0].set(directions)
-    ours = bound.run().value.get()
+    ours = to_numpy(bound.run().value)
     parameters = np.array(model.parameters, np.float32)
     value, status = np.empty(len(directions), np.float32), np.empty(len(directions), np.uint8)
     peer(directions, parameters, value, status)

@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.bvh import board, embree_scene
 from gpuvision.profiling.harness import Case
 from gpuvision.simulation.scene.scene import Scene
@@ -39,11 +39,12 @@ def _case(device: Device, name: str, mesh: Any) -> Case:
     scene = Scene.of(mesh)
     bound = VisibleIntervals(scene=scene).bind(device, fans.shape, fans.dtype)
     bound.inputs[0].set(fans)
-    ours = _shown(bound.run().intervals.get())
+    ours = _shown(to_numpy(bound.run().intervals))
     exact = VisibleIntervals(scene=scene, precision="double" if device.has_double else "single", max_intervals=49)(
         fans, device=device
     )
-    truth, known = _shown(exact.intervals), (exact.status == 0) & (bound.outputs.status.get() == 0)
+    truth = _shown(to_numpy(exact.intervals))
+    known = (to_numpy(exact.status) == 0) & (to_numpy(bound.outputs.status) == 0)
     peer = _Samples(scene, fans)
     facts = {"triangles": len(mesh.faces), "fans": _FANS, "peer_error": _error(peer(), truth, known)}
     return Case("visible_intervals", name, bound.run, {"embreex": peer}, _error(ours, truth, known), facts=facts)

@@ -57,7 +57,7 @@ def test_materials_come_in_the_order_of_the_file(tmp_path):
         ("", r"no table \[\[material\]\]"),
         ("material = 3", r"tables \[\[material\]\]"),
         ("[[material]]\nalbedo = 1.5", r"material\[0\].albedo is 1.5"),
-        ("[[material]]\nalbedo = 0.5\nmirror = 0.7", r"material\[0\]: Material throws back 1.20"),
+        ("[[material]]\nalbedo = 0.5\nmirror = 0.7", r"material\[0\]: Material reflects 1.20"),
         ("[[material]]\nalbedo = 0.5\n[[material]]\nname = 'x'", r"material\[1\].albedo' is missing"),
         ("[[material]]\nalbedo = 0.5\nroughness = 0.1\nslope_sigma = 0.1", "both roughness and slope_sigma"),
         ("[[material]]\nalbedo = 0.5\ngloss = {model = 'fong'}", "did you mean"),

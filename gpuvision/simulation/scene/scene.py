@@ -174,7 +174,7 @@ class Scene:
             scene = cls.of(trimesh.load(os.fspath(path), process=False), metres=metres)
         except _READ_ERRORS as error:
             raise ValueError(
-                f"{os.fspath(path)}: not a readable mesh; the file is damaged, truncated, or not a mesh"
+                f"{os.fspath(path)}: not a readable mesh (damaged, truncated or another format)"
             ) from error
         if not len(scene.corners):
             raise ValueError(f"{os.fspath(path)}: contains no triangles")

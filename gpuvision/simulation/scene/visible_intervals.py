@@ -35,7 +35,7 @@ class Intervals(NamedTuple):
     ----------
     intervals
         Real (..., max_intervals, 2), start and end of each part, 0 to 1, in ascending order; NaN after the last part.
-    count
+    interval_count
         uint8 (...,), number of parts.
     status
         uint8 `Status` flags, (...,): NOT_FINITE (a number of the input is not finite), AMBIGUOUS (there are more than
@@ -43,7 +43,7 @@ class Intervals(NamedTuple):
     """
 
     intervals: FloatArray
-    count: StatusArray
+    interval_count: StatusArray
     status: StatusArray
 
 
@@ -115,7 +115,7 @@ class VisibleIntervals(VisionOperation[Intervals]):
             inputs=[(shape, dtype)],
             outputs={
                 "intervals": ((*where, self.max_intervals, 2), real),
-                "count": (where, np.dtype(np.uint8)),
+                "interval_count": (where, np.dtype(np.uint8)),
                 "status": (where, np.dtype(np.uint8)),
             },
             arguments=[

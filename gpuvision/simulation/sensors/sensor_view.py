@@ -149,11 +149,11 @@ class SensorView:
         return self._in_sheet(met)
 
     def project(self, points: npt.ArrayLike, L: float = 0.0) -> Float64:
-        """Return the images of points: (..., 3) [m] to (u, v), (..., 2) [sensor unit]; NaN as for `sheet_coordinates`."""
+        """Return the images (u, v) of points: (..., 3) [m] to (..., 2) [sensor unit]; NaN as in `sheet_coordinates`."""
         return self.triangulation.to_sensor(self.sheet_coordinates(points, L))
 
     def points_in_sheet(self, u: npt.ArrayLike, v: npt.ArrayLike, L: float = 0.0) -> Float64:
-        """Return the points of the sheet that are imaged at (u, v), (..., 3) in the scene [m]; NaN beyond the horizon."""
+        """Return the points of the sheet imaged at (u, v), (..., 3) in the scene [m]; NaN beyond the horizon."""
         sensor = np.stack(np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64)), axis=-1)
         lens = self.triangulation.sensor_lens
         straight = sensor if lens is None else lens.undistort(sensor)

@@ -61,8 +61,8 @@ class ViewRays:
 
     Notes
     -----
-    An element sends albedo / pi times its irradiance towards the lens. Secondary light arrives from all directions, so a
-    rough diffuse surface (`OrenNayar`) is treated as `Lambert` with the same albedo.
+    An element sends albedo / pi times its irradiance towards the lens. Secondary light arrives from all directions:
+    a rough diffuse surface (`OrenNayar`) is treated as `Lambert` with the same albedo.
     """
 
     view: SensorView
@@ -171,5 +171,5 @@ def _nodes(edges: Float64, count: int) -> tuple[Float64, Float64]:
 
 
 def _nodes_last(array: Float64) -> Float64:
-    """Reorder (samples, nodes along v, bins, nodes along u, ...) to (samples, bins, nodes along v, nodes along u, ...)."""
+    """Reorder (samples, nodes along v, bins, nodes along u, ...) so that the nodes of a bin are contiguous."""
     return np.ascontiguousarray(array.swapaxes(1, 2))

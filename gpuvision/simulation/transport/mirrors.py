@@ -255,7 +255,7 @@ class Mirrors:
             some = _between(ends[row], share)
             nears = 1.0 / ((1.0 - share) / np.maximum(near[row, :1], 1e-30) + share / np.maximum(near[row, 1:], 1e-30))
             result = self._run(self._fans, np.hstack([apex[row], some.reshape(-1, 6), nears]))
-            which, slot = np.nonzero(np.arange(result.intervals.shape[1]) < result.count[:, None])
+            which, slot = np.nonzero(np.arange(result.intervals.shape[1]) < result.interval_count[:, None])
             rows.append(row[which])
             low, width = share[which, :1], np.diff(share[which])
             parts.append(low + width * result.intervals[which, slot])

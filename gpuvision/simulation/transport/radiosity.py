@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.simulation.scene.rays import ClosestHit
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import Irradiance, LitSegments
@@ -258,7 +258,8 @@ class Radiosity:
         """Return whether points see only backs of surfaces: such points are inside a body."""
         extent = float(np.ptp(scene.bvh.corners, axis=(0, 1)).max())
         clearance = self.limits.clearance * float(np.finfo(self._real).eps) * extent
-        hit = ClosestHit(scene=scene, clearance=clearance)(points.astype(self._real), device=self.device).triangle
+        hits = ClosestHit(scene=scene, clearance=clearance)(points.astype(self._real), device=self.device)
+        hit = to_numpy(hits.triangle)
         a, b, c = np.moveaxis(scene.corners[hit], 1, 0)
         behind = np.flatnonzero((hit >= 0) & (np.sum(np.cross(b - a, c - a) * points[:, 3:], axis=1) > 0.0))
         everything = np.ones(self.patches.count, self._real)

@@ -10,7 +10,7 @@ import trimesh
 
 from gpuvision.host import Device
 from gpuvision.simulation.scene.rays import ClosestHit
-from gpuvision.simulation.scene.scene import Scene, _numbered
+from gpuvision.simulation.scene.scene import Scene, _vertex_numbers
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_a_damaged_file_is_named(tmp_path: Path, ending: str, harm: str) -> None
     trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
     whole = path.read_bytes()
     path.write_bytes({"empty": b"", "cut": whole[: len(whole) // 2], "garbled": b"\x92\x00\x81mesh" * 40}[harm])
-    with pytest.raises(ValueError, match=rf"box\.{ending}: (not a readable mesh|holds no triangles)"):
+    with pytest.raises(ValueError, match=rf"box\.{ending}: (not a readable mesh|contains no triangles)"):
         Scene.load(path)
 
 
@@ -112,7 +112,7 @@ def test_the_same_points_have_the_same_number(rng: np.random.Generator) -> None:
     """Whatever the sign of a zero, and though they differ in the last bit only."""
     some = np.array([0.0, -0.0, 1.0, -1.0, np.nextafter(1.0, 2.0), 5e-324, 1e300])
     points = rng.choice(some, (3000, 3))
-    numbers = _numbered(points)
+    numbers = _vertex_numbers(points)
     _, first, expected = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
     np.testing.assert_array_equal(numbers, numbers[first][expected])
     assert len(np.unique(numbers)) == len(first)
@@ -154,5 +154,5 @@ def test_what_a_scene_does_not_take(box: np.ndarray) -> None:
         Scene(box[0])
     with pytest.raises(ValueError, match="integers"):
         Scene(box, np.zeros(3, int))
-    with pytest.raises(ValueError, match="below 0"):
+    with pytest.raises(ValueError, match="negative index"):
         Scene(box, np.full(12, -1))

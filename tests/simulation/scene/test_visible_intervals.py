@@ -34,7 +34,7 @@ def some_fans(rng: np.random.Generator, count: int, mirrors: bool) -> np.ndarray
 
 
 def parts(result: Any, n: int) -> np.ndarray:
-    return result.intervals[n, : result.count[n]]
+    return result.intervals[n, : result.interval_count[n]]
 
 
 @WAYS
@@ -51,7 +51,7 @@ def test_parts_as_the_reference_says(
     same, several = 0, 0
     for n, fan in enumerate(fans.astype(np.float64)):
         expected = reference.visible(corners, fan, least)
-        if len(expected) != result.count[n]:
+        if len(expected) != result.interval_count[n]:
             continue
         same += bool(np.all(np.abs(parts(result, n) - expected) < within))
         several += len(expected) > 1
@@ -86,7 +86,7 @@ def test_nothing_shows_between_neighbours(device: Device, variant: Any, dtype: A
     fans[:, 3:6] = 4.0 * ends / np.linalg.norm(ends, axis=1, keepdims=True)
     fans[:, 6:9] = fans[:, 3:6] + rng.normal(0.0, 0.5, (100, 3))
     result = VisibleIntervals(scene=scene, variant=variant)(fans, device=device)
-    assert not result.count.any()
+    assert not result.interval_count.any()
     assert not result.status.any()
 
 
@@ -98,7 +98,7 @@ def test_a_square_before_a_line(device: Device, variant: Any, dtype: Any) -> Non
     op = VisibleIntervals(scene=Scene(square), variant=variant)
     fans = np.array([[*fan, 0, 0], [*fan, 0.6, 0.6], [*fan, 0.4, 0.3]], dtype)
     result = op(fans, device=device)
-    np.testing.assert_array_equal(result.count, [2, 1, 2])
+    np.testing.assert_array_equal(result.interval_count, [2, 1, 2])
     expected = [[0.0, 0.5 * (1.0 - 0.22)], [0.5 * (1.0 + 0.18), 1.0]]
     for n in (0, 2):
         np.testing.assert_allclose(parts(result, n), expected, atol=1e-6 if dtype == np.float32 else 1e-12)
@@ -124,8 +124,8 @@ def test_more_parts_than_are_kept_and_numbers_that_are_none(device: Device, vari
     for kept, expected in ((4, Status.AMBIGUOUS), (40, 0)):
         result = VisibleIntervals(scene=Scene(bars), max_intervals=kept, variant=variant)(fans, device=device)
         np.testing.assert_array_equal(result.status, [expected, Status.NOT_FINITE, Status.NOT_FINITE, 0])
-        np.testing.assert_array_equal(result.count, [0 if expected else 21, 0, 0, 0])
-        assert np.isnan(result.intervals[result.count == 0]).all()
+        np.testing.assert_array_equal(result.interval_count, [0 if expected else 21, 0, 0, 0])
+        assert np.isnan(result.intervals[result.interval_count == 0]).all()
 
 
 def test_writes_only_its_outputs(device: Device, rng: np.random.Generator) -> None:

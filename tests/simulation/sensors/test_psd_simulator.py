@@ -195,7 +195,7 @@ def test_what_is_refused() -> None:
     light = {"direct": view.dark()}
     with pytest.raises(ValueError, match="strips at"):
         PsdSimulator(view=view, readout=replace(psd(view).readout, strip_length=5e-3))
-    with pytest.raises(ValueError, match="samples lie about v"):
+    with pytest.raises(ValueError, match="samples are at v"):
         PsdSimulator(view=psd_view(strips=4), readout=psd(view).readout)
     with pytest.raises(ValueError, match="layout"):
         psd(view, readout={"layout": "planar"})

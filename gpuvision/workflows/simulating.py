@@ -196,7 +196,7 @@ def prepare_simulation(
     profiles
         Number of profiles, about the middle of the part; None: all profiles that meet the part.
     transports
-        Positions of the sheet [m], in place of the sensor's own: for a second sensor on the same sheet.
+        Positions of the sheet [m] that replace the sensor's: for a second sensor on the same sheet.
 
     Raises
     ------
@@ -434,7 +434,7 @@ def _default_limit(reading: Reading) -> float:
 
 
 def _add_statistics(statistics: Mapping[str, float], block: LightBlock) -> dict[str, float]:
-    """Return the statistics with those of a block added; of bounds the larger one."""
+    """Return sums of the statistics and a block's; the larger value of bounds."""
     added = {}
     for name, each in block.statistics.items():
         before = statistics.get(name, 0.0)

@@ -66,10 +66,12 @@ class LightClustering:
     ValueError
         The tolerance or the clearance is negative or not finite.
 
-    Notes ----- Bound of one pair: the irradiance of a receiver from a segment of power W and length L is at most W
-    cos_r cos_e / (pi r^2), with the largest cosines and the least distance r of any two points, and at most W / (L r).
-    Bound of a cluster: see `gpuvision.simulation.clustering.light_tree`. Both hold with occlusion, because visibility
-    lies between 0 and 1 and a cluster is used only where no triangle can occlude any part of it.
+    Notes
+    -----
+    Bound of one pair: the irradiance of a receiver from a segment of power W and length L is at most W cos_r cos_e /
+    (pi r^2), with the largest cosines and the least distance r of any two points, and at most W / (L r). Bound of a
+    cluster: see `gpuvision.simulation.clustering.light_tree`. Both hold with occlusion, because visibility lies between
+    0 and 1 and a cluster is used only where no triangle can occlude any part of it.
     `StripErrorModel.error_per_irradiance` turns irradiance into metres of range; errors of pairs are added without
     cancellation.
 

@@ -28,7 +28,7 @@ Integers = npt.NDArray[np.int64]
 
 # Columns of a node in kernels/light_clustering/light_clustering.cl.
 COLUMNS = 24
-# Axes of a normal count, in the choice of the widest axis, as this part of the longest extent of what is lit.
+# Scale of the normals' axes in the choice of the widest axis, as part of the longest extent of the segments' midpoints.
 _NORMAL_SCALE = 0.5
 # Half length of a representative segment, in radii of the cluster, where all its points coincide: not 0, so that
 # its exitance stays finite.

@@ -189,8 +189,10 @@ class DirectLight:
     TypeError, ValueError
         A parameter has a wrong type or value; a triangle's material is missing.
 
-    Notes ----- The lit segments, their visible parts, and their division among samples and bins are exact to rounding.
-    Within a part of a line that falls into one bin, the two-point Gauss-Legendre rule is used.
+    Notes
+    -----
+    The lit segments, their visible parts, and their division among samples and bins are exact to rounding. Within a
+    part of a line that falls into one bin, the two-point Gauss-Legendre rule is used.
 
     The light of a slab is placed at the slab's mean and spread over the bins as a plane surface spreads it. So planes
     that end at edges along the sheet are exact for any number of slabs. Where the surface, its material or its shadow

@@ -46,9 +46,11 @@ def upper_envelope(group: npt.ArrayLike, x: npt.ArrayLike, height: npt.ArrayLike
     height
         (n, 2): heights there.
 
-    Notes ----- All ends of a group divide the x axis into intervals. A segment that is the highest at both ends of an
-    interval is the highest in all of it. Otherwise the segments that are highest at either end cross; the interval is
-    divided at the crossing and the test is repeated. Of coincident segments the first is taken.
+    Notes
+    -----
+    All ends of a group divide the x axis into intervals. A segment that is the highest at both ends of an interval is
+    the highest in all of it. Otherwise the segments that are highest at either end cross; the interval is divided at
+    the crossing and the test is repeated. Of coincident segments the first is taken.
 
     Where many long segments overlap, the envelopes of two halves are computed first, and then the envelope of the two:
     this takes n log n steps instead of n^2.

@@ -216,7 +216,7 @@ class LightSheet:
             The light is parallel.
         """
         if self.source is None:
-            raise ValueError("LightSheet.source is None: parallel light comes from nowhere; use `towards`")
+            raise ValueError("LightSheet.source is None: parallel light has no source; use direction_to_light")
         points, move = np.asarray(points, np.float64), self.transport
         axes = np.array([move.g_axis, move.h_axis, move.direction])
         away = np.array([*self.source, 0.0]) - (points - move.origin) @ np.linalg.inv(axes)

@@ -146,22 +146,26 @@ class LineIrradiance(VisionOperation[Irradiance]):
     TypeError
         ``segments`` is not a `LitSegments`.
 
-    Notes ----- The closed form of a differential receiver and a line in a diffuse surface, in a form without
-    cancellation (kernels/line_irradiance/line_irradiance.h): one form serves near, far and end-on receivers. Let E0 = M
-    h / pi times the integral of dt / r^3, the irradiance if the whole segment stood in the receiver's normal; E <= E0.
-    The error per segment is below 2e-6 E0 in single and 1e-14 (1 + D / h) E0 in double, at any distance: h is the
-    receiver's height above the lit surface, D the distance of the segment's far end or of the middle of all segments.
-    So the error is relative except where the receiver sees the segment at a grazing angle. On a device without double,
-    positions are single, which adds 1.2e-7 of the largest coordinate over h. The tests hold these limits at random and
-    extreme configurations.
+    Notes
+    -----
+    The closed form of a differential receiver and a line in a diffuse surface, in a form without cancellation
+    (kernels/line_irradiance/line_irradiance.h): one form serves near, far and end-on receivers. Let E0 = M h / pi times
+    the integral of dt / r^3, the irradiance if the whole segment stood in the receiver's normal; E <= E0. The error per
+    segment is below 2e-6 E0 in single and 1e-14 (1 + D / h) E0 in double, at any distance: h is the receiver's height
+    above the lit surface, D the distance of the segment's far end or of the middle of all segments. So the error is
+    relative except where the receiver sees the segment at a grazing angle. On a device without double, positions are
+    single, which adds 1.2e-7 of the largest coordinate over h. The tests hold these limits at random and extreme
+    configurations.
 
     Receivers are transformed once into a frame for all segments of one direction on surfaces of one normal, as on flat
     faces. In single, directions that differ by 1e-13 share a frame, which adds up to 1e-13 D / h.
 
     A receiver in the plane of a lit surface, or on the segment, gets no light from it.
 
-    References ---------- M. F. Cohen and J. R. Wallace, *Radiosity and Realistic Image Synthesis*, Academic Press 1993,
-    chapter 4: form factors of differential receivers, here integrated over a line.
+    References
+    ----------
+    M. F. Cohen and J. R. Wallace, *Radiosity and Realistic Image Synthesis*, Academic Press 1993, chapter 4: form
+    factors of differential receivers, here integrated over a line.
     """
 
     Result: ClassVar[type[Any]] = Irradiance

@@ -23,8 +23,8 @@ from gpuvision.status import Status
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Visible intervals of a segment that the kernel returns. A segment with more is halved, at most so many times, down to
-# a millionth of its length.
+# Visible intervals of a segment that the kernel returns, and number of times that a segment with more intervals is
+# halved: down to a millionth of its length.
 _MAX_INTERVALS, _MAX_HALVINGS = 8, 20
 # Fans of rays in one launch: a fixed shape, so that one bound kernel and one copy of the tree serve any number.
 _FANS_PER_LAUNCH = 1024
@@ -81,8 +81,10 @@ class LensVisibility:
     device
         Device of the `VisibleIntervals` kernel.
 
-    Notes ----- Ends of parts are accurate to 1e-10 of a segment (1e-5 on a device without double). Where more visible
-    parts lie within a millionth of a segment than the kernel returns, they count as hidden.
+    Notes
+    -----
+    Ends of parts are accurate to 1e-10 of a segment (1e-5 on a device without double). Where more visible parts lie
+    within a millionth of a segment than the kernel returns, they count as hidden.
     """
 
     scene: Scene

@@ -54,9 +54,11 @@ class MirrorFacets(VisionOperation[NearFacets]):
     ValueError
         The corners have a wrong shape or are not finite.
 
-    Notes ----- The test is conservative: no block that shows a part of the line is left out. A block is represented by
-    a ball and a cone of normals (`TriangleBlocks`), widened by more than rounding; the line is tested against the cone
-    of all points that these may show, bounded by tangents. Occlusion is not considered.
+    Notes
+    -----
+    The test is conservative: no block that shows a part of the line is left out. A block is represented by a ball and a
+    cone of normals (`TriangleBlocks`), widened by more than rounding; the line is tested against the cone of all points
+    that these may show, bounded by tangents. Occlusion is not considered.
     """
 
     Result: ClassVar[type[Any]] = NearFacets

@@ -242,14 +242,18 @@ class MirrorPoints(VisionOperation[MirrorImages]):
     ValueError
         A parameter lies outside its range.
 
-    Notes ----- Normal and surface are exact to second degree, so the error of an image is of third power in the
-    triangles' size over the radius of curvature, that of its density of first. One image per triangle is found:
-    triangles must be small beside distances and radii, at least a few across each image. An image on the edge of two
-    triangles is found on both. At grazing incidence, within about the angle that a triangle turns, an image may be
-    missed (measured on a sphere of 1280 triangles: 1 point in 300). Near a caustic the density is unbounded.
+    Notes
+    -----
+    Normal and surface are exact to second degree, so the error of an image is of third power in the triangles' size
+    over the radius of curvature, that of its density of first. One image per triangle is found: triangles must be small
+    beside distances and radii, at least a few across each image. An image on the edge of two triangles is found on
+    both. At grazing incidence, within about the angle that a triangle turns, an image may be missed (measured on a
+    sphere of 1280 triangles: 1 point in 300). Near a caustic the density is unbounded.
 
-    References ---------- D. P. Mitchell and P. Hanrahan, *Illumination from curved reflectors*, SIGGRAPH 1992, for
-    images and caustics of smooth reflectors by Newton's method.
+    References
+    ----------
+    D. P. Mitchell and P. Hanrahan, *Illumination from curved reflectors*, SIGGRAPH 1992, for images and caustics of
+    smooth reflectors by Newton's method.
     """
 
     Result: ClassVar[type[Any]] = MirrorImages

@@ -81,8 +81,8 @@ class Mirrors:
     normals
         (n, 3, 3): normals at the corners of all triangles; None: `smooth_normals` of the scene.
     steps_per_sample
-        A line in a curved mirror is imaged in steps: so many per sample of the sensor, measured in the sheet. More than
-        0, default 2.
+        Number of steps in which a line in a curved mirror is imaged, per sample of the sensor as measured in the sheet.
+        More than 0, default 2.
     max_reflections
         Largest number of mirrors that the light of the sheet meets one after another, 0 or more. Default 2.
     device
@@ -95,11 +95,13 @@ class Mirrors:
     ValueError
         A triangle has no material; a parameter lies outside its range.
 
-    Notes ----- Plane mirrors: exact windows, visible intervals on both sides of the reflection, images divided exactly
-    at the sensor's bins; errors are roundings. Curved mirrors: positions as `MirrorPoints` says, of second order in the
-    step, and of first order where an image ends. Lines that the lens sees are diffuse reflectors of the material's
-    albedo (`Lambert`); glossy lobes are not included. There is one mirror between line and lens. Light that curved
-    mirrors reflect to other surfaces is traced by rays, one step apart.
+    Notes
+    -----
+    Plane mirrors: exact windows, visible intervals on both sides of the reflection, images divided exactly at the
+    sensor's bins; errors are roundings. Curved mirrors: positions as `MirrorPoints` says, of second order in the step,
+    and of first order where an image ends. Lines that the lens sees are diffuse reflectors of the material's albedo
+    (`Lambert`); glossy lobes are not included. There is one mirror between line and lens. Light that curved mirrors
+    reflect to other surfaces is traced by rays, one step apart.
     """
 
     view: SensorView
@@ -140,8 +142,8 @@ class Mirrors:
         total = self.mirrored_exposure(lit, L)
         if sheet is None:
             return total
-        thrown = self.reflected_lines(lit, sheet, L + offset)
-        return total + self.direct_exposure(thrown, L) + self.mirrored_exposure(thrown, L)
+        reflected = self.reflected_lines(lit, sheet, L + offset)
+        return total + self.direct_exposure(reflected, L) + self.mirrored_exposure(reflected, L)
 
     @functools.cached_property
     def has_mirrors(self) -> bool:
@@ -344,9 +346,11 @@ class Mirrors:
         L
             Transport of the sheet [m].
 
-        Notes ----- Plane mirrors: the mirrored sheet cuts the scene exactly, and the energy is exact; `LitLine.power`
-        is a mean, as the sheet's `uniformity` says. Curved mirrors: the light is taken as even between rays that are a
-        step apart, of second order in the step; the end of a lit piece is located to 2^-12 of a step.
+        Notes
+        -----
+        Plane mirrors: the mirrored sheet cuts the scene exactly, and the energy is exact; `LitLine.power` is a mean, as
+        the sheet's `uniformity` says. Curved mirrors: the light is taken as even between rays that are a step apart, of
+        second order in the step; the end of a lit piece is located to 2^-12 of a step.
         """
         return self._interreflection.reflected_lines(lit, sheet, L, self.max_reflections)
 

@@ -114,9 +114,11 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
     TypeError, ValueError
         A parameter has a wrong type or lies outside its range.
 
-    Notes ----- The visible parts are summed by the closed form, with the errors of `LineIrradiance`. The edge of a
-    shadow moves along a segment by e D / d, if the occluding edge at distance d from the receiver is off by e and the
-    segment is D away; e is a few roundings of positions, 1e-7 or 2e-16 of the scene's size.
+    Notes
+    -----
+    The visible parts are summed by the closed form, with the errors of `LineIrradiance`. The edge of a shadow moves
+    along a segment by e D / d, if the occluding edge at distance d from the receiver is off by e and the segment is D
+    away; e is a few roundings of positions, 1e-7 or 2e-16 of the scene's size.
     """
 
     Result: ClassVar[type[Any]] = StripIrradiance

@@ -33,7 +33,8 @@ _LANES, _GROUP = 16, 64
 # In roundings of the largest coordinate: height up to which a receiver counts as in a triangle's plane, and default
 # clearance of rays.
 _LIFT, _CLEARANCE = 16.0, 64.0
-# Quadrature: a patch of fewer triangles gets three nodes on each, a larger one the centroids of so many of its largest.
+# Quadrature: a patch of fewer triangles than this gets three nodes on each; other patches get the centroids of this
+# number of their largest triangles.
 _TRIANGLES_PER_PATCH = 4
 _MESHING_LIMITS = MeshingLimits()
 # Nodes of Gauss' rule of second degree on a triangle, in barycentric coordinates.
@@ -180,7 +181,7 @@ class Patches:
     def bisected(self, wanted: npt.NDArray[np.bool_]) -> Patches:
         """Return the patches with the triangles of chosen patches halved at their longest edge.
 
-        Each half becomes a patch of its own. Patches with given `nodes` stay as they are.
+        Each half becomes a new patch. Patches with given `nodes` stay as they are.
 
         Parameters
         ----------
@@ -193,7 +194,7 @@ class Patches:
             ``wanted`` has another shape.
         """
         if np.shape(wanted) != (self.count,):
-            raise ValueError(f"Patches.bisected takes which patches, ({self.count},), got shape {np.shape(wanted)}")
+            raise ValueError(f"Patches.bisected takes a mask ({self.count},) of patches, got shape {np.shape(wanted)}")
         apart = np.array(wanted, bool)
         if self.nodes is not None:
             apart[self.nodes[1]] = False
@@ -357,20 +358,24 @@ class FormFactors(_PatchOperation[Factors]):
     TypeError, ValueError
         A parameter has a wrong type or lies outside its range.
 
-    Notes ----- Lambert's sum over the edges of each triangle, clipped at the receiver's plane, in a form without
-    cancellation for triangles that are small beside their distance (kernels/patches/patches.h). The error is below 32 f
-    (s + c / d + c / h) roundings: f is the factor that a receiver in that position would have if it faced the triangle
-    best, s the longest edge over the smallest altitude, c the distance of the farthest corner, d that of the nearest
-    line through an edge, h the height above the triangle. Below a height of 16 roundings of the largest coordinate the
-    receiver counts as in the triangle's plane, where the factor is 0. The tests hold these limits.
+    Notes
+    -----
+    Lambert's sum over the edges of each triangle, clipped at the receiver's plane, in a form without cancellation for
+    triangles that are small beside their distance (kernels/patches/patches.h). The error is below 32 f (s + c / d + c /
+    h) roundings: f is the factor that a receiver in that position would have if it faced the triangle best, s the
+    longest edge over the smallest altitude, c the distance of the farthest corner, d that of the nearest line through
+    an edge, h the height above the triangle. Below a height of 16 roundings of the largest coordinate the receiver
+    counts as in the triangle's plane, where the factor is 0. The tests hold these limits.
 
     Rays go to the middles of equal cells of the part of a triangle above the receiver's plane. The share of them that
     reach it, weighted by the cells' factors, times the exact factor is the result. A triangle that is entirely visible
     or entirely hidden is exact; the error of a partly hidden one is about F / sqrt(rays F), an estimate and not a
     bound.
 
-    References ---------- D. R. Baum, H. E. Rushmeier and J. M. Winget, *Improving radiosity solutions through the use
-    of analytically determined form-factors*, SIGGRAPH 1989, for the sum over edges (Lambert 1760).
+    References
+    ----------
+    D. R. Baum, H. E. Rushmeier and J. M. Winget, *Improving radiosity solutions through the use of analytically
+    determined form-factors*, SIGGRAPH 1989, for the sum over edges (Lambert 1760).
     """
 
     Result: ClassVar[type[Any]] = Factors

@@ -87,12 +87,14 @@ class Radiosity:
     TypeError, ValueError
         A parameter has a wrong type or lies outside its range.
 
-    Notes ----- Exitance is constant on a patch, arriving light is averaged over three nodes of it, form factors are
-    exact apart from partly hidden triangles (`FormFactors`). In a closed convex room the factors of each point add up
-    to 1 to rounding, so that energy is conserved for any number of bounces. Errors are of second order in the patches'
-    size where the light is smooth, of first order at shadow edges. Beside a lit line that runs into a wall light grows
-    as 1 / distance: `direct_irradiance` is the exact mean over each patch, and `refine_corners` makes the patches in
-    corners smaller.
+    Notes
+    -----
+    Exitance is constant on a patch, arriving light is averaged over three nodes of it, form factors are exact apart
+    from partly hidden triangles (`FormFactors`). In a closed convex room the factors of each point add up to 1 to
+    rounding, so that energy is conserved for any number of bounces. Errors are of second order in the patches' size
+    where the light is smooth, of first order at shadow edges. Beside a lit line that runs into a wall light grows as 1
+    / distance: `direct_irradiance` is the exact mean over each patch, and `refine_corners` makes the patches in corners
+    smaller.
 
     References
     ----------
@@ -197,7 +199,7 @@ class Radiosity:
         """
         first = np.asarray(arrival, np.float64)
         if first.shape != (self.patches.count,) or not np.isfinite(first).all():
-            raise ValueError(f"Radiosity.exitance takes finite irradiances ({self.patches.count},), got {first.shape}")
+            raise ValueError(f"Radiosity.solve takes finite irradiances ({self.patches.count},), got {first.shape}")
         return self._solve_system(self.albedo * first)
 
     def irradiance(
@@ -325,7 +327,7 @@ class _Surface(NamedTuple):
 
 
 _NO_STEADY_STATE = (
-    "Radiosity: no steady state: hardly any light gets out of the scene or is absorbed; "
+    "Radiosity: no steady state: hardly any light leaves the scene or is absorbed; "
     "expected an opening, or an albedo below 1"
 )
 

@@ -51,7 +51,7 @@ class Cuts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SheetIndex:
-    """Triangles of a scene in the transport's coordinates, sorted for the search of those that a sheet cuts.
+    """Triangles of a scene in the transport's coordinates, sorted so that a sheet's cuts are found quickly.
 
     A triangle with a corner in the sheet is cut as if the sheet stood just before the corner. A triangle that lies in
     the sheet is not cut. Instances are compared by identity.

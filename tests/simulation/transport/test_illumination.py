@@ -336,7 +336,7 @@ def test_where_a_fan_comes_from() -> None:
     )
     upright = SHEETS["tilted"]
     np.testing.assert_allclose(np.cross(upright.direction_to_light(np.zeros((4, 3))), move.h_axis), 0.0, atol=1e-15)
-    with pytest.raises(ValueError, match=r"parallel light comes from nowhere"):
+    with pytest.raises(ValueError, match=r"parallel light has no source"):
         upright.source_positions(point)
 
 

@@ -1,8 +1,8 @@
-"""Segments against a board with parts: AnyHit against Embree, and the build of the tree.
+"""Benchmark of `AnyHit` and of the BVH construction on a board with parts, compared with Embree.
 
-From points all over the board's surfaces to a line of light on it, the shadow rays of a simulation. Embree runs its
-occlusion query in one big call per core, which it serves best. The column `error` of these cases is the part of the
-segments on which the two disagree (silhouettes, by rounding).
+The segments are the shadow rays of a simulation: from points on all surfaces of the board to a line of light on it.
+Embree runs its occlusion query in one call per core, the fastest way to use it. The column `error` is the fraction of
+segments for which the two results differ (at silhouettes, by rounding).
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from gpuvision.simulation.scene.rays import AnyHit
 from gpuvision.simulation.scene.scene import Scene
 
 _PARTS, _RECEIVERS, _SAMPLES = 40, 4000, 64
-_LIFT = 1e-5  # metres, off the surface that a segment starts on
+_LIFT = 1e-5  # distance of a segment's start from the surface [m]
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield segments in order and shuffled, finer boards of the same shape, and builds."""
+    """Yield ordered and shuffled segments on a board, a board with smaller triangles, and a BVH construction."""
     for name, finer, shuffled in (("board", 0, False), ("board-shuffled", 0, True), ("board-fine", 3, False)):
         yield _any_hit(device, name, board(finer), shuffled)
     yield _build(board(3), "1e5")
 
 
 def board(finer: int) -> Any:
-    """Return a board of 100 mm x 80 mm with boxes and cylinders, each triangle cut into four so often."""
+    """Return a board of 100 mm x 80 mm with boxes and cylinders, subdivided `finer` times (4 triangles of each one)."""
     rng = np.random.default_rng(1)
     plate = trimesh.creation.box((0.1, 0.08, 0.0016)).subdivide().subdivide().subdivide()
     parts = [plate.apply_translation((0.0, 0.0, -0.0008))]
@@ -90,7 +90,7 @@ def _any_hit(device: Device, name: str, mesh: Any, shuffled: bool) -> Case:
 
 def _build(mesh: Any, size: str) -> Case:
     corners = np.asarray(mesh.triangles)
-    # Of embreex's time the larger part goes into handing over the triangles, not into the tree.
+    # Most of embreex's time is the transfer of the triangles; peer_tree_s is the construction alone.
     facts = {"triangles": len(corners), "peer_tree_s": min(_embree_tree_time(corners) for _ in range(3))}
     peers = {"embreex": lambda: embree_scene(corners)}
     return Case("bvh", f"build/{size}", lambda: Bvh.build(corners), peers, 0.0, facts=facts)

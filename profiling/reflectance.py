@@ -1,7 +1,7 @@
-"""Reflectance of pairs of directions against Numba: both cores, single, columns of a block, free of branches.
+"""Benchmark of `Reflectance`, compared with Numba: all cores, single precision, blocks by columns, without branches.
 
-A smooth metal (GGX) and a brushed one (Ward, with its exponential). Errors are over the largest reflectance, against
-`Brdf.value` in double; the peer's stands in ``peer_error``.
+The models are a smooth metal (GGX) and a brushed metal (Ward, with its exponential). Errors are relative to the largest
+reflectance, compared with `Brdf.value` in double precision. The error of the Numba code is in ``peer_error``.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _numba(model: Any) -> Callable[..., None]:
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a smooth metal and a brushed one, a million pairs each."""
+    """Yield a smooth and a brushed metal, with a million pairs of directions each."""
     yield _case(device, "ggx/1e6", Ggx(alpha=0.2, f0=0.9), _numba(_ggx))
     yield _case(device, "ward/1e6", Ward(albedo=0.8, alpha_x=0.15, alpha_y=0.4), _numba(_ward))
 

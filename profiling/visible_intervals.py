@@ -1,7 +1,7 @@
-"""What of a line is visible from points on a board: exact intervals against Embree, which is asked sample by sample.
+"""Benchmark of `VisibleIntervals` on a board, compared with shadow rays of Embree to samples of a line.
 
-Embree serves best in one big call per core. Errors are means of the visible share of the line, against ours in double;
-the peer's, which samples bound, stands in ``peer_error``.
+Embree is called once per core, the fastest way to use it. Errors are mean errors of the visible fraction of the line,
+relative to our result in double precision. The error of Embree's samples is in ``peer_error``.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.scene.visible_intervals import VisibleIntervals
 
 _FANS, _SAMPLES = 4000, 256
-_LIFT = 1e-5  # metres, off the surface that a fan starts on
+_LIFT = 1e-5  # distance of a fan's apex from the surface [m]
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a board, and one of the same shape in 64 times as many triangles."""
+    """Yield a board, and the same board with 64 times as many triangles."""
     for name, finer in (("board", 0), ("board-fine", 3)):
         yield _case(device, name, board(finer))
 
@@ -39,19 +39,19 @@ def _case(device: Device, name: str, mesh: Any) -> Case:
     scene = Scene.of(mesh)
     bound = VisibleIntervals(scene=scene).bind(device, fans.shape, fans.dtype)
     bound.inputs[0].set(fans)
-    ours = _shown(to_numpy(bound.run().intervals))
+    ours = _visible_fraction(to_numpy(bound.run().intervals))
     exact = VisibleIntervals(scene=scene, precision="double" if device.has_double else "single", max_intervals=49)(
         fans, device=device
     )
-    truth = _shown(to_numpy(exact.intervals))
+    truth = _visible_fraction(to_numpy(exact.intervals))
     known = (to_numpy(exact.status) == 0) & (to_numpy(bound.outputs.status) == 0)
     peer = _Samples(scene, fans)
     facts = {"triangles": len(mesh.faces), "fans": _FANS, "peer_error": _error(peer(), truth, known)}
     return Case("visible_intervals", name, bound.run, {"embreex": peer}, _error(ours, truth, known), facts=facts)
 
 
-def _shown(intervals: NDArray[Any]) -> NDArray[Any]:
-    """Return the visible share of each fan's segment."""
+def _visible_fraction(intervals: NDArray[Any]) -> NDArray[Any]:
+    """Return the visible fraction of the segment of each fan, (n,)."""
     shares: NDArray[Any] = np.nansum(intervals[..., 1] - intervals[..., 0], axis=-1)
     return shares
 
@@ -61,7 +61,7 @@ def _error(shares: NDArray[Any], truth: NDArray[Any], known: NDArray[np.bool_]) 
 
 
 class _Samples:
-    """Visible shares, from shadow rays to samples of the segments; on all cores."""
+    """Visible fractions by Embree: shadow rays to samples of the segments, on all cores."""
 
     def __init__(self, scene: Scene, fans: NDArray[np.float32]) -> None:
         self._embree = embree_scene(scene.corners)
@@ -75,7 +75,7 @@ class _Samples:
         self._pool = ThreadPoolExecutor(cores)
 
     def __call__(self) -> NDArray[np.float64]:
-        """Return the shares (n,)."""
+        """Return the visible fractions, (n,)."""
         parts = self._pool.map(self._query, self._queries, self._reach)
         return np.asarray((np.concatenate(list(parts)) != 0).reshape(-1, _SAMPLES).mean(axis=1))
 

@@ -1,14 +1,18 @@
-"""The glow beside a line of light in a recording, in a room's corner, and what the simulator predicts there.
+"""Secondary light beside a laser line in the corner of a room: recorded, and predicted by the simulator.
 
-Frames of corner_scene_sweep.mp4, with the geometry that the sensor file "corner_scene" has of it: the wall (z = 0) and
-the ceiling 2 m over the floor, seen by a camera at rest. The line on the ceiling lights the wall and the line on the
-wall lights the ceiling: two surfaces at right angles, with a line that runs into the other one on each.
+The recording is corner_scene_sweep.mp4, with the geometry of the sensor file "corner_scene": a camera at rest sees the
+wall (z = 0) and the ceiling, 2 m above the floor. The line on the ceiling illuminates the wall, and the line on the
+wall illuminates the ceiling. The two surfaces are perpendicular, and the lines meet in the corner.
 
-What is not known, and how it is dealt with. *Power and exposure*: one factor is fitted for each surface. *Other light*
-(the room's own, and what comes from its other parts): one constant is fitted for each. *Albedo*: 0.5; it matters for
-what bounces more than once only. *The light's own place on the axis*: at the height of the camera; it says how power
-changes along the lines. *Tone curve*: taken for sRGB's. Red is at its limit on the line itself and a few pixels beside
-it, which are left out.
+Unknown quantities and their treatment:
+
+- Power and exposure: one fitted factor for each surface.
+- Other light, of the room and of its other parts: one fitted constant for each surface.
+- Albedo: 0.5. It only affects light that is reflected more than once.
+- Position of the light source on its axis: the height of the camera. It determines the power along the lines.
+- Tone curve: sRGB.
+
+The red channel is saturated on the line and a few pixels beside it; these pixels are excluded.
 """
 
 from __future__ import annotations
@@ -33,22 +37,22 @@ Float64 = NDArray[np.float64]
 
 CEILING = 2.0  # m over the floor
 ALBEDO = 0.5
-LIMIT = 250.0  # grey levels: red is at its limit
-BESIDE = 0.02  # m off the line, where its own light ends
-WALL_DOWN, CEILING_OUT = 0.3, 0.3  # m from the corner that count
+LIMIT = 250.0  # grey level from which on red counts as saturated
+BESIDE = 0.02  # smallest distance from the line, beyond its direct light [m]
+WALL_DOWN, CEILING_OUT = 0.3, 0.3  # largest distance from the corner on wall and ceiling [m]
 _PIECES = 40
 _SHORTEST = 5e-3  # m, of a line's pieces, next to the corner
 
 
 class Surface(NamedTuple):
-    """Pixels of a frame that see one surface, and what the simulator says of them."""
+    """Pixels of a frame that see one surface, and their predicted irradiance."""
 
     rows: slice
     places: Float64  # (rows, columns, 3)
-    beside: Float64  # (rows, columns): off the plane of light, to its right [m]
-    away: Float64  # (rows, columns): from the corner [m]
+    beside: Float64  # (rows, columns): signed distance from the plane of light, > 0 on its right [m]
+    away: Float64  # (rows, columns): distance from the corner [m]
     once: Float64  # (rows, columns): irradiance by the other surface's line, for a power of 1 W/m at its foot
-    more: Float64  # the same, by all other bounces between the two
+    more: Float64  # irradiance by all further reflections between the surfaces
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,7 @@ class Fit:
 
     factor: float
     constant: float
-    deviation: float  # root of the mean square, relative
+    deviation: float  # relative RMS deviation
     correlation: float
 
 
@@ -75,17 +79,17 @@ class Room:
         return float(self.geometry.transport(1, frame)[0])
 
     def normal(self, frame: int) -> Float64:
-        """Of the plane of light, in the scene."""
+        """Return the normal of the plane of light, in the scene."""
         turn, _ = cv2.Rodrigues(np.array(self.geometry.axis_direction) * self.angle(frame))
         return np.asarray(self.axes @ turn @ np.array(self.geometry.sheet_normal))
 
     def foot(self, frame: int) -> Float64:
-        """Where the light meets the corner."""
+        """Return the point in which the plane of light meets the corner."""
         normal = self.normal(frame)
         return np.array([self.pivot[0] + self.pivot[2] * normal[2] / normal[0], CEILING, 0.0])
 
     def pixels(self, rows: NDArray[np.int64], columns: NDArray[np.int64], axis: int, level: float) -> Float64:
-        """Return where pixels see the plane in which a coordinate has a value."""
+        """Return the points of a plane, in which one coordinate has a constant value, that pixels see."""
         (middle, centre), focal = self.geometry.principal_point_px, self.geometry.focal_length_px
         column, row = np.meshgrid(columns, rows)
         rays = (
@@ -100,7 +104,7 @@ class Room:
         )
 
     def lines(self, frame: int, down: float = 0.7) -> tuple[LitSegments, LitSegments]:
-        """Return the lit lines on the wall, so far down, and on the ceiling: 1 W/m at the middle of the wall's."""
+        """Return the lit lines on the wall, `down` m long, and the ceiling; 1 W/m mid-way on the wall."""
         foot, source = self.foot(frame), self.pivot * (1.0, 0.0, 1.0) + (0.0, self.height, 0.0)
         out = (source - foot) * (1.0, 0.0, 1.0)
         wall = self._line(foot, foot - [0.0, down, 0.0], np.array([0.0, 0.0, 1.0]), source)
@@ -112,12 +116,12 @@ class Room:
         places = start + steps * (end - start)
         middle = 0.5 * (places[1:] + places[:-1]) - source
         along = (end - start) / np.linalg.norm(end - start)
-        # A fan that is even over its angle.
+        # The fan of light has constant power per angle.
         power = np.linalg.norm(np.cross(along, middle), axis=1) / np.sum(middle**2, axis=1)
         return LitSegments(np.stack([places[:-1], places[1:]], axis=1), np.tile(normal, (_PIECES, 1)), power)
 
     def predict(self, frame: int) -> dict[str, Surface]:
-        """Return wall and ceiling, as the frame shows them near the corner."""
+        """Return the predicted wall and ceiling near the corner in a frame."""
         wall, ceiling = self.lines(frame)
         corner = self.corner_row()
         columns = np.arange(1080)
@@ -137,10 +141,10 @@ class Room:
         return made
 
     def _bounces(self, frame: int, wall: LitSegments, ceiling: LitSegments) -> dict[str, Callable[[Float64], Float64]]:
-        """Return what all bounces after the first bring to (x, distance from the corner), by a midpoint rule.
+        """Return the irradiance by the second and all further reflections, as a function of (x, corner distance).
 
-        Its cells are finer towards the place where the lines meet; what a cell gets from one that is too near for its
-        size is cut to what a plane at right angles can give, half of its exitance.
+        Solved by a midpoint rule with cells that are smaller near the meeting point of the lines. Where cells are too
+        close for the rule, the form factors are scaled to the limit of a perpendicular plane, 1/2.
         """
         x = self.foot(frame)[0] + 1.5 * np.sinh(np.linspace(-6.0, 6.0, 71)) / math.sinh(6.0)
         away = np.append(0.0, np.geomspace(3e-3, CEILING, 51))
@@ -171,7 +175,7 @@ class Room:
 
 
 def linear(codes: Float64) -> Float64:
-    """Return light of sRGB codes, 0 to 1."""
+    """Return the linear intensity of sRGB codes, 0 to 1."""
     value = np.asarray(codes, np.float64) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
@@ -193,7 +197,7 @@ def room() -> Room:
 
 
 def kept(surface: Surface, red: Float64, reach: tuple[float, float]) -> NDArray[np.bool_]:
-    """Return which pixels count: near the corner, beside the line, not at red's limit, nothing else in the way."""
+    """Return a mask of the valid pixels: near the corner, beside the line, not saturated, and not occluded."""
     near = surface.away < (WALL_DOWN if surface.rows.start else CEILING_OUT)
     aside = (np.abs(surface.beside) > BESIDE) & (surface.beside > reach[0]) & (surface.beside < reach[1])
     return np.asarray(near & aside & (red[surface.rows] < LIMIT))
@@ -202,30 +206,30 @@ def kept(surface: Surface, red: Float64, reach: tuple[float, float]) -> NDArray[
 def fit(predicted: Float64, measured: Float64) -> Fit:
     table = np.column_stack([predicted, np.ones(len(predicted))]) / measured[:, None]
     (factor, constant), *_ = np.linalg.lstsq(table, np.ones(len(measured)), rcond=None)
-    said = factor * predicted + constant
-    deviation = float(np.sqrt(np.mean((said / measured - 1.0) ** 2)))
-    return Fit(float(factor), float(constant), deviation, float(np.corrcoef(said, measured)[0, 1]))
+    model = factor * predicted + constant
+    deviation = float(np.sqrt(np.mean((model / measured - 1.0) ** 2)))
+    return Fit(float(factor), float(constant), deviation, float(np.corrcoef(model, measured)[0, 1]))
 
 
 def brightest_away(surface: Surface, light: Float64, beside: float, within: float = 0.01) -> float:
-    """Return how far from the corner a surface is brightest, at a distance beside the line (negative: to its left)."""
+    """Return the distance from the corner of the brightest point, at a distance beside the line (< 0: left of it)."""
     near = np.abs(surface.beside - beside) < within
     bins = np.linspace(0.0, 0.4, 81)
-    slot = np.digitize(surface.away[near], bins)
-    mean = np.array([light[near][slot == n].mean() if (slot == n).any() else 0.0 for n in range(1, len(bins))])
+    index = np.digitize(surface.away[near], bins)
+    mean = np.array([light[near][index == n].mean() if (index == n).any() else 0.0 for n in range(1, len(bins))])
     smooth = np.convolve(mean, np.ones(5) / 5.0, mode="same")
     return float(0.5 * (bins[1:] + bins[:-1])[np.argmax(smooth)])
 
 
 def fall_off(surface: Surface, light: Float64, away: float, reach: tuple[float, float] = (0.05, 0.15)) -> float:
-    """Return by which power of the distance beside the line light falls, in a stripe along the corner."""
+    """Return the exponent of the fall-off of light with the distance from the line, in a stripe along the corner."""
     stripe = (np.abs(surface.away - away) < 0.2 * away) & (np.abs(surface.beside) > reach[0])
     stripe &= (np.abs(surface.beside) < reach[1]) & (light > 0.0)
     return float(np.polyfit(np.log(np.abs(surface.beside[stripe])), np.log(light[stripe]), 1)[0])
 
 
 def draw(recording: Path, picture: Path, frame: int = 90, reach: tuple[float, float] = (-0.15, 0.35)) -> None:
-    """Write a picture: a frame's glow beside the predicted one, and profiles across the line."""
+    """Write a picture: the measured and the predicted secondary light of a frame, and profiles across the line."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -239,8 +243,8 @@ def draw(recording: Path, picture: Path, frame: int = 90, reach: tuple[float, fl
         some = kept(surface, red, reach)
         light = linear(red[surface.rows])
         fits[name] = fit((surface.once + surface.more)[some], light[some])
-        said = fits[name].factor * (surface.once + surface.more) + fits[name].constant
-        for held, values in ((measured, light), (predicted, said)):
+        model = fits[name].factor * (surface.once + surface.more) + fits[name].constant
+        for held, values in ((measured, light), (predicted, model)):
             held[surface.rows] = np.where(some, values, np.nan)
     figure, panels = plt.subplots(1, 3, figsize=(12.0, 4.2), width_ratios=(1.0, 1.0, 1.25), layout="constrained")
     columns = np.flatnonzero(np.isfinite(measured).any(axis=0))
@@ -255,11 +259,11 @@ def draw(recording: Path, picture: Path, frame: int = 90, reach: tuple[float, fl
     middles = 0.5 * (bins[1:] + bins[:-1])
     for number, away in enumerate((0.03, 0.08, 0.2)):
         stripe = kept(wall, red, reach) & (np.abs(wall.away - away) < 0.1 * away)
-        slot = np.digitize(wall.beside[stripe], bins) - 1
-        count = np.maximum(np.bincount(slot, minlength=100), 1)
+        index = np.digitize(wall.beside[stripe], bins) - 1
+        count = np.maximum(np.bincount(index, minlength=100), 1)
         held = fits["wall"].factor * (wall.once + wall.more) + fits["wall"].constant
         for values, style in ((light, "."), (held, "-")):
-            mean = np.bincount(slot, values[stripe], minlength=100) / count
+            mean = np.bincount(index, values[stripe], minlength=100) / count
             label = f"{1e3 * away:.0f} mm below the ceiling" if style == "-" else None
             panels[2].plot(1e3 * middles, np.where(mean > 0.0, mean, np.nan), style, color=f"C{number}", label=label)
     panels[2].set(xlabel="beside the line [mm]", ylabel="red light on the wall (1: at its limit)", yscale="log")

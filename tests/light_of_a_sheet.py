@@ -1,4 +1,4 @@
-"""A sheet of light, a lens beside it, and simple surfaces: what tests of direct light share."""
+"""Common part of the tests of direct light: a sheet of light, a lens beside it, and simple surfaces."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GREY = Material(diffuse=Lambert(albedo=0.5))
 def sensor_view(
     *, scale: float = 1.0, bins: int = 12, samples: int = 8, lens: Lens | None = None, **more: Any
 ) -> SensorView:
-    """A lens beside the sheet, 0.15 m up; ``scale`` takes it farther, its focal distance along: the image stays."""
+    """Return a view with its lens 0.15 m above the plane; ``scale`` scales distance and focal length: same image."""
     baseline, stand_off, focal = 0.08 * scale, 0.15 * scale, 0.04 * scale
     geometry = Triangulation.from_stand_off(
         baseline=baseline, stand_off=stand_off, focal_distance=focal, region=((-3e-3, 3e-3), (-6e-3, 6e-3)), lens=lens
@@ -59,7 +59,7 @@ def u_of(exposure: Exposure, seen_by: SensorView) -> np.ndarray:
 
 
 def two_plates(before: float, behind: float) -> tuple[Scene, tuple[Material, ...]]:
-    """A plate whose albedo changes at y = 0."""
+    """Return a plate with a step of its albedo at y = 0."""
     corners = np.concatenate([plate(1.0, 0.5) + np.array([0.0, y, 0.0]) for y in (-0.5, 0.5)])
     made_of = tuple(Material(diffuse=Lambert(albedo=each)) for each in (before, behind))
     return Scene(corners, np.array([0, 0, 1, 1])), made_of

@@ -17,7 +17,7 @@ LENGTH, PITCH, STRIPS = 6e-3, 1e-4, 5
 
 
 def psd_view(bins: int = 60, strips: int = STRIPS) -> SensorView:
-    """Return strips of 6 mm beside a sheet that shines straight down."""
+    """Return the view of PSD strips of 6 mm on a vertical sheet of light."""
     half, v = 0.5 * LENGTH, PITCH * (np.arange(strips + 1) - 0.5 * strips)
     triangulation = Triangulation.from_stand_off(
         baseline=0.08, stand_off=0.15, focal_distance=0.04, region=((-half, half), (v[0], v[-1]))
@@ -40,7 +40,7 @@ def psd(view: SensorView | None = None, *, readout: dict | None = None, **more) 
 
 
 def camera_view(rows: int = 64, columns: int = 8) -> SensorView:
-    """Return a camera's columns beside the same sheet, 10 um pixels."""
+    """Return the view of a camera with 10 um pixels on the same sheet."""
     axes = [10e-6 * (np.arange(count + 1) - 0.5 * count) for count in (rows, columns)]
     triangulation = Triangulation.from_stand_off(
         baseline=0.08,
@@ -77,7 +77,7 @@ def gaussian(view: SensorView, u, power, sigma: float) -> Exposure:
     u, power = (np.array(np.broadcast_to(each, (*u.shape[:-1], view.samples)))[..., None] for each in (u, power))
     x = (view.u_edges - u) / sigma
     share = np.diff(ndtr(x), axis=-1)
-    # The far side's differences of shares near 1 would cancel.
+    # Above the centre, differences of the complement avoid the cancellation of numbers near 1.
     share = np.where(x[..., :-1] > 0.0, -np.diff(ndtr(-x), axis=-1), share)
     first = -sigma * np.diff(np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), axis=-1)
     return Exposure(power * share, power * (first + (u - view.u_centres) * share))

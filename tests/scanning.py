@@ -1,4 +1,4 @@
-"""What the tests of scans share: recordings of the shipped sensors, and the command as a user calls it."""
+"""Common part of the tests of scans: recordings of the shipped sensors, and runs of the command."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpuvision.sensor.sensor import Sensor
 
 
 def currents(frames: int, height: float = 2e-3, total: float = 1e-6) -> Any:
-    """Codes of the shipped PSD sensor that looks at a plane of some height; left and right as they divide."""
+    """Return codes (frames, 96, 2) of the shipped PSD sensor for a plane at a height [m], without noise."""
     sensor = Sensor.load("psd_line")
     readout: Any = sensor.readout
     (u, _v) = readout.triangulation.to_sensor([0.0, height])
@@ -24,13 +24,13 @@ def currents(frames: int, height: float = 2e-3, total: float = 1e-6) -> Any:
 
 
 def line_frames(rows: Any, sigma: float = 1.2, peak: float = 200.0) -> Any:
-    """Frames (n, 64, 480) of the shipped camera with a line at a row for each frame and column."""
+    """Return frames (n, 64, 480) of the shipped camera with a Gaussian line at given rows, (n, 480)."""
     distance = np.arange(64)[None, :, None] - np.asarray(rows)[:, None, :]
     return np.rint(peak * np.exp(-0.5 * (distance / sigma) ** 2)).astype(np.uint8)
 
 
 class Ran:
-    """``gpuvision`` with arguments: exit code and what it said."""
+    """A run of the command ``gpuvision``: exit code, standard output and standard error."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *args: object) -> None:
         monkeypatch.setattr(sys, "argv", ["gpuvision", *map(str, args)])

@@ -1,4 +1,9 @@
-"""Rays against every triangle, in float64 (Moeller and Trumbore)."""
+"""Reference for rays and segments: intersection with every triangle in float64.
+
+References
+----------
+T. Moeller and B. Trumbore, "Fast, minimum storage ray/triangle intersection", Journal of Graphics Tools 2(1), 1997.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +11,29 @@ import numpy as np
 
 
 def crossings(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return t, u, v (rays, triangles): t NaN where a ray does not meet a triangle, its edges included."""
+    """Intersect rays with triangles (n, 3, 3).
+
+    Returns
+    -------
+    t, u, v : numpy.ndarray
+        (rays, triangles) each: ray parameter, NaN without an intersection (edges belong to the triangle), and the
+        barycentric weights of the second and third corner.
+    """
     a, one, two = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     across = np.cross(directions[:, None], two)
     det = np.sum(across * one, axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         to = origins[:, None] - a
         u = np.sum(to * across, axis=-1) / det
-        turned = np.cross(to, one)
-        v = np.sum(turned * directions[:, None], axis=-1) / det
-        t = np.sum(turned * two, axis=-1) / det
+        normal_to = np.cross(to, one)
+        v = np.sum(normal_to * directions[:, None], axis=-1) / det
+        t = np.sum(normal_to * two, axis=-1) / det
     meets = (det != 0.0) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
     return np.where(meets, t, np.nan), u, v
 
 
 def closest(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return triangle (-1: none), distance, u, v of rays (n, 6)."""
+    """Return the closest hits of rays (n, 6): triangle (-1: none), distance [m], u and v."""
     lengths = np.linalg.norm(rays[:, 3:], axis=1, keepdims=True)
     t, u, v = crossings(corners, rays[:, :3], rays[:, 3:] / lengths)
     t = np.where(t > 0.0, t, np.inf)
@@ -33,7 +45,7 @@ def closest(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def occluded(corners: np.ndarray, segments: np.ndarray, margin: float = 0.0) -> np.ndarray:
-    """Return whether any triangle lies between the ends, but for so much of the length (may be negative)."""
+    """Return whether segments (n, 6) are occluded, except within a fraction of the length at both ends (may be < 0)."""
     t = crossings(corners, segments[:, :3], segments[:, 3:] - segments[:, :3])[0]
     with np.errstate(invalid="ignore"):
         return ((t > margin) & (t < 1.0 - margin)).any(axis=1)

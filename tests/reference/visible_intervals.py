@@ -1,4 +1,4 @@
-"""What of a segment is visible from an apex, by the ends of all hidden intervals, in float64."""
+"""Reference for visible intervals: complement of the union of all occluded intervals, in float64."""
 
 from __future__ import annotations
 
@@ -6,12 +6,25 @@ import numpy as np
 
 
 def visible(corners: np.ndarray, fan: np.ndarray, least: float = 1e-9) -> np.ndarray:
-    """Return the visible parts (k, 2) of one fan (11,): a triangle's cut is clipped by the fan in its plane."""
+    """Return the visible parts (k, 2) of the segment of one fan (11,), as fractions of its length.
+
+    The intersection of each triangle with the plane of the fan is a segment. It is clipped to the fan; its ends, seen
+    from the apex, bound an occluded interval.
+
+    Parameters
+    ----------
+    corners
+        (n, 3, 3), triangles [m].
+    fan
+        Apex, the two ends of the segment [m], and the two fractions from which on triangles occlude.
+    least
+        Shorter parts are ignored, as a fraction of the segment.
+    """
     apex, one, two = fan[:3], fan[3:6] - fan[:3], fan[6:9] - fan[:3]
     per = 1.0 / np.maximum(fan[9:], 1e-12)
     basis = np.linalg.pinv(np.stack([one, two], axis=1))
     normal = np.cross(one, two) / np.linalg.norm(np.cross(one, two))
-    hidden = []
+    occluded = []
     for triangle in corners - apex:
         above = triangle @ normal
         cuts = []
@@ -34,12 +47,12 @@ def visible(corners: np.ndarray, fan: np.ndarray, least: float = 1e-9) -> np.nda
                 high = min(high, a / (a - b))
         if high > low:
             ends = [start + share * (end - start) for share in (low, high)]
-            hidden.append(sorted(each[1] / each.sum() for each in ends))
-    shown, at = [], 0.0
-    for begin, finish in sorted(hidden):
+            occluded.append(sorted(each[1] / each.sum() for each in ends))
+    parts, at = [], 0.0
+    for begin, finish in sorted(occluded):
         if begin > at + least:
-            shown.append((at, begin))
+            parts.append((at, begin))
         at = max(at, finish)
     if at < 1.0 - least:
-        shown.append((at, 1.0))
-    return np.array(shown).reshape(-1, 2)
+        parts.append((at, 1.0))
+    return np.array(parts).reshape(-1, 2)

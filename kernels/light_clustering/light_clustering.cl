@@ -1,10 +1,11 @@
-// Which lit segments each block of receivers needs, to a tolerance: the tree of gpuvision/simulation/clusters.py from
-// its root, a block at a time. A cluster is left out where the light that it could send at most is under its share;
-// replaced by one segment where that is close enough and nothing can stand between; else opened.
+// Selection of the lit segments and clusters that each block of receivers needs, to a tolerance. Each block traverses the
+// tree of gpuvision/simulation/clustering/light_tree.py from its root. A node is left out where the bound of its light is
+// below its share of the tolerance, replaced by its representative segment where the bound of that error is and nothing
+// can occlude it, and opened otherwise.
 #include "light_clustering/light_bounds.h"
 #include "light_clustering/shaft.h"
 
-// Of a pick: a segment that nothing can hide; else without it. A cluster is ~node.
+// Bit of a selected segment that nothing can occlude. A cluster is ~node.
 #define CLEAR (1 << 30)
 // Whether anything may stand between is looked at for so many segments at once, and fewer, but not for one: a look takes
 // as long as the visibility of one that it would spare. A block looks so often in vain, and some times more for each time

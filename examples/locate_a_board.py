@@ -70,7 +70,7 @@ print(features.summary())
 
 # %%
 # Locate the board, and compare with the true pose.
-found = locate_board(image, artwork, scale=pixel, near=(10e-3, 8e-3, 0.0), features=features)
+found = locate_board(image, artwork, scale=pixel, initial_pose=(10e-3, 8e-3, 0.0), features=features)
 print(found.summary())
 error = np.array(found.pose) - true_pose
 print(f"error {1e6 * error[0]:+.2f} µm, {1e6 * error[1]:+.2f} µm, {1e6 * error[2]:+.0f} µrad")

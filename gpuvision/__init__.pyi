@@ -129,6 +129,9 @@ from .matching.features.feature_set import (
 from .matching.features.feature_set import (
     choose_features as choose_features,
 )
+from .matching.features.imaging import (
+    Imaging as Imaging,
+)
 from .matching.features.line_fit import (
     FitLines as FitLines,
 )
@@ -145,9 +148,6 @@ from .matching.features.ruler import (
     best_smoothing as best_smoothing,
 )
 from .matching.features.selection import (
-    Imaging as Imaging,
-)
-from .matching.features.selection import (
     Selection as Selection,
 )
 from .matching.field.distance_map import (
@@ -157,13 +157,13 @@ from .matching.field.distance_map import (
     Field as Field,
 )
 from .matching.field.field_pose import (
-    Candidate as Candidate,
-)
-from .matching.field.field_pose import (
     FieldPoseRefinement as FieldPoseRefinement,
 )
 from .matching.field.field_pose import (
     FieldPoseSearch as FieldPoseSearch,
+)
+from .matching.field.field_pose import (
+    PoseCandidate as PoseCandidate,
 )
 from .matching.field.located_robot import (
     LocatedRobot as LocatedRobot,
@@ -172,10 +172,10 @@ from .matching.field.odometry import (
     PoseEstimate as PoseEstimate,
 )
 from .matching.pose.board_pose import (
-    BoardPoseEstimator as BoardPoseEstimator,
+    BoardPoseEstimate as BoardPoseEstimate,
 )
 from .matching.pose.board_pose import (
-    Fix as Fix,
+    BoardPoseEstimator as BoardPoseEstimator,
 )
 from .matching.pose.board_pose import (
     place_rulers as place_rulers,
@@ -199,10 +199,10 @@ from .matching.pose.registration import (
     Registration as Registration,
 )
 from .matching.pose.registration import (
-    register as register,
+    prepare_board_registration as prepare_board_registration,
 )
 from .matching.pose.registration import (
-    register_board as register_board,
+    register_images as register_images,
 )
 from .ranging.line import (
     LineReading as LineReading,

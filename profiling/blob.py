@@ -17,8 +17,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
-from gpuvision.matching.features.blob import BEND, FindBlobs
+from gpuvision.host import Device, to_numpy
+from gpuvision.matching.features.blob import TUNING_CONSTANT, FindBlobs
 from gpuvision.profiling.harness import Case
 
 CELL, RADIUS, BLUR, CONTRAST, NOISE, OFF = 40, 8.0, 1.0, 100.0, 2.0, 2.0
@@ -110,7 +110,7 @@ def _circle_sums(ex, ey, there, widths, shape, blur, per_scale, sums):  # type: 
         per = one / math.sqrt(square)
         off = math.sqrt(square + blur + _F(0.5) * blur * blur * per * per) - shape[2]
         x, y, z = x * per, y * per, off * per_scale
-        left = max(one - z * z * _F(1.0 / BEND**2), _F(0.0))
+        left = max(one - z * z * _F(1.0 / TUNING_CONSTANT**2), _F(0.0))
         weight = there[m] * left * left
         a += weight * x * x
         b += weight * x * y
@@ -149,8 +149,8 @@ def _fit(ex, ey, there, widths, noises, shape, count, sums, room):  # type: igno
         noise += there[m] * noises[m]
         blur += there[m] * widths[m]
     predicted = _F(max(math.sqrt(noise / count), 0.01))
-    least, blur = _F(max(_F(0.6 / BEND), predicted)), blur / count
-    scale = _F(max(_F(1.2 / BEND), least))
+    least, blur = _F(max(_F(0.6 / TUNING_CONSTANT), predicted)), blur / count
+    scale = _F(max(_F(1.2 / TUNING_CONSTANT), least))
     for _ in range(12):
         blur = _circle_step(ex, ey, there, widths, shape, blur, scale, sums)
         if scale <= least:
@@ -162,7 +162,7 @@ def _fit(ex, ey, there, widths, noises, shape, count, sums, room):  # type: igno
             x, y = ex[m] - shape[0], ey[m] - shape[1]
             square = x * x + y * y
             off = abs(math.sqrt(square + blur + _F(0.5) * blur * blur / square) - shape[2])
-            if there[m] > _F(0.0) and off <= _F(BEND) * scale:
+            if there[m] > _F(0.0) and off <= _F(TUNING_CONSTANT) * scale:
                 room[within] = off
                 within += 1
         for i in range(1, within):  # so few are sorted soonest by insertion
@@ -181,7 +181,7 @@ def _fit(ex, ey, there, widths, noises, shape, count, sums, room):  # type: igno
 def _rows_of(pixels, pitch, x, y, shape, grey, slopes, scale, equation):  # type: ignore[no-untyped-def]
     """Fill the pixels' equations, weighted by the root of their weight; return how many there are."""
     reach, one = shape[2] + _F(5.0) * grey[2] + _F(2.0), _F(1.0)
-    per_blur, per_size, per_scale = one / grey[2], one / shape[2], _F(1.0 / BEND) / scale
+    per_blur, per_size, per_scale = one / grey[2], one / shape[2], _F(1.0 / TUNING_CONSTANT) / scale
     bend = _F(0.5) * grey[2] * per_size
     contrast, n = grey[1], 0
     c0, c1, c2 = _F(1.393465), _F(-2.767476), _F(4.513241)
@@ -250,7 +250,7 @@ def _match(pixels, pitch, x, y, shape, grey, noise, equation, matrix, right, to,
     """Move the circle to where its pixels have it."""
     slopes = np.zeros(2, np.float32)
     for step in range(3):
-        scale = (_F(0.1) * grey[1] + _F(4.0) * noise) / _F(BEND)
+        scale = (_F(0.1) * grey[1] + _F(4.0) * noise) / _F(TUNING_CONSTANT)
         n = _rows_of(pixels, pitch, x + shape[0], y + shape[1], shape, grey, slopes, scale, equation)
         for i in range(_UNKNOWNS + 1):
             for j in range(min(i, _UNKNOWNS - 1) + 1):
@@ -328,7 +328,7 @@ def _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, 
         dx, dy = ex[m] - shape[0], ey[m] - shape[1]
         square = dx * dx + dy * dy
         z = (math.sqrt(square + blur + _F(0.5) * blur * blur / square) - shape[2]) / scale
-        left = max(_F(1.0) - z * z * _F(1.0 / BEND**2), _F(0.0))
+        left = max(_F(1.0) - z * z * _F(1.0 / TUNING_CONSTANT**2), _F(0.0))
         weight = there[m] * left * left
         room[m] = weight
         weights += weight
@@ -453,7 +453,7 @@ def _case(device: Device, count: int) -> Case:
     bound.inputs[0].set(image)
     bound.inputs[1].set(places)
     blobs = bound.run()
-    if np.any(blobs.status.get()):
+    if np.any(to_numpy(blobs.status)):
         raise AssertionError("a mark was not found")
     table = np.asarray(operation.launch(device, image.shape, image.dtype).arguments[0])
     numbers = np.concatenate([table[[0, 3, 2]], table[-REACH:]]).astype(np.float32)
@@ -466,7 +466,7 @@ def _case(device: Device, count: int) -> Case:
         _find(image, places, numbers, directions, noise, found, covariance, status)
 
     fused()
-    ours = np.stack([blobs.x.get(), blobs.y.get()], axis=-1)
+    ours = np.stack([to_numpy(blobs.x), to_numpy(blobs.y)], axis=-1)
     facts = {
         "blobs": count,
         "deviation_px": _deviation(ours, true),

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from gpuvision.formats.field_file import read_field
-from gpuvision.host import Device
-from gpuvision.matching.field.distance_map import LEVELS, DistanceMap
+from gpuvision.host import Device, to_numpy
+from gpuvision.matching.field.distance_map import COST_LEVELS, DistanceMap
 from gpuvision.matching.field.field_pose import FieldPoseRefinement, FieldPoseSearch
 from gpuvision.profiling.harness import Case
 
@@ -29,8 +29,8 @@ _BLOCK, _RAYS = 64, 64
 
 def cases(device: Device) -> Iterator[Case]:
     """Yield the global search, with one heading and with 72, and the local one."""
-    junior = DistanceMap(field=read_field("robocup_junior"), cell=0.01, scale=0.05, reach=1.5, device=device)
-    large = DistanceMap(field=read_field("robocup_msl"), cell=0.1, scale=0.25, reach=6.0, device=device)
+    junior = DistanceMap(field=read_field("robocup_junior"), cell=0.01, scale=0.05, max_range=1.5, device=device)
+    large = DistanceMap(field=read_field("robocup_msl"), cell=0.1, scale=0.25, max_range=6.0, device=device)
     pose = (0.213, -0.177, 0.4)
     yield from _global(device, junior, pose)
     yield _turns(device, large, (3.1, -2.2, 0.7))
@@ -47,7 +47,7 @@ def _points(field_map: DistanceMap, pose: tuple[float, ...], sigma: float) -> ND
     x, y, heading = pose
     turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
     points = (np.concatenate(spread) - [x, y]) @ turn
-    points = points[np.hypot(*points.T) < 0.95 * field_map.reach]
+    points = points[np.hypot(*points.T) < 0.95 * field_map.max_range]
     points = points[rng.choice(len(points), _RAYS, replace=False)]
     return np.asarray(points + rng.normal(0.0, sigma, points.shape), np.float32)
 
@@ -131,7 +131,9 @@ class _Search:
         )
         self.bound.inputs[0].set(points)
         self.ours = self.bound.run()
-        self.scores = np.empty(self.ours.scores.shape, np.float32)
+        assert self.ours.scores is not None  # asked for above
+        self.our_scores = self.ours.scores
+        self.scores = np.empty(self.our_scores.shape, np.float32)
         self.sums = np.empty((len(headings) * self.scores.shape[1], self.scores.shape[2]), np.uint16)
         self.least = np.empty(self.ours.least.shape, np.float32)
         self.where = np.empty(self.ours.column.shape, np.int64)
@@ -162,7 +164,7 @@ class _Search:
         columns, rows = (each[0] for each in self.shifts())
         _, height, width = self.scores.shape
         at = (np.arange(height)[:, None, None] + rows, np.arange(width)[:, None] + columns)
-        self.scores[0] = self.float_level[at].sum(axis=-1) * np.float32(1.0 / (LEVELS * _RAYS))
+        self.scores[0] = self.float_level[at].sum(axis=-1) * np.float32(1.0 / (COST_LEVELS * _RAYS))
         self.least[:], self.where[:] = _numpy_least(self.scores)
 
     def numpy_shifts(self) -> None:
@@ -171,15 +173,16 @@ class _Search:
         total = np.zeros((height, width), np.float32)
         for column, row in zip(*(each[0] for each in self.shifts()), strict=True):
             total += self.float_level[row : row + height, column : column + width]
-        self.scores[0] = total * np.float32(1.0 / (LEVELS * _RAYS))
+        self.scores[0] = total * np.float32(1.0 / (COST_LEVELS * _RAYS))
         self.least[:], self.where[:] = _numpy_least(self.scores)
 
     def check(self, *peers: Callable[[], None]) -> None:
         """Check that the peers find the same."""
-        ours = self.ours.scores.get(), self.ours.least.get(), self.ours.column.get()
+        ours: tuple[NDArray[Any], ...]
+        ours = to_numpy(self.our_scores), to_numpy(self.ours.least), to_numpy(self.ours.column)
         for peer in peers:
             peer()
-            theirs = self.scores, self.least, self.where
+            theirs: tuple[NDArray[Any], ...] = (self.scores, self.least, self.where)
             if not all(np.allclose(each, other, atol=1e-6) for each, other in zip(theirs, ours, strict=True)):
                 raise AssertionError("the peer's scores are others than ours: it does other work")
 
@@ -196,7 +199,7 @@ class _Search:
         away = [np.abs(_offsets(shapes, np.full(x.shape, each), x, y)[0]) for each in range(len(shapes))]
         square = np.min(away, axis=0) ** 2
         exact = np.mean(square / (self.map.scale**2 + square), axis=1)
-        return float(np.max(np.abs(self.ours.scores.get()[turn, row, column] - exact)))
+        return float(np.max(np.abs(to_numpy(self.our_scores)[turn, row, column] - exact)))
 
 
 def _global(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> Iterator[Case]:
@@ -273,5 +276,5 @@ def _local(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> C
         fit = least_squares(residuals, start, slopes, method="lm", xtol=1e-6, ftol=1e-9)
         return fit.x, np.linalg.inv(fit.jac.T @ fit.jac)
 
-    error = float(np.max(np.abs(ours.poses.get()[0] - scipy()[0])))
+    error = float(np.max(np.abs(to_numpy(ours.poses)[0] - scipy()[0])))
     return Case("field", "local", bound.run, {"scipy": scipy}, error, facts={"rays": _RAYS})

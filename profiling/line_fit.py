@@ -15,9 +15,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.line_fit import FitLines
-from gpuvision.matching.robust import subsets
+from gpuvision.matching.robust import sample_subsets
 from gpuvision.profiling.harness import Case
 from gpuvision.profiling.pose import STEPS, TRIALS, fit_line
 
@@ -61,25 +61,25 @@ def cases(device: Device) -> Iterator[Case]:
 
 def _case(device: Device, count: int) -> Case:
     points, sigma = scene(count)
-    operation = FitLines(scale=1.0, weighted=True, trials=TRIALS, steps=STEPS)
+    operation = FitLines(scale=1.0, weighted=True, max_trials=TRIALS, max_iterations=STEPS)
     bound = operation.bind(device, points.shape, np.float32)
     for array, values in zip(bound.inputs, (points, sigma), strict=True):
         array.set(values)
-    pairs, out = subsets(count, 2, TRIALS), np.empty((_LINES, 7), np.float32)
+    pairs, out = sample_subsets(count, 2, TRIALS), np.empty((_LINES, 7), np.float32)
     peers: dict[str, Callable[[], object]] = {
         "numba": lambda: _numba(points, sigma, pairs, out),
         "opencv": lambda: [cv2.fitLine(each, cv2.DIST_WELSCH, 0, 0.01, 0.01) for each in points[:_FEW]],
     }
     bound.run()
     peers["numba"]()
-    normal, centre = bound.outputs.normal.get(), bound.outputs.centre.get()
+    normal, centre = to_numpy(bound.outputs.normal), to_numpy(bound.outputs.centre)
     apart = np.abs(normal[:, 0] * out[:, 1] - normal[:, 1] * out[:, 0])
     if not np.quantile(apart, 0.99) < 1e-4:
         raise AssertionError("Numba's lines are not ours")
     error = np.nan
     if device.has_double:
         exact = operation(points.astype(np.float64), sigma.astype(np.float64), device=device)
-        away = np.abs(np.sum(exact.normal * (centre - exact.centre), axis=-1))
+        away = np.abs(np.sum(to_numpy(exact.normal) * (centre - to_numpy(exact.centre)), axis=-1))
         # Where two starts are as good as each other to rounding, the other one may win: a few in ten thousand lines.
         error = float(np.quantile(away, 0.99))
     return Case("line_fit", f"tukey/1e4x{count}", bound.run, peers, error, factors={"opencv": _LINES / _FEW})

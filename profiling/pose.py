@@ -15,11 +15,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.pose.board_pose import BoardPoseEstimator, place_rulers
 from gpuvision.matching.pose.pose import SolvePose
-from gpuvision.matching.robust import efficiency, subsets
+from gpuvision.matching.robust import efficiency, sample_subsets
 from gpuvision.profiling import ruler as of_ruler
 from gpuvision.profiling.harness import Case
 
@@ -27,10 +27,10 @@ LINES, EACH, TRIALS, STEPS = 10, 10, 64, 12
 PIXEL, PATCH = 10e-6, 160  # m, px
 PLACEMENT = (2e-3, -1e-3)
 TRUE_POSE = np.array([3e-5, -2e-5, 0.004])
-BEND = 4.685
-_PER = np.float32(1.0 / BEND**2)
+TUNING_CONSTANT = 4.685
+_PER = np.float32(1.0 / TUNING_CONSTANT**2)
 _PLACE = np.array(PLACEMENT, np.float32)
-_EFFICIENCY = np.float32(efficiency("tukey", BEND))
+_EFFICIENCY = np.float32(efficiency("tukey", TUNING_CONSTANT))
 _ZERO, _HALF, _ONE, _TWO = (np.float32(each) for each in (0.0, 0.5, 1.0, 2.0))
 _SUMS = {"contract", "reassoc"}
 _rulers = of_ruler._compiled(of_ruler._sample_flat)
@@ -269,7 +269,7 @@ def _fused(image, plain, rulers, lines, taps, numbers, pairs, starts, edges, sta
 
 
 def _left_over(z: NDArray[Any]) -> NDArray[Any]:
-    return np.asarray(np.maximum(1.0 - z * z * (1.0 / BEND**2), 0.0))
+    return np.asarray(np.maximum(1.0 - z * z * (1.0 / TUNING_CONSTANT**2), 0.0))
 
 
 def _numpy_lines(u: NDArray[Any], v: NDArray[Any], w: NDArray[Any], pairs: NDArray[Any]) -> tuple[NDArray[Any], ...]:
@@ -353,7 +353,7 @@ class _Numpy:
         self.image, self.lines, self.noise = image, lines.astype(np.float64), noise
         self.plain, self.rulers = np.ascontiguousarray(rulers[..., :4].reshape(-1, 4)), rulers.astype(np.float64)
         self.matrix = of_ruler._gradient_matrix(np.float32)
-        self.pairs, self.starts = subsets(EACH, 2, TRIALS), subsets(2 * LINES, 3, TRIALS)
+        self.pairs, self.starts = sample_subsets(EACH, 2, TRIALS), sample_subsets(2 * LINES, 3, TRIALS)
 
     def __call__(self) -> tuple[NDArray[Any], NDArray[Any]]:
         return self._fixed(of_ruler._opencv(self.image, self.plain, self.matrix))
@@ -389,8 +389,8 @@ def cases(device: Device) -> Iterator[Case]:
         smoothing_px=of_ruler.SMOOTHING,
         noise=2.0,
     )
-    solver = SolvePose(placement=PLACEMENT, trials=TRIALS, steps=STEPS)
-    bound = BoardPoseEstimator(ruler=edges, lines=LINES, each=EACH, solver=solver).bind(
+    solver = SolvePose(placement=PLACEMENT, max_trials=TRIALS, max_iterations=STEPS)
+    bound = BoardPoseEstimator(ruler=edges, lines=LINES, rulers_per_line=EACH, solver=solver).bind(
         device, image.shape, image.dtype
     )
     inputs: tuple[NDArray[Any], ...] = (image, rulers, lines)
@@ -412,9 +412,9 @@ def cases(device: Device) -> Iterator[Case]:
 
     by_numba()
     (exact, spread), (rounded, _) = by_numpy.exact(), by_numpy()
-    ours = np.array([*result.placement.get(), result.pose.get()[2]])
+    ours = np.array([*to_numpy(result.placement), to_numpy(result.pose)[2]])
     sigma = np.sqrt(np.diag(spread))
-    of_ours = result.covariance.get()
+    of_ours = to_numpy(result.covariance)
     for what, each, of in (("ours", ours, of_ours), ("numba's", pose, covariance), ("numpy's", rounded, spread)):
         if np.any(np.abs(each - exact) > 0.5 * sigma) or np.any(np.abs(np.sqrt(np.diag(of)) / sigma - 1.0) > 0.1):
             raise AssertionError(f"{what} fix is not that in double: {each} and {exact}, of {sigma}")

@@ -20,9 +20,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
-from gpuvision.matching.pose.edge_search import SearchEdges, shifts_of
-from gpuvision.matching.pose.registration import register
+from gpuvision.host import Device, to_numpy
+from gpuvision.matching.pose.edge_search import EdgeSearch, cell_offsets
+from gpuvision.matching.pose.registration import register_images
 from gpuvision.profiling.harness import Case
 
 _ROWS, _HEADINGS, _POINTS, _CELL = 81, 21, 512, 2
@@ -99,8 +99,8 @@ def _search(device: Device) -> Case:
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         turned.append(((points - (319.5, 239.5)) @ turn + (319.5, 239.5), normals @ turn))
     seen, ways = (np.stack(each) for each in zip(*turned, strict=True))
-    shifts = shifts_of(seen, ways, _CELL, border, cells, (_ROWS, _ROWS))
-    op = SearchEdges(rows=_ROWS, columns=_ROWS, headings=_HEADINGS, points=_POINTS)
+    shifts = cell_offsets(seen, ways, _CELL, border, cells, (_ROWS, _ROWS))
+    op = EdgeSearch(rows=_ROWS, columns=_ROWS, headings=_HEADINGS, points=_POINTS)
     bound = op.bind(device, cells, np.uint16)
     bound.inputs[0].set(level)
     bound.inputs[1].set(shifts)
@@ -115,8 +115,8 @@ def _search(device: Device) -> Case:
 
     by_numba()
     exact, places = by_numpy()
-    error = float(np.max(np.abs(ours.least.get() - exact)))
-    same = np.array_equal(where, places) and np.array_equal(ours.column.get(), places)
+    error = float(np.max(np.abs(to_numpy(ours.least) - exact)))
+    same = np.array_equal(where, places) and np.array_equal(to_numpy(ours.column), places)
     if not (same and np.allclose(least, exact, rtol=1e-6) and error < 1e-6):
         raise AssertionError("the peers find other poses than we: they do other work")
     peers: dict[str, Callable[[], object]] = {"numba": by_numba, "numpy": by_numpy}
@@ -172,7 +172,7 @@ def _pair(device: Device) -> Case:
         return warp
 
     def ours() -> NDArray[np.float64]:
-        found = register(image, template, freedom="rigid", device=device)
+        found = register_images(image, template, transform="rigid", device=device)
         c, s = math.cos(found.pose[2]), math.sin(found.pose[2])
         return np.array([[c, -s, found.pose[0]], [s, c, found.pose[1]]])
 

@@ -20,7 +20,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.profiling.harness import Case
 
@@ -217,7 +217,7 @@ def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool =
     edges, status = np.empty((4, count), np.float32), np.empty(count, np.uint8)
     plain, _, widths, _, dark = _numpy(image, rulers.astype(np.float64), _gradient_matrix(np.float64))
     exact = _freed(rulers.astype(np.float64), plain, widths)
-    if np.any(bound.outputs.status.get()) or np.any(dark):
+    if np.any(to_numpy(bound.outputs.status)) or np.any(dark):
         raise AssertionError("a ruler across an edge found none")
     compiled(image, rulers, taps, numbers, edges, status)
     facts = {"peer_error": float(np.max(np.abs(edges[0] - plain))), "rulers": count}
@@ -227,5 +227,5 @@ def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool =
     if not alone:
         peers["opencv"] = lambda: _opencv(image, rulers, matrix)
         peers["numpy"] = lambda: _numpy(image, rulers, matrix)
-    error = float(np.max(np.abs(bound.outputs.position.get() - exact)))
+    error = float(np.max(np.abs(to_numpy(bound.outputs.position) - exact)))
     return Case("ruler", name, bound.run, peers, error, facts=facts)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtr
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.ruler import RulerEdges, best_smoothing
 
 SIDE, BLUR, LENGTH, WIDTH = 140, 1.2, 41, 5
@@ -105,9 +105,9 @@ def columns(device: Device) -> dict[str, Callable[[float], Callable[[Scene], tup
         def prepared(noise: float) -> Any:
             operation = RulerEdges(threshold=30.0, length=LENGTH, width=WIDTH, smoothing_px=smoothing, noise=noise)
 
-            def located(scene: Scene) -> tuple[Float64, Float64]:
+            def located(scene: Scene) -> Any:
                 edges = operation(scene[0], scene[1].astype(np.float32), device=device)
-                return edges.position, edges.sigma
+                return to_numpy(edges.position), to_numpy(edges.sigma)
 
             return located
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.matching.artwork.shapes import capsule
 from gpuvision.matching.field.distance_map import Field
-from gpuvision.matching.field.evidence import onto_field
+from gpuvision.matching.field.evidence import robot_to_field
 from gpuvision.plots.field import field_lines
 
 _FINE = 4  # samples of a pixel, along each side
@@ -76,7 +76,7 @@ def seen_ahead(
     total = np.zeros(shape)
     offsets = (np.arange(samples) + 0.5) / samples - 0.5
     for a, b in itertools.product(offsets, offsets):
-        at = onto_field(camera.to_floor(ideal + a * across + b * down), pose) / pixel * (1, -1) + middle
+        at = robot_to_field(camera.to_floor(ideal + a * across + b * down), pose) / pixel * (1, -1) + middle
         at = np.where(np.isfinite(at), at, -9.0).clip(-9.0, 1e5).astype(np.float32)
         total += cv2.remap(carpet, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     grey = cv2.GaussianBlur(60.0 + 170.0 * total / samples**2, (0, 0), 0.7) + rng.normal(0, noise, shape)

@@ -24,7 +24,7 @@ _HEAD = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
 def round_board(
     folder: Path,
     *,
-    lands: Sequence[tuple[float, float]] = LANDS,
+    pads: Sequence[tuple[float, float]] = LANDS,
     fiducials: Sequence[tuple[float, float]] = FIDUCIALS,
     traces: Sequence[tuple[float, float, float, float]] = (),
     width: float = 0.5,
@@ -41,7 +41,7 @@ def round_board(
 
     copper = f"%ADD10C,{width}*%\n%ADD11C,1.0*%\nD10*\n"
     copper += "".join(at(*each[:2], "D02") + at(*each[2:], "D01") for each in traces)
-    copper += "D11*\n" + "".join(at(*each, "D03") for each in (*lands, *fiducials))
+    copper += "D11*\n" + "".join(at(*each, "D03") for each in (*pads, *fiducials))
     mask = _flashes([*((*each, 2.6) for each in fiducials), *openings])
     ends = [(0, 0), (20, 0), (20, 16), (0, 16), (0, 0)]
     outline = "%ADD10C,0.1*%\nD10*\n" + "".join(at(*each, "D01" if n else "D02") for n, each in enumerate(ends))

@@ -135,13 +135,13 @@ def locate(
         picture,
         artwork,
         scale=pixel,
-        near=initial_pose_of(initial_pose),
-        within=_search_range(search_range),
+        initial_pose=initial_pose_of(initial_pose),
+        search_range=_search_range(search_range),
         features=chosen,
         model=None if camera is None else read_lens(camera),
         budget=budget or _BUDGET,
         blur_px=blur_px,
-        etch=quantities(etch_bias, "--etch-bias", "m")[0],
+        etch_bias_sigma=quantities(etch_bias, "--etch-bias", "m")[0],
         threshold=threshold,
         copper=copper.value,
         device=None if device is None else Device.named(device),
@@ -171,13 +171,13 @@ def _artwork(
 ) -> Artwork:
     """Read the side of the board that the features are on, with the clearance that the imaging needs."""
     from gpuvision.matching.artwork.artwork import read_artwork
-    from gpuvision.matching.features.feature_set import clearance_of
-    from gpuvision.matching.features.selection import Imaging
+    from gpuvision.matching.features.feature_set import edge_clearance
+    from gpuvision.matching.features.imaging import Imaging
 
     imaging = Imaging(pixel=pixel, blur_px=blur_px) if features is None else features.imaging
     return read_artwork(
         board,
         side=side if features is None else features.side,
         layers=layers_of(layers),
-        clearance=clearance_of(imaging),
+        clearance=edge_clearance(imaging),
     )

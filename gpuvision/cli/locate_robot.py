@@ -111,7 +111,7 @@ def locate_robot(
         measured = _scan(
             picture, described, camera, pixel, line_width, blind_radius, threshold=threshold, device=chosen
         )
-    located = locate(measured, described, near=pose, scale=pixel, device=chosen)
+    located = locate(measured, described, initial_pose=pose, scale=pixel, device=chosen)
     report_pose(located, lambda path: draw_located_robot(path, located, picture), out, as_json)
 
 
@@ -126,7 +126,7 @@ def _scan(
 ) -> FloorScan:
     """Find points on the lines of the floor in a top view, or in the view of a camera on the robot."""
     from gpuvision.formats.camera_file import read_lens, read_mounted
-    from gpuvision.workflows.locating_robot import line_width_of, scan_floor
+    from gpuvision.workflows.locating_robot import default_line_width, scan_floor
 
     shape = (int(picture.shape[0]), int(picture.shape[1]))
     mounted = None if camera is None else read_mounted(camera, shape)
@@ -135,7 +135,7 @@ def _scan(
         reject_unused(reason, scale=scale, blind_radius=blind_radius)
     elif scale is None:
         raise ValueError("--scale is missing: the size of a pixel on the floor, such as 1cm")
-    width = line_width_of(field) if line_width is None else quantities(line_width, "--line-width", "m")[0]
+    width = default_line_width(field) if line_width is None else quantities(line_width, "--line-width", "m")[0]
     return scan_floor(
         picture,
         scale=scale,

@@ -81,8 +81,8 @@ def select(
     from gpuvision.host import Device
     from gpuvision.host.files import check_folder, whole_folder
     from gpuvision.matching.artwork.artwork import read_artwork
-    from gpuvision.matching.features.feature_set import choose_features, clearance_of
-    from gpuvision.matching.features.selection import Imaging
+    from gpuvision.matching.features.feature_set import choose_features, edge_clearance
+    from gpuvision.matching.features.imaging import Imaging
     from gpuvision.plots.board import draw_features
 
     left, bottom, right, top = quantities(region, "--region", "m,m,m,m")
@@ -97,13 +97,13 @@ def select(
         contrast_bare=bare,
         contrast_masked=masked,
         width_px=width,
-        etch=quantities(etch_bias, "--etch-bias", "m")[0],
+        etch_bias_sigma=quantities(etch_bias, "--etch-bias", "m")[0],
         shift=shift,
         angle=angle,
     )
     at = None if placement is None else quantities(placement, "--placement", "m,m")
     check_folder(out)
-    artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=clearance_of(imaging))
+    artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=edge_clearance(imaging))
     box = ((left, bottom), (right, top))
     features = choose_features(
         artwork,

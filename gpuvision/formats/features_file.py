@@ -1,4 +1,4 @@
-"""Feature files: the features of a board that ``gpuvision select`` writes and ``gpuvision locate --features`` reads."""
+"""Feature files: ``gpuvision select`` writes the features of a board, ``gpuvision locate --features`` reads them."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import tomli_w
 
 from gpuvision.host.files import replacing
 from gpuvision.matching.artwork.artwork import Side
-from gpuvision.matching.features.feature_set import MOST_ROWS, FeatureSet
-from gpuvision.matching.features.fiducials import Marks
-from gpuvision.matching.features.selection import Imaging
+from gpuvision.matching.features.feature_set import MAX_ROWS, FeatureSet
+from gpuvision.matching.features.fiducials import Fiducials
+from gpuvision.matching.features.imaging import Imaging
 from gpuvision.schema import Section, read_toml
 
 
 def write_features(features: FeatureSet, path: str | Path) -> None:
-    """Write features as TOML, whole or not at all.
+    """Write features as TOML; the file is replaced only once it is complete.
 
     Raises
     ------
@@ -53,9 +53,9 @@ def write_features(features: FeatureSet, path: str | Path) -> None:
             }
             for number in range(len(features.length))
         ],
-        "mark": [
+        "fiducial": [
             {"point": point.tolist(), "radius": float(radius), "hole": float(hole), "sigma": float(sigma)}
-            for point, radius, hole, sigma in zip(*features.marks, strict=True)
+            for point, radius, hole, sigma in zip(*features.fiducials, strict=True)
         ],
     }
     with replacing(path) as file:
@@ -63,14 +63,14 @@ def write_features(features: FeatureSet, path: str | Path) -> None:
 
 
 def read_features(path: str | Path) -> FeatureSet:
-    """Read features as `write_features` wrote them.
+    """Read features from a file of `write_features`.
 
     Raises
     ------
     OSError
         The file cannot be read.
     DescriptionError
-        It says something else; the message names the key.
+        The file has another content; the message names the key.
     """
     top = read_toml(Path(path))
     side: Side = top.choice("side", get_args(Side))
@@ -86,12 +86,13 @@ def read_features(path: str | Path) -> FeatureSet:
     region.numbers("columns_and_rows", "pixel", (2,))
     region.finish()
     rows = [_ruler(table) for table in top.sections("ruler")]
-    marks = _marks(top.sections("mark"))
+    fiducials = _fiducials(top.sections("fiducial"))
     top.finish()
-    if not 3 <= len(rows) + 2 * len(marks.radius) <= MOST_ROWS:
+    if not 3 <= len(rows) + 2 * len(fiducials.radius) <= MAX_ROWS:
         raise top.error(
-            f"{len(rows)} tables [[ruler]] and {len(marks.radius)} [[mark]], expected 3 to {MOST_ROWS}, of marks half "
-            "as many"
+            f"{len(rows)} tables [[ruler]] and {len(fiducials.radius)} [[fiducial]], expected 3 to {MAX_ROWS} "
+            f"rows: one "
+            "for each ruler, two for each fiducial"
         )
     point, normal, spacing, length, sigma = (
         np.array([row[column] for row in rows], np.float64).reshape(-1, *shape)
@@ -109,7 +110,7 @@ def read_features(path: str | Path) -> FeatureSet:
         covariance=covariance,
         condition=condition,
         region=bounds,
-        marks=marks,
+        fiducials=fiducials,
     )
 
 
@@ -139,10 +140,10 @@ def _ruler(table: Section) -> tuple[Any, ...]:
     return row
 
 
-def _marks(tables: tuple[Section, ...]) -> Marks:
+def _fiducials(tables: tuple[Section, ...]) -> Fiducials:
     rows = []
     for table in tables:
         row = (table.numbers("point", "m", (2,)), table.number("radius", "m", above=0.0))
         rows.append((*row, table.number("hole", "m", at_least=0.0), table.number("sigma", "m", above=0.0)))
         table.finish()
-    return Marks(*(np.array(each) for each in zip(*rows, strict=True))) if rows else Marks.none()
+    return Fiducials(*(np.array(each) for each in zip(*rows, strict=True))) if rows else Fiducials.empty()

@@ -1,4 +1,4 @@
-"""Fields as files: TOML with the lines and arcs in metres about the field's middle.
+"""Field files: TOML with the lines and arcs in metres relative to the field's centre.
 
 Some come with the package, see `FIELDS`.
 """
@@ -13,7 +13,7 @@ from gpuvision.matching.field.distance_map import Arc, Field
 from gpuvision.schema import Section, read_toml
 
 FIELDS = ("robocup_msl", "robocup_junior")
-"""Those that come with the package."""
+"""Names of the fields in the package."""
 
 
 def read_field(path: str | Path) -> Field:
@@ -29,7 +29,7 @@ def read_field(path: str | Path) -> Field:
     OSError
         The file cannot be read.
     DescriptionError
-        It says something else; the message names the key.
+        The file has another content; the message names the key.
     """
     if str(path) in FIELDS:
         with resources.as_file(resources.files("gpuvision") / "presets" / "fields" / f"{path}.toml") as file:

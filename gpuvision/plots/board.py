@@ -1,4 +1,4 @@
-"""Pictures of boards: the artwork, the rulers that were chosen, and those that an image was measured with."""
+"""Pictures of boards: the artwork with the selected rulers and fiducials, and an image with its measurements."""
 
 from __future__ import annotations
 
@@ -24,13 +24,25 @@ Float64 = npt.NDArray[np.float64]
 
 _DPI = 150
 _LAMINATE, _COPPER, _OPEN, _SILK, _HOLE = "#1f3d2b", "#4f8a5b", "#d9b75f", "#f4f4f0", "#111111"
-# Of different lightness, too, for people who see few colours.
-_USED, _REJECTED, _NOTHING, _ARTWORK = "#00e5ff", "#ff9f1c", "#ff3366", "#ffe14d"
+# The colours differ in lightness too, for colour-blind readers.
+_USED, _REJECTED, _MISSING, _ARTWORK = "#00e5ff", "#ff9f1c", "#ff3366", "#ffe14d"
 _MM = 1e3
 
 
 def draw_features(path: str | Path, artwork: Artwork, features: FeatureSet, region: npt.ArrayLike) -> None:
-    """Draw a region of the artwork with the rulers chosen in it, as PNG, whole or not at all."""
+    """Draw a region of the artwork with the selected features as PNG.
+
+    Parameters
+    ----------
+    path
+        File to write; it is replaced only once the picture is complete.
+    artwork
+        The side of the board.
+    features
+        Selected features.
+    region
+        (2, 2) least and greatest x, y [m].
+    """
     box = np.asarray(region, np.float64)
     window = np.stack([np.minimum(box[0], features.region[0]), np.maximum(box[1], features.region[1])])
     border = 0.04 * (window[1] - window[0]).max()
@@ -44,7 +56,7 @@ def draw_features(path: str | Path, artwork: Artwork, features: FeatureSet, regi
     pair = features.spacing > 0
     for which, colour in ((~pair, _USED), (pair, "#ff66ff")):
         axes.add_collection(LineCollection(list(lines[which]), colors=colour, linewidths=1.4))
-    for middle, radius in zip(features.marks.point, features.marks.radius, strict=True):
+    for middle, radius in zip(features.fiducials.point, features.fiducials.radius, strict=True):
         axes.add_patch(Circle(_MM * middle, _MM * radius, fill=False, edgecolor=_USED, linewidth=1.6))
     axes.plot(*(_MM * features.placement), marker="+", color="white", markersize=16, markeredgewidth=2)
     axes.set(xlim=_MM * window[:, 0], ylim=_MM * window[:, 1], aspect="equal", xlabel="x [mm]", ylabel="y [mm]")
@@ -58,7 +70,7 @@ def draw_features(path: str | Path, artwork: Artwork, features: FeatureSet, regi
 
 
 def draw_artwork(axes: Any, artwork: Artwork, window: Float64) -> None:
-    """Fill copper, what the mask opens, silk and holes of a window [m], in millimetres."""
+    """Draw copper, mask openings, silk and holes of a window (2, 2) [m], in millimetres."""
     axes.set_facecolor(_LAMINATE)
     _fill(axes, artwork.copper, window, _COPPER, _LAMINATE)
     _fill(axes, artwork.mask, window, _OPEN, _COPPER, alpha=0.55)
@@ -80,30 +92,41 @@ def _fill(
 
 
 def draw_located_board(path: str | Path, image: npt.NDArray[Any], artwork: Artwork, located: LocatedBoard) -> None:
-    """Draw an image with the artwork at the pose that was found, the rulers, their edges, and marks, as PNG.
+    """Draw an image with the artwork at the located pose, the rulers with their edges, and the fiducials, as PNG.
 
-    The rulers are drawn as straight lines between their ends; through a lens they are bent by less than is seen.
+    Rulers are drawn as straight lines between their ends; the distortion of a lens over a ruler is not visible.
+
+    Parameters
+    ----------
+    path
+        File to write; it is replaced only once the picture is complete.
+    image
+        The image that was measured.
+    artwork, located
+        Artwork, and result of `locate_board`.
     """
     rows, columns = located.view.shape
     figure, axes = _page((10.0, min(max(10.0 * rows / columns, 3.0), 14.0) + 0.8))
     _show(axes, image)
     _draw_outlines(axes, artwork, located.view)
-    told, view = located.rulers, located.view
+    rulers, view = located.rulers, located.view
     classes = (
-        ("agree", told.used, _USED),
-        ("rejected", told.found & ~told.used, _REJECTED),
-        ("no edge found", told.laid & ~told.found, _NOTHING),
+        ("agree", rulers.used, _USED),
+        ("rejected", rulers.found & ~rulers.used, _REJECTED),
+        ("no edge found", rulers.in_image & ~rulers.found, _MISSING),
     )
-    ends = told.normal * (told.length_px * view.scale / 2)[:, None]
-    lines = np.stack([view.to_measured_pixels(told.point - ends), view.to_measured_pixels(told.point + ends)], axis=1)
-    places = view.to_measured_pixels(told.point + told.normal * (told.position_px * view.scale)[:, None])
+    ends = rulers.normal * (rulers.length_px * view.scale / 2)[:, None]
+    lines = np.stack(
+        [view.to_measured_pixels(rulers.point - ends), view.to_measured_pixels(rulers.point + ends)], axis=1
+    )
+    places = view.to_measured_pixels(rulers.point + rulers.normal * (rulers.position_px * view.scale)[:, None])
     handles = [Line2D([], [], color=_ARTWORK, label="artwork's edges" + _as_expected(located))]
     for name, which, colour in classes:
         axes.add_collection(LineCollection(list(lines[which]), colors=colour, linewidths=1.1))
         axes.plot(*places[which].T, ".", color=colour, markersize=4.0)
         handles.append(Line2D([], [], color=colour, label=f"{int(which.sum())} rulers: {name}"))
     axes.plot(*located.placement_px, marker="+", color="white", markersize=18, markeredgewidth=1.6)
-    handles += _draw_marks(axes, located)
+    handles += _draw_fiducials(axes, located)
     _draw_axes(axes, view)
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="column [px]", ylabel="row [px]")
     axes.set_title(located.summary(), fontsize=8, loc="left")
@@ -111,22 +134,22 @@ def draw_located_board(path: str | Path, image: npt.NDArray[Any], artwork: Artwo
     _write(figure, path)
 
 
-def _draw_marks(axes: Any, located: LocatedBoard) -> list[Line2D]:
-    """Draw marks as circles where they were found, and where they were not as they should lie; a legend's handles."""
-    told, view = located.marks, located.view
-    middles = np.where(told.found[:, None], told.image_px, view.to_measured_pixels(told.point))
-    size = np.where(told.found, np.nan_to_num(told.size), told.radius) / view.scale
+def _draw_fiducials(axes: Any, located: LocatedBoard) -> list[Line2D]:
+    """Draw fiducials as circles where they were found or expected, and return the handles of the legend."""
+    fiducials, view = located.fiducials, located.view
+    middles = np.where(fiducials.found[:, None], fiducials.image_px, view.to_measured_pixels(fiducials.point))
+    size = np.where(fiducials.found, np.nan_to_num(fiducials.size), fiducials.radius) / view.scale
     handles = []
     for name, which, colour in (
-        ("agree", told.used, _USED),
-        ("rejected", told.found & ~told.used, _REJECTED),
-        ("not found", told.laid & ~told.found, _NOTHING),
+        ("agree", fiducials.used, _USED),
+        ("rejected", fiducials.found & ~fiducials.used, _REJECTED),
+        ("not found", fiducials.in_image & ~fiducials.found, _MISSING),
     ):
         for middle, radius in zip(middles[which], size[which], strict=True):
             axes.add_patch(Circle(middle, radius, fill=False, edgecolor=colour, linewidth=1.4))
             axes.plot(*middle, "x", color=colour, markersize=4.0)
-        if told.laid.any():
-            label = f"{int(which.sum())} marks: {name}"
+        if fiducials.in_image.any():
+            label = f"{int(which.sum())} fiducials: {name}"
             handles.append(Line2D([], [], color=colour, marker="o", fillstyle="none", linestyle="", label=label))
     return handles
 
@@ -136,7 +159,7 @@ def _as_expected(located: LocatedBoard) -> str:
 
 
 def _draw_outlines(axes: Any, artwork: Artwork, view: BoardView) -> None:
-    """Draw the straight edges that can be seen."""
+    """Draw the visible straight edges of the artwork."""
     edges = artwork.edges
     ends = np.stack([edges.start, edges.end], axis=1)
     low, high = view.bounds
@@ -147,7 +170,7 @@ def _draw_outlines(axes: Any, artwork: Artwork, view: BoardView) -> None:
 
 
 def _draw_axes(axes: Any, view: BoardView) -> None:
-    """Draw the board's axes at the image's middle: x with a long arm, y with a short one."""
+    """Draw the board's axes at the image centre: x with a long arrow, y with a short one."""
     x, y, _ = view.pose
     arm = 0.08 * min(view.shape) * view.scale
     centre = view.to_measured_pixels(np.array([x, y]))

@@ -1,4 +1,4 @@
-"""A picture of where a robot may be: what it sees under the field's lines, and the field with the candidates."""
+"""Picture of a located robot: its view with the field's lines, and the field with the pose candidates."""
 
 from __future__ import annotations
 
@@ -26,7 +26,17 @@ _ELLIPSE = 3.0  # sigmas
 
 
 def draw_located_robot(path: str | Path, located: LocatedRobot, image: npt.NDArray[Any] | None = None) -> None:
-    """Draw what the robot sees beside the field with the candidates, as PNG, whole or not at all."""
+    """Draw the robot's view and the field with the candidates side by side, as PNG.
+
+    Parameters
+    ----------
+    path
+        File to write; it is replaced only once the picture is complete.
+    located
+        Result of `locate_robot`.
+    image
+        Top view of the floor; None: draw the points alone.
+    """
     figure = Figure(figsize=(13.0, 5.8), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
@@ -38,7 +48,7 @@ def draw_located_robot(path: str | Path, located: LocatedRobot, image: npt.NDArr
 
 
 def _draw_view(axes: Axes, located: LocatedRobot, image: npt.NDArray[Any] | None) -> None:
-    """Draw the robot's own frame: the image, its points, and the field's lines as the best candidate has them."""
+    """Draw the robot's frame: the image, its points, and the field's lines as seen from the best candidate."""
     reach = float(np.abs(located.points).max()) * 1.05 if len(located.points) else 1.0
     axes.set_facecolor(_CARPET if image is None else "black")
     if image is not None and located.scale is not None:
@@ -55,14 +65,14 @@ def _draw_view(axes: Axes, located: LocatedRobot, image: npt.NDArray[Any] | None
         pose = shown_poses[0].pose
         lines = [_into(line, pose) for line in field_lines(located.field)]
         axes.add_collection(LineCollection(lines, colors="#ffe14d", linewidths=0.8))
-        on = _distances(located.points, lines) < 3.0 * max(shown_poses[0].scale, 1e-3)
+        on = _distances(located.points, lines) < 3.0 * max(shown_poses[0].residual_std, 1e-3)
     for name, which, colour in (("on lines", on, _ON), ("beside them", ~on, _OFF)):
         axes.plot(
             *located.points[which].T, ".", color=colour, markersize=4.0, label=f"{int(which.sum())} points {name}"
         )
     axes.plot(0.0, 0.0, marker="+", color="white", markersize=14)
     axes.set(aspect="equal", xlabel="ahead [m]", ylabel="to the left [m]")
-    axes.set_title("as the robot sees it; yellow: the field, as the best candidate has it", fontsize=9, loc="left")
+    axes.set_title("view of the robot; yellow: the field's lines for the best candidate", fontsize=9, loc="left")
     axes.legend(loc="lower left", fontsize=7)
 
 
@@ -99,7 +109,7 @@ def _draw_field(axes: Axes, located: LocatedRobot) -> None:
 
 
 def field_lines(field: Field) -> list[Float64]:
-    """Return a field's lines and arcs as polygons' corners, (n, 2) [m] each."""
+    """Return a field's lines and arcs as polylines, (n, 2) [m] each."""
     lines = [np.array(each).reshape(2, 2) for each in field.lines]
     for arc in field.arcs:
         angle = np.linspace(arc.start, arc.end, max(8, math.ceil((arc.end - arc.start) / 0.08)))
@@ -114,7 +124,7 @@ def _into(line: Float64, pose: Float64) -> Float64:
 
 
 def _distances(points: npt.NDArray[Any], lines: list[Float64]) -> Float64:
-    """Return how far each point is from the nearest line."""
+    """Return the distance of each point from the nearest line [m]."""
     start = np.concatenate([each[:-1] for each in lines])
     along = np.concatenate([each[1:] - each[:-1] for each in lines])
     off = points[:, None] - start

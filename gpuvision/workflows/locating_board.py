@@ -1,8 +1,11 @@
-"""Where a camera is over a board: an image and the board's artwork become a pose with a covariance.
+"""Locate a camera over a board: from an image and the board's artwork to a pose with a covariance.
 
-Rulers find edges, round marks are found by their contours, from both a robust pose is solved, and looked for anew at
-that pose they measure it again. Where the board is not known to a few pixels, `gpuvision.matching.pose.registration`
-finds it first.
+Calipers (rulers) measure edges and blobs give the fiducials; a robust pose is solved from both, and they are measured
+again at that pose. Where the board is not known to a few pixels, `gpuvision.matching.pose.registration` finds it first.
+
+References
+----------
+.. [1] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, sections 6.3 and 8.6.
 """
 
 from __future__ import annotations
@@ -22,21 +25,51 @@ from gpuvision.camera.orthographic import BoardView
 from gpuvision.camera.undistort_image import UndistortImage
 from gpuvision.host import Device, to_numpy
 from gpuvision.matching.artwork.artwork import Artwork
-from gpuvision.matching.board.edge_measurement import Copper, Fix, Looking, features_in_view, moved
+from gpuvision.matching.board.edge_measurement import (
+    BoardMeasurement,
+    BoardMeasurer,
+    Copper,
+    move_view,
+)
 from gpuvision.matching.board.located_board import LocatedBoard
+from gpuvision.matching.board.view_features import select_features_in_view
 from gpuvision.matching.features.feature_set import FeatureSet
-from gpuvision.matching.features.selection import Imaging
-from gpuvision.matching.pose.registration import Registration, register_board
+from gpuvision.matching.features.imaging import Imaging
+from gpuvision.matching.pose.registration import Registration, prepare_board_registration
 from gpuvision.status import Status
 
 COPPER = ("auto", "bright", "dark")
 Float64 = npt.NDArray[np.float64]
 
-SURE = (1e-4, 0.3 * math.pi / 180)  # [m], [rad] that a board is within, where it is said where it is
-SEARCHED = (2e-3, 5 * math.pi / 180)  # and where it is not
-_MOST_RULED = (2.5e-4, 1.0 * math.pi / 180)  # what rulers alone are asked to bridge
-_AFTER_SEARCH = (6e-5, 2e-3)
-_OTHER_SHARE = 0.6  # of the rulers, up to which another place that the search likes is not believed
+# Default search ranges [m], [rad], with and without an initial pose (chosen).
+KNOWN_RANGE = (1e-4, 0.3 * math.pi / 180)
+UNKNOWN_RANGE = (2e-3, 5 * math.pi / 180)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizationLimits:
+    """Thresholds of the localization of a board.
+
+    Parameters
+    ----------
+    ruler_range
+        Largest search range [m], [rad] without a coarse registration: rulers alone reach so far (chosen).
+    ruler_range_px
+        The same shift in pixels, where that is more [px].
+    registered_range
+        Search range [m], [rad] after a coarse registration (chosen: several times its error).
+    registered_range_px
+        The same shift in pixels, where that is more [px].
+    max_other_share
+        The runner-up of an ambiguous coarse registration is excluded where at most this share of the rulers and
+        fiducials agree with it, relative to those that agree with the best pose (chosen).
+    """
+
+    ruler_range: tuple[float, float] = (2.5e-4, 1.0 * math.pi / 180)
+    ruler_range_px: float = 10.0
+    registered_range: tuple[float, float] = (6e-5, 2e-3)
+    registered_range_px: float = 3.0
+    max_other_share: float = 0.6
 
 
 def locate_board(
@@ -44,58 +77,69 @@ def locate_board(
     artwork: Artwork,
     *,
     scale: float,
-    near: tuple[float, float, float] | None = None,
-    within: tuple[float, float] | None = None,
+    initial_pose: tuple[float, float, float] | None = None,
+    search_range: tuple[float, float] | None = None,
     features: FeatureSet | None = None,
     model: Lens | Camera | None = None,
     budget: int = 60,
     blur_px: float = 1.0,
-    etch: float = 10e-6,
+    etch_bias_sigma: float = 10e-6,
     threshold: float | None = None,
     noise: float | None = None,
     copper: Copper = "auto",
     device: Device | None = None,
+    limits: LocalizationLimits = LocalizationLimits(),
 ) -> LocatedBoard:
-    """Locate a camera over a board, by rulers and round marks; ``reason`` of the result says why a pose is refused.
+    """Locate a camera over a board by calipers (rulers) and round fiducials.
 
     Parameters
     ----------
     image
-        Grey or colour (blue, green, red), uint8, uint16 or float32; the camera looks straight at the board.
+        Grey or colour (blue, green, red) image, uint8, uint16 or float32; the camera looks at right angles at the
+        board.
     artwork
-        The side that it sees.
+        The side that the camera sees.
     scale
-        Of a pixel on the board [m].
-    near
-        About where it is: the place on the board that the image's centre sees, x, y [m], and theta [rad], by which
-        the image's columns are turned from the artwork's x, counter-clockwise. None: over the board's middle.
-    within
-        How far from there it may be, along x and along y [m], and in angle [rad]. None: 0.1 mm (or 4 pixels) and 0.3
-        degrees; where ``near`` is None, 2 mm and 5 degrees. Beyond 0.25 mm (or 10 pixels) or 1 degree it is searched.
+        Size of a pixel on the board [m].
+    initial_pose
+        Expected pose: the place on the board at the image centre, x, y [m], and theta [rad], the angle from the
+        artwork's x axis to the image's columns, counter-clockwise. None: the centre of the board, theta 0.
+    search_range
+        Largest offset of the board from the expected pose, along x and along y [m], and largest angle [rad]. None: 0.1
+        mm (or 4 pixels) and 0.3 degrees; without ``initial_pose`` 2 mm and 5 degrees; the range of the features where
+        they are given. Beyond 0.25 mm (or 10 pixels) or 1 degree a coarse registration comes first.
     features
-        What to look for, and how far away; None: marks, and as many rulers as the budget says, are chosen now.
+        Features to measure, with their search range. None: fiducials, and as many rulers as the budget allows, are
+        selected now.
     model
-        The lens; None: there is none.
+        Lens or camera model; None: no distortion.
     budget
-        Rulers, where no features are given.
+        Number of rulers where no features are given, default 60.
     blur_px
-        Standard deviation of the edges' blur [px].
-    etch
-        Standard deviation of how far copper is etched beside its drawn edges, everywhere the same [m].
+        Standard deviation of the edges' blur [px], default 1.
+    etch_bias_sigma
+        Standard deviation of the etch bias [m], default 10 um.
     threshold
-        Least edge [grey levels]; None: 4 times the noise, and a twentieth of the image's range.
+        Least height of an edge [grey levels]; None: 4 times the noise, at least a twentieth of the image's range.
     noise
-        Standard deviation of a pixel [grey levels]; None: as the image shows it.
+        Standard deviation of a pixel [grey levels]; None: estimated from the image.
     copper
-        "bright" or "dark" beside what surrounds it; "auto": as more rulers agree.
+        Whether copper is "bright" or "dark" relative to its surroundings; "auto": what more rulers agree with.
     device
         Where to run; None: `Device.best`.
+    limits
+        Thresholds of the decisions.
+
+    Returns
+    -------
+    LocatedBoard
+        Its ``reason`` says why a pose is refused.
 
     Raises
     ------
     ValueError
-        A parameter is out of its range, the image's shape is not accepted, or the image shows no features that fix the
-        pose.
+        A parameter is out of its range, the image's shape is not accepted, or the view has no features that determine
+        the pose.
     TypeError
         The pixels are not uint8, uint16 or float32.
     """
@@ -103,50 +147,53 @@ def locate_board(
     if copper not in COPPER:
         raise ValueError(f"copper is {copper!r}, expected one of {', '.join(COPPER)}")
     levels = _levels(grey, noise, threshold)
-    job = _Job(grey, artwork, *levels, blur_px, etch, Device.best() if device is None else device)
-    view = _view_near(near, artwork, scale, grey.shape, model)
-    searched = job.searched(view, _reach(within, near is not None, scale, features))
-    return job.located(searched, job.chosen(searched, budget) if features is None else features, copper)
+    device = Device.best() if device is None else device
+    job = _Job(grey, artwork, *levels, blur_px, etch_bias_sigma, device, limits)
+    view = _initial_view(initial_pose, artwork, scale, grey.shape, model)
+    expected = job.register(view, _search_range(search_range, initial_pose is not None, scale, features))
+    return job.locate(expected, job.select_features(expected, budget) if features is None else features, copper)
 
 
 def _levels(grey: npt.NDArray[Any], noise: float | None, threshold: float | None) -> tuple[float, float]:
-    """Return a pixel's noise and the least edge [grey levels], as they are given or as the image shows them."""
+    """Return the noise of a pixel and the least height of an edge [grey levels], given or estimated from the image."""
     level = estimate_pixel_noise(grey) if noise is None else noise
     low, high = np.percentile(grey, [1, 99])
     return level, max(4.0 * level, 0.05 * float(high - low), 1e-6) if threshold is None else threshold
 
 
-def _view_near(
-    near: tuple[float, float, float] | None,
+def _initial_view(
+    initial_pose: tuple[float, float, float] | None,
     artwork: Artwork,
     scale: float,
     shape: tuple[int, int],
     model: Lens | Camera | None,
 ) -> BoardView:
-    x, y = artwork.bounds.mean(axis=0) if near is None else near[:2]
-    pose = (float(x), float(y), 0.0 if near is None else float(near[2]))
+    """Return the camera at the expected pose."""
+    x, y = artwork.bounds.mean(axis=0) if initial_pose is None else initial_pose[:2]
+    pose = (float(x), float(y), 0.0 if initial_pose is None else float(initial_pose[2]))
     return BoardView(scale=scale, shape=shape, pose=pose, mirrored=artwork.side == "bottom", model=model)
 
 
-def _reach(
-    within: tuple[float, float] | None, known: bool, scale: float, features: FeatureSet | None
+def _search_range(
+    search_range: tuple[float, float] | None, known: bool, scale: float, features: FeatureSet | None
 ) -> tuple[float, float]:
-    """Return how far, and how much turned, the board may be [m], [rad]."""
-    if within is not None:
-        if not (0 < within[0] < math.inf and 0 <= within[1] <= math.pi):
-            raise ValueError(f"within is {within}, expected metres above 0, and an angle of 0 to pi [rad]")
-        return within
+    """Return the search range [m], [rad]: as given, or its default."""
+    if search_range is not None:
+        if not (0 < search_range[0] < math.inf and 0 <= search_range[1] <= math.pi):
+            raise ValueError(f"search_range is {search_range}, expected metres above 0, and an angle of 0 to pi [rad]")
+        return search_range
     if not known:
-        return SEARCHED
+        return UNKNOWN_RANGE
     if features is not None:
         return features.imaging.shift, features.imaging.angle
-    return max(SURE[0], 4 * scale), SURE[1]
+    return max(KNOWN_RANGE[0], 4 * scale), KNOWN_RANGE[1]
 
 
-class _Searched(NamedTuple):
-    """Where the board is, as far as the search knows it, what is left to reach [m], [rad], and why it is nowhere.
+class _ExpectedPose(NamedTuple):
+    """Expected pose of the camera, remaining search range [m], [rad], and the reason of a refusal.
 
-    ``found`` is None where none was made; ``other`` is where the board may be as well.
+    ``found`` is the result of the coarse registration, None without one; ``other`` is its runner-up where it is
+    ambiguous.
     """
 
     view: BoardView
@@ -157,35 +204,38 @@ class _Searched(NamedTuple):
 
 
 class _Clock:
-    """What each step took."""
+    """Duration of each step [s]."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._last = time.perf_counter()
 
-    def told(self, step: str) -> None:
+    def record(self, step: str) -> None:
         now = time.perf_counter()
         self.seconds[step], self._last = now - self._last, now
 
 
 @dataclass(frozen=True)
 class _Job:
-    """An image of a board, and what is known of both."""
+    """An image of a board with the parameters of the localization."""
 
     grey: npt.NDArray[Any]
     artwork: Artwork
     noise: float
     threshold: float
     blur_px: float
-    etch: float
+    etch_bias_sigma: float
     device: Device
+    limits: LocalizationLimits
     clock: _Clock = field(default_factory=_Clock)
 
-    def searched(self, view: BoardView, reach: tuple[float, float]) -> _Searched:
-        """Find the board where rulers alone would not reach."""
-        if reach[0] <= max(_MOST_RULED[0], 10 * view.scale) and reach[1] <= _MOST_RULED[1]:
-            return _Searched(view, reach)
-        search = register_board(
+    def register(self, view: BoardView, reach: tuple[float, float]) -> _ExpectedPose:
+        """Run the coarse registration where the search range is too large for rulers alone."""
+        limits = self.limits
+        ruler_shift = max(limits.ruler_range[0], limits.ruler_range_px * view.scale)
+        if reach[0] <= ruler_shift and reach[1] <= limits.ruler_range[1]:
+            return _ExpectedPose(view, reach)
+        search = prepare_board_registration(
             self.artwork,
             view.matrix,
             view.shape,
@@ -194,84 +244,103 @@ class _Job:
             blur_px=self.blur_px,
             threshold=self.threshold,
         )
-        self.clock.told("search prepared")
-        straight = self.grey
+        self.clock.record("prepare registration")
+        undistorted = self.grey
         if view.model is not None:
             undistort = UndistortImage(model=view.model, border="replicate")
-            straight = to_numpy(undistort(self.grey, device=self.device).image)
-        found = search(straight, device=self.device)
-        self.clock.told("search")
-        left = (max(_AFTER_SEARCH[0], 3 * view.scale), _AFTER_SEARCH[1])
+            undistorted = to_numpy(undistort(self.grey, device=self.device).image)
+        found = search(undistorted, device=self.device)
+        self.clock.record("registration")
+        shift = max(limits.registered_range[0], limits.registered_range_px * view.scale)
+        left = (shift, limits.registered_range[1])
         if not np.all(np.isfinite(found.pose)):
-            best = f"the best one has {found.score:.0%} of its edges; is it in view, is the scale right?"
+            best = f"the best candidate has {found.score:.0%} of its edges; is the board in view, is the scale right?"
             if not found.rulers:
                 best = (
-                    "it has too few straight edges in view; say near where it is (marks will do then), or another scale"
+                    "too few straight edges are in view; give an initial pose (fiducials are enough then), or another "
+                    "scale"
                 )
-            reason = f"the search found no place for the board: {best}"
-            return _Searched(view, left, found, reason)
-        other = moved(view, found.runner_up_pose) if found.status & Status.AMBIGUOUS else None
-        return _Searched(moved(view, found.pose), left, found, other=other)
+            reason = f"the coarse registration found no pose of the board: {best}"
+            return _ExpectedPose(view, left, found, reason)
+        other = move_view(view, found.runner_up_pose) if found.status & Status.AMBIGUOUS else None
+        return _ExpectedPose(move_view(view, found.pose), left, found, other=other)
 
-    def chosen(self, searched: _Searched, budget: int) -> FeatureSet:
-        """Choose what to look for where the board is thought to be."""
-        shift, angle = searched.reach
-        imaging = Imaging(pixel=searched.view.scale, blur_px=self.blur_px, etch=self.etch, shift=shift, angle=angle)
-        features = features_in_view(self.artwork, searched.view, imaging, budget)
-        self.clock.told("features")
+    def select_features(self, expected: _ExpectedPose, budget: int) -> FeatureSet:
+        """Select the features of the view at the expected pose."""
+        shift, angle = expected.reach
+        imaging = Imaging(
+            pixel=expected.view.scale,
+            blur_px=self.blur_px,
+            etch_bias_sigma=self.etch_bias_sigma,
+            shift=shift,
+            angle=angle,
+        )
+        features = select_features_in_view(self.artwork, expected.view, imaging, budget)
+        self.clock.record("features")
         return features
 
-    def located(self, searched: _Searched, features: FeatureSet, copper: Copper) -> LocatedBoard:
-        """Look for the features, in copper of either kind where that is not known."""
-        looked = Looking(self.grey, features, self.noise, self.threshold, self.blur_px, self.etch, self.device)
+    def locate(self, expected: _ExpectedPose, features: FeatureSet, copper: Copper) -> LocatedBoard:
+        """Measure the features; where it is not known whether copper is bright or dark, try both."""
+        measurer = BoardMeasurer(
+            self.grey, features, self.noise, self.threshold, self.blur_px, self.etch_bias_sigma, self.device
+        )
         kinds: tuple[Copper, ...] = ("bright", "dark") if copper == "auto" else (copper,)
-        fixes = [(kind, looked.located(searched.view, kind)) for kind in kinds]
-        kind, fix = max(fixes, key=lambda each: (not each[1].reason, each[1].agreeing))
-        reason = searched.reason or fix.reason
-        if searched.other is not None and not reason:
-            reason = _undecided(searched, fix, looked.located(searched.other, kind))
-        self.clock.told("rulers")
-        return self._result(fix, kind, features, searched.found, reason)
+        measurements = [(kind, measurer.measure(expected.view, kind)) for kind in kinds]
+        kind, measurement = max(measurements, key=lambda each: (not each[1].reason, each[1].agreeing))
+        reason = expected.reason or measurement.reason
+        if expected.other is not None and not reason:
+            other = measurer.measure(expected.other, kind)
+            reason = _reason_of_ambiguity(expected, measurement, other, self.limits.max_other_share)
+        self.clock.record("rulers")
+        return self._result(measurement, kind, features, expected.found, reason)
 
     def _result(
-        self, fix: Fix, copper: Copper, features: FeatureSet, first: Registration | None, reason: str
+        self,
+        measurement: BoardMeasurement,
+        copper: Copper,
+        features: FeatureSet,
+        coarse_registration: Registration | None,
+        reason: str,
     ) -> LocatedBoard:
-        solution = fix.solution
-        # The board was seen moved by a small pose, at the placement point; the camera is moved against it. What the
-        # image's centre sees is off by the turn's error times its distance from there.
+        solution = measurement.solution
+        # The solver gives the motion of the board at the placement point; the camera moves the other way. At the image
+        # centre the error of the turn adds, times the distance from the placement point.
         covariance = np.full((3, 3), math.nan) if reason else solution.covariance
-        arm = np.array(fix.view.pose[:2]) - features.placement
+        arm = np.array(measurement.view.pose[:2]) - features.placement
         back = -np.array([[1.0, 0.0, -arm[1]], [0.0, 1.0, arm[0]], [0.0, 0.0, 1.0]])
         return LocatedBoard(
-            view=fix.view,
+            view=measurement.view,
             covariance=back @ covariance @ back.T,
             placement=features.placement,
-            placement_px=fix.view.to_measured_pixels(features.placement),
+            placement_px=measurement.view.to_measured_pixels(features.placement),
             placement_covariance=covariance,
             rulers=solution.rulers,
-            marks=solution.marks,
+            fiducials=solution.fiducials,
             features=features,
-            growth=solution.growth,
-            spread=solution.spread,
+            etch_bias=solution.etch_bias,
+            residual_scale=solution.residual_scale,
             condition=solution.condition,
             copper=copper,
             noise=self.noise,
             threshold=self.threshold,
             reason=reason,
-            first=first,
+            coarse_registration=coarse_registration,
             device=self.device,
             seconds=self.clock.seconds,
         )
 
 
-def _undecided(searched: _Searched, best: Fix, other: Fix) -> str:
-    """Return why a board that the search found at two places may be at either; empty where rulers tell them apart.
+def _reason_of_ambiguity(
+    expected: _ExpectedPose, best: BoardMeasurement, other: BoardMeasurement, max_other_share: float
+) -> str:
+    """Return why the board may be at either of two places; empty where the rulers exclude the second one.
 
-    Rulers that were chosen to fix the pose look at more than at what is repeated, and at traces by their widths.
+    The rulers differ from those of the coarse registration: they were selected to determine the pose, and pairs of
+    edges test the widths of traces.
     """
-    if other.reason or other.agreeing <= _OTHER_SHARE * best.agreeing:
+    if other.reason or other.agreeing <= max_other_share * best.agreeing:
         return ""
-    places = (searched.view.pose, other.view.pose)
-    told = " or ".join(f"x {1e3 * x:.2f} mm, y {1e3 * y:.2f} mm" for x, y, _ in places)
-    shares = f"{best.agreeing} and {other.agreeing} rulers and marks agree"
-    return f"the board may be at {told}: {shares}; say near which of them it is"
+    places = (expected.view.pose, other.view.pose)
+    either = " or ".join(f"x {1e3 * x:.2f} mm, y {1e3 * y:.2f} mm" for x, y, _ in places)
+    counts = f"{best.agreeing} and {other.agreeing} rulers and fiducials agree"
+    return f"the board may be at {either}: {counts}; give an initial pose near one of them"

@@ -1,13 +1,18 @@
-"""Where a robot is on a field: a top view of the floor around it, or points on lines, become candidates for its pose.
+"""Locate a robot on a field: from a top view of the floor, or from points on lines, to candidates for its pose.
 
-Rays from the image's middle cross the white lines of the floor; the middles of the stripes along them are points on
-lines, and `gpuvision.matching.field.field_pose` finds the poses that fit them.
+Rays from the image's centre cross the white lines of the floor. The centres of the stripes are points on lines;
+`gpuvision.matching.field.field_pose` finds the poses that fit them.
+
+References
+----------
+.. [1] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 6.4.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,51 +30,79 @@ from gpuvision.host.errors import RecordingError
 from gpuvision.host.recordings import read_image
 from gpuvision.matching.field.distance_map import DistanceMap, Field
 from gpuvision.matching.field.evidence import Evidence, evidence
-from gpuvision.matching.field.field_pose import Candidate, locate
-from gpuvision.matching.field.line_detection import FloorScan, least_edge, scan_ahead, scan_top_view
+from gpuvision.matching.field.field_pose import PoseCandidate, find_pose_candidates
+from gpuvision.matching.field.line_detection import FloorScan, default_threshold, scan_tilted_view, scan_top_view
 from gpuvision.matching.field.located_robot import LocatedRobot
 
 Float32 = npt.NDArray[np.float32]
 
 POINT_FILES = (".npy", ".csv")
 RAYS = 128
-_MOST_POINTS = 4096
-_FEWEST = 4
-_FARTHEST = 12.0  # [m]: further away pixels tell little, and errors of the tilt much
-_STARTS = 24  # so many poses are refined
-_BY_CHANCE, _MISSING = math.log(1e-3), 1.0 / 3.0
-_SMALL_FIELD, _SMALL_LINES, _LARGE_LINES = 5.0, 0.02, 0.125  # [m]: a field's length; a junior's lines, and others'
+_MAX_POINTS = 4096  # of `FieldPoseSearch`
+# Default range of a mounted camera [m]: farther away pixels resolve little and errors of the tilt grow (chosen).
+_MAX_RANGE = 12.0
+_MIN_REFINED = 24  # poses of the grid that are refined: cost against the chance to miss the best one (chosen)
+# Fields shorter than the first number [m] have lines of the second width, others of the third (RoboCup rules).
+_SMALL_FIELD, _SMALL_LINES, _LARGE_LINES = 5.0, 0.02, 0.125
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotLimits:
+    """Thresholds of the localization of a robot.
+
+    Parameters
+    ----------
+    min_points
+        Least number of points on lines: one more than unknowns.
+    max_log_nfa
+        Largest accepted `Evidence.log_nfa`: natural logarithm of the expected number of false alarms per search
+        (chosen: one in a thousand searches).
+    max_missing
+        Largest accepted `Evidence.missing` (chosen; tests with wrong fields and clutter confirm it).
+    """
+
+    min_points: int = 4
+    max_log_nfa: float = math.log(1e-3)
+    max_missing: float = 1.0 / 3.0
 
 
 def locate_robot(
     points: Float32 | FloorScan,
     field: Field,
     *,
-    near: tuple[float, float, float] | None = None,
+    initial_pose: tuple[float, float, float] | None = None,
     scale: float | None = None,
-    most: int = 6,
-    outside: float | None = None,
+    max_candidates: int = 6,
+    margin: float | None = None,
     device: Device | None = None,
+    limits: RobotLimits = RobotLimits(),
 ) -> LocatedRobot:
     """Locate a robot on a field by points on its lines.
 
     Parameters
     ----------
     points
-        float32 (points, 2), in the robot's frame: x ahead, y to its left [m]; or what `scan_floor` found: then lines
-        that should be seen and are not count, too.
+        float32 (points, 2) in the robot's frame: x ahead, y to its left [m]; or the result of `scan_floor`: then lines
+        that should be seen and are missing count too.
     field
-        Its lines.
-    near
-        About where it is, x, y [m] and heading [rad]: then nothing else is searched.
+        The field.
+    initial_pose
+        Expected pose, x, y [m] and heading [rad]: no search elsewhere. None: search everywhere.
     scale
-        Of the pixels that the points are from [m], for the report.
-    most
-        Candidates, at most.
-    outside
-        How far beside the field the robot may be [m]; None: a twentieth of its length.
+        Size of a pixel of the image that the points are from [m], for the report.
+    max_candidates
+        Largest number of candidates, default 6.
+    margin
+        Width of the border around the field in which the robot may be [m]; None: a twentieth of the field's length.
     device
         Where to run; None: `Device.best`.
+    limits
+        Thresholds of the decisions.
+
+    Returns
+    -------
+    LocatedRobot
+        Its ``reason`` says why a pose is refused.
 
     Raises
     ------
@@ -78,30 +111,39 @@ def locate_robot(
 
     Notes
     -----
-    Refused is what random points would reach by chance in more than one of a thousand searches; and, of scans, a pose
-    at which more of the lines is missing than a third of what it explains of the points (`Evidence.missing`): clutter
-    leaves points unexplained, robots in the way hide lines, but the wrong field does both.
+    A pose is refused where random points reach it by chance in more than one of a thousand searches. A pose of a scan
+    is also refused where the share of missing lines is more than a third of the share of explained points
+    (`Evidence.missing`): clutter leaves points unexplained and robots in the way hide lines, but a wrong field does
+    both.
     """
     device = Device.best() if device is None else device
     start = time.perf_counter()
     scan = points if isinstance(points, FloorScan) else None
     used = _usable(points.points if isinstance(points, FloorScan) else points)
     kept: dict[str, Any] = {"points": used, "field": field, "scale": scale, "device": device}
-    if len(used) < _FEWEST:
-        reason = f"{len(used)} points on lines, expected {_FEWEST} or more"
+    if len(used) < limits.min_points:
+        reason = f"{len(used)} points on lines, expected {limits.min_points} or more"
         return LocatedRobot(candidates=(), doubtful=(), evidence=None, reason=reason, seconds={}, **kept)
     size = max(field.length, field.width)
-    bend = min(0.25, 0.02 * size)  # a quarter of a metre in a field of 20 m, as the map's own
-    beside = 0.05 * size if outside is None else outside
-    reach = min(float(np.hypot(*used.T).max()) * 1.001 + bend, 1.5 * size)
-    field_map = DistanceMap(field=field, cell=0.4 * bend, scale=bend, reach=reach, outside=beside, device=device)
+    cost_scale = min(0.25, 0.02 * size)  # [m], that of `DistanceMap` in a field of 20 m
+    margin = 0.05 * size if margin is None else margin
+    max_range = min(float(np.hypot(*used.T).max()) * 1.001 + cost_scale, 1.5 * size)
+    field_map = DistanceMap(
+        field=field, cell=0.4 * cost_scale, scale=cost_scale, max_range=max_range, margin=margin, device=device
+    )
     mapped = time.perf_counter()
-    found = locate(field_map, used, near=near, most=max(most, _STARTS), device=device)
-    paths, wide = (None, line_width_of(field)) if scan is None else (scan.paths, scan.line_width)
-    looked: dict[str, Any] = {"scale": bend, "reach": reach, "outside": beside if near is None else None}
-    weights = [evidence(used, paths, field, each.pose, near=0.5 * wide, **looked) for each in found]
-    ordered, weights = _by_weight(found, weights, most)
-    reason = _doubt(weights[0] if weights else None, len(used))
+    found = find_pose_candidates(
+        field_map, used, initial_pose=initial_pose, max_candidates=max(max_candidates, _MIN_REFINED), device=device
+    )
+    paths, wide = (None, default_line_width(field)) if scan is None else (scan.paths, scan.line_width)
+    how: dict[str, Any] = {
+        "scale": cost_scale,
+        "max_range": max_range,
+        "margin": margin if initial_pose is None else None,
+    }
+    weights = [evidence(used, paths, field, each.pose, half_line_width=0.5 * wide, **how) for each in found]
+    ordered, weights = _order(found, weights, max_candidates)
+    reason = _doubt(weights[0] if weights else None, len(used), limits)
     return LocatedRobot(
         candidates=() if reason else ordered,
         doubtful=ordered[:1] if reason else (),
@@ -113,45 +155,50 @@ def locate_robot(
 
 
 def _usable(points: Float32) -> Float32:
-    """Return those that are finite; where they are too many, one of every few."""
+    """Return the finite points; where they are too many, every n-th of them."""
     finite = points[np.isfinite(points).all(axis=1)]
-    return np.ascontiguousarray(finite[:: -(-max(len(finite), 1) // _MOST_POINTS)], np.float32)
+    return np.ascontiguousarray(finite[:: -(-max(len(finite), 1) // _MAX_POINTS)], np.float32)
 
 
-def _by_weight(
-    found: tuple[Candidate, ...], weights: list[Evidence], most: int
-) -> tuple[tuple[Candidate, ...], list[Evidence]]:
+def _order(
+    found: tuple[PoseCandidate, ...], weights: list[Evidence], max_candidates: int
+) -> tuple[tuple[PoseCandidate, ...], list[Evidence]]:
     """Return candidates by how little is missing that they would show; of those that are alike in that, by score."""
-    order = sorted(range(len(found)), key=lambda number: (round(max(weights[number].missing, 0.0), 1), number))[:most]
+    order = sorted(range(len(found)), key=lambda number: (round(max(weights[number].missing, 0.0), 1), number))[
+        :max_candidates
+    ]
     place = {number: rank for rank, number in enumerate(order)}
     moved = [found[number] for number in order]
-    ordered = [each._replace(twin=None if each.twin is None else place.get(each.twin)) for each in moved]
+    ordered = [
+        each._replace(symmetric_twin=None if each.symmetric_twin is None else place.get(each.symmetric_twin))
+        for each in moved
+    ]
     return tuple(ordered), [weights[number] for number in order]
 
 
-def _doubt(best: Evidence | None, count: int) -> str:
-    """Return why the best pose is none, or nothing."""
+def _doubt(best: Evidence | None, count: int, limits: RobotLimits) -> str:
+    """Return why the best candidate is refused; empty where it is accepted."""
     if best is None:
-        return "no pose on the field fits the points; are they in metres, is it this field?"
-    if best.chance > _BY_CHANCE:
-        return f"{count} points fit the field no better than random ones would; is it a field, are they in metres?"
-    if best.missing > _MISSING:
+        return "no pose on the field fits the points; are they in metres, is this the right field?"
+    if best.log_nfa > limits.max_log_nfa:
+        return f"{count} points fit the field no better than random points; is it a field, are they in metres?"
+    if best.missing > limits.max_missing:
         return (
-            f"it does not look like this field: where it fits best, {max(best.seen, 0.0):.0%} of what should be seen "
-            f"of its lines is, and {best.on_lines:.0%} of the points are on them; is the scale right?"
+            f"the image does not match this field: at the best pose {max(best.seen, 0.0):.0%} of the expected lines "
+            f"are seen, and {best.on_lines:.0%} of the points are on lines; is the scale right?"
         )
     return ""
 
 
 def read_points(path: Path) -> Float32:
-    """Read points (n, 2) [m] of an NPY array, or of a CSV file of two columns.
+    """Read points (n, 2) [m] from an NPY array or from a CSV file of two columns.
 
     Raises
     ------
     OSError
         The file cannot be read.
     RecordingError
-        It holds something else.
+        The file has another content.
     """
     try:
         if path.suffix.lower() == ".npy":
@@ -166,14 +213,14 @@ def read_points(path: Path) -> Float32:
 
 
 def white_of(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return how white an image is: the darkest of its three colours, or its grey levels."""
+    """Return how white each pixel is: the darkest of the three colours, or the grey level."""
     if image.ndim == 3 and image.shape[2] in (3, 4):
         return grey_image(np.ascontiguousarray(image[:, :, :3].min(axis=2)))
     return grey_image(image)
 
 
-def line_width_of(field: Field) -> float:
-    """Return how wide a field's lines usually are [m]."""
+def default_line_width(field: Field) -> float:
+    """Return the usual width of the lines of a field [m]: 125 mm, on small fields 20 mm."""
     return _SMALL_LINES if max(field.length, field.width) < _SMALL_FIELD else _LARGE_LINES
 
 
@@ -186,46 +233,51 @@ def scan_floor(
     blind: float = 0.0,
     threshold: float | None = None,
     model: Lens | Camera | MountedCamera | None = None,
-    reach: float = _FARTHEST,
+    max_range: float = _MAX_RANGE,
     device: Device | None = None,
 ) -> FloorScan:
-    """Find the middles of white stripes on the floor, along rays from the robot's place (and, tilted, across them).
+    """Find the centres of white stripes on the floor, along rays from the robot's place.
+
+    Through a tilted camera, lines across the rays are scanned too.
 
     Parameters
     ----------
     image
-        Grey or colour (blue, green, red): the floor from above, the robot in its middle, ahead to the right; or what a
-        `MountedCamera` sees.
+        Grey or colour (blue, green, red) image: the floor from above with the robot in its centre, ahead to the right;
+        or the image of a `MountedCamera`.
     scale
-        Of a pixel on the floor [m]; a mounted camera has none.
+        Size of a pixel on the floor [m]; None for a mounted camera.
     line_width
-        Of the stripes [m].
+        Width of the stripes [m].
     rays
-        How many, all around.
+        Number of rays, all around.
     blind
-        So far from its middle the image shows the robot itself [m].
+        Distance from the centre up to which the image shows the robot itself [m].
     threshold
-        Least edge [grey levels]; None: 4 times the noise, and a tenth of the image's range.
+        Least height of an edge [grey levels]; None: 4 times the noise, at least a tenth of the image's range.
     model
-        The lens, or a camera that is mounted on the robot; None: the image is free of distortion.
-    reach
-        Of a mounted camera: how far from it lines are looked for [m].
+        Lens or camera model, or a camera mounted on the robot. None: no distortion.
+    max_range
+        Of a mounted camera: largest distance from it [m].
     device
         Where to run; None: `Device.best`.
 
     Raises
     ------
     ValueError
-        Lines are too narrow in the image, it is too small, or a scale is given where it is not known, or none.
+        Lines are too narrow in the image, the image is too small, or the scale is missing, or given for a mounted
+        camera.
     """
     white = white_of(image)
-    least = least_edge(white) if threshold is None else threshold
+    least = default_threshold(white) if threshold is None else threshold
     if isinstance(model, MountedCamera):
         if scale is not None:
-            raise ValueError("a mounted camera has no scale: its height and its focal length tell; leave it out")
-        return scan_ahead(white, model, line_width=line_width, lines=rays, reach=reach, threshold=least, device=device)
+            raise ValueError("scale is given for a mounted camera, whose height and focal length determine it; omit it")
+        return scan_tilted_view(
+            white, model, line_width=line_width, lines=rays, max_range=max_range, threshold=least, device=device
+        )
     if scale is None:
-        raise ValueError("the scale is missing: how wide a pixel is on the floor [m]")
+        raise ValueError("scale is missing: the size of a pixel on the floor [m]")
     return scan_top_view(
         white,
         BoardView(scale=scale, shape=white.shape, pose=(0.0, 0.0, 0.0), model=model),
@@ -238,7 +290,7 @@ def scan_floor(
 
 
 def floor_points(image: npt.NDArray[Any], **how: Any) -> Float32:
-    """Return the points on lines that `scan_floor` finds, float32 (points, 2) [m]: it says what can be given."""
+    """Return the points that `scan_floor` finds with the same parameters, float32 (points, 2) [m]."""
     return scan_floor(image, **how).points
 
 
@@ -248,7 +300,7 @@ def read_floor(path: Path) -> npt.NDArray[Any]:
     Raises
     ------
     RecordingError
-        It is no image.
+        The file is not an image.
     """
     image = read_image(path)
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGRA2BGR) if image.shape[2] == 4 else image

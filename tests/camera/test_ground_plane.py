@@ -19,7 +19,7 @@ from gpuvision.cli import main as cli
 from gpuvision.formats.camera_file import read_mounted
 from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
-from gpuvision.matching.field.evidence import distances_to_lines, expected_crossings, onto_field, seen_share
+from gpuvision.matching.field.evidence import detected_fraction, distances_to_lines, expected_crossings, robot_to_field
 from gpuvision.schema import DescriptionError
 from gpuvision.workflows.locating_robot import locate_robot, scan_floor
 
@@ -83,13 +83,13 @@ def test_stripes_are_found_on_their_lines(camera: MountedCamera, rng: np.random.
     image = seen_ahead(carpet(), camera, POSE, shape=SHAPE, rng=rng)
     scan = scan_floor(image, line_width=WIDE, model=camera, device=device)
     assert len(scan.points) > 60
-    away = distances_to_lines(field, onto_field(scan.points, POSE))
+    away = distances_to_lines(field, robot_to_field(scan.points, POSE))
     # Lines end and meet here and there; else it is a few millimetres, some centimetres at 10 m.
     assert np.median(away) < 0.005
     assert np.mean(away < 0.06) > 0.95
     crossings = expected_crossings(field, POSE, scan.paths, line_width=WIDE)
     assert len(crossings.places) > 40
-    assert seen_share(crossings, scan.points, 0.06) > 0.9
+    assert detected_fraction(crossings, scan.points, 0.06) > 0.9
     # Far points are known less well.
     far = np.hypot(*scan.points.T)
     assert np.median(scan.sigmas[far > 5.0]) > 3.0 * np.median(scan.sigmas[far < 3.0])

@@ -17,9 +17,9 @@ from gpuvision.cli import main as cli
 from gpuvision.formats.features_file import read_features, write_features
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
-from gpuvision.matching.board.edge_measurement import features_in_view
+from gpuvision.matching.board.view_features import select_features_in_view
 from gpuvision.matching.features.feature_set import FeatureSet, choose_features
-from gpuvision.matching.features.selection import Imaging
+from gpuvision.matching.features.imaging import Imaging
 from gpuvision.schema import DescriptionError
 from gpuvision.workflows.locating_board import locate_board
 from reference.board_images import View, board_image
@@ -106,7 +106,7 @@ def test_budgets_are_kept(artwork: Artwork, device: Device) -> None:
 def test_what_a_board_lacks_is_told(artwork: Artwork) -> None:
     with pytest.raises(ValueError, match="edges of the region"):
         choose_features(artwork, ((0.5e-3, 0.5e-3), (1.5e-3, 1.5e-3)), IMAGING)
-    with pytest.raises(ValueError, match="fix x, y and theta"):
+    with pytest.raises(ValueError, match="determine x, y and theta"):
         choose_features(artwork, ((7e-3, 2e-3), (11e-3, 3e-3)), IMAGING)
 
 
@@ -121,7 +121,9 @@ def test_a_camera_is_located_as_promised(artwork: Artwork, features: FeatureSet,
         picture = board_image(artwork, view, (0.0, 0.0, -pose[2]), pose[:2], rng=rng)
         image = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
         near = (*BOARD_MIDDLE, 0.0)
-        found = locate_board(image, artwork, scale=PIXEL, near=near, features=features, blur_px=1.04, device=device)
+        found = locate_board(
+            image, artwork, scale=PIXEL, initial_pose=near, features=features, blur_px=1.04, device=device
+        )
         assert found.reason == ""
         true = BoardView(scale=PIXEL, shape=SHAPE, pose=pose)
         off = found.view.to_plane(true.to_pixels(features.placement)) - features.placement
@@ -133,7 +135,7 @@ def test_a_camera_is_located_as_promised(artwork: Artwork, features: FeatureSet,
 
 def test_features_of_a_view_lie_in_it(artwork: Artwork) -> None:
     view = BoardView(scale=PIXEL, shape=SHAPE, pose=(*BOARD_MIDDLE, 0.6))
-    chosen = features_in_view(artwork, view, IMAGING, budget=40)
+    chosen = select_features_in_view(artwork, view, IMAGING, budget=40)
     ends = chosen.normal * chosen.length[:, None] / 2
     for sign in (-1.0, 1.0):
         pixels = view.to_pixels(chosen.point + sign * ends)
@@ -141,7 +143,7 @@ def test_features_of_a_view_lie_in_it(artwork: Artwork) -> None:
     # Thousands of places: the corners and the middle of the view stand for all of it.
     coarse = replace(IMAGING, pixel=5e-6, shift=20e-6)
     fine = BoardView(scale=5e-6, shape=(2400, 3200), pose=(*BOARD_MIDDLE, 0.0))
-    spread = np.ptp(features_in_view(artwork, fine, coarse, budget=40).point, axis=0)
+    spread = np.ptp(select_features_in_view(artwork, fine, coarse, budget=40).point, axis=0)
     assert np.all(spread > 0.5 * np.ptp(fine.bounds, axis=0))
 
 

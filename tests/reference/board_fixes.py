@@ -15,8 +15,10 @@ import numpy.typing as npt
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.artwork.shapes import Shape
+from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates
+from gpuvision.matching.features.imaging import Imaging
 from gpuvision.matching.features.ruler import Polarity, RulerEdges
-from gpuvision.matching.features.selection import Candidates, Imaging, Selection, candidates, promise, select
+from gpuvision.matching.features.selection import Selection, predict_selection, select_rulers
 from gpuvision.matching.pose.board_pose import BoardPoseEstimator, place_rulers
 from gpuvision.matching.pose.pose import SolvePose
 from reference.board_images import BoardPicture, View
@@ -69,7 +71,7 @@ class BoardFix:
         How many rulers.
     motion_px
         By which the picture is smeared along the rows, and is expected to be.
-    largest_leverage
+    max_leverage
         As in `SolvePose`.
     """
 
@@ -77,7 +79,7 @@ class BoardFix:
     middle: tuple[float, float]
     budget: int = 40
     motion_px: float = 0.0
-    largest_leverage: float = 0.95
+    max_leverage: float = 0.95
 
     @classmethod
     def drawn(cls, folder: Path) -> BoardFix:
@@ -127,22 +129,22 @@ class BoardFix:
         )
 
     @cached_property
-    def rulers(self) -> Candidates:
+    def rulers(self) -> FeatureCandidates:
         half = (np.array(SHAPE[::-1]) / 2 - 30) * PIXEL
-        found = candidates(self.artwork, (self.middle - half, self.middle + half), self.middle, self.imaging)
+        found = find_ruler_candidates(self.artwork, (self.middle - half, self.middle + half), self.middle, self.imaging)
         keep = ~found.pair & (found.ambiguity == 0)
-        return Candidates(*(each[keep] for each in found[:-1]), found.placement)
+        return FeatureCandidates(*(each[keep] for each in found[:-1]), found.placement)
 
     @cached_property
     def chosen(self) -> Selection:
-        return select(self.rulers, self.imaging, self.budget, per_source=8)
+        return select_rulers(self.rulers, self.imaging, self.budget, per_source=8)
 
     def at_random(self, rng: np.random.Generator) -> Selection:
         """As many rulers as were chosen, any that fix a pose."""
         while True:
             try:
                 some = rng.choice(len(self.rulers.sigma), len(self.chosen.chosen), replace=False)
-                return promise(self.rulers, self.imaging, some)
+                return predict_selection(self.rulers, self.imaging, some)
             except ValueError:
                 continue
 
@@ -161,7 +163,7 @@ class BoardFix:
         normal, point = self.rulers.normal[which], self.rulers.point[which] - self.middle
         per, (x, y) = 1 / PIXEL, np.array(self.view.corner) - self.middle
         matrix = np.array([[per, 0.0, -x * per], [0.0, -per, y * per], [0.0, 0.0, 1.0]])
-        laid = place_rulers(normal, point, np.zeros((len(which), 1)), matrix, grows=1.0)
+        laid = place_rulers(normal, point, np.zeros((len(which), 1)), matrix, etch_factor=1.0)
         ruler = RulerEdges(
             threshold=15.0,
             length=math.ceil(self.rulers.length.max() / PIXEL),
@@ -171,9 +173,14 @@ class BoardFix:
             noise=NOISE,
         )
         # Boards lie within a circle about the square of what was asked for.
-        within = (1.5 * self.imaging.shift, 1.5 * self.imaging.angle)
-        solver = SolvePose(etch=self.imaging.etch, trials=256, within=within, largest_leverage=self.largest_leverage)
-        fix = BoardPoseEstimator(ruler=ruler, lines=len(which), each=1, solver=solver)
+        search_range = (1.5 * self.imaging.shift, 1.5 * self.imaging.angle)
+        solver = SolvePose(
+            etch_bias_sigma=self.imaging.etch_bias_sigma,
+            max_trials=256,
+            search_range=search_range,
+            max_leverage=self.max_leverage,
+        )
+        fix = BoardPoseEstimator(ruler=ruler, lines=len(which), rulers_per_line=1, solver=solver)
         errors, covariances, status = (
             np.full((draws, 3), np.nan),
             np.full((draws, 3, 3), np.nan),
@@ -194,7 +201,7 @@ class BoardFix:
             self.painted(
                 replace(
                     self.view,
-                    growth=self.imaging.etch * float(rng.normal()),
+                    etch_bias=self.imaging.etch_bias_sigma * float(rng.normal()),
                     mask_shift=tuple(rng.uniform(-off, off, 2)),
                     silk_shift=tuple(rng.uniform(-off, off, 2)),
                 )
@@ -204,7 +211,7 @@ class BoardFix:
 
     def disturbed(self, kind: str, rng: np.random.Generator) -> BoardPicture:
         """A board with 30 % of the areas with rulers gone, 30 % of the rulers on wrong edges, or dark copper."""
-        view = replace(self.view, growth=self.imaging.etch * float(rng.normal()))
+        view = replace(self.view, etch_bias=self.imaging.etch_bias_sigma * float(rng.normal()))
         if kind == "reversed":
             return self.painted(replace(view, levels=(110.0, 60.0, 200.0, 90.0, 20.0, 240.0)))
         if kind == "missing":

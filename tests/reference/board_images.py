@@ -40,7 +40,7 @@ class View:
         Standard deviation [grey levels].
     mask_shift, silk_shift
         x, y [m] by which the mask's openings and the silk are printed off.
-    growth
+    etch_bias
         How far copper reaches beyond its drawn edge [m], below 0 where too much was etched.
     levels
         Grey levels of laminate and copper under the mask, laminate and copper in its openings, silk, holes.
@@ -54,7 +54,7 @@ class View:
     noise: float = 0.0
     mask_shift: tuple[float, float] = (0.0, 0.0)
     silk_shift: tuple[float, float] = (0.0, 0.0)
-    growth: float = 0.0
+    etch_bias: float = 0.0
     levels: tuple[float, float, float, float, float, float] = (60.0, 110.0, 90.0, 200.0, 240.0, 15.0)
 
     @property
@@ -77,7 +77,7 @@ class BoardPicture:
     more
         Areas that are drawn over the copper: splashes (dark), and scratches (not dark).
     growths
-        How much further than ``view.growth`` the edges of each of the copper's areas lie [m].
+        How much further than ``view.etch_bias`` the edges of each of the copper's areas lie [m].
     margin
         Pixels beside the picture that motions may bring into it.
     """
@@ -96,10 +96,10 @@ class BoardPicture:
     ) -> None:
         self.view, self._pose, self._about, self._margin = view, pose, np.array(about), margin
         painter = _Painter(view, pose, about, margin)
-        each = np.broadcast_to(np.asarray(growths, np.float64) + view.growth, len(artwork.copper))
+        each = np.broadcast_to(np.asarray(growths, np.float64) + view.etch_bias, len(artwork.copper))
         left = [
-            Shape(grown(shape.outline, growth if shape.dark else -growth), shape.dark)
-            for index, (shape, growth) in enumerate(zip(artwork.copper, each, strict=True))
+            Shape(grown(shape.outline, etch_bias if shape.dark else -etch_bias), shape.dark)
+            for index, (shape, etch_bias) in enumerate(zip(artwork.copper, each, strict=True))
             if index not in missing
         ]
         copper = painter.painted([*left, *more], (0.0, 0.0))

@@ -8,26 +8,26 @@ import numpy as np
 from scipy.optimize import least_squares, minimize
 
 
-def loss(z: np.ndarray, name: str, bend: float) -> np.ndarray:
+def loss(z: np.ndarray, name: str, tuning_constant: float) -> np.ndarray:
     """Of residuals in units of their scale."""
     if name == "huber":
-        return np.where(np.abs(z) <= bend, 0.5 * z**2, bend * (np.abs(z) - 0.5 * bend))
+        return np.where(np.abs(z) <= tuning_constant, 0.5 * z**2, tuning_constant * (np.abs(z) - 0.5 * tuning_constant))
     if name == "tukey":
-        return bend**2 / 6.0 * (1.0 - np.clip(1.0 - (z / bend) ** 2, 0.0, None) ** 3)
+        return tuning_constant**2 / 6.0 * (1.0 - np.clip(1.0 - (z / tuning_constant) ** 2, 0.0, None) ** 3)
     if name == "ransac":
-        return 0.5 * np.minimum(z**2, bend**2)
+        return 0.5 * np.minimum(z**2, tuning_constant**2)
     return 0.5 * z**2
 
 
 def fit_line(
-    points: np.ndarray, sigma: np.ndarray, scale: float, name: str, bend: float, start: tuple[float, float]
+    points: np.ndarray, sigma: np.ndarray, scale: float, name: str, tuning_constant: float, start: tuple[float, float]
 ) -> tuple[float, float]:
     """Return angle and distance from the origin (along (-sin, cos)) of the line of least loss near a start."""
 
     def total(parameters: np.ndarray) -> float:
         angle, distance = parameters
         across = points @ [-np.sin(angle), np.cos(angle)] - distance
-        return float(np.sum(loss(across / (sigma * scale), name, bend)))
+        return float(np.sum(loss(across / (sigma * scale), name, tuning_constant)))
 
     found = minimize(total, start, method="Nelder-Mead", options={"xatol": 1e-11, "fatol": 1e-14, "maxiter": 4000})
     return float(found.x[0]), float(found.x[1])
@@ -53,13 +53,15 @@ def residuals(parameters: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.sum(rows[:, :2] * (artwork - rows[:, 2:4]), axis=-1)
 
 
-def solve_pose(rows: np.ndarray, freedoms: int, scale: float, name: str, bend: float, start: np.ndarray) -> np.ndarray:
+def solve_pose(
+    rows: np.ndarray, freedoms: int, scale: float, name: str, tuning_constant: float, start: np.ndarray
+) -> np.ndarray:
     """Return the parameters of least loss near a start: least squares of the loss' square roots."""
     size = np.array([1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 1e-2])[:freedoms]
 
     def roots(scaled: np.ndarray) -> np.ndarray:
         z = residuals(scaled * size, rows) / (rows[:, 6] * scale)
-        return np.sqrt(2.0 * loss(z, name, bend))
+        return np.sqrt(2.0 * loss(z, name, tuning_constant))
 
     found: Any = least_squares(roots, start / size, xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=2000)
     return np.asarray(found.x) * size

@@ -28,7 +28,7 @@ from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.workflows.locating_board import locate_board
-from gpuvision.workflows.locating_robot import floor_points, line_width_of, locate_robot
+from gpuvision.workflows.locating_robot import default_line_width, floor_points, locate_robot
 from reference.board_images import BoardPicture, View
 
 PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0
@@ -103,39 +103,43 @@ def test_noise_is_that_of_the_image(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("turned", [0.0, math.pi / 2, -2.2])
 def test_a_camera_is_located_where_it_is(artwork: Artwork, turned: float, device: Device) -> None:
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, turned + 2e-3)
-    located = locate_board(seen(artwork, pose), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, turned), device=device)
+    located = locate_board(
+        seen(artwork, pose), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, turned), device=device
+    )
     assert located.reason == ""
     assert located.copper == "bright"
     assert np.abs(off(located, pose)).max() < SIGMAS
     assert np.all(located.sigmas[:2] < 0.05 * PIXEL)
-    assert located.rulers.used.sum() >= 0.9 * located.rulers.laid.sum()
+    assert located.rulers.used.sum() >= 0.9 * located.rulers.in_image.sum()
     assert located.noise == pytest.approx(NOISE, rel=0.1)
 
 
 def test_the_placement_point_is_where_it_is_seen(artwork: Artwork) -> None:
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 3e-3)
-    located = locate_board(seen(artwork, pose), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0))
+    located = locate_board(seen(artwork, pose), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0))
     true = BoardView(scale=PIXEL, shape=SHAPE, pose=pose).to_pixels(located.placement)
     sigmas = np.sqrt(np.diag(located.placement_covariance))[:2] / PIXEL
     assert np.abs((located.placement_px - true) / sigmas).max() < SIGMAS
 
 
-@pytest.mark.parametrize("growth", [-12e-6, 9e-6])
-def test_etching_is_solved_for(artwork: Artwork, growth: float) -> None:
+@pytest.mark.parametrize("etch_bias", [-12e-6, 9e-6])
+def test_etching_is_solved_for(artwork: Artwork, etch_bias: float) -> None:
     pose = (BOARD_MIDDLE[0] - 30e-6, BOARD_MIDDLE[1], -2e-3)
     located = locate_board(
-        seen(artwork, pose, growth=growth), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0), budget=120
+        seen(artwork, pose, etch_bias=etch_bias), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0), budget=120
     )
     assert np.abs(off(located, pose)).max() < SIGMAS
     # Edges are rendered to a hundredth of a pixel, all of them alike, and 40 of them are measured to 0.03.
     assert np.sum(located.features.spacing == 0) > 20
-    assert located.growth == pytest.approx(growth, abs=0.04 * PIXEL)
+    assert located.etch_bias == pytest.approx(etch_bias, abs=0.04 * PIXEL)
 
 
 def test_dark_copper_is_told_from_bright(artwork: Artwork) -> None:
     pose = (BOARD_MIDDLE[0] + 20e-6, BOARD_MIDDLE[1] + 35e-6, 1e-3)
     inverted = (110.0, 60.0, 200.0, 90.0, 240.0, 15.0)
-    located = locate_board(seen(artwork, pose, levels=inverted), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0))
+    located = locate_board(
+        seen(artwork, pose, levels=inverted), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0)
+    )
     assert located.copper == "dark"
     assert np.abs(off(located, pose)).max() < SIGMAS
 
@@ -149,17 +153,19 @@ def test_a_lens_is_undone(artwork: Artwork) -> None:
     bent = cv2.remap(straight, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     near = (*BOARD_MIDDLE, 0.0)
     # What the image was sampled from was noisy pixels; cubic interpolation leaves them so to some percent.
-    located = locate_board(bent, artwork, scale=PIXEL, near=near, model=lens)
+    located = locate_board(bent, artwork, scale=PIXEL, initial_pose=near, model=lens)
     assert np.abs(off(located, pose)).max() < SIGMAS + 1.0
-    bare = locate_board(bent, artwork, scale=PIXEL, near=near)
+    bare = locate_board(bent, artwork, scale=PIXEL, initial_pose=near)
     # 2e-7 px^-2 moves the corners by 5 px.
     assert bare.reason or np.abs(np.array(bare.pose) - pose).max() > 10 * np.abs(np.array(located.pose) - pose).max()
 
 
 def test_a_board_is_searched_where_it_is_not_known(artwork: Artwork, device: Device) -> None:
     pose = (BOARD_MIDDLE[0] + 1.3e-3, BOARD_MIDDLE[1] - 0.9e-3, 0.05)
-    located = locate_board(seen(artwork, pose), artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0), within=(2e-3, 0.09))
-    assert located.first is not None
+    located = locate_board(
+        seen(artwork, pose), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0), search_range=(2e-3, 0.09)
+    )
+    assert located.coarse_registration is not None
     assert located.reason == ""
     assert np.abs(off(located, pose)).max() < SIGMAS
 
@@ -172,7 +178,7 @@ def test_a_board_is_searched_where_it_is_not_known(artwork: Artwork, device: Dev
     ],
 )
 def test_what_shows_no_board_is_refused(artwork: Artwork, image: np.ndarray, words: str) -> None:
-    located = locate_board(image, artwork, scale=PIXEL, near=(*BOARD_MIDDLE, 0.0))
+    located = locate_board(image, artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0))
     assert re.search(words, located.reason)
     assert np.isnan(located.pose).all()
     json.dumps(located.report(), allow_nan=False)
@@ -181,15 +187,15 @@ def test_what_shows_no_board_is_refused(artwork: Artwork, image: np.ndarray, wor
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"near": (0.5, 0.5, 0.0)}, "0 edges of the top artwork in view"),
+        ({"initial_pose": (0.5, 0.5, 0.0)}, "0 edges of the top artwork in view"),
         ({"scale": 0.0}, "expected metres per pixel"),
         ({"copper": "green"}, "expected one of auto, bright, dark"),
-        ({"within": (-1e-3, 0.0)}, "expected metres above 0"),
-        ({"near": (math.nan, 0.0, 0.0)}, "expected x, y"),
+        ({"search_range": (-1e-3, 0.0)}, "expected metres above 0"),
+        ({"initial_pose": (math.nan, 0.0, 0.0)}, "expected x, y"),
     ],
 )
 def test_a_wrong_parameter_is_told(artwork: Artwork, change: dict[str, Any], words: str) -> None:
-    usual: dict[str, Any] = {"scale": PIXEL, "near": (*BOARD_MIDDLE, 0.0)}
+    usual: dict[str, Any] = {"scale": PIXEL, "initial_pose": (*BOARD_MIDDLE, 0.0)}
     with pytest.raises(ValueError, match=words):
         locate_board(np.zeros(SHAPE, np.uint8), artwork, **{**usual, **change})
 
@@ -332,21 +338,21 @@ def test_a_robot_is_located_with_its_twin(
     name: str, pose: tuple[float, float, float], scale: float, device: Device, rng: np.random.Generator
 ) -> None:
     field = read_field(name)
-    wide = line_width_of(field)
+    wide = default_line_width(field)
     image = floor_image(field, pose, scale=scale, shape=(400, 440), line_width=wide, rng=rng)
     points = floor_points(image, scale=scale, line_width=wide, device=device)
     assert len(points) > 30
     found = locate_robot(points, field, device=device)
     assert found.reason == ""
     first, second = found.candidates[:2]
-    assert (first.twin, second.twin) == (1, 0)
+    assert (first.symmetric_twin, second.symmetric_twin) == (1, 0)
     twins = [each.pose for each in (first, second)]
     true = min(twins, key=lambda each: abs(math.remainder(each[2] - pose[2], 2 * math.pi)))
     # A tenth of a pixel, and what 200 px away makes of it: 80 points, each found to a few tenths.
     np.testing.assert_allclose(true[:2], pose[:2], atol=0.2 * scale)
     assert math.remainder(true[2] - pose[2], 2 * math.pi) == pytest.approx(0.0, abs=2e-3)
     # Where it is known about where it is, its twin is not looked at.
-    near = locate_robot(points, field, near=(pose[0] + 0.02, pose[1], pose[2] + 0.05), device=device)
+    near = locate_robot(points, field, initial_pose=(pose[0] + 0.02, pose[1], pose[2] + 0.05), device=device)
     assert len(near.candidates) == 1
     np.testing.assert_allclose(near.candidates[0].pose[:2], pose[:2], atol=0.2 * scale)
 
@@ -364,7 +370,7 @@ def test_floor_points_lie_on_the_lines(rng: np.random.Generator) -> None:
     assert len(points) > 60
     assert np.hypot(*points.T).min() > 0.5
     found = locate_robot(points, field)
-    assert found.candidates[0].share > 0.95
+    assert found.candidates[0].inlier_fraction > 0.95
     assert found.candidates[0].scale < 0.5 * scale
     angle = np.arctan2(points[:, 1], points[:, 0])
     for each in np.unique(np.round(angle, 3)):
@@ -418,8 +424,8 @@ def board_of(folder: Path) -> Artwork:
 def test_boards_of_three_tools_are_located(data: Path, name: str, middle: tuple[float, float], device: Device) -> None:
     board = board_of(data / "gerber" / name)
     pose = (middle[0] + 45e-6, middle[1] - 60e-6, 3e-3)
-    image = seen(board, pose, FINE, FINE_SHAPE, growth=-8e-6)
-    located = locate_board(image, board, scale=FINE, near=(*middle, 0.0), device=device)
+    image = seen(board, pose, FINE, FINE_SHAPE, etch_bias=-8e-6)
+    located = locate_board(image, board, scale=FINE, initial_pose=(*middle, 0.0), device=device)
     assert located.reason == ""
     assert np.abs(off(located, pose)).max() < SIGMAS
     assert np.all(located.sigmas[:2] < 0.05 * FINE)
@@ -443,6 +449,6 @@ def test_a_mirrored_side_is_seen_from_below(artwork: Artwork) -> None:
     """The bottom as a camera below sees it: the top's image in a mirror."""
     pose = (BOARD_MIDDLE[0] + 20e-6, BOARD_MIDDLE[1] + 10e-6, 2e-3)
     below = np.ascontiguousarray(seen(artwork, pose)[:, ::-1])
-    located = locate_board(below, replace(artwork, side="bottom"), scale=PIXEL, near=(*BOARD_MIDDLE, 0.0))
+    located = locate_board(below, replace(artwork, side="bottom"), scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0))
     assert located.reason == ""
     assert np.abs(off(located, pose)).max() < SIGMAS

@@ -19,10 +19,10 @@ from gpuvision.formats.features_file import read_features, write_features
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.artwork.shapes import Shape
-from gpuvision.matching.board.edge_measurement import features_in_view
 from gpuvision.matching.board.located_board import LocatedBoard
+from gpuvision.matching.board.view_features import select_features_in_view
 from gpuvision.matching.features.feature_set import choose_features
-from gpuvision.matching.features.selection import Imaging
+from gpuvision.matching.features.imaging import Imaging
 from gpuvision.workflows.locating_board import locate_board
 from round_boards import (
     FIDUCIALS,
@@ -58,7 +58,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
 
 
 def located(image: np.ndarray, artwork: Artwork, **more: object) -> LocatedBoard:
-    return locate_board(image, artwork, scale=PIXEL, near=NEAR, copper="bright", **more)  # type: ignore[arg-type]
+    return locate_board(image, artwork, scale=PIXEL, initial_pose=NEAR, copper="bright", **more)  # type: ignore[arg-type]
 
 
 def squares(errors: list[np.ndarray], covariances: list[np.ndarray]) -> float:
@@ -79,8 +79,8 @@ def agree(total: float, numbers: int) -> bool:
 def test_errors_are_as_promised(board: str, device: Device, request: pytest.FixtureRequest) -> None:
     """Before any image is seen, and with each pose."""
     artwork, rng = request.getfixturevalue(board), np.random.default_rng(5)
-    features = features_in_view(artwork, VIEW, IMAGING, 40)
-    assert len(features.marks.radius) == len(LANDS) + len(FIDUCIALS)
+    features = select_features_in_view(artwork, VIEW, IMAGING, 40)
+    assert len(features.fiducials.radius) == len(LANDS) + len(FIDUCIALS)
     assert (len(features.length) == 0) == (board == "rounds")
     picture = round_picture(artwork)
     errors, told = [], []
@@ -88,7 +88,7 @@ def test_errors_are_as_promised(board: str, device: Device, request: pytest.Fixt
         image, true = moved_picture(picture, rng)
         found = located(image, artwork, features=features, device=device)
         assert found.reason == ""
-        assert found.marks.used.sum() >= 15  # Tukey's loss rejects no more than a few of 1e3 good rows
+        assert found.fiducials.used.sum() >= 15  # Tukey's loss rejects no more than a few of 1e3 good rows
         errors.append(np.array(found.pose) - true)
         told.append(found.covariance)
     assert agree(squares(errors, [features.covariance] * DRAWS), 3 * DRAWS)
@@ -98,8 +98,8 @@ def test_errors_are_as_promised(board: str, device: Device, request: pytest.Fixt
 
 
 def test_marks_beside_rulers_promise_more(mixed: Artwork) -> None:
-    both = features_in_view(mixed, VIEW, IMAGING, 40)
-    rulers = features_in_view(replace(mixed, lands=()), VIEW, IMAGING, 40)
+    both = select_features_in_view(mixed, VIEW, IMAGING, 40)
+    rulers = select_features_in_view(replace(mixed, pads=()), VIEW, IMAGING, 40)
     assert len(both.length) == len(rulers.length) == 40
     assert np.all(both.sigmas < 0.6 * rulers.sigmas)
 
@@ -121,7 +121,7 @@ def test_bad_marks_do_not_spoil_a_pose(board: str, how: str, device: Device, req
     """
     artwork, rng = request.getfixturevalue(board), np.random.default_rng(11)
     first = len(artwork.copper) - len(LANDS) - len(FIDUCIALS)
-    features = features_in_view(artwork, VIEW, IMAGING, 40)
+    features = select_features_in_view(artwork, VIEW, IMAGING, 40)
     errors, told = [], []
     for _ in range(3):
         bad = np.append(rng.choice(len(LANDS), 4, replace=False), len(LANDS) + rng.integers(len(FIDUCIALS)))
@@ -135,12 +135,12 @@ def test_bad_marks_do_not_spoil_a_pose(board: str, how: str, device: Device, req
             assert found.reason == ""
             errors.append(np.array(found.pose) - true)
             told.append(found.covariance)
-            places = np.stack([artwork.lands[n].centre for n in bad])
-            mine = np.hypot(*(found.marks.point[:, None] - places).T).min(axis=0) < 1e-6
+            places = np.stack([artwork.pads[n].centre for n in bad])
+            mine = np.hypot(*(found.fiducials.point[:, None] - places).T).min(axis=0) < 1e-6
             assert mine.sum() == 5
-            assert not found.marks.used[mine].any()
-            assert found.marks.used[~mine].sum() >= 10
-            assert how in ("apart", "together") or not found.marks.found[mine].any()
+            assert not found.fiducials.used[mine].any()
+            assert found.fiducials.used[~mine].sum() >= 10
+            assert how in ("apart", "together") or not found.fiducials.found[mine].any()
     assert squares(errors, told) < 1.1**2 * chi2.ppf(1 - 1e-4, 3 * len(errors))
 
 
@@ -154,20 +154,20 @@ def test_fiducials_that_agree_with_nothing_are_no_pose(rounds: Artwork, device: 
         found = located(image, rounds, device=device)
         assert found.reason == ""
         assert np.abs((np.array(found.pose) - true) / found.sigmas).max() < 4.5
-        assert not found.marks.used[:2].any()
+        assert not found.fiducials.used[:2].any()
 
 
 def test_a_board_of_marks_is_not_searched(rounds: Artwork) -> None:
     """The search looks at straight edges, of which there are none: it says what to do."""
     image, _ = moved_picture(round_picture(rounds), np.random.default_rng(13))
     found = locate_board(image, rounds, scale=PIXEL)
-    assert "too few straight edges in view; say near where it is" in found.reason
+    assert "too few straight edges are in view; give an initial pose" in found.reason
 
 
 def test_two_marks_are_too_few(tmp_path: Path) -> None:
     """Nothing would check them."""
-    artwork = round_artwork(round_board(tmp_path, lands=((6, 6), (14, 10)), fiducials=()))
-    with pytest.raises(ValueError, match=r"0 edges .* and 2 round marks, expected 3"):
+    artwork = round_artwork(round_board(tmp_path, pads=((6, 6), (14, 10)), fiducials=()))
+    with pytest.raises(ValueError, match=r"0 edges .* and 2 round pads can serve as fiducials, expected 3"):
         located(np.zeros(SHAPE, np.uint8), artwork)
 
 
@@ -181,7 +181,7 @@ def test_a_picture_without_the_board_is_refused(rounds: Artwork) -> None:
 
 def test_dark_marks_are_told_from_bright(rounds: Artwork, device: Device) -> None:
     image, true = moved_picture(round_picture(rounds), np.random.default_rng(4))
-    found = locate_board(255 - image, rounds, scale=PIXEL, near=NEAR, device=device)
+    found = locate_board(255 - image, rounds, scale=PIXEL, initial_pose=NEAR, device=device)
     assert found.copper == "dark"
     assert np.abs((np.array(found.pose) - true) / found.sigmas).max() < 4.5
 
@@ -197,10 +197,13 @@ def test_marks_are_seen_through_a_lens(rounds: Artwork) -> None:
     found = located(image, rounds, model=lens)
     # What the image was sampled from was noisy pixels; cubic interpolation leaves them so to some percent.
     assert np.abs((np.array(found.pose) - true) / found.sigmas).max() < 4.5 + 1.0
-    assert found.marks.used.sum() == len(LANDS) + len(FIDUCIALS)
+    assert found.fiducials.used.sum() == len(LANDS) + len(FIDUCIALS)
     # 2e-7 px^-2 moves the outer marks by a pixel.
     bare = located(image, rounds)
-    assert bare.reason or np.abs(bare.marks.residual[bare.marks.used]).max() > 3 * np.abs(found.marks.residual).max()
+    assert (
+        bare.reason
+        or np.abs(bare.fiducials.residual[bare.fiducials.used]).max() > 3 * np.abs(found.fiducials.residual).max()
+    )
 
 
 def test_a_mirrored_side_is_seen_from_below(rounds: Artwork) -> None:
@@ -214,16 +217,16 @@ def test_marks_are_chosen_for_their_cost(mixed: Artwork, tmp_path: Path) -> None
     """A mark costs 16 rulers; fiducials in the open are worth it, and more is promised than by rulers."""
     region = ((2.5e-3, 2.5e-3), (17e-3, 13.9e-3))
     features = choose_features(mixed, region, IMAGING, budget=80)
-    marks = len(features.marks.radius)
-    assert marks >= len(FIDUCIALS)
-    assert 80 - 16 < len(features.length) + 16 * marks <= 80
-    rulers = choose_features(replace(mixed, lands=()), region, IMAGING, budget=80)
+    fiducials = len(features.fiducials.radius)
+    assert fiducials >= len(FIDUCIALS)
+    assert 80 - 16 < len(features.length) + 16 * fiducials <= 80
+    rulers = choose_features(replace(mixed, pads=()), region, IMAGING, budget=80)
     assert np.linalg.det(features.covariance) < np.linalg.det(rulers.covariance)
     write_features(features, tmp_path / "features.toml")
     again = read_features(tmp_path / "features.toml")
-    for name in features.marks._fields:
-        np.testing.assert_array_equal(getattr(again.marks, name), getattr(features.marks, name))
-    assert np.all(features.marks.point - features.marks.radius[:, None] > features.region[0])
+    for name in features.fiducials._fields:
+        np.testing.assert_array_equal(getattr(again.fiducials, name), getattr(features.fiducials, name))
+    assert np.all(features.fiducials.point - features.fiducials.radius[:, None] > features.region[0])
 
 
 def test_the_command_tells_of_marks(
@@ -242,10 +245,10 @@ def test_the_command_tells_of_marks(
     with pytest.raises(SystemExit) as end:
         cli.main()
     assert not end.value.code
-    assert "15 of 16 marks agree, 15 were found" in capsys.readouterr().out
+    assert "15 of 16 fiducials agree, 15 were found" in capsys.readouterr().out
     told = json.loads((tmp_path / "out" / "pose.json").read_text())
-    assert (told["counts"]["marks_laid"], told["counts"]["marks_used"]) == (16, 15)
-    assert sum(each["found"] for each in told["marks"]) == 15
+    assert (told["counts"]["fiducials_in_image"], told["counts"]["fiducials_used"]) == (16, 15)
+    assert sum(each["found"] for each in told["fiducials"]) == 15
     for name, value in zip(("x", "y", "theta"), true, strict=True):
         assert abs(told["pose"][name] - value) < 4.5 * told["sigmas"][name]
     assert (tmp_path / "out" / "located.png").exists()

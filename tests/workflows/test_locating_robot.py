@@ -17,7 +17,7 @@ from gpuvision.cli import main as cli
 from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
 from gpuvision.matching.field.distance_map import Arc, Field
-from gpuvision.matching.field.evidence import distances_to_lines, expected_crossings, onto_field, seen_share
+from gpuvision.matching.field.evidence import detected_fraction, distances_to_lines, expected_crossings, robot_to_field
 from gpuvision.status import Status
 from gpuvision.workflows.locating_robot import locate_robot, scan_floor
 
@@ -131,7 +131,7 @@ def test_of_many_fields_nearly_all_are_found(rng: np.random.Generator) -> None:
     assert np.mean(found) > 0.9
 
 
-@pytest.mark.parametrize(("spots", "share"), [(0, 0.0), (60, 0.0), (0, 0.2), (20, 0.1)])
+@pytest.mark.parametrize(("spots", "inlier_fraction"), [(0, 0.0), (60, 0.0), (0, 0.2), (20, 0.1)])
 def test_fields_are_found(spots: int, share: float, device: Device, rng: np.random.Generator) -> None:
     """With things on the floor, and robots in the way."""
     field = read_field("robocup_msl")
@@ -143,7 +143,7 @@ def test_fields_are_found(spots: int, share: float, device: Device, rng: np.rand
         assert located.evidence is not None
         assert located.evidence.seen > 0.55
         told = located.report()["evidence"]
-        assert told["log10_chance"] < -3.0
+        assert told["log10_nfa"] < -3.0
         assert told["expected"] > 20
 
 
@@ -166,8 +166,8 @@ def test_every_stripe_along_a_ray_is_found(rng: np.random.Generator) -> None:
         scan = scan_floor(seen_from(field, pose, rng), scale=SCALE, line_width=WIDE)
         crossings = expected_crossings(field, pose, scan.paths, line_width=WIDE)
         assert len(crossings.places) > 60
-        assert seen_share(crossings, scan.points, 0.02) > 0.97
-        assert np.abs(distances_to_lines(field, onto_field(scan.points, pose))).max() < 0.05
+        assert detected_fraction(crossings, scan.points, 0.02) > 0.97
+        assert np.abs(distances_to_lines(field, robot_to_field(scan.points, pose))).max() < 0.05
         assert np.median(scan.sigmas) < 0.2 * SCALE
 
 

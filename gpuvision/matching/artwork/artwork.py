@@ -1,8 +1,8 @@
-"""A board's artwork from its Gerber and Excellon files: what a camera can measure on it, and what may hide it.
+"""Artwork of a board from its Gerber and Excellon files: measurable edges and pads, and what may hide them.
 
-Everything is in metres in the files' own frame, x to the right and y up as the board is seen from its *top*; the bottom
-side is in the same frame (seen through the board), so that a camera below sees a mirror image of it. Files of RS-274X
-with and without the attributes of X2, and Excellon, are read by gerbonara.
+Positions are in metres in the files' frame, x to the right and y up as the board is seen from its *top*. The bottom
+side is in the same frame (seen through the board), so that a camera below sees a mirror image of it. gerbonara reads
+RS-274X with and without the attributes of X2, and Excellon.
 """
 
 from __future__ import annotations
@@ -22,32 +22,36 @@ from gerbonara.utils import MM
 from scipy.spatial import cKDTree
 
 from gpuvision.matching.artwork.edges import BoardEdges, board_edges
-from gpuvision.matching.artwork.shapes import Drawn, Float64, Layer, Shape, area, drawn_objects, hull
+from gpuvision.matching.artwork.shapes import DrawnObject, Float64, Layer, Shape, area, drawn_objects, hull
 
 Side = Literal["top", "bottom"]
-Role = Literal["via", "pad", "fiducial"]
+Role = Literal["via", "component", "fiducial"]
 
-# What Gerber X2 calls what is no pad; its other words are of pads.
-_SAID: Mapping[str, Role] = {"ViaPad": "via", "FiducialPad": "fiducial"}
+# Values of ``.AperFunction`` in Gerber X2; all others are component pads.
+_ROLES: Mapping[str, Role] = {"ViaPad": "via", "FiducialPad": "fiducial"}
 
-_SAME = 5e-6  # [m] centres as near as this are one: files round to a micrometre or so
-_CONCENTRIC = 50e-6  # [m] a hole, and an opening of the mask, may lie as far from its pad's centre: tools round apart
-_FIDUCIAL_OPENING = 1.5  # diameters; IPC-7351 asks for 2 or more, a pad's opening is larger by 0.1 mm or so
-_ROUND = 0.985  # of the circle round it: a polygon of 16 corners has 0.974 of the area, one of 24 has 0.989
-_RECTANGULAR = 0.995
+_SAME_PLACE = 5e-6  # distance of equal centres [m]: files round to about a micrometre
+# Distance of a hole or a mask opening from the centre of its pad [m]: CAD tools round them separately.
+_CONCENTRIC = 50e-6
+# Least mask opening of a fiducial in diameters: IPC-7351 requires 2 or more; a component pad's opening is about 0.1 mm
+# larger than the pad.
+_FIDUCIAL_OPENING = 1.5
+# Least area over that of the enclosing circle: a polygon of 16 corners has 0.974, one of 24 has 0.989.
+_ROUND_AREA = 0.985
+_RECTANGLE_AREA = 0.995  # least area over that of the enclosing rectangle
 
 
 class Holes(NamedTuple):
-    """Holes and slots, of all drill files together, each once.
+    """Holes and slots of all drill files together, without duplicates.
 
     Attributes
     ----------
-    start, end
-        (n, 2) [m]; the same for a round hole.
-    diameter
-        (n,) of the tool [m]; copper plated inside makes a hole smaller.
-    plated
-        (n,) int8: 1 plated, 0 not, -1 where the files do not say it.
+    start, end : (n, 2)
+        Ends of a slot [m]; equal for a round hole.
+    diameter : (n,)
+        Diameter of the tool [m]; plating makes the hole smaller.
+    plated : (n,), int8
+        1 plated, 0 not plated, -1 where the files do not say it.
     """
 
     start: Float64
@@ -57,31 +61,30 @@ class Holes(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Land:
-    """A spot of copper: a via's, a pad, a fiducial.
+class Pad:
+    """Spot of copper: a via's pad, a component's pad, or a fiducial.
 
     Attributes
     ----------
     role
-        ``"via"``, ``"pad"`` or ``"fiducial"``: the file's word for it, and where it has none what
-        :func:`read_artwork` says of holes and of openings.
+        "via", "component" or "fiducial": from the file's attributes, and without them by the rules of `read_artwork`.
     shape
-        ``"circle"``, ``"rectangle"`` or ``"other"`` (rounded corners, obrounds, crosses).
-    centre
-        (2,) middle of the bounds [m].
-    size
-        (2,) along its own axes [m], of the least rectangle round it; the diameter twice for a circle.
+        "circle", "rectangle" or "other" (rounded corners, obrounds, crosses).
+    centre : (2,)
+        Centre of the bounding box [m].
+    size : (2,)
+        Extent along its own axes [m], of the smallest rectangle around it; of a circle twice the diameter.
     angle
-        Of its first axis [rad], in [0, pi/2); 0 for a circle.
-    outline
-        (n, 2) corners, counter-clockwise [m]; the convex hull where several areas make one spot.
+        Angle of its first axis [rad], in [0, pi/2); 0 for a circle.
+    outline : (n, 2)
+        Corners, counter-clockwise [m]; the convex hull where several areas make one pad.
     hole
-        Diameter of the hole in it, or width of the slot [m]; 0 without one.
+        Diameter of its hole, or width of its slot [m]; 0 without one.
     opening
-        How far the mask's opening reaches beyond the copper [m], the least of four sides: negative where the mask
-        lies on the copper, NaN where there is no opening about the same centre (a covered via).
+        Distance by which the mask opening extends beyond the copper [m], the least of four sides: negative where the
+        mask lies on the copper, NaN without a concentric opening (a covered via).
     function, net, part, pin
-        From Gerber X2; ``""`` where the file does not say it.
+        Attributes of Gerber X2; ``""`` where the file does not have them.
     """
 
     role: Role
@@ -105,18 +108,18 @@ class Artwork:
     Attributes
     ----------
     side
-        ``"top"`` or ``"bottom"``.
+        "top" or "bottom".
     copper, mask, silk
-        Areas in the order of drawing; of the mask the *openings*. A hole of an aperture takes away what was drawn
-        before it, too: under a pad's hole that is drilled in any case.
+        Areas in drawing order; of the mask these are the *openings*. A hole of an aperture also clears areas drawn
+        before it: under the hole of a pad the board is drilled in any case.
     holes
-        :class:`Holes`.
-    lands
-        Vias, pads and fiducials.
+        `Holes`.
+    pads
+        Pads of all roles.
     edges
-        :class:`~gpuvision.matching.artwork.edges.BoardEdges`: straight edges of traces and pads that can be seen.
-    bounds
-        (2, 2): least and greatest x, y [m] of the board's outline; of the copper where there is no file of it.
+        `BoardEdges`: visible straight edges of traces and pads.
+    bounds : (2, 2)
+        Least and greatest x, y [m] of the board's outline; of the copper where there is no outline file.
     """
 
     side: Side
@@ -124,30 +127,32 @@ class Artwork:
     mask: tuple[Shape, ...]
     silk: tuple[Shape, ...]
     holes: Holes
-    lands: tuple[Land, ...]
+    pads: tuple[Pad, ...]
     edges: BoardEdges
     bounds: Float64
 
     @property
-    def vias(self) -> tuple[Land, ...]:
-        """Lands whose role is a via."""
-        return tuple(each for each in self.lands if each.role == "via")
+    def vias(self) -> tuple[Pad, ...]:
+        """Pads of vias."""
+        return tuple(each for each in self.pads if each.role == "via")
 
     @property
-    def pads(self) -> tuple[Land, ...]:
-        """Lands whose role is a pad."""
-        return tuple(each for each in self.lands if each.role == "pad")
+    def component_pads(self) -> tuple[Pad, ...]:
+        """Pads of components."""
+        return tuple(each for each in self.pads if each.role == "component")
 
     @property
-    def fiducials(self) -> tuple[Land, ...]:
-        """Lands whose role is a fiducial."""
-        return tuple(each for each in self.lands if each.role == "fiducial")
+    def fiducials(self) -> tuple[Pad, ...]:
+        """Pads that are fiducials."""
+        return tuple(each for each in self.pads if each.role == "fiducial")
 
 
 class _Finder:
-    """What lies about a centre: a hole, an opening of the mask, paste."""
+    """Nearest hole, mask opening and paste around a centre."""
 
-    def __init__(self, holes: Holes, openings: tuple[Drawn, ...], pastes: tuple[Drawn, ...], via_drill: float) -> None:
+    def __init__(
+        self, holes: Holes, openings: tuple[DrawnObject, ...], pastes: tuple[DrawnObject, ...], via_drill: float
+    ) -> None:
         self.holes, self.openings, self.via_drill = holes, openings, via_drill
         self._holes = _tree((holes.start + holes.end) / 2)
         self._openings = _tree(_centres(openings))
@@ -156,7 +161,7 @@ class _Finder:
     def hole(self, centre: Float64) -> int | None:
         return _nearest(self._holes, centre)
 
-    def opening(self, centre: Float64) -> Drawn | None:
+    def opening(self, centre: Float64) -> DrawnObject | None:
         index = _nearest(self._openings, centre)
         return None if index is None else self.openings[index]
 
@@ -175,7 +180,7 @@ def _nearest(tree: Any, centre: Float64) -> int | None:
     return int(index) if distance <= _CONCENTRIC else None
 
 
-def _centres(objects: Sequence[Drawn]) -> Float64:
+def _centres(objects: Sequence[DrawnObject]) -> Float64:
     return np.array([each.centre for each in objects]).reshape(-1, 2)
 
 
@@ -187,30 +192,30 @@ def read_artwork(
     clearance: float = 50e-6,
     via_drill: float = 0.55e-3,
 ) -> Artwork:
-    """Artwork of one side of a board.
+    """Read one side of a board.
 
     Parameters
     ----------
     path
-        Folder, or ZIP, of Gerber and Excellon files.
+        Folder, or ZIP file, of Gerber and Excellon files.
     side
-        Which copper.
+        Side of the board, "top" or "bottom".
     layers
-        Regular expressions of whole file names, and what each is: ``"top copper"``, ``"bottom mask"``, ``"top silk"``,
-        ``"top paste"``, ``"mechanical outline"``, ``"drill plated"``, ``"drill nonplated"``, ``"drill unknown"``. Then
-        other files are not looked at; without it the names and the contents tell.
+        Regular expressions of whole file names, and the layer of each: ``"top copper"``, ``"bottom mask"``, ``"top
+        silk"``, ``"top paste"``, ``"mechanical outline"``, ``"drill plated"``, ``"drill nonplated"``, ``"drill
+        unknown"``. Other files are then ignored. None: names and contents of the files determine the layers.
     clearance
-        An edge counts as far as copper on its one side, bare laminate or mask on its other side and no silk reach
-        this far from it [m].
+        Distance [m], above 0, default 50 um, that a visible edge keeps from silk, and over which there is copper on its
+        one side, and bare laminate or mask on its other side.
     via_drill
-        Where a file does not say what a land is for: a round one with a plated hole up to this wide [m] is a via. One
-        without a hole, without paste, in an opening of the mask of 1.5 diameters or more is a fiducial. The others are
-        pads; so are areas (regions) whose place the mask opens, of which gerbonara does not hand on attributes.
+        Rule for pads without attributes: a round pad with a plated hole up to this diameter [m] is a via, default 0.55
+        mm. A round pad without a hole and without paste, in a mask opening of 1.5 diameters or more, is a fiducial. All
+        others are component pads; so are regions in a mask opening, whose attributes gerbonara does not provide.
 
     Raises
     ------
     ValueError
-        Files whose layers cannot be told, no copper for the side, or what gerbonara cannot read.
+        The layers of the files cannot be determined, the side has no copper, or gerbonara cannot read a file.
     """
     if side not in ("top", "bottom"):
         raise ValueError(f"side must be 'top' or 'bottom', not {side!r}")
@@ -219,14 +224,14 @@ def read_artwork(
     stack = _opened(Path(path), layers)
     drawn = {use: _layer(stack, side, use) for use in ("copper", "mask", "silk", "paste")}
     if not drawn["copper"]:
-        raise ValueError(f"{path}: no copper on the {side} side; say with layers which file is '{side} copper'")
+        raise ValueError(f"{path}: no copper on the {side} side; name the file of '{side} copper' with layers")
     holes = _holes(stack)
-    lands = _lands(drawn["copper"], _Finder(holes, drawn["mask"], drawn["paste"], via_drill))
+    pads = _pads(drawn["copper"], _Finder(holes, drawn["mask"], drawn["paste"], via_drill))
     shapes = {use: tuple(shape for each in objects for shape in each.shapes) for use, objects in drawn.items()}
     masked = (side, "mask") in stack.graphic_layers
     edges = board_edges(
         [each for each in drawn["copper"] if each.kind == "stroke"],
-        [each.outline for each in lands],
+        [each.outline for each in pads],
         Layer(shapes["copper"]),
         Layer(shapes["mask"]) if masked else None,
         Layer(shapes["silk"]),
@@ -238,7 +243,7 @@ def read_artwork(
         mask=shapes["mask"],
         silk=shapes["silk"],
         holes=holes,
-        lands=lands,
+        pads=pads,
         edges=edges,
         bounds=_bounds(stack, drawn["copper"]),
     )
@@ -249,7 +254,7 @@ def _opened(path: Path, layers: Mapping[str, str] | None) -> LayerStack:
         raise FileNotFoundError(f"{path}: no such folder or ZIP of Gerber files")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of old spellings, and of names that are told by their contents
+            warnings.simplefilter("ignore")  # of old spellings, and of layers determined by contents
             return LayerStack.open(path, overrides=dict(layers) if layers else None, autoguess=not layers)
     except (ValueError, SyntaxError, SystemError, KeyError, IndexError, UnicodeDecodeError) as problem:
         reason = " ".join(str(problem).split())[:300]
@@ -258,13 +263,13 @@ def _opened(path: Path, layers: Mapping[str, str] | None) -> LayerStack:
         ) from problem
 
 
-def _layer(stack: LayerStack, side: str, use: str) -> tuple[Drawn, ...]:
+def _layer(stack: LayerStack, side: str, use: str) -> tuple[DrawnObject, ...]:
     found = stack.graphic_layers.get((side, use))
     return () if found is None else drawn_objects(found)
 
 
-def _bounds(stack: LayerStack, copper: tuple[Drawn, ...]) -> Float64:
-    """Of the outline's middle line, which is where the board is cut."""
+def _bounds(stack: LayerStack, copper: tuple[DrawnObject, ...]) -> Float64:
+    """Return the bounds of the centre line of the outline, along which the board is cut."""
     found = stack.graphic_layers.get(("mechanical", "outline"))
     ends = [] if found is None else [point for each in found.objects for point in _outline_points(each)]
     if not ends:
@@ -293,43 +298,46 @@ def _holes(stack: LayerStack) -> Holes:
 
 
 def _drilled(layer: Any, plated: int) -> list[tuple[float, ...]]:
-    """Rows of start, end, diameter [m] and plating; a file of holes may be Gerber, with flashes."""
+    """Return rows of start, end, diameter [m] and plating; a drill file may be Gerber, with flashes."""
     rows = []
     for item in layer.objects:
         if not isinstance(item, Flash | Line):
             continue
-        said = getattr(item.aperture, "plated", None)
+        is_plated = getattr(item.aperture, "plated", None)
         tool = item.aperture.equivalent_width(MM)
         ends = (item.x, item.y, item.x, item.y) if isinstance(item, Flash) else (*item.p1, *item.p2)
         metres = [float(MM(each, item.unit)) * 1e-3 for each in ends]
-        rows.append((*metres, float(tool) * 1e-3, plated if said is None else int(said)))
+        rows.append((*metres, float(tool) * 1e-3, plated if is_plated is None else int(is_plated)))
     return rows
 
 
 def _first_of_equals(points: Float64) -> npt.NDArray[np.int64]:
-    """Pick, by index, the points that no earlier one lies within ``_SAME`` of."""
-    gone = {second for _, second in cKDTree(points).query_pairs(_SAME)} if len(points) else set()
+    """Return the indices of the points that have no earlier point within ``_SAME_PLACE``."""
+    gone = {second for _, second in cKDTree(points).query_pairs(_SAME_PLACE)} if len(points) else set()
     return np.array([index for index in range(len(points)) if index not in gone], dtype=np.int64)
 
 
-def _lands(copper: tuple[Drawn, ...], finder: _Finder) -> tuple[Land, ...]:
-    """Flashes, and regions that the mask opens; of several about one centre the largest."""
+def _pads(copper: tuple[DrawnObject, ...], finder: _Finder) -> tuple[Pad, ...]:
+    """Return flashes, and regions that the mask opens; of several about one centre the largest."""
     found = [each for each in copper if each.kind != "stroke" and each.shapes[-1].outline.size]
     spots = [each for each in found if each.kind == "flash" or _is_opened(each, finder)]
     spots = [each for each in spots if any(shape.dark for shape in each.shapes)]
     spots.sort(key=lambda each: -max(abs(area(shape.outline)) for shape in each.shapes if shape.dark))
     chosen = [spots[index] for index in _first_of_equals(_centres(spots))]
     chosen.sort(key=copper.index)
-    return tuple(_land(each, finder) for each in chosen)
+    return tuple(_pad(each, finder) for each in chosen)
 
 
-def _is_opened(spot: Drawn, finder: _Finder) -> bool:
-    """Whether the mask opens it, and not only a piece of it: what is poured has another centre than what is opened."""
+def _is_opened(spot: DrawnObject, finder: _Finder) -> bool:
+    """Return whether a mask opening belongs to the object.
+
+    A copper pour and an opening in it differ in centre or size.
+    """
     opening = finder.opening(spot.centre)
     return opening is not None and bool(np.all(np.ptp(opening.bounds, axis=0) > 0.5 * np.ptp(spot.bounds, axis=0)))
 
 
-def _land(spot: Drawn, finder: _Finder) -> Land:
+def _pad(spot: DrawnObject, finder: _Finder) -> Pad:
     dark = [each.outline for each in spot.shapes if each.dark]
     outline = _counter_clockwise(dark[0]) if len(dark) == 1 else hull(np.concatenate(dark))
     shape, size, angle = _described(outline)
@@ -338,7 +346,7 @@ def _land(spot: Drawn, finder: _Finder) -> Land:
     margin = math.nan
     if opening is not None:
         margin = float(np.min((opening.bounds - spot.bounds) * np.array([[-1.0], [1.0]])))
-    return Land(
+    return Pad(
         role=_role(spot, shape, float(size[0]), index, opening, finder),
         shape=shape,
         centre=spot.centre,
@@ -354,16 +362,18 @@ def _land(spot: Drawn, finder: _Finder) -> Land:
     )
 
 
-def _role(spot: Drawn, shape: str, across: float, hole: int | None, opening: Drawn | None, finder: _Finder) -> Role:
+def _role(
+    spot: DrawnObject, shape: str, across: float, hole: int | None, opening: DrawnObject | None, finder: _Finder
+) -> Role:
     if spot.function:
-        return _SAID.get(spot.function, "pad")
+        return _ROLES.get(spot.function, "component")
     if shape != "circle":
-        return "pad"
+        return "component"
     if hole is not None:
         small = finder.holes.diameter[hole] <= finder.via_drill and finder.holes.plated[hole] != 0
-        return "via" if small else "pad"
+        return "via" if small else "component"
     wide = opening is not None and bool(np.all(np.ptp(opening.bounds, axis=0) >= _FIDUCIAL_OPENING * across))
-    return "fiducial" if wide and not finder.paste(spot.centre) else "pad"
+    return "fiducial" if wide and not finder.paste(spot.centre) else "component"
 
 
 def _counter_clockwise(outline: Float64) -> Float64:
@@ -371,12 +381,15 @@ def _counter_clockwise(outline: Float64) -> Float64:
 
 
 def _described(outline: Float64) -> tuple[Literal["circle", "rectangle", "other"], Float64, float]:
-    """Shape, size along its own axes and angle: of the least rectangle round it, one of whose sides lies on a side."""
+    """Return shape, size along its own axes, and angle, from the smallest enclosing rectangle.
+
+    One side of that rectangle lies on a side of the convex hull.
+    """
     corners = hull(outline)
     inside = abs(area(outline))
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius = float(np.hypot(*(corners - middle).T).max())
-    if inside > _ROUND * math.pi * radius**2:
+    if inside > _ROUND_AREA * math.pi * radius**2:
         diameter = 2 * math.sqrt(inside / math.pi)
         return "circle", np.array([diameter, diameter]), 0.0
     sides = np.roll(corners, -1, axis=0) - corners
@@ -386,4 +399,4 @@ def _described(outline: Float64) -> tuple[Literal["circle", "rectangle", "other"
     second = np.ptp(np.stack([-axes[:, 1], axes[:, 0]], axis=1) @ corners.T, axis=1)
     best = int(np.argmin(first * second))
     size = np.array([first[best], second[best]])
-    return "rectangle" if inside > _RECTANGULAR * size[0] * size[1] else "other", size, float(angle[best])
+    return "rectangle" if inside > _RECTANGLE_AREA * size[0] * size[1] else "other", size, float(angle[best])

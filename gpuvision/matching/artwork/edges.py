@@ -1,4 +1,4 @@
-"""Straight edges of a board's copper, cut to what a camera can see of them."""
+"""Straight edges of a board's copper, cut to the parts that a camera can see."""
 
 from __future__ import annotations
 
@@ -9,33 +9,33 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.matching.artwork.shapes import SAGITTA, Crossings, Drawn, Float64, Layer, covered
+from gpuvision.matching.artwork.shapes import SAGITTA, Crossings, DrawnObject, Float64, Layer, is_covered
 
-# Lines are one where their angle [rad], distance from the origin and width [m] round to the same multiple. It is no
-# decimal fraction, so that lengths as files write them never lie on the border between two multiples.
+# Lines are equal where their angle [rad], distance from the origin and width [m] round to the same multiple of this
+# number. It is not a decimal fraction, so that the lengths in files never lie between two multiples.
 _QUANTUM = math.pi * 1e-8
-_CLOSE = 2 * SAGITTA
-_SHORTEST = 100e-6  # [m] of an edge, what a ruler of five pixels needs at 20 um each
+_CLOSE = 2 * SAGITTA  # distance of the lines along which the copper beside an edge is checked [m]
+_MIN_LENGTH = 100e-6  # of an edge [m]: a ruler of five lines at 20 um
 
 
 class BoardEdges(NamedTuple):
-    """Straight edges between copper and what lies beside it.
+    """Straight edges between copper and laminate.
 
     Attributes
     ----------
-    start, end
-        (n, 2) [m] of what can be seen: to the clearance from silk, from other copper and from the mask's openings.
-    normal
-        (n, 2) unit, out of the copper.
-    width
-        (n,) of the copper there, to its other edge [m].
-    bare
-        (n,) bool: True where the mask is open on both sides, False where both lie under it. Under the mask an edge
-        has another contrast, and the mask's own offset does not touch it; where the mask ends the edge is cut.
-    trace
-        (n,) which trace, the same for its two edges; -1 for the side of a land.
-    land
-        (n,) index of the land whose side it is; -1 for a trace's.
+    start, end : (n, 2)
+        Ends of the visible part [m]: it keeps the clearance from silk, from other copper and from mask openings.
+    normal : (n, 2)
+        Unit normal, out of the copper.
+    width : (n,)
+        Width of the copper there, to its other edge [m].
+    bare : (n,), bool
+        True where the mask is open on both sides, False where both sides are under the mask. Under the mask an edge has
+        another contrast, and the offset of the mask does not affect it. Where the mask ends, the edge is cut.
+    trace : (n,)
+        Index of the trace, equal for its two edges; -1 for a side of a pad.
+    pad : (n,)
+        Index of the pad; -1 for an edge of a trace.
     """
 
     start: Float64
@@ -44,11 +44,11 @@ class BoardEdges(NamedTuple):
     width: Float64
     bare: npt.NDArray[np.bool_]
     trace: npt.NDArray[np.int64]
-    land: npt.NDArray[np.int64]
+    pad: npt.NDArray[np.int64]
 
     @property
     def length(self) -> Float64:
-        """(n,) [m]."""
+        """(n,) lengths [m]."""
         return np.asarray(np.hypot(*(self.end - self.start).T))
 
 
@@ -58,33 +58,33 @@ class _Candidate(NamedTuple):
     normal: Float64
     width: float
     trace: int
-    land: int
+    pad: int
 
 
 def board_edges(
-    strokes: Sequence[Drawn],
+    strokes: Sequence[DrawnObject],
     outlines: Sequence[Float64],
     copper: Layer,
     mask: Layer | None,
     silk: Layer,
     clearance: float,
 ) -> BoardEdges:
-    """BoardEdges of strokes with a round aperture and of the straight sides of lands.
+    """Return the edges of strokes with a round aperture and of the straight sides of pads.
 
     Parameters
     ----------
     strokes
-        Of the copper; those that lie in line and are equally wide are one trace.
+        Strokes of the copper; collinear strokes of equal width are one trace.
     outlines
-        Of the lands, counter-clockwise.
+        Outlines of the pads, counter-clockwise [m].
     copper, mask, silk
-        What may hide an edge; no mask: everything is bare.
+        Layers that may hide an edge; without a mask everything is bare.
     clearance
-        [m], on both sides of an edge and at its ends.
+        Free distance on both sides of an edge and at its ends [m].
     """
     rows = []
-    for each in [*_trace_sides(strokes), *_land_sides(outlines)]:
-        for low, high, bare in _seen(each, copper, mask, silk, clearance):
+    for each in [*_trace_sides(strokes), *_pad_sides(outlines)]:
+        for low, high, bare in _visible_parts(each, copper, mask, silk, clearance):
             along = each.end - each.start
             rows.append((each.start + low * along, each.start + high * along, each.normal, each.width, bare, *each[4:]))
     columns: list[Any] = list(zip(*rows, strict=True)) if rows else [[]] * 7
@@ -99,7 +99,7 @@ def board_edges(
     )
 
 
-def _trace_sides(strokes: Sequence[Drawn]) -> Iterator[_Candidate]:
+def _trace_sides(strokes: Sequence[DrawnObject]) -> Iterator[_Candidate]:
     for index, (start, end, width) in enumerate(_joined(strokes)):
         x, y = (end - start) / math.dist(start, end)
         for normal in (np.array([-y, x]), np.array([y, -x])):
@@ -107,9 +107,9 @@ def _trace_sides(strokes: Sequence[Drawn]) -> Iterator[_Candidate]:
             yield _Candidate(start + shift, end + shift, normal, width, index, -1)
 
 
-def _joined(strokes: Sequence[Drawn]) -> list[tuple[Float64, Float64, float]]:
-    """Straight strokes, those on one line joined where they touch: start, end and width [m]."""
-    lines: dict[tuple[int, int, int], list[tuple[float, float, Drawn]]] = {}
+def _joined(strokes: Sequence[DrawnObject]) -> list[tuple[Float64, Float64, float]]:
+    """Return straight strokes as (start, end, width) [m], collinear ones that touch joined."""
+    lines: dict[tuple[int, int, int], list[tuple[float, float, DrawnObject]]] = {}
     for each in strokes:
         if each.ends is None or not each.width > 0 or not each.shapes[0].dark:
             continue
@@ -122,13 +122,13 @@ def _joined(strokes: Sequence[Drawn]) -> list[tuple[Float64, Float64, float]]:
 
 
 def _axis(ends: Float64) -> Float64:
-    """Give the unit vector along a line, the same for both of its senses."""
+    """Return the unit vector along a line, the same for both of its directions."""
     along = ends[1] - ends[0]
     backwards = along[0] < 0 or (along[0] == 0 and along[1] < 0)
     return np.asarray((-along if backwards else along) / math.hypot(*along))
 
 
-def _united(pieces: list[tuple[float, float, Drawn]]) -> Iterator[tuple[Float64, Float64, float]]:
+def _united(pieces: list[tuple[float, float, DrawnObject]]) -> Iterator[tuple[Float64, Float64, float]]:
     first = pieces[0][2]
     assert first.ends is not None
     axis = _axis(first.ends)
@@ -142,25 +142,25 @@ def _united(pieces: list[tuple[float, float, Drawn]]) -> Iterator[tuple[Float64,
         low, high = start, end
 
 
-def _land_sides(outlines: Sequence[Float64]) -> Iterator[_Candidate]:
+def _pad_sides(outlines: Sequence[Float64]) -> Iterator[_Candidate]:
     for index, outline in enumerate(outlines):
         for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
             length = math.dist(start, end)
-            if length < _SHORTEST:
+            if length < _MIN_LENGTH:
                 continue
             normal = np.array([end[1] - start[1], start[0] - end[0]]) / length
             width = float(np.max((start - outline) @ normal))
             yield _Candidate(start, end, normal, width, -1, index)
 
 
-def _seen(
+def _visible_parts(
     edge: _Candidate, copper: Layer, mask: Layer | None, silk: Layer, clearance: float
 ) -> list[tuple[float, float, bool]]:
-    """Pieces, from 0 at the start to 1 at the end, that can be seen, and whether they are bare.
+    """Return the visible parts of an edge, from 0 at its start to 1 at its end, and whether they are bare.
 
-    Copper is looked for along lines close to the edge and at the clearance, on either side; ink and openings along the
-    edge and at the clearance. What lies wholly between two of these lines is not found. Each piece is then cut by the
-    clearance at both ends.
+    Copper is checked along lines close to the edge and at the clearance, on both sides; ink and mask openings along the
+    edge and at the clearance. Objects wholly between two of these lines are not noticed. Each part is then shortened by
+    the clearance at both ends.
     """
 
     def along(layer: Layer, *offsets: float) -> list[Crossings]:
@@ -174,11 +174,11 @@ def _seen(
     cuts = np.unique(np.concatenate([np.array([0.0, 1.0]), *crossings]))
     cuts = cuts[(cuts >= 0) & (cuts <= 1)]
     middle = (cuts[1:] + cuts[:-1]) / 2
-    hidden = np.logical_or.reduce([covered(each, middle) for each in (*outside, *inks)])
-    good = np.logical_and.reduce([covered(each, middle) for each in inside]) & ~hidden
+    hidden = np.logical_or.reduce([is_covered(each, middle) for each in (*outside, *inks)])
+    good = np.logical_and.reduce([is_covered(each, middle) for each in inside]) & ~hidden
     bare = np.ones(len(middle), dtype=np.int64)
     if mask is not None:
-        bare = np.sum([covered(each, middle) for each in openings], axis=0)
+        bare = np.sum([is_covered(each, middle) for each in openings], axis=0)
         good &= (bare == 0) | (bare == len(openings))
     return list(_pieces(cuts, good, bare > 0, clearance, math.dist(edge.start, edge.end)))
 
@@ -186,12 +186,12 @@ def _seen(
 def _pieces(
     cuts: Float64, good: npt.NDArray[np.bool_], bare: npt.NDArray[np.bool_], clearance: float, length: float
 ) -> Iterator[tuple[float, float, bool]]:
-    """Neighbouring good intervals of one kind joined, and shortened at both ends."""
+    """Yield the joined neighbouring good intervals of one kind, shortened at both ends."""
     state = np.where(good, 1 + bare.astype(np.int64), 0)
     starts = np.flatnonzero(np.diff(state, prepend=-1))
     stops = np.append(starts[1:], len(state))
     margin = clearance / length
     for start, stop in zip(starts, stops, strict=True):
         low, high = float(cuts[start]) + margin, float(cuts[stop]) - margin
-        if state[start] and (high - low) * length >= _SHORTEST:
+        if state[start] and (high - low) * length >= _MIN_LENGTH:
             yield low, high, bool(state[start] == 2)

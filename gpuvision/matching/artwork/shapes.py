@@ -1,4 +1,4 @@
-"""Drawn layers of a board as polygons [m], and what of a straight line they cover."""
+"""Drawn layers of a board as polygons [m], and the parts of a straight line that they cover."""
 
 from __future__ import annotations
 
@@ -18,21 +18,22 @@ Float64 = npt.NDArray[np.float64]
 Crossings = list[tuple[bool, Float64]]
 
 SAGITTA = 0.5e-6
-"""How far [m] a chord of a polygon may lie inside the arc that it stands for."""
-_METRE = 1e-3  # gerbonara is asked for millimetres
-_BROKEN_MACROS = {6: "moiré", 7: "thermal"}  # gerbonara 1.5 reads them and cannot draw them
+"""Largest distance [m] between an arc and the chord that stands for it."""
+_METRE = 1e-3  # per unit: all calls of gerbonara ask for millimetres
+_UNSUPPORTED_MACROS = {6: "moiré", 7: "thermal"}  # gerbonara 1.5 reads them and cannot draw them
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One area of a layer, later ones drawn over earlier ones.
+    """Area of a layer; later areas are drawn over earlier ones.
 
     Attributes
     ----------
-    outline
-        (n, 2) corners [m], closed from the last to the first; inside is what an odd number of turns goes round.
+    outline : (n, 2)
+        Corners [m], closed from the last to the first; points with an odd number of crossings to the outside are
+        inside.
     dark
-        True where the layer's material (copper, ink, the mask's opening) is laid, False where it is taken away.
+        True where the layer's material (copper, ink, mask opening) is added, False where it is cleared.
     """
 
     outline: Float64
@@ -40,23 +41,23 @@ class Shape:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """One object of a layer: what it is drawn as, and what the file says it is for.
+class DrawnObject:
+    """Object of a layer: its areas, and its attributes in the file.
 
     Attributes
     ----------
     kind
-        ``"flash"``, ``"stroke"`` or ``"region"``.
+        "flash", "stroke" or "region".
     shapes
         Its areas.
-    ends
-        (2, 2) of a straight stroke's middle [m], None of anything else.
+    ends : (2, 2), optional
+        Ends of the centre line of a straight stroke [m]; None for all else.
     width
-        Of a stroke with a round aperture [m], otherwise NaN.
+        Width of a stroke with a round aperture [m], otherwise NaN.
     function
-        ``.AperFunction`` of Gerber X2, ``""`` where the file does not say it.
+        ``.AperFunction`` of Gerber X2, ``""`` where the file does not have it.
     net, part, pin
-        ``.N``, and ``.P`` of Gerber X2, ``""`` where the file does not say them.
+        ``.N`` and ``.P`` of Gerber X2, ``""`` where the file does not have them.
     """
 
     kind: str
@@ -70,24 +71,24 @@ class Drawn:
 
     @cached_property
     def bounds(self) -> Float64:
-        """(2, 2): the least and the greatest x, y [m] of what is laid (of everything, where nothing is)."""
+        """(2, 2) least and greatest x, y [m] of the added areas (of all areas where none is added)."""
         dark = [each.outline for each in self.shapes if each.dark] or [each.outline for each in self.shapes]
         points = np.concatenate(dark)
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
     @property
     def centre(self) -> Float64:
-        """(2,) middle of the bounds [m]."""
+        """(2,) centre of the bounds [m]."""
         return np.asarray(self.bounds.mean(axis=0))
 
 
 class Layer:
-    """Shapes of one layer, ordered, for asking what lies along a line.
+    """Shapes of one layer in drawing order, for queries along lines.
 
     Parameters
     ----------
     shapes
-        In the order of drawing.
+        Shapes in drawing order.
     """
 
     def __init__(self, shapes: tuple[Shape, ...]) -> None:
@@ -102,12 +103,14 @@ class Layer:
         self._high = np.array([each.outline.max(axis=0) for each in shapes]).reshape(-1, 2)
 
     def crossings(self, start: Float64, end: Float64) -> Crossings:
-        """Shapes that the bounds of a line meet, in order: whether dark, and where the endless line crosses them.
+        """Return the shapes near a segment, in drawing order: whether dark, and where the infinite line crosses them.
+
+        A shape is near where its bounding box meets that of the segment.
 
         Parameters
         ----------
         start, end
-            (2,) [m]; 0 and 1 are where the line starts and ends.
+            (2,) ends of the segment [m]; the crossings are 0 at the start and 1 at the end.
         """
         low, high = np.minimum(start, end), np.maximum(start, end)
         near = np.flatnonzero(np.all((self._low <= high) & (self._high >= low), axis=1))
@@ -125,40 +128,40 @@ class Layer:
         return found
 
 
-def covered(crossings: Crossings, at: Float64) -> npt.NDArray[np.bool_]:
-    """Whether a layer's material lies at places along a line; see :meth:`Layer.crossings`."""
-    laid = np.zeros(len(at), dtype=np.bool_)
+def is_covered(crossings: Crossings, at: Float64) -> npt.NDArray[np.bool_]:
+    """Return whether the material of a layer lies at places along a line; see `Layer.crossings`."""
+    is_dark = np.zeros(len(at), dtype=np.bool_)
     for dark, where in crossings:
-        laid[np.searchsorted(where, at) % 2 == 1] = dark
-    return laid
+        is_dark[np.searchsorted(where, at) % 2 == 1] = dark
+    return is_dark
 
 
-def drawn_objects(layer: Any) -> tuple[Drawn, ...]:
-    """Objects of a Gerber layer as gerbonara reads it; strokes without an area are left out.
+def drawn_objects(layer: Any) -> tuple[DrawnObject, ...]:
+    """Return the objects of a Gerber layer read by gerbonara, without strokes of no area.
 
     Raises
     ------
     ValueError
-        An aperture macro with a moiré or a thermal: they are obsolete or of inner layers, and are not read.
+        An aperture macro has a moiré or a thermal: these are obsolete or for inner layers, and are not supported.
     """
     return tuple(each for item in layer.objects if (each := _drawn(item)) is not None)
 
 
-def _drawn(item: Any) -> Drawn | None:
+def _drawn(item: Any) -> DrawnObject | None:
     if isinstance(item, graphic_objects.Region):
         (primitive,) = item.to_primitives(MM)
-        return Drawn("region", (Shape(_outline(primitive), bool(item.polarity_dark)),))
-    says = _attributes(item)
+        return DrawnObject("region", (Shape(_outline(primitive), bool(item.polarity_dark)),))
+    attributes = _attributes(item)
     if isinstance(item, graphic_objects.Flash):
         place = np.array([MM(item.x, item.unit), MM(item.y, item.unit)]) * _METRE
-        return Drawn("flash", tuple(_flashed(item.aperture, place, bool(item.polarity_dark))), **says)
+        return DrawnObject("flash", tuple(_flashed(item.aperture, place, bool(item.polarity_dark))), **attributes)
     lines = [item] if isinstance(item, graphic_objects.Line) else item.approximate(SAGITTA / _METRE, MM)
     ends = [np.array([[MM(x, item.unit), MM(y, item.unit)] for x, y in (each.p1, each.p2)]) * _METRE for each in lines]
     shapes = tuple(shape for each in ends for shape in _swept(item.aperture, each, bool(item.polarity_dark)))
     if not shapes:
         return None
     straight = len(ends) == 1 and math.dist(*ends[0]) > 0
-    return Drawn("stroke", shapes, ends[0] if straight else None, _round_width(item.aperture), **says)
+    return DrawnObject("stroke", shapes, ends[0] if straight else None, _round_width(item.aperture), **attributes)
 
 
 def _attributes(item: Any) -> dict[str, Any]:
@@ -176,9 +179,9 @@ def _round_width(aperture: Any) -> float:
 def _flashed(aperture: Any, place: Float64, dark: bool) -> Iterator[Shape]:
     if isinstance(aperture, ApertureMacroInstance):
         for primitive in aperture.macro.primitives:
-            if name := _BROKEN_MACROS.get(getattr(primitive, "code", 0)):
-                raise ValueError(f"aperture macro {aperture.macro.name}: a {name} is not read; draw it as regions")
-    # At the origin, and moved afterwards: gerbonara 1.5 forgets the place of a macro's regular polygons.
+            if name := _UNSUPPORTED_MACROS.get(getattr(primitive, "code", 0)):
+                raise ValueError(f"aperture macro {aperture.macro.name}: a {name} is not supported; draw it as regions")
+    # Draw at the origin and move afterwards: gerbonara 1.5 ignores the position of regular polygons in macros.
     for primitive in aperture.flash(0.0, 0.0, MM, dark):
         yield Shape(_outline(primitive) + place, bool(primitive.polarity_dark))
 
@@ -197,7 +200,7 @@ def _swept(aperture: Any, ends: Float64, dark: bool) -> Iterator[Shape]:
 
 
 def _outline(primitive: Any) -> Float64:
-    """Polygon [m] of what gerbonara draws, in millimetres; its own polygons of turned rectangles are not right."""
+    """Return the polygon [m] of a primitive of gerbonara [mm], whose own polygons of rotated rectangles are wrong."""
     if isinstance(primitive, graphic_primitives.Circle):
         return disk(np.array([primitive.x, primitive.y]) * _METRE, primitive.r * _METRE)
     if isinstance(primitive, graphic_primitives.Rectangle):
@@ -216,7 +219,10 @@ def _outline(primitive: Any) -> Float64:
 
 
 def disk(centre: Float64, radius: float) -> Float64:
-    """Regular polygon with the circle's area; (n, 2) corners within ``SAGITTA`` of it, the same on all four sides."""
+    """Return the regular polygon with the area of a circle: (n, 2) corners within `SAGITTA` of it.
+
+    The polygon is symmetric in x and y.
+    """
     count = 4 * math.ceil(_chords(radius, 2 * math.pi) / 4)
     angle = np.arange(count) * (2 * math.pi / count)
     step = 2 * math.pi / count
@@ -225,7 +231,7 @@ def disk(centre: Float64, radius: float) -> Float64:
 
 
 def capsule(start: Float64, end: Float64, radius: float) -> Float64:
-    """Polygon that a disk of a radius [m] sweeps along a line: straight sides, chords round the ends."""
+    """Return the polygon that a disk of a radius [m] sweeps along a segment: straight sides, chords around the ends."""
     along = end - start
     if not along.any():
         return disk(start, radius)
@@ -235,7 +241,7 @@ def capsule(start: Float64, end: Float64, radius: float) -> Float64:
 
 
 def hull(points: Float64) -> Float64:
-    """Corners of the convex hull, counter-clockwise (monotone chain)."""
+    """Return the corners of the convex hull, counter-clockwise (Andrew's monotone chain)."""
     order = sorted(set(map(tuple, points.tolist())))
 
     def half(sequence: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
@@ -253,18 +259,18 @@ def hull(points: Float64) -> Float64:
 
 
 def area(outline: Float64) -> float:
-    """Area [m^2] inside an outline, positive where it runs counter-clockwise."""
+    """Return the signed area [m^2] inside an outline, positive where it runs counter-clockwise."""
     x, y = (outline - outline[0]).T
     return float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2)
 
 
 def _chords(radius: float, angle: float) -> int:
-    """How many chords an arc needs."""
+    """Return the number of chords of an arc."""
     return max(math.ceil(angle / (2 * math.acos(1 - min(SAGITTA / max(radius, SAGITTA), 0.05)))), 1)
 
 
 def _arc(start: Float64, end: Float64, centre: Float64, clockwise: bool) -> Float64:
-    """Corners of an arc from its start, without its end; from a point to itself it is a whole circle."""
+    """Return the corners of an arc from its start, without its end; an arc from a point to itself is a full circle."""
     a, b = start - centre, end - centre
     sweep = (math.atan2(b[1], b[0]) - math.atan2(a[1], a[0])) % (2 * math.pi)
     sweep = sweep - 2 * math.pi if clockwise and sweep > 0 else sweep

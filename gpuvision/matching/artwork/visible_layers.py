@@ -1,4 +1,4 @@
-"""What lies along a line across a board's edge or mark: copper, and what may hide it."""
+"""Layers along a line across an edge or a pad of a board: copper, and the layers that may hide it."""
 
 from __future__ import annotations
 
@@ -9,35 +9,45 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.matching.artwork.artwork import Artwork
-from gpuvision.matching.artwork.shapes import Float64, Layer, Shape, capsule, covered
+from gpuvision.matching.artwork.shapes import Float64, Layer, Shape, capsule, is_covered
 
 
-class Sheet(NamedTuple):
-    """A layer, how far it may lie off the copper, and whether it is dark where the others are bright: holes are."""
+class VisibleLayer(NamedTuple):
+    """Layer, its largest offset from the copper [m], and whether it looks dark where the others look bright (holes)."""
 
     layer: Layer
-    off: float
+    max_offset: float
     dark: bool = False
 
 
-@lru_cache(maxsize=1)  # rulers and marks of a board are chosen one after the other
-def sheets_of(artwork: Artwork, off: float) -> tuple[Sheet, ...]:
-    """Return copper, and then what may lie on it, off by so much at most [m]."""
+@lru_cache(maxsize=1)  # rulers and fiducials of a board are selected one after the other
+def visible_layers(artwork: Artwork, max_offset: float) -> tuple[VisibleLayer, ...]:
+    """Return the copper, and then the layers that may hide it, with their largest offset [m]."""
     holes = zip(artwork.holes.start, artwork.holes.end, artwork.holes.diameter, strict=True)
     drilled = tuple(Shape(capsule(start, end, across / 2)) for start, end, across in holes)
     return (
-        Sheet(Layer(artwork.copper), 0.0),
-        Sheet(Layer(artwork.mask), off),
-        Sheet(Layer(artwork.silk), off),
-        Sheet(Layer(drilled), off, dark=True),
+        VisibleLayer(Layer(artwork.copper), 0.0),
+        VisibleLayer(Layer(artwork.mask), max_offset),
+        VisibleLayer(Layer(artwork.silk), max_offset),
+        VisibleLayer(Layer(drilled), max_offset, dark=True),
     )
 
 
-def steps_along(layer: Layer, point: Float64, normal: Float64, reach: float) -> tuple[Float64, npt.NDArray[np.bool_]]:
-    """Return where a layer begins and ends along a normal, as far as a reach [m] either way, and whether it ends."""
+def layer_edges_along(
+    layer: Layer, point: Float64, normal: Float64, reach: float
+) -> tuple[Float64, npt.NDArray[np.bool_]]:
+    """Return the positions along a normal at which a layer begins or ends, up to a distance [m] on both sides.
+
+    Returns
+    -------
+    position : numpy.ndarray
+        Positions relative to the point [m].
+    ends : numpy.ndarray
+        bool, whether the layer ends there in the direction of the normal.
+    """
     found = layer.crossings(point - reach * normal, point + reach * normal)
     cuts = np.unique(np.concatenate([np.array([0.0, 1.0]), *(where for _, where in found)]))
     cuts = cuts[(cuts >= 0) & (cuts <= 1)]
-    laid = covered(found, (cuts[1:] + cuts[:-1]) / 2)
-    step = laid[:-1] != laid[1:]
-    return (cuts[1:-1][step] - 0.5) * 2 * reach, laid[:-1][step]
+    inside = is_covered(found, (cuts[1:] + cuts[:-1]) / 2)
+    step = inside[:-1] != inside[1:]
+    return (cuts[1:-1][step] - 0.5) * 2 * reach, inside[:-1][step]

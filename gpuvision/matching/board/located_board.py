@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device
-from gpuvision.matching.board.edge_measurement import Copper, Rulers
-from gpuvision.matching.board.fiducial_detection import FoundMarks
+from gpuvision.matching.board.edge_measurement import Copper, RulerMeasurements
+from gpuvision.matching.board.fiducial_detection import FoundFiducials
 from gpuvision.matching.features.feature_set import FeatureSet
 from gpuvision.matching.pose.registration import Registration
 from gpuvision.status import Status
@@ -23,43 +23,43 @@ Float64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LocatedBoard:
-    """Where a camera is over a board, or why that is not known.
+    """Pose of a camera over a board, or the reason why it is refused.
 
     Attributes
     ----------
     view
-        With the pose that was found; where it is refused, the one last looked at.
-    covariance
-        (3, 3) of the pose's x, y [m] and theta [rad]; NaN where it is refused.
-    placement, placement_px
-        (2,) the artwork's placement point [m], and where it is seen in the image as it was taken [px].
-    placement_covariance
-        (3, 3) of the place on the board seen where the placement point is [m], and of theta [rad].
+        Pose, scale and lens of the camera; where the pose is refused, the last expected one.
+    covariance : (3, 3)
+        Covariance of the pose's x, y [m] and theta [rad]; NaN where the pose is refused.
+    placement, placement_px : (2,)
+        Placement point in the artwork [m], and where it is seen in the measured image [px].
+    placement_covariance : (3, 3)
+        Covariance of the board's position at the placement point, x, y [m], and of theta [rad].
     rulers
-        `Rulers` of the last pass.
-    marks
-        `FoundMarks` of the last pass.
+        `RulerMeasurements` of the last pass.
+    fiducials
+        `FoundFiducials` of the last pass.
     features
-        What was looked for.
-    growth
-        How far copper reaches beyond its drawn edges, below 0 where too much was etched [m], solved for along with the
-        pose; NaN where only the middles of traces were measured.
-    spread
-        Of what the pose leaves of the edges, in standard deviations: about 1 where these are right.
+        Features that were looked for.
+    etch_bias
+        Distance by which copper reaches beyond its drawn edges [m], negative for over-etched copper, solved together
+        with the pose; NaN where only centres of traces and fiducials were measured.
+    residual_scale
+        Scale of the residuals in standard deviations: about 1 where these are right.
     condition
-        Worst standard deviation over best.
+        Largest over smallest standard deviation of the pose.
     copper
-        Whether copper is brighter or darker than what lies beside it.
+        Whether copper is "bright" or "dark" relative to its surroundings.
     noise, threshold
-        Of a pixel, and the least edge looked for [grey levels].
+        Standard deviation of a pixel, and least height of an edge [grey levels].
     reason
-        Why the pose is refused; ``""`` where it is not.
-    first
-        What the search found; None where none was made.
+        Why the pose is refused; ``""`` where it is accepted.
+    coarse_registration
+        Result of the coarse registration; None where none was needed.
     device
         Where it ran.
     seconds
-        Of the steps, by name.
+        Duration of each step, by name [s].
     """
 
     view: BoardView
@@ -67,23 +67,23 @@ class LocatedBoard:
     placement: Float64
     placement_px: Float64
     placement_covariance: Float64
-    rulers: Rulers
-    marks: FoundMarks
+    rulers: RulerMeasurements
+    fiducials: FoundFiducials
     features: FeatureSet
-    growth: float
-    spread: float
+    etch_bias: float
+    residual_scale: float
     condition: float
     copper: Copper
     noise: float
     threshold: float
     reason: str
-    first: Registration | None
+    coarse_registration: Registration | None
     device: Device
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def pose(self) -> tuple[float, float, float]:
-        """What the image's centre sees, x, y [m], and theta [rad]; NaN where it is refused."""
+        """Place on the board at the image centre, x, y [m], and theta [rad]; NaN where the pose is refused."""
         return (math.nan,) * 3 if self.reason else self.view.pose
 
     @property
@@ -92,14 +92,17 @@ class LocatedBoard:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def summary(self) -> str:
-        """Return the pose in a line or two, or why there is none."""
+        """Return the pose with its standard deviations in two lines, or the reason of the refusal."""
         if self.reason:
             return f"refused: {self.reason}"
-        told, marks = self.rulers, self.marks
-        counts = f"; {np.sum(told.used)} of {np.sum(told.laid)} rulers agree, {np.sum(told.found)} found an edge"
-        if marks.laid.any():
-            counts = counts if told.laid.any() else ""
-            counts += f"; {np.sum(marks.used)} of {np.sum(marks.laid)} marks agree, {np.sum(marks.found)} were found"
+        rulers, fiducials = self.rulers, self.fiducials
+        counts = (
+            f"; {np.sum(rulers.used)} of {np.sum(rulers.in_image)} rulers agree, {np.sum(rulers.found)} found an edge"
+        )
+        if fiducials.in_image.any():
+            counts = counts if rulers.in_image.any() else ""
+            counts += f"; {np.sum(fiducials.used)} of {np.sum(fiducials.in_image)} fiducials agree, "
+            counts += f"{np.sum(fiducials.found)} were found"
         (x, y, theta), (sx, sy, turn) = self.pose, self.sigmas
         return (
             f"x {1e3 * x:.4f} mm, y {1e3 * y:.4f} mm, theta {math.degrees(theta):.4f} degrees\n"
@@ -107,9 +110,9 @@ class LocatedBoard:
         )
 
     def report(self) -> dict[str, Any]:
-        """Return what ``pose.json`` holds: metres, radians; what is not known is null."""
-        told, marks, first = self.rulers, self.marks, self.first
-        points = told.point + told.normal * np.nan_to_num(told.position_px * self.view.scale)[:, None]
+        """Return the content of ``pose.json``: metres, radians; unknown numbers are null."""
+        rulers, fiducials, coarse = self.rulers, self.fiducials, self.coarse_registration
+        points = rulers.point + rulers.normal * np.nan_to_num(rulers.position_px * self.view.scale)[:, None]
         return {
             "gpuvision": version("gpuvision"),
             "status": "refused" if self.reason else "located",
@@ -124,42 +127,42 @@ class LocatedBoard:
                 "covariance": _plain(self.placement_covariance),
             },
             "predicted_covariance": _plain(self.features.covariance),
-            "growth": _plain(self.growth),
-            "spread": _plain(self.spread),
+            "etch_bias": _plain(self.etch_bias),
+            "residual_scale": _plain(self.residual_scale),
             "condition": _plain(self.condition),
             "scale": self.view.scale,
             "copper": self.copper,
             "noise": self.noise,
             "threshold": self.threshold,
-            "search": None
-            if first is None
-            else {name: _plain(getattr(first, name)) for name in ("score", "runner_up")},
-            "counts": {name: int(np.sum(getattr(told, name))) for name in ("laid", "found", "used")}
-            | {f"marks_{name}": int(np.sum(getattr(marks, name))) for name in ("laid", "found", "used")},
+            "coarse_registration": None
+            if coarse is None
+            else {name: _plain(getattr(coarse, name)) for name in ("score", "runner_up")},
+            "counts": {name: int(np.sum(getattr(rulers, name))) for name in ("in_image", "found", "used")}
+            | {f"fiducials_{name}": int(np.sum(getattr(fiducials, name))) for name in ("in_image", "found", "used")},
             "rulers": [
                 {
-                    "point": _plain(told.point[number]),
+                    "point": _plain(rulers.point[number]),
                     "image_px": _plain(self.view.to_measured_pixels(points[number])),
-                    "found": bool(told.found[number]),
-                    "weight": _plain(told.weight[number]),
-                    "residual": _plain(told.residual[number]),
-                    "sigma": _plain(told.sigma[number]),
-                    "status": str(Status(int(told.status[number])).name or "OK"),
+                    "found": bool(rulers.found[number]),
+                    "weight": _plain(rulers.weight[number]),
+                    "residual": _plain(rulers.residual[number]),
+                    "sigma": _plain(rulers.sigma[number]),
+                    "status": str(Status(int(rulers.status[number])).name or "OK"),
                 }
-                for number in range(len(told.weight))
+                for number in range(len(rulers.weight))
             ],
-            "marks": [
+            "fiducials": [
                 {
-                    "point": _plain(marks.point[number]),
-                    "image_px": _plain(marks.image_px[number]),
-                    "found": bool(marks.found[number]),
-                    "weight": _plain(marks.weight[number]),
-                    "residual": _plain(marks.residual[number]),
-                    "sigmas": _plain(np.sqrt(np.diag(marks.covariance[number]))),
-                    "radius": _plain(marks.size[number]),
-                    "status": str(Status(int(marks.status[number])).name or "OK"),
+                    "point": _plain(fiducials.point[number]),
+                    "image_px": _plain(fiducials.image_px[number]),
+                    "found": bool(fiducials.found[number]),
+                    "weight": _plain(fiducials.weight[number]),
+                    "residual": _plain(fiducials.residual[number]),
+                    "sigmas": _plain(np.sqrt(np.diag(fiducials.covariance[number]))),
+                    "radius": _plain(fiducials.size[number]),
+                    "status": str(Status(int(fiducials.status[number])).name or "OK"),
                 }
-                for number in range(len(marks.weight))
+                for number in range(len(fiducials.weight))
             ],
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
             "seconds": self.seconds,
@@ -171,7 +174,7 @@ def _named(values: Any) -> dict[str, float | None]:
 
 
 def _plain(value: Any) -> Any:
-    """Return numbers as JSON has them, None for NaN."""
+    """Return numbers as JSON types, None for NaN."""
     array = np.asarray(value, np.float64)
     if array.ndim:
         return [_plain(each) for each in array]

@@ -1,8 +1,8 @@
-"""Marks located to a fraction of a pixel: vias, fiducials and pads near places where they are expected.
+"""Sub-pixel location of blobs: vias, fiducials and pads near their expected places.
 
-Rulers lie across the contour of the expected mark, each finds an edge, and a robust fit of the shape through the edges
-gives the mark's centre, size and angle. From there the grey levels of its pixels are matched to a blurred mark on a
-plane background, which is as accurate as their noise allows:
+Calipers (rulers) across the expected contour find edges, and a robust fit of the shape through the edges gives centre,
+size and angle. From there, a model of a blurred blob on a plane background is matched to the grey levels of the pixels,
+which is as accurate as their noise allows:
 
     operation = FindBlobs(threshold=20.0, shape="circle", polarity="bright", search_px=6.0)
     blobs = operation(image, places)  # places: float32 (n, 3): x, y, radius [px]
@@ -21,7 +21,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from gpuvision.host import Define, Device, Launch, LaunchBuilder, Variant, flags, round_up
+from gpuvision.host import (
+    Define,
+    Device,
+    FloatArray,
+    IntArray,
+    Launch,
+    LaunchBuilder,
+    StatusArray,
+    Variant,
+    flags,
+    round_up,
+)
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.robust import efficiency, loss_defines
 from gpuvision.operation import VisionOperation
@@ -32,144 +43,155 @@ Contrast = Literal["bright", "dark", "either"]
 
 SHAPES = ("circle", "ring", "square", "cross")
 CONTRASTS = ("bright", "dark", "either")
-BEND = 6.0  # of Tukey's loss [sigma]: 98 % efficient
-MOST_SPOKES = 256
+TUNING_CONSTANT = 6.0
+"""Of Tukey's loss, in standard deviations: 98 % efficiency."""
+MAX_SPOKES = 256
 _LANES, _GROUP = 16, 64
-_SHARES_PER_CORE = 4  # keep the cores even
-_ALONE = 8  # marks that the caller's thread does sooner than it wakes another
-_SMOOTHING, _TAPS = 3, 11  # in the table of ruler.h
-# Of rulers across a mark's edge: polarity along the ruler, which leaves the mark's area.
+_SHARES_PER_CORE = 4  # work-items per core: balances the cores
+_INLINE = 8  # blobs up to which one thread is faster than waking a second one (measured)
+_SMOOTHING, _TAPS = 3, 11  # indices in the table of ruler.h
+# Polarity along a ruler across the contour, which points out of the blob.
 _POLARITIES: dict[str, Literal["falling", "rising", "any"]] = {"bright": "falling", "dark": "rising", "either": "any"}
 
 
 class Blobs(NamedTuple):
-    """What was found at each place, arrays of shape (n,) unless said otherwise; all are NaN unless the mark is trusted.
+    """Blobs found near their expected places.
+
+    Arrays of shape (n,) unless stated otherwise, NaN where a blob was refused.
 
     Attributes
     ----------
-    x, y
+    x, y : float32
         Centre [px].
-    shift
-        (n, 2) the centre relative to the nominal place [px]: the same, with more digits.
-    size
-        Radius of a circle, outer radius of a ring, half of a square's side or of a cross's length [px].
-    angle
-        Of squares and crosses [rad], from x towards y, near the nominal one; None for round marks.
-    covariance
-        (n, 3, 3) of x, y, size; of squares and crosses (n, 4, 4) with the angle [px, rad]: from what the pixels differ
-        from the matched mark. Without ``match`` from the noise of the edges as it is predicted, or as they differ from
-        the shape, whichever is more.
-    residual
-        Root mean square distance of the edges from the shape [px], as they weigh in the fit.
-    inliers
-        int32, how many edges the fit to them has; 0 where there is none.
-    symmetry
-        How well opposite edges agree, 0 to 1: the mean over all rulers of the root of the weights of an edge and the
-        one opposite, times the ratio of their heights. 1 for an undisturbed mark, lower by the share that is hidden.
-    gravity_x, gravity_y
-        Centre of gravity of what differs from the background, a second estimate [px]: of the grey levels within the
-        found contour and its blur, less their mean in a ring of 2 px about that. NaN also where the ring leaves the
-        image.
-    distance
-        From the nominal place [px].
-    contrast
-        Grey levels of the mark above its background.
-    blur
-        Standard deviation of the edges' blur [px]; without ``match`` that of bilinear samples (0.4 px on average)
-        included.
-    status
-        uint8 `Status` flags. LOW_SIGNAL: too few rulers found an edge over the threshold, of the polarity, within the
-        search radius. OUT_OF_RANGE: too many rulers leave the image, or the mark lies further than the search radius
-        from its nominal place. NOT_FINITE: a place or radius is not finite, the radius not above 0, or too many
-        pixels are not finite. AMBIGUOUS: too few of the edges agree on one shape, or the pixels have none there. With
-        a value: SATURATED (a ruler of the fit has reached the saturation).
+    shift : float32, (n, 2)
+        Centre relative to the expected place [px]: the same information with more digits.
+    size : float32
+        Radius of a circle, outer radius of a ring, half the side of a square, half the length of a cross [px].
+    angle : float32, optional
+        Angle of squares and crosses [rad], from x towards y, near the expected one; None for circles and rings.
+    covariance : float32, (n, 3, 3) or (n, 4, 4)
+        Covariance of x, y, size; of squares and crosses of x, y, size, angle [px, rad]. From the residuals of the
+        pixels; without ``match`` from the predicted noise of the edges or from their residuals, whichever is larger.
+    residual : float32
+        Weighted root mean square distance of the edges from the shape [px].
+    inliers : int32
+        Number of edges in the fit; 0 without a fit.
+    symmetry : float32
+        Agreement of opposite edges, 0 to 1: mean over all rulers of the root of the product of the two weights, times
+        the ratio of the two heights. 1 for an undisturbed blob, lower by the share that is hidden.
+    gravity_x, gravity_y : float32
+        Centre of gravity of the grey levels within the contour and its blur, minus their mean in a ring of 2 px around
+        it: a second estimate of the centre [px]. NaN also where the ring leaves the image.
+    distance : float32
+        Distance from the expected place [px].
+    contrast : float32
+        Grey level of the blob minus that of its background.
+    blur : float32
+        Standard deviation of the edges' blur [px]; without ``match`` the blur of bilinear sampling (0.4 px on average)
+        is included.
+    status : uint8
+        `Status` flags. LOW_SIGNAL: too few rulers found an edge above the threshold, of the polarity, within the search
+        distance. OUT_OF_RANGE: too many rulers leave the image, or the blob is farther than the search distance from
+        its expected place. NOT_FINITE: a place or radius is not finite, the radius is not above 0, or too many pixels
+        are not finite. AMBIGUOUS: too few edges agree on one shape, or the match of the pixels has no minimum there.
+        With a value: SATURATED (a ruler of the fit has reached the saturation).
     """
 
-    x: Any
-    y: Any
-    shift: Any
-    size: Any
-    angle: Any
-    covariance: Any
-    residual: Any
-    inliers: Any
-    symmetry: Any
-    gravity_x: Any
-    gravity_y: Any
-    distance: Any
-    contrast: Any
-    blur: Any
-    status: Any
+    x: FloatArray
+    y: FloatArray
+    shift: FloatArray
+    size: FloatArray
+    angle: FloatArray | None
+    covariance: FloatArray
+    residual: FloatArray
+    inliers: IntArray
+    symmetry: FloatArray
+    gravity_x: FloatArray
+    gravity_y: FloatArray
+    distance: FloatArray
+    contrast: FloatArray
+    blur: FloatArray
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
 class FindBlobs(VisionOperation[Blobs]):
-    """Marks near their nominal places: ``op(image, places) -> Blobs``.
+    """Blobs near their expected places: ``op(image, places) -> Blobs``.
 
-    Takes a uint8, uint16 or float32 image (rows, columns), 16 columns or more, and float32 places: (n, 3) x, y and
-    radius of circles and rings, (n, 4) x, y, half side or half length, and angle [rad] of squares and crosses [px].
+    The image is uint8, uint16 or float32 of shape (rows, columns) with 16 columns or more. The places are float32: (n,
+    3) x, y and radius of circles and rings, (n, 4) x, y, half side or half length, and angle [rad] of squares and
+    crosses [px].
 
     Parameters
     ----------
-    threshold
-        Least height of an edge [grey levels]: that of a sharp step of the same greatest gradient.
-    shape
-        ``"circle"``, ``"ring"`` (two concentric edges), ``"square"``, ``"cross"`` (two bars of equal length and width).
-    ratio
-        Of a ring: inner radius to outer radius; of a cross: width to length of a bar.
-    polarity
-        Whether marks are ``"bright"``, ``"dark"``, or ``"either"``, each for itself.
-    search_px
-        How far from its nominal place a mark may be, and an edge from the nominal contour.
-    spokes
-        Rulers of a mark, a multiple of 4 (of a ring 8), evenly over its contour. With 32 less is lost beside what
-        hides a part of the contour.
-    width
-        Lines averaged by a ruler, a pixel apart: without ``match`` all of the contour is used where spokes times width
-        is as long as it is. More than a third of the radius blurs the edge.
-    smoothing_px
-        Of the edges; `best_smoothing` of the blur is the optimum where the mark is wide enough: less than half its
-        radius (of rings and crosses half the width of the bar).
-    passes
-        How often rulers are laid, at most: again where the mark was found more than 2 px (without ``match`` 0.1 px)
-        from where they were.
-    match
-        Match the pixels; else the fit to the edges is what is returned.
-    agreement
-        Share of the rulers whose edges must agree on the shape.
-    saturation
-        Level at which a sample is saturated; None does not look.
-    noise
-        Standard deviation of a pixel [grey levels]; the rounding of integer images comes on top of it.
-    count
-        Marks, n. None follows the places of a call; `bind` needs it.
-    variant
-        "vector" (16 rulers at a time, for CPU runtimes), "work_item" (a work-group per mark, for GPUs), or "auto".
+    threshold : float
+        Least height of an edge [grey levels], above 0: the height of a sharp step with the same maximum of the smoothed
+        gradient.
+    shape : {"circle", "ring", "square", "cross"}
+        A ring has two concentric edges, a cross two bars of equal length and width.
+    ratio : float
+        Inner over outer radius of a ring; width over length of a bar of a cross; 0 to 1, exclusive, default 0.5.
+    polarity : {"bright", "dark", "either"}
+        Contrast of the blobs; "either" lets each blob have its own.
+    search_px : float
+        Largest distance of a blob from its expected place, and of an edge from the expected contour [px], above 0 to
+        200, default 6.
+    spokes : int
+        Number of rulers of a blob, evenly over its contour: a multiple of 4 (of a ring 8), 8 to 256, default 16. With
+        32, less of the contour is lost beside an object that hides a part of it.
+    width : int
+        Number of lines, 1 px apart, that a ruler averages, default 1. Without ``match`` the whole contour is used where
+        spokes times width equals its length. Above a third of the radius it blurs the edge.
+    smoothing_px : float
+        Standard deviation of the Gaussian whose derivative finds the edges [px], default 1.5. `best_smoothing` is the
+        optimum where it is below half the radius (of rings and crosses below half the width of the bar).
+    passes : int
+        Largest number of passes, 1 to 10, default 2: rulers are placed again where the blob was found more than 2 px
+        (without ``match`` 0.1 px) from where they were.
+    match : bool
+        Whether to match the pixels; otherwise the result is the fit to the edges.
+    min_inlier_fraction : float
+        Least share of the rulers whose edges must agree on the shape, 0 to 1, exclusive, default 0.5.
+    saturation : float, optional
+        Grey level from which on a sample is saturated. None: no check.
+    noise : float
+        Standard deviation of a pixel [grey levels], default 1. The rounding of integer images is added.
+    count : int, optional
+        Number of blobs, n. None takes the number from the places of a call; `bind` needs a number.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: "vector" computes 16 rulers at a time (CPU runtimes), "work_item" one work-group per blob
+        (GPUs).
 
     Raises
     ------
     TypeError
-        A parameter is no number, or a count no whole one.
+        A parameter is not a number, or a count is not an integer.
     ValueError
         A parameter is out of its range.
 
     Notes
     -----
-    The fit starts from the shape through three edges that most edges agree with. Gauss-Newton with Tukey's weights
-    follows, within a reach that shrinks to the scale of the residuals (from their median). Whatever place a later pass
-    starts from, edges further than the search radius from the *nominal* contour are left out: it cannot walk away to
-    another mark.
+    The fit starts from the shape, through three edges, that most edges agree with. Gauss-Newton with Tukey's weights
+    follows; the range of accepted edges shrinks to the scale of the residuals (from their median). In every pass, edges
+    farther than the search distance from the *expected* contour are left out, so that the fit cannot drift to another
+    blob.
 
-    The match has the centre, size and angle, the blur, the contrast, and level and slopes of the background as
-    unknowns (Gauss-Newton, Tukey's weights, none past a tenth of the contrast and four deviations of the noise), over
-    all pixels within five blurs and 2 px of the mark, but for the parts of the contour whose rulers do not agree. At
-    SNR 6 to 200 and blurs of 0.5 px to a third of the radius the centre's standard deviation is 1.0 to 1.25 times the
-    Cramer-Rao bound of a disc on a known background, the radius is right to 0.01 px. A blur over a third of the radius
-    hides how large the mark is.
+    The match has these unknowns: centre, size and angle, blur, contrast, and level and slopes of the background. It
+    uses Gauss-Newton with Tukey's weights (0 beyond a tenth of the contrast plus four standard deviations of the noise)
+    over all pixels within five blurs and 2 px of the blob, except near the parts of the contour whose rulers do not
+    agree. At signal to noise ratios of 6 to 200 and blurs of 0.5 px to a third of the radius, the centre's standard
+    deviation is 1.0 to 1.25 times the Cramer-Rao bound of a disc on a known background, and the radius is right to 0.01
+    px. A blur over a third of the radius makes the radius undetermined.
 
-    A blurred edge of radius R is seen at sqrt(R^2 - v) to second order, v the variance of the blur and of the averaged
-    lines: the mean of sqrt(R^2 - u^2) over u across the ruler. The fit corrects the radius for that, with the mean blur
-    of the mark's own edges; the match has a blurred disc's own profile, to first order in blur over radius.
+    To second order, a blurred edge of radius R is measured at sqrt(R^2 - v), with v the variance of the blur plus that
+    of the averaged lines: the mean of sqrt(R^2 - u^2) over the position u across the ruler. The fit corrects the radius
+    by it, with the mean blur of the blob's own edges. The match uses the profile of a blurred disc, to first order in
+    blur over radius.
+
+    References
+    ----------
+    .. [1] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, sections 6.3.2
+       and 6.3.3.
     """
 
     Result: ClassVar[type[Any]] = Blobs
@@ -184,7 +206,7 @@ class FindBlobs(VisionOperation[Blobs]):
     smoothing_px: float = 1.5
     passes: int = 2
     match: bool = True
-    agreement: float = 0.5
+    min_inlier_fraction: float = 0.5
     saturation: float | None = None
     noise: float = 1.0
     count: int | None = None
@@ -194,20 +216,20 @@ class FindBlobs(VisionOperation[Blobs]):
         for name, allowed in (("shape", SHAPES), ("polarity", CONTRASTS)):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"FindBlobs.{name} is {getattr(self, name)!r}, expected one of {', '.join(allowed)}")
-        for name, low, high in (("ratio", 0.0, 1.0), ("agreement", 0.0, 1.0), ("search_px", 0.0, 200.0)):
+        for name, low, high in (("ratio", 0.0, 1.0), ("min_inlier_fraction", 0.0, 1.0), ("search_px", 0.0, 200.0)):
             if not low < finite(getattr(self, name), f"FindBlobs.{name}") < high:
                 raise ValueError(f"FindBlobs.{name} is {getattr(self, name)}, expected a number in ({low:g}, {high:g})")
         multiple = 8 if self.shape == "ring" else 4
-        for name, least, most, of in (("spokes", 8, MOST_SPOKES, multiple), ("passes", 1, 10, 1)):
+        for name, least, limit, of in (("spokes", 8, MAX_SPOKES, multiple), ("passes", 1, 10, 1)):
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool):
                 raise TypeError(f"FindBlobs.{name} must be a whole number, got {value!r}")
-            if not least <= value <= most or value % of:
-                raise ValueError(f"FindBlobs.{name} is {value}, expected {least} to {most}, a multiple of {of}")
+            if not least <= value <= limit or value % of:
+                raise ValueError(f"FindBlobs.{name} is {value}, expected {least} to {limit}, a multiple of {of}")
         self._ruler()
 
     def _ruler(self) -> RulerEdges:
-        """Return what finds the edges; it checks the other parameters."""
+        """Return the caliper (ruler) that finds the edges; it checks the parameters that both have."""
         ruler = RulerEdges(
             threshold=self.threshold,
             length=511,
@@ -222,7 +244,7 @@ class FindBlobs(VisionOperation[Blobs]):
         return replace(ruler, length=2 * (math.ceil(self.search_px) + math.ceil(3.0 * self.smoothing_px)) + 3)
 
     def __call__(self, *inputs: Any, device: Device | None = None, out: Blobs | None = None) -> Blobs:
-        """Run once, as every `Operation`; with ``count=None`` for as many marks as there are places."""
+        """Run once on the places of this call; ``count=None`` takes their number."""
         if self.count is None and len(inputs) == 2 and getattr(inputs[1], "ndim", 0) == 2:
             return replace(self, count=len(inputs[1]))(*inputs, device=device, out=out)
         return super().__call__(*inputs, device=device, out=out)
@@ -234,7 +256,7 @@ class FindBlobs(VisionOperation[Blobs]):
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
         if self.count is None:
-            raise ValueError("FindBlobs.count is None; to bind it say how many marks there will be")
+            raise ValueError("FindBlobs.count is None; to bind it say how many blobs there will be")
         edges = self._ruler().launch(device, shape, dtype)
         build = LaunchBuilder(self, device, shape, dtype, variant=self.variant)
         build.check_shape(shape[1] >= _LANES, f"images of {_LANES} columns or more")
@@ -245,7 +267,7 @@ class FindBlobs(VisionOperation[Blobs]):
         shapes |= {"shift": (self.count, 2), "covariance": (self.count, freedoms, freedoms)}
         noise = math.hypot(self.noise, math.sqrt(1.0 / 12.0) if dtype.kind == "u" else 0.0)
         numbers = ((self.width**2 - 1) / 12.0, self._overlap(), self._extent(), noise, self._contour() / self.spokes)
-        least = max(math.ceil(self.agreement * self.spokes), freedoms + 1)
+        least = max(math.ceil(self.min_inlier_fraction * self.spokes), freedoms + 1)
         return build.launch(
             "blob/blob.cl",
             "find_blobs",
@@ -264,14 +286,15 @@ class FindBlobs(VisionOperation[Blobs]):
                 *map(np.float32, numbers),
                 np.int32(self.passes),
             ],
-            passes_once=work.vectors and self.count <= _ALONE,
+            passes_once=work.vectors and self.count <= _INLINE,
         )
 
     def _table(self, edges: Launch) -> npt.NDArray[Any]:
-        """Return the table of ``ruler.h`` with the smoothing's variance as the peak of an edge has it.
+        """Return the table of ``ruler.h`` with the smoothing's variance as it acts on the maximum of an edge.
 
-        The filter ends at three deviations: what its own variance lacks by that the peak does not, and the curvature
-        correction would take for blur. Made exact for the blur whose best smoothing it is.
+        The filter is cut at three standard deviations, which reduces its own variance, but not the curvature at the
+        maximum. With the filter's variance, the curvature correction would take the difference for blur. The value is
+        exact for the blur whose best smoothing this is.
         """
         table = np.array(edges.arguments[0])
         taps, blur = table[_TAPS:].astype(np.float64), self.smoothing_px / math.sqrt(5.0)
@@ -283,8 +306,8 @@ class FindBlobs(VisionOperation[Blobs]):
 
     def _defines(self, freedoms: int) -> dict[str, Define]:
         return {
-            **loss_defines("tukey", BEND),
-            "EFFICIENCY": efficiency("tukey", BEND),
+            **loss_defines("tukey", TUNING_CONSTANT),
+            "EFFICIENCY": efficiency("tukey", TUNING_CONSTANT),
             "FREEDOMS": freedoms,
             "SPOKES": self.spokes,
             "ROOM": round_up(self.spokes, _LANES),
@@ -293,7 +316,7 @@ class FindBlobs(VisionOperation[Blobs]):
         }
 
     def _layout(self) -> npt.NDArray[np.float64]:
-        """Return the table of ``blob.cl``: six rows; rulers k and k + spokes / 2 are opposite."""
+        """Return the table of ``blob.cl``: six rows; the rulers k and k + spokes / 2 are opposite."""
         half = _half_layout(self.shape, self.ratio, self.spokes // 2)
         base, normal = (np.concatenate([each, -each]) for each in half)
         height = np.abs(np.sum(base * normal, axis=-1))
@@ -304,13 +327,13 @@ class FindBlobs(VisionOperation[Blobs]):
         return padded
 
     def _overlap(self) -> float:
-        """Return the size of a mark below which neighbouring rulers see the same noise."""
-        # Lines share noise with their neighbours: of the average of so many, 1/variance in pixels.
+        """Return the size of a blob below which neighbouring rulers share pixels, and so their noise."""
+        # Bilinear lines share noise with their neighbours: the average of `width` lines has the noise of this many.
         lines = self.width**2 / (self.width - 1.0 / 3.0)
         return self.spokes * lines / self._contour()
 
     def _contour(self) -> float:
-        """Return the length of contour that rulers lie on, of a mark of size 1."""
+        """Return the length of the contour on which rulers lie, for a blob of size 1."""
         round_ = {"circle": 2.0 * math.pi, "ring": 2.0 * math.pi * (1.0 + self.ratio)}
         if self.shape in round_:
             return round_[self.shape]
@@ -320,21 +343,21 @@ class FindBlobs(VisionOperation[Blobs]):
         return _END * 2.0 * self.ratio + 2.0 * _FLANK * (1.0 - self.ratio)
 
     def _extent(self) -> float:
-        """Return the farthest point of a mark of size 1."""
+        """Return the distance of the farthest point of a blob of size 1 from its centre."""
         return {"square": math.sqrt(2.0), "cross": math.hypot(1.0, self.ratio)}.get(self.shape, 1.0)
 
 
-# Which part of a straight edge has rulers: corners bend what is near them.
+# Share of a straight edge on which rulers lie: blur rounds the edge near its corners.
 _SIDE, _END, _FLANK = 0.7, 0.5, 0.5
 
 
 def _spread(count: int) -> npt.NDArray[np.float64]:
-    """Return so many places evenly over -1 to 1."""
+    """Return ``count`` numbers evenly over -1 to 1."""
     return (2.0 * np.arange(count) + 1.0) / count - 1.0
 
 
 def _half_layout(shape: str, ratio: float, count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return centres and directions of the rulers of half a mark of size 1."""
+    """Return centres and directions of the rulers of half a blob of size 1."""
     if shape == "circle":
         directions = _circle(np.arange(count) * math.pi / count)
         return directions, directions
@@ -359,7 +382,7 @@ def _side(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
 
 
 def _arm(ratio: float, count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return rulers across the end and the two flanks of the arm along x."""
+    """Return rulers across the end and the two flanks of the bar along x."""
     flank = max(round(0.375 * count), 0 if count < 3 else 1)
     end = count - 2 * flank
     out = 0.5 * (1.0 + ratio) + 0.5 * (1.0 - ratio) * _FLANK * _spread(flank)

@@ -1,6 +1,7 @@
-"""Features of a board that are chosen before it is seen, and the file that keeps them.
+"""Feature sets: rulers and fiducials of a board, selected from its artwork before the board is seen.
 
-``gpuvision select`` writes what ``gpuvision locate --features`` reads: rulers, and the imaging they were chosen for.
+``gpuvision select`` writes a feature set and the imaging for which it was selected; ``gpuvision locate --features``
+reads it.
 """
 
 from __future__ import annotations
@@ -15,47 +16,50 @@ import numpy.typing as npt
 
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, Side
-from gpuvision.matching.features.fiducials import SPOKES, Marks, marks_of, with_marks
-from gpuvision.matching.features.ruler import LONGEST, RulerEdges, best_smoothing
-from gpuvision.matching.features.selection import Candidates, Imaging, Selection, candidates, select
+from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates
+from gpuvision.matching.features.fiducials import SPOKES, Fiducials, append_fiducials, select_fiducials
+from gpuvision.matching.features.imaging import Imaging
+from gpuvision.matching.features.ruler import MAX_LENGTH, RulerEdges, best_smoothing
+from gpuvision.matching.features.selection import Selection, select_rulers
 
 Float64 = npt.NDArray[np.float64]
 BudgetUnit = Literal["rulers", "px", "us"]
 UNITS: tuple[str, ...] = get_args(BudgetUnit)
 _TIMED_RULERS, _TIMED_CALLS = 256, 20
-_PER_SOURCE = 4
-_NOTHING = 1e-9  # of the budget
-MOST_ROWS = 1000  # that one pose is solved from: one of a ruler, two of a mark
+_PER_SOURCE = 4  # as in `select_rulers`
+_FREE_COST = 1e-9  # of a free fiducial, relative to the budget: costs must be positive
+MAX_ROWS = 1000
+"""Largest number of rows of one pose: one of a ruler, two of a fiducial (`SolvePose` takes 1024)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeatureSet:
-    """Rulers and round marks on one side of a board, and what they promise.
+    """Rulers and fiducials on one side of a board, and the covariance that they predict.
 
     Attributes
     ----------
     side
-        Of the board.
-    placement
-        (2,) the point whose pose counts [m].
-    point, normal
-        (n, 2) middles on the board [m], and unit directions along which the rulers look: out of the copper.
-    spacing
-        (n,) of the two edges that a ruler lies across [m]; 0 where it is one.
-    length
-        (n,) along the normal [m].
-    sigma
-        (n,) of the place that each measures [m], predicted.
+        Side of the board, "top" or "bottom".
+    placement : (2,)
+        Point whose pose counts [m].
+    point, normal : (n, 2)
+        Centres of the rulers on the board [m], and their unit directions, out of the copper.
+    spacing : (n,)
+        Distance between the two edges of a ruler across a trace [m]; 0 at a single edge.
+    length : (n,)
+        Length along the normal [m].
+    sigma : (n,)
+        Predicted standard deviation of the measured position [m].
     imaging
-        What they were chosen for.
-    covariance
-        (3, 3) predicted, of the placement point's x, y [m] and theta [rad].
+        Image quality and search range for which the features were selected.
+    covariance : (3, 3)
+        Predicted covariance of the placement point's x, y [m] and of theta [rad].
     condition
-        Worst standard deviation over best.
-    region
-        (2, 2) least and greatest x, y [m] that they sample: what the camera must read.
-    marks
-        Vias, fiducials and other round lands.
+        Largest over smallest standard deviation.
+    region : (2, 2)
+        Least and greatest x, y [m] that the features sample: what the camera must read.
+    fiducials
+        Fiducials, vias and other round pads.
     """
 
     side: Side
@@ -69,15 +73,23 @@ class FeatureSet:
     covariance: Float64
     condition: float
     region: Float64
-    marks: Marks = field(default_factory=Marks.none)
+    fiducials: Fiducials = field(default_factory=Fiducials.empty)
 
     @classmethod
-    def of(
-        cls, rulers: Candidates, chosen: Selection, imaging: Imaging, side: Side, marks: Marks | None = None
+    def from_selection(
+        cls,
+        rulers: FeatureCandidates,
+        chosen: Selection,
+        imaging: Imaging,
+        side: Side,
+        fiducials: Fiducials | None = None,
     ) -> FeatureSet:
-        """Return what was chosen of rulers, and of marks that come after them (`with_marks`)."""
-        is_mark = rulers.radius[chosen.chosen] > 0
-        kept, first = chosen.chosen[~is_mark], len(rulers.radius) - (0 if marks is None else len(marks.radius))
+        """Return the selected features of candidates with fiducials at their end (`append_fiducials`)."""
+        is_fiducial = rulers.radius[chosen.chosen] > 0
+        kept, first = (
+            chosen.chosen[~is_fiducial],
+            len(rulers.radius) - (0 if fiducials is None else len(fiducials.radius)),
+        )
         return cls(
             side=side,
             placement=rulers.placement,
@@ -90,7 +102,7 @@ class FeatureSet:
             covariance=chosen.covariance,
             condition=chosen.condition,
             region=chosen.region,
-            marks=Marks.none() if marks is None else marks.only(chosen.chosen[is_mark] - first),
+            fiducials=Fiducials.empty() if fiducials is None else fiducials.subset(chosen.chosen[is_fiducial] - first),
         )
 
     @property
@@ -105,13 +117,14 @@ class FeatureSet:
         return int(columns), int(rows)
 
     def summary(self) -> str:
-        """Return what was chosen and what it promises, in two lines."""
+        """Return the selection and its predicted standard deviations, in two lines."""
         sx, sy, turn = self.sigmas
         pairs = int(np.sum(self.spacing > 0))
         columns, rows = self.region_px
-        marks = f" and {len(self.marks.radius)} marks" if len(self.marks.radius) else ""
+        fiducials = f" and {len(self.fiducials.radius)} fiducials" if len(self.fiducials.radius) else ""
         return (
-            f"{len(self.length)} rulers ({pairs} across traces){marks}, {int(self._pixels().sum())} px, in a region of "
+            f"{len(self.length)} rulers ({pairs} across traces){fiducials}, {int(self._pixels().sum())} px, in "
+            f"a region of "
             f"{columns} x {rows} px\n"
             f"predicted at ({1e3 * self.placement[0]:.3f}, {1e3 * self.placement[1]:.3f}) mm: sigma x {1e6 * sx:.2f} "
             f"µm, y {1e6 * sy:.2f} µm, theta {1e3 * turn:.4f} mrad"
@@ -121,10 +134,10 @@ class FeatureSet:
         return np.asarray(np.ceil(self.length / self.imaging.pixel) * self.imaging.width_px)
 
 
-def clearance_of(imaging: Imaging) -> float:
-    """Return how far edges must be from silk and from the mask's openings [m], as `read_artwork` takes it.
+def edge_clearance(imaging: Imaging) -> float:
+    """Return the distance that edges must keep from silk and mask openings [m], a parameter of `read_artwork`.
 
-    Both may be printed off by ``imaging.registration``, and blur.
+    It is the largest offset of these layers, ``imaging.registration``, plus two blurs.
     """
     return imaging.registration + 2 * imaging.blur_px * imaging.pixel
 
@@ -140,59 +153,64 @@ def choose_features(
     missing: float = 0.0,
     device: Device | None = None,
 ) -> FeatureSet:
-    """Choose the features of a region that fix a board's pose best.
+    """Select the features of a region that determine a board's pose best.
 
     Parameters
     ----------
-    artwork, imaging
-        The board's side, and the camera.
+    artwork
+        The board's side.
     region
         (2, 2) least and greatest x, y [m].
+    imaging
+        Image quality and search range.
     placement
-        (2,) the point whose pose counts [m]; None: the region's middle.
+        (2,) point whose pose counts [m]; None: the centre of the region.
     budget, unit
-        What may be spent: a number of rulers, pixels that they sample, or microseconds as rulers take them on the
-        device (measured now, a launch counted once).
+        Limit of the cost: number of "rulers" (a fiducial costs 16), "px" sampled pixels, or "us" microseconds on the
+        device, measured now, with one launch.
     missing
-        Share of the features that will not be found.
+        Expected share of features without a measurement, 0 to below 1.
     device
-        For microseconds; None: the best.
+        Device for microseconds; None: `Device.best`.
 
     Raises
     ------
     ValueError
-        What is there does not fix x, y and theta, or the budget is too small.
+        The features of the region do not determine x, y and theta, or the budget is too small.
     """
     box = np.asarray(region, np.float64)
     place = box.mean(axis=0) if placement is None else np.asarray(placement, np.float64)
-    rulers, marks = candidates(artwork, box, place, imaging), marks_of(artwork, box, place, imaging)
-    if len(rulers.sigma) + 2 * len(marks.sigma) < 3:
+    rulers, fiducials = (
+        find_ruler_candidates(artwork, box, place, imaging),
+        select_fiducials(artwork, box, place, imaging),
+    )
+    if len(rulers.sigma) + 2 * len(fiducials.sigma) < 3:
         raise ValueError(
-            f"{len(rulers.sigma)} edges of the region stand free enough for a ruler, expected 3 or more; give a larger "
+            f"{len(rulers.sigma)} edges of the region have room for a ruler, expected 3 or more; give a larger "
             "region, a smaller pixel or blur, or less shift"
         )
-    return chosen_of(
-        rulers, imaging, artwork.side, marks=marks, budget=budget, unit=unit, missing=missing, device=device
+    return select_feature_set(
+        rulers, imaging, artwork.side, fiducials=fiducials, budget=budget, unit=unit, missing=missing, device=device
     )
 
 
-def chosen_of(
-    rulers: Candidates,
+def select_feature_set(
+    rulers: FeatureCandidates,
     imaging: Imaging,
     side: Side,
     *,
     budget: float,
-    marks: Marks | None = None,
+    fiducials: Fiducials | None = None,
     are_free: bool = False,
     unit: BudgetUnit = "rulers",
     missing: float = 0.0,
     device: Device | None = None,
 ) -> FeatureSet:
-    """Choose among rulers that could be laid, and marks: all of them where they are free; see `choose_features`."""
+    """Select among rulers and fiducials; with ``are_free`` the fiducials cost nothing. See `choose_features`."""
     if unit not in UNITS:
         raise ValueError(f"the budget's unit is {unit!r}, expected one of {', '.join(UNITS)}")
-    marks = Marks.none() if marks is None else marks
-    both = with_marks(rulers, marks, imaging)
+    fiducials = Fiducials.empty() if fiducials is None else fiducials
+    both = append_fiducials(rulers, fiducials, imaging)
     costs = np.where(both.radius > 0, SPOKES, 1.0)
     if unit == "px":
         costs = both.pixels(imaging)
@@ -200,36 +218,39 @@ def chosen_of(
         launch, per_pixel = _microseconds(rulers, imaging, device)
         costs, budget = per_pixel * both.pixels(imaging), budget - launch
     if unit == "rulers":
-        budget = min(budget, MOST_ROWS - (2 * len(marks.radius) if are_free else 0))
+        budget = min(budget, MAX_ROWS - (2 * len(fiducials.radius) if are_free else 0))
     if budget <= 0:
         raise ValueError("the budget is used up before the first ruler; give a larger one")
-    # Enough of each trace for the budget, where there are few.
+    # Where there are few traces, allow as many rulers on each as the budget needs.
     affordable = budget / float(costs[both.radius == 0].mean()) if len(rulers.radius) else 0.0
     each = max(_PER_SOURCE, math.ceil(2 * affordable / max(len(np.unique(rulers.source)), 1)))
-    if are_free and len(marks.radius):
-        costs = np.where(both.radius > 0, _NOTHING * budget, costs)
-        budget *= 1 + (len(marks.radius) + 1) * _NOTHING
-    chosen = select(both, imaging, budget, costs=costs, missing=missing, per_source=each)
+    if are_free and len(fiducials.radius):
+        costs = np.where(both.radius > 0, _FREE_COST * budget, costs)
+        budget *= 1 + (len(fiducials.radius) + 1) * _FREE_COST
+    chosen = select_rulers(both, imaging, budget, costs=costs, missing=missing, per_source=each)
     rows = len(chosen.chosen) + int(np.sum(both.radius[chosen.chosen] > 0))
-    if rows > MOST_ROWS:
-        raise ValueError(f"{rows} rulers (marks twice) fit the budget, one pose takes {MOST_ROWS} at most")
-    return FeatureSet.of(both, chosen, imaging, side, marks)
+    if rows > MAX_ROWS:
+        raise ValueError(f"{rows} rows (a fiducial has two) fit the budget, one pose takes {MAX_ROWS} at most")
+    return FeatureSet.from_selection(both, chosen, imaging, side, fiducials)
 
 
-def _microseconds(rulers: Candidates, imaging: Imaging, device: Device | None) -> tuple[float, float]:
-    """Return what a launch takes, and each pixel of a ruler: from a few rulers and from many, the fastest of 20."""
+def _microseconds(rulers: FeatureCandidates, imaging: Imaging, device: Device | None) -> tuple[float, float]:
+    """Return the time of a launch and of a pixel of a ruler [us]: fastest of 20 calls with few and with many rulers."""
     device = Device.best() if device is None else device
-    usual = float(np.median(rulers.length)) if len(rulers.length) else 0.0
-    length = min(max(math.ceil(usual / imaging.pixel), 2 * math.ceil(3 * best_smoothing(imaging.blur_px)) + 3), LONGEST)
+    median_length = float(np.median(rulers.length)) if len(rulers.length) else 0.0
+    length = min(
+        max(math.ceil(median_length / imaging.pixel), 2 * math.ceil(3 * best_smoothing(imaging.blur_px)) + 3),
+        MAX_LENGTH,
+    )
     smoothing = min(best_smoothing(imaging.blur_px), (length - 3) / 6.5)
     ruler = RulerEdges(threshold=10.0, length=length, width=imaging.width_px, smoothing_px=smoothing)
     image = np.random.default_rng(1).integers(0, 255, (600, 800), np.uint8)
-    lain = np.tile(np.array([400.3, 300.6, 0.8, 0.6], np.float32), (_TIMED_RULERS, 1))
+    placed = np.tile(np.array([400.3, 300.6, 0.8, 0.6], np.float32), (_TIMED_RULERS, 1))
     taken = []
     for count in (_TIMED_RULERS // 8, _TIMED_RULERS):
         bound = replace(ruler, count=count).bind(device, image.shape, image.dtype)
         bound.inputs[0].set(image)
-        bound.inputs[1].set(lain[:count])
+        bound.inputs[1].set(placed[:count])
         times = []
         for _ in range(_TIMED_CALLS):
             start = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Round marks of a board, vias, fiducials and lands, of which a camera sees the copper's own contour."""
+"""Round fiducials of a board: fiducials, vias and other round pads whose copper contour a camera sees."""
 
 from __future__ import annotations
 
@@ -9,34 +9,37 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.matching.artwork.artwork import Artwork, Land
-from gpuvision.matching.artwork.shapes import Float64, covered
-from gpuvision.matching.artwork.visible_layers import Sheet, sheets_of, steps_along
-from gpuvision.matching.features.selection import Candidates, Imaging
+from gpuvision.matching.artwork.artwork import Artwork, Pad
+from gpuvision.matching.artwork.shapes import Float64, is_covered
+from gpuvision.matching.artwork.visible_layers import VisibleLayer, layer_edges_along, visible_layers
+from gpuvision.matching.features.candidates import SAME_EDGE, FeatureCandidates
+from gpuvision.matching.features.imaging import Imaging
 
-SPOKES = 16  # rulers of a mark
-LEAST_RADIUS_PX = 4.0
-_SMOOTHING = 1.5  # blurs: less than the best for a lone edge, next to which more room would have to be
-_ITSELF = 2e-6  # [m] within which a step is the contour that is looked for
-_FREE_SHARE = 0.75  # of the contour: a trace may end in a mark
-_CLEAR_BLURS = 5.0, 2.0  # and pixels, about a mark: so far out its pixels are matched
-_MATCHED, _EDGES = 1.1, 1.3  # standard deviations over the bound: of matched pixels, of edges at that smoothing
-_SOURCE = -(10**6)  # numbers of marks in a list of candidates
+SPOKES = 16  # rulers of a fiducial
+MIN_RADIUS_PX = 4.0
+"""Least radius of a fiducial [px] (chosen): with less, the blur hides the radius."""
+# Smoothing of the contour in blurs: less than the best for an isolated edge, which would need more room around it.
+_SMOOTHING_BLURS = 1.5
+_VISIBLE_SHARE = 0.75  # least share of the contour: a trace may end in a pad (chosen)
+_CLEAR_BLURS, _CLEAR_PX = 5.0, 2.0  # free distance around the contour: `FindBlobs` matches the pixels within it
+# Standard deviation over the Cramer-Rao bound: of matched pixels, and of edges at this smoothing (measured).
+_MATCHED_RATIO, _EDGES_RATIO = 1.1, 1.3
+_FIRST_SOURCE = -(10**6)  # `FeatureCandidates.source` of the first fiducial: rulers have greater numbers
 
 
-class Marks(NamedTuple):
-    """Marks of a board, (n, ...).
+class Fiducials(NamedTuple):
+    """Round pads that serve as fiducials, (n, ...).
 
     Attributes
     ----------
-    point
-        (n, 2) centres [m].
-    radius
-        (n,) as drawn [m].
-    hole
-        (n,) diameter of the hole in them [m], 0 without one; with it only their contour is known.
-    sigma
-        (n,) of x, and of y, predicted [m].
+    point : (n, 2)
+        Centres [m].
+    radius : (n,)
+        Radius as drawn [m].
+    hole : (n,)
+        Diameter of the hole [m], 0 without one; with a hole only the contour is measured.
+    sigma : (n,)
+        Predicted standard deviation of x, and of y [m].
     """
 
     point: Float64
@@ -45,78 +48,78 @@ class Marks(NamedTuple):
     sigma: Float64
 
     @classmethod
-    def none(cls) -> Marks:
-        """Return no marks."""
+    def empty(cls) -> Fiducials:
+        """Return no fiducials."""
         return cls(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0))
 
-    def only(self, which: npt.ArrayLike) -> Marks:
-        """Return some of them: indices, or which."""
-        return Marks(*(each[np.asarray(which)] for each in self))
+    def subset(self, which: npt.ArrayLike) -> Fiducials:
+        """Return some of the fiducials, by indices or by a mask."""
+        return Fiducials(*(each[np.asarray(which)] for each in self))
 
 
-def mark_smoothing(blur_px: float) -> float:
-    """Return the smoothing [px] that marks' contours are found with."""
-    return _SMOOTHING * blur_px
+def fiducial_smoothing(blur_px: float) -> float:
+    """Return the smoothing of the contours of fiducials [px] for a blur [px]."""
+    return _SMOOTHING_BLURS * blur_px
 
 
-def reach_of(centre: npt.ArrayLike, placement: npt.ArrayLike, imaging: Imaging) -> Float64:
-    """(...,) how far [m] marks may be from where they are looked for."""
+def search_distance(centre: npt.ArrayLike, placement: npt.ArrayLike, imaging: Imaging) -> Float64:
+    """Return the largest distance (...,) [m] of fiducials at centres (..., 2) [m] from their expected places."""
     arm = np.asarray(centre, np.float64) - np.asarray(placement, np.float64)
     return np.asarray(math.sqrt(2.0) * imaging.shift + imaging.angle * np.hypot(arm[..., 0], arm[..., 1]))
 
 
-def marks_of(
-    artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike, imaging: Imaging, most: int | None = None
-) -> Marks:
-    """Return marks of a region: round lands of whose contour three quarters or more can be seen, far from all else.
+def select_fiducials(
+    artwork: Artwork, region: npt.ArrayLike, placement: npt.ArrayLike, imaging: Imaging, max_count: int | None = None
+) -> Fiducials:
+    """Return round pads of a region whose contour is visible for three quarters or more, with free space around it.
 
-    Inside there is nothing but copper, or a hole in its middle that is far enough from the contour; about it lies bare
-    laminate, or laminate under the mask, as the land itself lies: what a mask's opening cuts, or ends beside, is left
-    out. Where another round land is so near that one may be taken for the other, neither counts.
+    Inside the contour there is only copper, or a concentric hole far enough from it. Outside lies bare laminate, or
+    laminate under the mask where the pad is under the mask too; pads that a mask opening cuts, or that lie near the
+    edge of one, are left out. Where another round pad is so near that the two may be confused, both are left out.
 
     Parameters
     ----------
     artwork
-        From `read_artwork`.
+        Result of `read_artwork`.
     region
-        (2, 2) least and greatest x, y [m]: they lie in it with all that is looked at.
+        (2, 2) least and greatest x, y [m]: the fiducials lie in it with their search windows.
     placement
-        (2,) the point about which the board may be turned [m].
+        (2,) point about which the board may be turned [m].
     imaging
-        The camera.
-    most
-        No more than so many, fiducials first, then those that are farthest from those chosen. None: all.
+        Image quality and search range.
+    max_count
+        Largest number, in order: fiducials first, then the pads farthest from those selected before. None: all.
     """
     box = np.asarray(region, np.float64)
-    sheets = sheets_of(artwork, imaging.registration)
-    rounds = [each for each in artwork.lands if each.shape == "circle"]
+    layers = visible_layers(artwork, imaging.registration)
+    rounds = [each for each in artwork.pads if each.shape == "circle"]
     centres = np.array([each.centre for each in rounds]).reshape(-1, 2)
-    reach = reach_of(centres, placement, imaging)
+    reach = search_distance(centres, placement, imaging)
     kept: list[tuple[Float64, float, float, float]] = []
     for index in _spread(rounds, centres, np.asarray(placement, np.float64)):
-        land, radius = rounds[index], float(rounds[index].size[0]) / 2
+        pad, radius = rounds[index], float(rounds[index].size[0]) / 2
         margin = radius + reach[index] + _clear(imaging)
         away = np.hypot(*(centres - centres[index]).T)
         away[index] = math.inf
-        is_there = np.all(land.centre - margin >= box[0]) and np.all(land.centre + margin <= box[1])
+        is_there = np.all(pad.centre - margin >= box[0]) and np.all(pad.centre + margin <= box[1])
         is_alone = away.min(initial=math.inf) > 2 * reach[index]
-        if radius < LEAST_RADIUS_PX * imaging.pixel or not (is_there and is_alone):
+        if radius < MIN_RADIUS_PX * imaging.pixel or not (is_there and is_alone):
             continue
-        if _is_free(sheets, land, radius, imaging):
-            is_bare = not artwork.mask or _covers(sheets[1], land.centre)
-            kept.append((land.centre, radius, land.hole, _sigma(land, radius, is_bare, imaging)))
-        if len(kept) == most:
+        if _is_free(layers, pad, radius, imaging):
+            is_bare = not artwork.mask or _covers(layers[1], pad.centre)
+            kept.append((pad.centre, radius, pad.hole, _sigma(pad, radius, is_bare, imaging)))
+        if len(kept) == max_count:
             break
     if not kept:
-        return Marks.none()
-    return Marks(*(np.array(each, np.float64) for each in zip(*kept, strict=True)))
+        return Fiducials.empty()
+    return Fiducials(*(np.array(each, np.float64) for each in zip(*kept, strict=True)))
 
 
-def _spread(lands: list[Land], centres: Float64, placement: Float64) -> Iterator[int]:
-    """Fiducials, then others; of either first the one that is farthest from the placement, then from all before."""
+def _spread(pads: list[Pad], centres: Float64, placement: Float64) -> Iterator[int]:
+    """Yield indices: fiducials first, then other pads, each time the one farthest from those before."""
     away = np.hypot(*(centres - placement).T)
     for is_fiducial in (True, False):
-        left = np.array([(each.role == "fiducial") == is_fiducial for each in lands], np.bool_)
+        left = np.array([(each.role == "fiducial") == is_fiducial for each in pads], np.bool_)
         while left.any():
             index = int(np.argmax(np.where(left, away, -1.0)))
             left[index] = False
@@ -125,77 +128,76 @@ def _spread(lands: list[Land], centres: Float64, placement: Float64) -> Iterator
 
 
 def _clear(imaging: Imaging) -> float:
-    """Return how far out nothing may be [m]."""
-    blurs, pixels = _CLEAR_BLURS
-    return (blurs * imaging.most_blur_px + pixels) * imaging.pixel
+    """Return the distance around the contour [m] that must be free of other objects."""
+    return (_CLEAR_BLURS * imaging.max_blur_px + _CLEAR_PX) * imaging.pixel
 
 
-def _is_free(sheets: tuple[Sheet, ...], land: Land, radius: float, imaging: Imaging) -> bool:
-    """Whether nothing but the contour, or a trace's copper, is seen along spokes, in to the middle or the hole."""
-    smoothing = math.hypot(mark_smoothing(imaging.blur_px), imaging.most_blur_px)
-    # Another edge 3.5 deviations of its gradient away pulls by less than a hundredth of a pixel.
-    inwards = 3.5 * smoothing * imaging.pixel if land.hole > 0 else radius
-    if inwards > radius - (land.hole / 2 + imaging.registration if land.hole > 0 else 0.0):
+def _is_free(layers: tuple[VisibleLayer, ...], pad: Pad, radius: float, imaging: Imaging) -> bool:
+    """Return whether spokes, in to the centre or to the hole, cross the contour only, or copper of a trace."""
+    smoothing = math.hypot(fiducial_smoothing(imaging.blur_px), imaging.max_blur_px)
+    # An edge 3.5 standard deviations of its gradient away shifts the contour by less than 0.01 px.
+    inwards = 3.5 * smoothing * imaging.pixel if pad.hole > 0 else radius
+    if inwards > radius - (pad.hole / 2 + imaging.registration if pad.hole > 0 else 0.0):
         return False
-    outwards, hidden = max(_clear(imaging), inwards if land.hole > 0 else 0.0), 0
+    outwards, hidden = max(_clear(imaging), inwards if pad.hole > 0 else 0.0), 0
     spokes = 2 * SPOKES
     for turn in np.arange(spokes) * (2 * math.pi / spokes):
         way = np.array([math.cos(turn), math.sin(turn)])
-        contours = _contours(sheets, land.centre + radius * way, way, -inwards, outwards)
+        contours = _contours(layers, pad.centre + radius * way, way, -inwards, outwards)
         if contours is None:
             return False
         hidden += contours == 0
-        if hidden > (1 - _FREE_SHARE) * spokes:
+        if hidden > (1 - _VISIBLE_SHARE) * spokes:
             return False
     return True
 
 
-def _contours(sheets: tuple[Sheet, ...], point: Float64, way: Float64, low: float, high: float) -> int | None:
-    """Return 1 where copper ends on a spoke, at the contour, and 0 where it goes on there; None where more is seen."""
+def _contours(layers: tuple[VisibleLayer, ...], point: Float64, way: Float64, low: float, high: float) -> int | None:
+    """Return 1 where copper ends at the contour, 0 where a trace continues it, None where another edge is seen."""
     contours = 0
-    for number, sheet in enumerate(sheets):
-        off = math.sqrt(2.0) * sheet.off
-        place, ends = steps_along(sheet.layer, point, way, max(-low, high) + off)
+    for number, visible in enumerate(layers):
+        off = math.sqrt(2.0) * visible.max_offset
+        place, ends = layer_edges_along(visible.layer, point, way, max(-low, high) + off)
         near = (place > low - off) & (place < high + off)
-        # Beyond the middle of a mark without a hole its other side is seen.
+        # Beyond the centre of a pad without a hole its other side would be seen.
         place, ends = place[near], ends[near]
-        if number == 0 and len(place) == 1 and ends[0] and place[0] > -_ITSELF:
-            contours = int(place[0] < _ITSELF)
+        if number == 0 and len(place) == 1 and ends[0] and place[0] > -SAME_EDGE:
+            contours = int(place[0] < SAME_EDGE)
         elif len(place):
             return None
     return contours
 
 
-def _covers(sheet: Sheet, point: Float64) -> bool:
+def _covers(visible: VisibleLayer, point: Float64) -> bool:
     beside = np.array([1e-6, 0.0])
-    crossings = sheet.layer.crossings(point - beside, point + beside)
-    return bool(covered(crossings, np.array([0.5]))[0])
+    crossings = visible.layer.crossings(point - beside, point + beside)
+    return bool(is_covered(crossings, np.array([0.5]))[0])
 
 
-def _sigma(land: Land, radius: float, is_bare: bool, imaging: Imaging) -> float:
-    """Return the standard deviation of x [m]: of lines side by side round the contour, or of as many as spokes."""
+def _sigma(pad: Pad, radius: float, is_bare: bool, imaging: Imaging) -> float:
+    """Return the standard deviation of x [m]: of lines side by side around the contour, or of the spokes."""
     contrast = imaging.contrast_bare if is_bare else imaging.contrast_masked
-    line = math.sqrt(2.0 * math.sqrt(math.pi) * imaging.most_blur_px) / contrast
+    line = math.sqrt(2.0 * math.sqrt(math.pi) * imaging.max_blur_px) / contrast
     lines = 2.0 * math.pi * radius / imaging.pixel
-    over, count = (_EDGES, min(SPOKES, lines)) if land.hole > 0 else (_MATCHED, lines)
+    over, count = (_EDGES_RATIO, min(SPOKES, lines)) if pad.hole > 0 else (_MATCHED_RATIO, lines)
     return float(over * line / math.sqrt(count / 2.0) * imaging.pixel)
 
 
-def with_marks(rulers: Candidates, marks: Marks, imaging: Imaging) -> Candidates:
-    """Candidates for `select`: the rulers, and the marks after them."""
-    count = len(marks.radius)
-    reach = reach_of(marks.point, rulers.placement, imaging)
-    more = Candidates(
-        point=marks.point,
+def append_fiducials(rulers: FeatureCandidates, fiducials: Fiducials, imaging: Imaging) -> FeatureCandidates:
+    """Return candidates for `select_rulers`: the rulers, and the fiducials after them."""
+    count = len(fiducials.radius)
+    reach = search_distance(fiducials.point, rulers.placement, imaging)
+    more = FeatureCandidates(
+        point=fiducials.point,
         normal=np.tile([1.0, 0.0], (count, 1)),
-        sigma=marks.sigma,
+        sigma=fiducials.sigma,
         pair=np.ones(count, np.bool_),
-        length=2 * (marks.radius + reach + _clear(imaging)),
+        length=2 * (fiducials.radius + reach + _clear(imaging)),
         ambiguity=np.zeros(count),
-        source=_SOURCE - np.arange(count),
+        source=_FIRST_SOURCE - np.arange(count),
         spacing=np.zeros(count),
-        radius=marks.radius,
+        radius=fiducials.radius,
         placement=rulers.placement,
     )
     joined = [np.concatenate(each) for each in zip(rulers[:-1], more[:-1], strict=True)]
-    return Candidates._make([*joined, rulers.placement])
+    return FeatureCandidates._make([*joined, rulers.placement])

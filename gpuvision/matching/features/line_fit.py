@@ -1,4 +1,4 @@
-"""Straight lines through points of which some may be far off: many sets at once, each with its covariance."""
+"""Robust fit of straight lines to sets of points, many sets in one launch, each with its covariance."""
 
 from __future__ import annotations
 
@@ -8,8 +8,20 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, capacity, flags, type_defines
-from gpuvision.matching.robust import Loss, efficiency, loss_defines, subsets, tuning_constant_of
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    IntArray,
+    Launch,
+    LaunchBuilder,
+    Precision,
+    StatusArray,
+    Variant,
+    capacity,
+    flags,
+    type_defines,
+)
+from gpuvision.matching.robust import Loss, efficiency, loss_defines, resolve_tuning_constant, sample_subsets
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite
 
@@ -18,112 +30,121 @@ _LARGEST_SET = 1024
 
 
 class LineFits(NamedTuple):
-    """Lines, each array of shape (lines..., what is said).
+    """Fitted lines; ``...`` stands for the shape of the batch of lines.
 
     Attributes
     ----------
-    normal
-        (..., 2) unit normal (-sin a, cos a) of the direction (cos a, sin a), -pi/2 < a <= pi/2.
-    distance
-        (...,) n . q of every point q of the line, in the points' unit.
-    centre
-        (..., 2) weighted middle of the points that count; it lies on the line. Angle and offset are uncorrelated here.
-    covariance
-        (..., 2, 2) of the angle [rad] and of the offset along the normal at the centre.
-    scale
-        (...,) standard deviation of a point's distance, of one without outliers; in units of the points' sigma where
-        that was given.
-    inliers
-        (...,) int32, how many points weigh anything.
-    weights
-        (..., points) what the loss makes of each point, 0 to 1; None unless asked for.
-    status
-        uint8 `Status` flags, (...,). NO_DATA: fewer than two points. AMBIGUOUS: all points are one, so that there is no
-        direction (NaN), or fewer than half of the points lie along the line (with a value).
+    normal : float, (..., 2)
+        Unit normal (-sin a, cos a) of the direction (cos a, sin a), -pi/2 < a <= pi/2.
+    distance : float, (...,)
+        n . q of every point q on the line, in the unit of the points.
+    centre : float, (..., 2)
+        Weighted mean of the inliers; it lies on the line. Angle and offset are uncorrelated at this point.
+    covariance : float, (..., 2, 2)
+        Covariance of the angle [rad] and of the offset along the normal at ``centre``.
+    scale : float, (...,)
+        Standard deviation of the distance of an inlier; in units of the points' sigma with ``weighted``.
+    inliers : int32, (...,)
+        Number of points with a weight above 0.
+    weights : float, (..., points), optional
+        Weight of each point in the fit, 0 to 1. None unless ``with_weights``.
+    status : uint8, (...,)
+        `Status` flags. NO_DATA: fewer than two points. AMBIGUOUS: all points coincide, so that the direction is
+        undefined (results are NaN), or fewer than half of the points are inliers (results are valid numbers).
     """
 
-    normal: Any
-    distance: Any
-    centre: Any
-    covariance: Any
-    scale: Any
-    inliers: Any
-    weights: Any
-    status: Any
+    normal: FloatArray
+    distance: FloatArray
+    centre: FloatArray
+    covariance: FloatArray
+    scale: FloatArray
+    inliers: IntArray
+    weights: FloatArray | None
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitLines(VisionOperation[LineFits]):
-    """Lines through sets of points: ``op(points) -> LineFits``, points float32 or float64 of (..., points, 2).
+    """Robust line fit: ``op(points) -> LineFits``, points float32 or float64 of shape (..., points, 2).
 
-    A point with a coordinate that is not finite is missing. With ``weighted`` there is a second input of shape
-    (..., points): each point's standard deviation; a point for which it is not positive or not finite is missing.
+    A point with a non-finite coordinate counts as missing. With ``weighted`` the operation takes a second input of
+    shape (..., points), the standard deviation of each point; a point whose sigma is not positive or not finite counts
+    as missing.
 
-    The fit starts at the line through two of the points that has the least loss (where the scale is None: the least
-    median of distances) and iterates reweighted total least squares from there.
+    The start is the line through two of the points that has the least loss (the least median of distances where
+    ``scale`` is None). Iteratively reweighted total least squares refines it.
 
     Parameters
     ----------
     loss : {"tukey", "huber", "ransac", "least_squares"}
-        Tukey's gives far points no weight at all, Huber's a little; ``"ransac"`` counts points within ``bend`` scales
-        fully and others not, and needs the scale.
-    bend
-        Where the loss bends, in scales; None: 4.685 for Tukey, 1.345 for Huber (95 % efficiency), 3 for RANSAC.
-    scale
-        Standard deviation of a good point's distance in the points' unit; with ``weighted`` in sigmas: 1 trusts them.
-        None: 1.4826 of the median of the absolute distances, raised by 1 + 5 / (points - 2) for few points;
-        then of those within 2.5 of it.
-    smallest_scale
-        The scale is not taken to be less (in its unit): points that lie on a line exactly leave none.
-    trials
-        Pairs that are tried for the start; all pairs where there are no more. 64 miss all good pairs among 30 % bad
-        points once in 1e19 sets, among 50 % once in 1e8.
-    steps
-        Of the iteration.
-    weighted
-        Whether the points' standard deviations are given.
-    with_weights
-        Whether `LineFits.weights` is asked for.
-    precision
-        Of the arithmetic and the outputs; None follows the input.
-    variant
-        "vector" (16 lines at once, for CPU runtimes), "work_item" (a work-item per line, for GPUs), or "auto".
+        Tukey's biweight gives outliers weight 0; Huber's loss gives them a small weight; ``"ransac"`` (truncated
+        quadratic) gives points within ``tuning_constant`` times the scale weight 1 and all others weight 0, and needs
+        ``scale``.
+    tuning_constant : float, optional
+        Residual at which the loss stops being quadratic, in units of the scale, above 0. None: 4.685 for Tukey and
+        1.345 for Huber (95 % efficiency), 3 for RANSAC.
+    scale : float, optional
+        Standard deviation of an inlier's distance in the unit of the points, above 0; with ``weighted`` in sigmas, so
+        that 1 trusts the given sigmas. None: 1.4826 times the median absolute distance, raised by 1 + 5 / (points - 2)
+        for small sets, then computed again from the points within 2.5 scales.
+    min_scale : float
+        Lower limit of the scale, 0 or more, default 0: points that lie on a line exactly have scale 0.
+    max_trials : int
+        Number of point pairs tried for the start, 1 or more, default 64; all pairs where there are not more. 64 random
+        pairs all contain an outlier once in 1e19 sets with 30 % outliers, once in 1e8 sets with 50 % outliers.
+    max_iterations : int
+        Number of reweighted fits, 1 or more, default 12.
+    weighted : bool
+        Whether the operation takes the standard deviations of the points as a second input.
+    with_weights : bool
+        Whether to return `LineFits.weights`.
+    precision : {None, "single", "double"}
+        Precision of the arithmetic and of the results; None follows the input.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: "vector" fits 16 lines at once (CPU runtimes), "work_item" one line per work-item (GPUs).
 
     Raises
     ------
     ValueError, TypeError
-        A parameter is out of its range.
+        A parameter is out of its range or of a wrong type.
 
     Notes
     -----
-    Error: distances are taken from one of the points, so that rounding adds 3e-7 of the points' extent in single
-    precision, and half a spacing of their coordinates. The covariance is the asymptotic one (Huber, 1981), from the
-    residuals unless ``scale`` is given: with twenty points its standard deviations are right to 15 %, with six or
-    fewer they are rough, and with two there is none (NaN).
+    Error: distances are computed relative to one of the points, so that rounding adds 3e-7 of the points' extent in
+    single precision, and half a unit in the last place of the coordinates. The covariance is the asymptotic one of an
+    M-estimator [1]_, computed from the residuals unless ``scale`` is given. With twenty points its standard deviations
+    are right to 15 %; with six or fewer they are rough; with two points it is NaN.
+
+    References
+    ----------
+    .. [1] P. J. Huber, *Robust Statistics*, Wiley 1981.
+    .. [2] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 8.6.4.
     """
 
     Result: ClassVar[type[Any]] = LineFits
 
     loss: Loss = "tukey"
-    bend: float | None = None
+    tuning_constant: float | None = None
     scale: float | None = None
-    smallest_scale: float = 0.0
-    trials: int = 64
-    steps: int = 12
+    min_scale: float = 0.0
+    max_trials: int = 64
+    max_iterations: int = 12
     weighted: bool = False
     with_weights: bool = False
     precision: Precision = None
     variant: Variant = "auto"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "bend", tuning_constant_of(self.loss, self.bend, "FitLines"))
+        object.__setattr__(
+            self, "tuning_constant", resolve_tuning_constant(self.loss, self.tuning_constant, "FitLines")
+        )
         if self.scale is not None and finite(self.scale, "FitLines.scale") <= 0.0:
             raise ValueError(f"FitLines.scale is {self.scale}, expected a number > 0, or None")
         if self.scale is None and self.loss == "ransac":
             raise ValueError("FitLines: loss 'ransac' cuts at bend times the scale; give the scale")
-        if finite(self.smallest_scale, "FitLines.smallest_scale") < 0.0:
-            raise ValueError(f"FitLines.smallest_scale is {self.smallest_scale}, expected a number >= 0")
-        for name in ("trials", "steps"):
+        if finite(self.min_scale, "FitLines.min_scale") < 0.0:
+            raise ValueError(f"FitLines.min_scale is {self.min_scale}, expected a number >= 0")
+        for name in ("max_trials", "max_iterations"):
             if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
                 raise ValueError(f"FitLines.{name} is {getattr(self, name)!r}, expected a whole number > 0")
 
@@ -134,9 +155,9 @@ class FitLines(VisionOperation[LineFits]):
         is_valid = len(shape) >= 2 and shape[-1] == 2 and 2 <= shape[-2] <= _LARGEST_SET
         build.check_shape(is_valid, f"points (..., 2 to {_LARGEST_SET}, 2)")
         batch, count = shape[:-2], shape[-2]
-        lines, pairs = math.prod(batch), subsets(count, 2, self.trials)
+        lines, pairs = math.prod(batch), sample_subsets(count, 2, self.max_trials)
         work = build.work(lines, each=_LANES, group=_GROUP)
-        assert self.bend is not None
+        assert self.tuning_constant is not None
         shapes = {
             "normal": (*batch, 2),
             "distance": batch,
@@ -155,10 +176,10 @@ class FitLines(VisionOperation[LineFits]):
             outputs=build.outputs(shapes, inliers=np.int32),
             defines={
                 **type_defines("INPUT", dtype),
-                **loss_defines(self.loss, self.bend),
+                **loss_defines(self.loss, self.tuning_constant),
                 **flags(WITH_SIGMA=self.weighted, WITH_WEIGHTS=self.with_weights),
                 **({} if self.scale is None else {"GIVEN_SCALE": self.scale}),
-                "EFFICIENCY": efficiency(self.loss, self.bend),
+                "EFFICIENCY": efficiency(self.loss, self.tuning_constant),
                 "CAPACITY": capacity(count, least=8),
             },
             arguments=[
@@ -166,8 +187,8 @@ class FitLines(VisionOperation[LineFits]):
                 np.int32(count),
                 pairs.ravel(),
                 np.int32(len(pairs)),
-                np.int32(self.steps),
-                build.real.type(self.smallest_scale),
+                np.int32(self.max_iterations),
+                build.real.type(self.min_scale),
             ],
             passes_once=work.vectors and lines <= _LANES,
         )

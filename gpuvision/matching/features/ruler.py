@@ -1,8 +1,8 @@
-"""Edges along rulers: short lines of samples anywhere in a frame, at which a step of the grey level is located.
+"""Caliper (ruler): sub-pixel edges along short lines of samples anywhere in an image.
 
-A ruler is a centre and a direction in the image. Along it the grey levels of several parallel lines are averaged and
-differentiated with the derivative of a Gaussian; an edge is a peak of that gradient, refined by a parabola through the
-logarithms of the peak and its neighbours (exact for a Gaussian edge).
+A ruler is a centre and a direction in the image. The operation averages the grey levels of several parallel lines and
+differentiates the profile with the derivative of a Gaussian. An edge is a local extremum of the gradient. A parabola
+through the logarithms of the extremum and its two neighbours gives its position; this is exact for a Gaussian edge.
 """
 
 from __future__ import annotations
@@ -16,138 +16,176 @@ import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Define, Device, Launch, LaunchBuilder, Variant, flags, opencl_type, type_defines
+from gpuvision.host import (
+    Define,
+    Device,
+    FloatArray,
+    Launch,
+    LaunchBuilder,
+    StatusArray,
+    Variant,
+    flags,
+    opencl_type,
+    type_defines,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite, integer
 
 Polarity = Literal["any", "rising", "falling"]
-Choice = Literal["strongest", "first", "last", "all"]
+EdgeSelection = Literal["strongest", "first", "last", "all"]
 
 POLARITIES = ("any", "rising", "falling")
-CHOICES = ("strongest", "first", "last", "all")
-LONGEST = 512  # samples: a bit of 32 for each 16 gradients
-WIDEST = 255
-MOST_EDGES = 64
+EDGE_SELECTIONS = ("strongest", "first", "last", "all")
+MAX_LENGTH = 512
+"""Largest number of samples: the kernel has one bit of 32 for each 16 gradients."""
+MAX_WIDTH = 255
+MAX_EDGES = 64
 _LANES, _GROUP = 16, 64
-_SHARES_PER_CORE = 4  # keep the cores even
-_ALONE = 128  # rulers that the caller's thread does sooner than it wakes another
-_LEAST_BITS, _MOST_BITS = 15, 23  # of 31, as a side of an image has 15; the most are what a mantissa has
+_SHARES_PER_CORE = 4  # work-items per core: balances the cores
+_INLINE = 128  # rulers up to which one thread is faster than waking a second one (measured)
+# Binary places of fixed-point positions, of 31 bits: a side of an image takes 15; a float's mantissa has 23.
+_LEAST_BITS, _MOST_BITS = 15, 23
 _REAL = np.dtype(np.float32)
 
 
 class Edges(NamedTuple):
-    """What rulers found, each array of shape (n,), for ``choice="all"`` (n, most).
+    """Edges found by calipers (rulers): arrays of shape (n,), with ``edge_selection="all"`` (n, max_edges).
 
     Attributes
     ----------
-    position
-        Of the edge from the ruler's centre along its direction, of a pair the middle [px]; NaN where the status has
-        LOW_SIGNAL, OUT_OF_RANGE, NOT_FINITE or NOT_INVERTIBLE, and so are the others.
-    amplitude
-        Height of the step [grey levels], above 0 where it rises along the ruler. Of a pair the mean of both, with the
-        sign of the first.
-    width
-        Standard deviation of the edge's blur [px], that of the bilinear samples (0.4 px on average) included.
-    sigma
-        Predicted standard deviation of the position [px], from the noise that the operation was given.
-    status
-        uint8 `Status` flags. LOW_SIGNAL: no edge over the threshold. OUT_OF_RANGE: the ruler leaves the image.
-        NOT_FINITE: a number of the ruler or a pixel under it is not, or grey levels times lines are beyond 1e37.
-        NOT_INVERTIBLE: the lens has no such point. With a value: SATURATED (a sample of the ruler reached the
-        saturation, the edge may be displaced), AMBIGUOUS (a second edge is comparable; for ``choice="all"`` in the last
-        place: there are more).
-    spacing
-        Of the edges of a pair [px]; None without ``pairs``.
+    position : float32
+        Position of the edge along the ruler, from its centre [px]; of a pair the middle of both edges. NaN where the
+        status has LOW_SIGNAL, OUT_OF_RANGE, NOT_FINITE or NOT_INVERTIBLE, like all other fields.
+    amplitude : float32
+        Height of the step [grey levels], positive where the grey level rises along the ruler. Of a pair the mean height
+        of both edges, with the sign of the first.
+    width : float32
+        Standard deviation of the edge's blur [px]. It includes the blur of bilinear sampling (0.4 px on average).
+    sigma : float32
+        Predicted standard deviation of the position [px] for the given ``noise``.
+    status : uint8
+        `Status` flags. LOW_SIGNAL: no edge above the threshold. OUT_OF_RANGE: the ruler leaves the image. NOT_FINITE: a
+        number of the ruler or a pixel under it is not finite, or grey level times ``width`` exceeds 1e37.
+        NOT_INVERTIBLE: the inverse of the lens model has no solution at the ruler. With a value: SATURATED (a sample of
+        the ruler reached ``saturation``; the edge may be displaced), AMBIGUOUS (a second edge is comparable; with
+        ``edge_selection="all"`` in the last column: there are more edges than ``max_edges``).
+    spacing : float32, optional
+        Distance between the two edges of a pair [px]; None without ``pairs``.
     """
 
-    position: Any
-    amplitude: Any
-    width: Any
-    sigma: Any
-    status: Any
-    spacing: Any = None
+    position: FloatArray
+    amplitude: FloatArray
+    width: FloatArray
+    sigma: FloatArray
+    status: StatusArray
+    spacing: FloatArray | None = None
 
 
 def best_smoothing(blur_px: float) -> float:
-    """Return the smoothing that locates an isolated edge of such a blur best: sqrt(5) times it.
+    """Return the smoothing that locates an isolated edge of a given blur best: sqrt(5) times the blur.
 
-    A gradient's peak has (3/8) (a^2 + s^2)^3 / (a^5 s) times the least possible variance for a smoothing a and a
-    blur s: 1.20 times its standard deviation there.
+    Parameters
+    ----------
+    blur_px
+        Standard deviation of the edge's blur [px].
+
+    Returns
+    -------
+    float
+        Standard deviation of the Gaussian whose derivative is taken [px].
+
+    Notes
+    -----
+    With smoothing a and blur s the variance of the gradient's maximum is (3/8) (a^2 + s^2)^3 / (a^5 s) times the
+    Cramer-Rao bound (derived for white noise). Its minimum lies at a = sqrt(5) s, where the standard deviation is 1.20
+    times the bound.
     """
     return math.sqrt(5.0) * blur_px
 
 
 @dataclass(frozen=True, kw_only=True)
 class RulerEdges(VisionOperation[Edges]):
-    """Edges along rulers: ``op(image, rulers) -> Edges``.
+    """Caliper (ruler), a 1-D edge measurement: ``op(image, rulers) -> Edges``.
 
-    Takes a uint8, uint16 or float32 image (rows, columns) and float32 rulers (n, 4): centre x, y [px], and the cosine
-    and sine of the direction along which the edge is looked for (of length 1).
+    The image is uint8, uint16 or float32 of shape (rows, columns). The rulers are float32 of shape (n, 4): centre x, y
+    [px], and cosine and sine of the direction along which the edge is measured (a unit vector).
 
     Parameters
     ----------
-    threshold
-        Least height of an edge [grey levels]: that of a sharp step of the same greatest gradient.
-    length
-        Samples of a ruler.
-    width
-        Lines averaged, a pixel apart.
-    step_px
-        From sample to sample.
-    smoothing_px
-        Of the Gaussian whose derivative is taken. `best_smoothing` is the optimum for isolated edges; a neighbour
-        nearer than 3 times this pulls.
-    polarity
-        Whether edges count that rise along the ruler, fall, or any; of pairs that of the first edge (``"rising"``: a
-        bright stripe).
-    choice
-        Which edge, where there are several.
-    most
-        Places for edges, for ``choice="all"``.
-    pairs
-        Look for two edges of opposite sign next to each other, such as the borders of a trace; how wide it was
-        etched drops out of the middle.
-    spacing_px
-        Least and greatest distance of the edges of a pair, to whole samples; None: any.
-    ambiguity
-        Share of the strongest edge's gradient from which on a second one makes it AMBIGUOUS; None does not look. For
-        ``choice="strongest"``.
-    saturation
-        Level at which a sample is saturated; None does not look.
-    noise
-        Standard deviation of a pixel [grey levels]; the rounding of integer images comes on top of it.
-    radius_px
-        Of the edge's curvature, above 0 where its centre lies ahead on the ruler, below 0 behind; the position is
-        then that of the edge on the ruler's middle line, where blur and the averaged lines would have it nearer to
-        the centre. None: straight.
-    model
-        `Lens` or `Camera`: rulers and positions are in undistorted pixels (of a `Camera`: under its own matrix), the
-        image is as measured. None: no lens.
-    count
-        Rulers, n. None follows the rulers of a call; `bind` needs it.
-    variant
-        "vector" (16 samples at a time, for CPU runtimes), "work_item" (a work-group per ruler, for GPUs), or "auto".
+    threshold : float
+        Least height of an edge [grey levels], above 0: the height of a sharp step with the same maximum of the smoothed
+        gradient.
+    length : int
+        Number of samples along a ruler, 5 to 512, default 64.
+    width : int
+        Number of averaged parallel lines, 1 px apart, 1 to 255, default 5.
+    step_px : float
+        Distance between samples [px], above 0, default 1.
+    smoothing_px : float
+        Standard deviation of the Gaussian whose derivative is taken [px], above 0, default 2. `best_smoothing` gives
+        the optimum for isolated edges. A second edge nearer than 3 times this value shifts the result.
+    polarity : {"any", "rising", "falling"}
+        Sign of the step along the ruler; with ``pairs`` that of the first edge ("rising": a bright stripe).
+    edge_selection : {"strongest", "first", "last", "all"}
+        Which edge to return where there are several.
+    max_edges : int
+        Number of returned edges with ``edge_selection="all"``, 1 to 64, default 8.
+    pairs : bool
+        Whether to look for two adjacent edges of opposite sign, such as the borders of a trace. The middle of a pair
+        does not depend on the etch bias.
+    spacing_px : (float, float), optional
+        Least and greatest distance between the edges of a pair [px], rounded to whole samples. None: any distance.
+    ambiguity : float, optional
+        Ratio of the second strongest to the strongest gradient from which on the edge is flagged AMBIGUOUS, above 0 to
+        1, with ``edge_selection="strongest"`` only. None: no check.
+    saturation : float, optional
+        Grey level from which on a sample is saturated. None: no check.
+    noise : float
+        Standard deviation of a pixel [grey levels], 0 or more, default 1. The rounding of integer images is added.
+    radius_px : float, optional
+        Radius of curvature of the edge [px]: positive where the centre of curvature lies ahead on the ruler, negative
+        where it lies behind. The operation then corrects the bias towards the centre that blur and the averaged lines
+        cause. None: straight edges.
+    model : Lens or Camera, optional
+        Lens model. Rulers and positions are then in undistorted pixels (of a `Camera`: under its own matrix), and the
+        image is as measured. None: no distortion.
+    count : int, optional
+        Number of rulers, n. None takes the number from the rulers of a call; `bind` needs a number.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: "vector" computes 16 samples at a time (CPU runtimes), "work_item" one work-group per ruler
+        (GPUs).
 
     Raises
     ------
     TypeError
-        A parameter is no number, a count no whole one, or the model none of these.
+        A parameter is not a number, a count is not an integer, or the model is neither a Lens nor a Camera.
     ValueError
         A parameter is out of its range.
 
     Notes
     -----
-    Error: samples are taken relative to a pixel of the ruler's own, so that single precision costs the position less
-    than 1e-4 px at contrasts over 10 times the threshold; centres above 1024 px are rounded to 6e-5 px as they are
-    given. With a model the samples have that rounding.
+    Error: the samples are taken relative to a pixel at the ruler, so that single precision costs the position less than
+    1e-4 px at contrasts above 10 times the threshold. Centres above 1024 px are rounded to 6e-5 px by their float32
+    format. With a model the samples have this rounding too.
 
-    Linear interpolation moves the sampled peak of an edge, by 0.013 px along the pixels for a smoothing of 1 px and
-    0.004 px at `best_smoothing`, both for a blur of 1.2 px. That is taken back, for a Gaussian edge at right angles to
-    the ruler; what is left is below 0.0035 px and 0.0015 px at any angle. With a model it is not.
+    Linear interpolation moves the maximum of the sampled gradient by up to 0.013 px along the pixels for a smoothing of
+    1 px, and by 0.004 px at `best_smoothing`, both for a blur of 1.2 px. The operation corrects this for a Gaussian
+    edge at right angles to the ruler; below 0.0035 px and 0.0015 px remain at any angle. With a model there is no such
+    correction.
 
-    ``sigma`` is the gradient noise at the peak over the curvature there, for white noise and rulers at random places:
-    within 5 % of what is measured from noise 0.5 at a step of 100 on, at any angle. At `best_smoothing` both are 1.2
-    times the Cramer-Rao bound of isolated edges, or less (1.17 to 1.18 from a step of 6 to 200 times the noise).
+    ``sigma`` is the noise of the gradient at the maximum divided by the curvature there, for white noise and rulers at
+    random sub-pixel positions. It agrees within 5 % with measured values from noise 0.5 at a step of 100 on, at any
+    angle. At `best_smoothing` both are at most 1.2 times the Cramer-Rao bound of isolated edges (1.17 to 1.18 from a
+    step of 6 to 200 times the noise).
+
+    References
+    ----------
+    .. [1] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 8.6.5.
+
+    Examples
+    --------
+    >>> import gpuvision as gv
+    >>> caliper = gv.RulerEdges(threshold=20.0, length=48, width=5, smoothing_px=2.7, polarity="rising")
     """
 
     Result: ClassVar[type[Any]] = Edges
@@ -158,8 +196,8 @@ class RulerEdges(VisionOperation[Edges]):
     step_px: float = 1.0
     smoothing_px: float = 2.0
     polarity: Polarity = "any"
-    choice: Choice = "strongest"
-    most: int = 8
+    edge_selection: EdgeSelection = "strongest"
+    max_edges: int = 8
     pairs: bool = False
     spacing_px: tuple[float, float] | None = None
     ambiguity: float | None = None
@@ -171,7 +209,7 @@ class RulerEdges(VisionOperation[Edges]):
     variant: Variant = "auto"
 
     def __post_init__(self) -> None:
-        for name, least, limit in (("length", 5, LONGEST), ("width", 1, WIDEST), ("most", 1, MOST_EDGES)):
+        for name, least, limit in (("length", 5, MAX_LENGTH), ("width", 1, MAX_WIDTH), ("max_edges", 1, MAX_EDGES)):
             object.__setattr__(
                 self, name, integer(getattr(self, name), f"RulerEdges.{name}", minimum=least, maximum=limit)
             )
@@ -192,14 +230,15 @@ class RulerEdges(VisionOperation[Edges]):
             )
 
     def _check_choices(self) -> None:
-        for name, allowed in (("polarity", POLARITIES), ("choice", CHOICES)):
+        """Check the parameters that choose among edges."""
+        for name, allowed in (("polarity", POLARITIES), ("edge_selection", EDGE_SELECTIONS)):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"RulerEdges.{name} is {getattr(self, name)!r}, expected one of {', '.join(allowed)}")
         if self.ambiguity is not None:
             if not 0.0 < finite(self.ambiguity, "RulerEdges.ambiguity") <= 1.0:
                 raise ValueError(f"RulerEdges.ambiguity is {self.ambiguity}, expected a share, 0 < share <= 1")
-            if self.choice != "strongest":
-                raise ValueError("RulerEdges.ambiguity goes with choice='strongest' only; leave it out")
+            if self.edge_selection != "strongest":
+                raise ValueError("RulerEdges.ambiguity goes with edge_selection='strongest' only; leave it out")
         if self.spacing_px is not None:
             if not self.pairs:
                 raise ValueError("RulerEdges.spacing_px goes with pairs=True only; leave it out")
@@ -213,12 +252,15 @@ class RulerEdges(VisionOperation[Edges]):
 
     @property
     def _reach(self) -> int:
-        """Taps either side."""
+        """Number of filter taps on either side of the centre."""
         return math.ceil(3.0 * self.smoothing_px / self.step_px)
 
     @property
     def _binary_places(self) -> int:
-        """Return how many a fixed-point place along a ruler, or with a model in the image, has below a pixel."""
+        """Number of binary places after the point of a fixed-point position [bits].
+
+        The position runs along the ruler, or with a model through the image.
+        """
         if self.model is not None:
             return _LEAST_BITS
         extent = (self.length - 1) * self.step_px + self.width + 2
@@ -226,10 +268,11 @@ class RulerEdges(VisionOperation[Edges]):
 
     @property
     def _places(self) -> int:
-        return self.most if self.choice == "all" else 1
+        """Number of returned edges of a ruler."""
+        return self.max_edges if self.edge_selection == "all" else 1
 
     def __call__(self, *inputs: Any, device: Device | None = None, out: Edges | None = None) -> Edges:
-        """Run once, as every `Operation`; with ``count=None`` for as many rulers as there are."""
+        """Run once on the rulers of this call; ``count=None`` takes their number."""
         if self.count is None and len(inputs) == 2 and getattr(inputs[1], "ndim", 0) == 2:
             return replace(self, count=len(inputs[1]))(*inputs, device=device, out=out)
         return super().__call__(*inputs, device=device, out=out)
@@ -244,7 +287,7 @@ class RulerEdges(VisionOperation[Edges]):
             raise ValueError("RulerEdges.count is None; to bind it say how many rulers there will be")
         each = max(build.share(self.count, per_core=_SHARES_PER_CORE, multiple=_LANES), _LANES)
         work = build.work(self.count, each=each, group=_GROUP, grouping="per_element")
-        found = (self.count, self.most) if self.choice == "all" else (self.count,)
+        found = (self.count, self.max_edges) if self.edge_selection == "all" else (self.count,)
         shapes = dict.fromkeys(("position", "amplitude", "width", "sigma"), found)
         return build.launch(
             "ruler/ruler.cl",
@@ -260,11 +303,11 @@ class RulerEdges(VisionOperation[Edges]):
                 np.uint32(self.count),
                 np.uint32(each),
             ],
-            passes_once=work.vectors and self.count <= _ALONE,
+            passes_once=work.vectors and self.count <= _INLINE,
         )
 
     def _defines(self, dtype: np.dtype[Any]) -> dict[str, Define]:
-        chosen = [f"CODE_{opencl_type(dtype)}", f"CHOOSE_{self.choice.upper()}"]
+        chosen = [f"CODE_{opencl_type(dtype)}", f"CHOOSE_{self.edge_selection.upper()}"]
         chosen += [] if self.polarity == "any" else [self.polarity.upper()]
         return {
             **({} if self.model is None else self._model_defines(self.model)),
@@ -297,7 +340,7 @@ class RulerEdges(VisionOperation[Edges]):
             return self.model.packed((0.0, 0.0), 1.0, inverse=True).astype(_REAL)
 
     def _packed(self, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-        """Return the table of ``ruler.h``."""
+        """Return the parameter table of ``ruler.h``."""
         taps = self._taps()
         k = np.arange(1, self._reach + 1)
         smoothing = float(np.sum(2.0 * taps * k**3)) / 3.0
@@ -318,15 +361,16 @@ class RulerEdges(VisionOperation[Edges]):
         return np.array([*table, *taps], _REAL)
 
     def _taps(self) -> npt.NDArray[np.float64]:
-        """Return the derivative of the Gaussian at 1, 2, ... samples: its gradient of a ramp is the ramp's."""
+        """Return the derivative of the Gaussian at 1, 2, ... samples; the gradient of a ramp is then its slope."""
         k = np.arange(1, self._reach + 1)
         taps = k * np.exp(-0.5 * (k * self.step_px / self.smoothing_px) ** 2)
         return np.asarray(taps / np.sum(2.0 * k * taps))
 
     def _noise_gain(self, taps: npt.NDArray[np.float64]) -> float:
-        """Return the noise of half the difference of the gradients beside a peak, for pixels of noise 1.
+        """Return the noise of half the difference of the two gradients beside a maximum, for pixel noise 1.
 
-        Bilinear samples at random places share noise as far as the cubic B-spline of their distance.
+        Bilinear samples at random sub-pixel positions are correlated; the covariance of two samples is the cubic
+        B-spline of their distance.
         """
         slope = np.concatenate([-taps[::-1], [0.0], taps])
         half_difference = 0.5 * (np.pad(slope, (2, 0)) - np.pad(slope, (0, 2)))
@@ -338,7 +382,7 @@ class RulerEdges(VisionOperation[Edges]):
 
 
 def _cubic_spline(distance: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """Return the cubic B-spline: what two triangles that far apart have in common."""
+    """Return the cubic B-spline of a distance [samples]: the overlap integral of two triangles at this distance."""
     far = np.abs(distance).astype(np.float64)
     near = 2.0 / 3.0 - far**2 + 0.5 * far**3
     return np.asarray(np.where(far < 1.0, near, np.maximum(2.0 - far, 0.0) ** 3 / 6.0))

@@ -1,4 +1,4 @@
-"""A field's lines, and a map over them: which line is the nearest everywhere, and what a point there costs."""
+"""Lines of a field, and their distance map: the nearest lines, and the cost of a point, in each cell of a grid."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, LaunchBuilder, WorkSize
+from gpuvision.host import Array, Device, FloatArray, Launch, LaunchBuilder, StatusArray, WorkSize
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite, numbers
 
-LEVELS = 1023
+COST_LEVELS = 1023
 """Steps of a point's cost in the map: 64 points fit 16 bits."""
 _BLOCK, _NEAREST, _MOST_LINES = 64, 4, 256
 _MOST_CELLS = 1 << 26
 
 
 class Arc(NamedTuple):
-    """A part of a circle, counter-clockwise from ``start`` to ``end`` [rad]; a whole circle where they are 2 pi apart.
+    """Arc of a circle, counter-clockwise from ``start`` to ``end``; a full circle where these differ by 2 pi.
 
     Attributes
     ----------
     x, y, radius
-        Centre and radius, m.
+        Centre and radius [m].
     start, end
-        rad.
+        Angles [rad].
     """
 
     x: float
@@ -40,23 +40,23 @@ class Arc(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Field:
-    """The lines of a field, in metres about its middle.
+    """Lines of a field, in metres relative to its centre.
 
     Parameters
     ----------
-    length, width
-        Of the area in x and in y, m.
-    lines
-        Straight ones, (x, y, x, y) of their ends.
-    arcs
-        Parts of circles.
-    name
-        What it is called.
+    length, width : float
+        Size of the field in x and in y [m], above 0.
+    lines : tuple of (float, float, float, float)
+        Straight lines: x, y of both ends [m].
+    arcs : tuple of Arc
+        Arcs of circles.
+    name : str
+        Name of the field.
 
     Raises
     ------
     ValueError
-        A size is not positive, a line has no length, or there is no line at all or more than 256.
+        A size is not positive, a line has no length, or there are no lines and arcs, or more than 256.
     """
 
     length: float
@@ -85,7 +85,7 @@ class Field:
 
     @property
     def shapes(self) -> npt.NDArray[np.float64]:
-        """The table of ``kernels/field/field.h``, (lines + arcs, 7)."""
+        """Table of ``kernels/field/field.h``, (lines + arcs, 7)."""
         rows = []
         for x0, y0, x1, y1 in self.lines:
             half = 0.5 * math.hypot(x1 - x0, y1 - y0)
@@ -99,7 +99,7 @@ class Field:
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether half a turn leaves the field as it is: then every pose has a twin that looks the same."""
+        """Whether half a turn maps the field to itself: then every pose has a symmetric twin with the same image."""
         lines = {_rounded(min((x0, y0, x1, y1), (x1, y1, x0, y0))) for x0, y0, x1, y1 in self.lines}
         turned = {_rounded(min((-x0, -y0, -x1, -y1), (-x1, -y1, -x0, -y0))) for x0, y0, x1, y1 in self.lines}
         arcs = {_arc_key(arc) for arc in self.arcs}
@@ -117,44 +117,48 @@ def _arc_key(arc: Arc) -> tuple[float, ...]:
     return _rounded((arc.x, arc.y, arc.radius, opening, math.cos(middle), math.sin(middle)))
 
 
-class FieldCells(NamedTuple):
-    """What is known of every cell, (rows, columns), rows along y.
+class DistanceMapCells(NamedTuple):
+    """Cells of a distance map, (rows, columns), rows along y.
 
     Attributes
     ----------
-    distance
-        float32, of the cell's middle to the nearest line, m.
-    nearest
-        uint8 (rows, columns, 4), which lines (arcs after the straight ones) may be the nearest within the cell, that
-        of its middle first; it stands again where there are fewer.
-    level
-        uint16, `LEVELS` times d^2 / (c^2 + d^2), rounded.
+    distance : float32
+        Distance from the cell's centre to the nearest line [m].
+    nearest : uint8, (rows, columns, 4)
+        Indices of the lines (arcs after the straight lines) that may be the nearest one in the cell, that of its centre
+        first; it is repeated where there are fewer than four.
+    level : uint16
+        Cost d^2 / (c^2 + d^2) of a point in `COST_LEVELS` steps, rounded.
     """
 
-    distance: Any
-    nearest: Any
-    level: Any
+    distance: FloatArray
+    nearest: StatusArray
+    level: Array
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistanceMapBuilder(VisionOperation[FieldCells]):
-    """Cells over a field: ``op(x) -> FieldCells``, x float32 (columns,): where the columns are [m].
+class DistanceMapBuilder(VisionOperation[DistanceMapCells]):
+    """Computation of a distance map: ``op(x) -> DistanceMapCells``.
+
+    The input x is float32 (columns,), the positions of the columns [m].
 
     Parameters
     ----------
-    field
-        Its lines.
-    first_y, cell, rows
-        The first row, the distance of rows [m], and how many there are.
-    scale
-        c of d^2 / (c^2 + d^2), m.
+    field : Field
+        Lines of the field.
+    first_y, cell : float
+        Position of the first row, and distance between rows [m].
+    rows : int
+        Number of rows.
+    scale : float
+        c of the cost d^2 / (c^2 + d^2) [m].
 
     Notes
     -----
     Distances are exact to single precision: 2e-6 m in a field of 20 m.
     """
 
-    Result: ClassVar[type[Any]] = FieldCells
+    Result: ClassVar[type[Any]] = DistanceMapCells
 
     field: Field
     first_y: float
@@ -176,7 +180,7 @@ class DistanceMapBuilder(VisionOperation[FieldCells]):
             outputs=build.outputs(
                 {"distance": cells, "nearest": (*cells, _NEAREST), "level": cells}, nearest=np.uint8, level=np.uint16
             ),
-            defines={"FIELD_LEVELS": LEVELS},
+            defines={"FIELD_LEVELS": COST_LEVELS},
             arguments=[
                 np.float32(self.first_y),
                 np.float32(self.cell),
@@ -189,52 +193,52 @@ class DistanceMapBuilder(VisionOperation[FieldCells]):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DistanceMap:
-    """A field on a grid: made once, searched with every view.
+    """Distance map of a field: computed once, searched with the points of every image.
 
-    Poses are looked for on the cells' middles, over the field and ``outside`` it; the map goes on for ``reach`` beyond
-    them, as far as points are seen.
+    Poses are searched at the centres of the cells, over the field and ``margin`` around it; the map extends by
+    ``max_range`` beyond them.
 
     Parameters
     ----------
-    field
-        Its lines.
-    cell
-        Distance of cells, m.
-    scale
-        c of a point's cost d^2 / (c^2 + d^2) at a distance d from the nearest line, m: what is much further away is no
-        line of this field (about 0.25 m in a field of 20 m).
-    reach
-        Points further from the robot than this are not used, m.
-    outside
-        How far beside the field the robot may be, m.
-    device
-        Which makes it; None: the best.
+    field : Field
+        Lines of the field.
+    cell : float
+        Distance between cells [m], above 0, default 0.05.
+    scale : float
+        c of a point's cost d^2 / (c^2 + d^2) at a distance d from the nearest line [m], above 0, default 0.25: points
+        much farther away count as outliers. 0.25 m suits a field of 20 m.
+    max_range : float
+        Points farther from the robot are not used [m], above 0, default 6.
+    margin : float
+        Width of the border around the field in which the robot may be [m], 0 or more, default 0.
+    device : Device, optional
+        Where to compute the map; None: `Device.best`.
 
     Raises
     ------
     ValueError
-        A size is not positive (``outside``: negative), or they make too many cells.
+        A size is out of its range, or the map would have too many cells.
     """
 
     field: Field
     cell: float = 0.05
     scale: float = 0.25
-    reach: float = 6.0
-    outside: float = 0.0
+    max_range: float = 6.0
+    margin: float = 0.0
     device: Device | None = None
-    cells: FieldCells = dataclasses.field(init=False, repr=False)
+    cells: DistanceMapCells = dataclasses.field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name in ("cell", "scale", "reach"):
+        for name in ("cell", "scale", "max_range"):
             if finite(getattr(self, name), f"DistanceMap.{name}") <= 0.0:
                 raise ValueError(f"DistanceMap.{name} is {getattr(self, name)}, expected metres above 0")
-        if finite(self.outside, "DistanceMap.outside") < 0.0:
-            raise ValueError(f"DistanceMap.outside is {self.outside}, expected metres, 0 or more")
-        extent = max(self.field.length, self.field.width) + 2.0 * (self.outside + self.reach)
+        if finite(self.margin, "DistanceMap.margin") < 0.0:
+            raise ValueError(f"DistanceMap.margin is {self.margin}, expected metres, 0 or more")
+        extent = max(self.field.length, self.field.width) + 2.0 * (self.margin + self.max_range)
         if extent / self.cell > math.sqrt(_MOST_CELLS):
             raise ValueError(
                 f"DistanceMap.cell is {self.cell} m, expected {extent / math.sqrt(_MOST_CELLS):.2g} m or more for this "
-                f"field; make it larger or the reach shorter"
+                f"field; make it larger or max_range smaller"
             )
         rows, columns = self.positions
         border = self.border
@@ -247,25 +251,25 @@ class DistanceMap:
 
     @property
     def positions(self) -> tuple[int, int]:
-        """Rows and columns of positions that are looked at."""
+        """Rows and columns of searched positions."""
         rows, columns = (
-            round((size + 2.0 * self.outside) / self.cell) or 1 for size in (self.field.width, self.field.length)
+            round((size + 2.0 * self.margin) / self.cell) or 1 for size in (self.field.width, self.field.length)
         )
         return rows, columns
 
     @property
     def border(self) -> int:
-        """Cells beyond the positions, on every side."""
-        return math.ceil(self.reach / self.cell) + 1
+        """Cells beyond the searched positions, on every side."""
+        return math.ceil(self.max_range / self.cell) + 1
 
     @property
     def first(self) -> tuple[float, float]:
-        """Place (x, y) of the first cell, m."""
+        """Position (x, y) of the first cell [m]."""
         rows, columns = self.positions
         return -self.cell * (0.5 * (columns - 1) + self.border), -self.cell * (0.5 * (rows - 1) + self.border)
 
     @property
     def first_position(self) -> tuple[float, float]:
-        """The first position (x, y) that is looked at, m."""
+        """First searched position (x, y) [m]."""
         rows, columns = self.positions
         return -self.cell * 0.5 * (columns - 1), -self.cell * 0.5 * (rows - 1)

@@ -1,8 +1,13 @@
-"""Whether what a robot sees is its field: more points on lines than chance brings, and lines seen where they must be.
+"""Evidence that a robot sees its field: more points on lines than by chance, and lines where they must be seen.
 
-`chance` weighs how many points lie on lines at a pose, however that pose was found: the expected number of poses that
-random points would fit as well (a-contrario test of Desolneux, Moisan and Morel). `expected_crossings` tells where scan
-lines cross the field's lines, so that lines that should be seen and are not count against a pose.
+`log_nfa` rates the number of points on lines at a pose, however that pose was found: the number of false alarms of an
+a-contrario test [1]_. `expected_crossings` predicts where scan lines cross the field's lines, so that missing lines
+count against a pose.
+
+References
+----------
+.. [1] A. Desolneux, L. Moisan and J.-M. Morel, "Meaningful alignments", International Journal of Computer Vision 40,
+   2000.
 """
 
 from __future__ import annotations
@@ -17,19 +22,21 @@ from gpuvision.matching.field.distance_map import Field
 
 Float64 = npt.NDArray[np.float64]
 
-_SHARES = (0.06, 0.12, 0.25, 0.5, 1.0)  # of the map's scale: how near to its line a point is on it
-_STEEP = 0.5  # sine of the least angle at which a line must be crossed to be expected
+# Distances, relative to the scale of the map, at which points count as on a line: octaves (each is one more test).
+_DISTANCE_RATIOS = (0.06, 0.12, 0.25, 0.5, 1.0)
+_MIN_SINE = 0.5  # of the angle at which a scan line must cross a line to find it surely: 30 degrees (chosen)
+_MIN_GAP = 3.0  # line widths between crossings that are expected separately (chosen)
 
 
 class Crossings(NamedTuple):
-    """Where scan lines cross the lines of a field.
+    """Crossings of scan lines with the lines of a field.
 
     Attributes
     ----------
-    places
-        (crossings, 2), in the robot's frame [m].
-    sines
-        (crossings,), of the angles at which they cross.
+    places : (crossings, 2)
+        Positions in the robot's frame [m].
+    sines : (crossings,)
+        Sines of the crossing angles.
     """
 
     places: Float64
@@ -37,28 +44,29 @@ class Crossings(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What speaks for a pose.
+    """Evidence for a pose.
 
     Attributes
     ----------
-    chance
-        Logarithm (natural) of how many poses random points would fit as well, see `chance`: above 0 it says nothing.
-    on_lines
-        Share of the points within a few centimetres of lines.
-    expected
-        How many crossings of scan lines with the field's lines should have been seen; 0 where that is not known.
-    seen
-        Share of them that is, beyond what points as dense as these meet by chance; NaN where none is expected.
+    log_nfa : float
+        Natural logarithm of the number of false alarms, see `log_nfa`: the pose is no better than chance where it is
+        above 0.
+    on_lines : float
+        Share of the points within half a line width of a line, 0 to 1.
+    expected : int
+        Number of crossings of scan lines with lines that should have been seen; 0 where the scan lines are unknown.
+    seen : float
+        Share of them that was seen, corrected for chance hits of equally dense points; NaN without expected crossings.
     """
 
-    chance: float
+    log_nfa: float
     on_lines: float
     expected: int
     seen: float
 
     @property
     def missing(self) -> float:
-        """How much should be seen and is not, beside what of the points is explained: 0 (or less) where all is seen."""
+        """Share of expected crossings not seen, over the share of points on lines; 0 or less where all are seen."""
         return (1.0 - self.seen) / max(self.on_lines, 1e-3) if self.expected else 0.0
 
 
@@ -68,90 +76,93 @@ def evidence(
     field: Field,
     pose: npt.ArrayLike,
     *,
-    near: float,
+    half_line_width: float,
     scale: float,
-    reach: float,
-    outside: float | None,
+    max_range: float,
+    margin: float | None,
 ) -> Evidence:
-    """Return what speaks for a pose.
+    """Compute the evidence for a pose.
 
     Parameters
     ----------
     points
-        (points, 2), in the robot's frame [m].
+        (points, 2) in the robot's frame [m].
     paths
-        (paths, 4), both ends of the scan lines that found them [m]; None: not known.
+        (paths, 4) both ends of the scan lines that found them [m]; None: unknown.
     field, pose
-        The field, and x, y [m] and heading [rad] on it.
-    near
-        How far from the middle of its line a point on it is at most [m]: half of the stripes' width.
-    scale, reach, outside
-        As `chance` takes them.
+        Field, and pose on it: x, y [m] and heading [rad].
+    half_line_width
+        Half the width of the lines [m]: largest distance of a point on a line from the line's centre.
+    scale, max_range, margin
+        As in `log_nfa`.
     """
     found = np.asarray(points, np.float64)
-    away = distances_to_lines(field, onto_field(found, pose))
-    # Points close together are of one thing, on a line or not: one of them counts.
+    away = distances_to_lines(field, robot_to_field(found, pose))
+    # Points close together belong to one object, on a line or not: one of them counts.
     _, alone = np.unique(np.floor(found / scale), axis=0, return_index=True)
-    by_chance = chance(away[alone], field, scale=scale, reach=reach, outside=outside)
-    on_lines = float(np.mean(away <= near))
+    nfa = log_nfa(away[alone], field, scale=scale, max_range=max_range, margin=margin)
+    on_lines = float(np.mean(away <= half_line_width))
     if paths is None or not np.size(paths):
-        return Evidence(by_chance, on_lines, 0, math.nan)
-    crossings = expected_crossings(field, pose, paths, line_width=2.0 * near)
+        return Evidence(nfa, on_lines, 0, math.nan)
+    crossings = expected_crossings(field, pose, paths, line_width=2.0 * half_line_width)
     ends = np.asarray(paths, np.float64)
     density = len(found) / float(np.sum(np.hypot(*(ends[:, 2:] - ends[:, :2]).T)))
-    windows = 2.0 * near * float(np.mean(1.0 / crossings.sines)) if len(crossings.sines) else 0.0
+    windows = 2.0 * half_line_width * float(np.mean(1.0 / crossings.sines)) if len(crossings.sines) else 0.0
     met = 1.0 - math.exp(-density * windows)
-    seen = (seen_share(crossings, found, near) - met) / max(1.0 - met, 1e-3)
-    return Evidence(by_chance, on_lines, len(crossings.sines), seen)
+    seen = (detected_fraction(crossings, found, half_line_width) - met) / max(1.0 - met, 1e-3)
+    return Evidence(nfa, on_lines, len(crossings.sines), seen)
 
 
-def chance(distances: npt.ArrayLike, field: Field, *, scale: float, reach: float, outside: float | None) -> float:
-    """Return the logarithm of how many poses random points would fit as well as these do, of all that are looked at.
+def log_nfa(distances: npt.ArrayLike, field: Field, *, scale: float, max_range: float, margin: float | None) -> float:
+    """Return the natural logarithm of the number of false alarms.
+
+    That is the expected number of poses, of all that are tested, that random points fit as well.
 
     Parameters
     ----------
     distances
-        Of the points from their nearest lines at the pose that fits them best [m].
+        Distances of the points from their nearest lines at the best pose [m].
     field
-        Its lines.
+        Lines of the field.
     scale
-        Points further off are on no line [m].
-    reach
-        How far points are seen [m].
-    outside
-        How far beside the field poses were looked for [m]; None: only near one, to ``scale``.
+        Largest distance of a point that counts as on a line [m].
+    max_range
+        Range at which points are seen [m].
+    margin
+        Border around the field in which poses were searched [m]; None: only near one pose, up to ``scale``.
 
     Notes
     -----
-    A point anywhere on the field is within t of lines of length l with a probability p = 2 t l / area; k of n
-    independent ones are with a probability of at most exp(-n KL(k/n, p)) (Chernoff). Poses that differ by more than t
-    are area / t^2 times 2 pi reach / t. Several t are tried, which multiplies the poses.
+    A random point on the field lies within t of lines of length l with probability p = 2 t l / area. At least k of n
+    independent points do so with a probability of at most exp(-n KL(k/n, p)) (Chernoff bound, KL the Kullback-Leibler
+    divergence). The number of poses that differ by more than t is area / t^2 times 2 pi max_range / t. Several t are
+    tried, which multiplies the number of tests.
     """
     away = np.abs(np.asarray(distances, np.float64))
     if not away.size:
         return math.inf
     size = math.hypot(field.length, field.width)
     area, turns = (2.0 * scale) ** 2, 2.0 * scale
-    if outside is not None:
-        area, turns = (field.length + 2.0 * outside) * (field.width + 2.0 * outside), 2.0 * math.pi * min(reach, size)
+    if margin is not None:
+        area, turns = (field.length + 2.0 * margin) * (field.width + 2.0 * margin), 2.0 * math.pi * min(max_range, size)
     best = math.inf
-    for share in _SHARES:
-        t = share * scale
-        p = min(2.0 * t * line_length(field) / (field.length * field.width), 0.99)
+    for ratio in _DISTANCE_RATIOS:
+        t = ratio * scale
+        p = min(2.0 * t * total_line_length(field) / (field.length * field.width), 0.99)
         k = float(np.mean(away <= t))
-        poses = max(area / t**2, 1.0) * max(turns / t, 1.0) * len(_SHARES)
+        poses = max(area / t**2, 1.0) * max(turns / t, 1.0) * len(_DISTANCE_RATIOS)
         best = min(best, math.log(poses) - away.size * _divergence(k, p))
     return best
 
 
-def line_length(field: Field) -> float:
-    """Return how long the lines of a field are together [m]."""
+def total_line_length(field: Field) -> float:
+    """Return the total length of the lines and arcs of a field [m]."""
     straight = sum(math.hypot(x1 - x0, y1 - y0) for x0, y0, x1, y1 in field.lines)
     return straight + sum(each.radius * (each.end - each.start) for each in field.arcs)
 
 
 def _divergence(share: float, p: float) -> float:
-    """Kullback and Leibler's divergence of two coins, 0 where the share is no more than expected."""
+    """Return the Kullback-Leibler divergence of two Bernoulli distributions, 0 where the share is not above p."""
     if share <= p:
         return 0.0
     rest = 0.0 if share >= 1.0 else (1.0 - share) * math.log((1.0 - share) / (1.0 - p))
@@ -159,7 +170,7 @@ def _divergence(share: float, p: float) -> float:
 
 
 def distances_to_lines(field: Field, places: npt.ArrayLike) -> Float64:
-    """Return how far places (..., 2) on the field are from its nearest line [m]."""
+    """Return the distances of places (..., 2) on the field from the nearest line [m]."""
     x, y = np.moveaxis(np.asarray(places, np.float64)[..., None, :], -1, 0)
     away = [np.full(x.shape[:-1], np.inf)]
     if field.lines:
@@ -177,7 +188,7 @@ def distances_to_lines(field: Field, places: npt.ArrayLike) -> Float64:
     return np.asarray(np.min(away, axis=0))
 
 
-def onto_field(points: npt.ArrayLike, pose: npt.ArrayLike) -> Float64:
+def robot_to_field(points: npt.ArrayLike, pose: npt.ArrayLike) -> Float64:
     """Return places (..., 2) in the robot's frame as places on the field."""
     x, y, heading = np.asarray(pose, np.float64)
     turn = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
@@ -185,21 +196,23 @@ def onto_field(points: npt.ArrayLike, pose: npt.ArrayLike) -> Float64:
 
 
 def expected_crossings(field: Field, pose: npt.ArrayLike, paths: npt.ArrayLike, *, line_width: float) -> Crossings:
-    """Return where scan lines must find a stripe: crossings at 30 degrees or more, by themselves and off the ends.
+    """Return the crossings at which a scan line must find a stripe.
+
+    These are crossings at 30 degrees or more, away from other crossings and from the ends of lines and scan lines.
 
     Parameters
     ----------
     field
-        Its lines.
+        Lines of the field.
     pose
         (3,): x, y [m] and heading [rad] of the robot.
     paths
-        (paths, 4), x, y of both ends of the scan lines in the robot's frame [m].
+        (paths, 4) both ends of the scan lines in the robot's frame [m].
     line_width
-        Of the stripes [m]: crossings nearer than 3 of it to another one are left out.
+        Width of the stripes [m]: crossings nearer than 3 widths to another one are left out.
     """
     ends = np.asarray(paths, np.float64).reshape(-1, 2, 2)
-    start, end = np.moveaxis(onto_field(ends, pose), 1, 0)
+    start, end = np.moveaxis(robot_to_field(ends, pose), 1, 0)
     length = np.linalg.norm(end - start, axis=-1)
     way = (end - start) / np.maximum(length, 1e-12)[:, None]
     found = [_across_line(start, way, each, line_width) for each in field.lines]
@@ -212,15 +225,15 @@ def expected_crossings(field: Field, pose: npt.ArrayLike, paths: npt.ArrayLike, 
     order = np.lexsort((away, path))
     path, away, sines, clear = (each[order] for each in (path, away, sines, clear))
     gap = np.where(path[1:] == path[:-1], away[1:] - away[:-1], np.inf)
-    alone = np.minimum(np.append(gap, np.inf), np.append(np.inf, gap)) > 3.0 * line_width
-    good = alone & clear & (sines >= _STEEP) & (away > line_width) & (away < length[path] - line_width)
+    alone = np.minimum(np.append(gap, np.inf), np.append(np.inf, gap)) > _MIN_GAP * line_width
+    good = alone & clear & (sines >= _MIN_SINE) & (away > line_width) & (away < length[path] - line_width)
     first, last = ends[path[good], 0], ends[path[good], 1]
     share = (away[good] / length[path[good]])[:, None]
     return Crossings(first + share * (last - first), sines[good])
 
 
-def seen_share(crossings: Crossings, points: npt.ArrayLike, tolerance: float) -> float:
-    """Return the share of the crossings at which there is a point, ``tolerance`` from the line at most; NaN of none."""
+def detected_fraction(crossings: Crossings, points: npt.ArrayLike, tolerance: float) -> float:
+    """Return the share of the crossings with a point within ``tolerance`` [m] of the line; NaN without crossings."""
     if not len(crossings.places):
         return math.nan
     seen = [
@@ -234,7 +247,7 @@ _Found = tuple[npt.NDArray[np.intp], Float64, Float64, npt.NDArray[np.bool_]]
 
 
 def _across_line(start: Float64, way: Float64, line: tuple[float, ...], line_width: float) -> _Found:
-    """Find which scan lines cross a line, how far on, at which sine, and whether off its ends."""
+    """Return which scan lines cross a line, at which distance and sine, and whether away from the line's ends."""
     x0, y0, x1, y1 = line
     size = math.hypot(x1 - x0, y1 - y0)
     ex, ey = (x1 - x0) / size, (y1 - y0) / size
@@ -249,7 +262,7 @@ def _across_line(start: Float64, way: Float64, line: tuple[float, ...], line_wid
 
 
 def _across_arc(start: Float64, way: Float64, arc: tuple[float, ...], sign: float, line_width: float) -> _Found:
-    """Find the same of an arc: where scan lines go into its circle (-1), or out of it (1)."""
+    """Return the same for an arc: crossings into its circle (sign -1) or out of it (sign 1)."""
     x, y, radius, first, last = arc
     dx, dy = x - start[:, 0], y - start[:, 1]
     ahead, aside = dx * way[:, 0] + dy * way[:, 1], dy * way[:, 0] - dx * way[:, 1]

@@ -1,8 +1,14 @@
-"""Where on a field a robot is: points on lines that it sees, against the map of the lines (thesis, section 6.4).
+"""Global and local localization of a robot on a field from points on its lines.
 
-Two tiers. `FieldPoseSearch` looks at every pose of a grid; `FieldPoseRefinement` takes the best ones to where the cost
-is least, with a covariance. `locate` does both. Fields are in `gpuvision.matching.field.distance_map`, what is known
-from odometry goes in by `gpuvision.matching.field.odometry`.
+`FieldPoseSearch` scores every pose of a grid; `FieldPoseRefinement` minimises the cost from the best ones and gives
+their covariance; `find_pose_candidates` does both. Fields and their distance maps are in
+`gpuvision.matching.field.distance_map`; `gpuvision.matching.field.odometry` combines the pose with odometry.
+
+References
+----------
+.. [1] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 6.4.
+.. [2] M. Lauer, S. Lange and M. Riedmiller, "Calculating the perfect match: an efficient and accurate approach for
+   robot self-localization", RoboCup 2005.
 """
 
 from __future__ import annotations
@@ -15,8 +21,23 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, LaunchBuilder, Spec, Variant, WorkSize, capacity, ceil_div, flags, round_up
-from gpuvision.matching.field.distance_map import LEVELS, DistanceMap
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    IntArray,
+    Launch,
+    LaunchBuilder,
+    Spec,
+    StatusArray,
+    Variant,
+    WorkSize,
+    capacity,
+    ceil_div,
+    flags,
+    round_up,
+    to_numpy,
+)
+from gpuvision.matching.field.distance_map import COST_LEVELS, DistanceMap
 from gpuvision.operation import VisionOperation
 from gpuvision.status import Status
 from gpuvision.validation import finite
@@ -24,28 +45,29 @@ from gpuvision.validation import finite
 _BLOCK, _MOST_POINTS = 64, 4096
 # Shares of the rows per core, so that the cores end together, and rows for which a point's shift is worth its work.
 _SHARES_PER_CORE, _FEWEST_ROWS = 4, 4
-_WEAKEST = 1e-3
+# Ratio of eigenvalues of the information below which the points do not determine the pose (chosen).
+_MIN_EIGENVALUE_RATIO = 1e-3
 
 
 class PoseCosts(NamedTuple):
-    """What the points cost, 0 (all on lines) to 1, by heading and position.
+    """Mean cost of the points, 0 (all on lines) to 1, by heading and position.
 
     Attributes
     ----------
-    scores
-        float32 (headings, rows, columns), mean cost of the points; None unless asked for.
-    least
-        float32 (headings, rows, blocks), the least score of 64 positions side by side. NaN where no point is used.
-    column
-        int32 (headings, rows, blocks), where that is; the first of several.
-    seen
-        int32 (headings,), how many points are used: those that are finite and no further than the map's reach.
+    scores : float32, (headings, rows, columns), optional
+        Mean cost of the points at every pose; None unless ``with_scores``.
+    least : float32, (headings, rows, blocks)
+        Least score of each block of 64 adjacent positions. NaN where no point is used.
+    column : int32, (headings, rows, blocks)
+        Column of the least score; the first one of equal scores.
+    seen : int32, (headings,)
+        Number of points used: those that are finite and within the range of the map.
     """
 
-    scores: Any
-    least: Any
-    column: Any
-    seen: Any
+    scores: FloatArray | None
+    least: FloatArray
+    column: IntArray
+    seen: IntArray
 
 
 def pose_grid_work(build: LaunchBuilder, headings: int, rows: int, columns: int) -> WorkSize:
@@ -69,29 +91,33 @@ def pose_cost_outputs(
 
 @dataclass(frozen=True, kw_only=True)
 class FieldPoseSearch(VisionOperation[PoseCosts]):
-    """Score all poses of a grid: ``op(points) -> PoseCosts``, points float32 (points, 2), in the robot's frame [m].
+    """Score of every pose of a grid: ``op(points) -> PoseCosts``.
+
+    The points are float32 (points, 2), in the robot's frame [m], up to 4096.
 
     Parameters
     ----------
-    map
-        The field. Positions are its cells; row ``r`` and column ``c`` is ``map.first_position + map.cell * (c, r)``.
-    headings
-        How many, all around from 0; or which [rad].
-    with_scores
-        Also give every pose's score, not only the least of each block.
-    variant
-        "vector" (64 positions at once, for CPU runtimes), "work_item" (a work-item per position, for GPUs), or "auto".
+    map : DistanceMap
+        Distance map of the field. The positions are its cells: row ``r`` and column ``c`` is at ``map.first_position +
+        map.cell * (c, r)``.
+    headings : int or tuple of float
+        Number of headings, evenly from 0 all around, default 72; or the headings [rad].
+    with_scores : bool
+        Whether to return the score of every pose, besides the least of each block.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: "vector" computes 64 positions at once (CPU runtimes), "work_item" one position per work-item
+        (GPUs).
 
     Raises
     ------
-    ValueError
-        There is no heading.
+    TypeError, ValueError
+        The map is not a `DistanceMap`, or there is no heading.
 
     Notes
     -----
-    A point costs d^2 / (c^2 + d^2) at the middle of the nearest cell: half a cell's diagonal at most from where it
-    is, and c and the slope 0.65 / c of the cost bound what that makes of a score: 0.46 cell / c; in the mean over many
-    points it is far less. The cost itself is rounded to 1/2046. The sum is exact.
+    A point costs d^2 / (c^2 + d^2) with c the scale of the map, taken at the centre of the nearest cell, half a cell
+    diagonal away at most. The slope of the cost is 0.65 / c at most, so that a score is wrong by 0.46 cell / c at most;
+    the mean over many points is far better. Costs are rounded to 1/2046; the sum is exact.
     """
 
     Result: ClassVar[type[Any]] = PoseCosts
@@ -113,7 +139,7 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
 
     @property
     def angles(self) -> npt.NDArray[np.float64]:
-        """The headings, rad."""
+        """Headings [rad]."""
         if isinstance(self.headings, tuple):
             return np.array(self.headings, np.float64)
         count = max(operator.index(self.headings), 0)
@@ -133,7 +159,7 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
             outputs=pose_cost_outputs(build, len(angles), rows, columns, with_scores=self.with_scores),
             defines={
                 "CAPACITY": capacity(count, least=64),
-                "FIELD_LEVELS": LEVELS,
+                "FIELD_LEVELS": COST_LEVELS,
                 **flags(WITH_SCORES=self.with_scores),
             },
             arguments=[
@@ -141,46 +167,49 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
                 np.stack([np.cos(angles), np.sin(angles)], axis=-1).astype(np.float32),
                 *map(np.int32, (count, rows, columns, self.map.border, self.map.cells.level.shape[1])),
                 np.float32(1.0 / self.map.cell),
-                np.float32(self.map.reach**2),
+                np.float32(self.map.max_range**2),
                 np.int32(work.each),
             ],
         )
 
-    def best(self, costs: PoseCosts, most: int = 8, *, apart: tuple[float, float] | None = None) -> RoughPoses:
-        """Return the best poses that are ``apart`` (m or rad) from each better one, best first.
+    def best(
+        self, costs: PoseCosts, max_candidates: int = 8, *, separation: tuple[float, float] | None = None
+    ) -> RoughPoses:
+        """Return the best poses of the grid, best first, with non-maximum suppression.
 
         Parameters
         ----------
         costs
-            What this operation gave, NumPy arrays.
-        most
-            How many at most.
-        apart
-            Poses that are nearer than this to a better one, in place (m) and in heading (rad), are the same. None:
-            twice the map's scale, and 20 degrees.
+            Result of this operation, NumPy arrays.
+        max_candidates
+            Largest number of poses, default 8.
+        separation
+            Distance [m] and angle [rad]: a pose within both of a better one is suppressed. None: twice the scale of the
+            map, and 20 degrees.
         """
-        far, turned = (2.0 * self.map.scale, math.radians(20.0)) if apart is None else apart
-        least = costs.least.ravel().copy()
+        far, turned = (2.0 * self.map.scale, math.radians(20.0)) if separation is None else separation
+        least_of_block = to_numpy(costs.least)
+        least = least_of_block.ravel().copy()
         least[~np.isfinite(least)] = np.inf
-        turn, row, _ = np.unravel_index(np.arange(least.size), costs.least.shape)
+        turn, row, _ = np.unravel_index(np.arange(least.size), least_of_block.shape)
         x0, y0 = self.map.first_position
-        x, y = x0 + self.map.cell * costs.column.ravel(), y0 + self.map.cell * row
+        x, y = x0 + self.map.cell * to_numpy(costs.column).ravel(), y0 + self.map.cell * row
         angles = self.angles[turn]
         chosen: list[int] = []
-        while len(chosen) < most:
+        while len(chosen) < max_candidates:
             number = int(np.argmin(least))
             if not np.isfinite(least[number]):
                 break
             chosen.append(number)
-            near = np.flatnonzero((x - x[number]) ** 2 + (y - y[number]) ** 2 < far**2)
-            least[near[np.abs(_wrapped(angles[near] - angles[number])) < turned]] = np.inf
+            close = np.flatnonzero((x - x[number]) ** 2 + (y - y[number]) ** 2 < far**2)
+            least[close[np.abs(_wrapped(angles[close] - angles[number])) < turned]] = np.inf
             least[number] = np.inf
         poses = np.stack([x[chosen], y[chosen], angles[chosen]], axis=-1)
-        return RoughPoses(poses, costs.least.ravel()[chosen])
+        return RoughPoses(poses, least_of_block.ravel()[chosen])
 
 
 class RoughPoses(NamedTuple):
-    """Poses (poses, 3): x, y [m] and heading [rad]; and what each costs, 0 to 1."""
+    """Poses (poses, 3), x, y [m] and heading [rad], and their costs (poses,), 0 to 1."""
 
     poses: npt.NDArray[np.float64]
     scores: npt.NDArray[np.float32]
@@ -191,67 +220,75 @@ class FieldPoses(NamedTuple):
 
     Attributes
     ----------
-    poses
-        (starts, 3): x, y [m] and heading [rad], -pi to pi.
-    covariance
-        (starts, 3, 3) of them; NaN where the points do not fix the pose.
-    information
-        (starts, 3, 3), its inverse, which is known also where the points fix a part of the pose only.
-    score
-        (starts,) mean cost of the points used, 0 to 1.
-    scale
-        (starts,) standard deviation of a point's distance, of one without outliers, m.
-    share
-        (starts,) of the points that lie within ``scale`` of the map (its c) from a line.
-    status
-        uint8 `Status` flags. AMBIGUOUS (with a pose): the points fix a part of the pose only, as those of one line or
-        of one circle do; along the rest the pose is about where it started. LOW_SIGNAL: fewer than four points on
-        lines. OUT_OF_RANGE: the pose left the map. NOT_FINITE: the start is not, or lies beyond 1e6 m. All else is NaN
-        then.
+    poses : float32, (starts, 3)
+        x, y [m] and heading [rad], -pi to pi.
+    covariance : float32, (starts, 3, 3)
+        Covariance of the pose; NaN where the points do not determine it.
+    information : float32, (starts, 3, 3)
+        Inverse covariance, defined also where the points determine a part of the pose only.
+    score : float32, (starts,)
+        Mean cost of the points used, 0 to 1.
+    residual_std : float32, (starts,)
+        Standard deviation of an inlier's distance to its line [m].
+    inlier_fraction : float32, (starts,)
+        Share of the points within the scale of the map from a line.
+    status : uint8, (starts,)
+        `Status` flags. AMBIGUOUS (with a pose): the points determine a part of the pose only, like those of one line or
+        of one circle; the rest of the pose stays near the start. Otherwise all fields are NaN: LOW_SIGNAL (fewer than
+        four points on lines), OUT_OF_RANGE (the pose left the map), NOT_FINITE (the start is not finite, or beyond 1e6
+        m).
     """
 
-    poses: Any
-    covariance: Any
-    information: Any
-    score: Any
-    scale: Any
-    share: Any
-    status: Any
+    poses: FloatArray
+    covariance: FloatArray
+    information: FloatArray
+    score: FloatArray
+    residual_std: FloatArray
+    inlier_fraction: FloatArray
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
 class FieldPoseRefinement(VisionOperation[FieldPoses]):
-    """Take rough poses to the least cost: ``op(points, starts) -> FieldPoses``, float32 (points, 2) and (starts, 3).
+    """Refinement of rough poses to the least cost: ``op(points, starts) -> FieldPoses``.
+
+    Points are float32 (points, 2), in the robot's frame [m]; starts are float32 (starts, 3), x, y [m] and heading
+    [rad].
 
     Parameters
     ----------
-    map
-        The field; its ``scale`` is c of the cost r^2 / (c^2 + r^2).
-    steps
-        At most so many steps (Levenberg-Marquardt).
-    count
-        How many starts; None: as many as a call brings. To bind it must be said.
+    map : DistanceMap
+        Distance map of the field; its ``scale`` is c of the cost r^2 / (c^2 + r^2) (Geman-McClure loss).
+    max_iterations : int
+        Largest number of Levenberg-Marquardt steps, 1 or more, default 40.
+    count : int, optional
+        Number of starts. None takes the number from a call; `bind` needs a number.
+
+    Raises
+    ------
+    TypeError, ValueError
+        A parameter is out of its range or of a wrong type.
 
     Notes
     -----
-    Distances to lines are exact, the map only says which ones to look at (four for a cell: where five meet in one cell,
-    the wrong one may be taken). So the pose is that of least cost to 3e-5 m and rad: rounding in a field of 20 m.
-    The covariance is an M-estimator's: from the curvature of the cost and the scatter of the
-    points themselves: over random poses on the middle-size field, 128 points of 1 to 3 cm, sigmas are right to 5 %. It
-    knows nothing of errors that points have in common, such as a wrong scale of the camera's.
+    Error: distances to lines are exact; the map only gives the lines to consider (four for each cell: where five lines
+    meet in one cell, the wrong one may be taken). The pose is that of least cost to 3e-5 m and rad, the rounding in a
+    field of 20 m. The covariance is that of an M-estimator, from the curvature of the cost and the residuals of the
+    points: over random poses on the middle-size field, with 128 points of 1 to 3 cm noise, its standard deviations are
+    right to 5 %. It does not contain errors that the points have in common, such as a wrong scale of the camera.
     """
 
     Result: ClassVar[type[Any]] = FieldPoses
 
     map: DistanceMap
-    steps: int = 40
+    max_iterations: int = 40
     count: int | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.map, DistanceMap):
             raise TypeError(f"FieldPoseRefinement.map is {self.map!r}, expected a DistanceMap")
-        if operator.index(self.steps) < 1:
-            raise ValueError(f"FieldPoseRefinement.steps is {self.steps}, expected 1 or more")
+        if operator.index(self.max_iterations) < 1:
+            raise ValueError(f"FieldPoseRefinement.max_iterations is {self.max_iterations}, expected 1 or more")
 
     def __call__(self, *inputs: Any, device: Device | None = None, out: FieldPoses | None = None) -> FieldPoses:
         """Run once, as every `Operation`; with ``count=None`` for as many starts as there are."""
@@ -272,129 +309,136 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
             "field_refine",
             work=WorkSize(starts, (1,)),
             more_inputs=[((self.count, 3), build.real)],
-            outputs=build.outputs(shapes | dict.fromkeys(("score", "scale", "share", "status"), starts)),
-            defines={"WEAKEST": f"{_WEAKEST}f"},
+            outputs=build.outputs(
+                shapes | dict.fromkeys(("score", "residual_std", "inlier_fraction", "status"), starts)
+            ),
+            defines={"WEAKEST": f"{_MIN_EIGENVALUE_RATIO}f"},
             arguments=[
                 self.map.field.shapes.astype(np.float32).ravel(),
                 cells,
                 *map(np.int32, (points, *cells.shape[:2])),
-                *map(np.float32, (*self.map.first, self.map.cell, self.map.scale**2, self.map.reach**2)),
-                np.int32(self.steps),
+                *map(np.float32, (*self.map.first, self.map.cell, self.map.scale**2, self.map.max_range**2)),
+                np.int32(self.max_iterations),
             ],
             passes_once=self.count == 1,
         )
 
 
-class Candidate(NamedTuple):
-    """A pose that a robot may have.
+class PoseCandidate(NamedTuple):
+    """A candidate for the pose of a robot.
 
     Attributes
     ----------
-    pose
-        (3,): x, y [m] and heading [rad].
-    covariance, information
-        (3, 3) of it; the covariance is NaN where the points do not fix the pose.
-    score
+    pose : (3,)
+        x, y [m] and heading [rad].
+    covariance, information : (3, 3)
+        Covariance and its inverse; the covariance is NaN where the points do not determine the pose.
+    score : float
         Mean cost of the points used, 0 to 1.
-    scale
-        Standard deviation of a point's distance to its line, m.
-    share
-        Of the points, those that lie on lines.
-    twin
-        Number of the candidate that the field's symmetry makes of this one: nothing seen tells them apart. None: not
-        among the candidates.
-    status
-        OK; or AMBIGUOUS: the points fix a part of the pose only.
+    residual_std : float
+        Standard deviation of an inlier's distance to its line [m].
+    inlier_fraction : float
+        Share of the points that lie on lines.
+    symmetric_twin : int, optional
+        Index of the candidate that the field's symmetry maps this one to: no measurement of lines can tell them apart.
+        None: it is not among the candidates.
+    status : Status
+        OK; or AMBIGUOUS: the points determine a part of the pose only.
     """
 
     pose: npt.NDArray[np.float64]
     covariance: npt.NDArray[np.float64]
     information: npt.NDArray[np.float64]
     score: float
-    scale: float
-    share: float
-    twin: int | None
+    residual_std: float
+    inlier_fraction: float
+    symmetric_twin: int | None
     status: Status
 
 
-def locate(
+def find_pose_candidates(
     field_map: DistanceMap,
     points: npt.NDArray[np.float32],
     *,
-    near: npt.ArrayLike | None = None,
+    initial_pose: npt.ArrayLike | None = None,
     headings: int | tuple[float, ...] = 72,
-    most: int = 6,
+    max_candidates: int = 6,
     device: Device | None = None,
-) -> tuple[Candidate, ...]:
-    """Return the poses that fit the points, best first; none where no pose does.
+) -> tuple[PoseCandidate, ...]:
+    """Return the poses that fit the points, best first; an empty tuple where no pose does.
 
-    A robot that sees 6 m of a middle-size field is found with 70 % of its points in clutter (150 of 150, up to the
-    field's symmetry). One that sees 3 m often is not: another place fits as well, and the candidates say so.
+    A robot that sees 6 m of a middle-size field is found with 70 % of its points in clutter (150 of 150 trials, up to
+    the field's symmetry). One that sees 3 m is often not found: another place fits as well, and is among the
+    candidates.
 
     Parameters
     ----------
     field_map
-        The field.
+        Distance map of the field.
     points
-        float32 (points, 2), on lines, in the robot's frame [m].
-    near
-        A rough pose (3,), or several (poses, 3): refined, nothing else is searched. None: everywhere.
+        float32 (points, 2), points on lines in the robot's frame [m].
+    initial_pose
+        One rough pose (3,), or several (poses, 3), to refine without a search. None: search everywhere.
     headings
-        How many are looked at, all around; or which [rad], where a compass says.
-    most
-        At most so many candidates.
+        Number of headings of the search, all around, default 72; or the headings [rad], for instance from a compass.
+    max_candidates
+        Largest number of candidates, default 6.
     device
-        Where; None: the best.
+        Where to run; None: `Device.best`.
 
     Raises
     ------
     TypeError, ValueError
-        The points or the rough poses are not what was expected.
+        The points or the initial poses have a wrong type or shape.
     """
-    if near is None:
+    if initial_pose is None:
         search = FieldPoseSearch(map=field_map, headings=headings)
-        starts = search.best(search(points, device=device), most).poses
+        starts = search.best(search(points, device=device), max_candidates).poses
     else:
-        starts = np.atleast_2d(np.asarray(near, np.float64))
+        starts = np.atleast_2d(np.asarray(initial_pose, np.float64))
         if starts.ndim != 2 or starts.shape[1] != 3:
-            raise ValueError(f"near has shape {np.shape(near)}, expected (3,) or (poses, 3): x, y, heading")
+            raise ValueError(
+                f"initial_pose has shape {np.shape(initial_pose)}, expected (3,) or (poses, 3): x, y, heading"
+            )
     if not len(starts):
         return ()
     fits = FieldPoseRefinement(map=field_map)(points, starts.astype(np.float32), device=device)
-    order = [each for each in np.argsort(fits.score) if np.isfinite(fits.score[each])]
+    score, fitted = to_numpy(fits.score), to_numpy(fits.poses)
     kept: list[int] = []
-    for number in order:
-        if not any(_same(fits.poses[number], fits.poses[other]) for other in kept):
+    for number in np.argsort(score):
+        if np.isfinite(score[number]) and not any(_same(fitted[number], fitted[other]) for other in kept):
             kept.append(int(number))
-    poses = [fits.poses[number].astype(np.float64) for number in kept]
+    poses = [fitted[number].astype(np.float64) for number in kept]
+    covariance, information, status = to_numpy(fits.covariance), to_numpy(fits.information), to_numpy(fits.status)
+    residual_std, inlier_fraction = to_numpy(fits.residual_std), to_numpy(fits.inlier_fraction)
     return tuple(
-        Candidate(
+        PoseCandidate(
             pose=pose,
-            covariance=fits.covariance[number].astype(np.float64),
-            information=fits.information[number].astype(np.float64),
-            score=float(fits.score[number]),
-            scale=float(fits.scale[number]),
-            share=float(fits.share[number]),
-            twin=_twin_of(pose, poses) if field_map.field.is_symmetric else None,
-            status=Status(int(fits.status[number])),
+            covariance=covariance[number].astype(np.float64),
+            information=information[number].astype(np.float64),
+            score=float(score[number]),
+            residual_std=float(residual_std[number]),
+            inlier_fraction=float(inlier_fraction[number]),
+            symmetric_twin=_index_of_twin(pose, poses) if field_map.field.is_symmetric else None,
+            status=Status(int(status[number])),
         )
         for number, pose in zip(kept, poses, strict=True)
     )
 
 
-def twin_of(pose: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return the pose half a turn about the field's middle away, (..., 3)."""
+def symmetric_twin(pose: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return the pose (..., 3) half a turn about the centre of the field away."""
     x, y, heading = np.moveaxis(np.asarray(pose, np.float64), -1, 0)
     return np.stack([-x, -y, _wrapped(heading + math.pi)], axis=-1)
 
 
-def _twin_of(pose: npt.NDArray[np.float64], poses: list[npt.NDArray[np.float64]]) -> int | None:
-    other = twin_of(pose)
+def _index_of_twin(pose: npt.NDArray[np.float64], poses: list[npt.NDArray[np.float64]]) -> int | None:
+    other = symmetric_twin(pose)
     return next((number for number, each in enumerate(poses) if _same(other, each)), None)
 
 
 def _same(pose: npt.NDArray[Any], other: npt.NDArray[Any]) -> bool:
-    """Whether two poses are one: 3 cm and 1 degree, more than where two starts of one valley end."""
+    """Return whether two poses are equal to 3 cm and 0.02 rad (chosen: refinements of one minimum end nearer)."""
     dx, dy, turn = np.asarray(pose, np.float64) - other
     return bool(math.hypot(dx, dy) < 0.03 and abs(_wrapped(turn)) < 0.02)
 

@@ -1,4 +1,7 @@
-"""White stripes on a floor along scan lines through an image of it: points on lines, and where they were looked for."""
+"""Detection of white stripes on a floor along scan lines: points on field lines, and where they were looked for.
+
+Calipers (rulers) that measure pairs of edges are placed along the scan lines.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +18,34 @@ from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.camera.image import estimate_pixel_noise
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.ruler import RulerEdges
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 
-FINEST_PX = 3.0
-"""A line's width in the image, at least."""
-_RULER, _TAPS = 128, 3.0  # samples of a piece of a scan line; sigmas of its smoothing either side
-_MARGIN_PX = 3.0
+MIN_LINE_WIDTH_PX = 3.0
+"""Least width of a line in the image [px]: below, its two edges blur into one another."""
+_RULER_LENGTH = 128  # samples of a piece of a scan line
+_TAPS_PER_SIGMA = 3.0  # of `RulerEdges`
+_MARGIN_PX = 3.0  # between rulers and the image's border
+# Widths of accepted stripes relative to the expected width (chosen).
+_MIN_WIDTH_RATIO, _MAX_WIDTH_RATIO = 0.4, 3.0
 
 
 class FloorScan(NamedTuple):
-    """What scan lines over a floor found, in the robot's frame: x ahead, y to its left [m].
+    """Result of a scan of the floor, in the robot's frame: x ahead, y to its left [m].
 
     Attributes
     ----------
-    points
-        float32 (points, 2), the middles of white stripes.
-    sigmas
-        float32 (points,), standard deviations along their scan lines, as the image's noise has it [m].
-    paths
-        float32 (paths, 4), x, y of both ends of what was scanned: a stripe across one of them would have been found.
-    line_width
-        Of the stripes [m].
+    points : float32, (points, 2)
+        Centres of white stripes [m].
+    sigmas : float32, (points,)
+        Standard deviations along the scan lines due to the noise of the image [m].
+    paths : float32, (paths, 4)
+        x, y of both ends of the scanned lines [m]: a stripe across one of them would have been found.
+    line_width : float
+        Width of the stripes [m].
     """
 
     points: Float32
@@ -58,104 +64,103 @@ def scan_top_view(
     threshold: float,
     device: Device | None,
 ) -> FloorScan:
-    """Scan a top view along rays from its middle.
+    """Scan a top view along rays from its centre.
 
     Parameters
     ----------
     white
-        Grey levels.
+        Grey levels (rows, columns).
     view
-        How the camera sees the floor.
+        Pose and scale of the camera over the floor.
     line_width
-        Of the stripes [m].
+        Width of the stripes [m].
     rays
-        How many, all around.
+        Number of rays, all around.
     blind
-        Where they begin [m].
+        Distance from the centre at which the rays begin [m].
     threshold
-        Least edge [grey levels].
+        Least height of an edge [grey levels].
     device
         Where to run; None: `Device.best`.
 
     Raises
     ------
     ValueError
-        Lines are too narrow in the image, or it is too small.
+        The lines are too narrow in the image, or the image is too small.
     """
     width_px = line_width / view.scale
-    if not width_px >= FINEST_PX:
+    if not width_px >= MIN_LINE_WIDTH_PX:
         raise ValueError(
             f"lines of {line_width:.3g} m are {width_px:.1f} px wide at {view.scale:.3g} m per pixel, expected "
-            f"{FINEST_PX:g} px or more; is the scale right?"
+            f"{MIN_LINE_WIDTH_PX:g} px or more; is the scale right?"
         )
-    rulers = stripe_rulers(white, width_px, threshold, view.model)
+    rulers = stripe_ruler(white, width_px, threshold, view.model)
     starts, ends = _rays(view, rays, blind)
     ways = (ends - starts) / np.linalg.norm(ends - starts, axis=-1, keepdims=True)
-    # Near a ruler's ends nothing is found: rays begin so much behind the middle, and end so much before the border.
-    unseen = trimmed(rulers) * ways
-    pieces, path = laid_along(starts - unseen, ends, rulers, width_px)
+    # Near a ruler's ends no edge is found: the rulers extend by this much beyond the scanned part of a ray.
+    unseen = end_margin_px(rulers) * ways
+    pieces, path = place_rulers_along(starts - unseen, ends, rulers, width_px)
     if not len(pieces):
         raise ValueError(
             f"the image of {white.shape[1]} x {white.shape[0]} px has no room for a ray of "
-            f"{(_RULER - 1) * rulers.step_px:.0f} px beside what is blind; give a larger one"
+            f"{(_RULER_LENGTH - 1) * rulers.step_px:.0f} px outside the blind area; give a larger image"
         )
     edges = rulers(white, pieces, device=device)
-    places = pieces[:, None, :2] + edges.position[..., None] * pieces[:, None, 2:]
-    found = np.isfinite(edges.position)
+    position, sigma = to_numpy(edges.position), to_numpy(edges.sigma)
+    places = pieces[:, None, :2] + position[..., None] * pieces[:, None, 2:]
+    found = np.isfinite(position)
     points = view.to_plane(places[found])
-    kept = once(points, np.broadcast_to(path[:, None], found.shape)[found], np.hypot(*points.T), line_width)
+    kept = unique_points(points, np.broadcast_to(path[:, None], found.shape)[found], np.hypot(*points.T), line_width)
     used = np.unique(path)
     paths = np.concatenate([view.to_plane(starts), view.to_plane(ends - unseen)], axis=-1)
     return FloorScan(
         points=np.ascontiguousarray(points[kept], np.float32),
-        sigmas=np.ascontiguousarray(view.scale * edges.sigma[found][kept], np.float32),
+        sigmas=np.ascontiguousarray(view.scale * sigma[found][kept], np.float32),
         paths=np.ascontiguousarray(paths[used], np.float32),
         line_width=line_width,
     )
 
 
-def least_edge(white: npt.NDArray[Any]) -> float:
-    """Return the least edge that counts [grey levels]: 4 times the noise, and a tenth of the image's range."""
+def default_threshold(white: npt.NDArray[Any]) -> float:
+    """Return the default threshold [grey levels]: 4 times the noise, at least a tenth of the image's range."""
     low, high = np.percentile(white, [1, 99])
     return max(4.0 * estimate_pixel_noise(white), 0.1 * float(high - low), 1e-6)
 
 
-def stripe_rulers(
-    white: npt.NDArray[Any], width_px: float, threshold: float, model: Lens | Camera | None
-) -> RulerEdges:
-    """Return what looks for bright stripes about so wide [px], a piece of a scan line at a time."""
+def stripe_ruler(white: npt.NDArray[Any], width_px: float, threshold: float, model: Lens | Camera | None) -> RulerEdges:
+    """Return the caliper (ruler) for bright stripes of about a width [px], for one piece of a scan line."""
     step = max(width_px / 8.0, 1.0)
     return RulerEdges(
         threshold=threshold,
-        length=_RULER,
+        length=_RULER_LENGTH,
         width=3,
         step_px=step,
         smoothing_px=1.5 * step,
         polarity="rising",
-        choice="all",
-        most=8,
+        edge_selection="all",
+        max_edges=8,
         pairs=True,
-        spacing_px=(0.4 * width_px, 3.0 * width_px),
+        spacing_px=(_MIN_WIDTH_RATIO * width_px, _MAX_WIDTH_RATIO * width_px),
         noise=estimate_pixel_noise(white),
         model=model,
     )
 
 
-def trimmed(rulers: RulerEdges) -> float:
-    """Return how far from a ruler's ends edges are found [px]."""
-    return math.ceil(_TAPS * rulers.smoothing_px / rulers.step_px) * rulers.step_px
+def end_margin_px(rulers: RulerEdges) -> float:
+    """Return the distance from a ruler's ends within which no edge is found [px]."""
+    return math.ceil(_TAPS_PER_SIGMA * rulers.smoothing_px / rulers.step_px) * rulers.step_px
 
 
-def laid_along(
+def place_rulers_along(
     starts: Float64, ends: Float64, rulers: RulerEdges, width_px: float
 ) -> tuple[Float32, npt.NDArray[np.intp]]:
-    """Return rulers (n, 4) along scan lines, so that each stripe lies whole on one; and which line each is along.
+    """Return rulers (n, 4) along scan lines, and the scan line of each ruler.
 
-    Scan lines that are shorter than a ruler have none.
+    The rulers overlap so that each stripe lies wholly on one of them. Scan lines shorter than a ruler get none.
     """
     length = (rulers.length - 1) * rulers.step_px
-    hop = max(length - 2.0 * trimmed(rulers) - 3.0 * width_px, 0.25 * length)
-    laid: list[tuple[float, ...]] = []
+    hop = max(length - 2.0 * end_margin_px(rulers) - 3.0 * width_px, 0.25 * length)
+    rulers_along: list[tuple[float, ...]] = []
     path: list[int] = []
     for number, (start, end) in enumerate(zip(starts, ends, strict=True)):
         far = float(np.linalg.norm(end - start))
@@ -163,13 +168,13 @@ def laid_along(
             continue
         way = (end - start) / far
         middles = [*np.arange(length / 2, far - length / 2, hop), far - length / 2]
-        laid += [(*(start + middle * way), *way) for middle in middles]
+        rulers_along += [(*(start + middle * way), *way) for middle in middles]
         path += [number] * len(middles)
-    return np.array(laid, np.float32).reshape(-1, 4), np.array(path, np.intp)
+    return np.array(rulers_along, np.float32).reshape(-1, 4), np.array(path, np.intp)
 
 
-def once(points: Float64, path: npt.NDArray[Any], away: Float64, line_width: float) -> npt.NDArray[np.intp]:
-    """Return which points are left where two pieces of one scan line have found the same: sorted along it."""
+def unique_points(points: Float64, path: npt.NDArray[Any], away: Float64, line_width: float) -> npt.NDArray[np.intp]:
+    """Return the indices of the points without duplicates of overlapping rulers, sorted along their scan lines."""
     order = np.lexsort((away, path))
     points, path = points[order], path[order]
     gone = np.zeros(len(points), np.bool_)
@@ -179,7 +184,7 @@ def once(points: Float64, path: npt.NDArray[Any], away: Float64, line_width: flo
 
 
 def _rays(view: BoardView, rays: int, blind: float) -> tuple[Float64, Float64]:
-    """Return where rays from the middle of a view begin and where they leave the image, (n, 2) each [px]."""
+    """Return where rays from the centre of a view begin and where they leave the image, (n, 2) each [px]."""
     turns = np.arange(rays) * (2 * math.pi / rays)
     ways = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     away = np.arange(math.ceil(0.5 * math.hypot(*view.shape)) + 2)
@@ -193,54 +198,56 @@ def _rays(view: BoardView, rays: int, blind: float) -> tuple[Float64, Float64]:
 
 # ---- through a tilted camera -------------------------------------------------------------------------------------
 
-_SHORT = 64  # samples of a ruler
-_SAMPLES = 512  # of a scan line, where it is looked at what of it the image shows
+_SHORT_LENGTH = 64  # samples of a ruler
+_SAMPLES = 512  # of a scan line, to find its parts in the image
 
 
-def scan_ahead(
+def scan_tilted_view(
     white: npt.NDArray[Any],
     camera: MountedCamera,
     *,
     line_width: float,
     lines: int,
-    reach: float,
+    max_range: float,
     threshold: float,
     device: Device | None,
 ) -> FloorScan:
-    """Scan what a tilted camera sees of the floor: along rays from the place below it, and across them.
+    """Scan the floor in the image of a tilted camera: along rays from the place below it, and across them.
 
-    A line that lies across is soon thinner than pixels tell, one that runs ahead is not: scan lines across see it as
-    far as it is three pixels wide. Rulers are as long as lines are wide in the image there, an octave at a time.
+    A line across the view direction is soon thinner than pixels resolve, a line along it is not: the scan lines across
+    find it as far as it is three pixels wide. The length of the rulers follows the width of the lines in the image, by
+    octaves.
 
     Parameters
     ----------
     white
-        Grey levels.
+        Grey levels (rows, columns).
     camera
-        How it sees the floor.
+        Camera mounted on the robot.
     line_width
-        Of the stripes [m].
+        Width of the stripes [m].
     lines
-        How many rays, and half as many as lines across them.
-    reach
-        No further than that from the camera [m].
+        Number of rays, and twice as many lines across them.
+    max_range
+        Largest distance from the camera [m].
     threshold
-        Least edge [grey levels].
+        Least height of an edge [grey levels].
     device
         Where to run; None: `Device.best`.
 
     Raises
     ------
     ValueError
-        No part of the floor is seen with lines wide enough.
+        On no part of the floor in view lines are wide enough.
     """
-    runs = _runs(camera, _scan_lines(camera, white.shape, lines, reach), white.shape, line_width)
+    runs = _runs(camera, _scan_lines(camera, white.shape, lines, max_range), white.shape, line_width)
     octaves = [[run for run in runs if run.octave == each] for each in sorted({run.octave for run in runs})]
     scans = [_octave(white, camera, each, line_width, threshold, device) for each in octaves]
     parts = [each for each in scans if each is not None]
     if not parts:
         raise ValueError(
-            f"lines of {line_width:.3g} m are nowhere on the floor {FINEST_PX:g} px wide in this image; are height, "
+            f"lines of {line_width:.3g} m are nowhere on the floor {MIN_LINE_WIDTH_PX:g} px wide in this image; "
+            f"are height, "
             "tilt and focal length right?"
         )
     return FloorScan(
@@ -252,7 +259,7 @@ def scan_ahead(
 
 
 class _Run(NamedTuple):
-    """A part of a scan line: both ends [px], how wide lines are there [px], and whether the image ends there."""
+    """Part of a scan line with one octave of line width: both ends [px], octave, and whether the image ends there."""
 
     start: Float64
     end: Float64
@@ -260,19 +267,19 @@ class _Run(NamedTuple):
     cut: tuple[bool, bool]
 
 
-def _scan_lines(camera: MountedCamera, shape: tuple[int, ...], lines: int, reach: float) -> Float64:
-    """Return samples of scan lines on the floor, (lines, samples, 2) [m]: rays from below the camera, and across."""
+def _scan_lines(camera: MountedCamera, shape: tuple[int, ...], lines: int, max_range: float) -> Float64:
+    """Return scan lines on the floor, (lines, samples, 2) [m]: rays from below the camera, and lines across them."""
     rows, columns = shape
     grid = np.stack(np.meshgrid(np.linspace(0, columns - 1, 64), np.linspace(0, rows - 1, 64)), axis=-1)
     seen = (
         camera.to_floor(grid if camera.model is None else camera.model.undistort(grid)).reshape(-1, 2) - camera.position
     )
     far = np.hypot(*seen.T)
-    seen = seen[far <= reach]
+    seen = seen[far <= max_range]
     if not len(seen):
         return np.empty((0, _SAMPLES, 2))
     far = np.hypot(*seen.T)
-    # Even in the angle below the camera, about as its pixels are.
+    # Evenly spaced in the angle below the camera, about as the pixels are.
     angle = np.linspace(np.arctan(far.min() / camera.height), np.arctan(far.max() / camera.height), _SAMPLES)
     c, s = math.cos(camera.heading), math.sin(camera.heading)
     ahead, aside = seen @ (c, s), seen @ (-s, c)
@@ -287,14 +294,14 @@ def _scan_lines(camera: MountedCamera, shape: tuple[int, ...], lines: int, reach
 
 
 def _runs(camera: MountedCamera, floors: Float64, shape: tuple[int, ...], line_width: float) -> list[_Run]:
-    """Return what the image shows of scan lines, cut where lines across them are twice as wide."""
+    """Return the parts of scan lines in the image, cut where the width of lines across them doubles."""
     pixels = camera.to_pixels(floors)
     measured = camera.distort(pixels)
     with np.errstate(invalid="ignore"):
         inside = (measured >= _MARGIN_PX) & (measured <= np.array(shape[::-1]) - 1 - _MARGIN_PX)
         steps = np.gradient(pixels, axis=1), np.gradient(floors, axis=1)
         width = line_width * np.hypot(*np.moveaxis(steps[0], -1, 0)) / np.hypot(*np.moveaxis(steps[1], -1, 0))
-        octave = np.floor(np.log2(width / FINEST_PX))
+        octave = np.floor(np.log2(width / MIN_LINE_WIDTH_PX))
         shown = inside.all(axis=-1) & (octave >= 0)
     runs = []
     for line, kind in zip(pixels, np.where(shown, octave, -1).astype(int), strict=True):
@@ -302,7 +309,7 @@ def _runs(camera: MountedCamera, floors: Float64, shape: tuple[int, ...], line_w
         for first, last in itertools.pairwise(cuts):
             if kind[first] >= 0 and last - first > 2:
                 cut = (first == 0 or kind[first - 1] < 0, last == len(kind) or kind[last] < 0)
-                # Up to where the next part begins.
+                # The part ends where the next one begins.
                 runs.append(_Run(line[first], line[last - 1 if cut[1] else last], int(kind[first]), cut))
     return runs
 
@@ -315,47 +322,51 @@ def _octave(
     threshold: float,
     device: Device | None,
 ) -> FloorScan | None:
-    """Scan runs along which lines are about as wide; None where none has room for a ruler."""
-    wide = FINEST_PX * 2.0 ** (runs[0].octave + 0.5)
-    rulers = replace(stripe_rulers(white, wide, threshold, camera.model), length=_SHORT)
-    edge, length = trimmed(rulers), (rulers.length - 1) * rulers.step_px
-    laid = [(run, _room(run, edge, edge + 2.0 * wide, length)) for run in runs]
-    runs, rooms = [run for run, room in laid if room is not None], [room for _, room in laid if room is not None]
+    """Scan the parts of one octave of line width; None where none of them has room for a ruler."""
+    wide = MIN_LINE_WIDTH_PX * 2.0 ** (runs[0].octave + 0.5)
+    rulers = replace(stripe_ruler(white, wide, threshold, camera.model), length=_SHORT_LENGTH)
+    edge, length = end_margin_px(rulers), (rulers.length - 1) * rulers.step_px
+    candidates = [(run, _room(run, edge, edge + 2.0 * wide, length)) for run in runs]
+    runs, rooms = (
+        [run for run, room in candidates if room is not None],
+        [room for _, room in candidates if room is not None],
+    )
     if not runs:
         return None
     starts = np.array([each.start for each in runs])
     far = np.linalg.norm([each.end - each.start for each in runs], axis=-1)
     ways = np.array([each.end - each.start for each in runs]) / far[:, None]
     room = np.array(rooms)
-    pieces, path = laid_along(starts + room[:, :1] * ways, starts + room[:, 1:2] * ways, rulers, wide)
+    pieces, path = place_rulers_along(starts + room[:, :1] * ways, starts + room[:, 1:2] * ways, rulers, wide)
     edges = rulers(white, pieces, device=device)
     assert edges.spacing is not None
-    places = pieces[:, None, :2] + edges.position[..., None] * pieces[:, None, 2:]
+    position, sigma, spacing = to_numpy(edges.position), to_numpy(edges.sigma), to_numpy(edges.spacing)
+    places = pieces[:, None, :2] + position[..., None] * pieces[:, None, 2:]
     away = np.sum((places - starts[path][:, None]) * ways[path][:, None], axis=-1)
     with np.errstate(invalid="ignore"):
         found = (away >= 0.0) & (away < far[path][:, None])
-    half = 0.5 * edges.spacing[found][:, None] * np.broadcast_to(pieces[:, None, 2:], places.shape)[found]
+    half = 0.5 * spacing[found][:, None] * np.broadcast_to(pieces[:, None, 2:], places.shape)[found]
     sides = camera.to_floor(places[found] - half), camera.to_floor(places[found] + half)
     size = np.hypot(*(sides[1] - sides[0]).T)
-    good = (size > 0.4 * line_width) & (size < 3.0 * line_width)
+    good = (size > _MIN_WIDTH_RATIO * line_width) & (size < _MAX_WIDTH_RATIO * line_width)
     points = (0.5 * (sides[0] + sides[1]))[good]
     number = np.broadcast_to(path[:, None], found.shape)[found][good]
-    kept = once(points, number, away[found][good], line_width)
-    per_px = (size / edges.spacing[found])[good]
+    kept = unique_points(points, number, away[found][good], line_width)
+    per_px = (size / spacing[found])[good]
     ends = [camera.to_floor(starts + room[:, which, None] * ways) for which in (2, 3)]
     whole = room[:, 3] > room[:, 2]
     return FloorScan(
         points=np.ascontiguousarray(points[kept], np.float32),
-        sigmas=np.ascontiguousarray((per_px * edges.sigma[found][good])[kept], np.float32),
+        sigmas=np.ascontiguousarray((per_px * sigma[found][good])[kept], np.float32),
         paths=np.ascontiguousarray(np.concatenate(ends, axis=-1)[whole], np.float32),
         line_width=line_width,
     )
 
 
 def _room(run: _Run, edge: float, over: float, length: float) -> tuple[float, float, float, float] | None:
-    """Return where rulers along a run begin and end, and what of it they see [px from its start]; None: no room.
+    """Return where rulers along a part begin and end, and the range that they scan [px]; None: no room.
 
-    Where the image goes on, so do they, so that what lies where two runs meet is seen whole.
+    Where the image goes on, the rulers extend beyond the part, so that a stripe between two parts is seen whole.
     """
     far = float(np.linalg.norm(run.end - run.start))
     begin, end = (0.0 if run.cut[0] else -over), far + (0.0 if run.cut[1] else over)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gpuvision.host import Device
 from gpuvision.matching.field.distance_map import Field
 from gpuvision.matching.field.evidence import Evidence
-from gpuvision.matching.field.field_pose import Candidate
+from gpuvision.matching.field.field_pose import PoseCandidate
 from gpuvision.status import Status
 
 Float32 = npt.NDArray[np.float32]
@@ -21,33 +21,32 @@ Float32 = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LocatedRobot:
-    """Where a robot may be, best first, or why that is not known.
+    """Pose candidates of a robot on a field, best first, or the reason why they are refused.
 
     Attributes
     ----------
     candidates
-        As `gpuvision.matching.field.field_pose.locate` gives them, those that explain best what is seen, and what is
-        not, first.
+        Results of `gpuvision.matching.field.field_pose.find_pose_candidates`, ordered by `Evidence.missing`.
     doubtful
-        Where it is refused: what the points would fit best, but do not carry.
+        Where the pose is refused: the best candidate, which the evidence does not support.
     evidence
-        What speaks for the first of them; None where there is none.
+        Evidence for the first candidate; None without a candidate.
     points
-        float32 (points, 2), on lines, in the robot's frame [m].
+        float32 (points, 2), points on lines in the robot's frame [m].
     field
         The field.
     scale
-        Of a pixel of the top view [m]; None where points were given.
+        Size of a pixel of the top view [m]; None where points were given.
     reason
-        Why there is no pose; ``""`` where there is one.
+        Why the pose is refused; ``""`` where it is accepted.
     device
         Where it ran.
     seconds
-        Of the steps, by name.
+        Duration of each step, by name [s].
     """
 
-    candidates: tuple[Candidate, ...]
-    doubtful: tuple[Candidate, ...]
+    candidates: tuple[PoseCandidate, ...]
+    doubtful: tuple[PoseCandidate, ...]
     evidence: Evidence | None
     points: Float32
     field: Field
@@ -57,7 +56,7 @@ class LocatedRobot:
     seconds: dict[str, float]
 
     def summary(self) -> str:
-        """Return the candidates, a line for each, or why there are none."""
+        """Return one line for each candidate, or the reason of the refusal."""
         if self.reason:
             return f"refused: {self.reason}"
         assert self.evidence is not None  # there are candidates
@@ -73,22 +72,22 @@ class LocatedRobot:
         sigmas = f"sigmas {1e3 * sx:.2g} mm, {1e3 * sy:.2g} mm, {math.degrees(turn):.2g} degrees"
         if each.status & Status.AMBIGUOUS:
             sigmas = "the points fix a part of it only"
-        twin = "" if each.twin is None else f"; twin of {each.twin + 1}"
+        symmetric_twin = "" if each.symmetric_twin is None else f"; twin of {each.symmetric_twin + 1}"
         return (
             f"{number + 1}: x {x:.3f} m, y {y:.3f} m, heading {math.degrees(heading):.2f} degrees; {sigmas}; "
-            f"score {each.score:.3f}, {each.share:.0%} of the points on lines{twin}"
+            f"score {each.score:.3f}, {each.inlier_fraction:.0%} of the points on lines{symmetric_twin}"
         )
 
     def report(self) -> dict[str, Any]:
-        """Return what ``pose.json`` holds: metres, radians; what is not known is null."""
+        """Return the content of ``pose.json``: metres, radians; unknown numbers are null."""
         return {
             "gpuvision": version("gpuvision"),
             "status": "refused" if self.reason else "located",
             "reason": self.reason or None,
             "field": self.field.name,
             "symmetric": self.field.is_symmetric,
-            "candidates": [_told(each) for each in self.candidates],
-            "evidence": _weighed(self.evidence),
+            "candidates": [_candidate_report(each) for each in self.candidates],
+            "evidence": _evidence_report(self.evidence),
             "scale": self.scale,
             "points": self.points.tolist(),
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
@@ -96,18 +95,18 @@ class LocatedRobot:
         }
 
 
-def _weighed(evidence: Evidence | None) -> dict[str, Any] | None:
+def _evidence_report(evidence: Evidence | None) -> dict[str, Any] | None:
     if evidence is None:
         return None
     return {
-        "log10_chance": evidence.chance / math.log(10.0),
+        "log10_nfa": evidence.log_nfa / math.log(10.0),
         "on_lines": evidence.on_lines,
         "expected": evidence.expected,
         "seen": evidence.seen if evidence.expected else None,
     }
 
 
-def _told(each: Candidate) -> dict[str, Any]:
+def _candidate_report(each: PoseCandidate) -> dict[str, Any]:
     sigmas = np.sqrt(np.diag(each.covariance))
     names = ("x", "y", "theta")
     is_known = bool(np.all(np.isfinite(each.covariance)))
@@ -117,8 +116,8 @@ def _told(each: Candidate) -> dict[str, Any]:
         "covariance": each.covariance.tolist() if is_known else None,
         "information": each.information.tolist(),
         "score": each.score,
-        "share": each.share,
-        "scatter": each.scale,
-        "twin": each.twin,
+        "inlier_fraction": each.inlier_fraction,
+        "residual_std": each.residual_std,
+        "symmetric_twin": each.symmetric_twin,
         "status": str(each.status.name or "OK"),
     }

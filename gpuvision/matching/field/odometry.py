@@ -1,6 +1,12 @@
-"""What wheels and views say together about a pose: predict with a motion, correct with a view.
+"""Kalman filter of a robot's pose: predict with odometry, correct with the pose from an image.
 
-Poses are (x, y, heading) in metres and radians, motions (forward, left, turn) in the robot's frame before it moves.
+Poses are (x, y, heading) in metres and radians, motions (forward, left, turn) in the frame of the robot before it
+moves.
+
+References
+----------
+.. [1] S. Thrun, W. Burgard and D. Fox, *Probabilistic Robotics*, MIT Press 2005, chapters 3 and 7 (extended Kalman
+   filter).
 """
 
 from __future__ import annotations
@@ -17,27 +23,27 @@ Float64 = npt.NDArray[np.float64]
 
 
 class PoseEstimate(NamedTuple):
-    """A pose (3,) with its covariance (3, 3)."""
+    """Pose (3,) with its covariance (3, 3)."""
 
     pose: Float64
     covariance: Float64
 
 
 def predict(estimate: PoseEstimate, motion: npt.ArrayLike, covariance: npt.ArrayLike) -> PoseEstimate:
-    """Return where the robot is after a motion.
+    """Return the estimate after a motion.
 
     Parameters
     ----------
     estimate
-        Where it was.
+        Estimate before the motion.
     motion
-        (forward, left, turn) as the wheels say.
+        (forward, left, turn) from odometry [m], [m], [rad].
     covariance
-        (3, 3) of the motion.
+        (3, 3) covariance of the motion.
 
     Notes
     -----
-    Covariances go through the motion's Jacobian: to first order in the heading's uncertainty.
+    The covariances are propagated with the Jacobian of the motion: to first order in the uncertainty of the heading.
     """
     forward, left, turn = numbers(motion, (3,), "motion")
     noise = np.array(numbers(covariance, (3, 3), "covariance"))
@@ -50,11 +56,23 @@ def predict(estimate: PoseEstimate, motion: npt.ArrayLike, covariance: npt.Array
     return PoseEstimate(np.array([x + dx, y + dy, _wrapped(heading + turn)]), moved)
 
 
-def disagreement(estimate: PoseEstimate, pose: npt.ArrayLike, information: npt.ArrayLike) -> float:
-    """Return how far a view's pose is from what was expected: squared, in standard deviations; 3 in the mean.
+def squared_mahalanobis_distance(estimate: PoseEstimate, pose: npt.ArrayLike, information: npt.ArrayLike) -> float:
+    """Return the squared Mahalanobis distance of a measured pose from the estimate (NIS).
 
-    Directions of which the view says nothing (``information`` of lower rank) say nothing here either; there the mean is
-    as much lower. Beyond 16.3 it is one in a thousand: another candidate, its twin, or a robot that was carried.
+    NIS is the normalised innovation squared.
+
+    Its mean is 3 for a consistent filter; it exceeds 16.3 with a probability of 0.001 (chi square with 3 degrees of
+    freedom): then the measurement is another candidate or a symmetric twin, or the robot was carried. An
+    ``information`` of lower rank has as many degrees of freedom as its rank.
+
+    Parameters
+    ----------
+    estimate
+        Expected pose.
+    pose
+        (3,) measured pose.
+    information
+        (3, 3) inverse of the covariance of the measured pose.
     """
     view, measured = np.array(numbers(pose, (3,), "pose")), np.array(numbers(information, (3, 3), "information"))
     off = view - estimate.pose
@@ -64,17 +82,17 @@ def disagreement(estimate: PoseEstimate, pose: npt.ArrayLike, information: npt.A
 
 
 def correct(estimate: PoseEstimate, pose: npt.ArrayLike, information: npt.ArrayLike) -> PoseEstimate:
-    """Return what is known once a view's pose is taken in.
+    """Return the estimate after a measured pose.
 
     Parameters
     ----------
     estimate
-        What was expected.
+        Expected pose.
     pose
-        (3,) as a `Candidate` has it.
+        (3,) measured pose, as in a `PoseCandidate`.
     information
-        (3, 3), inverse of the view's covariance. Of lower rank (one line seen, one circle): only that part of the
-        pose is corrected which was seen.
+        (3, 3) inverse of the covariance of the measured pose. With a lower rank (one line or one circle seen) the pose
+        is corrected only in the directions that were measured.
     """
     view, measured = np.array(numbers(pose, (3,), "pose")), np.array(numbers(information, (3, 3), "information"))
     off = view - estimate.pose

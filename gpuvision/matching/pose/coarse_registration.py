@@ -1,9 +1,15 @@
-"""The engine of first fixes: known edges, looked for in a picture from far away. Hypothesise and verify.
+"""Coarse registration: find known edges in an image from a large initial error, by hypothesis and verification.
 
-All shifts and headings of a grid are scored on the device (`gpuvision.matching.pose.edge_search`); over the best ones
-rulers are laid, whose edges make a pose each; the one that most rulers agree with is measured again, along shorter
-rulers that lie where the edges are. What is known is a board or another picture
-(`gpuvision.matching.pose.registration`).
+1. Score all shifts and headings of a grid on the device (`gpuvision.matching.pose.edge_search`).
+2. Place calipers (rulers) over the best candidates; a robust pose from their edges refines each candidate.
+3. Verify: count the rulers that find an edge where the candidate has one.
+4. Measure the best candidate again along shorter rulers, and compare it with the runner-up.
+
+The known edges are those of a board or of another image (`gpuvision.matching.pose.registration`).
+
+References
+----------
+.. [1] F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 6.3.
 """
 
 from __future__ import annotations
@@ -17,59 +23,96 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.pose.edge_search import (
     CellMeans,
-    EdgeLevels,
-    SearchEdges,
-    best_shifts,
-    shifts_of,
+    EdgeCostMap,
+    EdgeSearch,
+    cell_offsets,
+    find_best_shifts,
 )
-from gpuvision.matching.pose.pose import BoardPose, Freedom, SolvePose, line_rows
+from gpuvision.matching.pose.motion import (
+    KnownEdges,
+    apply_homography,
+    compose,
+    decompose,
+    move_edges,
+    project_edges,
+    rotation,
+)
+from gpuvision.matching.pose.pose import SolvePose, Transform, line_rows
 from gpuvision.status import Status
 from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
-MOST_RULERS = 1024  # rows of one pose
-_VERIFYING = 512
-_FEWEST = 12  # rulers and edges that a pose is believed from
-_SOLVED = 128  # of the edges that were found about a start
-_TRIALS = {"rigid": 128, "scale": 256, "affine": 512}  # one of them all good, of half bad rows: all but 6e-8
-_ROUNDS = 3
-_CLEAR = 2.0
-_BEYOND = 0.7
+
+MAX_RULERS = 1024  # rows of one `SolvePose`
+_VERIFICATION_RULERS = 512  # of each candidate: cost of step 3
+_REFINEMENT_ROWS = 128  # of each candidate: cost of step 2
+# Start candidates of a robust pose: of half bad rows all contain an outlier with a probability of 6e-8 (derived).
+_TRIALS = {"rigid": 128, "similarity": 256, "affine": 512}
+_SEPARATION = (3, 2)  # cells and headings within which two candidates of the grid are the same
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationLimits:
+    """Thresholds of the decisions of a coarse registration.
+
+    Parameters
+    ----------
+    min_rulers
+        Least number of rulers in the image, and of known edges, to decide on a pose (chosen: four times the three
+        unknowns).
+    significance
+        Difference of two counts of rulers that is significant [standard deviations] (3: one error in 700 for normal
+        counts).
+    min_ratio
+        Ratio of scores, or of the counts of rulers that speak for one pose only, from which on a pose is preferred to
+        another one (chosen; tests on boards with repeated patterns confirm it).
+    border_cost
+        Cost of an edge beyond the image, relative to the mean cost in the image (measured). With 1, poses that keep
+        more edges in the image would win over the right one; below 0.5, poses that keep few edges in the image would
+        win.
+    refinements
+        Number of measurements of the best pose along short rulers, each placed at the pose of the one before (chosen).
+    """
+
+    min_rulers: int = 12
+    significance: float = 3.0
+    min_ratio: float = 2.0
+    border_cost: float = 0.7
+    refinements: int = 3
 
 
 class Registration(NamedTuple):
-    """A pose and how sure it is; lengths in the unit of the known edges (metres of a board, pixels of a picture).
+    """Pose with its score; lengths in the unit of the known edges (metres of a board, pixels of an image).
 
     Attributes
     ----------
-    pose
-        (3,) x, y, theta [rad]: a known point p is seen at R(theta) (I + D) p + (x, y); NaN where refused, and so are
-        the next three.
-    deformation
-        (3,): scales along the known axes less 1, and shear, I + D = ((1 + kx, shear), (0, 1 + ky)); 0 where the freedom
-        is rigid.
-    placement
-        (2,) where the placement point is seen.
-    covariance
-        (f, f) of the placement point's x, y, of theta, and of the deformation that is free, from the scatter of the
-        edges themselves.
-    score
-        Share of the rulers in the picture whose edge lies within the tolerance of this pose, 0 to 1. Refused, of the
-        best one.
-    runner_up
-        Score of the best other pose; where AMBIGUOUS, of those that edges do not tell from this one. 0 without one.
-    runner_up_pose
-        (3,); NaN without one.
-    rulers
-        How many lay in the picture, of those that verify.
-    status
-        OK. With a pose: AMBIGUOUS (of the rulers that agree with only one of the two, too few more do with this one
-        than with the runner-up). Refused: LOW_SIGNAL (nothing fits), NO_DATA (too few known edges in
-        the picture), AMBIGUOUS with NaN (the edges that were found leave a part of the pose open).
+    pose : (3,)
+        x, y, theta [rad]: a known point p is seen at R(theta) (I + D) p + (x, y). Where the pose is refused, NaN like
+        ``deformation``, ``placement`` and ``covariance``.
+    deformation : (3,)
+        Scales along the known axes less 1, and shear: I + D = ((1 + kx, shear), (0, 1 + ky)); 0 for a rigid transform.
+    placement : (2,)
+        Where the placement point is seen.
+    covariance : (f, f)
+        Covariance of the placement point's x, y, of theta, and of the free deformation parameters, from the residuals
+        of the edges.
+    score : float
+        Share of the rulers in the image whose edge lies within the tolerance of the pose, 0 to 1; of the best pose
+        where it is refused.
+    runner_up : float
+        Score of the best other pose; where AMBIGUOUS, of the best pose that the edges do not exclude. 0 without one.
+    runner_up_pose : (3,)
+        NaN without one.
+    rulers : int
+        Number of verification rulers in the image.
+    status : Status
+        OK. With a pose: AMBIGUOUS (among the rulers that agree with one of the two poses only, too few more agree with
+        this pose than with the runner-up). Refused: LOW_SIGNAL (no pose reaches the least score), NO_DATA (too few
+        known edges in the image), AMBIGUOUS with NaN (the found edges do not determine all unknowns).
     """
 
     pose: Float64
@@ -83,15 +126,8 @@ class Registration(NamedTuple):
     status: Status
 
 
-class KnownEdges(NamedTuple):
-    """Edges that a picture should show: (n, 2) points and their unit normals, either way."""
-
-    point: Float64
-    normal: Float64
-
-
-class _Tried(NamedTuple):
-    """A motion (2, 3), of points relative to the placement point; which rulers lie in the picture, and which agree."""
+class _ScoredMotion(NamedTuple):
+    """A motion (2, 3), and (n,) which verification rulers lie in the image and which agree with it."""
 
     motion: Float64
     inside: npt.NDArray[np.bool_]
@@ -105,64 +141,70 @@ class _Tried(NamedTuple):
     def score(self) -> float:
         return float(np.count_nonzero(self.agrees)) / self.rulers
 
-    def is_clear_of(self, other: _Tried) -> bool:
-        """Whether the rulers that tell two motions apart, in the picture for both, speak for this one.
+    def is_better_than(self, other: _ScoredMotion, limits: RegistrationLimits) -> bool:
+        """Return whether the rulers prefer this motion significantly.
 
-        Of two right ones as many agree with the one as with the other. What is gone of one place is there at another
-        one by chance only: three standard deviations of their difference, and twice as many; or twice the share, where
-        the picture has few rulers for both.
+        Counted are the rulers in the image for both motions that agree with only one of them. Of two right motions (a
+        repeated pattern) about as many agree with either. An edge agrees with a wrong motion by chance only: the counts
+        must differ by three standard deviations of their difference, and by a factor of two. A factor of two between
+        the scores is enough too, for images with few rulers in common.
         """
-        if self.score >= _CLEAR * other.score:
+        if self.score >= limits.min_ratio * other.score:
             return True
         both = self.inside & other.inside
         own = np.count_nonzero(both & self.agrees & ~other.agrees)
         its = np.count_nonzero(both & other.agrees & ~self.agrees)
-        return bool(own >= max(_CLEAR * its, its + 3.0 * math.sqrt(own + its), 1.0))
+        return bool(own >= max(limits.min_ratio * its, its + limits.significance * math.sqrt(own + its), 1.0))
 
 
-class _Ruled(NamedTuple):
-    """Rulers for each motion, (k, n, 2) in the picture; how far away the edge is [px], or NaN; which are inside."""
+class _MeasuredRulers(NamedTuple):
+    """Rulers of each motion (k, n, 2) in the image, offset of the edge [px] or NaN, and which rulers lie inside."""
 
     centre: Float64
     direction: Float64
-    away: Float64
+    offset_px: Float64
     inside: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CoarseRegistration:
-    """Look for known edges: ``fix(image) -> Registration``, of uint8, uint16 or float32 (rows, columns).
+    """Search for known edges in an image: ``registration(image) -> Registration``.
+
+    The image is uint8, uint16 or float32 of shape (rows, columns).
 
     Parameters
     ----------
-    search
-        Edges that are searched with, 4096 at most: spread evenly, in or near the picture.
-    rulers
-        Edges that rulers are laid over, 1024 at most; up to 512 of them, spread evenly, for each pose that is verified.
-    to_image
-        3 x 3, where known points are expected, in pixels of the (undistorted) picture.
-    placement
-        Known point that the covariance holds for; about it the shift and the turn are looked for.
-    shift, angle
-        How far it may be off, along x and along y, and the angle [rad].
-    ruler
-        How edges are found; its length is set here.
-    freedom
-        ``"rigid"``, ``"scale"`` or ``"affine"``: what rulers measure; it may differ by a percent or two.
-    tolerance_px
-        How far an edge may lie from where the pose has it and still agree.
-    cell_px
-        Cells of the search: about as wide as what is thinnest, or less.
-    most
-        Poses that are verified.
-    least_score
-        A pose that a smaller share of the rulers agrees with is refused; 1.5 over the root of the rulers' number comes
-        on top: of few many may agree by chance.
+    search : KnownEdges
+        Edges of the grid search, 4096 at most, spread evenly over the image and its surroundings.
+    rulers : KnownEdges
+        Edges on which rulers are placed, 1024 at most. Up to 512 of them, spread evenly, verify each candidate.
+    to_image : array_like, (3, 3)
+        Homography from the known edges, where they are expected, to pixels of the (undistorted) image.
+    placement : (float, float)
+        Known point to which the covariance refers; the search range is about it.
+    shift, angle : float
+        Search range: largest offset of the placement point along x and along y (unit of the known edges, above 0), and
+        largest angle [rad], 0 to pi.
+    ruler : RulerEdges
+        Edge measurement of single edges; this class sets its length.
+    transform : {"rigid", "similarity", "affine"}
+        Unknowns of the pose. A deformation may be a percent or two.
+    tolerance_px : float
+        Largest distance of an edge from the pose at which the edge agrees with it [px], above 0 to 64, default 1.
+    cell_px : int
+        Side of a cell of the grid search [px], default 2: about the width of the finest structure, or less.
+    max_candidates : int
+        Number of verified candidates, default 48.
+    min_score : float
+        Least accepted score, above 0 to 1, default 0.4. 1.5 / sqrt(rulers), three standard deviations of a share of one
+        half, is added: among few rulers many may agree by chance.
+    limits : RegistrationLimits
+        Thresholds of the other decisions.
 
     Raises
     ------
     TypeError, ValueError
-        A parameter is not what was expected.
+        A parameter is out of its range or of a wrong type.
     """
 
     search: KnownEdges
@@ -172,11 +214,12 @@ class CoarseRegistration:
     shift: float
     angle: float
     ruler: RulerEdges
-    freedom: Freedom = "rigid"
+    transform: Transform = "rigid"
     tolerance_px: float = 1.0
     cell_px: int = 2
-    most: int = 48
-    least_score: float = 0.4
+    max_candidates: int = 48
+    min_score: float = 0.4
+    limits: RegistrationLimits = RegistrationLimits()
 
     def __post_init__(self) -> None:
         matrix = np.asarray(self.to_image, np.float64)
@@ -184,292 +227,263 @@ class CoarseRegistration:
             raise ValueError("CoarseRegistration.to_image must be 3 x 3, finite and invertible")
         object.__setattr__(self, "to_image", matrix)
         object.__setattr__(self, "placement", numbers(self.placement, (2,), "CoarseRegistration.placement"))
-        for name, limit in (("search", 4096), ("rulers", MOST_RULERS)):
-            point, normal = (np.asarray(each, np.float64) for each in getattr(self, name))
-            if point.shape != normal.shape or point.ndim != 2 or point.shape[1] != 2 or len(point) > limit:
-                raise ValueError(f"CoarseRegistration.{name} must have up to {limit} points (n, 2) and as many normals")
-            if not (np.all(np.isfinite(point)) and np.allclose(np.hypot(*normal.T), 1.0)):
-                raise ValueError(f"CoarseRegistration.{name} must have finite points and unit normals")
-            object.__setattr__(self, name, KnownEdges(point, normal))
-        for name, most in (("shift", math.inf), ("tolerance_px", 64.0), ("least_score", 1.0)):
-            if not 0.0 < finite(getattr(self, name), f"CoarseRegistration.{name}") <= most:
+        for name, max_count in (("search", 4096), ("rulers", MAX_RULERS)):
+            object.__setattr__(self, name, _checked_edges(getattr(self, name), name, max_count))
+        for name, limit in (("shift", math.inf), ("tolerance_px", 64.0), ("min_score", 1.0)):
+            if not 0.0 < finite(getattr(self, name), f"CoarseRegistration.{name}") <= limit:
                 raise ValueError(
-                    f"CoarseRegistration.{name} is {getattr(self, name)}, expected above 0 and up to {most}"
+                    f"CoarseRegistration.{name} is {getattr(self, name)}, expected above 0 and up to {limit}"
                 )
         if not 0.0 <= finite(self.angle, "CoarseRegistration.angle") <= math.pi:
             raise ValueError(f"CoarseRegistration.angle is {self.angle}, expected 0 to pi")
-        if not isinstance(self.ruler, RulerEdges) or self.ruler.choice == "all" or self.ruler.pairs:
-            raise TypeError("CoarseRegistration.ruler must be a RulerEdges that chooses one single edge")
-        if not isinstance(self.most, int) or self.most < 1:
-            raise ValueError(f"CoarseRegistration.most is {self.most!r}, expected 1 or more")
+        if not isinstance(self.ruler, RulerEdges) or self.ruler.edge_selection == "all" or self.ruler.pairs:
+            raise TypeError("CoarseRegistration.ruler must be a RulerEdges that returns one single edge")
+        if not isinstance(self.max_candidates, int) or self.max_candidates < 1:
+            raise ValueError(f"CoarseRegistration.max_candidates is {self.max_candidates!r}, expected 1 or more")
 
     def __call__(self, image: npt.NDArray[Any], *, device: Device | None = None) -> Registration:
-        """Look for the edges in a picture, on a device (None: the best).
+        """Search for the edges in an image.
+
+        Parameters
+        ----------
+        image
+            uint8, uint16 or float32 (rows, columns).
+        device
+            Where to run; None: `Device.best`.
 
         Raises
         ------
         TypeError, ValueError
-            The picture is not one, or is smaller than five cells or than a ruler.
+            The array is not such an image, or the image is smaller than five cells or than a ruler.
         """
-        if len(self.rulers.point) < _FEWEST or len(self.search.point) < _FEWEST:
-            return _NOTHING
-        tried = self._verified(image, self._searched(image, device), device)
+        if min(len(self.rulers.point), len(self.search.point)) < self.limits.min_rulers:
+            return _NOT_FOUND
+        tried = self._verify(image, self._search_grid(image, device), device)
         if not tried:
-            return _NOTHING
+            return _NOT_FOUND
         best = max(tried, key=lambda each: each.score)
-        others = self._others(best, tried)
-        if not self._is_enough(best):
-            return self._refused(Status.LOW_SIGNAL, best, others)
-        return self._measured(image, best, others, device)
+        others = self._distinct_from(best, tried)
+        if not self._is_accepted(best):
+            return self._refuse(Status.LOW_SIGNAL, best, others)
+        return self._measure(image, best, others, device)
 
-    # ---- the search ------------------------------------------------------------------------------------------
+    # ---- grid search -----------------------------------------------------------------------------------------
 
     def headings(self) -> Float64:
-        """Return the turns that are looked at [rad]: so far apart that half the points move by a cell or less."""
-        away = np.linalg.norm(self._pixels(self.search.point) - self._pixels(np.array(self.placement)), axis=-1)
+        """Return the angles of the grid [rad]: one step moves the points by a cell in the median."""
+        away = np.linalg.norm(self._to_pixels(self.search.point) - self._to_pixels(np.array(self.placement)), axis=-1)
         step = self.cell_px / max(float(np.median(away)), 4.0 * self.cell_px)
         half = math.ceil(self.angle / step)
         return np.asarray(np.arange(-half, half + 1) * (self.angle / max(half, 1)))
 
     def positions(self) -> tuple[int, int]:
-        """Return rows and columns of shifts that are looked at."""
+        """Return the rows and columns of shifts of the grid [cells]."""
         place = np.array(self.placement)
         corners = place + self.shift * np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])
-        reach = np.abs(self._pixels(corners) - self._pixels(place)).max(axis=0)
+        reach = np.abs(self._to_pixels(corners) - self._to_pixels(place)).max(axis=0)
         columns, rows = (2 * math.ceil(each / self.cell_px) + 1 for each in reach)
         return rows, columns
 
-    def _searched(self, image: npt.NDArray[Any], device: Device | None) -> list[Float64]:
-        """Motions that are worth rulers, best first."""
+    def _search_grid(self, image: npt.NDArray[Any], device: Device | None) -> list[Float64]:
+        """Return the motions of the best poses of the grid, best first."""
         headings, positions = self.headings(), self.positions()
-        points, normals = self._seen(self.search, [np.column_stack([_rotation(k), self.placement]) for k in headings])
-        middle = self._pixels(np.array(self.placement))
+        motions = [np.column_stack([rotation(k), self.placement]) for k in headings]
+        points, normals = project_edges(self.search, motions, self.placement, np.asarray(self.to_image))
+        middle = self._to_pixels(np.array(self.placement))
         turned = 2.0 * math.sin(min(self.angle, math.pi) / 2.0) * np.linalg.norm(points[0] - middle, axis=-1).max()
         border = max(positions) // 2 + 2 + math.ceil(min(turned, max(image.shape)) / self.cell_px)
         means = CellMeans(cell_px=self.cell_px)(image, device=device).means
-        level = EdgeLevels(threshold=self.ruler.threshold, border=border)(means, device=device).level
-        _blank_border(level, border)
-        shifts = shifts_of(points, normals, self.cell_px, border, level.shape, positions)
-        search = SearchEdges(
+        level = to_numpy(EdgeCostMap(threshold=self.ruler.threshold, border=border)(means, device=device).level)
+        _fill_border(level, border, self.limits.border_cost)
+        offsets = cell_offsets(points, normals, self.cell_px, border, level.shape, positions)
+        search = EdgeSearch(
             rows=positions[0], columns=positions[1], headings=len(headings), points=len(self.search.point)
         )
-        rough = best_shifts(search(level, shifts, device=device), positions, self.most, (3, 2))
-        places = self._known(middle + self.cell_px * rough.cells)
-        return [np.column_stack([_rotation(headings[k]), at]) for at, k in zip(places, rough.heading, strict=True)]
+        best = find_best_shifts(search(level, offsets, device=device), positions, self.max_candidates, _SEPARATION)
+        places = self._from_pixels(middle + self.cell_px * best.cells)
+        return [np.column_stack([rotation(headings[k]), at]) for at, k in zip(places, best.heading, strict=True)]
 
     # ---- rulers ----------------------------------------------------------------------------------------------
 
     @property
-    def _window(self) -> float:
-        """How far an edge is from where the search has it [px]: a cell and a half, its turn another cell."""
+    def _candidate_error_px(self) -> float:
+        """Largest distance of an edge from a candidate of the grid [px]: 1.5 cells by shift, 1 cell by turn."""
         return 2.5 * self.cell_px + self.tolerance_px
 
-    def _ruler(self, window_px: float) -> RulerEdges:
+    def _ruler(self, range_px: float) -> RulerEdges:
+        """Return the ruler that finds edges up to a distance from its centre."""
         taps = math.ceil(3.0 * self.ruler.smoothing_px / self.ruler.step_px)
-        return replace(self.ruler, length=2 * (taps + 1 + math.ceil(window_px / self.ruler.step_px)) + 1)
+        return replace(self.ruler, length=2 * (taps + 1 + math.ceil(range_px / self.ruler.step_px)) + 1)
 
-    def _ruled(
+    def _measure_rulers(
         self,
         image: npt.NDArray[Any],
         known: KnownEdges,
         motions: list[Float64],
         ruler: RulerEdges,
         device: Device | None,
-    ) -> _Ruled:
-        """Edges along rulers about where each motion has the known ones."""
-        centre, direction = self._seen(known, motions)
-        laid = np.concatenate([centre, direction], axis=-1).reshape(-1, 4).astype(np.float32)
-        edges = ruler(image, laid, device=device)
-        position, amplitude, status = (
-            each.reshape(centre.shape[:2]) for each in (edges.position, edges.amplitude, edges.status)
-        )
-        # Copper is brighter than laminate everywhere, or darker: what goes the other way is something else.
+    ) -> _MeasuredRulers:
+        """Measure edges along rulers placed where each motion has the known edges."""
+        centre, direction = project_edges(known, motions, self.placement, np.asarray(self.to_image))
+        placed = np.concatenate([centre, direction], axis=-1).reshape(-1, 4).astype(np.float32)
+        edges = ruler(image, placed, device=device)
+        position, amplitude = (to_numpy(each).reshape(centre.shape[:2]) for each in (edges.position, edges.amplitude))
+        status = to_numpy(edges.status).reshape(centre.shape[:2])
+        # Copper is brighter than laminate everywhere, or darker everywhere: edges of the minority sign are clutter.
         rising = amplitude > 0
         is_bright = 2 * rising.sum(axis=1) > np.isfinite(position).sum(axis=1)
-        away = np.where(rising == is_bright[:, None], position, np.nan)
-        return _Ruled(centre, direction, away.astype(np.float64), (status & Status.OUT_OF_RANGE) == 0)
+        offset = np.where(rising == is_bright[:, None], position, np.nan)
+        return _MeasuredRulers(centre, direction, offset.astype(np.float64), (status & Status.OUT_OF_RANGE) == 0)
 
-    def _rows(self, known: KnownEdges, motions: list[Float64], ruled: _Ruled) -> npt.NDArray[np.float32]:
-        """Rows for `SolvePose`, (k, n, 7), about where each motion has the placement point."""
-        found = self._known(ruled.centre + ruled.direction * ruled.away[..., None])
-        point, normal = _moved(known, motions, self.placement)
+    def _pose_rows(
+        self, known: KnownEdges, motions: list[Float64], measured: _MeasuredRulers
+    ) -> npt.NDArray[np.float32]:
+        """Return rows for `SolvePose`, (k, n, 7), relative to where each motion has the placement point."""
+        found = self._from_pixels(measured.centre + measured.direction * measured.offset_px[..., None])
+        point, normal = move_edges(known, motions, self.placement)
         place = np.stack(motions)[:, None, :, 2]
-        sigma = np.full(point.shape[:2], self.tolerance_px / self._scale)
+        sigma = np.full(point.shape[:2], self.tolerance_px / self._pixels_per_unit)
         rows = line_rows(normal, point - place, found - place, sigma)
         return rows.reshape(*point.shape[:2], -1).astype(np.float32)
 
-    def _verified(self, image: npt.NDArray[Any], starts: list[Float64], device: Device | None) -> list[_Tried]:
-        """Motions that most edges agree with, one from each start."""
-        known = self._verifying
-        ruled = self._ruled(image, known, starts, self._ruler(self._window), device)
-        rows = np.stack([_found(each) for each in self._rows(known, starts, ruled)])
+    def _verify(self, image: npt.NDArray[Any], starts: list[Float64], device: Device | None) -> list[_ScoredMotion]:
+        """Refine each start by the pose that most edges agree with, and score the refined motions."""
+        known = self._verification_edges
+        measured = self._measure_rulers(image, known, starts, self._ruler(self._candidate_error_px), device)
+        rows = np.stack([_select_found(each) for each in self._pose_rows(known, starts, measured)])
         solver = SolvePose(
-            loss="ransac", bend=1.0, least_agreement=0.0, freedom=self.freedom, trials=_TRIALS[self.freedom]
+            loss="ransac",
+            tuning_constant=1.0,
+            min_inlier_fraction=0.0,
+            transform=self.transform,
+            max_trials=_TRIALS[self.transform],
         )
         fits = solver(rows, device=device)
-        return self._judged(
-            image,
-            [start if fits.status[at] else _composed(fits, at, start) for at, start in enumerate(starts)],
-            device,
-        )
+        status, pose, deformation = (to_numpy(each) for each in (fits.status, fits.pose, fits.deformation))
+        motions = [
+            start if status[number] else compose(start, pose[number], deformation[number])
+            for number, start in enumerate(starts)
+        ]
+        return self._score(image, motions, device)
 
     @functools.cached_property
-    def _verifying(self) -> KnownEdges:
-        step = -(-len(self.rulers.point) // _VERIFYING)
+    def _verification_edges(self) -> KnownEdges:
+        step = -(-len(self.rulers.point) // _VERIFICATION_RULERS)
         return KnownEdges(*(each[::step] for each in self.rulers))
 
-    def _judged(self, image: npt.NDArray[Any], motions: list[Float64], device: Device | None) -> list[_Tried]:
-        """Motions with the share of the rulers, laid where each has the edges, that find one there.
+    def _score(self, image: npt.NDArray[Any], motions: list[Float64], device: Device | None) -> list[_ScoredMotion]:
+        """Score motions by the share of rulers, placed where each motion has the edges, that find an edge there.
 
-        The start of a motion does not count: from there some edges lie beyond the rulers' ends, however good it was.
+        The rulers are placed again: from the start of a refined motion, some edges lie beyond the ends of its rulers.
         """
-        ruled = self._ruled(image, self._verifying, motions, self._ruler(self._window), device)
-        tried = map(_Tried, motions, ruled.inside, np.abs(ruled.away) <= self.tolerance_px)
-        return [each for each in tried if each.rulers >= _FEWEST]
+        known = self._verification_edges
+        measured = self._measure_rulers(image, known, motions, self._ruler(self._candidate_error_px), device)
+        scored = map(_ScoredMotion, motions, measured.inside, np.abs(measured.offset_px) <= self.tolerance_px)
+        return [each for each in scored if each.rulers >= self.limits.min_rulers]
 
-    def _others(self, best: _Tried, tried: list[_Tried]) -> list[_Tried]:
-        """Those that put the rulers elsewhere than the best one does, best first."""
-        limit = (2.0 * self.tolerance_px + 1.0) / self._scale
+    def _distinct_from(self, best: _ScoredMotion, tried: list[_ScoredMotion]) -> list[_ScoredMotion]:
+        """Return the motions whose rulers lie elsewhere than those of the best one, best first."""
+        limit = (2.0 * self.tolerance_px + 1.0) / self._pixels_per_unit
         change = np.stack([each.motion for each in tried]) - best.motion
         points = (self.rulers.point - self.placement) @ change[..., :2].swapaxes(1, 2) + change[:, None, :, 2]
         is_other = np.median(np.hypot(points[..., 0], points[..., 1]), axis=1) > limit
         return sorted(itertools.compress(tried, is_other), key=lambda each: -each.score)
 
-    def _measured(
-        self, image: npt.NDArray[Any], best: _Tried, others: list[_Tried], device: Device | None
+    def _measure(
+        self, image: npt.NDArray[Any], best: _ScoredMotion, others: list[_ScoredMotion], device: Device | None
     ) -> Registration:
-        """Measure the best pose again, a few times, along rulers about where it has the edges."""
+        """Measure the best pose again, along short rulers placed where it has the edges."""
         ruler = self._ruler(2.0 * self.tolerance_px)
-        # Huber's solution is the only one, whatever it starts from: pictures that differ little give poses that do.
-        # What is no edge of the board cannot pull more than the rulers are long.
-        solver = SolvePose(loss="huber", scale=1.0, freedom=self.freedom, trials=_TRIALS[self.freedom])
+        # Huber's loss is convex: its solution does not depend on the start, so that similar images give similar poses.
+        # A wrong edge has a bounded influence, since the rulers are short.
+        solver = SolvePose(loss="huber", scale=1.0, transform=self.transform, max_trials=_TRIALS[self.transform])
         motion = best.motion
-        for _ in range(_ROUNDS):
-            ruled = self._ruled(image, self.rulers, [motion], ruler, device)
-            fit = solver(self._rows(self.rulers, [motion], ruled), device=device)
-            if fit.status[0]:
-                return self._refused(Status(int(fit.status[0])), best, others)
-            motion = _composed(fit, 0, motion)
-        judged = self._judged(image, [motion], device)
-        if not judged:
-            return self._refused(Status.NO_DATA, best, others)
-        (last,) = judged
-        if not self._is_enough(last):
-            return self._refused(Status.LOW_SIGNAL, last, others)
-        close = [other for other in others if not last.is_clear_of(other)]
-        pose, deformation = _described(motion, self.placement)
-        return self._refused(Status.AMBIGUOUS if close else Status.OK, last, close or others)._replace(
+        for _ in range(self.limits.refinements):
+            measured = self._measure_rulers(image, self.rulers, [motion], ruler, device)
+            fit = solver(self._pose_rows(self.rulers, [motion], measured), device=device)
+            status = Status(int(to_numpy(fit.status)[0]))
+            if status:
+                return self._refuse(status, best, others)
+            motion = compose(motion, to_numpy(fit.pose)[0], to_numpy(fit.deformation)[0])
+        scored = self._score(image, [motion], device)
+        if not scored:
+            return self._refuse(Status.NO_DATA, best, others)
+        (last,) = scored
+        if not self._is_accepted(last):
+            return self._refuse(Status.LOW_SIGNAL, last, others)
+        close = [other for other in others if not last.is_better_than(other, self.limits)]
+        pose, deformation = decompose(motion, self.placement)
+        residual_scale = float(to_numpy(fit.residual_scale)[0])
+        return self._refuse(Status.AMBIGUOUS if close else Status.OK, last, close or others)._replace(
             pose=pose,
-            deformation=deformation if self.freedom != "rigid" else np.zeros(3),
+            deformation=deformation if self.transform != "rigid" else np.zeros(3),
             placement=motion[:, 2],
-            covariance=fit.covariance[0].astype(np.float64) * float(fit.spread[0]) ** 2,
+            covariance=to_numpy(fit.covariance)[0].astype(np.float64) * residual_scale**2,
         )
 
-    def _refused(self, status: Status, best: _Tried, others: list[_Tried]) -> Registration:
-        """Say no pose, and what scores there were."""
-        said = _NOTHING._replace(score=best.score, rulers=best.rulers, status=status)
+    def _refuse(self, status: Status, best: _ScoredMotion, others: list[_ScoredMotion]) -> Registration:
+        """Return the scores without a pose."""
+        refused = _NOT_FOUND._replace(score=best.score, rulers=best.rulers, status=status)
         if not others:
-            return said
-        pose, _ = _described(others[0].motion, self.placement)
-        return said._replace(runner_up=others[0].score, runner_up_pose=pose)
+            return refused
+        pose, _ = decompose(others[0].motion, self.placement)
+        return refused._replace(runner_up=others[0].score, runner_up_pose=pose)
 
-    def _is_enough(self, tried: _Tried) -> bool:
-        return tried.score >= self.least_score + _chance(tried)
+    def _is_accepted(self, tried: _ScoredMotion) -> bool:
+        # A share of one half has the standard deviation 0.5 / sqrt(n).
+        return tried.score >= self.min_score + 0.5 * self.limits.significance / math.sqrt(tried.rulers)
 
-    # ---- places ----------------------------------------------------------------------------------------------
+    # ---- coordinates -----------------------------------------------------------------------------------------
 
     @functools.cached_property
-    def _scale(self) -> float:
-        """Pixels of a unit, at the placement point."""
+    def _pixels_per_unit(self) -> float:
+        """Pixels per unit of length at the placement point: root of the determinant of the derivative."""
         place = np.array(self.placement)
         step = 1e-6 * self.shift
-        x, y = (self._pixels(place + each) - self._pixels(place) for each in np.eye(2) * step)
+        x, y = (self._to_pixels(place + each) - self._to_pixels(place) for each in np.eye(2) * step)
         return float(np.sqrt(abs(x[0] * y[1] - x[1] * y[0]))) / step
 
-    def _pixels(self, points: Float64) -> Float64:
-        return through(np.asarray(self.to_image), points)
+    def _to_pixels(self, points: Float64) -> Float64:
+        return apply_homography(np.asarray(self.to_image), points)
 
-    def _known(self, pixels: Float64) -> Float64:
-        return through(np.linalg.inv(np.asarray(self.to_image)), pixels)
-
-    def _seen(self, edges: KnownEdges, motions: list[Float64]) -> tuple[Float64, Float64]:
-        """Points and unit normals in the picture, (k, n, 2) each, of edges where each motion has them.
-
-        What is along an edge stays along it: the way along is taken to the picture, as the map is about the point.
-        """
-        moved = np.zeros((len(motions), 3, 3))
-        moved[:, :2], moved[:, 2, 2] = motions, 1.0
-        matrix = (np.asarray(self.to_image) @ moved).swapaxes(1, 2)
-        lifted = (edges.point - self.placement) @ matrix[:, :2] + matrix[:, 2:]
-        x, y = edges.normal.T
-        along = np.stack([-y, x], axis=-1) @ matrix[:, :2]
-        pixels = lifted[..., :2] / lifted[..., 2:]
-        way = (along[..., :2] - pixels * along[..., 2:]) / lifted[..., 2:]
-        way /= np.hypot(way[..., 0], way[..., 1])[..., None]
-        return pixels, np.stack([way[..., 1], -way[..., 0]], axis=-1)
+    def _from_pixels(self, pixels: Float64) -> Float64:
+        return apply_homography(np.linalg.inv(np.asarray(self.to_image)), pixels)
 
 
-def _blank_border(level: npt.NDArray[np.uint16], border: int) -> None:
-    """Let edges beyond the picture cost somewhat less than they do on average in it.
+def _checked_edges(edges: KnownEdges, name: str, max_count: int) -> KnownEdges:
+    """Return known edges as float64 arrays, or raise what is wrong with them."""
+    point, normal = (np.asarray(each, np.float64) for each in edges)
+    if point.shape != normal.shape or point.ndim != 2 or point.shape[1] != 2 or len(point) > max_count:
+        raise ValueError(f"CoarseRegistration.{name} must have up to {max_count} points (n, 2) and as many normals")
+    if not (np.all(np.isfinite(point)) and np.allclose(np.hypot(*normal.T), 1.0)):
+        raise ValueError(f"CoarseRegistration.{name} must have finite points and unit normals")
+    return KnownEdges(point, normal)
 
-    If they cost all, poses that keep more of the edges in the picture would do better than right ones; on boards that
-    repeat themselves they still do at the average's cost, and if they cost less than half, those that keep few.
+
+def _fill_border(level: npt.NDArray[np.uint16], border: int, border_cost: float) -> None:
+    """Set the cost of edges beyond the image to a share of their mean cost in the image, for each direction.
+
+    At the full cost, poses that keep more edges in the image would win over the right pose; on boards with repeated
+    patterns they do so even at the mean cost. Below half the mean cost, poses that keep few edges in the image win.
     """
     inside = (slice(None), slice(border, -border), slice(border, -border))
     own = level[inside].copy()
-    level[:] = np.rint(_BEYOND * own.mean(axis=(1, 2)))[:, None, None]
+    level[:] = np.rint(border_cost * own.mean(axis=(1, 2)))[:, None, None]
     level[inside] = own
 
 
-def _chance(tried: _Tried) -> float:
-    """Return what a score may differ by without a reason: three standard deviations of a share of half."""
-    return 1.5 / math.sqrt(tried.rulers)
+def _select_found(rows: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Return the same number of rows for each start, evenly picked from those with an edge.
 
-
-def through(matrix: Float64, points: Float64) -> Float64:
-    """Return where a homography takes points (..., 2)."""
-    lifted = points @ matrix[:, :2].T + matrix[:, 2]
-    return np.asarray(lifted[..., :2] / lifted[..., 2:])
-
-
-def _rotation(angle: float) -> Float64:
-    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-
-
-def _moved(edges: KnownEdges, motions: list[Float64], placement: tuple[float, float]) -> KnownEdges:
-    """Edges, (k, n, 2), where each motion of points relative to the placement point has them."""
-    motion = np.stack(motions)
-    turn = motion[..., :2]
-    normal = edges.normal @ np.linalg.inv(turn)
-    point = (edges.point - placement) @ turn.swapaxes(1, 2) + motion[:, None, :, 2]
-    return KnownEdges(point, normal / np.hypot(normal[..., 0], normal[..., 1])[..., None])
-
-
-def _found(rows: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Pick as many rows for each start, evenly, of those with an edge: a trial of a missing one is none."""
+    Missing rows would waste start candidates of the robust fit.
+    """
     there = np.flatnonzero(np.all(np.isfinite(rows), axis=1))
     if not len(there):
-        return np.full((_SOLVED, rows.shape[1]), np.nan, np.float32)
-    return rows[there[np.arange(_SOLVED) * len(there) // _SOLVED]]
+        return np.full((_REFINEMENT_ROWS, rows.shape[1]), np.nan, np.float32)
+    return rows[there[np.arange(_REFINEMENT_ROWS) * len(there) // _REFINEMENT_ROWS]]
 
 
-def _composed(fits: BoardPose, index: int, motion: Float64) -> Float64:
-    """After a motion another one, which was measured about where the placement point is."""
-    x, y, theta = np.asarray(fits.pose[index], np.float64)
-    kx, ky, shear = np.asarray(fits.deformation[index], np.float64)
-    turn = _rotation(theta) @ np.array([[1.0 + kx, shear], [0.0, 1.0 + ky]])
-    return np.column_stack([turn @ motion[:, :2], motion[:, 2] + (x, y)])
-
-
-def _described(motion: Float64, placement: tuple[float, float]) -> tuple[Float64, Float64]:
-    """Pose of the origin, and deformation."""
-    turn = motion[:, :2]
-    theta = math.atan2(turn[1, 0], turn[0, 0])
-    bent = _rotation(theta).T @ turn
-    return np.array([*(motion[:, 2] - turn @ placement), theta]), np.array([bent[0, 0] - 1, bent[1, 1] - 1, bent[0, 1]])
-
-
-_NOTHING = Registration(
+_NOT_FOUND = Registration(
     pose=np.full(3, np.nan),
     deformation=np.full(3, np.nan),
     placement=np.full(2, np.nan),

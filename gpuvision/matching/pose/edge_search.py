@@ -1,8 +1,15 @@
-"""All poses of a grid on the device: known edges against a picture's edges, by place and direction.
+"""Exhaustive search of a grid of poses: known edges against the edges of an image, by position and direction.
 
-A picture becomes cells (`CellMeans`), and those what an edge costs in each of them, for eight directions of its normal
-(`EdgeLevels`): little where the gradient is strong and points that way or the other, whatever the contrast.
-`SearchEdges` adds that up over the known edges, for every shift and heading; `shifts_of` says where they lie.
+`CellMeans` reduces the image to cells. `EdgeCostMap` computes what an edge costs in each cell for eight directions of
+its normal: little where the gradient is strong and parallel to the normal (either sign), whatever the contrast.
+`EdgeSearch` sums these costs over the known edges for every shift and heading of the grid; `cell_offsets` gives the
+cells on which the known edges lie. The cost is that of chamfer matching [1]_ with a truncated orientation-dependent
+distance.
+
+References
+----------
+.. [1] H. G. Barrow et al., "Parametric correspondence and chamfer matching: two new techniques for image matching",
+   IJCAI 1977.
 """
 
 from __future__ import annotations
@@ -14,40 +21,57 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, LaunchBuilder, Variant, WorkSize, capacity, flags, type_defines
+from gpuvision.host import (
+    Array,
+    Device,
+    FloatArray,
+    Launch,
+    LaunchBuilder,
+    Variant,
+    WorkSize,
+    capacity,
+    flags,
+    to_numpy,
+    type_defines,
+)
 from gpuvision.matching.field.field_pose import PoseCosts, pose_cost_outputs, pose_grid_work
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite
 
-CHANNELS, LEVELS = 8, 1023
+CHANNELS, COST_LEVELS = 8, 1023
 """Directions of normals, pi / 8 apart, and steps of a cost."""
 _BLOCK, _MOST_POINTS, _MOST_CELLS = 64, 4096, 1 << 26
 
 
 class Means(NamedTuple):
-    """float32 (rows, columns) of cells, the means of their pixels."""
+    """Means of square cells: ``means`` is float32 (rows, columns) of cells."""
 
-    means: Any
+    means: FloatArray
 
 
-class Levels(NamedTuple):
-    """uint16 (8, rows, columns), an edge's cost in `LEVELS` steps, by the direction of its normal and its cell."""
+class EdgeCosts(NamedTuple):
+    """Costs of edges: ``level`` is uint16 (8, rows, columns), by direction of the normal, in `COST_LEVELS` steps."""
 
-    level: Any
+    level: Array
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellMeans(VisionOperation[Means]):
-    """Means of square cells: ``op(image) -> Means``, of uint8, uint16 or float32 (rows, columns).
+    """Means of square cells: ``op(image) -> Means``, image uint8, uint16 or float32 of shape (rows, columns).
 
     Parameters
     ----------
-    cell_px
-        A cell's side; what is left over at the right and below is not used.
+    cell_px : int
+        Side of a cell [px], 1 to 64, default 2. Incomplete cells at the right and at the bottom are dropped.
+
+    Raises
+    ------
+    ValueError
+        The parameter is out of its range.
 
     Notes
     -----
-    Error: single precision, at most cell_px^2 roundings of a sum: 2^-24 cell_px^2 of the greatest pixel.
+    Error: single precision with at most cell_px^2 roundings of a sum: 2^-24 cell_px^2 of the greatest pixel.
     """
 
     Result: ClassVar[type[Any]] = Means
@@ -76,35 +100,41 @@ class CellMeans(VisionOperation[Means]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EdgeLevels(VisionOperation[Levels]):
-    """What an edge costs in each cell: ``op(means) -> Levels``, of float32 (rows, columns).
+class EdgeCostMap(VisionOperation[EdgeCosts]):
+    """Cost of an edge in each cell: ``op(means) -> EdgeCosts``, means float32 of shape (rows, columns).
 
-    1 - (g_k^2 / (g^2 + t^2))^2, the least of the cell and its eight neighbours: g is the gradient by 3 x 3 cells
-    (Sobel), g_k its part along the normal of direction k, t a quarter of the threshold (a sharp step has half its
-    height for g). Without neighbours all round, or where one is not finite, there is no gradient; that costs 1.
+    The cost is 1 - (g_k^2 / (g^2 + t^2))^2, the least of the cell and its eight neighbours. g is the gradient over 3 x
+    3 cells (Sobel), g_k its component along the normal of direction k, and t a quarter of the threshold (a sharp step
+    of height h has g = h / 2). A cell without neighbours on all sides, or with one that is not finite, has no gradient
+    and costs 1.
 
     Parameters
     ----------
-    threshold
-        Height of an edge that costs a third [grey levels].
-    border
-        Cells without edges that are laid round.
+    threshold : float
+        Height of an edge that costs about a third [grey levels], above 0.
+    border : int
+        Width of a border of cells without edges around the image [cells], 0 or more.
+
+    Raises
+    ------
+    ValueError
+        A parameter is out of its range.
 
     Notes
     -----
-    Error: a step of `LEVELS`, and single precision's 1e-6 of the greatest mean in a gradient.
+    Error: one of `COST_LEVELS` steps, and single precision's 1e-6 of the greatest mean in a gradient.
     """
 
-    Result: ClassVar[type[Any]] = Levels
+    Result: ClassVar[type[Any]] = EdgeCosts
 
     threshold: float
     border: int = 0
 
     def __post_init__(self) -> None:
-        if finite(self.threshold, "EdgeLevels.threshold") <= 0.0:
-            raise ValueError(f"EdgeLevels.threshold is {self.threshold}, expected grey levels above 0")
+        if finite(self.threshold, "EdgeCostMap.threshold") <= 0.0:
+            raise ValueError(f"EdgeCostMap.threshold is {self.threshold}, expected grey levels above 0")
         if not isinstance(self.border, int) or self.border < 0:
-            raise ValueError(f"EdgeLevels.border is {self.border!r}, expected a whole number, 0 or more")
+            raise ValueError(f"EdgeCostMap.border is {self.border!r}, expected a whole number, 0 or more")
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -113,7 +143,7 @@ class EdgeLevels(VisionOperation[Levels]):
         build.check_shape(len(shape) == 2 and min(shape) >= 3, "means (rows, columns) of 3 cells or more each way")
         rows, columns = (each + 2 * self.border for each in shape)
         if CHANNELS * rows * columns > _MOST_CELLS:
-            raise ValueError(f"EdgeLevels: {rows} x {columns} cells with the border are too many; make cells larger")
+            raise ValueError(f"EdgeCostMap: {rows} x {columns} cells with the border are too many; make cells larger")
         angles = np.arange(CHANNELS) * (math.pi / CHANNELS)
         return build.launch(
             "edge_search/edge_search.cl",
@@ -130,27 +160,33 @@ class EdgeLevels(VisionOperation[Levels]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchEdges(VisionOperation[PoseCosts]):
-    """Score all shifts for all headings: ``op(level, shifts) -> PoseCosts``.
+class EdgeSearch(VisionOperation[PoseCosts]):
+    """Score of every pose of a grid: ``op(level, offsets) -> PoseCosts``.
 
-    ``level`` is uint16 (channels, rows, columns) as `EdgeLevels` gives it; ``shifts`` int32 (headings, points), for
-    every point the cell, counted through all of ``level``, that it lies on at the first position (row 0, column 0).
-    One that is negative, or from which a position leaves ``level``, is not used.
+    ``level`` is uint16 (channels, rows, columns), the result of `EdgeCostMap`. ``offsets`` is int32 (headings, points),
+    the result of `cell_offsets`: for every point the flat index into ``level`` of its cell at the first position (row
+    0, column 0). A point with a negative index, or one that leaves ``level`` at some position, is not used.
 
     Parameters
     ----------
-    rows, columns
-        Positions: shifts by 0, 1, ... cells down and to the right.
-    headings, points
-        How many.
-    with_scores
-        Also give every pose's score, not only the least of each block.
-    variant
-        "vector" (64 positions at once, for CPU runtimes), "work_item" (a work-item per position, for GPUs), or "auto".
+    rows, columns : int
+        Number of positions: shifts by 0, 1, ... cells down and to the right, 1 to 4096 each.
+    headings, points : int
+        Number of headings, 1 to 4096, and of points, 1 to 4096.
+    with_scores : bool
+        Whether to return the score of every pose, besides the least of each block.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: "vector" computes 64 positions at once (CPU runtimes), "work_item" one position per work-item
+        (GPUs).
+
+    Raises
+    ------
+    ValueError
+        A parameter is out of its range.
 
     Notes
     -----
-    Sums are exact; what a score says is `EdgeLevels`' error.
+    The sums are exact; the error of a score is that of `EdgeCostMap`.
     """
 
     Result: ClassVar[type[Any]] = PoseCosts
@@ -163,9 +199,9 @@ class SearchEdges(VisionOperation[PoseCosts]):
     variant: Variant = "auto"
 
     def __post_init__(self) -> None:
-        for name, most in (("rows", 4096), ("columns", 4096), ("headings", 4096), ("points", _MOST_POINTS)):
-            if not isinstance(getattr(self, name), int) or not 1 <= getattr(self, name) <= most:
-                raise ValueError(f"SearchEdges.{name} is {getattr(self, name)!r}, expected 1 to {most}")
+        for name, limit in (("rows", 4096), ("columns", 4096), ("headings", 4096), ("points", _MOST_POINTS)):
+            if not isinstance(getattr(self, name), int) or not 1 <= getattr(self, name) <= limit:
+                raise ValueError(f"EdgeSearch.{name} is {getattr(self, name)!r}, expected 1 to {limit}")
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -176,7 +212,7 @@ class SearchEdges(VisionOperation[PoseCosts]):
         limit = math.prod(shape) - (self.rows - 1) * shape[2] - max(self.columns, _BLOCK) + 1
         if shape[1] < self.rows or shape[2] < self.columns or limit < 1:
             raise ValueError(
-                f"SearchEdges takes levels of {self.rows} x {self.columns} cells or more, got shape {shape}; lay a "
+                f"EdgeSearch takes levels of {self.rows} x {self.columns} cells or more, got shape {shape}; give a "
                 f"wider border"
             )
         grid = (self.headings, self.rows, self.columns)
@@ -192,7 +228,7 @@ class SearchEdges(VisionOperation[PoseCosts]):
         )
 
 
-def shifts_of(
+def cell_offsets(
     points_px: npt.NDArray[np.float64],
     normals: npt.NDArray[np.float64],
     cell_px: int,
@@ -200,23 +236,23 @@ def shifts_of(
     shape: tuple[int, ...],
     positions: tuple[int, int],
 ) -> npt.NDArray[np.int32]:
-    """Say where points lie in ``level``, for positions about where they are.
+    """Return the index of the cell of each point in ``level``, at the first position of a grid centred on the points.
 
     Parameters
     ----------
     points_px, normals
-        (headings, points, 2) in the image, for the middle position.
+        (headings, points, 2) positions in the image [px] for the middle position, and unit normals.
     cell_px, border
-        Of `CellMeans` and `EdgeLevels`.
+        Parameters of `CellMeans` and `EdgeCostMap`.
     shape
-        Of ``level``.
+        Shape of ``level``.
     positions
-        Rows and columns; odd, the middle one is no shift.
+        Rows and columns of positions, odd; the middle one is no shift.
 
     Returns
     -------
     numpy.ndarray
-        int32 (headings, points) as `SearchEdges` takes them, -1 where not all positions lie in ``level``.
+        int32 (headings, points) as `EdgeSearch` takes them; -1 where not all positions lie in ``level``.
     """
     cell = (points_px + 0.5) / cell_px - 0.5
     rows, columns = positions
@@ -230,41 +266,43 @@ def shifts_of(
     return np.where(inside, shift, -1).astype(np.int32)
 
 
-class RoughShifts(NamedTuple):
-    """Poses of a grid: which heading, how many cells right and down (poses, 2), and what each costs, 0 to 1."""
+class GridShifts(NamedTuple):
+    """Poses of a grid: index of the heading, (poses, 2) cells right and down, and score, 0 to 1."""
 
     heading: npt.NDArray[np.int64]
     cells: npt.NDArray[np.int64]
     scores: npt.NDArray[np.float64]
 
 
-def best_shifts(costs: PoseCosts, positions: tuple[int, int], most: int, apart: tuple[int, int]) -> RoughShifts:
-    """Return the best poses, best first, none within ``apart`` (cells, headings) of a better one.
+def find_best_shifts(
+    costs: PoseCosts, positions: tuple[int, int], max_candidates: int, separation: tuple[int, int]
+) -> GridShifts:
+    """Return the best poses of a grid, best first, with non-maximum suppression.
 
     Parameters
     ----------
     costs
-        What `SearchEdges` gave, NumPy arrays.
+        Result of `EdgeSearch`, NumPy arrays.
     positions
-        As in `shifts_of`: cells are counted from the middle position.
-    most
-        How many at most.
-    apart
-        Cells each way, and headings, within which poses are the same.
+        As in `cell_offsets`: cells are counted from the middle position.
+    max_candidates
+        Largest number of poses.
+    separation
+        (cells, headings): poses within this distance of a better one are suppressed.
     """
-    least = np.array(costs.least, np.float64).ravel()
+    least = to_numpy(costs.least).astype(np.float64).ravel()
     least[~np.isfinite(least)] = np.inf
     heading, row, _ = np.unravel_index(np.arange(least.size), np.shape(costs.least))
     down = row - positions[0] // 2
-    right = np.ravel(costs.column) - positions[1] // 2
+    right = to_numpy(costs.column).ravel() - positions[1] // 2
     chosen: list[int] = []
     scores: list[float] = []
-    while len(chosen) < most:
+    while len(chosen) < max_candidates:
         number = int(np.argmin(least))
         if not np.isfinite(least[number]):
             break
         chosen.append(number)
         scores.append(float(least[number]))
-        near = (np.abs(down - down[number]) <= apart[0]) & (np.abs(right - right[number]) <= apart[0])
-        least[near & (np.abs(heading - heading[number]) <= apart[1])] = np.inf
-    return RoughShifts(heading[chosen], np.stack([right[chosen], down[chosen]], axis=-1), np.array(scores))
+        near = (np.abs(down - down[number]) <= separation[0]) & (np.abs(right - right[number]) <= separation[0])
+        least[near & (np.abs(heading - heading[number]) <= separation[1])] = np.inf
+    return GridShifts(heading[chosen], np.stack([right[chosen], down[chosen]], axis=-1), np.array(scores))

@@ -14,8 +14,8 @@ from gerbonara import LayerStack
 from gerbonara.utils import MM
 from matplotlib.path import Path as Outline
 
-from gpuvision.matching.artwork.artwork import Artwork, Land, read_artwork
-from gpuvision.matching.artwork.shapes import SAGITTA, Layer, Shape, area, capsule, covered, disk
+from gpuvision.matching.artwork.artwork import Artwork, Pad, read_artwork
+from gpuvision.matching.artwork.shapes import SAGITTA, Layer, Shape, area, capsule, disk, is_covered
 
 LAYERS = {
     r"copper\.gbr": "top copper",
@@ -105,19 +105,23 @@ def real_board(path: Path) -> Artwork:
     return read_artwork(path)
 
 
-def land_at(board: Artwork, x: float, y: float) -> Land:
-    (found,) = [each for each in board.lands if math.dist(each.centre, (x * 1e-3, y * 1e-3)) < 1e-6]
+def land_at(board: Artwork, x: float, y: float) -> Pad:
+    (found,) = [each for each in board.pads if math.dist(each.centre, (x * 1e-3, y * 1e-3)) < 1e-6]
     return found
 
 
 def test_says_what_each_spot_is_for(tmp_path: Path) -> None:
     board = read(tmp_path)
-    assert len(board.lands) == 5
+    assert len(board.pads) == 5
     via, hole, pad, fiducial, turned = (land_at(board, *each) for each in ((2, 5), (17, 2), (5, 2), (2, 8), (10, 2)))
     assert (via.role, via.shape, via.hole) == ("via", "circle", pytest.approx(0.3e-3))
     assert math.isnan(via.opening)
-    assert (hole.role, hole.hole, hole.opening) == ("pad", pytest.approx(0.9e-3), pytest.approx(0.1e-3, abs=SAGITTA))
-    assert (pad.role, pad.shape, pad.hole, pad.opening) == ("pad", "rectangle", 0, pytest.approx(0.1e-3))
+    assert (hole.role, hole.hole, hole.opening) == (
+        "component",
+        pytest.approx(0.9e-3),
+        pytest.approx(0.1e-3, abs=SAGITTA),
+    )
+    assert (pad.role, pad.shape, pad.hole, pad.opening) == ("component", "rectangle", 0, pytest.approx(0.1e-3))
     assert sorted(pad.size) == pytest.approx([0.9e-3, 1.5e-3])
     assert (fiducial.role, fiducial.opening) == ("fiducial", pytest.approx(0.5e-3, abs=SAGITTA))
     assert fiducial.size == pytest.approx([1e-3, 1e-3], abs=SAGITTA)
@@ -125,7 +129,7 @@ def test_says_what_each_spot_is_for(tmp_path: Path) -> None:
     assert (turned.shape, turned.angle, *turned.size) == ("rectangle", *map(pytest.approx, (math.pi / 6, 2e-3, 1e-3)))
     assert board.bounds == pytest.approx(np.array([[0, 0], [20e-3, 10e-3]]), abs=1e-9)
     assert (board.vias, board.fiducials) == ((via,), (fiducial,))
-    assert len(board.pads) == 3
+    assert len(board.component_pads) == 3
 
 
 def test_cuts_the_edges_to_what_can_be_seen(tmp_path: Path) -> None:
@@ -151,16 +155,16 @@ def test_cuts_the_edges_to_what_can_be_seen(tmp_path: Path) -> None:
 def test_takes_the_sides_of_pads_in_the_open(tmp_path: Path) -> None:
     board = read(tmp_path)
     edges = board.edges
-    of_pads = np.flatnonzero(edges.land >= 0)
-    counts = Counter(board.lands[i].shape for i in edges.land[of_pads])
+    of_pads = np.flatnonzero(edges.pad >= 0)
+    counts = Counter(board.pads[i].shape for i in edges.pad[of_pads])
     assert counts == {"rectangle": 8}
     assert edges.bare[of_pads].all()
     for index in of_pads:
-        land = board.lands[edges.land[index]]
+        pad = board.pads[edges.pad[index]]
         middle = (edges.start[index] + edges.end[index]) / 2
-        assert (middle - land.centre) @ edges.normal[index] == pytest.approx(edges.width[index] / 2)
-        across = min(land.size, key=lambda size: abs(size - edges.width[index]))
-        along = land.size.sum() - across
+        assert (middle - pad.centre) @ edges.normal[index] == pytest.approx(edges.width[index] / 2)
+        across = min(pad.size, key=lambda size: abs(size - edges.width[index]))
+        along = pad.size.sum() - across
         assert edges.width[index] == pytest.approx(across)
         assert edges.length[index] == pytest.approx(along - 2 * 50e-6)
 
@@ -168,8 +172,8 @@ def test_takes_the_sides_of_pads_in_the_open(tmp_path: Path) -> None:
 def test_a_mask_just_as_large_as_its_pad_hides_the_sides(tmp_path: Path) -> None:
     same = MASK.replace("1.7X1.1", "1.5X0.9")
     board = read(tmp_path, mask=same)
-    pad = board.lands.index(land_at(board, 5, 2))
-    assert not np.any(board.edges.land == pad)
+    pad = board.pads.index(land_at(board, 5, 2))
+    assert not np.any(board.edges.pad == pad)
     assert land_at(board, 5, 2).opening == pytest.approx(0, abs=1e-12)
 
 
@@ -178,7 +182,7 @@ def test_without_a_mask_everything_is_bare(tmp_path: Path) -> None:
     board = read_artwork(written(tmp_path, files), layers=LAYERS)
     assert board.edges.bare.all()
     assert not board.fiducials
-    assert all(math.isnan(each.opening) for each in board.lands)
+    assert all(math.isnan(each.opening) for each in board.pads)
 
 
 def test_the_file_s_word_counts_more_than_the_look(tmp_path: Path) -> None:
@@ -188,7 +192,7 @@ def test_the_file_s_word_counts_more_than_the_look(tmp_path: Path) -> None:
     said = said.replace("D11*\n", "%TO.N,GND*%\n%TO.P,R7,2*%\nD11*\n").replace("D12*\n", "%TD*%\nD12*\n")
     board = read(tmp_path, copper=said)
     roles = {where: land_at(board, *where).role for where in ((2, 8), (5, 2), (17, 2))}
-    assert roles == {(2, 8): "pad", (5, 2): "fiducial", (17, 2): "via"}
+    assert roles == {(2, 8): "component", (5, 2): "fiducial", (17, 2): "via"}
     assert land_at(board, 2, 8).function == "SMDPad"
     assert (land_at(board, 2, 5).net, land_at(board, 2, 5).part, land_at(board, 2, 5).pin) == ("GND", "R7", "2")
 
@@ -197,7 +201,7 @@ def test_areas_that_the_mask_opens_are_pads_and_pours_are_not(tmp_path: Path) ->
     square = "G36*\n" + line(12, 1, 13, 1) + at(13, 2, "D01") + at(12, 2, "D01") + at(12, 1, "D01") + "G37*\n"
     pour = "G36*\n" + line(0, 9, 20, 9) + at(20, 10, "D01") + at(0, 10, "D01") + at(0, 9, "D01") + "G37*\n"
     board = read(tmp_path, copper=COPPER + square + pour, mask=MASK + square)
-    assert len(board.lands) == 6
+    assert len(board.pads) == 6
     assert land_at(board, 12.5, 1.5).shape == "rectangle"
 
 
@@ -292,7 +296,7 @@ def test_what_lies_along_a_line_is_what_lies_at_its_points(rng: np.random.Genera
         laid = np.zeros(len(points), dtype=bool)
         for each in shapes:
             laid[Outline(each.outline).contains_points(points)] = each.dark
-        np.testing.assert_array_equal(covered(Layer(shapes).crossings(start, end), places), laid)
+        np.testing.assert_array_equal(is_covered(Layer(shapes).crossings(start, end), places), laid)
 
 
 def star(rng: np.random.Generator) -> np.ndarray:
@@ -316,7 +320,7 @@ def test_layers_are_where_gerbonara_says(data: Path, name: str) -> None:
 
 @pytest.mark.realdata
 @pytest.mark.parametrize(
-    ("name", "lands", "holes", "bounds"),
+    ("name", "pads", "holes", "bounds"),
     [
         ("fritzing", 364, 482, (96.96, 97.94)),
         ("upverter", 63, 63, (39.5, 60.025)),  # its holes are in two files
@@ -324,10 +328,10 @@ def test_layers_are_where_gerbonara_says(data: Path, name: str) -> None:
     ],
 )
 def test_reads_the_boards_of_three_tools(
-    data: Path, name: str, lands: int, holes: int, bounds: tuple[float, float]
+    data: Path, name: str, pads: int, holes: int, bounds: tuple[float, float]
 ) -> None:
     board = real_board(data / "gerber" / name)
-    assert len(board.lands) == lands
+    assert len(board.pads) == pads
     assert len(board.holes.start) == holes
     assert np.ptp(board.bounds, axis=0) * 1e3 == pytest.approx(bounds, abs=0.01)
     assert np.sum(board.edges.trace >= 0) > 100
@@ -361,10 +365,10 @@ def test_edges_lie_between_copper_and_laminate_in_a_picture(data: Path, name: st
 def test_one_board_written_four_ways_is_one_board(data: Path) -> None:
     """KiCad wrote it with and without X2's attributes, with and without macros of apertures."""
     first, *others = (real_board(data / "gerber" / name) for name in BOARDS[2:])
-    order = np.lexsort(np.round(np.array([each.centre for each in first.lands]).T, 5))
+    order = np.lexsort(np.round(np.array([each.centre for each in first.pads]).T, 5))
     for other in others:
-        also = np.lexsort(np.round(np.array([each.centre for each in other.lands]).T, 5))
-        pairs = [(first.lands[i], other.lands[j]) for i, j in zip(order, also, strict=True)]
+        also = np.lexsort(np.round(np.array([each.centre for each in other.pads]).T, 5))
+        pairs = [(first.pads[i], other.pads[j]) for i, j in zip(order, also, strict=True)]
         for one, two in pairs:
             assert (one.role, one.shape) == (two.role, two.shape)
             assert one.centre == pytest.approx(two.centre, abs=1e-6)

@@ -351,7 +351,7 @@ def test_wrong_input(device: Device) -> None:
         PLAIN(np.zeros(SHAPE), place(), device=device)
     with pytest.raises(ValueError, match="16 columns or more"):
         PLAIN(np.zeros((80, 15), np.uint8), place(), device=device)
-    with pytest.raises(ValueError, match="say how many marks"):
+    with pytest.raises(ValueError, match="say how many blobs"):
         PLAIN.bind(device, SHAPE, np.uint8)
     with pytest.raises(ValueError, match="shape"):
         replace(PLAIN, shape="square")(np.zeros(SHAPE, np.uint8), place(), device=device)
@@ -365,7 +365,7 @@ def test_wrong_input(device: Device) -> None:
         ({"shape": "star"}, ValueError, "expected one of circle, ring, square, cross"),
         ({"polarity": "light"}, ValueError, "expected one of bright, dark, either"),
         ({"ratio": 1.0}, ValueError, "ratio"),
-        ({"agreement": 0.0}, ValueError, "agreement"),
+        ({"min_inlier_fraction": 0.0}, ValueError, "min_inlier_fraction"),
         ({"search_px": math.nan}, ValueError, "search_px"),
         ({"spokes": 18}, ValueError, "a multiple of 4"),
         ({"spokes": 20, "shape": "ring"}, ValueError, "a multiple of 8"),

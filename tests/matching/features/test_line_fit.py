@@ -44,12 +44,12 @@ def errors(fits: LineFits, normal: np.ndarray, middle: np.ndarray) -> np.ndarray
 @pytest.mark.parametrize("loss", ["tukey", "huber", "ransac", "least_squares"])
 def test_lies_at_the_minimum_of_its_loss(device: Device, loss: Any, variant: Any, rng: np.random.Generator) -> None:
     _, _, points = scene(rng, 5, 20, 0.3 if loss != "least_squares" else 0.0, size=100.0)
-    operation = FitLines(loss=loss, scale=NOISE, variant=variant, steps=60)
+    operation = FitLines(loss=loss, scale=NOISE, variant=variant, max_iterations=60)
     fits = operation(points, device=device)
     for number, each in enumerate(points):
         angle = np.arctan2(-fits.normal[number, 0], fits.normal[number, 1])
         start = (angle + 1e-6, float(fits.distance[number]) + 1e-5)
-        found = robust.fit_line(each, np.ones(20), NOISE, loss, operation.bend, start)
+        found = robust.fit_line(each, np.ones(20), NOISE, loss, operation.tuning_constant, start)
         assert angle == pytest.approx(found[0], abs=1e-7)
         assert fits.distance[number] == pytest.approx(found[1], abs=1e-5)
 
@@ -173,9 +173,9 @@ def test_efficiencies() -> None:
         ({"loss": "l1"}, "loss is 'l1'"),
         ({"loss": "ransac"}, "give the scale"),
         ({"scale": 0.0}, "scale is 0.0"),
-        ({"bend": -1.0}, "bend is -1.0"),
-        ({"trials": 0}, "trials is 0"),
-        ({"smallest_scale": -1.0}, "smallest_scale"),
+        ({"tuning_constant": -1.0}, "tuning_constant is -1.0"),
+        ({"max_trials": 0}, "max_trials is 0"),
+        ({"min_scale": -1.0}, "min_scale"),
     ],
 )
 def test_refuses_parameters(parameters: dict[str, Any], message: str) -> None:

@@ -151,17 +151,19 @@ def test_any_direction(device: Device, angle: float, x: float, y: float) -> None
 
 
 @VARIANTS
-@pytest.mark.parametrize("choice", ["strongest", "first", "last", "all"])
-def test_choices(device: Device, variant: Any, choice: Any, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("edge_selection", ["strongest", "first", "last", "all"])
+def test_choices(device: Device, variant: Any, edge_selection: Any, rng: np.random.Generator) -> None:
     image = reference.stripe_image(SHAPE, 0.3, 90.0, 16.0, 1.0) + rng.normal(0.0, 1.0, SHAPE)
     image += 0.4 * reference.step_image(SHAPE, 0.3, 112.0, 1.0)
     rulers = reference.across(0.3, 94.0, 10, rng, MIDDLE)
-    operation = RulerEdges(threshold=15.0, length=80, smoothing_px=1.5, choice=choice, most=5, variant=variant)
+    operation = RulerEdges(
+        threshold=15.0, length=80, smoothing_px=1.5, edge_selection=edge_selection, max_edges=5, variant=variant
+    )
     ours = operation(image.astype(np.float32), rulers, device=device)
     for k, found in enumerate(expected(operation, image, rulers)):
         assert 2 <= len(found) <= 4
         mine = type(ours)(*(None if each is None else each[k] for each in ours))
-        if choice == "all":
+        if edge_selection == "all":
             assert_like(type(ours)(*(None if each is None else each[: len(found)] for each in mine)), found)
             assert (mine.status[: len(found)] == 0).all()
             assert (mine.status[len(found) :] == Status.LOW_SIGNAL).all()
@@ -171,13 +173,13 @@ def test_choices(device: Device, variant: Any, choice: Any, rng: np.random.Gener
                 "first": found[0],
                 "last": found[-1],
                 "strongest": max(found, key=lambda edge: abs(edge["gradient"])),
-            }[choice]
+            }[edge_selection]
             assert_like(mine, [wanted])
 
 
 def test_more_edges_than_places(device: Device) -> None:
     image = reference.stripe_image(SHAPE, 0.0, 75.0, 20.0, 1.0).astype(np.float32)
-    ours = RulerEdges(threshold=15.0, choice="all", most=1)(image, one_ruler(), device=device)
+    ours = RulerEdges(threshold=15.0, edge_selection="all", max_edges=1)(image, one_ruler(), device=device)
     assert ours.status.shape == (1, 1)
     assert ours.status[0, 0] == Status.AMBIGUOUS
     assert abs(ours.position[0, 0] + 10.0) < 0.05
@@ -432,9 +434,9 @@ def test_wrong_input(device: Device) -> None:
         ({"length": 513}, ValueError, "expected 5 to 512"),
         ({"width": 0}, ValueError, "width is 0"),
         ({"polarity": "up"}, ValueError, "expected one of any, rising, falling"),
-        ({"choice": "best"}, ValueError, "expected one of strongest"),
+        ({"edge_selection": "best"}, ValueError, "expected one of strongest"),
         ({"ambiguity": 1.5}, ValueError, "0 < share <= 1"),
-        ({"ambiguity": 0.5, "choice": "all"}, ValueError, "choice='strongest' only"),
+        ({"ambiguity": 0.5, "edge_selection": "all"}, ValueError, "edge_selection='strongest' only"),
         ({"spacing_px": (3.0, 5.0)}, ValueError, "pairs=True only"),
         ({"pairs": True, "spacing_px": (5.0, 3.0)}, ValueError, "0 <= least <= greatest"),
         ({"radius_px": 0.0}, ValueError, "radius_px is 0"),

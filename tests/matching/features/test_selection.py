@@ -12,7 +12,9 @@ import pytest
 
 from gpuvision.matching.artwork.artwork import Artwork, Holes, read_artwork
 from gpuvision.matching.artwork.shapes import Shape
-from gpuvision.matching.features.selection import Candidates, Imaging, Selection, candidates, select
+from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates
+from gpuvision.matching.features.imaging import Imaging
+from gpuvision.matching.features.selection import Selection, select_rulers
 
 IMAGING = Imaging(pixel=20e-6)
 REGION = ((-1e-3, -1e-3), (21e-3, 21e-3))
@@ -32,11 +34,11 @@ def board(folder: Path, *traces: Trace, flashes: tuple[tuple[float, float], ...]
     return read_artwork(folder, layers={r"copper\.gbr": "top copper"})
 
 
-def rulers_of(artwork: Artwork, imaging: Imaging = IMAGING) -> Candidates:
-    return candidates(artwork, REGION, MIDDLE, imaging)
+def rulers_of(artwork: Artwork, imaging: Imaging = IMAGING) -> FeatureCandidates:
+    return find_ruler_candidates(artwork, REGION, MIDDLE, imaging)
 
 
-def seen_offsets(rulers: Candidates, shift: np.ndarray, angle: float) -> np.ndarray:
+def seen_offsets(rulers: FeatureCandidates, shift: np.ndarray, angle: float) -> np.ndarray:
     """How far along each ruler the edge is met, of a board turned about the placement point and shifted."""
     cos, sin = math.cos(angle), math.sin(angle)
     turn = np.array([[cos, -sin], [sin, cos]])
@@ -45,7 +47,7 @@ def seen_offsets(rulers: Candidates, shift: np.ndarray, angle: float) -> np.ndar
     return np.sum(normal * (point - rulers.point), axis=1) / np.sum(normal * rulers.normal, axis=1)
 
 
-def covariance_of(rulers: Candidates, chosen: np.ndarray, imaging: Imaging) -> np.ndarray:
+def covariance_of(rulers: FeatureCandidates, chosen: np.ndarray, imaging: Imaging) -> np.ndarray:
     """Of generalised least squares: derivatives by differences, the etching as noise that all edges share."""
     step = 1e-7
     columns = [
@@ -53,7 +55,7 @@ def covariance_of(rulers: Candidates, chosen: np.ndarray, imaging: Imaging) -> n
         for shift, angle in (((1, 0), 0), ((0, 1), 0), ((0, 0), 1))
     ]
     rows = np.stack(columns, axis=1)[chosen]
-    shared = imaging.etch * (~rulers.pair[chosen])
+    shared = imaging.etch_bias_sigma * (~rulers.pair[chosen])
     noise = np.diag(rulers.sigma[chosen] ** 2) + np.outer(shared, shared)
     return np.linalg.inv(rows.T @ np.linalg.inv(noise) @ rows)
 
@@ -63,7 +65,7 @@ def test_promises_what_least_squares_deliver(tmp_path: Path, criterion: str) -> 
     rulers = rulers_of(board(tmp_path, *CROSS, flashes=((5, 15), (15, 5))))
     for which in (rulers.pair, ~rulers.pair):
         some = only(rulers, which)
-        found = select(some, IMAGING, 12, criterion=criterion)  # type: ignore[arg-type]
+        found = select_rulers(some, IMAGING, 12, criterion=criterion)  # type: ignore[arg-type]
         expected = covariance_of(some, found.chosen, IMAGING)
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         assert found.covariance / scale == pytest.approx(expected / scale, abs=1e-4)
@@ -71,15 +73,15 @@ def test_promises_what_least_squares_deliver(tmp_path: Path, criterion: str) -> 
         assert len(found.chosen) == len(set(found.chosen.tolist())) == 12
 
 
-def only(rulers: Candidates, which: np.ndarray) -> Candidates:
-    return Candidates(*(each[which] for each in rulers[:-1]), rulers.placement)
+def only(rulers: FeatureCandidates, which: np.ndarray) -> FeatureCandidates:
+    return FeatureCandidates(*(each[which] for each in rulers[:-1]), rulers.placement)
 
 
 def test_measured_poses_scatter_as_promised(tmp_path: Path, rng: np.random.Generator) -> None:
     rulers = rulers_of(board(tmp_path, *CROSS, flashes=((5, 15), (15, 5))))
-    found = select(rulers, IMAGING, 20)
+    found = select_rulers(rulers, IMAGING, 20)
     rows = np.concatenate([rulers.normal, lever(rulers)[:, None]], axis=1)[found.chosen]
-    shared = IMAGING.etch * (~rulers.pair[found.chosen])
+    shared = IMAGING.etch_bias_sigma * (~rulers.pair[found.chosen])
     noise = np.linalg.inv(np.diag(rulers.sigma[found.chosen] ** 2) + np.outer(shared, shared))
     solve = np.linalg.inv(rows.T @ noise @ rows) @ rows.T @ noise
     errors = []
@@ -92,13 +94,13 @@ def test_measured_poses_scatter_as_promised(tmp_path: Path, rng: np.random.Gener
     assert np.std(errors, axis=0) == pytest.approx(found.sigmas, rel=0.09)
 
 
-def lever(rulers: Candidates) -> np.ndarray:
+def lever(rulers: FeatureCandidates) -> np.ndarray:
     away = rulers.point - rulers.placement
     return np.asarray(away[:, 0] * rulers.normal[:, 1] - away[:, 1] * rulers.normal[:, 0])
 
 
 def test_comes_near_to_the_best_of_all_sets(tmp_path: Path, rng: np.random.Generator) -> None:
-    imaging = replace(IMAGING, etch=0.0)
+    imaging = replace(IMAGING, etch_bias_sigma=0.0)
     all_rulers = rulers_of(board(tmp_path, *CROSS), imaging)
     which = rng.choice(len(all_rulers.sigma), 14, replace=False)
     rulers = only(all_rulers, which)
@@ -111,15 +113,15 @@ def test_comes_near_to_the_best_of_all_sets(tmp_path: Path, rng: np.random.Gener
         information = prior + (some * weight[list(chosen), None]).T @ some
         return float(np.linalg.slogdet(information)[1] - np.linalg.slogdet(prior)[1])
 
-    found = select(rulers, imaging, 4, per_source=14)
+    found = select_rulers(rulers, imaging, 4, per_source=14)
     best = max(gain(each) for each in itertools.combinations(range(14), 4))
     assert best >= gain(tuple(found.chosen)) >= (1 - 1 / math.e) * best
 
 
 def test_beats_what_is_picked_at_random(tmp_path: Path, rng: np.random.Generator) -> None:
     rulers = rulers_of(board(tmp_path, *CROSS, flashes=((5, 15), (15, 5))))
-    found = select(rulers, IMAGING, 12)
-    placed = select(rulers, IMAGING, 12, criterion="placement")
+    found = select_rulers(rulers, IMAGING, 12)
+    placed = select_rulers(rulers, IMAGING, 12, criterion="placement")
     sets = [rng.choice(len(rulers.sigma), 12, replace=False) for _ in range(200)]
     others = [covariance_of(rulers, each, IMAGING) for each in sets]
     assert np.linalg.det(found.covariance) < min(np.linalg.det(each) for each in others)
@@ -139,20 +141,22 @@ def test_beats_what_is_picked_at_random(tmp_path: Path, rng: np.random.Generator
 def test_refuses_what_fixes_no_pose(tmp_path: Path, traces: tuple[Trace, ...], budget: float, message: str) -> None:
     rulers = rulers_of(board(tmp_path, *traces))
     with pytest.raises(ValueError, match=message):
-        select(rulers, IMAGING, budget, per_source=100)
+        select_rulers(rulers, IMAGING, budget, per_source=100)
 
 
 def test_etching_spoils_edges_that_face_one_way_and_no_others(tmp_path: Path) -> None:
     artwork = board(tmp_path, flashes=((2, 5), (18, 5), (5, 2), (5, 18)))
-    sure, unsure = replace(IMAGING, etch=1e-9), replace(IMAGING, etch=30e-6)
+    sure, unsure = replace(IMAGING, etch_bias_sigma=1e-9), replace(IMAGING, etch_bias_sigma=30e-6)
     rulers = rulers_of(artwork)
     one_way = only(rulers, (rulers.normal @ (1, 1) > 0.9) & ~rulers.pair)
-    assert select(one_way, sure, 16).sigmas[:2].max() < 1e-6
-    assert select(one_way, unsure, 16).sigmas[:2].min() > 20e-6
-    assert select(rulers, unsure, 16).sigmas[:2].max() < 1e-6
+    assert select_rulers(one_way, sure, 16).sigmas[:2].max() < 1e-6
+    assert select_rulers(one_way, unsure, 16).sigmas[:2].min() > 20e-6
+    assert select_rulers(rulers, unsure, 16).sigmas[:2].max() < 1e-6
     traces = rulers_of(board(tmp_path, *CROSS), unsure)
     pairs = only(traces, traces.pair)
-    assert select(pairs, unsure, 16).covariance == pytest.approx(select(pairs, sure, 16).covariance, rel=1e-6)
+    assert select_rulers(pairs, unsure, 16).covariance == pytest.approx(
+        select_rulers(pairs, sure, 16).covariance, rel=1e-6
+    )
 
 
 def test_repeated_edges_on_a_ruler_are_ambiguous(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -171,7 +175,7 @@ def test_repeated_edges_on_a_ruler_are_ambiguous(tmp_path: Path, rng: np.random.
         assert 0.05 < seen < 0.95
         assert rulers.ambiguity[here] == pytest.approx(seen, abs=0.015)
     assert not rulers.ambiguity[rulers.point[:, 0] > 9e-3].any()
-    chosen = select(rulers, imaging, 8).chosen
+    chosen = select_rulers(rulers, imaging, 8).chosen
     assert not rulers.ambiguity[chosen].any()
 
 
@@ -184,7 +188,7 @@ def test_ink_and_holes_are_ambiguous_too_and_may_lie_off(tmp_path: Path) -> None
     artwork = replace(artwork, silk=(ink,), holes=holes)
     far, near = (rulers_of(artwork, replace(IMAGING, registration=each)) for each in (0.0, 0.3e-3))
 
-    def upper(rulers: Candidates, low: float, high: float) -> np.ndarray:
+    def upper(rulers: FeatureCandidates, low: float, high: float) -> np.ndarray:
         x, y = rulers.point.T * 1e3
         return rulers.ambiguity[(x > low) & (x < high) & np.isclose(y, 10.15) & ~rulers.pair]
 
@@ -208,7 +212,7 @@ def test_edges_that_pull_at_each_other_are_left_out(tmp_path: Path) -> None:
 def test_rulers_stay_on_their_edges_and_in_the_region_to_read(tmp_path: Path, rng: np.random.Generator) -> None:
     artwork = board(tmp_path, *CROSS, flashes=((5, 15), (15, 5)))
     rulers = rulers_of(artwork)
-    found = select(rulers, IMAGING, 20)
+    found = select_rulers(rulers, IMAGING, 20)
     low, high = found.region
     half_width = IMAGING.width_px * IMAGING.pixel / 2
     edges = artwork.edges
@@ -233,7 +237,7 @@ def test_rulers_stay_on_their_edges_and_in_the_region_to_read(tmp_path: Path, rn
 def test_keeps_to_its_budget_and_to_few_rulers_on_each_side(tmp_path: Path) -> None:
     rulers = rulers_of(board(tmp_path, *CROSS, flashes=((5, 15), (15, 5))))
     costs = rulers.pixels(IMAGING)
-    found = select(rulers, IMAGING, 3000, costs=costs)
+    found = select_rulers(rulers, IMAGING, 3000, costs=costs)
     assert found.cost == costs[found.chosen].sum() <= 3000
     left = np.setdiff1d(np.arange(len(costs)), found.chosen)
     full = [source for source in set(rulers.source) if np.sum(rulers.source[found.chosen] == source) == 4]
@@ -241,8 +245,8 @@ def test_keeps_to_its_budget_and_to_few_rulers_on_each_side(tmp_path: Path) -> N
     counts = [np.sum(rulers.source[found.chosen] == each) for each in set(rulers.source)]
     assert max(counts) <= 4
     # The board is as it is when mirrored in its diagonal: x may be y.
-    assert np.sort(select(rulers, IMAGING, 12, missing=0.19).sigmas) == pytest.approx(
-        np.sort(select(rulers, IMAGING, 12).sigmas) / 0.9, rel=0.01
+    assert np.sort(select_rulers(rulers, IMAGING, 12, missing=0.19).sigmas) == pytest.approx(
+        np.sort(select_rulers(rulers, IMAGING, 12).sigmas) / 0.9, rel=0.01
     )
 
 
@@ -254,7 +258,7 @@ def test_the_sigma_is_1_2_times_the_bound() -> None:
 
 
 @pytest.mark.parametrize(
-    "changed", [{"pixel": 0.0}, {"blur_px": -1.0}, {"shift": math.nan}, {"etch": -1.0}, {"angle": math.inf}]
+    "changed", [{"pixel": 0.0}, {"blur_px": -1.0}, {"shift": math.nan}, {"etch_bias_sigma": -1.0}, {"angle": math.inf}]
 )
 def test_refuses_a_camera_that_is_none(changed: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="must be"):
@@ -265,15 +269,15 @@ def test_refuses_what_makes_no_sense(tmp_path: Path) -> None:
     artwork = board(tmp_path, *CROSS)
     rulers = rulers_of(artwork)
     with pytest.raises(ValueError, match="region must be"):
-        candidates(artwork, ((0, 0), (0, 1)), MIDDLE, IMAGING)
+        find_ruler_candidates(artwork, ((0, 0), (0, 1)), MIDDLE, IMAGING)
     with pytest.raises(ValueError, match="placement must be"):
-        candidates(artwork, REGION, (0, math.nan), IMAGING)
+        find_ruler_candidates(artwork, REGION, (0, math.nan), IMAGING)
     with pytest.raises(ValueError, match="costs must be"):
-        select(rulers, IMAGING, 5, costs=[1.0])
+        select_rulers(rulers, IMAGING, 5, costs=[1.0])
     with pytest.raises(ValueError, match="missing must be"):
-        select(rulers, IMAGING, 5, missing=1.0)
+        select_rulers(rulers, IMAGING, 5, missing=1.0)
     with pytest.raises(ValueError, match="criterion must be"):
-        select(rulers, IMAGING, 5, criterion="trace")  # type: ignore[arg-type]
+        select_rulers(rulers, IMAGING, 5, criterion="trace")  # type: ignore[arg-type]
 
 
 @pytest.mark.realdata
@@ -281,8 +285,8 @@ def test_refuses_what_makes_no_sense(tmp_path: Path) -> None:
 def test_finds_rulers_on_the_boards_of_three_tools(data: Path, name: str, rng: np.random.Generator) -> None:
     artwork = read_artwork(data / "gerber" / name)
     middle = artwork.bounds.mean(axis=0)
-    rulers = candidates(artwork, (middle - 8e-3, middle + 8e-3), middle, IMAGING)
-    found: Selection = select(rulers, IMAGING, 30)
+    rulers = find_ruler_candidates(artwork, (middle - 8e-3, middle + 8e-3), middle, IMAGING)
+    found: Selection = select_rulers(rulers, IMAGING, 30)
     others = [
         np.sqrt(np.diag(covariance_of(rulers, rng.choice(len(rulers.sigma), 30, replace=False), IMAGING)))
         for _ in range(50)

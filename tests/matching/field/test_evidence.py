@@ -11,13 +11,13 @@ import pytest
 from gpuvision.formats.field_file import read_field
 from gpuvision.matching.field.distance_map import Arc, Field
 from gpuvision.matching.field.evidence import (
-    chance,
+    detected_fraction,
     distances_to_lines,
     evidence,
     expected_crossings,
-    line_length,
-    onto_field,
-    seen_share,
+    log_nfa,
+    robot_to_field,
+    total_line_length,
 )
 from gpuvision.plots.field import field_lines
 
@@ -50,7 +50,7 @@ def test_crossings_are_where_scan_lines_meet_lines() -> None:
     c, s = math.cos(pose[2]), math.sin(pose[2])
     seen = (np.reshape(paths, (-1, 2, 2)) - pose[:2]) @ np.array([[c, -s], [s, c]])
     turned = expected_crossings(CROSS, pose, seen.reshape(-1, 4), line_width=0.1)
-    np.testing.assert_allclose(onto_field(turned.places, pose), found.places, atol=1e-12)
+    np.testing.assert_allclose(robot_to_field(turned.places, pose), found.places, atol=1e-12)
 
 
 def test_crossings_that_need_not_be_found_are_left_out() -> None:
@@ -71,10 +71,10 @@ def test_circles_are_crossed_twice() -> None:
 def test_seen_is_what_has_a_point() -> None:
     paths = [(x, -1.0, x, 1.0) for x in (-3.5, -3.0, -2.5, -2.0)]
     crossings = expected_crossings(CROSS, (0.0, 0.0, 0.0), paths, line_width=0.1)
-    assert seen_share(crossings, np.array([(-3.5, 0.04), (-2.0, -0.06), (5.0, 5.0)]), 0.05) == 0.25
-    assert seen_share(crossings, crossings.places, 0.05) == 1.0
+    assert detected_fraction(crossings, np.array([(-3.5, 0.04), (-2.0, -0.06), (5.0, 5.0)]), 0.05) == 0.25
+    assert detected_fraction(crossings, crossings.places, 0.05) == 1.0
     nothing = expected_crossings(CROSS, (0.0, 0.0, 0.0), [(5.0, 1.0, 5.0, 2.0)], line_width=0.1)
-    assert math.isnan(seen_share(nothing, crossings.places, 0.05))
+    assert math.isnan(detected_fraction(nothing, crossings.places, 0.05))
 
 
 def test_chance_bounds_what_random_points_reach(rng: np.random.Generator) -> None:
@@ -83,17 +83,17 @@ def test_chance_bounds_what_random_points_reach(rng: np.random.Generator) -> Non
     # Straight ones; goal and penalty areas; the circle; corners of 79.568 degrees.
     straight, areas = 2 * 21.875 + 3 * 13.875, 2 * (2 * 0.625 + 3.775 + 2 * 2.125 + 6.775)
     arcs = 2 * math.pi * 1.9375 + 4 * 0.6875 * math.radians(79.568)
-    assert line_length(field) == pytest.approx(straight + areas + arcs, abs=1e-4)
+    assert total_line_length(field) == pytest.approx(straight + areas + arcs, abs=1e-4)
     reached = []
     for _ in range(1000):
         places = rng.uniform(-0.5, 0.5, (60, 2)) * (field.length, field.width)
-        reached.append(chance(distances_to_lines(field, places), field, scale=0.25, reach=6.0, outside=None))
+        reached.append(log_nfa(distances_to_lines(field, places), field, scale=0.25, max_range=6.0, margin=None))
     # Expected below ln(1/100): 10 at most, and 4 sigmas of that.
     assert np.sum(np.array(reached) < math.log(0.01)) < 10 + 4 * math.sqrt(10)
-    assert chance([], field, scale=0.25, reach=6.0, outside=None) == math.inf
-    on_lines = chance(np.zeros(60), field, scale=0.25, reach=6.0, outside=1.0)
+    assert log_nfa([], field, scale=0.25, max_range=6.0, margin=None) == math.inf
+    on_lines = log_nfa(np.zeros(60), field, scale=0.25, max_range=6.0, margin=1.0)
     # All 60 points within 15 mm, but for what the poses' number takes from it.
-    assert on_lines == pytest.approx(60 * math.log(2 * 0.015 * line_length(field) / 308), rel=0.15)
+    assert on_lines == pytest.approx(60 * math.log(2 * 0.015 * total_line_length(field) / 308), rel=0.15)
 
 
 def test_missing_is_what_is_not_seen_beside_what_is_explained() -> None:
@@ -102,7 +102,7 @@ def test_missing_is_what_is_not_seen_beside_what_is_explained() -> None:
     pose = (1.0, 1.0, 0.5)
     paths = np.hstack([0.0 * ways, 3.0 * ways])
     places = expected_crossings(CROSS, pose, paths, line_width=0.1).places
-    told = {"near": 0.05, "scale": 0.2, "reach": 3.0, "outside": 0.5}
+    told = {"half_line_width": 0.05, "scale": 0.2, "max_range": 3.0, "margin": 0.5}
     whole = evidence(places, paths, CROSS, pose, **told)
     assert (whole.expected, whole.on_lines, whole.seen) == (len(places), 1.0, 1.0)
     assert whole.missing == 0.0

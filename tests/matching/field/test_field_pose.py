@@ -13,7 +13,12 @@ from canary import Guarded
 from gpuvision.formats.field_file import read_field
 from gpuvision.host import Device
 from gpuvision.matching.field.distance_map import Arc, DistanceMap, Field
-from gpuvision.matching.field.field_pose import FieldPoseRefinement, FieldPoseSearch, locate, twin_of
+from gpuvision.matching.field.field_pose import (
+    FieldPoseRefinement,
+    FieldPoseSearch,
+    find_pose_candidates,
+    symmetric_twin,
+)
 from gpuvision.status import Status
 from reference import field as reference
 
@@ -23,14 +28,14 @@ POSE = np.array([3.1, -2.2, 0.7])
 
 @cache
 def large(device: Device) -> DistanceMap:
-    return DistanceMap(field=read_field("robocup_msl"), cell=0.1, outside=1.0, device=device)
+    return DistanceMap(field=read_field("robocup_msl"), cell=0.1, margin=1.0, device=device)
 
 
 @cache
 def small(device: Device, columns: int = 7) -> DistanceMap:
     """A field of few columns, that no block fills."""
     field = Field(length=0.1 * columns, width=0.9, lines=((-1.0, 0.13, 2.0, 0.41),), arcs=(Arc(0.2, -0.3, 0.5, -1, 2),))
-    return DistanceMap(field=field, cell=0.1, reach=2.0, device=device)
+    return DistanceMap(field=field, cell=0.1, max_range=2.0, device=device)
 
 
 def view(
@@ -99,8 +104,8 @@ def test_wrong_maps_are_refused() -> None:
     field = read_field("robocup_msl")
     for change, match in (
         ({"cell": 0.0}, "cell"),
-        ({"outside": -1.0}, "outside"),
-        ({"reach": math.inf}, "reach"),
+        ({"margin": -1.0}, "margin"),
+        ({"max_range": math.inf}, "max_range"),
         ({"cell": 1e-3}, "or more for this field"),
     ):
         with pytest.raises(ValueError, match=match):
@@ -188,13 +193,13 @@ def test_scores_are_near_the_exact_cost(device: Device, rng: np.random.Generator
 
 
 def assert_found(field_map: DistanceMap, pose: Any, points: np.ndarray, device: Device) -> None:
-    candidates = locate(field_map, points, device=device)
+    candidates = find_pose_candidates(field_map, points, device=device)
     first = candidates[0]
     assert first.status == Status.OK
-    assert first.twin is not None
-    pair = {0, first.twin}
-    assert candidates[first.twin].score == pytest.approx(first.score, abs=1e-6)
-    assert candidates[first.twin].twin == 0
+    assert first.symmetric_twin is not None
+    pair = {0, first.symmetric_twin}
+    assert candidates[first.symmetric_twin].score == pytest.approx(first.score, abs=1e-6)
+    assert candidates[first.symmetric_twin].symmetric_twin == 0
     assert len(candidates) == 2 or candidates[2].score > first.score + 0.005
     right = min((candidates[number] for number in pair), key=lambda each: np.abs(off(each.pose, pose)).sum())
     far = off(right.pose, pose)
@@ -206,7 +211,7 @@ def test_kidnapped_robots_are_found(device: Device, rng: np.random.Generator) ->
     field_map = large(device)
     for _ in range(10):
         pose = rng.uniform([-10.0, -6.0, -np.pi], [10.0, 6.0, np.pi])
-        assert_found(field_map, pose, view(field_map, pose, rng, 128, reach=6.0), device)
+        assert_found(field_map, pose, view(field_map, pose, rng, 128, max_range=6.0), device)
 
 
 def test_clutter_of_70_percent(device: Device, rng: np.random.Generator) -> None:
@@ -214,25 +219,25 @@ def test_clutter_of_70_percent(device: Device, rng: np.random.Generator) -> None
     field_map = large(device)
     for _ in range(40):
         pose = rng.uniform([-10.5, -6.5, -np.pi], [10.5, 6.5, np.pi])
-        points = view(field_map, pose, rng, 200, reach=6.0)
+        points = view(field_map, pose, rng, 200, max_range=6.0)
         angle, far = rng.uniform(-np.pi, np.pi, 140), 6.0 * np.sqrt(rng.uniform(0.0, 1.0, 140))
         points[:140] = np.stack([far * np.cos(angle), far * np.sin(angle)], axis=-1)
-        first = locate(field_map, points, device=device)[0]
-        assert min(np.abs(off(each, pose)[:2]).max() for each in (first.pose, twin_of(first.pose))) < 0.3
+        first = find_pose_candidates(field_map, points, device=device)[0]
+        assert min(np.abs(off(each, pose)[:2]).max() for each in (first.pose, symmetric_twin(first.pose))) < 0.3
 
 
 def test_a_robot_outside_the_field(device: Device, rng: np.random.Generator) -> None:
     field_map = large(device)
     pose = np.array([4.0, 7.8, -1.2])
-    assert_found(field_map, pose, view(field_map, pose, rng, 128, reach=6.0), device)
+    assert_found(field_map, pose, view(field_map, pose, rng, 128, max_range=6.0), device)
 
 
 def test_a_compass_tells_twins_apart(device: Device, rng: np.random.Generator) -> None:
-    field_map = DistanceMap(field=read_field("robocup_junior"), cell=0.02, scale=0.05, reach=1.5, device=device)
+    field_map = DistanceMap(field=read_field("robocup_junior"), cell=0.02, scale=0.05, max_range=1.5, device=device)
     pose = np.array([0.31, -0.22, 0.7])
-    points = view(field_map, pose, rng, sigma=0.005, reach=1.2)
-    first, *others = locate(field_map, points, headings=(0.6,), device=device)
-    assert first.twin is None
+    points = view(field_map, pose, rng, sigma=0.005, max_range=1.2)
+    first, *others = find_pose_candidates(field_map, points, headings=(0.6,), device=device)
+    assert first.symmetric_twin is None
     assert np.abs(off(first.pose, pose)).max() < 0.02
     assert all(each.score > first.score + 0.05 for each in others)
 
@@ -240,8 +245,10 @@ def test_a_compass_tells_twins_apart(device: Device, rng: np.random.Generator) -
 def test_points_twice_are_the_same_pose(device: Device, rng: np.random.Generator) -> None:
     field_map = large(device)
     points = view(field_map, POSE, rng)
-    once, twice = (locate(field_map, each, device=device)[0] for each in (points, np.repeat(points, 2, axis=0)))
-    other = twice.pose if np.abs(off(twice.pose, once.pose)).sum() < 1.0 else twin_of(twice.pose)
+    once, twice = (
+        find_pose_candidates(field_map, each, device=device)[0] for each in (points, np.repeat(points, 2, axis=0))
+    )
+    other = twice.pose if np.abs(off(twice.pose, once.pose)).sum() < 1.0 else symmetric_twin(twice.pose)
     np.testing.assert_allclose(off(other, once.pose), 0.0, atol=3e-5)
 
 
@@ -249,25 +256,30 @@ def test_a_mirrored_view_is_a_mirrored_pose(device: Device, rng: np.random.Gener
     """The field is its own mirror image, so a mirrored camera finds the mirrored pose: no score can tell that."""
     field_map = large(device)
     points = view(field_map, POSE, rng)
-    right, mirrored = (locate(field_map, each, device=device)[0] for each in (points, points * np.float32([1, -1])))
+    right, mirrored = (
+        find_pose_candidates(field_map, each, device=device)[0] for each in (points, points * np.float32([1, -1]))
+    )
     assert mirrored.score == pytest.approx(right.score, abs=1e-5)
     mirror_pose = POSE * [1.0, -1.0, -1.0]
-    assert min(np.abs(off(each, mirror_pose)).max() for each in (mirrored.pose, twin_of(mirrored.pose))) < 0.05
+    assert min(np.abs(off(each, mirror_pose)).max() for each in (mirrored.pose, symmetric_twin(mirrored.pose))) < 0.05
 
 
 def test_a_wrong_scale_shows_in_the_scatter(device: Device, rng: np.random.Generator) -> None:
     field_map = large(device)
-    points = view(field_map, POSE, rng, 128, reach=6.0)
-    right, wrong = (locate(field_map, np.float32(s) * points, near=POSE, device=device)[0] for s in (1.0, 1.05))
-    assert wrong.scale > 1.5 * right.scale
+    points = view(field_map, POSE, rng, 128, max_range=6.0)
+    right, wrong = (
+        find_pose_candidates(field_map, np.float32(s) * points, initial_pose=POSE, device=device)[0]
+        for s in (1.0, 1.05)
+    )
+    assert wrong.residual_std > 1.5 * right.residual_std
     assert np.abs(off(wrong.pose, POSE)[:2]).max() < 0.3
     np.testing.assert_array_less(np.diag(right.covariance), np.diag(wrong.covariance))
 
 
 def test_no_points_no_pose(device: Device) -> None:
     nothing = np.full((8, 2), np.nan, np.float32)
-    assert locate(large(device), nothing, device=device) == ()
-    assert locate(large(device), nothing, near=POSE, device=device) == ()
+    assert find_pose_candidates(large(device), nothing, device=device) == ()
+    assert find_pose_candidates(large(device), nothing, initial_pose=POSE, device=device) == ()
 
 
 # ---- the local tier ------------------------------------------------------------------------------------------
@@ -321,7 +333,7 @@ def test_covariance_is_the_scatter(device: Device, rng: np.random.Generator) -> 
 def test_views_that_fix_a_part_only(device: Device, lines: Any, arcs: Any, rng: np.random.Generator) -> None:
     field_map = DistanceMap(field=Field(length=10.0, width=6.0, lines=lines, arcs=arcs), cell=0.1, device=device)
     pose = np.array([0.4, -0.3, 0.5])
-    points = view(field_map, pose, rng, reach=3.0)
+    points = view(field_map, pose, rng, max_range=3.0)
     fit = FieldPoseRefinement(map=field_map)(points, np.float32([pose]), device=device)
     assert fit.status[0] == Status.AMBIGUOUS
     assert np.isnan(fit.covariance).all()
@@ -338,7 +350,7 @@ def test_poses_that_are_none(device: Device, rng: np.random.Generator) -> None:
     fit = FieldPoseRefinement(map=field_map)(points, starts, device=device)
     # Far away nothing is near a line.
     assert fit.status.tolist() == [Status.NOT_FINITE, Status.NOT_FINITE, Status.OK, Status.LOW_SIGNAL]
-    for values in (fit.poses, fit.covariance, fit.information, fit.score, fit.scale, fit.share):
+    for values in (fit.poses, fit.covariance, fit.information, fit.score, fit.residual_std, fit.inlier_fraction):
         np.testing.assert_array_equal(np.isfinite(values.reshape(4, -1)).all(axis=1), [False, False, True, False])
     few = FieldPoseRefinement(map=field_map)(points[:3], starts[2:3], device=device)
     assert few.status[0] == Status.LOW_SIGNAL
@@ -357,7 +369,7 @@ def test_wrong_inputs_are_refused(device: Device) -> None:
         FieldPoseSearch(map=field_map, headings=0)
     with pytest.raises(ValueError, match="count"):
         refine.bind(device, (4, 2), np.float32)
-    with pytest.raises(ValueError, match="near"):
-        locate(field_map, np.zeros((4, 2), np.float32), near=(1.0, 2.0), device=device)
+    with pytest.raises(ValueError, match="initial_pose"):
+        find_pose_candidates(field_map, np.zeros((4, 2), np.float32), initial_pose=(1.0, 2.0), device=device)
     with pytest.raises(TypeError, match="DistanceMap"):
         FieldPoseSearch(map=field_map.field)

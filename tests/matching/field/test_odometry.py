@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gpuvision.matching.field.odometry import PoseEstimate, correct, disagreement, predict
+from gpuvision.matching.field.odometry import PoseEstimate, correct, predict, squared_mahalanobis_distance
 
 POSE = np.array([1.0, 2.0, 3.0])
 COVARIANCE = np.array([[4e-3, 1e-3, 2e-4], [1e-3, 9e-3, -3e-4], [2e-4, -3e-4, 1e-4]])
@@ -39,7 +39,7 @@ def test_correction_is_kalmans() -> None:
     np.testing.assert_allclose(corrected.pose, expected - [0, 0, 0 if expected[2] < np.pi else 2 * np.pi], rtol=1e-10)
     np.testing.assert_allclose(corrected.covariance, (np.eye(3) - gain) @ COVARIANCE, rtol=1e-9)
     far = (view - POSE) @ np.linalg.inv(COVARIANCE + noise) @ (view - POSE)
-    assert disagreement(estimate, view, np.linalg.inv(noise)) == pytest.approx(far, rel=1e-10)
+    assert squared_mahalanobis_distance(estimate, view, np.linalg.inv(noise)) == pytest.approx(far, rel=1e-10)
 
 
 def test_one_line_corrects_what_it_says() -> None:
@@ -48,19 +48,19 @@ def test_one_line_corrects_what_it_says() -> None:
     corrected = correct(estimate, (50.0, 2.1, 0.05), np.diag([0.0, 1e8, 1e8]))
     np.testing.assert_allclose(corrected.pose, [1.0, 2.1, 0.05], atol=1e-6)
     np.testing.assert_allclose(np.diag(corrected.covariance), [0.04, 1e-8, 1e-8], rtol=1e-5)
-    assert disagreement(estimate, (50.0, 2.0, 0.0), np.diag([0.0, 1e8, 1e8])) == pytest.approx(0.0)
+    assert squared_mahalanobis_distance(estimate, (50.0, 2.0, 0.0), np.diag([0.0, 1e8, 1e8])) == pytest.approx(0.0)
 
 
 def test_headings_are_compared_around_the_circle() -> None:
     estimate = PoseEstimate(np.array([0.0, 0.0, np.pi - 0.01]), np.eye(3) * 1e-4)
     corrected = correct(estimate, (0.0, 0.0, -np.pi + 0.01), np.eye(3) * 1e4)
     assert abs(abs(corrected.pose[2]) - np.pi) < 1e-9
-    assert disagreement(estimate, (0.0, 0.0, -np.pi + 0.01), np.eye(3) * 1e4) == pytest.approx(2.0)
+    assert squared_mahalanobis_distance(estimate, (0.0, 0.0, -np.pi + 0.01), np.eye(3) * 1e4) == pytest.approx(2.0)
 
 
 def test_the_twin_disagrees() -> None:
     estimate = PoseEstimate(np.array([3.0, 2.0, 0.5]), np.diag([0.01, 0.01, 0.01]))
-    assert disagreement(estimate, (-3.0, -2.0, 0.5 - np.pi), np.eye(3) * 1e4) > 16.3
+    assert squared_mahalanobis_distance(estimate, (-3.0, -2.0, 0.5 - np.pi), np.eye(3) * 1e4) > 16.3
 
 
 def test_wrong_sizes_are_refused() -> None:
@@ -70,4 +70,4 @@ def test_wrong_sizes_are_refused() -> None:
     with pytest.raises(ValueError, match="information"):
         correct(estimate, POSE, np.eye(2))
     with pytest.raises(ValueError, match="pose"):
-        disagreement(estimate, (1.0, 2.0, np.nan), np.eye(3))
+        squared_mahalanobis_distance(estimate, (1.0, 2.0, np.nan), np.eye(3))

@@ -52,7 +52,7 @@ def picture(rng: np.random.Generator, pose: np.ndarray = POSE, shifted: tuple[in
 
 def operation(variant: Any = "auto", **more: Any) -> BoardPoseEstimator:
     ruler = RulerEdges(threshold=20.0, length=48, width=5, smoothing_px=2.0, noise=NOISE, variant=variant)
-    return BoardPoseEstimator(ruler=ruler, lines=LINES, each=EACH, solver=SolvePose(placement=PLACE, **more))
+    return BoardPoseEstimator(ruler=ruler, lines=LINES, rulers_per_line=EACH, solver=SolvePose(placement=PLACE, **more))
 
 
 def laid(sigma: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +96,7 @@ def test_as_its_parts(device: Device, variant: Any, rng: np.random.Generator) ->
     normal, point, _ = artwork()
     sigma = edges.sigma.astype(float) * PIXEL
     rows = line_rows(np.repeat(normal, EACH, axis=0), np.repeat(point, EACH, axis=0), seen, sigma)
-    whole = SolvePose(placement=PLACE, trials=256)(rows, device=device)
+    whole = SolvePose(placement=PLACE, max_trials=256)(rows, device=device)
     deviation = np.sqrt(np.diag(whole.covariance))
     assert (np.abs(result.placement - whole.placement) < 0.3 * deviation[:2]).all()
     assert abs(result.pose[2] - whole.pose[2]) < 0.3 * deviation[2]
@@ -181,14 +181,14 @@ def test_writes_within_its_outputs(device: Device, rng: np.random.Generator) -> 
     ("more", "message"),
     [
         ({"lines": 1}, "lines is 1"),
-        ({"each": 0}, "each is 0"),
-        ({"lines": 500, "each": 100}, "in all"),
-        ({"ruler": RulerEdges(threshold=20.0, choice="all")}, "choice='all'"),
-        ({"solver": SolvePose(near=True)}, "no pose to start from"),
-        ({"lines": 2, "solver": SolvePose(freedom="affine")}, "too few"),
+        ({"rulers_per_line": 0}, "each is 0"),
+        ({"lines": 500, "rulers_per_line": 100}, "in all"),
+        ({"ruler": RulerEdges(threshold=20.0, edge_selection="all")}, "edge_selection='all'"),
+        ({"solver": SolvePose(with_initial_pose=True)}, "no pose to start from"),
+        ({"lines": 2, "solver": SolvePose(transform="affine")}, "too few"),
     ],
 )
 def test_refuses_parameters(more: dict[str, Any], message: str) -> None:
-    given = {"ruler": RulerEdges(threshold=20.0), "lines": 10, "each": 10} | more
+    given = {"ruler": RulerEdges(threshold=20.0), "lines": 10, "rulers_per_line": 10} | more
     with pytest.raises(ValueError, match=message):
         BoardPoseEstimator(**given)

@@ -46,7 +46,7 @@ def test_pictures_hold_what_is_on_the_board(tmp_path: Path) -> None:
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         expected = np.array([5e-3, 5e-3]) + 0.125e-3 * np.array([cos, sin]) + pose[:2]
         assert middle == pytest.approx(expected, abs=PIXEL / SAMPLES)
-    etched, _ = copper_of(replace(view, growth=-PIXEL))
+    etched, _ = copper_of(replace(view, etch_bias=-PIXEL))
     assert etched == pytest.approx((2e-3 - 2 * PIXEL) * (1.75e-3 - PIXEL), abs=around)
     assert copper_of(replace(view, silk_shift=(-1e-3, 0)))[0] == pytest.approx(4e-6, abs=around / 2)
     assert copper_of(replace(view, motion_px=5.0))[0] == pytest.approx(inside, abs=around / 2)

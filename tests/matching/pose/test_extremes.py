@@ -11,8 +11,9 @@ import pytest
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import read_artwork
 from gpuvision.matching.artwork.shapes import Shape
+from gpuvision.matching.features.candidates import find_ruler_candidates
 from gpuvision.matching.features.ruler import RulerEdges
-from gpuvision.matching.features.selection import candidates, select
+from gpuvision.matching.features.selection import select_rulers
 from gpuvision.matching.pose.board_pose import BoardPoseEstimator
 from gpuvision.matching.pose.pose import SolvePose
 from gpuvision.status import Status
@@ -64,7 +65,7 @@ def test_only_parallel_traces_are_left(board: BoardFix, device: Device, rng: np.
 @pytest.mark.parametrize("share", [0.5, 0.7])
 def test_mostly_clutter(board: BoardFix, share: float, device: Device, rng: np.random.Generator) -> None:
     """Half of the rulers, and most of them, on wrong edges: none is wrong where each row must have four others."""
-    careful = replace(board, largest_leverage=0.5)
+    careful = replace(board, max_leverage=0.5)
     pictures = [board.painted(board.view, more=board.splashes(rng, share)) for _ in range(3)]
     fixes = careful.fixes(pictures, 30, device, rng)
     assert not (fixes.squares > GROSS).any()
@@ -92,19 +93,19 @@ def test_a_comb_of_one_pitch_is_not_chosen(tmp_path: Path) -> None:
     artwork = read_artwork(tmp_path, layers={r"copper\.gbr": "top copper"})
     board = BoardFix(artwork=artwork, middle=(8e-3, 6e-3))
     imaging = replace(board.imaging, pixel=10e-6, shift=400e-6)
-    found = candidates(artwork, ((0, 0), (24e-3, 16e-3)), (8e-3, 6e-3), imaging)
+    found = find_ruler_candidates(artwork, ((0, 0), (24e-3, 16e-3)), (8e-3, 6e-3), imaging)
     inner = np.all((found.point > (3e-3, 3e-3)) & (found.point < (6e-3, 12e-3)), axis=1) & ~found.pair
     assert inner.any()
     assert (found.ambiguity[inner] == 1.0).all()
     with pytest.raises(ValueError, match="do not fix"):
-        select(type(found)(*(each[inner] for each in found[:-1]), found.placement), imaging, 40)
+        select_rulers(type(found)(*(each[inner] for each in found[:-1]), found.placement), imaging, 40)
 
 
 def test_two_rulers_are_too_few() -> None:
     ruler = RulerEdges(threshold=15.0, length=48, smoothing_px=2.0)
-    for solver, lines in ((SolvePose(), 2), (SolvePose(etch=10e-6), 3)):
+    for solver, lines in ((SolvePose(), 2), (SolvePose(etch_bias_sigma=10e-6), 3)):
         with pytest.raises(ValueError, match="too few"):
-            BoardPoseEstimator(ruler=ruler, lines=lines, each=1, solver=solver)
+            BoardPoseEstimator(ruler=ruler, lines=lines, rulers_per_line=1, solver=solver)
 
 
 def test_a_board_that_lies_further_off_than_it_was_looked_for(

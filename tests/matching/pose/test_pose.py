@@ -65,20 +65,22 @@ def errors(result: BoardPose, truth: np.ndarray) -> np.ndarray:
 
 
 @VARIANTS
-@pytest.mark.parametrize(("loss", "freedom"), [("tukey", "rigid"), ("huber", "scale"), ("least_squares", "affine")])
+@pytest.mark.parametrize(
+    ("loss", "transform"), [("tukey", "rigid"), ("huber", "similarity"), ("least_squares", "affine")]
+)
 def test_lies_at_the_minimum_of_its_loss(
-    device: Device, loss: Any, freedom: Any, variant: Any, rng: np.random.Generator
+    device: Device, loss: Any, transform: Any, variant: Any, rng: np.random.Generator
 ) -> None:
-    deformation = {"rigid": (0.0, 0.0, 0.0), "scale": (1e-3, 1e-3, 0.0), "affine": (1e-3, -2e-3, 5e-4)}[freedom]
+    deformation = {"rigid": (0.0, 0.0, 0.0), "similarity": (1e-3, 1e-3, 0.0), "affine": (1e-3, -2e-3, 5e-4)}[transform]
     bad = 0.3 if loss == "tukey" else 0.0
     truth, rows = scene(rng, 3, 33, bad=bad, deformation=deformation)
-    operation = SolvePose(loss=loss, freedom=freedom, variant=variant, steps=40, trials=64)
+    operation = SolvePose(loss=loss, transform=transform, variant=variant, max_iterations=40, max_trials=64)
     result = operation(rows, device=device)
     assert not result.status.any()
-    freedoms = {"rigid": 3, "scale": 4, "affine": 6}[freedom]
+    freedoms = {"rigid": 3, "similarity": 4, "affine": 6}[transform]
     for number, each in enumerate(rows):
         start = truth[number, :freedoms]
-        found = robust.solve_pose(each, freedoms, 1.0, loss, operation.bend, start)
+        found = robust.solve_pose(each, freedoms, 1.0, loss, operation.tuning_constant, start)
         ours = np.concatenate([result.pose[number], result.deformation[number]])[:freedoms]
         # A hundredth of their standard deviations (of the shifts, 0.1 m from the origin).
         np.testing.assert_allclose(ours[:2], found[:2], atol=5e-8)
@@ -87,11 +89,11 @@ def test_lies_at_the_minimum_of_its_loss(
         assert (result.weights[number, : int(bad * 33)] == 0.0).all()
 
 
-def carried(rows: np.ndarray, bad: int, freedom: str) -> tuple[float, float]:
+def carried(rows: np.ndarray, bad: int, transform: str) -> tuple[float, float]:
     """The least share of what all rows say that those behind the bad ones say, and the largest leverage of these."""
     nx, ny, px, py = rows[:, :4].T
     px, py = 100.0 * (px - px.mean()), 100.0 * (py - py.mean())
-    moves = [nx * px, nx * py, ny * px, ny * py] if freedom == "affine" else [ny * px - nx * py]
+    moves = [nx * px, nx * py, ny * px, ny * py] if transform == "affine" else [ny * px - nx * py]
     every = np.column_stack([nx, ny, *moves])
     good = every[bad:]
     share = eigh(good.T @ good, every.T @ every, eigvals_only=True)[0]
@@ -100,28 +102,28 @@ def carried(rows: np.ndarray, bad: int, freedom: str) -> tuple[float, float]:
 
 @VARIANTS
 @pytest.mark.parametrize(
-    ("freedom", "scale", "count", "bad", "turn"),
+    ("transform", "scale", "count", "bad", "turn"),
     [("rigid", 1.0, 32, 0.4, 0.08), ("rigid", None, 48, 0.3, 0.03), ("affine", 1.0, 64, 0.2, 0.03)],
 )
 def test_covariance_is_what_is_measured(
     device: Device,
     variant: Any,
-    freedom: Any,
+    transform: Any,
     scale: Any,
     count: int,
     bad: float,
     turn: float,
     rng: np.random.Generator,
 ) -> None:
-    deformation = (1e-3, -2e-3, 5e-4) if freedom == "affine" else (0.0, 0.0, 0.0)
+    deformation = (1e-3, -2e-3, 5e-4) if transform == "affine" else (0.0, 0.0, 0.0)
     truth, rows = scene(rng, 500, count, bad=bad, turn=turn, deformation=deformation)
-    operation = SolvePose(freedom=freedom, scale=scale, placement=PLACE, variant=variant, trials=256)
+    operation = SolvePose(transform=transform, scale=scale, placement=PLACE, variant=variant, max_trials=256)
     result = operation(rows, device=device)
     good = result.status == Status.OK
     # What is refused is what the good rows do not carry, to what their weights make of it.
-    agreement, leverage = np.transpose([carried(each, int(bad * count), freedom) for each in rows])
-    allowed = np.where(agreement > 0.75, 1.0, 0.5) * operation.largest_leverage
-    spare = np.minimum(agreement - operation.least_agreement, allowed - leverage)
+    agreement, leverage = np.transpose([carried(each, int(bad * count), transform) for each in rows])
+    allowed = np.where(agreement > 0.75, 1.0, 0.5) * operation.max_leverage
+    spare = np.minimum(agreement - operation.min_inlier_fraction, allowed - leverage)
     assert good[spare > 0.02].all()
     assert not good[spare < -0.02].any()
     assert np.mean(np.abs(spare) > 0.02) > 0.9
@@ -133,13 +135,13 @@ def test_covariance_is_what_is_measured(
     # No gross errors: 7 sigma have a chance of 1e-9 in three freedoms.
     squares = np.einsum("bi,bij,bj->b", found, np.linalg.inv(covariance), found)
     assert squares.max() < 49.0
-    np.testing.assert_allclose(np.mean(result.spread[good]), 1.0, atol=0.1)
+    np.testing.assert_allclose(np.mean(result.residual_scale[good]), 1.0, atol=0.1)
 
 
 def test_single_follows_double(device: Device, rng: np.random.Generator) -> None:
     _, rows = scene(rng, 20, 32, bad=0.3)
     rows = rows.astype(np.float32)
-    operation = SolvePose(placement=PLACE, trials=256)
+    operation = SolvePose(placement=PLACE, max_trials=256)
     single, double = operation(rows, device=device), operation(rows.astype(np.float64), device=device)
     # A twentieth of the standard deviations.
     np.testing.assert_allclose(single.placement, double.placement, atol=4e-8)
@@ -153,12 +155,12 @@ def test_points_of_a_board_turned_far(device: Device, variant: Any, rng: np.rand
     matrix, shift = robust.moved(np.array([0.02, -0.03, 1.2]))
     rows = point_rows(point, point @ matrix.T + shift, SIGMA)
     assert rows.shape == (12, 7)
-    result = SolvePose(variant=variant, steps=20)(rows, device=device)
+    result = SolvePose(variant=variant, max_iterations=20)(rows, device=device)
     np.testing.assert_allclose(result.pose, [0.02, -0.03, 1.2], atol=1e-10)
     # The other way round, started nearby.
     matrix, shift = robust.moved(np.array([0.02, -0.03, -3.0]))
     rows = point_rows(point, point @ matrix.T + shift, SIGMA)
-    result = SolvePose(variant=variant, near=True)(rows, np.array([0.0, 0.0, 3.0]), device=device)
+    result = SolvePose(variant=variant, with_initial_pose=True)(rows, np.array([0.0, 0.0, 3.0]), device=device)
     np.testing.assert_allclose(result.pose, [0.02, -0.03, -3.0], atol=1e-10)
 
 
@@ -207,7 +209,7 @@ def test_a_start_that_is_no_number(device: Device, rng: np.random.Generator) -> 
     _, rows = scene(rng, 2, 32)
     near = np.zeros((2, 3))
     near[1, 2] = np.nan
-    result = SolvePose(near=True)(rows, near, device=device)
+    result = SolvePose(with_initial_pose=True)(rows, near, device=device)
     np.testing.assert_array_equal(result.status, [Status.OK, Status.NOT_FINITE])
     assert np.isnan(result.pose[1]).all()
 
@@ -251,27 +253,29 @@ def etched(rng: np.random.Generator, boards: int, count: int, bad: float) -> tup
     """A scene whose edges all lie further out by what each board was etched; a fourth of them are no single edges."""
     truth, rows = scene(rng, boards, count, bad=bad)
     etch = rng.normal(0.0, ETCH, boards)
-    grows = np.where(np.arange(count) % 4, 1.0, 0.0) * np.ones((boards, 1))
+    etch_factor = np.where(np.arange(count) % 4, 1.0, 0.0) * np.ones((boards, 1))
     for number, parameters in enumerate(truth):
         matrix, _ = robust.moved(parameters)
         out = rows[number, :, :2] @ matrix.T
-        rows[number, :, 4:6] += etch[number] * grows[number][:, None] * out
-    return truth, etch, np.concatenate([rows, grows[..., None]], axis=-1)
+        rows[number, :, 4:6] += etch[number] * etch_factor[number][:, None] * out
+    return truth, etch, np.concatenate([rows, etch_factor[..., None]], axis=-1)
 
 
 @VARIANTS
 def test_an_etching_is_one_more_unknown(device: Device, variant: Any, rng: np.random.Generator) -> None:
     truth, etch, rows = etched(rng, 500, 40, 0.3)
     # Normals all over the upper half of the circle: without it the etching is a shift.
-    plain = SolvePose(placement=PLACE, trials=256, variant=variant)(np.ascontiguousarray(rows[..., :7]), device=device)
-    result = SolvePose(placement=PLACE, trials=256, etch=ETCH, variant=variant)(rows, device=device)
+    plain = SolvePose(placement=PLACE, max_trials=256, variant=variant)(
+        np.ascontiguousarray(rows[..., :7]), device=device
+    )
+    result = SolvePose(placement=PLACE, max_trials=256, etch_bias_sigma=ETCH, variant=variant)(rows, device=device)
     good = result.status == Status.OK
     assert np.mean(good) > 0.97
     found, covariance = errors(result, truth)[good], result.covariance[good]
     ratio = np.std(found, axis=0) / np.sqrt(np.mean(covariance[:, [0, 1, 2], [0, 1, 2]], axis=0))
     # 500 draws say a standard deviation to 3 %.
     np.testing.assert_allclose(ratio, 1.0, atol=0.15)
-    assert np.std(result.etch[good] - etch[good]) < 0.25 * ETCH
+    assert np.std(result.etch_bias[good] - etch[good]) < 0.25 * ETCH
     squares = np.einsum("bi,bij,bj->b", found, np.linalg.inv(covariance), found)
     assert squares.max() < 49.0
     seen = plain.status == Status.OK
@@ -281,7 +285,7 @@ def test_an_etching_is_one_more_unknown(device: Device, variant: Any, rng: np.ra
 
 def test_an_etching_takes_as_much_as_least_squares_say(device: Device, rng: np.random.Generator) -> None:
     _, _, rows = etched(rng, 1, 24, 0.0)
-    found = SolvePose(placement=(0.0, 0.0), loss="least_squares", etch=ETCH)(rows, device=device)
+    found = SolvePose(placement=(0.0, 0.0), loss="least_squares", etch_bias_sigma=ETCH)(rows, device=device)
     normal, point = rows[0, :, :2], rows[0, :, 2:4]
     lever = point[:, 0] * normal[:, 1] - point[:, 1] * normal[:, 0]
     equations = np.column_stack([normal, lever, rows[0, :, 7]])
@@ -305,10 +309,10 @@ def test_refuses_what_nothing_checks(device: Device, variant: Any, rng: np.rando
     result = SolvePose(variant=variant)(rows, device=device)
     np.testing.assert_array_equal(result.status, [Status.AMBIGUOUS] * 3 + [Status.OK] * 2)
     # About these shares: a turn takes part of what these edges say.
-    np.testing.assert_allclose(result.agreement, [1.0, 0.5, 0.5, 0.75, 1.0], atol=0.1)
+    np.testing.assert_allclose(result.inlier_fraction, [1.0, 0.5, 0.5, 0.75, 1.0], atol=0.1)
     np.testing.assert_allclose(result.leverage[[0, 1]], 1.0, atol=0.01)
     assert (result.leverage[2:] < 0.7).all()
-    lenient = SolvePose(largest_leverage=1.0, variant=variant)(rows, device=device)
+    lenient = SolvePose(max_leverage=1.0, variant=variant)(rows, device=device)
     assert not lenient.status.any()
 
 
@@ -318,7 +322,7 @@ def test_refuses_a_pose_out_of_where_was_looked(device: Device, rng: np.random.G
     for shift, turn in ((1.1, 1.1), (0.9, 1.1), (1.1, 0.9)):
         for board in range(2):
             limits = (shift * moved[board], turn * abs(truth[board, 2]))
-            result = SolvePose(placement=PLACE, within=limits)(rows[board], device=device)
+            result = SolvePose(placement=PLACE, search_range=limits)(rows[board], device=device)
             assert result.status == (Status.OK if shift > 1 < turn else Status.OUT_OF_RANGE)
             assert np.isnan(result.pose).all() == (result.status != Status.OK)
 
@@ -338,18 +342,18 @@ def test_writes_within_its_outputs(device: Device, variant: Any, rng: np.random.
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"freedom": "shear"}, "freedom is 'shear'"),
+        ({"transform": "shear"}, "transform is 'shear'"),
         ({"loss": "l1"}, "loss is 'l1'"),
         ({"loss": "ransac", "scale": None}, "give the scale"),
         ({"scale": -1.0}, "scale is -1.0"),
         ({"placement": (1.0, 2.0, 3.0)}, "placement"),
-        ({"trials": 10}, "multiple of 16"),
-        ({"least_agreement": 1.5}, "least_agreement"),
-        ({"largest_leverage": 0.0}, "largest_leverage"),
-        ({"within": (1e-3, -0.1)}, "within"),
-        ({"etch": 0.0}, "etch"),
-        ({"largest_condition": 0.0}, "largest_condition"),
-        ({"steps": 0}, "steps"),
+        ({"max_trials": 10}, "multiple of 16"),
+        ({"min_inlier_fraction": 1.5}, "min_inlier_fraction"),
+        ({"max_leverage": 0.0}, "max_leverage"),
+        ({"search_range": (1e-3, -0.1)}, "search_range"),
+        ({"etch_bias_sigma": 0.0}, "etch_bias_sigma"),
+        ({"max_condition": 0.0}, "max_condition"),
+        ({"max_iterations": 0}, "max_iterations"),
     ],
 )
 def test_refuses_parameters(parameters: dict[str, Any], message: str) -> None:

@@ -21,16 +21,16 @@ from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.field.field_pose import PoseCosts
 from gpuvision.matching.pose.edge_search import (
-    LEVELS,
+    COST_LEVELS,
     CellMeans,
-    EdgeLevels,
-    Levels,
+    EdgeCostMap,
+    EdgeCosts,
+    EdgeSearch,
     Means,
-    SearchEdges,
-    best_shifts,
-    shifts_of,
+    cell_offsets,
+    find_best_shifts,
 )
-from gpuvision.matching.pose.registration import CoarseRegistration, register, register_board
+from gpuvision.matching.pose.registration import CoarseRegistration, prepare_board_registration, register_images
 from gpuvision.status import Status
 from reference import registration as reference
 from reference.board_images import View, board_image
@@ -60,13 +60,13 @@ def test_cells_and_levels_are_those_of_their_definition(device: Device, dtype: A
         # As many roundings as pixels.
         np.testing.assert_allclose(means.out.means, exact, rtol=cell**2 * 2.0**-24)
         cells = tuple(each + 2 * border for each in exact.shape)
-        level = Guarded(Levels(np.empty((8, *cells), np.uint16)))
-        EdgeLevels(threshold=25.0, border=border)(means.out.means, device=device, out=level.out)
+        level = Guarded(EdgeCosts(np.empty((8, *cells), np.uint16)))
+        EdgeCostMap(threshold=25.0, border=border)(means.out.means, device=device, out=level.out)
         level.assert_intact()
-        costs = LEVELS * reference.edge_costs(exact, 25.0, border)
+        costs = COST_LEVELS * reference.edge_costs(exact, 25.0, border)
         # Half a step of rounding; single precision's 1e-6 is a hundredth of one where the mean is 100 times the step.
         np.testing.assert_allclose(level.out.level, costs, atol=0.51 if dtype != np.float32 else 0.52)
-        assert level.out.level.min() < 0.5 * LEVELS
+        assert level.out.level.min() < 0.5 * COST_LEVELS
 
 
 @VARIANTS
@@ -75,11 +75,11 @@ def test_scores_are_sums_of_levels(
     device: Device, variant: Any, rows: int, columns: int, rng: np.random.Generator
 ) -> None:
     height, stride, points, headings = 21, 160, 77, 3
-    level = rng.integers(0, LEVELS + 1, (8, height, stride)).astype(np.uint16)
+    level = rng.integers(0, COST_LEVELS + 1, (8, height, stride)).astype(np.uint16)
     limit = 8 * height * stride - (rows - 1) * stride - max(columns, 64) + 1
     shifts = rng.integers(0, limit, (headings, points)).astype(np.int32)
     shifts[0, ::5], shifts[2] = -1, -1
-    op = SearchEdges(rows=rows, columns=columns, headings=headings, points=points, with_scores=True, variant=variant)
+    op = EdgeSearch(rows=rows, columns=columns, headings=headings, points=points, with_scores=True, variant=variant)
     expected = reference.pose_costs(level, shifts, rows, columns)
     # Beyond the last cell from which all positions lie in the map: not used.
     shifts[0, 0], shifts[0, 5] = limit, 2**31 - 1
@@ -110,20 +110,20 @@ def test_a_shift_is_where_its_edge_is_cheap(device: Device) -> None:
     image = np.zeros((90, 121), np.uint8)
     image[30:60, 40:80] = 200
     cell, border, positions = 2, 9, (13, 11)
-    level = EdgeLevels(threshold=20.0, border=border)(CellMeans(cell_px=cell)(image, device=device).means).level
+    level = EdgeCostMap(threshold=20.0, border=border)(CellMeans(cell_px=cell)(image, device=device).means).level
     along = np.linspace(5.0, 25.0, 11)
     off = np.array([-3.0 * cell, 2.0 * cell])
     sides = [(x, 30.0 + y, 1.0, 0.0) for x in (39.5, 79.5) for y in along]
     sides += [(40.0 + x, y, 0.0, -1.0) for y in (29.5, 59.5) for x in along]
     edges = np.array(sides)
-    shifts = shifts_of((edges[:, :2] + off)[None], edges[None, :, 2:], cell, border, level.shape, positions)
-    op = SearchEdges(rows=13, columns=11, headings=1, points=len(edges))
-    best = best_shifts(op(level, shifts, device=device), positions, 3, (3, 1))
+    shifts = cell_offsets((edges[:, :2] + off)[None], edges[None, :, 2:], cell, border, level.shape, positions)
+    op = EdgeSearch(rows=13, columns=11, headings=1, points=len(edges))
+    best = find_best_shifts(op(level, shifts, device=device), positions, 3, (3, 1))
     # An edge costs as little in the cells beside its own.
     assert np.abs(best.cells[0] - [3, -2]).max() <= 1
     assert best.scores[0] < 0.02 < 0.2 < best.scores[1]
     assert np.all(np.abs(best.cells[1:] - best.cells[0]).max(axis=1) > 3)
-    far = shifts_of((edges[:, :2] + 200.0)[None], edges[None, :, 2:], cell, border, level.shape, positions)
+    far = cell_offsets((edges[:, :2] + 200.0)[None], edges[None, :, 2:], cell, border, level.shape, positions)
     assert (far == -1).all()
 
 
@@ -175,7 +175,7 @@ MIDDLE = (12e-3, 10e-3)
 @cache
 def prepared(artwork: Artwork, shape: tuple[int, int] = (301, 407)) -> tuple[View, CoarseRegistration]:
     view, matrix = looking_at(MIDDLE, shape)
-    return view, register_board(artwork, matrix, shape)
+    return view, prepare_board_registration(artwork, matrix, shape)
 
 
 def off(found: Any, pose: Any) -> np.ndarray:
@@ -230,7 +230,7 @@ def test_a_board_is_found_wherever_it_lies(
     found = fix(board_image(artwork, view, pose, MIDDLE, missing=gone, rng=rng), device=device)
     # Rulers whose copper is there agree, and no others. Two that touch the picture's border may lie in it or not.
     share, count = there(artwork, pose, gone)
-    enough, slack = fix.least_score + 1.5 / math.sqrt(count), 2.0 / count
+    enough, slack = fix.min_score + 1.5 / math.sqrt(count), 2.0 / count
     if found.status == Status.LOW_SIGNAL:
         # In view more may be missing than of all: too much to be sure of what is left.
         assert share < enough + slack
@@ -282,7 +282,7 @@ def tilted(artwork: Artwork, pose: tuple[float, float, float]) -> tuple[CoarseRe
     turn[:2, 2] = np.array([199.5, 149.5]) - turn[:2, :2] @ [259.5, 259.5]
     tilt = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [2e-5, -1e-5, 1.0]]) @ turn
     image = cv2.warpPerspective(wide, tilt, shape[::-1], flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
-    return register_board(artwork, tilt @ matrix, shape, placement=MIDDLE), image
+    return prepare_board_registration(artwork, tilt @ matrix, shape, placement=MIDDLE), image
 
 
 def test_another_camera_and_reversed_contrast(artwork: Artwork, device: Device) -> None:
@@ -302,7 +302,7 @@ def bars(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
 
 @cache
 def bars_fix(bars: Artwork, **reach: float) -> CoarseRegistration:
-    return register_board(bars, looking_at(MIDDLE, (300, 400))[1], (300, 400), **reach)
+    return prepare_board_registration(bars, looking_at(MIDDLE, (300, 400))[1], (300, 400), **reach)
 
 
 def test_a_repeated_pitch_is_ambiguous(bars: Artwork, device: Device, rng: np.random.Generator) -> None:
@@ -325,7 +325,7 @@ def test_a_repeated_pitch_is_ambiguous(bars: Artwork, device: Device, rng: np.ra
 def test_all_parallel_edges_are_refused(device: Device, tmp_path: Path, rng: np.random.Generator) -> None:
     artwork = board(tmp_path, [(-20.0, y, 44.0, y, 0.3) for y in (5.0, 7.3, 10.1, 13.9)])
     view, matrix = looking_at(MIDDLE, (300, 400))
-    found = register_board(artwork, matrix, (300, 400))(board_image(artwork, view, rng=rng), device=device)
+    found = prepare_board_registration(artwork, matrix, (300, 400))(board_image(artwork, view, rng=rng), device=device)
     assert found.status in (Status.AMBIGUOUS, Status.LOW_SIGNAL)
     assert np.isnan(found.pose).all()
 
@@ -344,7 +344,7 @@ def test_an_image_of_nothing_is_refused(artwork: Artwork, device: Device, rng: n
 def test_a_board_that_is_elsewhere_is_refused(artwork: Artwork, device: Device) -> None:
     shape = (301, 407)
     _, matrix = looking_at((80e-3, 80e-3), shape)
-    found = register_board(artwork, matrix, shape)(np.zeros(shape, np.uint8), device=device)
+    found = prepare_board_registration(artwork, matrix, shape)(np.zeros(shape, np.uint8), device=device)
     assert found.status == Status.NO_DATA
     assert found.rulers == 0
     assert np.isnan(found.pose).all()
@@ -359,7 +359,7 @@ def pictures(
     view, matrix = looking_at(middle, shape, mask_shift=(60e-6, -40e-6), silk_shift=(1e-4, 1e-4))
     poses = [(*rng.uniform(-2e-3, 2e-3, 2), math.radians(rng.uniform(-5, 5))) for _ in range(3)]
     images = [board_image(artwork, view, pose, middle, rng=rng) for pose in poses]
-    return register_board(artwork, matrix, shape), list(zip(images, poses, strict=True))
+    return prepare_board_registration(artwork, matrix, shape), list(zip(images, poses, strict=True))
 
 
 @pytest.mark.realdata
@@ -388,7 +388,7 @@ TOOLS = {"upverter": (-59.3e-3, 6.2e-3), "fritzing": (20e-3, 25e-3), "kicad-x2-t
 SEEDS = {"upverter": (0, 2, 3), "fritzing": (0, 3), "kicad-x2-tests/x2ap": (2, 4, 9, 21, 37, 69)}
 
 
-class Drawn(NamedTuple):
+class DrawnObject(NamedTuple):
     """A picture of a real board, and where it lies."""
 
     fix: CoarseRegistration
@@ -404,11 +404,13 @@ def artwork_of(folder: Path) -> Artwork:
 
 @cache
 def fix_of(folder: Path, middle: tuple[float, float], blur_px: float) -> CoarseRegistration:
-    return register_board(artwork_of(folder), looking_at(middle, (480, 640))[1], (480, 640), blur_px=blur_px)
+    return prepare_board_registration(
+        artwork_of(folder), looking_at(middle, (480, 640))[1], (480, 640), blur_px=blur_px
+    )
 
 
 @cache
-def drawn(data: Path, name: str, seed: int) -> Drawn:
+def drawn(data: Path, name: str, seed: int) -> DrawnObject:
     """Any shift, turn, blur, noise, etching, offset of mask and silk; up to 30 % of the copper is missing.
 
     With odd seeds it is shifted into a corner of the range, where most leaves the picture.
@@ -422,13 +424,13 @@ def drawn(data: Path, name: str, seed: int) -> Drawn:
         middle,
         (480, 640),
         blur_px=float(rng.choice([0.7, 1.0, 1.5])),
-        growth=rng.uniform(-12e-6, 12e-6),
+        etch_bias=rng.uniform(-12e-6, 12e-6),
         mask_shift=tuple(rng.uniform(-75e-6, 75e-6, 2)),
         silk_shift=tuple(rng.uniform(-1e-4, 1e-4, 2)),
     )
     picture = board_image(artwork, replace(view, noise=rng.uniform(1, 6)), pose, middle, missing=gone, rng=rng)
     image = picture.round().clip(0, 255).astype(np.uint8)
-    return Drawn(fix_of(data / "gerber" / name, middle, view.blur_px), image, middle, pose)
+    return DrawnObject(fix_of(data / "gerber" / name, middle, view.blur_px), image, middle, pose)
 
 
 @pytest.mark.slow
@@ -502,8 +504,8 @@ def agreement(pair: Path, shape: tuple[int, int], draws: int, device: Device) ->
     for _ in range(draws):
         angle, shift = math.radians(rng.uniform(-8, 8)), rng.uniform(-40, 40, 2)
         motion = mover.motion(angle, shift)
-        own = register(mover.seen(motion), template, device=device)
-        found = register(mover.moved(motion), template, device=device)
+        own = register_images(mover.seen(motion), template, device=device)
+        found = register_images(mover.moved(motion), template, device=device)
         assert own.status == found.status == Status.OK
         miss = found.placement - motion[:, :2] @ own.placement - motion[:, 2]
         turn = math.degrees(found.pose[2] - own.pose[2] - angle)

@@ -1,0 +1,76 @@
+"""Choice of rulers and fiducials that a camera sees at an expected pose over a board."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gpuvision.camera.orthographic import BoardView
+from gpuvision.matching.artwork.artwork import Artwork
+from gpuvision.matching.features.candidates import FeatureCandidates, find_ruler_candidates
+from gpuvision.matching.features.feature_set import FeatureSet, select_feature_set
+from gpuvision.matching.features.fiducials import search_distance, select_fiducials
+from gpuvision.matching.features.imaging import Imaging
+from gpuvision.matching.features.ruler import MAX_LENGTH
+
+# Candidates of a view; with more expected, five windows of the view are examined instead of the whole (cost).
+_USUAL_CANDIDATES = 2500
+_MAX_FIDUCIALS = 40  # cost of the first pass
+
+
+def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging, budget: float = 60) -> FeatureSet:
+    """Select rulers and fiducials that lie in the image wherever the board is within ``imaging.shift``.
+
+    In a view with thousands of candidates, rulers are taken from five windows of it only: its corners and its centre.
+
+    Parameters
+    ----------
+    artwork
+        The side that the camera sees.
+    view
+        Expected pose of the camera over the board.
+    imaging
+        Image quality and search range.
+    budget
+        Number of rulers, default 60; fiducials come in addition.
+
+    Raises
+    ------
+    ValueError
+        There are not enough edges, or they do not determine the pose.
+    """
+    placement = np.array(view.pose[:2])
+    parts = [find_ruler_candidates(artwork, window, placement, imaging) for window in _windows(artwork, view, imaging)]
+    joined = [np.concatenate(each) for each in zip(*(part[:-1] for part in parts), strict=True)]
+    rulers = FeatureCandidates._make([*joined, placement])
+    margin = (rulers.length / 2 + imaging.shift) / imaging.pixel + imaging.width_px
+    fits = view.contains(rulers.point, margin) & (rulers.length < (MAX_LENGTH - 2) * imaging.pixel)
+    rulers = FeatureCandidates._make([*(each[fits] for each in rulers[:-1]), placement])
+    fiducials = select_fiducials(artwork, view.bounds, placement, imaging, _MAX_FIDUCIALS)
+    reach = fiducials.radius + search_distance(fiducials.point, placement, imaging)
+    fiducials = fiducials.subset(view.contains(fiducials.point, reach / imaging.pixel))
+    if len(rulers.sigma) + len(fiducials.sigma) < 3:
+        raise ValueError(
+            f"{len(rulers.sigma)} edges of the {artwork.side} artwork in view have room for a ruler, and "
+            f"{len(fiducials.sigma)} round pads can serve as fiducials, expected 3 or more together; are the "
+            "initial pose and the scale right, is the blur less?"
+        )
+    return select_feature_set(rulers, imaging, artwork.side, fiducials=fiducials, are_free=True, budget=budget)
+
+
+def _windows(
+    artwork: Artwork, view: BoardView, imaging: Imaging
+) -> list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
+    """Return the windows (2, 2) of the board [m] in which candidates are looked for."""
+    low, high = view.bounds
+    edges = artwork.edges
+    middle = (edges.start + edges.end) / 2
+    inside = np.all((middle >= low) & (middle <= high), axis=1)
+    expected = 1.5 * float(np.sum(edges.length[inside])) / (imaging.width_px * imaging.pixel)
+    if expected <= _USUAL_CANDIDATES:
+        return [np.stack([low, high])]
+    size = (high - low) * math.sqrt(_USUAL_CANDIDATES / expected / 5)
+    shares = ((0, 0), (0, 1), (1, 0), (1, 1), (0.5, 0.5))
+    starts = [low + np.array(share) * (high - low - size) for share in shares]
+    return [np.stack([start, start + size]) for start in starts]

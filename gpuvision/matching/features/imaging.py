@@ -1,0 +1,100 @@
+"""Image quality of a board's edges and search range of the board, for which features are selected."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.matching.artwork.shapes import Float64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imaging:
+    """Image quality of a board's edges, and search range of the board.
+
+    Parameters
+    ----------
+    pixel : float
+        Size of a pixel on the board [m], above 0.
+    blur_px : float
+        Standard deviation of the edges' blur [px], above 0, default 1; the extent of the pixels (1 / sqrt(12) px)
+        included.
+    motion_px : (float, float)
+        Motion during the exposure along x and y [px], default 0. It blurs edges across it beyond the blur for which the
+        smoothing is chosen.
+    contrast_bare, contrast_masked : float
+        Height of the step at an edge over the noise of a pixel, above 0, for bare copper (default 40) and for copper
+        under the mask (default 15).
+    width_px : int
+        Number of lines that a ruler averages, default 5.
+    etch_bias_sigma : float
+        Standard deviation of the etch bias, common to the whole board [m], default 10 um.
+    registration : float
+        Largest offset, along x and along y, of mask, silk and holes relative to the copper [m], default 50 um.
+    shift, angle : float
+        Search range: largest offset of the board along x and along y [m], above 0, default 100 um, and largest angle
+        [rad], default 5 mrad.
+
+    Raises
+    ------
+    ValueError
+        A parameter is not finite, or not positive (``motion_px``, ``etch_bias_sigma``, ``registration`` and ``angle``
+        may be 0).
+    """
+
+    pixel: float
+    blur_px: float = 1.0
+    motion_px: tuple[float, float] = (0.0, 0.0)
+    contrast_bare: float = 40.0
+    contrast_masked: float = 15.0
+    width_px: int = 5
+    etch_bias_sigma: float = 10e-6
+    registration: float = 50e-6
+    shift: float = 100e-6
+    angle: float = 5e-3
+
+    def __post_init__(self) -> None:
+        positive = (self.pixel, self.blur_px, self.contrast_bare, self.contrast_masked, self.width_px, self.shift)
+        if not all(math.isfinite(each) and each > 0 for each in positive):
+            raise ValueError("pixel, blur, contrasts, width and shift must be positive and finite")
+        if not all(math.isfinite(each) and each >= 0 for each in (self.etch_bias_sigma, self.registration, self.angle)):
+            raise ValueError("etch_bias_sigma, registration and angle must be finite and not negative")
+        if len(self.motion_px) != 2 or not all(map(math.isfinite, self.motion_px)):
+            raise ValueError("motion_px must be a finite x, y")
+
+    @property
+    def smoothing_px(self) -> float:
+        """Best smoothing of an edge without motion [px]: sqrt(5) times the blur, see `best_smoothing`."""
+        return math.sqrt(5.0) * self.blur_px
+
+    @property
+    def max_blur_px(self) -> float:
+        """Standard deviation of the blur of edges across the motion [px]."""
+        return math.hypot(self.blur_px, math.hypot(*self.motion_px) / math.sqrt(12.0))
+
+    def sigma(self, bare: npt.ArrayLike, normal: npt.ArrayLike = (1.0, 0.0)) -> Float64:
+        """Return the standard deviation [m] of isolated edges with normals (..., 2), at ``smoothing_px``.
+
+        Parameters
+        ----------
+        bare
+            Whether the copper is bare; otherwise it is under the mask.
+        normal
+            (..., 2) unit normals.
+
+        Notes
+        -----
+        The Cramer-Rao bound for a Gaussian edge in white noise is 1.883 sqrt(blur) / (contrast sqrt(width)) pixels.
+        With smoothing a and blur s, the variance of the gradient's maximum is (3/8) (a^2 + s^2)^3 / (a^5 s) times the
+        bound: 1.2 standard deviations without motion. Motion over a length m adds m / sqrt(12) to the blur of edges
+        across it.
+        """
+        contrast = np.where(bare, self.contrast_bare, self.contrast_masked)
+        smear = np.asarray(normal, dtype=np.float64) @ np.asarray(self.motion_px) / math.sqrt(12.0)
+        blur = np.hypot(self.blur_px, smear)
+        bound = np.sqrt(2 * math.sqrt(math.pi) * blur / self.width_px) / contrast
+        worse = np.sqrt(3 / 8 * (self.smoothing_px**2 + blur**2) ** 3 / (self.smoothing_px**5 * blur))
+        return np.asarray(worse * bound * self.pixel)

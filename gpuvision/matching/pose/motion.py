@@ -1,0 +1,79 @@
+"""Motions in the plane: homographies, rotations, known edges under a motion, composition with a measured pose.
+
+A motion is a (2, 3) matrix that takes points, relative to the placement point, to where they are seen: its first two
+columns are the linear part, its last one is the place where the placement point is seen.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Float64 = npt.NDArray[np.float64]
+
+
+class KnownEdges(NamedTuple):
+    """Edges that an image should show: (n, 2) points and their (n, 2) unit normals, of either sign."""
+
+    point: Float64
+    normal: Float64
+
+
+def apply_homography(matrix: Float64, points: Float64) -> Float64:
+    """Return where a 3 x 3 homography takes points (..., 2)."""
+    lifted = points @ matrix[:, :2].T + matrix[:, 2]
+    return np.asarray(lifted[..., :2] / lifted[..., 2:])
+
+
+def rotation(angle: float) -> Float64:
+    """Return the 2 x 2 rotation by an angle [rad], counter-clockwise from x to y."""
+    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+
+
+def move_edges(edges: KnownEdges, motions: list[Float64], placement: tuple[float, float]) -> KnownEdges:
+    """Return the edges under each motion, (k, n, 2) points and unit normals."""
+    motion = np.stack(motions)
+    turn = motion[..., :2]
+    normal = edges.normal @ np.linalg.inv(turn)
+    point = (edges.point - placement) @ turn.swapaxes(1, 2) + motion[:, None, :, 2]
+    return KnownEdges(point, normal / np.hypot(normal[..., 0], normal[..., 1])[..., None])
+
+
+def project_edges(
+    edges: KnownEdges, motions: list[Float64], placement: tuple[float, float], to_image: Float64
+) -> tuple[Float64, Float64]:
+    """Return points [px] and unit normals of the edges in the image under each motion, (k, n, 2) each.
+
+    The tangent of an edge is taken to the image by the derivative of the homography at its point; the normal is at
+    right angles to it there.
+    """
+    moved = np.zeros((len(motions), 3, 3))
+    moved[:, :2], moved[:, 2, 2] = motions, 1.0
+    matrix = (to_image @ moved).swapaxes(1, 2)
+    lifted = (edges.point - placement) @ matrix[:, :2] + matrix[:, 2:]
+    x, y = edges.normal.T
+    tangent = np.stack([-y, x], axis=-1) @ matrix[:, :2]
+    pixels = lifted[..., :2] / lifted[..., 2:]
+    direction = (tangent[..., :2] - pixels * tangent[..., 2:]) / lifted[..., 2:]
+    direction /= np.hypot(direction[..., 0], direction[..., 1])[..., None]
+    return pixels, np.stack([direction[..., 1], -direction[..., 0]], axis=-1)
+
+
+def compose(motion: Float64, pose: npt.ArrayLike, deformation: npt.ArrayLike) -> Float64:
+    """Return a motion followed by a pose (3,) with a deformation (3,), both about the seen placement point."""
+    x, y, theta = np.asarray(pose, np.float64)
+    kx, ky, shear = np.asarray(deformation, np.float64)
+    turn = rotation(theta) @ np.array([[1.0 + kx, shear], [0.0, 1.0 + ky]])
+    return np.column_stack([turn @ motion[:, :2], motion[:, 2] + (x, y)])
+
+
+def decompose(motion: Float64, placement: tuple[float, float]) -> tuple[Float64, Float64]:
+    """Return the pose of the origin (3,), x, y, theta, and the deformation (3,): scales less 1, and shear."""
+    linear = motion[:, :2]
+    theta = math.atan2(linear[1, 0], linear[0, 0])
+    bent = rotation(theta).T @ linear
+    pose = np.array([*(motion[:, 2] - linear @ placement), theta])
+    return pose, np.array([bent[0, 0] - 1, bent[1, 1] - 1, bent[0, 1]])

@@ -48,8 +48,8 @@ def resolve_tuning_constant(loss: str, tuning_constant: float | None, owner: str
         raise ValueError(f"{owner}.loss is {loss!r}, expected one of {', '.join(TUNING_CONSTANTS)}")
     if tuning_constant is None:
         return TUNING_CONSTANTS[loss]
-    if finite(tuning_constant, f"{owner}.bend") <= 0.0:
-        raise ValueError(f"{owner}.bend is {tuning_constant}, expected a number > 0")
+    if finite(tuning_constant, f"{owner}.tuning_constant") <= 0.0:
+        raise ValueError(f"{owner}.tuning_constant is {tuning_constant}, expected a number > 0")
     return float(tuning_constant)
 
 

@@ -240,7 +240,7 @@ def test_holes_are_counted_once(tmp_path: Path) -> None:
 
 def test_a_moire_is_refused(tmp_path: Path) -> None:
     moire = "%AMMARK*6,0,0,5,0.5,0.5,2,0.1,6,0*%\n%ADD20MARK*%\nD20*\n" + at(10, 8, "D03")
-    with pytest.raises(ValueError, match="moiré is not read"):
+    with pytest.raises(ValueError, match="moiré is not supported"):
         read(tmp_path, copper=COPPER + moire)
 
 

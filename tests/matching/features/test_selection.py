@@ -132,10 +132,10 @@ def test_beats_what_is_picked_at_random(tmp_path: Path, rng: np.random.Generator
 @pytest.mark.parametrize(
     ("traces", "budget", "message"),
     [
-        (((2, 10, 18, 10), (2, 5, 18, 5), (2, 15, 18, 15)), 20, "do not fix"),
-        (((2, 2, 9, 9), (11, 11, 18, 18)), 20, "do not fix"),
-        (CROSS, 2, "2 rulers do not fix"),
-        (((1, 1, 1.2, 1.2),), 20, "0 rulers do not fix"),
+        (((2, 10, 18, 10), (2, 5, 18, 5), (2, 15, 18, 15)), 20, "do not determine"),
+        (((2, 2, 9, 9), (11, 11, 18, 18)), 20, "do not determine"),
+        (CROSS, 2, "2 rulers do not determine"),
+        (((1, 1, 1.2, 1.2),), 20, "0 rulers do not determine"),
     ],
 )
 def test_refuses_what_fixes_no_pose(tmp_path: Path, traces: tuple[Trace, ...], budget: float, message: str) -> None:

@@ -211,7 +211,7 @@ def test_kidnapped_robots_are_found(device: Device, rng: np.random.Generator) ->
     field_map = large(device)
     for _ in range(10):
         pose = rng.uniform([-10.0, -6.0, -np.pi], [10.0, 6.0, np.pi])
-        assert_found(field_map, pose, view(field_map, pose, rng, 128, max_range=6.0), device)
+        assert_found(field_map, pose, view(field_map, pose, rng, 128, reach=6.0), device)
 
 
 def test_clutter_of_70_percent(device: Device, rng: np.random.Generator) -> None:
@@ -219,7 +219,7 @@ def test_clutter_of_70_percent(device: Device, rng: np.random.Generator) -> None
     field_map = large(device)
     for _ in range(40):
         pose = rng.uniform([-10.5, -6.5, -np.pi], [10.5, 6.5, np.pi])
-        points = view(field_map, pose, rng, 200, max_range=6.0)
+        points = view(field_map, pose, rng, 200, reach=6.0)
         angle, far = rng.uniform(-np.pi, np.pi, 140), 6.0 * np.sqrt(rng.uniform(0.0, 1.0, 140))
         points[:140] = np.stack([far * np.cos(angle), far * np.sin(angle)], axis=-1)
         first = find_pose_candidates(field_map, points, device=device)[0]
@@ -229,13 +229,13 @@ def test_clutter_of_70_percent(device: Device, rng: np.random.Generator) -> None
 def test_a_robot_outside_the_field(device: Device, rng: np.random.Generator) -> None:
     field_map = large(device)
     pose = np.array([4.0, 7.8, -1.2])
-    assert_found(field_map, pose, view(field_map, pose, rng, 128, max_range=6.0), device)
+    assert_found(field_map, pose, view(field_map, pose, rng, 128, reach=6.0), device)
 
 
 def test_a_compass_tells_twins_apart(device: Device, rng: np.random.Generator) -> None:
     field_map = DistanceMap(field=read_field("robocup_junior"), cell=0.02, scale=0.05, max_range=1.5, device=device)
     pose = np.array([0.31, -0.22, 0.7])
-    points = view(field_map, pose, rng, sigma=0.005, max_range=1.2)
+    points = view(field_map, pose, rng, sigma=0.005, reach=1.2)
     first, *others = find_pose_candidates(field_map, points, headings=(0.6,), device=device)
     assert first.symmetric_twin is None
     assert np.abs(off(first.pose, pose)).max() < 0.02
@@ -266,7 +266,7 @@ def test_a_mirrored_view_is_a_mirrored_pose(device: Device, rng: np.random.Gener
 
 def test_a_wrong_scale_shows_in_the_scatter(device: Device, rng: np.random.Generator) -> None:
     field_map = large(device)
-    points = view(field_map, POSE, rng, 128, max_range=6.0)
+    points = view(field_map, POSE, rng, 128, reach=6.0)
     right, wrong = (
         find_pose_candidates(field_map, np.float32(s) * points, initial_pose=POSE, device=device)[0]
         for s in (1.0, 1.05)
@@ -333,7 +333,7 @@ def test_covariance_is_the_scatter(device: Device, rng: np.random.Generator) -> 
 def test_views_that_fix_a_part_only(device: Device, lines: Any, arcs: Any, rng: np.random.Generator) -> None:
     field_map = DistanceMap(field=Field(length=10.0, width=6.0, lines=lines, arcs=arcs), cell=0.1, device=device)
     pose = np.array([0.4, -0.3, 0.5])
-    points = view(field_map, pose, rng, max_range=3.0)
+    points = view(field_map, pose, rng, reach=3.0)
     fit = FieldPoseRefinement(map=field_map)(points, np.float32([pose]), device=device)
     assert fit.status[0] == Status.AMBIGUOUS
     assert np.isnan(fit.covariance).all()

@@ -181,8 +181,8 @@ def test_writes_within_its_outputs(device: Device, rng: np.random.Generator) -> 
     ("more", "message"),
     [
         ({"lines": 1}, "lines is 1"),
-        ({"rulers_per_line": 0}, "each is 0"),
-        ({"lines": 500, "rulers_per_line": 100}, "in all"),
+        ({"rulers_per_line": 0}, "rulers_per_line is 0"),
+        ({"lines": 500, "rulers_per_line": 100}, "up to 2048"),
         ({"ruler": RulerEdges(threshold=20.0, edge_selection="all")}, "edge_selection='all'"),
         ({"solver": SolvePose(with_initial_pose=True)}, "no pose to start from"),
         ({"lines": 2, "solver": SolvePose(transform="affine")}, "too few"),

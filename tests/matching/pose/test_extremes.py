@@ -97,7 +97,7 @@ def test_a_comb_of_one_pitch_is_not_chosen(tmp_path: Path) -> None:
     inner = np.all((found.point > (3e-3, 3e-3)) & (found.point < (6e-3, 12e-3)), axis=1) & ~found.pair
     assert inner.any()
     assert (found.ambiguity[inner] == 1.0).all()
-    with pytest.raises(ValueError, match="do not fix"):
+    with pytest.raises(ValueError, match="do not determine"):
         select_rulers(type(found)(*(each[inner] for each in found[:-1]), found.placement), imaging, 40)
 
 

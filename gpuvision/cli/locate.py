@@ -129,19 +129,22 @@ def locate(
             raise ValueError(f"--side is {side.value}, but {features} is of the {chosen.side}; leave it out")
     pixel = _pixel(scale, chosen)
     blur_px = blur or (_BLUR_PX if chosen is None else chosen.imaging.blur_px)
+    # Check the options before the files, which take longer to read.
+    pose, distance_and_angle = initial_pose_of(initial_pose), _search_range(search_range)
+    etch_bias_sigma = quantities(etch_bias, "--etch-bias", "m")[0]
     picture = read_image(image)
     artwork = _artwork(board, chosen, "top" if side is None else side.value, layers, pixel, blur_px)
     located = locate_board(
         picture,
         artwork,
         scale=pixel,
-        initial_pose=initial_pose_of(initial_pose),
-        search_range=_search_range(search_range),
+        initial_pose=pose,
+        search_range=distance_and_angle,
         features=chosen,
         model=None if camera is None else read_lens(camera),
         budget=budget or _BUDGET,
         blur_px=blur_px,
-        etch_bias_sigma=quantities(etch_bias, "--etch-bias", "m")[0],
+        etch_bias_sigma=etch_bias_sigma,
         threshold=threshold,
         copper=copper.value,
         device=None if device is None else Device.named(device),

@@ -100,9 +100,9 @@ class PatternScale(NamedTuple):
     """The blobs are brighter than the background."""
     pitch: float
     """Median length of the longer one of the two lattice steps [px]."""
-    cell: float
+    cell_area: float
     """Median area that the two lattice steps span [px^2]."""
-    number: int
+    blob_count: int
     """Number of blobs with symmetric neighbours."""
 
 
@@ -117,12 +117,12 @@ def find_pattern_blobs(grey: Float32, limits: BlobLimits = BlobLimits()) -> Patt
         Thresholds of the detection.
     """
     scale = estimate_scale(grey, limits)
-    if scale.number == 0:
+    if scale.blob_count == 0:
         return PatternBlobs(np.empty((0, 2)), np.empty((0, 2)), False, math.nan)
     smoothing = 2 * round(limits.smoothing_pitches * scale.pitch) + 1
     blobs = find_blobs(grey, limits.window_pitches * scale.pitch, scale.bright, smoothing, limits)
     kept = is_typical_area(blobs.area, limits)
-    coverage = float(np.median(blobs.area[kept])) / scale.cell if kept.any() else math.nan
+    coverage = float(np.median(blobs.area[kept])) / scale.cell_area if kept.any() else math.nan
     return PatternBlobs(blobs.points[kept], blobs.size[kept], scale.bright, coverage)
 
 
@@ -206,11 +206,11 @@ def estimate_scale(grey: Float32, limits: BlobLimits) -> PatternScale:
             for bright in (False, True):
                 blobs = find_blobs(small, part * min(small.shape), bright, _TRIAL_SMOOTHING, limits)
                 trial = _rate_trial(blobs, bright, limits)
-                if trial.number > best.number:
-                    best = trial._replace(pitch=trial.pitch * factor, cell=trial.cell * factor**2)
-                if trial.number > max(limits.sufficient_count, limits.sufficient_share * len(blobs.area)):
+                if trial.blob_count > best.blob_count:
+                    best = trial._replace(pitch=trial.pitch * factor, cell_area=trial.cell_area * factor**2)
+                if trial.blob_count > max(limits.sufficient_count, limits.sufficient_share * len(blobs.area)):
                     return best
-        if best.number > limits.sufficient_count:
+        if best.blob_count > limits.sufficient_count:
             break
     return best
 

@@ -30,9 +30,9 @@ class Centroids(NamedTuple):
 
     points: Float64
     """(rows, columns, 2) centres of gravity, column and row [px]."""
-    mass: Float64
+    dot_area: Float64
     """Area of the dot [px]."""
-    spread: Float64
+    variance: Float64
     """(rows, columns, 2) variance of the covered pixels' column and row [px^2]."""
     contrast: Float64
     """Grey level of the dot minus that of the background."""
@@ -95,8 +95,8 @@ def measure_dots(grey: Float32, points: Float64, size: Float64) -> Centroids:
     pitch = np.linalg.norm(steps, axis=-1).min(axis=-1)
     background, slope, background_residual = _fit_background(_smooth(grey, _BACKGROUND_BOX * pitch), at, steps)
     contrast = sample_bilinear(_smooth(grey, _DOT_BOX * box.min(axis=-1)), at) - background
-    whole_contrast = _to_lattice(contrast, nodes)
-    growth = np.linalg.solve(steps, estimate_steps(whole_contrast[..., None])[nodes])[..., 0]
+    lattice_contrast = _to_lattice(contrast, nodes)
+    contrast_slope = np.linalg.solve(steps, estimate_steps(lattice_contrast[..., None])[nodes])[..., 0]
     margin = np.clip(0.5 * (pitch - box.max(axis=-1)), *_MARGIN)
     half = 0.5 * box + margin[:, None]
     reach = math.ceil(float(half.max())) + 1
@@ -104,12 +104,14 @@ def measure_dots(grey: Float32, points: Float64, size: Float64) -> Centroids:
     moments = np.empty((len(at), 5))
     for start in range(0, len(at), chunk):
         part = slice(start, start + chunk)
-        planes = [np.column_stack([each[part], by[part]]) for each, by in ((background, slope), (contrast, growth))]
+        planes = [
+            np.column_stack([each[part], by[part]]) for each, by in ((background, slope), (contrast, contrast_slope))
+        ]
         moments[part] = _moments(grey, at[part], half[part], planes, reach)
-    mass = moments[:, 0]
+    dot_area = moments[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean, square = moments[:, 1:3] / mass[:, None], moments[:, 3:] / mass[:, None]
-    values = (np.rint(at) + mean, mass, square - mean**2, contrast, np.abs(background_residual / contrast))
+        mean, square = moments[:, 1:3] / dot_area[:, None], moments[:, 3:] / dot_area[:, None]
+    values = (np.rint(at) + mean, dot_area, square - mean**2, contrast, np.abs(background_residual / contrast))
     return Centroids(*(_to_lattice(each, nodes) for each in values))
 
 
@@ -174,7 +176,7 @@ def _moments(grey: Float32, at: Float64, half: Float64, planes: list[Float64], r
     return np.stack([by_x.sum(axis=1), x1, y1, x2, y2], axis=1) / (1.0 - _BACKGROUND_COVER)
 
 
-def disc_centre_offset(model: GridPolynomial, mass: Float64) -> Float64:
+def disc_centre_offset(model: GridPolynomial, dot_area: Float64) -> Float64:
     """Return the centre of gravity of each disc's image minus the image of its centre.
 
     With steps M = (m_u, m_v) of the grid, J = det M, and a disc of radius r pitches, the difference is
@@ -185,7 +187,7 @@ def disc_centre_offset(model: GridPolynomial, mass: Float64) -> Float64:
     ----------
     model : GridPolynomial
         Polynomial through the grid.
-    mass : numpy.ndarray
+    dot_area : numpy.ndarray
         (rows, columns): areas of the discs [px]; NaN where missing.
 
     Returns
@@ -196,6 +198,6 @@ def disc_centre_offset(model: GridPolynomial, mass: Float64) -> Float64:
     orders = ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
     u, v, uu, uv, vv = (model.derivative(*order) for order in orders)
     area = cross(u, v)
-    growth = (cross(uu, v) + cross(u, uv)) / area, (cross(uv, v) + cross(u, vv)) / area
-    shift = 0.5 * (uu + vv) + growth[0][..., None] * u + growth[1][..., None] * v
-    return np.asarray(shift * (mass / (4.0 * math.pi * np.abs(area)))[..., None])
+    log_gradient = (cross(uu, v) + cross(u, uv)) / area, (cross(uv, v) + cross(u, vv)) / area
+    shift = 0.5 * (uu + vv) + log_gradient[0][..., None] * u + log_gradient[1][..., None] * v
+    return np.asarray(shift * (dot_area / (4.0 * math.pi * np.abs(area)))[..., None])

@@ -100,7 +100,7 @@ def find_dots(image: npt.NDArray[Any], *, limits: DotLimits = DotLimits()) -> Pa
     place, size = (np.where(grid[..., None] < 0, np.nan, each[grid]) for each in (blobs.points, blobs.size))
     found = measure_dots(grey, place, size)
     model = GridPolynomial(found.points)
-    points = found.points - disc_centre_offset(model, found.mass)
+    points = found.points - disc_centre_offset(model, found.dot_area)
     points[~_agrees_with_neighbours(found, model, limits)] = np.nan
     count = np.count_nonzero(np.isfinite(points[..., 0]))
     if count < limits.min_dots:
@@ -117,7 +117,7 @@ def _agrees_with_neighbours(found: Centroids, model: GridPolynomial, limits: Dot
     with np.errstate(invalid="ignore", divide="ignore"):
         sound = agrees_with_grid(found.points, limits.max_deviation_medians, limits.min_position_tolerance)
         # Area, width and height of a disc over those of its grid cell are about the same everywhere.
-        disc = np.stack([found.mass / np.abs(cross(u, v)), *np.moveaxis(found.spread / (u**2 + v**2), -1, 0)])
+        disc = np.stack([found.dot_area / np.abs(cross(u, v)), *np.moveaxis(found.variance / (u**2 + v**2), -1, 0)])
         for each in disc:
             change = np.abs(np.log(each / _neighbourhood_median(each)))
             tolerance = limits.max_deviation_medians * float(np.nanmedian(change))

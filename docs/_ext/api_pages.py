@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 import typing
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -229,9 +230,27 @@ class OtherNames:
         return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", full, node, content)
 
 
+_NDARRAY = re.compile(
+    r"~?numpy\.ndarray\[tuple\[~?typing\.Any, \.\.\.\], ~?numpy\.dtype\[~?(?:\w+\.)*(\w+)(?:\[~?typing\.Any\])?\]\]"
+)
+
+
+def shorten_arrays(app: Any, what: str, name: str, value: Any, options: Any, signature: str, returns: str) -> Any:
+    """Return signature and return type with ``NDArray[float64]`` for what it stands for."""
+    texts = (None if each is None else _NDARRAY.sub(r"NDArray[\1]", each) for each in (signature, returns))
+    return tuple(texts)
+
+
+def skip_fields(app: Any, what: str, name: str, value: Any, skip: bool, options: Any) -> bool | None:
+    """Skip the fields of a named tuple: its docstring lists them, and their own says "Alias for field number 0"."""
+    return True if type(value).__name__ == "_tuplegetter" else None
+
+
 def setup(app: Any) -> dict[str, Any]:
     """Write the pages before Sphinx looks for documents."""
     names = OtherNames()
     app.connect("config-inited", lambda app, config: write_pages(Path(app.srcdir, FOLDER), api_pages()))
+    app.connect("autodoc-process-signature", shorten_arrays)
+    app.connect("autodoc-skip-member", skip_fields)
     app.connect("missing-reference", names.resolve)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

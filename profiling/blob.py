@@ -1,4 +1,4 @@
-"""Marks against one fused Numba function of the same method on all cores, and OpenCV mark by mark.
+"""Blobs against one fused Numba function of the same method on all cores, and OpenCV blob by blob.
 
 Bright discs of 8 px radius and 1 px blur on an 8-bit frame, noise 2 at a contrast of 100, each up to 2 px from its
 nominal place. Numba takes the same rulers, start, robust fit, match of the pixels, centre of gravity and covariance.
@@ -348,7 +348,7 @@ def _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, 
 
 @numba.njit(parallel=True, error_model="numpy", fastmath=_SUMS)
 def _find(image, places, table, directions, noise, found, covariance, status):  # type: ignore[no-untyped-def]
-    """Fill marks (n, 13): x, y, size, residual, inliers, symmetry, gravity, distance, contrast, blur, shift."""
+    """Fill blobs (n, 13): x, y, size, residual, inliers, symmetry, gravity, distance, contrast, blur, shift."""
     pixels, pitch = image.reshape(-1), np.uint32(image.shape[1])
     for n in numba.prange(places.shape[0]):
         profile, slopes = np.empty(LENGTH, np.float32), np.empty(_SLOPES, np.float32)
@@ -441,7 +441,7 @@ def scene(count: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[n
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield 16, 100 and 1000 marks."""
+    """Yield 16, 100 and 1000 blobs."""
     for count in (16, 100, 1000):
         yield _case(device, count)
 
@@ -454,7 +454,7 @@ def _case(device: Device, count: int) -> Case:
     bound.inputs[1].set(places)
     blobs = bound.run()
     if np.any(to_numpy(blobs.status)):
-        raise AssertionError("a mark was not found")
+        raise AssertionError("a blob was not found")
     table = np.asarray(operation.launch(device, image.shape, image.dtype).arguments[0])
     numbers = np.concatenate([table[[0, 3, 2]], table[-REACH:]]).astype(np.float32)
     angle = np.arange(SPOKES) * 2.0 * math.pi / SPOKES

@@ -1,4 +1,4 @@
-"""Finding a robot on its field against NumPy, Numba and SciPy.
+"""Localization of a robot on a field against NumPy, Numba and SciPy.
 
 ``global`` is a known robot's full search: 44 226 positions (243 x 182 at 1 cm), 64 rays, the heading from a compass.
 Every candidate gives the score of all poses and the least of each 64. Numba has our own form, the strongest there is:
@@ -28,7 +28,7 @@ _BLOCK, _RAYS = 64, 64
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield the global search, with one heading and with 72, and the local one."""
+    """Yield the global search, with one heading and with 72 headings, and the local refinement."""
     junior = DistanceMap(field=read_field("robocup_junior"), cell=0.01, scale=0.05, max_range=1.5, device=device)
     large = DistanceMap(field=read_field("robocup_msl"), cell=0.1, scale=0.25, max_range=6.0, device=device)
     pose = (0.213, -0.177, 0.4)

@@ -1,4 +1,4 @@
-"""The local fix against the same in NumPy and OpenCV, and in one fused Numba function.
+"""The fused board pose against the same in NumPy and OpenCV, and in one fused Numba function.
 
 A hundred rulers of 64 samples and 5 lines, ten across each of ten edges of the artwork, in an 8-bit frame of 640 x 480:
 edges, a robust line through those of each line, a robust pose from the lines, its covariance at the placement point.
@@ -237,7 +237,7 @@ def _fit_pose(rows, starts, placement, pose, covariance):  # type: ignore[no-unt
 
 @numba.njit(parallel=True, error_model="numpy", fastmath=_SUMS)
 def _fused(image, plain, rulers, lines, taps, numbers, pairs, starts, edges, status, pose, covariance):  # type: ignore[no-untyped-def]
-    """Do the whole fix; rulers and lines on all cores."""
+    """Compute the board pose in one call: edges along all rulers and line fits on all cores, then the pose."""
     _rulers(image, plain, taps, numbers, edges, status)
     count = lines.shape[0]
     rows = np.empty((7, 2 * count), np.float32)
@@ -301,7 +301,7 @@ def _numpy_lines(u: NDArray[Any], v: NDArray[Any], w: NDArray[Any], pairs: NDArr
 
 
 def _numpy_equations(rows: NDArray[Any], pose: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return equations (..., n, 3) and what is left (..., n) of rows (..., n, 7) at poses (..., 1, 3)."""
+    """Return the Jacobian (..., n, 3) and residuals (..., n) of rows (..., n, 7) at poses (..., 1, 3)."""
     x, y, less, sine = pose[..., 0], pose[..., 1], -2.0 * np.sin(0.5 * pose[..., 2]) ** 2, np.sin(pose[..., 2])
     nx, ny, px, py, ex, ey, _ = np.moveaxis(rows, -1, 0)
     wx, wy = ex - x - (less * px - sine * py), ey - y - (sine * px + less * py)
@@ -347,7 +347,7 @@ def _numpy_pose(rows: NDArray[Any], starts: NDArray[Any]) -> tuple[NDArray[Any],
 
 
 class _Numpy:
-    """Fixes with OpenCV's remap for the samples and NumPy for all else."""
+    """Board poses with OpenCV's remap for the samples and NumPy for all else."""
 
     def __init__(self, image: NDArray[Any], rulers: NDArray[Any], lines: NDArray[Any], noise: float) -> None:
         self.image, self.lines, self.noise = image, lines.astype(np.float64), noise
@@ -380,7 +380,7 @@ class _Numpy:
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield the local fix of a hundred rulers."""
+    """Yield the fused board pose from a hundred rulers."""
     image, rulers, lines = scene()
     edges = RulerEdges(
         threshold=of_ruler.THRESHOLD,

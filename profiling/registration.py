@@ -1,4 +1,4 @@
-"""First fixes against NumPy, Numba and OpenCV.
+"""Coarse registration against NumPy, Numba and OpenCV.
 
 ``search`` is what a board's first fix looks at: 81 x 81 shifts by 2 px and 21 headings (+-2 mm and +-5 degrees at 25 um
 in a frame of 640 x 480), 512 edges, every candidate with the least cost of 64 shifts side by side. Numba and NumPy have
@@ -31,7 +31,7 @@ _SIDE = 640
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield the search, and a pair of pictures."""
+    """Yield the grid search, and the registration of a pair of images."""
     yield _search(device)
     yield _pair(device)
 

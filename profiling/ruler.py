@@ -1,4 +1,4 @@
-"""Rulers against Numba on all cores, OpenCV's remap of all rulers in one call, and NumPy.
+"""Calipers (rulers) against Numba on all cores, OpenCV's remap of all rulers in one call, and NumPy.
 
 Numba sums the lines of a sample in a register, for LLVM to vectorise over samples. Cases named ``flat`` put it up in a
 form that LLVM likes better still: places of 32 bits in a flat image.

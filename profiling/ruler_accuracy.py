@@ -34,7 +34,7 @@ Scene = tuple[NDArray[np.uint8], Float64, Float64]
 
 
 def bound(noise: float) -> float:
-    """Return the Cramer-Rao bound of an edge's place [px]; the rounding of the image is noise, too."""
+    """Return the Cramer-Rao bound of an edge's position [px], with the rounding of the image as noise."""
     return math.hypot(noise, math.sqrt(1.0 / 12.0)) / 100.0 * math.sqrt(2.0 * BLUR * math.sqrt(math.pi) / WIDTH)
 
 

@@ -1,4 +1,4 @@
-"""Boards of round lands, with and without traces, as files, and pictures of them."""
+"""Boards of round pads, with and without traces, as files, and images of them."""
 
 from __future__ import annotations
 

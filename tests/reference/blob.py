@@ -1,4 +1,4 @@
-"""Images of marks in float64, by the exact profile of a blurred disc and by products of blurred edges."""
+"""Reference images of blobs in float64: exact profile of a blurred disc, and products of blurred edges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fixes of boards in pictures: rulers chosen from artwork, laid as a camera sees them, and poses of many pictures."""
+"""Reference of board poses: rulers selected from artwork and placed in simulated images, and poses of many images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of boards, from their artwork: sampled 8 x 8 times in a pixel, blurred, and then seen many times."""
+"""Simulated images of boards from their artwork: 8 x 8 samples in a pixel, blurred, then seen with many motions."""
 
 from __future__ import annotations
 

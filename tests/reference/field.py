@@ -1,4 +1,4 @@
-"""Float64 oracles of a field: distances to its lines from their definition, scores by counting, poses by SciPy."""
+"""Reference of field localization in float64: distances by definition, scores by counting, poses by SciPy."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def distance(field: Any, points: Float64) -> Float64:
 
 
 def moved(pose: Any, points: Float64) -> Float64:
-    """Points of the robot's frame on the field."""
+    """Return points of the robot's frame on the field."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return points @ np.array([[c, s], [-s, c]]) + np.asarray(pose)[:2]
 
 
 def cost(field: Any, pose: Any, points: Float64, scale: float) -> float:
-    """Mean cost of the points."""
+    """Return the mean cost of the points."""
     square = distance(field, moved(pose, points)) ** 2
     return float(np.mean(square / (scale**2 + square)))
 

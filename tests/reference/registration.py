@@ -1,4 +1,4 @@
-"""Float64 oracles of a first fix: cells, what edges cost in them, and what a pose costs, by their definition."""
+"""Reference of the coarse registration in float64: cells, costs of edges, and costs of poses, by definition."""
 
 from __future__ import annotations
 

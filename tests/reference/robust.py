@@ -1,4 +1,4 @@
-"""Robust fits by a general minimiser in double: the loss itself, whose minimum the kernels iterate to."""
+"""Reference of robust fits in float64: a general minimiser of the loss whose minimum the kernels iterate to."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.optimize import least_squares, minimize
 
 
 def loss(z: np.ndarray, name: str, tuning_constant: float) -> np.ndarray:
-    """Of residuals in units of their scale."""
+    """Return the loss of residuals in units of their scale."""
     if name == "huber":
         return np.where(np.abs(z) <= tuning_constant, 0.5 * z**2, tuning_constant * (np.abs(z) - 0.5 * tuning_constant))
     if name == "tukey":
@@ -46,7 +46,7 @@ def moved(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def residuals(parameters: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Of every row along its normal in the artwork, at a pose."""
+    """Return the residual of every row along its normal in the artwork, at a pose."""
     matrix, shift = moved(parameters)
     seen = rows[:, 2:4] + rows[:, 4:6]
     artwork = np.linalg.solve(matrix, (seen - shift).T).T

@@ -1,4 +1,4 @@
-"""Edges along one ruler in float64, sample by sample as the docstring of `RulerEdges` says it."""
+"""Reference caliper (ruler) in float64: edges along one ruler, sample by sample, as `RulerEdges` defines them."""
 
 from __future__ import annotations
 

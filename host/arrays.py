@@ -51,7 +51,7 @@ def host_view(array: DeviceArray) -> HostArray:
     return np.asarray(_Shared(array, memory))
 
 
-def to_numpy(array: NDArray[S] | DeviceArray) -> NDArray[S]:
+def to_numpy(array: NDArray[S] | DeviceArray | None) -> NDArray[S]:
     """Return a field of a result as a NumPy array: a NumPy array itself, a device array copied to the host.
 
     Parameters
@@ -65,7 +65,7 @@ def to_numpy(array: NDArray[S] | DeviceArray) -> NDArray[S]:
     Raises
     ------
     TypeError
-        The value is neither; a field that was not computed is ``None``.
+        The value is neither: the field is ``None``, because the operation did not compute it.
     """
     if isinstance(array, np.ndarray):
         return array

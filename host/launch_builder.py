@@ -54,7 +54,7 @@ class LaunchBuilder:
     Parameters
     ----------
     operation : Operation
-        Its class name stands in the messages.
+        The operation that the launch is for.
     device : Device
     shape : tuple of int
     dtype : numpy.dtype
@@ -65,6 +65,8 @@ class LaunchBuilder:
         Whether "single" takes float64 input; see `real_of`.
     variant : {"auto", "vector", "work_item"}
         Kernel variant that the user asks for.
+    name : str, optional
+        Name of the operation in messages; ``None``: the name of its class.
     """
 
     def __init__(
@@ -77,8 +79,9 @@ class LaunchBuilder:
         precision: Precision = None,
         narrows: bool = False,
         variant: Variant = "auto",
+        name: str | None = None,
     ) -> None:
-        self.name = type(operation).__name__
+        self.name = type(operation).__name__ if name is None else name
         self.device, self.shape, self.dtype = device, shape, dtype
         self._precision, self._narrows, self._variant = precision, narrows, variant
 
@@ -86,6 +89,11 @@ class LaunchBuilder:
     def real(self) -> np.dtype[Any]:
         """Floating-point type of the arithmetic and the outputs."""
         return real_of(self._precision, self.dtype, narrows=self._narrows)
+
+    @property
+    def widest(self) -> np.dtype[Any]:
+        """Widest floating-point type of the device."""
+        return np.dtype(np.float64 if self.device.has_double else np.float32)
 
     @functools.cached_property
     def uses_vectors(self) -> bool:

@@ -33,7 +33,7 @@ def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[
         build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "move" if device.is_cpu else "move_items"
     )
     kernel.set_args(memory_of(source), memory_of(target), np.int64(reads), np.int64(writes))
-    items = device.handle.max_compute_units * _ITEMS_PER_UNIT * (1 if device.is_cpu else 64)
+    items = device.compute_units * _ITEMS_PER_UNIT * (1 if device.is_cpu else 64)
 
     def run(kept: object = (source, target)) -> None:
         for _ in range(repeats):
@@ -49,7 +49,7 @@ def flop_rate(device: Device, *, seconds: float = 0.15) -> float:
 
     The median of short launches: a machine that changes its speed between two calls shows it here.
     """
-    items = device.handle.max_compute_units * (4 if device.is_cpu else 4096)
+    items = device.compute_units * (4 if device.is_cpu else 4096)
     target = device.empty((items * 16,), np.float32)
     kernel = cl.Kernel(build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "compute")
     steps = 20_000 if device.is_cpu else 2_000

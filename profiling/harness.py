@@ -257,7 +257,7 @@ def describe_machine(devices: Sequence[Device]) -> dict[str, Any]:
             each.label: {
                 "name": each.name,
                 "driver": each.driver,
-                "units": each.handle.max_compute_units,
+                "units": each.compute_units,
                 "gflops": round(ceiling.flop_rate(each) / 1e9),
             }
             for each in devices

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, host_view
+from gpuvision.host import Device, host_view, to_numpy
 from gpuvision.profiling.harness import Case
 from gpuvision.ranging.line import LineReadout, Method
 from gpuvision.ranging.triangulation import Triangulation
@@ -260,9 +260,9 @@ def _fused_case(device: Device, method: Method, count: int) -> Case:
     shared = alone.inputs[0]
     fused(shared).wait()
     expected = sheet(
-        fused.outputs.position.get(), np.tile(np.arange(COLUMNS, dtype=np.float32), (count, 1)), device=device
+        to_numpy(fused.outputs.position), np.tile(np.arange(COLUMNS, dtype=np.float32), (count, 1)), device=device
     )
-    error = float(np.nanmax(np.abs(fused.outputs.h.get() - expected.h)))
+    error = float(np.nanmax(np.abs(to_numpy(fused.outputs.h) - expected.h)))
     peers = {"gpuvision": lambda: alone.run(shared)}
     return Case("line", f"{_ROWS[method]}-fused/{count}", lambda: fused.run(shared), peers, error)
 

@@ -15,7 +15,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Device, DeviceArray
 from gpuvision.host.pipeline import Pipeline
 from gpuvision.host.report import StreamReport
 from gpuvision.host.sources import ArraySource, PacedSource
@@ -148,7 +148,8 @@ def _blocking_loop(frames: NDArray[np.uint8], device: Device) -> Callable[[], No
     apart.shares_memory = False
     bound = READOUT.bind(apart, SHAPE, np.uint8)
     target: Any = bound.inputs[0].base_data
-    results = [(np.empty(each.shape, each.dtype), each.base_data) for each in bound.outputs if each is not None]
+    outputs = [each for each in bound.outputs if isinstance(each, DeviceArray)]
+    results: list[tuple[Any, Any]] = [(np.empty(each.shape, each.dtype), each.base_data) for each in outputs]
 
     def loop() -> None:
         for number in range(_BURST):

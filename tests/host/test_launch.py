@@ -222,4 +222,4 @@ def test_results_become_numpy_arrays(device: Device) -> None:
     array.set(values)
     np.testing.assert_array_equal(to_numpy(array), values)
     with pytest.raises(TypeError, match="got NoneType"):
-        to_numpy(None)  # type: ignore[type-var]
+        to_numpy(None)

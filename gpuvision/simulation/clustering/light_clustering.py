@@ -9,7 +9,19 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, FloatArray, IntArray, Launch, Variant, capacity, to_numpy, uses_vectors
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    IntArray,
+    Launch,
+    LaunchBuilder,
+    Variant,
+    capacity,
+    ceil_div,
+    flags,
+    to_numpy,
+    type_defines,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.clustering.light_cut import BLOCK, LightCut
 from gpuvision.simulation.clustering.light_tree import COLUMNS, LightTree
@@ -209,56 +221,45 @@ class _SelectLights(VisionOperation[_Selection]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"LightClustering takes float32 or float64 receivers, got {dtype}")
-        if dtype == np.float64 and not device.has_double:
-            raise ValueError(f"device {device.label} has no double precision; give receivers as float32")
+        build = LaunchBuilder(
+            self, device, shape, dtype, precision="single", narrows=True, variant=self.variant, name="LightClustering"
+        )
+        build.check_dtype("float32", "float64", of="receivers")
         strips, count, _ = shape
-        of_strip = -(-count // BLOCK)
+        of_strip = ceil_div(count, BLOCK)
         blocks = strips * of_strip
-        strip = uses_vectors(self.variant, device)
-        each = -(-blocks // (_STRIPS_PER_CORE * device.handle.max_compute_units)) if strip else 1
-        items = -(-blocks // max(each, 1))
-        whole = np.dtype(np.int32)
-        tables: list[Any] = [None] * 5
-        depth = 1
-        if self.scene is not None:
-            tables, depth = list(self.scene.bvh.tables(_REAL)), self.scene.bvh.depth
-        present = {"VECTOR_VARIANT": strip, "OCCLUDERS": self.scene is not None, "CLUSTERS": self.clusters}
+        each = max(build.share(blocks, per_core=_STRIPS_PER_CORE), 1)
+        work = build.work(blocks, each=each, group=_GROUP)
+        tree = None if self.scene is None else self.scene.bvh
         reach = 0.0 if self.scene is None else _scene_reach(self.scene, dtype)
         margin = max(self.clearance, _MARGIN * reach)
-        return Launch(
-            source="light_clustering/light_clustering.cl",
-            kernel="select_lights",
-            defines={
-                **{name: None for name, is_present in present.items() if is_present},
-                "INPUT": "float" if dtype == np.float32 else "double",
-                "BVH_DEPTH": depth,
-                "BLOCK": BLOCK,
-            },
-            inputs=[
-                (shape, dtype),
+        selected = (blocks, self.capacity)
+        shapes = {"selected": selected, "errors": selected, "counts": (blocks,)}
+        shapes |= {"error_sums": (blocks, 2), "pair_counts": (blocks, 2)}
+        return build.launch(
+            "light_clustering/light_clustering.cl",
+            "select_lights",
+            work=work,
+            more_inputs=[
                 ((strips, count), _REAL),
                 ((strips,), _REAL),
                 ((self.nodes, COLUMNS), _REAL),
-                ((self.nodes, 2), whole),
+                ((self.nodes, 2), np.dtype(np.int32)),
                 ((self.segments, _SEGMENT_COLUMNS), _REAL),
                 ((4,), dtype),
             ],
-            outputs={
-                "selected": ((blocks, self.capacity), whole),
-                "errors": ((blocks, self.capacity), np.dtype(np.float32)),
-                "counts": ((blocks,), whole),
-                "error_sums": ((blocks, 2), _REAL),
-                "pair_counts": ((blocks, 2), whole),
+            outputs=build.outputs(shapes, selected=np.int32, counts=np.int32, pair_counts=np.int32),
+            defines={
+                **type_defines("INPUT", dtype),
+                "BVH_DEPTH": 1 if tree is None else tree.depth,
+                "BLOCK": BLOCK,
+                **flags(OCCLUDERS=tree is not None, CLUSTERS=self.clusters),
             },
             arguments=[
-                *tables,
+                *([None] * 5 if tree is None else tree.tables(_REAL)),
                 _REAL.type(margin),
-                *(np.uint32(value) for value in (self.capacity, blocks, of_strip, count, each)),
+                *map(np.uint32, (self.capacity, blocks, of_strip, count, work.each)),
             ],
-            global_size=(items,) if strip else (-(-items // _GROUP) * _GROUP,),
-            local_size=(1,) if strip else (_GROUP,),
         )
 
 

@@ -13,12 +13,12 @@ from gpuvision.host import (
     FloatArray,
     IntArray,
     Launch,
+    LaunchBuilder,
     Precision,
     StatusArray,
     Variant,
-    real_defines,
-    real_of,
-    uses_vectors,
+    flags,
+    type_defines,
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.scene import Scene
@@ -82,44 +82,49 @@ class _Rays(VisionOperation[R]):
         if not (math.isfinite(self.clearance) and self.clearance >= 0.0):
             raise ValueError(f"{type(self).__name__}.clearance is {self.clearance!r}, expected metres, 0 or more")
 
-    def _real(self, dtype: np.dtype[Any]) -> np.dtype[Any]:
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"{type(self).__name__} takes float32 or float64, got {dtype}")
-        return real_of(self.precision, dtype, narrows=True)
-
-    def _launch_of(
-        self, kernel: str, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any], outputs: dict[str, Spec]
+    def _trace(
+        self, kernel: str, build: LaunchBuilder, of: str, shapes: dict[str, tuple[int, ...]], **types: type[np.generic]
     ) -> Launch:
-        real = self._real(dtype)
-        count = math.prod(shape[:-1])
-        strip = uses_vectors(self.variant, device)
-        each = _RAYS_PER_STRIP if strip else 1
-        items = -(-count // each)
-        tree = self.scene.bvh
-        place = np.dtype(np.float64 if device.has_double else np.float32)
-        present = {"VECTOR_VARIANT": strip, "SEGMENTS": kernel == "any_hit", "WIDE_PLACES": device.has_double}
-        return Launch(
-            source="rays/rays.cl",
-            kernel=kernel,
+        """Check the input and describe the launch of a kernel of ``rays.cl``.
+
+        Parameters
+        ----------
+        kernel : str
+        build : LaunchBuilder
+        of : str
+            Name of the input in messages.
+        shapes : dict of str to tuple of int
+            Shapes of the outputs, without those of the rays.
+        **types : type
+            Dtypes of outputs that are not of the real type.
+        """
+        build.check_dtype("float32", "float64", of=of)
+        build.check_shape(build.shape[-1:] == (6,), f"{of} (..., 6)")
+        where, tree = build.shape[:-1], self.scene.bvh
+        count = math.prod(where)
+        work = build.work(count, each=_RAYS_PER_STRIP, group=_GROUP)
+        return build.launch(
+            "rays/rays.cl",
+            kernel,
+            work=work,
+            outputs=build.outputs({name: (*where, *shape) for name, shape in shapes.items()}, **types),
             defines={
-                **real_defines(device, real),
-                **{name: None for name, is_present in present.items() if is_present},
-                "INPUT": "float" if dtype == np.float32 else "double",
+                **type_defines("INPUT", build.dtype),
                 "BVH_DEPTH": tree.depth,
+                **flags(SEGMENTS=kernel == "any_hit", WIDE_PLACES=build.device.has_double),
             },
-            inputs=[(shape, dtype)],
-            outputs=outputs,
             arguments=[
-                *tree.tables(real),
-                tree.middle.astype(place),
-                place.type(tree.radius),
-                real.type(self.clearance),
+                *tree.tables(build.real),
+                tree.middle.astype(build.widest),
+                build.widest.type(tree.radius),
+                build.real.type(self.clearance),
                 np.uint64(count),
-                np.uint64(each),
+                np.uint64(work.each),
             ],
-            global_size=(items,) if strip else (-(-items // _GROUP) * _GROUP,),
-            local_size=(1,) if strip else (_GROUP,),
         )
+
+    def _builder(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> LaunchBuilder:
+        return LaunchBuilder(self, device, shape, dtype, precision=self.precision, narrows=True, variant=self.variant)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,15 +163,9 @@ class ClosestHit(_Rays[Hits]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        where = _shape_of("ClosestHit", "rays", shape)
-        real = self._real(dtype)
-        outputs: dict[str, Spec] = {
-            "triangle": (where, np.dtype(np.int32)),
-            "distance": (where, real),
-            "barycentric": ((*where, 2), real),
-            "status": (where, np.dtype(np.uint8)),
-        }
-        return self._launch_of("closest_hit", device, shape, dtype, outputs)
+        build = self._builder(device, shape, dtype)
+        shapes = {"triangle": (), "distance": (), "barycentric": (2,), "status": ()}
+        return self._trace("closest_hit", build, "rays", shapes, triangle=np.int32)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,13 +195,5 @@ class AnyHit(_Rays[Occlusion]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        where = _shape_of("AnyHit", "segments", shape)
-        flags = (where, np.dtype(np.uint8))
-        return self._launch_of("any_hit", device, shape, dtype, {"occluded": flags, "status": flags})
-
-
-def _shape_of(name: str, what: str, shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Check the shape (..., 6) of an input and return its leading dimensions."""
-    if not shape or shape[-1] != 6:
-        raise ValueError(f"{name} takes {what} (..., 6), got shape {shape}")
-    return shape[:-1]
+        build = self._builder(device, shape, dtype)
+        return self._trace("any_hit", build, "segments", {"occluded": (), "status": ()}, occluded=np.uint8)

@@ -17,12 +17,12 @@ from gpuvision.host import (
     Device,
     FloatArray,
     Launch,
+    LaunchBuilder,
     Precision,
     StatusArray,
     Variant,
-    real_defines,
-    real_of,
-    uses_vectors,
+    flags,
+    type_defines,
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite
@@ -347,28 +347,18 @@ class Reflectance(VisionOperation[Reflected]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"Reflectance takes float32 or float64 directions, got {dtype}")
-        if shape[-1:] != (6,):
-            raise ValueError(f"Reflectance takes directions (..., 6), got shape {shape}")
-        real, count = real_of(self.precision, dtype), math.prod(shape[:-1])
-        strip = uses_vectors(self.variant, device) and count >= _LANES
-        each = _STRIP if strip else max(min(count, _GROUP), 1)
-        items = -(-count // each)
-        return Launch(
-            source="reflectance/reflectance.cl",
-            kernel="reflectance",
-            defines={
-                **real_defines(device, real),
-                self.model.kind: None,
-                **({"VECTOR_VARIANT": None} if strip else {}),
-                "INPUT": "float" if dtype == np.float32 else "double",
-            },
-            inputs=[(shape, dtype)],
-            outputs={"value": (shape[:-1], real), "status": (shape[:-1], np.dtype(np.uint8))},
-            arguments=[np.array(self.model.parameters, real), np.uint64(count), np.uint64(each)],
-            global_size=(items,) if strip else (items * each,),
-            local_size=(1,) if strip else (each,),
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
+        build.check_dtype("float32", "float64", of="directions")
+        build.check_shape(shape[-1:] == (6,), "directions (..., 6)")
+        count = math.prod(shape[:-1])
+        work = build.work(count, each=_STRIP, group=_GROUP, least=_LANES, grouping="fitted")
+        return build.launch(
+            "reflectance/reflectance.cl",
+            "reflectance",
+            work=work,
+            outputs=build.outputs({"value": shape[:-1], "status": shape[:-1]}),
+            defines={**type_defines("INPUT", dtype), **flags(**{self.model.kind: True})},
+            arguments=[np.array(self.model.parameters, build.real), np.uint64(count), np.uint64(work.each)],
         )
 
 

@@ -8,17 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import (
-    Device,
-    FloatArray,
-    Launch,
-    Precision,
-    StatusArray,
-    Variant,
-    real_defines,
-    real_of,
-    uses_vectors,
-)
+from gpuvision.host import Device, FloatArray, Launch, LaunchBuilder, Precision, StatusArray, Variant, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.scene import Scene
 
@@ -96,35 +86,23 @@ class VisibleIntervals(VisionOperation[Intervals]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"VisibleIntervals takes float32 or float64, got {dtype}")
-        if not shape or shape[-1] != _NUMBERS:
-            raise ValueError(f"VisibleIntervals takes fans (..., {_NUMBERS}), got shape {shape}")
-        real = real_of(self.precision, dtype)
-        strip, tree, where = uses_vectors(self.variant, device), self.scene.bvh, shape[:-1]
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
+        build.check_dtype("float32", "float64", of="fans")
+        build.check_shape(shape[-1:] == (_NUMBERS,), f"fans (..., {_NUMBERS})")
+        tree, where = self.scene.bvh, shape[:-1]
         count = math.prod(where)
-        return Launch(
-            source="visible_intervals/visible_intervals.cl",
-            kernel="fan_intervals",
-            defines={
-                **real_defines(device, real),
-                **({"VECTOR_VARIANT": None} if strip else {}),
-                "INPUT": "float" if dtype == np.float32 else "double",
-                "BVH_DEPTH": tree.depth,
-            },
-            inputs=[(shape, dtype)],
-            outputs={
-                "intervals": ((*where, self.max_intervals, 2), real),
-                "interval_count": (where, np.dtype(np.uint8)),
-                "status": (where, np.dtype(np.uint8)),
-            },
+        shapes = {"intervals": (*where, self.max_intervals, 2), "interval_count": where, "status": where}
+        return build.launch(
+            "visible_intervals/visible_intervals.cl",
+            "fan_intervals",
+            work=build.work(count, each=1, group=_GROUP),
+            outputs=build.outputs(shapes, interval_count=np.uint8),
+            defines={**type_defines("INPUT", dtype), "BVH_DEPTH": tree.depth},
             arguments=[
-                *tree.tables(real),
+                *tree.tables(build.real),
                 tree.middle.astype(dtype),
-                real.type(_MIN_FRACTION[real]),
+                build.real.type(_MIN_FRACTION[build.real]),
                 np.uint32(self.max_intervals),
                 np.uint64(count),
             ],
-            global_size=(count,) if strip else (-(-count // _GROUP) * _GROUP,),
-            local_size=(1,) if strip else (_GROUP,),
         )

@@ -13,12 +13,13 @@ from gpuvision.host import (
     Device,
     FloatArray,
     Launch,
+    LaunchBuilder,
     Precision,
     StatusArray,
     Variant,
-    real_defines,
-    real_of,
-    uses_vectors,
+    ceil_div,
+    flags,
+    type_defines,
 )
 from gpuvision.operation import VisionOperation
 
@@ -180,52 +181,30 @@ class LineIrradiance(VisionOperation[Irradiance]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"LineIrradiance takes float32 or float64 receivers, got {dtype}")
-        if not shape or shape[-1] != 6:
-            raise ValueError(f"LineIrradiance takes receivers (..., 6), place and normal, got shape {shape}")
-        if dtype == np.float64 and not device.has_double:
-            raise ValueError(f"device {device.label} has no double precision; give receivers as float32")
-        real = real_of(self.precision, dtype, narrows=True)
-        place = np.dtype(np.float64 if device.has_double else np.float32)
-        middle, rows, axes, firsts, starts, lines = self.segments.tables(place, real)
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, narrows=True, variant=self.variant)
+        build.check_dtype("float32", "float64", of="receivers")
+        build.check_shape(shape[-1:] == (6,), "receivers (..., 6), place and normal")
+        tables = self.segments.tables(build.widest, build.real)
+        firsts = tables[3]
         count = math.prod(shape[:-1])
-        strip = uses_vectors(self.variant, device) and count >= _LANES
-        each = _strip_of(count, int(firsts[-1]), device) if strip else max(min(count, _GROUP), 1)
-        items = -(-count // each)
-        present = {"VECTOR_VARIANT": strip, "WIDE_PLACES": device.has_double}
-        return Launch(
-            source="line_irradiance/line_irradiance.cl",
-            kernel="line_irradiance",
-            defines={
-                **real_defines(device, real),
-                **{name: None for name, is_present in present.items() if is_present},
-                "INPUT": "float" if dtype == np.float32 else "double",
-            },
-            inputs=[(shape, dtype)],
-            outputs={"irradiance": (shape[:-1], real), "status": (shape[:-1], np.dtype(np.uint8))},
+        share = build.share(count, per_core=_STRIPS_PER_CORE, multiple=_LANES)
+        # Fewer receivers than this are not worth a work-item.
+        least = ceil_div(_PAIRS_PER_STRIP, max(int(firsts[-1]), 1) * _LANES) * _LANES
+        work = build.work(count, each=max(share, least), group=_GROUP, least=_LANES, grouping="fitted")
+        return build.launch(
+            "line_irradiance/line_irradiance.cl",
+            "line_irradiance",
+            work=work,
+            outputs=build.outputs({"irradiance": shape[:-1], "status": shape[:-1]}),
+            defines={**type_defines("INPUT", dtype), **flags(WIDE_PLACES=device.has_double)},
             arguments=[
-                middle,
-                rows,
-                axes,
-                firsts,
-                starts,
-                lines,
+                *tables,
                 np.uint32(np.count_nonzero(np.diff(firsts) == 1)),
                 np.uint32(len(firsts) - 1),
                 np.uint64(count),
-                np.uint64(each),
+                np.uint64(work.each),
             ],
-            # Left to itself PoCL may put all strips into one group, and so on one core.
-            global_size=(items,) if strip else (items * each,),
-            local_size=(1,) if strip else (each,),
         )
-
-
-def _strip_of(count: int, segments: int, device: Device) -> int:
-    share = -(-count // (_STRIPS_PER_CORE * _LANES * device.handle.max_compute_units)) * _LANES
-    worth = -(-_PAIRS_PER_STRIP // (max(segments, 1) * _LANES)) * _LANES
-    return int(max(share, worth))
 
 
 def _checked(values: Any, shape: tuple[int, ...], what: str) -> npt.NDArray[np.float64]:

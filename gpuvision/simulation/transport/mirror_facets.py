@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Device, Launch, Precision, StatusArray, Variant, real_defines, real_of, uses_vectors
+from gpuvision.host import Device, Launch, LaunchBuilder, Precision, StatusArray, Variant, type_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.transport.mirror_points import TriangleBlocks
 
@@ -86,31 +86,22 @@ class MirrorFacets(VisionOperation[NearFacets]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"MirrorFacets takes float32 or float64, got {dtype}")
-        if not shape or shape[-1] != 6:
-            raise ValueError(f"MirrorFacets takes lines (..., 6), both ends, got shape {shape}")
-        real = real_of(self.precision, dtype)
-        strip, where = uses_vectors(self.variant, device), shape[:-1]
-        count, blocks = math.prod(where), len(self.blocks.radius)
-        items = -(-count // _LANES) if strip else -(-count // _GROUP) * _GROUP
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
+        build.check_dtype("float32", "float64", of="lines")
+        build.check_shape(shape[-1:] == (6,), "lines (..., 6), both ends")
+        count, blocks = math.prod(shape[:-1]), len(self.blocks.radius)
         middle = (0.5 * (self.corners.min((0, 1)) + self.corners.max((0, 1)))).astype(dtype)
-        return Launch(
-            source="mirrors/mirrors.cl",
-            kernel="mirror_facets",
-            defines={
-                **real_defines(device, real),
-                **({"VECTOR_VARIANT": None} if strip else {}),
-                "INPUT": "float" if dtype == np.float32 else "double",
-            },
-            inputs=[(shape, dtype), ((3,), dtype)],
-            outputs={"near": ((*where, blocks), np.dtype(np.uint8))},
+        return build.launch(
+            "mirrors/mirrors.cl",
+            "mirror_facets",
+            work=build.work(count, each=_LANES, group=_GROUP),
+            more_inputs=[((3,), dtype)],
+            outputs=build.outputs({"near": (*shape[:-1], blocks)}, near=np.uint8),
+            defines=type_defines("INPUT", dtype),
             arguments=[
-                self.blocks.table(middle.astype(np.float64)).astype(real),
+                self.blocks.table(middle.astype(np.float64)).astype(build.real),
                 middle,
                 np.uint32(blocks),
                 np.uint64(count),
             ],
-            global_size=(items,),
-            local_size=(1,) if strip else (_GROUP,),
         )

@@ -15,12 +15,11 @@ from gpuvision.host import (
     FloatArray,
     IntArray,
     Launch,
+    LaunchBuilder,
     Precision,
     StatusArray,
     Variant,
-    real_defines,
-    real_of,
-    uses_vectors,
+    type_defines,
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.bvh import Bvh
@@ -303,44 +302,32 @@ class MirrorPoints(VisionOperation[MirrorImages]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"MirrorPoints takes float32 or float64, got {dtype}")
-        if not shape or shape[-1] != 6:
-            raise ValueError(f"MirrorPoints takes points (..., 6), place and step, got shape {shape}")
-        real = real_of(self.precision, dtype)
-        strip, where = uses_vectors(self.variant, device), shape[:-1]
-        count = math.prod(where)
-        items = -(-count // _LANES) if strip else -(-count // _GROUP) * _GROUP
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
+        build.check_dtype("float32", "float64", of="points")
+        build.check_shape(shape[-1:] == (6,), "points (..., 6), place and step")
+        where, count = shape[:-1], math.prod(shape[:-1])
         middle = 0.5 * (self.corners.min((0, 1)) + self.corners.max((0, 1))) if len(self.corners) else np.zeros(3)
         # The kernel subtracts the middle in the type of its input.
         middle = middle.astype(dtype)
-        return Launch(
-            source="mirrors/mirrors.cl",
-            kernel="mirror_points",
-            defines={
-                **real_defines(device, real),
-                **({"VECTOR_VARIANT": None} if strip else {}),
-                "INPUT": "float" if dtype == np.float32 else "double",
-            },
-            inputs=[(shape, dtype), ((3,), dtype)],
-            outputs={
-                "place": ((*where, self.kept, 3), dtype),
-                "move": ((*where, self.kept, 3), real),
-                "density": ((*where, self.kept), real),
-                "triangle": ((*where, self.kept), np.dtype(np.int32)),
-                "image_count": (where, np.dtype(np.uint8)),
-                "status": (where, np.dtype(np.uint8)),
-            },
+        found = (*where, self.kept)
+        shapes = {"place": (*found, 3), "move": (*found, 3), "density": found, "triangle": found}
+        return build.launch(
+            "mirrors/mirrors.cl",
+            "mirror_points",
+            work=build.work(count, each=_LANES, group=_GROUP),
+            more_inputs=[((3,), dtype)],
+            outputs=build.outputs(
+                {**shapes, "image_count": where, "status": where}, place=dtype, triangle=np.int32, image_count=np.uint8
+            ),
+            defines=type_defines("INPUT", dtype),
             arguments=[
-                self._table(middle.astype(np.float64)).astype(real),
+                self._table(middle.astype(np.float64)).astype(build.real),
                 np.append(self.numbers[self._blocks.order], -1).astype(np.int32),
-                self._blocks.table(middle.astype(np.float64)).astype(real),
+                self._blocks.table(middle.astype(np.float64)).astype(build.real),
                 self._blocks.start.astype(np.int32),
                 middle,
                 np.uint32(len(self._blocks.radius)),
                 np.uint32(self.kept),
                 np.uint64(count),
             ],
-            global_size=(items,),
-            local_size=(1,) if strip else (_GROUP,),
         )

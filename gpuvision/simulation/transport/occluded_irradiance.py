@@ -13,12 +13,15 @@ from gpuvision.host import (
     Device,
     FloatArray,
     Launch,
+    LaunchBuilder,
     Precision,
     StatusArray,
     Variant,
-    real_defines,
-    real_of,
-    uses_vectors,
+    WorkSize,
+    ceil_div,
+    flags,
+    group_per_element,
+    type_defines,
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.scene import Scene
@@ -144,56 +147,50 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        if len(shape) != 3 or shape[-1] != 6 or not shape[1]:
-            raise ValueError(f"OccludedIrradiance takes receivers (strips, n, 6), n at least 1, got shape {shape}")
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"OccludedIrradiance takes float32 or float64, got {dtype}")
-        if dtype == np.float64 and not device.has_double:
-            raise ValueError(f"device {device.label} has no double precision; give float32")
-        real = real_of(self.precision, dtype, narrows=True)
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, narrows=True, variant=self.variant)
+        build.check_dtype("float32", "float64", of="receivers")
+        is_valid = len(shape) == 3 and shape[-1] == 6 and shape[1] > 0
+        build.check_shape(is_valid, "receivers (strips, n, 6), n at least 1")
         strips, each = shape[:2]
-        strip, place, tree = uses_vectors(self.variant, device), _place(device), self.scene.bvh
-        shares = min(strips, _SHARES_PER_CORE * device.handle.max_compute_units)
-        present = {
-            "VECTOR_VARIANT": strip,
-            "WIDE_PLACES": device.has_double,
-            "INTERVALS": self.visibility == "intervals",
-            "RAYS": self.visibility == "rays",
-            "SELECTED": self.selected is not None,
-        }
-        inputs: list[Spec] = [(shape, dtype), ((strips, each, 2), dtype), ((self.segments, 10), dtype)]
+        tree = self.scene.bvh
+        if build.uses_vectors:
+            work = WorkSize((min(strips, _SHARES_PER_CORE * device.compute_units),), (1,), vectors=True)
+        else:
+            work = group_per_element(strips, _GROUP)
+        inputs: list[Spec] = [((strips, each, 2), dtype), ((self.segments, 10), dtype)]
         if self.selected is not None:
             integers = np.dtype(np.int32)
-            inputs += [((strips * -(-each // SELECTION_BLOCK) + 1,), integers), ((self.selected,), integers)]
-        return Launch(
-            source="occluded_irradiance/occluded_irradiance.cl",
-            kernel="occluded_irradiance",
+            inputs += [((strips * ceil_div(each, SELECTION_BLOCK) + 1,), integers), ((self.selected,), integers)]
+        of_receivers, of_strips = (strips, each), (strips,)
+        return build.launch(
+            "occluded_irradiance/occluded_irradiance.cl",
+            "occluded_irradiance",
+            work=work,
+            more_inputs=inputs,
+            outputs=build.outputs(
+                {"irradiance": of_receivers, "left": of_strips, "right": of_strips, "status": of_receivers}
+            ),
             defines={
-                **real_defines(device, real),
-                **{name: None for name, is_present in present.items() if is_present},
-                "INPUT": "float" if dtype == np.float32 else "double",
+                **type_defines("INPUT", dtype),
                 "BVH_DEPTH": max(tree.depth, _LEAST_DEPTH),
-                **({} if strip else {"GROUP": _GROUP}),
-            },
-            inputs=inputs,
-            outputs={
-                "irradiance": ((strips, each), real),
-                "left": ((strips,), real),
-                "right": ((strips,), real),
-                "status": ((strips, each), np.dtype(np.uint8)),
+                **({} if work.vectors else {"GROUP": _GROUP}),
+                **flags(
+                    WIDE_PLACES=device.has_double,
+                    INTERVALS=self.visibility == "intervals",
+                    RAYS=self.visibility == "rays",
+                    SELECTED=self.selected is not None,
+                ),
             },
             arguments=[
-                *tree.tables(real),
-                tree.middle.astype(place),
-                _clearance(self.clearance, self.scene, real, dtype),
+                *tree.tables(build.real),
+                tree.middle.astype(build.widest),
+                _clearance(self.clearance, self.scene, build.real, dtype),
                 np.uint32(self.samples),
                 np.uint32(each),
                 np.uint32(self.segments),
                 np.uint32(self.selected or 0),
                 np.uint32(strips),
             ],
-            global_size=(shares if strip else strips * _GROUP,),
-            local_size=(1 if strip else _GROUP,),
         )
 
 
@@ -225,10 +222,6 @@ def _check_scene(scene: object, clearance: float | None) -> None:
         raise TypeError(f"OccludedIrradiance.scene is {scene!r}, expected a Scene")
     if clearance is not None and not (math.isfinite(clearance) and clearance >= 0.0):
         raise ValueError(f"OccludedIrradiance.clearance is {clearance!r}, expected metres, 0 or more, or None")
-
-
-def _place(device: Device) -> np.dtype[Any]:
-    return np.dtype(np.float64 if device.has_double else np.float32)
 
 
 def _clearance(given: float | None, scene: Scene, real: np.dtype[Any], dtype: np.dtype[Any]) -> Any:

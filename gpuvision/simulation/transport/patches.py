@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -14,12 +15,13 @@ from gpuvision.host import (
     Device,
     FloatArray,
     Launch,
+    LaunchBuilder,
     Precision,
+    Spec,
     StatusArray,
     Variant,
-    real_defines,
-    real_of,
-    uses_vectors,
+    flags,
+    type_defines,
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.scene.scene import Scene
@@ -274,46 +276,37 @@ class _PatchOperation(VisionOperation[R]):
         if self.clearance is not None and not (math.isfinite(self.clearance) and self.clearance >= 0.0):
             raise ValueError(f"{name}.clearance is {self.clearance!r}, expected metres, 0 or more, or None")
 
-    def _real(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.dtype[Any]:
-        name = type(self).__name__
-        if dtype not in (np.float32, np.float64):
-            raise TypeError(f"{name} takes float32 or float64 receivers, got {dtype}")
-        if not shape or shape[-1] != 6:
-            raise ValueError(f"{name} takes receivers (..., 6), place and normal, got shape {shape}")
-        if dtype == np.float64 and not device.has_double:
-            raise ValueError(f"device {device.label} has no double precision; give receivers as float32")
-        return real_of(self.precision, dtype, narrows=True)
+    def _builder(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> LaunchBuilder:
+        """Check the receivers and return the builder of their launch."""
+        build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, narrows=True, variant=self.variant)
+        build.check_dtype("float32", "float64", of="receivers")
+        build.check_shape(shape[-1:] == (6,), "receivers (..., 6), place and normal")
+        return build
 
-    def _launch_of(
-        self,
-        kernel: str,
-        device: Device,
-        inputs: list[tuple[tuple[int, ...], np.dtype[Any]]],
-        outputs: dict[str, Any],
-        real: np.dtype[Any],
+    def _sum(
+        self, kernel: str, build: LaunchBuilder, shapes: dict[str, tuple[int, ...]], more_inputs: Sequence[Spec] = ()
     ) -> Launch:
-        (shape, dtype), count = inputs[0], math.prod(inputs[0][0][:-1])
-        strip = uses_vectors(self.variant, device) and count >= _LANES
-        each = _LANES if strip else max(min(count, _GROUP), 1)
+        """Describe the launch of a kernel of ``patches.cl`` with outputs of these shapes."""
+        count, real = math.prod(build.shape[:-1]), build.real
+        work = build.work(count, each=_LANES, group=_GROUP, least=_LANES, grouping="fitted")
         tree = None if self.scene is None or not len(self.scene.bvh.numbers) else self.scene.bvh
         low, high = self.patches.corners.min(axis=(0, 1)), self.patches.corners.max(axis=(0, 1))
-        place = np.result_type(dtype, real)
+        place = np.result_type(build.dtype, real)
         middle = (0.5 * (low + high) if tree is None else tree.middle).astype(place)
         eps, reach = float(np.finfo(real).eps), float(np.abs([low - middle, high - middle]).max())
         clearance = _CLEARANCE * eps * reach if self.clearance is None else self.clearance
-        present = {"VECTOR_VARIANT": strip, "FACTORS": kernel == "form_factors", "OCCLUSION": tree is not None}
-        return Launch(
-            source="patches/patches.cl",
-            kernel=kernel,
+        return build.launch(
+            "patches/patches.cl",
+            kernel,
+            work=work,
+            more_inputs=more_inputs,
+            outputs=build.outputs({**shapes, "status": build.shape[:-1]}),
             defines={
-                **real_defines(device, real),
-                **{name: None for name, is_present in present.items() if is_present},
-                "INPUT": "float" if dtype == np.float32 else "double",
-                "PLACE": "float" if place == np.float32 else "double",
+                **type_defines("INPUT", build.dtype),
+                **type_defines("PLACE", place),
                 "BVH_DEPTH": 1 if tree is None else tree.depth,
+                **flags(FACTORS=kernel == "form_factors", OCCLUSION=tree is not None),
             },
-            inputs=inputs,
-            outputs={**outputs, "status": (shape[:-1], np.dtype(np.uint8))},
             arguments=[
                 *self.patches.tables(middle, real),
                 *([None] * 5 if tree is None else tree.tables(real)),
@@ -323,10 +316,8 @@ class _PatchOperation(VisionOperation[R]):
                 real.type(self.rays),
                 np.uint32(self.patches.count),
                 np.uint64(count),
-                np.uint64(each),
+                np.uint64(work.each),
             ],
-            global_size=(-(-count // each) * (1 if strip else each),),
-            local_size=(1,) if strip else (each,),
         )
 
 
@@ -382,9 +373,8 @@ class FormFactors(_PatchOperation[Factors]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        real = self._real(device, shape, dtype)
-        outputs = {"factors": ((*shape[:-1], self.patches.count), real)}
-        return self._launch_of("form_factors", device, [(shape, dtype)], outputs, real)
+        build = self._builder(device, shape, dtype)
+        return self._sum("form_factors", build, {"factors": (*shape[:-1], self.patches.count)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -399,6 +389,6 @@ class PatchLight(_PatchOperation[Irradiance]):
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
-        real = self._real(device, shape, dtype)
-        inputs = [(shape, dtype), ((self.patches.count,), real)]
-        return self._launch_of("patch_light", device, inputs, {"irradiance": (shape[:-1], real)}, real)
+        build = self._builder(device, shape, dtype)
+        exitance = ((self.patches.count,), build.real)
+        return self._sum("patch_light", build, {"irradiance": shape[:-1]}, [exitance])

@@ -464,7 +464,7 @@ def test_wrong_parameters(device: Device) -> None:
         OccludedIrradiance(scene=scene, segments=1, visibility="some")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"receivers \(strips, n, 6\), n at least 1, got shape \(4, 6\)"):
         light_of(NO_TRIANGLES, np.zeros((4, 6)), np.zeros((1, 10)), device, weights=np.zeros((4, 2)))
-    with pytest.raises(TypeError, match="takes float32 or float64, got int64"):
+    with pytest.raises(TypeError, match="takes float32 or float64 receivers, got int64"):
         light_of(NO_TRIANGLES, np.zeros((1, 4, 6), np.int64), np.zeros((1, 10)), device)
     with pytest.raises(ValueError, match="precision must be"):
         light_of(NO_TRIANGLES, np.zeros((1, 4, 6)), np.zeros((1, 10)), device, precision="half")

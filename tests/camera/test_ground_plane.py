@@ -135,7 +135,7 @@ def test_what_it_cannot_be_is_refused() -> None:
     up = MountedCamera(height=0.8, tilt=-1.0, focal_px=500.0, centre_px=(319.5, 239.5))
     with pytest.raises(ValueError, match="nowhere on the floor"):
         scan_floor(np.zeros(SHAPE, np.uint8), line_width=WIDE, model=up)
-    with pytest.raises(ValueError, match="has no scale"):
+    with pytest.raises(ValueError, match="scale is given for a mounted camera"):
         scan_floor(np.zeros(SHAPE, np.uint8), line_width=WIDE, scale=0.01, model=PINHOLE)
     with pytest.raises(ValueError, match="scale is missing"):
         scan_floor(np.zeros(SHAPE, np.uint8), line_width=WIDE)

@@ -1,42 +1,43 @@
-// Marks of a known shape near a place: rulers (ruler.h) across the contour, and a robust fit of the shape to the edges
-// they find. On CPU runtimes an item takes `each` marks, the rulers of one 16 at a time; on GPUs a group of RULER_GROUP
-// items takes one, ruler after ruler.
+// Fiducials and blobs of a known shape near given positions: calipers (rulers) across the contour, then a robust fit of the
+// shape to their edges, optionally refined by the grey levels (blob_match.h).
 //
-//     ROUND       the contour is one circle or two, FREEDOMS is 3: x, y, size; else of straight edges, FREEDOMS is 4:
-//                 x, y, size, angle
-//     EITHER      marks may be brighter or darker than what is about them
-//     SPOKES      rulers of a mark, an even number; those opposite are half of them apart. ROOM: so many, to whole
-//                 vectors
-//
-// The layout has six rows of ROOM numbers: where the ruler's centre lies, its direction (outwards from the mark's own
-// area), the distance of the edge from the centre of the mark; all for a mark of size 1. The sixth is 1, or 0 for what
-// only fills the vectors.
+// Inputs:  image (rows, columns), type CODE; places (count, PLACE): x, y, size, and the angle of shapes that are not round.
+// Outputs: (count,) each: x, y, size, residual, distance, blur [px], angle [rad], symmetry, contrast, centroid (gravity_x,
+//          gravity_y), inliers, status; shift (count, 2); covariance (count, FREEDOMS, FREEDOMS).
+// Tables:  table: parameters of ruler.h. laid, six rows of ROOM numbers for a shape of size 1: centre of the ruler (x, y);
+//          its direction (x, y), outwards from the fiducial; distance of the edge from the centre; 1, or 0 for padding.
+// Options: ROUND: the contour is one circle or two, FREEDOMS is 3: x, y, size; else straight edges, FREEDOMS is 4: x, y,
+//          size, angle. EITHER: fiducials may be brighter or darker than the background. MATCH: refine by grey levels.
+//          SPOKES: number of rulers, even; opposite rulers are SPOKES / 2 apart. ROOM: SPOKES rounded up to whole vectors.
+// Variants: vector: a work-item takes `each` fiducials, 16 rulers at a time; work-item: a work-group of RULER_GROUP items
+//          per fiducial, one ruler after the other.
 #include "blob/blob_match.h"
 #include "ruler/ruler.h"
 
-#define LEAST_REACH (real)0.6f     // [px] within which edges count before their scale is known
-#define LEAST_SCALE (real)0.01f // [px]
+#define LEAST_REACH (real)0.6f    // residual up to which an edge is an inlier before the scale is known [px]
+#define LEAST_SCALE (real)0.01f   // smallest scale of the residuals [px]
+// Rulers are placed again unless the shape moved by less than this [px].
 #ifdef MATCH
-#define STILL (real)2 // [px] less than which a mark lies from where the rulers were laid for
+#define STILL (real)2
 #else
 #define STILL (real)0.1f
 #endif
-#define MOST_STEPS 12
-#define STEPS_AT_SCALE 2
-#define RING (real)2    // [px] of background about a mark
-#define BILINEAR (real)(1.0f / 6) // [px^2] of bilinear samples, the variance
-#define BEYOND (real)2.5f // blurs of an edge away from it
-#define OWN (real)0.5f    // least weight of an edge of the mark's own
+#define MOST_STEPS 12             // iterations with shrinking scale
+#define STEPS_AT_SCALE 2          // iterations at the estimated scale
+#define RING (real)2              // width of the background ring for the centroid [px]
+#define BILINEAR (real)(1.0f / 6) // variance that bilinear sampling adds to the blur [px^2]
+#define BEYOND (real)2.5f         // distance of background samples from an edge, in blurs
+#define OWN (real)0.5f            // smallest weight of an edge that belongs to the fiducial
 
 #ifdef ROUND
 #define PLACE 3
-#define START_REACH LEAST_REACH // of edges of a start
+#define START_REACH LEAST_REACH // residual up to which an edge supports a start shape [px]
 #else
 #define PLACE 4
-#define START_REACH (3 * LEAST_REACH) // the angle is that of the place
+#define START_REACH (3 * LEAST_REACH) // larger: start shapes have the nominal angle
 #endif
 
-// The edges of a mark: places relative to the nominal one, variances of the blur and of the place.
+// Edges of a fiducial: positions relative to the nominal one, variances of blur and of position.
 typedef struct {
     real x[ROOM], y[ROOM], amplitude[ROOM], blur[ROOM], noise[ROOM], there[ROOM];
     int saturated[ROOM];
@@ -58,8 +59,8 @@ typedef struct {
 
 #define FROM(table, i) (*(constant const reals_at *)((table) + (i)))
 
-// How far an edge lies outside the shape. A round edge is seen nearer to the centre than it is: blurred and averaged
-// across by a variance v its mean place along the radius is that of sqrt(R^2 - u^2), u of that variance.
+// Residual of an edge (distance outside the shape) and its derivatives. A round edge appears nearer to the centre: blur and
+// averaging across by a variance v move it to the mean of sqrt(R^2 - u^2) over u with that variance (`bent`).
 static inline blob_equation equation_of(private const blob_edges *edges, int i, blob_layout layout, blob_shape shape,
                                  real cosine, real sine, real bent) {
     blob_equation equation;
@@ -81,14 +82,14 @@ static inline blob_equation equation_of(private const blob_edges *edges, int i, 
     return equation;
 }
 
-// Under VECTOR_VARIANT an item has its edges to itself, else a group shares them.
+// Address space of the edges: private to a work-item (vector variant), or shared by a work-group.
 #ifdef VECTOR_VARIANT
 #define EDGE_SPACE private
 #else
 #define EDGE_SPACE local
 #endif
 
-// Takes what a vector of rulers found.
+// Store the edges that a vector of rulers found.
 static inline void take_edges(ruler_edge edge, int i, blob_layout layout, blob_shape shape, real cosine, real sine,
                        reals from_x, reals from_y, EDGE_SPACE blob_edges *edges) {
     const reals nx = FROM(layout.nx, i), ny = FROM(layout.ny, i);
@@ -110,8 +111,8 @@ static inline void take_edges(ruler_edge edge, int i, blob_layout layout, blob_s
     }
 }
 
-// Leaves out edges that lie further than `search` from the nominal contour, wherever the rulers were, and under EITHER
-// those of the polarity that there is less of.
+// Reject edges further than `search` from the nominal contour and, with EITHER, those of the minority polarity. Return the
+// number of edges kept, and their mean variances.
 static inline int keep_edges(private blob_edges *edges, blob_layout layout, blob_shape nominal, real cosine, real sine,
                       real search, private real *noise, private real *blur) {
 #ifdef EITHER
@@ -137,7 +138,7 @@ static inline int keep_edges(private blob_edges *edges, blob_layout layout, blob
     return (int)count;
 }
 
-// The scale of the residuals within reach, by their median.
+// Robust scale of the residuals within reach: their median absolute deviation.
 static inline real scale_of(private const blob_edges *edges, blob_layout layout, blob_shape shape, real bent, real reach) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle);
     real distances[ROOM];
@@ -159,7 +160,7 @@ static inline real scale_of(private const blob_edges *edges, blob_layout layout,
     return MAD_TO_SIGMA * (1 + FEW_FITTED / fmax((real)(within - FREEDOMS), (real)1)) * as_real(found);
 }
 
-// A step of the fit; returns whether there is one.
+// One Gauss-Newton step of the reweighted fit; return 0 if it is singular.
 static inline int fit_step(private const blob_edges *edges, blob_layout layout, real scale, private blob_shape *shape,
                     private real *blur, real across) {
     const real cosine = cos(shape->angle), sine = sin(shape->angle), per_scale = 1 / scale;
@@ -196,13 +197,13 @@ static inline int fit_step(private const blob_edges *edges, blob_layout layout, 
     return shape->size > 0 && !not_finite(shape->x + shape->y + shape->size + shape->angle);
 }
 
-// Three rulers of a start: so many sixteenths of all rulers from the first to the second, and to the third.
+// Triples of rulers for start shapes: offsets of the second and third ruler in sixteenths of the contour.
 #define PATTERNS 4
 constant const int pattern[PATTERNS][2] = {{4, 8}, {5, 10}, {3, 6}, {2, 6}};
 #define START_STEPS 3
 #define WRAPPED (ROOM + SPOKES + LANES)
 
-// Edges one after the other, the first after the last again; normals of straight ones as they are at the nominal angle.
+// Edges in the order of the contour, repeated after the last one; straight edges with normals at the nominal angle.
 typedef struct {
     real x[WRAPPED], y[WRAPPED], there[WRAPPED], height[WRAPPED];
 #ifndef ROUND
@@ -226,41 +227,43 @@ static inline void wrap(private const blob_edges *edges, blob_layout layout, rea
         }
 }
 
-// A shape in each lane: centre and size.
+// Shape in each lane: centre and size.
 typedef struct {
     reals x, y, size;
 } laned_shape;
 
-// The normal of an edge as a shape has it, and how far the edge lies outside.
+// Residual of an edge, and its derivatives by the position.
+typedef struct {
+    reals nx, ny, off;
+} edge_residual;
+
 #ifdef ROUND
-#define NORMAL(of, circuit, take, i, nx, ny, off)                                                                      \
-    const reals ax = take((circuit)->x, i) - (of).x, ay = take((circuit)->y, i) - (of).y;                              \
-    const reals square = ax * ax + ay * ay + (reals)1e-12f, per = rsqrt(square), nx = ax * per, ny = ay * per;         \
-    const reals off = square * per - (of).size * take((circuit)->height, i)
+// Edge at (x, y) of a circle: the normal points from the centre to the edge.
+static inline edge_residual residual_at(laned_shape of, reals x, reals y, reals height) {
+    const reals ax = x - of.x, ay = y - of.y;
+    const reals square = ax * ax + ay * ay + (reals)1e-12f, per = rsqrt(square);
+    return (edge_residual){ax * per, ay * per, square * per - of.size * height};
+}
+#define RESIDUAL(of, circuit, take, i)                                                                                 \
+    residual_at(of, take((circuit)->x, i), take((circuit)->y, i), take((circuit)->height, i))
 #else
-#define NORMAL(of, circuit, take, i, nx, ny, off)                                                                      \
-    const reals nx = take((circuit)->nx, i), ny = take((circuit)->ny, i);                                              \
-    const reals off = nx * (take((circuit)->x, i) - (of).x) + ny * (take((circuit)->y, i) - (of).y) -                  \
-                      (of).size * take((circuit)->height, i)
+// Edge at (x, y) of a straight side with normal (nx, ny).
+static inline edge_residual residual_at(laned_shape of, reals x, reals y, reals nx, reals ny, reals height) {
+    return (edge_residual){nx, ny, nx * (x - of.x) + ny * (y - of.y) - of.size * height};
+}
+#define RESIDUAL(of, circuit, take, i)                                                                                 \
+    residual_at(of, take((circuit)->x, i), take((circuit)->y, i), take((circuit)->nx, i), take((circuit)->ny, i),      \
+                take((circuit)->height, i))
 #endif
 #define FOR_ALL(from, i) ((reals)((from)[i]))
 
-// Through three edges each, the first of them i and on: Newton's steps.
+// Shapes through three edges each (first edges i, i + 1, ...), by Newton's method.
 static inline laned_shape shape_through(private const blob_circuit *circuit, int i, int j, int k, laned_shape shape) {
     for (int step = 0; step < START_STEPS; step++) {
-        reals ux, uy, u, vx, vy, v, wx, wy, w;
-        {
-            NORMAL(shape, circuit, READ, i, nx, ny, off);
-            ux = nx, uy = ny, u = off;
-        }
-        {
-            NORMAL(shape, circuit, READ, j, nx, ny, off);
-            vx = nx, vy = ny, v = off;
-        }
-        {
-            NORMAL(shape, circuit, READ, k, nx, ny, off);
-            wx = nx, wy = ny, w = off;
-        }
+        const edge_residual one = RESIDUAL(shape, circuit, READ, i), two = RESIDUAL(shape, circuit, READ, j);
+        const edge_residual three = RESIDUAL(shape, circuit, READ, k);
+        const reals ux = one.nx, uy = one.ny, u = one.off, vx = two.nx, vy = two.ny, v = two.off;
+        const reals wx = three.nx, wy = three.ny, w = three.off;
         const reals uh = READ(circuit->height, i), vh = READ(circuit->height, j), wh = READ(circuit->height, k);
         const reals a = vy * wh - vh * wy, b = vh * wx - vx * wh, c = vx * wy - vy * wx;
         const reals whole = 1 / (ux * a + uy * b + uh * c);
@@ -271,7 +274,7 @@ static inline laned_shape shape_through(private const blob_circuit *circuit, int
     return shape;
 }
 
-// The shape through three edges that most edges agree with: the least sum of squares, none more than within reach.
+// Start shape: of the shapes through three edges the one with the least sum of truncated squares.
 static inline blob_shape start_of(private const blob_edges *edges, blob_layout layout, blob_shape near, real reach) {
     blob_circuit circuit;
     wrap(edges, layout, cos(near.angle), sin(near.angle), &circuit);
@@ -286,8 +289,7 @@ static inline blob_shape start_of(private const blob_edges *edges, blob_layout l
             const masks all = mask_of(found > (reals)0);
             reals loss = 0;
             for (int m = 0; m < SPOKES; m++) {
-                NORMAL(tried, &circuit, FOR_ALL, m, nx, ny, off);
-                const reals squared = off * off;
+                const reals off = RESIDUAL(tried, &circuit, FOR_ALL, m).off, squared = off * off;
                 const masks there = mask_of((reals)circuit.there[m] > (reals)0);
                 const masks in = there & mask_of(squared < (reals)(reach * reach));
                 loss += in ? squared : (reals)(reach * reach);
@@ -303,8 +305,8 @@ static inline blob_shape start_of(private const blob_edges *edges, blob_layout l
     return best;
 }
 
-// From where it is to where most edges within reach agree, the reach halved from step to step; returns whether there is
-// such a place. `scale` is that of the residuals there.
+// Fit the shape to the edges by reweighted least squares, with the scale halved from step to step and then estimated from
+// the residuals. Return 0 if the fit is singular.
 static inline int fit_shape(private const blob_edges *edges, blob_layout layout, real reach, real noise, real across,
                      private blob_shape *shape, private real *blur, private real *scale) {
     const real predicted = fmax(sqrt(noise), LEAST_SCALE), least = fmax(LEAST_REACH / TUNING, predicted);
@@ -327,24 +329,24 @@ static inline int fit_shape(private const blob_edges *edges, blob_layout layout,
     return 1;
 }
 
-// What is known of a mark besides its place.
+// Quality of a fit: covariance, residual, symmetry, contrast, weights of the edges, counts.
 typedef struct {
     real covariance[FREEDOMS][FREEDOMS];
     real residual, symmetry, contrast;
     real weights[ROOM + SPOKES / 2 + LANES];
     int inliers, saturated, regular;
-} blob_facts;
+} blob_quality;
 
-static inline blob_facts facts_of(private blob_edges *edges, blob_layout layout, blob_shape shape, real scale, real bent,
+static inline blob_quality quality_of(private blob_edges *edges, blob_layout layout, blob_shape shape, real scale, real bent,
                            real overlap) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle), per_scale = 1 / scale;
-    blob_facts facts;
+    blob_quality quality;
     reals matrix[TRIANGLE], weights = 0, squares = 0, noises = 0, amplitudes = 0, inliers = 0;
     reals slopes = 0;
     real height[ROOM + SPOKES / 2 + LANES];
-    private real *of = facts.weights;
+    private real *of = quality.weights;
     for (int j = 0; j < TRIANGLE; j++) matrix[j] = 0;
-    facts.saturated = 0;
+    quality.saturated = 0;
     for (int i = 0; i < ROOM; i += LANES) {
         const blob_equation equation = equation_of(edges, i, layout, shape, cosine, sine, bent);
         const reals z = equation.residual * (reals)per_scale, weight = READ(edges->there, i) * loss_weight(z);
@@ -361,23 +363,23 @@ static inline blob_facts facts_of(private blob_edges *edges, blob_layout layout,
         *(private reals_at *)(of + i) = weight;
         *(private reals_at *)(height + i) = FABS(READ(edges->amplitude, i));
         for (int lane = 0; lane < LANES; lane++)
-            facts.saturated |= edges->saturated[i + lane] & (LANE_BITS(is_in, lane) != 0);
+            quality.saturated |= edges->saturated[i + lane] & (LANE_BITS(is_in, lane) != 0);
     }
     const real count = sum_of(inliers), free = fmax(count - FREEDOMS, (real)1), mean = sum_of(slopes) / count;
-    facts.inliers = (int)count;
-    facts.residual = scale * sqrt(sum_of(squares) / sum_of(weights));
-    facts.contrast = -sum_of(amplitudes) / sum_of(weights);
-    // Of an edge: as its noise has it, or as the edges differ from the shape, whichever is more.
+    quality.inliers = (int)count;
+    quality.residual = scale * sqrt(sum_of(squares) / sum_of(weights));
+    quality.contrast = -sum_of(amplitudes) / sum_of(weights);
+    // Variance of an edge: predicted from the noise, or measured from the residuals, whichever is larger.
     const real measured = scale * scale * sum_of(squares) / (free * mean * mean);
     const real predicted = sum_of(noises) / (count * (real)EFFICIENCY);
     const real variance = fmax(measured, predicted) * fmax(overlap / shape.size, (real)1);
     for (int j = 0; j < TRIANGLE; j++) matrix[j] = (reals)sum_of(matrix[j]);
-    facts.regular = !any_lane(factored(matrix)) && mean > 0;
+    quality.regular = !any_lane(factored(matrix)) && mean > 0;
     for (int j = 0; j < FREEDOMS; j++) {
         reals unit[FREEDOMS], column[FREEDOMS];
         for (int k = 0; k < FREEDOMS; k++) unit[k] = (reals)(real)(j == k);
         solved(matrix, unit, column);
-        for (int k = 0; k < FREEDOMS; k++) facts.covariance[j][k] = variance * FIRST(column[k]);
+        for (int k = 0; k < FREEDOMS; k++) quality.covariance[j][k] = variance * FIRST(column[k]);
     }
     for (int i = 0; i < SPOKES / 2 + LANES; i++) {
         of[SPOKES + i] = of[i];
@@ -390,11 +392,11 @@ static inline blob_facts facts_of(private blob_edges *edges, blob_layout layout,
         const reals product = READ(of, i) * READ(of, i + SPOKES / 2) * FROM(layout.counts, i);
         agreed += sqrt(product) * low / (high + (reals)1e-30f);
     }
-    facts.symmetry = sum_of(agreed) / SPOKES;
-    return facts;
+    quality.symmetry = sum_of(agreed) / SPOKES;
+    return quality;
 }
 
-// The grey level of the background, beyond the edges of the fit.
+// Grey level of the background, sampled beyond the edges of the fit.
 static inline real background_of(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
                           private const blob_edges *edges, private const real *weights, blob_layout layout, real blur) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle), out = BEYOND * blur + (real)0.5f;
@@ -412,7 +414,7 @@ static inline real background_of(global const CODE *image, int rows, int columns
     return sum / all;
 }
 
-// Where the contour is not the mark's own, as wide as the rulers beside those that say so.
+// Mark the parts of the contour whose edges disagree with the shape, as wide as the spacing of the rulers.
 static inline void hide(blob_shape shape, private const real *weights, blob_layout layout, real spacing, real blur,
                  private blob_hidden *hidden) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle);
@@ -429,14 +431,14 @@ static inline void hide(blob_shape shape, private const real *weights, blob_layo
     }
 }
 
-// The centre of gravity of what differs from the ring about the mark, relative to (x, y); false where the ring leaves
-// the image.
+// Centroid of the grey levels over the background of a ring around the fiducial, relative to (x, y). Return 0 if the ring
+// leaves the image.
 static inline int gravity_of(global const CODE *image, int rows, int columns, real x, real y, real reach, private real *to_x,
                       private real *to_y) {
     const real outer = reach + RING;
     if (!(x - outer >= 0 && y - outer >= 0 && x + outer <= columns - 1 && y + outer <= rows - 1)) return 0;
     const int left = (int)(x - outer), right = (int)(x + outer), top = (int)(y - outer), bottom = (int)(y + outer);
-    // Grey levels relative to one of them keep their digits.
+    // Subtract one grey level first: sums of differences keep more digits.
     const reals level = (reals)convert_real(image[(int)y * columns + (int)x]);
     reals area = 0, sum = 0, sum_x = 0, sum_y = 0, at_x = 0, at_y = 0, about = 0, sum_about = 0;
     for (int row = top; row <= bottom; row++) {
@@ -464,7 +466,7 @@ static inline int gravity_of(global const CODE *image, int rows, int columns, re
     return !not_finite(*to_x + *to_y) && fabs(*to_x) <= reach && fabs(*to_y) <= reach;
 }
 
-// Lays the rulers of a mark and takes what they find.
+// Place the rulers of a fiducial and store their edges.
 static inline void measure(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape, real turned,
                     constant real *table, blob_layout layout, EDGE_SPACE blob_edges *edges
 #ifndef VECTOR_VARIANT
@@ -509,7 +511,7 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
     const uint first = get_global_id(0) * each, end = min(first + each, count);
     const int mine = 1;
 #else
-    local real profile[LENGTH], slopes[RULER_SLOPES], told[5];
+    local real profile[LENGTH], slopes[RULER_SLOPES], shared_state[5];
     local int flags;
     local blob_edges shared;
     const uint first = get_group_id(0), end = first + 1;
@@ -556,12 +558,12 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
 #ifndef VECTOR_VARIANT
             barrier(CLK_LOCAL_MEM_FENCE);
             if (mine) {
-                told[0] = shape.x, told[1] = shape.y, told[2] = shape.size, told[3] = shape.angle;
-                told[4] = done;
+                shared_state[0] = shape.x, shared_state[1] = shape.y, shared_state[2] = shape.size, shared_state[3] = shape.angle;
+                shared_state[4] = done;
             }
             barrier(CLK_LOCAL_MEM_FENCE);
-            shape.x = told[0], shape.y = told[1], shape.size = told[2], shape.angle = told[3];
-            done = told[4] != 0;
+            shape.x = shared_state[0], shape.y = shared_state[1], shape.size = shared_state[2], shape.angle = shared_state[3];
+            done = shared_state[4] != 0;
 #endif
             if (done) break;
         }
@@ -574,7 +576,7 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
 #else
         const real bent = 0;
 #endif
-        blob_facts facts;
+        blob_quality quality;
         int what = bad ? STATUS_NOT_FINITE : 0;
         if (!bad) {
             what |= SPOKES - edges.outside < least ? STATUS_OUT_OF_RANGE : 0;
@@ -583,22 +585,22 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
             if (!what && !agreed) what = STATUS_AMBIGUOUS;
         }
         if (!what) {
-            facts = facts_of(&edges, layout, shape, scale, bent, overlap);
-            if (facts.inliers < least || !facts.regular) what = STATUS_AMBIGUOUS;
+            quality = quality_of(&edges, layout, shape, scale, bent, overlap);
+            if (quality.inliers < least || !quality.regular) what = STATUS_AMBIGUOUS;
             else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
         }
 #ifdef MATCH
         if (!what) {
-            blob_grey grey = {0, facts.contrast, sqrt(fmax(variance - BILINEAR, SHARPEST * SHARPEST))};
-            grey.background = background_of(image, rows, columns, place[0], place[1], shape, &edges, facts.weights,
+            blob_grey grey = {0, quality.contrast, sqrt(fmax(variance - BILINEAR, SHARPEST * SHARPEST))};
+            grey.background = background_of(image, rows, columns, place[0], place[1], shape, &edges, quality.weights,
                                             layout, grey.blur);
             blob_hidden hidden;
-            hide(shape, facts.weights, layout, spacing, grey.blur, &hidden);
+            hide(shape, quality.weights, layout, spacing, grey.blur, &hidden);
             if (!match(image, rows, columns, place[0], place[1], pixel_noise, extent, &hidden, &shape, &grey,
-                       facts.covariance))
+                       quality.covariance))
                 what = STATUS_AMBIGUOUS;
             else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
-            facts.contrast = grey.contrast;
+            quality.contrast = grey.contrast;
             variance = grey.blur * grey.blur;
         }
 #endif
@@ -613,12 +615,12 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
 #endif
         for (int j = 0; j < FREEDOMS; j++)
             for (int k = 0; k < FREEDOMS; k++)
-                covariance[((ulong)n * FREEDOMS + j) * FREEDOMS + k] = good ? facts.covariance[j][k] : REAL_NAN;
-        residual[n] = good ? facts.residual : REAL_NAN;
-        inliers[n] = good ? facts.inliers : 0;
-        symmetry[n] = good ? facts.symmetry : REAL_NAN;
+                covariance[((ulong)n * FREEDOMS + j) * FREEDOMS + k] = good ? quality.covariance[j][k] : REAL_NAN;
+        residual[n] = good ? quality.residual : REAL_NAN;
+        inliers[n] = good ? quality.inliers : 0;
+        symmetry[n] = good ? quality.symmetry : REAL_NAN;
         distance[n] = good ? sqrt(shape.x * shape.x + shape.y * shape.y) : REAL_NAN;
-        contrast[n] = good ? facts.contrast : REAL_NAN;
+        contrast[n] = good ? quality.contrast : REAL_NAN;
         blur[n] = good ? sqrt(variance) : REAL_NAN;
         real to_x = 0, to_y = 0;
         const real middle_x = place[0] + shape.x, middle_y = place[1] + shape.y;
@@ -626,6 +628,6 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
                                              shape.size * extent + (real)2.5f * sqrt(variance) + 1, &to_x, &to_y);
         gravity_x[n] = heavy ? middle_x + to_x : REAL_NAN;
         gravity_y[n] = heavy ? middle_y + to_y : REAL_NAN;
-        status[n] = (uchar)(what | (good && facts.saturated ? STATUS_SATURATED : 0));
+        status[n] = (uchar)(what | (good && quality.saturated ? STATUS_SATURATED : 0));
     }
 }

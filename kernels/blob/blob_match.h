@@ -1,42 +1,42 @@
-// A mark as its pixels have it: least squares of grey levels against a blurred shape on a plane background, from where
-// its edges say it is. No interpolation between pixels, and all of the contour's pixels count once.
+// Refinement of a fiducial by its grey levels: robust least squares of the pixels against a blurred shape on a plane
+// background, starting at the shape fitted to its edges. The contour is sampled at pixel centres without interpolation;
+// each contour pixel contributes one residual.
 //
-//     ROUND, FREEDOMS     as in blob.cl
-//     RATIO               of a ring, or of a cross; else the mark is a disc or a square
+// Options: ROUND, FREEDOMS as in blob.cl; RATIO: inner over outer size of a ring or a cross; else a disc or a square.
 #ifndef BLOB_MATCH_H
 #define BLOB_MATCH_H
 #include "common/least_squares.h"
 #include "common/robust.h"
 
-// Relative to the nominal place.
+// Shape of a fiducial; its position is relative to the nominal position [px], [rad].
 typedef struct {
     real x, y, size, angle;
 } blob_shape;
 
-// Level (0 to 1), and its derivatives with respect to the shape and the blur.
+// Grey level of the model (0 to 1) and its derivatives with respect to the shape and the blur.
 typedef struct {
     reals level, row[FREEDOMS + 1];
 } blob_model;
 
-// A mark's grey levels: of the background at its centre, and above that; and how wide its edges are.
+// Grey levels of a fiducial: background at its centre, contrast over the background; blur of its edges [px].
 typedef struct {
     real background, contrast, blur;
 } blob_grey;
 
-#define UNKNOWNS (FREEDOMS + 5) // with blur, contrast, background and its two slopes
+#define UNKNOWNS (FREEDOMS + 5) // shape; blur, contrast, background and its two slopes
 #define UNKNOWN_CELLS (UNKNOWNS * (UNKNOWNS + 1) / 2)
-#define MATCH_STEPS 3
-#define MATCHED (real)0.05f     // [blurs] a step after which there is none
-#define MATCH_FURTHEST (real)1   // [px] from where the edges say
-#define MATCH_SHARE (real)0.1f  // of the contrast, and
-#define MATCH_NOISES (real)4     // of the noise: what no pixel of the mark is off by
-#define MATCH_OWN (real)0.7f     // of the pixels that must be a mark's or its background's
-#define SHARPEST (real)0.3f      // [px]
-#define ABOUT_BLURS (real)5      // about a mark its background is looked at: so many blurs
-#define ABOUT (real)2            // [px] and so much
+#define MATCH_STEPS 3          // iterations
+#define MATCHED (real)0.05f    // a step below this fraction of the blur ends the iteration
+#define MATCH_FURTHEST (real)1 // largest distance from the shape fitted to the edges [px]
+#define MATCH_SHARE (real)0.1f // largest residual of an inlier: this fraction of the contrast ...
+#define MATCH_NOISES (real)4   // ... plus this multiple of the noise
+#define MATCH_OWN (real)0.7f   // smallest fraction of inlier pixels
+#define SHARPEST (real)0.3f    // smallest blur [px]: a sharper edge is undersampled
+#define ABOUT_BLURS (real)5    // width of the background around the fiducial: this multiple of the blur ...
+#define ABOUT (real)2          // ... plus this width [px]
 
-// A step blurred by a Gaussian at t deviations, and its density; zero past 3.5. Odd polynomials, so that what they are
-// off by (2.4e-4 at most) moves no edge.
+// Step blurred by a Gaussian at t standard deviations, and its derivative; clamped at 3.5 standard deviations.
+// Odd polynomial approximation, error 2.4e-4: an odd error does not move an edge.
 #define STEP_END (real)3.5f
 static inline reals blurred_step(reals t, private reals *density) {
     const reals end = (reals)STEP_END;
@@ -49,8 +49,8 @@ static inline reals blurred_step(reals t, private reals *density) {
 }
 
 #ifdef ROUND
-// A disc of so much of the size. Its edge bends: to first order in the blur over the radius the level is lower by
-// density times half of that.
+// Add a disc whose radius is the fraction `share` of the size. Its edge is curved: to first order in blur / radius the
+// level is lower by half of that ratio times the density.
 static inline void add_disc(reals r, real size, real share, real sign, real per_blur, private blob_model *model) {
     reals density;
     const reals t = (share * size - r) * per_blur;
@@ -75,7 +75,7 @@ static inline blob_model model_at(reals x, reals y, blob_shape shape, real cosin
     return model;
 }
 #else
-// Between two edges at distance `half` of 0: level, and derivatives by place, half and blur.
+// Band between two edges at -half_ and half_: level, and derivatives by position, half width and blur.
 typedef struct {
     reals level, place, half_, blur;
 } blob_band;
@@ -117,8 +117,7 @@ static inline blob_model model_at(reals x, reals y, blob_shape shape, real cosin
 }
 #endif
 
-// Parts of the contour that are not this mark's: what rulers there saw does not agree with the shape. Relative to the
-// mark's centre.
+// Parts of the contour that belong to something else: their edges disagree with the shape. Relative to the centre.
 typedef struct {
     real x[SPOKES], y[SPOKES], nx[SPOKES], ny[SPOKES];
     real half_width, half_length;
@@ -148,8 +147,7 @@ typedef struct {
     reals matrix[UNKNOWN_CELLS], right[UNKNOWNS], squares, weights, count, pixels;
 } match_sums;
 
-// The equations of the pixels about (x, y), as far as they are of this mark and its background; in units of its
-// contrast.
+// Accumulate the normal equations of the pixels of the fiducial and its background around (x, y), in units of the contrast.
 static inline void match_summed(global const CODE *image, int rows, int columns, real x, real y, blob_shape shape,
                          blob_grey grey, real slope_x, real slope_y, real scale, real reach,
                          private const blob_hidden *hidden, private match_sums *sums) {
@@ -197,8 +195,7 @@ static inline void match_summed(global const CODE *image, int rows, int columns,
     }
 }
 
-// Moves the shape to where its pixels have it; returns whether there is such a place near by. `covariance` is what
-// their differences from the model make of it.
+// Fit the shape to the grey levels; return 0 if the fit fails or moves too far. `covariance`: from the residuals.
 static inline int match(global const CODE *image, int rows, int columns, real x, real y, real noise, real extent,
                  private const blob_hidden *hidden, private blob_shape *shape, private blob_grey *grey,
                  real covariance[FREEDOMS][FREEDOMS]) {

@@ -1,5 +1,5 @@
-// Small least squares in lanes: sums over the lanes, and Cholesky's solution of equations, of FREEDOMS unknowns unless
-// said otherwise.
+// Small least-squares problems in lanes: sums over lanes, and Cholesky factorisation and solution of the normal equations
+// with FREEDOMS unknowns (or a given number).
 #ifndef LEAST_SQUARES_H
 #define LEAST_SQUARES_H
 
@@ -19,11 +19,11 @@ static inline real sum_of(reals value) { return value; }
 #define FIRST(value) (value)
 #endif
 
-// Triangles of a symmetric matrix, row by row: (0, 0), (1, 0), (1, 1), ...
+// Lower triangle of a symmetric matrix, row by row: (0, 0), (1, 0), (1, 1), ...
 #define TRIANGLE (FREEDOMS * (FREEDOMS + 1) / 2)
 #define CELL(row, column) ((row) * ((row) + 1) / 2 + (column))
 
-// Cholesky: the matrix becomes its factor, with the diagonal's inverse on the diagonal. Returns where it has none.
+// Cholesky factorisation in place; the diagonal holds reciprocals. Returns the lanes in which the matrix is singular.
 static inline masks factored_of(const int unknowns, private reals *matrix) {
     masks bad = 0;
     for (int i = 0; i < unknowns; i++) {

@@ -1,5 +1,7 @@
-// Losses of M-estimators, and medians: of residuals in units of their scale. LOSS_HUBER, LOSS_TUKEY and LOSS_CUT say
-// which, none of them least squares; TUNING_CONSTANT is where the loss bends.
+// Loss functions of M-estimators (Huber, 1981) and medians, for residuals in units of their scale.
+//
+// Options: LOSS_HUBER, LOSS_TUKEY (biweight) or LOSS_CUT (truncated squares); none: least squares. TUNING_CONSTANT: residual
+// at which the loss departs from least squares.
 #ifndef ROBUST_H
 #define ROBUST_H
 
@@ -7,7 +9,7 @@
 
 #if defined(LOSS_HUBER) || defined(LOSS_TUKEY) || defined(LOSS_CUT)
 #define ROBUST
-// The step before which the scale is taken anew.
+// Iteration before which the scale is estimated again.
 #define RESCALED_AT(step) ((step) == 2)
 #else
 #define RESCALED_AT(step) 0
@@ -26,12 +28,12 @@
 #define BITS_TO_ONE_PERCENT 16
 #endif
 #define MAD_TO_SIGMA (real)1.4826022185056018
-// How much too small the median is for few points: much where the fit is the best of many through two or three of them
-// (Rousseeuw and Leroy, 1987), a little where all took part.
+// Small-sample correction of the scale from the median, 1 + c / (n - p): c = 5 where the fit is the best of many trials
+// through p points (Rousseeuw and Leroy, 1987), c = 1 where all points took part.
 #define FEW_TRIED (real)5
 #define FEW_FITTED (real)1
 
-// A value of one lane.
+// Value of one lane.
 #ifdef VECTOR_VARIANT
 #define LANE(values, lane) (((private real *)&(values))[lane])
 #define LANE_BITS(values, lane) (((private const bits *)&(values))[lane])
@@ -42,7 +44,7 @@
 
 static inline reals kept_where(masks mask, reals value) { return as_reals(as_masks(value) & mask); }
 
-// What a residual weighs in the next step of least squares.
+// Weight of a residual in iteratively reweighted least squares: psi(z) / z.
 static inline reals loss_weight(reals z) {
 #if defined(LOSS_HUBER)
     const reals size = FABS(z);
@@ -57,7 +59,7 @@ static inline reals loss_weight(reals z) {
 #endif
 }
 
-// The slope of what it weighs times it: how much the estimate gives way.
+// Derivative psi'(z): the sensitivity of the estimate to a residual.
 static inline reals loss_slope(reals z) {
 #if defined(LOSS_HUBER) || defined(LOSS_CUT)
     return FABS(z) <= (reals)TUNING ? (reals)1 : (reals)0;
@@ -84,8 +86,10 @@ static inline reals loss_of(reals z) {
 #endif
 }
 
-// Of each lane, the value with so many values at or below it, itself among them, built bit by bit from the top;
-// `lowest` bits stay zero. The values are not negative (bits order such reals); infinity where there is none.
+// Order statistic of each lane: the smallest value with at least `rank` values at or below it; infinity if there is none.
+//
+// Built bit by bit from the top: the bit patterns of non-negative reals have the order of the reals, so counting the values
+// below a pattern decides each bit. The `lowest` bits stay zero, which rounds the result down.
 static inline reals ranked_of(private const reals *values, int count, masks rank, int lowest) {
     masks found = 0;
     for (int bit = BITS_BELOW_SIGN - 1; bit >= lowest; bit--) {

@@ -1,10 +1,10 @@
-// What a cluster of lit segments, or one segment, can give a block of receivers at most, and what the segment that
-// stands for a cluster is off by at most.
+// Bounds for light clustering: the largest irradiance that a cluster or a segment can cause on a block of receivers, and the
+// largest error of the segment that represents a cluster. Derivations: gpuvision/simulation/clustering/light_tree.py.
 #ifndef LIGHT_BOUNDS_H
 #define LIGHT_BOUNDS_H
 #include "common/bvh.h"
 
-// Of a row of a cluster.
+// Columns of a cluster.
 #define COLUMNS 24
 #define CENTRE 0
 #define LOW 3
@@ -23,16 +23,16 @@
 #define ARM 22
 #define LENGTH 23
 
-// Of a lit segment: its normal, the height of its plane, start, end.
+// Numbers of a lit segment: normal (3), height of its plane (1), start (3), end (3).
 #define PLACED 10
 
 #define PER_PI ((real)0.31830988618379067)
 #define PI ((real)3.14159265358979324)
-// Rounding of the bounds themselves.
+// Factor that covers the rounding of the bounds themselves.
 #define UP ((real)1 + (real)256 * (real)REAL_EPSILON)
 
-// The receivers of a block that count: their box about its middle, mean normal, how far their normals are from that, how
-// high the middle is above their planes, how far they are from the mean plane through it.
+// Receivers of a block with a cost: box and its centre, mean normal, largest deviation of a normal (spread), heights of the
+// centre above their planes, largest distance from the mean plane (slab).
 typedef struct {
     real centre[3], low[3], high[3], normal[3];
     real radius, spread, most_height, least_height, slab, cost;
@@ -46,7 +46,7 @@ typedef struct {
     int faces;  // whether all of one face all of the other
 } meeting;
 
-// A runtime may call a function for fmin and fmax. A second number that is NaN does not count.
+// fmin() and fmax() may become function calls. NaN in b is ignored.
 static inline real lower(real a, real b) { return b < a ? b : a; }
 static inline real higher(real a, real b) { return b > a ? b : a; }
 
@@ -59,7 +59,7 @@ static inline void cross3(const real *a, const real *b, real *c) {
     c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-// Those without cost have no part in the reading; a normal of zero is no receiver.
+// Skip receivers without cost, which do not affect the reading, and those with a zero normal.
 static inline receivers_block block_of(global const INPUT *receivers, global const real *costs, int count,
                                 global const INPUT *middle) {
     receivers_block block;
@@ -126,14 +126,14 @@ static inline meeting meeting_of(const receivers_block *block, global const real
         const real high = block->normal[k] * (row[HIGH + k] - row[CENTRE + k]);
         front += higher(low, high), back -= lower(low, high);
     }
-    // Points of a box reach no further along a normal than its sides, those of a disc no further than that.
+    // Extent along a normal: the smaller of the bounds from the box and from the disc.
     real across[3];
     cross3(normal, block->normal, across);
     const real sine = length3(across), cosine = fabs(dot3(normal, block->normal));
     const real between = length3(to), wide = row[RADIUS], lit_disc = cosine * row[SLAB] + sine * wide;
     reach = lower(reach, cosine * block->slab + sine * block->radius);
     front = lower(front, lit_disc), back = lower(back, lit_disc);
-    // How high receivers stand above the lit surfaces, and the lit above the receivers' planes.
+    // Heights of the receivers above the lit surfaces, and of the segments above the receivers' planes.
     const real lit_turn = row[SPREAD] * (between + block->radius), got_turn = block->spread * (between + wide);
     const real lit = dot3(normal, to), got = -dot3(block->normal, to);
     const real lit_most = lit + lit_turn + row[MOST_HEIGHT] + reach;
@@ -154,13 +154,13 @@ static inline meeting meeting_of(const receivers_block *block, global const real
     }
     const real per = UP / distance;
     const real cosines = lower((lit_most + rounding) * per, (real)1) * lower((got_most + rounding) * per, (real)1);
-    // The integral of dt / r^2 over a line is pi / r at most.
+    // The integral of dt / r^2 over a line at distance r is at most pi / r.
     const real spread = single ? PI * per / row[LENGTH] : (real)INFINITY;
     met.bound = cosines * lower(per * per, spread) * PER_PI * UP;
     return met;
 }
 
-// What the cluster's own segment is off by at most, as irradiance by a watt.
+// Largest error of the representing segment: irradiance per watt (third-order expansion of the kernel, light_tree.py).
 static inline real error_of(const receivers_block *block, global const real *row, real rounding) {
     real gap = 0;
     for (int k = 0; k < 3; k++) {
@@ -176,7 +176,7 @@ static inline real error_of(const receivers_block *block, global const real *row
     return per * per * per * (row[FIRST_ORDER] + per * beyond) * PER_PI * UP;
 }
 
-// What a watt of a segment costs at most at a lane's receiver, times pi.
+// Largest cost of a watt of a segment at the receiver of each lane, times pi.
 INLINE reals most_of_lane(const real *lane, global const real *lit, real length, real rounding) {
     const reals zero = (reals)0, one = (reals)1;
     const reals nx = load_private(lane + 3 * WIDTH), ny = load_private(lane + 4 * WIDTH);
@@ -196,7 +196,7 @@ INLINE reals most_of_lane(const real *lane, global const real *lit, real length,
     return gets ? (mask_of(distance > 0) ? light : (reals)INFINITY) : zero;
 }
 
-// What a segment costs at most, each receiver for itself: so that it stays finite where a block touches what is lit.
+// Largest cost of a segment, summed over receivers: finite even where the block touches the lit surface.
 static inline real most_of_segment(const receivers_block *block, global const real *lit, real length, real power,
                             real rounding) {
     real sum = 0;

@@ -1,19 +1,26 @@
-// Selection of the lit segments and clusters that each block of receivers needs, to a tolerance. Each block traverses the
-// tree of gpuvision/simulation/clustering/light_tree.py from its root. A node is left out where the bound of its light is
-// below its share of the tolerance, replaced by its representative segment where the bound of that error is and nothing
-// can occlude it, and opened otherwise.
+// Error-bounded light clustering: the cut through a light tree (lightcuts, Walter et al. 2005) for each block of receivers.
+//
+// Inputs:  receivers (strips, of_strip, 6) position [m] and normal, type INPUT; costs (strips, of_strip), weight of a
+//          receiver's irradiance in the reading; shares (strips,), error allowed per watt; rows (nodes, COLUMNS), spans
+//          (nodes, 2), the tree of gpuvision/simulation/clustering/light_tree.py; placed (segments, PLACED); frame (4,),
+//          middle of the positions and their rounding.
+// Outputs: per block: picks and errors (blocks, capacity), counts, spent (2), tallies (2).
+// Options: OCCLUDERS (a scene can hide light), CLUSTERS (clusters may be represented), BLOCK (receivers per block), INPUT,
+//          REAL_IS_DOUBLE, BVH_DEPTH. Variants: vector: `each` blocks per work-item; work-item: one block per item.
+//
+// From the root down, a cluster is (1) left out if the light that it can send is below its share; (2) represented by one
+// segment if the bound of the error is below its share and nothing can occlude it; (3) else opened.
 #include "light_clustering/light_bounds.h"
 #include "light_clustering/shaft.h"
 
-// Bit of a selected segment that nothing can occlude. A cluster is ~node.
+// Flag of a pick: a segment that nothing can occlude. A picked cluster is ~node.
 #define CLEAR (1 << 30)
-// Whether anything may stand between is looked at for so many segments at once, and fewer, but not for one: a look takes
-// as long as the visibility of one that it would spare. A block looks so often in vain, and some times more for each time
-// that it did not.
+// Occlusion is tested for clusters of at most this many segments, not for single ones: the test costs as much as the exact
+// visibility of one segment. PATIENCE: failed tests per block before it gives up; each success adds PATIENCE_WON.
 #define MOST_LOOKED_AT 16
 #define PATIENCE 32
 #define PATIENCE_WON 2
-// Of a block's tallies.
+// Counts of a block: segments left out, segments represented by a cluster.
 #define OUT 0
 #define TOGETHER 1
 #define TALLIES 2
@@ -23,7 +30,7 @@ typedef struct {
     reals x, y, z;
 } vectors;
 
-// What stands for many points with normals: as far as they reach, as a box and as a disc, and their planes.
+// Bounds of a set of points with normals: box, disc, and cone of normals.
 typedef struct {
     real centre[3], low[3], high[3], normal[3];
     real radius, slab, spread, most_height;
@@ -53,14 +60,14 @@ INLINE reals highest(vectors a, vectors b, vectors c, const real *up) {
     return lane_max(lane_max(u, v), along(c, up[0], up[1], up[2]));
 }
 
-// How high a place is above any of the planes, at most.
+// Upper bound of the height of a point above any of the planes.
 INLINE reals rise(const extent *many, vectors corner) {
     const vectors way = from(corner, many->centre);
     return along(way, many->normal[0], many->normal[1], many->normal[2]) + many->spread * size_of(way) +
            many->most_height;
 }
 
-// Between what the points lie along a direction, from a place.
+// Interval of the points along a direction, from a level.
 INLINE void between(const extent *many, vectors n, reals size, reals level, reals *low,
                         reals *high) {
     const reals middle = along(n, many->centre[0], many->centre[1], many->centre[2]) - level;
@@ -194,7 +201,7 @@ static inline int is_clear(const bvh_tree *tree, const receivers_block *block, g
 }
 #endif
 
-// The node after all of those below one, in the order of a heap: 0 after the last.
+// Next node in heap order that is not below `node`; 0 after the last.
 static inline uint after(uint node) {
     const uint next = node + 1;
     const uint at = next >> popcount((next & -next) - 1);
@@ -219,7 +226,7 @@ kernel void select_lights(global const INPUT *restrict receivers, global const r
 #ifdef OCCLUDERS
     const bvh_tree tree = {nodes, children, axes, leaves, triangles};
 #endif
-    // Places are from the frame's middle; behind it stands by how much they may be rounded.
+    // Positions are relative to the middle of the frame; frame[3] bounds their rounding.
     const real rounding = (real)frame[3];
     const uint begin = get_global_id(0) * each, end = min(begin + each, blocks);
     for (uint b = begin; b < end; b++) {
@@ -232,7 +239,7 @@ kernel void select_lights(global const INPUT *restrict receivers, global const r
         global float *error = errors + (size_t)b * capacity;
         uint found = 0;
         int out = 0, together = 0, culprit = -1, patience = PATIENCE;
-        // The level of the cluster that nothing can hide, whose parts are being looked at; else below all levels.
+        // Level of the ancestor that nothing can occlude; OPEN_LEVEL if there is none.
         int open_level = OPEN_LEVEL;
         real lost = 0, whole = 0;
         uint node = block.count ? 1 : 0;
@@ -246,7 +253,7 @@ kernel void select_lights(global const INPUT *restrict receivers, global const r
                 continue;
             }
             const meeting met = meeting_of(&block, row, count == 1, rounding);
-            // A bound of zero may meet a cost that is infinite.
+            // Avoid 0 times infinity: a zero bound may meet an infinite cost.
             real most = met.bound > 0 ? met.bound * row[POWER] * block.cost : 0;
             if (count == 1 && met.bound > share) {
                 global const real *lit = placed + PLACED * place;
@@ -264,7 +271,7 @@ kernel void select_lights(global const INPUT *restrict receivers, global const r
 #endif
             const int close = wrong <= share;
 #ifdef OCCLUDERS
-            // Looked at where that may spare something: many at once, or few that one could stand for.
+            // Test occlusion only where it can save work: for many segments, or for few that one could represent.
             const int worth = count > 1 && count <= MOST_LOOKED_AT && (2 * count > MOST_LOOKED_AT || close);
             if (level < open_level && patience > 0 && worth) {
                 const int clear = is_clear(&tree, &block, row, placed + PLACED * place, count, margin, &culprit);

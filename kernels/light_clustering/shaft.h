@@ -1,5 +1,7 @@
-// The convex hull of two boxes against the tree of kernels/common/bvh.h: at the part t of the way from one to the other the
-// hull is a box again, whose sides move evenly. So a third box meets it if six straight lines in t leave an interval.
+// Shaft culling: the convex hull of two boxes against the tree of common/bvh.h.
+//
+// At the fraction t between the two boxes the hull is a box whose sides are linear in t. A third box meets the hull if the
+// six linear inequalities in t leave a non-empty interval.
 #ifndef SHAFT_H
 #define SHAFT_H
 #include "common/bvh.h"
@@ -20,7 +22,7 @@ static inline shaft shaft_of(const real *low, const real *high, const real *to_l
     return hull;
 }
 
-// Narrows (first, last) to where the hull's box overlaps along one axis.
+// Clip the interval [first, last] of t to where the hull overlaps [low, high] along one axis.
 INLINE void shaft_narrow(const shaft *hull, int axis, reals low, reals high, reals *first,
                              reals *last) {
     const reals under = (high - hull->low[axis]) * hull->per_low[axis];

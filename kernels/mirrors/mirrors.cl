@@ -1,27 +1,33 @@
-// Where curved mirrors show points: on triangles whose corners have normals of their own, the place at which the
-// direction half way between lens and point is along the normal. A work-item takes 16 points (one, without VECTOR_VARIANT)
-// through all triangles.
+// Reflections in curved mirrors: positions on the mirror at which a lens sees given points, and the mirrors that may show
+// given lines.
 //
-// On a triangle the normal is N = sum b_i n_i, and the surface S = sum b_i (p_i - f_i n_i / 2) with p on the flat
-// triangle and f_i = (p - p_i) n_i: both exact where the surface is of second degree. With c and q from S to the lens and
-// to the point, the law of reflection along both edges e is
+// mirror_points: Inputs:  points (count, 6): position and step [m], type INPUT; lens_place (3,).
+//                Outputs: per point up to `kept` reflections: places, moves (derivative by the step) (count, kept, 3),
+//                         densities (solid angle of the lens' rays per area at the point [1/m2]), triangles; counts, status.
+// mirror_facets: Inputs:  lines (count, 6), both ends [m]; lens_place (3,). Outputs: near (count, blocks) 0 or 1.
+// Tables:  table (n, ROW), triangles; block_table (blocks, BLOCK), groups of triangles; starts (blocks + 1,); numbers (n,).
+// Options: INPUT, REAL_IS_DOUBLE. Variants: vector: 16 points or lines per work-item; work-item: one.
+//
+// Law of reflection. A triangle with normals n_i at its corners p_i has the normal N = sum b_i n_i and the surface
+// S = sum b_i (p_i - f_i n_i / 2), with f_i = (p - p_i) n_i for p on the flat triangle: exact for surfaces of second degree.
+// With c and q, the vectors from S to the lens and to the point, reflection requires along both edges e
 //     R = NN ((c e) (q N) + (q e) (c N)) - 2 (e N) (c N) (q N) = 0,
-// a polynomial that is linear over a flat mirror. From it also follow how the place moves with the point, and what solid
-// angle of the lens' rays a square metre at the point takes: R = w q with a w that does not depend on q, and
-//     |S_x x S_y . c| |w_1 x w_2 . q| / (|c|^3 |q| |det dR|),  1 / (|c| + |q|)^2 in a plane.
+// a polynomial, linear for a flat mirror; it is solved by Newton's method. R = w q with a w that does not depend on q, which
+// also gives the derivative of the position, and the solid angle of the lens' rays per area at the point,
+//     |S_x x S_y . c| |w_1 x w_2 . q| / (|c|^3 |q| |det dR|);  for a plane 1 / (|c| + |q|)^2.
 #include "common/lanes.h"
 #include "common/status.h"
 
-// A row: first corner; two edges; three normals; both edges on each normal; first corner from the other two on their
-// normals; whether only the side of the normals reflects.
+// Numbers per triangle: first corner (3), two edges (6), three normals (9), products of both edges with each normal (6),
+// f of the first corner at the other two (2), whether only the side of the normals reflects (1).
 #define ROW 27
-// Of a block of triangles: middle, radius; axis of its normals, cosine and sine of twice their cone; whether only that
-// side of all of them reflects, and the sine of their cone.
+// Numbers per block of triangles: centre and radius of its ball (4), axis of the cone of its normals (3), cosine and sine of
+// twice the cone's half angle (2), whether only that side reflects (1), sine of the half angle (1).
 #define BLOCK 11
-#define STEPS 16
-#define ASTRAY ((real)5)
-#define TANGENTS 4
-// How far out of the triangle, in its own size, the linear guess may lie.
+#define STEPS 16          // Newton steps
+#define ASTRAY ((real)5) // barycentric distance from which Newton's method does not return
+#define TANGENTS 4        // tangent refinements of the cone test
+// Largest barycentric distance of the start value outside the triangle.
 #define MARGIN ((real)0.5)
 #ifdef REAL_IS_DOUBLE
 #define NEAR_ENOUGH ((real)1e-7)
@@ -44,10 +50,10 @@ typedef struct {
 } Fixed;
 
 typedef struct {
-    Vector place, along_x, along_y; // on the surface, and how it goes on in x and y
+    Vector place, along_x, along_y;   // point of the surface and its derivatives by x and y (barycentric)
     Vector to_lens, to_point, w1, w2;
-    reals up_lens, up_point;          // these on the normal
-    reals r1, r2, r1x, r1y, r2x, r2y; // what is to be zero, and its slopes
+    reals up_lens, up_point;          // components of to_lens and to_point along the normal
+    reals r1, r2, r1x, r1y, r2x, r2y; // R along both edges and its derivatives
 } Reflection;
 
 INLINE reals dot_of(Vector a, Vector b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
@@ -65,13 +71,13 @@ INLINE Vector moved(Vector a, Fixed by, real sign) { return (Vector){a.x + sign 
 INLINE Vector minus(Vector a, Vector b) { return (Vector){a.x - b.x, a.y - b.y, a.z - b.z}; }
 INLINE masks positive(reals value) { return mask_of(value > (reals)(real)0); }
 
-// w of an edge: NN ((c e) N + (c N) e) - 2 (e N) (c N) N.
+// Vector w of an edge: NN ((c e) N + (c N) e) - 2 (e N) (c N) N.
 INLINE Vector weight_of(Vector c, reals up, Vector n, reals square, Fixed edge) {
     const reals along = square * dot_fixed(c, edge) - (real)2 * dot_fixed(n, edge) * up, beside = square * up;
     return (Vector){along * n.x + beside * edge.x, along * n.y + beside * edge.y, along * n.z + beside * edge.z};
 }
 
-// The slope of R of an edge where place and normal change by `s` and `m`.
+// Derivative of R of an edge when position and normal change by `s` and `m`.
 INLINE reals slope_of(const Reflection *it, Vector n, reals square, Vector s, Vector m, Fixed edge) {
     const reals ce = dot_fixed(it->to_lens, edge), qe = dot_fixed(it->to_point, edge), ne = dot_fixed(n, edge);
     const reals se = dot_fixed(s, edge), sn = dot_of(s, n), c = it->up_lens, q = it->up_point;
@@ -114,8 +120,8 @@ INLINE Reflection reflection_at(reals x, reals y, Vector point, Vector lens, glo
     return it;
 }
 
-// The equation at a corner; on which sides of the surface there lens and point lie is added to `lens_sides` (1: above,
-// 2: below), `above` and `below`.
+// R at a corner. The side of the surface on which the lens lies is added to `lens_sides` (1: above, 2: below), that of the
+// points to `above` and `below`.
 INLINE void at_corner(Vector point, Fixed lens, global const real *row, int corner, reals *r1, reals *r2,
                       int *lens_sides, masks *above, masks *below) {
     global const real *edge = corner == 0 ? row : row + 3 * corner;
@@ -134,7 +140,7 @@ INLINE void at_corner(Vector point, Fixed lens, global const real *row, int corn
     *below |= positive(-up);
 }
 
-// Whether the linear guess lies in the triangle or near it, and the guess.
+// Start value: solution of R interpolated linearly between the corners. Returns the lanes in which it lies near the triangle.
 INLINE masks guessed(Vector point, Fixed lens, global const real *row, reals *x, reals *y) {
     reals u0, v0, u1, v1, u2, v2;
     int lens_sides = 0;
@@ -142,7 +148,7 @@ INLINE masks guessed(Vector point, Fixed lens, global const real *row, reals *x,
     at_corner(point, lens, row, 0, &u0, &v0, &lens_sides, &above, &below);
     at_corner(point, lens, row, 1, &u1, &v1, &lens_sides, &above, &below);
     at_corner(point, lens, row, 2, &u2, &v2, &lens_sides, &above, &below);
-    // At a silhouette they may be on one side only in between.
+    // At a silhouette lens and point may be on one side of the surface only between the corners.
     const masks facing = (lens_sides & 1 ? above : (masks)0) | (lens_sides & 2 && row[26] == 0 ? below : (masks)0);
     const reals a = u1 * v2 - u2 * v1, b = u2 * v0 - u0 * v2, c = u0 * v1 - u1 * v0, whole = a + b + c;
     const reals per = (real)1 / whole, least = -MARGIN;
@@ -151,9 +157,9 @@ INLINE masks guessed(Vector point, Fixed lens, global const real *row, reals *x,
     return facing & mask_of(a * per > least) & mask_of(*x > least) & mask_of(*y > least);
 }
 
-// Whether a block of triangles may show a point. Reflection turns a direction by twice what it turns the normal, so the
-// point lies within a cone: about the way of the lens' ray off the block's middle, as wide as twice the cone of the
-// normals and what the block spans as seen from the lens and from the point.
+// Whether a block of triangles may show a point (conservative). Tilting the normal by an angle turns the reflected ray by
+// twice that angle, so the point lies in a cone around the ray reflected at the block's centre, with a half angle of twice
+// that of the normals plus the angles that the block subtends at the lens and at the point.
 INLINE masks may_show(Vector point, Fixed lens, global const real *block) {
     const Fixed middle = fixed_at(block), axis = fixed_at(block + 4);
     const real radius = block[3], cx = lens.x - middle.x, cy = lens.y - middle.y, cz = lens.z - middle.z;
@@ -164,7 +170,7 @@ INLINE masks may_show(Vector point, Fixed lens, global const real *block) {
     if (block[9] > 0 && facing < -(block[10] + sine + SLACK)) return mask_of((reals)(real)0 > (reals)(real)0);
     const Vector q = moved(point, middle, -1);
     const reals far = dot_of(q, q), room = far - radius * radius, zero = (real)0;
-    // Too wide to say: both cosines say whether the sum is beyond a right angle.
+    // Cones beyond a right angle exclude nothing.
     if (!(sine < (real)1 && block[7] > (real)0 && cos_all > (real)0)) return mask_of(far >= zero);
     const real up = (real)2 * facing;
     const Fixed on = {up * axis.x - cx * per, up * axis.y - cy * per, up * axis.z - cz * per};
@@ -178,7 +184,7 @@ INLINE reals within(reals value, real limit) {
     return value < low ? low : value;
 }
 
-// A start in the triangle or next to it.
+// Clamp a start value to the triangle and its neighbourhood.
 INLINE reals within_triangle(reals value, masks near) {
     const reals low = (real)-0.1, high = (real)1.1;
     value = zero_where(~near, value);
@@ -186,7 +192,7 @@ INLINE reals within_triangle(reals value, masks near) {
     return value > high ? high : value;
 }
 
-// Newton's method from the guess; which lanes came to rest in the triangle, lens and point on one side of it.
+// Newton's method from the start value. Returns the lanes that converged in the triangle with lens and point on one side.
 INLINE masks solved(masks near, Vector point, Vector lens, global const real *row, reals *x, reals *y,
                     Reflection *it) {
     reals step = (real)1;
@@ -198,23 +204,23 @@ INLINE masks solved(masks near, Vector point, Vector lens, global const real *ro
         *x -= dx;
         *y -= dy;
         step = fabs(dx) + fabs(dy);
-        // What has gone astray does not come back.
+        // Drop lanes that left the neighbourhood: they do not return.
         near &= mask_of(fabs(*x) + fabs(*y) < ASTRAY);
         if (!any_lane(near & mask_of(step > NEAR_ENOUGH))) break;
     }
     *it = reflection_at(*x, *y, point, lens, row);
     const reals zero = (real)0;
-    // What lies on the edge of two is to be in one at least.
+    // Widen the triangle by rounding: a point on the edge of two triangles must lie in at least one.
     const reals least = -EDGE, most = (real)1 + EDGE;
     const masks inside = mask_of(*x >= least) & mask_of(*y >= least) & mask_of(*x + *y <= most);
     const masks outside = mask_of(it->up_lens > zero) | mask_of((reals)row[26] == zero);
-    // R is zero, too, where the surface is seen edge on from both.
+    // R is also zero where the surface is seen edge-on from both sides: reject grazing solutions.
     const reals ways = sqrt(dot_of(it->to_lens, it->to_lens) * dot_of(it->to_point, it->to_point));
     const masks sides = positive(it->up_lens * it->up_point - GRAZING * GRAZING * ways);
     return near & inside & sides & outside & mask_of(step <= NEAR_ENOUGH);
 }
 
-// The solid angle of the lens' rays per area across them at the point.
+// Solid angle of the lens' rays per area perpendicular to them at the point.
 INLINE reals concentration(const Reflection *it) {
     const reals lens_side = dot_of(it->to_lens, cross_of(it->along_x, it->along_y));
     const reals point_side = dot_of(it->to_point, cross_of(it->w1, it->w2));
@@ -223,7 +229,7 @@ INLINE reals concentration(const Reflection *it) {
     return fabs(lens_side * point_side / (square * sqrt(square * dot_of(it->to_point, it->to_point)) * slopes));
 }
 
-// How the place moves as the point does.
+// Derivative of the position on the mirror when the point moves by `step`.
 INLINE Vector place_moves(const Reflection *it, Vector step) {
     const reals s1 = dot_of(it->w1, step), s2 = dot_of(it->w2, step);
     const reals det = (real)-1 / (it->r1x * it->r2y - it->r1y * it->r2x);
@@ -231,7 +237,7 @@ INLINE Vector place_moves(const Reflection *it, Vector step) {
     return sum_of(scaled(it->along_x, dx), scaled(it->along_y, dy));
 }
 
-// Lanes behind the last point repeat it.
+// Load a column of LANES points; lanes beyond the last point repeat it.
 INLINE reals loaded(global const INPUT *points, int column, INPUT middle, int last) {
     real each[LANES];
     for (int n = 0; n < LANES; n++) each[n] = (real)(points[6 * min(n, last) + column] - middle);
@@ -309,7 +315,7 @@ kernel void mirror_points(global const INPUT *restrict points, global const INPU
     }
 }
 
-// Of y = start + t way, how far it is inside a cone: y axis - cosine |y|, which bends downwards; its slope.
+// Depth of y = start + t way inside a cone, y axis - cosine |y|, a concave function of t; and its derivative.
 INLINE reals inside_cone(Vector start, Vector way, reals t, Fixed axis, real cosine, reals *slope) {
     const Vector y = sum_of(start, scaled(way, t));
     const reals length = sqrt(dot_of(y, y));
@@ -317,8 +323,8 @@ INLINE reals inside_cone(Vector start, Vector way, reals t, Fixed axis, real cos
     return dot_fixed(y, axis) - cosine * length;
 }
 
-// Whether a lens may see a part of a line in a block of mirrors: the cone of `may_show` about a ball lies in one with
-// its tip before the ball, and tangents say how deep in that the line may get.
+// Whether a lens may see a part of a line in a block of mirrors (conservative). The cone of `may_show` around a ball lies in
+// a cone with its apex before the ball; tangents bound the concave depth of the line in it from above.
 INLINE masks may_show_part(Vector start, Vector way, Fixed lens, global const real *block) {
     const Fixed middle = fixed_at(block), axis = fixed_at(block + 4);
     const real radius = block[3], cx = lens.x - middle.x, cy = lens.y - middle.y, cz = lens.z - middle.z;
@@ -350,7 +356,7 @@ INLINE masks may_show_part(Vector start, Vector way, Fixed lens, global const re
     return seen | open;
 }
 
-// Which lines (both ends) a lens may see in which blocks of mirrors.
+// Blocks of mirrors in which a lens may see each line.
 kernel void mirror_facets(global const INPUT *restrict lines, global const INPUT *restrict lens_place,
                           global uchar *restrict near, global const real *restrict block_table, constant INPUT *middle,
                           const uint blocks, const ulong count) {

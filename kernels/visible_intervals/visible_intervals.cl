@@ -1,25 +1,30 @@
-// What of a segment is visible from an apex, exactly: every triangle that cuts the fan of rays between them hides an
-// interval. The rays may begin on the way, where a plane mirror sends them on: then the apex is the lens' mirror image,
-// and what lies before the mirror does not count.
+// Visible intervals of segments from apexes: exact occlusion, as fractions of the segment.
 //
-// A place in the fan's plane is apex + a (end 0 - apex) + b (end 1 - apex): the fan is a >= 0, b >= 0, the segment
-// a + b = 1, at b / (a + b) of its length, and the line where the rays begin a / near 0 + b / near 1 = 1. All are linear,
-// in a triangle's corners too.
+// Inputs:  fans (count, FAN): apex, both ends of the segment [m], and per end the fraction of the way from the apex at which
+//          the ray begins (0; with a plane mirror on the way the fraction at the mirror, and the apex is the mirror image of
+//          the lens), type INPUT.
+// Outputs: intervals (count, kept, 2) fractions of the segment, NaN behind the last; counts (count,); status (count,).
+// Tables:  the tree of common/bvh.h; middle. Options: INPUT, REAL_IS_DOUBLE, BVH_DEPTH. Variants: vector: boxes and
+//          triangles 16 at a time; work-item: one at a time. One fan per work-item in both.
+//
+// Coordinates in the plane of the fan: place = apex + a (end 0 - apex) + b (end 1 - apex). The fan is a >= 0, b >= 0; the
+// segment is a + b = 1, at the fraction b / (a + b) of its length; rays begin where a / near 0 + b / near 1 = 1. All these
+// are linear along the line in which a triangle cuts the plane, so clipping is exact.
 #include "common/bvh.h"
 #include "common/status.h"
 
-#define FAN 11
-// Fragments that are hidden; joined as they touch.
-#define HIDDEN_KEPT 48
+#define FAN 11         // numbers per fan
+#define HIDDEN_KEPT 48 // capacity for disjoint hidden intervals
 
 typedef struct {
     real x, y, z;
 } Vector;
 
 typedef struct {
-    Vector apex, across, a, b, far, near; // `across` is unit; a, b, a + b, a / near 0 + b / near 1 are linear in a place
-    real per_0, per_1;                    // one over the nears
-    real flat;                            // within this of the plane, a corner lies in it
+    Vector apex, across;    // apex; unit normal of the plane
+    Vector a, b, far, near; // gradients of a, b, a + b, a / near 0 + b / near 1
+    real per_0, per_1;      // reciprocals of near 0 and near 1
+    real flat;              // a corner within this distance of the plane counts as in the plane [m]
 } Fan;
 
 static inline Vector minus(Vector a, Vector b) { return (Vector){a.x - b.x, a.y - b.y, a.z - b.z}; }
@@ -32,7 +37,7 @@ static inline Vector combined(real a, Vector u, real b, Vector v) {
     return (Vector){a * u.x + b * v.x, a * u.y + b * v.y, a * u.z + b * v.z};
 }
 
-// Returns 0 for a segment that is seen end on.
+// Set up a fan; return 0 for a segment that is seen end-on.
 static inline int fan_of(const Vector *corners, real near_0, real near_1, real least_near, Fan *fan) {
     const Vector one = minus(corners[1], corners[0]), two = minus(corners[2], corners[0]);
     const Vector normal = cross_of(one, two);
@@ -50,12 +55,13 @@ static inline int fan_of(const Vector *corners, real near_0, real near_1, real l
     return 1;
 }
 
-// The largest (sign 1) or smallest (-1) value of a linear function over boxes.
+// Largest (sign 1) or smallest (sign -1) value of a linear function over boxes.
 INLINE reals extreme(Vector of, real sign, const reals *middle, const reals *half_size) {
     return of.x * middle[0] + of.y * middle[1] + of.z * middle[2] +
            sign * (fabs(of.x) * half_size[0] + fabs(of.y) * half_size[1] + fabs(of.z) * half_size[2]);
 }
 
+// Boxes that may contain an occluder of the fan.
 INLINE masks fan_boxes(const Fan *fan, global const real *node) {
     const real apex[3] = {fan->apex.x, fan->apex.y, fan->apex.z};
     reals middle[3], half_size[3];
@@ -65,7 +71,7 @@ INLINE masks fan_boxes(const Fan *fan, global const real *node) {
         half_size[k] = (real)0.5 * (high - low);
     }
     const real slack = (real)16 * (real)REAL_EPSILON;
-    // Where there is no box, low is infinity and the comparisons with NaN are false.
+    // A missing child has infinite bounds: its values are NaN and its comparisons false.
     return mask_of(extreme(fan->across, 1, middle, half_size) >= -fan->flat) &
            mask_of(extreme(fan->across, -1, middle, half_size) <= fan->flat) &
            mask_of(extreme(fan->a, 1, middle, half_size) >= -slack) &
@@ -74,7 +80,7 @@ INLINE masks fan_boxes(const Fan *fan, global const real *node) {
            mask_of(extreme(fan->near, 1, middle, half_size) >= (real)1 - slack);
 }
 
-// Cuts [low, high] of a segment to where a function, linear on it, is positive.
+// Clip [low, high] of a line to where a linear function, `start` and `end` at its ends, is positive.
 INLINE void cut(reals start, reals end, reals *low, reals *high) {
     const reals zero = (real)0, place = start / (start - end);
     *low = start < zero ? lane_max(*low, place) : *low;
@@ -82,7 +88,7 @@ INLINE void cut(reals start, reals end, reals *low, reals *high) {
     *high = ((start < zero) & (end < zero)) ? (reals)(real)-1 : *high;
 }
 
-// Which triangles hide something; from where to where.
+// Triangles that hide a part of the segment, and the hidden intervals.
 INLINE masks fan_triangles(const Fan *fan, real slack, global const real *leaf, reals *from, reals *to) {
     reals d[3], a[3], b[3];
     for (int n = 0; n < 3; n++) {
@@ -97,7 +103,7 @@ INLINE masks fan_triangles(const Fan *fan, real slack, global const real *leaf, 
     const reals zero = (real)0, one = (real)1;
     const masks s0 = mask_of(d[0] < zero), s1 = mask_of(d[1] < zero), s2 = mask_of(d[2] < zero);
     const masks lone_0 = (s0 ^ s1) & (s0 ^ s2), lone_1 = (s1 ^ s0) & (s1 ^ s2), crossed = (s0 ^ s1) | (s0 ^ s2);
-    // The corner alone on its side, and the other two.
+    // k: the corner alone on its side of the plane; i, j: the other two.
     const reals dk = lone_0 ? d[0] : lone_1 ? d[1] : d[2], di = lone_0 ? d[1] : d[0];
     const reals ak = lone_0 ? a[0] : lone_1 ? a[1] : a[2], ai = lone_0 ? a[1] : a[0];
     const reals bk = lone_0 ? b[0] : lone_1 ? b[1] : b[2], bi = lone_0 ? b[1] : b[0];
@@ -124,7 +130,7 @@ typedef struct {
     int count, lost;
 } Hidden;
 
-// Adds an interval to those there, in order and apart.
+// Insert an interval into the sorted, disjoint intervals; merge those that it touches.
 static inline void hide(Hidden *hidden, real from, real to, real gap) {
     int first = 0;
     while (first < hidden->count && hidden->to[first] < from - gap) first++;
@@ -148,6 +154,7 @@ static inline void hide(Hidden *hidden, real from, real to, real gap) {
     hidden->count += 1 - joined;
 }
 
+// Add the intervals that the triangles of a leaf hide.
 INLINE void hide_leaf(const Fan *fan, real slack, global const real *leaf, Hidden *hidden) {
     reals from, to;
 #ifdef VECTOR_VARIANT
@@ -172,6 +179,7 @@ INLINE uint fan_met(const Fan *fan, global const real *node) {
 #endif
 }
 
+// Add the intervals that all triangles hide; stop when the whole segment is hidden.
 static inline void hide_all(const bvh_tree *tree, const Fan *fan, real slack, Hidden *hidden) {
     int nodes[BVH_DEPTH];
     uint left[BVH_DEPTH];
@@ -200,7 +208,7 @@ static inline void hide_all(const bvh_tree *tree, const Fan *fan, real slack, Hi
     }
 }
 
-// Writes what lies between the hidden ones; returns how many, or -1 if there are too many.
+// Write the visible intervals; return their number, or -1 if they exceed `kept`.
 static inline int show(const Hidden *hidden, real slack, uint kept, global real *to) {
     uint count = 0;
     real start = 0;

@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import pyopencl as cl
@@ -13,10 +13,8 @@ import pyopencl.array
 
 from gpuvision.host.arrays import DeviceArray, HostArray, check_host, host_view, memory_of
 from gpuvision.host.device import Device
+from gpuvision.host.launch import Launchable
 from gpuvision.host.program import build
-
-if TYPE_CHECKING:
-    from gpuvision.host.operation import Operation
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
@@ -50,7 +48,7 @@ class Bound(Generic[R]):
     """
 
     def __init__(
-        self, operation: Operation[R], device: Device, shape: tuple[int, ...], dtype: np.dtype[Any], queue: Any
+        self, operation: Launchable, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any], queue: Any
     ) -> None:
         launch = operation.launch(device, shape, dtype)
         self.operation, self.device = operation, device

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -112,6 +113,18 @@ def real_defines(device: Device, real: np.dtype[Any]) -> dict[str, Define]:
     if not device.has_double:
         raise ValueError(f"device {device.label} has no double precision; use precision='single'")
     return {"REAL_IS_DOUBLE": None}
+
+
+class Launchable(Protocol):
+    """Operation as a bound instance sees it: a result type, a kernel folder, and a description of the launch."""
+
+    Result: ClassVar[type[Any]]
+    kernel_folder: ClassVar[Path | None]
+    include_folders: ClassVar[tuple[Path, ...]]
+
+    def launch(self, device: Device, shape: Shape, dtype: np.dtype[Any]) -> Launch:
+        """Describe the launch for inputs of one shape and dtype."""
+
 
 
 def uses_vectors(variant: Variant, device: Device) -> bool:

@@ -341,14 +341,28 @@ class LineReadout(VisionOperation[LineReading]):
             AMBIGUITY=self.ambiguity is not None,
             CANDIDATES=self._has_candidates,
             WIDTH_LIMITS=self._limits_width,
-            WITH_LIT="width" in chosen or (self.method == "centroid" and self._limits_width),
+            COUNT_WIDTH="width" in chosen or (self.method == "centroid" and self._limits_width),
             LONG_MOMENT=bits < 32 and length**2 // 2 * np.iinfo(f"uint{bits}").max >= 2**32,
         )
 
     def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any], length: int) -> Any:
-        """Return the parameters of ``line.cl``, in its order."""
+        """Return the parameter table of the kernel."""
         widest = length if self.maximum_width is None else min(self.maximum_width, length)
-        return np.array(
-            [min(self.minimum_width, length + 1), widest, self.ambiguity or 0.0, self.read_noise**2, self.gain],
-            real,
+        table = LineTable(
+            min_width=min(self.minimum_width, length + 1),
+            max_width=widest,
+            ambiguous_ratio=self.ambiguity or 0.0,
+            read_variance=self.read_noise**2,
+            gain=self.gain,
         )
+        return np.array(table, real)
+
+
+class LineTable(NamedTuple):
+    """Parameters of ``kernels/line/line.cl``, in the order of its struct ``LineTable``."""
+
+    min_width: float
+    max_width: float
+    ambiguous_ratio: float
+    read_variance: float
+    gain: float

@@ -1,8 +1,9 @@
-"""Position sensitive devices: pairs of currents become positions of the light.
+"""Position sensitive devices (PSD): pairs of currents become positions of the light.
 
-The two currents of a PSD strip divide inversely to the light's distances from its ends, so that
-``u = (L/2) (I_right - I_left) / (I_right + I_left)`` is the centre of gravity of *all* light on the strip,
-whatever its shape and strength: ``u`` in [-L/2, L/2], positive towards the right electrode.
+The two currents of a PSD strip divide inversely to the distances of the light from its ends:
+``u = (L/2) (I_right - I_left) / (I_right + I_left)``, with ``u`` in [-L/2, L/2], positive towards the right electrode.
+u is the centroid (centre of gravity) of *all* light on the strip, independent of the shape and power of the light (F.
+de Jong, section 4.2.1).
 """
 
 from __future__ import annotations
@@ -13,60 +14,78 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from gpuvision.host import Define, Device, Launch, LaunchBuilder, Precision, Variant, WorkSize, flags, type_defines
+from gpuvision.host import (
+    Define,
+    Device,
+    FloatArray,
+    Launch,
+    LaunchBuilder,
+    Precision,
+    StatusArray,
+    Variant,
+    WorkSize,
+    flags,
+    type_defines,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.validation import finite
 
-ELECTRON = 1.602176634e-19  # C
-# Samples of a strip: long where enough strips remain to share among the cores, a multiple of 16 always.
+ELECTRON = 1.602176634e-19  # elementary charge [C]
+# Samples of a work-item of the vector variant, multiples of 16: long, unless there are too few to keep every core busy.
 _SHORT_STRIP, _LONG_STRIP, _STRIPS_PER_CORE = 4096, 65536, 4
 _LANES = 16
 
 
 class PsdReading(NamedTuple):
-    """What a PSD says, each array of the shape of the batch; fields not asked for are ``None``.
+    """Readings of a PSD: arrays of the shape of the batch; fields that were not requested are ``None``.
 
     Attributes
     ----------
     position
-        u [m]; NaN where the status has LOW_SIGNAL, SATURATED, OUT_OF_RANGE or NOT_FINITE.
+        Position u of the light [m]; NaN where the status has LOW_SIGNAL, SATURATED, OUT_OF_RANGE or NOT_FINITE.
     total
-        Sum of both currents after dark level and gain [A].
+        Sum of both currents, after dark level and gain correction [A].
     status
         uint8 `Status` flags: LOW_SIGNAL (total not above the minimum), SATURATED (either channel), OUT_OF_RANGE (beyond
-        the strip's ends), NOT_FINITE; HORIZON and NOT_INVERTIBLE from the triangulation.
+        the ends of the strip), NOT_FINITE (a current is NaN or infinite). HORIZON and NOT_INVERTIBLE come from the
+        triangulation.
     sigma
         Predicted standard deviation of the position [m].
     g, h
-        The point in the sheet of light [m], where the readout has a triangulation.
+        Point in the sheet of light [m], if the readout has a triangulation.
     """
 
-    position: Any = None
-    total: Any = None
-    status: Any = None
-    sigma: Any = None
-    g: Any = None
-    h: Any = None
+    position: FloatArray | None = None
+    total: FloatArray | None = None
+    status: StatusArray | None = None
+    sigma: FloatArray | None = None
+    g: FloatArray | None = None
+    h: FloatArray | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class PsdNoise:
-    """What moves the position of a steady light; three covariances of the two currents' noise.
+    """Noise model of a PSD: three components of the noise of the two currents.
 
     Parameters
     ----------
-    independent
-        Standard deviation of each channel's own noise [A]: amplifiers. Grows towards the ends of the strip:
-        ``L s / S sqrt((1 + xi^2) / 2)``, with ``xi = 2 u / L`` and the total S.
-    opposed
-        Standard deviation of noise that leaves at one electrode what enters at the other [A]: the Johnson current of
-        the strip's resistance, ``sqrt(4 k T B / R_ie)``. The same everywhere: ``L s / S``.
-    spot
-        Standard deviation of the light spot [m]; its electrons divide together, so that shot noise leaves
-        ``spot / sqrt(N)`` with N electrons within the time constant.
-    bandwidth
-        B [Hz]; ``N = S / (2 q B)``.
+    independent : float
+        Standard deviation s of the noise of each channel (amplifiers) [A], default 0. Its effect on the position grows
+        towards the ends of the strip: ``(L s / S) sqrt((1 + xi^2) / 2)``, with ``xi = 2 u / L`` and the total S.
+    opposed : float
+        Standard deviation s of noise that leaves at one electrode and enters at the other [A], default 0: the Johnson
+        current of the strip resistance, ``sqrt(4 k T B / R_ie)``. Its effect is the same everywhere: ``L s / S``.
+    spot : float
+        Standard deviation of the width of the light spot [m], default 0. The electrons of one spot divide together, so
+        shot noise contributes ``spot / sqrt(N)``, with N electrons within the time constant.
+    bandwidth : float
+        Bandwidth B [Hz], default 0; ``N = S / (2 q B)``.
+
+    Raises
+    ------
+    ValueError
+        A number is negative or not finite.
     """
 
     independent: float = 0.0
@@ -82,54 +101,72 @@ class PsdNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class PsdReadout(VisionOperation[PsdReading]):
-    """Pairs of PSD currents to positions: ``readout(currents) -> PsdReading``.
+    """PSD readout: pairs of currents to positions of the light, ``readout(currents) -> PsdReading``.
 
-    Takes float32 or float64 currents [A] or uint16 codes, of shape (..., 2) with (left, right) side by side, or
-    (2, ...) with ``layout="planar"``. The axis before the pair (the last one, if planar) counts the strips.
+    Takes float32 or float64 currents [A] or uint16 codes of shape (..., 2), pairs (left, right), or of shape (2, ...)
+    with ``layout="planar"``. The axis before the pair axis (the last axis if planar) is the axis of the strips.
 
     Parameters
     ----------
-    strip_length
-        L, between the electrodes [m].
-    ampere
-        Amperes per unit of the input: 1 for currents, the converter's step for codes.
-    dark
-        Dark current of (left, right), subtracted first [A].
-    right_gain
-        Gain of the right channel over the left one's; divided out.
-    interelectrode_resistance, load_resistance
-        R_ie and the load R_L at either end [Ohm]: the position shrinks to R_ie / (R_ie + 2 R_L); undone exactly.
-    minimum_total
-        The total that makes a position trustworthy [A]; at or below it the sample is LOW_SIGNAL.
-    saturation
-        Current at which a channel saturates, dark level included [A]; ``None``: the highest code of integer input,
-        and no limit for currents.
-    linearity
-        A row of corrections per strip [m], added to the position; the row's knots divide the strip evenly from
-        -L/2 to L/2, linear between them.
-    noise
-        For the output ``sigma``. The quantisation of integer codes is added by itself.
-    triangulation, axes
-        Fuses sensor -> sheet into the same pass (outputs ``g`` and ``h``): u is the position, v the strip's number
-        as ``axes`` places it.
+    strip_length : float
+        Length L between the electrodes [m].
+    ampere : float
+        Amperes per unit of the input, default 1 (currents); for codes the step of the converter.
+    dark : (left, right)
+        Dark currents [A], subtracted first, default 0.
+    right_gain : float
+        Gain of the right channel relative to the left channel, default 1; the right current is divided by it.
+    interelectrode_resistance, load_resistance : float
+        Resistance R_ie of the strip and load R_L at either end [Ohm]. Loads shrink the position by the factor
+        R_ie / (R_ie + 2 R_L), which is corrected exactly.
+    minimum_total : float
+        Total current at or below which a sample is LOW_SIGNAL [A], default 0.
+    saturation : float, optional
+        Current at which a channel saturates, dark level included [A]. Default: the largest code of integer input, no
+        limit for currents.
+    linearity : array_like of shape (strips, knots), optional
+        Corrections added to the position [m]. The knots divide a strip evenly from -L/2 to L/2; the correction is
+        linear between knots.
+    noise : PsdNoise, optional
+        Noise model for the output ``sigma``. The quantisation of integer codes is added.
+    triangulation, axes : Triangulation, SampleAxes
+        Triangulate in the same kernel (outputs ``g`` and ``h``): u is the position, v the number of the strip,
+        converted to sensor coordinates by ``axes``.
     layout : {"pairs", "planar"}
-    outputs
-        Names of the `PsdReading` fields to compute; what is not asked for is not compiled. ``None``: position,
-        total and status, with sigma if there is ``noise``, with g and h if there is a ``triangulation``.
-    precision
-        Of the arithmetic and the outputs; ``None`` follows the input.
-    variant
-        Wide strips or one item per sample; ``"auto"`` follows the device.
+        Order of the input, default ``"pairs"``.
+    outputs : tuple of str, optional
+        Names of the `PsdReading` fields to compute; the code of other fields is not compiled. Default: position, total
+        and status, with sigma if there is ``noise``, with g and h if there is a ``triangulation``.
+    precision : {"single", "double", None}
+        Precision of the arithmetic and of the outputs; ``None`` follows the input.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: vectors of 16 samples (CPU runtimes) or one work-item per sample (GPUs); ``"auto"`` follows the
+        device.
 
     Raises
     ------
+    TypeError
+        A parameter is not a number.
     ValueError
         A parameter is out of its range.
 
     Notes
     -----
-    Error: the arithmetic adds at most 4 epsilon of L/2 to the position (5e-7 of it in single precision), for 16-bit
-    codes too; near the middle less, since the difference of nearby currents is exact.
+    Error: the arithmetic adds at most 4 epsilon of L/2 to the position (5e-7 L/2 in single precision), also for 16-bit
+    codes. It adds less near the middle, since the difference of nearly equal currents is exact.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 4.2.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import gpuvision as gv
+    >>> currents = np.array([[1e-6, 1e-6], [1e-6, 3e-6]])
+    >>> reading = gv.PsdReadout(strip_length=6e-3)(currents)
+    >>> reading.position.round(6).tolist()
+    [0.0, 0.0015]
     """
 
     Result: ClassVar[type[Any]] = PsdReading
@@ -216,7 +253,7 @@ class PsdReadout(VisionOperation[PsdReading]):
         many = samples >= _STRIPS_PER_CORE * _LONG_STRIP * device.compute_units
         each = _LONG_STRIP if many else _SHORT_STRIP
         if build.uses_vectors and samples >= _LANES:
-            # The last work-item takes the rest: less than two strips.
+            # The last work-item takes the remainder too.
             work = WorkSize((max(samples // each, 1),), (1,), each, vectors=True)
         else:
             work = WorkSize((samples,), None, each)
@@ -243,21 +280,21 @@ class PsdReadout(VisionOperation[PsdReading]):
         )
 
     def _defines(self, dtype: np.dtype[Any]) -> dict[str, Define]:
-        defines = type_defines("CODE", dtype, 16)
+        defines = type_defines("INPUT", dtype, 16)
         defines |= flags(**{f"WITH_{name.upper()}": True for name in self.outputs or ()})
         if self.triangulation is not None:
             defines |= {"WITH_SHEET": None} | self.triangulation.defines
         return defines | flags(
             PLANAR=self.layout == "planar",
             DARK_LEVEL=any(self.dark),
-            # Where a current can be negative or not finite, or the load resistors shrink the range.
+            # A current can be negative or not finite, or the load resistors shrink the range.
             SIGNED=dtype.kind == "f" or any(self.dark) or self.load_resistance > 0.0,
             GAIN=self.right_gain != 1.0,
             LINEARITY=self.linearity is not None,
         )
 
     def _packed(self, real: np.dtype[Any], dtype: np.dtype[Any]) -> Any:
-        """Return the parameters of ``psd.cl``, in its order and in the input's unit."""
+        """Return the parameter table of the kernel, in units of the input."""
         limit = 1.0
         if self.interelectrode_resistance:
             limit = self.interelectrode_resistance / (self.interelectrode_resistance + 2.0 * self.load_resistance)
@@ -265,22 +302,36 @@ class PsdReadout(VisionOperation[PsdReading]):
         if dtype.kind == "u":
             ceiling, quantisation = float(np.iinfo(dtype).max), 1.0 / 12.0
         else:
-            # A limit whose double is finite, in amperes too: nothing beyond it may reach the arithmetic.
+            # Twice the limit is finite, in amperes too: no sum below the limit overflows.
             ceiling, quantisation = float(np.finfo(real).max) / (4.0 * max(self.ampere, 1.0)), 0.0
         saturation = ceiling if self.saturation is None else min(self.saturation / self.ampere, ceiling)
-        return np.array(
-            [
-                0.5 * self.strip_length / limit,
-                limit,
-                self.minimum_total / self.ampere,
-                saturation,
-                self.ampere,
-                self.dark[0] / self.ampere,
-                self.dark[1] / self.ampere,
-                1.0 / self.right_gain,
-                (noise.independent / self.ampere) ** 2 + quantisation,
-                (noise.opposed / self.ampere) ** 2,
-                noise.spot**2 * 2.0 * ELECTRON * noise.bandwidth / self.ampere,
-            ],
-            real,
+        table = PsdTable(
+            half_length=0.5 * self.strip_length / limit,
+            limit=limit,
+            minimum=self.minimum_total / self.ampere,
+            saturation=saturation,
+            ampere=self.ampere,
+            dark_left=self.dark[0] / self.ampere,
+            dark_right=self.dark[1] / self.ampere,
+            right_gain=1.0 / self.right_gain,
+            independent=(noise.independent / self.ampere) ** 2 + quantisation,
+            opposed=(noise.opposed / self.ampere) ** 2,
+            common_noise=noise.spot**2 * 2.0 * ELECTRON * noise.bandwidth / self.ampere,
         )
+        return np.array(table, real)
+
+
+class PsdTable(NamedTuple):
+    """Parameters of ``kernels/psd/psd.cl``, in the order and the units of its struct ``PsdTable``."""
+
+    half_length: float
+    limit: float
+    minimum: float
+    saturation: float
+    ampere: float
+    dark_left: float
+    dark_right: float
+    right_gain: float
+    independent: float
+    opposed: float
+    common_noise: float

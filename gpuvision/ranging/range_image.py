@@ -1,14 +1,15 @@
 """Range images: profiles over a moving sheet of light become x, y, z for every (profile, sample).
 
-Two ways to move the sheet over a scene:
+The sheet moves over the scene in one of two ways:
 
-- `StraightTransport`: the scene moves past a sensor that stands still (a conveyor belt, a stage). Profiles come as
-  points (G, H) in the sheet of light, the transport L from an encoder or at a uniform step.
-- `RotatingSheet`: camera and scene stand still, the sheet turns about an axis (a rotating mirror, a motor). Profiles
-  come as the line's position in the camera image, the transport is the sheet's angle.
+- `StraightTransport`: the scene moves past a fixed sensor (conveyor belt, linear stage). A profile is a row of points
+  (G, H) in the sheet of light; the transport L comes from an encoder or has a uniform step.
+- `RotatingSheet`: camera and scene are fixed, the sheet turns about an axis (rotating mirror, motor). A profile is a
+row
+  of line positions in the camera image; the transport is the angle of the sheet.
 
-The result is *organised*: neighbours in the arrays are neighbours on the sensor. `gpuvision.ranging.regrid` turns it
-into a height map over regular cells.
+The result is an *organised point cloud*: neighbours in the arrays are neighbours on the sensor.
+`gpuvision.ranging.regrid` resamples it to a height map over regular cells.
 """
 
 from __future__ import annotations
@@ -22,14 +23,25 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, WorkSize, type_defines
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    Launch,
+    LaunchBuilder,
+    Precision,
+    StatusArray,
+    Variant,
+    WorkSize,
+    type_defines,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import check_keys, finite, numbers
 
-_STRIP = 1024  # samples, as in range_image.cl
+_STRIP = 1024  # samples of a work-item of the vector variant: SAMPLES_PER_STRIP in range_image.cl
 _LANES = 16
-_PARALLEL = 1e-9
-# A vector so near length 1 is one that was divided by its length: what was written reads back as it was.
+_PARALLEL = 1e-9  # volume of three unit vectors, or sine between two, below which they count as coplanar or parallel
+# A vector whose length is 1 within this rounding (two epsilon) is not normalised again, so that a written vector reads
+# back unchanged.
 _UNIT_ROUNDING = 4e-16
 
 Vector = tuple[float, float, float]
@@ -38,22 +50,22 @@ _EVERYWHERE: Limits = ((-math.inf, math.inf),) * 3
 
 
 class RangePoints(NamedTuple):
-    """An organised range image, each array (profiles, samples).
+    """Organised range image (point cloud): arrays of shape (profiles, samples).
 
     Attributes
     ----------
     x, y, z
-        The point in the scene [m]; NaN where a flag other than SATURATED and AMBIGUOUS is set.
+        Point in the scene [m]; NaN where a flag other than SATURATED and AMBIGUOUS is set.
     status
-        uint8 `Status` flags: those that came in, and NOT_FINITE (a coordinate, the transport, or the result is not),
-        NOT_INVERTIBLE (beyond the lens' fold), HORIZON (the ray does not meet the sheet in front of the camera),
-        OUT_OF_RANGE (outside the limits).
+        uint8 `Status` flags: the flags of the input, and NOT_FINITE (a coordinate, the transport or the result is not
+        finite), NOT_INVERTIBLE (beyond the fold of the lens), HORIZON (the ray does not meet the sheet in front of the
+        camera), OUT_OF_RANGE (outside the limits).
     """
 
-    x: Any
-    y: Any
-    z: Any
-    status: Any
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    status: StatusArray
 
 
 def _vector(value: Any, what: str) -> Vector:
@@ -72,31 +84,60 @@ def _unit(value: Any, what: str) -> Vector:
     return x, y, z
 
 
+class StraightTable(NamedTuple):
+    """Parameters of ``kernels/range_image/range_image.cl`` after the limits, for a straight transport."""
+
+    origin: npt.ArrayLike
+    e1: npt.ArrayLike
+    e2: npt.ArrayLike
+    e3: npt.ArrayLike
+
+
+class RotatingTable(NamedTuple):
+    """Parameters of ``kernels/range_image/range_image.cl`` after the limits, under ``GEOMETRY_ROTATING``."""
+
+    origin: npt.ArrayLike
+    e1: npt.ArrayLike
+    e2: npt.ArrayLike
+    e3: npt.ArrayLike
+    position_origin: float
+    sample_origin: float
+    scale: float
+    horizon: float
+    normal: npt.ArrayLike
+    reach: npt.ArrayLike
+    lens: npt.ArrayLike
+
+
 @dataclass(frozen=True, kw_only=True)
 class StraightTransport:
-    """A sheet of light over which the scene moves straight: ``point = origin + G g_axis + H h_axis + L direction``.
+    """Straight transport under a sheet of light: ``point = origin + G g_axis + H h_axis + L direction``.
 
-    The defaults put G on x, the transport on y, and H, the height, on z (F. de Jong, 2.3.5). A tilted sheet has tilted
-    axes: with the light at an angle theta from the vertical, along the transport, ``h_axis = (0, tan(theta), 1)`` for
-    heights H that were calibrated vertically (the sheared sampling of fig. 2.5).
+    By default G is along x, the transport along y, and the height H along z. A tilted sheet has tilted axes: for light
+    at an angle theta from the vertical, along the transport, and heights H that were calibrated vertically, ``h_axis =
+    (0, tan(theta), 1)`` (the sheared sampling of Figure 2.5).
 
     Parameters
     ----------
-    step
-        Transport per profile [m], for `transport`; None where an encoder measures every profile's.
-    start
-        Transport of profile 0 [m].
-    g_axis, h_axis
-        Where the sheet's coordinates point, in the scene; of length 1 where G and H are metres along them.
-    direction
-        Where the next profile lies; made a unit vector.
-    origin
-        The sheet's G = H = 0 at L = 0 [m].
+    step : float, optional
+        Transport per profile [m], not 0, used by `transport`; ``None`` if an encoder measures the transport.
+    start : float
+        Transport of profile 0 [m], default 0.
+    g_axis, h_axis : (3,) array_like
+        Directions of G and H in the scene; of length 1 if G and H are metres along them.
+    direction : (3,) array_like
+        Direction of the transport, from a profile to the next one; it is normalised.
+    origin : (3,) array_like
+        Point G = H = 0 of the sheet at L = 0 [m].
 
     Raises
     ------
     ValueError
         A number is not finite, the step is 0, or the three directions lie in one plane.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 2.3.5.
     """
 
     step: float | None = None
@@ -120,89 +161,90 @@ class StraightTransport:
             raise ValueError("StraightTransport: g_axis, h_axis and direction lie in one plane; expected a volume")
 
     def transport(self, profiles: int, first: int = 0) -> npt.NDArray[np.float64]:
-        """Transport of profiles `first`, `first` + 1, ... [m], where it is uniform.
+        """Return the transport of the profiles ``first``, ``first + 1``, ... for a uniform step [m], shape (profiles,).
 
-        In single precision keep it within some metres of the origin: rounding is 6e-8 of it.
+        In single precision keep it within some metres of the origin: the rounding error is 6e-8 of it.
 
         Raises
         ------
         ValueError
-            There is no uniform step; give the encoder's positions.
+            The step is None: use the positions of an encoder.
         """
         if self.step is None:
-            raise ValueError("StraightTransport has no step; give the encoder's positions [m], one per profile")
+            raise ValueError("StraightTransport has no step; give the positions of an encoder [m], one per profile")
         return self.start + self.step * np.arange(first, first + profiles, dtype=np.float64)
 
     @property
     def inputs(self) -> int:
-        """Number of arrays per sample that `RangeImage` takes: g and h."""
+        """Number of profile arrays that `RangeImage` takes: 2 (g and h)."""
         return 2
 
     @property
     def defines(self) -> dict[str, None]:
-        """What ``kernels/range_image/range_image.cl`` has to compile."""
+        """Build options of ``kernels/range_image/range_image.cl`` for this geometry."""
         return {}
 
     def packed(self) -> npt.NDArray[np.float64]:
-        """Table of ``kernels/range_image/range_image.cl`` after its limits."""
-        return np.concatenate([self.origin, self.g_axis, self.h_axis, self.direction])
+        """Return the part of the kernel's parameter table after the limits."""
+        return np.hstack(StraightTable(origin=self.origin, e1=self.g_axis, e2=self.h_axis, e3=self.direction))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, as TOML holds them."""
+        """Return plain numbers and lists, as in a TOML file."""
         numbers = {name: list(getattr(self, name)) for name in ("g_axis", "h_axis", "direction", "origin")}
         return ({} if self.step is None else {"step": self.step}) | {"start": self.start} | numbers
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> StraightTransport:
-        """Build one from a table with some of the parameters' names.
+        """Build a transport from a table; its keys are names of parameters.
 
         Raises
         ------
         TypeError, ValueError
-            A key is unknown, or a value is not what it should be.
+            A key is unknown, or a value has the wrong type or range.
         """
         return cls(**check_keys(table, cls.__dataclass_fields__, (), "straight transport"))
 
 
 @dataclass(frozen=True, kw_only=True)
 class RotatingSheet:
-    """A sheet of light that turns about an axis, seen by a camera at rest.
+    """Sheet of light that turns about an axis, seen by a fixed camera.
 
-    Camera frame: x right, y down, z forward, the pinhole at 0. At angle 0 the sheet is the plane
-    ``sheet_normal . (X - axis_point) = sheet_offset``; it turns right-handed about the axis. A pixel's ray
-    ``r = (a, b, 1)`` meets it at ``depth = (sheet_offset + n . axis_point) / (n . r)``.
+    Camera frame: x right, y down, z forward, pinhole at 0. At angle 0 the sheet is the plane
+    ``sheet_normal . (X - axis_point) = sheet_offset``; it turns right-handed about the axis. With n the turned normal,
+    the ray ``r = (a, b, 1)`` of a pixel meets the sheet at ``depth = (sheet_offset + n . axis_point) / (n . r)``.
 
     Parameters
     ----------
-    focal_length_px
-        Focal length [pixel].
-    principal_point_px
-        (column, row) of the optical axis; a region of interest shifts it.
-    axis_point, axis_direction
-        A point [m] and the direction of the axis of rotation, in the camera frame.
-    sheet_normal
-        Normal of the sheet at angle 0, in the camera frame; made a unit vector.
-    sheet_offset
-        Distance of the sheet from the axis point along its normal [m]; 0 for a sheet through the axis.
-    first_angle, angle_step
-        Angle of profile 0 and its change per profile [rad], for `transport`; None where an encoder measures it.
-    along
-        What the samples of a profile run along. ``"rows"``: one sample per row, the position is a column (a vertical
-        line); ``"columns"``: one sample per column, the position is a row.
-    lens
-        Undone in the coordinates; None for a pinhole.
-    scene_axes
-        The scene's x, y and z axes in the camera frame, orthonormal: rows of the rotation camera -> scene.
-    scene_origin
-        The scene's origin in the camera frame [m].
-    horizon
-        Least ``n . r`` that counts: about the sine of the angle between ray and sheet.
+    focal_length_px : float
+        Focal length [px], positive.
+    principal_point_px : (column, row)
+        Image of the optical axis [px]; a region of interest shifts it.
+    axis_point, axis_direction : (3,) array_like
+        A point [m] on the axis of rotation and the direction of the axis, in the camera frame.
+    sheet_normal : (3,) array_like
+        Normal of the sheet at angle 0, in the camera frame; it is normalised.
+    sheet_offset : float
+        Distance of the sheet from the axis point along its normal [m], default 0: a sheet through the axis.
+    first_angle, angle_step : float
+        Angle of profile 0 and its change per profile [rad], used by `transport`. ``angle_step`` is ``None`` if an
+        encoder measures the angle.
+    along : {"rows", "columns"}
+        Image axis along which the samples of a profile run, default ``"rows"``: one sample per row, the position is a
+        column (a vertical line). ``"columns"``: one sample per column, the position is a row.
+    lens : Lens, optional
+        Radial lens distortion, corrected in the positions; ``None`` for a pinhole camera.
+    scene_axes : (3, 3) array_like
+        Axes x, y and z of the scene in the camera frame, orthonormal: the rows of the rotation camera -> scene.
+    scene_origin : (3,) array_like
+        Origin of the scene in the camera frame [m].
+    horizon : float
+        Smallest ``n . r`` of a valid point, default 1e-4: about the sine of the angle between ray and sheet.
 
     Raises
     ------
     ValueError
-        A number is not finite or out of its range, the axes are not orthonormal, or the sheet does not move when
-        turned (its normal lies along the axis).
+        A number is not finite or out of its range, the axes are not orthonormal, or the normal of the sheet lies along
+        the axis, so that turning does not move the sheet.
     """
 
     focal_length_px: float
@@ -239,63 +281,67 @@ class RotatingSheet:
         for name in ("axis_direction", "sheet_normal"):
             object.__setattr__(self, name, _unit(getattr(self, name), f"RotatingSheet.{name}"))
         if np.linalg.norm(np.cross(self.axis_direction, self.sheet_normal)) <= _PARALLEL:
-            raise ValueError("RotatingSheet: the sheet's normal lies along the axis, so that turning does not move it")
+            raise ValueError("RotatingSheet: the normal lies along the axis, so that turning does not move the sheet")
         axes = numbers(self.scene_axes, (3, 3), "RotatingSheet.scene_axes")
         if np.max(np.abs(np.array(axes) @ np.array(axes).T - np.eye(3))) > 1e-6:
             raise ValueError("RotatingSheet.scene_axes are not three orthonormal vectors")
         object.__setattr__(self, "scene_axes", axes)
 
     def transport(self, profiles: int, first: int = 0) -> npt.NDArray[np.float64]:
-        """Angle of the sheet in profiles `first`, `first` + 1, ... [rad], where it turns uniformly.
+        """Return the angle of the sheet in the profiles ``first``, ``first + 1``, ... for a uniform step [rad].
 
         Raises
         ------
         ValueError
-            There is no uniform step; give the encoder's angles.
+            The step is None: use the angles of an encoder.
         """
         if self.angle_step is None:
-            raise ValueError("RotatingSheet has no angle_step; give the encoder's angles [rad], one per profile")
+            raise ValueError("RotatingSheet has no angle_step; give the angles of an encoder [rad], one per profile")
         return self.first_angle + self.angle_step * np.arange(first, first + profiles, dtype=np.float64)
 
     def normals(self) -> npt.NDArray[np.float64]:
-        """Three vectors, ``normal = v[0] + v[1] cos(angle) + v[2] sin(angle)``, in the camera frame."""
+        """Return three vectors v in the camera frame: ``normal = v[0] + v[1] cos(angle) + v[2] sin(angle)``."""
         axis, normal = np.array(self.axis_direction), np.array(self.sheet_normal)
         fixed = axis * (axis @ normal)
         return np.stack([fixed, normal - fixed, np.cross(axis, normal)])
 
     @property
     def inputs(self) -> int:
-        """Number of arrays per sample that `RangeImage` takes: the position."""
+        """Number of profile arrays that `RangeImage` takes: 1 (the position)."""
         return 1
 
     @property
     def defines(self) -> dict[str, None]:
-        """What ``kernels/range_image/range_image.cl`` has to compile."""
+        """Build options of ``kernels/range_image/range_image.cl`` for this geometry."""
         return {"GEOMETRY_ROTATING": None} | ({} if self.lens is None else self.lens.defines)
 
     def packed(self) -> npt.NDArray[np.float64]:
-        """Table of ``kernels/range_image/range_image.cl`` after its limits."""
-        # The kernel knows (position, sample), not (column, row).
+        """Return the part of the kernel's parameter table after the limits."""
+        # The kernel's coordinates are (position, sample) instead of (column, row).
         order = [0, 1, 2] if self.along == "rows" else [1, 0, 2]
         to_scene, normals = np.array(self.scene_axes), self.normals()
         reach = normals @ np.array(self.axis_point) + self.sheet_offset * np.array([1.0, 0.0, 0.0])
         middle = np.array(self.principal_point_px)[order[:2]]
         scale = 1.0 / self.focal_length_px
         lens = self.lens if self.lens is None or self.along == "rows" else self.lens.swapped()
-        return np.concatenate(
-            [
-                -to_scene @ np.array(self.scene_origin),
-                to_scene.T[order].ravel(),
-                middle,
-                [scale, self.horizon],
-                normals[:, order].ravel(),
-                reach,
-                [] if lens is None else lens.packed(middle.tolist(), scale),
-            ]
+        e1, e2, e3 = to_scene.T[order]
+        table = RotatingTable(
+            origin=-to_scene @ np.array(self.scene_origin),
+            e1=e1,
+            e2=e2,
+            e3=e3,
+            position_origin=middle[0],
+            sample_origin=middle[1],
+            scale=scale,
+            horizon=self.horizon,
+            normal=normals[:, order].ravel(),
+            reach=reach,
+            lens=np.empty(0) if lens is None else lens.packed(middle.tolist(), scale),
         )
+        return np.hstack(table)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, as TOML holds them."""
+        """Return plain numbers and lists, as in a TOML file."""
         table: dict[str, Any] = {}
         for name in self.__dataclass_fields__:
             value = getattr(self, name)
@@ -307,12 +353,12 @@ class RotatingSheet:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> RotatingSheet:
-        """Build one from a table with the parameters' names; the lens is a table in it.
+        """Build a rotating sheet from a table; its keys are names of parameters, and the lens is a table.
 
         Raises
         ------
         TypeError, ValueError
-            A key is unknown or missing, or a value is not what it should be.
+            A key is unknown or missing, or a value has the wrong type or range.
         """
         required = ("focal_length_px", "principal_point_px", "axis_point", "axis_direction", "sheet_normal")
         values = dict(check_keys(table, cls.__dataclass_fields__, required, "rotating sheet"))
@@ -323,31 +369,35 @@ class RotatingSheet:
 
 @dataclass(frozen=True, kw_only=True)
 class RangeImage(VisionOperation[RangePoints]):
-    """Profiles and the transport of each -> an organised range image.
+    """Assembly of profiles to an organised range image (point cloud).
 
-    Called as ``op(g, h, transport, status)`` with a `StraightTransport` and ``op(position, transport, status)`` with a
-    `RotatingSheet`. Profile arrays are (profiles, samples), float32 or float64; ``transport`` is (profiles,) of the
-    same dtype: metres or radians, measured by an encoder or from ``geometry.transport``; ``status`` is (profiles,
-    samples), uint8, of the readout or the triangulation.
-
-    Error: a few roundings of the largest term of the point. Single precision holds 6e-8 of the distance from the
-    scene's origin, and for a `RotatingSheet` 6e-8 / (n . r) of the depth: lay origins near what is measured.
+    Called as ``op(g, h, transport, status)`` with a `StraightTransport` and as ``op(position, transport, status)`` with
+    a `RotatingSheet`; returns `RangePoints`. The profile arrays g and h [m], or position [px], have the shape
+    (profiles, samples) and are float32 or float64. ``transport`` has the shape (profiles,) and the same dtype: metres
+    or radians, from an encoder or from ``geometry.transport``. ``status`` (profiles, samples) uint8 holds the flags of
+    the readout or of the triangulation.
 
     Parameters
     ----------
-    geometry
-        How the sheet moves over the scene.
-    limits
-        Lowest and highest x, y and z that a point can have [m]; what lies outside is OUT_OF_RANGE.
-    precision
-        ``"single"``, ``"double"``, or None: follows the profiles.
-    variant
-        ``"vector"`` (CPU runtimes), ``"work_item"`` (GPUs), or ``"auto"``.
+    geometry : StraightTransport or RotatingSheet
+        Motion of the sheet over the scene.
+    limits : ((low, high), (low, high), (low, high))
+        Limits of x, y and z [m]; points outside are OUT_OF_RANGE. Default: no limits.
+    precision : {"single", "double", None}
+        Precision of the arithmetic and of the outputs; ``None`` follows the profiles.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: vectors of 16 (CPU runtimes) or one work-item per sample (GPUs); ``"auto"`` follows the device.
 
     Raises
     ------
     ValueError
-        A lower limit is not below its upper one.
+        A lower limit is not below its upper limit.
+
+    Notes
+    -----
+    Error: a few roundings of the largest term of the point. Single precision resolves 6e-8 of the distance from the
+    origin of the scene, and for a `RotatingSheet` 6e-8 / (n . r) of the depth: choose origins near the measured
+    surface.
     """
 
     Result: ClassVar[type[Any]] = RangePoints
@@ -364,8 +414,8 @@ class RangeImage(VisionOperation[RangePoints]):
         object.__setattr__(self, "limits", limits)
 
     def packed(self, real: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
-        """Table of ``kernels/range_image/range_image.cl`` in the device's real type."""
-        # Finite limits keep infinite results out by the same comparisons.
+        """Return the parameter table of the kernel in its real type: limits (low, high), then `geometry`'s part."""
+        # Finite limits exclude infinite results by the same comparisons.
         largest = np.finfo(np.dtype(real)).max
         limits = np.clip(np.array(self.limits).T.ravel(), -largest, largest)
         return np.concatenate([limits, self.geometry.packed()]).astype(real)

@@ -1,9 +1,9 @@
-"""Regular resampling: an organised range image becomes a height map over x by y cells.
+"""Resampling of an organised range image (point cloud) to a height map over regular cells in x and y.
 
-A range scan samples its surface where the light happens to fall (F. de Jong, fig. 2.5). Standard image processing wants
-regular cells. Resampling runs twice along lines of the organised points: along the samples of each profile, which
-carries the other coordinate with it, and then along the profiles. Everything is linear between neighbours, holes stay
-holes, and steps in height stay steps.
+A range scan samples a surface at irregular places (F. de Jong, Figure 2.5), while standard image processing needs
+regular cells. Resampling runs twice: along the samples of every profile, where the other coordinate is interpolated
+too, and then along the profiles. Interpolation between neighbours is linear. Holes remain holes, and height steps
+remain steps.
 """
 
 from __future__ import annotations
@@ -15,7 +15,19 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.host import Bound, Device, DeviceArray, Launch, LaunchBuilder, Precision, WorkSize, flags, type_defines
+from gpuvision.host import (
+    Bound,
+    Device,
+    DeviceArray,
+    FloatArray,
+    Launch,
+    LaunchBuilder,
+    Precision,
+    StatusArray,
+    WorkSize,
+    flags,
+    type_defines,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite
 
@@ -25,41 +37,41 @@ _DIRECTIONS = ("x", "-x", "y", "-y")
 
 
 class HeightMap(NamedTuple):
-    """Heights over the cells of a grid, each array (rows, columns).
+    """Height map over the cells of a grid: arrays of shape (rows, columns).
 
     Attributes
     ----------
     z
         Height [m]; NaN in holes.
     intensity
-        Of the light, in the units of the input; NaN in holes.
+        Intensity of the light, in the unit of the input; NaN in holes.
     status
-        uint8 `Status` flags. NO_DATA: no measurement near enough. NOT_INVERTIBLE: the sampling ran backwards here.
-        SATURATED and AMBIGUOUS come with a value.
+        uint8 `Status` flags. NO_DATA: no measurement near enough. NOT_INVERTIBLE: the sampling runs backwards here, two
+        surfaces share the cell. A cell with SATURATED or AMBIGUOUS keeps its value.
     """
 
-    z: Any
-    intensity: Any
-    status: Any
+    z: FloatArray
+    intensity: FloatArray
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """Regular cells, laid out as a picture: x grows with the column, y falls with the row.
+    """Regular cells of a height map, as in an image: x grows with the column, y falls with the row.
 
     Parameters
     ----------
-    left, top
-        Centre of the cell [0, 0] [m]: lowest x, highest y.
-    cell_x, cell_y
-        Distance between cells [m].
-    columns, rows
-        Their numbers.
+    left, top : float
+        Centre of the cell [0, 0] [m]: smallest x, largest y.
+    cell_x, cell_y : float
+        Distance between cells in x and in y [m], positive.
+    columns, rows : int
+        Number of columns and rows, positive.
 
     Raises
     ------
     ValueError
-        A number is not finite, or not above 0 where it has to be.
+        A number is not finite or not positive.
     """
 
     left: float
@@ -78,12 +90,12 @@ class Grid:
 
     @classmethod
     def covering(cls, x: npt.ArrayLike, y: npt.ArrayLike, cell: float) -> Grid:
-        """Return the grid of square cells that covers all finite points.
+        """Return the grid of square cells of size `cell` [m] that covers all finite points (x, y) [m].
 
         Raises
         ------
         ValueError
-            There is no finite point, or the cell is not above 0.
+            No point is finite, or the cell size is not positive.
         """
         if finite(cell, "the cell of a grid") <= 0.0:
             raise ValueError(f"the cell of a grid is {cell}, expected metres above 0")
@@ -105,59 +117,61 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of a map over this grid."""
+        """Shape (rows, columns) of a height map over this grid."""
         return self.rows, self.columns
 
     @property
     def x(self) -> npt.NDArray[np.float64]:
-        """Centres of the columns [m]."""
+        """Centres of the columns, ascending [m]."""
         return self.left + self.cell_x * np.arange(self.columns, dtype=np.float64)
 
     @property
     def y(self) -> npt.NDArray[np.float64]:
-        """Centres of the rows [m], falling."""
+        """Centres of the rows, descending [m]."""
         return self.top - self.cell_y * np.arange(self.rows, dtype=np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Regrid:
-    """An organised range image -> heights over regular cells.
+    """Resampling of an organised range image to heights over regular cells.
 
-    ``op(x, y, z, intensity, status)``, each (profiles, samples), float32 or float64 (uint8 status), NumPy or device
-    arrays; returns a `HeightMap`.
+    Called as ``op(x, y, z, intensity, status)`` with arrays of shape (profiles, samples), float32 or float64 (uint8
+    status), NumPy or device arrays; returns a `HeightMap`.
 
-    Linear between neighbouring good samples, in x and in y. Two samples are neighbours over at most `max_gap` (bad ones
-    between them are bridged then) and at most `max_step` in height.
+    Interpolation is linear between neighbouring good samples, in x and in y. Two samples are neighbours if they are at
+    most `max_gap` apart and their heights differ by at most `max_step`; bad samples between them are bridged.
 
     Where the coordinate along a line runs backwards (dX/di <= 0), two surfaces share the cells: all cells from there to
     the furthest point reached before are NOT_INVERTIBLE. Noise makes a fine sampling run backwards by a little
-    everywhere: `fold_tolerance` says how much is noise.
-
-    Error: interpolation of a surface with curvature k between samples at a distance d errs by k d^2 / 8; in single
-    precision a cell's place is good to 6e-8 of its distance from the origin.
+    everywhere; `fold_tolerance` is the size of this noise.
 
     Parameters
     ----------
-    grid
-        The cells.
-    max_gap, max_step
-        Largest distance between neighbours along x or y, and in height [m].
-    along
-        Scene direction in which the samples of a profile advance.
-    across
-        Scene direction in which the profiles advance: y for samples along x, and the other way round. None takes the
-        positive one.
-    fold_tolerance
-        How far a line may fall back before it counts as folded [m].
-    folded
-        ``"drop"``: NOT_INVERTIBLE cells are NaN. ``"top"``: they keep the highest surface found, with the flag.
-    precision
-        ``"single"``, ``"double"``, or None: follows the input.
+    grid : Grid
+        Cells of the height map.
+    max_gap, max_step : float
+        Largest distance between neighbours along x or y, and largest difference of their heights [m], >= 0.
+    along : {"x", "-x", "y", "-y"}
+        Scene direction in which the samples of a profile advance, default ``"x"``.
+    across : {"x", "-x", "y", "-y"}, optional
+        Scene direction in which the profiles advance: along y if the samples advance along x, and vice versa. ``None``:
+        the positive direction.
+    fold_tolerance : float
+        Distance by which a line may run backwards before it counts as folded [m], >= 0, default 0.
+    folded : {"drop", "top"}
+        ``"drop"``: NOT_INVERTIBLE cells are NaN. ``"top"``: they keep the highest surface, with the flag.
+    precision : {"single", "double", None}
+        Precision of the arithmetic and of the outputs; ``None`` follows the input.
 
     Raises
     ------
     ValueError
         A length is negative or not finite, or the directions are not one of x and one of y.
+
+    Notes
+    -----
+    Error: linear interpolation of a surface with curvature k between samples at a distance d has an error of at most
+    k d^2 / 8. In single precision the place of a cell has an error of 6e-8 of its distance from the origin.
     """
 
     grid: Grid
@@ -183,7 +197,7 @@ class Regrid:
 
     @property
     def directions(self) -> tuple[Direction, Direction]:
-        """Scene directions along the samples and across the profiles, the default one filled in."""
+        """Scene directions in which the samples and the profiles advance."""
         positive: Direction = "y" if self.along[-1] == "x" else "x"
         return self.along, self.across or positive
 
@@ -204,7 +218,7 @@ class Regrid:
         device: Device | None = None,
         out: HeightMap | None = None,
     ) -> HeightMap:
-        """Run once: NumPy in, NumPy out; device arrays in, device arrays out.
+        """Resample once: NumPy arrays give NumPy arrays, device arrays give device arrays.
 
         Raises
         ------
@@ -223,13 +237,14 @@ class Regrid:
 
 
 class BoundRegrid:
-    """A `Regrid` bound to a device, a queue and a shape; use it as `gpuvision.host.Bound`.
+    """`Regrid` bound to a device, a queue and a shape; used like `gpuvision.host.Bound`.
 
     Attributes
     ----------
     inputs : tuple of pyopencl.array.Array
-        x, y, z, intensity, status: its own input slot.
+        Input arrays of the instance: x, y, z, intensity, status.
     outputs : HeightMap of pyopencl.array.Array
+        Output arrays of the instance.
     """
 
     def __init__(
@@ -252,7 +267,7 @@ class BoundRegrid:
         Parameters
         ----------
         *frames : pyopencl.array.Array
-            x, y, z, intensity, status; none: the instance's own `inputs`.
+            x, y, z, intensity, status; without arguments: `inputs`.
         out : HeightMap, optional
             Where to write instead of `outputs`.
         wait_for : sequence of pyopencl.Event, optional
@@ -260,7 +275,7 @@ class BoundRegrid:
         Raises
         ------
         TypeError, ValueError
-            A frame is not what the instance was bound to.
+            A frame has another shape, dtype or device than the instance.
         """
         if len(frames) not in (0, 5):
             raise TypeError(f"expected x, y, z, intensity and status, got {len(frames)} arrays")
@@ -271,24 +286,47 @@ class BoundRegrid:
         return self._profiles(lines.across, lines.z, lines.intensity, lines.status, out=out, wait_for=[first])
 
 
-class _Lines(NamedTuple):
-    """Profiles resampled along their samples, each array (profiles, cells)."""
+class RegridCounts(NamedTuple):
+    """Sizes and pitches [elements] of ``kernels/regrid/regrid.cl``, in the order of its struct ``RegridCounts``."""
 
-    z: Any
-    intensity: Any
-    status: Any
-    across: Any
+    samples: int
+    line_pitch: int
+    sample_pitch: int
+    cells: int
+    out_line_pitch: int
+    out_cell_pitch: int
+    drop_folded: int
+
+
+class RegridTable(NamedTuple):
+    """Parameters of ``kernels/regrid/regrid.cl``, in the order of its struct ``RegridTable``."""
+
+    origin: float
+    per_metre: float
+    sense: float
+    max_gap: float
+    max_step: float
+    fold_tolerance: float
+
+
+class _Lines(NamedTuple):
+    """Profiles resampled along their samples: arrays of shape (profiles, cells)."""
+
+    z: FloatArray
+    intensity: FloatArray
+    status: StatusArray
+    across: FloatArray
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Pass(VisionOperation[R]):
-    """One pass of a `Regrid`: lines of an array onto the cells of one direction."""
+    """One pass of a `Regrid`: resample the lines of an array to the cells of one direction."""
 
     regrid: Regrid
     direction: Direction
 
-    def _numbers(self) -> npt.NDArray[np.float64]:
-        """``GRID_*`` of regrid.cl."""
+    def _table(self) -> RegridTable:
+        """Return the parameter table of the kernel."""
         grid, regrid = self.regrid.grid, self.regrid
         on_x = self.direction[-1] == "x"
         origin = grid.left if on_x else grid.top
@@ -297,7 +335,14 @@ class _Pass(VisionOperation[R]):
         sense = math.copysign(1.0, per_metre) * (-1.0 if self.direction.startswith("-") else 1.0)
         per_length = abs(per_metre)
         gap, tolerance = regrid.max_gap * per_length, regrid.fold_tolerance * per_length
-        return np.array([origin, per_metre, sense, gap, regrid.max_step, tolerance])
+        return RegridTable(
+            origin=origin,
+            per_metre=per_metre,
+            sense=sense,
+            max_gap=gap,
+            max_step=regrid.max_step,
+            fold_tolerance=tolerance,
+        )
 
     def _cells(self) -> int:
         return self.regrid.grid.columns if self.direction[-1] == "x" else self.regrid.grid.rows
@@ -309,9 +354,9 @@ class _Pass(VisionOperation[R]):
         return build
 
     def _resample(
-        self, build: LaunchBuilder, lines: int, made: tuple[int, int], layout: list[int], *, carries: bool
+        self, build: LaunchBuilder, lines: int, made: tuple[int, int], counts: RegridCounts, *, carries: bool
     ) -> Launch:
-        """Describe the launch that resamples lines; with `carries` a further coordinate along with the values.
+        """Describe the launch that resamples lines; `carries`: interpolate the other coordinate too.
 
         Parameters
         ----------
@@ -319,9 +364,8 @@ class _Pass(VisionOperation[R]):
             Number of lines.
         made : tuple of int
             Shape of the outputs.
-        layout : list of int
-            Samples of a line, pitch of lines and samples, cells of a line, pitch of lines and cells in the outputs,
-            and whether folded parts are dropped, as ``regrid.cl`` takes them.
+        counts : RegridCounts
+            Sizes and pitches of the inputs and outputs.
         """
         value = (build.shape, build.dtype)
         return build.launch(
@@ -332,13 +376,13 @@ class _Pass(VisionOperation[R]):
             more_inputs=[value, value, (build.shape, np.dtype(np.uint8)), *([value] if carries else [])],
             outputs=build.outputs(dict.fromkeys(self.Result._fields, made)),
             defines=type_defines("INPUT", build.dtype) | flags(CARRY=carries),
-            arguments=[np.array(layout, np.uint32), self._numbers().astype(build.real)],
+            arguments=[np.array(counts, np.uint32), np.array(self._table(), build.real)],
         )
 
 
 @dataclass(frozen=True, kw_only=True)
 class _AlongSamples(_Pass[_Lines]):
-    """The first pass: every profile is a line, and the other coordinate rides along."""
+    """First pass: a line is a profile; the other coordinate is interpolated too."""
 
     Result: ClassVar[type[Any]] = _Lines
 
@@ -347,13 +391,21 @@ class _AlongSamples(_Pass[_Lines]):
         build = self._builder(device, shape, dtype)
         profiles, samples = shape
         cells = self._cells()
-        layout = [samples, samples, 1, cells, cells, 1, 0]
-        return self._resample(build, profiles, (profiles, cells), layout, carries=True)
+        counts = RegridCounts(
+            samples=samples,
+            line_pitch=samples,
+            sample_pitch=1,
+            cells=cells,
+            out_line_pitch=cells,
+            out_cell_pitch=1,
+            drop_folded=0,
+        )
+        return self._resample(build, profiles, (profiles, cells), counts, carries=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _AlongProfiles(_Pass[HeightMap]):
-    """The second pass: every cell of the first one's is a line across the profiles."""
+    """Second pass: a line is a cell of the first pass over all profiles."""
 
     Result: ClassVar[type[Any]] = HeightMap
 
@@ -364,5 +416,13 @@ class _AlongProfiles(_Pass[HeightMap]):
         cells = self._cells()
         # A line is a row of the map or a column of it.
         line_pitch, cell_pitch = (cells, 1) if self.direction[-1] == "x" else (1, lines)
-        layout = [profiles, 1, lines, cells, line_pitch, cell_pitch, int(self.regrid.folded == "drop")]
-        return self._resample(build, lines, self.regrid.grid.shape, layout, carries=False)
+        counts = RegridCounts(
+            samples=profiles,
+            line_pitch=1,
+            sample_pitch=lines,
+            cells=cells,
+            out_line_pitch=line_pitch,
+            out_cell_pitch=cell_pitch,
+            drop_folded=int(self.regrid.folded == "drop"),
+        )
+        return self._resample(build, lines, self.regrid.grid.shape, counts, carries=False)

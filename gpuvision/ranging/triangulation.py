@@ -1,10 +1,11 @@
-"""Triangulation: a light position on the sensor becomes a point in the sheet of light.
+"""Laser triangulation: a light position on the sensor becomes a point in the sheet of light.
 
-Sensor coordinates follow the thesis' Figure 3.4: **u is the measured coordinate**, along which the light
-moves when the height H changes, and **v runs along the profile**. Both are in one unit, pixels or metres. A
-camera whose profile runs along its columns axis measures a row for every column (``along="columns"``: u =
-row, v = column); one whose profile runs along the rows measures a column for every row (``along="rows"``: u
-= column, v = row). On a PSD u is the position on a strip and v the place of the strip.
+Sensor coordinates follow F. de Jong, Figure 3.4: **u is the measured coordinate**, along which the light moves when the
+height H changes, and **v runs along the profile**. Both have the same unit, pixels or metres.
+
+- Camera whose laser line runs along the columns axis (``along="columns"``): one row per column; u = row, v = column.
+- Camera whose laser line runs along the rows axis (``along="rows"``): one column per row; u = column, v = row.
+- PSD: u is the position on a strip and v the place of the strip.
 """
 
 from __future__ import annotations
@@ -18,7 +19,17 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.camera.lens import Lens
-from gpuvision.host import Device, Launch, LaunchBuilder, Precision, Variant, flags, type_defines
+from gpuvision.host import (
+    Device,
+    FloatArray,
+    Launch,
+    LaunchBuilder,
+    Precision,
+    StatusArray,
+    Variant,
+    flags,
+    type_defines,
+)
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging import homography
 from gpuvision.ranging.homography import Model
@@ -29,7 +40,8 @@ Matrix = tuple[tuple[float, float, float], ...]
 Float64 = npt.NDArray[np.float64]
 
 _LANES, _GROUP = 16, 256
-# Points of a strip: long ones keep the prefetchers running, several per core keep the cores even.
+# Points of a strip in the vector variant. Long strips keep the hardware prefetchers running; several strips per core
+# balance the load.
 _SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
 _KEYS = ("homography", "region", "model", "along", "lens", "covariance", "sigma", "horizon")
 
@@ -40,28 +52,63 @@ class SheetPoints(NamedTuple):
     Attributes
     ----------
     g, h
-        Along the sheet and up in it [m]; NaN where the status is not OK.
+        Coordinates along the sheet and up in the sheet [m]; NaN where the status is not OK.
     status
-        uint8 `Status` flags: NOT_FINITE (u or v is not, or lies a million half regions away), NOT_INVERTIBLE (beyond
-        the fold of the lens polynomial), HORIZON (the ray does not meet the sheet, or too far away to mean anything).
+        uint8 `Status` flags: NOT_FINITE (u or v is not finite, or lies more than 1e6 half extents of the region away),
+        NOT_INVERTIBLE (beyond the fold of the lens polynomial), HORIZON (the ray does not meet the sheet in front of
+        the sensor, or meets it too far away).
     sigma_g, sigma_h
-        Their standard deviations [m]; None unless the triangulation knows the sensor's ``sigma``.
+        Standard deviations of g and h [m]; ``None`` unless the triangulation has the ``sigma`` of the sensor.
     """
 
-    g: Any
-    h: Any
-    status: Any
-    sigma_g: Any = None
-    sigma_h: Any = None
+    g: FloatArray
+    h: FloatArray
+    status: StatusArray
+    sigma_g: FloatArray | None = None
+    sigma_h: FloatArray | None = None
+
+
+class SheetTable(NamedTuple):
+    """Parameters of ``kernels/common/sheet.h``, in the order of its struct ``SheetTable``."""
+
+    position_origin: float
+    position_scale: float
+    sample_origin: float
+    sample_scale: float
+    horizon: float
+    w_terms: npt.ArrayLike
+    g_terms: npt.ArrayLike
+    h_terms: npt.ArrayLike
+    lens: npt.ArrayLike
+    factor_g: npt.ArrayLike
+    factor_h: npt.ArrayLike
 
 
 @dataclass(frozen=True, kw_only=True)
 class SampleAxes:
-    """Where a readout's samples lie on the sensor: u = position_origin + position_pitch position, v likewise.
+    """Affine map from the output of a readout to sensor coordinates.
 
-    The default says that a readout's position and sample index are the sensor's coordinates themselves. A
-    region of interest that begins at column 100 has ``sample_origin=100``; a PSD of 64 strips 0.1 mm apart,
-    in metres about the middle, has ``sample_pitch=1e-4, sample_origin=-31.5e-4``.
+    ``u = position_origin + position_pitch * position`` and ``v = sample_origin + sample_pitch * sample``, with the
+    sample index counted from 0. By default position and sample index are the sensor coordinates.
+
+    Parameters
+    ----------
+    sample_origin, sample_pitch : float
+        v of sample 0 and distance between samples [sensor unit], default 0 and 1. The pitch is not 0.
+    position_origin, position_pitch : float
+        u of position 0 and size of a position unit [sensor unit], default 0 and 1. The pitch is not 0.
+
+    Raises
+    ------
+    ValueError
+        A pitch is 0, or a number is not finite.
+
+    Examples
+    --------
+    A region of interest that begins at column 100, and a PSD of 64 strips 0.1 mm apart, in metres from the middle:
+
+    >>> roi = SampleAxes(sample_origin=100.0)
+    >>> psd = SampleAxes(sample_pitch=1e-4, sample_origin=-31.5e-4)
     """
 
     sample_origin: float = 0.0
@@ -78,43 +125,54 @@ class SampleAxes:
 
 @dataclass(frozen=True, kw_only=True)
 class Triangulation(VisionOperation[SheetPoints]):
-    """Sensor coordinates (u, v) to sheet coordinates (G, H), with the lens undone in the same pass.
+    """Triangulation of sensor coordinates (u, v) to sheet coordinates (G, H), with lens correction.
 
-    ``(G, H, 1) ~ homography (u, v, 1)``, a plane-plane homography: it holds for any pinhole sensor however
-    it is tilted (a Scheimpflug sensor is one), since both the sensor and the sheet are planes.
+    ``(G, H, 1) ~ homography (u, v, 1)``. Sensor and sheet of light are planes, so the plane-to-plane homography holds
+    for every pinhole sensor, tilted ones included (Scheimpflug).
+
+    Called as ``triangulation(u, v)`` with float32 or float64 arrays of one shape; returns `SheetPoints`.
 
     Parameters
     ----------
-    homography
-        3 x 3, from *undistorted* sensor coordinates to metres in the sheet; its scale does not matter.
-    region
-        ((u_min, u_max), (v_min, v_max)) of the sensor, in sensor coordinates. It conditions the arithmetic
-        and says which side of the horizon is in front of the sensor: the middle of the region must see the
-        sheet.
-    model
-        What the homography was fitted as; see `fit`.
-    along
-        Which sensor axis v is; only a lens, whose centre is (column, row), needs to know.
-    lens
-        Radial lens, undone in the coordinates; without one no lens code is compiled.
-    covariance
-        8 x 8 covariance of (g0, gx, gy, h0, hx, hy, dx, dy), the parameters of the displacement form over
-        ``region`` (see `conditioned`); it adds to the sigmas.
-    sigma
-        (sigma_u, sigma_v) of the sensor coordinates; asks for the outputs sigma_g and sigma_h.
-    horizon
-        Smallest denominator, relative to the one in the middle of the region: a point further away than about
-        1/horizon times the usual distance is flagged HORIZON.
-    precision
-        Of the arithmetic and the outputs; None follows the input.
-    variant
-        "vector" (16-wide vectors, for CPU runtimes), "work_item" (a work-item per point, for GPUs), or "auto".
+    homography : (3, 3) array_like
+        From *undistorted* sensor coordinates to the sheet [m]; its scale is free.
+    region : ((u_min, u_max), (v_min, v_max))
+        Region of the sensor [sensor unit]. It conditions the arithmetic. Its middle must see the sheet: this defines
+        the side of the horizon that is in front of the sensor.
+    model : {"C3", "C4", "D6", "H8"}
+        Model that the homography was fitted as, default ``"H8"``; see `fit`.
+    along : {"columns", "rows"}
+        Sensor axis of v, default ``"columns"``. Only a lens needs it, since its centre is (column, row).
+    lens : Lens, optional
+        Radial lens distortion, corrected before the homography.
+    covariance : (8, 8) array_like, optional
+        Covariance of (g0, gx, gy, h0, hx, hy, dx, dy), the parameters of the displacement form over ``region`` (see
+        `conditioned`). It is added to the sigmas.
+    sigma : (sigma_u, sigma_v), optional
+        Standard deviations of the sensor coordinates [sensor unit]; requests the outputs sigma_g and sigma_h.
+    horizon : float
+        Smallest denominator of the homography, relative to the denominator in the middle of the region, 0 to 1, default
+        1e-3. A point further away than about 1/horizon times the usual distance has the flag HORIZON.
+    precision : {"single", "double", None}
+        Precision of the arithmetic and of the outputs; ``None`` follows the input.
+    variant : {"auto", "vector", "work_item"}
+        Kernel variant: vectors of 16 (CPU runtimes) or one work-item per point (GPUs); ``"auto"`` follows the device.
 
     Raises
     ------
     ValueError
-        If the homography is singular (the sheet is seen edge-on), if the middle of the region lies on the
-        horizon, or if a parameter is out of range.
+        The homography is singular (the sensor sees the sheet edge-on), the middle of the region lies on the horizon, or
+        a parameter is out of range.
+
+    Notes
+    -----
+    Error: a few roundings of the size of the measuring range, since the arithmetic uses displacements from the middle
+    of the region.
+
+    References
+    ----------
+    F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, sections 2.3.3, 3.3.2
+    and 3.3.3 (lens).
     """
 
     Result: ClassVar[type[Any]] = SheetPoints
@@ -153,24 +211,24 @@ class Triangulation(VisionOperation[SheetPoints]):
             raise ValueError(f"Triangulation.sigma is {self.sigma}, expected (sigma_u, sigma_v), neither negative")
         self.conditioned()
 
-    # ---- what the kernels take -----------------------------------------------------------------------------
+    # ---- parameters of the kernels -------------------------------------------------------------------------
 
     @property
     def defines(self) -> dict[str, None]:
-        """What ``kernels/common/sheet.h`` has to compile for this triangulation."""
+        """Build options of ``kernels/common/sheet.h`` for this triangulation."""
         lens = {} if self.lens is None else self.lens.defines
         return lens if self.covariance is None else {**lens, "SHEET_COVARIANCE": None}
 
     def packed(self, real: npt.DTypeLike, axes: SampleAxes | None = None) -> npt.NDArray[Any]:
-        """Return the parameter table of ``kernels/common/sheet.h``: what its device functions take as ``sheet``.
+        """Return the parameter table of the device functions of ``kernels/common/sheet.h`` (`SheetTable`).
 
         Parameters
         ----------
-        real
-            float32 or float64, the kernel's real type. Origins and scales are rounded to it *before* the
-            rest is computed from them, so that their rounding costs no accuracy.
-        axes
-            Where the kernel's positions and sample indices lie on the sensor; folded in at no cost.
+        real : dtype
+            float32 or float64, the real type of the kernel. Origins and scales are rounded to it *before* the other
+            numbers are computed from them, so that their rounding costs no accuracy.
+        axes : SampleAxes, optional
+            Map from the positions and sample indices of the kernel to sensor coordinates; it is folded into the table.
         """
         real, axes = np.dtype(real), SampleAxes() if axes is None else axes
         middle, half = self._middle_and_half()
@@ -185,16 +243,29 @@ class Triangulation(VisionOperation[SheetPoints]):
             # The two scales differ by a rounding only, which moves a distorted point by less than a rounding.
             lens = self.sensor_lens.packed(start, 1.0 / half[0])
         g0, gx, gy, h0, hx, hy, dx, dy = terms
-        head = [origin[0], scale[0], origin[1], scale[1], self.horizon, dx, dy, g0, gx, gy, h0, hx, hy]
+        factor_g, factor_h = self._factors()
+        table = SheetTable(
+            position_origin=origin[0],
+            position_scale=scale[0],
+            sample_origin=origin[1],
+            sample_scale=scale[1],
+            horizon=self.horizon,
+            w_terms=(dx, dy),
+            g_terms=(g0, gx, gy),
+            h_terms=(h0, hx, hy),
+            lens=lens,
+            factor_g=factor_g,
+            factor_h=factor_h,
+        )
         with np.errstate(over="ignore"):
-            return np.concatenate([head, lens, *self._factors()]).astype(real)
+            return np.hstack(table).astype(real)
 
     def conditioned(self) -> Float64:
         """(g0, gx, gy, h0, hx, hy, dx, dy) of the displacement form over ``region``.
 
-        ``G = g0 + (gx x + gy y) / (1 + dx x + dy y)``, H likewise, with x and y the undistorted u and v
-        shifted and scaled to about -1 to 1: x = (u - u_middle) / half the region's extent (the larger one,
-        for both).
+        ``G = g0 + (gx x + gy y) / (1 + dx x + dy y)``, H likewise. x and y are the undistorted u and v, shifted and
+        scaled to about -1 to 1: ``x = (u - u_middle) / half``, where ``half`` is half of the larger extent of the
+        region.
         """
         return self._displacement(*self._middle_and_half())
 
@@ -207,7 +278,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         return homography.to_displacement(matrix, rank=2 if self.model == "C3" else 3)
 
     def _factors(self) -> tuple[Float64, Float64]:
-        """Return triangular factors of the parameters' covariance as G and as H see it."""
+        """Return triangular factors of the covariance of the parameters of G, and of the parameters of H."""
         if self.covariance is None:
             return np.zeros(15), np.zeros(15)
         covariance = np.array(self.covariance)
@@ -243,19 +314,19 @@ class Triangulation(VisionOperation[SheetPoints]):
             passes_once=work.vectors,
         )
 
-    # ---- on the host: simulators, planners, error budgets --------------------------------------------------
+    # ---- host computations for simulators, planners and error budgets --------------------------------------
 
     def to_sensor(self, points: npt.ArrayLike) -> Float64:
-        """Measured sensor coordinates (u, v) of sheet points, shape (..., 2): the inverse.
+        """Compute the measured sensor coordinates (u, v) of sheet points (G, H), both of shape (..., 2): the inverse.
 
-        NaN for points behind the sensor's horizon, and for those that the lens cannot show.
+        NaN for points behind the horizon of the sensor and for points that the lens does not image.
         """
         points = np.asarray(points, dtype=np.float64)
         origin, unit = self._middle_and_half()
         g0, gx, gy, h0, hx, hy, dx, dy = self.conditioned()
         matrix = np.array([[gx + g0 * dx, gy + g0 * dy, g0], [hx + h0 * dx, hy + h0 * dy, h0], [dx, dy, 1.0]])
         if self.model == "C3":
-            # A beam has no v: report the region's middle.
+            # A single beam has no v: return the middle of the region.
             matrix[0], points = (0.0, 1.0, 0.0), points * (0.0, 1.0)
         inverse = np.linalg.inv(matrix)
         lifted = points @ inverse[:, :2].T + inverse[:, 2]
@@ -265,17 +336,18 @@ class Triangulation(VisionOperation[SheetPoints]):
         return straight if self.sensor_lens is None else self.sensor_lens.distort(straight)
 
     def covariance_at(self, points: npt.ArrayLike) -> Float64:
-        """Covariance of (G, H) at measured points (u, v): (..., 2) to (..., 2, 2); NaN beyond the horizon.
+        """Compute the covariance (..., 2, 2) of (G, H) at measured points (u, v) (..., 2); NaN beyond the horizon.
 
-        ``J diag(sigma_u^2, sigma_v^2) J'``, with J over lens and homography, and the parameters' own part.
+        ``J diag(sigma_u^2, sigma_v^2) J'`` with the Jacobian J of lens and homography, plus the contribution of the
+        covariance of the parameters.
 
         Raises
         ------
         ValueError
-            If neither ``sigma`` nor ``covariance`` is known.
+            Neither ``sigma`` nor ``covariance`` is known.
         """
         if self.sigma is None and self.covariance is None:
-            raise ValueError("Triangulation knows neither sigma nor covariance; give it one of them")
+            raise ValueError("Triangulation has neither sigma nor covariance; give one of them")
         points = np.asarray(points, dtype=np.float64)
         origin, unit = self._middle_and_half()
         x = ((points if self.sensor_lens is None else self.sensor_lens.undistort(points)) - origin) / unit
@@ -285,10 +357,10 @@ class Triangulation(VisionOperation[SheetPoints]):
         p = x / w[..., None]
         values = p @ np.array([[gx, hx], [gy, hy]])
         slopes = np.array([[gx, gy], [hx, hy]]) - values[..., None] * np.array([dx, dy])
-        bend = np.eye(2) if self.sensor_lens is None else self.sensor_lens.jacobian(points)
-        slopes = (slopes / w[..., None, None]) @ bend / unit
-        spread = slopes * np.array(self.sigma or (0.0, 0.0))
-        total: Float64 = spread @ np.swapaxes(spread, -1, -2)
+        lens_slopes = np.eye(2) if self.sensor_lens is None else self.sensor_lens.jacobian(points)
+        slopes = (slopes / w[..., None, None]) @ lens_slopes / unit
+        scaled = slopes * np.array(self.sigma or (0.0, 0.0))
+        total: Float64 = scaled @ np.swapaxes(scaled, -1, -2)
         if self.covariance is None:
             return total
         design = np.zeros((*points.shape[:-1], 2, 8))
@@ -301,10 +373,10 @@ class Triangulation(VisionOperation[SheetPoints]):
 
     @property
     def sensor_lens(self) -> Lens | None:
-        """The lens for points in (u, v) order; None without one."""
+        """Lens for points in (u, v) order; None without a lens."""
         return _in_sensor_order(self.lens, self.along)
 
-    # ---- where one comes from ------------------------------------------------------------------------------
+    # ---- construction --------------------------------------------------------------------------------------
 
     @classmethod
     def fit(
@@ -320,34 +392,33 @@ class Triangulation(VisionOperation[SheetPoints]):
         along: Along = "columns",
         lens: Lens | None = None,
     ) -> Triangulation:
-        """Fit calibration points; take the smallest model of the family that suffices.
+        """Calibrate: fit calibration points, and select the smallest sufficient model of the family.
 
-        A normalised direct linear transform starts Levenberg-Marquardt on the *sensor* residuals, where the
-        noise is: the sheet points are taken as exact. See `homography` for the family.
+        Levenberg-Marquardt minimises the *sensor* residuals, where the noise is; the sheet points are taken as exact. A
+        normalised direct linear transform gives the start values. `gpuvision.ranging.homography` describes the models.
 
         Parameters
         ----------
-        sensor_points, sheet_points
-            Measured (u, v) and known (G, H) [m], each (n, 2).
-        sigma
-            Standard deviation of the sensor coordinates: a number, (sigma_u, sigma_v), or one per point and
-            coordinate, (n, 2). None: equal, and estimated from the residuals.
-        model
-            "C3", "C4", "D6" or "H8"; None takes the smallest one which the F test against the largest does
-            not refute.
-        significance
-            A model is refuted where residuals so much larger have a smaller probability than this.
-        symmetry
-            v of the plane of symmetry, for C4.
-        region
-            Of the sensor; None: the box around the points.
+        sensor_points, sheet_points : (n, 2) array_like
+            Measured (u, v) [sensor unit] and known (G, H) [m].
+        sigma : float, (2,) or (n, 2) array_like, optional
+            Standard deviation of the sensor coordinates [sensor unit]: one number, (sigma_u, sigma_v), or one number
+            per point and coordinate. ``None``: the same for all, estimated from the residuals.
+        model : {"C3", "C4", "D6", "H8"}, optional
+            Model to fit. ``None`` selects the smallest model that the F test against the largest model does not reject.
+        significance : float
+            Probability (p-value of the F test) below which a model is rejected, default 0.01.
+        symmetry : float
+            v of the plane of symmetry for C4 [sensor unit], default 0.
+        region : ((u_min, u_max), (v_min, v_max)), optional
+            Region of the sensor; ``None``: the bounding box of the points.
         along, lens
             As in the class.
 
         Raises
         ------
         ValueError
-            If shapes differ, a point is not finite or lies beyond the lens' fold, or the points do not fix
+            Shapes differ, a point is not finite or lies beyond the fold of the lens, or the points do not determine
             the model.
         """
         sensor = np.asarray(sensor_points, dtype=np.float64)
@@ -387,18 +458,18 @@ class Triangulation(VisionOperation[SheetPoints]):
         along: Along = "columns",
         **more: Any,
     ) -> Triangulation:
-        """Build one from a camera's matrix and pose and the place of the sheet.
+        """Build a triangulation from the matrix and the pose of a camera and the pose of the sheet of light.
 
         Parameters
         ----------
-        camera_matrix
-            3 x 3, (column, row, 1) ~ camera_matrix (X, Y, Z); any invertible one, a tilted sensor's too.
-        rotation, translation
-            World to camera, (3, 3) and (3,) [m].
-        g_axis, h_axis, origin
-            The sheet in the world: G along the first, H along the second, from the third [m].
+        camera_matrix : (3, 3) array_like
+            ``(column, row, 1) ~ camera_matrix (X, Y, Z)``; any invertible matrix, also of a tilted sensor.
+        rotation, translation : (3, 3) and (3,) array_like
+            World to camera; the translation in metres.
+        g_axis, h_axis, origin : (3,) array_like
+            Sheet in the world: directions of G and H, and the point G = H = 0 [m].
         along, **more
-            The other parameters of the class; ``region`` is needed.
+            Other parameters of the class; ``region`` is required.
         """
         to_sensor = homography.seen_by_camera(camera_matrix, rotation, translation, (g_axis, h_axis, origin))
         if along == "columns":
@@ -416,30 +487,36 @@ class Triangulation(VisionOperation[SheetPoints]):
         tilt: float | None = None,
         **more: Any,
     ) -> Triangulation:
-        """Build the thesis' triangulation setup (Figure 3.4): a sheet straight down, a lens beside it.
+        """Build a triangulation from baseline and stand-off: a sheet of light straight down, a lens beside the sheet.
 
-        The optical axis meets the sheet at H = 0, G = 0, where u = v = 0; u grows with H. With t the angle
-        between the axis and the sheet, tan t = baseline / stand_off, and D the distance along the axis:
-        ``u = f' H sin t / (D cos a - H cos(t - a))``, ``v = f' G cos a / (D cos a - H cos(t - a))``.
+        The optical axis meets the sheet at G = H = 0, where u = v = 0; u grows with H. With t the angle between the
+        axis and the sheet, ``tan t = baseline / stand_off``, and D the distance along the axis: ``u = f' H sin t / (D
+        cos a - H cos(t - a))``, ``v = f' G cos a / (D cos a - H cos(t - a))``.
 
         Parameters
         ----------
-        baseline
-            From the sheet to the lens, b [m].
-        stand_off
-            From H = 0 up to the lens, Z0 [m].
-        focal_distance
-            From the lens to the sensor along the axis, f' [m]; in pixels, u and v are pixels.
-        tilt
-            Angle a of the sensor [rad]; None takes Scheimpflug's, which holds the whole sheet in focus:
-            tan a = f' / (D tan t). ``focal_distance`` must then be in metres.
+        baseline : float
+            Distance from the sheet to the lens, b [m], positive.
+        stand_off : float
+            Distance from H = 0 up to the lens, Z0 [m], positive.
+        focal_distance : float
+            Distance from the lens to the sensor along the axis, f' [m], positive. If it is in pixels, u and v are
+            pixels.
+        tilt : float, optional
+            Angle a of the sensor [rad], between -pi/2 and pi/2. ``None``: the Scheimpflug angle,
+            ``tan a = f' / (D tan t)``, with the whole sheet in focus; ``focal_distance`` must then be in metres.
         **more
-            The other parameters of the class; ``region`` is needed.
+            Other parameters of the class; ``region`` is required.
 
         Raises
         ------
         ValueError
-            If a length is not positive, or the tilt is not within a right angle.
+            A length is not positive, or the tilt is not between -pi/2 and pi/2.
+
+        References
+        ----------
+        F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 3.3.2 and
+        Figure 3.4.
         """
         to_sensor = homography.seen_from_beside(baseline, stand_off, focal_distance, tilt)
         matrix = numbers(homography.inverse(to_sensor), (3, 3), "Triangulation.homography")
@@ -449,7 +526,7 @@ class Triangulation(VisionOperation[SheetPoints]):
 
     @classmethod
     def from_constants(cls, constants: Sequence[float], **more: Any) -> Triangulation:
-        """Build one from De Bakker's constants or the extended ones; their number names the model.
+        """Build a triangulation from constants; their number selects the model.
 
         3: ``H = (c1 u + c2)/(c3 u + 1)``, G = 0. 4: ``H = (C1 u + C2)/(u + C3)``, ``G = C4 v/(u + C3)``.
         6: ``H = (D1 u + D2)/(u + D3)``, ``G = (D4 v + D5 u + D6)/(u + D3)``. 8: the homography's rows, its
@@ -464,7 +541,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         return cls(homography=rows, model=model, **more)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, strings and lists, as TOML holds them; what is None is left out."""
+        """Return plain numbers, strings and lists, as in a TOML file; parameters that are None are left out."""
         table: dict[str, Any] = {"homography": [list(row) for row in self.homography]}
         table["region"] = [list(bounds) for bounds in self.region]
         table |= {"model": self.model, "along": self.along, "horizon": self.horizon}
@@ -478,12 +555,12 @@ class Triangulation(VisionOperation[SheetPoints]):
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], *, precision: Precision = None) -> Triangulation:
-        """Build a triangulation from such a table; ``homography`` and ``region`` are needed.
+        """Build a triangulation from a table as `to_dict` makes it; ``homography`` and ``region`` are required.
 
         Raises
         ------
         ValueError, TypeError
-            If a key is unknown or missing, or a value is not what it must be.
+            A key is unknown or missing, or a value has the wrong type or shape.
         """
         values = dict(check_keys(table, _KEYS, ("homography", "region"), "triangulation"))
         if "lens" in values:

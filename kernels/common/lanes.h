@@ -1,6 +1,16 @@
-// One body of code for both shapes: under VECTOR_VARIANT a value is 16 samples of a CPU's strip, else it is one sample.
-// Loads and stores go through element-aligned vector types: PoCL's vstore16 nearly doubles the time of a PSD
-// readout, a plain assignment does not, and a caller's array need not be aligned to a vector.
+// Vector vocabulary of the kernels: one source serves both kernel variants.
+//
+// Under VECTOR_VARIANT (CPU runtimes) a work-item processes LANES = 16 neighbouring samples side by side, and the types
+// below are 16-wide vectors. Otherwise (GPUs) a work-item processes one sample, and the same types are scalars.
+//
+//     reals        values of the real type (real.h)
+//     masks        signed integers as wide as a real: all bits set where a condition holds, else 0
+//     ints, uints  32-bit indices and counts; also masks of conditions on integers (int_mask)
+//     bytes        status flags
+//
+// A comparison of vectors gives -1 in the lanes where it holds, a comparison of scalars gives 1. mask_of() and
+// int_mask() turn a comparison into a mask in both variants. The build options are REAL_IS_DOUBLE, VECTOR_VARIANT and
+// PAST_CACHES (outputs larger than the last cache).
 #ifndef LANES_H
 #define LANES_H
 
@@ -12,73 +22,116 @@
 #define LANES 16
 typedef real16 reals;
 typedef bits16 masks;
+typedef int16 ints;
+typedef uint16 uints;
 typedef uchar16 bytes;
-typedef real16 reals_at __attribute__((aligned(sizeof(real))));
-typedef uchar16 bytes_at __attribute__((aligned(1)));
+// LANED(name): the 16-wide version of a function or conversion that exists for scalars and for vectors of 16.
 #define LANED(name) name##16
+// mask_of: mask (as wide as a real) of a comparison of reals. int_mask: 32-bit mask of any comparison.
 #define mask_of(comparison) (comparison)
+#define int_mask(comparison) convert_int16(comparison)
+#define to_reals convert_real16
+#define to_ints convert_int16
+#define to_masks convert_bits16
+#define as_uints as_uint16
 #define convert_bytes convert_uchar16
 #define as_masks as_bits16
-#define as_reals LANED(as_real)
 #ifdef REAL_IS_DOUBLE
-#define as_real16 as_double16
+#define as_reals as_double16
 #else
-#define as_real16 as_float16
+#define as_reals as_float16
 #endif
+// 0, 1, ...: number of each lane.
+#define LANE_NUMBERS ((int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #else
 #define LANES 1
 typedef real reals;
 typedef bits masks;
+typedef int ints;
+typedef uint uints;
 typedef uchar bytes;
-typedef real reals_at;
-typedef uchar bytes_at;
 #define LANED(name) name
 #define mask_of(comparison) (-(bits)(comparison))
+#define int_mask(comparison) (-(int)(comparison))
+#define to_reals (real)
+#define to_ints (int)
+#define to_masks (bits)
+#define as_uints as_uint
 #define convert_bytes convert_uchar
 #define as_masks as_bits
 #define as_reals as_real
+#define LANE_NUMBERS 0
 #endif
+
+// Types for loads and stores at addresses that are aligned to an element only: a caller's array need not be aligned to
+// a vector. PoCL's vload16 and vstore16 take apart such an access (a PSD readout takes nearly twice the time).
+typedef reals reals_at __attribute__((aligned(sizeof(real))));
+typedef ints ints_at __attribute__((aligned(sizeof(int))));
+typedef bytes bytes_at __attribute__((aligned(1)));
 
 #define NAN_BITS as_bits(REAL_NAN)
 
-// NaN where the mask is set: every bit of a quiet NaN put on top of a number makes a NaN.
-inline reals nan_where(masks mask, reals value) { return as_reals(as_masks(value) | (mask & (masks)NAN_BITS)); }
+// NaN where the mask is set: a number with all bits of a quiet NaN set is a NaN.
+static inline reals nan_where(masks mask, reals value) {
+    return as_reals(as_masks(value) | (mask & (masks)NAN_BITS));
+}
 
-// Whether the mask is set in any lane. (PoCL takes any() apart into scalars.)
+// Zero where the mask is set.
+static inline reals zero_where(masks mask, reals value) { return as_reals(as_masks(value) & ~mask); }
+
+// Select by a 32-bit mask, bit by bit.
+static inline ints choose_ints(ints mask, ints yes, ints no) { return (yes & mask) | (no & ~mask); }
+static inline reals choose_reals(ints mask, reals yes, reals no) {
+    const masks wide = to_masks(mask);
+    return as_reals((as_masks(yes) & wide) | (as_masks(no) & ~wide));
+}
+
+// A status flag in the lanes of a 32-bit mask.
+static inline ints flag_where(ints mask, int flag) { return mask & (ints)flag; }
+
+// 32-bit mask of the lanes that are infinite or NaN.
+static inline ints not_finite_lanes(reals value) { return int_mask(LANED(not_finite)(value)); }
+
+// Whether the mask is set in any lane. The lanes are combined by OR in halves, because PoCL compiles any() to a test of
+// every lane by itself.
 #if defined(VECTOR_VARIANT) && defined(REAL_IS_DOUBLE)
-inline int any_lane(masks mask) {
+static inline int any_lane(masks mask) {
     const long8 half_of_it = mask.lo | mask.hi;
     const long4 quarter = half_of_it.lo | half_of_it.hi;
     return (quarter.x | quarter.y | quarter.z | quarter.w) != 0;
 }
 #elif defined(VECTOR_VARIANT)
-inline int any_lane(masks mask) {
+static inline int any_lane(masks mask) {
     const int8 half_of_it = mask.lo | mask.hi;
     const long2 quarter = as_long2(half_of_it.lo | half_of_it.hi);
     return (quarter.x | quarter.y) != 0;
 }
 #else
-inline int any_lane(masks mask) { return mask != 0; }
+static inline int any_lane(masks mask) { return mask != 0; }
 #endif
 
-// Zero where the mask is set.
-inline reals zero_where(masks mask, reals value) { return as_reals(as_masks(value) & ~mask); }
+// The same for a 32-bit mask.
+#ifdef VECTOR_VARIANT
+static inline int any_int_lane(ints mask) { return any(mask); }
+#else
+static inline int any_int_lane(ints mask) { return mask != 0; }
+#endif
 
 #ifdef PAST_CACHES
-// Outputs that the caches cannot hold go past them: a line that is written whole need not be read first. Only whole,
-// aligned vectors can.
-inline int aligned_to(size_t size, global const void *to) { return ((size_t)to & (size - 1)) == 0; }
-inline void store_reals(reals value, global real *to) {
+// Stores that bypass the caches: a cache line that is written as a whole need not be read first. Only vectors at an
+// aligned address can bypass them.
+static inline int aligned_to(size_t size, global const void *to) { return ((size_t)to & (size - 1)) == 0; }
+static inline void store_reals(reals value, global real *to) {
     if (aligned_to(sizeof(reals), to)) __builtin_nontemporal_store(value, (global reals *)to);
     else *(global reals_at *)to = value;
 }
-inline void store_bytes(bytes value, global uchar *to) {
+static inline void store_bytes(bytes value, global uchar *to) {
     if (aligned_to(sizeof(bytes), to)) __builtin_nontemporal_store(value, (global bytes *)to);
     else *(global bytes_at *)to = value;
 }
 #else
-inline void store_reals(reals value, global real *to) { *(global reals_at *)to = value; }
-inline void store_bytes(bytes value, global uchar *to) { *(global bytes_at *)to = value; }
+static inline void store_reals(reals value, global real *to) { *(global reals_at *)to = value; }
+static inline void store_bytes(bytes value, global uchar *to) { *(global bytes_at *)to = value; }
 #endif
 
 // ---- loads, stores and lane-wise operations of the tree and light kernels ---------------------------------------------

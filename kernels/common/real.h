@@ -1,4 +1,4 @@
-// The real type of a build, and tests on its bits.
+// The real type of a build (float, or double under REAL_IS_DOUBLE), its bits, and tests on them.
 #ifndef REAL_H
 #define REAL_H
 
@@ -39,17 +39,17 @@ typedef int16 bits16;
 #define REAL_EPSILON 1.1920929e-7f
 #endif
 
+// Attribute of a kernel that uses vectors of 16 explicitly: the compiler need not search for more vectors across
+// work-items (Intel's does so, for seconds).
 #ifdef VECTOR_VARIANT
-// Of a kernel: its vectors are the code's own, a compiler need not look for more across work-items (Intel's does, for
-// seconds).
 #define AS_IT_IS __attribute__((vec_type_hint(real16)))
 #else
 #define AS_IT_IS
 #endif
 
-// Infinity and NaN by their exponent: an integer test means the same under every compiler option,
-// where isnan() and x != x do not.
-inline int not_finite(real x) { return (as_bits(x) & EXPONENT_BITS) == EXPONENT_BITS; }
-inline bits16 not_finite16(real16 x) { return (as_bits16(x) & (bits16)EXPONENT_BITS) == (bits16)EXPONENT_BITS; }
+// Infinity and NaN have all exponent bits set. This integer test means the same under every compiler option; isnan()
+// and x != x are removed under finite-math options.
+static inline int not_finite(real x) { return (as_bits(x) & EXPONENT_BITS) == EXPONENT_BITS; }
+static inline bits16 not_finite16(real16 x) { return (as_bits16(x) & (bits16)EXPONENT_BITS) == (bits16)EXPONENT_BITS; }
 
 #endif

@@ -1,12 +1,15 @@
-// A light position on the sensor -> a point in the sheet of light, by a plane-plane homography in displacement form:
+// Triangulation: light position on the sensor -> point (G, H) in the sheet of light [m].
 //
-//     x = (position - x0) sx,  y = (sample - y0) sy           about -1 .. 1; then the lens, where there is one
-//     w = 1 + dx x + dy y                                     the denominator, 1 in the middle of the sensor
+// A plane-to-plane homography in displacement form (F. de Jong, sections 2.3.3 and 3.3.2; Triangulation in
+// gpuvision/ranging/triangulation.py):
+//
+//     x = (position - x0) sx,  y = (sample - y0) sy           about -1 .. 1; then the lens is undone, if there is one
+//     w = 1 + dx x + dy y                                     denominator, 1 in the middle of the sensor
 //     G = g0 + gx p + gy q,  H = h0 + hx p + hy q             with p = x/w, q = y/w
 //
-// The host folds everything else into these numbers in double, with origins and scales as the device's real type
-// holds them: a single-precision result is a few roundings away from the double one. The table is
-// Triangulation.packed in triangulation.py.
+// The host folds all other constants into these numbers in double precision. Origins and scales are rounded to the
+// kernel's real type before that, so a single-precision result is within a few roundings of the double-precision one.
+// Build options: LENS, LENS_K2 (lens.h); SHEET_COVARIANCE adds the covariance of the parameters to the sigmas.
 #ifndef SHEET_H
 #define SHEET_H
 
@@ -14,54 +17,55 @@
 #include "common/lens.h"
 #include "common/status.h"
 
-#define SHEET_POSITION_ORIGIN 0
-#define SHEET_POSITION_SCALE 1
-#define SHEET_SAMPLE_ORIGIN 2
-#define SHEET_SAMPLE_SCALE 3
-#define SHEET_HORIZON 4
-#define SHEET_W_TERMS 5
-#define SHEET_G_TERMS 7
-#define SHEET_H_TERMS 10
-#define SHEET_LENS 13
-#define SHEET_FACTOR_G 18
-#define SHEET_FACTOR_H 33
+// Parameters, in the order of SheetTable in triangulation.py (tests/ranging/test_tables.py compares them).
+typedef struct {
+    real position_origin, position_scale;  // x0, sx: position in its own unit -> about -1 .. 1
+    real sample_origin, sample_scale;      // y0, sy
+    real horizon;                          // smallest denominator w that counts
+    real w_terms[2];                       // dx, dy
+    real g_terms[3], h_terms[3];           // g0, gx, gy and h0, hx, hy [m]
+    real lens[5];                          // table of lens.h, for x and y
+    real factor_g[15], factor_h[15];       // triangular factors of the covariance of (g0, gx, gy, dx, dy) and of
+                                           // (h0, hx, hy, dx, dy), column by column
+} SheetTable;
 
-// Squared distance, in half the sensor's extent, from which a coordinate counts as not finite: nothing below
-// overflows, and one comparison of bits finds what is larger, infinite or NaN.
+// Bits of the squared distance, in half extents of the sensor region, from which a coordinate counts as not finite.
+// Smaller values do not overflow. As integers the bits of non-negative numbers, infinity and NaN (without sign) are in
+// ascending order, so one comparison finds all of them.
 #define SHEET_REACH as_bits((real)1e12)
 
-// Where a light position lies, undistorted and conditioned; returns its squared distance from the lens' centre, or from
-// the middle of the sensor.
-inline reals LANED(sheet_place)(reals position, reals sample, constant real *sheet, reals *x, reals *y) {
-    *x = (position - sheet[SHEET_POSITION_ORIGIN]) * sheet[SHEET_POSITION_SCALE];
-    *y = (sample - sheet[SHEET_SAMPLE_ORIGIN]) * sheet[SHEET_SAMPLE_SCALE];
+// Compute the undistorted, scaled place (x, y) of a light position; return its squared distance from the centre of the
+// lens, or without a lens from the middle of the sensor region.
+static inline reals sheet_place(reals position, reals sample, constant SheetTable *sheet, reals *x, reals *y) {
+    *x = (position - sheet->position_origin) * sheet->position_scale;
+    *y = (sample - sheet->sample_origin) * sheet->sample_scale;
 #ifdef LENS
-    return LANED(lens_straighten)(x, y, sheet + SHEET_LENS);
+    return LANED(lens_straighten)(x, y, sheet->lens);
 #else
     return *x * *x + *y * *y;
 #endif
 }
 
-// Writes G and H (NaN where the status is not 0) and returns the status: NOT_FINITE; NOT_INVERTIBLE, beyond the lens' fold;
-// HORIZON, the ray does not meet the sheet in front of the sensor, or so far away that the place means nothing.
-inline bytes LANED(sheet_point)(reals position, reals sample, constant real *sheet, reals *g, reals *h) {
-    constant real *in_w = sheet + SHEET_W_TERMS, *in_g = sheet + SHEET_G_TERMS, *in_h = sheet + SHEET_H_TERMS;
+// Compute G and H (NaN where the status is not 0) and return the status: NOT_FINITE; NOT_INVERTIBLE: beyond the fold of
+// the lens; HORIZON: the ray does not meet the sheet in front of the sensor, or meets it too far away.
+static inline bytes sheet_point(reals position, reals sample, constant SheetTable *sheet, reals *g, reals *h) {
+    constant real *in_w = sheet->w_terms, *in_g = sheet->g_terms, *in_h = sheet->h_terms;
     reals x, y;
-    const reals square = LANED(sheet_place)(position, sample, sheet, &x, &y);
+    const reals square = sheet_place(position, sample, sheet, &x, &y);
     const reals w = 1 + in_w[0] * x + in_w[1] * y;
     const reals p = x / w, q = y / w;
     *g = in_g[0] + (in_g[1] * p + in_g[2] * q);
     *h = in_h[0] + (in_h[1] * p + in_h[2] * q);
     const masks lost = mask_of(as_masks(square) >= SHEET_REACH);
-    const masks hidden = mask_of(w <= sheet[SHEET_HORIZON]);
+    const masks hidden = mask_of(w <= sheet->horizon);
 #ifdef LENS
-    const masks folded = mask_of(square >= sheet[SHEET_LENS + LENS_FOLD_SQUARE]);
+    const masks folded = mask_of(square >= sheet->lens[LENS_FOLD_SQUARE]);
 #else
     const masks folded = 0;
 #endif
     const masks flagged = lost | hidden | folded;
     bytes status = STATUS_OK;
-    // Flags are rare, and telling which costs half as much as the geometry.
+    // Flags are rare, and computing them takes half as long as the geometry: skip it where no lane has one.
     if (any_lane(flagged)) {
         *g = nan_where(flagged, *g);
         *h = nan_where(flagged, *h);
@@ -71,8 +75,9 @@ inline bytes LANED(sheet_point)(reals position, reals sample, constant real *she
     return status;
 }
 
-// The variance that the parameters' covariance brings in: |factor' d|^2, d = (1, p, q, -r p, -r q), r = value - value0.
-inline reals LANED(sheet_parameter_variance)(constant real *factor, reals p, reals q, reals r) {
+// Variance of G or H from the covariance C = F F' of its parameters (a0, ax, ay, dx, dy): |F' d|^2 with the gradient
+// d = (1, p, q, -r p, -r q) and r = value - a0. F is lower triangular, column by column in `factor`.
+static inline reals sheet_parameter_variance(constant real *factor, reals p, reals q, reals r) {
     const reals first = factor[0] + factor[1] * p + factor[2] * q - r * (factor[3] * p + factor[4] * q);
     const reals second = factor[5] * p + factor[6] * q - r * (factor[7] * p + factor[8] * q);
     const reals third = factor[9] * q - r * (factor[10] * p + factor[11] * q);
@@ -80,40 +85,42 @@ inline reals LANED(sheet_parameter_variance)(constant real *factor, reals p, rea
     return first * first + second * second + third * third + fourth * fourth + fifth * fifth;
 }
 
-// Standard deviation of G or H (its terms and factor) at (p, q) with denominator w, for conditioned sigma_x, sigma_y.
-inline reals LANED(sheet_sigma_of)(constant real *terms, constant real *factor, reals measured_x, reals measured_y,
-                                   reals p, reals q, reals w, reals sigma_x, reals sigma_y, constant real *sheet) {
+// Compute the standard deviation of G or H, given its terms and factor, at (p, q) with denominator w, for the standard
+// deviations sigma_x and sigma_y of the measured x and y.
+static inline reals sheet_sigma_of(constant real *terms, constant real *factor, reals measured_x, reals measured_y,
+                                   reals p, reals q, reals w, reals sigma_x, reals sigma_y,
+                                   constant SheetTable *sheet) {
     const reals offset = terms[1] * p + terms[2] * q;
-    reals slope_x = (terms[1] - offset * sheet[SHEET_W_TERMS]) / w;
-    reals slope_y = (terms[2] - offset * sheet[SHEET_W_TERMS + 1]) / w;
+    reals slope_x = (terms[1] - offset * sheet->w_terms[0]) / w;
+    reals slope_y = (terms[2] - offset * sheet->w_terms[1]) / w;
 #ifdef LENS
-    LANED(lens_pull_back)(measured_x, measured_y, sheet + SHEET_LENS, &slope_x, &slope_y);
+    LANED(lens_pull_back)(measured_x, measured_y, sheet->lens, &slope_x, &slope_y);
 #endif
     slope_x *= sigma_x;
     slope_y *= sigma_y;
     reals variance = slope_x * slope_x + slope_y * slope_y;
 #ifdef SHEET_COVARIANCE
-    variance += LANED(sheet_parameter_variance)(factor, p, q, offset);
+    variance += sheet_parameter_variance(factor, p, q, offset);
 #endif
     return sqrt(variance);
 }
 
-// Standard deviations of G and H for independent ones of position and sample, by the gradients at the point; the
-// parameters' own covariance is added under SHEET_COVARIANCE. Means nothing where sheet_point flags the point.
-inline void LANED(sheet_sigma)(reals position, reals sample, reals sigma_position, reals sigma_sample,
-                               constant real *sheet, reals *sigma_g, reals *sigma_h) {
+// Compute the standard deviations of G and H for independent errors of position and sample, to first order. Under
+// SHEET_COVARIANCE the covariance of the parameters is added. The result is meaningless where sheet_point sets a flag.
+static inline void sheet_sigma(reals position, reals sample, reals sigma_position, reals sigma_sample,
+                               constant SheetTable *sheet, reals *sigma_g, reals *sigma_h) {
     reals x, y;
-    LANED(sheet_place)(position, sample, sheet, &x, &y);
-    const reals w = 1 + sheet[SHEET_W_TERMS] * x + sheet[SHEET_W_TERMS + 1] * y;
+    sheet_place(position, sample, sheet, &x, &y);
+    const reals w = 1 + sheet->w_terms[0] * x + sheet->w_terms[1] * y;
     const reals p = x / w, q = y / w;
-    const reals measured_x = (position - sheet[SHEET_POSITION_ORIGIN]) * sheet[SHEET_POSITION_SCALE];
-    const reals measured_y = (sample - sheet[SHEET_SAMPLE_ORIGIN]) * sheet[SHEET_SAMPLE_SCALE];
-    const reals sigma_x = sigma_position * sheet[SHEET_POSITION_SCALE];
-    const reals sigma_y = sigma_sample * sheet[SHEET_SAMPLE_SCALE];
-    *sigma_g = LANED(sheet_sigma_of)(sheet + SHEET_G_TERMS, sheet + SHEET_FACTOR_G, measured_x, measured_y, p, q, w,
-                                     sigma_x, sigma_y, sheet);
-    *sigma_h = LANED(sheet_sigma_of)(sheet + SHEET_H_TERMS, sheet + SHEET_FACTOR_H, measured_x, measured_y, p, q, w,
-                                     sigma_x, sigma_y, sheet);
+    const reals measured_x = (position - sheet->position_origin) * sheet->position_scale;
+    const reals measured_y = (sample - sheet->sample_origin) * sheet->sample_scale;
+    const reals sigma_x = sigma_position * sheet->position_scale;
+    const reals sigma_y = sigma_sample * sheet->sample_scale;
+    *sigma_g =
+        sheet_sigma_of(sheet->g_terms, sheet->factor_g, measured_x, measured_y, p, q, w, sigma_x, sigma_y, sheet);
+    *sigma_h =
+        sheet_sigma_of(sheet->h_terms, sheet->factor_h, measured_x, measured_y, p, q, w, sigma_x, sigma_y, sheet);
 }
 
 #endif

@@ -1,4 +1,4 @@
-// Status flags of a sample; the same bits as gpuvision.status.Status (a test holds them together).
+// Status flags of a sample: the bits of gpuvision.status.Status (tests/test_house.py compares them).
 #ifndef STATUS_H
 #define STATUS_H
 

@@ -1,9 +1,42 @@
-// Light lines in camera frames: every profile (a column, or under ALONG_ROWS a row) -> position, peak, width, total,
-// status, and under WITH_SHEET the point in the sheet of light. METHOD_... says how; line.py documents the defines.
+// Laser line readout: every profile of a camera frame -> sub-pixel position of the line, peak, width, total light,
+// status, and under WITH_SHEET the point in the sheet of light (triangulation in the same pass).
+//
+// A profile is a column of the frame, or a row under ALONG_ROWS. `length` is the number of its samples, `samples` the
+// number of profiles of a frame. METHOD_... selects the peak estimator:
+//     CENTROID  sum v k / sum v over the whole profile, v the light (line_centroid.h)
+//     WINDOWED  the same in a window of RADIUS samples on either side of the peak (line_window.h)
+//     GAUSS3    parabola through three logarithms, FIR zero crossing of a derivative filter (line_points.h)
+//     ML        maximum-likelihood fit of a Gaussian (line_ml.h)
+//
+// Inputs:  frames     (frames, rows, columns) CODE [grey levels]
+//          previous   (frames, samples) real [px], under SELECT_NEAREST: earlier positions, NaN: unknown
+//          threshold, saturation, minimum  CODE [grey levels]: level of no light, of saturation, smallest peak
+//          table      LineTable;  sheet  SheetTable (common/sheet.h), under WITH_SHEET
+// Outputs: (frames, samples), each one compiled only under its WITH_... option:
+//          position real [px], peak real [grey levels], width real [px], total real [grey levels], status uchar,
+//          g, h real [m] (under WITH_SHEET)
+// Build options: CODE, CODE4, CODE8, CODE16, CODE_BITS (type of the samples), REAL_IS_DOUBLE, ALONG_ROWS, RADIUS and
+// REACH
+// (window that counts, and window that is read), FIR_HALF, CANDIDATES with SELECT_... (line_peak.h), AMBIGUITY,
+//          WIDTH_LIMITS, COUNT_WIDTH, LONG_MOMENT, PREFETCH, WITH_POSITION/PEAK/WIDTH/TOTAL/STATUS/SHEET/G/H, LENS,
+//          LENS_K2, PAST_CACHES, VECTOR_VARIANT.
+// Work:    global size (work-items of a frame, frames). Vector variant: a work-item reads a strip of columns, or 16
+// rows;
+//          under CANDIDATES 16 profiles. Otherwise: one work-item per profile, padded to whole work-groups.
+#include "line/line_profiles.h"
+#include "common/sheet.h"
+
+// Parameters, in the order of LineTable in gpuvision/ranging/line.py.
+typedef struct {
+    real min_width, max_width;  // limits on the number of samples above the threshold
+    real ambiguous_ratio;       // fraction of the peak's light from which on a second peak counts
+    real read_variance;         // METHOD_ML: variance of a dark sample [grey level^2]
+    real gain;                  // METHOD_ML: variance per grey level of light
+} LineTable;
+
 #include "line/line_peak.h"
 #include "line/line_centroid.h"
 #include "line/line_window.h"
-#include "common/sheet.h"
 #ifdef VECTOR_VARIANT
 #include "line/line_wide_peak.h"
 #endif
@@ -14,36 +47,30 @@
 #include "line/line_ml.h"
 #endif
 
-// The parameters, as LineReadout packs them.
-#define MIN_WIDTH 0
-#define MAX_WIDTH 1
-#define AMBIGUOUS_RATIO 2
-#define READ_VARIANCE 3  // of a dark sample [level^2]
-#define GAIN 4           // variance per level of light
-
 typedef struct {
     global real *position, *peak, *width, *total;
     global uchar *status;
     global real *g, *h;
-    constant real *sheet;
+    constant SheetTable *sheet;
 } Outputs;
 
-// Lanes that go to samples first, first + 1, ... of the output.
-inline void store_reading(const Outputs *to, ulong first, int sample, reals position, codes peak, reals width,
-                          reals total, ints flags) {
-    ints lost = ~INT_MASK((flags & (STATUS_LOW_SIGNAL | STATUS_OUT_OF_RANGE | STATUS_NOT_FINITE)) == 0);
+// Write the readings of LANES profiles, the first of them element `first` of the outputs and profile `sample` of its
+// frame.
+static inline void store_reading(const Outputs *to, ulong first, int sample, reals position, codes peak, reals width,
+                                 reals total, ints flags) {
+    ints lost = ~int_mask((flags & (STATUS_LOW_SIGNAL | STATUS_OUT_OF_RANGE | STATUS_NOT_FINITE)) == 0);
 #if CODE_BITS == 32
-    // Numbers whose sums are none.
+    // Sums that overflow to infinity or NaN.
     const ints overflown = not_finite_lanes(total) | (not_finite_lanes(position) & ~lost);
     flags |= flag_where(overflown, STATUS_NOT_FINITE);
     lost |= overflown;
 #endif
-    const ints not_finite = ~INT_MASK((flags & STATUS_NOT_FINITE) == 0);
+    const ints not_finite = ~int_mask((flags & STATUS_NOT_FINITE) == 0);
     position = nan_where(to_masks(lost), position);
 #ifdef WITH_SHEET
     reals g, h;
-    const reals samples = to_reals((ints)sample + lane_numbers);
-    const ints sheet_flags = to_ints(LANED(sheet_point)(position, samples, to->sheet, &g, &h));
+    const reals samples = to_reals((ints)sample + LANE_NUMBERS);
+    const ints sheet_flags = to_ints(sheet_point(position, samples, to->sheet, &g, &h));
     flags |= sheet_flags & ~lost;
 #ifdef WITH_G
     store_reals(g, to->g + first);
@@ -69,42 +96,42 @@ inline void store_reading(const Outputs *to, ulong first, int sample, reals posi
 #endif
 }
 
-inline ints common_flags(const Profiles *profiles, codes peak, ints lost) {
-    return flag_where(CODE_MASK(peak >= (codes)profiles->saturation), STATUS_SATURATED) |
-           flag_where(lost, STATUS_NOT_FINITE);
+static inline ints common_flags(const Profiles *profiles, codes peak, ints not_finite) {
+    return flag_where(int_mask(peak >= (codes)profiles->saturation), STATUS_SATURATED) |
+           flag_where(not_finite, STATUS_NOT_FINITE);
 }
 
 #ifdef METHOD_CENTROID
-// Light over the threshold of sample k.
-inline reals light_at(const Profiles *profiles, int k) {
+// Light of sample k of every lane.
+static inline reals light_at(const Profiles *profiles, int k) {
     return over_threshold(sample_of(profiles, k), profiles->threshold);
 }
 
-inline void finish_whole(const Profiles *profiles, const Gravity *gravity, constant real *p, const Outputs *to,
-                         ulong first, int sample) {
-    ints dark = dark_lanes(profiles, gravity->peak);
+static inline void finish_centroid(const Profiles *profiles, const Centroid *centroid, constant LineTable *table,
+                                   const Outputs *to, ulong first, int sample) {
+    ints dark = dark_lanes(profiles, centroid->peak);
 #ifdef WIDTH_LIMITS
-    dark |= REAL_MASK(gravity->lit < p[MIN_WIDTH]) | REAL_MASK(gravity->lit > p[MAX_WIDTH]);
+    dark |= int_mask(centroid->width < table->min_width) | int_mask(centroid->width > table->max_width);
 #endif
-    // Light whose half maximum lies outside: its centre of gravity does not.
-    const reals least = over_threshold(gravity->peak, profiles->threshold) / 2;
+    // A line whose half maximum lies beyond the border is cut: its centroid is wrong.
+    const reals least = over_threshold(centroid->peak, profiles->threshold) / 2;
     const reals begin = light_at(profiles, 0), end = light_at(profiles, profiles->length - 1);
-    const ints cut = REAL_MASK(begin >= least) | REAL_MASK(end >= least);
+    const ints cut = int_mask(begin >= least) | int_mask(end >= least);
     const ints flags = flag_where(dark, STATUS_LOW_SIGNAL) | flag_where(cut & ~dark, STATUS_OUT_OF_RANGE) |
-                       common_flags(profiles, gravity->peak, gravity->lost);
-    store_reading(to, first, sample, gravity->position, gravity->peak, gravity->lit, gravity->total, flags);
+                       common_flags(profiles, centroid->peak, centroid->not_finite);
+    store_reading(to, first, sample, centroid->position, centroid->peak, centroid->width, centroid->total, flags);
 }
 #else
-inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place *found, constant real *p,
-                        const Outputs *to, ulong first, int sample) {
+static inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place *found,
+                               constant LineTable *table, const Outputs *to, ulong first, int sample) {
     const Place place = middle_of_wide_top(peak, *found);
     const ints cut = cut_lanes(profiles, peak) & peak->found;
-    ints flags = place.flags | common_flags(profiles, peak->level, peak->lost);
+    ints flags = place.flags | common_flags(profiles, peak->level, peak->not_finite);
     flags |= flag_where(~peak->found, STATUS_LOW_SIGNAL) | flag_where(cut, STATUS_OUT_OF_RANGE);
 #ifdef AMBIGUITY
-    flags |= flag_where(has_second(profiles, peak, p[AMBIGUOUS_RATIO]) & peak->found, STATUS_AMBIGUOUS);
+    flags |= flag_where(has_second(profiles, peak, table->ambiguous_ratio) & peak->found, STATUS_AMBIGUOUS);
 #endif
-#ifdef WITH_LIT
+#ifdef COUNT_WIDTH
     const reals width = run_length(profiles, peak);
 #else
     const reals width = 0;
@@ -113,14 +140,14 @@ inline void finish_peak(const Profiles *profiles, const Peak *peak, const Place 
     store_reading(to, first, sample, to_reals(peak->at) + place.at, peak->level, width, total, flags);
 }
 
-// The window of every lane by itself, by any method.
-inline Place place_apart(const Profiles *profiles, Peak *peak, constant real *p) {
+// Copy the window of every lane and estimate the position in it, by any of the methods.
+static inline Place place_in_window(const Profiles *profiles, Peak *peak, constant LineTable *table) {
     CODE window[(2 * REACH + 1) * LANES];
-    settle(profiles, peak, REACH, window);
+    gather_centred(profiles, peak, REACH, window);
 #if defined(METHOD_WINDOWED)
-    return window_gravity(window, REACH, profiles, peak);
+    return window_centroid(window, REACH, profiles, peak);
 #elif defined(METHOD_ML)
-    return likeliest_place(window, profiles, peak, p + READ_VARIANCE);
+    return fit_gaussian(window, profiles, peak, table);
 #else
     return place_by_points(window, profiles, peak);
 #endif
@@ -131,86 +158,91 @@ inline Place place_apart(const Profiles *profiles, Peak *peak, constant real *p)
 #include "line/line_strip.h"
 #endif
 
-#define ARGUMENTS                                                                                                      \
-    global const CODE *restrict frames, INPUT_PREVIOUS global real *restrict position, global real *restrict peak,     \
-        global real *restrict width, global real *restrict total, global uchar *restrict status,                       \
-        global real *restrict g, global real *restrict h, const int rows, const int columns, const CODE threshold,     \
-        const CODE saturation, const CODE minimum, constant real *p, constant real *sheet
-#ifdef SELECT_NEAREST
-#define INPUT_PREVIOUS global const real *restrict previous,
-#else
-#define INPUT_PREVIOUS
-#endif
-#define OUTPUTS {position, peak, width, total, status, g, h, sheet}
+// The LANES profiles of a frame from profile `sample` on.
+static inline Profiles profiles_from(const Profiles *frame, int sample) {
+    Profiles profiles = *frame;
+    profiles.first += (long)sample * frame->lane_stride;
+    return profiles;
+}
 
-#ifdef ALONG_ROWS
-#define LENGTH columns
-#define SAMPLES rows
-#define STRIDE 1
-#define LANE_STRIDE columns
-#else
-#define LENGTH rows
-#define SAMPLES columns
-#define STRIDE columns
-#define LANE_STRIDE 1
-#endif
-
-// The LANES profiles from a given one on.
-#define PROFILES_FROM(sample)                                                                                          \
-    {frames + (ulong)frame * rows * columns + (long)(sample) * LANE_STRIDE,                                            \
-     STRIDE, LANE_STRIDE, LENGTH, threshold, saturation, minimum}
-
+// read_frame: read the part of a frame that this work-item processes. `first` is the element of the frame's first
+// profile in the outputs.
 #if defined(CANDIDATES) || (!defined(VECTOR_VARIANT) && !defined(METHOD_CENTROID))
-// LANES profiles, by a walk along them. Items beyond the last profile fill up a work-group.
-kernel void line_readout(ARGUMENTS) {
-    const Outputs to = OUTPUTS;
-    const int frame = get_global_id(1), sample = min((int)get_global_id(0) * LANES, SAMPLES - LANES);
-    if ((int)get_global_id(0) * LANES >= SAMPLES) return;
-    const Profiles profiles = PROFILES_FROM(sample);
-    const ulong first = (ulong)frame * SAMPLES + sample;
+// LANES profiles, by a walk along them. Work-items beyond the last profile only fill up a work-group.
+static inline void read_frame(const Profiles *frame, int samples, constant LineTable *table, const Outputs *to,
+                              ulong first, global const real *previous) {
+    const int sample = min((int)get_global_id(0) * LANES, samples - LANES);
+    if ((int)get_global_id(0) * LANES >= samples) return;
+    const Profiles profiles = profiles_from(frame, sample);
 #ifdef CANDIDATES
     ints nearest = -1;
 #ifdef SELECT_NEAREST
-    const reals before = *(global const reals_at *)(previous + first);
-    nearest = choose_ints(REAL_MASK(before >= 0) & REAL_MASK(before < (real)LENGTH), to_ints(rint(before)), -1);
+    const reals before = *(global const reals_at *)(previous + first + sample);
+    const ints known = int_mask(before >= 0) & int_mask(before < (real)frame->length);
+    nearest = choose_ints(known, to_ints(rint(before)), -1);
 #endif
-    Peak found = choose_peak(&profiles, nearest, (int)p[MIN_WIDTH], (int)p[MAX_WIDTH]);
+    Peak found = select_peak(&profiles, nearest, (int)table->min_width, (int)table->max_width);
 #else
     Peak found = strongest_peak(&profiles);
 #endif
-    const Place place = place_apart(&profiles, &found, p);
-    finish_peak(&profiles, &found, &place, p, &to, first, sample);
+    const Place place = place_in_window(&profiles, &found, table);
+    finish_peak(&profiles, &found, &place, table, to, first + sample, sample);
 }
 
-#elif defined(METHOD_CENTROID) && !defined(VECTOR_VARIANT)
-kernel void line_readout(ARGUMENTS) {
-    const Outputs to = OUTPUTS;
-    const int frame = get_global_id(1), sample = get_global_id(0);
-    if (sample >= SAMPLES) return;
-    const Profiles profiles = PROFILES_FROM(sample);
-    const Gravity gravity = whole_gravity(&profiles);
-    finish_whole(&profiles, &gravity, p, &to, (ulong)frame * SAMPLES + sample, sample);
+#elif !defined(VECTOR_VARIANT)
+// The centroid of one profile.
+static inline void read_frame(const Profiles *frame, int samples, constant LineTable *table, const Outputs *to,
+                              ulong first, global const real *previous) {
+    const int sample = get_global_id(0);
+    if (sample >= samples) return;
+    const Profiles profiles = profiles_from(frame, sample);
+    const Centroid centroid = profile_centroid(&profiles);
+    finish_centroid(&profiles, &centroid, table, to, first + sample, sample);
 }
 
 #elif !defined(ALONG_ROWS)
-// A strip of columns, from the first row to the last: blocks of rows outside, groups of WIDE columns inside, so that
-// memory is read nearly in sequence while the sums of a group stay in registers.
-kernel void line_readout(ARGUMENTS) {
-    const Outputs to = OUTPUTS;
-    const int strips = get_global_size(0), frame = get_global_id(1);
-    const int strip = ((columns + strips - 1) / strips + WIDE - 1) / WIDE * WIDE;
-    const int begin = (int)get_global_id(0) * strip, end = min(begin + strip, columns);
-    const Profiles profiles = PROFILES_FROM(0);
+// A strip of columns, in parts of at most MAX_STRIP columns. Memory is read nearly in sequence, while the sums of a
+// group of columns stay in registers.
+static inline void read_frame(const Profiles *frame, int samples, constant LineTable *table, const Outputs *to,
+                              ulong first, global const real *previous) {
+    const int strips = get_global_size(0);
+    const int strip = ((samples + strips - 1) / strips + WIDE - 1) / WIDE * WIDE;
+    const int begin = (int)get_global_id(0) * strip, end = min(begin + strip, samples);
     for (int part = begin; part < end; part += MAX_STRIP) {
-        read_strip(&profiles, part, min(part + MAX_STRIP, end), p, &to, (ulong)frame * columns);
+        read_strip(frame, part, min(part + MAX_STRIP, end), table, to, first);
     }
 }
+
 #else
-// Sixteen rows.
-kernel void line_readout(ARGUMENTS) {
-    const Outputs to = OUTPUTS;
-    const int frame = get_global_id(1), sample = min((int)get_global_id(0) * LANES, SAMPLES - LANES);
-    const Profiles profiles = PROFILES_FROM(sample);
-    read_rows(&profiles, p, &to, (ulong)frame * SAMPLES + sample, sample);
+// 16 rows; the last work-item moves back to end with the last row.
+static inline void read_frame(const Profiles *frame, int samples, constant LineTable *table, const Outputs *to,
+                              ulong first, global const real *previous) {
+    const int sample = min((int)get_global_id(0) * LANES, samples - LANES);
+    const Profiles profiles = profiles_from(frame, sample);
+    read_rows(&profiles, table, to, first + sample, sample);
 }
 #endif
+
+kernel void line_readout(global const CODE *restrict frames,
+#ifdef SELECT_NEAREST
+                         global const real *restrict previous,
+#endif
+                         global real *restrict position, global real *restrict peak, global real *restrict width,
+                         global real *restrict total, global uchar *restrict status, global real *restrict g,
+                         global real *restrict h, const int rows, const int columns, const CODE threshold,
+                         const CODE saturation, const CODE minimum, constant LineTable *table,
+                         constant SheetTable *sheet) {
+#ifndef SELECT_NEAREST
+    global const real *previous = 0;
+#endif
+#ifdef ALONG_ROWS
+    const int samples = rows, length = columns, stride = 1, lane_stride = columns;
+#else
+    const int samples = columns, length = rows, stride = columns, lane_stride = 1;
+#endif
+    const ulong number = get_global_id(1);
+    const Profiles frame = {frames + number * rows * columns, stride, lane_stride, length,
+                            threshold,                        saturation, minimum};
+    const Outputs to = {position, peak, width, total, status, g, h, sheet};
+    read_frame(&frame, samples, table, &to, number * samples, previous);
+}

@@ -1,47 +1,56 @@
-// The walks of the wide shape: a strip of columns, or sixteen rows. Included by line.cl, whose finish_... they call.
+// Vector variant of the line readout: a strip of columns (read_strip), or 16 rows under ALONG_ROWS (read_rows).
+// Included by line.cl, whose finish_centroid and finish_peak write the readings.
 #ifndef LINE_STRIP_H
 #define LINE_STRIP_H
 
-#define MAX_STRIP 1024  // columns whose sums stay in the first cache
+#define MAX_STRIP 1024  // columns whose sums fit the first-level cache (_STRIP in gpuvision/ranging/line.py)
 #define MAX_GROUPS (MAX_STRIP / WIDE)
 
-// Group of WIDE columns: the last one moves back to end with the frame, and does some columns twice.
-inline int group_start(int begin, int group, int columns) { return min(begin + group * WIDE, columns - WIDE); }
+// First column of a group of WIDE columns. The last group of a frame is moved back to end with the frame, and some
+// columns are read twice.
+static inline int group_start(int begin, int group, int columns) { return min(begin + group * WIDE, columns - WIDE); }
 
-// The rows from a given one on, in the columns of a strip.
-inline Ahead ahead_of(global const CODE *at, int width, int columns) {
+// Prefetch the rows from `at` on, `width` columns of each.
+static inline Ahead prefetch_from(global const CODE *at, int width, int columns) {
     const Ahead ahead = {at, at + width, columns - width, width};
     return ahead;
 }
 
-#ifdef METHOD_CENTROID
+// The 16 profiles of quarter i % QUARTERS of group i / QUARTERS in a strip; `sample` is the first one's column.
+static inline Profiles profiles_of_quarter(const Profiles *frame, int begin, int i, int *sample) {
+    Profiles profiles = *frame;
+    *sample = group_start(begin, i / QUARTERS, frame->stride) + i % QUARTERS * 16;
+    profiles.first += *sample;
+    return profiles;
+}
 
-#ifndef ALONG_ROWS
-inline void read_strip(const Profiles *frame, int begin, int end, constant real *p, const Outputs *to, ulong first) {
+#if defined(METHOD_CENTROID) && !defined(ALONG_ROWS)
+// Read the columns begin <= column < end, at most MAX_STRIP: blocks of STEPS rows outside, groups of WIDE columns
+// inside.
+static inline void read_strip(const Profiles *frame, int begin, int end, constant LineTable *table, const Outputs *to,
+                              ulong first) {
     WideSums sums[MAX_GROUPS];
     const int columns = frame->stride, groups = (end - begin + WIDE - 1) / WIDE;
     for (int i = 0; i < groups; i++) clear_sums(&sums[i]);
     for (int row = 0; row < frame->length; row += STEPS) {
         global const CODE *at = frame->first + (long)row * columns;
         const int steps = min(STEPS, frame->length - row);
-        Ahead ahead = ahead_of(at + (long)BLOCKS_AHEAD * STEPS * columns + begin, groups * WIDE, columns);
+        Ahead ahead = prefetch_from(at + (long)BLOCKS_AHEAD * STEPS * columns + begin, groups * WIDE, columns);
         for (int i = 0; i < groups; i++) {
             add_steps(&sums[i], at + group_start(begin, i, columns), columns, steps, row, frame->threshold, &ahead);
         }
     }
     for (int i = 0; i < groups * QUARTERS; i++) {
-        const int sample = group_start(begin, i / QUARTERS, columns) + i % QUARTERS * 16;
-        const Gravity gravity = wide_gravity(&sums[i / QUARTERS], i % QUARTERS);
-        Profiles profiles = *frame;
-        profiles.first += sample;
-        finish_whole(&profiles, &gravity, p, to, first + sample, sample);
+        int sample;
+        const Profiles profiles = profiles_of_quarter(frame, begin, i, &sample);
+        const Centroid centroid = wide_centroid(&sums[i / QUARTERS], i % QUARTERS);
+        finish_centroid(&profiles, &centroid, table, to, first + sample, sample);
     }
 }
 
-#else
-
-// Sums along one row, lane by lane in steps of WIDE samples, then over the lanes and the rest of the row.
-inline void read_row(global const CODE *row, int length, CODE threshold, RowSums *sums, Ahead *ahead) {
+#elif defined(METHOD_CENTROID)
+// Sum a row lane by lane in steps of WIDE samples, then combine the lanes and add the remainder of the row.
+static inline void read_row(global const CODE *row, int length, CODE threshold, RowSums *sums, Ahead *ahead) {
     WideSums wide;
     clear_sums(&wide);
     const int blocks = length / WIDE;
@@ -52,95 +61,93 @@ inline void read_row(global const CODE *row, int length, CODE threshold, RowSums
     for (int k = blocks * WIDE; k < length; k++) add_sample(sums, row[k], k, threshold);
 }
 
-inline void read_rows(const Profiles *profiles, constant real *p, const Outputs *to, ulong first, int sample) {
+// Read 16 rows.
+static inline void read_rows(const Profiles *profiles, constant LineTable *table, const Outputs *to, ulong first,
+                             int sample) {
     RowSums rows[LANES];
     for (int i = 0; i < LANES; i++) {
         global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
         global const CODE *later = row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride;
-        Ahead ahead = ahead_of(later, profiles->length, profiles->length);
+        Ahead ahead = prefetch_from(later, profiles->length, profiles->length);
         read_row(row, profiles->length, profiles->threshold, &rows[i], &ahead);
     }
-    const Gravity gravity = row_gravity(rows);
-    finish_whole(profiles, &gravity, p, to, first, sample);
+    const Centroid centroid = row_centroid(rows);
+    finish_centroid(profiles, &centroid, table, to, first, sample);
 }
-#endif
 
-#else
-
-#ifndef ALONG_ROWS
-
-// Sixteen columns of which the peaks' levels and blocks are known.
-inline void finish_group(const Profiles *profiles, const WidePeak *wide, int i, int tall, constant real *p,
-                         const Outputs *to, ulong first, int sample) {
+#elif !defined(ALONG_ROWS)
+// Finish the 16 columns of quarter i, given the level and the block of their peaks.
+static inline void finish_quarter(const Profiles *profiles, const WidePeak *wide, int i, int tall,
+                                  constant LineTable *table, const Outputs *to, ulong first, int sample) {
     Peak peak;
     peak.level = ((const codes *)&wide->level)[i];
     peak.found = ~dark_lanes(profiles, peak.level);
-    peak.lost = 0;
+    peak.not_finite = 0;
 #if CODE_BITS == 32
-    peak.lost = not_finite_lanes(to_reals(wide->lost));
+    peak.not_finite = not_finite_lanes(to_reals(wide->poison));
 #endif
     const ints block = convert_int16(((const step_lanes16 *)&wide->block)[i]);
     Span span = span_of(block * tall, peak.found, 0, tall - 1, profiles->length);
     const int together = span.end - span.begin <= SPAN_LIMIT + tall;
     Place place;
-    if (!any(peak.found)) {
+    if (!any_int_lane(peak.found)) {
         peak.at = 0;
         peak.top = 1;
         place.at = place.total = 0;
         place.flags = 0;
     } else {
-        peak.at = together ? locate(profiles, peak.level, span) : locate_apart(profiles, peak.level, block, tall);
+        peak.at = together ? first_row(profiles, peak.level, span) : first_row_apart(profiles, peak.level, block, tall);
 #ifdef METHOD_WINDOWED
-        place = together ? gravity_together(profiles, &peak) : place_apart(profiles, &peak, p);
+        place = together ? centroid_together(profiles, &peak) : place_in_window(profiles, &peak, table);
 #else
-        place = place_apart(profiles, &peak, p);
+        place = place_in_window(profiles, &peak, table);
 #endif
     }
-    finish_peak(profiles, &peak, &place, p, to, first, sample);
+    finish_peak(profiles, &peak, &place, table, to, first, sample);
 }
 
-inline void read_strip(const Profiles *frame, int begin, int end, constant real *p, const Outputs *to, ulong first) {
+// Read the columns begin <= column < end, at most MAX_STRIP.
+static inline void read_strip(const Profiles *frame, int begin, int end, constant LineTable *table, const Outputs *to,
+                              ulong first) {
     WidePeak peaks[MAX_GROUPS];
     const int columns = frame->stride, groups = (end - begin + WIDE - 1) / WIDE;
-    // A block's number fits a byte: blocks of taller frames have more rows.
+    // The number of a block fits a byte: blocks of taller frames have more rows.
     const int tall = STEPS * (frame->length / (255 * STEPS) + 1);
     for (int i = 0; i < groups; i++) clear_peak(&peaks[i]);
     for (int row = 0; row < frame->length; row += tall) {
         global const CODE *at = frame->first + (long)row * columns;
         const int steps = min(tall, frame->length - row);
-        Ahead ahead = ahead_of(at + (long)BLOCKS_AHEAD * tall * columns + begin, groups * WIDE, columns);
+        Ahead ahead = prefetch_from(at + (long)BLOCKS_AHEAD * tall * columns + begin, groups * WIDE, columns);
         for (int i = 0; i < groups; i++) {
             find_steps(&peaks[i], at + group_start(begin, i, columns), columns, steps, row / tall, &ahead);
         }
     }
     for (int i = 0; i < groups * QUARTERS; i++) {
-        const int sample = group_start(begin, i / QUARTERS, columns) + i % QUARTERS * 16;
-        Profiles profiles = *frame;
-        profiles.first += sample;
-        finish_group(&profiles, &peaks[i / QUARTERS], i % QUARTERS, tall, p, to, first + sample, sample);
+        int sample;
+        const Profiles profiles = profiles_of_quarter(frame, begin, i, &sample);
+        finish_quarter(&profiles, &peaks[i / QUARTERS], i % QUARTERS, tall, table, to, first + sample, sample);
     }
 }
 
 #else
-
-inline void read_rows(const Profiles *profiles, constant real *p, const Outputs *to, ulong first, int sample) {
-    int at[LANES], lost[LANES];
+// Read 16 rows.
+static inline void read_rows(const Profiles *profiles, constant LineTable *table, const Outputs *to, ulong first,
+                             int sample) {
+    int at[LANES], not_finite_mask[LANES];
     CODE level[LANES];
     for (int i = 0; i < LANES; i++) {
         global const CODE *row = profiles->first + (long)i * profiles->lane_stride;
         global const CODE *later = row + (long)BLOCKS_AHEAD * LANES * profiles->lane_stride;
-        Ahead ahead = ahead_of(later, profiles->length, profiles->length);
-        find_in_row(row, profiles->length, &at[i], &level[i], &lost[i], &ahead);
+        Ahead ahead = prefetch_from(later, profiles->length, profiles->length);
+        find_in_row(row, profiles->length, &at[i], &level[i], &not_finite_mask[i], &ahead);
     }
     Peak peak;
     peak.at = *(const ints_at *)at;
     peak.level = *(const codes_at *)level;
-    peak.lost = *(const ints_at *)lost;
+    peak.not_finite = *(const ints_at *)not_finite_mask;
     peak.found = ~dark_lanes(profiles, peak.level);
-    const Place place = place_apart(profiles, &peak, p);
-    finish_peak(profiles, &peak, &place, p, to, first, sample);
+    const Place place = place_in_window(profiles, &peak, table);
+    finish_peak(profiles, &peak, &place, table, to, first, sample);
 }
-
-#endif
 #endif
 #endif

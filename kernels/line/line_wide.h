@@ -1,24 +1,28 @@
-// 64 bytes of neighbouring samples at once: one cache line, the shape in which a CPU runtime reads memory best.
+// Wide vectors: WIDE neighbouring samples (64 bytes, one cache line) at once, the unit in which a CPU reads memory
+// best.
 //
-// Vectors of 32 and 64 elements are the compiler's (clang's, as in every CPU runtime), beyond OpenCL C's 16. Only
-// builds under VECTOR_VARIANT include this file.
+// Vectors of 32 and 64 elements are an extension of clang, which all CPU runtimes use; OpenCL C ends at 16. Only builds
+// under VECTOR_VARIANT include this file. A wide vector consists of QUARTERS groups of 16 lanes.
+// Build options: PREFETCH fetches memory ahead of its use.
 #ifndef LINE_WIDE_H
 #define LINE_WIDE_H
 
 #include "line/line_profiles.h"
 
 #define WIDE (512 / CODE_BITS)
-#define QUARTERS (WIDE / 16)  // groups of 16 lanes in it
+#define QUARTERS (WIDE / 16)
 
+// wides: samples. wide_steps: a small number per sample. wide_pairs: the samples of a wide vector taken two by two as
+// numbers of double width. step_lanes16: 16 lanes of wide_steps.
 #if CODE_BITS == 8
 typedef uchar wides __attribute__((ext_vector_type(64)));
 typedef uchar wide_steps __attribute__((ext_vector_type(64)));
-typedef ushort halves __attribute__((ext_vector_type(32)));
+typedef ushort wide_pairs __attribute__((ext_vector_type(32)));
 typedef uchar16 step_lanes16;
 #elif CODE_BITS == 16
 typedef ushort wides __attribute__((ext_vector_type(32)));
 typedef ushort wide_steps __attribute__((ext_vector_type(32)));
-typedef uint16 halves;
+typedef uint16 wide_pairs;
 typedef ushort16 step_lanes16;
 #else
 typedef float16 wides;
@@ -27,23 +31,23 @@ typedef int16 step_lanes16;
 #endif
 typedef wides wides_at __attribute__((aligned(sizeof(CODE))));
 
-inline wides wide_load(global const CODE *at) { return *(global const wides_at *)at; }
+static inline wides wide_load(global const CODE *at) { return *(global const wides_at *)at; }
 
-// Into the second cache what is needed some blocks later: the hardware does not guess a walk in blocks.
+// Memory is prefetched into the second-level cache a few blocks ahead: the hardware does not predict a walk in blocks.
 #define BLOCKS_AHEAD 4
+static inline void prefetch_line(global const CODE *at) {
 #ifdef PREFETCH
-#define prefetch_line(at) __builtin_prefetch((const void *)(ulong)(at), 0, 2)
-#else
-#define prefetch_line(at)
+    __builtin_prefetch((const void *)(ulong)at, 0, 2);
 #endif
+}
 
-// Where a later block is fetched from: line by line in the order of memory, whatever order the block is worked in.
+// The next addresses of a block to prefetch, row by row in the order of memory, whatever the order of the computation.
 typedef struct {
-    global const CODE *at, *end;
-    int gap, extent;
+    global const CODE *at, *end;  // next address, and end of the current row of the block
+    int gap, extent;              // elements from the end of a row to the next row, and elements of a row
 } Ahead;
 
-inline void fetch_lines(Ahead *ahead) {
+static inline void prefetch_lines(Ahead *ahead) {
     prefetch_line(ahead->at);
     prefetch_line(ahead->at + WIDE);
     prefetch_line(ahead->at + 2 * WIDE);
@@ -55,12 +59,12 @@ inline void fetch_lines(Ahead *ahead) {
     }
 }
 
-inline int lowest(int16 v) {
+static inline int lowest(int16 v) {
     const int8 a = min(v.lo, v.hi);
     const int4 b = min(a.lo, a.hi);
     const int2 c = min(b.lo, b.hi);
     return min(c.x, c.y);
 }
-inline int highest(int16 v) { return -lowest(-v); }
+static inline int highest(int16 v) { return -lowest(-v); }
 
 #endif

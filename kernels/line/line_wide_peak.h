@@ -1,7 +1,8 @@
-// The strongest samples of wide groups of profiles, and the centre of gravity in the window about them.
+// Strongest samples of WIDE profiles at once (every method but the centroid), and the windowed centroid of 16 of them.
 //
-// Down the columns the walk keeps, of every profile, the strongest sample and the block of rows that it first stood in;
-// 16 profiles at a time are then looked at again in the few rows that matter, unless their peaks lie far apart.
+// Down the columns the walk keeps two numbers per profile: the largest sample, and the number of the block of rows
+// where it first occurred. Then 16 profiles at a time are read again in the few rows around their peaks; together,
+// unless the peaks lie far apart.
 #ifndef LINE_WIDE_PEAK_H
 #define LINE_WIDE_PEAK_H
 
@@ -10,68 +11,81 @@
 
 typedef struct {
     wides level;
-    wide_steps block;  // number of the block of rows that the level first stood in
+    wide_steps block;  // number of the block in which the level first occurred
 #if CODE_BITS == 32
-    wides lost;
+    wides poison;  // 0, or NaN after a sample that is not finite: x * 0 is NaN for infinity and NaN
 #endif
 } WidePeak;
 
-inline void clear_peak(WidePeak *peak) {
+static inline void clear_peak(WidePeak *peak) {
     peak->level = (wides)DARKEST;
     peak->block = 0;
 #if CODE_BITS == 32
-    peak->lost = 0;
+    peak->poison = 0;
 #endif
 }
 
-inline void find_steps(WidePeak *peak, global const CODE *at, int stride, int steps, int block, Ahead *ahead) {
-    wides level = (wides)DARKEST;
+// Largest sample of one block, and a test for samples that are not finite.
+typedef struct {
+    wides level;
 #if CODE_BITS == 32
-    wides lost = peak->lost;
-#define STEP_LOST(x) lost += x * 0;
-#else
-#define STEP_LOST(x)
+    wides poison;
 #endif
-#define FIND_STEP                                                                                                      \
-    {                                                                                                                  \
-        const wides x = wide_load(at);                                                                                 \
-        at += stride;                                                                                                  \
-        level = x > level ? x : level;                                                                                 \
-        STEP_LOST(x)                                                                                                   \
-    }
+} BlockPeak;
+
+static inline void find_step(BlockPeak *block, wides x) {
+    block->level = x > block->level ? x : block->level;
+#if CODE_BITS == 32
+    block->poison += x * 0;
+#endif
+}
+
+// Search a block of `steps` samples in every lane: the first at `at`, the next ones `stride` elements further.
+static inline void find_steps(WidePeak *peak, global const CODE *at, int stride, int steps, int number, Ahead *ahead) {
+    BlockPeak block;
+    block.level = (wides)DARKEST;
+#if CODE_BITS == 32
+    block.poison = peak->poison;
+#endif
     int k = 0;
     for (; k + 4 <= steps; k += 4) {
-        FIND_STEP FIND_STEP FIND_STEP FIND_STEP fetch_lines(ahead);
+        find_step(&block, wide_load(at));
+        find_step(&block, wide_load(at + stride));
+        find_step(&block, wide_load(at + 2 * (long)stride));
+        find_step(&block, wide_load(at + 3 * (long)stride));
+        at += 4 * (long)stride;
+        prefetch_lines(ahead);
     }
-    for (; k < steps; k++) FIND_STEP
-    peak->block = level > peak->level ? (wide_steps)block : peak->block;
-    peak->level = level > peak->level ? level : peak->level;
+    for (; k < steps; k++, at += stride) find_step(&block, wide_load(at));
+    peak->block = block.level > peak->level ? (wide_steps)number : peak->block;
+    peak->level = block.level > peak->level ? block.level : peak->level;
 #if CODE_BITS == 32
-    peak->lost = lost;
+    peak->poison = block.poison;
 #endif
 }
 
-#define NO_INDEX (1 << 24)
+#define NO_INDEX (1 << 24)  // larger than any index
 
 #ifndef ALONG_ROWS
 
-// Rows begin <= row < end.
+// The rows begin <= row < end.
 typedef struct {
     int begin, end;
 } Span;
 
-// From the first to the last of the lanes' rows that are found, and a margin either side.
-inline Span span_of(ints rows, ints found, int before, int after, int length) {
+// Span of rows from the first to the last row of the lanes that are found, with a margin before and after.
+static inline Span span_of(ints rows, ints found, int before, int after, int length) {
     Span span;
     span.begin = max(lowest(choose_ints(found, rows, NO_INDEX)) - before, 0);
     span.end = min(highest(choose_ints(found, rows, -NO_INDEX)) + after + 1, length);
     return span;
 }
 
-// Peaks further apart than this are worked on lane by lane.
+// Rows of the span above which the lanes are processed one by one.
 #define SPAN_LIMIT (4 * WINDOW + 64)
 
-// Narrow where it suffices: a row's index, and sums over the window.
+// Integer types of a row index and of the sums over a window: 16 bits where they suffice. Bytes and RADIUS <= 15: the
+// total is at most 31 * 255 = 7905, the moment at most 255 * (1 + ... + 15) = 30600 < 2^15.
 #if CODE_BITS == 8 && RADIUS <= 15
 typedef short16 indices;
 typedef short16 sums16;
@@ -93,8 +107,8 @@ typedef int16 sums16;
 #endif
 #endif
 
-// The first row in the span whose sample is the level.
-inline ints locate(const Profiles *profiles, codes level, Span span) {
+// First row of the span whose sample equals the level, in every lane.
+static inline ints first_row(const Profiles *profiles, codes level, Span span) {
     indices at = (indices)span.begin;
     for (int k = span.end - 1; k >= span.begin; k--) {
         at = to_indices(sample_of(profiles, k) == level) ? (indices)k : at;
@@ -102,8 +116,8 @@ inline ints locate(const Profiles *profiles, codes level, Span span) {
     return convert_int16(at);
 }
 
-// The same for lanes whose peaks lie far apart: each one in its own block.
-inline ints locate_apart(const Profiles *profiles, codes level, ints block, int tall) {
+// The same for lanes whose peaks lie far apart: each lane searches its own block of `tall` rows.
+static inline ints first_row_apart(const Profiles *profiles, codes level, ints block, int tall) {
     int first[LANES];
     CODE levels[LANES];
     *(ints_at *)first = block * tall;
@@ -116,12 +130,15 @@ inline ints locate_apart(const Profiles *profiles, codes level, ints block, int 
     return *(const ints_at *)first;
 }
 
-// Centre of gravity of all lanes over one span, every lane by a mask in its own window.
-inline Place span_gravity(const Profiles *profiles, const Peak *peak, Span span, ints *top) {
+// Windowed centroid of all lanes over one span of rows. Each lane takes the rows of its own window by a mask. A signed
+// offset o is in the window where o + RADIUS <= 2 * RADIUS as unsigned numbers. Also count the flat top: the first
+// offset past it is the smallest unsigned offset whose sample differs from the peak (negative offsets are large
+// unsigned numbers; an equal sample has all bits set by the OR with its mask).
+static inline Place span_centroid(const Profiles *profiles, const Peak *peak, Span span, ints *top) {
     const indices at = to_indices(peak->at);
     sums16 total = 0, moment = 0;
     indices offset = (indices)span.begin - at;
-    unsigned_indices past = as_unsigned((indices)-1);  // the first offset past the flat top; unsigned, none before it is
+    unsigned_indices past = as_unsigned((indices)-1);  // first offset past the flat top; -1: none yet
     for (int k = span.begin; k < span.end; k++) {
         const codes x = sample_of(profiles, k);
         const indices inside = as_unsigned(offset + (indices)RADIUS) <= (unsigned_indices)(2 * RADIUS);
@@ -144,44 +161,48 @@ inline Place span_gravity(const Profiles *profiles, const Peak *peak, Span span,
     return place;
 }
 
-inline Place gravity_together(const Profiles *profiles, Peak *peak) {
+// Windowed centroid of all lanes over their common span; twice where a flat top moves a peak to its middle.
+static inline Place centroid_together(const Profiles *profiles, Peak *peak) {
     ints top;
     const Span span = span_of(peak->at, peak->found, RADIUS, RADIUS, profiles->length);
-    const Place place = span_gravity(profiles, peak, span, &peak->top);
+    const Place place = span_centroid(profiles, peak, span, &peak->top);
     if (!centre_top(profiles, peak)) return place;
     const Span settled = span_of(peak->at, peak->found, RADIUS, RADIUS, profiles->length);
-    return span_gravity(profiles, peak, settled, &top);
+    return span_centroid(profiles, peak, settled, &top);
 }
 
 #else
 
-// Index of the row's first sample that has the peak's level, which first stood in one of the blocks of WIDE samples.
-inline int locate_in_row(global const CODE *row, CODE level, const WidePeak *peak) {
+// Index of the first sample of the row that equals the level. It lies in the earliest of the blocks of WIDE samples in
+// which the level occurred.
+static inline int locate_in_row(global const CODE *row, CODE level, const WidePeak *peak) {
     int16 block = NO_INDEX, lane = NO_INDEX;
     for (int i = 0; i < QUARTERS; i++) {
-        const ints here = CODE_MASK(((const codes *)&peak->level)[i] == (codes)level);
+        const ints here = int_mask(((const codes *)&peak->level)[i] == (codes)level);
         block = min(block, choose_ints(here, convert_int16(((const step_lanes16 *)&peak->block)[i]), NO_INDEX));
     }
     const int first = lowest(block) * WIDE;
     for (int i = 0; i < QUARTERS; i++) {
-        const ints here = CODE_MASK(*(global const codes_at *)(row + first + 16 * i) == (codes)level);
-        lane = min(lane, choose_ints(here, lane_numbers + 16 * i, NO_INDEX));
+        const ints here = int_mask(*(global const codes_at *)(row + first + 16 * i) == (codes)level);
+        lane = min(lane, choose_ints(here, LANE_NUMBERS + 16 * i, NO_INDEX));
     }
-    // A row of nothing but NaN and -infinity may hold no sample of the level.
+    // A row of NaN and -infinity only may have no sample that equals the level.
     return first + min(lowest(lane), WIDE - 1);
 }
 
-inline void find_in_row(global const CODE *row, int length, int *at, CODE *level, int *lost, Ahead *ahead) {
+// Find the largest sample of a row, its index, and whether a sample is not finite.
+static inline void find_in_row(global const CODE *row, int length, int *at, CODE *level, int *not_finite_mask,
+                               Ahead *ahead) {
     WidePeak peak;
     clear_peak(&peak);
     const int blocks = length / WIDE;
     for (int block = 0; block < blocks; block++) {
         const wides x = wide_load(row + block * WIDE);
-        if ((block & 3) == 0) fetch_lines(ahead);
+        if ((block & 3) == 0) prefetch_lines(ahead);
         peak.block = x > peak.level ? (wide_steps)block : peak.block;
         peak.level = x > peak.level ? x : peak.level;
 #if CODE_BITS == 32
-        peak.lost += x * 0;
+        peak.poison += x * 0;
 #endif
     }
     codes levels = ((const codes *)&peak.level)[0];
@@ -189,16 +210,16 @@ inline void find_in_row(global const CODE *row, int length, int *at, CODE *level
     const CODE highest = highest_level(levels);
     *at = locate_in_row(row, highest, &peak);
     *level = highest;
-    *lost = 0;
+    *not_finite_mask = 0;
 #if CODE_BITS == 32
-    *lost = any(not_finite_lanes(to_reals(peak.lost))) ? -1 : 0;
+    *not_finite_mask = any(not_finite_lanes(to_reals(peak.poison))) ? -1 : 0;
 #endif
     for (int k = blocks * WIDE; k < length; k++) {
         const CODE x = row[k];
         *at = x > *level ? k : *at;
         *level = x > *level ? x : *level;
 #if CODE_BITS == 32
-        *lost |= -not_finite(x);
+        *not_finite_mask |= -not_finite(x);
 #endif
     }
 }

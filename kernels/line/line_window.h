@@ -1,4 +1,7 @@
-// The window of samples around the peak, and the centre of gravity in it.
+// Window of samples around a peak, flat tops, and the centroid of the light in the window.
+//
+// A window holds the samples [peak - reach, peak + reach] of every lane: sample k of the lanes lies at window[k *
+// LANES]. Build options: RADIUS (samples on either side that count), COUNT_WIDTH (lengths of runs).
 #ifndef LINE_WINDOW_H
 #define LINE_WINDOW_H
 
@@ -7,13 +10,13 @@
 #define WINDOW (2 * RADIUS + 1)
 
 typedef struct {
-    reals at;     // position relative to the peak
-    reals total;  // light over the threshold in the window
+    reals at;     // position relative to the index of the peak
+    reals total;  // light in the window
     ints flags;
 } Place;
 
-// Copies [peak - reach, peak + reach] of every lane side by side; beyond the border its last sample is repeated.
-inline void gather(const Profiles *profiles, ints peak, int reach, CODE *window) {
+// Copy the window of every lane; beyond the border the sample at the border is repeated.
+static inline void gather(const Profiles *profiles, ints peak, int reach, CODE *window) {
     int at[LANES];
     *(ints_at *)at = peak;
     for (int lane = 0; lane < LANES; lane++) {
@@ -31,10 +34,10 @@ inline void gather(const Profiles *profiles, ints peak, int reach, CODE *window)
     }
 }
 
-inline codes window_level(const CODE *window, int k) { return *(const codes_at *)(window + k * LANES); }
+static inline codes window_level(const CODE *window, int k) { return *(const codes_at *)(window + k * LANES); }
 
-// Counts flat tops that reach beyond the window to their ends.
-inline void follow_tops(const Profiles *profiles, Peak *peak) {
+// Count flat tops that extend beyond the window up to their end.
+static inline void follow_tops(const Profiles *profiles, Peak *peak) {
     int at[LANES], top[LANES];
     CODE level[LANES];
     *(ints_at *)at = peak->at;
@@ -50,46 +53,48 @@ inline void follow_tops(const Profiles *profiles, Peak *peak) {
     peak->top = *(const ints_at *)top;
 }
 
-// Moves peaks from the first sample of their flat top to its middle; returns whether any moved.
-inline int centre_top(const Profiles *profiles, Peak *peak) {
-    if (any_lane(INT_MASK(peak->top > RADIUS) & peak->found)) follow_tops(profiles, peak);
+// Move peaks from the first sample of their flat top to its middle; return whether a peak moved.
+static inline int centre_top(const Profiles *profiles, Peak *peak) {
+    if (any_int_lane(int_mask(peak->top > RADIUS) & peak->found)) follow_tops(profiles, peak);
     const ints shift = ((peak->top - 1) >> 1) & peak->found;
     peak->at += shift;
-    return any_lane(INT_MASK(shift > 0));
+    return any_int_lane(int_mask(shift > 0));
 }
 
-// Gathers the window about the middle of the peak's flat top, to which the peak moves.
-inline void settle(const Profiles *profiles, Peak *peak, int reach, CODE *window) {
+// Move the peaks to the middle of their flat tops and copy the windows around them.
+static inline void gather_centred(const Profiles *profiles, Peak *peak, int reach, CODE *window) {
     gather(profiles, peak->at, reach, window);
-    ints run = -1;
+    ints equal = -1;
     peak->top = 0;
     for (int k = 0; k <= RADIUS; k++) {
-        run &= CODE_MASK(window_level(window, k + reach) == peak->level) & INT_MASK(peak->at + k < profiles->length);
-        peak->top -= run;
+        equal &= int_mask(window_level(window, k + reach) == peak->level) & int_mask(peak->at + k < profiles->length);
+        peak->top -= equal;  // a mask is -1
     }
     if (centre_top(profiles, peak)) gather(profiles, peak->at, reach, window);
 }
 
-// Lanes where the border cuts the window, or a flat top wider than it.
-inline ints cut_lanes(const Profiles *profiles, const Peak *peak) {
+// Lanes where the border cuts the window, or cuts a flat top wider than the window.
+static inline ints cut_lanes(const Profiles *profiles, const Peak *peak) {
     const ints begin = peak->at - ((peak->top + 1) >> 1), end = peak->at + (peak->top >> 1) + 1;
-    return INT_MASK(peak->at < RADIUS) | INT_MASK(peak->at + RADIUS >= profiles->length) |
-           (INT_MASK(peak->top > WINDOW) & (INT_MASK(begin < 0) | INT_MASK(end >= profiles->length)));
+    return int_mask(peak->at < RADIUS) | int_mask(peak->at + RADIUS >= profiles->length) |
+           (int_mask(peak->top > WINDOW) & (int_mask(begin < 0) | int_mask(end >= profiles->length)));
 }
 
-// A flat top wider than the window hides all that the methods go by: its middle, flagged as AMBIGUOUS.
-inline Place middle_of_wide_top(const Peak *peak, Place place) {
-    const ints wide = INT_MASK(peak->top > WINDOW) & peak->found;
+// Replace the position by the middle of the flat top, with AMBIGUOUS, where the top is wider than the window: the
+// window then holds no slope to measure.
+static inline Place middle_of_wide_top(const Peak *peak, Place place) {
+    const ints wide = int_mask(peak->top > WINDOW) & peak->found;
     place.at = choose_reals(wide, to_reals((peak->top - 1) & 1) / 2, place.at);
     place.flags = choose_ints(wide, STATUS_AMBIGUOUS, place.flags);
     return place;
 }
 
-// Centre of gravity about the middle of the window; what gather() repeated beyond the border is no light.
-inline Place window_gravity(const CODE *window, int reach, const Profiles *profiles, const Peak *peak) {
+// Centroid of the light in the window, relative to its middle. Samples that gather() repeated beyond the border have no
+// light; peak + k as an unsigned integer is below the length only for indices inside the profile.
+static inline Place window_centroid(const CODE *window, int reach, const Profiles *profiles, const Peak *peak) {
     reals total = 0, moment = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
-        const ints inside = INT_MASK(as_uints(peak->at + k) < (uints)profiles->length);
+        const ints inside = int_mask(as_uints(peak->at + k) < (uints)profiles->length);
         const reals v = choose_reals(inside, over_threshold(window_level(window, k + reach), profiles->threshold), 0);
         total += v;
         moment += v * (real)k;
@@ -101,9 +106,9 @@ inline Place window_gravity(const CODE *window, int reach, const Profiles *profi
     return place;
 }
 
-#ifdef WITH_LIT
-// Samples in the run over the threshold that holds the peak.
-inline reals run_length(const Profiles *profiles, const Peak *peak) {
+#ifdef COUNT_WIDTH
+// Number of samples in the run above the threshold that contains the peak.
+static inline reals run_length(const Profiles *profiles, const Peak *peak) {
     int at[LANES], length[LANES];
     *(ints_at *)at = peak->at;
     *(ints_at *)length = peak->found;

@@ -1,103 +1,107 @@
-// Position sensitive device: a pair of currents -> position, total, status, predicted noise.
+// Position sensitive device (PSD): a pair of currents -> position, total current, status, predicted noise.
 //
-// The currents divide inversely to the distances from the electrodes: u = (L/2)(right - left)/(right + left).
-// Inputs are pairs (left, right) side by side, or under PLANAR all left values before all right ones. CODE is their
-// type, and the unit of everything until it is written out. WITH_... say which outputs are wanted.
-#include "common/lanes.h"
+// The currents divide inversely to the distances from the electrodes (F. de Jong, section 4.2.1):
+//     u = (L/2) (right - left) / (right + left)
+//
+// Inputs:  currents    (samples, 2) INPUT, pairs (left, right); under PLANAR (2, samples): all left, then all right
+// values
+//          table       PsdTable, in units of the input
+//          linearity   (strips, knots) real [m], under LINEARITY: correction added to u
+//          sheet       SheetTable (common/sheet.h), under WITH_SHEET
+// Outputs: (samples,), each one compiled only under its WITH_... option:
+//          position real [m], total real [A], status uchar, sigma real [m] (standard deviation of the position),
+//          g, h real [m] (point in the sheet of light)
+// Build options: INPUT, INPUT16 (float, double or ushort), REAL_IS_DOUBLE, PLANAR, DARK_LEVEL (subtract dark currents),
+//          GAIN (equalise the channels), LINEARITY, SIGNED (a current can be negative or not finite, or the load
+//          resistors shrink the range), WITH_POSITION/TOTAL/STATUS/SIGMA/SHEET/G/H, LENS, LENS_K2, PAST_CACHES,
+//          VECTOR_VARIANT.
+// Work:    vector variant: a work-item processes `each` consecutive samples, the last one up to twice as many less one.
+//          Otherwise: one work-item per sample.
+#include "common/load.h"
 #include "common/sheet.h"
 #include "common/status.h"
 
-// The parameters, as PsdReadout packs them, in the input's unit where none is given.
-#define HALF_LENGTH 0  // L/2 times the correction for the load resistors [m]
-#define LIMIT 1        // what |right - left| / sum is at the strip's ends, load resistors considered
-#define MINIMUM 2      // of the sum
-#define SATURATION 3   // of either channel, dark level included
-#define AMPERE 4       // per unit of the input
-#define DARK_LEFT 5
-#define DARK_RIGHT 6
-#define RIGHT_GAIN 7   // brings the right channel to the left one's gain
-#define INDEPENDENT 8  // noise of each channel, squared
-#define OPPOSED 9      // noise that leaves one electrode and enters the other, squared
-#define COMMON 10      // variance of the place times the sum: a spot of finitely many electrons [m^2]
+// Parameters in units of the input if no other unit is given, in the order of PsdTable in gpuvision/ranging/psd.py.
+typedef struct {
+    real half_length;  // L/2, divided by `limit` [m]
+    real limit;        // |right - left| / sum at the ends of the strip: below 1 with load resistors
+    real minimum;      // smallest sum of a trusted position (exclusive)
+    real saturation;   // of a channel, dark level included
+    real ampere;       // amperes per unit of the input
+    real dark_left, dark_right;
+    real right_gain;   // factor that brings the right channel to the gain of the left one
+    real independent;  // variance of the noise of each channel
+    real opposed;      // variance of noise that leaves one electrode and enters the other
+    real common_noise;  // variance of the position times the sum: shot noise of a spot of finite width [m^2]
+} PsdTable;
 
-#ifdef VECTOR_VARIANT
-#define BLOCK 16  // vectors that are judged together
-typedef CODE16 codes_at __attribute__((aligned(sizeof(CODE))));
-#ifdef REAL_IS_DOUBLE
-#define to_reals convert_double16
-#else
-#define to_reals convert_float16
-#endif
-#else
-typedef CODE codes_at;
-#define to_reals (real)
-#endif
+typedef struct {
+    global const INPUT *currents;
+    global real *position, *total;
+    global uchar *status;
+    global real *sigma, *g, *h;
+    constant PsdTable *table;
+    int samples, strips, knots;
+    global const real *linearity;
+    constant SheetTable *sheet;
+} Readout;
 
-inline reals load(global const CODE *codes) { return to_reals(*(global const codes_at *)codes); }
-
-inline void load_pair(global const CODE *currents, int sample, int samples, reals *left, reals *right) {
+static inline void load_pair(const Readout *io, int sample, reals *left, reals *right) {
 #if defined(PLANAR)
-    *left = load(currents + sample);
-    *right = load(currents + samples + sample);
+    *left = load_reals(io->currents + sample);
+    *right = load_reals(io->currents + io->samples + sample);
 #elif defined(VECTOR_VARIANT)
-    const reals low = load(currents + 2 * sample), high = load(currents + 2 * sample + LANES);
+    global const INPUT *pairs = io->currents + 2 * sample;
+    const reals low = load_reals(pairs), high = load_reals(pairs + LANES);
     *left = (reals)(low.even, high.even);
     *right = (reals)(low.odd, high.odd);
 #else
-    *left = load(currents + 2 * sample);
-    *right = load(currents + 2 * sample + 1);
+    *left = load_reals(io->currents + 2 * sample);
+    *right = load_reals(io->currents + 2 * sample + 1);
 #endif
 }
 
 #ifdef LINEARITY
-// The strip's own correction at place u, linear between knots that divide the strip evenly.
-inline real correction(real u, int strip, global const real *table, int knots, real half_length) {
-    const real place = (u / half_length + 1) * (knots - 1) / 2;
-    const int knot = clamp((int)place, 0, knots - 2);
-    global const real *at = table + strip * knots + knot;
+// Correction at position u of a strip [m]: linear between knots that divide the strip evenly from end to end.
+static inline real correction(real u, int strip, const Readout *io, real half_length) {
+    const real place = (u / half_length + 1) * (io->knots - 1) / 2;
+    const int knot = clamp((int)place, 0, io->knots - 2);
+    global const real *at = io->linearity + strip * io->knots + knot;
     return at[0] + (place - knot) * (at[1] - at[0]);
 }
 
-inline reals corrected(reals u, int sample, int strips, global const real *table, int knots, real half_length) {
+static inline reals corrected(reals u, int sample, const Readout *io) {
+    const real half_length = io->table->half_length * io->table->limit;
 #ifdef VECTOR_VARIANT
     real lane[LANES];
     vstore16(u, 0, lane);
-    for (int k = 0; k < LANES; k++) lane[k] += correction(lane[k], (sample + k) % strips, table, knots, half_length);
+    for (int k = 0; k < LANES; k++) lane[k] += correction(lane[k], (sample + k) % io->strips, io, half_length);
     return vload16(0, lane);
 #else
-    return u + correction(u, sample % strips, table, knots, half_length);
-#endif
-}
-#endif
-
-#ifdef WITH_SHEET
-// The strips' numbers are the sheet's other sensor coordinate.
-inline reals strip_numbers(int sample, int strips) {
-#ifdef VECTOR_VARIANT
-    const int16 at = sample + (int16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-    return LANED(convert_real)(at % strips);
-#else
-    return (real)(sample % strips);
+    return u + correction(u, sample % io->strips, io, half_length);
 #endif
 }
 #endif
 
 #ifdef WITH_SIGMA
-// Standard deviation of the place: independent noise grows towards the ends, opposed noise acts alike everywhere,
-// common noise (the electrons of one spot divide together) leaves only the spot's own width.
-inline reals sigma_of(reals balance, reals sum, constant real *p) {
-    const reals spread = p[INDEPENDENT] * (1 + balance * balance) / 2 + p[OPPOSED];
-    return sqrt(4 * p[HALF_LENGTH] * p[HALF_LENGTH] * spread / (sum * sum) + p[COMMON] / sum);
+// Standard deviation of the position. Independent noise grows towards the ends of the strip. Opposed noise is the same
+// everywhere. Common noise (the electrons of one light spot divide together) leaves the width of the spot.
+static inline reals sigma_of(reals balance, reals sum, constant PsdTable *table) {
+    const reals spread = table->independent * (1 + balance * balance) / 2 + table->opposed;
+    const real length = 4 * table->half_length * table->half_length;
+    return sqrt(length * spread / (sum * sum) + table->common_noise / sum);
 }
 #endif
 
-// Why samples are not good; the weightiest reason comes last. Codes without a dark level are finite and not negative.
-inline masks reasons(reals left, reals right, masks saturated, reals sum, reals difference, constant real *p) {
+// Flags of samples that are not good; a later assignment has priority. Integer codes without a dark level are finite
+// and not negative, so the tests under SIGNED are left out for them.
+static inline masks flags_of(reals left, reals right, masks saturated, reals sum, reals difference,
+                             constant PsdTable *table) {
     masks flags = STATUS_OK;
 #ifdef SIGNED
-    flags = fabs(difference) > p[LIMIT] * sum ? (masks)STATUS_OUT_OF_RANGE : flags;
+    flags = fabs(difference) > table->limit * sum ? (masks)STATUS_OUT_OF_RANGE : flags;
 #endif
-    flags = sum <= p[MINIMUM] ? (masks)STATUS_LOW_SIGNAL : flags;
+    flags = sum <= table->minimum ? (masks)STATUS_LOW_SIGNAL : flags;
     flags |= saturated & STATUS_SATURATED;
 #ifdef SIGNED
     flags = LANED(not_finite)(left) | LANED(not_finite)(right) ? (masks)STATUS_NOT_FINITE : flags;
@@ -105,124 +109,139 @@ inline masks reasons(reals left, reals right, masks saturated, reals sum, reals 
     return flags;
 }
 
-// What is known of a block's samples so far: enough to tell whether all are good.
+// Verdict: summary of a block of samples that tells whether all of them are good.
 #ifdef SIGNED
-typedef masks Verdict;
-#define UNBLEMISHED 0
-inline int is_blemished(Verdict bad, constant real *p) { return any_lane(bad); }
+typedef masks Verdict;  // lanes with a bad sample
+static inline Verdict clean_verdict(void) { return 0; }
+static inline int has_bad(Verdict bad, constant PsdTable *table) { return any_lane(bad); }
 #else
-// Of codes, which are numbers, the extremes suffice: in vectors they cost less than masks.
+// For integer codes the extremes of the block suffice; as vectors they cost less than masks.
 typedef struct {
     reals least_sum, largest_code;
 } Verdict;
-#define UNBLEMISHED {MAXFLOAT, 0}
-inline int is_blemished(Verdict worst, constant real *p) {
-    return any_lane(mask_of(worst.least_sum <= p[MINIMUM]) | mask_of(worst.largest_code >= p[SATURATION]));
+static inline Verdict clean_verdict(void) {
+    const Verdict verdict = {MAXFLOAT, 0};
+    return verdict;
+}
+static inline int has_bad(Verdict worst, constant PsdTable *table) {
+    return any_lane(mask_of(worst.least_sum <= table->minimum) | mask_of(worst.largest_code >= table->saturation));
 }
 #endif
 
-// Reads the sample(s) at `sample`, writes what is asked for there, and adds to the verdict. Unless it is told to be
-// careful it writes as if all were good: the caller comes again where some are not.
-inline void read_out(const int careful, int sample, Verdict *verdict, global const CODE *currents,
-                     global real *position, global real *total, global uchar *status, global real *sigma,
-                     global real *g, global real *h, constant real *p, int samples, global const real *table,
-                     int strips, int knots, constant real *sheet) {
+// Read the LANES samples from `sample` on, write the outputs, and add the samples to the verdict. Without `careful` the
+// outputs are written as if all samples were good: the caller repeats a block that has a bad sample with `careful`.
+static inline void read_samples(const int careful, int sample, const Readout *io, Verdict *verdict) {
+    constant PsdTable *table = io->table;
     reals left, right;
-    load_pair(currents, sample, samples, &left, &right);
+    load_pair(io, sample, &left, &right);
     const reals larger = left > right ? left : right;
-    const masks saturated = mask_of(larger >= p[SATURATION]);
+    const masks saturated = mask_of(larger >= table->saturation);
 #ifdef SIGNED
-    masks good = mask_of(left < p[SATURATION]) & mask_of(right < p[SATURATION]);
+    masks good = mask_of(left < table->saturation) & mask_of(right < table->saturation);
 #else
     masks good = ~saturated;
 #endif
 #ifdef DARK_LEVEL
-    left -= p[DARK_LEFT];
-    right -= p[DARK_RIGHT];
+    left -= table->dark_left;
+    right -= table->dark_right;
 #endif
 #ifdef GAIN
-    right *= p[RIGHT_GAIN];
+    right *= table->right_gain;
 #endif
     const reals sum = left + right, difference = right - left;
-    // Comparisons that hold: NaN fails them, and the saturation limit keeps infinity and an overflowing sum out.
-    good &= mask_of(sum > p[MINIMUM]);
+    // These comparisons are false for NaN. The saturation limit excludes infinity and sums that overflow.
+    good &= mask_of(sum > table->minimum);
 #ifdef SIGNED
-    good &= mask_of(fabs(difference) <= p[LIMIT] * sum);
+    good &= mask_of(fabs(difference) <= table->limit * sum);
     *verdict |= ~good;
 #else
     verdict->least_sum = sum < verdict->least_sum ? sum : verdict->least_sum;
     verdict->largest_code = larger > verdict->largest_code ? larger : verdict->largest_code;
 #endif
     const reals balance = difference / sum;
-    reals u = p[HALF_LENGTH] * balance;
+    reals u = table->half_length * balance;
     masks flags = STATUS_OK;
     if (careful) {
-        flags = reasons(left, right, saturated, sum, difference, p);
+        flags = flags_of(left, right, saturated, sum, difference, table);
         u = nan_where(~good, u);
     }
 #ifdef LINEARITY
-    u = nan_where(~good, corrected(zero_where(~good, u), sample, strips, table, knots, p[HALF_LENGTH] * p[LIMIT]));
+    u = nan_where(~good, corrected(zero_where(~good, u), sample, io));
 #endif
 #ifdef WITH_POSITION
-    store_reals(u, position + sample);
+    store_reals(u, io->position + sample);
 #endif
 #ifdef WITH_TOTAL
-    store_reals(sum * p[AMPERE], total + sample);
+    store_reals(sum * table->ampere, io->total + sample);
 #endif
 #ifdef WITH_SIGMA
-    store_reals(nan_where(~good, sigma_of(balance, sum, p)), sigma + sample);
+    store_reals(nan_where(~good, sigma_of(balance, sum, table)), io->sigma + sample);
 #endif
 #ifdef WITH_SHEET
+    // The number of the strip is the second sensor coordinate.
+    const reals strip = to_reals((sample + LANE_NUMBERS) % io->strips);
     reals at_g, at_h;
-    const bytes lost = LANED(sheet_point)(u, strip_numbers(sample, strips), sheet, &at_g, &at_h);
-    // The sheet sees NaN where the reading was bad: the reason is the reading's own.
+    const bytes lost = sheet_point(u, strip, io->sheet, &at_g, &at_h);
+    // A bad reading is NaN for the sheet; its own flag is the reason, not the sheet's.
     flags |= LANED(convert_bits)(lost) & good;
 #ifdef WITH_G
-    store_reals(at_g, g + sample);
+    store_reals(at_g, io->g + sample);
 #endif
 #ifdef WITH_H
-    store_reals(at_h, h + sample);
+    store_reals(at_h, io->h + sample);
 #endif
 #endif
 #ifdef WITH_STATUS
-    store_bytes(convert_bytes(flags), status + sample);
+    store_bytes(convert_bytes(flags), io->status + sample);
 #endif
 }
 
-kernel void psd_readout(global const CODE *currents, global real *position, global real *total, global uchar *status,
-                        global real *sigma, global real *g, global real *h, constant real *p, int samples, int each,
-                        global const real *table, int strips, int knots, constant real *sheet) {
-    Verdict verdict = UNBLEMISHED;
-#define READ_OUT(careful, sample)                                                                                      \
-    read_out(careful, sample, &verdict, currents, position, total, status, sigma, g, h, p, samples, table, strips,     \
-             knots, sheet)
 #ifdef VECTOR_VARIANT
-    // The last strip takes the remainder too, and its last vector overlaps the one before: no sample is left over,
-    // and no other work-item writes there.
-    int sample = get_global_id(0) * each;
-    const int end = get_global_id(0) + 1 == get_global_size(0) ? samples : sample + each;
-    int all_troubled = 0;
+#define BLOCK 16  // vectors that share a verdict
+
+// Read the samples of a block; return whether one of them is bad.
+static inline int read_block(const int careful, int first, const Readout *io) {
+    Verdict verdict = clean_verdict();
+    for (int k = 0; k < BLOCK; k++) read_samples(careful, first + k * LANES, io, &verdict);
+    return has_bad(verdict, io->table);
+}
+
+// Read the samples begin <= sample < end. Blocks with bad samples come in runs and are rare. Blocks are read quickly,
+// in groups of up to 32; the blocks with a bad sample are noted in the bits of `troubled` and read again with care.
+// Where all blocks of a group were bad, the next group is read with care at once.
+static inline void read_range(int begin, int end, const Readout *io) {
+    int sample = begin, all_troubled = 0;
     while (sample + BLOCK * LANES <= end) {
-        // Blocks with bad samples come in runs and are few: they are noted, and written again with care.
         const int blocks = min((end - sample) / (BLOCK * LANES), 32);
         const uint all = ~0u >> (32 - blocks);
         uint troubled = all_troubled ? all : 0, found = 0;
         for (int block = 0; block < blocks && !all_troubled; block++) {
-            verdict = (Verdict)UNBLEMISHED;
-            for (int k = 0; k < BLOCK; k++) READ_OUT(0, sample + (block * BLOCK + k) * LANES);
-            troubled |= (uint)is_blemished(verdict, p) << block;
+            troubled |= (uint)read_block(0, sample + block * BLOCK * LANES, io) << block;
         }
         for (; troubled; troubled &= troubled - 1) {
             const int block = 31 - clz(troubled & -troubled);
-            verdict = (Verdict)UNBLEMISHED;
-            for (int k = 0; k < BLOCK; k++) READ_OUT(1, sample + (block * BLOCK + k) * LANES);
-            found |= (uint)is_blemished(verdict, p) << block;
+            found |= (uint)read_block(1, sample + block * BLOCK * LANES, io) << block;
         }
         all_troubled = found == all;
         sample += blocks * BLOCK * LANES;
     }
-    for (; sample < end; sample += LANES) READ_OUT(1, min(sample, end - LANES));
+    Verdict unused = clean_verdict();
+    for (; sample < end; sample += LANES) read_samples(1, min(sample, end - LANES), io, &unused);
+}
+#endif
+
+kernel void psd_readout(global const INPUT *currents, global real *position, global real *total, global uchar *status,
+                        global real *sigma, global real *g, global real *h, constant PsdTable *table, int samples,
+                        int each, global const real *linearity, int strips, int knots, constant SheetTable *sheet) {
+    const Readout io = {currents, position, total,   status, sigma, g,        h,
+                        table,    samples,  strips, knots,  linearity, sheet};
+#ifdef VECTOR_VARIANT
+    // The last work-item takes the remainder too, and its last vector overlaps the one before: every sample is covered,
+    // and no other work-item writes there.
+    const int begin = get_global_id(0) * each;
+    read_range(begin, get_global_id(0) + 1 == get_global_size(0) ? samples : begin + each, &io);
 #else
-    READ_OUT(1, get_global_id(0));
+    Verdict unused = clean_verdict();
+    read_samples(1, get_global_id(0), &io, &unused);
 #endif
 }

@@ -1,65 +1,76 @@
-// Profiles over a moving sheet of light -> organised range image: x, y, z per (profile, sample).
+// Range image: profiles over a moving sheet of light -> point (x, y, z) per (profile, sample) in the scene [m].
 //
-// Two geometries:
-//   straight:            point = origin + G g + H h + L d        (g, h in the sheet, L travelled along d)
-//   GEOMETRY_ROTATING:   the ray r = (a, b, 1) of a camera at rest meets the sheet n.(X - p) = e, whose normal turns
-//                        about an axis through p:
-//                        depth = (e + n.p) / (n.r),  point = origin + depth (a ex + b ey + ez)
-// The table is RangeImage.packed in range_image.py, folded on the host in double. INPUT is the profiles' type.
-#include "common/lanes.h"
+// Two geometries (RangeImage in gpuvision/ranging/range_image.py):
+//     straight transport:  point = origin + G e1 + H e2 + L e3     (G, H in the sheet, L travelled along e3)
+// GEOMETRY_ROTATING:   the ray r = (a, b, 1) of a camera at rest meets the sheet n.(X - p) = e, whose normal n turns
+//                          about an axis through p:
+//                          depth = (e + n.p) / (n.r),  point = origin + depth (a e1 + b e2 + e3)
+//
+// Inputs:  g, h        (profiles, samples) INPUT [m]; under GEOMETRY_ROTATING instead: position (profiles, samples)
+// [px]
+//          transport   (profiles,) INPUT [m], or the angle of the sheet [rad]
+//          given       (profiles, samples) uchar: status flags of the readout
+//          table       RangeTable
+// Outputs: x, y, z     (profiles, samples) real [m]; NaN under a flag other than SATURATED and AMBIGUOUS
+// status      (profiles, samples) uchar: the given flags, and NOT_FINITE, NOT_INVERTIBLE, HORIZON, OUT_OF_RANGE Build
+// options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, GEOMETRY_ROTATING, LENS, LENS_K2, PAST_CACHES,
+//          VECTOR_VARIANT.
+// Work:    vector variant: global size (strips of SAMPLES_PER_STRIP samples, profiles), the last strip up to twice as
+// long.
+//          Otherwise: one work-item per sample, (samples, profiles).
 #include "common/lens.h"
+#include "common/load.h"
 #include "common/status.h"
 
-#define SAMPLES_PER_STRIP 1024
-#define BLOCK 8  // vectors that are judged together
-// These flags come with a value; every other one withholds it.
+#define SAMPLES_PER_STRIP 1024  // _STRIP in range_image.py
+#define BLOCK 8                 // vectors that are tested together for bad samples
+// A sample with only these flags keeps its value; every other flag withholds it.
 #define STATUS_INFORMS (STATUS_SATURATED | STATUS_AMBIGUOUS)
 #define STATUS_WITHHOLDS (~STATUS_INFORMS & 0xff)
 
-#define LIMIT_LOW 0
-#define LIMIT_HIGH 3
-#define POINT_ORIGIN 6
-#define POINT_E1 9
-#define POINT_E2 12
-#define POINT_E3 15
-
-#ifdef VECTOR_VARIANT
-#define NEXT_LANES (real16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
-typedef INPUT16 inputs_at __attribute__((aligned(sizeof(INPUT))));
-#else
-#define NEXT_LANES 0
-typedef INPUT inputs_at;
+// Parameters, in the order of RangeTable in range_image.py.
+typedef struct {
+    real low[3], high[3];             // limits of x, y, z [m]
+    real origin[3];                   // of the points
+    real e1[3], e2[3], e3[3];         // axes of the points
+#ifdef GEOMETRY_ROTATING
+    real position_origin, sample_origin, scale;  // a = (position - position_origin) scale, b = (sample - ...) scale
+    real horizon;                     // smallest n.r that counts
+    real normal[9];                   // n = normal[0..2] + normal[3..5] cos(angle) + normal[6..8] sin(angle)
+    real reach[3];                    // e + n.p, in the same way [m]
+#ifdef LENS
+    real lens[5];                     // table of lens.h, for (a, b)
 #endif
-
-inline reals load(global const INPUT *from) { return LANED(convert_real)(*(global const inputs_at *)from); }
+#endif
+} RangeTable;
 
 #ifdef GEOMETRY_ROTATING
 
-#define RAY_POSITION_ORIGIN 18
-#define RAY_SAMPLE_ORIGIN 19
-#define RAY_SCALE 20
-#define SHEET_HORIZON 21
-#define SHEET_NORMAL 22
-#define SHEET_REACH 31
-#define RAY_LENS 34
-
-// What one profile has of its own: the sheet's normal in (position, sample, depth), the depth's numerator, the least
-// denominator, and whether the angle is unknown.
+// Sheet of one profile: its normal along position, sample and depth, the numerator e + n.p of the depth, the smallest
+// denominator n.r, and whether the angle is not finite.
 typedef struct {
     real position, sample, depth, reach, horizon;
     int unknown;
 } Pose;
 
-inline Pose pose_of(real angle, constant real *table) {
+// fixed + cosine_part cos + sine_part sin.
+static inline real turned(real fixed, real cosine_part, real sine_part, real cosine, real sine) {
+    return fixed + cosine_part * cosine + sine_part * sine;
+}
+
+static inline Pose pose_of(real angle, constant RangeTable *table) {
+    constant real *n = table->normal, *reach = table->reach;
     real cosine;
     const real sine = sincos(angle, &cosine);
-#define TURNED(at, step) (table[at] + table[at + step] * cosine + table[at + 2 * step] * sine)
-    Pose pose = {TURNED(SHEET_NORMAL, 3), TURNED(SHEET_NORMAL + 1, 3), TURNED(SHEET_NORMAL + 2, 3),
-                 TURNED(SHEET_REACH, 1), table[SHEET_HORIZON], not_finite(angle)};
-#undef TURNED
-    // A sheet through the pinhole is seen edge-on: no ray meets it.
+    Pose pose = {turned(n[0], n[3], n[6], cosine, sine),
+                 turned(n[1], n[4], n[7], cosine, sine),
+                 turned(n[2], n[5], n[8], cosine, sine),
+                 turned(reach[0], reach[1], reach[2], cosine, sine),
+                 table->horizon,
+                 not_finite(angle)};
+    // The camera sees a sheet through its pinhole edge-on: no ray meets it.
     if (pose.reach == 0) pose.horizon = INFINITY;
-    // What is in front of the camera has depth > 0: turn the normal so that this means a denominator > 0.
+    // In front of the camera the depth is > 0: turn the normal so that the denominator is > 0 there as well.
     if (pose.reach < 0) {
         pose.position = -pose.position;
         pose.sample = -pose.sample;
@@ -69,71 +80,84 @@ inline Pose pose_of(real angle, constant real *table) {
     return pose;
 }
 
-// The point of a light position; `missed` and `folded` say where there is none.
-inline void locate(reals position, reals sample, Pose pose, constant real *table, reals *x, reals *y, reals *z,
-                   masks *missed, masks *folded) {
-    reals a = (position - table[RAY_POSITION_ORIGIN]) * table[RAY_SCALE];
-    reals b = (sample - table[RAY_SAMPLE_ORIGIN]) * table[RAY_SCALE];
+// Compute the point of a light position. `missed`: the ray does not meet the sheet; `folded`: beyond the fold of the
+// lens.
+static inline void locate(reals position, reals sample, Pose pose, constant RangeTable *table, reals *x, reals *y,
+                          reals *z, masks *missed, masks *folded) {
+    reals a = (position - table->position_origin) * table->scale;
+    reals b = (sample - table->sample_origin) * table->scale;
 #ifdef LENS
-    *folded = mask_of(LANED(lens_undistort)(&a, &b, table + RAY_LENS));
+    *folded = mask_of(LANED(lens_undistort)(&a, &b, table->lens));
 #else
     *folded = 0;
 #endif
     const reals facing = pose.position * a + (pose.sample * b + pose.depth);
     const reals depth = pose.reach / facing;
     *missed = ~mask_of(facing > pose.horizon);
-    constant real *e1 = table + POINT_E1, *e2 = table + POINT_E2, *e3 = table + POINT_E3, *o = table + POINT_ORIGIN;
+    constant real *e1 = table->e1, *e2 = table->e2, *e3 = table->e3, *o = table->origin;
     *x = o[0] + depth * (e1[0] * a + (e2[0] * b + e3[0]));
     *y = o[1] + depth * (e1[1] * a + (e2[1] * b + e3[1]));
     *z = o[2] + depth * (e1[2] * a + (e2[2] * b + e3[2]));
 }
 
-#define PROFILES global const INPUT *restrict position, global const INPUT *restrict transport
-#define FIRST(i) load(position + i)
-#define SECOND(i, sample) ((real)(sample) + (reals)NEXT_LANES)
-
 #else
 
-// What one profile has of its own: where its sheet stands, and whether that is unknown.
+// Sheet of one profile: its origin in the scene, and whether the transport is not finite.
 typedef struct {
     real x, y, z;
     int unknown;
 } Pose;
 
-inline Pose pose_of(real travelled, constant real *table) {
-    constant real *d = table + POINT_E3, *o = table + POINT_ORIGIN;
+static inline Pose pose_of(real travelled, constant RangeTable *table) {
+    constant real *d = table->e3, *o = table->origin;
     Pose pose = {o[0] + d[0] * travelled, o[1] + d[1] * travelled, o[2] + d[2] * travelled, not_finite(travelled)};
     return pose;
 }
 
-inline void locate(reals g, reals h, Pose pose, constant real *table, reals *x, reals *y, reals *z, masks *missed,
-                   masks *folded) {
-    constant real *e1 = table + POINT_E1, *e2 = table + POINT_E2;
+// Compute the point of (g, h); no ray misses the sheet here, and no lens folds.
+static inline void locate(reals g, reals h, Pose pose, constant RangeTable *table, reals *x, reals *y, reals *z,
+                          masks *missed, masks *folded) {
+    constant real *e1 = table->e1, *e2 = table->e2;
     *missed = *folded = 0;
     *x = pose.x + (e1[0] * g + e2[0] * h);
     *y = pose.y + (e1[1] * g + e2[1] * h);
     *z = pose.z + (e1[2] * g + e2[2] * h);
 }
 
-#define PROFILES                                                                                                       \
-    global const INPUT *restrict g, global const INPUT *restrict h, global const INPUT *restrict transport
-#define FIRST(i) load(g + i)
-#define SECOND(i, sample) load(h + i)
-
 #endif
 
-// Assembles the sample(s) from element i on, and says which are not good. Unless it is told to be careful it writes as
-// if all were good: the caller comes again where some are not.
-inline masks assemble(const int careful, ulong i, reals first, reals second, Pose pose, global const uchar *given,
-                      global real *out_x, global real *out_y, global real *out_z, global uchar *status,
-                      constant real *table) {
-    constant real *low = table + LIMIT_LOW, *high = table + LIMIT_HIGH;
+// Flags of samples that are not good; a later reason has priority. A sample with a withholding flag gets no further
+// flag.
+static inline masks reasons(masks inside, masks missed, masks folded, masks lost, masks unknown) {
+    masks reason = ~inside & STATUS_OUT_OF_RANGE;
+    reason = (reason & ~lost) | (lost & STATUS_NOT_FINITE);
+    reason = (reason & ~missed) | (missed & STATUS_HORIZON);
+    reason = (reason & ~folded) | (folded & STATUS_NOT_INVERTIBLE);
+    return (reason & ~unknown) | (unknown & STATUS_NOT_FINITE);
+}
+
+// Assemble the LANES samples from element i = row + sample on; return the mask of the samples that are not good.
+// Without `careful` the outputs are written as if all samples were good: the caller repeats a block that has a bad
+// sample with `careful`. The arrays are separate parameters, since `restrict` is lost for pointers in a struct (20 % of
+// the time).
+static inline masks assemble(const int careful, ulong row, uint sample, Pose pose, global const INPUT *first_input,
+                             global const INPUT *second_input, global const uchar *given, global real *out_x,
+                             global real *out_y, global real *out_z, global uchar *status,
+                             constant RangeTable *table) {
+    const ulong i = row + sample;
+    const reals first = load_reals(first_input + i);
+#ifdef GEOMETRY_ROTATING
+    const reals second = (real)sample + to_reals(LANE_NUMBERS);
+#else
+    const reals second = load_reals(second_input + i);
+#endif
     const bytes flags_in = *(global const bytes_at *)(given + i);
     const masks flags = LANED(convert_bits)(flags_in);
     reals x, y, z;
     masks missed, folded;
     locate(first, second, pose, table, &x, &y, &z, &missed, &folded);
-    // Comparisons that hold: NaN fails them, and limits that are finite keep infinity out.
+    // These comparisons are false for NaN, and limits that are finite exclude infinity.
+    constant real *low = table->low, *high = table->high;
     const masks inside = mask_of(x >= low[0]) & mask_of(x <= high[0]) & mask_of(y >= low[1]) & mask_of(y <= high[1]) &
                          mask_of(z >= low[2]) & mask_of(z <= high[2]);
     const masks withheld = mask_of((flags & STATUS_WITHHOLDS) != 0);
@@ -143,12 +167,7 @@ inline masks assemble(const int careful, ulong i, reals first, reals second, Pos
             mask_of(LANED(not_finite)(x)) | mask_of(LANED(not_finite)(y)) | mask_of(LANED(not_finite)(z));
         const masks unknown =
             mask_of(LANED(not_finite)(first)) | mask_of(LANED(not_finite)(second)) | (masks)(pose.unknown ? -1 : 0);
-        // Why a sample is not good; the weightiest reason comes last, and what came in with one keeps it.
-        masks reason = ~inside & STATUS_OUT_OF_RANGE;
-        reason = (reason & ~lost) | (lost & STATUS_NOT_FINITE);
-        reason = (reason & ~missed) | (missed & STATUS_HORIZON);
-        reason = (reason & ~folded) | (folded & STATUS_NOT_INVERTIBLE);
-        reason = (reason & ~unknown) | (unknown & STATUS_NOT_FINITE);
+        const masks reason = reasons(inside, missed, folded, lost, unknown);
         store_bytes(convert_bytes(flags | (reason & ~withheld)), status + i);
         x = nan_where(~good, x);
         y = nan_where(~good, y);
@@ -162,29 +181,51 @@ inline masks assemble(const int careful, ulong i, reals first, reals second, Pos
     return ~good;
 }
 
-// Items: (samples, profiles). Strips: (strips, profiles).
-kernel void assemble_profiles(PROFILES, global const uchar *restrict given, global real *restrict x,
-                              global real *restrict y, global real *restrict z, global uchar *restrict status,
-                              constant real *table, const uint samples) {
+// The same for `vectors` vectors of samples.
+static inline masks assemble_block(const int careful, uint vectors, ulong row, uint sample, Pose pose,
+                                   global const INPUT *first, global const INPUT *second, global const uchar *given,
+                                   global real *x, global real *y, global real *z, global uchar *status,
+                                   constant RangeTable *table) {
+    masks bad = 0;
+    for (uint k = 0; k < vectors; k++) {
+        bad |= assemble(careful, row, sample + k * LANES, pose, first, second, given, x, y, z, status, table);
+    }
+    return bad;
+}
+
+kernel void assemble_profiles(
+#ifdef GEOMETRY_ROTATING
+    global const INPUT *restrict position,
+#else
+    global const INPUT *restrict g, global const INPUT *restrict h,
+#endif
+    global const INPUT *restrict transport, global const uchar *restrict given, global real *restrict x,
+    global real *restrict y, global real *restrict z, global uchar *restrict status, constant RangeTable *table,
+    const uint samples) {
     const uint profile = get_global_id(1);
     const ulong row = (ulong)profile * samples;
     const Pose pose = pose_of((real)transport[profile], table);
-#define ASSEMBLE(careful, sample)                                                                                      \
-    assemble(careful, row + (sample), FIRST(row + (sample)), SECOND(row + (sample), sample), pose, given, x, y, z,     \
-             status, table)
+#ifdef GEOMETRY_ROTATING
+    global const INPUT *first = position, *second = 0;
+#else
+    global const INPUT *first = g, *second = h;
+#endif
 #ifdef VECTOR_VARIANT
-    // The last strip takes the remainder too, and its last vector overlaps the one before: no sample is left over, and
+    // The last strip takes the remainder too, and its last vector overlaps the one before: every sample is covered, and
     // no other work-item writes there.
     uint sample = get_global_id(0) * SAMPLES_PER_STRIP;
     const uint end = get_global_id(0) + 1 == get_global_size(0) ? samples : sample + SAMPLES_PER_STRIP;
     for (; sample + BLOCK * LANES <= end; sample += BLOCK * LANES) {
-        masks bad = 0;
-        for (uint k = 0; k < BLOCK; k++) bad |= ASSEMBLE(0, sample + k * LANES);
-        if (any_lane(bad))
-            for (uint k = 0; k < BLOCK; k++) ASSEMBLE(1, sample + k * LANES);
+        const masks bad =
+            assemble_block(0, BLOCK, row, sample, pose, first, second, given, x, y, z, status, table);
+        if (any_lane(bad)) {
+            assemble_block(1, BLOCK, row, sample, pose, first, second, given, x, y, z, status, table);
+        }
     }
-    for (; sample < end; sample += LANES) ASSEMBLE(1, min(sample, end - LANES));
+    for (; sample < end; sample += LANES) {
+        assemble(1, row, min(sample, end - LANES), pose, first, second, given, x, y, z, status, table);
+    }
 #else
-    ASSEMBLE(1, get_global_id(0));
+    assemble(1, row, get_global_id(0), pose, first, second, given, x, y, z, status, table);
 #endif
 }

@@ -245,15 +245,15 @@ def test_sigmas_against_the_host(
 
 
 FUSED = """
-#include "sheet.h"
+#include "common/sheet.h"
 kernel void fused(global const real *position, global real *g, global real *h, global uchar *status, global real *sigma,
-                  constant real *sheet) {
+                  constant SheetTable *sheet) {
     const size_t i = get_global_id(0);
     real16 at_g, at_h, of_g, of_h;
     const real16 samples = (real)(16 * i) + (real16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
     const real16 at = vload16(i, position);
-    vstore16(sheet_point16(at, samples, sheet, &at_g, &at_h), i, status);
-    sheet_sigma16(at, samples, (real16)0.1, (real16)0.05, sheet, &of_g, &of_h);
+    vstore16(sheet_point(at, samples, sheet, &at_g, &at_h), i, status);
+    sheet_sigma(at, samples, (real16)0.1, (real16)0.05, sheet, &of_g, &of_h);
     vstore16(at_g, i, g);
     vstore16(at_h, i, h);
     vstore16(of_h, i, sigma);

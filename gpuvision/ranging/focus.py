@@ -1,8 +1,9 @@
 """Depth from focus with parallel pinholes: the intensities behind K pinholes give the distance of sharpest focus.
 
-Partly transparent mirrors spread the light of one illuminated point over K pinholes at equally spaced image
-distances (F. de Jong, Figure 2.6). Behind each the intensity falls off like a Gaussian with the defocus; its peak is
-the image distance LI, and the thin lens ``1/f = 1/LI + 1/LO`` (eq. 2.1) turns that into the object distance LO.
+Partly transparent mirrors distribute the light of one illuminated point over K pinholes at equally spaced image
+distances (F. de Jong, Figure 2.6). The intensity behind a pinhole falls off with the defocus like a Gaussian. The peak
+of the Gaussian is the image distance LI, and the thin lens equation ``1/f = 1/LI + 1/LO`` (eq. 2.1) gives the object
+distance LO.
 """
 
 from __future__ import annotations
@@ -19,27 +20,27 @@ from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]
 
-# A parabola through logarithms of equal intensities has a curvature of this many roundings, of either sign.
+# The parabola through the logarithms of equal intensities has a curvature up to this rounding error, of either sign.
 _ROUNDINGS = 16.0 * float(np.finfo(np.float64).eps)
 
 
 class FocusReading(NamedTuple):
-    """What the pinholes say, each array of the batch's shape; NaN where the status is not OK.
+    """Distances from the pinholes: arrays of the shape of the batch; NaN where the status is not OK.
 
     Attributes
     ----------
     image_distance
-        LI, of the sharpest image behind the lens [m].
+        Distance LI of the sharpest image behind the lens [m].
     object_distance
-        LO, of the point in front of the lens [m].
+        Distance LO of the point in front of the lens [m].
     width
         Standard deviation of the Gaussian through the intensities [m].
     sigma_image, sigma_object
-        Predicted standard deviations of LI and LO [m]; None unless ``sigma_intensity`` is known.
+        Predicted standard deviations of LI and LO [m]; ``None`` without ``sigma_intensity``.
     status
-        uint8 `Status` flags: NOT_FINITE; LOW_SIGNAL (fewer than three pinholes above the minimum; with three pinholes:
-        one of them not); AMBIGUOUS (no maximum: equal intensities, or a valley); OUT_OF_RANGE (the peak lies outside
-        the pinholes, or no object in front of the lens has its image there).
+        uint8 `Status` flags: NOT_FINITE; LOW_SIGNAL (fewer than three pinholes are above the minimum); AMBIGUOUS (no
+        maximum: equal intensities, or a valley); OUT_OF_RANGE (the peak lies outside the pinholes, or no object in
+        front of the lens has its image there).
     """
 
     image_distance: Float64
@@ -52,29 +53,29 @@ class FocusReading(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class DepthFromFocus:
-    """Parallel pinholes behind one lens: call it with intensities, shape (..., K).
+    """Depth from focus: parallel pinholes behind one lens; called with intensities of shape (..., K).
 
-    Three pinholes have a closed form: with z from the middle one and spacing d,
-    ``z = d/2 (ln I- - ln I+) / (ln I- - 2 ln I0 + ln I+)``. With more, a parabola is fitted to ln I with weights
-    I^2 (equal noise on every I), or dim pinholes would dominate.
+    For three pinholes the solution is ``z = d/2 (ln I- - ln I+) / (ln I- - 2 ln I0 + ln I+)``, with z measured from the
+    middle pinhole and the spacing d. For more pinholes a parabola is fitted to ln I with weights I^2 (equal noise on
+    every I); without weights dim pinholes would dominate.
 
     Parameters
     ----------
     first
         Image distance of the first pinhole [m].
     spacing
-        Of the pinholes [m].
+        Distance between the pinholes [m].
     focal_length
-        Of the lens, f [m].
+        Focal length f of the lens [m].
     minimum
-        Intensity that a pinhole must exceed to be used.
+        Intensity above which a pinhole is used, in the unit of the intensities, default 0.
     sigma_intensity
-        Standard deviation of an intensity, the same for every pinhole; asks for the sigmas.
+        Standard deviation of an intensity, the same for every pinhole; requests the sigmas.
 
     Raises
     ------
     ValueError
-        If the pinholes do not lie beyond the focal length, or a number is out of range.
+        The pinholes do not lie beyond the focal length, or a number is out of range.
     """
 
     first: float
@@ -97,17 +98,17 @@ class DepthFromFocus:
             raise ValueError(f"DepthFromFocus.sigma_intensity is {self.sigma_intensity}, expected a positive number")
 
     def __call__(self, intensities: npt.ArrayLike) -> FocusReading:
-        """Find the sharpest focus.
+        """Compute the distance of the sharpest focus.
 
         Parameters
         ----------
         intensities
-            Shape (..., K), K >= 3, behind the first pinhole to the last.
+            Intensities behind the pinholes in order, shape (..., K), K >= 3.
 
         Raises
         ------
         ValueError
-            If there are fewer than three pinholes.
+            There are fewer than three pinholes.
         """
         light = np.asarray(intensities, dtype=np.float64)
         if not light.ndim or light.shape[-1] < 3:
@@ -144,7 +145,7 @@ class DepthFromFocus:
         )
 
     def _weights(self, light: Float64, lit: npt.NDArray[np.bool_]) -> Float64:
-        """I^2 relative to the brightest; three pinholes are met exactly, whatever the weights."""
+        """Return weights I^2 relative to the brightest pinhole; with three pinholes the weights have no effect."""
         if light.shape[-1] == 3:
             return np.where(lit, 1.0, 0.0)
         brightest = np.max(np.where(lit, light, 0.0), axis=-1, keepdims=True)
@@ -153,7 +154,7 @@ class DepthFromFocus:
     def _peak(
         self, log: Float64, weights: Float64, lit: npt.NDArray[np.bool_], light: Float64
     ) -> tuple[Float64, Float64, Float64 | None]:
-        """Peak and curvature of the weighted parabola, in spacings, and the peak's standard deviation.
+        """Return peak and curvature of the weighted parabola [spacings], and the standard deviation of the peak.
 
         Polynomials orthogonal under the weights keep the fit well conditioned where few pinholes carry the weight.
         """
@@ -179,9 +180,9 @@ class DepthFromFocus:
 
 
 def conjugate(distance: npt.ArrayLike, focal_length: float) -> Float64:
-    """Distance on the other side of a thin lens [m]: ``1/f = 1/LI + 1/LO``, either way.
+    """Return the conjugate distance on the other side of a thin lens [m]: ``1/f = 1/LI + 1/LO``, in either direction.
 
-    NaN where there is none: at the focal length or nearer.
+    NaN for distances up to the focal length.
     """
     reach = np.asarray(distance, dtype=np.float64)
     beyond = reach > finite(focal_length, "focal_length")

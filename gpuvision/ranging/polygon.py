@@ -1,13 +1,14 @@
 """Scanning geometries that sample a surface irregularly: the polygon mirror, and the beam at 45 degrees.
 
 Polygon mirror (F. de Jong, Figures 2.7 and 2.8): a horizontal beam hits a facet of a turning polygon at the
-height of the facet's middle and is thrown down on the surface. With R the polygon's apothem, D the drop from
+height of the middle of the facet and is reflected down to the surface. With R the polygon's apothem, D the drop from
 the hit point to the surface and phi the rotation, 0 where the facet lies at 45 degrees and is hit in its middle::
 
     x_h = R (1 + sin(psi)/sqrt(2)) / cos(psi),  psi = phi - pi/4
     x = x_h(phi) - x_h(0) + D tan(2 phi)
 
-The second term of x is the polygon's own; it makes the scan asymmetric in second order.
+The difference ``x_h(phi) - x_h(0)`` comes from the motion of the hit point; it makes the scan asymmetric in second
+order.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ _HALF_ROOT = math.sqrt(0.5)
 
 @dataclass(frozen=True, kw_only=True)
 class PolygonMirror:
-    """A turning polygon mirror that scans a beam over a surface.
+    """Rotating polygon mirror that scans a laser beam over a surface.
 
     Parameters
     ----------
     apothem
-        R, from the axis to the middle of a facet [m].
+        Distance R from the axis to the middle of a facet [m], positive.
     facets
-        Number of mirrors; the beam stays on one for 2 pi / facets.
+        Number of mirrors, at least 3; the beam stays on one facet for a rotation of 2 pi / facets.
     height
-        H, of the polygon above the surface [m].
+        Height H of the polygon above the surface [m], positive.
     height_from
         "centre": H is measured from the polygon's axis, and D = H - R/sqrt(2); "hit": from the point where the
         beam hits the facet, and D = H.
@@ -72,42 +73,43 @@ class PolygonMirror:
 
     @property
     def drop(self) -> float:
-        """D, from the point where the beam hits the facet down to the surface [m]."""
+        """Distance D from the point where the beam hits the facet down to the surface [m]."""
         return self.height - self.apothem * _HALF_ROOT if self.height_from == "centre" else self.height
 
     def position(self, rotation: npt.ArrayLike) -> Float64:
-        """Place x on the surface [m] for rotations phi [rad]; NaN outside `limits`."""
+        """Return the position x of the beam on the surface [m] for rotations phi [rad]; NaN outside `limits`."""
         phi = np.asarray(rotation, dtype=np.float64)
         low, high = self.limits
         return np.where((phi >= low) & (phi <= high), self._position(phi), np.nan)
 
     def slope(self, rotation: npt.ArrayLike) -> Float64:
-        """dx/dphi [m/rad]; 2 D in the middle of the scan."""
+        """Return dx/dphi [m/rad]; it is 2 D in the middle of the scan."""
         phi = np.asarray(rotation, dtype=np.float64)
         facet = 0.25 * math.pi - phi
         own = self.apothem * (_HALF_ROOT - np.sin(facet)) / np.cos(facet) ** 2
         return np.asarray(own + 2.0 * self.drop / np.cos(2.0 * phi) ** 2)
 
     def rotation(self, position: npt.ArrayLike) -> Float64:
-        """Rotation phi [rad] that throws the beam to x [m]: the inverse of `position`; NaN where none does.
+        """Return the rotation phi [rad] that directs the beam to x [m]: the inverse of `position`; NaN out of reach.
 
         Bracketed Newton steps; the round trip is exact to rounding.
         """
         x = np.asarray(position, dtype=np.float64)
         bounds = self.limits
         first, last = self._position(np.array(bounds))
-        # Where x folds it hardly changes with phi: `position` of a rotation inside may round to less than at the limit.
+        # At a fold x hardly changes with phi: the position of a rotation inside may be rounded below the position at
+        # the limit.
         below, above = (_ROUNDINGS * (abs(end) + self.apothem) for end in (first, last))
         reachable = (x >= first - below) & (x <= last + above)
         x = np.clip(x, first, last)
         low, high = np.full_like(x, bounds[0]), np.full_like(x, bounds[1])
-        # Without the polygon's own term this is the answer.
+        # Start value: the exact solution without the motion of the hit point.
         phi = np.where(reachable, np.clip(0.5 * np.arctan(x / self.drop), *bounds), np.nan)
         for _ in range(_STEPS):
             excess = self._position(phi) - x
             high = np.where(excess > 0.0, phi, high)
             low = np.where(excess < 0.0, phi, low)
-            with np.errstate(divide="ignore"):  # at a fold the slope is 0: such a step is not inside
+            with np.errstate(divide="ignore"):  # the slope is 0 at a fold; the infinite step is rejected below
                 step = phi - np.divide(excess, self.slope(phi), out=np.zeros_like(x), where=excess != 0.0)
             inside = (step >= low) & (step <= high)
             better = np.where(inside | ~reachable, step, 0.5 * (low + high))
@@ -117,17 +119,17 @@ class PolygonMirror:
         return phi
 
     def times(self, positions: npt.ArrayLike, angular_speed: float) -> Float64:
-        """Return the times [s] at which a turning mirror throws the beam to ``positions`` [m].
+        """Return the times [s] at which a rotating mirror directs the beam to ``positions`` [m].
 
-        Sampling at these times, counted from the middle of the facet, gives equidistant samples where the positions
-        are so. The next facet repeats them after ``2 pi / (facets angular_speed)``, with ``angular_speed`` in rad/s.
+        Sampling at these times, counted from the middle of the facet, gives equidistant samples for equidistant
+        positions. The next facet repeats them after ``2 pi / (facets angular_speed)``, with ``angular_speed`` in rad/s.
         """
         if not finite(angular_speed, "angular_speed") > 0.0:
             raise ValueError(f"angular_speed is {angular_speed}, expected a positive one [rad/s]")
         return self.rotation(positions) / angular_speed
 
     def facet_position(self, rotation: npt.ArrayLike) -> Float64:
-        """Where the beam hits the facet, from its middle along the facet [m]."""
+        """Return the distance along the facet from its middle to the point that the beam hits [m]."""
         facet = 0.25 * math.pi - np.asarray(rotation, dtype=np.float64)
         return np.asarray(self.apothem * (_HALF_ROOT - np.sin(facet)) / np.cos(facet))
 
@@ -176,7 +178,7 @@ class ShearedProfile(NamedTuple):
 
 
 def sheared(start: npt.ArrayLike, height: npt.ArrayLike, angle: float = 0.25 * math.pi) -> ShearedProfile:
-    """Place the samples of a beam that comes down at an angle: ``X = X0 + H tan(angle)`` (F. de Jong, Figure 2.5).
+    """Compute the positions of samples of an inclined beam: ``X = X0 + H tan(angle)`` (F. de Jong, Figure 2.5).
 
     Parameters
     ----------
@@ -195,7 +197,7 @@ def sheared(start: npt.ArrayLike, height: npt.ArrayLike, angle: float = 0.25 * m
     Raises
     ------
     ValueError
-        If shapes differ, ``start`` is not strictly monotone, or the angle is not within a right angle.
+        Shapes differ, ``start`` is not strictly monotone, or the angle is not between -pi/2 and pi/2.
     """
     x0, h = np.asarray(start, dtype=np.float64), np.asarray(height, dtype=np.float64)
     if x0.shape != h.shape or not x0.ndim:
@@ -208,7 +210,7 @@ def sheared(start: npt.ArrayLike, height: npt.ArrayLike, angle: float = 0.25 * m
     forward = 1.0 if np.all(steps > 0.0) else -1.0
     x = x0 + h * math.tan(angle)
     known = np.isfinite(x)
-    # The furthest sample's number so far that is known: forward fill of the holes.
+    # Number of the last known sample up to each sample: forward fill of the holes.
     number = np.maximum.accumulate(np.where(known, np.arange(x.shape[-1]), -1), axis=-1)
     before = np.take_along_axis(x, np.maximum(number[..., :-1], 0), axis=-1)
     folded = known[..., 1:] & (number[..., :-1] >= 0) & (forward * (x[..., 1:] - before) <= 0.0)

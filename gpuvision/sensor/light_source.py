@@ -1,28 +1,28 @@
-"""The light of a sensor: what ``gpuvision simulate`` must know beside what a scan needs, table ``[light]`` of its file.
+"""Light source and electronics of a sensor, table ``[light]`` of its file: the input of a simulation beyond a scan's.
 
 ==============  ======================================================================================================
-``lens``        where the pinhole is, in the scene [m]; needless beside a triangulation from baseline and stand-off
-``aperture``    diameter of the lens' opening [m]
-``power``       of the sheet of light, per metre of G [W/m]
+``lens``        position of the pinhole in the scene [m]; not needed with a triangulation from baseline and stand-off
+``aperture``    diameter of the lens aperture [m]
+``power``       power of the sheet of light per metre of G [W/m]
 ``thickness``   standard deviation of the light across the sheet [m]; 0: thin
-``source``      (G, H) where a fan comes from [m]; without: parallel light
-``width``       lowest and highest G that are lit [m]; without: all
-``profile``     rows of G [m] and a factor to the power there
-``sub_sheets``  thin sheets that stand for a thick one
+``source``      (G, H) of the source of a fan [m]; default: parallel light
+``width``       lowest and highest lit G [m]; default: all
+``profile``     rows (G [m], factor on the power at this G)
+``sub_sheets``  number of thin sheets that represent a thick one
 ``blur``        standard deviation of a point's image along u [sensor unit]
-``bins``        PSD: parts of a strip in which light is kept (a camera has its pixels)
-``nodes``       rays per bin along u and along v, for light that comes by detours
+``bins``        PSD: number of parts of a strip in which light is collected (a camera has its pixels)
+``nodes``       rays per bin along u and along v, for indirect light
 ==============  ======================================================================================================
 
-What the electronics make of the light:
+Electronics:
 
 ==================  ==================================================================================================
 ``responsivity``    A/W
-``ambient``         other light on every strip or pixel [W]
-``modulated``       PSD: the light is modulated, ambient light adds its noise only
-``exposure``        camera: time of a frame [s]
-``full_well``       camera: electrons of the highest grey level
-``read_noise``      camera: electrons
+``ambient``         ambient light on every strip or pixel [W]
+``modulated``       PSD: the light is modulated, so that ambient light adds only noise
+``exposure``        camera: exposure time of a frame [s]
+``full_well``       camera: electrons at the highest grey level
+``read_noise``      camera: read noise [electrons]
 ==================  ==================================================================================================
 """
 
@@ -36,7 +36,7 @@ from gpuvision.schema import Section
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """The light of a sensor; see the module for what the fields are.
+    """Light source and electronics of a sensor; the module documentation describes the fields.
 
     Attributes
     ----------
@@ -66,12 +66,12 @@ class Light:
 
 
 def read_light(table: Section) -> Light:
-    """Read the table, and finish it.
+    """Read the table ``[light]`` and check that it has no unknown key.
 
     Raises
     ------
     DescriptionError
-        It says something that it cannot say.
+        A value is missing or out of range.
     """
     lens, source = table.numbers("lens", "m", (3,), None), table.numbers("source", "m", (2,), None)
     width, nodes = table.numbers("width", "m", (2,), None), table.numbers("nodes", "", (2,), (1.0, 1.0))

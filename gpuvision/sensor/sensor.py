@@ -1,6 +1,6 @@
-"""A sensor as a file: ``sensor.toml`` says how it reads, how it triangulates and how it moves over the scene.
+"""Sensor description files: a TOML file describes the readout, the triangulation and the transport of a sensor.
 
-Tables of the file (the ones in ``gpuvision/sensors`` are commented examples):
+Tables of the file (the files in ``gpuvision/presets/sensors`` are commented examples):
 
 ====================  ==================================================================================================
 ``kind``, ``name``    ``"camera"`` or ``"psd"``; a name for the report
@@ -8,7 +8,7 @@ Tables of the file (the ones in ``gpuvision/sensors`` are commented examples):
 ``[line]``            camera: fields of `LineReadout`
 ``[psd]``             PSD: number of strips, fields of `PsdReadout`; ``[psd.noise]``: fields of `PsdNoise`
 ``[frame]``           camera: columns and rows of a frame; needed for a triangulation
-``[axes]``            where positions and samples lie in the triangulation's coordinates, see `SampleAxes`
+``[axes]``            map from positions and samples to the coordinates of the triangulation, see `SampleAxes`
 ``[lens]``            radial distortion, see `Lens`
 ``[triangulation]``   sensor to sheet, for a straight transport: ``baseline``, ``stand_off`` and so on (see
                       `Triangulation.from_stand_off`); or a camera's ``focal_length_px``, ``principal_point_px`` and the
@@ -16,7 +16,7 @@ Tables of the file (the ones in ``gpuvision/sensors`` are commented examples):
                       (`Triangulation.from_constants`); or ``points``: calibration points (u, v, G, H) to fit
 ``[transport]``       ``kind = "straight"``, fields of `StraightTransport`; or ``"rotating"``, of `RotatingSheet`
 ``[output]``          see `Output`
-``[light]``           what ``gpuvision simulate`` must know beside: see `gpuvision.sensor.light_source`
+``[light]``           light source and electronics, for a simulation: see `gpuvision.sensor.light_source`
 ====================  ==================================================================================================
 """
 
@@ -47,16 +47,16 @@ Ambiguous = Literal["drop", "keep"]
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """How the sensor was recorded.
+    """Properties of the recordings of a sensor.
 
     Attributes
     ----------
     channel
-        Which channel of colour frames holds the line.
+        Channel of colour frames that holds the laser line, default ``"grey"``.
     key
-        Which array of an NPZ file, if it holds more than one.
+        Name of the array in an NPZ file, if the file holds more than one.
     rate
-        Frames per second of the sensor; a scan says how many times faster it is.
+        Frame rate of the sensor [frames/s]; a scan reports its own rate relative to it.
     """
 
     channel: Channel = "grey"
@@ -66,18 +66,18 @@ class Recording:
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    """The height map: size of its cells, what counts as neighbours, what lies in the scene; all in metres.
+    """Height map of a scan: cell size, limits between neighbours, limits of the scene; all in metres.
 
     Attributes
     ----------
     cell
-        Distance between cells.
+        Distance between cells [m].
     max_gap, max_step, fold_tolerance, folded
         As for `gpuvision.ranging.regrid.Regrid`.
     ambiguous
-        Whether a sample with more than one candidate for the light keeps its point beside the flag.
+        Whether a sample with the flag AMBIGUOUS (several candidates for the light) keeps its point.
     limits
-        Lowest and highest x, y and z of the scene; what lies outside is OUT_OF_RANGE.
+        Lowest and highest x, y and z of the scene [m]; points outside are OUT_OF_RANGE.
     """
 
     cell: float
@@ -91,22 +91,22 @@ class Output:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """A sensor: its readout (with the triangulation in the same pass), its transport, and what to make of them.
+    """Sensor: its readout (with the triangulation in the same pass), its transport, and the output of a scan.
 
     Attributes
     ----------
     name
-        For reports.
+        Name for reports.
     readout
         `LineReadout` for a camera, `PsdReadout` for a PSD.
     transport
-        `StraightTransport` for a readout with a triangulation, or a `RotatingSheet`, which triangulates itself.
+        `StraightTransport` for a readout with a triangulation, or a `RotatingSheet`, which includes the triangulation.
     frame
-        Shape that a frame must have, where the file says: (rows, columns), or (strips, 2).
+        Shape of a frame if the file gives it: (rows, columns), or (strips, 2).
     recording, output
-        See there.
+        See `Recording` and `Output`.
     light
-        Where the file says: what a simulation needs.
+        Light source and electronics for a simulation, if the file has them.
     """
 
     name: str
@@ -119,14 +119,14 @@ class Sensor:
 
     @classmethod
     def load(cls, path: str | Path) -> Sensor:
-        """Read a sensor from a TOML file, or one that the package brings by its name (``"corner_scene"``).
+        """Read a sensor from a TOML file, or a sensor of the package by its name (``"corner_scene"``).
 
         Raises
         ------
         FileNotFoundError
-            There is neither such a file nor such a name.
+            There is no file and no sensor of the package with this name.
         DescriptionError
-            The file says something that it cannot say: key, value, unit and allowed range are in the message.
+            A key is missing or unknown, or a value is out of range; the message has key, value, unit and range.
         """
         brought = {
             Path(each.name).stem: each for each in resources.files("gpuvision").joinpath("presets", "sensors").iterdir()
@@ -171,7 +171,7 @@ class Sensor:
         moving = top.section("transport")
         axes, sheet = SampleAxes(), None
         transport: StraightTransport | RotatingSheet
-        # A PSD does not say where in the beam's plane the light is: it cannot stand beside a sheet that turns.
+        # A PSD does not measure the place of the light in the plane of the beam: it cannot see a rotating sheet.
         if moving.choice("kind", ("straight", "rotating") if kind == "camera" else ("straight",)) == "rotating":
             transport = _rotating(moving, lens, along)
         else:
@@ -193,16 +193,16 @@ class Sensor:
 
     @property
     def kind(self) -> Literal["camera", "psd"]:
-        """What makes the frames."""
+        """Kind of the sensor: ``"camera"`` or ``"psd"``."""
         return "camera" if isinstance(self.readout, LineReadout) else "psd"
 
     def check_frame(self, shape: tuple[int, ...], what: str) -> None:
-        """Check that a recording's frames are this sensor's.
+        """Check that the frames of a recording have the shape of this sensor's frames.
 
         Raises
         ------
         ValueError
-            They are of another shape.
+            The shape differs.
         """
         words = "(rows, columns)" if self.kind == "camera" else "(strips, 2)"
         if len(shape) != 2 or shape != (self.frame or shape):
@@ -243,7 +243,7 @@ def _axes(table: Section | None) -> SampleAxes:
 def _region(
     kind: str, top: Section, frame: tuple[int, int] | None, along: Along, axes: SampleAxes, readout: Section
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return what the sensor covers in u and v: the positions of a strip or the pixels of a frame."""
+    """Return the region of the sensor in u and v: the positions on a strip or the pixels of a frame."""
     if frame is None:
         raise top.error("the table [frame] with columns and rows [pixel] is missing; a triangulation needs it")
     if kind == "psd":

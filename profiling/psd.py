@@ -149,7 +149,8 @@ def _case(device: Device, dtype: str, count: int, name: str, layout: Any = "plan
             _numpy(left, right)
 
     bound().wait()
-    error = _error(bound.outputs.position.get(), bound.outputs.status.get(), left, right)
+    outputs: Any = bound.outputs
+    error = _error(outputs.position.get(), outputs.status.get(), left, right)
     traffic = (currents.nbytes, 5 * count)
     return Case("psd", name, ours, {"numba": with_numba, "numpy": with_numpy}, error, traffic, repeats)
 

@@ -104,9 +104,10 @@ def _case(device: Device, operation: Triangulation, dtype: str, count: int, name
     }
     bound().wait()
     exact = _numpy(u.astype(np.float64), v.astype(np.float64), operation.packed(np.float64), operation.lens is not None)
-    if not np.array_equal(bound.outputs.status.get(), exact[2]):
+    outputs: Any = bound.outputs
+    if not np.array_equal(outputs.status.get(), exact[2]):
         raise AssertionError("the triangulation and float64 disagree on which points are good")
-    outputs = (bound.outputs.g.get(), bound.outputs.h.get())
-    error = max(float(np.nanmax(np.abs(a - b))) for a, b in zip(outputs, exact, strict=False))
+    points = (outputs.g.get(), outputs.h.get())
+    error = max(float(np.nanmax(np.abs(a - b))) for a, b in zip(points, exact, strict=False))
     item = u.itemsize
     return Case("triangulation", name, bound.run, peers, error, (2 * item * count, (2 * item + 1) * count))

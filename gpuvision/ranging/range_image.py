@@ -25,11 +25,9 @@ import numpy.typing as npt
 from gpuvision.camera.lens import Lens
 from gpuvision.host import (
     Device,
-    FloatArray,
     Launch,
     LaunchBuilder,
     Precision,
-    StatusArray,
     Variant,
     WorkSize,
     type_defines,
@@ -62,10 +60,10 @@ class RangePoints(NamedTuple):
         camera), OUT_OF_RANGE (outside the limits).
     """
 
-    x: FloatArray
-    y: FloatArray
-    z: FloatArray
-    status: StatusArray
+    x: Any
+    y: Any
+    z: Any
+    status: Any
 
 
 def _vector(value: Any, what: str) -> Vector:

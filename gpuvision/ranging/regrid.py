@@ -50,9 +50,9 @@ class HeightMap(NamedTuple):
         surfaces share the cell. A cell with SATURATED or AMBIGUOUS keeps its value.
     """
 
-    z: FloatArray
-    intensity: FloatArray
-    status: StatusArray
+    z: Any
+    intensity: Any
+    status: Any
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,7 +282,7 @@ class BoundRegrid:
         x, y, z, intensity, status = frames or self.inputs
         along, across = (x, y) if self._x_first else (y, x)
         first = self._samples(along, z, intensity, status, across, wait_for=wait_for)
-        lines = self._lines
+        lines: Any = self._lines
         return self._profiles(lines.across, lines.z, lines.intensity, lines.status, out=out, wait_for=[first])
 
 

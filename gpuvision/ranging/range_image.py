@@ -169,7 +169,7 @@ class StraightTransport:
             The step is None: use the positions of an encoder.
         """
         if self.step is None:
-            raise ValueError("StraightTransport has no step; give the positions of an encoder [m], one per profile")
+            raise ValueError("StraightTransport has no step; give the encoder's positions [m], one per profile")
         return self.start + self.step * np.arange(first, first + profiles, dtype=np.float64)
 
     @property
@@ -279,7 +279,7 @@ class RotatingSheet:
         for name in ("axis_direction", "sheet_normal"):
             object.__setattr__(self, name, _unit(getattr(self, name), f"RotatingSheet.{name}"))
         if np.linalg.norm(np.cross(self.axis_direction, self.sheet_normal)) <= _PARALLEL:
-            raise ValueError("RotatingSheet: the normal lies along the axis, so that turning does not move the sheet")
+            raise ValueError("RotatingSheet: the sheet's normal lies along the axis, so that turning does not move it")
         axes = numbers(self.scene_axes, (3, 3), "RotatingSheet.scene_axes")
         if np.max(np.abs(np.array(axes) @ np.array(axes).T - np.eye(3))) > 1e-6:
             raise ValueError("RotatingSheet.scene_axes are not three orthonormal vectors")
@@ -294,7 +294,7 @@ class RotatingSheet:
             The step is None: use the angles of an encoder.
         """
         if self.angle_step is None:
-            raise ValueError("RotatingSheet has no angle_step; give the angles of an encoder [rad], one per profile")
+            raise ValueError("RotatingSheet has no angle_step; give the encoder's angles [rad], one per profile")
         return self.first_angle + self.angle_step * np.arange(first, first + profiles, dtype=np.float64)
 
     def normals(self) -> npt.NDArray[np.float64]:

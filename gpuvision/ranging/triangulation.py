@@ -347,7 +347,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             Neither ``sigma`` nor ``covariance`` is known.
         """
         if self.sigma is None and self.covariance is None:
-            raise ValueError("Triangulation has neither sigma nor covariance; give one of them")
+            raise ValueError("Triangulation knows neither sigma nor covariance; give it one of them")
         points = np.asarray(points, dtype=np.float64)
         origin, unit = self._middle_and_half()
         x = ((points if self.sensor_lens is None else self.sensor_lens.undistort(points)) - origin) / unit

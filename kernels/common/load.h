@@ -10,7 +10,7 @@ typedef INPUT16 input_vector_at __attribute__((aligned(sizeof(INPUT))));
 typedef INPUT input_vector_at;
 #endif
 
-static inline reals load_reals(global const INPUT *from) {
+static inline reals load_inputs(global const INPUT *from) {
     return LANED(convert_real)(*(global const input_vector_at *)from);
 }
 

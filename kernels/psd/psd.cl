@@ -48,16 +48,16 @@ typedef struct {
 
 static inline void load_pair(const Readout *io, int sample, reals *left, reals *right) {
 #if defined(PLANAR)
-    *left = load_reals(io->currents + sample);
-    *right = load_reals(io->currents + io->samples + sample);
+    *left = load_inputs(io->currents + sample);
+    *right = load_inputs(io->currents + io->samples + sample);
 #elif defined(VECTOR_VARIANT)
     global const INPUT *pairs = io->currents + 2 * sample;
-    const reals low = load_reals(pairs), high = load_reals(pairs + LANES);
+    const reals low = load_inputs(pairs), high = load_inputs(pairs + LANES);
     *left = (reals)(low.even, high.even);
     *right = (reals)(low.odd, high.odd);
 #else
-    *left = load_reals(io->currents + 2 * sample);
-    *right = load_reals(io->currents + 2 * sample + 1);
+    *left = load_inputs(io->currents + 2 * sample);
+    *right = load_inputs(io->currents + 2 * sample + 1);
 #endif
 }
 

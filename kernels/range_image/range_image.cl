@@ -145,11 +145,11 @@ static inline masks assemble(const int careful, ulong row, uint sample, Pose pos
                              global real *out_y, global real *out_z, global uchar *status,
                              constant RangeTable *table) {
     const ulong i = row + sample;
-    const reals first = load_reals(first_input + i);
+    const reals first = load_inputs(first_input + i);
 #ifdef GEOMETRY_ROTATING
     const reals second = (real)sample + to_reals(LANE_NUMBERS);
 #else
-    const reals second = load_reals(second_input + i);
+    const reals second = load_inputs(second_input + i);
 #endif
     const bytes flags_in = *(global const bytes_at *)(given + i);
     const masks flags = LANED(convert_bits)(flags_in);

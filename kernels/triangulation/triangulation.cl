@@ -19,7 +19,7 @@
 static inline void triangulate_at(ulong i, global const INPUT *u, global const INPUT *v, global real *g, global real *h,
                                   global uchar *status, global real *sigma_g, global real *sigma_h,
                                   constant SheetTable *sheet, real sigma_u, real sigma_v) {
-    const reals position = load_reals(u + i), sample = load_reals(v + i);
+    const reals position = load_inputs(u + i), sample = load_inputs(v + i);
     reals at_g, at_h;
     store_bytes(sheet_point(position, sample, sheet, &at_g, &at_h), status + i);
     store_reals(at_g, g + i);

@@ -45,6 +45,7 @@ nitpick_ignore_regex = [
     ("py:.*", r"(?!gpuvision\.).*"),
     ("py:class", r"gpuvision\.(.*\.)?(_\w+|[RS]|schema\.Section)"),  # private bases, type variables
 ]
+suppress_warnings = ["ref.citation"]  # a docstring's section References may list works that its text does not cite
 numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
 

@@ -126,7 +126,6 @@ class Launchable(Protocol):
         """Describe the launch for inputs of one shape and dtype."""
 
 
-
 def uses_vectors(variant: Variant, device: Device) -> bool:
     """Decide between the vector variant of a kernel (CPU runtimes) and one work-item per element."""
     if variant not in ("auto", "vector", "work_item"):

@@ -7,6 +7,7 @@ FLOP rate differs before and after is measured again.
 
 from __future__ import annotations
 
+import datetime
 import importlib
 import json
 import platform
@@ -249,6 +250,7 @@ def _steady_section(
 def describe_machine(devices: Sequence[Device]) -> dict[str, Any]:
     """Return what a reader needs to place the numbers."""
     return {
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "processor": _processor(),
         "system": platform.platform(terse=True),
         "python": platform.python_version(),

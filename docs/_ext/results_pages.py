@@ -77,13 +77,12 @@ def run_page(name: str, run: Mapping[str, Any]) -> str:
     rows = run["rows"]
     operations = list(dict.fromkeys(row["operation"] for row in rows))
     slower = sum(row["ratio"] < 1.0 for row in rows)
-    date = f"- Date: {run['date']}.\n" if "date" in run else ""
-    command = run.get("command", f"gpuvision profile {' '.join(operations)} --json FILE")
+    date = f"- Date: {run['machine']['date']}.\n" if "date" in run["machine"] else ""
     parts = [
         ":html_theme.sidebar_secondary.remove:\n",  # the tables are wide
         title(name),
         _machine(run["machine"]),
-        f"{date}- Command: ``{command}``.",
+        f"{date}- Command: ``gpuvision profile {' '.join(operations)} --json FILE``.",
         f"- The machine held its speed during the run: {'yes' if run['valid'] else '**no**'}.",
         f"- Rows: {len(rows)}; the peer is faster in {slower} of them (ratio in bold).\n",
         "See :doc:`../index` for the meaning of the columns.\n",

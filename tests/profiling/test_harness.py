@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import time
 import types
@@ -99,4 +100,5 @@ def test_a_machine_that_never_holds_its_speed_voids_the_run(fake, device, tmp_pa
     assert table["valid"] is False
     expected = {"operation", "case", "device", "seconds", "peer", "peer_version", "peer_seconds", "ratio", "error"}
     assert expected | {"fraction"} <= set(table["rows"][0])
+    assert datetime.date.fromisoformat(table["machine"]["date"]).year >= 2026
     assert table["machine"]["devices"][device.label]["driver"] == device.driver

@@ -388,7 +388,9 @@ static inline void pose_covariance(private solved_pose *fit, pose_rows all, priv
 }
 
 // The places' unit must be about their distance from the origin. `room` has as many reals as there are rows.
-static inline solved_pose pose_solved(laned_pose near, pose_rows all, constant const int *subsets, int trials, int steps,
+// Not inlined: PoCL 3.1 computes wrong weights in the work-item variant of board_pose.cl when this function is inlined
+// behind the kernel's last barrier (bisected; the vector variant and Intel's runtime are not affected).
+static __attribute__((noinline)) solved_pose pose_solved(laned_pose near, pose_rows all, constant const int *subsets, int trials, int steps,
                                real smallest, real share, private reals *room) {
     solved_pose fit;
     real present = 0;

@@ -262,7 +262,7 @@ def _fused_case(device: Device, method: Method, count: int) -> Case:
     expected = sheet(
         to_numpy(fused.outputs.position), np.tile(np.arange(COLUMNS, dtype=np.float32), (count, 1)), device=device
     )
-    error = float(np.nanmax(np.abs(to_numpy(fused.outputs.h) - expected.h)))
+    error = float(np.nanmax(np.abs(to_numpy(fused.outputs.h) - to_numpy(expected.h))))
     peers = {"gpuvision": lambda: alone.run(shared)}
     return Case("line", f"{_ROWS[method]}-fused/{count}", lambda: fused.run(shared), peers, error)
 

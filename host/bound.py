@@ -73,7 +73,7 @@ class Bound(Generic[R]):
         self._site_of_queue = self._site_on(self.queue)
         self._here: _Site | None = None
         if not self._site_of_queue.at_once and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
-            own = device.callers_queue(self.queue, groups=launch.groups)
+            own = device.inline_queue(self.queue, groups=launch.groups)
             self._here = None if own is None else self._site_on(own)
         for array in self.inputs:
             self._clear(array)
@@ -264,7 +264,7 @@ class Bound(Generic[R]):
         tables = iter(self._tables)
         for place, value in enumerate(launch.arguments, after_outputs):
             kernel.set_arg(place, next(tables) if isinstance(value, np.ndarray) else value)
-        return _Site(queue, kernel, (None,) * len(self._own), self.device.is_callers(queue))
+        return _Site(queue, kernel, (None,) * len(self._own), self.device.is_inline(queue))
 
     def _upload(self, table: HostArray) -> Any:
         flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR

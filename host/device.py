@@ -48,19 +48,19 @@ class Device:
         Whether `precision="double"` works here.
     cache_bytes : int
         Size of the last cache; more than that comes from memory and goes there.
-    callers_thread : pyopencl.Device or None
+    inline_device : pyopencl.Device or None
         PoCL's other device, in the same context: it runs a kernel in the thread that enqueues it, which is done before
         the first one's workers have woken up where there is little to do. Operations go there by themselves.
     """
 
-    def __init__(self, handle: Any, label: str, kind: str, *, queue: Any = None, callers_thread: Any = None) -> None:
+    def __init__(self, handle: Any, label: str, kind: str, *, queue: Any = None, inline_device: Any = None) -> None:
         self.handle = handle
         self.label, self.kind = label, kind
         self.name, self.driver = handle.name.strip(), handle.driver_version
         # Held for the queue's sake too: Intel's runtime lets a context go while a queue of it lives.
-        own = [handle] if callers_thread is None else [handle, callers_thread]
+        own = [handle] if inline_device is None else [handle, inline_device]
         self.context = queue.context if queue is not None else cl.Context(own)
-        self.callers_thread = callers_thread
+        self.inline_device = inline_device
         self.queue = queue if queue is not None else cl.CommandQueue(self.context, handle)
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
         self.compute_units = int(handle.max_compute_units)
@@ -165,33 +165,33 @@ class Device:
                 os.sched_yield()  # to a worker of the runtime that waits for this processor
         event.wait()
 
-    def new_queue(self, *, profiling: bool = False, callers_thread: bool = False) -> Any:
+    def new_queue(self, *, profiling: bool = False, inline_device: bool = False) -> Any:
         """Return another in-order queue; with `profiling`, its events carry device times.
 
-        With `callers_thread`, what is enqueued runs in the thread that enqueues it and is done when that returns: for
+        With `inline_device`, what is enqueued runs in the thread that enqueues it and is done when that returns: for
         chains of work of a few microseconds each. Where the runtime has no such queue it is one as any other.
         """
         properties = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
-        return (self._callers_queue(properties) if callers_thread else None) or self._queue(self.handle, properties)
+        return (self._new_inline_queue(properties) if inline_device else None) or self._queue(self.handle, properties)
 
-    def callers_queue(self, like: Any, *, groups: int) -> Any:
+    def inline_queue(self, like: Any, *, groups: int) -> Any:
         """Return a queue like another, whose kernels run in the thread that enqueues them; None where there is none.
 
         Intel's runtime, whose workers are awake sooner than PoCL's, gets one for work of a single group: there is
         nothing to share with a worker.
         """
-        worthwhile = groups == 1 or self.callers_thread is not None
-        return self._callers_queue(like.properties) if worthwhile else None
+        worthwhile = groups == 1 or self.inline_device is not None
+        return self._new_inline_queue(like.properties) if worthwhile else None
 
-    def is_callers(self, queue: Any) -> bool:
+    def is_inline(self, queue: Any) -> bool:
         """Tell whether what is enqueued in a queue of this device is done when that returns."""
         if _LOCAL_THREAD not in self.handle.extensions.split():
-            return bool(queue.device == self.callers_thread)
+            return bool(queue.device == self.inline_device)
         return _LOCAL_THREAD_QUEUE in queue.get_info(cl.command_queue_info.PROPERTIES_ARRAY)
 
-    def _callers_queue(self, properties: Any) -> Any:
-        if self.callers_thread is not None:
-            return self._queue(self.callers_thread, properties)
+    def _new_inline_queue(self, properties: Any) -> Any:
+        if self.inline_device is not None:
+            return self._queue(self.inline_device, properties)
         if _LOCAL_THREAD in self.handle.extensions.split():
             return self._queue(self.handle, properties | _LOCAL_THREAD_QUEUE)
         return None
@@ -226,9 +226,7 @@ _opening = threading.Lock()
 def _open(listed: discovery.Listed) -> Device:
     with _opening:
         if listed.label not in _opened:
-            _opened[listed.label] = Device(
-                listed.handle, listed.label, listed.kind, callers_thread=listed.callers_thread
-            )
+            _opened[listed.label] = Device(listed.handle, listed.label, listed.kind, inline_device=listed.inline_device)
         return _opened[listed.label]
 
 

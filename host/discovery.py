@@ -18,7 +18,7 @@ import pyopencl as cl
 
 from gpuvision.host.files import write_whole
 from gpuvision.host.runtime import (
-    ask_for_callers_thread,
+    request_inline_device,
     cache_folder,
     expose_installed_runtime,
     pin_workers,
@@ -56,7 +56,7 @@ class Listed:
     handle : pyopencl.Device
     key : str
         Names what a verdict depends on: the driver, the device, and the probe itself.
-    callers_thread : pyopencl.Device or None
+    inline_device : pyopencl.Device or None
         The same processor as PoCL offers it to the thread that enqueues: no worker has to wake up.
     """
 
@@ -66,7 +66,7 @@ class Listed:
     device_index: int
     handle: Any
     key: str
-    callers_thread: Any
+    inline_device: Any
 
     @property
     def name(self) -> str:
@@ -188,7 +188,7 @@ def platforms() -> tuple[Any, ...]:
     provide_cache()
     pin_workers()
     expose_installed_runtime()
-    ask_for_callers_thread()
+    request_inline_device()
     try:
         return tuple(cl.get_platforms())
     except cl.Error:  # PLATFORM_NOT_FOUND_KHR is how the loader says "none"
@@ -202,7 +202,7 @@ def _devices_of(platform: Any) -> list[Any]:
         return []
 
 
-def _callers_thread(devices: Sequence[Any]) -> Any:
+def _inline_device(devices: Sequence[Any]) -> Any:
     """Return PoCL's device without worker threads where it is there beside the one with them."""
     with_workers = any(each.name.startswith("pthread-") for each in devices)
     return next((each for each in devices if with_workers and each.name.startswith("basic-")), None)
@@ -214,7 +214,7 @@ def listing() -> tuple[Listed, ...]:
     found = []
     for p, platform in enumerate(platforms()):
         devices = _devices_of(platform)
-        beside = _callers_thread(devices)
+        beside = _inline_device(devices)
         found += [(p, d, handle, beside) for d, handle in enumerate(devices) if handle is not beside]
     kinds = [kind_of(handle) for _, _, handle, _ in found]
     count, seen, twins = Counter(kinds), Counter[str](), Counter[str]()

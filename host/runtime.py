@@ -63,7 +63,7 @@ def pin_workers() -> None:
     os.environ.setdefault("POCL_AFFINITY", "1")
 
 
-def ask_for_callers_thread() -> None:
+def request_inline_device() -> None:
     """Have PoCL list the device that runs kernels in the caller's thread beside the one with worker threads.
 
     To wake a worker takes longer than a frame takes to compute. Left alone where the user decided, and where there is

@@ -207,7 +207,7 @@ def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool =
     image, rulers = scene(count)
     operation = RulerEdges(threshold=THRESHOLD, length=LENGTH, width=WIDTH, smoothing_px=SMOOTHING, count=count)
     # So little work is done before a worker has begun.
-    queue = device.new_queue(callers_thread=True) if count <= _FEW else None
+    queue = device.new_queue(inline=True) if count <= _FEW else None
     bound = operation.bind(device, image.shape, image.dtype, queue=queue)
     bound.inputs[0].set(image)
     bound.inputs[1].set(rulers)

@@ -102,14 +102,14 @@ def test_order_of_preference(see: Any) -> None:
     assert [each.kind for each in ranked] == ["nvidia", "pocl", "intel", "other", "oclgrind"]
 
 
-def test_callers_thread_is_no_device_of_its_own(see: Any) -> None:
+def test_inline_device_is_listed_with_the_device_it_belongs_to(see: Any) -> None:
     basic, workers = FakeDevice("basic-cpu"), FakeDevice("pthread-cpu")
     see(FakePlatform(devices=[basic, workers]))
     (only,) = discovery.candidates()
-    assert (only.label, only.handle, only.callers_thread, only.device_index) == ("pocl", workers, basic, 1)
+    assert (only.label, only.handle, only.inline_device, only.device_index) == ("pocl", workers, basic, 1)
     see(FakePlatform(devices=[basic]))
     (only,) = discovery.candidates()
-    assert (only.handle, only.callers_thread) == (basic, None), "asked for alone, it is the device"
+    assert (only.handle, only.inline_device) == (basic, None), "asked for alone, it is the device"
 
 
 def test_platform_without_devices(see: Any) -> None:

@@ -102,9 +102,9 @@ def test_calls_wait_for_events(device, pairs):
     event.wait()
 
 
-def test_short_work_runs_in_the_callers_thread(device, pairs):
+def test_short_work_runs_inline(device, pairs):
     """There it is done on return, and only there; long work goes to the workers."""
-    if device.callers_thread is None:
+    if device.inline_device is None:
         pytest.skip("only PoCL 3 has such a device")
     complete = cl.command_execution_status.COMPLETE
     many = np.ones((400_000, 2), np.float32)
@@ -114,11 +114,11 @@ def test_short_work_runs_in_the_callers_thread(device, pairs):
         event = bound()
         assert (event.command_execution_status == complete) or not here
         event.wait()
-        assert (event.get_info(cl.event_info.COMMAND_QUEUE).device == device.callers_thread) is here
+        assert (event.get_info(cl.event_info.COMMAND_QUEUE).device == device.inline_device) is here
         np.testing.assert_allclose(host_view(bound.outputs.position), expected(frame), atol=5e-7)
 
 
-def test_work_of_one_group_runs_in_the_callers_thread(device):
+def test_work_of_one_group_runs_inline(device):
     if device.kind != "intel":
         pytest.skip("only Intel's runtime does so by the work's groups")
     for count, here in ((16, True), (400_000, False)):
@@ -146,11 +146,11 @@ def test_short_work_comes_after_the_long_work_before_it(device, rng):
 
 
 @pytest.mark.parametrize("count", [0, 16, 400_000])
-def test_in_a_queue_of_the_callers_thread_work_is_done_on_return(device, rng, count):
-    queue = device.new_queue(callers_thread=True)
-    assert device.is_callers(queue) or not device.is_cpu
-    assert not device.is_callers(device.queue)
-    if not device.is_callers(queue):
+def test_work_in_an_inline_queue_is_done_on_return(device, rng, count):
+    queue = device.new_queue(inline=True)
+    assert device.is_inline(queue) or not device.is_cpu
+    assert not device.is_inline(device.queue)
+    if not device.is_inline(queue):
         pytest.skip("the runtime has no such queue")
     bound = READOUT.bind(device, (count, 2), np.float32, queue=queue)
     for _ in range(5 if count > 16 else 200):
@@ -162,8 +162,8 @@ def test_in_a_queue_of_the_callers_thread_work_is_done_on_return(device, rng, co
         np.testing.assert_allclose(host_view(bound.run().position), expected(frame), atol=5e-7)
 
 
-def test_a_queue_of_the_callers_thread_waits_for_others(device, rng):
-    queue = device.new_queue(callers_thread=True)
+def test_an_inline_queue_waits_for_others(device, rng):
+    queue = device.new_queue(inline=True)
     workers = READOUT.bind(device, (400_000, 2), np.float32)
     short = READOUT.bind(device, (1000, 2), np.float32, queue=queue)
     both = cl.array.Array(device.queue, (1000, 2), np.float32, data=workers.outputs.position.base_data)
@@ -175,8 +175,8 @@ def test_a_queue_of_the_callers_thread_waits_for_others(device, rng):
         np.testing.assert_allclose(short.outputs.position.get(), expected(middle), atol=1e-5)
 
 
-def test_arrays_of_a_queue_of_the_callers_thread(device, pairs):
-    frame = cl.array.to_device(device.new_queue(callers_thread=True), pairs)
+def test_arrays_of_an_inline_queue(device, pairs):
+    frame = cl.array.to_device(device.new_queue(inline=True), pairs)
     np.testing.assert_allclose(READOUT(frame).position.get(), expected(pairs), atol=5e-7)
 
 

@@ -112,7 +112,7 @@ def test_home_that_can_be_written_is_used(monkeypatch: pytest.MonkeyPatch, tmp_p
         ([], False),
     ],
 )
-def test_callers_thread_is_asked_for_where_its_name_is_known(
+def test_inline_device_is_requested_where_its_name_is_known(
     vendors: Path, monkeypatch: pytest.MonkeyPatch, entries: list[str], asked: bool
 ) -> None:
     monkeypatch.delenv("POCL_DEVICES", raising=False)
@@ -120,10 +120,10 @@ def test_callers_thread_is_asked_for_where_its_name_is_known(
     (vendors / "pocl.icd").unlink()
     for number, text in enumerate(entries):
         (vendors / f"{number}.icd").write_text(text)
-    runtime.ask_for_callers_thread()
+    runtime.request_inline_device()
     assert os.environ.get("POCL_DEVICES") == ("pthread basic" if asked else None)
     monkeypatch.setenv("POCL_DEVICES", "pthread")
-    runtime.ask_for_callers_thread()
+    runtime.request_inline_device()
     assert os.environ["POCL_DEVICES"] == "pthread", "the user decided"
 
 

@@ -1,4 +1,4 @@
-"""Arrays that the device reads and writes, and how NumPy sees them."""
+"""Device arrays, their NumPy views, and the types of result fields."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SHARED_FLAGS = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUF
 
 
 class _Shared:
-    """Show shared memory to NumPy; the array that NumPy makes keeps this object, and so the memory, alive."""
+    """Shared memory as NumPy sees it. The NumPy array keeps this object and so the memory alive."""
 
     def __init__(self, array: DeviceArray, memory: cl.SVMPointer) -> None:
         self.memory = memory
@@ -36,14 +36,22 @@ class _Shared:
 
 
 def host_view(array: DeviceArray) -> HostArray:
-    """Return shared device memory as a NumPy array: no copy, no map.
+    """Return the NumPy view of a device array in shared memory, without copy or map.
 
-    The host may touch it only while no kernel that uses it runs: wait for the event first.
+    Parameters
+    ----------
+    array : pyopencl.array.Array
+        Array in shared memory, as `Device.empty` makes it where `Device.shares_memory`.
+
+    Returns
+    -------
+    numpy.ndarray
+        View of the same memory. Read or write it only while no kernel uses the array: wait for the event first.
 
     Raises
     ------
     ValueError
-        The array lies in memory that the host does not share; `array.get()` copies it.
+        The array is in device memory that the host does not share; ``array.get()`` copies it.
     """
     memory = array.base_data
     if not isinstance(memory, cl.SVMPointer):
@@ -81,7 +89,7 @@ def memory_of(array: DeviceArray) -> Any:
     Raises
     ------
     ValueError
-        The array is a part of another one, or not C-contiguous.
+        The array is a part of another array, or it is not C-contiguous.
     """
     if array.offset or not array.flags.c_contiguous:
         raise ValueError("expected a whole C-contiguous device array, got a part or another layout; use array.copy()")
@@ -89,14 +97,14 @@ def memory_of(array: DeviceArray) -> Any:
 
 
 def check_host(array: HostArray, shape: tuple[int, ...], dtype: np.dtype[Any], what: str) -> None:
-    """Check that a NumPy array is what a kernel will take.
+    """Check dtype, shape and layout of a NumPy array for a kernel.
 
     Raises
     ------
     TypeError
-        The dtype is another one.
+        The dtype differs.
     ValueError
-        The shape is another one, or the array is not C-contiguous.
+        The shape differs, or the array is not C-contiguous.
     """
     if array.dtype != dtype:
         raise TypeError(f"{what}: expected dtype {dtype}, got {array.dtype}; convert it with .astype")

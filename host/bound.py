@@ -1,4 +1,4 @@
-"""An operation bound to a device, a queue and a shape: its program, its arrays and the calls that launch it."""
+"""Operations bound to a device, a queue and a shape: program, arrays, and the calls that launch the kernel."""
 
 from __future__ import annotations
 
@@ -19,32 +19,33 @@ from gpuvision.host.program import build
 R = TypeVar("R", bound=tuple[Any, ...])
 
 _COMPLETE = cl.command_execution_status.COMPLETE
-# One core of a PC moves so much in the time in which PoCL wakes two.
+# Launches that move fewer bytes run inline. Measured on PoCL 3.1: one core moves 1 MiB within its cache in about 100 us,
+# the time that PoCL needs to wake two worker threads.
 _SHORT_BYTES = 1 << 20
 
 
 @dataclass(slots=True, eq=False)
 class _Site:
-    """Where a bound operation runs: a queue, the kernel as compiled for its device, and the arrays set in that.
+    """Queue and kernel of a bound operation, with the arrays that are set as the kernel's arguments.
 
-    The runtime may abort the process on a freed buffer: what the kernel was given stays referenced.
+    The arrays stay referenced, because a runtime may abort the process when a kernel uses a freed buffer.
     """
 
     queue: Any
     kernel: Any
     given: tuple[Any, ...]
-    at_once: bool  # in the caller's thread, done when enqueued
+    inline: bool  # kernels run in the calling thread and are complete when enqueued
 
 
 class Bound(Generic[R]):
-    """An operation bound to a device, a queue and a shape: call it with frames.
+    """Operation bound to a device, a queue and a shape; a call launches the kernel and allocates nothing.
 
     Attributes
     ----------
     inputs : tuple of pyopencl.array.Array
-        Its own input slot: fill it (`arrays.host_view` where memory is shared) and call with no arguments.
+        Input arrays of the instance: fill them (with `host_view` where memory is shared) and call without arguments.
     outputs : Result of pyopencl.array.Array
-        What each call writes, unless it is given ``out``; ``None`` where nothing is computed.
+        Arrays that calls without ``out`` write; ``None`` for fields that the operation does not compute.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class Bound(Generic[R]):
         self._launch = launch
         self._computed_specs = {name: spec for name, spec in launch.outputs.items() if spec is not None}
         self._global, self._local = launch.global_size, launch.local_size
-        # What `Device.wait` comes to, found out once: a call of short work is a few microseconds in all.
+        # `Device.wait` with its branch on the runtime resolved here: short calls take a few microseconds in all.
         self._wait: Callable[[Any], object] = device.wait if device.kind == "pocl" else cl.Event.wait
         self._empty = not all(launch.global_size)
         self.inputs = tuple(device.empty(shape, dtype, self.queue) for shape, dtype in launch.inputs)
@@ -64,41 +65,42 @@ class Bound(Generic[R]):
         self._tables = [self._upload(each) for each in launch.arguments if isinstance(each, np.ndarray)]
         self._in_flight: collections.deque[tuple[Any, Any]] = collections.deque()
         after_inputs = enumerate(launch.outputs.values(), len(launch.inputs))
-        # Of the arrays that calls bind, among the kernel's arguments.
+        # Indices of the input and output arrays among the kernel's arguments.
         self._places = [*range(len(launch.inputs)), *(place for place, spec in after_inputs if spec is not None)]
         self._own = (*self.inputs, *self._computed(self.outputs))
-        # Intel's runtime looks an SVM pointer up at every launch; a buffer over the same memory it knows.
+        # Intel's runtime searches for the allocation of an SVM pointer at every launch, but not for that of a buffer.
         known = self._own if device.kind == "intel" and device.shares_memory else ()
         self._known = {id(each): _buffer_over(device.context, each) for each in known}
-        self._site_of_queue = self._site_on(self.queue)
-        self._here: _Site | None = None
-        if not self._site_of_queue.at_once and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
+        self._queue_site = self._site_on(self.queue)
+        self._inline_site: _Site | None = None
+        if not self._queue_site.inline and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
             own = device.inline_queue(self.queue, groups=launch.groups)
-            self._here = None if own is None else self._site_on(own)
+            self._inline_site = None if own is None else self._site_on(own)
         for array in self.inputs:
             self._clear(array)
         self().wait()
-        if self._here is not None and not self._empty:
-            self._set_arrays(self._site_of_queue, self._own)
-            cl.enqueue_nd_range_kernel(self.queue, self._site_of_queue.kernel, self._global, self._local).wait()
+        if self._inline_site is not None and not self._empty:
+            self._set_arrays(self._queue_site, self._own)
+            cl.enqueue_nd_range_kernel(self.queue, self._queue_site.kernel, self._global, self._local).wait()
 
     def allocate(self) -> R:
-        """Return fresh device arrays for the outputs."""
+        """Return new device arrays for the outputs."""
         arrays = {
             name: self.device.empty(shape, dtype, self.queue) for name, (shape, dtype) in self._computed_specs.items()
         }
         return self._result(arrays)
 
     def __call__(self, *frames: DeviceArray, out: R | None = None, wait_for: Sequence[Any] | None = None) -> Any:
-        """Enqueue the operation and return its event.
+        """Enqueue the kernel and return its event.
 
         Parameters
         ----------
         *frames : pyopencl.array.Array
-            Device arrays of the bound shape and dtype; none: the instance's own `inputs`.
+            Device arrays of the bound shape and dtype; without arguments, the instance's `inputs`.
         out : Result of pyopencl.array.Array, optional
-            Where to write instead of `outputs`.
+            Arrays to write instead of `outputs`.
         wait_for : sequence of pyopencl.Event, optional
+            Events that must be complete before the kernel starts.
 
         Returns
         -------
@@ -107,30 +109,30 @@ class Bound(Generic[R]):
         Raises
         ------
         TypeError, ValueError
-            A frame is not what the instance was bound to.
+            Shape, dtype or device of an array differ from those of the instance.
         """
         return self._enqueue(self._own if not frames and out is None else self._given(frames, out), wait_for)
 
     def run(self, *frames: DeviceArray, out: R | None = None) -> R:
-        """Call, wait with the least delay, and return what was written: `out`, or `outputs`."""
+        """Launch, wait with the least delay, and return the written arrays: `out` or `outputs`."""
         event = self._enqueue(self._own if not frames and out is None else self._given(frames, out))
-        if not self._site_of_queue.at_once:
+        if not self._queue_site.inline:
             self._wait(event)
         return self.outputs if out is None else out
 
     def _given(self, frames: tuple[DeviceArray, ...], out: R | None) -> tuple[Any, ...]:
-        """Return the arrays of a call in the kernel's order, its own in place of what is not given."""
+        """Return the arrays of a call in the kernel's order; the instance's arrays where none are given."""
         if out is not None and out is not self.outputs:
             self._check_fields(out)
         return (*(frames or self.inputs), *self._computed(self.outputs if out is None else out))
 
     def _enqueue(self, given: tuple[Any, ...], wait_for: Sequence[Any] | None = None) -> Any:
-        site = self._site_of_queue if self._here is None else self._site(wait_for)
+        site = self._queue_site if self._inline_site is None else self._site(wait_for)
         if given is not site.given:
             self._set_arrays(site, given)
         if self._empty:
             return cl.enqueue_marker(self.queue, wait_for=wait_for)
-        if site.at_once:
+        if site.inline:
             if wait_for:
                 cl.wait_for_events(wait_for)
             return cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
@@ -140,17 +142,20 @@ class Bound(Generic[R]):
         return event
 
     def _site(self, wait_for: Sequence[Any] | None = None) -> _Site:
-        """Return where to run: short work in the caller's thread, once all before it in the queue is done.
+        """Return the site to run at: inline for short launches, after all earlier work of the queue.
 
-        Work that must wait is left to the workers: PoCL hangs where one of its devices waits for an event of the other.
+        Launches that must wait for an event run in the queue, because PoCL hangs when one of its devices waits for an
+        event of the other.
         """
-        if self._here is None or (wait_for and any(each.command_execution_status > _COMPLETE for each in wait_for)):
-            return self._site_of_queue
+        if self._inline_site is None or (
+            wait_for and any(each.command_execution_status > _COMPLETE for each in wait_for)
+        ):
+            return self._queue_site
         self.queue.finish()
-        return self._here
+        return self._inline_site
 
     def on_host(self, frames: Sequence[HostArray], out: R | None = None) -> R:
-        """Run on NumPy arrays and wait; on shared memory the kernel reads and writes them in place."""
+        """Run on NumPy arrays and wait; where memory is shared, the kernel reads and writes them in place."""
         if len(frames) != len(self.inputs):
             raise TypeError(f"expected {len(self.inputs)} input arrays, got {len(frames)}")
         for number, (frame, (shape, dtype)) in enumerate(zip(frames, self._launch.inputs, strict=True)):
@@ -180,13 +185,13 @@ class Bound(Generic[R]):
             site.kernel.set_arg(index, memory)
         cl.enqueue_nd_range_kernel(site.queue, site.kernel, self._global, self._local)
         for memory, array in zip(write, targets, strict=True):
-            # The map is what makes the kernel's writes visible to the host; the address stays the same.
+            # Mapping makes the kernel's writes visible to the host; the address stays the same.
             mapped, _ = cl.enqueue_map_buffer(
                 site.queue, memory, cl.map_flags.READ, 0, array.shape, array.dtype, is_blocking=False
             )
             mapped.base.release(site.queue)
         site.queue.finish()
-        # The next call binds others before these go away: a preset argument must never dangle.
+        # Replace the temporary buffers before they are freed: kernel arguments must never dangle.
         self._set_arrays(site, self._own)
 
     def _run_with_copies(self, frames: Sequence[HostArray], targets: Sequence[HostArray]) -> None:
@@ -243,7 +248,7 @@ class Bound(Generic[R]):
             cl.enqueue_fill_buffer(self.queue, memory_of(array), np.zeros(1, np.uint8), 0, array.nbytes)
 
     def _site_on(self, queue: Any) -> _Site:
-        """Compile the kernel for a queue's device and set what no call changes."""
+        """Build the kernel for the device of a queue and set the arguments that calls do not change."""
         launch, operation = self._launch, self.operation
         if operation.kernel_folder is None:
             raise ValueError(f"{type(operation).__name__} has no kernel_folder; set it to the folder of its .cl files")
@@ -271,7 +276,7 @@ class Bound(Generic[R]):
         return cl.Buffer(self.device.context, flags, hostbuf=np.ascontiguousarray(table))
 
     def _hold(self, event: Any, given: tuple[Any, ...]) -> None:
-        """Keep what a running kernel uses until it has run; its own arrays the instance keeps anyway."""
+        """Keep references to arrays of the caller until the kernel has run."""
         flight = self._in_flight
         while flight and flight[0][0].command_execution_status <= _COMPLETE:
             flight.popleft()
@@ -279,13 +284,13 @@ class Bound(Generic[R]):
 
 
 def _buffer_over(context: Any, array: DeviceArray) -> Any:
-    """Return a buffer that is an array's shared memory."""
+    """Return a buffer over the shared memory of an array."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
     return cl.Buffer(context, flags, hostbuf=host_view(array)) if array.nbytes else None
 
 
 def _check_apart(inputs: Sequence[Any], outputs: Sequence[Any], same: Callable[[Any, Any], bool]) -> None:
-    """Check that no output is an input or another output: kernels read and write in an order of their own."""
+    """Check that no output is an input or another output, because kernels read and write in any order."""
     for number, output in enumerate(outputs):
         if any(same(output, other) for other in (*inputs, *outputs[:number])):
             raise ValueError("an output shares its memory with an input or another output; expected arrays apart")

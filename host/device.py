@@ -1,4 +1,4 @@
-"""A device that works: chosen, named, or taken over from the caller."""
+"""OpenCL devices: the best one, one by name, or the one behind a handle that the caller owns."""
 
 from __future__ import annotations
 
@@ -19,45 +19,49 @@ from gpuvision.host.errors import DeviceUnusableError, NoDeviceError
 
 VARIABLE = "GPUVISION_DEVICE"
 _COMPLETE = cl.command_execution_status.COMPLETE
-_WATCHED_NS = 200_000
+# Time for which `Device.wait` polls an event before it sleeps. Measured on PoCL 3.1, two cores: waking from sleep takes
+# 50 to 100 us, and most frames of the speed benchmarks are computed within 200 us.
+_POLLING_NS = 200_000
 _LOCAL_THREAD = "cl_intel_exec_by_local_thread"
 _LOCAL_THREAD_QUEUE = 1 << 31  # CL_QUEUE_THREAD_LOCAL_EXEC_ENABLE_INTEL
-_LEAST_LAST_CACHE = 32 << 20  # Intel's runtime tells of the second level only
+# Lower bound of the last-level cache: Intel's runtime reports the second level only. 32 MiB is the third level of common
+# server processors; a smaller cache only makes the bypass of the caches begin later.
+_MIN_LAST_CACHE = 32 << 20
 
 
 class Device:
-    """An OpenCL device with its context and a default queue.
+    """OpenCL device with its context and a default queue.
 
-    Get one from `best`, `named`, `all` or `of`; two calls for one device return one object.
+    Get a device from `best`, `named`, `all` or `of`. Two calls for the same device return the same object.
 
     Attributes
     ----------
     handle : pyopencl.Device
     context : pyopencl.Context
     queue : pyopencl.CommandQueue
-        The in-order queue on which operations run unless they are given another.
+        In-order queue on which operations run unless another queue is given.
     label, kind, name, driver : str
-        Short unique name, maker (``pocl``, ``intel``, ``nvidia``, ...), full name, driver version.
+        Short unique name, vendor (``pocl``, ``intel``, ``nvidia``, ...), full name, driver version.
     is_cpu : bool
-        Whether kernels should walk strips with wide vectors (CPU runtimes) or run one item per sample.
+        Whether the device is a CPU. Kernels run their vector variant there, and one work-item per element elsewhere.
     shares_memory : bool
-        Whether host and device read and write the same allocations with no map or copy (fine-grained SVM).
+        Whether host and device read and write the same allocations without map or copy (fine-grained SVM).
     compute_units : int
         Cores of a CPU, multiprocessors of a GPU.
     has_double : bool
-        Whether `precision="double"` works here.
+        Whether the device computes in double precision.
     cache_bytes : int
-        Size of the last cache; more than that comes from memory and goes there.
+        Size of the last-level cache, at least 32 MiB [bytes].
     inline_device : pyopencl.Device or None
-        PoCL's other device, in the same context: it runs a kernel in the thread that enqueues it, which is done before
-        the first one's workers have woken up where there is little to do. Operations go there by themselves.
+        PoCL's second device in the same context, which runs a kernel in the thread that enqueues it. A small kernel
+        ends there before the worker threads of the first device wake up. Operations use it automatically.
     """
 
     def __init__(self, handle: Any, label: str, kind: str, *, queue: Any = None, inline_device: Any = None) -> None:
         self.handle = handle
         self.label, self.kind = label, kind
         self.name, self.driver = handle.name.strip(), handle.driver_version
-        # Held for the queue's sake too: Intel's runtime lets a context go while a queue of it lives.
+        # The context is kept for the queue, too: Intel's runtime frees a context while a queue of it exists.
         own = [handle] if inline_device is None else [handle, inline_device]
         self.context = queue.context if queue is not None else cl.Context(own)
         self.inline_device = inline_device
@@ -65,7 +69,7 @@ class Device:
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
         self.compute_units = int(handle.max_compute_units)
         self.has_double = bool(handle.double_fp_config)
-        self.cache_bytes = max(int(handle.global_mem_cache_size), _LEAST_LAST_CACHE)
+        self.cache_bytes = max(int(handle.global_mem_cache_size), _MIN_LAST_CACHE)
         self.shares_memory = self.is_cpu and _has_fine_grained_memory(handle)
 
     def __repr__(self) -> str:
@@ -73,21 +77,25 @@ class Device:
 
     @staticmethod
     def all() -> tuple[Device, ...]:
-        """Return every healthy device, the best first."""
+        """Return all healthy devices, best first; see `best` for the order."""
         healthy = [each for each in discovery.candidates() if each.healthy]
         return tuple(_open(each) for each in sorted(healthy, key=lambda each: each.rank))
 
     @staticmethod
     def best() -> Device:
-        """Return the device to use when nobody asked for one.
+        """Return the default device.
 
-        The variable ``GPUVISION_DEVICE`` names it; else a healthy GPU, else PoCL, else Intel's CPU runtime,
-        else any other.
+        The environment variable ``GPUVISION_DEVICE`` names it. Without the variable: a healthy GPU, else PoCL, else
+        Intel's CPU runtime, else any other healthy device.
+
+        Returns
+        -------
+        Device
 
         Raises
         ------
         NoDeviceError
-            Nothing healthy is there; the message says what to install.
+            There is no healthy device; the message names packages to install.
         """
         asked = os.environ.get(VARIABLE)
         if asked:
@@ -101,14 +109,23 @@ class Device:
 
     @staticmethod
     def named(name: str) -> Device:
-        """Return the one healthy device of that label, or with `name` in its label, name or platform.
+        """Return the healthy device with this label, or with `name` in its label, name or platform.
+
+        Parameters
+        ----------
+        name : str
+            Label or part of a name, in any case.
+
+        Returns
+        -------
+        Device
 
         Raises
         ------
         NoDeviceError
-            No device, or more than one healthy device, answers to the name. Never another device instead.
+            No device or more than one healthy device matches the name.
         DeviceUnusableError
-            The device is there and its probe failed.
+            The device exists, and its probe failed.
         """
         listed = discovery.candidates()
         asked = name.strip().lower()
@@ -129,18 +146,23 @@ class Device:
 
     @staticmethod
     def of(handle: Any) -> Device:
-        """Return the device behind a queue, context, or device array that the caller already owns.
+        """Return the device of a queue, context or device array that the caller owns.
 
         Parameters
         ----------
         handle : pyopencl.CommandQueue, pyopencl.Context or pyopencl.array.Array
 
+        Returns
+        -------
+        Device
+            Its default queue is the queue of the handle. The device is not probed.
+
         Raises
         ------
         TypeError
-            `handle` is none of these.
+            `handle` has another type.
         ValueError
-            The queue runs out of order.
+            The queue executes out of order.
         """
         if isinstance(handle, cl.array.Array):
             handle = handle.queue if handle.queue is not None else handle.context
@@ -154,37 +176,61 @@ class Device:
         return _adopt(handle)
 
     def wait(self, event: Any) -> None:
-        """Wait for an event with the least delay; `event.wait` leaves the processor to others at once.
+        """Wait for an event with the least delay.
 
-        PoCL puts the caller to sleep, and an idle processor takes longer to wake than a frame takes to compute: so
-        watch the event for a moment first. The other runtimes do so by themselves.
+        Parameters
+        ----------
+        event : pyopencl.Event
+
+        Notes
+        -----
+        ``event.wait`` of PoCL puts the calling thread to sleep at once, and waking takes longer than computing a small
+        frame. This method polls the event for 200 us first. Other runtimes poll by themselves.
         """
         if self.kind == "pocl":
-            end = time.perf_counter_ns() + _WATCHED_NS
+            end = time.perf_counter_ns() + _POLLING_NS
             while event.command_execution_status > _COMPLETE and time.perf_counter_ns() < end:
-                os.sched_yield()  # to a worker of the runtime that waits for this processor
+                os.sched_yield()  # a worker thread of the runtime may be waiting for this core
         event.wait()
 
-    def new_queue(self, *, profiling: bool = False, inline_device: bool = False) -> Any:
-        """Return another in-order queue; with `profiling`, its events carry device times.
+    def new_queue(self, *, profiling: bool = False, inline: bool = False) -> Any:
+        """Return a new in-order queue of the device.
 
-        With `inline_device`, what is enqueued runs in the thread that enqueues it and is done when that returns: for
-        chains of work of a few microseconds each. Where the runtime has no such queue it is one as any other.
+        Parameters
+        ----------
+        profiling : bool
+            Whether events carry device times.
+        inline : bool
+            Whether kernels run in the thread that enqueues them and are complete when the call returns. Useful for
+            chains of kernels of a few microseconds each. Runtimes without inline queues (all but PoCL 3 and Intel's
+            CPU runtime) return an ordinary queue.
+
+        Returns
+        -------
+        pyopencl.CommandQueue
         """
         properties = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
-        return (self._new_inline_queue(properties) if inline_device else None) or self._queue(self.handle, properties)
+        return (self._new_inline_queue(properties) if inline else None) or self._queue(self.handle, properties)
 
     def inline_queue(self, like: Any, *, groups: int) -> Any:
-        """Return a queue like another, whose kernels run in the thread that enqueues them; None where there is none.
+        """Return an inline queue with the properties of a queue, or None where it brings no gain.
 
-        Intel's runtime, whose workers are awake sooner than PoCL's, gets one for work of a single group: there is
-        nothing to share with a worker.
+        Parameters
+        ----------
+        like : pyopencl.CommandQueue
+        groups : int
+            Work-groups of the kernel.
+
+        Returns
+        -------
+        pyopencl.CommandQueue or None
+            On Intel's runtime, whose workers wake faster than PoCL's, only kernels of one work-group gain.
         """
         worthwhile = groups == 1 or self.inline_device is not None
         return self._new_inline_queue(like.properties) if worthwhile else None
 
     def is_inline(self, queue: Any) -> bool:
-        """Tell whether what is enqueued in a queue of this device is done when that returns."""
+        """Return whether kernels of this queue run in the thread that enqueues them."""
         if _LOCAL_THREAD not in self.handle.extensions.split():
             return bool(queue.device == self.inline_device)
         return _LOCAL_THREAD_QUEUE in queue.get_info(cl.command_queue_info.PROPERTIES_ARRAY)
@@ -200,12 +246,25 @@ class Device:
         return cl.CommandQueue(self.context, handle, properties=properties)
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike, queue: Any = None) -> DeviceArray:
-        """Return an uninitialised device array; on shared memory `arrays.host_view` shows it to NumPy."""
+        """Return an uninitialised device array.
+
+        Parameters
+        ----------
+        shape : tuple of int
+        dtype : dtype
+        queue : pyopencl.CommandQueue, optional
+            Queue of the array; the device's default queue otherwise.
+
+        Returns
+        -------
+        pyopencl.array.Array
+            Where `shares_memory`, `host_view` shows it to NumPy.
+        """
         queue = self.queue if queue is None else queue
         dtype = np.dtype(dtype)
         if not self.shares_memory:
             return cl.array.Array(queue, shape, dtype)
-        # An allocation of no bytes is an error in OpenCL, and a batch of no frames is none here.
+        # OpenCL refuses allocations of zero bytes; an empty batch needs one byte.
         size = max(int(np.prod(shape, dtype=np.int64)) * dtype.itemsize, 1)
         memory = cl.SVMAllocation(self.context, size, 0, SHARED_FLAGS, queue)
         return cl.array.Array(queue, shape, dtype, data=memory)
@@ -214,11 +273,11 @@ class Device:
 def _has_fine_grained_memory(handle: Any) -> bool:
     try:
         return bool(handle.svm_capabilities & cl.device_svm_capabilities.FINE_GRAIN_BUFFER)
-    except cl.Error:  # OpenCL 1.x does not know the question
+    except cl.Error:  # OpenCL 1.x has no such query
         return False
 
 
-# One device, one context: arrays of two contexts do not meet. The lock keeps two threads from opening it twice.
+# One context per device, because kernels cannot mix arrays of two contexts. The lock serialises opening.
 _opened: dict[str, Device] = {}
 _opening = threading.Lock()
 
@@ -237,7 +296,7 @@ def _default_queue(context: Any) -> Any:
 
 @functools.lru_cache(maxsize=32)
 def _adopt(queue: Any) -> Device:
-    """Give the caller's own queue a device: nothing is probed, and no other device is opened."""
+    """Return the device of a queue that the caller owns, without probing it or opening other devices."""
     for each in _opened.values():
         if each.queue == queue:
             return each

@@ -18,11 +18,11 @@ import pyopencl as cl
 
 from gpuvision.host.files import write_whole
 from gpuvision.host.runtime import (
-    request_inline_device,
     cache_folder,
     expose_installed_runtime,
     pin_workers,
     provide_cache,
+    request_inline_device,
 )
 
 INSTALL_HINT = (

@@ -1,7 +1,7 @@
 """Base class of all operations: described once, bound to a device and a shape, then called.
 
-``op(array)`` is convenience: it binds behind the scene and keeps the bound instance. ``op.bind(...)`` is the hot
-path: after it nothing is compiled, allocated or copied.
+``op(array)`` binds the operation on the first call for a shape and reuses the bound instance. ``op.bind(...)`` is
+the fast path: calls of a bound instance compile, allocate and copy nothing.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from gpuvision.host.launch import Launch
 
 R = TypeVar("R", bound=tuple[Any, ...])
 
+# Bound instances that each thread keeps for `Operation.__call__`; each of them holds device memory for its arrays.
 _KEPT_BOUND = 16
 
 
 class Operation(Generic[R]):
-    """Base of the operations: frozen dataclasses of physics and units, validated once.
+    """Base class of operations, which are frozen dataclasses of parameters that are validated once.
 
-    A subclass names its result type in `Result`, its kernel folder in `kernel_folder`, and describes in `launch` which
-    kernel runs.
+    A subclass sets its result type `Result` and its `kernel_folder`, and describes in `launch` the kernel to run.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Operation(Generic[R]):
         raise NotImplementedError
 
     def bind(self, device: Device | None, shape: tuple[int, ...], dtype: DTypeLike, *, queue: Any = None) -> Bound[R]:
-        """Prepare the operation for frames of one shape: build, allocate, and warm up with a launch.
+        """Prepare the operation for inputs of one shape: build the program, allocate arrays, launch once.
 
         Parameters
         ----------
@@ -81,14 +81,14 @@ class Operation(Generic[R]):
         shape : tuple of int
             Shape of the (first) input.
         dtype : dtype
-            Its dtype.
+            Dtype of the (first) input, in native byte order.
         queue : pyopencl.CommandQueue, optional
-            Where it runs; the device's default queue otherwise.
+            Queue to run in; the device's default queue otherwise.
 
         Returns
         -------
         Bound
-            Not safe to share between threads: bind once per thread.
+            For one thread: threads must not share a bound instance.
 
         Raises
         ------
@@ -105,14 +105,14 @@ class Operation(Generic[R]):
         return Bound(self, device, tuple(map(operator.index, shape)), dtype, queue)
 
     def __call__(self, *inputs: Any, device: Device | None = None, out: R | None = None) -> R:
-        """Run once on NumPy arrays (and wait) or on device arrays (and return at once).
+        """Run once: on NumPy arrays and wait, or on device arrays and return without waiting.
 
         Parameters
         ----------
         *inputs : numpy.ndarray or pyopencl.array.Array
-            C-contiguous. All of one kind.
+            C-contiguous arrays, all NumPy arrays or all device arrays.
         device : Device, optional
-            Where to run; device arrays run where they lie, on their own queue.
+            Device to run on; `Device.best` by default. Device arrays run on their own device, in their own queue.
         out : Result, optional
             Arrays of the same kind as the inputs to write into; the same object is returned. Fields that the
             operation does not compute are ``None``.
@@ -120,12 +120,12 @@ class Operation(Generic[R]):
         Returns
         -------
         Result
-            NumPy in, NumPy out; device arrays in, device arrays out.
+            NumPy arrays from NumPy inputs, device arrays from device inputs.
 
         Raises
         ------
         TypeError, ValueError
-            Wrong dtype, shape, layout or device: nothing is converted behind the caller's back.
+            Wrong dtype, shape, layout or device. Inputs are never converted.
         """
         if out is not None and not isinstance(out, self.Result):
             raise TypeError(f"out: expected a {self.Result.__name__} of arrays, got {type(out).__name__}")
@@ -142,7 +142,7 @@ class Operation(Generic[R]):
             raise ValueError(f"the input lies on {home.label}, not on {device.label}; copy it there first")
         bound = self._bound(home, inputs[0].queue, inputs[0])
         result = bound.allocate() if out is None else out
-        # Another queue may still be writing the inputs.
+        # A kernel in another queue may still write the inputs: wait for their events.
         event = bound(*inputs, out=result, wait_for=[event for array in inputs for event in array.events])
         for array in result:
             if array is not None:
@@ -150,7 +150,7 @@ class Operation(Generic[R]):
         return result
 
     def _bound(self, device: Device, queue: Any, first: HostArray | DeviceArray) -> Bound[R]:
-        """Return the bound instance of this thread for such an input, from the few kept ones."""
+        """Return this thread's bound instance for a first input; bind a new one where none is kept."""
         kept: collections.OrderedDict[Any, Bound[R]] = _kept_bound()
         key = (self, device, queue, first.shape, first.dtype)
         if key not in kept:
@@ -161,7 +161,7 @@ class Operation(Generic[R]):
         return kept[key]
 
 
-# Kernel objects are not safe to share between threads: each thread keeps its own.
+# OpenCL kernel objects are not thread-safe: each thread keeps its own bound instances.
 _thread = threading.local()
 
 

@@ -18,9 +18,10 @@ Define = int | float | str | None
 
 
 def options(defines: Mapping[str, Define]) -> list[str]:
-    """Write defines as compiler options; ``None`` defines a name without a value.
+    """Return compiler options for macros; the value ``None`` defines a macro without a value.
 
-    Never fast-relaxed or finite-math-only: range images carry NaN holes.
+    The options never contain ``-cl-fast-relaxed-math`` or ``-cl-finite-math-only``, because range images mark missing
+    points with NaN.
     """
     words = [f"-D{name}" if value is None else f"-D{name}={value}" for name, value in sorted(defines.items())]
     return ["-cl-mad-enable", *words]
@@ -49,7 +50,7 @@ def build(
     include_folders : sequence of pathlib.Path, optional
         More folders that are searched for headers, after `folder`.
     handle : pyopencl.Device, optional
-        Which device of the context; ``device.handle`` unless another is named.
+        Device of the context to build for; ``device.handle`` by default.
 
     Returns
     -------
@@ -58,7 +59,7 @@ def build(
     Raises
     ------
     BuildError
-        The source does not compile; carries the log.
+        The source does not compile; the message contains the compiler's log.
     """
     handle = device.handle if handle is None else handle
     return _build(device.context, handle, folder, source, tuple(options(defines)), tuple(include_folders))
@@ -72,7 +73,7 @@ def _build(
     includes = [word for each in (folder, *include_folders) for word in ("-I", os.fspath(each))]
     try:
         with warnings.catch_warnings():
-            # Both CPU runtimes report success ("Device ... successfully vectorised") as compiler output.
+            # The CPU runtimes report success ("Device ... successfully vectorised") as compiler output.
             warnings.simplefilter("ignore", cl.CompilerWarning)
             return program.build(options=[*words, *includes], devices=[handle])
     except cl.RuntimeError as error:

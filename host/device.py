@@ -19,13 +19,13 @@ from gpuvision.host.errors import DeviceUnusableError, NoDeviceError
 
 VARIABLE = "GPUVISION_DEVICE"
 _COMPLETE = cl.command_execution_status.COMPLETE
-# Time for which `Device.wait` polls an event before it sleeps. Measured on PoCL 3.1, two cores: waking from sleep takes
-# 50 to 100 us, and most frames of the speed benchmarks are computed within 200 us.
+# Time for which `Device.wait` polls an event before it sleeps: longer than a small frame takes to compute, so that only
+# long kernels pay the delay of waking the calling thread.
 _POLLING_NS = 200_000
 _LOCAL_THREAD = "cl_intel_exec_by_local_thread"
 _LOCAL_THREAD_QUEUE = 1 << 31  # CL_QUEUE_THREAD_LOCAL_EXEC_ENABLE_INTEL
-# Lower bound of the last-level cache: Intel's runtime reports the second level only. 32 MiB is the third level of common
-# server processors; a smaller cache only makes the bypass of the caches begin later.
+# Lower bound of the last-level cache: Intel's runtime reports the second level only. 32 MiB is a common third level of
+# servers. On a processor with less, kernels only begin later to write past the caches.
 _MIN_LAST_CACHE = 32 << 20
 
 

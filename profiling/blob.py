@@ -3,7 +3,7 @@
 Bright discs of 8 px radius and 1 px blur on an 8-bit frame, noise 2 at a contrast of 100, each up to 2 px from its
 nominal place. Numba takes the same rulers, start, robust fit, match of the pixels, centre of gravity and covariance.
 OpenCV cuts each mark out, takes Otsu's threshold off, and has the moments of the grey levels above it (the most
-accurate of what is quick: `findContours` with `fitEllipse` is named in the facts); it returns the centre alone.
+accurate of what is quick: `findContours` with `fitEllipse` is named in the metadata); it returns the centre alone.
 """
 
 from __future__ import annotations
@@ -467,7 +467,7 @@ def _case(device: Device, count: int) -> Case:
 
     fused()
     ours = np.stack([to_numpy(blobs.x), to_numpy(blobs.y)], axis=-1)
-    facts = {
+    metadata = {
         "blobs": count,
         "deviation_px": _deviation(ours, true),
         "numba_deviation_px": _deviation(found[:, :2], true),
@@ -475,7 +475,7 @@ def _case(device: Device, count: int) -> Case:
         "ellipse_deviation_px": _deviation(_ellipses(image, places), true),
     }
     peers: dict[str, Callable[[], object]] = {"numba": fused, "opencv": lambda: _moments(image, places)}
-    return Case("blob", str(count), bound.run, peers, float(np.max(np.abs(ours - true))), facts=facts)
+    return Case("blob", str(count), bound.run, peers, float(np.max(np.abs(ours - true))), metadata=metadata)
 
 
 def _deviation(found: NDArray[Any], true: NDArray[Any]) -> float:

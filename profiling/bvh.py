@@ -84,16 +84,16 @@ def _any_hit(device: Device, name: str, mesh: Any, shuffled: bool) -> Case:
     bound.run()
     occluded = to_numpy(bound.outputs.occluded) != 0
     disagree = float(np.mean((np.concatenate(embree()) == 0) != occluded))
-    facts = {"triangles": len(mesh.faces), "segments": len(segments), "occluded": float(np.mean(occluded))}
-    return Case("bvh", f"any-hit/{name}", bound.run, {"embreex": embree}, disagree, facts=facts)
+    metadata = {"triangles": len(mesh.faces), "segments": len(segments), "occluded": float(np.mean(occluded))}
+    return Case("bvh", f"any-hit/{name}", bound.run, {"embreex": embree}, disagree, metadata=metadata)
 
 
 def _build(mesh: Any, size: str) -> Case:
     corners = np.asarray(mesh.triangles)
     # Most of embreex's time is the transfer of the triangles; peer_tree_s is the construction alone.
-    facts = {"triangles": len(corners), "peer_tree_s": min(_embree_tree_time(corners) for _ in range(3))}
+    metadata = {"triangles": len(corners), "peer_tree_s": min(_embree_tree_time(corners) for _ in range(3))}
     peers = {"embreex": lambda: embree_scene(corners)}
-    return Case("bvh", f"build/{size}", lambda: Bvh.build(corners), peers, 0.0, facts=facts)
+    return Case("bvh", f"build/{size}", lambda: Bvh.build(corners), peers, 0.0, metadata=metadata)
 
 
 def embree_scene(corners: NDArray[Any]) -> Any:

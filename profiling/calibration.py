@@ -67,7 +67,7 @@ def cases(device: Device) -> Iterator[Case]:
 @functools.lru_cache(maxsize=len(_TARGETS))
 def case_of(name: str, file: str, shape: tuple[int, int]) -> Case:
     """Return the case of a target, or of a synthetic grid if the image is missing."""
-    families, facts = _measured(file) if (_DATA / file).is_file() else _synthetic(shape)
+    families, metadata = _measured(file) if (_DATA / file).is_file() else _synthetic(shape)
 
     def ours() -> Lens | None:
         return fit_lens(families, model="k1,k2", lines="free").lens
@@ -76,14 +76,14 @@ def case_of(name: str, file: str, shape: tuple[int, int]) -> Case:
     start = time.perf_counter()
     chosen = fit_lens(families)
     line_coefficients = time.perf_counter() - start
-    facts |= {
+    metadata |= {
         "points": sum(len(line) for family in families for line in family),
         "error_raw": straightness_px(families),
         "error_discorpy": straightness_px(families, theirs()),
         "model": f"{chosen.model}, {chosen.lines}",
         "seconds_with_choice": line_coefficients,
     }
-    return Case("calibration", name, ours, {"discorpy": theirs}, straightness_px(families, ours()), facts=facts)
+    return Case("calibration", name, ours, {"discorpy": theirs}, straightness_px(families, ours()), metadata=metadata)
 
 
 def discorpy_fit(families: Families) -> Callable[[], Radial]:
@@ -113,8 +113,8 @@ def _measured(file: str) -> tuple[Families, dict[str, Any]]:
         start = time.perf_counter()
         found = find()
         times.append(time.perf_counter() - start)
-    facts = {"data": file, "seconds_to_find": float(np.median(times[1:])), "seconds_to_find_discorpy": times[0]}
-    return found, facts
+    metadata = {"data": file, "seconds_to_find": float(np.median(times[1:])), "seconds_to_find_discorpy": times[0]}
+    return found, metadata
 
 
 def _found(image: NDArray[Any], file: str) -> Families:

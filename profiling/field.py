@@ -205,21 +205,21 @@ class _Search:
 def _global(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> Iterator[Case]:
     search = _Search(device, field_map, _points(field_map, pose, 0.003), (pose[2],))
     height, width = field_map.positions
-    facts = {"poses": height * width, "rays": _RAYS}
+    metadata = {"poses": height * width, "rays": _RAYS}
     search.check(search.numba_shifts, search.numpy_poses, search.numba_poses, search.numpy_shifts)
     peers: dict[str, Callable[[], object]] = {"numba": search.numba_shifts, "numpy": search.numpy_poses}
-    yield Case("field", "global", search.bound.run, peers, search.error, search.traffic, facts=facts)
+    yield Case("field", "global", search.bound.run, peers, search.error, search.traffic, metadata=metadata)
     peers = {"numba": search.numba_poses, "numpy": search.numpy_shifts}
-    yield Case("field", "global-shifts", search.bound.run, peers, search.error, search.traffic, facts=facts)
+    yield Case("field", "global-shifts", search.bound.run, peers, search.error, search.traffic, metadata=metadata)
 
 
 def _turns(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> Case:
     headings = tuple(np.arange(72) * (np.pi / 36.0))
     search = _Search(device, field_map, _points(field_map, pose, 0.02), headings)
     search.check(search.numba_shifts)
-    facts = {"poses": search.scores.size, "rays": _RAYS}
+    metadata = {"poses": search.scores.size, "rays": _RAYS}
     peers = {"numba": search.numba_shifts}
-    return Case("field", "turns", search.bound.run, peers, search.error, search.traffic, facts=facts)
+    return Case("field", "turns", search.bound.run, peers, search.error, search.traffic, metadata=metadata)
 
 
 # ---- local ---------------------------------------------------------------------------------------------------
@@ -277,4 +277,4 @@ def _local(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> C
         return fit.x, np.linalg.inv(fit.jac.T @ fit.jac)
 
     error = float(np.max(np.abs(to_numpy(ours.poses)[0] - scipy()[0])))
-    return Case("field", "local", bound.run, {"scipy": scipy}, error, facts={"rays": _RAYS})
+    return Case("field", "local", bound.run, {"scipy": scipy}, error, metadata={"rays": _RAYS})

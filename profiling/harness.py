@@ -1,8 +1,8 @@
-"""Measure candidates side by side.
+"""Benchmark harness: measure our operation and its peers interleaved.
 
-Absolute times lie on a shared machine: it changes its speed by a factor of two within minutes. So the candidates of a
-case take turns within each round, a ratio is the median over rounds of the ratio within a round, and a section whose
-FLOP rate differs before and after is measured again.
+Absolute times on a shared machine are unreliable: its speed changes by a factor of two within minutes. Therefore the
+candidates of a case run in turn within each round, a ratio is the median over the rounds of the ratio within a round,
+and a section is measured again if the FLOP rate of the machine differs before and after it.
 """
 
 from __future__ import annotations
@@ -49,36 +49,36 @@ OPERATIONS = (
     "launch",
     "stream",
 )
-_ROUND_LIMITS = (7, 101)
-_WARM_UP = 1e-3  # s
+_ROUND_LIMITS = (7, 101)  # smallest and largest number of rounds
+_WARM_UP = 1e-3  # duration of untimed calls before a timed one [s]
 _CALLS_PER_TURN = 3
-_STEADY = 0.2
-_ATTEMPTS = 4
+_STEADY = 0.2  # largest relative change of the FLOP rate during a valid section
+_ATTEMPTS = 4  # measurements of a section before the run is marked invalid
 
 
 @dataclass(frozen=True)
 class Case:
-    """One row or more to measure: our call, and peers that do the same work on the same input.
+    """Benchmark case: our call, and peers that do the same work on the same input. It gives one row for each peer.
 
     Attributes
     ----------
     operation, name
-        As in the rows; names stay stable, they are tracked over time.
+        Columns ``operation`` and ``case`` of the rows. Names stay stable, because results are compared over time.
     ours
-        A call that does the work and waits for it.
+        Function that does the work and waits until it is finished.
     peers
-        Calls by the peer's name (``numba``, ``numpy``, ``opencv``, ``pyopencl``).
+        Functions by the name of the peer (``numba``, ``numpy``, ``opencv``, ``pyopencl``).
     error
-        Our largest error against float64, in the output's unit, measured on the case's own input.
+        Our largest error compared with float64 on the input of the case, in the unit of the output.
     traffic
-        Bytes (read, written) that the work needs at least, for the fraction of the device's limit.
+        Least number of bytes (read, written) of the work, for the fraction of the device's limit; None: no fraction.
     repeats
-        How often every call does the work back to back; a row's times are for one.
-    facts
-        More columns for the row (latencies, rates).
+        Number of times that each function does the work back to back; the times in a row are for one.
+    metadata
+        Additional columns of the row (latencies, rates).
     factors
-        What the measured time of a peer, by name, is multiplied with, where all of its work would take too long; the
-        facts say how the factor was found.
+        Factors, by the name of the peer, that multiply the measured time of a peer which does only a part of the work,
+        because all of it would take too long. The module of the case documents the origin of a factor.
     """
 
     operation: str
@@ -88,13 +88,29 @@ class Case:
     error: float
     traffic: tuple[int, int] | None = None
     repeats: int = 1
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    metadata: Mapping[str, Any] = field(default_factory=dict)
     factors: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One measured comparison; ``ratio`` is the peer's time over ours, more than 1 where we are faster."""
+    """Result of one comparison.
+
+    Attributes
+    ----------
+    operation, case, device, peer, peer_version
+        Names of the operation, the case, the device and the peer, and the version of the peer.
+    seconds, peer_seconds
+        Median times of our function and of the peer [s].
+    ratio
+        Time of the peer over our time, median over the rounds; above 1 if we are faster.
+    error
+        Our largest error, see `Case`.
+    fraction
+        Time of a copy with the same traffic over our time; None if the case gives no traffic.
+    metadata
+        Additional columns.
+    """
 
     operation: str
     case: str
@@ -106,30 +122,40 @@ class Row:
     ratio: float
     error: float
     fraction: float | None
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the row as JSON takes it, the facts beside the other columns."""
+        """Return the columns by name, with those of the metadata after the others."""
         table = asdict(self)
-        return {key: value for key, value in table.items() if key != "facts"} | dict(self.facts)
+        return {key: value for key, value in table.items() if key != "metadata"} | dict(self.metadata)
 
 
 @dataclass(frozen=True)
 class Run:
-    """Rows, and whether the machine held its speed while they were measured."""
+    """Rows of a benchmark run.
+
+    Attributes
+    ----------
+    rows
+        Measured comparisons.
+    valid
+        Whether the machine held its speed during the measurement.
+    machine
+        Description of the machine, see `describe_machine`.
+    """
 
     rows: Sequence[Row]
     valid: bool
     machine: Mapping[str, Any]
 
     def write(self, path: Path) -> None:
-        """Write the run as JSON, whole or not at all."""
+        """Write the run as JSON; on an error no file is written."""
         rows = [row.to_dict() for row in self.rows]
         write_whole(path, json.dumps({"machine": self.machine, "valid": self.valid, "rows": rows}, indent=1) + "\n")
 
 
 def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
-    """Let our call, the peers and the device's ceiling take turns for about so many seconds."""
+    """Measure our function, the peers and the limit of the device interleaved, for about ``seconds`` [s]."""
     calls: dict[str, Callable[[], object]] = {"": case.ours, **case.peers}
     if case.traffic is not None:
         calls["ceiling"] = ceiling.move(device, *case.traffic, case.repeats)
@@ -150,7 +176,7 @@ def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
             ratio=float(np.median(theirs / ours)),
             error=case.error,
             fraction=fraction,
-            facts=case.facts,
+            metadata=case.metadata,
         )
         for peer, theirs in times.items()
     ]
@@ -171,13 +197,13 @@ def _take_turns(calls: Mapping[str, Callable[[], object]], seconds: float) -> di
 
 
 def _round(calls: Mapping[str, Callable[[], object]], number: int) -> dict[str, float]:
-    """Give each call a turn, in another order each round: whoever follows a neighbour that fills the caches pays."""
+    """Time each function once, in a different order each round: a predecessor that fills the caches costs time."""
     order = np.random.default_rng(number).permutation(list(calls))
     return {name: _turn(calls[name]) for name in order}
 
 
 def _turn(call: Callable[[], object]) -> float:
-    """Return the median of a few calls, after it had the machine for a moment and left the caches its own way."""
+    """Return the median time of a few calls [s], after untimed calls that fill the caches with the data of `call`."""
     begun = time.perf_counter()
     call()
     while time.perf_counter() - begun < _WARM_UP:
@@ -191,7 +217,7 @@ def _turn(call: Callable[[], object]) -> float:
 
 
 def peer_version(peer: str) -> str:
-    """Return the version of the package a peer's name stands for."""
+    """Return the version of the package of a peer; "a+b" stands for two packages."""
     packages = {"opencv": "opencv-contrib-python-headless"}
     return " + ".join(version(packages.get(each, each)) for each in peer.split("+") if each)
 
@@ -201,39 +227,36 @@ def profile(
     devices: Sequence[Device],
     *,
     seconds: float = 2.0,
-    told: Callable[[str], None] = lambda line: None,
-    row_ready: Callable[[Row], None] = lambda row: None,
+    progress: Callable[[str], None] = lambda line: None,
 ) -> Run:
-    """Measure the cases of some operations on some devices.
+    """Measure the cases of the given operations on the given devices.
 
     Parameters
     ----------
     operations
-        Names of modules in ``profiling``, each with ``cases(device)``.
+        Names of modules in ``profiling``, each with a function ``cases(device)``.
     devices
-        Where to measure.
+        Devices to measure on.
     seconds
-        About how long to measure each case.
-    told, row_ready
-        Called with a line of progress, and with each row of a section that stands.
+        Approximate time to measure each case [s].
+    progress
+        Function that is called with lines of text about the progress.
     """
     rows: list[Row] = []
     valid = True
     for operation in operations:
         for device in devices:
-            told(f"{operation} on {device.label}")
-            section, steady = _steady_section(operation, device, seconds, told)
-            for row in section:
-                row_ready(row)
+            progress(f"{operation} on {device.label}")
+            section, steady = _steady_section(operation, device, seconds, progress)
             rows += section
             valid &= steady
     return Run(rows, valid, describe_machine(devices))
 
 
 def _steady_section(
-    operation: str, device: Device, seconds: float, told: Callable[[str], None]
+    operation: str, device: Device, seconds: float, progress: Callable[[str], None]
 ) -> tuple[list[Row], bool]:
-    """Measure a section; again when the machine changed its speed meanwhile."""
+    """Measure an operation on a device; again if the machine changed its speed meanwhile. Return rows and validity."""
     module = importlib.import_module(f"gpuvision.profiling.{operation}")
     rows: list[Row] = []
     for attempt in range(_ATTEMPTS):
@@ -243,12 +266,12 @@ def _steady_section(
         after = ceiling.flop_rate(device)
         if abs(after / before - 1.0) <= _STEADY:
             return rows, True
-        told(f"  {before / 1e9:.0f} -> {after / 1e9:.0f} GFLOP/s: the machine changed its speed ({attempt + 1})")
+        progress(f"  {before / 1e9:.0f} -> {after / 1e9:.0f} GFLOP/s: the machine changed its speed ({attempt + 1})")
     return rows, False
 
 
 def describe_machine(devices: Sequence[Device]) -> dict[str, Any]:
-    """Return what a reader needs to place the numbers."""
+    """Return date, processor, system, versions and devices, which the times depend on."""
     return {
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "processor": _processor(),

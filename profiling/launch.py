@@ -42,8 +42,8 @@ def cases(device: Device) -> Iterator[Case]:
         queue.finish()
 
     for name, call in (("bound", preset), ("given", given)):
-        facts = {"overhead_us": _overhead(call, plain) * 1e6}
-        yield Case("launch", name, call, {"pyopencl": plain}, error=0.0, repeats=_LAUNCHES, facts=facts)
+        metadata = {"overhead_us": _overhead(call, plain) * 1e6}
+        yield Case("launch", name, call, {"pyopencl": plain}, error=0.0, repeats=_LAUNCHES, metadata=metadata)
 
 
 def _overhead(call: Callable[[], None], plain: Callable[[], None]) -> float:

@@ -211,7 +211,7 @@ def _case(
     off = np.abs(part.shifts(result.irradiance) - part.shifts(exact))
     counts = result.cut.counts
     pairs = max(counts["pairs"], 1)
-    facts: dict[str, Any] = {
+    metadata: dict[str, Any] = {
         "tolerance": tolerance,
         "bound": float(result.cut.bound.max()),
         "within": float(np.mean(off <= max(tolerance, _ROUNDING))),
@@ -221,6 +221,8 @@ def _case(
         **{kind: counts[kind] / pairs for kind in ("exact", "clear", "clustered", "work")},
     }
     if since is not None:
-        more = math.log(pairs / since.facts["pairs"])
-        facts["exponent"] = 1.0 + math.log(facts["work"] / since.facts["work"]) / more
-    return Case("light_clustering", name, call, {"gpuvision": part.all_pairs(device)}, float(off.max()), facts=facts)
+        more = math.log(pairs / since.metadata["pairs"])
+        metadata["exponent"] = 1.0 + math.log(metadata["work"] / since.metadata["work"]) / more
+    return Case(
+        "light_clustering", name, call, {"gpuvision": part.all_pairs(device)}, float(off.max()), metadata=metadata
+    )

@@ -77,8 +77,12 @@ def _balls(device: Device) -> Case:
     ours, same = np.take_along_axis(triangle, order, axis=1), np.take_along_axis(found, their_order, axis=1)
     apart = np.take_along_axis(place, order[..., None], axis=1) - np.take_along_axis(theirs, their_order[..., None], 1)
     both = (ours == same) & (ours >= 0)
-    facts = {"pairs": _POINTS * len(corners), "images": int((triangle >= 0).sum()), "others": int((ours != same).sum())}
-    return Case("mirrors", "balls", bound.run, {"numba": peer}, float(np.abs(apart[both]).max()), facts=facts)
+    metadata = {
+        "pairs": _POINTS * len(corners),
+        "images": int((triangle >= 0).sum()),
+        "others": int((ours != same).sum()),
+    }
+    return Case("mirrors", "balls", bound.run, {"numba": peer}, float(np.abs(apart[both]).max()), metadata=metadata)
 
 
 def _corner_table(lens: Array, corners: Array, normals: Array) -> Array:
@@ -198,14 +202,14 @@ def _facets(device: Device, samples: int) -> Case:
     ours, theirs = mirrors.mirrored_exposure(lit, 0.0).total(), peer().total()
     lit_up = ours > 0.0
     error = float(np.median(np.abs(theirs[lit_up] / ours[lit_up] - 1.0)))
-    facts = {"triangles": len(scene.corners), "samples": samples * len(lit.power), "peer_error": error}
+    metadata = {"triangles": len(scene.corners), "samples": samples * len(lit.power), "peer_error": error}
     return Case(
         "mirrors",
         f"facets/{samples}",
         lambda: mirrors.mirrored_exposure(lit, 0.0),
         {"numpy+embreex": peer},
         0.0,
-        facts=facts,
+        metadata=metadata,
     )
 
 

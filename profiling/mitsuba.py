@@ -53,7 +53,7 @@ def _case(device: Device, lit: LitScene, name: str, variant: str, *, samples: in
 
     theirs = median_error(picture(samples, 1))
     ours = median_error(bound.run().irradiance.get().reshape(lit.pixels).astype(np.float64))
-    facts = {
+    metadata = {
         "variant": variant,
         "pixels": int(np.prod(lit.pixels)),
         "samples": samples,
@@ -62,5 +62,5 @@ def _case(device: Device, lit: LitScene, name: str, variant: str, *, samples: in
     }
     factors = {"mitsuba": (theirs / _ASKED) ** 2}
     return Case(
-        "mitsuba", name, bound.run, {"mitsuba": lambda: picture(samples, 2)}, ours, facts=facts, factors=factors
+        "mitsuba", name, bound.run, {"mitsuba": lambda: picture(samples, 2)}, ours, metadata=metadata, factors=factors
     )

@@ -112,7 +112,7 @@ def _case(device: Device, board: Board, name: str, samples: int = 1024, **more: 
     if device.has_double:
         truth = to_numpy(operation(receivers.astype(float), weights.astype(float), rows, device=device).irradiance)
     peer = functools.partial(irradiance_by_samples, board, samples, embree_of(board.scene))
-    facts = {
+    metadata = {
         "triangles": len(board.scene.corners),
         "segments": len(rows),
         "receivers": ours.size,
@@ -126,7 +126,7 @@ def _case(device: Device, board: Board, name: str, samples: int = 1024, **more: 
         {"numpy+embreex": peer},
         error_of(ours, truth),
         repeats=_PROFILES,
-        facts=facts,
+        metadata=metadata,
         factors={"numpy+embreex": _PROFILES},
     )
 

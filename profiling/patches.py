@@ -55,10 +55,15 @@ def _room(device: Device, receivers: int) -> Case:
         return np.where(apart, np.concatenate(parts), 0.0)
 
     theirs = numpy()
-    facts = {"pairs": ours.size, "peer_error": 0.0}
+    metadata = {"pairs": ours.size, "peer_error": 0.0}
     error = float(np.abs(ours - theirs).max() / theirs.max())
     return Case(
-        "reflections", f"bounces/room/{len(points)}x{patches.count}", bound.run, {"numpy": numpy}, error, facts=facts
+        "reflections",
+        f"bounces/room/{len(points)}x{patches.count}",
+        bound.run,
+        {"numpy": numpy},
+        error,
+        metadata=metadata,
     )
 
 
@@ -88,9 +93,11 @@ def _board(device: Device, size: float) -> Case:
     exact = PatchLight(patches=patches, scene=scene, rays=4096.0)
     truth = to_numpy(exact(points.astype(real), exitance.astype(real), device=device).irradiance)
     by_points = _PointByPoint(scene, patches, exitance, points)
-    facts = {"patches": patches.count, "receivers": len(points), "peer_error": _error(by_points(), truth)}
+    metadata = {"patches": patches.count, "receivers": len(points), "peer_error": _error(by_points(), truth)}
     peers = {"numpy+embreex": by_points}
-    return Case("reflections", f"bounces/board/{patches.count}", bound.run, peers, _error(ours, truth), facts=facts)
+    return Case(
+        "reflections", f"bounces/board/{patches.count}", bound.run, peers, _error(ours, truth), metadata=metadata
+    )
 
 
 def _error(values: NDArray[Any], truth: NDArray[Any]) -> float:

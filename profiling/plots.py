@@ -26,10 +26,10 @@ def draw_plots(folder: str | Path, rows: Sequence[Row]) -> list[str]:
     """
     drawn = []
     grown = [row for row in rows if _GROWTH.match(row.case)]
-    bases = {row.facts.get("base") for row in grown}
+    bases = {row.metadata.get("base") for row in grown}
     for name, draw, chosen in (
         ("growth.png", _growth, grown and [row for row in rows if row in grown or row.case in bases]),
-        ("tolerance.png", _tolerance, [row for row in rows if "tolerance" in row.facts and "/" in row.case]),
+        ("tolerance.png", _tolerance, [row for row in rows if "tolerance" in row.metadata and "/" in row.case]),
     ):
         some = [row for row in chosen if name == "growth.png" or not row.case.startswith("growth/")]
         if some:
@@ -61,8 +61,8 @@ def _growth(axes: Any, rows: Sequence[Row]) -> None:
         what, times = grown.groups()
         line = lines.setdefault(what or "all, within a tolerance", {})
         line[int(times)] = row.seconds
-        if "base" in row.facts:
-            line[1] = bases[row.facts["base"]]
+        if "base" in row.metadata:
+            line[1] = bases[row.metadata["base"]]
         if row.peer == "gpuvision":
             lines.setdefault("all, all pairs", {})[int(times)] = row.peer_seconds
     for colour, (name, line) in zip(_COLOURS, lines.items(), strict=False):
@@ -76,8 +76,10 @@ def _tolerance(axes: Any, rows: Sequence[Row]) -> None:
     for row in rows:
         lines.setdefault(row.case.split("/")[0], []).append(row)
     for colour, (name, line) in zip(_COLOURS, lines.items(), strict=False):
-        asked = sorted((row for row in line if row.facts["tolerance"] > 0.0), key=lambda row: row.facts["tolerance"])
-        x = [1e6 * row.facts["tolerance"] for row in asked]
+        asked = sorted(
+            (row for row in line if row.metadata["tolerance"] > 0.0), key=lambda row: row.metadata["tolerance"]
+        )
+        x = [1e6 * row.metadata["tolerance"] for row in asked]
         axes.loglog(x, [1e3 * row.seconds for row in asked], "o-", color=colour, label=f"{name}: time", markersize=3)
         off = [1e6 * max(row.error, 1e-12) for row in asked]
         axes.loglog(x, off, "s--", color=colour, label=f"{name}: largest error", markersize=3)

@@ -128,13 +128,15 @@ def _case(
 
     peers: dict[str, Callable[[], object]] = {"opencv": opencv}
     exact = camera.distort(points) if inverse else camera.undistort(points)
-    facts = {"peer_error": _worst(opencv()[:, 0], exact)}
+    metadata = {"peer_error": _worst(opencv()[:, 0], exact)}
     if camera is STANDARD:
         peers["numba"] = _newton(points, camera)
     if np.any(to_numpy(bound.outputs.status)):
         raise AssertionError("a point within the invertible region was flagged")
     traffic = (points.nbytes, points.nbytes + len(points))
-    return Case("points", name, bound.run, peers, _worst(to_numpy(bound.outputs.points), exact), traffic, facts=facts)
+    return Case(
+        "points", name, bound.run, peers, _worst(to_numpy(bound.outputs.points), exact), traffic, metadata=metadata
+    )
 
 
 def _newton(points: NDArray[Any], camera: Camera) -> Callable[[], object]:

@@ -418,10 +418,10 @@ def cases(device: Device) -> Iterator[Case]:
     for what, each, of in (("ours", ours, of_ours), ("numba's", pose, covariance), ("numpy's", rounded, spread)):
         if np.any(np.abs(each - exact) > 0.5 * sigma) or np.any(np.abs(np.sqrt(np.diag(of)) / sigma - 1.0) > 0.1):
             raise AssertionError(f"{what} fix is not that in double: {each} and {exact}, of {sigma}")
-    facts = {"p50_us": _median(bound.run) * 1e6, "sigma_m": float(sigma[0]), "numba_error": _worst(pose, exact)}
-    facts["numpy_error"] = _worst(rounded, exact)
+    metadata = {"p50_us": _median(bound.run) * 1e6, "sigma_m": float(sigma[0]), "numba_error": _worst(pose, exact)}
+    metadata["numpy_error"] = _worst(rounded, exact)
     peers: dict[str, Callable[[], object]] = {"numpy": by_numpy, "numba": by_numba}
-    yield Case("pose", "local-fix", bound.run, peers, _worst(ours, exact), facts=facts)
+    yield Case("pose", "local-fix", bound.run, peers, _worst(ours, exact), metadata=metadata)
 
 
 def _worst(pose: NDArray[Any], exact: NDArray[Any]) -> float:

@@ -87,10 +87,10 @@ def _case(device: Device, name: str, model: Brdf, peer: Callable[..., None]) -> 
     value, status = np.empty(len(directions), np.float32), np.empty(len(directions), np.uint8)
     peer(directions, parameters, value, status)
     truth = model.value(directions)
-    facts = {"peer_error": _error(value, truth)}
+    metadata = {"peer_error": _error(value, truth)}
     peers = {"numba": lambda: peer(directions, parameters, value, status)}
     traffic = (directions.nbytes, value.nbytes + status.nbytes)
-    return Case("reflectance", name, bound.run, peers, _error(ours, truth), traffic=traffic, facts=facts)
+    return Case("reflectance", name, bound.run, peers, _error(ours, truth), traffic=traffic, metadata=metadata)
 
 
 def _error(values: NDArray[Any], truth: NDArray[np.float64]) -> float:

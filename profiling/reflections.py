@@ -92,9 +92,9 @@ def _case(device: Device, segments: LitSegments, receivers: NDArray[np.float32],
     exact = LineIrradiance(segments=segments, precision="double")
     truth = to_numpy(exact(receivers, device=device).irradiance) if device.has_double else np.full(len(out), np.nan)
     pairs = len(segments.exitance) * len(receivers)
-    facts = {"pairs": pairs, "peer_error": _error(out, truth)}
+    metadata = {"pairs": pairs, "peer_error": _error(out, truth)}
     peers = {"numba": lambda: _numba(receivers, table, out)}
-    return Case("reflections", name, bound.run, peers, _error(ours, truth), facts=facts)
+    return Case("reflections", name, bound.run, peers, _error(ours, truth), metadata=metadata)
 
 
 def _error(values: NDArray[Any], truth: NDArray[Any]) -> float:

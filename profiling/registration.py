@@ -120,8 +120,8 @@ def _search(device: Device) -> Case:
     if not (same and np.allclose(least, exact, rtol=1e-6) and error < 1e-6):
         raise AssertionError("the peers find other poses than we: they do other work")
     peers: dict[str, Callable[[], object]] = {"numba": by_numba, "numpy": by_numpy}
-    facts = {"poses": _HEADINGS * _ROWS**2, "points": _POINTS}
-    return Case("registration", "search", bound.run, peers, error, facts=facts)
+    metadata = {"poses": _HEADINGS * _ROWS**2, "points": _POINTS}
+    return Case("registration", "search", bound.run, peers, error, metadata=metadata)
 
 
 # ---- a pair --------------------------------------------------------------------------------------------------
@@ -176,5 +176,5 @@ def _pair(device: Device) -> Case:
         c, s = math.cos(found.pose[2]), math.sin(found.pose[2])
         return np.array([[c, -s, found.pose[0]], [s, c, found.pose[1]]])
 
-    facts = {"opencv_error_px": _off(by_opencv().astype(np.float64), motion)}
-    return Case("registration", "pair", ours, {"opencv": by_opencv}, _off(ours(), motion), facts=facts)
+    metadata = {"opencv_error_px": _off(by_opencv().astype(np.float64), motion)}
+    return Case("registration", "pair", ours, {"opencv": by_opencv}, _off(ours(), motion), metadata=metadata)

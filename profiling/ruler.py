@@ -220,7 +220,7 @@ def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool =
     if np.any(to_numpy(bound.outputs.status)) or np.any(dark):
         raise AssertionError("a ruler across an edge found none")
     compiled(image, rulers, taps, numbers, edges, status)
-    facts = {"peer_error": float(np.max(np.abs(edges[0] - plain))), "rulers": count}
+    metadata = {"peer_error": float(np.max(np.abs(edges[0] - plain))), "rulers": count}
     peers: dict[str, Callable[[], object]] = {
         "numba": lambda: compiled(image, rulers, taps, numbers, edges, status),
     }
@@ -228,4 +228,4 @@ def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool =
         peers["opencv"] = lambda: _opencv(image, rulers, matrix)
         peers["numpy"] = lambda: _numpy(image, rulers, matrix)
     error = float(np.max(np.abs(to_numpy(bound.outputs.position) - exact)))
-    return Case("ruler", name, bound.run, peers, error, facts=facts)
+    return Case("ruler", name, bound.run, peers, error, metadata=metadata)

@@ -44,11 +44,11 @@ def _case(device: Device, name: str) -> Case:
         truth = to_numpy(exact(seen.receivers, np.zeros((*seen.weights.shape, 2)), rows, device=device).irradiance)
     peer = functools.partial(irradiance_by_samples, board, _SAMPLES, embree_of(task.part))
     seen_at_all = seen.weights > 0.0
-    facts = {
+    metadata = {
         "receivers": int(seen_at_all.sum()),
         "segments": len(segments.exitance),
         "peer_error": error_of(peer().reshape(truth.shape)[seen_at_all], truth[seen_at_all]),
     }
     run = functools.partial(model.profile, _AT)
     error = error_of(ours[seen_at_all], truth[seen_at_all])
-    return Case("simulate", f"profile/{name}", run, {"numpy+embreex": peer}, error, facts=facts)
+    return Case("simulate", f"profile/{name}", run, {"numpy+embreex": peer}, error, metadata=metadata)

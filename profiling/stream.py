@@ -50,7 +50,7 @@ class Held:
         """Whether nothing was lost."""
         return not self.report.dropped and self.late < _STALL_S
 
-    def facts(self) -> dict[str, Any]:
+    def metadata(self) -> dict[str, Any]:
         """Return the columns of a row."""
         latency = self.report.latency
         micro = {"p50": latency.p50, "p99": latency.p99, "p999": latency.p999, "max": latency.maximum}
@@ -139,7 +139,7 @@ def _case(name: str, frames: NDArray[np.uint8], device: Device, held: Held, erro
                 next(stream)
 
         loop = _blocking_loop(frames, device)
-        yield Case("stream", name, burst, {"pyopencl": loop}, error=error, facts=held.facts())
+        yield Case("stream", name, burst, {"pyopencl": loop}, error=error, metadata=held.metadata())
 
 
 def _blocking_loop(frames: NDArray[np.uint8], device: Device) -> Callable[[], None]:

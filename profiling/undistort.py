@@ -77,9 +77,9 @@ def _case(device: Device, name: str, camera: Camera, dtype: str, size: int, **op
     exact, inner = _exact(image, positions, interpolation)
     ours, theirs = (np.abs(each[inner] - exact[inner]) for each in (to_numpy(bound.outputs.image), undistorted))
     numbers = {"rms": _rms(ours), "peer_error": theirs.max(), "peer_rms": _rms(theirs)}
-    facts = {name: float(f"{number:.5g}") for name, number in numbers.items()}
+    metadata = {name: float(f"{number:.5g}") for name, number in numbers.items()}
     traffic = (image.nbytes, image.nbytes + bound.outputs.status.nbytes)
-    return Case("undistort", name, bound.run, {"opencv": peer}, float(ours.max()), traffic, facts=facts)
+    return Case("undistort", name, bound.run, {"opencv": peer}, float(ours.max()), traffic, metadata=metadata)
 
 
 def _rms(values: Float64) -> float:

@@ -46,8 +46,8 @@ def _case(device: Device, name: str, mesh: Any) -> Case:
     truth = _visible_fraction(to_numpy(exact.intervals))
     known = (to_numpy(exact.status) == 0) & (to_numpy(bound.outputs.status) == 0)
     peer = _Samples(scene, fans)
-    facts = {"triangles": len(mesh.faces), "fans": _FANS, "peer_error": _error(peer(), truth, known)}
-    return Case("visible_intervals", name, bound.run, {"embreex": peer}, _error(ours, truth, known), facts=facts)
+    metadata = {"triangles": len(mesh.faces), "fans": _FANS, "peer_error": _error(peer(), truth, known)}
+    return Case("visible_intervals", name, bound.run, {"embreex": peer}, _error(ours, truth, known), metadata=metadata)
 
 
 def _visible_fraction(intervals: NDArray[Any]) -> NDArray[Any]:

@@ -54,7 +54,7 @@ def profile(
         operations or harness.OPERATIONS,
         devices,
         seconds=seconds,
-        told=lambda line: typer.echo(line, err=True),
+        progress=lambda line: typer.echo(line, err=True),
     )
     if as_json is not None:
         run.write(as_json)
@@ -84,12 +84,14 @@ def _show(rows: list[Row]) -> None:
             if each.operation == operation:
                 table.add_row(*_cells(each))
         console.print(table)
-        for told in dict.fromkeys(_facts(each) for each in rows if each.operation == operation and each.facts):
-            console.print(told, highlight=False, markup=False)
+        for line in dict.fromkeys(
+            _metadata_line(each) for each in rows if each.operation == operation and each.metadata
+        ):
+            console.print(line, highlight=False, markup=False)
 
 
-def _facts(row: Row) -> str:
-    return f" {row.case} on {row.device}: " + ", ".join(f"{name} {value}" for name, value in row.facts.items())
+def _metadata_line(row: Row) -> str:
+    return f" {row.case} on {row.device}: " + ", ".join(f"{name} {value}" for name, value in row.metadata.items())
 
 
 def _cells(row: Row) -> tuple[str, ...]:

@@ -64,8 +64,8 @@ class Scan:
         The account of the frames' way.
     seconds
         Time of the steps after it, by name.
-    facts
-        More for the report: what was scanned, and how it was asked for.
+    metadata
+        Entries of the report about the recording and the requested rate.
     """
 
     sensor: Sensor
@@ -77,7 +77,7 @@ class Scan:
     device: Device
     stream: StreamReport
     seconds: dict[str, float]
-    facts: dict[str, Any]
+    metadata: dict[str, Any]
 
     @property
     def valid_fraction(self) -> float:
@@ -92,10 +92,10 @@ class Scan:
 
     def summary(self) -> str:
         """Return what came out, in a line."""
-        stream, usual, late = self.stream, self.sensor.recording.rate, self.facts["late"]
+        stream, usual, late = self.stream, self.sensor.recording.rate, self.metadata["late"]
         dropped = f" ({stream.dropped} dropped)" if stream.dropped else ""
         speed = f"{self.throughput:,.0f} frames/s on {self.device.label}"
-        if usual is not None and self.facts["rate"] is None:
+        if usual is not None and self.metadata["rate"] is None:
             speed += f" ({self.throughput / usual:.1f} times the sensor's rate)"
         good = f"{100 * self.valid_fraction:.1f} % of the samples valid"
         overdue = f"; frames were read up to {1e3 * late:.0f} ms late" if late and late > LATE else ""
@@ -116,7 +116,7 @@ class Scan:
         stream.pop("throughput")
         return {
             "gpuvision": version("gpuvision"),
-            **self.facts,
+            **self.metadata,
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
             "precision": "double" if self.points.z.dtype == np.float64 else "single",
             "frames": self.stream.frames,
@@ -243,7 +243,7 @@ def scan(
         device=stream.device,
         stream=stream.report(),
         seconds=seconds,
-        facts=_facts(name, sensor, rate, paced),
+        metadata=_metadata(name, sensor, rate, paced),
     )
 
 
@@ -270,8 +270,8 @@ def _opened(recording: str | Path | Source | Array, sensor: Sensor) -> tuple[Sou
     return open_recording(recording, channel=sensor.recording.channel, key=sensor.recording.key), str(recording)
 
 
-def _facts(name: str, sensor: Sensor, rate: float | None, source: Source) -> dict[str, Any]:
-    """Return what the report says of the recording and of how it was asked for; seconds and frames per second."""
+def _metadata(name: str, sensor: Sensor, rate: float | None, source: Source) -> dict[str, Any]:
+    """Return the entries of the report about the recording and the requested rate: seconds, frames per second."""
     return {
         "recording": name,
         "sensor": sensor.name,

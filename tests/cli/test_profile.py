@@ -27,7 +27,7 @@ ROW = Row(
     ratio=3.14159,
     error=1.5e-9,
     fraction=0.5,
-    facts={"rate": 4000, "p50": 1e-4},
+    metadata={"rate": 4000, "p50": 1e-4},
 )
 
 

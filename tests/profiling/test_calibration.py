@@ -25,10 +25,10 @@ def test_cases_without_recordings(device: Device) -> None:
     assert [case.name for case in cases] == ["fit/66x96", "fit/33x39", "fit/lines"]
     for case in cases:
         assert set(case.peers) == {"discorpy"}
-        assert case.facts["data"] == "synthetic"
+        assert case.metadata["data"] == "synthetic"
         # The noise is 0.05 px; four parameters and the lines take up little of it.
         assert 0.045 < case.error < 0.051
-        assert case.error < case.facts["error_discorpy"] < case.facts["error_raw"]
+        assert case.error < case.metadata["error_discorpy"] < case.metadata["error_raw"]
 
 
 def test_the_peers_model_is_inverted() -> None:

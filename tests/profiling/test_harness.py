@@ -52,9 +52,9 @@ def test_what_moves_bytes_runs(device):
 
 
 def test_facts_stand_beside_the_columns(device):
-    (row,) = harness.measure(case(facts={"p50_us": 12.0}), device, seconds=0.01)
+    (row,) = harness.measure(case(metadata={"p50_us": 12.0}), device, seconds=0.01)
     assert row.to_dict()["p50_us"] == 12.0
-    assert "facts" not in row.to_dict()
+    assert "metadata" not in row.to_dict()
 
 
 def test_a_part_of_a_peers_work_stands_for_all_of_it(device):
@@ -85,7 +85,7 @@ def fake(monkeypatch):
 def test_a_section_is_measured_again_when_the_machine_changed_its_speed(fake, device, tmp_path):
     fake(100.0, 55.0, 100.0, 99.0)
     lines = []
-    run = harness.profile(["psd"], [device], seconds=0.01, told=lines.append)
+    run = harness.profile(["psd"], [device], seconds=0.01, progress=lines.append)
     assert run.valid
     assert len(run.rows) == 1
     assert sum("changed its speed" in line for line in lines) == 1

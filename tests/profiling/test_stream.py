@@ -57,10 +57,10 @@ def test_rows_for_each_rate_and_the_highest(device):
     for case in cases:
         assert case.operation == "stream"
         assert case.error < 1e-4  # single precision of a position below 512 is 3e-5
-        facts = case.facts
-        assert facts["frames"] + facts["dropped"] == pytest.approx(facts["rate"] * 0.05, abs=1)
-        assert 0.0 < facts["p50_us"] <= facts["p99_us"] <= facts["p999_us"] <= facts["max_us"]
+        metadata = case.metadata
+        assert metadata["frames"] + metadata["dropped"] == pytest.approx(metadata["rate"] * 0.05, abs=1)
+        assert 0.0 < metadata["p50_us"] <= metadata["p99_us"] <= metadata["p999_us"] <= metadata["max_us"]
         case.peers["pyopencl"]()
     with pytest.raises(StreamError, match="not open"):
         cases[0].ours()  # its stream was closed when the next case was asked for
-    assert cases[2].facts["holds"]
+    assert cases[2].metadata["holds"]

@@ -329,15 +329,15 @@ def test_host_view_refuses_memory_that_is_not_shared(device):
 
 
 def test_a_program_is_built_once(device):
-    defines = {"CODE": "float", "CODE16": "float16", "WITH_POSITION": None}
+    defines = {"INPUT": "float", "INPUT16": "float16", "WITH_POSITION": None}
     assert build(device, KERNEL_FOLDER, "psd/psd.cl", defines) is build(
         device, KERNEL_FOLDER, "psd/psd.cl", dict(reversed(defines.items()))
     )
 
 
 def test_a_kernel_that_does_not_compile_is_told_with_its_log(device):
-    with pytest.raises(BuildError, match=r"psd/psd\.cl does not build with .*-DCODE=nonsense"):
-        build(device, KERNEL_FOLDER, "psd/psd.cl", {"CODE": "nonsense", "CODE16": "float16"})
+    with pytest.raises(BuildError, match=r"psd/psd\.cl does not build with .*-DINPUT=nonsense"):
+        build(device, KERNEL_FOLDER, "psd/psd.cl", {"INPUT": "nonsense", "INPUT16": "float16"})
 
 
 def test_no_option_gives_up_on_nan():

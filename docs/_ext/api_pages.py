@@ -103,7 +103,8 @@ def _mentioned(value: Any) -> Iterator[type]:
     if inspect.ismodule(value):
         parts = [each for each in vars(value).values() if getattr(each, "__module__", None) == value.__name__]
     for part in parts:
-        members = [each for name, each in vars(part).items() if name[0] != "_"] if inspect.isclass(part) else []
+        inside = vars(part).items() if inspect.isclass(part) else ()
+        members = [each for name, each in inside if name[0] != "_" or name in ("__init__", "__call__")]
         for base in getattr(part, "__orig_bases__", ()):
             yield from _classes_in(base)
         for each in (part, *members):
@@ -119,10 +120,11 @@ def _mentioned(value: Any) -> Iterator[type]:
 
 
 def _classes_in(hint: Any) -> Iterator[type]:
-    if inspect.isclass(hint) and not typing.get_args(hint):
-        package, _, inside = hint.__module__.partition(".")
-        if package == "gpuvision" and inside.partition(".")[0] in PACKAGES and not hint.__name__.startswith("_"):
-            yield hint
+    bare = typing.get_origin(hint) or hint
+    if inspect.isclass(bare):
+        package, _, inside = bare.__module__.partition(".")
+        if package == "gpuvision" and inside.partition(".")[0] in PACKAGES and not bare.__name__.startswith("_"):
+            yield bare
     for each in typing.get_args(hint):
         yield from _classes_in(each)
 

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.host import Device
+from gpuvision.host import Device, to_numpy
 from gpuvision.profiling.harness import Case
 from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
 from gpuvision.ranging.regrid import Grid, Regrid
@@ -223,7 +223,7 @@ def _assembly(
     out = [np.empty(SHAPE, np.float32) for _ in range(3)] + [np.empty(SHAPE, np.uint8)]
     bound().wait()
     exact = plain(*(each.astype(np.float64) for each in frames), given, operation.packed())
-    differences = [np.abs(ours.get() - truth) for ours, truth in zip(bound.outputs[:3], exact[:3], strict=True)]
+    differences = [np.abs(to_numpy(ours) - truth) for ours, truth in zip(bound.outputs[:3], exact[:3], strict=True)]
     error = max(float(np.max(each)) for each in differences)
     peers: dict[str, Callable[[], object]] = {
         "numba": lambda: loop(*frames, given, table, *out),
@@ -248,10 +248,10 @@ def _resampling(device: Device) -> Case:
         array.set(values)
     bound().wait()
     looped = _numba_regrid(operation, frames, given)
-    if not np.array_equal(looped()[1], bound.outputs.status.get()):
+    if not np.array_equal(looped()[1], to_numpy(bound.outputs.status)):
         raise AssertionError("Numba's cells are not ours")
     exact = _numpy_regrid([each.astype(np.float64) for each in frames], grid)
-    error = float(np.max(np.abs(bound.outputs.z.get() - exact[0])))
+    error = float(np.max(np.abs(to_numpy(bound.outputs.z) - exact[0])))
     peers: dict[str, Callable[[], object]] = {"numba": looped, "numpy": lambda: _numpy_regrid(frames, grid)}
     cells = grid.columns * grid.rows
     lines = SHAPE[0] * grid.columns

@@ -137,7 +137,7 @@ class DepthFromFocus:
         slope = self.focal_length / (image - self.focal_length)
         return FocusReading(
             image_distance=image,
-            object_distance=conjugate(image, self.focal_length),
+            object_distance=conjugate_distance(image, self.focal_length),
             width=np.where(good, width, np.nan),
             sigma_image=sigma,
             sigma_object=None if sigma is None else sigma * slope**2,
@@ -179,7 +179,7 @@ class DepthFromFocus:
         return peak, curvature[..., 0], np.sqrt(np.sum((gain * noise) ** 2, axis=-1))
 
 
-def conjugate(distance: npt.ArrayLike, focal_length: float) -> Float64:
+def conjugate_distance(distance: npt.ArrayLike, focal_length: float) -> Float64:
     """Return the conjugate distance on the other side of a thin lens [m]: ``1/f = 1/LI + 1/LO``, in either direction.
 
     NaN for distances up to the focal length.

@@ -1,6 +1,6 @@
 """Scanning geometries that sample a surface irregularly: the polygon mirror, and the beam at 45 degrees.
 
-Polygon mirror (F. de Jong, Figures 2.7 and 2.8): a horizontal beam hits a facet of a turning polygon at the
+Polygon mirror (thesis, Figures 2.7 and 2.8): a horizontal beam hits a facet of a turning polygon at the
 height of the middle of the facet and is reflected down to the surface. With R the polygon's apothem, D the drop from
 the hit point to the surface and phi the rotation, 0 where the facet lies at 45 degrees and is hit in its middle::
 
@@ -9,6 +9,11 @@ the hit point to the surface and phi the rotation, 0 where the facet lies at 45 
 
 The difference ``x_h(phi) - x_h(0)`` comes from the motion of the hit point; it makes the scan asymmetric in second
 order.
+
+References
+----------
+F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 2.3 (Figures 2.5,
+2.7 and 2.8).
 """
 
 from __future__ import annotations
@@ -25,8 +30,11 @@ from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]
 
-_STEPS = 80
-_ROUNDINGS = 4.0 * np.finfo(np.float64).eps
+# Cap on the bracketed Newton iterations. Bisection alone narrows the bracket, which is at most pi/2 wide, below the
+# spacing of float64 in about 55.
+_MAX_ITERATIONS = 80
+_POSITION_ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a position, relative to |x| + R: four roundings
+_IMAGINARY_ROUNDING = 1e-9  # a root of the cubic, which is of order 1, counts as real below this imaginary part
 _HALF_ROOT = math.sqrt(0.5)
 
 
@@ -77,35 +85,59 @@ class PolygonMirror:
         return self.height - self.apothem * _HALF_ROOT if self.height_from == "centre" else self.height
 
     def position(self, rotation: npt.ArrayLike) -> Float64:
-        """Return the position x of the beam on the surface [m] for rotations phi [rad]; NaN outside `limits`."""
+        """Return the position x of the beam on the surface [m] for rotations phi [rad]; NaN outside `limits`.
+
+        Parameters
+        ----------
+        rotation : array_like
+            Rotations phi [rad], any shape.
+
+        Returns
+        -------
+        numpy.ndarray
+            Positions x [m], float64, of the same shape.
+        """
         phi = np.asarray(rotation, dtype=np.float64)
         low, high = self.limits
         return np.where((phi >= low) & (phi <= high), self._position(phi), np.nan)
 
     def slope(self, rotation: npt.ArrayLike) -> Float64:
-        """Return dx/dphi [m/rad]; it is 2 D in the middle of the scan."""
+        """Return the derivative dx/dphi [m/rad] at rotations phi [rad]; it is 2 D in the middle of the scan."""
         phi = np.asarray(rotation, dtype=np.float64)
         facet = 0.25 * math.pi - phi
-        own = self.apothem * (_HALF_ROOT - np.sin(facet)) / np.cos(facet) ** 2
-        return np.asarray(own + 2.0 * self.drop / np.cos(2.0 * phi) ** 2)
+        hit_point = self.apothem * (_HALF_ROOT - np.sin(facet)) / np.cos(facet) ** 2
+        return np.asarray(hit_point + 2.0 * self.drop / np.cos(2.0 * phi) ** 2)
 
     def rotation(self, position: npt.ArrayLike) -> Float64:
         """Return the rotation phi [rad] that directs the beam to x [m]: the inverse of `position`; NaN out of reach.
 
-        Bracketed Newton steps; the round trip is exact to rounding.
+        Parameters
+        ----------
+        position : array_like
+            Positions x on the surface [m], any shape.
+
+        Returns
+        -------
+        numpy.ndarray
+            Rotations phi [rad], float64, of the same shape.
+
+        Notes
+        -----
+        Newton iterations, replaced by bisection where a step leaves the bracket. `position` of the result equals x up
+        to rounding.
         """
         x = np.asarray(position, dtype=np.float64)
         bounds = self.limits
         first, last = self._position(np.array(bounds))
-        # At a fold x hardly changes with phi: the position of a rotation inside may be rounded below the position at
-        # the limit.
-        below, above = (_ROUNDINGS * (abs(end) + self.apothem) for end in (first, last))
+        # At a fold dx/dphi is 0: rounding can place the position of a rotation within the limits outside the positions
+        # of the limits.
+        below, above = (_POSITION_ROUNDING * (abs(end) + self.apothem) for end in (first, last))
         reachable = (x >= first - below) & (x <= last + above)
         x = np.clip(x, first, last)
         low, high = np.full_like(x, bounds[0]), np.full_like(x, bounds[1])
         # Start value: the exact solution without the motion of the hit point.
         phi = np.where(reachable, np.clip(0.5 * np.arctan(x / self.drop), *bounds), np.nan)
-        for _ in range(_STEPS):
+        for _ in range(_MAX_ITERATIONS):
             excess = self._position(phi) - x
             high = np.where(excess > 0.0, phi, high)
             low = np.where(excess < 0.0, phi, low)
@@ -122,7 +154,24 @@ class PolygonMirror:
         """Return the times [s] at which a rotating mirror directs the beam to ``positions`` [m].
 
         Sampling at these times, counted from the middle of the facet, gives equidistant samples for equidistant
-        positions. The next facet repeats them after ``2 pi / (facets angular_speed)``, with ``angular_speed`` in rad/s.
+        positions. The next facet repeats them after ``2 pi / (facets angular_speed)``.
+
+        Parameters
+        ----------
+        positions : array_like
+            Positions x on the surface [m], any shape.
+        angular_speed : float
+            Rotation speed of the mirror [rad/s], positive.
+
+        Returns
+        -------
+        numpy.ndarray
+            Times [s] from the middle of the facet; NaN out of reach.
+
+        Raises
+        ------
+        ValueError
+            ``angular_speed`` is not positive.
         """
         if not finite(angular_speed, "angular_speed") > 0.0:
             raise ValueError(f"angular_speed is {angular_speed}, expected a positive one [rad/s]")
@@ -138,8 +187,8 @@ class PolygonMirror:
         """Smallest and largest phi [rad] of a scan.
 
         Three conditions hold within the limits. The beam hits the facet: ``|facet_position| <= R tan(pi / facets)``.
-        The beam is reflected downwards: ``|phi| < pi/4``. And x increases with phi, which ends towards negative phi
-        where the drop is small.
+        The beam is reflected downwards: ``|phi| < pi/4``. And x increases with phi; for a small drop this bounds
+        phi on the negative side.
         """
         half = math.pi / self.facets
         middle = 0.25 * math.pi - math.asin(_HALF_ROOT * math.cos(half))
@@ -149,55 +198,55 @@ class PolygonMirror:
     def _position(self, phi: Float64) -> Float64:
         facet = 0.25 * math.pi - phi
         # x_h(phi) - x_h(0) as one quotient, 2 R sin^2(phi/2) (...): the difference itself cancels near phi = 0.
-        own = 2.0 * self.apothem * np.sin(0.5 * phi) ** 2 / np.cos(facet)
-        return np.asarray(own + self.drop * np.tan(2.0 * phi))
+        hit_point = 2.0 * self.apothem * np.sin(0.5 * phi) ** 2 / np.cos(facet)
+        return np.asarray(hit_point + self.drop * np.tan(2.0 * phi))
 
     def _fold(self) -> float:
         """Negative phi at which dx/dphi vanishes; -pi/4 where it never does."""
         # With s = sin(pi/4 - phi), dx/dphi has the sign of D/(2 s^2) + R/sqrt(2) - R s, which falls with s.
         roots = np.roots([-self.apothem, self.apothem * _HALF_ROOT, 0.0, 0.5 * self.drop])
-        real = roots[np.abs(roots.imag) < 1e-9].real
+        real = roots[np.abs(roots.imag) < _IMAGINARY_ROUNDING].real
         folded = real[(real > _HALF_ROOT) & (real < 1.0)]
         return 0.25 * math.pi - math.asin(folded.min()) if len(folded) else -0.25 * math.pi
 
 
 class ShearedProfile(NamedTuple):
-    """Where the samples of a slanted beam lie.
+    """Positions of the samples of an inclined beam, shape (..., n).
 
     Attributes
     ----------
     x
-        X of every sample [m], folded ones too; NaN where H is not finite.
+        X of every sample [m], also where the status is NOT_INVERTIBLE; NaN where H is not finite.
     status
-        uint8 `Status` flags: NOT_FINITE (H is not), NOT_INVERTIBLE (X does not advance from the sample before it: the
-        surface is steeper than the beam, or two samples coincide).
+        uint8 `Status` flags: NOT_FINITE (H is not finite), NOT_INVERTIBLE (X does not advance from the previous finite
+        sample: the surface is steeper than the beam, or two samples coincide).
     """
 
     x: Float64
     status: npt.NDArray[np.uint8]
 
 
-def sheared(start: npt.ArrayLike, height: npt.ArrayLike, angle: float = 0.25 * math.pi) -> ShearedProfile:
+def shear_profile(start: npt.ArrayLike, height: npt.ArrayLike, angle: float = 0.25 * math.pi) -> ShearedProfile:
     """Compute the positions of samples of an inclined beam: ``X = X0 + H tan(angle)`` (F. de Jong, Figure 2.5).
 
     Parameters
     ----------
-    start
-        X0, where each beam meets H = 0 [m]; (..., n), monotone along the last axis.
-    height
-        H of the sample [m], of the same shape.
-    angle
-        Between the beam and the H axis [rad].
+    start : array_like
+        X0, position where each beam meets H = 0 [m]; (..., n), strictly monotone along the last axis.
+    height : array_like
+        H of the samples [m], of the same shape.
+    angle : float
+        Angle between the beam and the H axis [rad], -pi/2 to pi/2 (exclusive).
 
     Returns
     -------
     ShearedProfile
-        A sample after a hole is compared with the last one before it.
+        The sample after a hole is compared with the last finite sample before the hole.
 
     Raises
     ------
     ValueError
-        Shapes differ, ``start`` is not strictly monotone, or the angle is not between -pi/2 and pi/2.
+        Shapes differ, ``start`` is not strictly monotone, or the angle is out of its range.
     """
     x0, h = np.asarray(start, dtype=np.float64), np.asarray(height, dtype=np.float64)
     if x0.shape != h.shape or not x0.ndim:

@@ -25,9 +25,11 @@ import numpy.typing as npt
 from gpuvision.camera.lens import Lens
 from gpuvision.host import (
     Device,
+    FloatArray,
     Launch,
     LaunchBuilder,
     Precision,
+    StatusArray,
     Variant,
     WorkSize,
     type_defines,
@@ -60,10 +62,10 @@ class RangePoints(NamedTuple):
         camera), OUT_OF_RANGE (outside the limits).
     """
 
-    x: Any
-    y: Any
-    z: Any
-    status: Any
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    status: StatusArray
 
 
 def _vector(value: Any, what: str) -> Vector:

@@ -50,9 +50,9 @@ class HeightMap(NamedTuple):
         surfaces share the cell. A cell with SATURATED or AMBIGUOUS keeps its value.
     """
 
-    z: Any
-    intensity: Any
-    status: Any
+    z: FloatArray
+    intensity: FloatArray
+    status: StatusArray
 
 
 @dataclass(frozen=True, kw_only=True)

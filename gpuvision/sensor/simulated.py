@@ -1,4 +1,4 @@
-"""A described sensor as the simulator takes it: what it sees, its sheet of light, and what reads the light."""
+"""Inputs of the simulator from a sensor file: sensor view, sheet of light, and simulator of the readings."""
 
 from __future__ import annotations
 
@@ -19,16 +19,25 @@ from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
 from gpuvision.simulation.sensors.sensor_view import SensorView
 from gpuvision.simulation.transport.illumination import LightSheet
 
-_CODES = 255.0
+_MAX_GREY_LEVEL = 255.0  # of an 8-bit camera: the full well
 
 
-def light_of(sensor: Sensor) -> Light:
-    """Return the sensor's light.
+def require_light(sensor: Sensor) -> Light:
+    """Return the light source of a sensor, complete for a simulation.
+
+    Parameters
+    ----------
+    sensor : Sensor
+
+    Returns
+    -------
+    Light
+        With the position of the pinhole (``lens``).
 
     Raises
     ------
     ValueError
-        The sensor's file has none, or the sheet turns: a simulation needs a straight transport.
+        The sensor file has no table ``[light]`` or no pinhole position, or the transport is not straight.
     """
     name = sensor.name or "the sensor"
     if not isinstance(sensor.transport, StraightTransport):
@@ -42,15 +51,24 @@ def light_of(sensor: Sensor) -> Light:
     return sensor.light
 
 
-def sheet_of(sensor: Sensor) -> LightSheet:
-    """Return the sensor's sheet of light.
+def make_light_sheet(sensor: Sensor) -> LightSheet:
+    """Make the sheet of light of a sensor.
+
+    Parameters
+    ----------
+    sensor : Sensor
+
+    Returns
+    -------
+    LightSheet
+        Power [W], thickness sigma [m] and limits [m] are those of the table ``[light]``.
 
     Raises
     ------
     ValueError
-        As `light_of`; or the light cannot be such.
+        As `require_light`; or `LightSheet` refuses a value of the table.
     """
-    light = light_of(sensor)
+    light = require_light(sensor)
     return LightSheet(
         transport=_transport(sensor),
         power=light.power,
@@ -61,17 +79,29 @@ def sheet_of(sensor: Sensor) -> LightSheet:
     )
 
 
-def sensor_view_of(sensor: Sensor) -> SensorView:
-    """Return what the sensor sees: a PSD's strips, as wide as they lie apart, or a camera's columns of pixels.
+def make_sensor_view(sensor: Sensor) -> SensorView:
+    """Make the view of a sensor: the edges of its bins along u and of its samples along v.
+
+    A sample is a strip of a PSD, as wide as the pitch of the strips, or a line of pixels of a camera.
+
+    Parameters
+    ----------
+    sensor : Sensor
+
+    Returns
+    -------
+    SensorView
+        Edges in sensor units, ascending: ``light.bins`` bins over the length of a PSD strip, one bin per pixel of a
+        camera.
 
     Raises
     ------
     ValueError
-        As `light_of`.
+        As `require_light`.
     """
-    light, readout = light_of(sensor), sensor.readout
-    assert sensor.frame is not None  # a triangulation has a region, which came from it
-    assert light.lens is not None  # the file says, or its baseline
+    light, readout = require_light(sensor), sensor.readout
+    assert sensor.frame is not None  # the region of a triangulation is derived from the frame
+    assert light.lens is not None  # require_light checked it
     axes = readout.axes
     if isinstance(readout, PsdReadout):
         samples = sensor.frame[0]
@@ -90,27 +120,55 @@ def sensor_view_of(sensor: Sensor) -> SensorView:
     )
 
 
-def floor_of(sensor: Sensor) -> float:
-    """Return the power of a sample below which it is not read, W.
+def minimum_sample_power(sensor: Sensor) -> float:
+    """Return the power of a sample [W] below which the readout gives no position.
 
-    Of a PSD, what makes the least total current; of a camera, what makes the least peak, or the threshold.
-    """
-    light, readout = light_of(sensor), sensor.readout
-    if isinstance(readout, PsdReadout):
-        return readout.minimum_total / light.responsivity
-    grey = max(readout.minimum_peak or 0.0, readout.threshold)
-    return grey * light.full_well / _CODES * ELECTRON / (light.responsivity * light.exposure)
+    PSD: ``minimum_total / responsivity``. Camera: the power whose photo-electrons in one exposure give the larger of
+    ``minimum_peak`` and ``threshold``, ``grey full_well / 255 q / (responsivity exposure)``, with the charge q of an
+    electron.
 
+    Parameters
+    ----------
+    sensor : Sensor
 
-def simulator_of(sensor: Sensor, view: SensorView, mask: Mask | None = None) -> PsdSimulator | CameraSimulator:
-    """Return what makes readings of the light.
+    Returns
+    -------
+    float
+        Power [W].
 
     Raises
     ------
     ValueError
-        As `light_of`; or the mask is not one for this sensor.
+        As `require_light`.
     """
-    light, readout = light_of(sensor), sensor.readout
+    light, readout = require_light(sensor), sensor.readout
+    if isinstance(readout, PsdReadout):
+        return readout.minimum_total / light.responsivity
+    grey = max(readout.minimum_peak or 0.0, readout.threshold)
+    return grey * light.full_well / _MAX_GREY_LEVEL * ELECTRON / (light.responsivity * light.exposure)
+
+
+def make_simulator(sensor: Sensor, view: SensorView, mask: Mask | None = None) -> PsdSimulator | CameraSimulator:
+    """Make the simulator that computes readings of a sensor from the light on it.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    view : SensorView
+        View of the sensor, see `make_sensor_view`.
+    mask : Mask, optional
+        Mask in front of the sensor.
+
+    Returns
+    -------
+    PsdSimulator or CameraSimulator
+
+    Raises
+    ------
+    ValueError
+        As `require_light`; or the mask does not fit the view.
+    """
+    light, readout = require_light(sensor), sensor.readout
     if isinstance(readout, PsdReadout):
         return PsdSimulator(
             view=view,
@@ -126,7 +184,7 @@ def simulator_of(sensor: Sensor, view: SensorView, mask: Mask | None = None) -> 
         readout=readout,
         exposure_time=light.exposure,
         responsivity=light.responsivity,
-        gain=_CODES / light.full_well,
+        gain=_MAX_GREY_LEVEL / light.full_well,
         read_noise=light.read_noise,
         full_well=light.full_well,
         ambient=light.ambient,
@@ -135,12 +193,12 @@ def simulator_of(sensor: Sensor, view: SensorView, mask: Mask | None = None) -> 
 
 
 def _transport(sensor: Sensor) -> StraightTransport:
-    assert isinstance(sensor.transport, StraightTransport)  # light_of looked
+    assert isinstance(sensor.transport, StraightTransport)  # require_light checked it
     return sensor.transport
 
 
 def _triangulation(readout: PsdReadout | LineReadout) -> Triangulation:
-    assert readout.triangulation is not None  # a straight transport's file has one
+    assert readout.triangulation is not None  # a sensor file with a straight transport has a triangulation
     return readout.triangulation
 
 

@@ -24,7 +24,7 @@ from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import replacing
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.sensor.simulated import floor_of, light_of, sensor_view_of, sheet_of
+from gpuvision.sensor.simulated import make_light_sheet, make_sensor_view, minimum_sample_power, require_light
 from gpuvision.simulation.light_paths import LightPaths
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.scene import Scene
@@ -87,7 +87,7 @@ class SimulationTask:
         optics = [readout.triangulation, readout.axes, length, sensor.transport, sensor.frame]
         light = [getattr(sensor.light, name) for name in _OPTICAL]
         # The light that may be left out depends on the least readable power, and so on the electronics.
-        least = floor_of(sensor) if self.tolerance > 0.0 else None
+        least = minimum_sample_power(sensor) if self.tolerance > 0.0 else None
         words = repr([version("gpuvision"), self.materials, optics, light, self.paths, self.tolerance, least])
         digest = hashlib.sha256(words.encode())
         for array in (self.part.corners, self.part.material, self.transports):
@@ -231,10 +231,10 @@ def compute_missing_blocks(
 
 def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
     """Return the `LightPaths` of a task."""
-    light = light_of(task.sensor)
+    light = require_light(task.sensor)
     return LightPaths(
-        view=sensor_view_of(task.sensor),
-        sheet=sheet_of(task.sensor),
+        view=make_sensor_view(task.sensor),
+        sheet=make_light_sheet(task.sensor),
         scene=task.part,
         materials=task.materials,
         paths=task.paths,
@@ -242,7 +242,7 @@ def make_light_paths(task: SimulationTask, device: Device) -> LightPaths:
         blur=light.blur,
         nodes=light.nodes,
         tolerance=task.tolerance,
-        min_power=floor_of(task.sensor),
+        min_power=minimum_sample_power(task.sensor),
         device=device,
     )
 

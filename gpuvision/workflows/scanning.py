@@ -1,7 +1,7 @@
-"""A recording and the description of its sensor become a range image, files and a report.
+"""Scan of a recording: range image, height map, files and a report.
 
-Frames stream through the readout (`gpuvision.host.pipeline`), the profiles are assembled and resampled
-(`gpuvision.ranging`), and everything is written at the end, whole or not at all.
+The frames stream through the readout (`gpuvision.host.pipeline`). The profiles are then assembled to a range image and
+resampled to a height map (`gpuvision.ranging`). `Scan.write` writes the files: all of them, or none after an error.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
-from gpuvision.host import Device, Operation, Precision
+from gpuvision.host import Device, Operation, Precision, to_numpy
 from gpuvision.host.files import check_file, whole_folder
 from gpuvision.host.pipeline import Pipeline, Policy
 from gpuvision.host.plan import plan
@@ -35,8 +35,9 @@ from gpuvision.ranging.regrid import Direction, Grid, HeightMap, Regrid
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 
-LATE = 0.01  # s: a recording read later than this did not hold the rate that was asked for
-_MOST_CELLS = 1 << 26
+# Delay [s] of a frame from which on the summary says that the replay did not hold the requested rate.
+MAX_DELAY = 0.01
+_MAX_CELLS = 1 << 26  # of a height map: 256 MiB of float32 heights
 
 Array = npt.NDArray[Any]
 Progress = Callable[[int, int | None], object]
@@ -44,28 +45,30 @@ Progress = Callable[[int, int | None], object]
 
 @dataclass(frozen=True, kw_only=True)
 class Scan:
-    """A range image and how it came about.
+    """Range image of a recording, with its height map and the report of the stream.
 
     Attributes
     ----------
-    sensor
-        What was scanned with.
-    points
-        The organised range image, (profiles, samples); status flags say why a point is missing.
-    intensity
-        Of the light, (profiles, samples): grey levels of a camera, amperes of a PSD.
-    heights, grid
-        The height map over regular cells, and where they lie.
-    numbers
-        The recording's frame behind each profile: with drops they are not consecutive.
-    device
-        Where it was computed.
-    stream
-        The account of the frames' way.
-    seconds
-        Time of the steps after it, by name.
-    metadata
-        Entries of the report about the recording and the requested rate.
+    sensor : Sensor
+        Sensor of the recording.
+    points : RangePoints
+        Organised range image, NumPy arrays (profiles, samples); the status flags say why a point is missing.
+    intensity : numpy.ndarray
+        Intensity of the light, (profiles, samples): grey levels of a camera, amperes of a PSD.
+    heights : HeightMap
+        Height map, NumPy arrays of the shape of the grid.
+    grid : Grid
+        Cells of the height map.
+    frame_numbers : numpy.ndarray
+        Number of each profile's frame in the recording, (profiles,); not consecutive where frames were dropped.
+    device : Device
+        Device of the computation.
+    stream : StreamReport
+        Frame counts, times and latencies of the stream.
+    seconds : dict of str to float
+        Duration [s] of the steps after the stream, by name.
+    metadata : dict
+        Further entries of the report: recording, sensor, rates [frames/s], delay of the replay [s].
     """
 
     sensor: Sensor
@@ -73,7 +76,7 @@ class Scan:
     intensity: Array
     heights: HeightMap
     grid: Grid
-    numbers: Array
+    frame_numbers: Array
     device: Device
     stream: StreamReport
     seconds: dict[str, float]
@@ -81,38 +84,38 @@ class Scan:
 
     @property
     def valid_fraction(self) -> float:
-        """Part of the samples that have a point."""
-        return float(np.mean(np.isfinite(self.points.z)))
+        """Fraction of the samples that have a point, 0 to 1."""
+        return float(np.mean(np.isfinite(to_numpy(self.points.z))))
 
     def counts(self) -> dict[str, int]:
-        """Return how many samples are good (``OK``), and how many have each flag; a sample may have several."""
-        status = self.points.status
+        """Return the number of samples without a flag (``OK``) and with each flag; a sample may have several flags."""
+        status = to_numpy(self.points.status)
         flags = {str(flag.name): int(np.count_nonzero(status & flag)) for flag in Status if flag}
         return {"OK": int(np.count_nonzero(status == 0))} | flags
 
     def summary(self) -> str:
-        """Return what came out, in a line."""
-        stream, usual, late = self.stream, self.sensor.recording.rate, self.metadata["late"]
+        """Return one line: frames, throughput, fraction of valid samples, size of the height map."""
+        stream, sensor_rate, delay = self.stream, self.sensor.recording.rate, self.metadata["late"]
         dropped = f" ({stream.dropped} dropped)" if stream.dropped else ""
         speed = f"{self.throughput:,.0f} frames/s on {self.device.label}"
-        if usual is not None and self.metadata["rate"] is None:
-            speed += f" ({self.throughput / usual:.1f} times the sensor's rate)"
-        good = f"{100 * self.valid_fraction:.1f} % of the samples valid"
-        overdue = f"; frames were read up to {1e3 * late:.0f} ms late" if late and late > LATE else ""
-        return (
-            f"{stream.frames} frames{dropped} at {speed}, {good}, {self.grid.columns} x {self.grid.rows} cells{overdue}"
-        )
+        if sensor_rate is not None and self.metadata["rate"] is None:
+            speed += f" ({self.throughput / sensor_rate:.1f} times the sensor's rate)"
+        valid = f"{100 * self.valid_fraction:.1f} % of the samples valid"
+        overdue = f"; frames were read up to {1e3 * delay:.0f} ms late" if delay and delay > MAX_DELAY else ""
+        size = f"{self.grid.columns} x {self.grid.rows} cells"
+        return f"{stream.frames} frames{dropped} at {speed}, {valid}, {size}{overdue}"
 
     @property
     def throughput(self) -> float:
         """Frames per second."""
-        # A short recording is over before the stream is warm: its own span is all there is.
+        # A short recording ends within the warm-up of the stream, which then has no throughput: use the whole time.
         measured = self.stream.throughput
         return measured if measured > 0 else self.stream.frames / max(self.stream.seconds, 1e-9)
 
     def report(self) -> dict[str, Any]:
-        """Return what `write` puts into ``report.json``; times in seconds, rates in frames per second."""
+        """Return the content of ``report.json``; times in seconds, rates in frames per second."""
         stream = self.stream.to_dict()
+        valid_cells = float(np.mean(np.isfinite(to_numpy(self.heights.z))))
         stream.pop("throughput")
         return {
             "gpuvision": version("gpuvision"),
@@ -129,14 +132,19 @@ class Scan:
             "stages": stream.pop("stages"),
             "seconds": {"stream": stream.pop("seconds")} | self.seconds,
             "stream": stream,
-            "map": dataclasses.asdict(self.grid) | {"valid_fraction": float(np.mean(np.isfinite(self.heights.z)))},
+            "map": dataclasses.asdict(self.grid) | {"valid_fraction": valid_cells},
         }
 
     def write(self, folder: str | Path) -> None:
-        """Write the range image, pictures and the report into a folder, all or nothing.
+        """Write the range image, pictures and the report into a folder; after an error none of the files is left.
 
-        ``range_image.tiff``, ``.png`` (16 bit) and ``picture.png`` show the height map, ``range_image.ply`` and
-        ``scan.png`` the organised points, ``range_image.npz`` holds both.
+        ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` show the height map. ``range_image.ply``
+        and ``scan.png`` show the organised points. ``range_image.npz`` holds both. ``report.json`` holds the report.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Output folder; created if it is missing.
 
         Raises
         ------
@@ -161,12 +169,13 @@ class Scan:
         return self.sensor.name or "Height map"
 
     def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
+        """Return the arrays of ``range_image.npz`` and their units, by name."""
         light = "grey level" if self.sensor.kind == "camera" else "A"
         held: dict[str, tuple[Any, str]] = {
             **{name: (getattr(self.points, name), "m") for name in ("x", "y", "z")},
             "status": (self.points.status, "flags"),
             "intensity": (self.intensity, light),
-            "frame": (self.numbers, ""),
+            "frame": (self.frame_numbers, ""),
             "map_x": (self.grid.x, "m"),
             "map_y": (self.grid.y, "m"),
             "map_z": (self.heights.z, "m"),
@@ -187,51 +196,58 @@ def scan(
     trace: str | Path | None = None,
     progress: Progress = lambda done, of: None,
 ) -> Scan:
-    """Scan a recording.
+    """Compute the range image and the height map of a recording.
 
     Parameters
     ----------
-    recording
-        A file or folder (`open_recording`), a source, or an array: (frames, rows, columns) of a camera, (frames,
-        strips, 2) of a PSD.
-    sensor
-        Its description.
-    device
-        `Device.best` otherwise.
-    precision
-        Of the arithmetic; None follows the recording.
-    rate
-        Replay at so many frames per second, as a sensor would send them; the stream is planned for it.
-    policy
-        What happens to a frame for which there is no room; None: the recording waits, a replay drops the oldest.
-    trace
-        File for the timeline; tried before the scan.
-    progress
-        Called with the frames done, and of how many (None: unknown).
+    recording : str, Path, Source or numpy.ndarray
+        A file or folder (`open_recording`), a source of frames, or an array: (frames, rows, columns) of a camera,
+        (frames, strips, 2) of a PSD.
+    sensor : Sensor
+        Sensor of the recording.
+    device : Device, optional
+        Device of the computation; default `Device.best`.
+    precision : {"single", "double"}, optional
+        Precision of the arithmetic; default: that of the recording.
+    rate : float, optional
+        Replay the recording at this rate [frames/s]; batch and ring size of the stream are planned for it. Default:
+        read as fast as the device processes.
+    policy : {"block", "drop_oldest", "raise"}, optional
+        Handling of a frame when the queue is full; default "block" without a rate and "drop_oldest" with one.
+    trace : str or Path, optional
+        Output file for the timeline of the stream. The path is checked before the scan.
+    progress : callable, optional
+        Called with the number of processed frames and the number of all frames (None if unknown).
+
+    Returns
+    -------
+    Scan
 
     Raises
     ------
-    RecordingError, StreamError
-        The recording cannot be read, or no plan keeps up with the rate.
+    RecordingError
+        The recording cannot be read.
+    StreamError
+        No plan keeps up with the rate.
     TypeError, ValueError
-        The frames are not the sensor's, or no sample is valid.
+        The frames do not fit the sensor, or no sample is valid.
     OSError
-        The timeline cannot be written there.
+        The timeline cannot be written.
     """
-    timeline = None if trace is None else _Timeline(trace)
-    source, name = _opened(recording, sensor)
+    timeline = None if trace is None else _DeferredTrace(trace)
+    source, name = _open_source(recording, sensor)
     sensor.check_frame(source.shape, name)
-    readout = _asking_for(sensor, precision)
+    readout = _with_range_outputs(sensor, precision)
     device = Device.best() if device is None else device
     paced, stream = _pipeline(source, readout, device, rate, policy, timeline)
-    fields, numbers = _streamed(stream, readout.outputs or (), source.length, progress)
+    fields, frame_numbers = _read_frames(stream, readout.outputs or (), source.length, progress)
     start = time.perf_counter()
-    points = _points(sensor, fields, numbers, stream.device)
+    points = _points(sensor, fields, frame_numbers, stream.device)
     intensity = fields["peak" if sensor.kind == "camera" else "total"]
     middle = time.perf_counter()
-    heights, grid = resampled(sensor, points, intensity, stream.device)
+    heights, grid = resample_heights(sensor, points, intensity, stream.device)
     if timeline is not None:
-        timeline.write_now()
+        timeline.write_file()
     seconds = {"assemble": middle - start, "resample": time.perf_counter() - middle}
     return Scan(
         sensor=sensor,
@@ -239,7 +255,7 @@ def scan(
         intensity=intensity,
         heights=heights,
         grid=grid,
-        numbers=numbers,
+        frame_numbers=frame_numbers,
         device=stream.device,
         stream=stream.report(),
         seconds=seconds,
@@ -247,22 +263,26 @@ def scan(
     )
 
 
-class _Timeline(Trace):
-    """A trace that waits for the end of the scan: bad input leaves no file, and one that cannot be is told first."""
+class _DeferredTrace(Trace):
+    """Trace that writes its file after the scan: a scan that fails leaves no file.
+
+    The constructor checks that the file can be written.
+    """
 
     def __init__(self, path: str | Path) -> None:
         check_file(path)
         super().__init__(path)
 
     def write(self) -> None:
-        """Do nothing at the end of the stream."""
+        """Do nothing: the end of the stream is before the end of the scan."""
 
-    def write_now(self) -> None:
+    def write_file(self) -> None:
         """Write the file."""
         super().write()
 
 
-def _opened(recording: str | Path | Source | Array, sensor: Sensor) -> tuple[Source, str]:
+def _open_source(recording: str | Path | Source | Array, sensor: Sensor) -> tuple[Source, str]:
+    """Return the source of the frames, and its name for messages and the report."""
     if isinstance(recording, Source):
         return recording, type(recording).__name__
     if isinstance(recording, np.ndarray):
@@ -271,7 +291,7 @@ def _opened(recording: str | Path | Source | Array, sensor: Sensor) -> tuple[Sou
 
 
 def _metadata(name: str, sensor: Sensor, rate: float | None, source: Source) -> dict[str, Any]:
-    """Return the entries of the report about the recording and the requested rate: seconds, frames per second."""
+    """Return the entries of the report about the recording and the replay: rates [frames/s], delay ``late`` [s]."""
     return {
         "recording": name,
         "sensor": sensor.name,
@@ -282,11 +302,11 @@ def _metadata(name: str, sensor: Sensor, rate: float | None, source: Source) -> 
     }
 
 
-def _asking_for(sensor: Sensor, precision: Precision) -> LineReadout | PsdReadout:
-    """Return the readout with just the outputs that a range image needs."""
-    place = ("position",) if isinstance(sensor.transport, RotatingSheet) else ("g", "h")
+def _with_range_outputs(sensor: Sensor, precision: Precision) -> LineReadout | PsdReadout:
+    """Return the sensor's readout with only the outputs that a range image needs."""
+    positions = ("position",) if isinstance(sensor.transport, RotatingSheet) else ("g", "h")
     light = "peak" if sensor.kind == "camera" else "total"
-    return dataclasses.replace(sensor.readout, outputs=(*place, light, "status"), precision=precision)
+    return dataclasses.replace(sensor.readout, outputs=(*positions, light, "status"), precision=precision)
 
 
 def _pipeline(
@@ -297,86 +317,112 @@ def _pipeline(
     policy: Policy | None,
     timeline: Trace | None,
 ) -> tuple[Source, Pipeline[Any]]:
-    """Return the source, held back to a rate if one is given, and the stream of its frames."""
+    """Return the source, paced if a rate [frames/s] is given, and the pipeline over its frames."""
     if rate is None:
         stream = Pipeline(source, operation, device=device, profile=True, trace=timeline, policy=policy or "block")
         return source, stream
     paced = PacedSource(source, rate)
-    fitting = plan(paced, operation, device=device)
-    setup: dict[str, Any] = {"policy": policy or "drop_oldest", "batch": fitting.batch, "ring": fitting.ring}
+    planned = plan(paced, operation, device=device)
+    setup: dict[str, Any] = {"policy": policy or "drop_oldest", "batch": planned.batch, "ring": planned.ring}
     return paced, Pipeline(paced, operation, device=device, profile=True, trace=timeline, **setup)
 
 
-def _streamed(
+def _read_frames(
     stream: Pipeline[Any], names: Sequence[str], length: int | None, progress: Progress
 ) -> tuple[dict[str, Array], Array]:
-    """Return the fields of all frames by name, and the frames' numbers."""
-    parts, numbers = [], []
+    """Return the readout's outputs of all frames by name, (frames, ...), and the frame numbers (frames,)."""
+    parts, frame_numbers = [], []
     with stream:
         for batch in stream:
             kept = batch.result
             parts.append(type(kept)(*(None if each is None else each.copy() for each in kept)))
-            numbers.append(np.arange(batch.number, batch.number + len(batch)))
+            frame_numbers.append(np.arange(batch.number, batch.number + len(batch)))
             progress(batch.number + len(batch), length)
     if not parts:
         raise ValueError("the recording has no frame; expected at least one")
-    return {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}, np.concatenate(numbers)
+    return {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}, np.concatenate(
+        frame_numbers
+    )
 
 
-def _points(sensor: Sensor, fields: dict[str, Array], numbers: Array, device: Device) -> RangePoints:
-    """Return the organised range image of the fields that a readout gave for the frames of these numbers."""
-    place = [fields[name] for name in ("position", "g", "h") if name in fields]
-    transports = sensor.transport.transport(int(numbers[-1]) + 1)[numbers]
-    return assembled(sensor, place, transports, fields["status"], device)
+def _points(sensor: Sensor, fields: dict[str, Array], frame_numbers: Array, device: Device) -> RangePoints:
+    """Return the organised range image of the readout's outputs, with the transport of each frame number."""
+    positions = [fields[name] for name in ("position", "g", "h") if name in fields]
+    transports = sensor.transport.transport(int(frame_numbers[-1]) + 1)[frame_numbers]
+    return assemble_points(sensor, positions, transports, fields["status"], device)
 
 
-def assembled(sensor: Sensor, place: Sequence[Array], transports: Array, status: Array, device: Device) -> RangePoints:
-    """Return the organised range image of what a sensor reads.
+def assemble_points(
+    sensor: Sensor, positions: Sequence[Array], transports: Array, status: Array, device: Device
+) -> RangePoints:
+    """Compute the organised range image of the profiles of a sensor.
 
     Parameters
     ----------
-    sensor
-        Says how the sheet moves, what lies in the scene, and whether doubtful points stay.
-    place
-        g and h, (profiles, samples) each, or the position for a sheet that turns.
-    transports
-        (profiles,).
-    status
-        (profiles, samples) flags.
-    device
-        Where it is done.
+    sensor : Sensor
+        Gives the transport, the limits of the scene and the handling of ambiguous samples (``[output]``).
+    positions : sequence of numpy.ndarray
+        g and h [m] for a straight transport; the position [px] alone for a rotating sheet. Each (profiles, samples).
+    transports : numpy.ndarray
+        Transport of each profile, (profiles,): [m], or the rotation [rad] of a rotating sheet.
+    status : numpy.ndarray
+        `Status` flags of the samples, (profiles, samples), uint8.
+    device : Device
+        Device of the computation.
+
+    Returns
+    -------
+    RangePoints
+        NumPy arrays (profiles, samples). Ambiguous points are NaN where the sensor drops them.
     """
-    moved = transports.astype(place[0].dtype)
+    typed_transports = transports.astype(positions[0].dtype)
     assemble = RangeImage(geometry=sensor.transport, limits=sensor.output.limits)
-    points: RangePoints = assemble(*place, moved, status, device=device)
+    points: RangePoints = assemble(*positions, typed_transports, status, device=device)
     if sensor.output.ambiguous == "drop":
-        doubtful = (points.status & Status.AMBIGUOUS) != 0
-        for array in points[:3]:
-            array[doubtful] = np.nan
+        ambiguous = (to_numpy(points.status) & Status.AMBIGUOUS) != 0
+        for coordinate in (points.x, points.y, points.z):
+            to_numpy(coordinate)[ambiguous] = np.nan
     return points
 
 
-def resampled(sensor: Sensor, points: RangePoints, light: Array, device: Device) -> tuple[HeightMap, Grid]:
-    """Return the height map of organised points, over the cells that the sensor's file asks for.
+def resample_heights(sensor: Sensor, points: RangePoints, light: Array, device: Device) -> tuple[HeightMap, Grid]:
+    """Resample an organised range image to a height map over the grid of the sensor file (``[output]``).
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Gives the cell size and the limits of interpolation.
+    points : RangePoints
+        Organised range image, NumPy arrays (profiles, samples).
+    light : numpy.ndarray
+        Intensity of the samples, (profiles, samples).
+    device : Device
+        Device of the computation.
+
+    Returns
+    -------
+    HeightMap
+        NumPy arrays (rows, columns).
+    Grid
+        Cells of the height map; they cover all points.
 
     Raises
     ------
     ValueError
-        No point is valid, or they span too many cells.
+        No point is valid, or the points span more than 2^26 cells.
     """
-    if not np.any(np.isfinite(points.z)):
-        flags = ", ".join(flag.name or "" for flag in Status if flag and np.any(points.status & flag))
-        raise ValueError(
-            f"not one valid sample in {len(points.z)} frames ({flags}); check thresholds and [output] limits"
-        )
+    x, y, z, status = to_numpy(points.x), to_numpy(points.y), to_numpy(points.z), to_numpy(points.status)
+    if not np.any(np.isfinite(z)):
+        flags = ", ".join(flag.name or "" for flag in Status if flag and np.any(status & flag))
+        raise ValueError(f"no valid sample in {len(z)} frames ({flags}); check thresholds and [output] limits")
     output = sensor.output
-    grid = Grid.covering(points.x, points.y, output.cell)
-    if grid.rows * grid.columns > _MOST_CELLS:
+    grid = Grid.covering(x, y, output.cell)
+    if grid.rows * grid.columns > _MAX_CELLS:
         raise ValueError(
             f"the points span {grid.columns} x {grid.rows} cells of {output.cell} m; "
             "give [output] a larger cell, or limits x and y [m]"
         )
-    along, across = _directions(points)
+    along, across = _directions(x, y)
     regrid = Regrid(
         grid=grid,
         max_gap=output.max_gap,
@@ -386,18 +432,17 @@ def resampled(sensor: Sensor, points: RangePoints, light: Array, device: Device)
         along=along,
         across=across,
     )
-    return regrid(*points[:3], light, points.status, device=device), grid
+    return regrid(x, y, z, light, status, device=device), grid
 
 
-def _directions(points: RangePoints) -> tuple[Direction, Direction]:
-    """Find in which scene directions samples and profiles advance: what most neighbours say."""
+def _directions(x: Array, y: Array) -> tuple[Direction, Direction]:
+    """Return the scene directions of increasing sample and profile number, by the median steps in x and y."""
     steps = np.empty((2, 2))
-    for place, name in enumerate("xy"):
-        values = getattr(points, name)
+    for coordinate, values in enumerate((x, y)):
         for axis in (0, 1):
             known = np.diff(values, axis=axis)
             known = known[np.isfinite(known)]
-            steps[place, axis] = np.median(known) if known.size else 0.0
+            steps[coordinate, axis] = np.median(known) if known.size else 0.0
     samples_on_x = abs(steps[0, 1]) >= abs(steps[1, 1])
     on_samples, on_profiles = (0, 1) if samples_on_x else (1, 0)
     names: tuple[tuple[Direction, Direction], tuple[Direction, Direction]] = (("x", "-x"), ("y", "-y"))

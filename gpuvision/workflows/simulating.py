@@ -25,7 +25,7 @@ from gpuvision.plots.simulation import draw_causes, draw_errors
 from gpuvision.ranging.range_image import RangePoints, StraightTransport
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.sensor.sensor import Sensor
-from gpuvision.sensor.simulated import light_of, sensor_view_of, simulator_of
+from gpuvision.sensor.simulated import make_sensor_view, make_simulator, require_light
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution, attribute_errors
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
@@ -37,7 +37,7 @@ from gpuvision.simulation.sensors.readings import PATHS, GroundTruth, Reading
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
 from gpuvision.workflows.light_cache import LightBlock, LightStore, Progress, SimulationTask, compute_missing_blocks
-from gpuvision.workflows.scanning import assembled, resampled
+from gpuvision.workflows.scanning import assemble_points, resample_heights
 
 DEFAULT_PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse")
 # Default error limit in predicted standard deviations: noise alone exceeds it in less than one of a million samples.
@@ -203,9 +203,9 @@ def prepare_simulation(
     ValueError
         The sensor cannot be simulated, a parameter lies outside its range, or no profile meets the part.
     """
-    light_of(sensor)
+    require_light(sensor)
     transport = sensor.transport
-    assert isinstance(transport, StraightTransport)  # light_of looked
+    assert isinstance(transport, StraightTransport)  # require_light checked it
     if not (np.isfinite(tolerance) and tolerance >= 0.0):
         raise ValueError(f"the tolerance is {tolerance}, expected metres, 0 or more")
     for path in paths:
@@ -270,14 +270,14 @@ def simulate(
     start = time.perf_counter()
     computed = compute_missing_blocks(store, device=device, scheduler=scheduler, progress=progress)
     lit = time.perf_counter()
-    view = sensor_view_of(task.sensor)
+    view = make_sensor_view(task.sensor)
     found = optimise_mask(view, *_all_light(store, view.samples * view.bins)) if mask == "best" else None
     before = found.mask if found is not None else mask if isinstance(mask, Mask) else None
-    attribution, statistics = _attribute_errors(store, simulator_of(task.sensor, view, before), seed, device)
+    attribution, statistics = _attribute_errors(store, make_simulator(task.sensor, view, before), seed, device)
     points = _points(task, attribution.reading, device)
     if task.sensor.output.ambiguous == "drop":
         attribution = attribution.without_flagged(Status.AMBIGUOUS)
-    heights, grid = resampled(task.sensor, points, _strength(attribution.reading), device)
+    heights, grid = resample_heights(task.sensor, points, _strength(attribution.reading), device)
     return Simulation(
         task=task,
         attribution=attribution,
@@ -317,7 +317,7 @@ def simulate_recording(
     """
     store = LightStore(Path(folder), task)
     compute_missing_blocks(store, device=device)
-    simulator = simulator_of(task.sensor, sensor_view_of(task.sensor), mask)
+    simulator = make_simulator(task.sensor, make_sensor_view(task.sensor), mask)
     record = simulator.currents if isinstance(simulator, PsdSimulator) else simulator.frames
     parts, first = [], 0
     for block in store:
@@ -424,7 +424,7 @@ def _attribute_errors(
 def _points(task: SimulationTask, reading: Reading, device: Device) -> RangePoints:
     """Return the organised range image of a reading."""
     place = [np.ascontiguousarray(each, np.float32) for each in (reading.g, reading.h)]
-    return assembled(task.sensor, place, task.transports, reading.status, device)
+    return assemble_points(task.sensor, place, task.transports, reading.status, device)
 
 
 def _default_limit(reading: Reading) -> float:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gpuvision.ranging.focus import DepthFromFocus, conjugate
+from gpuvision.ranging.focus import DepthFromFocus, conjugate_distance
 from gpuvision.status import Status
 
 FOCAL, FIRST, SPACING = 0.05, 0.06, 1e-3
@@ -134,11 +134,11 @@ def test_level_and_width_do_not_move_the_peak(peak: float, width: float, level: 
 
 def test_thin_lens_both_ways() -> None:
     image = np.array([0.0501, 0.06, 0.1, 1.0])
-    far = conjugate(image, FOCAL)
+    far = conjugate_distance(image, FOCAL)
     np.testing.assert_allclose(1.0 / image + 1.0 / far, 1.0 / FOCAL, rtol=1e-12)
-    np.testing.assert_allclose(conjugate(far, FOCAL), image, rtol=1e-12)
-    assert conjugate(0.1, FOCAL) == pytest.approx(0.1)
-    assert np.all(np.isnan(conjugate([FOCAL, 0.01, -1.0, np.nan], FOCAL)))
+    np.testing.assert_allclose(conjugate_distance(far, FOCAL), image, rtol=1e-12)
+    assert conjugate_distance(0.1, FOCAL) == pytest.approx(0.1)
+    assert np.all(np.isnan(conjugate_distance([FOCAL, 0.01, -1.0, np.nan], FOCAL)))
 
 
 def test_shapes() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gpuvision.ranging.polygon import PolygonMirror, sheared
+from gpuvision.ranging.polygon import PolygonMirror, shear_profile
 from gpuvision.status import Status
 
 # x/H at phi = -.3, -.1, .1, .3 rad for H/R, H from the polygon's centre: derived and checked by ray tracing.
@@ -163,7 +163,7 @@ def test_bad_speed() -> None:
 def test_sheared_samples() -> None:
     x0 = np.linspace(0.0, 1e-2, 11)
     height = np.where(np.arange(11) < 5, 0.0, 5e-4)
-    profile = sheared(x0, height)
+    profile = shear_profile(x0, height)
     np.testing.assert_allclose(profile.x, x0 + height, rtol=1e-14)
     assert not profile.status.any()
 
@@ -171,38 +171,38 @@ def test_sheared_samples() -> None:
 def test_fold_over_where_the_surface_falls_faster_than_the_beam() -> None:
     x0 = np.arange(6) * 1e-3
     height = np.array([2e-3, 2e-3, 0.0, 0.0, 0.0, 0.0])
-    np.testing.assert_array_equal(sheared(x0, height).status, [0, 0, Status.NOT_INVERTIBLE, 0, 0, 0])
+    np.testing.assert_array_equal(shear_profile(x0, height).status, [0, 0, Status.NOT_INVERTIBLE, 0, 0, 0])
     # The other way round the beam and the scan run together: no fold, a gap.
-    assert not sheared(x0, height[::-1].copy()).status.any()
+    assert not shear_profile(x0, height[::-1].copy()).status.any()
     # A scan that runs backwards folds on the other flank.
-    np.testing.assert_array_equal(sheared(x0[::-1], height[::-1]).status, [0, 0, 0, 0, Status.NOT_INVERTIBLE, 0])
-    np.testing.assert_array_equal(sheared(x0[::-1], height).status, [0] * 6)
-    np.testing.assert_array_equal(sheared(x0[::-1], -height).status, [0, 0, Status.NOT_INVERTIBLE, 0, 0, 0])
+    np.testing.assert_array_equal(shear_profile(x0[::-1], height[::-1]).status, [0, 0, 0, 0, Status.NOT_INVERTIBLE, 0])
+    np.testing.assert_array_equal(shear_profile(x0[::-1], height).status, [0] * 6)
+    np.testing.assert_array_equal(shear_profile(x0[::-1], -height).status, [0, 0, Status.NOT_INVERTIBLE, 0, 0, 0])
 
 
 def test_samples_that_coincide_are_folded() -> None:
     # Multiples of a power of two, so that the coincidence is exact.
     x0, height = np.arange(4) * 0.25, np.array([0.0, 0.0, -0.25, 0.0])
     np.testing.assert_array_equal(
-        sheared(x0, height, math.atan(1.0)).status & Status.NOT_INVERTIBLE, [0, 0, Status.NOT_INVERTIBLE, 0]
+        shear_profile(x0, height, math.atan(1.0)).status & Status.NOT_INVERTIBLE, [0, 0, Status.NOT_INVERTIBLE, 0]
     )
 
 
 def test_hole_is_skipped_in_the_comparison() -> None:
     x0, height = np.arange(5) * 1e-3, np.array([0.0, 3e-3, np.nan, 0.0, 0.0])
-    profile = sheared(x0, height)
+    profile = shear_profile(x0, height)
     np.testing.assert_array_equal(profile.status, [0, 0, Status.NOT_FINITE, Status.NOT_INVERTIBLE, 0])
     assert np.isnan(profile.x[2])
-    first = sheared(x0, np.array([np.nan, 0.0, 0.0, 0.0, 0.0]))
+    first = shear_profile(x0, np.array([np.nan, 0.0, 0.0, 0.0, 0.0]))
     np.testing.assert_array_equal(first.status, [Status.NOT_FINITE, 0, 0, 0, 0])
 
 
 def test_batches_of_profiles_are_independent(rng: np.random.Generator) -> None:
     height = rng.uniform(-2e-3, 2e-3, (3, 4, 50))
     x0 = np.broadcast_to(np.arange(50) * 1e-3, height.shape)
-    together = sheared(x0, height, 0.6)
+    together = shear_profile(x0, height, 0.6)
     for index in np.ndindex(3, 4):
-        alone = sheared(x0[index], height[index], 0.6)
+        alone = shear_profile(x0[index], height[index], 0.6)
         np.testing.assert_array_equal(together.x[index], alone.x)
         np.testing.assert_array_equal(together.status[index], alone.status)
 
@@ -218,4 +218,4 @@ def test_batches_of_profiles_are_independent(rng: np.random.Generator) -> None:
 )
 def test_bad_shear(x0: list[float], height: list[float], angle: float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        sheared(x0, height, angle)
+        shear_profile(x0, height, angle)

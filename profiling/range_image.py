@@ -223,7 +223,9 @@ def _assembly(
     out = [np.empty(SHAPE, np.float32) for _ in range(3)] + [np.empty(SHAPE, np.uint8)]
     bound().wait()
     exact = plain(*(each.astype(np.float64) for each in frames), given, operation.packed())
-    differences = [np.abs(to_numpy(ours) - truth) for ours, truth in zip(bound.outputs[:3], exact[:3], strict=True)]
+    differences = [
+        np.abs(to_numpy(ours) - to_numpy(truth)) for ours, truth in zip(bound.outputs[:3], exact[:3], strict=True)
+    ]
     error = max(float(np.max(each)) for each in differences)
     peers: dict[str, Callable[[], object]] = {
         "numba": lambda: loop(*frames, given, table, *out),

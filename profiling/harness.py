@@ -148,10 +148,14 @@ class Run:
     valid: bool
     machine: Mapping[str, Any]
 
+    def to_json(self) -> str:
+        """Return the run as JSON."""
+        rows = [row.to_dict() for row in self.rows]
+        return json.dumps({"machine": self.machine, "valid": self.valid, "rows": rows}, indent=1) + "\n"
+
     def write(self, path: Path) -> None:
         """Write the run as JSON; on an error no file is written."""
-        rows = [row.to_dict() for row in self.rows]
-        write_whole(path, json.dumps({"machine": self.machine, "valid": self.valid, "rows": rows}, indent=1) + "\n")
+        write_whole(path, self.to_json())
 
 
 def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:

@@ -12,15 +12,18 @@ from typing import Annotated
 
 import typer
 
-DeviceLabel = Annotated[str | None, typer.Option(help="Label of an OpenCL device, see `gpuvision devices`.")]
+DeviceLabel = Annotated[
+    str | None,
+    typer.Option(metavar="LABEL", help="Label of an OpenCL device, see `gpuvision devices`. Default: the best device."),
+]
 
 LayerNames = Annotated[
     list[str] | None,
     typer.Option(
         "--layers",
         metavar="NAME=LAYER",
-        help="Layer of a file whose name does not show it: '*.gtl=top copper', '*.gko=mechanical outline'. Repeat the "
-        "option for every file to read.",
+        help="Layer of a file whose name does not show it, such as `*.gtl=top copper` or `*.gko=mechanical outline`; "
+        "repeat the option for every file to read.",
     ),
 ]
 
@@ -40,7 +43,12 @@ def named_path(text: str | Path) -> Path:
 
 ReportFile = Annotated[
     Path | None,
-    typer.Option("--json", metavar="FILE", parser=named_path, help="Write the report there, too; - prints it."),
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        parser=named_path,
+        help="Also write the report (JSON) to this file; - prints it to standard output, without other text.",
+    ),
 ]
 
 
@@ -54,8 +62,13 @@ def check_report_file(path: Path | None) -> None:
     """
     from gpuvision.host.files import check_file
 
-    if path is not None and str(path) != "-":
+    if path is not None and not prints_report(path):
         check_file(path)
+
+
+def prints_report(path: Path | None) -> bool:
+    """Return whether ``--json`` asks for the report on standard output; other text then goes to standard error."""
+    return str(path) == "-"
 
 
 def write_report(path: Path | None, report: object) -> None:
@@ -69,7 +82,7 @@ def write_report(path: Path | None, report: object) -> None:
     if path is None:
         return
     text = json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n"
-    if str(path) == "-":
+    if prints_report(path):
         typer.echo(text, nl=False)
     else:
         write_whole(path, text)
@@ -149,6 +162,6 @@ def layers_of(given: Sequence[str] | None) -> dict[str, str] | None:
     for each in given or ():
         name, equals, layer = each.partition("=")
         if not (name and equals and layer.strip()):
-            raise ValueError(f"--layers is {each!r}, expected a name, or a pattern, and a layer: '*.gtl=top copper'")
+            raise ValueError(f"--layers is {each!r}, expected a file name or pattern and a layer: '*.gtl=top copper'")
         table[fnmatch.translate(name)] = layer.strip()
     return table or None

@@ -13,7 +13,14 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from gpuvision.cli.arguments import ReportFile, check_report_file, named_path, reject_unused, write_report
+from gpuvision.cli.arguments import (
+    ReportFile,
+    check_report_file,
+    named_path,
+    prints_report,
+    reject_unused,
+    write_report,
+)
 from gpuvision.cli.scan import progress_bar
 
 if TYPE_CHECKING:
@@ -45,14 +52,14 @@ class RobustLoss(StrEnum):
 
 
 Images = Annotated[
-    list[Path], typer.Argument(metavar="IMAGES...", parser=named_path, help="Images of one camera, all of one size.")
+    list[Path], typer.Argument(metavar="IMAGES", parser=named_path, help="Images of one camera, all of one size.")
 ]
 LensFile = Annotated[
     Path,
     typer.Option(
         metavar="FILE.toml",
         parser=named_path,
-        help="Camera file to write; report (.json) and picture (.png) go beside it.",
+        help="Camera file to write; the report (.json) and a plot (.png) are written beside it.",
     ),
 ]
 Pattern = Annotated[
@@ -73,13 +80,18 @@ Model = Annotated[
     ),
 ]
 InnerCorners = Annotated[
-    str | None, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the chessboard, such as 9x6.")
+    str | None,
+    typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the chessboard, such as 9x6. Default: any number."),
 ]
 Pitch = Annotated[
     float | None,
-    typer.Option(min=1e-9, help="Distance of neighbouring points on the target [m]; scales the poses. Default: 1."),
+    typer.Option(
+        min=1e-9, help="Distance between neighbouring points on the target [m]; it scales the poses only. Default: 1."
+    ),
 ]
-FocalLength = Annotated[float | None, typer.Option(help="Known focal length [px]: one view then suffices.")]
+FocalLength = Annotated[
+    float | None, typer.Option(help="Known focal length [px]; with it one view suffices. Default: estimated.")
+]
 Loss = Annotated[RobustLoss, typer.Option(help="Robust loss: huber and tukey reduce the weight of outliers.")]
 
 
@@ -109,10 +121,15 @@ def calibrate(
         reject_unused(f"with --pattern {pattern.value}, only with chessboard", inner_corners=inner_corners)
     if method is CalibrationMethod.lines:
         reject_unused("with --method lines, which finds no poses", pitch=pitch, focal_length=focal_length)
+    elif method is CalibrationMethod.auto and pattern is TargetPattern.lines:
+        reject_unused("with --pattern lines, which gives no poses", pitch=pitch, focal_length=focal_length)
     corners = None if inner_corners is None else _corners(inner_corners)
     check_report_file(as_json)
     if out.suffix in (".json", ".png"):
-        raise ValueError(f"--out is {out}, a name that the report or the plot takes; give a name such as lens.toml")
+        raise ValueError(
+            f"--out is {out}, but the report and the plot get the suffixes .json and .png; give a name such as "
+            "lens.toml"
+        )
     for place in (out, out.with_suffix(".json"), out.with_suffix(".png")):
         check_file(place)
     with progress_bar(f"detecting {pattern.value}") as progress:
@@ -127,26 +144,30 @@ def calibrate(
             loss=loss.value,
             progress=progress,
         )
-    _show(done)
+    _show(done, to_stderr=prints_report(as_json))
     write_calibration(done, out)
     write_report(as_json, done.report())
     typer.echo(
-        f"next: check {out.with_suffix('.png')}; correct images with gpuvision undistort IMAGES --lens {out} --out DIR"
+        f"next: check {out.with_suffix('.png')}; correct images with gpuvision undistort IMAGES --lens {out} --out DIR",
+        err=prints_report(as_json),
     )
 
 
 def _corners(text: str) -> tuple[int, int]:
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.strip().isdigit() for part in parts):
-        raise ValueError(f"--inner-corners is {text!r}, expected the inner corners along both sides, such as 9x6")
+        raise ValueError(
+            f"--inner-corners is {text!r}, expected the numbers of inner corners along both sides, such as 9x6"
+        )
     return int(parts[0]), int(parts[1])
 
 
-def _show(done: Calibration) -> None:
-    console = Console()
-    typer.echo(done.summary())
+def _show(done: Calibration, to_stderr: bool) -> None:
+    """Print the summary, the parameters with uncertainties, the alternative models and the warnings."""
+    console = Console(stderr=to_stderr)
+    typer.echo(done.summary(), err=to_stderr)
     for path, reason in done.skipped_images:
-        typer.echo(f"skipped {path}: {reason}")
+        typer.echo(f"skipped {path}: {reason}", err=to_stderr)
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("parameter")
     table.add_column("value", justify="right")
@@ -157,7 +178,7 @@ def _show(done: Calibration) -> None:
     if done.alternatives:
         console.print(_alternatives(done))
     for each in done.fit.warnings:
-        typer.echo(f"warning: {each}")
+        typer.echo(f"warning: {each}", err=to_stderr)
 
 
 def _digits(value: float, error: float) -> int:

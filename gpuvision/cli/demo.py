@@ -54,10 +54,11 @@ def demo(
         masked.write(inside / f"{name}_masked")
         results[f"{name}_masked"] = {"predicted": masked.report()}
         (inside / "report.json").write_text(json.dumps(results, indent=1) + "\n")
-    typer.echo(f"{name} behind a mask made for the part: {masked.summary()}")
+    typer.echo(f"{name} with a mask computed for the part: {masked.summary()}")
     camera = out / "camera_line"
     typer.echo(
-        f"scan one yourself: gpuvision scan {camera / 'recording.npy'} --sensor camera_line --out {out / 'again'}"
+        "next: scan a recording yourself: "
+        f"gpuvision scan {camera / 'recording.npy'} --sensor camera_line --out {out / 'again'}"
     )
     typer.echo(
         f"Range image of the part: {camera / 'picture.png'}. Errors of the PSD strips from light in the corners: "

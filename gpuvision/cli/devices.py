@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import ReportFile, check_report_file, write_report
+from gpuvision.cli.arguments import ReportFile, check_report_file, prints_report, write_report
 
 if TYPE_CHECKING:
     from gpuvision.host.discovery import Candidate
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def devices(
     as_json: ReportFile = None,
-    probe: Annotated[bool, typer.Option("--probe", help="Probe again the devices that failed before.")] = False,
+    probe: Annotated[bool, typer.Option("--probe", help="Repeat the probe of devices that failed before.")] = False,
 ) -> None:
     """List every OpenCL device: whether it works, why not, and what to install.
 
@@ -25,7 +25,7 @@ def devices(
     check_report_file(as_json)
     listed = sorted(discovery.candidates(probe_again=probe), key=lambda each: each.rank)
     write_report(as_json, [_described(each) for each in listed])
-    if str(as_json) != "-":
+    if not prints_report(as_json):
         _show(listed)
     if not any(each.healthy for each in listed):
         raise typer.Exit(1)
@@ -68,4 +68,4 @@ def _show(listed: list[Candidate]) -> None:
             typer.echo(f"{each.label} does not work: {each.reason}\n    {each.advice}")
     healthy = [each.label for each in listed if each.healthy]
     if len(healthy) > 1:
-        typer.echo(f"choose one with --device {healthy[0]} or with the variable GPUVISION_DEVICE={healthy[0]}")
+        typer.echo(f"choose a device with --device {healthy[0]} or with the variable GPUVISION_DEVICE={healthy[0]}")

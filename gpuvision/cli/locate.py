@@ -37,7 +37,12 @@ class Copper(StrEnum):
     dark = "dark"
 
 
-Image = Annotated[Path, typer.Argument(metavar="IMAGE", parser=named_path, help="Camera image, perpendicular view.")]
+Image = Annotated[
+    Path,
+    typer.Argument(
+        metavar="IMAGE", parser=named_path, help="Image of a camera that looks at the board at right angles."
+    ),
+]
 Board = Annotated[
     Path,
     typer.Option(metavar="GERBERS", parser=named_path, help="Folder or ZIP of the board's Gerber and Excellon files."),
@@ -60,16 +65,26 @@ SearchRange = Annotated[
     str | None,
     typer.Option(
         metavar="LENGTH,ANGLE",
-        help="Largest distance and rotation from there. Default: 100um,0.3deg; without --initial-pose 2mm,5deg.",
+        help="Largest distance and rotation from the expected pose. Default: 2mm,5deg; with "
+        "--initial-pose that of --features, or 100um,0.3deg.",
     ),
 ]
 CameraFile = Annotated[
-    Path | None, typer.Option(metavar="FILE.toml", parser=named_path, help="Camera file of `gpuvision calibrate`.")
+    Path | None,
+    typer.Option(
+        metavar="FILE.toml", parser=named_path, help="Camera file of `gpuvision calibrate`. Default: no distortion."
+    ),
 ]
 Features = Annotated[
-    Path | None, typer.Option(metavar="FILE.toml", parser=named_path, help="Features file of `gpuvision select`.")
+    Path | None,
+    typer.Option(
+        metavar="FILE.toml", parser=named_path, help="Features file of `gpuvision select`. Default: select now."
+    ),
 ]
-Budget = Annotated[int | None, typer.Option(min=3, max=1000, help=f"Number of calipers (rulers). Default: {_BUDGET}.")]
+Budget = Annotated[
+    int | None,
+    typer.Option(min=3, max=1000, help=f"Number of calipers (rulers); not with --features. Default: {_BUDGET}."),
+]
 Blur = Annotated[
     float | None,
     typer.Option(min=0.1, help=f"Edge blur, standard deviation [px]. Default: {_BLUR_PX:g}, or that of --features."),
@@ -78,10 +93,13 @@ EtchBias = Annotated[
     str, typer.Option(metavar="LENGTH", help="Over- or under-etch of copper edges, standard deviation.")
 ]
 Threshold = Annotated[
-    float | None, typer.Option(min=0.0, help="Smallest edge [grey levels]. Default: from the image's noise and range.")
+    float | None,
+    typer.Option(
+        min=0.0, help="Smallest height of an edge [grey levels]. Default: from the noise and the range of the image."
+    ),
 ]
 CopperChoice = Annotated[
-    Copper, typer.Option(help="Copper is brighter or darker than its surroundings; auto: the better fit.")
+    Copper, typer.Option(help="Copper is brighter or darker than its surroundings; auto: the better fit of both.")
 ]
 
 
@@ -124,9 +142,11 @@ def locate(
         check_folder(out)
     chosen = None if features is None else read_features(features)
     if chosen is not None:
-        reject_unused("with --features, whose rulers are chosen already", budget=budget)
+        reject_unused("with --features, a file with a fixed selection of calipers", budget=budget)
         if side is not None and side.value != chosen.side:
-            raise ValueError(f"--side is {side.value}, but {features} is of the {chosen.side}; leave it out")
+            raise ValueError(
+                f"--side is {side.value}, but the features in {features} are on the {chosen.side}; leave it out"
+            )
     pixel = _pixel(scale, chosen)
     blur_px = blur or (_BLUR_PX if chosen is None else chosen.imaging.blur_px)
     # Check the options before the files, which take longer to read.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gpuvision.matching.field.distance_map import Field
     from gpuvision.matching.field.line_detection import FloorScan
 
-_WITH_POINTS = "with a file of points, which are measured already"
+_WITH_POINTS = "with a file of points, only with an image"
 
 Input = Annotated[
     Path,
@@ -30,7 +30,8 @@ Input = Annotated[
     ),
 ]
 FieldFile = Annotated[
-    str, typer.Option(metavar="FIELD", help="Lines of the field: a TOML file, or robocup_msl, robocup_junior.")
+    str,
+    typer.Option(metavar="FIELD", help="Field file (TOML) with the lines, or a preset: robocup_msl, robocup_junior."),
 ]
 Scale = Annotated[
     str | None, typer.Option(metavar="LENGTH", help="Size of a pixel on the floor in a top view, such as 1cm.")
@@ -45,18 +46,23 @@ CameraFile = Annotated[
         metavar="FILE.toml",
         parser=named_path,
         help="Camera file of `gpuvision calibrate`. With a table [mount] (height, tilt_degrees) the image is the view "
-        "of that camera on the robot, and --scale is left out.",
+        "of that camera on the robot; leave out --scale.",
     ),
 ]
 Threshold = Annotated[
-    float | None, typer.Option(min=0.0, help="Smallest edge [grey levels]. Default: from the image's noise and range.")
+    float | None,
+    typer.Option(
+        min=0.0, help="Smallest height of an edge [grey levels]. Default: from the noise and the range of the image."
+    ),
 ]
 LineWidth = Annotated[
     str | None, typer.Option(metavar="LENGTH", help="Width of the lines. Default: 125mm; 20mm on fields under 5 m.")
 ]
 BlindRadius = Annotated[
     str | None,
-    typer.Option(metavar="LENGTH", help="Radius around the middle of a top view that shows the robot. Default: 0."),
+    typer.Option(
+        metavar="LENGTH", help="Radius of the area in the middle of a top view that shows the robot itself. Default: 0."
+    ),
 ]
 
 

@@ -9,10 +9,16 @@ from typing import Annotated, Any, Protocol
 
 import typer
 
-from gpuvision.cli.arguments import named_path, quantities, write_report
+from gpuvision.cli.arguments import named_path, prints_report, quantities, write_report
 
 PoseFolder = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", parser=named_path, help="Folder for pose.json and located.png.")
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="DIR",
+        parser=named_path,
+        help="Folder for pose.json and the picture located.png. Default: no files.",
+    ),
 ]
 
 
@@ -39,7 +45,7 @@ def check_image(path: Path) -> None:
         The file does not exist.
     """
     if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file")
+        raise FileNotFoundError(f"{path}: no such file")
 
 
 def initial_pose_of(text: str | None) -> tuple[float, float, float] | None:
@@ -70,4 +76,4 @@ def report_pose(located: Located, draw: Callable[[Path], None], out: Path | None
         shown = f"look at {out / 'located.png'} and {out / 'pose.json'}"
     if located.reason:
         raise ValueError(f"no pose: {located.reason}{'; ' + shown if shown else ''}")
-    typer.echo("\n".join(filter(None, (located.summary(), shown))))
+    typer.echo("\n".join(filter(None, (located.summary(), shown))), err=prints_report(as_json))

@@ -8,27 +8,36 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import named_path
+from gpuvision.cli.arguments import ReportFile, check_report_file, named_path, prints_report
 from gpuvision.host.errors import GpuVisionError
 
 if TYPE_CHECKING:
     from gpuvision.profiling.harness import Row
 
+_NO_PLOTS = "no plots: these operations have no series over size or tolerance; try light_clustering or reflections"
+
 
 def profile(
     operations: Annotated[
-        list[str] | None, typer.Argument(metavar="[OPERATION]...", help="psd, line, ...; default: all.")
+        list[str] | None,
+        typer.Argument(metavar="OPERATION", help="Operations to measure, such as psd or line. Default: all."),
     ] = None,
     device: Annotated[
-        list[str] | None, typer.Option(help="Label of a device, see `gpuvision devices`; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            metavar="LABEL",
+            help="Label of an OpenCL device, see `gpuvision devices`; repeat the option for several. Default: all.",
+        ),
     ] = None,
-    seconds: Annotated[float, typer.Option(help="Time to measure each case [s].", min=0.01)] = 2.0,
-    as_json: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", parser=named_path, help="Write the rows there.")
-    ] = None,
+    seconds: Annotated[float, typer.Option(help="Approximate time to measure each case [s].", min=0.01)] = 2.0,
+    as_json: ReportFile = None,
     plots: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", parser=named_path, help="Folder for plots: time over size, and error over time."),
+        typer.Option(
+            metavar="DIR",
+            parser=named_path,
+            help="Folder for plots of time and error over the amount of work and over the tolerance.",
+        ),
     ] = None,
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
@@ -39,11 +48,10 @@ def profile(
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the peer numba is missing; install it: pip install 'gpuvision[profile]'")
     from gpuvision.host import Device
-    from gpuvision.host.files import check_file, check_folder
+    from gpuvision.host.files import check_folder
     from gpuvision.profiling import harness
 
-    if as_json is not None:
-        check_file(as_json)
+    check_report_file(as_json)
     if plots is not None:
         check_folder(plots)
     for name in operations or ():
@@ -56,28 +64,31 @@ def profile(
         seconds=seconds,
         progress=lambda line: typer.echo(line, err=True),
     )
-    if as_json is not None:
+    if prints_report(as_json):
+        typer.echo(run.to_json(), nl=False)
+    elif as_json is not None:
         run.write(as_json)
+    _show(list(run.rows), to_stderr=prints_report(as_json))
     if plots is not None:
         from gpuvision.profiling.plots import draw_plots
 
         plots.mkdir(parents=True, exist_ok=True)
-        draw_plots(plots, run.rows)
-    _show(list(run.rows))
+        drawn = draw_plots(plots, run.rows)
+        typer.echo(f"look at {', '.join(str(plots / name) for name in drawn)}" if drawn else _NO_PLOTS, err=True)
     if not run.valid:
-        typer.echo("not valid: the machine changed its speed during the measurement; run it again", err=True)
+        typer.echo("not valid: the machine changed its speed during the measurement; run the command again", err=True)
 
 
-def _show(rows: list[Row]) -> None:
+def _show(rows: list[Row], to_stderr: bool) -> None:
     """Print a table for each operation, narrow enough for a terminal of 80 columns."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = Console(stderr=to_stderr)
     for operation in dict.fromkeys(each.operation for each in rows):
         table = Table(title=operation, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        for heading in ("case", "device", "time", "peer", "its time", "ratio", "error", "ceiling"):
+        for heading in ("case", "device", "time", "peer", "peer time", "ratio", "error", "ceiling"):
             words = heading in ("case", "device", "peer")
             table.add_column(heading, justify="left" if words else "right", no_wrap=heading != "case", overflow="fold")
         for each in rows:

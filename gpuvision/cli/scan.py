@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, ReportFile, check_report_file, named_path, write_report
+from gpuvision.cli.arguments import DeviceLabel, ReportFile, check_report_file, named_path, prints_report, write_report
 
 
 class Precision(StrEnum):
@@ -38,19 +38,31 @@ Recording = Annotated[
         "PSD recording: NPY array (frames, strips, 2).",
     ),
 ]
-SensorFile = Annotated[str, typer.Option(help="Sensor file (TOML), or a preset: camera_line, corner_scene, psd_line.")]
+SensorFile = Annotated[
+    str, typer.Option(metavar="SENSOR", help="Sensor file (TOML), or a preset: camera_line, corner_scene, psd_line.")
+]
 Results = Annotated[
     Path,
     typer.Option(metavar="DIR", parser=named_path, help="Folder for the range image, the pictures and report.json."),
 ]
-Rate = Annotated[float | None, typer.Option(help="Replay the recording at this rate [frames/s].")]
+Rate = Annotated[
+    float | None, typer.Option(help="Replay the recording at this rate [frames/s]. Default: as fast as possible.")
+]
 RoomPolicy = Annotated[
     QueuePolicy | None,
-    typer.Option(help="Full queue: block (default), drop_oldest (default with --rate), or raise an error."),
+    typer.Option(
+        help="If the frame queue is full: block the recording (default), drop the oldest frame (default with "
+        "--rate), or "
+        "raise an error."
+    ),
 ]
 TraceFile = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", parser=named_path, help="Timeline for chrome://tracing or ui.perfetto.dev."),
+    typer.Option(
+        metavar="FILE",
+        parser=named_path,
+        help="Write a timeline of the stages for chrome://tracing or ui.perfetto.dev.",
+    ),
 ]
 
 
@@ -60,7 +72,7 @@ def scan(
     out: Results,
     device: DeviceLabel = None,
     precision: Annotated[
-        Precision | None, typer.Option(help="Precision of the arithmetic. Default: that of the recording.")
+        Precision | None, typer.Option(help="Floating-point precision. Default: that of the recording.")
     ] = None,
     rate: Rate = None,
     policy: RoomPolicy = None,
@@ -71,7 +83,7 @@ def scan(
 
     Files are written only after the whole recording was processed.
     """
-    # Silence the video decoder: the command reports a bad video in one line of its own.
+    # Silence the video decoder: the command reports a bad video in one line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host import Device
@@ -100,11 +112,11 @@ def scan(
         )
     done.write(out)
     write_report(as_json, done.report())
-    typer.echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}")
+    typer.echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}", err=prints_report(as_json))
 
 
 @contextlib.contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[int, int | None], object]]:
+def progress_bar(description: str) -> Iterator[Callable[[int, int | None], object]]:
     """Show a progress bar on stderr if it is a terminal; yield a function (done, total) that updates it."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -112,5 +124,5 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int | None], object]]:
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=None)
+        task = bar.add_task(description, total=None)
         yield lambda done, of: bar.update(task, completed=done, total=of)

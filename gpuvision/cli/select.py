@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, LayerNames, layers_of, named_path, quantities
+from gpuvision.cli.arguments import LayerNames, layers_of, named_path, quantities, reject_unused
 
 
 class Side(StrEnum):
@@ -24,17 +24,27 @@ Gerbers = Annotated[
 ]
 Region = Annotated[
     str,
-    typer.Option(metavar="X0,Y0,X1,Y1", help="Region that the camera reads, in the frame of the files: m, or 12mm."),
+    typer.Option(
+        metavar="X0,Y0,X1,Y1",
+        help="Region of the board in view, in the coordinates of the files, such as 0,0,12mm,8mm; without a unit: m.",
+    ),
 ]
 Budget = Annotated[
-    str, typer.Option(help="Budget: 60 or 60rulers (a fiducial counts as 16), 20000px, or 150us on this device.")
+    str,
+    typer.Option(
+        metavar="NUMBER[UNIT]",
+        help="Budget of the measurement: number of calipers (60 or 60rulers; a fiducial counts as 16), pixels that "
+        "they "
+        "read (20000px), or time on the device (150us).",
+    ),
 ]
 Results = Annotated[
     Path, typer.Option(metavar="DIR", parser=named_path, help="Folder for features.toml and features.png.")
 ]
 Scale = Annotated[str, typer.Option(metavar="LENGTH", help="Size of a pixel on the board: 25e-6 (m) or 25um.")]
 Placement = Annotated[
-    str | None, typer.Option(metavar="X,Y", help="Point at which the pose error counts. Default: middle of the region.")
+    str | None,
+    typer.Option(metavar="X,Y", help="Board point whose position error is minimised. Default: middle of the region."),
 ]
 SearchRange = Annotated[
     str,
@@ -70,7 +80,13 @@ def select(
     etch_bias: EtchBias = "10um",
     missing: Missing = 0.0,
     layers: LayerNames = None,
-    device: DeviceLabel = None,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LABEL",
+            help="Label of the OpenCL device of a --budget in us, see `gpuvision devices`. Default: the best device.",
+        ),
+    ] = None,
 ) -> None:
     """Choose the edges and fiducials of a board that determine its pose best, for `gpuvision locate --features`.
 
@@ -87,8 +103,10 @@ def select(
 
     left, bottom, right, top = quantities(region, "--region", "m,m,m,m")
     if not (left < right and bottom < top):
-        raise ValueError(f"--region is {region!r}, expected the least x, y first and the greatest last")
+        raise ValueError(f"--region is {region!r}, expected X0 < X1 and Y0 < Y1")
     amount, unit = _budget(budget)
+    if unit != "us":
+        reject_unused("without a --budget in us, the only one that is measured on a device", device=device)
     shift, angle = quantities(search_range, "--search-range", "m,rad")
     bare, masked = _contrasts(contrast)
     imaging = Imaging(
@@ -119,7 +137,7 @@ def select(
         write_features(features, inside / "features.toml")
         draw_features(inside / "features.png", artwork, features, box)
     typer.echo(
-        f"{features.summary()}\nlook at {out / 'features.png'}; locate the board with: "
+        f"{features.summary()}\nlook at {out / 'features.png'}; next: "
         f"gpuvision locate IMAGE --board {gerbers} --features {out / 'features.toml'}"
     )
 
@@ -135,5 +153,5 @@ def _contrasts(text: str) -> tuple[float, float]:
     try:
         bare, masked = (float(each) for each in text.split(","))
     except ValueError:
-        raise ValueError(f"--contrast is {text!r}, expected two numbers, as 40,15") from None
+        raise ValueError(f"--contrast is {text!r}, expected two numbers, such as 40,15") from None
     return bare, masked

@@ -13,6 +13,7 @@ from gpuvision.cli.arguments import (
     ReportFile,
     check_report_file,
     named_path,
+    prints_report,
     reject_unused,
     write_report,
 )
@@ -48,7 +49,12 @@ _METRES = {Unit.metre: 1.0, Unit.millimetre: 1e-3, Unit.micrometre: 1e-6, Unit.i
 PartFile = Annotated[
     Path, typer.Argument(metavar="PART", parser=named_path, help="Mesh of the part: STL, PLY, OBJ or GLB.")
 ]
-LitSensor = Annotated[str, typer.Option(help="The sensor's TOML file, with its light; or camera_line, psd_line.")]
+LitSensor = Annotated[
+    str,
+    typer.Option(
+        metavar="SENSOR", help="Sensor file (TOML) that describes the light, or a preset: camera_line, psd_line."
+    ),
+]
 Results = Annotated[
     Path, typer.Option(metavar="DIR", parser=named_path, help="Folder for pictures, range image and report.json.")
 ]
@@ -57,16 +63,19 @@ MaterialsFile = Annotated[
     typer.Option(metavar="FILE", parser=named_path, help="TOML file with a material for each mesh of the part."),
 ]
 Albedo = Annotated[
-    float | None, typer.Option(min=0.0, max=1.0, help="Albedo of all surfaces, without --materials. Default: 0.5.")
+    float | None, typer.Option(min=0.0, max=1.0, help="Albedo of all surfaces; not with --materials. Default: 0.5.")
 ]
 Paths = Annotated[
     str,
     typer.Option(
-        help="Light paths: all, or some of direct, specular, diffuse-specular, diffuse-diffuse, multi-bounce."
+        help="Light paths: all, or a list of direct, specular, diffuse-specular, diffuse-diffuse, multi-bounce."
     ),
 ]
 Tolerance = Annotated[
-    float, typer.Option(min=0.0, help="Range error [m] allowed for light that is left out; 0: nothing is left out.")
+    float,
+    typer.Option(
+        min=0.0, help="Largest range error [m] that the approximation of indirect light may cause; 0: no approximation."
+    ),
 ]
 MaskChoice = Annotated[
     str,
@@ -76,13 +85,26 @@ MaskChoice = Annotated[
 ]
 SecondSensor = Annotated[
     str | None,
-    typer.Option(metavar="SENSOR", help="Second sensor on the same sheet of light; the two readings are merged."),
+    typer.Option(metavar="SENSOR", help="Second sensor on the same sheet of light; the two range images are merged."),
 ]
-Limit = Annotated[float | None, typer.Option(min=0.0, help="Smallest error [m] that counts as wrong in the summary.")]
-Profiles = Annotated[int | None, typer.Option(min=1, help="Number of profiles. Default: the length of the part.")]
+Limit = Annotated[
+    float | None,
+    typer.Option(
+        min=0.0,
+        help="Smallest error [m] that counts as wrong in the summary. Default: 5 standard deviations of the noise, "
+        "or --tolerance if that is larger.",
+    ),
+]
+Profiles = Annotated[
+    int | None, typer.Option(min=1, help="Number of profiles around the middle of the part. Default: the whole part.")
+]
 Scheduler = Annotated[
     str | None,
-    typer.Option(metavar="ADDRESS", help="Address of a Dask scheduler; needs the extra cluster."),
+    typer.Option(
+        metavar="ADDRESS",
+        help="Address of a Dask scheduler whose workers compute the light, each on its best device. It needs Dask: "
+        "pip install 'gpuvision[cluster]'.",
+    ),
 ]
 
 
@@ -98,7 +120,7 @@ def simulate(
     mask: MaskChoice = "none",
     second: SecondSensor = None,
     rule: Annotated[
-        Rule | None, typer.Option(help="Rule for samples in which two sensors disagree. Default: stronger.")
+        Rule | None, typer.Option(help="Rule for samples in which the two sensors disagree. Default: stronger.")
     ] = None,
     limit: Limit = None,
     profiles: Profiles = None,
@@ -110,8 +132,8 @@ def simulate(
 ) -> None:
     """Predict the range image that a sensor makes of a PART, its errors, and their causes.
 
-    The light of each profile is kept in DIR: a stopped run continues there, and a run with another --mask, --seed or
-    --noise reuses it.
+    The light of each profile is stored in DIR. A stopped run continues there; a run with another --mask, --seed or
+    --noise reuses the stored light.
     """
     from gpuvision.formats.materials_file import read_materials
     from gpuvision.host import Device
@@ -148,7 +170,10 @@ def simulate(
     }
     summary, report = _run(task, other, rule or Rule.stronger, out, made, f"simulating {part.name}")
     write_report(as_json, report)
-    typer.echo(f"{summary}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}")
+    typer.echo(
+        f"{summary}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}",
+        err=prints_report(as_json),
+    )
 
 
 def _names(paths: str) -> tuple[str, ...]:
@@ -170,18 +195,18 @@ def _mask(choice: str) -> Mask | str | None:
 
 
 def _run(
-    task: SimulationTask, other: SimulationTask | None, rule: Rule, out: Path, made: dict[str, Any], what: str
+    task: SimulationTask, other: SimulationTask | None, rule: Rule, out: Path, made: dict[str, Any], description: str
 ) -> tuple[str, dict[str, Any]]:
     """Simulate one sensor or two, write the results, and return the summary and the first sensor's report."""
     from gpuvision.simulation.errors.recommendations import SensorFusion
     from gpuvision.workflows.sensor_pair import SensorPair
     from gpuvision.workflows.simulating import simulate as run
 
-    with progress_bar(what) as progress:
+    with progress_bar(description) as progress:
         done = run(task, out, progress=progress, **made)
     summary = done.summary()
     if other is not None:
-        with progress_bar(f"{what}, second sensor") as progress:
+        with progress_bar(f"{description}, second sensor") as progress:
             pair = SensorPair.of(done, run(other, out, progress=progress, **made), SensorFusion(rule=rule.value))
         pair.write(out)
         summary += f"\n{pair.summary()}"

@@ -33,7 +33,7 @@ def undistort(
     inputs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="INPUTS...", parser=named_path, help="Images, and NPY arrays (..., 2) of points (column, row) [px]."
+            metavar="INPUTS", parser=named_path, help="Images, and NPY arrays (..., 2) of points (column, row) [px]."
         ),
     ],
     lens: Annotated[
@@ -47,9 +47,15 @@ def undistort(
     ] = None,
     border: Annotated[
         Border | None,
-        typer.Option(help="Pixels outside the image: mask (0 or NaN; default), a constant, or border pixels."),
+        typer.Option(
+            help="Values outside the image: mask (default; 0 or NaN), constant (--border-value), or replicate or "
+            "reflect the "
+            "border pixels."
+        ),
     ] = None,
-    border_value: Annotated[float | None, typer.Option(help="Grey level of --border constant. Default: 0.")] = None,
+    border_value: Annotated[
+        float | None, typer.Option(help="Grey level outside the image with --border constant. Default: 0.")
+    ] = None,
     region: Annotated[
         str | None,
         typer.Option(metavar="COLUMN,ROW,COLUMNS,ROWS", help="Part of the corrected images to compute. Default: all."),

@@ -78,6 +78,17 @@ def test_what_was_asked_for_is_measured_and_shown(asked: dict[str, Any], tmp_pat
     assert written["rows"][0]["case"] == "float32/1e6"
 
 
+def test_rows_on_standard_output_are_json_alone(asked: dict[str, Any]) -> None:
+    ran = CliRunner().invoke(application(), ["profile", "psd", "--json", "-"])
+    assert json.loads(ran.stdout)["rows"][0]["case"] == "float32/1e6"
+    assert "12.3 ms" in ran.stderr
+
+
+def test_without_plots_it_says_which_operations_have_some(asked: dict[str, Any], tmp_path: Path) -> None:
+    ran = CliRunner().invoke(application(), ["profile", "psd", "--plots", str(tmp_path / "plots")])
+    assert "no plots: " in ran.stderr
+
+
 def test_without_names_everything_is_measured_everywhere(asked: dict[str, Any]) -> None:
     asked["valid"] = False
     ran = CliRunner().invoke(application(), ["profile"])

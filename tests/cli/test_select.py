@@ -182,7 +182,7 @@ def test_the_command_writes_features_and_a_picture(tmp_path: Path, run: Select) 
     ("arguments", "words"),
     [
         (("--region", "1,2,3"), "expected 4 numbers"),
-        (("--region", "17mm,2mm,3mm,13mm"), "the least x, y first"),
+        (("--region", "17mm,2mm,3mm,13mm"), "expected X0 < X1 and Y0 < Y1"),
         (("--budget", "40furlongs"), "60rulers, 20000px or 150us"),
         (("--budget", "0"), "above 0"),
         (("--contrast", "40"), "two numbers"),

@@ -17,6 +17,7 @@ from gpuvision.cli.main import application
         (("calibrate", "a.png", "--out", "l.toml", "--inner-corners", "9x6"), "--inner-corners"),
         (("calibrate", "a.png", "--out", "l.toml", "--method", "lines", "--pitch", "0.01"), "--pitch"),
         (("calibrate", "a.png", "--out", "l.toml", "--method", "lines", "--focal-length", "900"), "--focal-length"),
+        (("calibrate", "a.png", "--out", "l.toml", "--pattern", "lines", "--pitch", "0.01"), "--pitch"),
         (("undistort", "a.png", "--lens", "l.toml", "--out", "d", "--border-value", "7"), "--border-value"),
         (
             ("undistort", "a.png", "--lens", "l.toml", "--out", "d", "--border", "mask", "--border-value", "7"),
@@ -31,6 +32,7 @@ from gpuvision.cli.main import application
             ("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--materials", "m.toml", "--albedo", "0"),
             "--albedo",
         ),
+        (("select", "g", "--region", "0,0,1cm,1cm", "--scale", "25um", "--out", "d", "--device", "pocl"), "--device"),
         (("locate-robot", "points.npy", "--field", "robocup_msl", "--scale", "1cm"), "--scale"),
         (("locate-robot", "points.npy", "--field", "robocup_msl", "--camera", "c.toml"), "--camera"),
         (("locate-robot", "points.npy", "--field", "robocup_msl", "--line-width", "5cm"), "--line-width"),

@@ -220,7 +220,7 @@ def test_inputs_of_one_name(tmp_path: Path, device: Device) -> None:
     ("arguments", "said"),
     [
         (("--pattern", "chessboard", "--inner-corners", "nine"), "--inner-corners is 'nine', expected"),
-        (("--out", "lens.json"), "a name that the report or the plot takes"),
+        (("--out", "lens.json"), "the report and the plot get the suffixes .json and .png"),
         (("--model", "k7"), "k7"),
         (("--method", "views"), "focal"),
     ],

@@ -12,7 +12,7 @@ from gpuvision.host.errors import (
     StreamError,
 )
 from gpuvision.host.launch import Launch, Precision, Spec, Variant, real_defines, real_of, uses_vectors
-from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, type_defines
+from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, table_offsets, type_defines
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Batch, Pipeline
 from gpuvision.host.plan import Plan, plan
@@ -78,6 +78,7 @@ __all__ = [
     "real_defines",
     "real_of",
     "round_up",
+    "table_offsets",
     "to_numpy",
     "type_defines",
     "uses_vectors",

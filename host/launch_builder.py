@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -232,6 +233,31 @@ def type_defines(name: str, dtype: DTypeLike, *lanes: int) -> dict[str, Define]:
     """Return macros for the OpenCL type of a dtype: `name`, and the vector types `name` with each width appended."""
     word = opencl_type(dtype)
     return {name: word, **{f"{name}{width}": f"{word}{width}" for width in lanes}}
+
+
+def table_offsets(prefix: str, sizes: Mapping[str, int]) -> dict[str, Define]:
+    """Return macros for the offsets of named parts in a table of numbers, so that a kernel reads them by name.
+
+    Parameters
+    ----------
+    prefix : str
+        Start of each macro's name.
+    sizes : mapping of str to int
+        Name and number of numbers of each part, in the order of the table.
+
+    Returns
+    -------
+    dict
+        ``PREFIX_NAME``: offset of the part; ``PREFIX_SIZE``: numbers in all.
+
+    Examples
+    --------
+    >>> table_offsets("NODE", {"centre": 3, "radius": 1})
+    {'NODE_CENTRE': 0, 'NODE_RADIUS': 3, 'NODE_SIZE': 4}
+    """
+    ends = list(itertools.accumulate(sizes.values(), initial=0))
+    names = [f"{prefix}_{name.upper()}" for name in (*sizes, "size")]
+    return dict(zip(names, ends, strict=True))
 
 
 def _or(names: Iterable[str]) -> str:

@@ -4,27 +4,8 @@
 #define LIGHT_BOUNDS_H
 #include "common/bvh.h"
 
-// Columns of a cluster.
-#define COLUMNS 24
-#define CENTRE 0
-#define LOW 3
-#define HIGH 6
-#define NORMAL 9
-#define RADIUS 12
-#define SPREAD 13
-#define MOST_HEIGHT 14
-#define LEAST_HEIGHT 15
-#define SLAB 16
-#define POWER 17
-#define FIRST_ORDER 18
-#define SECOND_ORDER 19
-#define THIRD_MOMENT 20
-#define FOURTH_MOMENT 21
-#define ARM 22
-#define LENGTH 23
-
-// Numbers of a lit segment: normal (3), height of its plane (1), start (3), end (3).
-#define PLACED 10
+// Offsets in the rows of nodes (NODE_CENTRE, ..., NODE_SIZE) and of segments (SEGMENT_NORMAL, ..., SEGMENT_SIZE) are build
+// options: NODE_SIZES in gpuvision/simulation/clustering/light_tree.py, _SEGMENT_SIZES in light_clustering.py.
 
 #define PER_PI ((real)0.31830988618379067)
 #define PI ((real)3.14159265358979324)
@@ -117,34 +98,34 @@ static inline receivers_block block_of(global const INPUT *receivers, global con
 
 static inline meeting meeting_of(const receivers_block *block, global const real *row, int single, real rounding) {
     real to[3], side[3], reach = 0, back = 0, front = 0;
-    const real normal[3] = {row[NORMAL], row[NORMAL + 1], row[NORMAL + 2]};
+    const real normal[3] = {row[NODE_NORMAL], row[NODE_NORMAL + 1], row[NODE_NORMAL + 2]};
     for (int k = 0; k < 3; k++) {
-        to[k] = block->centre[k] - row[CENTRE + k];
+        to[k] = block->centre[k] - row[NODE_CENTRE + k];
         side[k] = (real)0.5 * (block->high[k] - block->low[k]);
         reach += fabs(normal[k]) * side[k];
-        const real low = block->normal[k] * (row[LOW + k] - row[CENTRE + k]);
-        const real high = block->normal[k] * (row[HIGH + k] - row[CENTRE + k]);
+        const real low = block->normal[k] * (row[NODE_LOW + k] - row[NODE_CENTRE + k]);
+        const real high = block->normal[k] * (row[NODE_HIGH + k] - row[NODE_CENTRE + k]);
         front += higher(low, high), back -= lower(low, high);
     }
     // Extent along a normal: the smaller of the bounds from the box and from the disc.
     real across[3];
     cross3(normal, block->normal, across);
     const real sine = length3(across), cosine = fabs(dot3(normal, block->normal));
-    const real between = length3(to), wide = row[RADIUS], lit_disc = cosine * row[SLAB] + sine * wide;
+    const real between = length3(to), wide = row[NODE_RADIUS], lit_disc = cosine * row[NODE_SLAB] + sine * wide;
     reach = lower(reach, cosine * block->slab + sine * block->radius);
     front = lower(front, lit_disc), back = lower(back, lit_disc);
     // Heights of the receivers above the lit surfaces, and of the segments above the receivers' planes.
-    const real lit_turn = row[SPREAD] * (between + block->radius), got_turn = block->spread * (between + wide);
+    const real lit_turn = row[NODE_SPREAD] * (between + block->radius), got_turn = block->spread * (between + wide);
     const real lit = dot3(normal, to), got = -dot3(block->normal, to);
-    const real lit_most = lit + lit_turn + row[MOST_HEIGHT] + reach;
+    const real lit_most = lit + lit_turn + row[NODE_MAX_HEIGHT] + reach;
     const real got_most = got + got_turn + block->most_height + front;
     meeting met = {0, 0};
     if (!(lit_most > 0 && got_most > 0)) return met;
-    met.faces = lit - lit_turn + row[LEAST_HEIGHT] - reach > rounding &&
+    met.faces = lit - lit_turn + row[NODE_MIN_HEIGHT] - reach > rounding &&
                 got - got_turn + block->least_height - back > rounding;
     real gap = 0;
     for (int k = 0; k < 3; k++) {
-        const real apart = higher(higher(block->low[k] - row[HIGH + k], row[LOW + k] - block->high[k]), (real)0);
+        const real apart = higher(higher(block->low[k] - row[NODE_HIGH + k], row[NODE_LOW + k] - block->high[k]), (real)0);
         gap += apart * apart;
     }
     const real distance = higher(sqrt(gap), between - block->radius - wide) - rounding;
@@ -155,7 +136,7 @@ static inline meeting meeting_of(const receivers_block *block, global const real
     const real per = UP / distance;
     const real cosines = lower((lit_most + rounding) * per, (real)1) * lower((got_most + rounding) * per, (real)1);
     // The integral of dt / r^2 over a line at distance r is at most pi / r.
-    const real spread = single ? PI * per / row[LENGTH] : (real)INFINITY;
+    const real spread = single ? PI * per / row[NODE_LENGTH] : (real)INFINITY;
     met.bound = cosines * lower(per * per, spread) * PER_PI * UP;
     return met;
 }
@@ -165,15 +146,15 @@ static inline real error_of(const receivers_block *block, global const real *row
     real gap = 0;
     for (int k = 0; k < 3; k++) {
         const real apart =
-            higher(higher(block->low[k] - row[CENTRE + k], row[CENTRE + k] - block->high[k]), (real)0);
+            higher(higher(block->low[k] - row[NODE_CENTRE + k], row[NODE_CENTRE + k] - block->high[k]), (real)0);
         gap += apart * apart;
     }
     const real distance = sqrt(gap) - rounding, per = UP / distance;
-    const real q = row[RADIUS] * per, arm = row[ARM] * per;
+    const real q = row[NODE_RADIUS] * per, arm = row[NODE_ARM] * per;
     if (!(distance > 0 && q < 1 && arm < 1)) return INFINITY;
     const real third = ((real)4 - 3 * q) / ((1 - q) * (1 - q)), fourth = ((real)5 - 4 * arm) / ((1 - arm) * (1 - arm));
-    const real beyond = row[SECOND_ORDER] + per * (row[THIRD_MOMENT] * third + per * row[FOURTH_MOMENT] * fourth);
-    return per * per * per * (row[FIRST_ORDER] + per * beyond) * PER_PI * UP;
+    const real beyond = row[NODE_SECOND_ORDER] + per * (row[NODE_THIRD_MOMENT] * third + per * row[NODE_FOURTH_MOMENT] * fourth);
+    return per * per * per * (row[NODE_FIRST_ORDER] + per * beyond) * PER_PI * UP;
 }
 
 // Largest cost of a watt of a segment at the receiver of each lane, times pi.
@@ -181,10 +162,10 @@ INLINE reals most_of_lane(const real *lane, global const real *lit, real length,
     const reals zero = (reals)0, one = (reals)1;
     const reals nx = load_private(lane + 3 * WIDTH), ny = load_private(lane + 4 * WIDTH);
     const reals nz = load_private(lane + 5 * WIDTH), cost = load_private(lane + 6 * WIDTH);
-    const reals x = load_private(lane) - lit[4], y = load_private(lane + WIDTH) - lit[5];
-    const reals z = load_private(lane + 2 * WIDTH) - lit[6];
-    const real dx = lit[7] - lit[4], dy = lit[8] - lit[5], dz = lit[9] - lit[6];
-    const reals up = x * lit[0] + y * lit[1] + z * lit[2];
+    const reals x = load_private(lane) - lit[SEGMENT_START], y = load_private(lane + WIDTH) - lit[SEGMENT_START + 1];
+    const reals z = load_private(lane + 2 * WIDTH) - lit[SEGMENT_START + 2];
+    const real dx = lit[SEGMENT_END] - lit[SEGMENT_START], dy = lit[SEGMENT_END + 1] - lit[SEGMENT_START + 1], dz = lit[SEGMENT_END + 2] - lit[SEGMENT_START + 2];
+    const reals up = x * lit[SEGMENT_NORMAL] + y * lit[SEGMENT_NORMAL + 1] + z * lit[SEGMENT_NORMAL + 2];
     const reals start = -(nx * x + ny * y + nz * z);
     const reals ahead = start + lane_max(nx * dx + ny * dy + nz * dz, zero);
     const reals part = lane_min(lane_max((x * dx + y * dy + z * dz) / (length * length), zero), one);

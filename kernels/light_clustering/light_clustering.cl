@@ -1,8 +1,8 @@
 // Error-bounded light clustering: the cut through a light tree (lightcuts, Walter et al. 2005) for each block of receivers.
 //
 // Inputs:  receivers (strips, of_strip, 6) position [m] and normal, type INPUT; costs (strips, of_strip), weight of a
-//          receiver's irradiance in the reading; shares (strips,), error allowed per watt; rows (nodes, COLUMNS), spans
-//          (nodes, 2), the tree of gpuvision/simulation/clustering/light_tree.py; placed (segments, PLACED); frame (4,),
+//          receiver's irradiance in the reading; shares (strips,), error allowed per watt; rows (nodes, NODE_SIZE), spans
+//          (nodes, 2), the tree of gpuvision/simulation/clustering/light_tree.py; placed (segments, SEGMENT_SIZE); frame (4,),
 //          middle of the positions and their rounding.
 // Outputs: per block: picks and errors (blocks, capacity), counts, spent (2), tallies (2).
 // Options: OCCLUDERS (a scene can hide light), CLUSTERS (clusters may be represented), BLOCK (receivers per block), INPUT,
@@ -99,13 +99,13 @@ INLINE int hides(const shaft *hull, const receivers_block *block, const extent *
     const reals level = n.x * a.x + n.y * a.y + n.z * a.z, slack = margin * size_of(n);
     masks above = (masks)(0), below = (masks)(0);
     for (int i = 0; i < count; i++) {
-        const real normal[3] = {lit[0], lit[1], lit[2]};
-        const masks over = left & mask_of(highest(a, b, c, normal) > lit[3] + margin);
-        const reals start = along(n, lit[4], lit[5], lit[6]) - level;
-        const reals end = along(n, lit[7], lit[8], lit[9]) - level;
+        const real normal[3] = {lit[SEGMENT_NORMAL], lit[SEGMENT_NORMAL + 1], lit[SEGMENT_NORMAL + 2]};
+        const masks over = left & mask_of(highest(a, b, c, normal) > lit[SEGMENT_HEIGHT] + margin);
+        const reals start = along(n, lit[SEGMENT_START], lit[SEGMENT_START + 1], lit[SEGMENT_START + 2]) - level;
+        const reals end = along(n, lit[SEGMENT_END], lit[SEGMENT_END + 1], lit[SEGMENT_END + 2]) - level;
         above |= over & mask_of(lane_max(start, end) > slack);
         below |= over & mask_of(lane_min(start, end) < -slack);
-        lit += PLACED;
+        lit += SEGMENT_SIZE;
     }
     left &= above | below;
     if (!any_compared(left)) return 0;
@@ -160,12 +160,12 @@ static inline int is_clear(const bvh_tree *tree, const receivers_block *block, g
     for (int k = 0; k < 3; k++) {
         got.centre[k] = block->centre[k], got.low[k] = block->low[k], got.high[k] = block->high[k];
         got.normal[k] = block->normal[k];
-        out.centre[k] = row[CENTRE + k], out.low[k] = row[LOW + k], out.high[k] = row[HIGH + k];
-        out.normal[k] = row[NORMAL + k];
+        out.centre[k] = row[NODE_CENTRE + k], out.low[k] = row[NODE_LOW + k], out.high[k] = row[NODE_HIGH + k];
+        out.normal[k] = row[NODE_NORMAL + k];
     }
     got.radius = block->radius, got.slab = block->slab;
     got.spread = block->spread, got.most_height = block->most_height;
-    out.radius = row[RADIUS], out.slab = row[SLAB], out.spread = row[SPREAD], out.most_height = row[MOST_HEIGHT];
+    out.radius = row[NODE_RADIUS], out.slab = row[NODE_SLAB], out.spread = row[NODE_SPREAD], out.most_height = row[NODE_MAX_HEIGHT];
     const shaft hull = shaft_of(got.low, got.high, out.low, out.high, margin);
     if (*culprit >= 0) {
         global const real *leaf = tree->leaves + (size_t)*culprit * (9 * WIDTH);
@@ -245,21 +245,21 @@ kernel void select_lights(global const INPUT *restrict receivers, global const r
         uint node = block.count ? 1 : 0;
         while (node) {
             const int place = spans[2 * node], count = spans[2 * node + 1], level = 31 - (int)clz(node);
-            global const real *row = rows + (size_t)node * COLUMNS;
+            global const real *row = rows + (size_t)node * NODE_SIZE;
             const uint next = after(node);
             if (level <= open_level) open_level = OPEN_LEVEL;
-            if (!(row[POWER] > 0)) {
+            if (!(row[NODE_POWER] > 0)) {
                 node = next;
                 continue;
             }
             const meeting met = meeting_of(&block, row, count == 1, rounding);
             // Avoid 0 times infinity: a zero bound may meet an infinite cost.
-            real most = met.bound > 0 ? met.bound * row[POWER] * block.cost : 0;
+            real most = met.bound > 0 ? met.bound * row[NODE_POWER] * block.cost : 0;
             if (count == 1 && met.bound > share) {
-                global const real *lit = placed + PLACED * place;
-                most = lower(most, most_of_segment(&block, lit, row[LENGTH], row[POWER], rounding));
+                global const real *lit = placed + SEGMENT_SIZE * place;
+                most = lower(most, most_of_segment(&block, lit, row[NODE_LENGTH], row[NODE_POWER], rounding));
             }
-            if (most == 0 || met.bound <= share || most <= share * row[POWER] * block.cost) {
+            if (most == 0 || met.bound <= share || most <= share * row[NODE_POWER] * block.cost) {
                 out += count;
                 lost += most, whole += most;
                 node = next;
@@ -274,7 +274,7 @@ kernel void select_lights(global const INPUT *restrict receivers, global const r
             // Test occlusion only where it can save work: for many segments, or for few that one could represent.
             const int worth = count > 1 && count <= MOST_LOOKED_AT && (2 * count > MOST_LOOKED_AT || close);
             if (level < open_level && patience > 0 && worth) {
-                const int clear = is_clear(&tree, &block, row, placed + PLACED * place, count, margin, &culprit);
+                const int clear = is_clear(&tree, &block, row, placed + SEGMENT_SIZE * place, count, margin, &culprit);
                 if (clear) open_level = level;
                 patience += clear ? PATIENCE_WON : -1;
             }
@@ -284,7 +284,7 @@ kernel void select_lights(global const INPUT *restrict receivers, global const r
                 node = 2 * node;
                 continue;
             }
-            if (count > 1) together += count, lost += wrong * row[POWER] * block.cost;
+            if (count > 1) together += count, lost += wrong * row[NODE_POWER] * block.cost;
             whole += most;
             if (found < capacity) {
                 pick[found] = count > 1 ? ~(int)node : open ? place | CLEAR : place;

@@ -15,25 +15,14 @@
 //     CURVED             correct the position for a curved edge
 //     LENS or CAMERA     rulers are straight in the undistorted image; pixels are read from the distorted image
 //
-// The parameter table is packed by RulerEdges in gpuvision/matching/features/ruler.py.
 #ifndef RULER_H
 #define RULER_H
 #include "common/camera.h"
 #include "common/lens.h"
 #include "common/status.h"
 
-#define RULER_THRESHOLD 0   // smallest gradient of an edge, of sums over the lines [grey levels]
-#define RULER_SATURATION 1  // smallest saturated sample [grey levels]
-#define RULER_NOISE 2       // standard deviation of half the difference of the gradients beside a peak
-#define RULER_SMOOTHING 3   // variance of the smoothing [samples^2]
-#define RULER_AMBIGUITY 4   // ratio of the second strongest edge to the strongest from which on an edge is ambiguous
-#define RULER_NEAREST 5     // smallest spacing of the edges of a pair [samples]
-#define RULER_FARTHEST 6    // largest spacing
-#define RULER_BEND 7        // 1 / (2 radius) of the edge [1/px]
-#define RULER_ACROSS 8      // variance of the line positions across the ruler [px^2]
-#define RULER_STEP 9        // distance of samples [px]
-#define RULER_PER_LINE 10   // 1 / WIDTH
-#define RULER_TAPS 11       // taps of the gradient filter on one side
+// Offsets in the parameter table (RULER_THRESHOLD, ..., RULER_TAPS) are build options: the fields of RulerTable in
+// gpuvision/matching/features/ruler.py, with their units.
 
 #define RULER_SLOPES (LENGTH - 2 * TAPS)
 #define RULER_MIDDLE ((real)0.5f * (LENGTH - 1))

@@ -94,7 +94,7 @@ static inline ruler_edge ruler_refine(ruler_peak peak, private const ruler_place
     edge.spacing = REAL_NAN;
     edge.status = 0;
 #ifdef CURVED
-    edge.position -= table[RULER_BEND] * (edge.width * edge.width + table[RULER_ACROSS]);
+    edge.position -= table[RULER_CURVATURE] * (edge.width * edge.width + table[RULER_ACROSS]);
 #endif
     return edge;
 }

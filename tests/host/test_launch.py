@@ -22,6 +22,7 @@ from gpuvision.host import (
     padded_groups,
     real_of,
     round_up,
+    table_offsets,
     to_numpy,
     type_defines,
     vector_work,
@@ -223,3 +224,9 @@ def test_results_become_numpy_arrays(device: Device) -> None:
     np.testing.assert_array_equal(to_numpy(array), values)
     with pytest.raises(TypeError, match="got NoneType"):
         to_numpy(None)
+
+
+def test_offsets_of_a_table_with_parts_of_several_sizes() -> None:
+    offsets = table_offsets("NODE", {"centre": 3, "radius": 1, "normal": 3})
+    assert offsets == {"NODE_CENTRE": 0, "NODE_RADIUS": 3, "NODE_NORMAL": 4, "NODE_SIZE": 7}
+    assert table_offsets("EMPTY", {}) == {"EMPTY_SIZE": 0}

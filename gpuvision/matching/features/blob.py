@@ -33,7 +33,7 @@ from gpuvision.host import (
     flags,
     round_up,
 )
-from gpuvision.matching.features.ruler import RulerEdges
+from gpuvision.matching.features.ruler import RulerEdges, RulerTable
 from gpuvision.matching.robust import efficiency, loss_defines
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite
@@ -49,7 +49,6 @@ MAX_SPOKES = 256
 _LANES, _GROUP = 16, 64
 _SHARES_PER_CORE = 4  # work-items per core: balances the cores
 _INLINE = 8  # blobs up to which one thread is faster than waking a second one (measured)
-_SMOOTHING, _TAPS = 3, 11  # indices in the table of ruler.h
 # Polarity along a ruler across the contour, which points out of the blob.
 _POLARITIES: dict[str, Literal["falling", "rising", "any"]] = {"bright": "falling", "dark": "rising", "either": "any"}
 
@@ -297,11 +296,11 @@ class FindBlobs(VisionOperation[Blobs]):
         exact for the blur whose best smoothing this is.
         """
         table = np.array(edges.arguments[0])
-        taps, blur = table[_TAPS:].astype(np.float64), self.smoothing_px / math.sqrt(5.0)
+        taps, blur = table[len(RulerTable._fields) :].astype(np.float64), self.smoothing_px / math.sqrt(5.0)
         k = np.arange(-taps.size, taps.size + 1)
         weights = np.concatenate([-taps[::-1], [0.0], taps])
         peak, beside = (float(np.sum(weights * ndtr((k + at) / blur))) for at in (0.0, 1.0))
-        table[_SMOOTHING] = 0.5 / math.log(peak / beside) - blur**2
+        table[RulerTable._fields.index("smoothing")] = 0.5 / math.log(peak / beside) - blur**2
         return table
 
     def _defines(self, freedoms: int) -> dict[str, Define]:

@@ -26,6 +26,7 @@ from gpuvision.host import (
     Variant,
     flags,
     opencl_type,
+    table_offsets,
     type_defines,
 )
 from gpuvision.operation import VisionOperation
@@ -46,6 +47,49 @@ _INLINE = 128  # rulers up to which one thread is faster than waking a second on
 # Binary places of fixed-point positions, of 31 bits: a side of an image takes 15; a float's mantissa has 23.
 _LEAST_BITS, _MOST_BITS = 15, 23
 _REAL = np.dtype(np.float32)
+
+
+class RulerTable(NamedTuple):
+    """Parameters of ``kernels/ruler/ruler.h``, which reads them by name; the taps of the filter follow.
+
+    Attributes
+    ----------
+    threshold
+        Least gradient of an edge, of sums over the lines [grey levels].
+    saturation
+        Least saturated sample [grey levels].
+    noise
+        Standard deviation of half the difference of the gradients beside a maximum, of sums over the lines.
+    smoothing
+        Variance of the smoothing [samples^2].
+    ambiguity
+        Ratio of the second strongest edge to the strongest from which on an edge is ambiguous.
+    nearest, farthest
+        Least and greatest spacing of the edges of a pair [samples].
+    curvature
+        1 / (2 radius) of the edge [1/px].
+    across
+        Variance of the positions of the lines across the ruler [px^2].
+    step
+        Distance between samples [px].
+    per_line
+        Reciprocal of the number of lines.
+    """
+
+    threshold: float
+    saturation: float
+    noise: float
+    smoothing: float
+    ambiguity: float
+    nearest: float
+    farthest: float
+    curvature: float
+    across: float
+    step: float
+    per_line: float
+
+
+RULER_OFFSETS = table_offsets("RULER", {**dict.fromkeys(RulerTable._fields, 1), "taps": 0})
 
 
 class Edges(NamedTuple):
@@ -312,6 +356,7 @@ class RulerEdges(VisionOperation[Edges]):
         return {
             **({} if self.model is None else self._model_defines(self.model)),
             **type_defines("CODE", dtype),
+            **RULER_OFFSETS,
             "LENGTH": self.length,
             "WIDTH": self.width,
             "TAPS": self._reach,
@@ -346,18 +391,19 @@ class RulerEdges(VisionOperation[Edges]):
         smoothing = float(np.sum(2.0 * taps * k**3)) / 3.0
         noise = math.sqrt(self.noise**2 + (1.0 / 12.0 if dtype.kind == "u" else 0.0))
         low, high = self.spacing_px or (0.0, math.inf)
-        table = [
-            self.threshold / math.sqrt(2.0 * math.pi * smoothing) * self.width,
-            math.inf if self.saturation is None else self.saturation,
-            noise * self._noise_gain(taps) * self.width,
-            smoothing,
-            self.ambiguity or 0.0,
-            *(round(low / self.step_px), round(high / self.step_px) if math.isfinite(high) else math.inf),
-            0.0 if self.radius_px is None else 0.5 / self.radius_px,
-            (self.width**2 - 1) / 12.0,
-            self.step_px,
-            1.0 / self.width,
-        ]
+        table = RulerTable(
+            threshold=self.threshold / math.sqrt(2.0 * math.pi * smoothing) * self.width,
+            saturation=math.inf if self.saturation is None else self.saturation,
+            noise=noise * self._noise_gain(taps) * self.width,
+            smoothing=smoothing,
+            ambiguity=self.ambiguity or 0.0,
+            nearest=round(low / self.step_px),
+            farthest=round(high / self.step_px) if math.isfinite(high) else math.inf,
+            curvature=0.0 if self.radius_px is None else 0.5 / self.radius_px,
+            across=(self.width**2 - 1) / 12.0,
+            step=self.step_px,
+            per_line=1.0 / self.width,
+        )
         return np.array([*table, *taps], _REAL)
 
     def _taps(self) -> npt.NDArray[np.float64]:

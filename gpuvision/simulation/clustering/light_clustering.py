@@ -19,12 +19,13 @@ from gpuvision.host import (
     capacity,
     ceil_div,
     flags,
+    table_offsets,
     to_numpy,
     type_defines,
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.simulation.clustering.light_cut import BLOCK, LightCut
-from gpuvision.simulation.clustering.light_tree import COLUMNS, LightTree
+from gpuvision.simulation.clustering.light_tree import COLUMNS, NODE_SIZES, LightTree
 from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 
@@ -36,7 +37,8 @@ Integers = npt.NDArray[np.int32]
 _REAL = np.dtype(np.float32)
 _ROUNDING, _MARGIN = 4.0 * 2.0**-23, 32.0 * 2.0**-23
 # Columns of a segment in kernels/light_clustering/light_clustering.cl: normal, height of its plane, start, end.
-_SEGMENT_COLUMNS = 10
+_SEGMENT_SIZES = {"normal": 3, "height": 1, "start": 3, "end": 3}
+_SEGMENT_COLUMNS = sum(_SEGMENT_SIZES.values())
 _GROUP, _STRIPS_PER_CORE = 64, 8
 # Bit of a selected segment that nothing can occlude, as the kernel sets it.
 _CLEAR = 1 << 30
@@ -251,6 +253,8 @@ class _SelectLights(VisionOperation[_Selection]):
             outputs=build.outputs(shapes, selected=np.int32, counts=np.int32, pair_counts=np.int32),
             defines={
                 **type_defines("INPUT", dtype),
+                **table_offsets("NODE", NODE_SIZES),
+                **table_offsets("SEGMENT", _SEGMENT_SIZES),
                 "BVH_DEPTH": 1 if tree is None else tree.depth,
                 "BLOCK": BLOCK,
                 **flags(OCCLUDERS=tree is not None, CLUSTERS=self.clusters),

@@ -26,8 +26,26 @@ import numpy.typing as npt
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Columns of a node in kernels/light_clustering/light_clustering.cl.
-COLUMNS = 24
+# Numbers of a node in the order of its row; kernels/light_clustering/light_bounds.h reads them by name.
+NODE_SIZES = {
+    "centre": 3,
+    "low": 3,
+    "high": 3,
+    "normal": 3,
+    "radius": 1,
+    "spread": 1,
+    "max_height": 1,
+    "min_height": 1,
+    "slab": 1,
+    "power": 1,
+    "first_order": 1,
+    "second_order": 1,
+    "third_moment": 1,
+    "fourth_moment": 1,
+    "arm": 1,
+    "length": 1,
+}
+COLUMNS = sum(NODE_SIZES.values())
 # Scale of the normals' axes in the choice of the widest axis, as part of the longest extent of the segments' midpoints.
 _NORMAL_SCALE = 0.5
 # Half length of a representative segment, in radii of the cluster, where all its points coincide: not 0, so that
@@ -167,27 +185,25 @@ def _fill_nodes(
     high = np.maximum.reduceat(np.maximum(one, other), begin)
     turn = normal - face
     scale, each = np.where(total > 0.0, total / mass, 0.0), np.where(total > 0.0, 1.0 / mass, 0.0)
-    table = np.column_stack(
-        [
-            centre,
-            centre + np.minimum(low, -np.abs(arm)),
-            centre + np.maximum(high, np.abs(arm)),
-            facing,
-            np.maximum(reach, arm_size),
-            np.sqrt(np.maximum.reduceat(_dot(turn, turn), begin)),
-            np.maximum.reduceat(height, begin),
-            np.minimum.reduceat(height, begin),
-            slab,
-            total,
-            2.0 * np.sqrt(3.0) * np.linalg.norm(skew, axis=(1, 2)) * each,
-            3.0 * (rest + sums(weight * tilt * square)) * each,
-            sums(weight * np.sqrt(square * fourth)) * each,
-            0.2 * effective * arm_size**4 * each,
-            np.where(lean > _MIN_COSINE, arm_size, np.inf),
-            2.0 * np.linalg.norm(half, axis=1)[begin],
-        ]
-    )
-    rows[full] = table
+    parts = {
+        "centre": centre,
+        "low": centre + np.minimum(low, -np.abs(arm)),
+        "high": centre + np.maximum(high, np.abs(arm)),
+        "normal": facing,
+        "radius": np.maximum(reach, arm_size),
+        "spread": np.sqrt(np.maximum.reduceat(_dot(turn, turn), begin)),
+        "max_height": np.maximum.reduceat(height, begin),
+        "min_height": np.minimum.reduceat(height, begin),
+        "slab": slab,
+        "power": total,
+        "first_order": 2.0 * np.sqrt(3.0) * np.linalg.norm(skew, axis=(1, 2)) * each,
+        "second_order": 3.0 * (rest + sums(weight * tilt * square)) * each,
+        "third_moment": sums(weight * np.sqrt(square * fourth)) * each,
+        "fourth_moment": 0.2 * effective * arm_size**4 * each,
+        "arm": np.where(lean > _MIN_COSINE, arm_size, np.inf),
+        "length": 2.0 * np.linalg.norm(half, axis=1)[begin],
+    }
+    rows[full] = np.column_stack([parts[name] for name in NODE_SIZES])
     exitance = effective * scale / np.where(arm_size > 0.0, 2.0 * arm_size, 1.0)
     representatives[full] = np.column_stack(
         [centre - arm, centre + arm, facing, np.where(arm_size > 0.0, exitance, 0.0)]

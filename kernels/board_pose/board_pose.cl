@@ -1,17 +1,31 @@
-// A frame to a pose at once: edges along rulers, robust lines through the edges of each line of the artwork, and the
-// pose from the lines. One work-item does a whole fix on CPU runtimes (waking another core takes longer than it does);
-// on GPUs a work-group does: rulers together, then an item a line, then one the pose.
+// Pose of a board from an image in one launch: edges along calipers (rulers), a robust line through the edges of each
+// line of the artwork, and a robust pose from these lines.
 //
-// A ruler has RULER numbers: centre and direction in the image, and where its samples lie in its line's own frame,
-// (u, v) = ((u0, v0) + s (du, dv)) / (1 + s bend) for a sample s pixels from the centre.
+// Inputs:  image (rows, columns), type CODE; rulers (lines, each, RULER); line (lines, LINE).
+// Tables:  table, model (ruler/ruler.h); pairs (pair_trials, 2): edges of the start candidates of a line; subsets
+//          (trials / LANES, FREEDOMS, LANES): rows of the start candidates of the pose.
+// Outputs: pose (3,) x, y [m], theta [rad]; deformation (3,); placement (2,) [m]; covariance (OF_POSE, OF_POSE);
+//          residuals [m] and weights (lines, EACH_ROWS); scale, residual_scale, condition, rank, inliers,
+//          status, etch [m], inlier_fraction, leverage: one number each (pose/pose.cl); edges [px], edge_status,
+//          edge_weights (lines, each).
+// Options: those of ruler/ruler.h, line_fit/line_fit.h and pose/pose.h; EACH: capacity for the rulers of a line; ROOM:
+//          capacity for all rulers.
+// Variants: vector: one work-item does everything, 16 rulers or lines at a time (to start a second core takes longer
+//          than the computation); work-item: one work-group: all items together for each ruler, then an item per line,
+//          then item 0 for the pose.
+//
+// A ruler has RULER numbers: centre (2) [px] and direction (2) in the image, u0, v0, du, dv, k. They take the position
+// s [px] on the ruler to the frame of its line [m], u along the line and v along its normal, exactly for a homography:
+// (u, v) = ((u0, v0) + s (du, dv)) / (1 + s k).
 #include "line_fit/line_fit.h"
 #include "pose/pose_result.h"
 #include "ruler/ruler.h"
 
 #define RULER 9
-#define LINE 6 // unit normal, point, standard deviation of where it was made, how much the etching displaces it
+// Numbers per line: unit normal (2), point (2) [m], standard deviation of its position on the board [m], etch factor.
+#define LINE 6
 
-// Rows that a line makes: offset and angle, or of a single edge its offset.
+// Rows per line: two for offset and angle, one for the offset of a line with a single ruler.
 #define EACH_ROWS (EACH > 1 ? 2 : 1)
 
 #ifdef VECTOR_VARIANT
@@ -20,17 +34,18 @@
 #define SHARED local
 #endif
 
-// What rulers found, one after the other: places in their line's frame, and certainties.
+// Measured edges of all rulers: places in the frames of their lines [m], and certainties 1/sigma (0: no edge).
 typedef struct {
     SHARED real *u;
     SHARED real *v;
     SHARED real *certainty;
-} fix_places;
+} edge_places;
 
-static inline void put_edge(real position, real sigma, global const real *ruler, int i, fix_places to) {
+// Store the edge of ruler i from its position and sigma on the ruler [px].
+static inline void put_edge(real position, real sigma, global const real *ruler, int i, edge_places to) {
     const real per = 1 / (1 + position * ruler[8]);
     const real at_u = (ruler[4] + position * ruler[6]) * per, at_v = (ruler[5] + position * ruler[7]) * per;
-    // Along the ruler a pixel moves the place across the line by so much.
+    // Sigma across the line: |dv/ds| sigma, with dv/ds = (dv - v k) / (1 + s k).
     const real across = fabs(ruler[7] - at_v * ruler[8]) * per * sigma;
     const int good = !not_finite(at_u) & !not_finite(at_v) & !not_finite(across) & across > 0;
     to.u[i] = good ? at_u : 0;
@@ -38,6 +53,7 @@ static inline void put_edge(real position, real sigma, global const real *ruler,
     to.certainty[i] = good ? 1 / across : 0;
 }
 
+// Columns of the rows of the pose (pose/pose.h).
 typedef struct {
     SHARED real *nx;
     SHARED real *ny;
@@ -46,10 +62,12 @@ typedef struct {
     SHARED real *ex;
     SHARED real *ey;
     SHARED real *certainty;
-    SHARED real *grows;
-} fix_rows;
+    SHARED real *etch_factor;
+} line_rows;
 
-static inline void put_row(fix_rows rows, int i, global const real *line, real u, real v, real variance) {
+// Store row i: at u along the line, the line was seen displaced by v along its normal, with the given variance [m2].
+// The variance of the line's position on the board is added. A variance that is not finite makes a missing row.
+static inline void put_row(line_rows rows, int i, global const real *line, real u, real v, real variance) {
     const int good = variance > 0 && !not_finite(variance) && !not_finite(u + v);
     const real sigma = sqrt(variance + line[4] * line[4]);
     rows.nx[i] = good ? line[0] : 0;
@@ -59,22 +77,27 @@ static inline void put_row(fix_rows rows, int i, global const real *line, real u
     rows.ex[i] = good ? v * line[0] : 0;
     rows.ey[i] = good ? v * line[1] : 0;
     rows.certainty[i] = good ? 1 / sigma : 0;
-    rows.grows[i] = line[5];
+    rows.etch_factor[i] = line[5];
 }
 
-// A line is two rows: places either side of its middle whose offsets are uncorrelated carry its offset and its angle.
-// With one edge, or all in one place, it has no angle, and is one row.
-static inline void put_line(fix_rows rows, int i, global const real *line, real x, real y, real c, real s, real of_offset,
-                     real of_angle, int has_angle) {
-    const real reach = has_angle ? sqrt(of_offset / of_angle) : 0, side = c < 0 ? -reach : reach;
-    put_row(rows, EACH_ROWS * i, line, x - side * c, y - side * s, has_angle ? 2 * of_offset : of_offset);
+// Store the rows of line i, fitted through (x, y) along (c, s).
+//
+// Offset and angle are uncorrelated at (x, y). At the distance +-sigma(offset) / sigma(angle) from it the offsets have
+// the variance 2 sigma(offset)^2 and the covariance sigma(offset)^2 - reach^2 sigma(angle)^2 = 0: two independent rows
+// carry the same information as offset and angle. A line with one edge, or with all edges in one place, has no angle
+// and gives one row.
+static inline void put_line(line_rows rows, int i, global const real *line, real x, real y, real c, real s,
+                            real offset_variance, real angle_variance, int has_angle) {
+    const real reach = has_angle ? sqrt(offset_variance / angle_variance) : 0, side = c < 0 ? -reach : reach;
+    put_row(rows, EACH_ROWS * i, line, x - side * c, y - side * s, has_angle ? 2 * offset_variance : offset_variance);
     if (EACH_ROWS > 1)
-        put_row(rows, EACH_ROWS * i + 1, line, x + side * c, y + side * s, has_angle ? 2 * of_offset : REAL_NAN);
+        put_row(rows, EACH_ROWS * i + 1, line, x + side * c, y + side * s, has_angle ? 2 * offset_variance : REAL_NAN);
 }
 
-// Lines `first` on of this item, LANES at once: rows of each, and a weight for each edge.
-static inline void fit_lines(laned_points all, int first, int lines, global const real *line, constant int *pairs, int trials,
-                      int steps, fix_rows rows, global real *edge_weights) {
+// Fit LANES lines from `first` on; store their rows, and the weight of each edge. The least scale is the rounding error
+// of the places, in sigmas.
+static inline void fit_lines(laned_points all, int first, int lines, global const real *line, constant int *pairs,
+                             int trials, int steps, line_rows rows, global real *edge_weights) {
     reals reach = 0;
     for (int k = 0; k < all.count; k++) {
         const reals far = (FABS(all.x[k]) + FABS(all.y[k])) * all.certainty[k];
@@ -99,21 +122,22 @@ kernel void board_pose(global const CODE *restrict image, global const real *res
                       global const real *restrict line, global real *restrict pose, global real *restrict deformation,
                       global real *restrict placement, global real *restrict covariance,
                       global real *restrict residuals, global real *restrict weights, global real *restrict scale,
-                      global real *restrict spread, global real *restrict condition, global int *restrict rank,
-                      global int *restrict inliers, global uchar *restrict status, global real *restrict etch, global real *restrict agreement,
-                      global real *restrict leverage, global real *restrict edges,
-                      global uchar *restrict edge_status, global real *restrict edge_weights, constant real *table,
+                      global real *restrict residual_scale, global real *restrict condition, global int *restrict rank,
+                      global int *restrict inliers, global uchar *restrict status, global real *restrict etch,
+                      global real *restrict inlier_fraction, global real *restrict leverage,
+                      global real *restrict edges, global uchar *restrict edge_status,
+                      global real *restrict edge_weights, constant real *table,
                       constant real *model, const int rows, const int columns, const int lines, const int each,
                       constant int *pairs, const int pair_trials, constant int *subsets, const int trials,
-                      const int steps, const real share, const real least_agreeing,
-                      const real largest_leverage, const real shift_within, const real turn_within, const real place_x,
+                      const int steps, const real rank_tolerance, const real min_inlier_fraction,
+                      const real max_leverage, const real max_shift, const real max_turn, const real place_x,
                       const real place_y, const real etch_certainty) {
     const int count = EACH_ROWS * lines, padded = (count + LANES - 1) / LANES * LANES;
     SHARED real row[8][CAPACITY];
-    const fix_rows lined = {row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7]};
+    const line_rows lined = {row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7]};
     ruler_edge edge[MOST];
     SHARED real place[3][ROOM];
-    const fix_places places_of = {place[0], place[1], place[2]};
+    const edge_places places_of = {place[0], place[1], place[2]};
 #ifdef VECTOR_VARIANT
     const int item = 0, items = LANES;
     for (int first = 0; first < lines * each; first += LANES) {
@@ -157,8 +181,9 @@ kernel void board_pose(global const CODE *restrict image, global const real *res
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item) return;
 #endif
+    // Copies in private memory of the rows, padded with missing rows.
     real nx[CAPACITY], ny[CAPACITY], px[CAPACITY], py[CAPACITY], ex[CAPACITY], ey[CAPACITY], certain[CAPACITY];
-    real grows[CAPACITY];
+    real etch_factor[CAPACITY];
     reals room[CAPACITY];
     real sum = 0, sum_x = 0, sum_y = 0;
     for (int i = 0; i < padded; i++) {
@@ -170,18 +195,18 @@ kernel void board_pose(global const CODE *restrict image, global const real *res
         ex[i] = there ? row[4][i] : 0;
         ey[i] = there ? row[5][i] : 0;
         certain[i] = there ? row[6][i] : 0;
-        grows[i] = there ? row[7][i] : 0;
+        etch_factor[i] = there ? row[7][i] : 0;
         sum += certain[i] > 0;
         sum_x += px[i];
         sum_y += py[i];
     }
-    pose_rows all = {nx, ny, px, py, ex, ey, certain, grows, padded, etch_certainty};
-    const pose_frame frame = framed(&all, sum, sum_x, sum_y);
+    pose_rows all = {nx, ny, px, py, ex, ey, certain, etch_factor, padded, etch_certainty};
+    const pose_frame frame = centre_rows(&all, sum, sum_x, sum_y);
     const laned_pose about = {0, 0, 0, 0, 0, 0, 0};
-    const solved_pose fit = pose_solved(about, all, subsets, trials, steps, 1e-3f, share, room);
+    const solved_pose fit = pose_solved(about, all, subsets, trials, steps, 1e-3f, rank_tolerance, room);
     const pose_outputs outputs = {pose,   deformation, placement, covariance, residuals, weights,
-                                  scale,  spread,      condition, rank,       inliers,   status,     etch,
-                                  agreement, leverage};
-    const pose_limits asked = {least_agreeing, largest_leverage, shift_within, turn_within};
-    store_pose(fit, all, frame, 1, 0, count, asked, place_x, place_y, outputs);
+                                  scale,  residual_scale,      condition, rank,       inliers,   status,     etch,
+                                  inlier_fraction, leverage};
+    const pose_limits limits = {min_inlier_fraction, max_leverage, max_shift, max_turn};
+    store_pose(fit, all, frame, 1, 0, count, limits, place_x, place_y, outputs);
 }

@@ -1,8 +1,24 @@
-// Poses of boards, one for each set of equations; a work-item each. CPU runtimes take sixteen equations, or starts, at
-// a time.
+// Robust poses of boards from feature rows, each with its covariance, residuals and status.
+//
+// Each row is one scalar equation n . (T^-1(p + e) - p) = g etch of the pose T (pose.h). The pose minimises
+// sum rho(residual / (sigma scale)) with the loss rho of common/robust.h.
+//
+// Inputs:  rows (poses, count, ROW), type INPUT: unit normal n (2), place p in the artwork (2) [m], displacement e from
+//          there to where the feature was seen (2) [m], sigma along the normal [m], and with ETCHED the etch factor g;
+//          start (poses, 3) with WITH_NEAR: initial pose x, y [m], theta [rad].
+// Tables:  subsets (trials / LANES, FREEDOMS, LANES): rows of the start candidates.
+// Outputs: pose (poses, 3) x, y [m], theta [rad]; deformation (poses, 3); placement (poses, 2) [m]; covariance (poses,
+//          OF_POSE, OF_POSE) of the placement point [m2, m rad, rad2]; residuals (poses, count) [m]; weights (poses,
+//          count), 0 to 1; etch (poses,) [m]; (poses,): scale, residual_scale, condition, rank,
+//          inliers, status, inlier_fraction, leverage. Refused poses are NaN.
+// Options: INPUT, REAL_IS_DOUBLE, WITH_NEAR (initial pose; otherwise no motion), OF_POSE, FREEDOMS, ETCHED, CAPACITY,
+//          START_STEPS, GIVEN_SCALE, EFFICIENCY (pose.h), loss options (common/robust.h).
+// Variants: vector: 16 rows, or 16 start candidates, at a time; work-item: one at a time.
+//
+// One work-item solves one pose.
 #include "pose/pose_result.h"
 
-// Numbers of a row: normal, place, displacement seen, sigma; and with ETCHED how much the etching displaces it.
+// Numbers per row: normal (2), place (2), displacement (2), sigma, and with ETCHED the etch factor.
 #ifdef ETCHED
 #define ROW 8
 #else
@@ -11,26 +27,28 @@
 
 kernel void pose_sets(global const INPUT *restrict rows,
 #ifdef WITH_NEAR
-                      global const INPUT *restrict near,
+                      global const INPUT *restrict start,
 #endif
                       global real *restrict pose, global real *restrict deformation, global real *restrict placement,
                       global real *restrict covariance, global real *restrict residuals, global real *restrict weights,
-                      global real *restrict scale, global real *restrict spread, global real *restrict condition,
-                      global int *restrict rank, global int *restrict inliers, global uchar *restrict status,
-                      global real *restrict etch, global real *restrict agreement,
-                      global real *restrict leverage,                       const long poses, const int count, constant int *subsets, const int trials, const int steps,
-                      const real smallest, const real share, const real least_agreeing,
-                      const real largest_leverage, const real shift_within, const real turn_within, const real place_x,
-                      const real place_y, const real etch_certainty) {
+                      global real *restrict scale, global real *restrict residual_scale,
+                      global real *restrict condition, global int *restrict rank, global int *restrict inliers,
+                      global uchar *restrict status, global real *restrict etch, global real *restrict inlier_fraction,
+                      global real *restrict leverage, const long poses, const int count, constant int *subsets,
+                      const int trials, const int steps, const real min_scale, const real rank_tolerance,
+                      const real min_inlier_fraction, const real max_leverage, const real max_shift,
+                      const real max_turn, const real place_x, const real place_y,
+                      const real etch_certainty) {
     const long item = (long)get_global_id(0);
     if (item >= poses) return;
     real nx[CAPACITY], ny[CAPACITY], px[CAPACITY], py[CAPACITY], ex[CAPACITY], ey[CAPACITY], certainty[CAPACITY];
     reals room[CAPACITY];
 #ifdef ETCHED
-    real grows[CAPACITY];
+    real etch_factor[CAPACITY];
 #else
-    private real *grows = 0;
+    private real *etch_factor = 0;
 #endif
+    // The row count is padded with rows of certainty 0 to whole vectors. Missing rows get certainty 0, too.
     const int padded = (count + LANES - 1) / LANES * LANES;
     global const INPUT *row = rows + item * count * ROW;
     real sum = 0, sum_x = 0, sum_y = 0;
@@ -48,25 +66,25 @@ kernel void pose_sets(global const INPUT *restrict rows,
         ey[i] = good ? row[at + 5] : 0;
         certainty[i] = good ? 1 / (real)row[at + 6] : 0;
 #ifdef ETCHED
-        grows[i] = good ? row[at + 7] : 0;
+        etch_factor[i] = good ? row[at + 7] : 0;
 #endif
         sum += good;
         sum_x += px[i];
         sum_y += py[i];
     }
-    pose_rows all = {nx, ny, px, py, ex, ey, certainty, grows, padded, etch_certainty};
-    const pose_frame frame = framed(&all, sum, sum_x, sum_y);
+    pose_rows all = {nx, ny, px, py, ex, ey, certainty, etch_factor, padded, etch_certainty};
+    const pose_frame frame = centre_rows(&all, sum, sum_x, sum_y);
     laned_pose about = {0, 0, 0, 0, 0, 0, 0};
 #ifdef WITH_NEAR
-    const real x = near[3 * item], y = near[3 * item + 1], turn = near[3 * item + 2];
+    const real x = start[3 * item], y = start[3 * item + 1], turn = start[3 * item + 2];
     all_finite = !(not_finite(x) | not_finite(y) | not_finite(turn));
-    about = pose_near(x, y, turn, frame);
+    about = pose_in_frame(x, y, turn, frame);
 #endif
-    const solved_pose fit = pose_solved(about, all, subsets, trials, steps, smallest, share, room);
+    const solved_pose fit = pose_solved(about, all, subsets, trials, steps, min_scale, rank_tolerance, room);
 
     const pose_outputs outputs = {pose,   deformation, placement, covariance, residuals, weights,
-                                  scale,  spread,      condition, rank,       inliers,   status,     etch,
-                                  agreement, leverage};
-    const pose_limits asked = {least_agreeing, largest_leverage, shift_within, turn_within};
-    store_pose(fit, all, frame, all_finite, item, count, asked, place_x, place_y, outputs);
+                                  scale,  residual_scale,      condition, rank,       inliers,   status,     etch,
+                                  inlier_fraction, leverage};
+    const pose_limits limits = {min_inlier_fraction, max_leverage, max_shift, max_turn};
+    store_pose(fit, all, frame, all_finite, item, count, limits, place_x, place_y, outputs);
 }

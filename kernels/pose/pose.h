@@ -1,26 +1,37 @@
-// A board's pose by robust, weighted Gauss-Newton from scalar equations, and its covariance.
+// Pose of a board by iteratively reweighted Gauss-Newton from scalar equations, and its covariance.
 //
-// A point p of the artwork is seen at q = p + e. The pose T(p) = (I + D) p + t says that it is seen there if
-// n . (T^-1(q) - p) = 0, for a feature's normal n: of an edge its own, of a point two at right angles. With
-// w = e - t - D p that is n . (I + D)^-1 w, in which nothing large is subtracted. A step d of the pose turns it into
-// T exp(d), and adds h . d to n . (T^-1(q) - p): h = (n, n . J p', ...) with p' = T^-1(q).
+// A point p of the artwork is seen at q = p + e. The pose is T(p) = (I + D) p + t. A feature with the unit normal n
+// gives the equation n . (T^-1(q) - p) = 0: an edge one equation, a point two with normals at right angles.
 //
-// With ETCHED the copper of the whole board is larger all round by one more unknown, about which something is known
-// before: an edge out of the copper lies that much further along its normal, h has 1 more.
+// Residual: T^-1(q) - p = (I + D)^-1 w with w = e - t - D p. All terms of w are small displacements, so that no large
+// coordinates are subtracted and single precision keeps the digits of the displacement.
+//
+// Jacobian: a step d changes the pose to T exp(d). To first order the residual decreases by h . d, with p' = T^-1(q) =
+// (x, y) and h = (n_x, n_y, n_y x - n_x y, ...). The further terms are n . p' for a common scale, or
+// (n_x x, n_y y, n_x y) for two scales and the shear.
+//
+// Etch bias (ETCHED): copper reaches beyond its drawn edges by one unknown distance, with a given standard deviation
+// around 0. An edge moves along its normal by g times this distance (g: etch factor), so that h has the further term g.
+//
+// Options: OF_POSE: number of pose parameters, 3 (rigid), 4 (common scale) or 6 (two scales and shear). FREEDOMS:
+//          number of unknowns, OF_POSE and the etch bias. ETCHED: solve for the etch bias. CAPACITY: size of the row
+//          arrays. START_STEPS: Gauss-Newton steps of a start candidate. GIVEN_SCALE: known scale of the residuals in
+//          sigmas; otherwise it is estimated from their median. EFFICIENCY: of the loss for normal residuals, for the
+//          covariance at a known scale.
 #ifndef POSE_H
 #define POSE_H
 
 #include "common/least_squares.h"
 #include "common/robust.h"
 
-// OF_POSE: 3, the board is rigid; 4, with a scale; 6, with scales along both axes and a shear. FREEDOMS: the etching, too.
+// Poses, one per lane: D, the translation (x, y), and the etch bias.
 typedef struct {
     reals dxx, dxy, dyx, dyy, x, y, etch;
 } laned_pose;
 
-// One equation: normal, place, what it was seen to be displaced by, 1/sigma, and how much the etching displaces it.
+// Rows, one per lane: normal, place, displacement, certainty 1/sigma (0: missing row), and etch factor.
 typedef struct {
-    reals nx, ny, px, py, ex, ey, certainty, grows;
+    reals nx, ny, px, py, ex, ey, certainty, etch_factor;
 } laned_row;
 
 #ifdef ETCHED
@@ -33,7 +44,7 @@ typedef struct {
 #define ETCH_GATHERED(from, at) ((reals)0)
 #endif
 
-// Equations side by side, padded with ones of certainty zero to whole vectors.
+// Columns of all rows, padded with rows of certainty 0 to whole vectors.
 typedef struct {
     private const real *nx;
     private const real *ny;
@@ -42,27 +53,30 @@ typedef struct {
     private const real *ex;
     private const real *ey;
     private const real *certainty;
-    private const real *grows; // null without ETCHED
+    private const real *etch_factor; // null without ETCHED
     int count;
-    real etch; // 1/sigma of what is known of the etching before
+    real etch; // 1/sigma of the etch bias
 } pose_rows;
 
+// Linearised equations, one per lane: Jacobian row h and residual.
 typedef struct {
     reals row[FREEDOMS], residual;
 } pose_equation;
 
+// Load LANES rows from row i on.
 static inline laned_row row_of(pose_rows all, int i) {
     return (laned_row){READ(all.nx, i), READ(all.ny, i), READ(all.px, i),       READ(all.py, i),
-                       READ(all.ex, i), READ(all.ey, i), READ(all.certainty, i), ETCH_OF(all.grows, i)};
+                       READ(all.ex, i), READ(all.ey, i), READ(all.certainty, i), ETCH_OF(all.etch_factor, i)};
 }
 
-// The same one for all lanes.
+// Broadcast row i to all lanes.
 static inline laned_row row_for_all(pose_rows all, int i) {
     return (laned_row){(reals)all.nx[i], (reals)all.ny[i], (reals)all.px[i],       (reals)all.py[i],
                        (reals)all.ex[i], (reals)all.ey[i], (reals)all.certainty[i],
-                       ETCH_FOR_ALL(all.grows, i)};
+                       ETCH_FOR_ALL(all.etch_factor, i)};
 }
 
+// Compute Jacobian row and residual of a feature row at a pose.
 static inline pose_equation equation_of(laned_pose pose, laned_row at) {
     const reals wx = at.ex - pose.x - (pose.dxx * at.px + pose.dxy * at.py);
     const reals wy = at.ey - pose.y - (pose.dyx * at.px + pose.dyy * at.py);
@@ -71,7 +85,7 @@ static inline pose_equation equation_of(laned_pose pose, laned_row at) {
     const reals bx = (ayy * wx - pose.dxy * wy) * per, by = (axx * wy - pose.dyx * wx) * per;
     const reals x = at.px + bx, y = at.py + by;
     pose_equation equation;
-    equation.residual = at.nx * bx + at.ny * by - at.grows * pose.etch;
+    equation.residual = at.nx * bx + at.ny * by - at.etch_factor * pose.etch;
     equation.row[0] = at.nx;
     equation.row[1] = at.ny;
     equation.row[2] = at.ny * x - at.nx * y;
@@ -83,17 +97,19 @@ static inline pose_equation equation_of(laned_pose pose, laned_row at) {
     equation.row[5] = at.nx * y;
 #endif
 #ifdef ETCHED
-    equation.row[OF_POSE] = at.grows;
+    equation.row[OF_POSE] = at.etch_factor;
 #endif
     return equation;
 }
 
 static inline reals residual_of(laned_pose pose, laned_row at) { return equation_of(pose, at).residual; }
 
-// T exp(step). The angle is taken for its tangent: at the end of the iteration it is zero.
+// Compute T exp(step). The angle step is used as the tangent of the rotation, cos = 1 / sqrt(1 + tan^2): this differs
+// from the exponential in third order, and the last step of the iteration is about 0. It needs no trigonometry.
 static inline laned_pose pose_after(laned_pose pose, private const reals *step) {
     const reals tangent = step[2], cosine = (reals)1 / sqrt((reals)1 + tangent * tangent), sine = tangent * cosine;
-    const reals less = -sine * sine / ((reals)1 + cosine); // cosine - 1, to all its digits
+    // cosine - 1 = -sine^2 / (1 + cosine), without cancellation.
+    const reals less = -sine * sine / ((reals)1 + cosine);
     reals exx = less, exy = -sine, eyx = sine, eyy = less;
 #if OF_POSE == 4
     exx += cosine * step[3], exy -= sine * step[3], eyx += sine * step[3], eyy += cosine * step[3];
@@ -113,6 +129,7 @@ static inline laned_pose pose_after(laned_pose pose, private const reals *step) 
     return next;
 }
 
+// Add weight h h^T to the lower triangle of the normal matrix, and weight h residual to the right side.
 static inline void add_equation(pose_equation equation, reals weight, private reals *matrix, private reals *right) {
     for (int i = 0; i < FREEDOMS; i++) {
         const reals weighted = weight * equation.row[i];
@@ -121,7 +138,7 @@ static inline void add_equation(pose_equation equation, reals weight, private re
     }
 }
 
-// Adds what is known of the etching before, as one more equation.
+// Add the prior of the etch bias, etch = 0 with the given certainty (1/sigma), to the normal equations.
 static inline void add_etch(laned_pose pose, real certainty, private reals *matrix, private reals *right) {
 #ifdef ETCHED
     const reals square = (reals)(certainty * certainty);
@@ -130,6 +147,7 @@ static inline void add_etch(laned_pose pose, real certainty, private reals *matr
 #endif
 }
 
+// Gather the values at the indices at[0 .. LANES - 1].
 #ifdef VECTOR_VARIANT
 #define GATHERED(from, at)                                                                                             \
     (reals)((from)[(at)[0]], (from)[(at)[1]], (from)[(at)[2]], (from)[(at)[3]], (from)[(at)[4]], (from)[(at)[5]],        \
@@ -139,7 +157,9 @@ static inline void add_etch(laned_pose pose, real certainty, private reals *matr
 #define GATHERED(from, at) ((from)[(at)[0]])
 #endif
 
-// How badly each lane's pose does: the loss at the scale that is known, or the median of the residuals to a percent.
+// Compute the score of each lane's candidate pose over all rows, least is best: the loss where the scale is given,
+// otherwise the absolute residual of rank (n + FREEDOMS + 1) / 2 in sigmas, to 1 % (least median of squares, Rousseeuw
+// and Leroy, 1987).
 static inline reals pose_score(laned_pose pose, pose_rows all, private reals *distances, int present) {
 #ifdef ETCHED
     const reals off = pose.etch * (reals)all.etch;
@@ -161,11 +181,13 @@ static inline reals pose_score(laned_pose pose, pose_rows all, private reals *di
 #endif
 }
 
-// Of the poses that FREEDOMS equations each make, the one that does best; `subsets` has the equations of LANES poses
-// side by side: (trials / LANES, FREEDOMS, LANES).
-static inline laned_pose pose_start(laned_pose near, pose_rows all, constant const int *subsets, int trials,
-                             private reals *distances, int present) {
-    laned_pose best = near;
+// Find the start pose: the candidate with the least score.
+//
+// A candidate is the pose through FREEDOMS rows, from START_STEPS Gauss-Newton steps from `start`. `subsets` holds the
+// rows of LANES candidates side by side, (trials / LANES, FREEDOMS, LANES): each lane solves one candidate.
+static inline laned_pose pose_start(laned_pose start, pose_rows all, constant const int *subsets, int trials,
+                                    private reals *distances, int present) {
+    laned_pose best = start;
     real least = INFINITY;
     for (int trial = 0; trial < trials; trial += LANES) {
         laned_row of[FREEDOMS];
@@ -173,9 +195,9 @@ static inline laned_pose pose_start(laned_pose near, pose_rows all, constant con
             constant const int *at = subsets + (size_t)trial * FREEDOMS + k * LANES;
             of[k] = (laned_row){GATHERED(all.nx, at), GATHERED(all.ny, at), GATHERED(all.px, at),
                                 GATHERED(all.py, at), GATHERED(all.ex, at), GATHERED(all.ey, at),
-                                GATHERED(all.certainty, at), ETCH_GATHERED(all.grows, at)};
+                                GATHERED(all.certainty, at), ETCH_GATHERED(all.etch_factor, at)};
         }
-        laned_pose tried = near;
+        laned_pose candidate = start;
         masks bad = 0;
         for (int step = 0; step < START_STEPS; step++) {
             reals matrix[TRIANGLE], right[FREEDOMS], change[FREEDOMS];
@@ -187,28 +209,33 @@ static inline laned_pose pose_start(laned_pose near, pose_rows all, constant con
 #else
                 const reals weight = mask_of(of[k].certainty > (reals)0) ? (reals)1 : (reals)0;
 #endif
-                add_equation(equation_of(tried, of[k]), weight, matrix, right);
+                add_equation(equation_of(candidate, of[k]), weight, matrix, right);
             }
-            add_etch(tried, all.etch, matrix, right);
+            add_etch(candidate, all.etch, matrix, right);
             bad |= factored(matrix);
             solved(matrix, right, change);
-            tried = pose_after(tried, change);
+            candidate = pose_after(candidate, change);
         }
-        const reals loss = pose_score(tried, all, distances, present);
+        const reals loss = pose_score(candidate, all, distances, present);
         for (int lane = 0; lane < LANES; lane++) {
             if (LANE_BITS(bad, lane) || !(LANE(loss, lane) < least)) continue;
             least = LANE(loss, lane);
-            best = (laned_pose){(reals)LANE(tried.dxx, lane), (reals)LANE(tried.dxy, lane), (reals)LANE(tried.dyx, lane),
-                                (reals)LANE(tried.dyy, lane), (reals)LANE(tried.x, lane),   (reals)LANE(tried.y, lane),
-                                (reals)LANE(tried.etch, lane)};
+            best = (laned_pose){(reals)LANE(candidate.dxx, lane), (reals)LANE(candidate.dxy, lane),
+                                (reals)LANE(candidate.dyx, lane), (reals)LANE(candidate.dyy, lane),
+                                (reals)LANE(candidate.x, lane),   (reals)LANE(candidate.y, lane),
+                                (reals)LANE(candidate.etch, lane)};
         }
     }
     return best;
 }
 
-// The scale of the residuals in sigmas: as it is known, or by their median; of those only within `reach`, once a scale
-// is known: outliers raise the median too.
-static inline real pose_scale(laned_pose pose, pose_rows all, private reals *room, real reach, real few, real smallest) {
+// Return the scale of the residuals in sigmas: GIVEN_SCALE, or 1.4826 times the median absolute residual to 1 %, with
+// the small-sample correction 1 + few / (n - FREEDOMS).
+//
+// Only residuals up to `reach` take part: once a first scale is known, this removes the outliers, which raise the
+// median. The median is built bit by bit as in ranked_of (common/robust.h), here over rows in lanes.
+static inline real pose_scale(laned_pose pose, pose_rows all, private reals *room, real reach, real few,
+                              real min_scale) {
 #ifdef GIVEN_SCALE
     return (real)(GIVEN_SCALE);
 #else
@@ -230,21 +257,23 @@ static inline real pose_scale(laned_pose pose, pose_rows all, private reals *roo
         found = (int)sum_of(LANED(convert_real)(below)) > within / 2 ? found : next;
     }
     const real free = max((real)(within - FREEDOMS), (real)1);
-    return max(smallest, MAD_TO_SIGMA * (1 + few / free) * as_real(found));
+    return max(min_scale, MAD_TO_SIGMA * (1 + few / free) * as_real(found));
 #endif
 }
 
-// What the equations say together at a pose: the matrix of their squares, and what is left.
+// Normal equations over all rows at a pose, and the sums of psi'(z) and psi(z)^2 over the inliers for the covariance.
 typedef struct {
     reals matrix[TRIANGLE], right[FREEDOMS];
     int inliers;
     real slopes, squares;
 } pose_sums;
 
-#define WEIGHTED 0
-#define EVENLY 1     // those that count at all count fully
-#define EVERY_ROW 2  // that there is
+// Weight of a row in the sums.
+#define WEIGHTED 0   // robust weight
+#define EVENLY 1     // 1 for rows with a robust weight above 0 (inliers), 0 for others
+#define EVERY_ROW 2  // 1
 
+// Sum the normal equations of all rows. Padding rows add nothing: their certainty is 0.
 static inline void pose_summed(laned_pose pose, pose_rows all, real per_scale, int how, private pose_sums *sums) {
     masks inliers = 0;
     reals slopes = 0, squares = 0;
@@ -273,7 +302,8 @@ typedef struct {
     real cell[OF_POSE][OF_POSE];
 } pose_matrix;
 
-// The pose's part of a matrix: what the etching takes is taken out.
+// Return the information matrix of the pose parameters, with the etch bias b eliminated (Schur complement):
+// M_ij - M_ib M_jb / M_bb.
 static inline pose_matrix pose_part(private const reals *triangle) {
     pose_matrix of;
     for (int i = 0; i < OF_POSE; i++)
@@ -288,9 +318,9 @@ static inline pose_matrix pose_part(private const reals *triangle) {
     return of;
 }
 
-// Eigenvalues of a symmetric matrix by Jacobi's rotations: least and largest, and how many are over a share of the
-// largest.
-static inline int eigenvalues(pose_matrix of, real share, private real *least, private real *largest) {
+// Compute the least and the largest eigenvalue of a symmetric matrix by Jacobi rotations (5 sweeps, up to 6 x 6).
+// Returns the rank: the number of eigenvalues above `rank_tolerance` times the largest.
+static inline int eigenvalues(pose_matrix of, real rank_tolerance, private real *least, private real *largest) {
     for (int sweep = 0; sweep < 5; sweep++)
         for (int p = 0; p < OF_POSE - 1; p++)
             for (int q = p + 1; q < OF_POSE; q++) {
@@ -316,13 +346,15 @@ static inline int eigenvalues(pose_matrix of, real share, private real *least, p
         *largest = max(*largest, of.cell[i][i]);
     }
     int rank = 0;
-    for (int i = 0; i < OF_POSE; i++) rank += of.cell[i][i] > share * *largest;
+    for (int i = 0; i < OF_POSE; i++) rank += of.cell[i][i] > rank_tolerance * *largest;
     return rank;
 }
 
-// Which share of all that the rows say of the pose agrees, of the combination of freedoms of which least does: the
-// least eigenvalue of L^-1 M L^-T, M of those that agree and L L^T of all.
-static inline real least_agreement(pose_matrix agrees, pose_matrix all) {
+// Return the inlier fraction of the information, for the combination of parameters with the least fraction.
+//
+// It is the minimum over v of (v^T M v) / (v^T A v), with the information matrices M of the inliers and A of all rows.
+// With the Cholesky factor A = L L^T, this is the least eigenvalue of L^-1 M L^-T. 0 where A is singular.
+static inline real least_inlier_fraction(pose_matrix inlier_matrix, pose_matrix all) {
     real factor[OF_POSE][OF_POSE];
     for (int i = 0; i < OF_POSE; i++)
         for (int j = 0; j <= i; j++) {
@@ -333,37 +365,43 @@ static inline real least_agreement(pose_matrix agrees, pose_matrix all) {
         }
     for (int column = 0; column < OF_POSE; column++)
         for (int i = 0; i < OF_POSE; i++) {
-            for (int k = 0; k < i; k++) agrees.cell[i][column] -= factor[i][k] * agrees.cell[k][column];
-            agrees.cell[i][column] /= factor[i][i];
+            for (int k = 0; k < i; k++) inlier_matrix.cell[i][column] -= factor[i][k] * inlier_matrix.cell[k][column];
+            inlier_matrix.cell[i][column] /= factor[i][i];
         }
     for (int row = 0; row < OF_POSE; row++)
         for (int i = 0; i < OF_POSE; i++) {
-            for (int k = 0; k < i; k++) agrees.cell[row][i] -= factor[i][k] * agrees.cell[row][k];
-            agrees.cell[row][i] /= factor[i][i];
+            for (int k = 0; k < i; k++) inlier_matrix.cell[row][i] -= factor[i][k] * inlier_matrix.cell[row][k];
+            inlier_matrix.cell[row][i] /= factor[i][i];
         }
     real least, largest;
-    eigenvalues(agrees, 0, &least, &largest);
+    eigenvalues(inlier_matrix, 0, &least, &largest);
     return least;
 }
 
+// Solution in the frame of the rows (their centre is 0, their size 1).
 typedef struct {
     laned_pose pose;
-    real covariance[FREEDOMS][FREEDOMS]; // of the step in the artwork's frame, about the origin of the rows' places
-    real scale, spread, condition;
-    real agreement, leverage; // least share that agrees, and the largest of a row in its own residual
+    real covariance[FREEDOMS][FREEDOMS]; // of the step d in T exp(d), about the centre of the rows
+    real scale, residual_scale, condition;
+    real inlier_fraction, leverage; // least inlier fraction of the information; largest leverage of an inlier
     int present, inliers, rank;
 } solved_pose;
 
+// Compute the covariance and the largest leverage from the normal equations of the inliers, each with weight 1.
+//
+// Covariance of an M-estimator (Huber, 1981): variance * A^-1, A = sum of h h^T / sigma^2 over the inliers. With a
+// given scale, variance = scale^2 / EFFICIENCY. Otherwise it is estimated from the residuals z in units of the scale:
+// variance = scale^2 (sum psi(z)^2 / (n - FREEDOMS)) / (mean psi'(z))^2. The leverage of a row is h^T A^-1 h / sigma^2.
 static inline void pose_covariance(private solved_pose *fit, pose_rows all, private const pose_sums *sums) {
     reals factor[TRIANGLE];
     for (int i = 0; i < TRIANGLE; i++) factor[i] = sums->matrix[i];
     factored(factor);
     const real free = (real)(fit->inliers - FREEDOMS), mean = sums->slopes / fit->inliers;
-    fit->spread = fit->scale * sqrt(sums->squares / free) / mean;
+    fit->residual_scale = fit->scale * sqrt(sums->squares / free) / mean;
 #ifdef GIVEN_SCALE
     const real variance = fit->scale * fit->scale / (real)(EFFICIENCY);
 #else
-    const real variance = fit->spread * fit->spread;
+    const real variance = fit->residual_scale * fit->residual_scale;
 #endif
     for (int i = 0; i < FREEDOMS; i++) {
         reals unit[FREEDOMS], column[FREEDOMS];
@@ -376,7 +414,8 @@ static inline void pose_covariance(private solved_pose *fit, pose_rows all, priv
     for (int at = 0; at < all.count; at += LANES) {
         const laned_row row = row_of(all, at);
         const pose_equation equation = equation_of(fit->pose, row);
-        const masks is_in = mask_of(row.certainty * loss_weight(equation.residual * row.certainty / fit->scale) > (reals)0);
+        const masks is_in =
+            mask_of(row.certainty * loss_weight(equation.residual * row.certainty / fit->scale) > (reals)0);
         reals sum = 0;
         for (int i = 0; i < FREEDOMS; i++)
             for (int k = 0; k < FREEDOMS; k++)
@@ -387,24 +426,29 @@ static inline void pose_covariance(private solved_pose *fit, pose_rows all, priv
 #endif
 }
 
-// The places' unit must be about their distance from the origin. `room` has as many reals as there are rows.
+// Solve one pose. With a robust loss: start candidates, then `steps` reweighted Gauss-Newton steps; the scale is
+// estimated again before the step RESCALED_AT. Rows must be centred and scaled to size 1 (pose_result.h), so that
+// shifts and turns have the same unit for `condition` and the rank. `room` is scratch space of CAPACITY reals.
+//
 // Not inlined: PoCL 3.1 computes wrong weights in the work-item variant of board_pose.cl when this function is inlined
 // behind the kernel's last barrier (bisected; the vector variant and Intel's runtime are not affected).
-static __attribute__((noinline)) solved_pose pose_solved(laned_pose near, pose_rows all, constant const int *subsets, int trials, int steps,
-                               real smallest, real share, private reals *room) {
+static __attribute__((noinline)) solved_pose pose_solved(laned_pose start, pose_rows all, constant const int *subsets,
+                                                         int trials, int steps, real min_scale, real rank_tolerance,
+                                                         private reals *room) {
     solved_pose fit;
     real present = 0;
     for (int i = 0; i < all.count; i++) present += all.certainty[i] > 0;
     fit.present = (int)present;
-    fit.pose = near;
+    fit.pose = start;
     pose_sums sums;
-    fit.scale = smallest;
+    fit.scale = min_scale;
 #ifdef ROBUST
-    fit.pose = pose_start(near, all, subsets, trials, room, fit.present);
-    fit.scale = pose_scale(fit.pose, all, room, INFINITY, FEW_TRIED, smallest);
+    fit.pose = pose_start(start, all, subsets, trials, room, fit.present);
+    fit.scale = pose_scale(fit.pose, all, room, INFINITY, FEW_TRIED, min_scale);
 #endif
     for (int step = 0; step < steps; step++) {
-        if (RESCALED_AT(step)) fit.scale = pose_scale(fit.pose, all, room, (real)2.5f * fit.scale, FEW_FITTED, smallest);
+        if (RESCALED_AT(step))
+            fit.scale = pose_scale(fit.pose, all, room, (real)2.5f * fit.scale, FEW_FITTED, min_scale);
         reals change[FREEDOMS];
         pose_summed(fit.pose, all, 1 / fit.scale, WEIGHTED, &sums);
         if (any_lane(factored(sums.matrix))) break;
@@ -412,16 +456,16 @@ static __attribute__((noinline)) solved_pose pose_solved(laned_pose near, pose_r
         fit.pose = pose_after(fit.pose, change);
     }
 #ifndef ROBUST
-    fit.scale = pose_scale(fit.pose, all, room, INFINITY, FEW_FITTED, smallest);
+    fit.scale = pose_scale(fit.pose, all, room, INFINITY, FEW_FITTED, min_scale);
 #endif
     pose_summed(fit.pose, all, 1 / fit.scale, EVERY_ROW, &sums);
-    const pose_matrix every = pose_part(sums.matrix);
+    const pose_matrix row_matrix = pose_part(sums.matrix);
     pose_summed(fit.pose, all, 1 / fit.scale, EVENLY, &sums);
-    const pose_matrix agrees = pose_part(sums.matrix);
+    const pose_matrix inlier_matrix = pose_part(sums.matrix);
     fit.inliers = sums.inliers;
     real least, largest;
-    fit.rank = eigenvalues(agrees, share, &least, &largest);
-    fit.agreement = least_agreement(agrees, every);
+    fit.rank = eigenvalues(inlier_matrix, rank_tolerance, &least, &largest);
+    fit.inlier_fraction = least_inlier_fraction(inlier_matrix, row_matrix);
     fit.condition = sqrt(largest / max(least, (real)REAL_EPSILON * largest));
     pose_covariance(&fit, all, &sums);
     return fit;

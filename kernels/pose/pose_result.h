@@ -1,15 +1,19 @@
-// Rows about their middle, and what is said of a solved pose.
+// Frame of the rows in which a pose is solved, and output of a solved pose in metres about the artwork's origin.
+//
+// In the frame of the rows their centre is 0 and their root-mean-square distance from it is 1: p' = (p - centre) /
+// size, e' = e / size, sigma' = sigma / size. A translation t of the frame is t size metres.
 #ifndef POSE_RESULT_H
 #define POSE_RESULT_H
 
 #include "pose/pose.h"
 #include "common/status.h"
 
+// Centre [m], size [m] and 1 / size of the rows.
 typedef struct {
     real x, y, size, per_size;
 } pose_frame;
 
-// As the kernels have them, in the order of BoardPose.
+// Output arrays of the kernels, in the order of the fields of BoardPose (pose.py).
 typedef struct {
     global real *pose;
     global real *deformation;
@@ -18,24 +22,25 @@ typedef struct {
     global real *residuals;
     global real *weights;
     global real *scale;
-    global real *spread;
+    global real *residual_scale;
     global real *condition;
     global int *rank;
     global int *inliers;
     global uchar *status;
     global real *etch;
-    global real *agreement;
+    global real *inlier_fraction;
     global real *leverage;
 } pose_outputs;
 
-// What is asked of a pose.
+// Limits of an accepted pose: least inlier fraction, largest leverage, largest shift of the placement point [m],
+// largest turn [rad].
 typedef struct {
-    real agreement, leverage, shift, turn;
+    real inlier_fraction, leverage, shift, turn;
 } pose_limits;
 
-// Takes rows to where their middle is zero and their size one: then a turn and a shift are alike, and the digits are
-// where they count. There are `sum` of them, and their places add up to (sum_x, sum_y).
-static inline pose_frame framed(private pose_rows *all, real sum, real sum_x, real sum_y) {
+// Transform rows to their frame, in place: shifts and turns then have the same unit, and places have no large offset
+// that costs digits. `sum` is the number of rows, (sum_x, sum_y) the sum of their places.
+static inline pose_frame centre_rows(private pose_rows *all, real sum, real sum_x, real sum_y) {
     private real *px = (private real *)all->px, *py = (private real *)all->py;
     private real *ex = (private real *)all->ex, *ey = (private real *)all->ey;
     private real *certainty = (private real *)all->certainty;
@@ -55,28 +60,37 @@ static inline pose_frame framed(private pose_rows *all, real sum, real sum_x, re
     return (pose_frame){x, y, size, per_size};
 }
 
-static inline laned_pose pose_near(real x, real y, real turn, pose_frame frame) {
+// Return the pose (x, y, turn) about the artwork's origin as a pose in the frame of the rows.
+// cos(turn) - 1 = -2 sin^2(turn / 2) avoids cancellation for small turns.
+static inline laned_pose pose_in_frame(real x, real y, real turn, pose_frame frame) {
     const real half_sine = sin(turn / 2), less = -2 * half_sine * half_sine, sine = sin(turn);
     return (laned_pose){(reals)less, (reals)-sine, (reals)sine, (reals)less,
                         (reals)((x + less * frame.x - sine * frame.y) * frame.per_size),
                         (reals)((y + sine * frame.x + less * frame.y) * frame.per_size), 0};
 }
 
+// Check a pose against the limits and store it; a refused pose is stored as NaN.
+//
+// Translation about the origin: T(p) = c + (I + D) (p - c) + t gives t - D c for the centre c of the rows. Deformation:
+// I + D = R(theta) ((1 + kx, shear), (0, 1 + ky)), kx and theta from its first column. Covariance of the placement
+// point: `lever` is the Jacobian of its x, y, and of the other parameters, with respect to the step d; C' = lever C
+// lever^T.
 static inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, int all_finite, long item, int count,
-                       pose_limits asked, real place_x, real place_y, pose_outputs to) {
+                              pose_limits limits, real place_x, real place_y, pose_outputs to) {
     const int few = fit.present < OF_POSE;
-    // Where many disagree two that agree may do so by chance: each must have two others.
-    const real leverage = fit.agreement > 0.75f ? asked.leverage : asked.leverage / 2;
-    const int refused = fit.rank < OF_POSE || fit.inliers < OF_POSE || !(fit.agreement >= asked.agreement) ||
-                        !(fit.leverage < leverage);
+    // Below an inlier fraction of 0.75 two outliers may agree by chance. Half the leverage limit then requires that two
+    // other rows check each row.
+    const real leverage = fit.inlier_fraction > 0.75f ? limits.leverage : limits.leverage / 2;
+    const int refused = fit.rank < OF_POSE || fit.inliers < OF_POSE ||
+                        !(fit.inlier_fraction >= limits.inlier_fraction) || !(fit.leverage < leverage);
     const real axx = 1 + FIRST(fit.pose.dxx), axy = FIRST(fit.pose.dxy), ayx = FIRST(fit.pose.dyx),
                ayy = 1 + FIRST(fit.pose.dyy), length = sqrt(axx * axx + ayx * ayx), c = axx / length, s = ayx / length;
     const real move_x = FIRST(fit.pose.x) * frame.size, move_y = FIRST(fit.pose.y) * frame.size;
-    // From a step about the middle to the pose of the placement point.
+    // Placement point in the frame of the rows, and its shift [m].
     const real at_x = (place_x - frame.x) * frame.per_size, at_y = (place_y - frame.y) * frame.per_size;
     const real shift_x = move_x + ((axx - 1) * at_x + axy * at_y) * frame.size;
     const real shift_y = move_y + (ayx * at_x + (ayy - 1) * at_y) * frame.size, turn = atan2(ayx, axx);
-    const int away = !(sqrt(shift_x * shift_x + shift_y * shift_y) <= asked.shift) || !(fabs(turn) <= asked.turn);
+    const int away = !(sqrt(shift_x * shift_x + shift_y * shift_y) <= limits.shift) || !(fabs(turn) <= limits.turn);
     const int bad = few || refused || away || !all_finite;
     to.status[item] = !all_finite ? STATUS_NOT_FINITE
                       : few       ? STATUS_NO_DATA
@@ -120,9 +134,9 @@ static inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, 
     }
     to.etch[item] = bad ? REAL_NAN : FIRST(fit.pose.etch) * frame.size;
     to.scale[item] = bad ? REAL_NAN : fit.scale;
-    to.spread[item] = bad ? REAL_NAN : fit.spread;
+    to.residual_scale[item] = bad ? REAL_NAN : fit.residual_scale;
     to.condition[item] = few || !all_finite ? REAL_NAN : fit.condition;
-    to.agreement[item] = few || !all_finite ? REAL_NAN : fit.agreement;
+    to.inlier_fraction[item] = few || !all_finite ? REAL_NAN : fit.inlier_fraction;
     to.leverage[item] = few || !all_finite ? REAL_NAN : fit.leverage;
     to.rank[item] = few ? min(fit.rank, fit.present) : fit.rank;
     to.inliers[item] = fit.inliers;

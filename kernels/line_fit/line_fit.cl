@@ -1,19 +1,31 @@
-// Lines through sets of points, one line for each set. CPU runtimes take sixteen lines a work-item, GPUs one.
+// Robust straight lines through sets of points, one line per set, with covariance and status (line_fit.h).
+//
+// Inputs:  points (lines, count, 2) x, y, type INPUT; with WITH_SIGMA also sigma (lines, count), in the unit of the
+//          points. A point that is not finite, or whose sigma is not positive and finite, is missing.
+// Tables:  pairs (trials, 2): points of the start candidates.
+// Outputs: normal (lines, 2), (n_x, n_y) with n_y > 0, or n_x = -1 for a vertical line; distance (lines,) n . p from
+//          the origin; centre (lines, 2); covariance (lines, 2, 2) of angle [rad] and offset at the centre; scale
+//          (lines,); inliers (lines,); status (lines,); with WITH_WEIGHTS also weights (lines, count), 0 to 1.
+// Options: INPUT, REAL_IS_DOUBLE, WITH_SIGMA, WITH_WEIGHTS, CAPACITY (size of the point arrays), GIVEN_SCALE,
+//          EFFICIENCY (line_fit.h), loss options (common/robust.h).
+// Variants: vector: 16 lines per work-item, a line per lane; work-item: one line per item.
+//
+// The last lanes of the last vector repeat the last line; they are not stored.
 #include "line_fit/line_fit.h"
 #include "common/status.h"
 
 #ifdef VECTOR_VARIANT
-typedef long16 places;
+typedef long16 indices;
 #else
-typedef long places;
+typedef long indices;
 #endif
-// Of each lane, the value at its place.
+// Gather the value at each lane's index.
 #ifdef VECTOR_VARIANT
 #define AT(from, place)                                                                                                \
     (reals)((from)[place.s0], (from)[place.s1], (from)[place.s2], (from)[place.s3], (from)[place.s4], (from)[place.s5],  \
             (from)[place.s6], (from)[place.s7], (from)[place.s8], (from)[place.s9], (from)[place.sa], (from)[place.sb],  \
             (from)[place.sc], (from)[place.sd], (from)[place.se], (from)[place.sf])
-#define LANE_NUMBERS (places)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
+#define LANE_NUMBERS (indices)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
 #else
 #define AT(from, place) ((real)(from)[place])
 #define LANE_NUMBERS 0L
@@ -27,17 +39,17 @@ kernel void line_fit_sets(global const INPUT *restrict points,
                           global real *restrict covariance, global real *restrict scale, global int *restrict inliers,
                           global real *restrict weights, global uchar *restrict status, const long lines,
                           const int count, constant int *pairs, const int trials, const int steps,
-                          const real smallest) {
+                          const real min_scale) {
     reals x[CAPACITY], y[CAPACITY], certainty[CAPACITY], distances[CAPACITY];
     const long first = (long)get_global_id(0) * LANES;
     if (first >= lines) return;
-    const places line = min((places)first + LANE_NUMBERS, (places)(lines - 1));
-    const places set = line * (places)count;
-    // Near the first points: coordinates of a large image have few digits left for distances.
+    const indices line = min((indices)first + LANE_NUMBERS, (indices)(lines - 1));
+    const indices set = line * (indices)count;
+    // Coordinates relative to the first valid point: coordinates of a large image leave few digits for distances.
     reals origin_x = 0, origin_y = 0, reach = 0;
     masks found = 0;
     for (int i = 0; i < count; i++) {
-        const places at = set + (places)i;
+        const indices at = set + (indices)i;
         const reals px = AT(points, 2 * at), py = AT(points, (2 * at + 1));
         masks good = ~(mask_of(LANED(not_finite)(px)) | mask_of(LANED(not_finite)(py)));
 #ifdef WITH_SIGMA
@@ -60,18 +72,19 @@ kernel void line_fit_sets(global const INPUT *restrict points,
         x[i] = kept_where(good, x[i] - origin_x);
         y[i] = kept_where(good, y[i] - origin_y);
     }
-    // No scale below what the points' own rounding makes.
+    // The scale is at least the rounding error of the coordinates: eps times the largest |x| + |y|, in sigmas.
     const reals rounding = (reals)REAL_EPSILON * reach + (reals)1e-30f;
-    const reals floor_of_scale = rounding > (reals)smallest ? rounding : (reals)smallest;
+    const reals least_scale = rounding > (reals)min_scale ? rounding : (reals)min_scale;
     const laned_points all = {x, y, certainty, distances, count};
-    laned_fit fit = line_fit(all, pairs, trials, steps, floor_of_scale);
+    laned_fit fit = line_fit(all, pairs, trials, steps, least_scale);
 
     const masks few = mask_of(fit.points < 2);
     const masks bad = few | fit.coincide;
     masks flags = few ? (masks)STATUS_NO_DATA : (fit.coincide ? (masks)STATUS_AMBIGUOUS : (masks)0);
     flags |= ~bad & mask_of(2 * fit.inliers < fit.points) & (masks)STATUS_AMBIGUOUS;
-    // One way along a line is as good as the other: to the right, or straight up.
-    const masks back = mask_of(fit.line.c < (reals)0) | (mask_of(fit.line.c == (reals)0) & mask_of(fit.line.s < (reals)0));
+    // The direction is ambiguous by half a turn: choose c > 0, or c = 0 and s > 0.
+    const masks back =
+        mask_of(fit.line.c < (reals)0) | (mask_of(fit.line.c == (reals)0) & mask_of(fit.line.s < (reals)0));
     const reals c = back ? -fit.line.c : fit.line.c, s = back ? -fit.line.s : fit.line.s;
     const reals at_x = fit.line.x + origin_x, at_y = fit.line.y + origin_y;
     const reals nx = nan_where(bad, -s), ny = nan_where(bad, c), d = nan_where(bad, c * at_y - s * at_x);

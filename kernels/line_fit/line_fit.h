@@ -1,4 +1,11 @@
-// A straight line through points, of which some may be far from it: one line in each lane.
+// Robust straight line through points, one line per lane.
+//
+// The line minimises sum rho(v / (sigma scale)), v = c (y - y0) - s (x - x0) the distance of a point to the line
+// through (x0, y0) along (c, s), and rho the loss of common/robust.h. The start is the best line through a pair of
+// points; iteratively reweighted total least squares refines it.
+//
+// Options: GIVEN_SCALE: known scale of the distances in sigmas; otherwise it is estimated from their median.
+//          EFFICIENCY: of the loss for normal residuals, for the covariance at a known scale.
 #ifndef LINE_FIT_H
 #define LINE_FIT_H
 
@@ -8,27 +15,29 @@
 #define SCALE ((real)(GIVEN_SCALE))
 #endif
 
-// Through (x, y), along the unit vector (c, s).
+// Line through (x, y) along the unit vector (c, s).
 typedef struct {
     reals x, y, c, s;
 } laned_line;
 
-// Of each lane: places, and 1/sigma of each, zero where a point is missing.
+// Points of each lane, and their certainties 1/sigma (0: missing point).
 typedef struct {
     private const reals *x;
     private const reals *y;
     private const reals *certainty;
-    private reals *distances; // room for as many
+    private reals *distances; // scratch space for `count` values
     int count;
 } laned_points;
 
+// Fitted line; variances of its angle [rad2] and of its offset at (x, y).
 typedef struct {
     laned_line line;
     reals scale, variance_of_angle, variance_of_offset;
-    masks points, inliers; // how many there are, and how many weigh anything
-    masks coincide;        // no direction: all places are one
+    masks points, inliers; // number of points, and of points with a weight above 0
+    masks coincide;        // lanes whose points coincide: no direction
 } laned_fit;
 
+// Return the signed distance of (x, y) to the line.
 static inline reals line_distance(laned_line line, reals x, reals y) {
     return line.c * (y - line.y) - line.s * (x - line.x);
 }
@@ -42,7 +51,8 @@ static inline void line_distances(laned_line line, laned_points all) {
     }
 }
 
-// How badly a line does: the loss at the scale that is known, or the median of the distances to a percent.
+// Return the score of a line, least is best: the loss where the scale is given, otherwise the distance of the given
+// rank (median) to 1 %.
 static inline reals line_score(laned_line line, laned_points all, masks rank) {
 #ifdef SCALE
     reals sum = 0;
@@ -55,7 +65,7 @@ static inline reals line_score(laned_line line, laned_points all, masks rank) {
 #endif
 }
 
-// The weighted middle of all points, and any direction.
+// Return the line through the weighted mean of all points, along x.
 static inline laned_line line_middle(laned_points all) {
     reals sum = 0, sum_x = 0, sum_y = 0;
     for (int i = 0; i < all.count; i++) {
@@ -66,7 +76,7 @@ static inline laned_line line_middle(laned_points all) {
     return (laned_line){sum_x * per, sum_y * per, 1, 0};
 }
 
-// Of the lines through pairs of points the one that does best.
+// Find the line through a pair of points with the least score. A pair of coinciding or missing points is skipped.
 static inline laned_line line_start(laned_points all, constant const int *pairs, int trials, masks rank) {
     laned_line best = line_middle(all);
     reals least = INFINITY;
@@ -77,19 +87,25 @@ static inline laned_line line_start(laned_points all, constant const int *pairs,
         const masks usable =
             mask_of(square > (reals)0) & mask_of(all.certainty[i] * all.certainty[j] > (reals)0);
         const reals per = (reals)1 / sqrt(usable ? square : (reals)1);
-        const laned_line tried = {all.x[i], all.y[i], along_x * per, along_y * per};
-        const reals score = line_score(tried, all, rank);
+        const laned_line candidate = {all.x[i], all.y[i], along_x * per, along_y * per};
+        const reals score = line_score(candidate, all, rank);
         const masks better = usable & mask_of(score < least);
         least = better ? score : least;
-        best.x = better ? tried.x : best.x;
-        best.y = better ? tried.y : best.y;
-        best.c = better ? tried.c : best.c;
-        best.s = better ? tried.s : best.s;
+        best.x = better ? candidate.x : best.x;
+        best.y = better ? candidate.y : best.y;
+        best.c = better ? candidate.c : best.c;
+        best.s = better ? candidate.s : best.s;
     }
     return best;
 }
 
-// One step of weighted total least squares. The line is turned from where it is: half its angle needs no arctangent.
+// Do one step of reweighted total least squares (orthogonal regression).
+//
+// With the central moments S of the points in the frame of the current line (u along it, v across), the line of least
+// sum w v^2 is turned by phi / 2, tan(phi) = 2 S_uv / (S_uu - S_vv). Half-angle formulas need no arctangent:
+// cos(phi / 2) = sqrt((1 + cos(phi)) / 2), sin(phi / 2) = sin(phi) / (2 cos(phi / 2)). Both use |cos(phi)|, which
+// avoids cancellation; where cos(phi) < 0, cosine and sine of the half angle are exchanged. `coincide` gets the lanes
+// without a direction: S_uu = S_vv and S_uv = 0 up to rounding.
 static inline laned_line line_step(laned_line line, laned_points all, reals per_scale, masks *coincide) {
     reals sum = 0, sum_u = 0, sum_v = 0, sum_uu = 0, sum_uv = 0, sum_vv = 0;
     for (int i = 0; i < all.count; i++) {
@@ -105,11 +121,11 @@ static inline laned_line line_step(laned_line line, laned_points all, reals per_
     const reals length = sqrt(along * along + across * across);
     const masks none = mask_of(!(length > (reals)(16 * REAL_EPSILON) * (sum_uu + sum_vv))) | mask_of(!(sum > (reals)0));
     const reals over = (reals)1 / (none ? (reals)1 : length);
-    // A sum of squares across that is larger than along: the points say that the line is the other way round.
-    const masks stands = mask_of(along < (reals)0);
+    // S_vv > S_uu: the turn exceeds 45 degrees.
+    const masks is_steep = mask_of(along < (reals)0);
     const reals part = sqrt((reals)0.5 + (reals)0.5 * FABS(along) * over);
     const reals rest = FABS(across) * over / ((reals)2 * part);
-    const reals turned_c = stands ? rest : part, turned = stands ? part : rest;
+    const reals turned_c = is_steep ? rest : part, turned = is_steep ? part : rest;
     const reals turned_s = across < (reals)0 ? -turned : turned;
     laned_line next = {line.x + line.c * u - line.s * v, line.y + line.s * u + line.c * v,
                        line.c * turned_c - line.s * turned_s, line.s * turned_c + line.c * turned_s};
@@ -120,22 +136,29 @@ static inline laned_line line_step(laned_line line, laned_points all, reals per_
     return next;
 }
 
-// By the median of the distances; of those only within `reach`, once a scale is known: outliers raise the median too.
-static inline reals line_scale(laned_line line, laned_points all, reals reach, real few, reals smallest) {
+// Return the scale of the distances in sigmas: GIVEN_SCALE, or 1.4826 times the median absolute distance with the
+// small-sample correction 1 + few / (n - 2). Only distances up to `reach` take part: once a first scale is known, this
+// removes the outliers, which raise the median.
+static inline reals line_scale(laned_line line, laned_points all, reals reach, real few, reals min_scale) {
 #ifdef SCALE
     return (reals)SCALE;
 #else
     line_distances(line, all);
     masks within = 0;
-    for (int i = 0; i < all.count; i++) within -= mask_of(all.distances[i] <= reach) & mask_of(all.certainty[i] > (reals)0);
+    for (int i = 0; i < all.count; i++)
+        within -= mask_of(all.distances[i] <= reach) & mask_of(all.certainty[i] > (reals)0);
     const reals middle = ranked_of(all.distances, all.count, (within >> 1) + 1, 0);
     const reals free = LANED(convert_real)(within) - (reals)2;
     const reals scale = (reals)MAD_TO_SIGMA * ((reals)1 + (reals)few / (free > (reals)1 ? free : (reals)1)) * middle;
-    return scale > smallest ? scale : smallest;
+    return scale > min_scale ? scale : min_scale;
 #endif
 }
 
-// Adds to the fit what its residuals say about it.
+// Compute the number of inliers and the variances.
+//
+// Covariance of an M-estimator (Huber, 1981): f A^-1 with A = sum of h h^T / sigma^2 over the inliers. A is diagonal
+// for offset and angle at the weighted mean: sum w and sum w u^2. With a given scale f = scale^2 / EFFICIENCY,
+// otherwise f = scale^2 (sum psi(z)^2 / (n - 2)) / (mean psi'(z))^2, NaN for two inliers.
 static inline void line_variances(laned_fit *fit, laned_points all) {
     const reals per_scale = (reals)1 / fit->scale;
     reals sum = 0, sum_uu = 0, slopes = 0, squares = 0;
@@ -164,21 +187,23 @@ static inline void line_variances(laned_fit *fit, laned_points all) {
     fit->variance_of_angle = factor / sum_uu;
 }
 
-static inline laned_fit line_fit(laned_points all, constant const int *pairs, int trials, int steps, reals smallest) {
-    laned_fit fit = {line_middle(all), smallest, 0, 0, 0, 0, 0};
+// Fit the lines: start, then `steps` reweighted steps. `pairs` (trials, 2) holds the points of the start candidates.
+static inline laned_fit line_fit(laned_points all, constant const int *pairs, int trials, int steps, reals min_scale) {
+    laned_fit fit = {line_middle(all), min_scale, 0, 0, 0, 0, 0};
     for (int i = 0; i < all.count; i++) fit.points -= mask_of(all.certainty[i] > (reals)0);
 #ifdef ROBUST
     fit.line = line_start(all, pairs, trials, (fit.points >> 1) + 1);
-    fit.scale = line_scale(fit.line, all, (reals)INFINITY, FEW_TRIED, smallest);
+    fit.scale = line_scale(fit.line, all, (reals)INFINITY, FEW_TRIED, min_scale);
 #endif
     for (int step = 0; step < steps; step++) {
-        // About a line that all its points have moved, the median says more than about one through two of them.
+        // Estimate the scale again: residuals of a line fitted to all points are more accurate than those of a line
+        // through two points.
         if (RESCALED_AT(step))
-            fit.scale = line_scale(fit.line, all, (reals)2.5f * fit.scale, FEW_FITTED, smallest);
+            fit.scale = line_scale(fit.line, all, (reals)2.5f * fit.scale, FEW_FITTED, min_scale);
         fit.line = line_step(fit.line, all, (reals)1 / fit.scale, &fit.coincide);
     }
 #ifndef ROBUST
-    fit.scale = line_scale(fit.line, all, (reals)INFINITY, FEW_FITTED, smallest);
+    fit.scale = line_scale(fit.line, all, (reals)INFINITY, FEW_FITTED, min_scale);
 #endif
     line_variances(&fit, all);
     return fit;

@@ -1,20 +1,34 @@
-// Sums of a map's cells under many shifts, for positions that are neighbours as the cells are. Sums of integers: exact,
-// in any order. CPU runtimes take 64 positions at once in registers, for some rows; GPUs an item per position.
+// Costs of the poses of a grid: for each heading and position, the sum of a map's levels at the cells of all points.
+//
+// For one heading a point is a fixed offset (shift) into the map: score(row, column) = sum over points of
+// level[row stride + column + shift] / (LEVELS used). Adjacent positions read adjacent cells. The sums are of integers:
+// exact in any order.
+//
+// Inputs:  level (map rows, stride) uint16, 0 to LEVELS; shifts (used,) of one heading.
+// Outputs: scores (headings, rows, columns) float32, 0 to 1, with WITH_SCORES; least (headings, rows, blocks) float32,
+//          the least score of each block of BLOCK adjacent positions; column (headings, rows, blocks) int32, its
+//          column, the first of equal scores. NaN scores where no point is used.
+// Options: LEVELS (of the includer): the cost 1 in the map; WITH_SCORES.
+// Variants: vector (sum_rows): 64 positions at once in four vectors of 16, for some rows; work-item (sum_block): a
+//          group of BLOCK items per block, an item per position.
 #ifndef SHIFT_SUMS_H
 #define SHIFT_SUMS_H
 
 #define BLOCK 64
-// So many cells of LEVELS each fit sixteen bits.
+// Number of levels that are summed in 16 bits without overflow: 64 * 1023 = 65472 < 65536.
 #define CHUNK 64
 #define NO_KEY 0xffffffffu
 
-// Where a block begins: the last one moves back, so as to be whole, and does some positions twice.
+// Return the first column of a block. The last block moves back to end with the row, and repeats some positions.
 static inline int block_from(int block, int columns) { return min(block * BLOCK, max(columns - BLOCK, 0)); }
 
-// From a sum to a score: NaN where there is none.
+// Return the factor from a sum to a score; NaN if no point is used.
 static inline float score_scale(int used) { return used ? 1.0f / (float)(LEVELS * used) : NAN; }
 
-// The least cost of a block and where it is, in one number.
+// Store the least score of a block and its column from a key, sum * BLOCK + position in the block.
+//
+// The least key holds the least sum, and among equal sums the first position: one minimum finds both. It fits 32 bits:
+// 4096 points * 1023 * 64 < 2^32.
 static inline void store_least(uint key, float scale, global float *least, global int *column, size_t to, int from) {
     least[to] = (float)(key / BLOCK) * scale;
     column[to] = from + (int)(key % BLOCK);
@@ -26,17 +40,22 @@ typedef float16 floats_at __attribute__((aligned(4)));
 
 #define LOWER(a, b) ((a) < (b) ? (a) : (b))
 
-static inline uint least_lane(uint16 of) {
+// Return the minimum over the lanes.
+static inline uint min_of_lanes(uint16 of) {
     const uint8 eight = LOWER(of.lo, of.hi);
     const uint4 four = LOWER(eight.lo, eight.hi);
     const uint2 two = LOWER(four.lo, four.hi);
     return LOWER(two.x, two.y);
 }
 
-// All positions of the rows from `first` up to `end`, for the shifts of one heading.
-static inline void sum_rows(global const ushort *restrict level, private const int *shifts, int used, int turn, int first,
-                     int end, int rows, int columns, int stride, global float *restrict scores,
-                     global float *restrict least, global int *restrict column) {
+// Sum all positions of the rows `first` to `end` - 1, for the shifts of one heading (index `turn`).
+//
+// Chunks of CHUNK points are summed in 16 bits, then added to sums of 32 bits: twice as many lanes per instruction as
+// with 32 bits throughout. A map narrower than a block is read beyond its columns (the host provides the cells), but
+// only `columns` positions count.
+static inline void sum_rows(global const ushort *restrict level, private const int *shifts, int used, int turn,
+                            int first, int end, int rows, int columns, int stride, global float *restrict scores,
+                            global float *restrict least, global int *restrict column) {
     const int blocks = (columns + BLOCK - 1) / BLOCK;
     const float scale = score_scale(used);
     const uint16 lane = (uint16)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
@@ -66,7 +85,7 @@ static inline void sum_rows(global const ushort *restrict level, private const i
             uint key = NO_KEY;
             if (columns >= BLOCK) {
                 const uint16 ab = LOWER(ka, kb), cd = LOWER(kc, kd);
-                key = least_lane(LOWER(ab, cd));
+                key = min_of_lanes(LOWER(ab, cd));
 #ifdef WITH_SCORES
                 global float *to = scores + place * columns + from;
                 *(global floats_at *)to = convert_float16(a) * scale;
@@ -91,10 +110,11 @@ static inline void sum_rows(global const ushort *restrict level, private const i
         }
 }
 #else
-// One block of positions by a group of BLOCK items; `key` holds NO_KEY, and both it and the shifts stand for all items.
+// Sum one block of positions with a group of BLOCK items. The caller sets `key` to NO_KEY and fills `shifts`, followed
+// by a barrier.
 static inline void sum_block(global const ushort *restrict level, local const int *shifts, int used, local uint *key,
-                      int columns, int stride, global float *restrict scores, global float *restrict least,
-                      global int *restrict column) {
+                             int columns, int stride, global float *restrict scores, global float *restrict least,
+                             global int *restrict column) {
     const int item = (int)get_local_id(0), block = (int)get_group_id(0), row = (int)get_group_id(1),
               turn = (int)get_group_id(2), rows = (int)get_num_groups(1), blocks = (int)get_num_groups(0);
     const int from = block_from(block, columns), at = from + item;

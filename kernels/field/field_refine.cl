@@ -1,51 +1,76 @@
-// From rough poses to good ones: Levenberg and Marquardt's steps on the sum of r^2 / (c^2 + r^2), r from a point to the
-// line nearest to it, exactly: the map only says which few to look at. One start a work-item.
+// Refinement of robot poses by Levenberg-Marquardt steps on the robust cost of points near field lines.
+//
+// The cost is sum r^2 / (c^2 + r^2) (Geman-McClure loss) over the points, r the exact distance of a point to the
+// nearest line. The distance map only selects up to NEAREST candidate lines per cell.
+//
+// Inputs:  points (count, 2) in the robot's frame [m]; starts (starts, 3) x, y [m], heading [rad]; scale_squared: c^2
+//          [m2]; max_range_squared: square of the largest range of a point [m2].
+// Tables:  shapes (lines, SHAPE) (field.h); nearest (rows, columns, NEAREST) (distance_map.cl), with first_x, first_y,
+//          cell: centre of the first cell and size of a cell [m].
+// Outputs: poses (starts, 3); covariance, information (starts, 3, 3) [m2, m rad, rad2, and inverse]; score (starts,)
+//          mean cost, 0 to 1; scale (starts,) standard deviation of an inlier's distance [m]; share (starts,) fraction
+//          of the points within c of a line; status (starts,).
+// Options: WEAKEST: least ratio of eigenvalues of a determined pose.
+//
+// One work-item refines one start.
 #include "field/field.h"
 #include "common/status.h"
 
+// Cost; normal matrix J^T W J by (x, y, t); gradient J^T W r. t is the heading.
 typedef struct {
     float cost, xx, xy, yy, xt, yt, tt, x, y, t;
 } normal_equations;
 
+// Grid of the distance map; per_cell: cells per metre.
 typedef struct {
     float first_x, first_y, per_cell;
     int rows, columns;
 } field_grid;
 
-// A point seen from a pose: its residual and that one's slopes.
+// Residual r of a point at a pose [m], and its derivatives by x, y and t.
 typedef struct {
     float r, x, y, t;
 } field_row;
 
-static inline field_row row_of(float2 point, float3 pose, float2 turn, constant float *shapes, global const uchar *nearest,
-                        field_grid grid) {
+// Compute residual and derivatives of a point. `turn` holds cosine and sine of the heading. The derivative by the
+// heading is the gradient times the derivative of the rotated point, (-dy, dx).
+static inline field_row row_of(float2 point, float3 pose, float2 turn, constant float *shapes,
+                               global const uchar *nearest, field_grid grid) {
     const float dx = turn.x * point.x - turn.y * point.y, dy = turn.y * point.x + turn.x * point.y;
     const float x = pose.x + dx, y = pose.y + dy;
     const int column = convert_int_sat_rte((x - grid.first_x) * grid.per_cell);
     const int row = convert_int_sat_rte((y - grid.first_y) * grid.per_cell);
     const size_t cell = (size_t)clamp(row, 0, grid.rows - 1) * grid.columns + clamp(column, 0, grid.columns - 1);
-    global const uchar *may = nearest + NEAREST * cell;
-    field_offset offset = field_away(shapes + SHAPE * may[0], x, y);
-    for (int k = 1; k < NEAREST && may[k] != may[0]; k++) {
-        const field_offset other = field_away(shapes + SHAPE * may[k], x, y);
-        offset = fabs(other.away) < fabs(offset.away) ? other : offset;
+    global const uchar *candidates = nearest + NEAREST * cell;
+    field_offset offset = field_distance(shapes + SHAPE * candidates[0], x, y);
+    for (int k = 1; k < NEAREST && candidates[k] != candidates[0]; k++) {
+        const field_offset other = field_distance(shapes + SHAPE * candidates[k], x, y);
+        offset = fabs(other.distance) < fabs(offset.distance) ? other : offset;
     }
-    const field_row result = {offset.away, offset.x, offset.y, offset.y * dx - offset.x * dy};
+    const field_row result = {offset.distance, offset.x, offset.y, offset.y * dx - offset.x * dy};
     return result;
 }
 
-// Whether it is finite and within the reach, by squares.
-static inline int point_counts(float2 point, float farthest) { return point.x * point.x + point.y * point.y <= farthest; }
+// Return whether a point is finite and within the largest range (given as its square). NaN compares false.
+static inline int point_counts(float2 point, float max_range_squared) {
+    return point.x * point.x + point.y * point.y <= max_range_squared;
+}
 
+// Sum cost and normal equations at a pose.
+//
+// With share = c^2 / (c^2 + r^2) the cost of a point is 1 - share, and its derivative by r is 2 r share^2 / c^2: the
+// weight of iteratively reweighted least squares is share^2. The factor 2 / c^2 is left out: it does not change the
+// step.
 static inline normal_equations equations_at(global const float *points, int count, float3 pose, constant float *shapes,
-                                     global const uchar *nearest, field_grid grid, float square, float farthest) {
+                                            global const uchar *nearest, field_grid grid, float scale_squared,
+                                            float max_range_squared) {
     const float2 turn = (float2)(cos(pose.z), sin(pose.z));
     normal_equations sum = {0};
     for (int i = 0; i < count; i++) {
         const float2 point = (float2)(points[2 * i], points[2 * i + 1]);
-        if (!point_counts(point, farthest)) continue;
+        if (!point_counts(point, max_range_squared)) continue;
         const field_row at = row_of(point, pose, turn, shapes, nearest, grid);
-        const float share = square / (square + at.r * at.r), weight = share * share, pull = weight * at.r;
+        const float share = scale_squared / (scale_squared + at.r * at.r), weight = share * share, psi = weight * at.r;
         sum.cost += 1.0f - share;
         sum.xx += weight * at.x * at.x;
         sum.xy += weight * at.x * at.y;
@@ -53,14 +78,14 @@ static inline normal_equations equations_at(global const float *points, int coun
         sum.xt += weight * at.x * at.t;
         sum.yt += weight * at.y * at.t;
         sum.tt += weight * at.t * at.t;
-        sum.x += pull * at.x;
-        sum.y += pull * at.y;
-        sum.t += pull * at.t;
+        sum.x += psi * at.x;
+        sum.y += psi * at.y;
+        sum.t += psi * at.t;
     }
     return sum;
 }
 
-// Cofactors of a symmetric matrix (xx, xy, yy, xt, yt, tt), as its own fields.
+// Return the cofactors of the symmetric matrix (xx, xy, yy, xt, yt, tt), in the same fields.
 static inline normal_equations cofactors(normal_equations of) {
     normal_equations c = {0};
     c.xx = of.yy * of.tt - of.yt * of.yt;
@@ -72,7 +97,10 @@ static inline normal_equations cofactors(normal_equations of) {
     return c;
 }
 
-// Solves (M + damping) step = -g; angles in units of 1 / lever, so that damping means the same for all three.
+// Solve (M + damping trace(M) I) step = -g by cofactors.
+//
+// The heading is scaled to a length, t / lever, with lever = 1 / (root-mean-square distance of the points): the damping
+// then affects all three unknowns alike.
 static inline float3 damped_step(normal_equations of, float damping, float lever) {
     const float more = damping * (of.xx + of.yy + of.tt * lever * lever) + 1e-20f;
     of.xx += more;
@@ -88,6 +116,7 @@ static inline float3 damped_step(normal_equations of, float damping, float lever
                     (c.xt * of.x + c.yt * of.y + c.tt * of.t) * scale * lever);
 }
 
+// Store a symmetric matrix times `scale` as (3, 3).
 static inline void store_symmetric(global float *to, normal_equations of, float scale) {
     to[0] = of.xx * scale;
     to[1] = to[3] = of.xy * scale;
@@ -103,76 +132,82 @@ kernel void field_refine(global const float *restrict points, global const float
                          global float *restrict scale, global float *restrict share, global uchar *restrict status,
                          constant float *shapes, global const uchar *restrict nearest, const int count,
                          const int rows, const int columns, const float first_x, const float first_y,
-                         const float cell, const float square, const float farthest, const int steps) {
+                         const float cell, const float scale_squared, const float max_range_squared, const int steps) {
     const size_t i = get_global_id(0);
     const field_grid grid = {first_x, first_y, 1.0f / cell, rows, columns};
     float3 pose = (float3)(starts[3 * i], starts[3 * i + 1], starts[3 * i + 2]);
-    float levers = 0, used = 0;
+    float sum_squares = 0, used = 0;
     for (int k = 0; k < count; k++) {
         const float2 point = (float2)(points[2 * k], points[2 * k + 1]);
-        if (!point_counts(point, farthest)) continue;
-        levers += point.x * point.x + point.y * point.y;
+        if (!point_counts(point, max_range_squared)) continue;
+        sum_squares += point.x * point.x + point.y * point.y;
         used += 1;
     }
     const int finite = fabs(pose.x) + fabs(pose.y) + fabs(pose.z) < 1e6f;
-    const float lever = 1.0f / sqrt(levers / fmax(used, 1.0f) + 1e-12f);
+    const float lever = 1.0f / sqrt(sum_squares / fmax(used, 1.0f) + 1e-12f);
     normal_equations here = {0};
-    if (finite) here = equations_at(points, count, pose, shapes, nearest, grid, square, farthest);
+    if (finite) here = equations_at(points, count, pose, shapes, nearest, grid, scale_squared, max_range_squared);
     float damping = 1e-4f;
     for (int step = 0; finite && step < steps && damping < 1e6f; step++) {
         const float3 by = damped_step(here, damping, lever);
         const float3 next = pose + by;
-        const normal_equations there = equations_at(points, count, next, shapes, nearest, grid, square, farthest);
-        // As good as the sum's rounding can tell: near the least cost the step says more than the cost.
+        const normal_equations there =
+            equations_at(points, count, next, shapes, nearest, grid, scale_squared, max_range_squared);
+        // Accept a cost that is equal within the rounding of the sum: near the minimum the step is more accurate than
+        // the difference of costs.
         const int better = there.cost <= here.cost * 1.000004f;
         damping = better ? fmax(0.1f * damping, 1e-7f) : 10.0f * damping;
         pose = better ? next : pose;
         here = better ? there : here;
         if (fabs(by.x) + fabs(by.y) + fabs(by.z) / lever < 3e-6f) break;
     }
-    // The curvature of the cost, and what the points' own scatter makes of it.
+    // Covariance of an M-estimator (Huber, 1981), variance * H^-1: H = sum psi'(r) h h^T with psi(r) = r share^2 and
+    // psi'(r) = share^2 (4 share - 3), clipped at 0, and variance = sum psi^2 / (sum psi' - 3). The heading is scaled
+    // by lever.
     const float2 turn = (float2)(cos(pose.z), sin(pose.z));
-    normal_equations bent = {0};
-    float bends = 0, pulls = 0, close = 0;
+    normal_equations hessian = {0};
+    float sum_curvature = 0, sum_psi_squared = 0, inliers = 0;
     for (int k = 0; finite && k < count; k++) {
         const float2 point = (float2)(points[2 * k], points[2 * k + 1]);
-        if (!point_counts(point, farthest)) continue;
+        if (!point_counts(point, max_range_squared)) continue;
         const field_row at = row_of(point, pose, turn, shapes, nearest, grid);
-        const float part = square / (square + at.r * at.r), weight = part * part;
-        const float bend = fmax(weight * (4.0f * part - 3.0f), 0.0f);
-        bends += bend;
-        pulls += weight * weight * at.r * at.r;
-        close += at.r * at.r < square;
-        bent.xx += bend * at.x * at.x;
-        bent.xy += bend * at.x * at.y;
-        bent.yy += bend * at.y * at.y;
-        bent.xt += bend * at.x * at.t * lever;
-        bent.yt += bend * at.y * at.t * lever;
-        bent.tt += bend * at.t * at.t * lever * lever;
+        const float part = scale_squared / (scale_squared + at.r * at.r), weight = part * part;
+        const float curvature = fmax(weight * (4.0f * part - 3.0f), 0.0f);
+        sum_curvature += curvature;
+        sum_psi_squared += weight * weight * at.r * at.r;
+        inliers += at.r * at.r < scale_squared;
+        hessian.xx += curvature * at.x * at.x;
+        hessian.xy += curvature * at.x * at.y;
+        hessian.yy += curvature * at.y * at.y;
+        hessian.xt += curvature * at.x * at.t * lever;
+        hessian.yt += curvature * at.y * at.t * lever;
+        hessian.tt += curvature * at.t * at.t * lever * lever;
     }
-    normal_equations inverse = cofactors(bent);
-    const float determinant = bent.xx * inverse.xx + bent.xy * inverse.xy + bent.xt * inverse.xt;
-    const float minors = inverse.xx + inverse.yy + inverse.tt, all = bent.xx + bent.yy + bent.tt;
-    const int few = used < 4 || bends < 4;
+    normal_equations inverse = cofactors(hessian);
+    const float determinant = hessian.xx * inverse.xx + hessian.xy * inverse.xy + hessian.xt * inverse.xt;
+    const float minors = inverse.xx + inverse.yy + inverse.tt, all = hessian.xx + hessian.yy + hessian.tt;
+    const int few = used < 4 || sum_curvature < 4;
     const float last_x = first_x + cell * (float)(columns - 1), last_y = first_y + cell * (float)(rows - 1);
     const int outside = !(pose.x >= first_x && pose.x <= last_x && pose.y >= first_y && pose.y <= last_y);
+    // det > WEAKEST trace (sum of principal minors): for eigenvalues l1 << l2 <= l3 this bounds l1 / l3.
     const int weak = !(determinant > (float)WEAKEST * all * minors);
     const int bad = !finite || few || outside;
     status[i] = !finite ? STATUS_NOT_FINITE
-                        : (few ? STATUS_LOW_SIGNAL : (outside ? STATUS_OUT_OF_RANGE : (weak ? STATUS_AMBIGUOUS : STATUS_OK)));
-    const float variance = pulls / fmax(bends - 3.0f, 1.0f) + 1e-12f;
+                        : (few ? STATUS_LOW_SIGNAL
+                               : (outside ? STATUS_OUT_OF_RANGE : (weak ? STATUS_AMBIGUOUS : STATUS_OK)));
+    const float variance = sum_psi_squared / fmax(sum_curvature - 3.0f, 1.0f) + 1e-12f;
     poses[3 * i] = bad ? NAN : pose.x;
     poses[3 * i + 1] = bad ? NAN : pose.y;
     poses[3 * i + 2] = bad ? NAN : pose.z - 6.2831853071795865f * rint(pose.z / 6.2831853071795865f);
     score[i] = bad ? NAN : here.cost / used;
     scale[i] = bad ? NAN : sqrt(variance);
-    share[i] = bad ? NAN : close / used;
-    bent.xt /= lever;
-    bent.yt /= lever;
-    bent.tt /= lever * lever;
+    share[i] = bad ? NAN : inliers / used;
+    hessian.xt /= lever;
+    hessian.yt /= lever;
+    hessian.tt /= lever * lever;
     inverse.xt *= lever;
     inverse.yt *= lever;
     inverse.tt *= lever * lever;
-    store_symmetric(information + 9 * i, bent, bad ? NAN : 1.0f / variance);
+    store_symmetric(information + 9 * i, hessian, bad ? NAN : 1.0f / variance);
     store_symmetric(covariance + 9 * i, inverse, bad || weak ? NAN : variance / determinant);
 }

@@ -1,12 +1,23 @@
-// What the points of a view cost at every pose of a grid. Positions lie as the map's cells do: for one heading a point
-// is one shift of the map (shift_sums.h).
+// Cost of the points of a view at every pose of a grid (exhaustive search).
+//
+// The positions are the centres of the map's cells: for one heading, a point is one shift of the map (shift_sums.h).
+// The cost of a pose is the mean of the levels of the cells in which the points lie.
+//
+// Inputs:  points (count, 2) in the robot's frame [m]; points that are not finite, or out of range, are not used.
+// Tables:  level (map rows, stride) uint16 (distance_map.cl), border: cells around the positions; headings (headings,
+//          2) cosine and sine; per_cell: cells per metre; max_range_squared: square of the largest range [m2].
+// Outputs: scores, least, column (shift_sums.h); seen (headings,) number of points used.
+// Options: FIELD_LEVELS, CAPACITY (size of the array of shifts), WITH_SCORES.
+// Variants: vector: a work-item per heading and `each` rows of positions; work-item: a group of BLOCK items per heading
+//          and block of positions.
 #define LEVELS FIELD_LEVELS
 #include "common/shift_sums.h"
 
-// The shift of a point for a heading; negative where it has none: not finite, or further than the reach.
-static inline int shift_of(float2 point, float2 heading, float per_cell, float square, int border, int stride) {
-    // False for NaN, too.
-    if (!(point.x * point.x + point.y * point.y <= square)) return -1;
+// Return the shift of a point for a heading; -1 for a point that is not finite or out of range.
+static inline int shift_of(float2 point, float2 heading, float per_cell, float max_range_squared, int border,
+                           int stride) {
+    // NaN compares false.
+    if (!(point.x * point.x + point.y * point.y <= max_range_squared)) return -1;
     const float x = (heading.x * point.x - heading.y * point.y) * per_cell;
     const float y = (heading.y * point.x + heading.x * point.y) * per_cell;
     return ((int)rint(y) + border) * stride + (int)rint(x) + border;
@@ -17,13 +28,13 @@ kernel void field_search(global const float *restrict points, global float *rest
                          global float *restrict least, global int *restrict column, global int *restrict seen,
                          global const ushort *restrict level, constant float *headings, const int count,
                          const int rows, const int columns, const int border, const int stride, const float per_cell,
-                         const float square, const int each) {
+                         const float max_range_squared, const int each) {
     const int turn = (int)get_global_id(1), first = (int)get_global_id(0) * each, end = min(first + each, rows);
     const float2 heading = (float2)(headings[2 * turn], headings[2 * turn + 1]);
     int shifts[CAPACITY], used = 0;
     for (int i = 0; i < count; i++) {
         const float2 point = (float2)(points[2 * i], points[2 * i + 1]);
-        const int shift = shift_of(point, heading, per_cell, square, border, stride);
+        const int shift = shift_of(point, heading, per_cell, max_range_squared, border, stride);
         shifts[used] = shift;
         used += shift >= 0;
     }
@@ -35,7 +46,7 @@ kernel void field_search(global const float *restrict points, global float *rest
                          global float *restrict least, global int *restrict column, global int *restrict seen,
                          global const ushort *restrict level, constant float *headings, const int count,
                          const int rows, const int columns, const int border, const int stride, const float per_cell,
-                         const float square, const int each) {
+                         const float max_range_squared, const int each) {
     const int item = (int)get_local_id(0), turn = (int)get_group_id(2);
     local int shifts[CAPACITY], used;
     local uint key;
@@ -46,8 +57,8 @@ kernel void field_search(global const float *restrict points, global float *rest
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int i = item; i < count; i += BLOCK) {
         const int shift = shift_of((float2)(points[2 * i], points[2 * i + 1]),
-                                   (float2)(headings[2 * turn], headings[2 * turn + 1]), per_cell, square, border,
-                                   stride);
+                                   (float2)(headings[2 * turn], headings[2 * turn + 1]), per_cell, max_range_squared,
+                                   border, stride);
         if (shift >= 0) shifts[atomic_inc(&used)] = shift;
     }
     barrier(CLK_LOCAL_MEM_FENCE);

@@ -1,7 +1,7 @@
-"""Pictures of range images to look at: heights in colours or as a lit relief, with their scales and what is missing.
+"""Pictures of range images: heights in colours or as shaded relief, with scale bars and a legend of missing heights.
 
-A cell without a height is never painted as if it had one: each reason has a colour of its own, and a legend says which
-and how many.
+A cell without a height gets the colour of its status flag. The legend gives the meaning of each colour and the fraction
+of the cells that have it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from matplotlib.colors import ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from gpuvision.host import to_numpy
 from gpuvision.host.files import replacing
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.status import Status
@@ -30,34 +31,47 @@ Style = Literal["colour", "shaded"]
 Array = npt.NDArray[Any]
 
 _STYLES = ("colour", "shaded")
-# Without its darkest end, on which no shade shows.
+# Viridis without its darkest 14 %, where the shading is not visible.
 _COLOURS = ListedColormap(mpl.colormaps["viridis"](np.linspace(0.14, 1.0, 256)))
 _DPI = 150
-_PICTURE_PX = 1100  # the map's longer side
+_PICTURE_PX = 1100  # longer side of the map
 _INK, _PAPER, _FAINT = "#22262b", "#ffffff", "#6b7280"
-# Light from the upper left, 50 degrees above the plane, and some from everywhere.
+# Unit vector (right, up, out of the picture) towards the lamp: from the upper left, 50 degrees above the plane.
 _LIGHT = np.array([-0.455, 0.455, 0.766])
-_AMBIENT, _FLAT, _STEEPEST, _USUAL_SLOPE = 0.3, 0.95, 4.0, 0.33
-_GREY = 0.78  # of a flat surface in the grey relief
-# Of several reasons the first one is shown: the rarer and graver before the common.
+# Brightness, 0 to 1: ambient light alone, and a flat surface under all light.
+_AMBIENT, _FLAT = 0.3, 0.95
+_MAX_SLOPE = 4.0  # steeper slopes are clipped before smoothing, so that a cliff does not darken its surroundings
+_SHOWN_SLOPE = 0.33  # slope after exaggeration, chosen by eye: 90 % of the slopes stay below it
+_GREY = 0.78  # brightness of a flat surface in the grey relief
+# Status flag, colour, text. A cell with several flags gets the first: rare and severe flags come before common ones.
 _REASONS = (
-    (Status.NO_DATA, "#cbd5e1", "hole: no measurement near enough"),
-    (Status.NOT_INVERTIBLE, "#e0218a", "folded: two surfaces share the place"),
+    (Status.NO_DATA, "#cbd5e1", "hole: no measurement within the gap limit"),
+    (Status.NOT_INVERTIBLE, "#e0218a", "folded: two surfaces share a cell"),
     (Status.OUT_OF_RANGE, "#f28c28", "out of range"),
     (Status.NOT_FINITE, "#d62728", "not finite"),
-    (Status.HORIZON, "#17becf", "horizon: the ray misses the sheet"),
+    (Status.HORIZON, "#17becf", "horizon: the ray misses the sheet of light"),
     (Status.AMBIGUOUS, "#b07aa1", "ambiguous: more than one peak"),
     (Status.SATURATED, "#bcbd22", "saturated"),
-    (Status.LOW_SIGNAL, "#4b5563", "dark: no light that counts"),
+    (Status.LOW_SIGNAL, "#4b5563", "low signal: below the threshold"),
 )
-# These come with a height, which is shown under a tint; a saturated line is as good as another one.
+# Cells with these flags may have a height, which is shown with a tint. SATURATED needs none: its heights are valid.
 _TINTED = Status.NOT_INVERTIBLE | Status.AMBIGUOUS
-_TINT = 0.45
+_TINT = 0.45  # weight of the tint
 _LENGTHS = ((1e-6, "µm"), (1e-3, "mm"), (1.0, "m"), (1e3, "km"))
 
 
-class Entry(NamedTuple):
-    """A line of the legend: what the colour means, and how much of the picture has it."""
+class LegendEntry(NamedTuple):
+    """Line of the legend.
+
+    Attributes
+    ----------
+    colour : str
+        Colour, ``#rrggbb``.
+    meaning : str
+        Reason why the height is missing or doubtful.
+    part : float
+        Fraction of the cells with this colour, 0 to 1.
+    """
 
     colour: str
     meaning: str
@@ -65,66 +79,75 @@ class Entry(NamedTuple):
 
 
 def length_unit(length: float) -> tuple[float, str]:
-    """Return the unit (in metres, and its name) in which a length is a number of one to three digits."""
+    """Return the unit (its length [m] and its name) in which a length [m] has one to three digits before the point."""
+    # A length within half of the last of three digits below a unit is rounded up to the unit.
     fitting = [each for each in _LENGTHS if abs(length) >= 0.9995 * each[0]]
     return fitting[-1] if fitting else _LENGTHS[0]
 
 
 def round_length(length: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is not above the length."""
+    """Return the largest number of the form 1, 2 or 5 times a power of ten that does not exceed the length."""
     power = 10.0 ** math.floor(math.log10(length))
     return max(each * power for each in (1.0, 2.0, 5.0) if each * power <= length * (1 + 1e-9))
 
 
-def steepness(z: Array, cell_x: float, cell_y: float) -> float:
-    """Return by how much slopes have to be exaggerated for a relief to show them: 1, 2, 5, 10 or 20.
+def choose_exaggeration(z: Array, cell_x: float, cell_y: float) -> float:
+    """Return the exaggeration of the heights that makes slopes visible in a relief: 1, 2, 5, 10 or 20.
 
-    Nine tenths of the slopes then stay below a third, whatever the edges do.
-    """
-    slopes = np.hypot(_slope(z, 1) / cell_x, _slope(z, 0) / cell_y)[np.isfinite(z)]
-    usual = float(np.percentile(slopes, 90)) if slopes.size else 0.0
-    return round_length(min(max(_USUAL_SLOPE / max(usual, 1e-9), 1.0), 20.0))
-
-
-def relief(z: Array, cell_x: float, cell_y: float, *, exaggeration: float = 1.0, blur: float = 1.5) -> Array:
-    """Light that a matt surface throws back, lit from the upper left; 0.95 where it is flat.
+    90 % of the exaggerated slopes are below 0.33; the percentile ignores the steep edges.
 
     Parameters
     ----------
-    z
-        Heights [m], rows downwards; NaN in holes.
-    cell_x, cell_y
+    z : numpy.ndarray
+        Heights [m], (rows, columns); NaN in holes.
+    cell_x, cell_y : float
         Distance between cells [m].
-    exaggeration
-        Of the heights.
-    blur
-        Standard deviation of the smoothing of slopes, in cells: a relief shows noise first.
+    """
+    slopes = np.hypot(_slope(z, 1) / cell_x, _slope(z, 0) / cell_y)[np.isfinite(z)]
+    percentile = float(np.percentile(slopes, 90)) if slopes.size else 0.0
+    # 1e-9 avoids a division by 0 on a plane; the result is clipped to 20 anyway.
+    return round_length(min(max(_SHOWN_SLOPE / max(percentile, 1e-9), 1.0), 20.0))
+
+
+def shade_relief(z: Array, cell_x: float, cell_y: float, *, exaggeration: float = 1.0, blur: float = 1.5) -> Array:
+    """Compute the brightness of a matt (Lambertian) surface that is lit from the upper left.
+
+    Parameters
+    ----------
+    z : numpy.ndarray
+        Heights [m], (rows, columns), rows downwards; NaN in holes.
+    cell_x, cell_y : float
+        Distance between cells [m].
+    exaggeration : float
+        Factor on the heights. Default 1.
+    blur : float
+        Standard deviation of the Gaussian smoothing of the slopes [cells], which suppresses noise. Default 1.5.
 
     Returns
     -------
     numpy.ndarray
-        As `z`; NaN in holes.
+        Brightness, (rows, columns): 0.95 where the surface is flat; NaN in holes.
     """
     known = np.isfinite(z)
-    steep = exaggeration * _slope(z, 1) / cell_x, exaggeration * _slope(z, 0) / cell_y
-    slopes = [-_blurred(steep[0], known, blur), _blurred(steep[1], known, blur)]
+    slope_x, slope_y = exaggeration * _slope(z, 1) / cell_x, exaggeration * _slope(z, 0) / cell_y
+    slopes = [-_smooth_slopes(slope_x, known, blur), _smooth_slopes(slope_y, known, blur)]
     normal = np.stack([*slopes, np.ones(z.shape)])
-    # What lies flat is nearly white, so that slopes darken and lighten the heights' colours but keep them.
+    # Normalised to 1 on flat surfaces, so that the shading keeps the hue of the height colours.
     lit = np.tensordot(_LIGHT / _LIGHT[2], normal, 1) / np.linalg.norm(normal, axis=0)
     shade: Array = np.where(known, _AMBIENT + (_FLAT - _AMBIENT) * np.clip(lit, 0.0, None), np.nan)
     return shade
 
 
-def _blurred(slope: Array, known: npt.NDArray[np.bool_], blur: float) -> Array:
-    """Smooth slopes where heights are known; a cliff weighs no more than the steepest slope that light can tell."""
+def _smooth_slopes(slope: Array, known: npt.NDArray[np.bool_], blur: float) -> Array:
+    """Smooth slopes over the known heights (normalised convolution); clip them to `_MAX_SLOPE` first."""
     weight = scipy.ndimage.gaussian_filter(known.astype(np.float64), blur, mode="nearest")
-    cliffs = np.where(known, np.clip(slope, -_STEEPEST, _STEEPEST), 0.0)
-    smooth: Array = scipy.ndimage.gaussian_filter(cliffs, blur, mode="nearest") / np.where(known, weight, 1.0)
+    clipped = np.where(known, np.clip(slope, -_MAX_SLOPE, _MAX_SLOPE), 0.0)
+    smooth: Array = scipy.ndimage.gaussian_filter(clipped, blur, mode="nearest") / np.where(known, weight, 1.0)
     return smooth
 
 
 def _slope(z: Array, axis: int) -> Array:
-    """Mean of the differences to the neighbours that are there; 0 where none is."""
+    """Return the mean difference [m] to the known neighbours along an axis; 0 without a known neighbour."""
     ahead = np.diff(z, axis=axis, append=np.nan)
     behind = np.diff(z, axis=axis, prepend=np.nan)
     both = np.stack([ahead, behind])
@@ -133,8 +156,31 @@ def _slope(z: Array, axis: int) -> Array:
     return slope
 
 
-def paint(z: Array, status: Array, shade: Array, span: tuple[float, float], style: Style) -> tuple[Array, list[Entry]]:
-    """Colours (rows, columns, 3) of heights under light, and the legend of what is missing or doubtful."""
+def paint_heights(
+    z: Array, status: Array, shade: Array, span: tuple[float, float], style: Style
+) -> tuple[Array, list[LegendEntry]]:
+    """Compute the colours of shaded heights, and the legend of missing and doubtful heights.
+
+    Parameters
+    ----------
+    z : numpy.ndarray
+        Heights [m], (rows, columns); NaN in holes.
+    status : numpy.ndarray
+        `Status` flags, (rows, columns), uint8.
+    shade : numpy.ndarray
+        Brightness, (rows, columns), see `shade_relief`; NaN counts as 1.
+    span : (float, float)
+        Heights of the ends of the colour scale [m].
+    style : {"colour", "shaded"}
+        Heights in colours, or a grey relief.
+
+    Returns
+    -------
+    numpy.ndarray
+        RGB colours 0 to 1, (rows, columns, 3).
+    list of LegendEntry
+        One entry for each colour of the picture that is not a height.
+    """
     light = np.where(np.isfinite(shade), shade, 1.0)[..., None]
     grey = np.full((*z.shape, 3), _GREY / _FLAT)
     heights = _COLOURS(Normalize(*span, clip=True)(np.nan_to_num(z)))[..., :3] if style == "colour" else grey
@@ -148,7 +194,7 @@ def paint(z: Array, status: Array, shade: Array, span: tuple[float, float], styl
         picture[tinted] = (1 - _TINT) * picture[tinted] + _TINT * np.array(to_rgb(colour))
         left &= ~(bare | tinted)
         if np.any(bare | tinted):
-            legend.append(Entry(colour, meaning, float(np.mean(bare | tinted))))
+            legend.append(LegendEntry(colour, meaning, float(np.mean(bare | tinted))))
     unexplained = left & missing
     picture[unexplained] = to_rgb(_REASONS[0][1])
     return np.clip(picture, 0.0, 1.0), legend
@@ -163,40 +209,42 @@ def draw_height_map(
     title: str = "Height map",
     span: tuple[float, float] | None = None,
 ) -> None:
-    """Draw a height map as PNG: with a length bar, a height bar, and a legend of what is missing. Written atomically.
+    """Draw a height map as PNG, with length bar, height bar and a legend of missing heights. Written atomically.
 
     Parameters
     ----------
-    path
-        Where to.
-    heights, grid
-        What `Regrid` gives, as NumPy arrays, and where its cells lie.
-    style
-        ``"colour"``: heights in colours under light. ``"shaded"``: a grey relief under light.
-    title
-        Over the picture.
-    span
-        Heights of the ends of the colour scale [m]; None leaves half a percent of the heights outside on either side.
+    path : path-like
+        Output file.
+    heights : HeightMap
+        Height map, arrays of the shape of the grid.
+    grid : Grid
+        Cells of the height map.
+    style : {"colour", "shaded"}
+        Shaded heights in colours, or a grey relief. Default "colour".
+    title : str
+        Title above the picture.
+    span : (float, float), optional
+        Heights of the ends of the colour scale [m]. Default: the 0.5 % and 99.5 % percentiles of the heights.
 
     Raises
     ------
     ValueError
-        The heights are not of the grid's shape, or the style is another one.
+        The heights do not have the shape of the grid, or the style is unknown.
     """
     if style not in _STYLES:
         raise ValueError(f"style is {style!r}, expected one of {', '.join(_STYLES)}")
-    z, status = np.asarray(heights.z, np.float64), np.asarray(heights.status)
+    z, status = to_numpy(heights.z).astype(np.float64), to_numpy(heights.status)
     if z.shape != grid.shape:
         raise ValueError(f"heights have shape {z.shape}, the grid has {grid.shape}; expected the same")
-    span = _span_of(z) if span is None else span
-    steeper = steepness(z, grid.cell_x, grid.cell_y)
-    shade = relief(z, grid.cell_x, grid.cell_y, exaggeration=steeper)
-    picture, legend = paint(z, status, shade, span, style)
-    told = _told(z, _cells(grid)) + (f"  ·  relief {steeper:.0f} ×" if steeper > 1 else "")
+    span = _default_span(z) if span is None else span
+    exaggeration = choose_exaggeration(z, grid.cell_x, grid.cell_y)
+    shade = shade_relief(z, grid.cell_x, grid.cell_y, exaggeration=exaggeration)
+    picture, legend = paint_heights(z, status, shade, span, style)
+    subtitle = _subtitle(z, _grid_size(grid)) + (f"  ·  relief {exaggeration:.0f} ×" if exaggeration > 1 else "")
     width, height = grid.columns * grid.cell_x, grid.rows * grid.cell_y
-    sheet = _Sheet(picture, width / height, legend, title, told, span if style == "colour" else None)
-    sheet.length_bar(width)
-    sheet.write(path)
+    page = _Page(picture, width / height, legend, title, subtitle, span if style == "colour" else None)
+    page.length_bar(width)
+    page.write(path)
 
 
 def draw_scan(
@@ -209,34 +257,39 @@ def draw_scan(
     title: str = "Range image as scanned",
     span: tuple[float, float] | None = None,
 ) -> None:
-    """Draw an organised range image as the sensor saw it, profile beside profile, as PNG. Written atomically.
+    """Draw an organised range image as PNG, one row or column of the picture per profile. Written atomically.
 
-    Nothing is resampled, so that there are no lengths to show but the height.
+    The samples are not resampled, so that the picture has a height bar but no length bar.
 
     Parameters
     ----------
-    path
-        Where to.
-    z, status
-        (profiles, samples), of `RangePoints`, as NumPy arrays.
-    samples
-        Whether the samples of a profile run down the picture or across it.
-    aspect
-        Width of the picture over its height.
-    title, span
+    path : path-like
+        Output file.
+    z : array_like
+        Heights [m], (profiles, samples), of `RangePoints`.
+    status : array_like
+        `Status` flags, (profiles, samples), uint8.
+    samples : {"across", "down"}
+        Direction of the samples of a profile in the picture. Default "across".
+    aspect : float
+        Width of the picture divided by its height. Default 1.
+    title : str
+        Title above the picture.
+    span : (float, float), optional
         As for `draw_height_map`.
     """
     z, status = np.asarray(z, np.float64), np.asarray(status)
-    span = _span_of(z) if span is None else span
-    picture, legend = paint(z, status, np.where(np.isfinite(z), 1.0, np.nan), span, "colour")
-    told = _told(z, f"{z.shape[0]} profiles of {z.shape[1]} samples")
+    span = _default_span(z) if span is None else span
+    picture, legend = paint_heights(z, status, np.where(np.isfinite(z), 1.0, np.nan), span, "colour")
+    subtitle = _subtitle(z, f"{z.shape[0]} profiles of {z.shape[1]} samples")
     labels = ("sample", "profile")
     if samples == "down":
         picture, labels = picture.transpose(1, 0, 2), ("profile", "sample")
-    _Sheet(picture, aspect, legend, title, told, span, labels=labels).write(path)
+    _Page(picture, aspect, legend, title, subtitle, span, labels=labels).write(path)
 
 
-def _span_of(z: Array) -> tuple[float, float]:
+def _default_span(z: Array) -> tuple[float, float]:
+    """Return the 0.5 % and 99.5 % percentiles of the heights [m], 1 µm apart if equal; (0, 1) without heights."""
     known = z[np.isfinite(z)]
     if not known.size:
         return 0.0, 1.0
@@ -244,14 +297,15 @@ def _span_of(z: Array) -> tuple[float, float]:
     return (low, high) if high > low else (low - 0.5e-6, high + 0.5e-6)
 
 
-def _number(value: float, unit: float, step: float) -> str:
-    """Write a length in a unit, to the digits that a step needs."""
+def _format_length(value: float, unit: float, step: float) -> str:
+    """Return a length [m] as a number in a unit [m], with the decimals that resolve a step [m]."""
     digits = max(0, math.ceil(-math.log10(step / unit) - 1e-9))
     text = f"{value / unit:.{digits}f}"
     return text.replace("-", "\N{MINUS SIGN}") if float(text) != 0.0 else text.lstrip("-")
 
 
-def _cells(grid: Grid) -> str:
+def _grid_size(grid: Grid) -> str:
+    """Return the number of cells and the cell size as text."""
     sizes = []
     for cell in dict.fromkeys((grid.cell_x, grid.cell_y)):
         unit, name = length_unit(cell)
@@ -259,30 +313,31 @@ def _cells(grid: Grid) -> str:
     return f"{grid.columns} × {grid.rows} cells of {' × '.join(sizes)}"
 
 
-def _told(z: Array, what: str) -> str:
+def _subtitle(z: Array, size: str) -> str:
+    """Return the line below the title: size, fraction of cells with a height, range of the heights."""
     known = z[np.isfinite(z)]
-    told = f"{what}  ·  {100 * known.size / z.size:.1f} % measured"
+    subtitle = f"{size}  ·  {100 * known.size / z.size:.1f} % measured"
     if known.size:
         low, high = float(known.min()), float(known.max())
         unit, name = length_unit(max(abs(low), abs(high), 1e-6))
         step = max(high - low, 1e-6 * unit) / 100
-        told += f"  ·  heights {_number(low, unit, step)} to {_number(high, unit, step)} {name}"
-    return told
+        subtitle += f"  ·  heights {_format_length(low, unit, step)} to {_format_length(high, unit, step)} {name}"
+    return subtitle
 
 
-class _Sheet:
-    """A page with the picture, its title and legend, and room for bars; lengths on it are in inches."""
+class _Page:
+    """Page with picture, title, legend and scale bars; lengths on the page are in inches."""
 
-    _LEFT, _RIGHT, _TOP, _BOTTOM, _LINE, _LEAST_WIDTH = 0.3, 0.3, 0.72, 0.12, 0.21, 5.6
+    _LEFT, _RIGHT, _TOP, _BOTTOM, _LINE, _MIN_WIDTH = 0.3, 0.3, 0.72, 0.12, 0.21, 5.6
     _HEIGHT_BAR, _LENGTH_BAR, _AXES, _LABELS = 0.9, 0.45, 0.5, 0.5
 
     def __init__(
         self,
         picture: Array,
         aspect: float,
-        legend: list[Entry],
+        legend: list[LegendEntry],
         title: str,
-        told: str,
+        subtitle: str,
         span: tuple[float, float] | None,
         *,
         labels: tuple[str, str] | None = None,
@@ -291,25 +346,25 @@ class _Sheet:
         self.width, self.height = (longer, longer / aspect) if aspect >= 1 else (longer * aspect, longer)
         self.left = self._LEFT + (self._AXES if labels else 0.0)
         right = self._RIGHT + (self._HEIGHT_BAR if span else 0.0)
-        # A title needs its room, however narrow the picture.
-        page_width = max(self.left + self.width + right, self._LEAST_WIDTH)
+        # The title needs this width even above a narrow picture.
+        page_width = max(self.left + self.width + right, self._MIN_WIDTH)
         self.below = self._BOTTOM + self._LINE * len(legend)
         self.bottom = self.below + (self._LABELS if labels else self._LENGTH_BAR)
         self.page = (page_width, self.bottom + self.height + self._TOP)
         self.figure = Figure(figsize=self.page, dpi=_DPI, facecolor=_PAPER)
         FigureCanvasAgg(self.figure)
         axes = self.axes(self.left, self.bottom, self.width, self.height)
-        # Where cells are larger than pixels they stay cells: between a colour and its neighbour nothing was measured.
+        # Enlarged cells keep sharp edges: interpolated colours would show heights that were not measured.
         enlarged = picture.shape[0] < self.height * _DPI or picture.shape[1] < self.width * _DPI
         axes.imshow(picture, aspect="auto", interpolation="nearest" if enlarged else "antialiased")
         self._frame(axes, labels)
-        self._say(title, told)
+        self._write_titles(title, subtitle)
         self._legend(legend)
         if span:
             self._height_bar(span)
 
     def axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        """Axes at a place on the page."""
+        """Add axes at a position on the page [in]."""
         across, up = self.page
         return self.figure.add_axes((left / across, bottom / up, width / across, height / up))
 
@@ -323,13 +378,13 @@ class _Sheet:
         axes.set_xlabel(labels[0], fontsize=8, color=_INK)
         axes.set_ylabel(labels[1], fontsize=8, color=_INK)
 
-    def _say(self, title: str, told: str) -> None:
+    def _write_titles(self, title: str, subtitle: str) -> None:
         across, up = self.page
         x = self.left / across
         self.figure.text(x, 1 - 0.33 / up, title, fontsize=12, fontweight="bold", color=_INK)
-        self.figure.text(x, 1 - 0.57 / up, told, fontsize=7.5, color=_FAINT)
+        self.figure.text(x, 1 - 0.57 / up, subtitle, fontsize=7.5, color=_FAINT)
 
-    def _legend(self, legend: list[Entry]) -> None:
+    def _legend(self, legend: list[LegendEntry]) -> None:
         across, up = self.page
         for line, entry in enumerate(legend):
             y = self.below - self._LINE * (line + 1)
@@ -342,14 +397,14 @@ class _Sheet:
             self.figure.text((self.left + 0.28) / across, (y + 0.015) / up, text, fontsize=7.5, color=_INK)
 
     def length_bar(self, width: float) -> None:
-        """Draw a bar of a round length under the picture, which is `width` metres wide."""
+        """Draw a bar of a round length below the picture, which is `width` metres wide."""
         length = round_length(width / 4)
         unit, name = length_unit(length)
         inches = self.width * length / width
         axes = self.axes(self.left, self.below + 0.08, inches, 0.09)
         axes.set_axis_off()
         axes.set(xlim=(0, 4), ylim=(0, 1))
-        # Four fields, as on a map: quarters can be read off.
+        # Four fields of alternating colour, as on a map, show the quarters of the length.
         for field in range(4):
             colour = _INK if field % 2 == 0 else _PAPER
             axes.add_patch(Rectangle((field, 0), 1, 1, facecolor=colour, edgecolor=_INK, linewidth=0.7, clip_on=False))

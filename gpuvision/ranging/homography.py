@@ -1,17 +1,25 @@
-"""Plane-plane homographies between sensor and sheet of light: the nested family, its fit, and the choice.
+"""Plane-to-plane homographies between sensor and sheet of light: a nested family of models, their fit and F tests.
 
-The family is written for the direction sheet -> sensor, in which the calibration's noise lives:
-``(u, v, 1) ~ N (G, H, 1)``. Each member fixes some elements of N at 0 and is closed under inversion.
+The models map the sheet to the sensor, ``(u, v, 1) ~ N (G, H, 1)``, because the noise of a calibration is on the sensor
+coordinates. Each model fixes some elements of N at 0; the inverse of N has as many zeros, see
+`homography_from_constants`.
 
 - C3: ``u = (a H + b)/(c H + 1)``. A single beam: only u and H.
 - C4: also ``v = d G/(c H + 1)``. Symmetric about G = 0 and v = ``symmetry``: De Bakker's four constants,
   ``H = (C1 u + C2)/(u + C3)``, ``G = C4 v/(u + C3)``.
-- D6: also ``v = (d G + e H + f)/(c H + 1)``. The sensor's and the sheet's middle are offset, the profile axis is
-  not square to the measured one; H still follows from u alone.
-- H8: all elements. Any pinhole sensor and any sheet; with a sensor rolled about its axis H depends on v too.
+- D6: also ``v = (d G + e H + f)/(c H + 1)``. Sensor and sheet are offset along the profile, and the profile axis is not
+  perpendicular to the measuring axis; H still depends on u alone.
+- H8: all elements. Any pinhole sensor and any sheet; if the sensor is rolled about its axis, H depends on v too.
 
-F. de Jong lists C1-C4 and D1-D6 among the symbols; their equations are derived here: C4 is the one map of four
-constants that a symmetric setup has, D6 the smallest extension of it by offsets that keeps H independent of v.
+The thesis lists C1-C4 and D1-D6 among its symbols without their equations. The equations are derived here: C4 is the
+only model with four constants for a symmetric setup. D6 is its smallest extension by offsets that keeps H independent
+of v.
+
+References
+----------
+F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 2.3.3 and the
+list of symbols. R. Hartley and A. Zisserman, *Multiple View Geometry in Computer Vision*, 2nd ed. 2004, chapter 4
+(direct linear transform, maximum likelihood estimate of a homography).
 """
 
 from __future__ import annotations
@@ -41,37 +49,40 @@ MODELS: dict[str, npt.NDArray[np.bool_]] = {
         "H8": ((1, 1, 1), (1, 1, 1), (1, 1, 1)),
     }.items()
 }
-"""By name: which elements of sheet -> sensor are free (one of them is the scale)."""
+"""Free elements of N (sheet to sensor) by model name; one of them is the scale."""
 
+# Singular values and denominators below this part of the largest one count as 0: well above the rounding of float64
+# (2e-16), well below those of a setup that can be built.
 _RANK_LIMIT = 1e-10
-_BOTH_SIDES = "points lie on both sides of the horizon; expected points in front of the sensor"
-# Residuals below this part of the coordinates are rounding; to test them against each other would be noise.
-_ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
+_BOTH_SIDES_MESSAGE = "points lie on both sides of the horizon; expected points in front of the sensor"
+# Residuals below this part of the largest coordinate are rounding errors, which an F test must not compare.
+_RESIDUAL_ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
 
 
 class DegenerateError(ValueError):
-    """The calibration points do not fix the model's parameters."""
+    """Error: the calibration points do not determine the parameters of the model."""
 
 
 class ModelFit(NamedTuple):
-    """One member of the family, fitted.
+    """Fit of one model of the family.
 
     Attributes
     ----------
-    model
-        Its name.
-    homography
-        3 x 3, undistorted sensor -> sheet.
-    covariance
-        8 x 8 covariance of the displacement parameters over the region (`to_displacement`); None where no
-        sigma is known and no residual is left over to estimate one.
-    rms
-        Root mean square residual of a sensor coordinate: in sigmas, or in sensor units where no sigma is
-        known.
-    degrees_of_freedom
-        Residuals less parameters.
-    p_value
-        Of the F test against the largest model that the points fix: small where this model does not suffice.
+    model : {"C3", "C4", "D6", "H8"}
+        Name of the model.
+    homography : numpy.ndarray
+        Homography from the undistorted sensor to the sheet, (3, 3).
+    covariance : numpy.ndarray or None
+        Covariance of the displacement parameters over the region (`to_displacement`), (8, 8). None without a given
+        sigma if there are no degrees of freedom to estimate it.
+    rms : float
+        Root mean square residual of a sensor coordinate: in standard deviations, or in sensor units without a given
+        sigma.
+    degrees_of_freedom : int
+        Number of residuals minus number of parameters.
+    p_value : float
+        p-value of the F test against the largest model that the points determine, 0 to 1. A small value rejects this
+        model.
     """
 
     model: Model
@@ -83,14 +94,14 @@ class ModelFit(NamedTuple):
 
 
 def shift_and_scale(origin: npt.ArrayLike, unit: npt.ArrayLike) -> Float64:
-    """3 x 3 matrix that takes (x, y, 1) to (origin + unit (x, y), 1)."""
+    """Return the (3, 3) matrix that maps (x, y, 1) to (origin + unit (x, y), 1)."""
     matrix = np.diag([*np.broadcast_to(np.asarray(unit, dtype=np.float64), 2), 1.0])
     matrix[:2, 2] = origin
     return matrix
 
 
 def project(matrix: Float64, points: Float64) -> Float64:
-    """Map points (..., 2) by a homography; infinite or NaN on its horizon."""
+    """Map points (..., 2) by a homography (3, 3); the result is infinite or NaN on the horizon."""
     lifted = points @ matrix[:, :2].T + matrix[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         mapped: Float64 = lifted[..., :2] / lifted[..., 2:]
@@ -98,12 +109,12 @@ def project(matrix: Float64, points: Float64) -> Float64:
 
 
 def inverse(matrix: Float64) -> Float64:
-    """Inverse of a homography.
+    """Return the inverse (3, 3) of a homography.
 
     Raises
     ------
     ValueError
-        If it is singular: the sheet of light is seen edge-on.
+        The homography is singular: the sensor sees the sheet of light edge-on.
     """
     try:
         inverted = np.linalg.inv(matrix)
@@ -113,75 +124,116 @@ def inverse(matrix: Float64) -> Float64:
 
 
 def to_displacement(matrix: Float64, *, rank: int = 3) -> Float64:
-    """(g0, gx, gy, h0, hx, hy, dx, dy) of ``G = g0 + (gx x + gy y)/(1 + dx x + dy y)``, H likewise.
+    """Return the displacement parameters of a homography: value at the centre, gradients, and denominator.
+
+    They are (g0, gx, gy, h0, hx, hy, dx, dy) of ``G = g0 + (gx x + gy y)/(1 + dx x + dy y)``, and likewise for H.
 
     Parameters
     ----------
-    matrix
-        3 x 3, (x, y, 1) to (G, H, 1), with x and y about -1 to 1.
-    rank
-        3, or 2 for a single beam, where only H follows from x.
+    matrix : numpy.ndarray
+        Homography (3, 3) from (x, y, 1) to (G, H, 1), with x and y in -1 to 1.
+    rank : {3, 2}
+        Rank that the homography must have: 3, or 2 for a single beam, where only H depends on x.
+
+    Returns
+    -------
+    numpy.ndarray
+        Eight parameters; g and h in metres, d without unit.
 
     Raises
     ------
     ValueError
-        If x = y = 0 lies on the horizon, or the matrix is singular.
+        x = y = 0 lies on the horizon, or the rank is lower.
     """
     if abs(matrix[2, 2]) <= _RANK_LIMIT * np.max(np.abs(matrix[2])):
         raise ValueError("the middle of the region lies on the horizon; expected a region that sees the sheet")
     scaled = matrix / matrix[2, 2]
-    slopes = scaled[:2, :2] - np.outer(scaled[:2, 2], scaled[2, :2])
-    steepness = np.linalg.svd(slopes, compute_uv=False)
-    if steepness[rank - 2] <= _RANK_LIMIT * steepness[0] or not np.all(np.isfinite(scaled)):
+    gradients = scaled[:2, :2] - np.outer(scaled[:2, 2], scaled[2, :2])
+    singular = np.linalg.svd(gradients, compute_uv=False)
+    if singular[rank - 2] <= _RANK_LIMIT * singular[0] or not np.all(np.isfinite(scaled)):
         raise ValueError("the homography is singular: the sensor sees the sheet of light edge-on")
-    return np.array([scaled[0, 2], *slopes[0], scaled[1, 2], *slopes[1], *scaled[2, :2]])
+    return np.array([scaled[0, 2], *gradients[0], scaled[1, 2], *gradients[1], *scaled[2, :2]])
 
 
-def displacement_slopes(matrix: Float64, changes: Float64) -> Float64:
-    """Change of `to_displacement` for small changes (..., 3, 3) of the matrix, shape (..., 8)."""
+def displacement_jacobian(matrix: Float64, changes: Float64) -> Float64:
+    """Return the changes (..., 8) of `to_displacement` for small changes (..., 3, 3) of the matrix (product rule)."""
     scaled = matrix / matrix[2, 2]
-    turned = changes / matrix[2, 2]
-    turned = turned - scaled * turned[..., 2:, 2:]
-    slopes = turned[..., :2, :2] - turned[..., :2, 2:] * scaled[2, :2] - scaled[:2, 2:] * turned[..., 2:, :2]
+    moved = changes / matrix[2, 2]
+    moved = moved - scaled * moved[..., 2:, 2:]
+    gradients = moved[..., :2, :2] - moved[..., :2, 2:] * scaled[2, :2] - scaled[:2, 2:] * moved[..., 2:, :2]
     blocks = [
-        turned[..., :1, 2],
-        slopes[..., 0, :],
-        turned[..., 1:2, 2],
-        slopes[..., 1, :],
-        turned[..., 2, :2],
+        moved[..., :1, 2],
+        gradients[..., 0, :],
+        moved[..., 1:2, 2],
+        gradients[..., 1, :],
+        moved[..., 2, :2],
     ]
     return np.concatenate(blocks, axis=-1)
 
 
-def packed_factor(covariance: npt.ArrayLike, which: Sequence[int]) -> Float64:
-    """Lower triangular factor of a part of a covariance, which may be singular, column after column."""
-    part = np.asarray(covariance, dtype=np.float64)[np.ix_(which, which)]
-    values, vectors = np.linalg.eigh(part)
+def packed_covariance_factor(covariance: npt.ArrayLike, which: Sequence[int]) -> Float64:
+    """Return the lower triangular factor of a block of a covariance, packed by columns; the block may be singular.
+
+    Parameters
+    ----------
+    covariance : array_like
+        Covariance (n, n).
+    which : sequence of int
+        Indices of the m rows and columns of the block.
+
+    Returns
+    -------
+    numpy.ndarray
+        The m (m + 1) / 2 elements of L, with ``L L^T`` the block.
+    """
+    block = np.asarray(covariance, dtype=np.float64)[np.ix_(which, which)]
+    values, vectors = np.linalg.eigh(block)
     triangle = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r")).T
     return np.concatenate([triangle[column:, column] for column in range(len(which))])
 
 
-def seen_by_camera(
+def camera_homography(
     camera_matrix: npt.ArrayLike,
     rotation: npt.ArrayLike,
     translation: npt.ArrayLike,
     plane: Sequence[npt.ArrayLike],
 ) -> Float64:
-    """Sheet -> (column, row) for a pinhole camera; ``plane``: G axis, H axis and origin in the world."""
-    turned = np.asarray(rotation, dtype=np.float64) @ np.column_stack([np.asarray(each, np.float64) for each in plane])
-    turned[:, 2] += np.asarray(translation, dtype=np.float64)
-    return np.asarray(camera_matrix, dtype=np.float64) @ turned
+    """Return the homography (3, 3) from the sheet to the pixels (column, row) of a pinhole camera.
+
+    Parameters
+    ----------
+    camera_matrix : array_like
+        Camera matrix (3, 3) [px].
+    rotation, translation : array_like
+        Pose of the camera, world to camera: (3, 3), and (3,) [m].
+    plane : sequence of array_like
+        G axis, H axis (unit vectors) and origin [m] of the sheet in the world, (3,) each.
+    """
+    axes = np.asarray(rotation, dtype=np.float64) @ np.column_stack([np.asarray(each, np.float64) for each in plane])
+    axes[:, 2] += np.asarray(translation, dtype=np.float64)
+    return np.asarray(camera_matrix, dtype=np.float64) @ axes
 
 
-def seen_from_beside(baseline: float, stand_off: float, focal_distance: float, tilt: float | None) -> Float64:
-    """Sheet -> (u, v) for a lens beside the sheet whose axis meets it at the origin.
+def triangulation_homography(baseline: float, stand_off: float, focal_distance: float, tilt: float | None) -> Float64:
+    """Return the homography (3, 3) from the sheet to the sensor (u, v) of a laser triangulation setup.
 
-    A tilt of None is Scheimpflug's.
+    The lens lies beside the sheet. Its axis meets the sheet at the origin.
+
+    Parameters
+    ----------
+    baseline : float
+        Distance of the lens from the sheet [m], positive.
+    stand_off : float
+        Distance of the lens from the origin along the sheet [m], positive.
+    focal_distance : float
+        Distance of the sensor from the lens along the axis [m], positive.
+    tilt : float or None
+        Tilt of the sensor [rad], -pi/2 to pi/2 (exclusive). None: the Scheimpflug condition.
 
     Raises
     ------
     ValueError
-        If a length is not positive, or the tilt not within a right angle.
+        A length is not positive, or the tilt is out of its range.
     """
     for name, value in (("baseline", baseline), ("stand_off", stand_off), ("focal_distance", focal_distance)):
         if not finite(value, name) > 0.0:
@@ -200,13 +252,25 @@ def seen_from_beside(baseline: float, stand_off: float, focal_distance: float, t
     )
 
 
-def of_constants(constants: tuple[float, ...]) -> tuple[tuple[tuple[float, float, float], ...], Model]:
-    """Sensor -> sheet and the model's name from its constants: see `Triangulation.from_constants`.
+def homography_from_constants(constants: tuple[float, ...]) -> tuple[tuple[tuple[float, float, float], ...], Model]:
+    """Return the homography from sensor to sheet, and the model, for given constants.
+
+    Parameters
+    ----------
+    constants : tuple of float
+        3, 4, 6 or 8 constants, see `Triangulation.from_constants`.
+
+    Returns
+    -------
+    tuple of tuple of float
+        Rows of the homography.
+    Model
+        "C3", "C4", "D6" or "H8".
 
     Raises
     ------
     ValueError
-        There are not 3, 4, 6 or 8 of them.
+        Another number of constants.
     """
     match constants:
         case (c1, c2, c3):
@@ -220,19 +284,19 @@ def of_constants(constants: tuple[float, ...]) -> tuple[tuple[tuple[float, float
     raise ValueError(f"got {len(constants)} constants, expected 3, 4, 6 or 8")
 
 
-def middle_and_half(region: npt.ArrayLike) -> tuple[Float64, Float64]:
-    """Middle of a region and half its larger extent, for both axes: a radius stays a radius."""
+def centre_and_half_extent(region: npt.ArrayLike) -> tuple[Float64, Float64]:
+    """Return the centre (2,) of a region and half its larger extent, twice: equal scales keep circles circles."""
     bounds = np.asarray(region, dtype=np.float64)
     return bounds.mean(axis=1), np.full(2, 0.5 * np.max(bounds[:, 1] - bounds[:, 0]))
 
 
-def box(points: Float64) -> Region:
-    """Smallest region around points (n, 2)."""
+def bounding_box(points: Float64) -> Region:
+    """Return the smallest region that contains points (n, 2)."""
     (u_min, v_min), (u_max, v_max) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
     return (u_min, u_max), (v_min, v_max)
 
 
-def compare(
+def fit_models(
     sensor_points: npt.ArrayLike,
     sheet_points: npt.ArrayLike,
     *,
@@ -242,67 +306,84 @@ def compare(
     region: Region | None = None,
     lens: Lens | None = None,
 ) -> tuple[ModelFit, ...]:
-    """Fit every model which the points fix, each tested against the largest of them.
+    """Fit every model that the points determine; test each against the largest of them.
 
     Parameters
     ----------
-    sensor_points, sheet_points
-        Measured (u, v) and known (G, H) [m], each (n, 2).
-    sigma
-        Standard deviation of the sensor coordinates: a number, (sigma_u, sigma_v), or (n, 2). None: equal,
-        and estimated from the residuals.
-    models
-        Names, from small to large; None: "C3" for a single beam (all v, or all G, are equal), else "C4",
-        "D6", "H8".
-    symmetry
-        v of the plane of symmetry, for C4.
-    region
-        Where the covariance's parameters are defined (`to_displacement`); None: the box around the points.
-    lens
-        Undone before the fit; its centre in (u, v) order.
+    sensor_points, sheet_points : array_like
+        Measured (u, v) [sensor units] and known (G, H) [m], each (n, 2).
+    sigma : array_like, optional
+        Standard deviation of the sensor coordinates: a number, (sigma_u, sigma_v), or (n, 2). Default: equal for all
+        coordinates and estimated from the residuals.
+    models : sequence of str, optional
+        Names, from small to large. Default: "C3" for a single beam (all v, or all G, are equal), otherwise "C4", "D6",
+        "H8".
+    symmetry : float
+        v of the plane of symmetry, for C4. Default 0.
+    region : ((u_min, u_max), (v_min, v_max)), optional
+        Region that defines the parameters of the covariance (`to_displacement`). Default: the bounding box of the
+        points.
+    lens : Lens, optional
+        Distortion that is removed before the fit; its centre in (u, v) order.
 
     Returns
     -------
     tuple of ModelFit
-        From small to large; models that the points do not fix are left out.
+        From small to large, without the models that the points do not determine.
 
     Raises
     ------
     ValueError
-        If shapes differ, a point is not finite or lies beyond the lens' fold, or the points fix no model.
+        Shapes differ, a point is not finite or lies beyond the fold of the lens polynomial, or the points determine no
+        model.
+
+    Notes
+    -----
+    The fit minimises the sensor residuals, divided by their standard deviations: direct linear transform, then
+    Levenberg-Marquardt. The F test compares the sums of squares of the small and the large model.
     """
     sensor, sheet = _points(sensor_points, "sensor_points"), _points(sheet_points, "sheet_points")
     if len(sensor) != len(sheet):
         raise ValueError(f"got {len(sensor)} sensor points and {len(sheet)} sheet points, expected pairs")
-    straight = sensor if lens is None else lens.undistort(sensor)
-    if not np.all(np.isfinite(straight)):
+    undistorted = sensor if lens is None else lens.undistort(sensor)
+    if not np.all(np.isfinite(undistorted)):
         raise ValueError("a sensor point lies beyond the fold of the lens polynomial; check the lens, or drop it")
-    spread = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, dtype=np.float64), sensor.shape)
-    if not np.all(spread > 0.0):
+    deviation = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, dtype=np.float64), sensor.shape)
+    if not np.all(deviation > 0.0):
         raise ValueError("sigma must be positive everywhere, got a value that is not")
-    beam = np.ptp(sensor[:, 1]) == 0.0 or np.ptp(sheet[:, 0]) == 0.0
-    family: tuple[Model, ...] = ("C3",) if beam else ("C4", "D6", "H8")
-    bend = np.eye(2) if lens is None else lens.jacobian(sensor)
-    data = _Calibration(straight, sheet, bend * spread[:, None, :], symmetry)
-    frame = shift_and_scale(*middle_and_half(box(sensor) if region is None else region))
+    single_beam = np.ptp(sensor[:, 1]) == 0.0 or np.ptp(sheet[:, 0]) == 0.0
+    family: tuple[Model, ...] = ("C3",) if single_beam else ("C4", "D6", "H8")
+    undistortion = np.eye(2) if lens is None else lens.jacobian(sensor)
+    data = _Calibration(undistorted, sheet, undistortion * deviation[:, None, :], symmetry)
+    frame = shift_and_scale(*centre_and_half_extent(bounding_box(sensor) if region is None else region))
     fits: list[tuple[ModelFit, float]] = []
     reasons: list[DegenerateError] = []
     for model in family if models is None else models:
         try:
-            fits.append(_fit(data, model, frame))
+            fits.append(_fit_model(data, model, frame))
         except DegenerateError as error:
             reasons.append(error)
     if not fits:
         raise reasons[0]
-    return _tested(fits, data, sigma is not None)
+    return _add_f_tests(fits, data, sigma is not None)
 
 
 class _Calibration(NamedTuple):
-    """Undistorted (u, v); (G, H); matrices that take unit variance to the sensor's; the symmetry's v."""
+    """Data of a fit.
+
+    Attributes
+    ----------
+    sensor, sheet
+        Undistorted (u, v) [sensor units] and (G, H) [m], (n, 2) each.
+    sigma_factor
+        Factors (n, 2, 2) of the covariances of the undistorted sensor points: factor times its transpose.
+    symmetry
+        v of the plane of symmetry.
+    """
 
     sensor: Float64
     sheet: Float64
-    spread: Float64
+    sigma_factor: Float64
     symmetry: float
 
 
@@ -315,45 +396,48 @@ def _points(values: npt.ArrayLike, name: str) -> Float64:
     return points
 
 
-def _tested(fits: Sequence[tuple[ModelFit, float]], data: _Calibration, sigma_known: bool) -> tuple[ModelFit, ...]:
-    """Add the F test against the last fit; scale the covariance by the residuals where no sigma is known."""
-    reach = np.max(np.abs(np.linalg.solve(data.spread, data.sensor[..., None])))
-    floor = (_ROUNDING * float(reach)) ** 2
+def _add_f_tests(fits: Sequence[tuple[ModelFit, float]], data: _Calibration, sigma_known: bool) -> tuple[ModelFit, ...]:
+    """Add the F test against the last fit; without a given sigma, scale the covariances by the residual variance."""
+    largest = np.max(np.abs(np.linalg.solve(data.sigma_factor, data.sensor[..., None])))
+    floor = (_RESIDUAL_ROUNDING * float(largest)) ** 2
     full, full_sum = fits[-1]
     variance = max(full_sum / max(full.degrees_of_freedom, 1), floor)
     tested = []
     for fit, squares in fits:
-        spare = fit.degrees_of_freedom
-        extra = spare - full.degrees_of_freedom
-        # Without a residual to spare the full model fits anything and refutes nothing.
+        freedom = fit.degrees_of_freedom
+        extra = freedom - full.degrees_of_freedom
+        # Without degrees of freedom the largest model fits any points, and no test is possible.
         if extra and full.degrees_of_freedom:
             ratio = max(squares - full_sum, 0.0) / (extra * variance)
             fit = fit._replace(p_value=float(scipy.special.fdtrc(extra, full.degrees_of_freedom, ratio)))
         if not sigma_known and fit.covariance is not None:
-            fit = fit._replace(covariance=fit.covariance * (squares / spare) if spare else None)
+            fit = fit._replace(covariance=fit.covariance * (squares / freedom) if freedom else None)
         tested.append(fit)
     return tuple(tested)
 
 
-def _fit(data: _Calibration, model: Model, frame: Float64) -> tuple[ModelFit, float]:
-    """Direct linear transform, then Levenberg-Marquardt on the sensor residuals; with the sum of squares."""
+def _fit_model(data: _Calibration, model: Model, frame: Float64) -> tuple[ModelFit, float]:
+    """Fit a model: direct linear transform, then Levenberg-Marquardt on the sensor residuals.
+
+    Return the fit and its weighted sum of squared residuals.
+    """
     free = MODELS[model]
-    seen = (0,) if model == "C3" else (0, 1)
+    rows = (0,) if model == "C3" else (0, 1)
     to_sensor = _conditioning(data.sensor, (None, data.symmetry if model == "C4" else None))
     to_sheet = _conditioning(data.sheet, (0.0 if model == "C4" else None, None))
     x = project(inverse(to_sensor), data.sensor)
     points = np.column_stack([project(inverse(to_sheet), data.sheet), np.ones(len(data.sheet))])
-    # The scale is free: the denominator in the middle of the points is 1.
+    # The scale is fixed by a denominator of 1 at the centre of the points.
     elements = np.argwhere(free)[:-1]
-    excess = len(x) * len(seen) - len(elements)
+    excess = len(x) * len(rows) - len(elements)
     if excess < 0:
         raise DegenerateError(f"{len(x)} points are too few for the model {model}; measure more")
-    start = _direct_linear(x, points, free, seen, model)
+    start = _direct_linear(x, points, free, rows, model)
     if model == "C3":
-        # The marginal spread of u: a beam's v is not compared.
-        white = to_sensor[0, 0] / np.linalg.norm(data.spread[:, :1], axis=-1, keepdims=True)
+        # Marginal standard deviation of u: the v of a single beam has no residual.
+        whitening = to_sensor[0, 0] / np.linalg.norm(data.sigma_factor[:, :1], axis=-1, keepdims=True)
     else:
-        white = np.linalg.inv(data.spread) * np.diag(to_sensor)[:2]
+        whitening = np.linalg.inv(data.sigma_factor) * np.diag(to_sensor)[:2]
 
     def assemble(values: Float64) -> Float64:
         matrix = np.zeros((3, 3))
@@ -363,21 +447,21 @@ def _fit(data: _Calibration, model: Model, frame: Float64) -> tuple[ModelFit, fl
 
     def residuals(values: Float64) -> Float64:
         lifted = points @ assemble(values).T
-        missed = (lifted[:, :2] / lifted[:, 2:] - x)[:, seen]
-        return np.asarray(np.einsum("nij,nj->ni", white, missed)).ravel()
+        difference = (lifted[:, :2] / lifted[:, 2:] - x)[:, rows]
+        return np.asarray(np.einsum("nij,nj->ni", whitening, difference)).ravel()
 
-    def slopes(values: Float64) -> Float64:
+    def jacobian(values: Float64) -> Float64:
         lifted = points @ assemble(values).T
         change = np.zeros((len(points), 3, len(elements)))
         change[:, elements[:, 0], np.arange(len(elements))] = points[:, elements[:, 1]]
         moved = change[:, :2] - (lifted[:, :2] / lifted[:, 2:])[:, :, None] * change[:, 2:]
-        moved = (moved / lifted[:, 2:, None])[:, seen]
-        return np.asarray(np.einsum("nij,njp->nip", white, moved)).reshape(-1, len(elements))
+        moved = (moved / lifted[:, 2:, None])[:, rows]
+        return np.asarray(np.einsum("nij,njp->nip", whitening, moved)).reshape(-1, len(elements))
 
     solution = scipy.optimize.least_squares(
         residuals,
         start[elements[:, 0], elements[:, 1]],
-        jac=slopes,
+        jac=jacobian,
         method="lm",
         xtol=1e-15,
         ftol=1e-15,
@@ -386,33 +470,33 @@ def _fit(data: _Calibration, model: Model, frame: Float64) -> tuple[ModelFit, fl
     squares = 2.0 * float(solution.cost)
     matrix = assemble(solution.x)
     if np.any(points @ matrix[2] <= 0.0):
-        raise DegenerateError(_BOTH_SIDES)
-    homography, changes = _to_sheet(matrix, elements, to_sensor, to_sheet, model)
-    slope = displacement_slopes(homography @ frame, changes @ frame)
-    # (J' J)^-1 by the triangular factor of J: squaring J would square its condition.
-    spread = slope.T @ np.linalg.inv(np.linalg.qr(solution.jac, mode="r"))
-    rms = float(np.sqrt(squares / (len(x) * len(seen))))
-    return ModelFit(model, homography, spread @ spread.T, rms, excess, 1.0), squares
+        raise DegenerateError(_BOTH_SIDES_MESSAGE)
+    homography, changes = _invert_model(matrix, elements, to_sensor, to_sheet, model)
+    gradient = displacement_jacobian(homography @ frame, changes @ frame)
+    # (J^T J)^-1 from the triangular factor of J: the product J^T J would square the condition number.
+    factor = gradient.T @ np.linalg.inv(np.linalg.qr(solution.jac, mode="r"))
+    rms = float(np.sqrt(squares / (len(x) * len(rows))))
+    return ModelFit(model, homography, factor @ factor.T, rms, excess, 1.0), squares
 
 
 def _conditioning(points: Float64, fixed: tuple[float | None, float | None]) -> Float64:
-    """Matrix from coordinates about -1 to 1 to the points' own; a fixed origin keeps a model's symmetry."""
+    """Return the matrix that maps coordinates in -1 to 1 to those of the points; a fixed origin keeps a symmetry."""
     origin = [np.mean(column) if value is None else value for column, value in zip(points.T, fixed, strict=True)]
     unit = np.max(np.abs(points - origin), axis=0)
     return shift_and_scale(origin, np.where(unit > 0.0, unit, 1.0))
 
 
 def _direct_linear(
-    x: Float64, points: Float64, free: npt.NDArray[np.bool_], seen: tuple[int, ...], model: Model
+    x: Float64, points: Float64, free: npt.NDArray[np.bool_], rows: tuple[int, ...], model: Model
 ) -> Float64:
-    """Sheet -> sensor by the smallest right singular vector of the linearised equations."""
+    """Return N (sheet to sensor) from the right singular vector of the smallest singular value (algebraic error)."""
     blocks = []
-    for row in seen:
+    for row in rows:
         equations = np.zeros((len(points), 3, 3))
         equations[:, row] = points
         equations[:, 2] = -x[:, row, None] * points
         blocks.append(equations[:, free])
-    # The row of zeros makes sure of a last singular vector where the equations are one too few to need the fit.
+    # With one equation less than elements, the row of zeros makes the decomposition return the null vector too.
     blocks.append(np.zeros((1, np.count_nonzero(free))))
     _, values, vectors = np.linalg.svd(np.concatenate(blocks), full_matrices=False)
     if values[np.count_nonzero(free) - 2] <= _RANK_LIMIT * values[0]:
@@ -420,24 +504,25 @@ def _direct_linear(
     matrix = np.zeros((3, 3))
     matrix[free] = vectors[-1]
     if abs(matrix[2, 2]) <= _RANK_LIMIT:
-        raise DegenerateError(_BOTH_SIDES)
+        raise DegenerateError(_BOTH_SIDES_MESSAGE)
     return np.asarray(matrix / matrix[2, 2])
 
 
-def _to_sheet(
+def _invert_model(
     matrix: Float64, elements: npt.NDArray[np.intp], to_sensor: Float64, to_sheet: Float64, model: Model
 ) -> tuple[Float64, Float64]:
-    """Invert sheet -> sensor: the homography sensor -> sheet, and its change (p, 3, 3) for each parameter."""
+    """Return the homography from sensor to sheet, and its derivatives (p, 3, 3) by the p parameters of N."""
     if model == "C3":
-        # A beam has no v: any will do to invert, and G stays where the points have it.
+        # A single beam does not determine v: any nonzero element makes N invertible, and G is set to that of the
+        # points.
         matrix = matrix.copy()
         matrix[1, 0] = 1.0
-    inside = inverse(matrix)
+    inverted = inverse(matrix)
     unit = np.zeros((len(elements), 3, 3))
     unit[np.arange(len(elements)), elements[:, 0], elements[:, 1]] = 1.0
-    changes = -inside @ unit @ inside
+    changes = -inverted @ unit @ inverted
     if model == "C3":
-        inside[0] = 0.0
+        inverted[0] = 0.0
         changes[:, 0] = 0.0
-    outside = inverse(to_sensor)
-    return to_sheet @ inside @ outside, np.asarray(to_sheet @ changes @ outside)
+    from_sensor = inverse(to_sensor)
+    return to_sheet @ inverted @ from_sensor, np.asarray(to_sheet @ changes @ from_sensor)

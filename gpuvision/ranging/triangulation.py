@@ -231,7 +231,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             Map from the positions and sample indices of the kernel to sensor coordinates; it is folded into the table.
         """
         real, axes = np.dtype(real), SampleAxes() if axes is None else axes
-        middle, half = self._middle_and_half()
+        middle, half = self._centre_and_half_extent()
         pitch = np.array([axes.position_pitch, axes.sample_pitch])
         first = np.array([axes.position_origin, axes.sample_origin])
         origin = ((middle - first) / pitch).astype(real).astype(np.float64)
@@ -267,10 +267,10 @@ class Triangulation(VisionOperation[SheetPoints]):
         scaled to about -1 to 1: ``x = (u - u_middle) / half``, where ``half`` is half of the larger extent of the
         region.
         """
-        return self._displacement(*self._middle_and_half())
+        return self._displacement(*self._centre_and_half_extent())
 
-    def _middle_and_half(self) -> tuple[Float64, Float64]:
-        return homography.middle_and_half(self.region)
+    def _centre_and_half_extent(self) -> tuple[Float64, Float64]:
+        return homography.centre_and_half_extent(self.region)
 
     def _displacement(self, origin: Float64, unit: Float64) -> Float64:
         """Return the eight parameters for u = origin + unit x."""
@@ -282,8 +282,10 @@ class Triangulation(VisionOperation[SheetPoints]):
         if self.covariance is None:
             return np.zeros(15), np.zeros(15)
         covariance = np.array(self.covariance)
-        seen_by_g, seen_by_h = (0, 1, 2, 6, 7), (3, 4, 5, 6, 7)
-        return homography.packed_factor(covariance, seen_by_g), homography.packed_factor(covariance, seen_by_h)
+        # Displacement parameters on which G and H depend.
+        of_g, of_h = (0, 1, 2, 6, 7), (3, 4, 5, 6, 7)
+        factor_g, factor_h = (homography.packed_covariance_factor(covariance, which) for which in (of_g, of_h))
+        return factor_g, factor_h
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -322,7 +324,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         NaN for points behind the horizon of the sensor and for points that the lens does not image.
         """
         points = np.asarray(points, dtype=np.float64)
-        origin, unit = self._middle_and_half()
+        origin, unit = self._centre_and_half_extent()
         g0, gx, gy, h0, hx, hy, dx, dy = self.conditioned()
         matrix = np.array([[gx + g0 * dx, gy + g0 * dy, g0], [hx + h0 * dx, hy + h0 * dy, h0], [dx, dy, 1.0]])
         if self.model == "C3":
@@ -349,7 +351,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         if self.sigma is None and self.covariance is None:
             raise ValueError("Triangulation knows neither sigma nor covariance; give it one of them")
         points = np.asarray(points, dtype=np.float64)
-        origin, unit = self._middle_and_half()
+        origin, unit = self._centre_and_half_extent()
         x = ((points if self.sensor_lens is None else self.sensor_lens.undistort(points)) - origin) / unit
         _, gx, gy, _, hx, hy, dx, dy = self.conditioned()
         w = 1.0 + x @ np.array([dx, dy])
@@ -422,7 +424,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             the model.
         """
         sensor = np.asarray(sensor_points, dtype=np.float64)
-        fits = homography.compare(
+        fits = homography.fit_models(
             sensor,
             sheet_points,
             sigma=sigma,
@@ -438,7 +440,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             covariance=None
             if chosen.covariance is None
             else numbers(chosen.covariance, (8, 8), "Triangulation.covariance"),
-            region=homography.box(sensor) if region is None else region,
+            region=homography.bounding_box(sensor) if region is None else region,
             model=chosen.model,
             along=along,
             lens=lens,
@@ -471,7 +473,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         along, **more
             Other parameters of the class; ``region`` is required.
         """
-        to_sensor = homography.seen_by_camera(camera_matrix, rotation, translation, (g_axis, h_axis, origin))
+        to_sensor = homography.camera_homography(camera_matrix, rotation, translation, (g_axis, h_axis, origin))
         if along == "columns":
             to_sensor = to_sensor[[1, 0, 2]]
         matrix = numbers(homography.inverse(to_sensor), (3, 3), "Triangulation.homography")
@@ -518,7 +520,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 3.3.2 and
         Figure 3.4.
         """
-        to_sensor = homography.seen_from_beside(baseline, stand_off, focal_distance, tilt)
+        to_sensor = homography.triangulation_homography(baseline, stand_off, focal_distance, tilt)
         matrix = numbers(homography.inverse(to_sensor), (3, 3), "Triangulation.homography")
         return cls(homography=matrix, model="C4", **more)
 
@@ -537,7 +539,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         ValueError
             If there are not 3, 4, 6 or 8.
         """
-        rows, model = homography.of_constants(tuple(finite(each, "constants") for each in constants))
+        rows, model = homography.homography_from_constants(tuple(finite(each, "constants") for each in constants))
         return cls(homography=rows, model=model, **more)
 
     def to_dict(self) -> dict[str, Any]:

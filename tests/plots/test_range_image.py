@@ -40,7 +40,7 @@ def test_lengths_have_units_of_few_digits(length, name):
 def test_light_falls_from_the_upper_left():
     x, y = np.meshgrid(np.arange(20.0), np.arange(15.0))
     shades = {
-        name: float(picture.relief(z, 1.0, 1.0)[7, 10])
+        name: float(picture.shade_relief(z, 1.0, 1.0)[7, 10])
         for name, z in {"flat": 0 * x, "faces left": x, "faces right": -x, "faces up": y, "faces down": -y}.items()
     }
     assert shades["flat"] == pytest.approx(0.95)
@@ -50,7 +50,9 @@ def test_light_falls_from_the_upper_left():
 
 def test_relief_is_a_slope_not_a_number_of_cells():
     x = np.tile(np.arange(20.0), (15, 1))
-    np.testing.assert_allclose(picture.relief(x, 1.0, 1.0), picture.relief(0.01 * x, 0.01, 0.01), rtol=1e-12)
+    np.testing.assert_allclose(
+        picture.shade_relief(x, 1.0, 1.0), picture.shade_relief(0.01 * x, 0.01, 0.01), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize(("slope", "times"), [(1.0, 1), (0.1, 2), (0.03, 10), (1e-3, 20), (0.0, 20)])
@@ -58,20 +60,20 @@ def test_gentle_slopes_are_exaggerated(slope, times):
     z = slope * 0.01 * np.tile(np.arange(20.0), (15, 1))
     z[3, 4:9] = np.nan
     z[10, 10] += 5.0  # an edge is no slope to go by
-    assert picture.steepness(z, 0.01, 0.01) == times
+    assert picture.choose_exaggeration(z, 0.01, 0.01) == times
 
 
 def test_exaggeration_is_of_the_heights():
     z = np.cos(np.arange(20.0) / 3) * np.ones((15, 1))
     np.testing.assert_allclose(
-        picture.relief(z, 1.0, 1.0, exaggeration=5.0), picture.relief(5 * z, 1.0, 1.0), rtol=1e-12
+        picture.shade_relief(z, 1.0, 1.0, exaggeration=5.0), picture.shade_relief(5 * z, 1.0, 1.0), rtol=1e-12
     )
 
 
 def test_relief_stops_at_holes():
     z = np.zeros((20, 20))
     z[5:9, 5:9] = np.nan
-    shade = picture.relief(z, 1.0, 1.0)
+    shade = picture.shade_relief(z, 1.0, 1.0)
     np.testing.assert_array_equal(np.isnan(shade), np.isnan(z))
     np.testing.assert_allclose(shade[np.isfinite(z)], 0.95, rtol=1e-12)
 
@@ -89,7 +91,7 @@ def test_what_is_missing_has_a_colour_of_its_own():
     z[0, 6] = 0.5
     status = np.array([[*flags, 0]], np.uint8)
     for style in ("colour", "shaded"):
-        made, legend = picture.paint(z, status, np.where(np.isfinite(z), 0.95, np.nan), (0.0, 1.0), style)
+        made, legend = picture.paint_heights(z, status, np.where(np.isfinite(z), 0.95, np.nan), (0.0, 1.0), style)
         colours = {tuple(each) for each in made[0]}
         assert len(colours) == 7
         assert {to_rgb(each.colour) for each in legend} == {tuple(each) for each in made[0, :6]}
@@ -99,7 +101,7 @@ def test_what_is_missing_has_a_colour_of_its_own():
 def test_a_doubtful_height_is_tinted_and_a_saturated_one_is_not():
     z = np.full((1, 3), 0.5)
     status = np.array([[0, Status.NOT_INVERTIBLE, Status.SATURATED]], np.uint8)
-    made, legend = picture.paint(z, status, np.full_like(z, 0.95), (0.0, 1.0), "colour")
+    made, legend = picture.paint_heights(z, status, np.full_like(z, 0.95), (0.0, 1.0), "colour")
     assert [each.meaning[:6] for each in legend] == ["folded"]
     assert np.array_equal(made[0, 0], made[0, 2])
     assert np.linalg.norm(made[0, 1] - to_rgb(legend[0].colour)) < np.linalg.norm(made[0, 0] - to_rgb(legend[0].colour))
@@ -174,7 +176,7 @@ def test_wrong_maps_are_refused(tmp_path, heights):
 
 
 def test_numbers_have_the_digits_of_their_step():
-    assert picture._number(0.12345, 1e-3, 1e-4) == "123.5"
-    assert picture._number(-0.5, 1.0, 0.01) == "\N{MINUS SIGN}0.50"
-    assert picture._number(-1e-9, 1.0, 0.01) == "0.00"
+    assert picture._format_length(0.12345, 1e-3, 1e-4) == "123.5"
+    assert picture._format_length(-0.5, 1.0, 0.01) == "\N{MINUS SIGN}0.50"
+    assert picture._format_length(-1e-9, 1.0, 0.01) == "0.00"
     assert math.isclose(picture.round_length(1e-3), 1e-3)

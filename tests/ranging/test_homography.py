@@ -74,10 +74,10 @@ def test_camera_against_projection() -> None:
     pixels = seen[:, :2] / seen[:, 2:]
     place = {"origin": origin, "g_axis": g_axis, "h_axis": h_axis}
     columns = Triangulation.from_camera(
-        camera, rotation, translation, along="columns", region=homography.box(pixels[:, ::-1]), **place
+        camera, rotation, translation, along="columns", region=homography.bounding_box(pixels[:, ::-1]), **place
     )
     rows = Triangulation.from_camera(
-        camera, rotation, translation, along="rows", region=homography.box(pixels), **place
+        camera, rotation, translation, along="rows", region=homography.bounding_box(pixels), **place
     )
     np.testing.assert_allclose(columns.to_sensor(SHEET), pixels[:, ::-1], rtol=1e-11)
     np.testing.assert_allclose(rows.to_sensor(SHEET), pixels, rtol=1e-11)
@@ -209,7 +209,7 @@ def test_lens_is_undone_in_the_fit(rng: np.random.Generator) -> None:
     assert fitted.model == "C4"
     np.testing.assert_allclose(fitted.to_sensor(SHEET), seen, rtol=0, atol=1e-14)
     noisy = seen + rng.normal(0.0, 0.01 * SIGMA, seen.shape)
-    without, with_lens = homography.compare(noisy, SHEET), homography.compare(noisy, SHEET, lens=lens.swapped())
+    without, with_lens = homography.fit_models(noisy, SHEET), homography.fit_models(noisy, SHEET, lens=lens.swapped())
     assert without[-1].rms > 10.0 * with_lens[-1].rms
 
 
@@ -229,7 +229,7 @@ def test_sigma_weighs_the_points(rng: np.random.Generator) -> None:
 def test_residuals_are_told_in_sigmas(rng: np.random.Generator) -> None:
     seen = psd().to_sensor(SHEET)
     noisy = seen + rng.normal(0.0, (SIGMA, 3.0 * SIGMA), seen.shape)
-    full = homography.compare(noisy, SHEET, sigma=(SIGMA, 3.0 * SIGMA))[-1]
+    full = homography.fit_models(noisy, SHEET, sigma=(SIGMA, 3.0 * SIGMA))[-1]
     # Of 126 residuals 8 are spent; a root mean square from the rest is known to 6.5 %.
     assert full.degrees_of_freedom == 126 - 8
     assert full.rms == pytest.approx(math.sqrt(118 / 126), rel=0.26)
@@ -240,7 +240,7 @@ def test_single_beam_is_a_moebius_map(rng: np.random.Generator) -> None:
     sheet = np.stack([np.full(21, 0.003), heights], -1)
     seen = psd().to_sensor(sheet) + rng.normal(0.0, SIGMA, (21, 1)) * (1.0, 0.0)
     seen[:, 1] = 4e-4
-    fits = homography.compare(seen, sheet)
+    fits = homography.fit_models(seen, sheet)
     assert [each.model for each in fits] == ["C3"]
     fitted = Triangulation.fit(seen, sheet, sigma=SIGMA)
     assert fitted.model == "C3"

@@ -41,10 +41,6 @@ from gpuvision.status import Status
 COPPER = ("auto", "bright", "dark")
 Float64 = npt.NDArray[np.float64]
 
-# Default search ranges [m], [rad], with and without an initial pose (chosen).
-KNOWN_RANGE = (1e-4, 0.3 * math.pi / 180)
-UNKNOWN_RANGE = (2e-3, 5 * math.pi / 180)
-
 
 @dataclass(frozen=True, kw_only=True)
 class LocalizationLimits:
@@ -52,6 +48,12 @@ class LocalizationLimits:
 
     Parameters
     ----------
+    known_range
+        Default search range [m], [rad] with an initial pose (chosen).
+    known_range_px
+        The same shift in pixels, where that is more [px] (chosen).
+    unknown_range
+        Default search range [m], [rad] without an initial pose (chosen).
     ruler_range
         Largest search range [m], [rad] without a coarse registration: rulers alone reach so far (chosen).
     ruler_range_px
@@ -65,6 +67,9 @@ class LocalizationLimits:
         fiducials agree with it, relative to those that agree with the best pose (chosen).
     """
 
+    known_range: tuple[float, float] = (1e-4, 0.3 * math.pi / 180)
+    known_range_px: float = 4.0
+    unknown_range: tuple[float, float] = (2e-3, 5 * math.pi / 180)
     ruler_range: tuple[float, float] = (2.5e-4, 1.0 * math.pi / 180)
     ruler_range_px: float = 10.0
     registered_range: tuple[float, float] = (6e-5, 2e-3)
@@ -150,7 +155,7 @@ def locate_board(
     device = Device.best() if device is None else device
     job = _Job(grey, artwork, *levels, blur_px, etch_bias_sigma, device, limits)
     view = _initial_view(initial_pose, artwork, scale, grey.shape, model)
-    expected = job.register(view, _search_range(search_range, initial_pose is not None, scale, features))
+    expected = job.register(view, _search_range(search_range, initial_pose is not None, scale, features, limits))
     return job.locate(expected, job.select_features(expected, budget) if features is None else features, copper)
 
 
@@ -175,7 +180,11 @@ def _initial_view(
 
 
 def _search_range(
-    search_range: tuple[float, float] | None, known: bool, scale: float, features: FeatureSet | None
+    search_range: tuple[float, float] | None,
+    known: bool,
+    scale: float,
+    features: FeatureSet | None,
+    limits: LocalizationLimits,
 ) -> tuple[float, float]:
     """Return the search range [m], [rad]: as given, or its default."""
     if search_range is not None:
@@ -183,10 +192,10 @@ def _search_range(
             raise ValueError(f"search_range is {search_range}, expected metres above 0, and an angle of 0 to pi [rad]")
         return search_range
     if not known:
-        return UNKNOWN_RANGE
+        return limits.unknown_range
     if features is not None:
         return features.imaging.shift, features.imaging.angle
-    return max(KNOWN_RANGE[0], 4 * scale), KNOWN_RANGE[1]
+    return max(limits.known_range[0], limits.known_range_px * scale), limits.known_range[1]
 
 
 class _ExpectedPose(NamedTuple):

@@ -41,7 +41,6 @@ RAYS = 128
 _MAX_POINTS = 4096  # of `FieldPoseSearch`
 # Default range of a mounted camera [m]: farther away pixels resolve little and errors of the tilt grow (chosen).
 _MAX_RANGE = 12.0
-_MIN_REFINED = 24  # poses of the grid that are refined: cost against the chance to miss the best one (chosen)
 # Fields shorter than the first number [m] have lines of the second width, others of the third (RoboCup rules).
 _SMALL_FIELD, _SMALL_LINES, _LARGE_LINES = 5.0, 0.02, 0.125
 
@@ -59,11 +58,15 @@ class RobotLimits:
         (chosen: one in a thousand searches).
     max_missing
         Largest accepted `Evidence.missing` (chosen; tests with wrong fields and clutter confirm it).
+    min_refined
+        Least number of poses of the search grid that are refined (chosen: cost against the chance to miss the best
+        one).
     """
 
     min_points: int = 4
     max_log_nfa: float = math.log(1e-3)
     max_missing: float = 1.0 / 3.0
+    min_refined: int = 24
 
 
 def locate_robot(
@@ -133,7 +136,11 @@ def locate_robot(
     )
     mapped = time.perf_counter()
     found = find_pose_candidates(
-        field_map, used, initial_pose=initial_pose, max_candidates=max(max_candidates, _MIN_REFINED), device=device
+        field_map,
+        used,
+        initial_pose=initial_pose,
+        max_candidates=max(max_candidates, limits.min_refined),
+        device=device,
     )
     paths, wide = (None, default_line_width(field)) if scan is None else (scan.paths, scan.line_width)
     how: dict[str, Any] = {

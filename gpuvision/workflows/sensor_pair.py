@@ -15,8 +15,19 @@ from gpuvision.simulation.errors.error_attribution import ErrorAttribution
 from gpuvision.simulation.errors.recommendations import SensorFusion, attribute_pair_errors, rank_candidates
 from gpuvision.workflows.simulating import Simulation
 
-# Largest gap between points that is interpolated, in median distances of neighbouring samples.
-_MAX_GAP = 2.5
+
+@dataclass(frozen=True, kw_only=True)
+class FusionLimits:
+    """Limits of the fusion of two sensors.
+
+    Attributes
+    ----------
+    max_gap : float
+        Largest gap between points that is interpolated [median distances of neighbouring samples]. Chosen: one missing
+        sample is interpolated, two are not.
+    """
+
+    max_gap: float = 2.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +53,9 @@ class SensorPair:
     limit: float
 
     @classmethod
-    def of(cls, first: Simulation, second: Simulation, fusion: SensorFusion) -> SensorPair:
+    def of(
+        cls, first: Simulation, second: Simulation, fusion: SensorFusion, *, limits: FusionLimits = FusionLimits()
+    ) -> SensorPair:
         """Fuse two simulations of the same profiles.
 
         Parameters
@@ -51,6 +64,8 @@ class SensorPair:
             Simulations with the same transports.
         fusion
             Fusion rule.
+        limits
+            Limits of the interpolation.
 
         Raises
         ------
@@ -62,7 +77,7 @@ class SensorPair:
                 "the two sensors' profiles are not the same; give prepare_simulation the first one's transports"
             )
         steps = np.abs(np.diff(first.attribution.truth.g, axis=-1))
-        max_gap = _MAX_GAP * float(np.nanmedian(steps)) if np.isfinite(steps).any() else np.inf
+        max_gap = limits.max_gap * float(np.nanmedian(steps)) if np.isfinite(steps).any() else np.inf
         errors = attribute_pair_errors(first.attribution, second.attribution, fusion, max_gap=max_gap)
         return cls(first=first, second=second, errors=errors, fusion=fusion, limit=max(first.limit, second.limit))
 

@@ -17,6 +17,7 @@ from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import ELECTRON
 from gpuvision.simulation.sensors.masks import Mask, apply_mask
 from gpuvision.simulation.sensors.readings import (
+    AlignmentLimits,
     Reading,
     add_ambient,
     check_not_negative,
@@ -28,8 +29,7 @@ from gpuvision.simulation.sensors.readings import (
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 
 Float64 = npt.NDArray[np.float64]
-# Allowed difference between the edges of bins and of pixels [pixel]: rounding of the description.
-_EDGE_TOLERANCE = 1e-6
+_ALIGNMENT_LIMITS = AlignmentLimits()
 # Largest mean for which Poisson numbers are drawn [electrons]; no well holds as many, and NumPy's limit is 9e18.
 _MAX_ELECTRONS = 1e15
 
@@ -62,6 +62,8 @@ class CameraSimulator:
         Power of the ambient light on every profile, uniform along u [W], 0 or more.
     mask
         Mask before the pixels, for example a region of interest that follows the line.
+    limits
+        Allowed differences between view and readout.
 
     Raises
     ------
@@ -80,6 +82,7 @@ class CameraSimulator:
     bits: Literal[8, 10, 12, 14, 16] = 8
     ambient: float = 0.0
     mask: Mask | None = None
+    limits: AlignmentLimits = _ALIGNMENT_LIMITS
 
     def __post_init__(self) -> None:
         check_not_negative(self, "exposure_time", "responsivity", "gain", "offset", "read_noise", "ambient")
@@ -97,12 +100,12 @@ class CameraSimulator:
         object.__setattr__(self, "readout", readout)
         axes = readout.axes
         pixels = axes.position_origin + axes.position_pitch * (np.arange(self.view.bins + 1) - 0.5)
-        if np.any(np.abs(self.view.u_edges - np.sort(pixels)) > _EDGE_TOLERANCE * abs(axes.position_pitch)):
+        if np.any(np.abs(self.view.u_edges - np.sort(pixels)) > self.limits.edge_tolerance * abs(axes.position_pitch)):
             raise ValueError(
                 f"CameraSimulator: the view's bins are at {self.view.u_edges[0]:g} ... {self.view.u_edges[-1]:g}, the "
                 f"readout's pixels at {pixels[0]:g} ... {pixels[-1]:g}; expected a bin for every pixel"
             )
-        check_sample_axes(self.view, axes.sample_origin, axes.sample_pitch)
+        check_sample_axes(self.view, axes.sample_origin, axes.sample_pitch, self.limits)
 
     @property
     def _max_level(self) -> float:

@@ -32,13 +32,24 @@ from gpuvision.validation import finite
 Float64 = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 
-# Candidates for each end of a window in one step of the grid search.
+# Candidates for each end of a window in one step of the grid search (speed only: the search goes on to single bins).
 _CANDIDATES = 16
 # Pairs of window ends per batch: bounds the memory of a batch, 8 bytes a pair.
 _PAIRS_PER_BATCH = 4_000_000
-# Fixed-point iterations for a window's end. Each one reduces the error by the relative change of the slope between the
-# profile and the window's end.
-_MAX_ITERATIONS = 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskLimits:
+    """Limits of the windows of a mask around a profile.
+
+    Attributes
+    ----------
+    iterations : int
+        Number of fixed-point iterations for the ends of a window. Each one reduces the error by the relative change of
+        the slope between the profile and the end of the window. Chosen.
+    """
+
+    iterations: int = 30
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,7 +91,9 @@ class Mask:
             object.__setattr__(self, "transmission", shares)
 
     @classmethod
-    def around_profile(cls, view: SensorView, truth: GroundTruth, half_height: float) -> Mask:
+    def around_profile(
+        cls, view: SensorView, truth: GroundTruth, half_height: float, *, limits: MaskLimits = MaskLimits()
+    ) -> Mask:
         """Return a mask that follows an expected profile, with windows of constant height in the sheet.
 
         Parameters
@@ -91,6 +104,8 @@ class Mask:
             Expected points, (samples,) or (profiles, samples). Samples without a point have a closed window.
         half_height
             Height above and below the profile that passes [m], > 0. Windows are clipped to the sensor.
+        limits
+            Limits of the iteration.
 
         Raises
         ------
@@ -103,7 +118,7 @@ class Mask:
         low, high = view.u_edges[0], view.u_edges[-1]
         ends = np.stack([u, u], axis=-1)
         rise = np.array([-half_height, half_height])
-        for _ in range(_MAX_ITERATIONS):
+        for _ in range(limits.iterations):
             slope = height_secant(view.triangulation, u[..., None], ends, view.v_centres[:, None])
             with np.errstate(invalid="ignore", divide="ignore"):
                 ends = np.clip(u[..., None] + rise / slope, low, high)

@@ -19,6 +19,7 @@ from gpuvision.ranging.psd import ELECTRON, PsdNoise, PsdReading, PsdReadout
 from gpuvision.simulation.sensors.masks import Mask, apply_mask
 from gpuvision.simulation.sensors.readings import (
     AMBIENT,
+    AlignmentLimits,
     Reading,
     add_ambient,
     check_not_negative,
@@ -30,10 +31,9 @@ from gpuvision.simulation.sensors.readings import (
 from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 
 Float64 = npt.NDArray[np.float64]
+_ALIGNMENT_LIMITS = AlignmentLimits()
 # Largest code of the converter, uint16.
 _MAX_CODE = 65535
-# Allowed difference between the ends of view and strips, as a fraction of half a strip: rounding of the description.
-_EDGE_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,6 +58,8 @@ class PsdSimulator:
         Mask before the strips.
     quantised
         True: an analogue-to-digital converter makes uint16 codes of the currents, with a step of `readout.ampere`.
+    limits
+        Allowed differences between view and readout.
 
     Raises
     ------
@@ -72,6 +74,7 @@ class PsdSimulator:
     modulated: bool = False
     mask: Mask | None = None
     quantised: bool = False
+    limits: AlignmentLimits = _ALIGNMENT_LIMITS
 
     def __post_init__(self) -> None:
         check_not_negative(self, "responsivity", "ambient")
@@ -86,12 +89,12 @@ class PsdSimulator:
         axes, edges = self.readout.axes, self.view.u_edges
         half = 0.5 * abs(axes.position_pitch) * self.readout.strip_length
         ends = np.array([axes.position_origin - half, axes.position_origin + half])
-        if np.any(np.abs(edges[[0, -1]] - ends) > _EDGE_TOLERANCE * half):
+        if np.any(np.abs(edges[[0, -1]] - ends) > self.limits.edge_tolerance * half):
             raise ValueError(
                 f"PsdSimulator: the view ends at u = {edges[0]:g} and {edges[-1]:g}, the readout's strips at "
                 f"{ends[0]:g} and {ends[1]:g}; expected the same"
             )
-        check_sample_axes(self.view, axes.sample_origin, axes.sample_pitch)
+        check_sample_axes(self.view, axes.sample_origin, axes.sample_pitch, self.limits)
 
     def detected_light(self, exposures: Mapping[str, Exposure]) -> dict[str, Exposure]:
         """Return the light behind the mask by path, with the ambient light unless demodulation removes it."""

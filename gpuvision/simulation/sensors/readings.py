@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -23,11 +24,28 @@ AMBIENT = "ambient"
 UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED = "direct, uniform", "direct, unoccluded", "direct, uniform, unoccluded"
 """Hypothetical variants of the direct light: with uniform reflectivity of all surfaces, without occlusion between
 surfaces and lens, and both. They serve to attribute errors; the sensor never receives them."""
-# Allowed difference between the samples of view and readout, as a fraction of the pitch: rounding of descriptions.
-_PITCH_TOLERANCE = 1e-6
-# A lens' derivative replaces the secant for positions closer than this fraction of the region.
+# For positions closer than this fraction of the region, the lens' derivative replaces the secant: a difference quotient
+# loses digits there. Chosen: the rounding error of the quotient stays below about 2e-10, and the derivative at one end
+# differs from the secant by about 1e-6 times the relative curvature of the distortion.
 _MIN_SECANT = 1e-6
 _RECEIVED, _KNOWN = (*PATHS, AMBIENT), (*PATHS, AMBIENT, UNIFORM, UNOCCLUDED, UNIFORM_UNOCCLUDED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignmentLimits:
+    """Allowed differences between the descriptions of a view and of its readout, which differ by rounding.
+
+    Attributes
+    ----------
+    edge_tolerance : float
+        Difference between the edges of the view and of the readout along u. Camera: fraction of a pixel. PSD: fraction
+        of half a strip. Chosen.
+    pitch_tolerance : float
+        Difference between the samples of the view and of the readout along v, as a fraction of the pitch. Chosen.
+    """
+
+    edge_tolerance: float = 1e-6
+    pitch_tolerance: float = 1e-6
 
 
 class GroundTruth(NamedTuple):
@@ -215,7 +233,7 @@ def check_not_negative(simulator: Any, *names: str) -> None:
             raise ValueError(f"{type(simulator).__name__}.{name} is {getattr(simulator, name)}, expected 0 or more")
 
 
-def check_sample_axes(view: SensorView, origin: float, pitch: float) -> None:
+def check_sample_axes(view: SensorView, origin: float, pitch: float, limits: AlignmentLimits) -> None:
     """Check that the axes of a readout have the samples of the view.
 
     Raises
@@ -224,7 +242,7 @@ def check_sample_axes(view: SensorView, origin: float, pitch: float) -> None:
         The positions differ.
     """
     expected = np.sort(origin + pitch * np.arange(view.samples))
-    if np.any(np.abs(view.v_centres - expected) > _PITCH_TOLERANCE * abs(pitch)):
+    if np.any(np.abs(view.v_centres - expected) > limits.pitch_tolerance * abs(pitch)):
         raise ValueError(
             f"the view's samples are at v = {view.v_centres[0]:g} ... {view.v_centres[-1]:g}, the readout's axes "
             f"place them at {expected[0]:g} ... {expected[-1]:g}; expected the same"

@@ -21,10 +21,6 @@ from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
-# Radius of a blurred spot in standard deviations: less than 3e-12 of a Gaussian is farther away.
-_SPOT_RADIUS = 7.0
-# Smallest distance of the lens from the sheet, as a fraction of its distance from the sheet's origin.
-_MIN_OFF_SHEET = 1e-9
 
 
 class Exposure(NamedTuple):
@@ -56,6 +52,24 @@ class Exposure(NamedTuple):
         return np.asarray(self.moment.sum(axis=-1) + self.power @ (0.5 * (u_edges[1:] + u_edges[:-1])))
 
 
+@dataclass(frozen=True, kw_only=True)
+class ViewLimits:
+    """Limits of `SensorView`.
+
+    Attributes
+    ----------
+    spot_radius : float
+        Radius of a blurred spot [standard deviations]; the light beyond is left out. Derived: less than 3e-12 of a
+        Gaussian is farther away.
+    min_off_sheet : float
+        Least distance of the lens from the sheet of light, as a fraction of its distance from the sheet's origin.
+        Chosen.
+    """
+
+    spot_radius: float = 7.0
+    min_off_sheet: float = 1e-9
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SensorView:
     """View of a pinhole sensor on a sheet of light and a scene; compared by identity.
@@ -78,6 +92,8 @@ class SensorView:
     axis
         Direction of the lens' optical axis in the scene, (3,). None: towards the point of the sheet that the centre of
         the sensor sees.
+    limits
+        Limits of the blur and of the lens' position.
 
     Raises
     ------
@@ -92,6 +108,7 @@ class SensorView:
     v_edges: Float64
     aperture: float = 1e-3
     axis: Vector | None = None
+    limits: ViewLimits = ViewLimits()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lens", numbers(self.lens, (3,), "SensorView.lens"))
@@ -99,7 +116,7 @@ class SensorView:
         object.__setattr__(self, "v_edges", _edges(self.v_edges, "SensorView.v_edges"))
         if finite(self.aperture, "SensorView.aperture") <= 0.0:
             raise ValueError(f"SensorView.aperture is {self.aperture:g} m, expected a diameter > 0")
-        if abs(self._off_sheet) <= _MIN_OFF_SHEET * float(np.linalg.norm(self._to_sheet)):
+        if abs(self._off_sheet) <= self.limits.min_off_sheet * float(np.linalg.norm(self._to_sheet)):
             raise ValueError("SensorView.lens lies in the sheet of light: nothing can be triangulated")
         if self.axis is not None:
             towards: npt.ArrayLike = numbers(self.axis, (3,), "SensorView.axis")
@@ -260,8 +277,9 @@ class SensorView:
         sample, place = np.nonzero(exposure.power)
         light = exposure.power[sample, place]
         at = self.u_centres[place] + exposure.moment[sample, place] / light
-        first = np.maximum(np.searchsorted(self.u_edges, at - _SPOT_RADIUS * sigma) - 1, 0)
-        last = np.minimum(np.searchsorted(self.u_edges, at + _SPOT_RADIUS * sigma), self.bins)
+        radius = self.limits.spot_radius * sigma
+        first = np.maximum(np.searchsorted(self.u_edges, at - radius) - 1, 0)
+        last = np.minimum(np.searchsorted(self.u_edges, at + radius), self.bins)
         widest = int(np.max(last - first, initial=0))
         bins = np.minimum(first[:, None] + np.arange(widest + 1), self.bins)
         edges = (self.u_edges[bins] - at[:, None]) / sigma

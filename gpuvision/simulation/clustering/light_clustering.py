@@ -32,21 +32,22 @@ from gpuvision.simulation.scene.scene import Scene
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int32]
 
-# The kernel computes in single. In parts of the scene's reach: how far a position may be rounded, and how high a
-# surface must rise above the planes of receiver and segment to occlude.
+# The kernel computes in single. In parts of the scene's reach: how far a position may be rounded (derived: a few
+# roundings of single), and how high a surface must rise above the planes of receiver and segment to occlude (chosen:
+# well above the rounding).
 _REAL = np.dtype(np.float32)
-_ROUNDING, _MARGIN = 4.0 * 2.0**-23, 32.0 * 2.0**-23
+_POSITION_ROUNDING, _OCCLUDER_MARGIN = 4.0 * 2.0**-23, 32.0 * 2.0**-23
 # Columns of a segment in kernels/light_clustering/light_clustering.cl: normal, height of its plane, start, end.
 _SEGMENT_SIZES = {"normal": 3, "height": 1, "start": 3, "end": 3}
 _SEGMENT_COLUMNS = sum(_SEGMENT_SIZES.values())
 _GROUP, _STRIPS_PER_CORE = 64, 8
 # Bit of a selected segment that nothing can occlude, as the kernel sets it.
-_CLEAR = 1 << 30
+_UNOCCLUDED_BIT = 1 << 30
 # Entries of a block that fit at first. If a block needs more, the capacity grows to the next power of two and the
 # kernel runs again.
 _FIRST_CAPACITY = 64
 # Many pairs have a bound of 0 and leave their share of the tolerance unused. All shares are multiplied by this factor;
-# a strip whose error sum then exceeds the tolerance is traversed again with the factor 1.
+# a strip whose error sum then exceeds the tolerance is traversed again with the factor 1. Speed only (chosen).
 _SHARE_FACTOR = 2.0
 # Classes of errors, in powers of two below the tolerance, by which the smallest errors are found without a sort.
 _ERROR_CLASSES = 64
@@ -188,8 +189,8 @@ class _Selection(NamedTuple):
     Attributes
     ----------
     selected
-        int32 (blocks, capacity): position of a segment in the tree, with the bit `_CLEAR` if nothing can occlude it, or
-        ~node of a cluster.
+        int32 (blocks, capacity): position of a segment in the tree, with the bit `_UNOCCLUDED_BIT` if nothing can
+        occlude it, or ~node of a cluster.
     errors
         float32 (blocks, capacity): bound of the range error if that entry were left out [m].
     counts
@@ -234,7 +235,7 @@ class _SelectLights(VisionOperation[_Selection]):
         work = build.work(blocks, each=each, group=_GROUP)
         tree = None if self.scene is None else self.scene.bvh
         reach = 0.0 if self.scene is None else _scene_reach(self.scene, dtype)
-        margin = max(self.clearance, _MARGIN * reach)
+        margin = max(self.clearance, _OCCLUDER_MARGIN * reach)
         selected = (blocks, self.capacity)
         shapes = {"selected": selected, "errors": selected, "counts": (blocks,)}
         shapes |= {"error_sums": (blocks, 2), "pair_counts": (blocks, 2)}
@@ -279,7 +280,7 @@ def _frame(scene: Scene | None, segments: Reals, receivers: npt.NDArray[Any]) ->
         low, high = places.min(axis=0), places.max(axis=0)
         middle = (0.5 * (low + high)).astype(receivers.dtype)
         reach = float(np.abs(places).max()) if receivers.dtype == np.float32 else 0.5 * float((high - low).max())
-    return np.append(middle, _ROUNDING * reach)
+    return np.append(middle, _POSITION_ROUNDING * reach)
 
 
 def _scene_reach(scene: Scene, dtype: np.dtype[Any]) -> float:
@@ -353,9 +354,9 @@ def _assemble(
 ) -> LightCut:
     """Make the cut from the kernel's entries: turn positions in the tree and nodes into indices of segments."""
     cluster = selected < 0
-    clear = cluster | (selected >= _CLEAR)
+    clear = cluster | (selected >= _UNOCCLUDED_BIT)
     numbers = np.zeros(len(selected), np.int64)
-    numbers[~cluster] = tree.order[selected[~cluster] & (_CLEAR - 1)] if len(segments) else 0
+    numbers[~cluster] = tree.order[selected[~cluster] & (_UNOCCLUDED_BIT - 1)] if len(segments) else 0
     nodes, place = np.unique(~selected[cluster], return_inverse=True)
     numbers[cluster] = len(segments) + place
     starts = np.zeros(len(receivers_of) + 1, np.int32)

@@ -46,12 +46,13 @@ NODE_SIZES = {
     "length": 1,
 }
 COLUMNS = sum(NODE_SIZES.values())
-# Scale of the normals' axes in the choice of the widest axis, as part of the longest extent of the segments' midpoints.
+# Scale of the normals' axes in the choice of the widest axis, in extents of the segments' midpoints (speed only).
 _NORMAL_SCALE = 0.5
 # Half length of a representative segment, in radii of the cluster, where all its points coincide: not 0, so that
-# its exitance stays finite.
+# its exitance stays finite (chosen; the error bound of the node includes it).
 _MIN_LENGTH = 1e-3
-# Least cosine between a segment's normal and the mean normal at which a cluster has a representative.
+# Least cosine between a segment's normal and the mean normal at which a cluster has a representative. Chosen (speed
+# only): a cluster without a representative is opened.
 _MIN_COSINE = 0.1
 
 

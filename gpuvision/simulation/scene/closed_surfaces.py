@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 from gpuvision.simulation.scene.scene import Scene
 
 Float64 = npt.NDArray[np.float64]
-# Smallest volume of a closed surface, as a fraction of its bounding box: below, the sign of the volume is rounding.
-_MIN_VOLUME_FRACTION = 1e-9
 
 
-def visible_sides(scene: Scene, eye: npt.ArrayLike, direction: npt.ArrayLike) -> npt.NDArray[np.int8]:
+@dataclass(frozen=True, kw_only=True)
+class ClosedSurfaceLimits:
+    """Limits of `visible_sides`.
+
+    Attributes
+    ----------
+    min_volume_fraction : float
+        Least volume of a closed surface, as a fraction of its bounding box; of flatter surfaces both sides are visible.
+        Chosen: the sign of smaller volumes may be rounding.
+    """
+
+    min_volume_fraction: float = 1e-9
+
+
+def visible_sides(
+    scene: Scene,
+    eye: npt.ArrayLike,
+    direction: npt.ArrayLike,
+    *,
+    limits: ClosedSurfaceLimits = ClosedSurfaceLimits(),
+) -> npt.NDArray[np.int8]:
     """Return the side of each triangle that is visible from a view point that moves along a straight line.
 
     A closed surface is a set of connected triangles in which every edge belongs to exactly two of them. Only its outer
@@ -24,6 +44,8 @@ def visible_sides(scene: Scene, eye: npt.ArrayLike, direction: npt.ArrayLike) ->
         Triangles. Connected triangles share corners with identical coordinates.
     eye, direction
         A point of the line [m] and its direction, (3,) each.
+    limits
+        Limits of the volume.
 
     Returns
     -------
@@ -59,7 +81,7 @@ def visible_sides(scene: Scene, eye: npt.ArrayLike, direction: npt.ArrayLike) ->
     np.maximum.at(high, part, corners.max(axis=1))
     from_low = corners - low[part][:, None]
     volume = np.bincount(part, np.linalg.det(from_low) / 6.0, minlength=count)
-    whole &= np.abs(volume) > _MIN_VOLUME_FRACTION * np.prod(high - low, axis=1)
+    whole &= np.abs(volume) > limits.min_volume_fraction * np.prod(high - low, axis=1)
     whole &= ~_line_meets_boxes(np.asarray(eye, np.float64), np.asarray(direction, np.float64), low, high)
     sides[triangles] = np.where(whole, np.sign(volume), 0.0)[part]
     return sides

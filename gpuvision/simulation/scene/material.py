@@ -9,7 +9,7 @@ import numpy as np
 from gpuvision.simulation.scene.reflectance import Brdf, Lambert, OrenNayar
 from gpuvision.validation import finite
 
-# Allowed excess of the total albedo over 1: error of the numerical integration of a lobe's albedo.
+# Allowed excess of the total albedo over 1, for the error of the numerical integration of a lobe's albedo (chosen).
 _ALBEDO_TOLERANCE = 1e-2
 
 

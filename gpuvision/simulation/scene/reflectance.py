@@ -28,7 +28,7 @@ from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite
 
 Array = npt.NDArray[np.float64]
-# Smallest roughness parameter alpha: nearly a mirror.
+# Smallest roughness parameter alpha: nearly a mirror (chosen).
 _MIN_ALPHA = 1e-4
 # Lanes of a vector, work-items of a group, pairs of a work-item of the vector variant: tuned for speed.
 _LANES, _GROUP, _STRIP = 16, 64, 4096

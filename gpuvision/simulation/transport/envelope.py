@@ -14,8 +14,8 @@ Integers = npt.NDArray[np.int64]
 
 # Pairs of a segment and an interval in memory at once: some 100 MB. More are divided into halves.
 _MAX_PAIRS = 1_000_000
-# Relative rounding of a height at a crossing.
-_ROUNDING = 1e-13
+# Relative rounding of a height at a crossing. Derived: some hundred roundings of double.
+_HEIGHT_ROUNDING = 1e-13
 
 
 class Pieces(NamedTuple):
@@ -148,7 +148,7 @@ class _Crossings:
             known = np.maximum(*(_heights_at(self.x[each], self.height[each], at) for each in (one, two)))
             inside = (at > left) & (at < right)
             # A third segment counts as higher only beyond the rounding of the heights.
-            more = inside & (level > known + _ROUNDING * np.abs(level)) & (top != one) & (top != two)
+            more = inside & (level > known + _HEIGHT_ROUNDING * np.abs(level)) & (top != one) & (top != two)
             ended = ~more
             done.append(Pieces(one[ended], left[ended], at[ended]))
             done.append(Pieces(two[ended], at[ended], right[ended]))

@@ -18,11 +18,30 @@ from gpuvision.validation import finite, numbers
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# A fan lights points whose depth below the source exceeds this part of the source's height: its rays meet H = 0 within
-# a thousand heights, so that x stays finite.
-_FLATTEST = 1e-3
-# `LitLine.merged`: relative distance at which ends touch (some roundings), and at which normals and powers agree.
-_TOUCHING, _EVEN = 1e-14, 1e-9
+# Least depth of a lit point below the source of a fan, as a fraction of the source's height. Derived: rays then meet
+# H = 0 within a thousand heights, so that x stays finite. Part of the definition of `LightSheet.source`.
+_MIN_DEPTH_FRACTION = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class MergeLimits:
+    """Tolerances of `LitLine.merged`.
+
+    Attributes
+    ----------
+    end_gap : float
+        Largest distance between two ends that touch, as a fraction of their coordinates. Derived: some roundings of
+        double.
+    agreement : float
+        Largest difference between the normals, and relative difference between the powers, of merged segments. Chosen:
+        far above rounding, far below the errors of a scan.
+    """
+
+    end_gap: float = 1e-14
+    agreement: float = 1e-9
+
+
+_MERGE_LIMITS = MergeLimits()
 
 
 class LitLine(NamedTuple):
@@ -58,24 +77,22 @@ class LitLine(NamedTuple):
         """Return the segments of an index array, a mask or a slice."""
         return LitLine(self.ends[which], self.normals[which], self.triangle[which], self.power[which])
 
-    def merged(self, kind: npt.ArrayLike) -> LitLine:
+    def merged(self, kind: npt.ArrayLike, *, limits: MergeLimits = _MERGE_LIMITS) -> LitLine:
         """Return the segments with neighbours merged that touch and lie in one plane, with the same power and kind.
 
         Parameters
         ----------
         kind
             (m,) integers, such as the materials of the segments' triangles. A merged segment keeps its first triangle.
-
-        Notes
-        -----
-        Ends touch within 1e-14 of their coordinates; normals and powers agree within 1e-9.
+        limits
+            Tolerances. Default: ends touch within 1e-14 of their coordinates, normals and powers agree within 1e-9.
         """
         kind = np.asarray(kind)
         gap = np.abs(self.ends[1:, 0] - self.ends[:-1, 1]).max(axis=1, initial=0.0)
         size = np.abs(self.ends[1:, 0]).max(axis=1, initial=0.0)
         turn = np.abs(np.diff(self.normals, axis=0)).max(axis=1, initial=0.0)
-        alike = (gap <= _TOUCHING * size) & (turn <= _EVEN) & (np.diff(kind) == 0)
-        alike &= np.abs(np.diff(self.power)) <= _EVEN * self.power[1:]
+        alike = (gap <= limits.end_gap * size) & (turn <= limits.agreement) & (np.diff(kind) == 0)
+        alike &= np.abs(np.diff(self.power)) <= limits.agreement * self.power[1:]
         first = np.flatnonzero(np.append(True, ~alike)[: len(self.power)])
         last = np.append(first[1:], len(self.power))[: len(first)] - 1
         ends = np.stack([self.ends[first, 0], self.ends[last, 1]], axis=1)
@@ -231,7 +248,7 @@ class LightSheet:
         the height is 1 / (depth below the source).
         """
         if self.source is not None:
-            cuts = _clip_below(cuts, self.source[1] * (1.0 - _FLATTEST))
+            cuts = _clip_below(cuts, self.source[1] * (1.0 - _MIN_DEPTH_FRACTION))
         G, H = cuts.ends[..., 0], cuts.ends[..., 1]
         if self.source is not None:
             above, depth = self.source[1], self.source[1] - H

@@ -26,10 +26,26 @@ from gpuvision.operation import VisionOperation
 _LANES, _GROUP = 16, 64
 # Strips of receivers: several per core balance the load, and each has enough pairs to outweigh its start.
 _STRIPS_PER_CORE, _PAIRS_PER_STRIP = 8, 8192
-# In single, frames whose components differ by less than this share one frame (rounding of equal directions).
-_ALIKE = 1e-13
-# Largest cosine between a segment and its normal that counts as rounding; a segment lies in its surface.
-_LEAN = 1e-5
+# In single, frames whose components differ by less than this share one frame. Derived: the rounding of equal directions
+# is some 1e-16.
+_FRAME_ROUNDING = 1e-13
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentLimits:
+    """Limits of `LitSegments`.
+
+    Attributes
+    ----------
+    max_normal_cosine : float
+        Largest cosine of the angle between a segment and its normal; the segment must lie in its surface. Chosen: above
+        the rounding of inputs in single.
+    """
+
+    max_normal_cosine: float = 1e-5
+
+
+_SEGMENT_LIMITS = SegmentLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +60,8 @@ class LitSegments:
         (m, 3): normals of the lit surfaces on the side that emits, of any length, perpendicular to the segment.
     exitance
         (m,): power that leaves a metre of the line [W/m], 0 or more: albedo times the power that arrives on it.
+    limits
+        Tolerance of the check of the normals.
 
     Raises
     ------
@@ -56,6 +74,7 @@ class LitSegments:
     ends: npt.NDArray[np.float64]
     normals: npt.NDArray[np.float64]
     exitance: npt.NDArray[np.float64]
+    limits: SegmentLimits = _SEGMENT_LIMITS
 
     def __post_init__(self) -> None:
         exitance = _checked(self.exitance, (-1,), "exitance")
@@ -66,7 +85,9 @@ class LitSegments:
         normals = _unit(normals)
         along = _unit(ends[:, 1] - ends[:, 0])
         lean = np.sum(normals * along, axis=1, keepdims=True)
-        _refuse(np.abs(lean[:, 0]) > _LEAN, "does not lie in its surface: its normal leans along it")
+        _refuse(
+            np.abs(lean[:, 0]) > self.limits.max_normal_cosine, "does not lie in its surface: its normal leans along it"
+        )
         object.__setattr__(self, "exitance", exitance)
         object.__setattr__(self, "ends", ends)
         object.__setattr__(self, "normals", _unit(normals - lean * along))
@@ -86,7 +107,7 @@ class LitSegments:
         along, normals = _unit(across[emits]), self.normals[emits]
         frames = np.stack([along, normals, np.cross(along, normals)], axis=1)
         # In single, frames that differ by rounding share one frame.
-        key = frames.reshape(-1, 9) if real == np.float64 else np.rint(frames.reshape(-1, 9) / _ALIKE)
+        key = frames.reshape(-1, 9) if real == np.float64 else np.rint(frames.reshape(-1, 9) / _FRAME_ROUNDING)
         _, group, members = np.unique(key, axis=0, return_inverse=True, return_counts=True)
         # The kernel takes the segments that are alone in their frame first.
         order = np.lexsort((group, members[group] > 1))

@@ -23,15 +23,31 @@ from gpuvision.status import Status
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Visible intervals of a segment that the kernel returns, and number of times that a segment with more intervals is
-# halved: down to a millionth of its length.
-_MAX_INTERVALS, _MAX_HALVINGS = 8, 20
 # Fans of rays in one launch: a fixed shape, so that one bound kernel and one copy of the tree serve any number.
 _FANS_PER_LAUNCH = 1024
-# Points nearer than this to a limit of the view, in parts of the farther end's distance, count as beyond it.
+# Points nearer to a limit of the view than this fraction of the farther end's distance count as beyond it. Chosen: a
+# million roundings of double; the lost part of a line is far below the resolution of a sensor.
 _VIEW_MARGIN = 1e-9
-# Newton iterations that find an edge under lens distortion.
-_NEWTON_STEPS = 3
+# Newton iterations that find an edge under lens distortion. Chosen: the error of the start value is squared each time.
+_NEWTON_ITERATIONS = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class VisibilityLimits:
+    """Limits of `LensVisibility`.
+
+    Attributes
+    ----------
+    max_intervals : int
+        Number of visible intervals of a segment that one run of the kernel returns. Chosen for speed: a segment with
+        more intervals is halved.
+    max_halvings : int
+        Largest number of times that a segment is halved; what then still has too many intervals counts as hidden.
+        Derived: 2^-20 is a millionth of the segment.
+    """
+
+    max_intervals: int = 8
+    max_halvings: int = 20
 
 
 class Parts(NamedTuple):
@@ -80,6 +96,8 @@ class LensVisibility:
         Triangles that may occlude.
     device
         Device of the `VisibleIntervals` kernel.
+    limits
+        Limits of the subdivision.
 
     Notes
     -----
@@ -89,11 +107,12 @@ class LensVisibility:
 
     scene: Scene
     device: Device
+    limits: VisibilityLimits = VisibilityLimits()
     _bound: Any = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         real = np.dtype(np.float64 if self.device.has_double else np.float32)
-        fans = VisibleIntervals(scene=self.scene, max_intervals=_MAX_INTERVALS)
+        fans = VisibleIntervals(scene=self.scene, max_intervals=self.limits.max_intervals)
         object.__setattr__(self, "_bound", fans.bind(self.device, (_FANS_PER_LAUNCH, 11), real))
 
     def visible_parts(self, line: LitLine, lens: Float64, *, with_hidden: bool = False) -> Parts:
@@ -112,7 +131,7 @@ class LensVisibility:
         lens = np.broadcast_to(lens, (count, 3))
         todo = Parts(np.arange(count), np.zeros(count), np.ones(count), np.ones(count, bool))
         found = [todo.select(np.zeros(0, np.int64))]
-        for _ in range(_MAX_HALVINGS):
+        for _ in range(self.limits.max_halvings):
             if not len(todo.segment):
                 break
             shown, many = self._visible_once(line, todo, lens)
@@ -333,7 +352,7 @@ class ProjectedLines:
         with np.errstate(divide="ignore", invalid="ignore"):
             found = (straight * start[:, 2] - start[:, axis]) / (way[:, axis] - straight * way[:, 2])
         found = self._clamp(parts, found)
-        for _ in range(0 if self.lens is None else _NEWTON_STEPS):
+        for _ in range(0 if self.lens is None else _NEWTON_ITERATIONS):
             step = np.where(2.0 * found < parts.start + parts.end, 1e-4, -1e-4) * (parts.end - parts.start)
             here, there = self.image_points(parts.segment, np.stack([found, found + step]))[..., axis]
             with np.errstate(divide="ignore", invalid="ignore"):

@@ -18,8 +18,8 @@ Float64 = npt.NDArray[np.float64]
 
 _GROUP, _LANES = 64, 16
 # Facets of different directions are moved apart by this many extents before they are sorted into blocks, so that the
-# facets of a block have one direction as far as possible.
-_APART = 100.0
+# facets of a block have one direction as far as possible (speed only).
+_DIRECTION_SEPARATION = 100.0
 
 
 class NearFacets(NamedTuple):
@@ -79,7 +79,7 @@ class MirrorFacets(VisionOperation[NearFacets]):
         corners = self.corners
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        reach = _APART * float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+        reach = _DIRECTION_SEPARATION * float(np.ptp(corners.reshape(-1, 3), axis=0).max())
         normals = np.repeat(normal[:, None], 3, axis=1)
         # Sorted at the moved positions, measured at the true ones.
         return TriangleBlocks.of(corners, normals, corners + reach * normals)

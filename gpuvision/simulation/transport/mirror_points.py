@@ -30,11 +30,11 @@ from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
 Float64 = npt.NDArray[np.float64]
 # Columns of a triangle and of a block in kernels/mirrors/mirrors.cl; work-items of a group; lanes of a vector.
 _ROW, _BLOCK, _GROUP, _LANES = 27, 11, 64, 16
-# Angle between neighbouring triangles above which their edge is sharp [rad].
-_CREASE = math.radians(40.0)
+# Default angle between neighbouring triangles above which their edge is sharp [rad] (chosen).
+CREASE = math.radians(40.0)
 
 
-def smooth_normals(scene: Scene, crease: float = _CREASE) -> Float64:
+def smooth_normals(scene: Scene, crease: float = CREASE) -> Float64:
     """Return unit normals of a smooth surface at the corners of triangles, (n, 3, 3).
 
     The normal at a corner is the weighted mean over all triangles that share the corner, without those that lean more

@@ -23,8 +23,14 @@ from gpuvision.simulation.sensors.view_rays import check_materials
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
 from gpuvision.simulation.transport.line_exposure import expose_lines
 from gpuvision.simulation.transport.mirror_facets import MirrorFacets
-from gpuvision.simulation.transport.mirror_points import MirrorPoints, max_bulge, smooth_normals
-from gpuvision.simulation.transport.plane_mirrors import heights_above, mirror_windows, reflect_points, triangle_planes
+from gpuvision.simulation.transport.mirror_points import CREASE, MirrorPoints, max_bulge, smooth_normals
+from gpuvision.simulation.transport.plane_mirrors import (
+    MIN_HEIGHT,
+    heights_above,
+    mirror_windows,
+    reflect_points,
+    triangle_planes,
+)
 from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
 from gpuvision.simulation.transport.specular_interreflection import SpecularInterreflection
 from gpuvision.status import Status
@@ -50,11 +56,18 @@ class MirrorLimits:
     clearance
         Distance from a surface within which nothing occludes a ray, as part of the scene's reach; about one rounding in
         single.
+    crease
+        Angle between neighbouring triangles above which their edge is sharp [rad], of `smooth_normals`; chosen.
+    min_height
+        Least height of the lens above a mirror's plane, and of a point relative to that of the lens; in parts of the
+        lens' distance. Lower ones count as in the plane; derived: some thousand roundings of double.
     """
 
     flat_angle: float = 1e-6
     max_halvings: int = 12
     clearance: float = 1e-7
+    crease: float = CREASE
+    min_height: float = MIN_HEIGHT
 
 
 class _MirroredParts(NamedTuple):
@@ -212,7 +225,12 @@ class Mirrors:
         """Return the parts of lines that the lens sees in plane mirrors, unoccluded before and after the reflection."""
         lens = self.view.lens_at(L)
         line, mirror, share = mirror_windows(
-            lens, lit.ends, self._facets.corners, self._planes, *self._candidate_pairs(lit, lens)
+            lens,
+            lit.ends,
+            self._facets.corners,
+            self._planes,
+            *self._candidate_pairs(lit, lens),
+            min_height=self.limits.min_height,
         )
         # The lit side of the line must face the mirror image of the lens.
         apex = reflect_points(lens, self._planes[mirror])
@@ -389,7 +407,7 @@ class Mirrors:
             found = np.zeros(self.scene.corners.shape)
             some = np.flatnonzero(self._reflects)
             if len(some):
-                found[some] = smooth_normals(Scene(self.scene.corners[some]))
+                found[some] = smooth_normals(Scene(self.scene.corners[some]), self.limits.crease)
         with np.errstate(invalid="ignore"):
             inward = np.sum(found.sum(axis=1) * self._normal_of, axis=1) * self._sides < 0.0
         found[inward] *= -1.0

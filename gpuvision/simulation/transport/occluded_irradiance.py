@@ -38,7 +38,7 @@ _GROUP = 64
 # Parts of the work per CPU core: enough to balance the load; few, because each groups the segments into lines anew.
 _SHARES_PER_CORE = 8
 # Least stack depth in the build options, so that all small scenes share one build.
-_LEAST_DEPTH = 4
+_MIN_STACK_DEPTH = 4
 # Default clearance in parts of the scene's reach, by bytes of the type: below it, the rounding of positions (of the
 # caller's, too) decides on which side of a surface a point lies.
 _CLEARANCE = {4: 4e-6, 8: 1e-12}
@@ -172,7 +172,7 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
             ),
             defines={
                 **type_defines("INPUT", dtype),
-                "BVH_DEPTH": max(tree.depth, _LEAST_DEPTH),
+                "BVH_DEPTH": max(tree.depth, _MIN_STACK_DEPTH),
                 **({} if work.vectors else {"GROUP": _GROUP}),
                 **flags(
                     WIDE_PLACES=device.has_double,

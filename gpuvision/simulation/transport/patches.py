@@ -33,8 +33,8 @@ Integers = npt.NDArray[np.int64]
 R = TypeVar("R", bound=tuple[Any, ...])
 _LANES, _GROUP = 16, 64
 # In roundings of the largest coordinate: height up to which a receiver counts as in a triangle's plane, and default
-# clearance of rays.
-_LIFT, _CLEARANCE = 16.0, 64.0
+# clearance of rays (`FormFactors.clearance`). Chosen: a few times the rounding of a transformed point, and above it.
+_PLANE_ROUNDINGS, _CLEARANCE_ROUNDINGS = 16.0, 64.0
 # Quadrature: a patch of fewer triangles than this gets three nodes on each; other patches get the centroids of this
 # number of their largest triangles.
 _TRIANGLES_PER_PATCH = 4
@@ -294,7 +294,7 @@ class _PatchOperation(VisionOperation[R]):
         place = np.result_type(build.dtype, real)
         middle = (0.5 * (low + high) if tree is None else tree.middle).astype(place)
         eps, reach = float(np.finfo(real).eps), float(np.abs([low - middle, high - middle]).max())
-        clearance = _CLEARANCE * eps * reach if self.clearance is None else self.clearance
+        clearance = _CLEARANCE_ROUNDINGS * eps * reach if self.clearance is None else self.clearance
         return build.launch(
             "patches/patches.cl",
             kernel,
@@ -311,7 +311,7 @@ class _PatchOperation(VisionOperation[R]):
                 *self.patches.tables(middle, real),
                 *([None] * 5 if tree is None else tree.tables(real)),
                 middle,
-                real.type(_LIFT * eps * reach),
+                real.type(_PLANE_ROUNDINGS * eps * reach),
                 real.type(clearance),
                 real.type(self.rays),
                 np.uint32(self.patches.count),

@@ -10,8 +10,9 @@ import numpy.typing as npt
 Float64 = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-# Points nearer to a mirror's plane than this part of the lens' distance count as in the plane (rounding).
-_IN_PLANE = 1e-12
+# Default height above a mirror's plane, in parts of the lens' distance, below which a point counts as in the plane.
+# Derived: some thousand roundings of double.
+MIN_HEIGHT = 1e-12
 
 
 class MirrorWindows(NamedTuple):
@@ -48,7 +49,14 @@ def reflect_points(points: Float64, planes: Float64) -> Float64:
 
 
 def mirror_windows(
-    lens: Float64, ends: Float64, corners: Float64, planes: Float64, line: Integers, mirror: Integers
+    lens: Float64,
+    ends: Float64,
+    corners: Float64,
+    planes: Float64,
+    line: Integers,
+    mirror: Integers,
+    *,
+    min_height: float = MIN_HEIGHT,
 ) -> MirrorWindows:
     """Return the parts of lines that a lens sees in triangles.
 
@@ -65,10 +73,12 @@ def mirror_windows(
         (m, 3, 3) and (m, 4): mirrors [m], each with an area, and their `triangle_planes`.
     line, mirror
         (n,): pairs of a line and a mirror to test.
+    min_height
+        As `MirrorLimits.min_height`.
     """
     from_lens, planes = corners[mirror] - lens, planes[mirror]
     lens_height = heights_above(lens, planes)
-    usable = np.abs(lens_height) > _IN_PLANE * np.linalg.norm(from_lens[:, 0], axis=1)
+    usable = np.abs(lens_height) > min_height * np.linalg.norm(from_lens[:, 0], axis=1)
     # Normals are turned to the lens' side, and the planes through lens and edges so that the triangle is on their
     # positive side.
     normal, lens_height = planes[:, :3] * np.sign(lens_height)[:, None], np.abs(lens_height)
@@ -77,7 +87,7 @@ def mirror_windows(
     points = ends[line] - lens
     height = np.einsum("nek,nk->ne", points, normal) + lens_height[:, None]
     low, high = np.zeros(len(line)), np.ones(len(line))
-    _clip_positive(low, high, height - _IN_PLANE * lens_height[:, None])
+    _clip_positive(low, high, height - min_height * lens_height[:, None])
     # The mirror image of a point: the point minus twice its height along the normal.
     image = points - 2.0 * height[..., None] * normal[:, None]
     for n in range(3):

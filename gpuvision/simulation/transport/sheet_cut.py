@@ -25,9 +25,12 @@ Integers = npt.NDArray[np.int64]
 # Triangles are sorted into levels of lengths along the transport, 2^-n of the longest; the last level holds all shorter
 # ones. A search then looks only a short way back in each level.
 _MAX_LEVELS = 24
-# `parallel_edges`: slope out of the sheet up to which an edge lies in it, and cosine of the angle between two triangles
-# below which their common edge is sharp (0.2 rad).
-_PARALLEL, _SMOOTH = 1e-9, math.cos(0.2)
+# `parallel_edges`. Largest slope of an edge that lies in a sheet, and, in parts of the scene's length, largest distance
+# of edges at one transport. Chosen: far above rounding, far below a step of the transport.
+_MAX_EDGE_SLOPE = 1e-9
+# Cosine of the angle between two triangles below which their common edge is sharp. Chosen: 0.2 rad is more than between
+# the facets of a finely meshed curved surface. Only places where the integral over the sheet is divided depend on it.
+_MIN_SMOOTH_COSINE = math.cos(0.2)
 _INDEX_CACHE: WeakKeyDictionary[Scene, dict[tuple[object, ...], SheetIndex]] = WeakKeyDictionary()
 
 
@@ -128,12 +131,12 @@ class SheetIndex:
         corners = self.corners[np.stack([one, two])]
         normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        smooth = (uses == 2) & (np.sum(normal[0] * normal[1], axis=-1) > _SMOOTH)
+        smooth = (uses == 2) & (np.sum(normal[0] * normal[1], axis=-1) > _MIN_SMOOTH_COSINE)
         sharp = edges[first[~smooth | (self.material[one] != self.material[two])]]
         places, lengths = sharp[:, 0, 2], np.linalg.norm(sharp[:, 1] - sharp[:, 0], axis=1)
         order = np.argsort(places, kind="stable")
         places, lengths = places[order], lengths[order]
-        apart = np.diff(places, prepend=-np.inf) > _PARALLEL * np.abs(self.corners[..., 2]).max(initial=0.0)
+        apart = np.diff(places, prepend=-np.inf) > _MAX_EDGE_SLOPE * np.abs(self.corners[..., 2]).max(initial=0.0)
         begin = np.flatnonzero(apart)
         return places[begin], np.add.reduceat(lengths, begin) if len(begin) else lengths
 
@@ -146,7 +149,7 @@ class SheetIndex:
         for n in range(3):
             both = self.corners[:, [n, (n + 1) % 3]]
             way = np.abs(both[:, 1] - both[:, 0])
-            found = np.flatnonzero(way[:, 2] <= _PARALLEL * np.maximum(way[:, 0], way[:, 1]))
+            found = np.flatnonzero(way[:, 2] <= _MAX_EDGE_SLOPE * np.maximum(way[:, 0], way[:, 1]))
             edges.append(both[found])
             rows.append(found)
         whole = np.concatenate(edges)

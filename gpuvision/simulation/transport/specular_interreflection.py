@@ -23,12 +23,28 @@ Integers = npt.NDArray[np.int64]
 
 # Pairs of a sheet and a block of triangles in memory at once.
 _MAX_PAIRS = 2_000_000
-# Decimals, in units of the scene's reach, to which mirrored sheets agree that are one sheet (rounding with a margin).
-_DIGITS = 11
-# Points nearer to a mirror than this part of the source's distance, or of the scene's reach, lie on it (rounding).
-_ON_MIRROR = 1e-12
-# Halvings of a step between two rays off a curved mirror that meet different triangles: 2^-12 of a step.
-_MAX_HALVINGS = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class InterreflectionLimits:
+    """Numerical limits of `SpecularInterreflection`.
+
+    Attributes
+    ----------
+    sheet_decimals : int
+        Number of decimals, in units of the scene's reach, to which two mirrored sheets must agree to count as one.
+        Derived: the rounding of double with a margin of some ten thousand.
+    on_mirror : float
+        Points nearer to a mirror than this fraction of the source's distance, or of the scene's reach, lie on it.
+        Derived: some thousand roundings of double.
+    max_halvings : int
+        Largest number of times that a step is halved between two rays off a curved mirror that meet different
+        triangles. Chosen: 2^-12 of a step.
+    """
+
+    sheet_decimals: int = 11
+    on_mirror: float = 1e-12
+    max_halvings: int = 12
 
 
 class _Beam(NamedTuple):
@@ -58,6 +74,8 @@ class SpecularInterreflection:
         Distance from a surface within which a ray meets nothing [m].
     device
         Device of the ray queries.
+    limits
+        Numerical limits.
     """
 
     scene: Scene
@@ -67,6 +85,7 @@ class SpecularInterreflection:
     step: float
     clearance: float
     device: Device
+    limits: InterreflectionLimits = InterreflectionLimits()
 
     def reflected_lines(self, lit: LitLine, sheet: LightSheet, L: float, max_reflections: int) -> LitLine:
         """Return the lines that are lit after 1 to ``max_reflections`` reflections.
@@ -172,7 +191,7 @@ class SpecularInterreflection:
             normal = normal * np.sign(largest)
             planes += [normal, np.sum(normal * start, axis=1, keepdims=True) / self._reach]
         light[:, :3] /= np.where(light[:, 3:] != 0.0, self._reach, 1.0)
-        return np.round(np.hstack([*planes, light]), _DIGITS) + 0.0
+        return np.round(np.hstack([*planes, light]), self.limits.sheet_decimals) + 0.0
 
     def _cuts(self, fans: _MirroredSheets) -> _SheetCuts:
         """Return the cuts of mirrored sheets through the scene's triangles beyond their mirrors."""
@@ -181,11 +200,15 @@ class SpecularInterreflection:
         for first in range(0, len(fans.length), step):
             some = slice(first, first + step)
             off = fans.across[some] @ blocks.middle.T - np.sum(fans.across * fans.start, axis=1)[some, None]
-            fan, block = np.nonzero(np.abs(off) <= blocks.radius * (1.0 + 1e-9) + _ON_MIRROR * self._reach)
+            fan, block = np.nonzero(np.abs(off) <= blocks.radius * (1.0 + 1e-9) + self.limits.on_mirror * self._reach)
             fan, block = fans.reachable(fan + first, block, blocks)
             count = np.diff(blocks.start)[block]
             triangle = blocks.order[concatenated_ranges(blocks.start[block], count)]
-            found.append(_cut_triangles(fans, np.repeat(fan, count), self.scene.corners, triangle, self._reach))
+            found.append(
+                _cut_triangles(
+                    fans, np.repeat(fan, count), self.scene.corners, triangle, self._reach, self.limits.on_mirror
+                )
+            )
         return _SheetCuts(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
     # ---- curved mirrors: rays ----------------------------------------------------------------------------------
@@ -199,7 +222,7 @@ class SpecularInterreflection:
         number = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
         share = np.stack([number, number + 1], axis=1) / count[row, None]
         found = []
-        for left in range(_MAX_HALVINGS, -1, -1):
+        for left in range(self.limits.max_halvings, -1, -1):
             if not len(row):
                 break
             spots, towards, triangle = self._reflected(beam, row, share)
@@ -351,7 +374,7 @@ def _mirrored_sheets(beam: _Beam, first: Integers, group: Integers, planes: Floa
 
 
 def _cut_triangles(
-    fans: _MirroredSheets, fan: Integers, corners: Float64, triangle: Integers, reach: float
+    fans: _MirroredSheets, fan: Integers, corners: Float64, triangle: Integers, reach: float, on_mirror: float
 ) -> _SheetCuts:
     """Cut triangles with sheets, pair by pair, and keep the parts beyond the mirror and within the light."""
     points = corners[triangle] - fans.start[fan][:, None]
@@ -377,7 +400,7 @@ def _cut_triangles(
     p, q = np.moveaxis(np.einsum("fij,fpj->fpi", fans.basis[fan], place), -1, 0)
     # Beyond the mirror q is negative. Rays from a source are 1 - q times as far apart as at the mirror.
     is_point = light[:, 3] != 0.0
-    p, depth, kept = _clip_beyond(p, -q, _ON_MIRROR * np.where(is_point, 1.0, reach))
+    p, depth, kept = _clip_beyond(p, -q, on_mirror * np.where(is_point, 1.0, reach))
     fan, triangle, is_point = fan[kept], triangle[kept], is_point[kept, None]
     wide = np.where(is_point, 1.0 + depth, 1.0)
     x, height = p / wide, np.where(is_point, 1.0 / wide, -depth)

@@ -35,12 +35,24 @@ from gpuvision.ranging.regrid import Direction, Grid, HeightMap, Regrid
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 
-# Delay [s] of a frame from which on the summary says that the replay did not hold the requested rate.
-MAX_DELAY = 0.01
-_MAX_CELLS = 1 << 26  # of a height map: 256 MiB of float32 heights
-
 Array = npt.NDArray[Any]
 Progress = Callable[[int, int | None], object]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanLimits:
+    """Limits of a scan.
+
+    Attributes
+    ----------
+    max_delay : float
+        Delay of a frame [s] from which on the summary says that the replay did not hold the requested rate. Chosen.
+    max_cells : int
+        Largest number of cells of a height map. Chosen: bounds the memory, 256 MiB of float32 heights.
+    """
+
+    max_delay: float = 0.01
+    max_cells: int = 1 << 26
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +81,8 @@ class Scan:
         Duration [s] of the steps after the stream, by name.
     metadata : dict
         Further entries of the report: recording, sensor, rates [frames/s], delay of the replay [s].
+    limits : ScanLimits
+        Limits of the scan.
     """
 
     sensor: Sensor
@@ -81,6 +95,7 @@ class Scan:
     stream: StreamReport
     seconds: dict[str, float]
     metadata: dict[str, Any]
+    limits: ScanLimits = ScanLimits()
 
     @property
     def valid_fraction(self) -> float:
@@ -101,7 +116,9 @@ class Scan:
         if sensor_rate is not None and self.metadata["rate"] is None:
             speed += f" ({self.throughput / sensor_rate:.1f} times the sensor's rate)"
         valid = f"{100 * self.valid_fraction:.1f} % of the samples valid"
-        overdue = f"; frames were read up to {1e3 * delay:.0f} ms late" if delay and delay > MAX_DELAY else ""
+        overdue = (
+            f"; frames were read up to {1e3 * delay:.0f} ms late" if delay and delay > self.limits.max_delay else ""
+        )
         size = f"{self.grid.columns} x {self.grid.rows} cells"
         return f"{stream.frames} frames{dropped} at {speed}, {valid}, {size}{overdue}"
 
@@ -195,6 +212,7 @@ def scan(
     policy: Policy | None = None,
     trace: str | Path | None = None,
     progress: Progress = lambda done, of: None,
+    limits: ScanLimits = ScanLimits(),
 ) -> Scan:
     """Compute the range image and the height map of a recording.
 
@@ -218,6 +236,8 @@ def scan(
         Output file for the timeline of the stream. The path is checked before the scan.
     progress : callable, optional
         Called with the number of processed frames and the number of all frames (None if unknown).
+    limits : ScanLimits, optional
+        Limits of the delay and of the size of the height map.
 
     Returns
     -------
@@ -245,7 +265,7 @@ def scan(
     points = _points(sensor, fields, frame_numbers, stream.device)
     intensity = fields["peak" if sensor.kind == "camera" else "total"]
     middle = time.perf_counter()
-    heights, grid = resample_heights(sensor, points, intensity, stream.device)
+    heights, grid = resample_heights(sensor, points, intensity, stream.device, max_cells=limits.max_cells)
     if timeline is not None:
         timeline.write_file()
     seconds = {"assemble": middle - start, "resample": time.perf_counter() - middle}
@@ -260,6 +280,7 @@ def scan(
         stream=stream.report(),
         seconds=seconds,
         metadata=_metadata(name, sensor, rate, paced),
+        limits=limits,
     )
 
 
@@ -385,7 +406,9 @@ def assemble_points(
     return points
 
 
-def resample_heights(sensor: Sensor, points: RangePoints, light: Array, device: Device) -> tuple[HeightMap, Grid]:
+def resample_heights(
+    sensor: Sensor, points: RangePoints, light: Array, device: Device, *, max_cells: int = ScanLimits.max_cells
+) -> tuple[HeightMap, Grid]:
     """Resample an organised range image to a height map over the grid of the sensor file (``[output]``).
 
     Parameters
@@ -398,6 +421,8 @@ def resample_heights(sensor: Sensor, points: RangePoints, light: Array, device: 
         Intensity of the samples, (profiles, samples).
     device : Device
         Device of the computation.
+    max_cells : int
+        Largest number of cells of the grid, default 2^26.
 
     Returns
     -------
@@ -409,7 +434,7 @@ def resample_heights(sensor: Sensor, points: RangePoints, light: Array, device: 
     Raises
     ------
     ValueError
-        No point is valid, or the points span more than 2^26 cells.
+        No point is valid, or the points span more than ``max_cells`` cells.
     """
     x, y, z, status = to_numpy(points.x), to_numpy(points.y), to_numpy(points.z), to_numpy(points.status)
     if not np.any(np.isfinite(z)):
@@ -417,7 +442,7 @@ def resample_heights(sensor: Sensor, points: RangePoints, light: Array, device: 
         raise ValueError(f"no valid sample in {len(z)} frames ({flags}); check thresholds and [output] limits")
     output = sensor.output
     grid = Grid.covering(x, y, output.cell)
-    if grid.rows * grid.columns > _MAX_CELLS:
+    if grid.rows * grid.columns > max_cells:
         raise ValueError(
             f"the points span {grid.columns} x {grid.rows} cells of {output.cell} m; "
             "give [output] a larger cell, or limits x and y [m]"

@@ -37,15 +37,32 @@ from gpuvision.simulation.sensors.readings import PATHS, GroundTruth, Reading
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
 from gpuvision.workflows.light_cache import LightBlock, LightStore, Progress, SimulationTask, compute_missing_blocks
-from gpuvision.workflows.scanning import assemble_points, resample_heights
+from gpuvision.workflows.scanning import ScanLimits, assemble_points, resample_heights
 
 DEFAULT_PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse")
-# Default error limit in predicted standard deviations: noise alone exceeds it in less than one of a million samples.
-_LIMIT_SIGMAS = 5.0
-# Bins of all profiles that a mask is optimised on: bounds the memory (512 MB per array).
-_MAX_MASK_BINS = 1 << 26
 
 Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationLimits:
+    """Limits of the evaluation of a simulated scan.
+
+    Attributes
+    ----------
+    limit_sigmas : float
+        Default error limit [predicted standard deviations]. Derived: Gaussian noise alone exceeds 5 standard deviations
+        in less than one of a million samples.
+    max_mask_bins : int
+        Largest number of bins, over all profiles, on which a mask is optimised; with more bins every n-th profile is
+        used. Chosen: bounds the memory, 512 MB per array.
+    max_cells : int
+        Largest number of cells of a height map, as `ScanLimits.max_cells`.
+    """
+
+    limit_sigmas: float = 5.0
+    max_mask_bins: int = 1 << 26
+    max_cells: int = ScanLimits.max_cells
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,6 +252,7 @@ def simulate(
     device: Device | None = None,
     scheduler: str | None = None,
     progress: Progress = lambda done, of: None,
+    limits: SimulationLimits = SimulationLimits(),
 ) -> Simulation:
     """Simulate a scan. Light that the folder already holds is not computed again.
 
@@ -249,14 +267,16 @@ def simulate(
     seed
         Seed of the noise; None: no noise.
     limit
-        Smallest error that counts as wrong [m]. None: five times the median of the predicted standard deviation, or the
-        task's tolerance if that is larger.
+        Smallest error that counts as wrong [m]. None: `SimulationLimits.limit_sigmas` times the median of the predicted
+        standard deviation, or the task's tolerance if that is larger.
     device
         None: `Device.best`.
     scheduler
         Address of a Dask scheduler whose workers compute the light; None: compute here.
     progress
         Called with the number of profiles done and the number of all profiles.
+    limits
+        Limits of the evaluation.
 
     Raises
     ------
@@ -271,20 +291,24 @@ def simulate(
     computed = compute_missing_blocks(store, device=device, scheduler=scheduler, progress=progress)
     lit = time.perf_counter()
     view = make_sensor_view(task.sensor)
-    found = optimise_mask(view, *_all_light(store, view.samples * view.bins)) if mask == "best" else None
+    found = None
+    if mask == "best":
+        found = optimise_mask(view, *_all_light(store, view.samples * view.bins, limits.max_mask_bins))
     before = found.mask if found is not None else mask if isinstance(mask, Mask) else None
     attribution, statistics = _attribute_errors(store, make_simulator(task.sensor, view, before), seed, device)
     points = _points(task, attribution.reading, device)
     if task.sensor.output.ambiguous == "drop":
         attribution = attribution.without_flagged(Status.AMBIGUOUS)
-    heights, grid = resample_heights(task.sensor, points, _strength(attribution.reading), device)
+    heights, grid = resample_heights(
+        task.sensor, points, _strength(attribution.reading), device, max_cells=limits.max_cells
+    )
     return Simulation(
         task=task,
         attribution=attribution,
         points=points,
         heights=heights,
         grid=grid,
-        limit=max(_default_limit(attribution.reading), task.tolerance) if limit is None else limit,
+        limit=_default_limit(attribution.reading, task, limits) if limit is None else limit,
         mask=found,
         statistics=statistics,
         device=device,
@@ -377,9 +401,9 @@ def _transports_over(part: Scene, transport: StraightTransport, profiles: int | 
     return transport.start + transport.step * np.arange(first, last + 1, dtype=np.float64)
 
 
-def _all_light(store: LightStore, bins: int) -> tuple[dict[str, Exposure], GroundTruth]:
-    """Return the light of all profiles by path; of every n-th profile where all would exceed `_MAX_MASK_BINS`."""
-    every = -(-len(store.task.transports) * bins // _MAX_MASK_BINS)
+def _all_light(store: LightStore, bins: int, max_bins: int) -> tuple[dict[str, Exposure], GroundTruth]:
+    """Return the light of all profiles by path; of every n-th profile where all would exceed ``max_bins``."""
+    every = -(-len(store.task.transports) * bins // max_bins)
     light: dict[str, list[Exposure]] = {}
     truths = []
     for block, profiles in zip(store, store.task.blocks(), strict=True):
@@ -427,10 +451,10 @@ def _points(task: SimulationTask, reading: Reading, device: Device) -> RangePoin
     return assemble_points(task.sensor, place, task.transports, reading.status, device)
 
 
-def _default_limit(reading: Reading) -> float:
-    """Return the error that noise alone hardly ever exceeds [m]."""
+def _default_limit(reading: Reading, task: SimulationTask, limits: SimulationLimits) -> float:
+    """Return the error that noise alone hardly ever exceeds [m], but at least the tolerance of the task."""
     sigma = reading.sigma[np.isfinite(reading.sigma)]
-    return _LIMIT_SIGMAS * float(np.median(sigma)) if sigma.size else 0.0
+    return max(limits.limit_sigmas * float(np.median(sigma)) if sigma.size else 0.0, task.tolerance)
 
 
 def _add_statistics(statistics: Mapping[str, float], block: LightBlock) -> dict[str, float]:

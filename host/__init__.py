@@ -15,7 +15,7 @@ from gpuvision.host.launch import Launch, Precision, Spec, Variant, real_defines
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, table_offsets, type_defines
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Batch, Pipeline
-from gpuvision.host.plan import Plan, plan
+from gpuvision.host.plan import Plan, PlanLimits, plan
 from gpuvision.host.program import Define
 from gpuvision.host.recordings import open_recording
 from gpuvision.host.report import StreamReport
@@ -54,6 +54,7 @@ __all__ = [
     "PacedSource",
     "Pipeline",
     "Plan",
+    "PlanLimits",
     "Precision",
     "RecordingError",
     "Source",

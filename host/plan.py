@@ -20,13 +20,38 @@ from gpuvision.host.sources import ArraySource, Source
 
 BATCHES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096)
 
-_RING = 4
-_ROUNDS = 3
-_PROBES = 15
-_TRIAL_S = 0.05
-_PATIENCE = 3
-_GAIN = 1.05
-_MOST_BYTES = 1 << 28
+
+@dataclass(frozen=True, kw_only=True)
+class PlanLimits:
+    """Limits of `plan`.
+
+    Attributes
+    ----------
+    min_ring : int
+        Least number of slots of the ring, also that of the trials. Chosen: one slot each for the source, the device and
+        the consumer, and one spare.
+    rounds : int
+        Number of throughput measurements of a batch size, of which the best one counts. Chosen: pauses of a shared
+        machine hit some of the rounds.
+    latency_batches : int
+        Number of batches whose median time is measured. Chosen.
+    trial_seconds : float
+        Duration of a throughput measurement [s]. Chosen.
+    patience : int
+        Number of batch sizes without a gain after which the search ends. Chosen.
+    min_gain : float
+        Least ratio of service rates that counts as a gain. Chosen: above the scatter of the measurements.
+    max_bytes : int
+        Largest memory of the frames of a ring [bytes]. Chosen.
+    """
+
+    min_ring: int = 4
+    rounds: int = 3
+    latency_batches: int = 15
+    trial_seconds: float = 0.05
+    patience: int = 3
+    min_gain: float = 1.05
+    max_bytes: int = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -83,6 +108,7 @@ def plan(
     zero_copy: bool | None = None,
     batches: Sequence[int] = BATCHES,
     measure: Callable[[int], tuple[float, float]] | None = None,
+    limits: PlanLimits = PlanLimits(),
 ) -> Plan:
     """Choose batch and ring by measuring on blank frames, before one is taken from the source.
 
@@ -105,6 +131,8 @@ def plan(
         What to try, ascending.
     measure : callable, optional
         Takes a batch size, returns service rate [frames/s] and time of one batch [s]; instead of the device.
+    limits : PlanLimits
+        Limits of the measurements and of the memory.
 
     Returns
     -------
@@ -122,17 +150,18 @@ def plan(
         raise ValueError(f"rate is {rate}, expected the sensor's frames per second, > 0")
     if measure is None:
         device = Device.best() if device is None else device
-        measure = _Measurement(source, operation, device, zero_copy)
+        measure = _Measurement(source, operation, device, zero_copy, limits)
     trials: list[Trial] = []
     for batch in batches:
-        if trials and (batch * _RING * _frame_bytes(source) > _MOST_BYTES or not _is_gaining(trials)):
+        ring_bytes = batch * limits.min_ring * _frame_bytes(source)
+        if trials and (ring_bytes > limits.max_bytes or not _is_gaining(trials, limits)):
             break
         service_rate, seconds = measure(batch)
         trials.append(Trial(batch, service_rate, (batch - 1) / rate + seconds))
         if latency is not None and trials[-1].latency > latency:
             break  # larger ones are only later
         if service_rate >= margin * rate:
-            return Plan(batch, _ring_for(stall, rate, batch, source), rate, tuple(trials))
+            return Plan(batch, _ring_for(stall, rate, batch, source, limits), rate, tuple(trials))
     asked = f"{rate:.0f} frames/s with a margin of {margin:g}"
     raise _too_slow(trials, asked if latency is None else f"{asked} within {latency * 1e3:.3g} ms")
 
@@ -145,43 +174,48 @@ def _too_slow(trials: Sequence[Trial], asked: str) -> StreamError:
     )
 
 
-def _is_gaining(trials: Sequence[Trial]) -> bool:
+def _is_gaining(trials: Sequence[Trial], limits: PlanLimits) -> bool:
     """Say whether the last trials served more than those before: beyond some size a batch is no faster."""
     rates = [trial.service_rate for trial in trials]
-    return len(rates) <= _PATIENCE or max(rates[-_PATIENCE:]) > _GAIN * max(rates[:-_PATIENCE])
+    patience = limits.patience
+    return len(rates) <= patience or max(rates[-patience:]) > limits.min_gain * max(rates[:-patience])
 
 
 def _frame_bytes(source: Source) -> int:
     return max(math.prod(source.shape) * source.dtype.itemsize, 1)
 
 
-def _ring_for(stall: float, rate: float, batch: int, source: Source) -> int:
+def _ring_for(stall: float, rate: float, batch: int, source: Source, limits: PlanLimits) -> int:
     """Return the slots that hold the frames of a stall, beside the consumer's and the source's."""
     wanted = math.ceil(stall * rate / batch) + 2
-    return max(min(wanted, _MOST_BYTES // (batch * _frame_bytes(source))), _RING)
+    return max(min(wanted, limits.max_bytes // (batch * _frame_bytes(source))), limits.min_ring)
 
 
 class _Measurement:
     """Runs blank frames through streams of the same make."""
 
-    def __init__(self, source: Source, operation: Any, device: Device, zero_copy: bool | None) -> None:
+    def __init__(
+        self, source: Source, operation: Any, device: Device, zero_copy: bool | None, limits: PlanLimits
+    ) -> None:
         self._operation = operation
+        self._limits = limits
         self._setup: dict[str, Any] = {"device": device, "zero_copy": zero_copy}
         self._blank = np.zeros((1, *source.shape), source.dtype)
 
     def __call__(self, batch: int) -> tuple[float, float]:
         seconds = self._one_by_one(batch)
-        batches = max(int(_TRIAL_S / seconds), 2 * _RING)
+        batches = max(int(self._limits.trial_seconds / seconds), 2 * self._limits.min_ring)
         # A shared machine pauses now and then; the best round is what the stream itself can do.
-        return max(self._unpaused(batch, batches) for _ in range(_ROUNDS)), seconds
+        return max(self._unpaused(batch, batches) for _ in range(self._limits.rounds)), seconds
 
     def _unpaused(self, batch: int, batches: int) -> float:
         source = ArraySource(self._blank, batch * batches)
-        return Pipeline(source, self._operation, batch=batch, ring=_RING, **self._setup).run().throughput
+        stream = Pipeline(source, self._operation, batch=batch, ring=self._limits.min_ring, **self._setup)
+        return stream.run().throughput
 
     def _one_by_one(self, batch: int) -> float:
         """Return the median time of a batch that finds the stream empty."""
-        source = _Stepped(self._blank, batch * _PROBES)
+        source = _Stepped(self._blank, batch * self._limits.latency_batches)
         with Pipeline(source, self._operation, batch=batch, ring=2, warm_up=2, **self._setup) as stream:
             for _ in stream:
                 source.released.release()

@@ -20,8 +20,9 @@ from gpuvision.validation import finite
 
 Float64 = npt.NDArray[np.float64]
 
-# The parabola through the logarithms of equal intensities has a curvature up to this rounding error, of either sign.
-_ROUNDINGS = 16.0 * float(np.finfo(np.float64).eps)
+# Curvature of the parabola through the logarithms of equal intensities, relative to the largest logarithm: sixteen
+# roundings, of either sign (derived). Readings below it are AMBIGUOUS.
+_CURVATURE_ROUNDING = 16.0 * float(np.finfo(np.float64).eps)
 
 
 class FocusReading(NamedTuple):
@@ -125,7 +126,7 @@ class DepthFromFocus:
             # In units of the spacing, from the middle of the pinholes.
             image = self.first + self.spacing * (peak + 0.5 * (count - 1))
             width = self.spacing * np.sqrt(-0.5 / curvature)
-        flat = _ROUNDINGS * np.max(np.abs(np.log(safe)), axis=-1)
+        flat = _CURVATURE_ROUNDING * np.max(np.abs(np.log(safe)), axis=-1)
         status = np.zeros(light.shape[:-1], dtype=np.uint8)
         status[~(np.abs(peak) <= 0.5 * (count - 1))] = Status.OUT_OF_RANGE
         status[~(curvature < -flat)] = Status.AMBIGUOUS

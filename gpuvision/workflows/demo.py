@@ -18,7 +18,7 @@ from gpuvision.workflows.light_cache import SimulationTask
 from gpuvision.workflows.simulating import prepare_simulation
 
 SENSORS = ("camera_line", "psd_line")
-_ALBEDO = 0.5
+_ALBEDO = 0.5  # of the demo's part: matt grey plastic (chosen)
 
 
 def part() -> trimesh.Trimesh:

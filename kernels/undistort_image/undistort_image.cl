@@ -1,8 +1,18 @@
-// Images as an ideal camera would show them: each output pixel is interpolated at its place in the measured image.
-// CODE is the pixels' type, LARGEST its largest value where it is a whole number, CHANNELS of them lie side by side.
-// BICUBIC or bilinear; BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT.
+// Undistortion of images: each output pixel is interpolated at its source position in the measured image.
 //
-// Places come from a map in runs of 16 pixels (image_map.py), or under COMPUTED from the camera model.
+// made(row, column) = sum over taps of w_x w_y image(tap), bilinear or bicubic (undistort_image_pixel.h). The source
+// positions come from a packed map (undistort_image_map.h), or with COMPUTED from the camera model.
+//
+// Inputs:  image (frames, source rows, source columns[, CHANNELS]), type CODE.
+// Outputs: made (frames, made rows, made columns[, CHANNELS]), type CODE; status (made rows, made columns), the
+//          same for all frames.
+// Tables:  heads (made rows, runs), curves (made rows, runs), points (n, RUN) of the packed map, or model: the table of
+//          the lens or camera model; size (7,) int32: sizes, origin of the output and status of missing pixels; fill:
+//          value of pixels without a source.
+// Options: CODE, LARGEST (largest value of an integer CODE), CHANNELS (1 or 3, interleaved), BICUBIC (otherwise
+//          bilinear), BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT, COMPUTED, LENS or CAMERA,
+//          PAST_CACHES.
+// Variants: vector: a work-item per row and frame, a run of 16 pixels at a time; work-item: one pixel per item.
 #include "common/camera.h"
 #include "common/lanes.h"
 #include "common/lens.h"
@@ -18,8 +28,8 @@
 #endif
 
 #ifdef VECTOR_VARIANT
-// One work-item per row of a frame: its runs may overlap. The hint keeps compilers from looking for more vectors, which
-// takes them half a minute.
+// One work-item per row of a frame, since the last two runs of a row overlap. vec_type_hint keeps compilers from
+// vectorising the kernel across work-items, which takes half a minute of compilation.
 kernel __attribute__((vec_type_hint(float16))) __attribute__((reqd_work_group_size(1, 1, 1)))
 void undistort(global const CODE *image, global CODE *made, global uchar *status, global const int4 *heads,
                global const float8 *curves, global const float2 *points, constant real *model, constant int *size,
@@ -29,7 +39,7 @@ void undistort(global const CODE *image, global CODE *made, global uchar *status
     image += frame * size[SOURCE_ROWS] * size[SOURCE_COLUMNS] * CHANNELS;
     made += (frame * size[MADE_ROWS] + row) * columns * CHANNELS;
     status = frame ? 0 : status + (size_t)row * columns;
-    // All is well but where a run says otherwise.
+    // The status is OK except where a run changes it.
     for (int column = 0; status && column < columns; column++) status[column] = STATUS_OK;
 #ifdef COMPUTED
     for (int run = 0; run < RUNS(columns); run++) computed_run(image, made, status, row, run, model, size, fill);

@@ -1,23 +1,26 @@
-// One pixel at a place of the source image: taps, border, rounding. Every walk uses it where nothing better fits.
+// One output pixel at a position of the source image: taps, border policy, rounding. Both kernel variants use it; the
+// vector variant only for runs that do not fit a window.
 #ifndef UNDISTORT_IMAGE_PIXEL_H
 #define UNDISTORT_IMAGE_PIXEL_H
 
-// Whole numbers, as UndistortImage packs them.
+// Indices into the table `size` (int32) of UndistortImage.
 #define SOURCE_COLUMNS 0
 #define SOURCE_ROWS 1
 #define MADE_COLUMNS 2
 #define MADE_ROWS 3
-#define FIRST_COLUMN 4  // of the output, in the ideal image
+#define FIRST_COLUMN 4  // origin of the output in the ideal image
 #define FIRST_ROW 5
-#define MISSING 6  // status of a pixel that has no place at all
+#define MISSING 6  // status of a pixel without a source position
 
-// Places farther away than this are moved to it: a whole number that a float holds.
+// Positions are clamped to this magnitude [px]: 2^24, the range in which a float holds every integer.
 #define FARTHEST 16777216.0f
 
 #ifdef BICUBIC
 #define TAPS_BEFORE 1
 #define TAPS_AFTER 2
-// OpenCV's cubic kernel, by its slope at 1.
+// Cubic convolution (Keys, 1981) with a = SLOPE, the slope of the kernel at 1, as in OpenCV. Weights of the four taps
+// for the fraction part = t: a t (1 - t)^2, 1 + t^2 ((a + 2) t - (a + 3)), the rest, a (1 - t) t^2. The third weight is
+// one less the others, so that the sum is 1 up to rounding.
 #define SLOPE (-0.75f)
 #define DEFINE_CUBIC(Weights, floats, weights_of)                    \
     typedef struct {                                                 \
@@ -38,7 +41,8 @@ DEFINE_CUBIC(CubicWeights, float, cubic_weights)
 #define TAPS_AFTER 1
 #endif
 
-// A float of 24 bits with this on top has its whole part, rounded half to even, in its lowest bits.
+// 1.5 * 2^23. The sum of it and a float of magnitude below 2^22 has a unit in the last place of 1: the addition rounds
+// to the nearest integer (half to even), and the low bits of the sum's pattern are this integer.
 #define TO_WHOLE 12582912.0f
 
 #ifdef LARGEST
@@ -51,8 +55,9 @@ static inline CODE to_code(float value) {
 static inline CODE to_code(float value) { return value; }
 #endif
 
-// The place of a tap within the image, by the border's policy. (BORDER_CONSTANT asks before.)
-static inline int settled(int place, int size) {
+// Return the index of a tap inside the image by the border policy: mirrored or clamped.
+// tap handles BORDER_CONSTANT.
+static inline int border_index(int place, int size) {
 #ifdef BORDER_REFLECT
     const int period = max(2 * (size - 1), 1), folded = abs(place) % period;
     return min(folded, period - folded);
@@ -61,29 +66,33 @@ static inline int settled(int place, int size) {
 #endif
 }
 
+// Return the value of a tap.
 static inline float tap(global const CODE *image, int column, int row, constant int *size, float fill) {
     const int columns = size[SOURCE_COLUMNS], rows = size[SOURCE_ROWS];
 #ifdef BORDER_CONSTANT
     if (column < 0 || column >= columns || row < 0 || row >= rows) return fill;
 #endif
-    return image[((size_t)settled(row, rows) * columns + settled(column, columns)) * CHANNELS];
+    return image[((size_t)border_index(row, rows) * columns + border_index(column, columns)) * CHANNELS];
 }
 
-// A weighted sum along a row. The difference of neighbours keeps a constant image constant.
+// Interpolate along a row. left + part (right - left) returns exactly the value of a constant image.
 #ifdef BICUBIC
-static inline float along_row(global const CODE *image, int column, int row, CubicWeights w, constant int *size, float fill) {
+static inline float along_row(global const CODE *image, int column, int row, CubicWeights w, constant int *size,
+                              float fill) {
     return w.before * tap(image, column - 1, row, size, fill) + w.at * tap(image, column, row, size, fill) +
            w.after * tap(image, column + 1, row, size, fill) + w.last * tap(image, column + 2, row, size, fill);
 }
 #else
-static inline float along_row(global const CODE *image, int column, int row, float part, constant int *size, float fill) {
+static inline float along_row(global const CODE *image, int column, int row, float part, constant int *size,
+                              float fill) {
     const float left = tap(image, column, row, size, fill), right = tap(image, column + 1, row, size, fill);
     return left + part * (right - left);
 }
 #endif
 
-static inline float at_place(global const CODE *image, int column, int row, float part_x, float part_y, constant int *size,
-                      float fill) {
+// Interpolate at (column + part_x, row + part_y), parts 0 to 1.
+static inline float interpolate(global const CODE *image, int column, int row, float part_x, float part_y,
+                                constant int *size, float fill) {
 #ifdef BICUBIC
     const CubicWeights x = cubic_weights(part_x), y = cubic_weights(part_y);
     return y.before * along_row(image, column, row - 1, x, size, fill) +
@@ -96,26 +105,29 @@ static inline float at_place(global const CODE *image, int column, int row, floa
 #endif
 }
 
+// Write the fill value to a pixel without a source; return the given status.
 static inline uchar blank(uchar status, float fill, global CODE *made) {
     for (int channel = 0; channel < CHANNELS; channel++) made[channel] = to_code(fill);
     return status;
 }
 
-// Whether no tap lies in the image.
-static inline int beyond(int place, int size) { return place + TAPS_AFTER < 0 || place - TAPS_BEFORE >= size; }
-
-// The pixel that a place counts from: within what a float holds, also where the place is none. (PoCL takes floor() of
-// a scalar apart.)
-static inline int pixel_before(real place) {
-    const real held = fmin(fmax(place, (real)-FARTHEST), (real)FARTHEST);
-    const int whole = (int)held;
-    return whole - (held < whole);
+// Return whether all taps of one axis lie outside the image.
+static inline int all_taps_outside(int place, int size) {
+    return place + TAPS_AFTER < 0 || place - TAPS_BEFORE >= size;
 }
 
-// Writes the pixel seen at (column + x, row + y), and returns its status. Past the image's outermost half pixels lies
-// no source.
-static inline uchar sample(global const CODE *image, int column, int row, float x, float y, constant int *size, float fill,
-                    global CODE *made) {
+// Return floor(place) as an integer, clamped to +-FARTHEST. Clamping makes the conversion defined for every number; a
+// NaN gives a bound. The comparison replaces floor(), which PoCL compiles to slow code for scalars.
+static inline int floor_pixel(real place) {
+    const real clamped = fmin(fmax(place, (real)-FARTHEST), (real)FARTHEST);
+    const int whole = (int)clamped;
+    return whole - (clamped < whole);
+}
+
+// Write the pixel at the source position (column + x, row + y) and return its status: NO_DATA for a position more than
+// half a pixel beyond the centres of the outermost pixels, size[MISSING] for a position that is not finite.
+static inline uchar sample(global const CODE *image, int column, int row, float x, float y, constant int *size,
+                           float fill, global CODE *made) {
     if ((as_int(x) & 0x7f800000) == 0x7f800000 || (as_int(y) & 0x7f800000) == 0x7f800000)
         return blank(size[MISSING], fill, made);
     const int columns = size[SOURCE_COLUMNS], rows = size[SOURCE_ROWS];
@@ -125,14 +137,14 @@ static inline uchar sample(global const CODE *image, int column, int row, float 
 #ifdef BORDER_MASK
     if (status) return blank(status, fill, made);
 #endif
-    const int whole_x = pixel_before(x), whole_y = pixel_before(y);
+    const int whole_x = floor_pixel(x), whole_y = floor_pixel(y);
     column += whole_x;
     row += whole_y;
 #ifdef BORDER_CONSTANT
-    if (beyond(column, columns) || beyond(row, rows)) return blank(status, fill, made);
+    if (all_taps_outside(column, columns) || all_taps_outside(row, rows)) return blank(status, fill, made);
 #endif
     for (int channel = 0; channel < CHANNELS; channel++)
-        made[channel] = to_code(at_place(image + channel, column, row, x - whole_x, y - whole_y, size, fill));
+        made[channel] = to_code(interpolate(image + channel, column, row, x - whole_x, y - whole_y, size, fill));
     return status;
 }
 

@@ -1,4 +1,4 @@
-// Output pixels go in runs of 16 along a row; the last run of a row moves back to end with it.
+// Runs of 16 output pixels along a row. The last run moves back to end with the row and overlaps the one before it.
 #ifndef UNDISTORT_IMAGE_RUN_H
 #define UNDISTORT_IMAGE_RUN_H
 
@@ -7,9 +7,9 @@
 #define RUN_START(run, columns) max(min(RUN * (run), (columns) - RUN), 0)
 
 #ifdef VECTOR_VARIANT
-// The pixels of a run one by one, at places (x, y) from the source pixel (column, row) on.
+// Compute the pixels of a run one by one, at the source positions (column + x, row + y).
 static inline void each_pixel(global const CODE *image, global CODE *made, global uchar *status, int column, int row,
-                       int lanes, float16 x, float16 y, constant int *size, float fill) {
+                              int lanes, float16 x, float16 y, constant int *size, float fill) {
     float along[RUN], across[RUN];
     vstore16(x, 0, along);
     vstore16(y, 0, across);

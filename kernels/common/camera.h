@@ -1,34 +1,38 @@
-// OpenCV's camera with 14 coefficients, in displacement form. A point's ideal place is where a pinhole would show it,
-// its measured place is where the lens and the tilted sensor show it:
+// OpenCV's camera model with 14 coefficients, in displacement form.
+//
+// The ideal position of a point is its image by a pinhole camera; its measured position is that with lens distortion
+// and tilted sensor:
 //
 //     x = (column - cx) / f                                  normalised ideal place, y likewise; q = x^2 + y^2
 //     bent x - x = x e + q (a0 + a1 q)                       with e = stretch(q) + 2 (p1 y + p2 x),
 //     bent y - y = y e + q (b0 + b1 q)                       a0 = p2 + s1, a1 = s2, b0 = p1 + s3, b1 = s4
 //     stretch(q) = (1 + k1 q + k2 q^2 + k3 q^3) / (1 + k4 q + k5 q^2 + k6 q^3) - 1
-//     measured = H bent                                      the sensor's tilt, a homography that keeps the centre
+//     measured = H bent                                      tilt of the sensor, a homography that keeps the centre
 //
-// Only terms that are not zero are compiled: CAMERA_RADIAL and CAMERA_RATIONAL (0 to 3: how many of k1.. and k4..),
-// CAMERA_DECENTRED (p and s), CAMERA_PRISM (s2 and s4), CAMERA_TILTED, CAMERA_MATRICES (ideal pixels other than the
-// camera's own). The host computes the constants in double; a point keeps its digits, since what moves it is small
-// beside it.
-// The tables are Camera.packed in camera.py, one for either direction; camera_undistort needs CAMERA_STEPS as well,
-// how many steps serve most places (Camera.steps).
+// Only the displacement is computed, and added to the pixel: in single precision its relative error is 1e-6, and the
+// pixel keeps its digits. The host computes all constants in double precision.
+//
+// Options: only terms that are not zero are compiled. CAMERA; CAMERA_RADIAL and CAMERA_RATIONAL: number of coefficients
+//          (0 to 3) of k1.. and k4..; CAMERA_DECENTRED: p and s; CAMERA_PRISM: s2 and s4; CAMERA_TILTED;
+//          CAMERA_MATRICES: the ideal pixels have another camera matrix; CAMERA_STEPS: Newton steps after which most
+//          points have converged (Camera.newton_steps); it compiles camera_undistort.
+// Tables:  Camera.packed in camera.py, one per direction, with the entries CAMERA_...
 #ifndef CAMERA_H
 #define CAMERA_H
 #include "common/lanes.h"
 #ifdef CAMERA
 
-#define CAMERA_CENTRE_X 0  // of the pixels that come in
+#define CAMERA_CENTRE_X 0  // principal point of the input pixels [px]
 #define CAMERA_CENTRE_Y 1
-#define CAMERA_PER_X 2     // their 1/f
+#define CAMERA_PER_X 2     // 1 / focal length of the input pixels [1/px]
 #define CAMERA_PER_Y 3
-#define CAMERA_FOCAL_X 4   // of the pixels that go out
+#define CAMERA_FOCAL_X 4   // focal length of the output pixels [px]
 #define CAMERA_FOCAL_Y 5
-#define CAMERA_SHIFT_X 6   // from the one principal point to the other [px]
+#define CAMERA_SHIFT_X 6   // principal point of the output less that of the input, as rounded [px]
 #define CAMERA_SHIFT_Y 7
-#define CAMERA_GROWTH_X 8  // one f over the other, less 1
+#define CAMERA_GROWTH_X 8  // focal length of the output over that of the input, less 1
 #define CAMERA_GROWTH_Y 9
-#define CAMERA_TILT 10     // the homography less the identity: xx, xy, yx, yy, then wx, wy; its inverse to undistort
+#define CAMERA_TILT 10     // H less the identity: xx, xy, yx, yy, then wx, wy; undistortion: the inverse of H
 #define CAMERA_K 16        // k1 .. k6
 #define CAMERA_P1 22
 #define CAMERA_P2 23
@@ -36,16 +40,17 @@
 #define CAMERA_A1 25
 #define CAMERA_B0 26
 #define CAMERA_B1 27
-#define CAMERA_SAFE 28     // q up to which nothing folds
-#define CAMERA_LIMIT 29    // q from which all is folded; between them the sign of the determinant says
-#define CAMERA_BENT 30       // q from which no bent place is looked for: past the fold's image, or out of all bounds
-#define CAMERA_PER_REACH 31  // 1 over the bent q up to which the host's guess holds
-#define CAMERA_FIRST 32      // relative square of a step that goes before the first, as it were
+#define CAMERA_SAFE 28     // q below which every point is invertible
+#define CAMERA_LIMIT 29    // q from which no point is invertible; in between, those with a Jacobian determinant > 0
+#define CAMERA_BENT 30       // q of bent points from which no inverse is searched: beyond the fold's image, or 1e6 f
+#define CAMERA_PER_REACH 31  // 1 / (q of bent points up to which the start polynomials hold)
+#define CAMERA_FIRST 32      // squared length of a virtual step before the first one, relative to q
 #define CAMERA_GUESS 33
 #define CAMERA_GUESS_TERMS 8
 
-// Steps shrink evenly: one of size s after one of size t leaves about s^2 / t. Relative squares: of what may be left,
-// and of a step that is rounding.
+// Convergence of camera_approach. Its steps shrink linearly: a step of length s after one of length t leaves an error
+// of about s (s / t) = s^2 / t. CAMERA_LEFT is the accepted error and CAMERA_NOISE a step that is rounding, both
+// squared and relative to q.
 #ifdef REAL_IS_DOUBLE
 #define CAMERA_LEFT 1e-31
 #define CAMERA_NOISE 1e-28
@@ -80,7 +85,8 @@
 #define CAMERA_UNDER_SLOPE(q, k) ((reals)((k)[3]))
 #endif
 
-// The stretch, and its derivative by q.
+// Compute stretch(q) and its derivative by q. For over / under - 1 the difference (over - under) / (1 + under) of the
+// polynomials without their leading 1 avoids cancellation.
 #if CAMERA_RATIONAL
 static inline reals LANED(camera_stretch)(reals q, constant real *k, reals *slope) {
     const reals under = CAMERA_UNDER(q, k), per = 1 / (1 + under);
@@ -101,7 +107,7 @@ static inline reals LANED(camera_stretch)(reals q, constant real *k, reals *slop
 #define CAMERA_PRISM_TERM(a, q) 0
 #endif
 
-// How far the lens moves the ideal place (x, y); returns q.
+// Compute the displacement of the ideal point (x, y) by the lens (normalised coordinates); return q.
 static inline reals LANED(camera_bend)(reals x, reals y, constant real *camera, reals *move_x, reals *move_y) {
     const reals q = x * x + y * y;
     reals slope;
@@ -117,9 +123,9 @@ static inline reals LANED(camera_bend)(reals x, reals y, constant real *camera, 
     return q;
 }
 
-// Jacobian of the bent place: xx, xy; yx, yy. Returns its determinant.
+// Compute the Jacobian of the bent point by the ideal point, (xx, xy; yx, yy); return its determinant.
 static inline reals LANED(camera_slopes)(reals x, reals y, constant real *camera, reals *xx, reals *xy, reals *yx,
-                                  reals *yy) {
+                                         reals *yy) {
     const reals q = x * x + y * y;
     reals slope;
     reals growth = 1 + LANED(camera_stretch)(q, camera + CAMERA_K, &slope);
@@ -144,9 +150,11 @@ static inline reals LANED(camera_slopes)(reals x, reals y, constant real *camera
     return *xx * *yy - *xy * *yx;
 }
 
-// How far the tilt (or its inverse) moves (x, y); sets what lies behind the sensor's plane.
+// Compute the displacement of (x, y) by the tilt or its inverse, H(x, y) - (x, y); set the mask of points behind the
+// sensor plane (denominator w <= 0).
 #ifdef CAMERA_TILTED
-static inline void LANED(camera_tilt)(reals x, reals y, constant real *tilt, reals *move_x, reals *move_y, masks *behind) {
+static inline void LANED(camera_tilt)(reals x, reals y, constant real *tilt, reals *move_x, reals *move_y,
+                                      masks *behind) {
     const reals far = tilt[4] * x + tilt[5] * y, w = 1 + far, per = 1 / w;
     *move_x = (tilt[0] * x + tilt[1] * y - x * far) * per;
     *move_y = (tilt[2] * x + tilt[3] * y - y * far) * per;
@@ -154,7 +162,8 @@ static inline void LANED(camera_tilt)(reals x, reals y, constant real *tilt, rea
 }
 #endif
 
-// Moves the pixels (column, row) by a normalised displacement, and to the other matrix if there is one.
+// Move pixels by a normalised displacement: column + f move_x. With CAMERA_MATRICES also from the input matrix to the
+// output matrix: f' / f (column - cx) + cx' = column + growth (column - cx) + shift.
 static inline void LANED(camera_move)(reals *column, reals *row, reals move_x, reals move_y, constant real *camera) {
 #ifdef CAMERA_MATRICES
     move_x = camera[CAMERA_GROWTH_X] * (*column - camera[CAMERA_CENTRE_X]) + camera[CAMERA_FOCAL_X] * move_x;
@@ -167,7 +176,8 @@ static inline void LANED(camera_move)(reals *column, reals *row, reals move_x, r
 #endif
 }
 
-// Moves the ideal pixel (column, row) to its measured one; returns where there is none, being past the fold.
+// Move ideal pixels to their measured positions; return the mask of pixels without one: beyond the fold of the lens, or
+// behind the sensor plane.
 static inline masks LANED(camera_distort)(reals *column, reals *row, constant real *camera) {
     const reals x = (*column - camera[CAMERA_CENTRE_X]) * camera[CAMERA_PER_X];
     const reals y = (*row - camera[CAMERA_CENTRE_Y]) * camera[CAMERA_PER_Y];
@@ -193,9 +203,9 @@ static inline masks LANED(camera_distort)(reals *column, reals *row, constant re
     return folded;
 }
 
-// As newton.h asks for it.
-static inline masks LANED(camera_newton)(reals x, reals y, reals back_x, reals back_y, constant real *camera, reals *step_x,
-                                  reals *step_y, reals *left) {
+// Newton step for newton.h: solve bend(x + back) + back = 0, bend: displacement by the lens.
+static inline masks LANED(camera_newton)(reals x, reals y, reals back_x, reals back_y, constant real *camera,
+                                         reals *step_x, reals *step_y, reals *left) {
     const reals at_x = x + back_x, at_y = y + back_y;
     reals move_x, move_y, xx, xy, yx, yy;
     const reals q = LANED(camera_bend)(at_x, at_y, camera, &move_x, &move_y);
@@ -211,15 +221,22 @@ static inline masks LANED(camera_newton)(reals x, reals y, reals back_x, reals b
 #include "common/newton.h"
 
 #ifdef CAMERA_STEPS
-// The way back for most places m = (x, y). The host fitted polynomials in z = q / reach:
+// Compute the inverse displacement `back` of measured points m = (x, y); return the mask of points without convergence.
 //
-//     back = m (z g(z) + v(z).m) + q w(z)                    v and w, which have a direction, for a decentred lens
+// Start: polynomials in z = q / reach, which the host fits to the inverse (inverse_start.py):
 //
-// Their Jacobian is about the inverse of the lens' own: it turns what is left into a step, without a division. Returns
-// the places that a few steps do not settle. (PoCL neither inlines what is so long nor unrolls, unless it is told to:
-// it is half as fast then.)
+//     back = m (z g(z) + v(z) . m) + q w(z)                  vectors v and w only for a decentred lens
+//
+// Iteration: the residual is r = bend(m + back) + back. A Newton step needs the inverse Jacobian of the lens, times r.
+// The Jacobian of the inverse mapping m -> m + back is this inverse up to the error of the fit, so that the step is r +
+// (d back / dm) r: no division, and the derivatives are computed once. With G = z g + v . m:
+//
+//     (d back / dm) r = G r + m (slope (m . r) + v . r) + 2 (z w)' (m . r),   slope = 2 ((z g)' + v' . m) / reach
+//
+// PoCL does not inline a function of this length, or unroll the loop, without the attribute and the pragma: it would be
+// half as fast.
 static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals x, reals y, constant real *camera,
-                                                                   reals *back_x, reals *back_y) {
+                                                                          reals *back_x, reals *back_y) {
     constant real *c = camera + CAMERA_GUESS;
     const real per = camera[CAMERA_PER_REACH];
     const reals q = x * x + y * y, z = q * per;
@@ -231,7 +248,7 @@ static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals 
     slope = g + z * slope;
     g *= z;
 #ifdef CAMERA_DECENTRED
-    c += CAMERA_GUESS_TERMS;  // v0x, v0y, v1x ..., w, and the derivatives v' and 2 (z w)'
+    c += CAMERA_GUESS_TERMS;  // coefficients v0x, v0y, v1x, ... of v, then those of w, v' and 2 (z w)'
     const reals v_x = c[0] + z * (c[2] + z * c[4]), v_y = c[1] + z * (c[3] + z * c[5]);
     const reals w_x = c[6] + z * (c[8] + z * c[10]), w_y = c[7] + z * (c[9] + z * c[11]);
     const reals turn_x = c[16] + z * (c[18] + z * c[20]), turn_y = c[17] + z * (c[19] + z * c[21]);
@@ -269,10 +286,11 @@ static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals 
     return ~(within & settled);
 }
 
-// Moves the measured pixel (column, row) to its ideal one; returns where there is none, being past the fold's image, a
-// million focal lengths away, or no pixel at all.
+// Move measured pixels to their ideal positions; return the mask of pixels without one: beyond the image of the fold, a
+// million focal lengths away, or not finite. Points that camera_approach does not solve take Newton's method
+// (newton.h).
 static inline __attribute__((always_inline)) masks LANED(camera_undistort)(reals *column, reals *row,
-                                                                    constant real *camera) {
+                                                                           constant real *camera) {
     reals x = (*column - camera[CAMERA_CENTRE_X]) * camera[CAMERA_PER_X];
     reals y = (*row - camera[CAMERA_CENTRE_Y]) * camera[CAMERA_PER_Y];
     reals back_x, back_y;
@@ -285,7 +303,8 @@ static inline __attribute__((always_inline)) masks LANED(camera_undistort)(reals
 #endif
     const masks open = LANED(camera_approach)(x, y, camera, &back_x, &back_y) & ~folded;
     if (any_lane(open)) {
-        // One comparison of bits finds what is larger, infinite or NaN.
+        // The bit patterns of non-negative reals have the order of the reals, and those of infinity and NaN are larger:
+        // one comparison of bits finds points that are too far or not finite.
         const masks far = mask_of(as_masks(x * x + y * y) >= as_bits(camera[CAMERA_BENT]));
         folded |= far | LANED(newton_back)(x, y, open & ~far, camera, &back_x, &back_y);
     }

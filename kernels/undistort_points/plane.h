@@ -1,11 +1,14 @@
-// Sensor -> measurement plane by two cubic polynomials (F. de Jong, eq. 3.6 and 3.7), and back. They are taken apart
-// into a displacement on the sensor and an affine map, which the displacement is small beside:
+// Mapping from the sensor to the measurement plane by two cubic polynomials, and its inverse (F. de Jong, Range Imaging
+// and Visual Servoing for industrial applications, TU Delft 2008, eq. 3.6 and 3.7).
 //
-//     x = (u - u0) su, y = (v - v0) sv                      -1 .. 1 within the region that the polynomials hold for
+// The polynomials are split into a small displacement on the sensor and an affine map, so that the large terms are not
+// subtracted from each other:
+//
+//     x = (u - u0) su, y = (v - v0) sv                      -1 to 1 in the calibrated region
 //     bent x - x = a0 x^2 + a1 x y + a2 y^2 + a3 x^3 + a4 x^2 y + a5 x y^2 + a6 y^3,  y likewise with b0 .. b6
 //     (G, H) = (g0, h0) + M (bent x, bent y)
 //
-// The table is PlanePolynomial.packed in polynomial.py. Compiled only under PLANE.
+// The table is PlanePolynomial.packed in polynomial.py. Option: PLANE.
 #ifndef PLANE_H
 #define PLANE_H
 #include "common/lanes.h"
@@ -19,28 +22,30 @@
 #define PLANE_BACK 12    // its inverse
 #define PLANE_A 16
 #define PLANE_B 23
-// The region's edge, given and found.
+// Edge of the region, with a tolerance for rounding: of input positions, and of positions from the inverse.
 #define PLANE_EDGE ((real)(1 + 4 * REAL_EPSILON))
 #define PLANE_FOUND_EDGE ((real)(1 + 64 * REAL_EPSILON))
-// How far out of the region a Newton step may look.
+// Newton iterations may go this far beyond the region (normalised coordinates).
 #define PLANE_OUTSKIRTS ((real)1.25)
-// No bending takes a place in the region as far as that.
+// Positions beyond this (normalised coordinates) are not the image of any position in the region.
 #define PLANE_FARTHEST ((real)1e3)
 
 static inline masks LANED(plane_within)(reals x, reals y, real edge) {
     return mask_of(fabs(x) <= edge) & mask_of(fabs(y) <= edge);
 }
 
+// Return the displacement bent x - x (or y) for its seven coefficients c.
 static inline reals LANED(plane_bend)(reals x, reals y, constant real *c) {
     return x * x * (c[0] + c[3] * x + c[4] * y) + y * (x * c[1] + y * (c[2] + c[5] * x + c[6] * y));
 }
 
+// Compute the derivatives of the displacement by x and y.
 static inline void LANED(plane_slopes)(reals x, reals y, constant real *c, reals *by_x, reals *by_y) {
     *by_x = x * (2 * c[0] + 3 * c[3] * x + 2 * c[4] * y) + y * (c[1] + c[5] * y);
     *by_y = x * (c[1] + c[4] * x) + y * (2 * c[2] + 2 * c[5] * x + 3 * c[6] * y);
 }
 
-// Moves sensor coordinates to the plane; returns which lie outside the region.
+// Map sensor coordinates to the plane [m]; return the mask of points outside the region.
 static inline masks LANED(plane_measure)(reals *u, reals *v, constant real *plane) {
     constant real *matrix = plane + PLANE_MATRIX;
     const reals x = (*u - plane[PLANE_ORIGIN]) * plane[PLANE_SCALE];
@@ -52,9 +57,9 @@ static inline masks LANED(plane_measure)(reals *u, reals *v, constant real *plan
     return ~LANED(plane_within)(x, y, PLANE_EDGE);
 }
 
-// As newton.h asks for it.
-static inline masks LANED(plane_newton)(reals x, reals y, reals back_x, reals back_y, constant real *plane, reals *step_x,
-                                 reals *step_y, reals *left) {
+// Newton step for newton.h: solve bend(x + back) + back = 0 with the Jacobian I + d bend.
+static inline masks LANED(plane_newton)(reals x, reals y, reals back_x, reals back_y, constant real *plane,
+                                        reals *step_x, reals *step_y, reals *left) {
     const reals at_x = x + back_x, at_y = y + back_y;
     reals xx, xy, yx, yy;
     LANED(plane_slopes)(at_x, at_y, plane + PLANE_A, &xx, &xy);
@@ -73,7 +78,7 @@ static inline masks LANED(plane_newton)(reals x, reals y, reals back_x, reals ba
 #define NEWTON_STEP LANED(plane_newton)
 #include "common/newton.h"
 
-// Moves plane coordinates to the sensor; returns which are not seen within the region.
+// Map plane coordinates [m] to the sensor; return the mask of points outside the region.
 static inline masks LANED(plane_show)(reals *g, reals *h, constant real *plane) {
     constant real *back = plane + PLANE_BACK;
     const reals along = *g - plane[PLANE_OFFSET], up = *h - plane[PLANE_OFFSET + 1];

@@ -1,6 +1,13 @@
-// Measured points -> ideal ones, or back under INVERSE, pairs (column, row) side by side. CPU runtimes take strips of
-// 16-wide vectors, GPUs an item per point; `each` is the number of points of a strip, or of a work-group. Which model,
-// CAMERA or LENS or PLANE, says what is compiled.
+// Undistortion of points: measured points to ideal points, or ideal to measured with INVERSE.
+//
+// Inputs:  points (count, 2) column, row [px], type INPUT.
+// Outputs: moved_points (count, 2) column, row [px]; with PLANE x, y [m]; NaN where the status is not OK. status
+//          (count,): NOT_INVERTIBLE beyond the fold of the lens, OUT_OF_RANGE outside the region of PLANE, NOT_FINITE.
+// Tables:  model: parameters of the model.
+// Options: INPUT, REAL_IS_DOUBLE, INVERSE; the model: CAMERA (common/camera.h), LENS (common/lens.h) or PLANE
+//          (plane.h).
+// Variants: vector: a work-item takes `each` points, 16 at a time; work-item: one point per item, `each` per
+//          work-group.
 #include "common/camera.h"
 #include "common/lens.h"
 #include "undistort_points/plane.h"
@@ -11,6 +18,7 @@ typedef INPUT16 inputs_at __attribute__((aligned(sizeof(INPUT))));
 #define LOAD(from) convert_real16(*(global const inputs_at *)(from))
 #endif
 
+// Load LANES points from point i on, and separate x and y.
 static inline void load_points(global const INPUT *points, ulong i, reals *x, reals *y) {
 #ifdef VECTOR_VARIANT
     const reals low = LOAD(points + 2 * i), high = LOAD(points + 2 * i + LANES);
@@ -22,6 +30,7 @@ static inline void load_points(global const INPUT *points, ulong i, reals *x, re
 #endif
 }
 
+// Store LANES points from point i on, with x and y interleaved.
 static inline void store_points(reals x, reals y, global real *points, ulong i) {
 #ifdef VECTOR_VARIANT
     reals low, high;
@@ -37,7 +46,7 @@ static inline void store_points(reals x, reals y, global real *points, ulong i) 
 #endif
 }
 
-// Moves (x, y); returns the flag of those that have no such place.
+// Move points (x, y) by the model; return the status flags of points without a result.
 static inline __attribute__((always_inline)) masks LANED(moved)(reals *x, reals *y, constant real *model) {
 #if defined(PLANE) && defined(INVERSE)
     return LANED(plane_show)(x, y, model) & STATUS_OUT_OF_RANGE;
@@ -57,8 +66,8 @@ static inline __attribute__((always_inline)) masks LANED(moved)(reals *x, reals 
 kernel void undistort_points(global const INPUT *restrict points, global real *restrict moved_points,
                              global uchar *restrict status, constant real *model, const ulong count,
                              const ulong each) {
-    // The last vector, or work-group, moves back to end with the last point, and does some points twice: a test for the
-    // end within it would cost more than they do.
+    // The last vector (or work-group) moves back to end with the last point, and computes some points twice. This is
+    // cheaper than a test for the end in every vector.
 #ifdef VECTOR_VARIANT
     const ulong first = get_global_id(0) * each, end = min(first + each, count);
     for (ulong next = first; next < end; next += LANES) {
@@ -71,7 +80,7 @@ kernel void undistort_points(global const INPUT *restrict points, global real *r
         load_points(points, i, &x, &y);
         const reals given_x = x, given_y = y;
         masks flags = LANED(moved)(&x, &y, model);
-        // Flags are rare.
+        // Flags are rare: one test of all lanes skips the rest.
         const masks bad = mask_of(flags != 0) | mask_of(LANED(not_finite)(x)) | mask_of(LANED(not_finite)(y));
         if (any_lane(bad)) {
             const masks good = ~mask_of(LANED(not_finite)(given_x)) & ~mask_of(LANED(not_finite)(given_y));

@@ -1,9 +1,10 @@
-"""Blobs against one fused Numba function of the same method on all cores, and OpenCV blob by blob.
+"""Blob measurement compared with one fused Numba function of the same method, and with OpenCV blob by blob.
 
-Bright discs of 8 px radius and 1 px blur on an 8-bit frame, noise 2 at a contrast of 100, each up to 2 px from its
-nominal place. Numba takes the same rulers, start, robust fit, match of the pixels, centre of gravity and covariance.
-OpenCV cuts each mark out, takes Otsu's threshold off, and has the moments of the grey levels above it (the most
-accurate of what is quick: `findContours` with `fitEllipse` is named in the metadata); it returns the centre alone.
+The 8-bit frame shows bright discs with a radius of 8 px, a blur of 1 px, a contrast of 100 and noise of 2 grey levels,
+each up to 2 px from its nominal position. Numba uses the same rulers, start, robust fit, match of the pixels, centre of
+gravity and covariance on all cores. OpenCV crops each blob, applies Otsu's threshold, and computes the moments of the
+grey levels above it, the most accurate of its fast methods; it returns the centre alone. The metadata also list the
+deviation of `findContours` with `fitEllipse`.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _SUMS = {"contract", "reassoc", "nsz", "arcp"}
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _edge(pixels, pitch, x, y, cosine, sine, table, profile, slopes):  # type: ignore[no-untyped-def]
-    """Return place, amplitude, squared width and squared deviation of the strongest falling edge; 0, ... if none."""
+    """Return position, amplitude, squared width and variance of the strongest falling edge; zeros without an edge."""
     middle, one = _F(0.5 * (LENGTH - 1)), np.uint32(1)
     first_x, first_y = x - middle * cosine, y - middle * sine
     for i in range(LENGTH):
@@ -69,7 +70,7 @@ def _edge(pixels, pitch, x, y, cosine, sine, table, profile, slopes):  # type: i
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _start(ex, ey, there, count, shape, reach):  # type: ignore[no-untyped-def]
-    """Return the circle through three edges that most agree with."""
+    """Return the circle through three edges that has the smallest truncated loss over all edges."""
     best_x, best_y, best_r, least = shape[0], shape[1], shape[2], _F(SPOKES) * reach * reach
     one = _F(1.0)
     for p in range(_PATTERNS.shape[0]):
@@ -100,7 +101,7 @@ def _start(ex, ey, there, count, shape, reach):  # type: ignore[no-untyped-def]
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _circle_sums(ex, ey, there, widths, shape, blur, per_scale, sums):  # type: ignore[no-untyped-def]
-    """Sum the weighted equations of the edges; return the sum of weights and that of weighted widths."""
+    """Sum the weighted normal equations of the edges; return the sums of the weights and of the weighted widths."""
     a, b, c, d, e = _F(0.0), _F(0.0), _F(0.0), _F(0.0), _F(0.0)
     f, g, h, k = _F(0.0), _F(0.0), _F(0.0), _F(0.0)
     weights, wide, one = _F(0.0), _F(0.0), _F(1.0)
@@ -130,7 +131,7 @@ def _circle_sums(ex, ey, there, widths, shape, blur, per_scale, sums):  # type: 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _circle_step(ex, ey, there, widths, shape, blur, scale, sums):  # type: ignore[no-untyped-def]
-    """Move the circle by a Gauss-Newton step; return the blur."""
+    """Move the circle by a Gauss-Newton step; return the squared blur."""
     weights, wide = _circle_sums(ex, ey, there, widths, shape, blur, _F(1.0) / scale, sums)
     a, b, c, d, e, f, g, h = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]
     p, q, r = c * weights - e * e, e * d - b * weights, b * e - c * d
@@ -143,7 +144,7 @@ def _circle_step(ex, ey, there, widths, shape, blur, scale, sums):  # type: igno
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _fit(ex, ey, there, widths, noises, shape, count, sums, room):  # type: ignore[no-untyped-def]
-    """Fit a circle to most edges; return blur and scale."""
+    """Fit a circle robustly to the edges; return squared blur and residual scale."""
     noise, blur = _F(0.0), _F(0.0)
     for m in range(SPOKES):
         noise += there[m] * noises[m]
@@ -165,7 +166,7 @@ def _fit(ex, ey, there, widths, noises, shape, count, sums, room):  # type: igno
             if there[m] > _F(0.0) and off <= _F(TUNING_CONSTANT) * scale:
                 room[within] = off
                 within += 1
-        for i in range(1, within):  # so few are sorted soonest by insertion
+        for i in range(1, within):  # insertion sort is fastest for so few values
             value, j = room[i], i
             while j > 0 and room[j - 1] > value:
                 room[j] = room[j - 1]
@@ -179,7 +180,7 @@ def _fit(ex, ey, there, widths, noises, shape, count, sums, room):  # type: igno
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _rows_of(pixels, pitch, x, y, shape, grey, slopes, scale, equation):  # type: ignore[no-untyped-def]
-    """Fill the pixels' equations, weighted by the root of their weight; return how many there are."""
+    """Fill the equations of the pixels, scaled by the root of their weights; return the number of pixels."""
     reach, one = shape[2] + _F(5.0) * grey[2] + _F(2.0), _F(1.0)
     per_blur, per_size, per_scale = one / grey[2], one / shape[2], _F(1.0 / TUNING_CONSTANT) / scale
     bend = _F(0.5) * grey[2] * per_size
@@ -247,7 +248,7 @@ def _solve(matrix, right, to):  # type: ignore[no-untyped-def]
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _match(pixels, pitch, x, y, shape, grey, noise, equation, matrix, right, to, covariance):  # type: ignore[no-untyped-def]
-    """Move the circle to where its pixels have it."""
+    """Refine circle, blur and grey levels by a least-squares match of the pixels; fill the covariance."""
     slopes = np.zeros(2, np.float32)
     for step in range(3):
         scale = (_F(0.1) * grey[1] + _F(4.0) * noise) / _F(TUNING_CONSTANT)
@@ -290,7 +291,7 @@ def _match(pixels, pitch, x, y, shape, grey, noise, equation, matrix, right, to,
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _gravity(pixels, pitch, x, y, reach):  # type: ignore[no-untyped-def]
-    """Return the centre of gravity within reach of (x, y), less the ring about it."""
+    """Return the centre of gravity within `reach` of (x, y), with the background of the surrounding ring subtracted."""
     outer, zero, one = reach + _F(2.0), _F(0.0), _F(1.0)
     level = _F(pixels[np.uint32(y) * pitch + np.uint32(x)])
     area, total, sum_x, sum_y = zero, zero, zero, zero
@@ -320,7 +321,7 @@ def _gravity(pixels, pitch, x, y, reach):  # type: ignore[no-untyped-def]
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, found):  # type: ignore[no-untyped-def]
-    """Fill what is known of the fit, and the grey levels that the match starts from."""
+    """Fill residual, inliers and symmetry of the fit, and the initial grey levels of the match."""
     ex, ey, there, heights, room = edges[0], edges[1], edges[2], edges[3], edges[6]
     weights, squares, amplitude, inside, own = _F(0.0), _F(0.0), _F(0.0), _F(0.0), _F(0.0)
     level, reach = _F(0.0), _F(2.5) * math.sqrt(max(blur - _F(1.0 / 6.0), _F(0.09))) + _F(0.5)
@@ -398,7 +399,7 @@ def _cut(image: NDArray[Any], place: NDArray[Any]) -> tuple[NDArray[Any], int, i
 
 
 def _moments(image: NDArray[Any], places: NDArray[Any]) -> NDArray[Any]:
-    """Return centres by the moments of the grey levels above a half of Otsu's threshold."""
+    """Return centres from the moments of the grey levels above 0.7 of Otsu's threshold."""
     centres = np.empty((len(places), 2))
     for k, place in enumerate(places):
         part, left, top = _cut(image, place)
@@ -409,7 +410,7 @@ def _moments(image: NDArray[Any], places: NDArray[Any]) -> NDArray[Any]:
 
 
 def _ellipses(image: NDArray[Any], places: NDArray[Any]) -> NDArray[Any]:
-    """Return centres by ellipses through the contour of what is above Otsu's threshold."""
+    """Return centres from ellipses fitted to the contours of the pixels above Otsu's threshold."""
     centres = np.empty((len(places), 2))
     for k, place in enumerate(places):
         part, left, top = _cut(image, place)
@@ -421,7 +422,7 @@ def _ellipses(image: NDArray[Any], places: NDArray[Any]) -> NDArray[Any]:
 
 
 def scene(count: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float64]]:
-    """Return a frame of discs, where they should be, and where they are."""
+    """Return a frame of discs, their nominal positions and radii (count, 3), and their true positions (count, 2)."""
     rng = np.random.default_rng(5)
     across = math.ceil(math.sqrt(count))
     image = np.full((across * CELL, across * CELL), 50.0)

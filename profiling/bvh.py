@@ -97,7 +97,7 @@ def _build(mesh: Any, size: str) -> Case:
 
 
 def embree_scene(corners: NDArray[Any]) -> Any:
-    """Return Embree's scene, its tree built."""
+    """Return an Embree scene with its tree built."""
     scene = EmbreeScene()
     TriangleMesh(scene, corners.astype(np.float32))
     _first_query(scene)
@@ -113,5 +113,5 @@ def _embree_tree_time(corners: NDArray[Any]) -> float:
 
 
 def _first_query(scene: Any) -> None:
-    """Make Embree build: it does so at the first query."""
+    """Run a query: Embree builds its tree at the first one."""
     scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), query="OCCLUDED")

@@ -1,4 +1,4 @@
-"""The device's own limits, measured: what to hold a kernel against."""
+"""Measured limits of a device: time of a copy, and rate of multiply-adds."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from gpuvision.host.arrays import memory_of
 from gpuvision.host.program import build
 from gpuvision.operation import KERNEL_FOLDER
 
-_VECTOR = 64  # bytes
+_VECTOR = 64  # bytes that a work-item moves per step
 _ITEMS_PER_UNIT = 64
-_FLOPS_PER_STEP = 8 * 16 * 2
+_FLOPS_PER_STEP = 8 * 16 * 2  # 8 vectors of 16 floats, one multiplication and one addition each
 
 
 def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[[], None]:
-    """Return a call that reads and writes so many bytes in order, `repeats` times back to back, and waits.
+    """Return a function that reads and writes memory sequentially, `repeats` times back to back, and waits.
 
-    Timed beside a kernel of the same traffic it gives the part of that kernel's time that the traffic alone costs,
-    launch included, in the same cache or memory.
+    The arguments `read` and `written` are numbers of bytes. The time of this copy is a lower limit for a kernel with
+    the same traffic in the same cache or memory; it includes the launch.
     """
     reads, writes = max(read // _VECTOR, 1), written // _VECTOR
     source = device.empty((reads * 16,), np.float32)
     target = device.empty((max(writes, 1) * 16,), np.float32)
     source.set(np.ones(source.shape, np.float32))
-    target.set(np.ones(target.shape, np.float32))  # touches the pages before anything is timed
+    target.set(np.ones(target.shape, np.float32))  # maps the pages before the first timed run
     kernel = cl.Kernel(
         build(device, KERNEL_FOLDER, "ceiling/ceiling.cl", {}), "move" if device.is_cpu else "move_items"
     )
@@ -45,9 +45,9 @@ def move(device: Device, read: int, written: int, repeats: int = 1) -> Callable[
 
 
 def flop_rate(device: Device, *, seconds: float = 0.15) -> float:
-    """Measure single-precision multiply-adds on all cores, as operations per second.
+    """Return the rate of single-precision multiply-adds on all cores [FLOP/s]: median of short launches.
 
-    The median of short launches: a machine that changes its speed between two calls shows it here.
+    Two calls differ if the machine changed its speed between them.
     """
     items = device.compute_units * (4 if device.is_cpu else 4096)
     target = device.empty((items * 16,), np.float32)

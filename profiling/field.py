@@ -1,11 +1,15 @@
-"""Localization of a robot on a field against NumPy, Numba and SciPy.
+"""Localization of a robot on a field, compared with NumPy, Numba and SciPy.
 
-``global`` is a known robot's full search: 44 226 positions (243 x 182 at 1 cm), 64 rays, the heading from a compass.
-Every candidate gives the score of all poses and the least of each 64. Numba has our own form, the strongest there is:
-for one heading a ray is a shift of the map, whose rows are added in 16 bits, so that it vectorises. NumPy looks every
-pose and ray up in the map. ``global-shifts`` has NumPy add shifted maps, and Numba look every pose and ray up, as one
-writes it for any set of poses. ``turns`` is a whole field of 22 m with 72 headings, Numba as in ``global``. ``local``
-is one pose to the least cost; SciPy has exact distances and slopes as we do, in double.
+Cases:
+
+- ``global``: search over 44 226 positions (243 x 182 at 1 cm) with 64 rays; the heading is known from a compass. Every
+  candidate returns the scores of all poses and the smallest score of each block of 64 poses. The Numba peer uses our
+  algorithm: for one heading a ray is a shift of the map, and rows of the map are added in 16 bits, which vectorises.
+  The NumPy peer looks up every ray of every pose in the map.
+- ``global-shifts``: the same search; NumPy adds shifted maps, and Numba looks up every ray of every pose, the direct
+  form for any set of poses.
+- ``turns``: a field of 22 m with 72 headings; Numba as in ``global``.
+- ``local``: refinement of one pose; SciPy uses exact distances and their gradients as we do, in double.
 """
 
 from __future__ import annotations
@@ -38,15 +42,15 @@ def cases(device: Device) -> Iterator[Case]:
 
 
 def _points(field_map: DistanceMap, pose: tuple[float, ...], sigma: float) -> NDArray[np.float32]:
-    """As many points as rays, on lines within the reach, as seen from a pose."""
+    """Return noisy points on lines within the range of the map, one for each ray, in the frame of a pose."""
     rng = np.random.default_rng(5)
-    spread: list[NDArray[np.float64]] = []
+    sampled: list[NDArray[np.float64]] = []
     for x0, y0, x1, y1 in field_map.field.lines:
         part = np.linspace(0.0, 1.0, int(np.hypot(x1 - x0, y1 - y0) / field_map.cell) + 2)[:, None]
-        spread.append(np.array([x0, y0]) * (1.0 - part) + np.array([x1, y1]) * part)
+        sampled.append(np.array([x0, y0]) * (1.0 - part) + np.array([x1, y1]) * part)
     x, y, heading = pose
     turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-    points = (np.concatenate(spread) - [x, y]) @ turn
+    points = (np.concatenate(sampled) - [x, y]) @ turn
     points = points[np.hypot(*points.T) < 0.95 * field_map.max_range]
     points = points[rng.choice(len(points), _RAYS, replace=False)]
     return np.asarray(points + rng.normal(0.0, sigma, points.shape), np.float32)
@@ -70,7 +74,7 @@ def _shifts(points, headings, per_cell, border):  # type: ignore[no-untyped-def]
 
 @numba.njit(parallel=True, error_model="numpy")
 def _numba_shifts(level, columns, rows, scores, sums, least, where):  # type: ignore[no-untyped-def]
-    """Add rows of the map in 16 bits, a row of positions for one heading a task."""
+    """Add rows of the map in 16 bits; a task is a row of positions for one heading."""
     turns, height, width = scores.shape
     scale = np.float32(1.0 / (1023.0 * columns.shape[1]))
     for task in numba.prange(turns * height):
@@ -120,7 +124,7 @@ def _numpy_least(scores: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 class _Search:
-    """Our call on one map with its points, and the peers' arrays."""
+    """Bound search on a map, and the arrays and functions of the peers."""
 
     def __init__(
         self, device: Device, field_map: DistanceMap, points: NDArray[Any], headings: tuple[float, ...]
@@ -131,7 +135,7 @@ class _Search:
         )
         self.bound.inputs[0].set(points)
         self.ours = self.bound.run()
-        assert self.ours.scores is not None  # asked for above
+        assert self.ours.scores is not None  # because of with_scores
         self.our_scores = self.ours.scores
         self.scores = np.empty(self.our_scores.shape, np.float32)
         self.sums = np.empty((len(headings) * self.scores.shape[1], self.scores.shape[2]), np.uint16)
@@ -141,22 +145,22 @@ class _Search:
 
     @property
     def traffic(self) -> tuple[int, int]:
-        """The map's cells that are seen, and what is written."""
+        """Bytes read from the map and bytes written."""
         return self.map.cells.level.nbytes, self.scores.nbytes + 2 * self.least.nbytes
 
     def shifts(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Where each ray lies for each heading."""
+        """Return the column and row offsets of the rays for each heading, (headings, rays) each."""
         result: tuple[NDArray[Any], NDArray[Any]] = _shifts(
             self.points, self.headings, np.float32(1.0 / self.map.cell), self.map.border
         )
         return result
 
     def numba_shifts(self) -> None:
-        """In our form."""
+        """Add shifted rows of the map, the algorithm of our kernel."""
         _numba_shifts(self.map.cells.level, *self.shifts(), self.scores, self.sums, self.least, self.where)
 
     def numba_poses(self) -> None:
-        """As one writes it."""
+        """Look up every ray of every pose, compiled."""
         _numba_poses(self.map.cells.level, *self.shifts(), self.scores, self.least, self.where)
 
     def numpy_poses(self) -> None:
@@ -177,18 +181,18 @@ class _Search:
         self.least[:], self.where[:] = _numpy_least(self.scores)
 
     def check(self, *peers: Callable[[], None]) -> None:
-        """Check that the peers find the same."""
+        """Raise an error if the result of a peer differs from ours."""
         ours: tuple[NDArray[Any], ...]
         ours = to_numpy(self.our_scores), to_numpy(self.ours.least), to_numpy(self.ours.column)
         for peer in peers:
             peer()
             theirs: tuple[NDArray[Any], ...] = (self.scores, self.least, self.where)
             if not all(np.allclose(each, other, atol=1e-6) for each, other in zip(theirs, ours, strict=True)):
-                raise AssertionError("the peer's scores are others than ours: it does other work")
+                raise AssertionError("the scores of a peer differ from ours")
 
     @property
     def error(self) -> float:
-        """Our scores' largest error against exact distances, in double, at some of the poses."""
+        """Largest error of our scores at a sample of the poses, compared with exact distances in double."""
         turn, row, column = (each[:: max(each.size // 200, 1)] for each in np.indices(self.scores.shape).reshape(3, -1))
         x0, y0 = self.map.first_position
         c, s = np.cos(self.headings[turn])[:, None], np.sin(self.headings[turn])[:, None]
@@ -226,7 +230,7 @@ def _turns(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> C
 
 
 def _offsets(shapes: NDArray[Any], which: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> tuple[Any, Any, Any]:
-    """Signed distances to given straight lines, full circles and quarters, and their slopes."""
+    """Return signed distances of points to straight lines, circles and quarter circles, and their gradients."""
     sx, sy, c, s, half, end, radius = np.moveaxis(shapes[which], -1, 0)
     dx, dy = x - sx, y - sy
     along, across = c * dx + s * dy, c * dy - s * dx

@@ -1,4 +1,4 @@
-"""What a bound operation costs over pyopencl's own enqueue, from Python: a hundred launches of next to no work."""
+"""Launch overhead of a bound operation in Python, compared with pyopencl: a hundred launches of a tiny kernel."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _REPEATS = 50
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield `bound`: preset arguments; and `given`: another input array with each call."""
+    """Yield `bound`, with fixed arguments, and `given`, with a different input array in each call."""
     bound = PsdReadout(strip_length=6e-3).bind(device, (16, 2), np.float32)
     frames = [device.empty((16, 2), np.float32) for _ in range(2)]
     for frame in frames:
         frame.set(np.ones((16, 2), np.float32))
-    # A bound instance's own kernel and sizes, launched without it.
+    # The peer launches the kernel of the bound operation with the same sizes.
     site, sizes = bound._site(), (bound._global, bound._local)
     queue, kernel = site.queue, site.kernel
 
@@ -47,7 +47,7 @@ def cases(device: Device) -> Iterator[Case]:
 
 
 def _overhead(call: Callable[[], None], plain: Callable[[], None]) -> float:
-    """Return the median extra time of one launch [s]."""
+    """Return the median difference between our time and the time of the peer, for one launch [s]."""
     extra = []
     for _ in range(_REPEATS):
         start = time.perf_counter()

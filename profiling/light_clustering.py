@@ -1,4 +1,4 @@
-"""Speed against accuracy of secondary light: ClusteredIrradiance at tolerances of the range, against all pairs.
+"""Speed and accuracy of indirect light: ClusteredIrradiance at several range tolerances, compared with all pairs.
 
 The peer is this library without clustering: `OccludedIrradiance` over all pairs, with its copies to and from the
 device. Our time includes the traversal of the light tree. `error` is the largest error of the range among the strips
@@ -37,13 +37,13 @@ Heights = Callable[[Reals, Reals], Reals]
 
 _TOLERANCES = (0.0, 1e-6, 5e-6, 5e-5, 5e-4)
 _FEW_TOLERANCES = (0.0, 5e-6, 5e-4)
-_AT_GROWTH = 5e-6
+_AT_GROWTH = 5e-6  # tolerance of the cases growth/... [m]
 _SIZES = (1, 2, 4)
 _STRIPS, _EACH = 64, 64
-_X, _LOW, _HIGH = 0.1, -0.02, 0.04  # metres along the sheet to both sides, and across it
+_X, _LOW, _HIGH = 0.1, -0.02, 0.04  # half length along the sheet, and limits across it [m]
 _ALBEDO = 0.5
-_ROUNDING = 1e-9  # metres, by the kernel in single
-_OFF_BOARD = 1e-6  # metres: receivers on the board are in single
+_ROUNDING = 1e-9  # rounding error of the kernel in single precision [m]
+_OFF_BOARD = 1e-6  # clearance [m]: the receivers on the board have single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class Part:
 
     @classmethod
     def surface(cls, heights: Heights, cells: int, across: int, strips: int = _STRIPS, each: int = _EACH) -> Part:
-        """Return a mesh of cells under heights(x, y), lit along y = 0, each strip at one x."""
+        """Return a mesh of cells with heights(x, y), lit along y = 0; each strip lies at one x."""
         mesh = _Mesh(heights, cells, across)
         x = np.linspace(-_X, _X, 2 * cells + 1)
         middle, half = 0.5 * (x[1:] + x[:-1]), 0.5 * (x[1] - x[0])
@@ -93,7 +93,7 @@ class Part:
 
     @classmethod
     def board(cls, **more: int) -> Part:
-        """Return the board of the section `reflections`, its line in 4 times as many parts."""
+        """Return the board of the operation `reflections`, with 4 times as many lit segments."""
         board = Board.of(parts_of_segments=4, **more)
         count = board.receivers[..., 0].size
         area, width = 0.1 * 0.08 / count, 0.1 / len(board.receivers)
@@ -129,7 +129,7 @@ class Part:
 
 
 class _Mesh:
-    """Heights over a grid, two triangles a cell; y = 0 runs through the middle of cells."""
+    """Height field on a grid, two triangles per cell; y = 0 runs through the middle of cells."""
 
     def __init__(self, heights: Heights, cells: int, across: int) -> None:
         self.step = np.array([2.0 * _X / cells, (_HIGH - _LOW) / across])
@@ -144,7 +144,7 @@ class _Mesh:
         )
 
     def at(self, x: Reals, y: Reals) -> tuple[Reals, Reals]:
-        """Return height and normal of the triangles at places."""
+        """Return heights and normals of the mesh at positions (x, y)."""
         part = (np.stack([x, y], axis=-1) - self.origin) / self.step
         last = np.array(self.heights.shape) - 2
         cell = np.clip(np.floor(part).astype(int), 0, last)
@@ -168,7 +168,7 @@ def _valley(x: Reals, y: Reals) -> Reals:
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield the scenes at each tolerance, and the groove as it grows."""
+    """Yield the scenes at each tolerance, and the groove in increasing sizes."""
     scenes: dict[str, Callable[[], Part]] = {
         "groove": functools.partial(Part.surface, _groove, 64, 16),
         "valley": functools.partial(Part.surface, _valley, 64, 24),

@@ -1,6 +1,6 @@
-"""Line readout against Numba in strips of 256 columns and against NumPy: position, total and status.
+"""Line readout compared with Numba, in strips of 256 columns, and with NumPy: position, total and status.
 
-Frames of 512 rows and 1024 columns, 8 bit, of a line that wanders over half the frame.
+The frames have 512 rows, 1024 columns and 8 bits; the line moves over half the height of the frame.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from gpuvision.ranging.line import LineReadout, Method
 from gpuvision.ranging.triangulation import Triangulation
 
 ROWS, COLUMNS, THRESHOLD, SATURATION, WINDOW = 512, 1024, 25, 255, 8
-GAIN = 0.1  # of the likelihood's noise
+GAIN = 0.1  # gain of the noise model of the likelihood
 OUTPUTS = ("position", "total", "status")
-_STRIP = 256
-_DISTINCT = 8
+_STRIP = 256  # columns that a Numba task sums
+_DISTINCT = 8  # different frames in a batch
 Frames = NDArray[np.uint8]
 
 
 @numba.njit(error_model="numpy")
 def _add_row(line, totals, moments, tops, threshold):  # type: ignore[no-untyped-def]
-    """Sum a strip's row; the moment is the sum of the running totals, without a multiplication."""
+    """Add a row of a strip. The moment is the sum of the running totals, which needs no multiplication."""
     for c in range(line.size):
         x = line[c]
         total = totals[c] + np.uint32(max(x, threshold) - threshold)
@@ -124,7 +124,7 @@ def _numpy_windowed(frames: Frames) -> tuple[NDArray[Any], ...]:
 
 
 def _windows(frames: Frames, reach: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the peaks' rows, and the samples about them as float64 of shape (frames, 2 reach + 1, columns)."""
+    """Return the rows of the peaks, and the samples around them: float64 (frames, 2 reach + 1, columns)."""
     at = frames.argmax(axis=1)
     index = np.clip(at[:, None, :] + np.arange(-reach, reach + 1)[None, :, None], 0, frames.shape[1] - 1)
     return at, np.take_along_axis(frames, index, axis=1).astype(np.float64)
@@ -149,7 +149,7 @@ def _numpy_fir(frames: Frames) -> Any:
 
 
 def _numpy_ml(frames: Frames, steps: int = 12) -> Any:
-    """Fisher scoring for a pixel-integrated Gaussian on a background, all columns at once."""
+    """Fit a pixel-integrated Gaussian on a background by Fisher scoring, for all columns at once."""
     at, near = _windows(frames, WINDOW)
     y = np.moveaxis(near, 1, 2)
     edge = np.arange(2 * WINDOW + 2) - WINDOW - 0.5
@@ -182,7 +182,7 @@ _NUMPY_FITS = {"gauss3": _numpy_gauss3, "fir": _numpy_fir, "ml": _numpy_ml}
 
 
 def line_frames(count: int) -> Frames:
-    """Return frames with a Gaussian line of 2 px and 3 levels of noise, a few distinct ones in turn."""
+    """Return frames with a Gaussian line (sigma 2 px) and noise of 3 grey levels; a few different frames repeat."""
     rng = np.random.default_rng(1)
     row, column = np.arange(ROWS)[:, None], np.arange(COLUMNS)
     distinct = np.empty((min(count, _DISTINCT), ROWS, COLUMNS), np.uint8)
@@ -194,7 +194,7 @@ def line_frames(count: int) -> Frames:
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield both centres of gravity on 1, 16 and 64 frames, the fits, along rows, and fused with the triangulation."""
+    """Yield both centroids on 1, 16 and 64 frames, the fits, readout along rows, and readout with triangulation."""
     centres: tuple[Method, ...] = ("centroid", "windowed")
     fits: tuple[Method, ...] = ("gauss3", "fir", "ml")
     for method in centres:
@@ -208,8 +208,8 @@ def cases(device: Device) -> Iterator[Case]:
             yield _fused_case(device, method, count)
 
 
-# Names in the rows of the results. "whole" (the whole profile) is older than the method's name "centroid": stored
-# results and their lowest accepted ratios are found by it.
+# Case names in the results. "whole" (the whole profile) is older than the method name "centroid"; it stays, because
+# stored results and their lowest accepted ratios refer to it.
 _ROWS: Mapping[Method, str] = {"centroid": "whole", "windowed": "windowed"}
 _SETTINGS: Mapping[str, Any] = {"threshold": THRESHOLD, "window": WINDOW, "outputs": OUTPUTS}
 
@@ -226,7 +226,7 @@ def _case(device: Device, readout: LineReadout, count: int, name: str) -> Case:
 
 
 def _peers(readout: LineReadout, frames: Frames, across: Frames) -> dict[str, Callable[[], object]]:
-    """Return who does the same; across has the profiles in columns."""
+    """Return the peers of a readout; `across` holds the frames with the profiles in columns."""
     if readout.method in _NUMPY_FITS:
         return {"numpy": lambda: _NUMPY_FITS[readout.method](across)}
     is_centroid = readout.method == "centroid"
@@ -244,10 +244,10 @@ def _peers(readout: LineReadout, frames: Frames, across: Frames) -> dict[str, Ca
 
 
 def _fused_case(device: Device, method: Method, count: int) -> Case:
-    """With coordinates undistorted and triangulated in the same pass; the peer is our readout alone.
+    """Return a case with undistortion and triangulation in the same pass; the peer is our readout without them.
 
-    No traffic is named: the copy that would measure the device's limit empties the caches, for whoever comes after
-    it and not for the other, and the difference is a few percent.
+    The case gives no traffic: the copy that measures the limit of the device evicts the caches for the function that
+    is timed next, and not for the other one. The difference is a few percent.
     """
     sheet = Triangulation(
         homography=((1.1e-5, 2.0e-4, -0.1), (-2.2e-4, 1.0e-6, 0.06), (2.0e-4, 1.0e-5, 1.0)),
@@ -268,7 +268,7 @@ def _fused_case(device: Device, method: Method, count: int) -> Case:
 
 
 def _bound(device: Device, readout: LineReadout, frames: Frames) -> tuple[Any, Frames]:
-    """Return the bound readout with the frames in its input slot, and the frames where peers should read them."""
+    """Return the bound readout with the frames in its input, and the frames in host memory for the peers."""
     bound = readout.bind(device, frames.shape, frames.dtype)
     if device.shares_memory:
         host_view(bound.inputs[0])[...] = frames
@@ -280,7 +280,7 @@ def _bound(device: Device, readout: LineReadout, frames: Frames) -> tuple[Any, F
 
 
 def _error(reading: Any, frames: Frames, readout: LineReadout) -> float:
-    """Return the largest deviation from float64 of the same definition."""
+    """Return the largest deviation [px] from the same method in float64."""
     position, status = (each.get()[:_DISTINCT] for each in (reading.position, reading.status))
     frames = frames[:_DISTINCT]
     if readout.method in _NUMPY_FITS:

@@ -1,9 +1,9 @@
-"""Robust lines through sets of points, against a Numba loop and OpenCV's ``fitLine``.
+"""Robust line fits to sets of points, compared with Numba and OpenCV's ``fitLine``.
 
-Points along lines of a picture, 30 % of them far aside, each with its standard deviation: the start is the best of 64
-pairs by Tukey's loss, twelve steps follow, then the covariance. Numba does the same on all cores, a line at a time with
-its points side by side in vectors. OpenCV's loss is Welsch's, which gives far points up as Tukey's does; it does less:
-its starts are random, and there is no covariance.
+The sets contain points along image lines, 30 % outliers, and a standard deviation for each point. A fit starts from the
+best of 64 pairs by Tukey's loss, does twelve iterations, and computes the covariance. The Numba peer does the same on
+all cores, one line per task, vectorised over its points. OpenCV uses Welsch's loss, which rejects distant points like
+Tukey's; it does less work: its starts are random, and it computes no covariance.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gpuvision.profiling.harness import Case
 from gpuvision.profiling.pose import STEPS, TRIALS, fit_line
 
 _LINES, _SIGMA = 10_000, 0.05  # px
-_FEW = 100  # of the lines, for OpenCV; each takes as long as any other
+_FEW = 100  # lines that OpenCV fits; its time for all lines is extrapolated, since the lines are alike
 _ONE = np.float32(1.0)
 
 
@@ -39,7 +39,7 @@ def scene(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 @numba.njit(parallel=True, error_model="numpy")
 def _numba(points, sigma, pairs, out):  # type: ignore[no-untyped-def]
-    """Fit a line at a time, each thread in rooms of its own."""
+    """Fit the lines one after another in each thread, with separate buffers per thread."""
     threads, lines = numba.get_num_threads(), points.shape[0]
     for part in numba.prange(threads):
         u = np.empty(points.shape[1], np.float32)
@@ -54,7 +54,7 @@ def _numba(points, sigma, pairs, out):  # type: ignore[no-untyped-def]
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield ten thousand lines through 20 points, and through 64, which fill a vector's lanes."""
+    """Yield ten thousand lines through 20 points, and through 64 points, a multiple of the vector width."""
     for count in (20, 64):
         yield _case(device, count)
 
@@ -75,11 +75,11 @@ def _case(device: Device, count: int) -> Case:
     normal, centre = to_numpy(bound.outputs.normal), to_numpy(bound.outputs.centre)
     apart = np.abs(normal[:, 0] * out[:, 1] - normal[:, 1] * out[:, 0])
     if not np.quantile(apart, 0.99) < 1e-4:
-        raise AssertionError("Numba's lines are not ours")
+        raise AssertionError("the lines of the peer numba differ from ours")
     error = np.nan
     if device.has_double:
         exact = operation(points.astype(np.float64), sigma.astype(np.float64), device=device)
         away = np.abs(np.sum(to_numpy(exact.normal) * (centre - to_numpy(exact.centre)), axis=-1))
-        # Where two starts are as good as each other to rounding, the other one may win: a few in ten thousand lines.
+        # If two starts are equally good within rounding, precision decides between them: a few in ten thousand lines.
         error = float(np.quantile(away, 0.99))
     return Case("line_fit", f"tukey/1e4x{count}", bound.run, peers, error, factors={"opencv": _LINES / _FEW})

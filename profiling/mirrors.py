@@ -1,11 +1,12 @@
-"""Lit lines in mirrors: curved mirrors against Numba, plane mirrors against NumPy with Embree.
+"""Lit lines in mirrors: curved mirrors compared with Numba, plane mirrors with NumPy and Embree.
 
 ``balls``: images of the points of a line in 20 balls of 1280 triangles. The peer tests all triangles with the same
 equations, in double like ours, compiled by Numba on all cores; quantities that do not depend on the point are computed
-before. `error` is the distance between its images and ours [m]. ``facets/N``: light of a line on a floor, seen in the
-sides of boxes. The peer takes N samples of each lit segment, finds their mirror images in all facets, and traces both
-ways of each through Embree. Ours is the exact form; `peer_error` is the peer's error in the median sample of the
-sensor.
+beforehand. `error` is the largest distance between its images and ours [m].
+
+``facets/N``: light of a line on a floor, seen in the sides of boxes. The peer takes N samples of each lit segment,
+finds their mirror images in all facets, and traces both paths of each image with Embree. Our result is exact;
+`peer_error` is the median error of the peer over the samples of the sensor.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def _balls(device: Device) -> Case:
 
 
 def _corner_table(lens: Array, corners: Array, normals: Array) -> Array:
-    """Return for each corner: place, normal, the lens' height c, for both edges e: c e - 2 (e n) c; and the edges."""
+    """Return for each corner: position, normal, lens height c, c e - 2 (e n) c for both edges e, and the edges."""
     edges = corners[:, 1:] - corners[:, :1]
     to_lens = lens - corners
     up = np.sum(to_lens * normals, axis=2)
@@ -108,7 +109,7 @@ def _law_at(t, k, n, x, y, z):  # type: ignore[no-untyped-def]
 
 @numba.njit(parallel=True, error_model="numpy")
 def _numba(points, lens, corners, normals, table, found, places):  # type: ignore[no-untyped-def]
-    """Try all triangles for each point: the law of reflection at the corners, and Newton's method where it may hold."""
+    """Test all triangles for each point: law of reflection at the corners, then Newton's method on the candidates."""
     count, kept = found.shape
     for i in numba.prange(count):
         shown = 0
@@ -214,7 +215,7 @@ def _facets(device: Device, samples: int) -> Case:
 
 
 def _box_scene() -> tuple[Scene, SensorView, LitLine]:
-    """Return boxes on a floor whose sides are mirrors, a sensor beside a sheet of light, and what that lights."""
+    """Return boxes with mirroring sides on a floor, a sensor beside a sheet of light, and the lit line."""
     rng = np.random.default_rng(1)
     floor = np.array(
         [[[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0]], [[-0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]]]
@@ -239,14 +240,14 @@ def _box_scene() -> tuple[Scene, SensorView, LitLine]:
 
 
 def _turned(angle: float) -> Array:
-    """Return the transformation that turns about z."""
+    """Return the matrix (4, 4) of a rotation about z."""
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     return turn
 
 
 def _by_samples(scene: Scene, view: SensorView, lit: LitLine, embree: Any, samples: int) -> Exposure:
-    """Return the light of samples of lit segments in mirrors: images, and rays for both ways of each."""
+    """Return the mirrored light from samples of lit segments: mirror images, and rays for both ways of each."""
     assert scene.material is not None
     dull = scene.material[lit.triangle] == 0
     share = ((np.arange(samples) + 0.5) / samples)[:, None]

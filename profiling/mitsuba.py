@@ -1,10 +1,11 @@
-"""Light of lit strips by Monte Carlo against the closed forms: Mitsuba's time for a median error of 1 % in a picture.
+"""Light of lit strips: our closed forms compared with Mitsuba's time for a median error of 1 % in a picture.
 
 Mitsuba runs in its fastest variant on the machine (LLVM where it works, else scalar) with next-event estimation, which
-suits these scenes best. Its time is that of ``samples`` per pixel times (its median error / 1 %)^2, because its error
-is inversely proportional to the root of the number of samples. Ours is the time for the centres of all pixels and
-strips as lines, in single. Errors are relative to the closed form in double with strips 0.1 mm wide, averaged over each
-pixel; ``error`` is our median and ``peer_error`` Mitsuba's, over the pixels that see one plane and get light.
+suits these scenes best. Its time is extrapolated: the time for ``samples`` per pixel times (its median error / 1 %)^2,
+because the error is inversely proportional to the root of the number of samples. Our time is that for the centres of
+all pixels and strips as lines, in single precision. Errors are relative to the closed form in double with strips
+0.1 mm wide, averaged over each pixel; ``error`` is our median and ``peer_error`` that of Mitsuba, over the pixels that
+see one plane and get light.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ from gpuvision.profiling.mitsuba_scenes import (
     groove,
 )
 
-_ASKED = 0.01
+_TARGET_ERROR = 0.01  # relative median error for which the time of Mitsuba is given
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a corner of 90 degrees, a groove of 60, and a board with parts; without Mitsuba nothing, and say so."""
+    """Yield a corner of 90 degrees, a groove of 60 degrees, and a board with parts; nothing if Mitsuba is missing."""
     if importlib.util.find_spec("mitsuba") is None:
-        print("mitsuba is left out: the package is missing; install it: pip install mitsuba", file=sys.stderr)
+        print("operation mitsuba skipped: the package is missing; install it: pip install mitsuba", file=sys.stderr)
         return
     variant = best_variant()
     yield _case(device, groove(np.radians(90.0), (256, 256)), "corner/90", variant, samples=16)
@@ -58,9 +59,9 @@ def _case(device: Device, lit: LitScene, name: str, variant: str, *, samples: in
         "pixels": int(np.prod(lit.pixels)),
         "samples": samples,
         "peer_error": theirs,
-        "its_time_is_for": f"{_ASKED:g}, extrapolated by 1/sqrt(samples)",
+        "its_time_is_for": f"{_TARGET_ERROR:g}, extrapolated by 1/sqrt(samples)",
     }
-    factors = {"mitsuba": (theirs / _ASKED) ** 2}
+    factors = {"mitsuba": (theirs / _TARGET_ERROR) ** 2}
     return Case(
         "mitsuba", name, bound.run, {"mitsuba": lambda: picture(samples, 2)}, ours, metadata=metadata, factors=factors
     )

@@ -1,8 +1,8 @@
 """Scenes with lit strips for Mitsuba and for the closed forms: irradiance in the pixels of a picture.
 
-A strip lies on the surface and emits. Mitsuba samples it by next-event estimation, with one sample of the light per
-path and none of the surface. Its rays start 1e-4 of the coordinates, at least 1e-4 units, off a surface; so it gets the
-scenes in millimetres.
+A strip lies on the surface and emits light. Mitsuba samples it by next-event estimation, with one sample of the light
+per path and none of the surface. Its rays start at a distance of 1e-4 times the coordinates, at least 1e-4 units, from
+a surface; therefore it gets the scenes in millimetres.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ Float64 = NDArray[np.float64]
 Picture = NDArray[np.float64]
 
 _MILLI = 1e-3
-_LIFT = 1e-6  # m: of a strip over its surface
-_ACROSS = 3  # lines for a strip
+_LIFT = 1e-6  # distance of a strip from its surface [m]
+_ACROSS = 3  # lines that represent a strip
 _TRY = "import mitsuba as mi; mi.set_variant({0!r}); mi.render(mi.load_dict(mi.cornell_box()), spp=1).numpy()"
 
 
@@ -65,15 +65,15 @@ class LitScene:
     Parameters
     ----------
     scene
-        Wound outwards: the side that is seen from there is white and diffuse, the other black.
+        Triangles with outward winding: the outer side is white and diffuse, the inner side black.
     segments
-        The middle lines of the strips, all of one exitance [W/m].
+        Centre lines of the strips, all with the same exitance [W/m].
     width
-        Of the strips [m].
+        Width of the strips [m].
     middle, right, up
-        The picture's middle in the scene, and the vectors from there to the middles of its right and its upper edge.
+        Centre of the picture in the scene, and the vectors from it to the middles of the right and upper edges [m].
     pixels
-        Rows and columns.
+        Numbers of rows and columns.
     """
 
     scene: Scene
@@ -86,17 +86,17 @@ class LitScene:
 
     @property
     def towards(self) -> Float64:
-        """Where the camera looks, a unit vector."""
+        """Viewing direction of the camera, a unit vector."""
         across = np.cross(self.up, self.right)
         return np.asarray(across / np.linalg.norm(across))
 
     @property
     def before(self) -> Float64:
-        """The place on the camera's axis from where it sees everything."""
+        """Camera position on the optical axis from which the whole scene is in view."""
         return np.asarray(np.array(self.middle) - 4.0 * float(np.ptp(self.scene.corners)) * self.towards)
 
     def lines(self, across: int = _ACROSS) -> LitSegments:
-        """Return so many lines for each strip, Gauss and Legendre's across it."""
+        """Return `across` lines for each strip, at the Gauss-Legendre nodes of its width."""
         node, weight = np.polynomial.legendre.leggauss(across)
         along = self.segments.ends[:, 1] - self.segments.ends[:, 0]
         beside = np.cross(self.segments.normals, along / np.linalg.norm(along, axis=1, keepdims=True))
@@ -108,7 +108,7 @@ class LitScene:
         )
 
     def receivers(self, nodes: int = 4, off: float = 3.0) -> Receivers:
-        """Return where pixels look, ``off`` pixels off the strips where they count."""
+        """Return the receivers of the pixels; pixels closer than ``off`` pixels to a strip are not ``whole``."""
         node, weight = np.polynomial.legendre.leggauss(nodes)
         inside = np.stack(np.meshgrid(node, node, indexing="ij"), axis=-1).reshape(-1, 2)
         corners = 0.999 * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
@@ -142,9 +142,9 @@ class LitScene:
 
 
 def groove(angle: float, pixels: tuple[int, int] = (64, 64)) -> LitScene:
-    """Return two walls at an angle [rad]: a strip on one runs into the edge; seen: the other, 80 mm high, 120 wide.
+    """Return two walls at an angle [rad] with a strip on one of them that runs into the common edge.
 
-    The camera looks along the line that halves the angle.
+    The camera looks along the bisector of the angle and sees 80 mm x 120 mm of the other wall.
     """
     one = np.array([0.0, math.sin(0.5 * angle), math.cos(0.5 * angle)])
     other = one * (1.0, -1.0, 1.0)
@@ -166,7 +166,7 @@ def groove(angle: float, pixels: tuple[int, int] = (64, 64)) -> LitScene:
 
 
 def board(pixels: tuple[int, int] = (40, 184)) -> LitScene:
-    """Return a board with parts and a line of strips over all; seen: the parts' sides that face it, at 45 degrees."""
+    """Return a board with parts and a line of strips over them, seen at 45 degrees: the sides that face the line."""
     of = Board.of()
     slope = math.sqrt(0.5)
     return LitScene(
@@ -183,7 +183,7 @@ def board(pixels: tuple[int, int] = (40, 184)) -> LitScene:
 def by_closed_form(
     lit: LitScene, receivers: Receivers, device: Device, *, occluding: bool, precision: Precision = "double"
 ) -> Picture:
-    """Return the mean irradiance [W/m^2] of every pixel; ``occluding``: parts hide strips from others."""
+    """Return the mean irradiance [W/m^2] of every pixel; with ``occluding``, parts occlude strips."""
     made = bound_closed_form(lit, receivers, device, occluding=occluding, precision=precision).run()
     return np.asarray(made.irradiance.get(), np.float64).reshape(*lit.pixels, -1) @ receivers.weights
 
@@ -197,7 +197,7 @@ def bound_closed_form(
     precision: Precision = "single",
     across: int = _ACROSS,
 ) -> Any:
-    """Return what computes the irradiance of all receivers, a strip as so many lines, ready to run on a device."""
+    """Return a bound operation for the irradiance of all receivers; a strip is represented by `across` lines."""
     lines = lit.lines(across)
     places = receivers.rows.reshape(lit.pixels[0], -1, 6)
     light: Any = LineIrradiance(segments=lines, precision=precision)
@@ -214,21 +214,21 @@ def bound_closed_form(
 def best_variant() -> str:
     """Return Mitsuba's fastest variant that runs here: "llvm_ad_rgb", or "scalar_rgb".
 
-    It is tried in another process: of an LLVM that does not know the processor the process dies.
+    The variant is tried in a separate process, because an LLVM that does not know the processor aborts the process.
     """
     tried = subprocess.run([sys.executable, "-c", _TRY.format("llvm_ad_rgb")], capture_output=True, check=False)
     return "scalar_rgb" if tried.returncode else "llvm_ad_rgb"
 
 
 def by_mitsuba(lit: LitScene, variant: str = "scalar_rgb") -> Callable[[int, int], Picture]:
-    """Return what renders a picture of irradiance [W/m^2]: ``picture(samples, seed)``, samples of light per pixel."""
+    """Return a function ``picture(samples, seed)`` that renders the irradiance [W/m^2] with samples per pixel."""
     mi: Any = importlib.import_module("mitsuba")
     mi.set_variant(variant)
     rows, columns = lit.pixels
     transform = mi.ScalarTransform4f
     white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
     emission = float(lit.segments.exitance[0]) / (math.pi * lit.width)
-    # A film is [-1, 1] wide, and as high as its pixels are square.
+    # The film spans [-1, 1] in width; its height follows from square pixels.
     half = [
         float(np.linalg.norm(each)) / _MILLI * times for each, times in ((lit.right, 1.0), (lit.up, columns / rows))
     ]

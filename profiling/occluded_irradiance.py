@@ -1,10 +1,10 @@
-"""Light of a lit line on a board with parts, with occlusion: OccludedIrradiance against NumPy with Embree.
+"""Light of a lit line on a board with parts, with occlusion: OccludedIrradiance compared with NumPy and Embree.
 
-The peer takes samples of the line, keeps the pairs that face each other (by matrix products, in blocks), traces a
-shadow ray for each through Embree on all cores, and sums, one profile at a time; ours are eight profiles in a row. Both
-errors are medians over the receivers that get light, relative to OccludedIrradiance in double, which the tests compare
-with rays in float64; NaN on a device without double. Cases ``growth/...`` have four times the segments or receivers of
-the board, or four and sixteen times its triangles.
+The peer samples the line, keeps the pairs that face each other (by matrix products, in blocks), traces a shadow ray for
+each pair with Embree on all cores, and sums. It computes one profile at a time; we compute eight profiles in sequence.
+Both errors are medians over the receivers that get light, relative to OccludedIrradiance in double, which the tests
+compare with rays in float64; they are NaN on a device without double. Cases ``growth/...`` have four times the segments
+or receivers of the board, or four and sixteen times its triangles.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
 
 _PARTS, _STRIPS, _EACH = 40, 100, 30
-_LIFT = 1e-6  # metres, within which of a surface nothing hides; the peer's rays begin and end so far off
-_PROFILES = 8  # one after another, as a scan has them; the peer gains nothing by that
-_BLOCK = 1 << 22  # pairs of a block of the peer's
-_BASE = "board/1024"  # what the boards of growth/... have more of
-_AT = 0.0  # metres, where the sheet of light stands: along the middle row of parts
+_LIFT = 1e-6  # clearance from a surface [m], also that of the ends of the rays of the peer
+_PROFILES = 8  # profiles in sequence, as in a scan; the peer gains nothing from a sequence
+_BLOCK = 1 << 22  # pairs per block of the peer
+_BASE = "board/1024"  # case that the sizes of growth/... refer to
+_AT = 0.0  # position of the sheet of light [m]: along the middle row of parts
 
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """A plate with boxes and cylinders, a line of light over it, and receivers on all that faces up or aside."""
+    """Plate with boxes and cylinders, a lit line across it, and receivers on surfaces that face up or sideways."""
 
     scene: Scene
     segments: LitSegments
@@ -47,7 +47,7 @@ class Board:
 
     @classmethod
     def of(cls, *, finer: int = 0, strips: int = _STRIPS, parts_of_segments: int = 1) -> Board:
-        """Return the board, each triangle cut into four so often, each lit segment into so many."""
+        """Return the board; triangles are subdivided `finer` times, lit segments cut into `parts_of_segments`."""
         rng = np.random.default_rng(1)
         mesh: Any = trimesh.creation.box((0.1, 0.08, 0.0016)).apply_translation((0.0, 0.0, -0.0008))
         parts = [mesh.subdivide().subdivide().subdivide()]
@@ -68,7 +68,7 @@ class Board:
         seen = np.where(mesh.face_normals[:, 2] > -0.5, mesh.area_faces, 0.0)
         points, faces = trimesh.sample.sample_surface(mesh, strips * _EACH, face_weight=seen, seed=3)
         receivers = np.hstack([points, mesh.face_normals[faces]])[np.argsort(points[:, 0])].reshape(strips, _EACH, 6)
-        # A strip of a sensor sees a slice of the board, from one of its edges to the other.
+        # A strip of the sensor sees a slice across the whole board.
         receivers = np.take_along_axis(receivers, np.argsort(receivers[:, :, 1], axis=1)[:, :, None], axis=1)
         for _ in range(finer):
             mesh = mesh.subdivide()
@@ -76,7 +76,7 @@ class Board:
 
 
 def _line(tops: list[tuple[float, float, float]], parts: int) -> LitSegments:
-    """Return what is highest of tops (from, to, height) along x, each piece cut into parts of one length."""
+    """Return the upper envelope of `tops` (from, to, height) along x, each piece cut into equal parts."""
     cuts = np.unique([edge for top in tops for edge in top[:2]])
     middles = 0.5 * (cuts[1:] + cuts[:-1])
     heights = np.max([np.where((middles > low) & (middles < high), z, -1.0) for low, high, z in tops], axis=0)
@@ -90,7 +90,7 @@ def _line(tops: list[tuple[float, float, float]], parts: int) -> LitSegments:
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield the board at the peer's 1024 and 16384 samples a line, and boards that are larger in one way."""
+    """Yield the board with 1024 and 16384 line samples of the peer, and boards that are larger in one respect."""
     board = Board.of()
     for samples in (1024, 16_384):
         yield _case(device, board, f"board/{samples}", samples)
@@ -138,13 +138,13 @@ def _in_a_row(bound: Bound[Any]) -> None:
 
 
 def error_of(values: NDArray[Any], truth: NDArray[np.float64]) -> float:
-    """Return the median relative error of what gets light; NaN where nothing does."""
+    """Return the median relative error of the lit receivers; NaN if no receiver is lit."""
     lit = truth > 1e-6 * np.nanmax(truth)
     return float(np.median(np.abs(values[lit] / truth[lit] - 1.0))) if lit.any() else float("nan")
 
 
 def embree_of(scene: Scene) -> Any:
-    """Return a scene as Embree takes it."""
+    """Return an Embree scene of the triangles."""
     embree = EmbreeScene()
     TriangleMesh(embree, scene.corners.astype(np.float32))
     return embree
@@ -174,7 +174,7 @@ def irradiance_by_samples(board: Board, samples: int, embree: Any) -> NDArray[np
 
 
 def _samples(segments: LitSegments, samples: int) -> tuple[NDArray[np.float32], ...]:
-    """Return places, normals and exitance over pi of samples at even distances along all of the line."""
+    """Return positions, normals and exitance over pi of equidistant samples of the line."""
     lengths = np.linalg.norm(segments.ends[:, 1] - segments.ends[:, 0], axis=1)
     begin = np.cumsum(lengths) - lengths
     at = (np.arange(samples) + 0.5) * (lengths.sum() / samples)

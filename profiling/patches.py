@@ -1,9 +1,9 @@
-"""Light of patches on points: exact form factors in a room, and a board with occlusion, against NumPy and Embree.
+"""Light of patches on points: form factors in a room, and a board with occlusion, compared with NumPy and Embree.
 
-In the room the peer is Lambert's sum over edges in NumPy, float64. Nothing occludes there and no wall crosses a
-receiver's horizon, so neither side clips or casts rays. On the board the peer is the usual approximation: a patch is
-the point in its middle, and Embree tests its visibility. Errors are over the largest irradiance, against double with
-sixteen times as many rays; `peer_error` is the peer's.
+In the room the peer is Lambert's sum over edges in NumPy, float64. There is no occlusion, and no wall crosses the
+horizon of a receiver; neither side clips patches or traces rays. On the board the peer is the usual approximation: a
+patch is a point at its centroid, and Embree tests its visibility. Errors are relative to the largest irradiance,
+compared with double precision and sixteen times as many rays; `peer_error` is that of the peer.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.patches import FormFactors, Patches, PatchLight
 
 _CHUNK = 64
-_LIFT = 1e-5  # metres, of rays off the surfaces
+_LIFT = 1e-5  # distance of the ray ends from the surfaces [m]
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a room without anything in it, and a board in coarse and fine patches."""
+    """Yield an empty room, and a board with coarse and with fine patches."""
     yield _room(device, 1024)
     for size in (0.016, 0.008):
         yield _board(device, size)
@@ -46,7 +46,7 @@ def _room(device: Device, receivers: int) -> Case:
     bound = FormFactors(patches=patches).bind(device, points.shape, np.float32)
     bound.inputs[0].set(points.astype(np.float32))
     ours = to_numpy(bound.run().factors)
-    # Its own wall lies in a receiver's plane.
+    # Exclude the wall of the receiver: it lies in the plane of the receiver.
     way = patches.corners[None] - points[:, None, None, :3]
     apart = np.abs(np.einsum("nmkd,nd->nmk", way, points[:, 3:])).max(axis=2) > 1e-9
 
@@ -68,7 +68,7 @@ def _room(device: Device, receivers: int) -> Case:
 
 
 def _lambert(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (n, m): what triangles send to receivers that see all of them, by the sum over their edges."""
+    """Return the form factors (n, m) of fully visible triangles, by Lambert's sum over their edges."""
     a = corners[None] - points[:, None, None, :3]
     b = np.roll(a, -1, axis=2)
     turn = np.cross(b, a)
@@ -82,7 +82,7 @@ def _board(device: Device, size: float) -> Case:
     scene = Scene.of(board(0))
     patches = Patches.from_scene(scene, size=size)
     points = np.resize(Patches.from_scene(scene, size=0.004).quadrature[0], (60_000, 6))[::20]
-    # Patches on top shine, as under a lamp.
+    # Patches that face up emit light, as under a lamp.
     first = np.searchsorted(np.asarray(patches.patch), np.arange(patches.count))
     exitance = np.maximum(patches.normals[first, 2], 0.0)
     bound = PatchLight(patches=patches, scene=scene).bind(device, points.shape, np.float32)
@@ -101,12 +101,12 @@ def _board(device: Device, size: float) -> Case:
 
 
 def _error(values: NDArray[Any], truth: NDArray[Any]) -> float:
-    """Return the root mean square of the difference, over the largest."""
+    """Return the root mean square of the difference, relative to the largest true value."""
     return float(np.sqrt(np.mean((values - truth) ** 2)) / np.max(truth))
 
 
 class _PointByPoint:
-    """Irradiance from the middles of patches, where Embree sees them; on all cores."""
+    """Irradiance from the centroids of patches with visibility by Embree, on all cores."""
 
     def __init__(
         self, scene: Scene, patches: Patches, exitance: NDArray[np.float64], points: NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Pictures of a run: how time grows with the work, and what accuracy costs."""
+"""Plots of a benchmark run: time over the amount of work, and time and error over the tolerance."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _GROWTH = re.compile(r"^growth/(?:(\w+)-)?x(\d+)$")
 
 
 def draw_plots(folder: str | Path, rows: Sequence[Row]) -> list[str]:
-    """Draw what the rows hold into a folder, as PNG; return the names of the files.
+    """Draw the plots of the rows into a folder, as PNG; return the names of the files.
 
-    ``growth.png``: times over the work, of all cases ``growth/...``, from their ``base`` on; ``tolerance.png``: times
-    and errors over the tolerance asked for, of the cases that have one.
+    ``growth.png``: times of the cases ``growth/...`` over the amount of work, relative to the case ``base`` of their
+    metadata. ``tolerance.png``: times and errors over the tolerance, of the cases that have one in their metadata.
     """
     drawn = []
     grown = [row for row in rows if _GROWTH.match(row.case)]

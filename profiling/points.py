@@ -1,7 +1,7 @@
-"""Undistortion of points against OpenCV's undistortPoints, and against Newton's method in Numba.
+"""Undistortion of points, compared with OpenCV's undistortPoints and Newton's method in Numba.
 
 OpenCV's default of five fixed-point steps does not converge for every camera; the column ``peer_error`` has its error
-on the points of the case. Case names name the camera; in ``converged`` cases OpenCV runs up to 200 steps.
+on the points of the case. Case names contain the camera; in ``converged`` cases OpenCV runs up to 200 steps.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The fused board pose against the same in NumPy and OpenCV, and in one fused Numba function.
+"""Fused board pose, compared with the same method in NumPy and OpenCV, and in one fused Numba function.
 
-A hundred rulers of 64 samples and 5 lines, ten across each of ten edges of the artwork, in an 8-bit frame of 640 x 480:
-edges, a robust line through those of each line, a robust pose from the lines, its covariance at the placement point.
-One line is not where it should be, and every tenth ruler sees something brighter than its edge.
+A hundred calipers (rulers) of 64 samples and 5 lines, ten across each of ten edges of the artwork, in an 8-bit frame of
+640 x 480: edge positions, a robust line through the edge points of each artwork edge, a robust pose from the lines, and
+its covariance at the placement point. One line is displaced, and every tenth ruler sees a spot brighter than its edge.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _rulers = of_ruler._compiled(of_ruler._sample_flat)
 
 
 def scene() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
-    """Return a frame, and rulers and lines of `BoardPoseEstimator`; every edge has a part of the frame to itself."""
+    """Return a frame, and rulers and lines of `BoardPoseEstimator`; every edge has a separate patch of the frame."""
     rng = np.random.default_rng(11)
     columns, rows = of_ruler.COLUMNS // PATCH, of_ruler.ROWS // PATCH
     matrix = np.array([[1.0 / PIXEL, 0.0, 320.0], [0.0, -1.0 / PIXEL, 240.0], [2.0, 1.0, 1.0]])
@@ -70,7 +70,7 @@ def scene() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def fit_line(u, v, w, pairs):  # type: ignore[no-untyped-def]
-    """Return middle, direction and variances of the robust line through places with certainties."""
+    """Return centre, direction and variances of the robust line through points with inverse standard deviations."""
     best_x, best_y, best_c, best_s, least = _ZERO, _ZERO, _ONE, _ZERO, np.float32(np.inf)
     for t in range(pairs.shape[0]):
         i, j = pairs[t, 0], pairs[t, 1]
@@ -118,7 +118,7 @@ def fit_line(u, v, w, pairs):  # type: ignore[no-untyped-def]
 
 @numba.njit(error_model="numpy")
 def _solve3(m, r, d):  # type: ignore[no-untyped-def]
-    """Solve a symmetric 3 x 3 system, triangle (00, 10, 11, 20, 21, 22), by Cramer's rule; returns its determinant."""
+    """Solve a symmetric 3 x 3 system, triangle (00, 10, 11, 20, 21, 22), by Cramer's rule; return its determinant."""
     a, b, c = m[2] * m[5] - m[4] * m[4], m[3] * m[4] - m[1] * m[5], m[1] * m[4] - m[2] * m[3]
     e, f, g = m[0] * m[5] - m[3] * m[3], m[1] * m[3] - m[0] * m[4], m[0] * m[2] - m[1] * m[1]
     determinant = m[0] * a + m[1] * b + m[3] * c
@@ -131,7 +131,7 @@ def _solve3(m, r, d):  # type: ignore[no-untyped-def]
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _add(rows, i, pose, weight, m, r):  # type: ignore[no-untyped-def]
-    """Add a row's equation at a pose (cosine - 1, sine, x, y), by its weight."""
+    """Add the weighted normal equation of a row at a pose (cosine - 1, sine, x, y)."""
     less, sine = pose[0], pose[1]
     wx = rows[4, i] - pose[2] - (less * rows[2, i] - sine * rows[3, i])
     wy = rows[5, i] - pose[3] - (sine * rows[2, i] + less * rows[3, i])
@@ -172,7 +172,7 @@ def _move(pose, d):  # type: ignore[no-untyped-def]
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _fit_pose(rows, starts, placement, pose, covariance):  # type: ignore[no-untyped-def]
-    """Solve the pose of rows (7, n) about their middle, and its covariance at the placement point."""
+    """Solve the pose from rows (7, n), relative to their centre, and its covariance at the placement point."""
     count = rows.shape[1]
     m, r, d = np.empty(6, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
     x, y = np.mean(rows[2]), np.mean(rows[3])
@@ -273,7 +273,7 @@ def _left_over(z: NDArray[Any]) -> NDArray[Any]:
 
 
 def _numpy_lines(u: NDArray[Any], v: NDArray[Any], w: NDArray[Any], pairs: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """Fit all lines at once, (lines, each)."""
+    """Fit all lines at once; the arrays have the shape (lines, rulers per line)."""
     i, j = pairs.T
     x, y = u[:, j] - u[:, i], v[:, j] - v[:, i]
     per = 1.0 / np.hypot(x, y)
@@ -301,7 +301,7 @@ def _numpy_lines(u: NDArray[Any], v: NDArray[Any], w: NDArray[Any], pairs: NDArr
 
 
 def _numpy_equations(rows: NDArray[Any], pose: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the Jacobian (..., n, 3) and residuals (..., n) of rows (..., n, 7) at poses (..., 1, 3)."""
+    """Return Jacobian (..., n, 3) and residuals (..., n) of rows (..., n, 7), linearised at poses (..., 1, 3)."""
     x, y, less, sine = pose[..., 0], pose[..., 1], -2.0 * np.sin(0.5 * pose[..., 2]) ** 2, np.sin(pose[..., 2])
     nx, ny, px, py, ex, ey, _ = np.moveaxis(rows, -1, 0)
     wx, wy = ex - x - (less * px - sine * py), ey - y - (sine * px + less * py)
@@ -317,7 +317,7 @@ def _numpy_moved(pose: NDArray[Any], step: NDArray[Any]) -> NDArray[Any]:
 
 
 def _numpy_pose(rows: NDArray[Any], starts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the placement point's x, y and theta, and their covariance."""
+    """Return x, y [m] and theta [rad] of the placement point, and their covariance."""
     middle = rows[:, 2:4].mean(axis=0)
     rows = np.column_stack([rows[:, :2], rows[:, 2:4] - middle, rows[:, 4:]])
     size = np.sqrt(np.mean(np.sum(rows[:, 2:4] ** 2, axis=-1)))
@@ -347,7 +347,7 @@ def _numpy_pose(rows: NDArray[Any], starts: NDArray[Any]) -> tuple[NDArray[Any],
 
 
 class _Numpy:
-    """Board poses with OpenCV's remap for the samples and NumPy for all else."""
+    """Board poses by NumPy, with samples from OpenCV's remap."""
 
     def __init__(self, image: NDArray[Any], rulers: NDArray[Any], lines: NDArray[Any], noise: float) -> None:
         self.image, self.lines, self.noise = image, lines.astype(np.float64), noise
@@ -356,14 +356,14 @@ class _Numpy:
         self.pairs, self.starts = sample_subsets(EACH, 2, TRIALS), sample_subsets(2 * LINES, 3, TRIALS)
 
     def __call__(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        return self._fixed(of_ruler._opencv(self.image, self.plain, self.matrix))
+        return self._pose(of_ruler._opencv(self.image, self.plain, self.matrix))
 
     def exact(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the fix from samples in double: OpenCV rounds them to whole grey levels."""
+        """Return the pose from samples in double; OpenCV rounds samples to whole grey levels."""
         matrix = of_ruler._gradient_matrix(np.float64)
-        return self._fixed(of_ruler._numpy(self.image, self.plain.astype(np.float64), matrix))
+        return self._pose(of_ruler._numpy(self.image, self.plain.astype(np.float64), matrix))
 
-    def _fixed(self, found: tuple[NDArray[Any], ...]) -> tuple[NDArray[Any], NDArray[Any]]:
+    def _pose(self, found: tuple[NDArray[Any], ...]) -> tuple[NDArray[Any], NDArray[Any]]:
         position, width, sigma, dark = (found[i].reshape(LINES, EACH).astype(np.float64) for i in (0, 2, 3, 4))
         sigma = sigma * np.exp(0.5 / (width * width + of_ruler._VARIANCE))
         *_, u0, v0, du, dv, bend = np.moveaxis(self.rulers, -1, 0)
@@ -411,13 +411,19 @@ def cases(device: Device) -> Iterator[Case]:
         _fused(image, plain, flat, lines, taps, numbers, pairs, starts, found, status, pose, covariance)
 
     by_numba()
-    (exact, spread), (rounded, _) = by_numpy.exact(), by_numpy()
+    (exact, exact_covariance), (rounded, _) = by_numpy.exact(), by_numpy()
     ours = np.array([*to_numpy(result.placement), to_numpy(result.pose)[2]])
-    sigma = np.sqrt(np.diag(spread))
+    sigma = np.sqrt(np.diag(exact_covariance))
     of_ours = to_numpy(result.covariance)
-    for what, each, of in (("ours", ours, of_ours), ("numba's", pose, covariance), ("numpy's", rounded, spread)):
+    for name, each, of in (
+        ("gpuvision", ours, of_ours),
+        ("numba", pose, covariance),
+        ("numpy", rounded, exact_covariance),
+    ):
         if np.any(np.abs(each - exact) > 0.5 * sigma) or np.any(np.abs(np.sqrt(np.diag(of)) / sigma - 1.0) > 0.1):
-            raise AssertionError(f"{what} fix is not that in double: {each} and {exact}, of {sigma}")
+            raise AssertionError(
+                f"the pose of {name} differs from that in double: {each} and {exact}, standard deviations {sigma}"
+            )
     metadata = {"p50_us": _median(bound.run) * 1e6, "sigma_m": float(sigma[0]), "numba_error": _worst(pose, exact)}
     metadata["numpy_error"] = _worst(rounded, exact)
     peers: dict[str, Callable[[], object]] = {"numpy": by_numpy, "numba": by_numba}
@@ -430,7 +436,7 @@ def _worst(pose: NDArray[Any], exact: NDArray[Any]) -> float:
 
 
 def _median(call: Callable[[], object]) -> float:
-    """Return the median time of a call, one after the other as in a stream [s]."""
+    """Return the median time of a call in a sequence of calls [s]."""
     times = []
     for _ in range(300):
         begun = time.perf_counter()

@@ -1,4 +1,4 @@
-"""PSD readout against a Numba loop and against NumPy, position and status."""
+"""PSD readout, compared with a Numba loop and NumPy: position and status."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _numpy(left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArr
 
 
 def scan_currents(dtype: str, count: int) -> NDArray[Any]:
-    """Return (2, count) currents of a scan: 5 % of the samples dark, 1 % saturated, in runs, as scenes have them."""
+    """Return currents (2, count) of a scan: 5 % of the samples dark and 1 % saturated, in runs as in real scenes."""
     rng = np.random.default_rng(1)
     place = rng.uniform(0.1, 0.9, count)
     level = rng.uniform(1_000.0, 50_000.0, count)
@@ -100,7 +100,7 @@ def scan_currents(dtype: str, count: int) -> NDArray[Any]:
 def cases(device: Device) -> Iterator[Case]:
     """Yield float32 and uint16 batches of 1e4, 1e6 and 16e6 samples, planar, and 1e6 as pairs.
 
-    Small batches come eight in a row, as a stream enqueues them; ``...-alone`` waits for each.
+    Smaller batches run eight in sequence, as a stream enqueues them; ``...-alone`` waits for each batch.
     """
     for dtype in ("float32", "uint16"):
         yield _case(device, dtype, 10_000, f"{dtype}/1e4", repeats=_IN_A_ROW)
@@ -159,5 +159,5 @@ def _error(position: NDArray[Any], status: NDArray[Any], left: NDArray[Any], rig
     a, b = left.astype(np.float64), right.astype(np.float64)
     good = (a + b > MINIMUM) & (a < SATURATION) & (b < SATURATION)
     if not np.array_equal(status == 0, good):
-        raise AssertionError("the readout and float64 disagree on which samples are good")
+        raise AssertionError("the readout and float64 differ in the valid samples")
     return float(np.max(np.abs(position[good] - LENGTH / 2 * (b - a)[good] / (a + b)[good])))

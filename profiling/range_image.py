@@ -1,4 +1,4 @@
-"""Assembly and regular resampling of range images against Numba loops and NumPy."""
+"""Assembly and regular resampling of range images, compared with Numba loops and NumPy."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _numpy_flags(points: list[Array], known: Array, given: Array, low: Array, hi
 
 @numba.njit(error_model="numpy")
 def _fill(n, a, b, one, two, flags, grid, out, status):  # type: ignore[no-untyped-def]
-    """Fill the cells between two neighbours at a and b, where they are joined."""
+    """Fill the cells between two neighbouring points at a and b, if they are close enough to be joined."""
     length, rise, cells = b - a, two[0] - one[0], status.shape[0]
     if (abs(length) > grid[3]) | (abs(rise) > grid[4]):
         return
@@ -165,7 +165,7 @@ def _numba_lines(at, values, given, grid, out, status):  # type: ignore[no-untyp
 
 
 def _numba_regrid(operation: Regrid, frames: list[Array], given: Array) -> Callable[[], tuple[Array, Array]]:
-    """Return a call that resamples as `Regrid` does, along x and then along y; points without folds."""
+    """Return a function that resamples like `Regrid`, along x and then along y; for points without folds."""
     x, y, z, intensity = frames
     grid, cell, values = operation.grid, operation.grid.cell_x, np.stack([z, intensity, y])
     joined = (operation.max_gap / cell, operation.max_step, operation.fold_tolerance / cell)
@@ -183,7 +183,7 @@ def _numba_regrid(operation: Regrid, frames: list[Array], given: Array) -> Calla
 
 
 def _numpy_regrid(frames: list[Array], grid: Grid) -> tuple[Array, Array]:
-    """Interpolate along the samples, then along the profiles: no holes, no steps, no folds are looked for."""
+    """Interpolate along the samples, then along the profiles, without a test for holes, steps or folds."""
     x, y, z, intensity = frames
     columns, rows = grid.x, grid.y[::-1]
     lines = [[np.interp(columns, x[n], each[n]) for each in (y, z, intensity)] for n in range(len(x))]
@@ -194,7 +194,7 @@ def _numpy_regrid(frames: list[Array], grid: Grid) -> tuple[Array, Array]:
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a million points over a straight transport and a rotating sheet, and their resampling."""
+    """Yield a million points of a straight transport and of a rotating sheet, and a resampling."""
     yield _assembly(device, RangeImage(geometry=STRAIGHT), "straight/1e6", _numba_straight, _numpy_straight)
     yield _assembly(device, RangeImage(geometry=ROTATING), "rotating/1e6", _numba_rotating, _numpy_rotating)
     yield _resampling(device)
@@ -211,7 +211,7 @@ def _assembly(
     spread = (0.0, 1000.0) if operation.geometry.inputs == 1 else (-0.05, 0.05)
     profiles = [rng.uniform(*spread, SHAPE) for _ in range(operation.geometry.inputs)]
     if operation.geometry.inputs == 1:
-        # Only what the camera sees in front of the sheet: positions to the right of the sheet's own direction.
+        # Visible points only: positions to the right of the direction of the sheet.
         direction = np.tan(operation.geometry.transport(SHAPE[0]))[:, None]
         profiles = [511.5 + 1700.0 * (direction + profiles[0] / 5000 + 0.1)]
     given = np.zeros(SHAPE, np.uint8)
@@ -251,7 +251,7 @@ def _resampling(device: Device) -> Case:
     bound().wait()
     looped = _numba_regrid(operation, frames, given)
     if not np.array_equal(looped()[1], to_numpy(bound.outputs.status)):
-        raise AssertionError("Numba's cells are not ours")
+        raise AssertionError("the cells of the peer numba differ from ours")
     exact = _numpy_regrid([each.astype(np.float64) for each in frames], grid)
     error = float(np.max(np.abs(to_numpy(bound.outputs.z) - exact[0])))
     peers: dict[str, Callable[[], object]] = {"numba": looped, "numpy": lambda: _numpy_regrid(frames, grid)}

@@ -1,10 +1,11 @@
-"""Light of lit lines on surfaces, all pairs without occlusion, against the same closed form in Numba.
+"""Light of lit lines on surfaces, all pairs without occlusion, compared with the same closed form in Numba.
 
-The peer is branch-free and vectorised by LLVM over receivers, with a polynomial arc tangent, in single throughout.
-`peer_error` is its error over the largest irradiance of the case, as `error` is ours (NaN on a device without double).
-``wall``: lines that run into a wall; all pairs face each other. ``board``: patches of boxes on a board. In these,
-segments have few directions and surfaces, as on flat faces, which our kernel uses. In ``closed-form-slopes`` each line
-lies on a slope of its own: our worst case, and no difference to the peer.
+The peer is branch-free and vectorised by LLVM over receivers, with a polynomial arc tangent, in single precision.
+`error` and `peer_error` are relative to the largest irradiance of the case (NaN on a device without double).
+
+``wall``: lines that run into a wall; all pairs face each other. ``board``: patches of boxes on a board. In both cases
+the segments have few directions and surfaces, as on flat faces; our kernel exploits this. In ``closed-form-slopes``
+each line lies on a different slope: the worst case for our kernel, without an effect on the peer.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSe
 _BLOCK = 512
 F = np.float32
 ZERO, HALF, ONE, QUARTER, TURN, TINY = F(0.0), F(0.5), F(1.0), F(np.pi / 2.0), F(np.pi), F(1e-24)
-# Minimax for atan(z) / z on [0, 1] in z^2, to 1.6e-8.
+# Minimax polynomial in z^2 of atan(z) / z on [0, 1]; largest error 1.6e-8.
 A0, A1, A2, A3, A4 = F(-0.333333317), F(0.199997393), F(-0.142785687), F(0.110337641), F(-0.086568804)
 A5, A6, A7, A8 = F(0.062501694), F(-0.035871539), F(0.013507771), F(-0.002386997)
 
 
 @numba.njit(parallel=True, error_model="numpy")
 def _numba(receivers, table, out):  # type: ignore[no-untyped-def]
-    """Sum over segments for blocks of receivers, each block turned into columns first; written out, for LLVM."""
+    """Sum over segments for blocks of receivers. Blocks are transposed and the code is unrolled for LLVM."""
     count = receivers.shape[0]
     for block in numba.prange((count + _BLOCK - 1) // _BLOCK):
         begin = block * _BLOCK
@@ -74,7 +75,7 @@ def _numba(receivers, table, out):  # type: ignore[no-untyped-def]
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a wall over many lines and over few, a board with boxes, light of patches, and light with occlusion."""
+    """Yield a wall with many and with few lines, a board with boxes, light of patches, and light with occlusion."""
     yield _case(device, *_wall(64, 20_000), "closed-form/wall/64x20000")
     yield _case(device, *_wall(16, 100_000), "closed-form/wall/16x1e5")
     yield _case(device, *_board(20_000), "closed-form/board/64x20000")
@@ -122,7 +123,7 @@ def _wall(segments: int, receivers: int) -> tuple[LitSegments, NDArray[np.float3
 
 
 def _slopes(segments: int, receivers: int) -> tuple[LitSegments, NDArray[np.float32]]:
-    """Return lines on slopes that face a wall, no two alike, and receivers on the wall."""
+    """Return lines on different slopes that face a wall, and receivers on the wall."""
     rng = np.random.default_rng(7)
     start = np.column_stack(
         [rng.uniform(0.01, 0.1, segments), rng.uniform(-0.1, 0.1, segments), np.full(segments, -0.05)]
@@ -134,7 +135,7 @@ def _slopes(segments: int, receivers: int) -> tuple[LitSegments, NDArray[np.floa
 
 
 def _board(receivers: int) -> tuple[LitSegments, NDArray[np.float32]]:
-    """Return lines over boxes and the board between them, and patches on sides and tops of boxes, face by face."""
+    """Return lines over boxes and the board between them, and patches on the sides and tops of the boxes."""
     rng = np.random.default_rng(2)
     at = np.linspace(-0.1, 0.1, 33)[:-1]
     ends = np.zeros((64, 2, 3))

@@ -1,12 +1,14 @@
-"""Coarse registration against NumPy, Numba and OpenCV.
+"""Coarse registration, compared with NumPy, Numba and OpenCV.
 
-``search`` is what a board's first fix looks at: 81 x 81 shifts by 2 px and 21 headings (+-2 mm and +-5 degrees at 25 um
-in a frame of 640 x 480), 512 edges, every candidate with the least cost of 64 shifts side by side. Numba and NumPy have
-our own form, the strongest there is: an edge is a shift of the map, whose rows are added in 16 bits (Numba). ``pair``
-is a whole registration of two binary pictures of 640 x 640 with the scatter and the defects of real ones, from nothing
-to the pose; OpenCV's findTransformECC starts nearer, at the true shift to 2 px and the true turn to 0.2 degrees,
-because it finds nothing from here. ``error`` is the worst place of the four corners [px], OpenCV's in
-``opencv_error_px``.
+``search`` is the search of the coarse registration of a board: 81 x 81 shifts by 2 px and 21 headings (+-2 mm and +-5
+degrees at 25 um in a frame of 640 x 480) with 512 edges; every candidate returns the smallest cost of 64 adjacent
+shifts. Numba and NumPy use our algorithm: an edge is a shift of the map, and rows of the map are added (in 16 bits by
+Numba).
+
+``pair`` is a complete registration of two binary images of 640 x 640 with realistic noise and defects, without an
+initial pose. OpenCV's findTransformECC starts within 2 px and 0.2 degrees of the true pose, because it does not
+converge without an initial pose. ``error`` is the largest error of the four corners [px], ``opencv_error_px`` that of
+OpenCV.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from gpuvision.matching.pose.registration import register_images
 from gpuvision.profiling.harness import Case
 
 _ROWS, _HEADINGS, _POINTS, _CELL = 81, 21, 512, 2
-_WIDE = 96  # columns of the Numba peer, a constant: 1.7 times as fast as the 81 that it needs
+_WIDE = 96  # columns of the Numba peer, a compile-time constant: 1.7 times as fast as the necessary 81
 _SIDE = 640
 
 
@@ -41,7 +43,7 @@ def cases(device: Device) -> Iterator[Case]:
 
 @numba.njit(parallel=True, error_model="numpy")
 def _numba_search(level, shifts, columns, least, where):  # type: ignore[no-untyped-def]
-    """Add rows of the map in 16 bits, a row of positions for one heading a task; so many columns as LLVM likes."""
+    """Add rows of the map in 16 bits; a task is a row of positions for one heading, padded for vectorisation."""
     turns, rows, blocks = least.shape
     stride = level.shape[2]
     flat = level.reshape(-1)
@@ -118,7 +120,7 @@ def _search(device: Device) -> Case:
     error = float(np.max(np.abs(to_numpy(ours.least) - exact)))
     same = np.array_equal(where, places) and np.array_equal(to_numpy(ours.column), places)
     if not (same and np.allclose(least, exact, rtol=1e-6) and error < 1e-6):
-        raise AssertionError("the peers find other poses than we: they do other work")
+        raise AssertionError("the poses of a peer differ from ours")
     peers: dict[str, Callable[[], object]] = {"numba": by_numba, "numpy": by_numpy}
     metadata = {"poses": _HEADINGS * _ROWS**2, "points": _POINTS}
     return Case("registration", "search", bound.run, peers, error, metadata=metadata)
@@ -142,7 +144,7 @@ def pictures() -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     middle = np.full(2, (_SIDE - 1) / 2.0)
     motion = np.column_stack([turn, middle + shift - turn @ middle])
-    # Of the fine pictures: pixel centres lie at (x + 0.5) * 4 - 0.5.
+    # Motion of the fine pictures: pixel centres lie at (x + 0.5) * 4 - 0.5.
     start = 4.0 * motion[:, 2] + (turn @ np.ones(2) - 1.0) * -1.5
     seen = cv2.warpAffine(fine, np.column_stack([turn, start]), fine.shape, borderValue=255)
     for _ in range(8):
@@ -154,7 +156,7 @@ def pictures() -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64
 
 
 def _off(found: NDArray[Any], true: NDArray[np.float64]) -> float:
-    """How far the worst corner is from where it should be [px]."""
+    """Return the largest error of the four corners [px]."""
     corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)]) * (_SIDE - 1.0)
     return float(np.max(np.linalg.norm(corners @ (found - true)[:, :2].T + (found - true)[:, 2], axis=-1)))
 

@@ -1,12 +1,12 @@
 """Calipers (rulers) against Numba on all cores, OpenCV's remap of all rulers in one call, and NumPy.
 
-Numba sums the lines of a sample in a register, for LLVM to vectorise over samples. Cases named ``flat`` put it up in a
-form that LLVM likes better still: places of 32 bits in a flat image.
+Numba sums the lines of a sample in a register, so that LLVM vectorises over samples. Cases named ``flat`` use a form
+that LLVM compiles to faster code: 32-bit indices into a flat image.
 
-Rulers of 64 samples and 5 lines, smoothing 1 px, across the border of a disc in an 8-bit frame of 640 x 480: one edge
-each, at any angle. All return position, amplitude, width, predicted deviation and status of the strongest edge; ours
-frees the position from what linear interpolation does to it, the peers do without. Ours takes 16 rulers in a queue of
-the caller's thread.
+The rulers have 64 samples, 5 lines and a smoothing of 1 px; each crosses the border of a disc once, at any angle, in an
+8-bit frame of 640 x 480. All candidates return position, amplitude, width, predicted standard deviation and status of
+the strongest edge. We correct the position for the bias of linear interpolation; the peers do not. We measure 16 rulers
+in an inline queue, which runs in the thread of the caller.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from gpuvision.profiling.harness import Case
 
 ROWS, COLUMNS, RADIUS = 480, 640, 150.0
 LENGTH, WIDTH, SMOOTHING, THRESHOLD = 64, 5, 1.0, 20.0
-_FEW = 16  # rulers, up to which the caller's thread takes them
+_FEW = 16  # largest number of rulers that are measured in an inline queue
 _REACH = 3
-_OPENCV_ROWS = 32767  # of an image that remap makes
+_OPENCV_ROWS = 32767  # largest number of rows of an image from remap
 _TAPS = np.arange(1, _REACH + 1) * np.exp(-0.5 * np.arange(1, _REACH + 1) ** 2)
 _TAPS /= 2.0 * np.sum(_TAPS * np.arange(1, _REACH + 1))
 _VARIANCE = float(np.sum(2.0 * _TAPS * np.arange(1, _REACH + 1) ** 3)) / 3.0
@@ -37,7 +37,7 @@ _LEAST = THRESHOLD / math.sqrt(2.0 * math.pi * _VARIANCE)
 
 @numba.njit(error_model="numpy", fastmath={"contract"})
 def _sample(image, pixels, pitch, x, y):  # type: ignore[no-untyped-def]
-    """Return a bilinear sample; unsigned places, which need no test for being below 0."""
+    """Return a bilinear sample. Unsigned indices avoid the test for negative ones."""
     column, row = np.int32(x), np.int32(y)
     dx, dy = x - np.float32(column), y - np.float32(row)
     u, v, one = np.uint64(row), np.uint64(column), np.uint64(1)
@@ -50,7 +50,7 @@ def _sample(image, pixels, pitch, x, y):  # type: ignore[no-untyped-def]
 
 @numba.njit(error_model="numpy", fastmath={"contract"})
 def _sample_flat(image, pixels, pitch, x, y):  # type: ignore[no-untyped-def]
-    """Return the same from places of 32 bits in a flat image."""
+    """Return a bilinear sample by 32-bit indices into a flat image."""
     column, row = np.int32(x), np.int32(y)
     dx, dy = x - np.float32(column), y - np.float32(row)
     one, at = np.uint32(1), np.uint32(row) * pitch + np.uint32(column)
@@ -62,7 +62,7 @@ def _sample_flat(image, pixels, pitch, x, y):  # type: ignore[no-untyped-def]
 
 
 def _compiled(sample: Any) -> Any:
-    """Return Numba's rulers, ``(image, rulers, taps, numbers, edges, status)`` with edges of (4, n)."""
+    """Return a Numba function ``(image, rulers, taps, numbers, edges, status)`` that fills the edges (4, n)."""
 
     @numba.njit(parallel=True, error_model="numpy", fastmath={"contract"})
     def measure(image, rulers, taps, numbers, edges, status):  # type: ignore[no-untyped-def]
@@ -112,7 +112,7 @@ def _compiled(sample: Any) -> Any:
 
 
 def _gradient_matrix(dtype: Any) -> NDArray[Any]:
-    """Return what takes samples (LENGTH,) to gradients: BLAS has it."""
+    """Return the matrix that maps samples (LENGTH,) to gradients; BLAS multiplies it."""
     matrix = np.zeros((LENGTH, LENGTH - 2 * _REACH))
     for k, tap in enumerate(_TAPS, 1):
         for i in range(matrix.shape[1]):
@@ -156,7 +156,7 @@ def _numpy(image: NDArray[Any], rulers: NDArray[Any], matrix: NDArray[Any]) -> t
 
 
 def _opencv(image: NDArray[Any], rulers: NDArray[Any], matrix: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """Take as many rulers a call of remap as it can make rows."""
+    """Measure the rulers in blocks that do not exceed the rows of remap."""
     parts, most = [], _OPENCV_ROWS // WIDTH
     for first in range(0, len(rulers), most):
         x, y = (each.reshape(-1, LENGTH) for each in _places(rulers[first : first + most]))
@@ -165,8 +165,8 @@ def _opencv(image: NDArray[Any], rulers: NDArray[Any], matrix: NDArray[Any]) -> 
     return _refined((parts[0] if len(parts) == 1 else np.concatenate(parts)) * np.float32(1.0 / WIDTH), matrix)
 
 
-def _freed(rulers: NDArray[np.float64], position: NDArray[Any], width: NDArray[Any]) -> NDArray[Any]:
-    """Return positions without what the interpolation moves them by, as ``ruler_pull`` says it, in float64."""
+def _corrected(rulers: NDArray[np.float64], position: NDArray[Any], width: NDArray[Any]) -> NDArray[Any]:
+    """Return positions corrected for the bias of linear interpolation, the formula of ``ruler_pull``, in float64."""
     blur = np.maximum(width**2, 0.05 * _VARIANCE)
     variance, common, moved = _VARIANCE + blur, _VARIANCE * blur / (_VARIANCE + blur), np.zeros_like(position)
     x, y, cosine, sine = rulers.T
@@ -206,7 +206,7 @@ def cases(device: Device) -> Iterator[Case]:
 def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool = False) -> Case:
     image, rulers = scene(count)
     operation = RulerEdges(threshold=THRESHOLD, length=LENGTH, width=WIDTH, smoothing_px=SMOOTHING, count=count)
-    # So little work is done before a worker has begun.
+    # A few rulers are measured faster than a worker thread starts.
     queue = device.new_queue(inline=True) if count <= _FEW else None
     bound = operation.bind(device, image.shape, image.dtype, queue=queue)
     bound.inputs[0].set(image)
@@ -216,9 +216,9 @@ def _case(device: Device, count: int, name: str, compiled: Any, *, alone: bool =
     numbers = np.array([_LEAST * WIDTH, _VARIANCE, 1.0], np.float32)
     edges, status = np.empty((4, count), np.float32), np.empty(count, np.uint8)
     plain, _, widths, _, dark = _numpy(image, rulers.astype(np.float64), _gradient_matrix(np.float64))
-    exact = _freed(rulers.astype(np.float64), plain, widths)
+    exact = _corrected(rulers.astype(np.float64), plain, widths)
     if np.any(to_numpy(bound.outputs.status)) or np.any(dark):
-        raise AssertionError("a ruler across an edge found none")
+        raise AssertionError("a ruler across an edge found no edge")
     compiled(image, rulers, taps, numbers, edges, status)
     metadata = {"peer_error": float(np.max(np.abs(edges[0] - plain))), "rulers": count}
     peers: dict[str, Callable[[], object]] = {

@@ -1,10 +1,10 @@
-"""How well edges are located, side by side: ``python -m gpuvision.profiling.ruler_accuracy`` prints a table.
+"""Accuracy of edge positions: ``python -m gpuvision.profiling.ruler_accuracy`` prints a table with the peers.
 
 8-bit images of a straight edge of 100 grey levels, blurred by 1.2 px, with white noise, at twelve angles; rulers of 41
-samples and 5 lines across it. The Cramer-Rao bound is that of five lines of independent samples a pixel apart. The
-peers take the parabola through the logarithms of the gradients as well: OpenCV of samples by ``remap`` (rounded to grey
-levels), NumPy (and Numba, which does the same) of bilinear ones, scikit-image, where it is installed, of
-``profile_line``, at the step that it takes.
+samples and 5 lines across it. The Cramer-Rao bound holds for five lines of independent samples at a distance of one
+pixel. The peers also fit a parabola to the logarithms of the gradients: OpenCV with samples by ``remap`` (rounded to
+grey levels), NumPy (and Numba, which does the same) with bilinear samples, and scikit-image, if it is installed, with
+the samples and the step of ``profile_line``.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from gpuvision.matching.features.ruler import RulerEdges, best_smoothing
 SIDE, BLUR, LENGTH, WIDTH = 140, 1.2, 41, 5
 NOISES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 ANGLES = np.radians([0.0, 2.0, 12.0, 26.565, 30.0, 40.0, 45.0, 73.0, 100.0, 160.0, 225.0, 301.0])
-_SEVERAL = 9  # rulers of an image
-_SLOW = 1500  # rulers for peers that take half a millisecond each
+_RULERS = 9  # rulers per image
+_SLOW = 1500  # rulers for peers that take half a millisecond per ruler
 
 Float64 = NDArray[np.float64]
 Scene = tuple[NDArray[np.uint8], Float64, Float64]
 
 
 def bound(noise: float) -> float:
-    """Return the Cramer-Rao bound of an edge's position [px], with the rounding of the image as noise."""
+    """Return the Cramer-Rao bound of the position of an edge [px]; rounding of the image counts as noise."""
     return math.hypot(noise, math.sqrt(1.0 / 12.0)) / 100.0 * math.sqrt(2.0 * BLUR * math.sqrt(math.pi) / WIDTH)
 
 
 def scenes(noise: float, images: int, seed: int = 1) -> Iterator[Scene]:
-    """Yield images, rulers far enough apart to have noise of their own, and where the edge is along each."""
+    """Yield images, rulers so far apart that their noise is independent, and the true edge positions [px]."""
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[:SIDE, :SIDE].astype(np.float64)
     for angle in ANGLES:
@@ -49,16 +49,16 @@ def scenes(noise: float, images: int, seed: int = 1) -> Iterator[Scene]:
             distance = float(0.5 * SIDE * direction.sum() + rng.uniform(-0.5, 0.5))
             clean = 50.0 + 100.0 * ndtr((column * direction[0] + row * direction[1] - distance) / BLUR)
             foot = 0.5 * SIDE + (distance - 0.5 * SIDE * direction.sum()) * direction
-            places = np.arange(-28.0, 29.0, 7.0)[:, None] + rng.uniform(-0.5, 0.5, (_SEVERAL, 1))
-            centres = foot + places * along + rng.uniform(-3.0, 3.0, (_SEVERAL, 1)) * direction
-            rulers = np.concatenate([centres, np.tile(direction, (_SEVERAL, 1))], axis=1).astype(np.float32)
+            places = np.arange(-28.0, 29.0, 7.0)[:, None] + rng.uniform(-0.5, 0.5, (_RULERS, 1))
+            centres = foot + places * along + rng.uniform(-3.0, 3.0, (_RULERS, 1)) * direction
+            rulers = np.concatenate([centres, np.tile(direction, (_RULERS, 1))], axis=1).astype(np.float32)
             image = np.rint(clean + rng.normal(0.0, noise, clean.shape)).astype(np.uint8)
             exact = rulers.astype(np.float64)
             yield image, exact, distance - np.einsum("ij,ij->i", exact[:, :2], exact[:, 2:])
 
 
 def _peak(profiles: Float64, smoothing: float, step: float = 1.0) -> Float64:
-    """Return where the gradient of profiles (n, samples) is greatest, from their middle."""
+    """Return the positions of the largest gradients of profiles (n, samples), relative to their middle [px]."""
     reach = math.ceil(3.0 * smoothing / step)
     k = np.arange(-reach, reach + 1)
     taps = k * np.exp(-0.5 * (k * step / smoothing) ** 2)
@@ -99,7 +99,7 @@ def _skimage(image: NDArray[np.uint8], rulers: Float64, smoothing: float) -> Flo
 
 
 def columns(device: Device) -> dict[str, Callable[[float], Callable[[Scene], tuple[Float64, Float64 | None]]]]:
-    """Return for each column what makes of the noise a function of scenes to positions and predicted deviations."""
+    """Return for each column a function of the noise that returns a function (scene) -> (positions, deviations)."""
 
     def ours(smoothing: float) -> Any:
         def prepared(noise: float) -> Any:
@@ -139,7 +139,7 @@ def table(device: Device, images: int = 40) -> list[str]:
         cells = [f"{noise:g} ({100.0 / noise:.0f})" if noise else "0", f"{bound(noise):.4f}"]
         for name, method in methods.items():
             located = method(noise)
-            few = min(images, _SLOW // (_SEVERAL * len(ANGLES))) if name.startswith("scikit") else images
+            few = min(images, _SLOW // (_RULERS * len(ANGLES))) if name.startswith("scikit") else images
             found = [(located(scene), scene[2]) for scene in scenes(noise, few)]
             error = np.concatenate([position - true for (position, _), true in found])
             cell = f"{error.std():.4f} ({error.std() / bound(noise):.2f}), {error.mean():+.4f}"

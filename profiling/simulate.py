@@ -1,8 +1,8 @@
-"""A whole profile of a simulated scan, against the time of NumPy and Embree for its secondary light alone.
+"""Complete profile of a simulated scan, compared with the time of NumPy and Embree for its indirect light alone.
 
-Ours: lit segments, shadows, parts that the lens sees, causes of errors, the surface seen by every bin, secondary light
-with exact visibility, true positions. The peer: 256 samples of the line, rays to the same elements of the surface
-(`occluded_irradiance`). Errors are those of the secondary light, medians relative to the same in double.
+We compute lit segments, shadows, the visible parts, causes of errors, the surface in the view of every bin, indirect
+light with exact visibility, and true positions. The peer traces rays from 256 samples of the line to the same surface
+elements (`occluded_irradiance`). Errors are medians of the indirect light, relative to double precision.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gpuvision.workflows.demo import scanned_part
 from gpuvision.workflows.light_cache import make_light_paths
 
 _SAMPLES = 256
-_AT = 0.006  # m: over the cylinder's rim, the box and the ball
+_AT = 0.006  # transport position [m]: the sheet crosses the rim of the cylinder, the box and the ball
 
 
 def cases(device: Device) -> Iterator[Case]:

@@ -1,7 +1,8 @@
-"""Camera frames at sensor rate through the line readout, against a loop that copies, runs and copies back.
+"""Line readout of camera frames at sensor rate, compared with a loop that copies, runs and copies back.
 
-A sensor thread gives frames of 512 x 1024 pixels on a rate clock; a rate holds if no frame is given up and none waits
-for its slot longer than a sensor's own buffers last. Latency: from a frame's arrival to its positions in host memory.
+A thread delivers frames of 512 x 1024 pixels at a fixed rate. The stream holds a rate if no frame is dropped and no
+frame waits longer for its slot than the buffers of a sensor last. Latency is the time from the arrival of a frame until
+its positions are in host memory.
 """
 
 from __future__ import annotations
@@ -27,19 +28,19 @@ RATES = (1000, 4000)
 READOUT = LineReadout(method="centroid", threshold=20)
 
 _FRAMES = 16
-_ENDLESS = 1 << 40
-_BURST = 1024
-_STALL_S = 0.1
-_TRIAL_S = 1.0
+_ENDLESS = 1 << 40  # frames
+_BURST = 1024  # frames
+_STALL_S = 0.1  # time that the buffers of a sensor bridge [s]
+_TRIAL_S = 1.0  # duration of a trial of the search [s]
 _BATCHES = (1, 2, 4, 8, 16)
-_RESOLUTION = 0.03
-_MARGIN = 1.25
+_RESOLUTION = 0.03  # relative width of the interval at which the search stops
+_MARGIN = 1.25  # throughput of the chosen batch size over the rate
 _RING_FRAMES = 512  # 256 MB
 
 
 @dataclass(frozen=True)
 class Held:
-    """How a stream fared at a rate."""
+    """Result of a stream at a rate [frames/s]."""
 
     rate: float
     report: StreamReport
@@ -47,11 +48,11 @@ class Held:
 
     @property
     def holds(self) -> bool:
-        """Whether nothing was lost."""
+        """Whether no frame was lost."""
         return not self.report.dropped and self.late < _STALL_S
 
     def metadata(self) -> dict[str, Any]:
-        """Return the columns of a row."""
+        """Return the additional columns of a row."""
         latency = self.report.latency
         micro = {"p50": latency.p50, "p99": latency.p99, "p999": latency.p999, "max": latency.maximum}
         return {
@@ -68,7 +69,7 @@ class Held:
 
 
 def cases(device: Device, *, run_seconds: float = 60.0) -> Iterator[Case]:
-    """Yield `1000` and `4000` [frames/s], each held for `run_seconds`, and `highest`: the highest rate without loss."""
+    """Yield `1000` and `4000` [frames/s], each for `run_seconds`, and `highest`: the highest rate without loss."""
     frames = line_frames()
     error = _error(frames, device)
     rates = service_rates(frames, device)
@@ -79,7 +80,7 @@ def cases(device: Device, *, run_seconds: float = 60.0) -> Iterator[Case]:
 
 
 def line_frames() -> NDArray[np.uint8]:
-    """Return frames with a line that wanders, 4 pixels wide, in noise."""
+    """Return noisy frames with a moving line (sigma 2 px)."""
     rng = np.random.default_rng(4)
     rows = np.arange(SHAPE[0])[:, None]
     frames = rng.integers(0, 20, (_FRAMES, *SHAPE), dtype=np.uint8)
@@ -90,7 +91,7 @@ def line_frames() -> NDArray[np.uint8]:
 
 
 def service_rates(frames: NDArray[np.uint8], device: Device) -> dict[int, float]:
-    """Return the rate at which frames that need not be waited for are served, by batch size [frames/s]."""
+    """Return the throughput by batch size [frames/s], with frames that are always available."""
     rates = {}
     for batch in _BATCHES:
         source = ArraySource(frames, 2 * _BURST)
@@ -104,7 +105,7 @@ def _batch_for(rate: float, rates: Mapping[int, float]) -> int:
 
 
 def hold(frames: NDArray[np.uint8], device: Device, rate: float, seconds: float, batch: int) -> Held:
-    """Run the stream at a rate for so long."""
+    """Run the stream at a rate [frames/s] for some seconds."""
     source = PacedSource(ArraySource(frames, max(int(rate * seconds), 1)), rate)
     ring = max(min(int(_STALL_S * rate), _RING_FRAMES) // batch, 4)
     stream = Pipeline(source, READOUT, device=device, batch=batch, ring=ring, policy="drop_oldest")
@@ -114,7 +115,7 @@ def hold(frames: NDArray[np.uint8], device: Device, rate: float, seconds: float,
 def highest(
     frames: NDArray[np.uint8], device: Device, rates: Mapping[int, float], trial_seconds: float = _TRIAL_S
 ) -> Held:
-    """Search the highest rate that holds: bisection with a second chance, since machines stall now and then."""
+    """Search the highest rate that holds by bisection; each rate has two trials, since machines stall at times."""
     batch = max(rates, key=rates.__getitem__)
     low, high = 0.0, 1.4 * rates[batch]
     best: Held | None = None
@@ -130,7 +131,7 @@ def highest(
 
 
 def _case(name: str, frames: NDArray[np.uint8], device: Device, held: Held, error: float) -> Iterator[Case]:
-    """Time a burst through an open stream and through the loop."""
+    """Yield the case of a burst of frames through an open stream; the peer is the loop."""
     batch = held.report.batch
     with Pipeline(ArraySource(frames, _ENDLESS), READOUT, device=device, batch=batch) as stream:
 
@@ -143,7 +144,7 @@ def _case(name: str, frames: NDArray[np.uint8], device: Device, held: Held, erro
 
 
 def _blocking_loop(frames: NDArray[np.uint8], device: Device) -> Callable[[], None]:
-    """Return the loop that needs no stream: copy a frame in, run, copy the results out, each to its end."""
+    """Return a loop without a stream: copy a frame in, run, copy the results out, and wait after each step."""
     apart = copy.copy(device)
     apart.shares_memory = False
     bound = READOUT.bind(apart, SHAPE, np.uint8)

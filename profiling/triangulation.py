@@ -1,4 +1,4 @@
-"""Triangulation against a Numba loop and against NumPy: sensor coordinates to sheet coordinates and status."""
+"""Triangulation, compared with a Numba loop and NumPy: sensor coordinates to sheet coordinates and status."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gpuvision.profiling.harness import Case
 from gpuvision.ranging.triangulation import Triangulation
 
 REGION = ((0.0, 1023.0), (0.0, 1279.0))
-# A camera of 1700 pixels focal length, 0.35 m from the sheet and 35 degrees aside.
+# Camera with a focal length of 1700 px, 0.35 m from the sheet, at an angle of 35 degrees.
 HOMOGRAPHY = ((1.3e-6, 2.1e-4, -0.134), (2.5e-4, 2.0e-6, -0.131), (-4.2e-4, 8.0e-6, 1.21))
 LENS = Lens(k1=-2e-7, k2=5e-14, centre=(650.0, 500.0))
 
@@ -39,7 +39,7 @@ def _numba(u, v, table, g, h, status):  # type: ignore[no-untyped-def]
 
 @numba.njit(parallel=True, error_model="numpy")
 def _numba_lens(u, v, table, g, h, status):  # type: ignore[no-untyped-def]
-    """Undo the lens as well."""
+    """Triangulate on all cores, with correction of the lens distortion."""
     one, nan = table.dtype.type(1), table.dtype.type(np.nan)
     for i in numba.prange(u.shape[0]):
         x, y = (u[i] - table[0]) * table[1], (v[i] - table[2]) * table[3]
@@ -79,7 +79,7 @@ def _numpy(u: NDArray[Any], v: NDArray[Any], table: NDArray[Any], lens: bool) ->
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield 1e4, 1e6 and 16e6 points in single precision, with a lens, in double, and with sigmas."""
+    """Yield 1e4, 1e6 and 16e6 points in single precision; 1e6 points with a lens, and in double precision."""
     plain = Triangulation(homography=HOMOGRAPHY, region=REGION)
     lens = Triangulation(homography=HOMOGRAPHY, region=REGION, lens=LENS)
     for count, size in ((10_000, "1e4"), (1_000_000, "1e6"), (16_000_000, "16e6")):
@@ -106,7 +106,7 @@ def _case(device: Device, operation: Triangulation, dtype: str, count: int, name
     exact = _numpy(u.astype(np.float64), v.astype(np.float64), operation.packed(np.float64), operation.lens is not None)
     outputs: Any = bound.outputs
     if not np.array_equal(outputs.status.get(), exact[2]):
-        raise AssertionError("the triangulation and float64 disagree on which points are good")
+        raise AssertionError("the triangulation and float64 differ in the valid points")
     points = (outputs.g.get(), outputs.h.get())
     error = max(float(np.nanmax(np.abs(a - b))) for a, b in zip(points, exact, strict=False))
     item = u.itemsize

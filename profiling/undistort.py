@@ -1,4 +1,4 @@
-"""Image undistortion against OpenCV's remap with float maps: its exact path, and its fastest one since version 5.
+"""Image undistortion, compared with OpenCV's remap with float maps: its exact path, the fastest since version 5.
 
 Errors are output pixels minus the float64 value at the exact source position, including the rounding to integers; each
 row has the errors of both libraries. Cases without a map compare with ``cv2.undistort``, which computes its maps in
@@ -25,7 +25,7 @@ _FILTERS = {"bilinear": cv2.INTER_LINEAR, "bicubic": cv2.INTER_CUBIC}
 _LARGEST = {"uint8": 255.0, "uint16": 65535.0, "float32": 255.0}
 # Margin [px]: errors are evaluated where all taps lie within the image.
 _BORDER = 8
-_ROWS_AT_ONCE = 256
+_ROWS_AT_ONCE = 256  # bounds the memory of the float64 reference
 
 Float64 = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def _peer(
 
 
 def _exact(image: NDArray[Any], positions: Float64, interpolation: Interpolation) -> tuple[Float64, NDArray[np.bool_]]:
-    """Return exact values in float64, clipped to the range of the pixel type, and where they need no border."""
+    """Return exact values in float64, clipped to the pixel range, and a mask of pixels whose taps need no border."""
     rows, columns = image.shape[:2]
     x, y = np.moveaxis(positions, -1, 0)
     inner = (x > _BORDER) & (x < columns - 1 - _BORDER) & (y > _BORDER) & (y < rows - 1 - _BORDER)

@@ -147,6 +147,9 @@ def simulate(
         reject_unused("without --second", rule=rule)
     if not noise:
         reject_unused("with --no-noise", seed=seed)
+    names = _names(paths)
+    if not {"diffuse-diffuse", "multi-bounce"} & set(names):
+        reject_unused("without diffuse-diffuse or multi-bounce in --paths", tolerance=tolerance or None)
     check_report_file(as_json)
     described = Sensor.load(sensor)
     beside = None if second is None else Sensor.load(second)
@@ -156,7 +159,6 @@ def simulate(
     scene, made_of = load_part(part, _METRES[unit], given, 0.5 if albedo is None else albedo)
     if str(scene.defects) != "no defects":
         typer.echo(f"{part.name}: {'; '.join(str(scene.defects).splitlines())}", err=True)
-    names = _names(paths)
     task = prepare_simulation(scene, made_of, described, paths=names, tolerance=tolerance, profiles=profiles)
     other = None
     if beside is not None:

@@ -29,6 +29,10 @@ from gpuvision.cli.main import application
         (("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--rule", "mean"), "--rule"),
         (("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--no-noise", "--seed", "3"), "--seed"),
         (
+            ("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--paths", "direct", "--tolerance", "1e-6"),
+            "--tolerance",
+        ),
+        (
             ("simulate", "p.stl", "--sensor", "psd_line", "--out", "d", "--materials", "m.toml", "--albedo", "0"),
             "--albedo",
         ),

@@ -2,7 +2,7 @@
 //
 // A lens is smooth: the source positions of 16 adjacent pixels lie in a window of a few rows and at most 32 samples per
 // row. Each row of the window is loaded as one or two vectors, and a permutation in registers selects the taps of each
-// pixel. This replaces 16 scalar loads for each tap. Positions that are spread more widely (SCATTERED) take these loads.
+// pixel. This replaces 16 scalar loads for each tap. Positions that are spread widely (SCATTERED) take these loads.
 #ifndef UNDISTORT_IMAGE_WINDOW_H
 #define UNDISTORT_IMAGE_WINDOW_H
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pyopencl as cl
 
+from gpuvision.host.debug import debug_folder, dump_program
 from gpuvision.host.device import Device
 from gpuvision.host.errors import BuildError
 
@@ -60,6 +61,11 @@ def build(
     ------
     BuildError
         The source does not compile; the message contains the compiler's log.
+
+    Notes
+    -----
+    Where the environment variable ``GPUVISION_DEBUG`` names a folder, each build writes its complete source there, see
+    `gpuvision.host.debug`.
     """
     handle = device.handle if handle is None else handle
     return _build(device.context, handle, folder, source, tuple(options(defines)), tuple(include_folders))
@@ -71,12 +77,18 @@ def _build(
 ) -> Any:
     program = cl.Program(context, (folder / source).read_text())
     includes = [word for each in (folder, *include_folders) for word in ("-I", os.fspath(each))]
+    dump = functools.partial(dump_program, handle, folder, source, words, include_folders)
     try:
         with warnings.catch_warnings():
             # The CPU runtimes report success ("Device ... successfully vectorised") as compiler output.
             warnings.simplefilter("ignore", cl.CompilerWarning)
-            return program.build(options=[*words, *includes], devices=[handle])
+            # A program from pyopencl's cache has no build log.
+            cache_dir: Any = None if debug_folder() is None else False
+            built: Any = program.build(options=[*words, *includes], devices=[handle], cache_dir=cache_dir)
     except cl.RuntimeError as error:
-        said = [line for line in str(error).splitlines() if line.strip()]
-        name = f"{folder.name}/{source}"
-        raise BuildError(f"{name} does not build with {' '.join(words)}:\n" + "\n".join(said)) from error
+        log = "\n".join(line for line in str(error).splitlines() if line.strip())
+        dump(log)
+        raise BuildError(f"{folder.name}/{source} does not build with {' '.join(words)}:\n{log}") from error
+    if debug_folder() is not None:
+        dump(built.get_build_info(handle, cl.program_build_info.LOG))
+    return built

@@ -9,7 +9,7 @@ import hypothesis
 import numpy as np
 import pytest
 
-from gpuvision.host import Device
+from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
 
 # New draws in every run; what fails prints how to repeat it. Without a clock: a busy machine is no fault of the code.
@@ -34,6 +34,17 @@ def _a_device_is_there(request: pytest.FixtureRequest) -> None:
     if device is None:
         pytest.fail(f"this test needs a healthy OpenCL device; {INSTALL_HINT}", pytrace=False)
     request.node.user_properties.append(("device", device.label))
+
+
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
+    """Write the arrays of a test whose comparison failed to the folder of ``GPUVISION_DEBUG``, if it is set."""
+    if call.excinfo is None or not call.excinfo.errisinstance(AssertionError):
+        return
+    frames = [each.frame for each in call.excinfo.traceback if each.path == item.path]
+    values = {name: value for frame in frames for name, value in frame.f_locals.items() if name != "self"}
+    path = debug.dump_arrays(item.nodeid, **values) if values else None
+    if path is not None:
+        item.add_report_section(call.when, "arrays", str(path))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -75,8 +75,9 @@ Method = Annotated[
 Model = Annotated[
     str,
     typer.Option(
+        metavar="MODEL",
         help="auto: the smallest model that the data do not reject (F test). lines: none, k1 or k1,k2. "
-        "views: some of k1,k2,p1,p2,k3,tilt."
+        "views: some of k1,k2,p1,p2,k3,tilt.",
     ),
 ]
 InnerCorners = Annotated[

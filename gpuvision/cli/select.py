@@ -44,7 +44,9 @@ Results = Annotated[
 Scale = Annotated[str, typer.Option(metavar="LENGTH", help="Size of a pixel on the board: 25e-6 (m) or 25um.")]
 Placement = Annotated[
     str | None,
-    typer.Option(metavar="X,Y", help="Board point whose position error is minimised. Default: middle of the region."),
+    typer.Option(
+        metavar="X,Y", help="Board point whose standard deviations are predicted. Default: middle of the region."
+    ),
 ]
 SearchRange = Annotated[
     str,

@@ -68,7 +68,8 @@ Albedo = Annotated[
 Paths = Annotated[
     str,
     typer.Option(
-        help="Light paths: all, or a list of direct, specular, diffuse-specular, diffuse-diffuse, multi-bounce."
+        metavar="PATHS",
+        help="Light paths: all, or a list of direct, specular, diffuse-specular, diffuse-diffuse, multi-bounce.",
     ),
 ]
 Tolerance = Annotated[
@@ -80,7 +81,8 @@ Tolerance = Annotated[
 MaskChoice = Annotated[
     str,
     typer.Option(
-        help="Mask before the sensor: none, best (a window per sample, computed for the part), or a mask file."
+        metavar="MASK",
+        help="Mask before the sensor: none, best (a window per sample, computed for the part), or a mask file.",
     ),
 ]
 SecondSensor = Annotated[

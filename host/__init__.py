@@ -14,7 +14,7 @@ from gpuvision.host.errors import (
 from gpuvision.host.launch import Launch, Precision, Spec, Variant, real_defines, real_of, uses_vectors
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, table_offsets, type_defines
 from gpuvision.host.operation import Operation
-from gpuvision.host.pipeline import Batch, Pipeline
+from gpuvision.host.pipeline import Batch, Pipeline, PipelineLimits
 from gpuvision.host.plan import Plan, PlanLimits, plan
 from gpuvision.host.program import Define
 from gpuvision.host.recordings import open_recording
@@ -53,6 +53,7 @@ __all__ = [
     "Operation",
     "PacedSource",
     "Pipeline",
+    "PipelineLimits",
     "Plan",
     "PlanLimits",
     "Precision",

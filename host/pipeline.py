@@ -33,9 +33,23 @@ from gpuvision.host.trace import Trace
 Policy = Literal["block", "drop_oldest", "raise"]
 R = TypeVar("R", bound=tuple[Any, ...])
 
+# Size of the default batch [bytes]: enough work for a launch, small enough for the last-level cache (speed only).
 _DEFAULT_BATCH_BYTES = 1 << 22
-_PATIENCE_S = 10.0
-_CALIBRATIONS = 3
+# Empty launches that measure the offset between the clocks of device and host; the result is the best of them.
+_CLOCK_LAUNCHES = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelineLimits:
+    """Limits of `Pipeline`.
+
+    Attributes
+    ----------
+    stop_timeout : float
+        Longest time [s] that the end of a stream waits for the source to return from a read. Chosen.
+    """
+
+    stop_timeout: float = 10.0
 
 
 @dataclass(slots=True)
@@ -109,6 +123,8 @@ class Pipeline(Generic[R]):
         Batches at the start that the report leaves out; otherwise one per slot.
     clock : callable
         Nanoseconds; the same as the source's.
+    limits : PipelineLimits
+        Limits of waiting.
 
     Raises
     ------
@@ -130,7 +146,9 @@ class Pipeline(Generic[R]):
         trace: Trace | None = None,
         warm_up: int | None = None,
         clock: Clock = time.perf_counter_ns,
+        limits: PipelineLimits = PipelineLimits(),
     ) -> None:
+        self._limits = limits
         self.source = _source(source)
         self.ring, self.policy, self.trace = _whole(ring, "ring", 2, " slots"), policy, trace
         self.batch = default_batch(self.source, self.ring) if batch is None else _whole(batch, "batch", 1)
@@ -212,11 +230,11 @@ class Pipeline(Generic[R]):
             return
         self.stop()
         self._state = "closed"
-        self._producer.join(_PATIENCE_S)
+        self._producer.join(self._limits.stop_timeout)
         if self._producer.is_alive():
             raise StreamError(
-                f"the source has not returned from a read for {_PATIENCE_S:.0f} s after the stream's end; "
-                "give it a stop() that ends the read"
+                f"the source has not returned from a read for {self._limits.stop_timeout:.0f} s after the "
+                "stream's end; give it a stop() that ends the read"
             )
         try:
             self._queues.finish()
@@ -398,7 +416,7 @@ class Pipeline(Generic[R]):
     def _calibrated(self, slot: Slot[R]) -> int:
         """Return what to add to the device's times to have the host's, from a few empty launches."""
         offsets = []
-        for _ in range(_CALIBRATIONS):
+        for _ in range(_CLOCK_LAUNCHES):
             slot.launch()
             slot.wait()
             now = self._clock()

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -51,12 +52,25 @@ MODELS: dict[str, npt.NDArray[np.bool_]] = {
 }
 """Free elements of N (sheet to sensor) by model name; one of them is the scale."""
 
-# Singular values and denominators below this part of the largest one count as 0: well above the rounding of float64
-# (2e-16), well below those of a setup that can be built.
-_RANK_LIMIT = 1e-10
 _BOTH_SIDES_MESSAGE = "points lie on both sides of the horizon; expected points in front of the sensor"
-# Residuals below this part of the largest coordinate are rounding errors, which an F test must not compare.
-_RESIDUAL_ROUNDING = 64.0 * float(np.finfo(np.float64).eps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HomographyLimits:
+    """Limits of the fit of homographies.
+
+    Attributes
+    ----------
+    rank_tolerance : float
+        Singular values and denominators below this fraction of the largest one count as 0. Chosen: well above the
+        rounding of float64 (2e-16), well below those of a setup that can be built.
+    residual_rounding : float
+        Residuals below this fraction of the largest coordinate are rounding errors, which an F test must not compare.
+        Chosen: 64 roundings of float64.
+    """
+
+    rank_tolerance: float = 1e-10
+    residual_rounding: float = 64.0 * float(np.finfo(np.float64).eps)
 
 
 class DegenerateError(ValueError):
@@ -123,7 +137,9 @@ def inverse(matrix: Float64) -> Float64:
     return np.asarray(inverted, dtype=np.float64)
 
 
-def to_displacement(matrix: Float64, *, rank: int = 3) -> Float64:
+def to_displacement(
+    matrix: Float64, *, rank: int = 3, rank_tolerance: float = HomographyLimits.rank_tolerance
+) -> Float64:
     """Return the displacement parameters of a homography: value at the centre, gradients, and denominator.
 
     They are (g0, gx, gy, h0, hx, hy, dx, dy) of ``G = g0 + (gx x + gy y)/(1 + dx x + dy y)``, and likewise for H.
@@ -134,6 +150,8 @@ def to_displacement(matrix: Float64, *, rank: int = 3) -> Float64:
         Homography (3, 3) from (x, y, 1) to (G, H, 1), with x and y in -1 to 1.
     rank : {3, 2}
         Rank that the homography must have: 3, or 2 for a single beam, where only H depends on x.
+    rank_tolerance : float
+        As `HomographyLimits.rank_tolerance`.
 
     Returns
     -------
@@ -145,12 +163,12 @@ def to_displacement(matrix: Float64, *, rank: int = 3) -> Float64:
     ValueError
         x = y = 0 lies on the horizon, or the rank is lower.
     """
-    if abs(matrix[2, 2]) <= _RANK_LIMIT * np.max(np.abs(matrix[2])):
+    if abs(matrix[2, 2]) <= rank_tolerance * np.max(np.abs(matrix[2])):
         raise ValueError("the middle of the region lies on the horizon; expected a region that sees the sheet")
     scaled = matrix / matrix[2, 2]
     gradients = scaled[:2, :2] - np.outer(scaled[:2, 2], scaled[2, :2])
     singular = np.linalg.svd(gradients, compute_uv=False)
-    if singular[rank - 2] <= _RANK_LIMIT * singular[0] or not np.all(np.isfinite(scaled)):
+    if singular[rank - 2] <= rank_tolerance * singular[0] or not np.all(np.isfinite(scaled)):
         raise ValueError("the homography is singular: the sensor sees the sheet of light edge-on")
     return np.array([scaled[0, 2], *gradients[0], scaled[1, 2], *gradients[1], *scaled[2, :2]])
 
@@ -305,6 +323,7 @@ def fit_models(
     symmetry: float = 0.0,
     region: Region | None = None,
     lens: Lens | None = None,
+    limits: HomographyLimits = HomographyLimits(),
 ) -> tuple[ModelFit, ...]:
     """Fit every model that the points determine; test each against the largest of them.
 
@@ -325,6 +344,8 @@ def fit_models(
         points.
     lens : Lens, optional
         Distortion that is removed before the fit; its centre in (u, v) order.
+    limits : HomographyLimits, optional
+        Limits of rank and rounding.
 
     Returns
     -------
@@ -360,12 +381,12 @@ def fit_models(
     reasons: list[DegenerateError] = []
     for model in family if models is None else models:
         try:
-            fits.append(_fit_model(data, model, frame))
+            fits.append(_fit_model(data, model, frame, limits.rank_tolerance))
         except DegenerateError as error:
             reasons.append(error)
     if not fits:
         raise reasons[0]
-    return _add_f_tests(fits, data, sigma is not None)
+    return _add_f_tests(fits, data, sigma is not None, limits.residual_rounding)
 
 
 class _Calibration(NamedTuple):
@@ -396,10 +417,12 @@ def _points(values: npt.ArrayLike, name: str) -> Float64:
     return points
 
 
-def _add_f_tests(fits: Sequence[tuple[ModelFit, float]], data: _Calibration, sigma_known: bool) -> tuple[ModelFit, ...]:
+def _add_f_tests(
+    fits: Sequence[tuple[ModelFit, float]], data: _Calibration, sigma_known: bool, residual_rounding: float
+) -> tuple[ModelFit, ...]:
     """Add the F test against the last fit; without a given sigma, scale the covariances by the residual variance."""
     largest = np.max(np.abs(np.linalg.solve(data.sigma_factor, data.sensor[..., None])))
-    floor = (_RESIDUAL_ROUNDING * float(largest)) ** 2
+    floor = (residual_rounding * float(largest)) ** 2
     full, full_sum = fits[-1]
     variance = max(full_sum / max(full.degrees_of_freedom, 1), floor)
     tested = []
@@ -416,7 +439,7 @@ def _add_f_tests(fits: Sequence[tuple[ModelFit, float]], data: _Calibration, sig
     return tuple(tested)
 
 
-def _fit_model(data: _Calibration, model: Model, frame: Float64) -> tuple[ModelFit, float]:
+def _fit_model(data: _Calibration, model: Model, frame: Float64, rank_tolerance: float) -> tuple[ModelFit, float]:
     """Fit a model: direct linear transform, then Levenberg-Marquardt on the sensor residuals.
 
     Return the fit and its weighted sum of squared residuals.
@@ -432,7 +455,7 @@ def _fit_model(data: _Calibration, model: Model, frame: Float64) -> tuple[ModelF
     excess = len(x) * len(rows) - len(elements)
     if excess < 0:
         raise DegenerateError(f"{len(x)} points are too few for the model {model}; measure more")
-    start = _direct_linear(x, points, free, rows, model)
+    start = _direct_linear(x, points, free, rows, model, rank_tolerance)
     if model == "C3":
         # Marginal standard deviation of u: the v of a single beam has no residual.
         whitening = to_sensor[0, 0] / np.linalg.norm(data.sigma_factor[:, :1], axis=-1, keepdims=True)
@@ -487,7 +510,12 @@ def _conditioning(points: Float64, fixed: tuple[float | None, float | None]) -> 
 
 
 def _direct_linear(
-    x: Float64, points: Float64, free: npt.NDArray[np.bool_], rows: tuple[int, ...], model: Model
+    x: Float64,
+    points: Float64,
+    free: npt.NDArray[np.bool_],
+    rows: tuple[int, ...],
+    model: Model,
+    rank_tolerance: float,
 ) -> Float64:
     """Return N (sheet to sensor) from the right singular vector of the smallest singular value (algebraic error)."""
     blocks = []
@@ -499,11 +527,11 @@ def _direct_linear(
     # With one equation less than elements, the row of zeros makes the decomposition return the null vector too.
     blocks.append(np.zeros((1, np.count_nonzero(free))))
     _, values, vectors = np.linalg.svd(np.concatenate(blocks), full_matrices=False)
-    if values[np.count_nonzero(free) - 2] <= _RANK_LIMIT * values[0]:
+    if values[np.count_nonzero(free) - 2] <= rank_tolerance * values[0]:
         raise DegenerateError(f"the points do not fix the model {model}; spread them over the sheet")
     matrix = np.zeros((3, 3))
     matrix[free] = vectors[-1]
-    if abs(matrix[2, 2]) <= _RANK_LIMIT:
+    if abs(matrix[2, 2]) <= rank_tolerance:
         raise DegenerateError(_BOTH_SIDES_MESSAGE)
     return np.asarray(matrix / matrix[2, 2])
 

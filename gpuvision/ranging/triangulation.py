@@ -32,7 +32,7 @@ from gpuvision.host import (
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging import homography
-from gpuvision.ranging.homography import Model
+from gpuvision.ranging.homography import HomographyLimits, Model
 from gpuvision.validation import check_keys, finite, numbers
 
 Along = Literal["columns", "rows"]
@@ -43,6 +43,7 @@ _LANES, _GROUP = 16, 256
 # Points of a strip in the vector variant. Long strips keep the hardware prefetchers running; several strips per core
 # balance the load.
 _SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
+_FIT_LIMITS = HomographyLimits()
 _KEYS = ("homography", "region", "model", "along", "lens", "covariance", "sigma", "horizon")
 
 
@@ -393,6 +394,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         region: tuple[tuple[float, float], tuple[float, float]] | None = None,
         along: Along = "columns",
         lens: Lens | None = None,
+        limits: HomographyLimits = _FIT_LIMITS,
     ) -> Triangulation:
         """Calibrate: fit calibration points, and select the smallest sufficient model of the family.
 
@@ -416,6 +418,8 @@ class Triangulation(VisionOperation[SheetPoints]):
             Region of the sensor; ``None``: the bounding box of the points.
         along, lens
             As in the class.
+        limits : HomographyLimits, optional
+            Limits of rank and rounding.
 
         Raises
         ------
@@ -432,6 +436,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             symmetry=symmetry,
             region=region,
             lens=_in_sensor_order(lens, along),
+            limits=limits,
         )
         chosen = next(each for each in fits if each.p_value >= significance or each is fits[-1])
         known = np.ravel([] if sigma is None else sigma)

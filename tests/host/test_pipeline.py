@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gpuvision.host import Device, RecordingError, StreamError
-from gpuvision.host.pipeline import Batch, Pipeline, default_batch
+from gpuvision.host.pipeline import Batch, Pipeline, PipelineLimits, default_batch
 from gpuvision.host.ring import Step
 from gpuvision.host.sources import ArraySource, IteratedSource
 from gpuvision.ranging.psd import PsdReadout
@@ -296,15 +296,15 @@ def test_stopping_from_another_thread_ends_the_loop_after_what_is_under_way(devi
     assert not stopper.is_alive()
 
 
-def test_a_source_that_does_not_return_is_reported(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gpuvision.host.pipeline._PATIENCE_S", 0.1)
+def test_a_source_that_does_not_return_is_reported(device: Device) -> None:
     gate = threading.Event()
 
     def blocked() -> Iterator[np.ndarray]:
         yield np.ones(2, np.float32)
         gate.wait(30)
 
-    stream = Pipeline(IteratedSource(blocked()), READOUT, device=device, batch=1)
+    limits = PipelineLimits(stop_timeout=0.1)
+    stream = Pipeline(IteratedSource(blocked()), READOUT, device=device, batch=1, limits=limits)
     with pytest.raises(StreamError, match=r"has not returned from a read .* give it a stop"), stream:
         next(stream)
     gate.set()

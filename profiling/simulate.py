@@ -17,7 +17,7 @@ from gpuvision.profiling.harness import Case
 from gpuvision.profiling.occluded_irradiance import Board, embree_of, error_of, irradiance_by_samples
 from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
-from gpuvision.workflows.demo import scanned_part
+from gpuvision.workflows.demo import make_scan_task
 from gpuvision.workflows.light_cache import make_light_paths
 
 _SAMPLES = 256
@@ -31,7 +31,7 @@ def cases(device: Device) -> Iterator[Case]:
 
 
 def _case(device: Device, name: str) -> Case:
-    task = scanned_part(name)
+    task = make_scan_task(name)
     model = make_light_paths(task, device)
     seen = model.view_rays.visible_surface(_AT)
     lit = model.sheet.illuminate(task.part, _AT)

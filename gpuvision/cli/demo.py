@@ -29,7 +29,7 @@ def demo(
     from gpuvision.cli.scan import progress_bar
     from gpuvision.host import Device
     from gpuvision.host.files import check_folder, whole_folder
-    from gpuvision.workflows.demo import SENSORS, part, scanned_part
+    from gpuvision.workflows.demo import SENSORS, make_part, make_scan_task
     from gpuvision.workflows.scanning import scan
     from gpuvision.workflows.simulating import simulate, simulate_recording
 
@@ -37,20 +37,20 @@ def demo(
     chosen = Device.best() if device is None else Device.named(device)
     typer.echo(f"device {chosen.label}: {chosen.name}")
     results: dict[str, Any] = {}
-    with whole_folder(out) as inside, tempfile.TemporaryDirectory() as light:
-        part().export(inside / "part.ply")
+    with whole_folder(out) as inside, tempfile.TemporaryDirectory() as light_folder:
+        make_part().export(inside / "part.ply")
         for name in SENSORS:
-            task = scanned_part(name)
+            task = make_scan_task(name)
             with progress_bar(f"{name}: simulating") as progress:
-                known = simulate(task, light, seed=seed, device=chosen, progress=progress)
-            recording = simulate_recording(task, light, seed=seed, device=chosen)
+                known = simulate(task, light_folder, seed=seed, device=chosen, progress=progress)
+            recording = simulate_recording(task, light_folder, seed=seed, device=chosen)
             done = scan(recording, task.sensor, device=chosen)
             known.write(inside / name)
             done.write(inside / name)
             np.save(inside / name / "recording.npy", recording)
             results[name] = {"predicted": known.report(), **done.report()}
             typer.echo(f"{name}: {done.summary()}\n  {known.summary()}")
-        masked = simulate(task, light, seed=seed, mask="best", device=chosen)
+        masked = simulate(task, light_folder, seed=seed, mask="best", device=chosen)
         masked.write(inside / f"{name}_masked")
         results[f"{name}_masked"] = {"predicted": masked.report()}
         (inside / "report.json").write_text(json.dumps(results, indent=1) + "\n")

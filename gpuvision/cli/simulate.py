@@ -211,7 +211,7 @@ def _run(
     summary = done.summary()
     if other is not None:
         with progress_bar(f"{description}, second sensor") as progress:
-            pair = SensorPair.of(done, run(other, out, progress=progress, **made), SensorFusion(rule=rule.value))
+            pair = SensorPair.fuse(done, run(other, out, progress=progress, **made), SensorFusion(rule=rule.value))
         pair.write(out)
         summary += f"\n{pair.summary()}"
     done.write(out)

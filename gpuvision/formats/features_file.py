@@ -19,7 +19,14 @@ from gpuvision.schema import Section, read_toml
 
 
 def write_features(features: FeatureSet, path: str | Path) -> None:
-    """Write features as TOML; the file is replaced only once it is complete.
+    """Write features as TOML. On an error the former file remains.
+
+    Parameters
+    ----------
+    features : FeatureSet
+        Features of a board.
+    path : str or Path
+        Output file; its folder must exist.
 
     Raises
     ------
@@ -65,12 +72,20 @@ def write_features(features: FeatureSet, path: str | Path) -> None:
 def read_features(path: str | Path) -> FeatureSet:
     """Read features from a file of `write_features`.
 
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    FeatureSet
+
     Raises
     ------
     OSError
         The file cannot be read.
     DescriptionError
-        The file has another content; the message names the key.
+        A key is missing, unknown or has a wrong value; the message names the key.
     """
     top = read_toml(Path(path))
     side: Side = top.choice("side", get_args(Side))
@@ -91,8 +106,7 @@ def read_features(path: str | Path) -> FeatureSet:
     if not 3 <= len(rows) + 2 * len(fiducials.radius) <= MAX_ROWS:
         raise top.error(
             f"{len(rows)} tables [[ruler]] and {len(fiducials.radius)} [[fiducial]], expected 3 to {MAX_ROWS} "
-            f"rows: one "
-            "for each ruler, two for each fiducial"
+            "rows: one for each ruler, two for each fiducial"
         )
     point, normal, spacing, length, sigma = (
         np.array([row[column] for row in rows], np.float64).reshape(-1, *shape)

@@ -1,6 +1,6 @@
 """Field files: TOML with the lines and arcs in metres relative to the field's centre.
 
-Some come with the package, see `FIELDS`.
+The package contains the fields in `FIELDS`.
 """
 
 from __future__ import annotations
@@ -21,15 +21,19 @@ def read_field(path: str | Path) -> Field:
 
     Parameters
     ----------
-    path
-        A file, or one of `FIELDS`.
+    path : str or Path
+        Path of a file, or one of `FIELDS`.
+
+    Returns
+    -------
+    Field
 
     Raises
     ------
     OSError
         The file cannot be read.
     DescriptionError
-        The file has another content; the message names the key.
+        A key is missing, unknown or has a wrong value; the message names the key.
     """
     if str(path) in FIELDS:
         with resources.as_file(resources.files("gpuvision") / "presets" / "fields" / f"{path}.toml") as file:

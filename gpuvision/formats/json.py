@@ -7,7 +7,7 @@ from typing import Any
 
 
 def json_tree(value: Any) -> Any:
-    """Return a tree of plain values with None in place of infinite numbers and NaN, for which JSON has no word."""
+    """Return a copy of a tree with None for infinities and NaN, which JSON cannot represent."""
     if isinstance(value, dict):
         return {key: json_tree(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

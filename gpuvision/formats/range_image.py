@@ -1,4 +1,4 @@
-"""Range images as files: TIFF, 16-bit PNG, PLY and NPZ, each written whole or not at all.
+"""Files of range images: TIFF, 16-bit PNG, PLY and NPZ. On an error no file is left behind.
 
 ==========  =================================================================================================
 TIFF        float32 heights [m], NaN in holes; the resolution tags and a JSON description hold the cells
@@ -29,10 +29,10 @@ from gpuvision.host.files import replacing
 from gpuvision.ranging.regrid import Grid
 
 _GRID_KEYS = ("left", "top", "cell_x", "cell_y")
-_NO_DATA_TAG = 42113  # GDAL_NODATA: what geographic and image tools take as a hole
-_CENTIMETRE = 0.01
-_HIGHEST_CODE = 65535
-_LEAST_SCALE = 1e-9  # m per code, for heights that are all the same
+_NO_DATA_TAG = 42113  # GDAL_NODATA: value that image and geographic tools read as missing
+_CENTIMETRE = 0.01  # [m]: the resolution tags count cells per centimetre
+_MAX_CODE = 65535
+_MIN_SCALE = 1e-9  # m per code, if all heights are equal
 _PNG_HEAD = 8 + 25  # signature and IHDR
 _PLY_TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "uint16": "ushort", "uint32": "uint"}
 _PLY_DTYPES = {name: np.dtype(dtype).newbyteorder("<") for dtype, name in _PLY_TYPES.items()}
@@ -42,14 +42,14 @@ Array = npt.NDArray[Any]
 
 
 class HeightFile(NamedTuple):
-    """What a file of heights holds.
+    """Heights and grid of a file.
 
     Attributes
     ----------
     z
         Heights [m], (rows, columns); NaN in holes.
     grid
-        Where the cells lie; None where the file does not say.
+        Grid of the heights; None if the file has no grid.
     """
 
     z: Array
@@ -81,12 +81,21 @@ def _grid_table(grid: Grid | None) -> dict[str, float]:
 def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None) -> None:
     """Write heights as float32 TIFF: metres, NaN in holes.
 
-    With a grid the resolution tags say cells per centimetre. The description is JSON: unit, hole, and the grid.
+    With a grid the resolution tags hold the cells per centimetre. The description is JSON: unit, value of a hole, grid.
+
+    Parameters
+    ----------
+    path : path-like
+        Output file.
+    z : array_like
+        Heights [m], (rows, columns); NaN in holes.
+    grid : Grid, optional
+        Grid of the heights.
 
     Raises
     ------
     ValueError
-        `z` is not (rows, columns), or not of the grid's shape.
+        ``z`` does not have two dimensions, or not the shape of the grid.
     """
     z = _heights(z, grid).astype(np.float32)
     cells: dict[str, Any] = (
@@ -107,7 +116,7 @@ def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None) -
 
 
 def read_tiff(path: str | os.PathLike[str]) -> HeightFile:
-    """Read what `write_tiff` wrote."""
+    """Read heights from a TIFF file of `write_tiff`."""
     with tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
         z = page.asarray()
@@ -127,21 +136,21 @@ def write_png16(
 ) -> None:
     """Write heights as 16-bit PNG: ``height = Offset + Scale (code - 1)`` in metres, code 0 is a hole.
 
-    The codes 1 to 65535 span `low` to `high`, so that a height is off by half a step at most. Both numbers, the unit
-    and the grid are text chunks of the file.
+    The codes 1 to 65535 span ``low`` to ``high``; the rounding error of a height is at most half of Scale. Offset,
+    Scale, the unit and the grid are text chunks of the file.
 
     Parameters
     ----------
     path, z, grid
         As for `write_tiff`.
     low, high
-        Heights of the first and the last code [m]; None takes the lowest and highest there is. Heights outside are
-        holes, not the nearest code.
+        Heights of the first and the last code [m]. Default: lowest and highest of the heights. Heights outside become
+        holes.
 
     Raises
     ------
     ValueError
-        `z` is not (rows, columns), or not of the grid's shape, or `low` is not below `high`.
+        ``z`` does not have two dimensions, or not the shape of the grid; or ``low`` exceeds ``high``.
     """
     z = _heights(z, grid).astype(np.float64)
     finite = z[np.isfinite(z)]
@@ -151,7 +160,7 @@ def write_png16(
         low = high = 0.0
     if not low <= high:
         raise ValueError(f"low is {low} and high is {high}, expected low below high")
-    scale = max((high - low) / (_HIGHEST_CODE - 1), _LEAST_SCALE)
+    scale = max((high - low) / (_MAX_CODE - 1), _MIN_SCALE)
     with np.errstate(invalid="ignore"):
         codes = np.where((z >= low) & (z <= high), np.rint((z - low) / scale) + 1, 0).astype(np.uint16)
     done, image = cv2.imencode(".png", codes)
@@ -189,12 +198,12 @@ def _text_chunks(encoded: bytes) -> dict[str, str]:
 
 
 def read_png16(path: str | os.PathLike[str]) -> HeightFile:
-    """Read what `write_png16` wrote.
+    """Read heights from a PNG file of `write_png16`.
 
     Raises
     ------
     ValueError
-        The file is no 16-bit PNG, or does not say how codes become heights.
+        The file is not a 16-bit PNG, or has no Offset or Scale.
     """
     encoded = Path(path).read_bytes()
     codes = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -222,22 +231,22 @@ def write_ply(
 
     Parameters
     ----------
-    path
-        Where to.
-    x, y, z
-        (profiles, samples), float32 or float64; the file keeps the type.
-    intensity, status
-        Of the same shape; left out where None.
-    organised
-        All samples in scan order, with NaN in holes, and ``obj_info num_cols`` (samples) and ``num_rows`` (profiles).
-        False: the valid points only, for viewers that know no NaN.
+    path : path-like
+        Output file.
+    x, y, z : array_like
+        Coordinates [m], (profiles, samples), float32 or float64; the file keeps the type.
+    intensity, status : array_like, optional
+        Intensity and `Status` flags, of the same shape.
+    organised : bool
+        True (default): all samples in scan order, with NaN in holes, and ``obj_info num_cols`` (samples) and
+        ``num_rows`` (profiles). False: the valid points only, for viewers that do not support NaN.
 
     Raises
     ------
     ValueError
-        The arrays are not all (profiles, samples).
+        The arrays do not all have the shape (profiles, samples).
     TypeError
-        A PLY file has no such type.
+        PLY does not support the type of an array.
     """
     arrays = {"x": x, "y": y, "z": z, "intensity": intensity, "status": status}
     fields = {name: np.asarray(each) for name, each in arrays.items() if each is not None}
@@ -268,12 +277,12 @@ def write_ply(
 
 
 def read_ply(path: str | os.PathLike[str]) -> dict[str, Array]:
-    """Read what `write_ply` wrote: arrays by name, (profiles, samples) where the file is organised.
+    """Read the arrays of a PLY file of `write_ply`, by name; (profiles, samples) if organised, otherwise (points,).
 
     Raises
     ------
     ValueError
-        The file is of another kind of PLY, or shorter than its header says.
+        The file is not a binary little-endian PLY of points, or its size differs from that in its header.
     """
     with Path(path).open("rb") as file:
         lines = []
@@ -296,12 +305,21 @@ def read_ply(path: str | os.PathLike[str]) -> dict[str, Array]:
 
 
 def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], units: Mapping[str, str]) -> None:
-    """Write arrays by name, with the unit of each.
+    """Write arrays and their units as NPZ.
+
+    Parameters
+    ----------
+    path : path-like
+        Output file.
+    arrays : mapping of str to array_like
+        Arrays by name.
+    units : mapping of str to str
+        Unit of each array, by the same names; ``""`` for an array without a unit.
 
     Raises
     ------
     ValueError
-        An array has no unit, or a unit no array (``""`` is the unit of what has none).
+        The names of arrays and units differ.
     """
     if _UNITS_KEY in arrays or set(units) != set(arrays):
         odd = ", ".join(sorted(set(units) ^ set(arrays))) or _UNITS_KEY
@@ -312,7 +330,7 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], units: Ma
 
 
 def read_npz(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, str]]:
-    """Read what `write_npz` wrote: the arrays and their units, by name."""
+    """Read the arrays and their units, by name, from an NPZ file of `write_npz`."""
     with np.load(path) as file:
         units: dict[str, str] = json.loads(str(file[_UNITS_KEY]))
         return {name: file[name] for name in file.files if name != _UNITS_KEY}, units

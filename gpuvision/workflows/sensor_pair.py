@@ -39,7 +39,8 @@ class SensorPair:
     first, second
         Simulations of the single sensors.
     errors
-        "first", "second" and "both", at common positions, compared with the surfaces that either sensor sees.
+        Errors of "first", "second" and "both" at common positions; the truth is every surface that at least one sensor
+        sees.
     fusion
         Fusion rule.
     limit
@@ -53,19 +54,23 @@ class SensorPair:
     limit: float
 
     @classmethod
-    def of(
+    def fuse(
         cls, first: Simulation, second: Simulation, fusion: SensorFusion, *, limits: FusionLimits = FusionLimits()
     ) -> SensorPair:
         """Fuse two simulations of the same profiles.
 
         Parameters
         ----------
-        first, second
+        first, second : Simulation
             Simulations with the same transports.
-        fusion
+        fusion : SensorFusion
             Fusion rule.
-        limits
+        limits : FusionLimits
             Limits of the interpolation.
+
+        Returns
+        -------
+        SensorPair
 
         Raises
         ------
@@ -82,7 +87,7 @@ class SensorPair:
         return cls(first=first, second=second, errors=errors, fusion=fusion, limit=max(first.limit, second.limit))
 
     def summary(self) -> str:
-        """Return for each sensor and both, the best first: fraction read within the limit, and spurious readings."""
+        """Return one line: fractions within the limit and of spurious readings of each sensor and both, best first."""
         parts = [
             f"{each.name} {100 * (1 - each.failed_fraction):.1f} % ({100 * each.spurious_fraction:.1f} % spurious)"
             for each in rank_candidates(self.errors, self.limit)

@@ -12,7 +12,7 @@ import pytest
 
 from gpuvision.cli import main as cli
 from gpuvision.host import Device
-from gpuvision.workflows.demo import SENSORS, scanned_part
+from gpuvision.workflows.demo import SENSORS, make_scan_task
 from gpuvision.workflows.scanning import scan
 from gpuvision.workflows.simulating import simulate, simulate_recording
 
@@ -35,7 +35,7 @@ def away_from_edges(height: Any) -> Any:
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_scan_of_the_recording_is_what_was_predicted(name: str, light: Path, device: Device) -> None:
-    task = scanned_part(name, PROFILES)
+    task = make_scan_task(name, PROFILES)
     recording = simulate_recording(task, light, seed=7)
     shape = {"camera_line": (PROFILES, 64, 480), "psd_line": (PROFILES, 96, 2)}[name]
     assert (recording.shape, recording.dtype) == (shape, np.uint8 if name == "camera_line" else np.uint16)
@@ -46,7 +46,7 @@ def test_a_scan_of_the_recording_is_what_was_predicted(name: str, light: Path, d
 
 
 def test_a_camera_finds_the_part_again(light: Path) -> None:
-    told = simulate(scanned_part("camera_line", PROFILES), light, seed=7).attribution
+    told = simulate(make_scan_task("camera_line", PROFILES), light, seed=7).attribution
     smooth = away_from_edges(told.truth.h) & np.isfinite(told.error)
     assert smooth.sum() > 15_000
     # 0.03 pixel at 0.24 mm a pixel; a windowed centre of gravity of this line reaches 0.01 to 0.02.
@@ -54,7 +54,7 @@ def test_a_camera_finds_the_part_again(light: Path) -> None:
 
 
 def test_the_noise_is_what_the_sensor_predicts(light: Path) -> None:
-    told = simulate(scanned_part("psd_line", PROFILES), light, seed=7).attribution
+    told = simulate(make_scan_task("psd_line", PROFILES), light, seed=7).attribution
     noise, sigma = told.causes["noise"], told.reading.sigma
     known = np.isfinite(noise) & np.isfinite(sigma) & away_from_edges(told.truth.h)
     assert known.sum() > 2000
@@ -63,7 +63,7 @@ def test_the_noise_is_what_the_sensor_predicts(light: Path) -> None:
 
 def test_what_the_lens_does_not_see_is_dark(light: Path) -> None:
     """The box covers the plate on the side away from the lens."""
-    done = simulate(scanned_part("camera_line", PROFILES), light, seed=7)
+    done = simulate(make_scan_task("camera_line", PROFILES), light, seed=7)
     y = done.task.transports
     behind = np.flatnonzero((y > 1.2e-3) & (y < 3.7e-3))  # the box ends at 4 mm, and covers 6 mm x 80/144
     columns = slice(70, 160)  # x from -18 to -8 mm

@@ -129,12 +129,6 @@ def dump_arrays(name: str, **values: Any) -> Path | None:
     -------
     pathlib.Path or None
         ``FOLDER/name.npz``, or ``FOLDER/name-2.npz``, ... where the file exists.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> dump_arrays("without a debug folder", currents=np.ones(3)) is None
-    True
     """
     folder = debug_folder()
     if folder is None:

@@ -29,6 +29,7 @@ INSTALL_HINT = (
     "install one: `apt-get install pocl-opencl-icd` (as root), or `pip install 'gpuvision[cpu]'` "
     "(Intel's CPU runtime, no root needed), or your GPU maker's OpenCL driver"
 )
+# Time-out of the probe's process [s] (chosen): a first build by a driver on a busy machine takes its time.
 _PROBE_SECONDS = 120
 _KINDS = {
     "portable computing language": "pocl",

@@ -18,6 +18,7 @@ from gpuvision.host.pipeline import Pipeline
 from gpuvision.host.ring import Step
 from gpuvision.host.sources import ArraySource, Source
 
+# Default batch sizes [frames] that are tried, doubling: the chosen one is at most twice the smallest that suffices.
 BATCHES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096)
 
 

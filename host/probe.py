@@ -33,6 +33,7 @@ kernel void probe(global const uchar *bytes, global uint *sums, local uint *shar
     sums[get_global_id(0)] = shared[get_local_size(0) - 1 - get_local_id(0)];
 }
 """
+# Size of the probe's problem: an odd number of rows, and several work-groups.
 _ROWS, _ITEMS, _GROUP = 37, 64, 16
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 _DROPPED_BITS = 16
 _LOWEST = int(np.float32(1.0).view(np.int32)) >> _DROPPED_BITS
 _BINS = (int(np.float32(2.0**44).view(np.int32)) >> _DROPPED_BITS) - _LOWEST
-_PENDING = 1024
+_PENDING = 1024  # durations that are collected before they are sorted into bins (speed only)
 
 
 @dataclass(frozen=True)

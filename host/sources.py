@@ -20,7 +20,8 @@ from gpuvision.host.errors import RecordingError
 Clock = Callable[[], int]
 Arrivals = NDArray[np.int64]
 
-# Sleeping overshoots by some 80 us on a common kernel: yield the processor for the last stretch instead.
+# Last part of a wait [ns] in which the processor is yielded, because sleeping overshoots: by some 80 us on a common
+# kernel (measured).
 _SPIN_NS = 200_000
 
 _yield = getattr(os, "sched_yield", lambda: time.sleep(0))

@@ -35,7 +35,7 @@ Float64 = npt.NDArray[np.float64]
 _MAX_ITERATIONS = 80
 _POSITION_ROUNDING = 4.0 * np.finfo(np.float64).eps  # of a position, relative to |x| + R: four roundings
 _IMAGINARY_ROUNDING = 1e-9  # a root of the cubic, which is of order 1, counts as real below this imaginary part
-_HALF_ROOT = math.sqrt(0.5)
+_HALF_ROOT = math.sqrt(0.5)  # cosine of 45 degrees, at which the middle of a facet reflects the beam downwards
 
 
 @dataclass(frozen=True, kw_only=True)

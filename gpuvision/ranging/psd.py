@@ -34,7 +34,7 @@ from gpuvision.validation import finite
 ELECTRON = 1.602176634e-19  # elementary charge [C]
 # Samples of a work-item of the vector variant, multiples of 16: long, unless there are too few to keep every core busy.
 _SHORT_STRIP, _LONG_STRIP, _STRIPS_PER_CORE = 4096, 65536, 4
-_LANES = 16
+_LANES = 16  # of a vector of the vector variant: its kernel's vectors have 16 elements
 
 
 class PsdReading(NamedTuple):

@@ -38,7 +38,7 @@ from gpuvision.operation import VisionOperation
 from gpuvision.validation import check_keys, finite, numbers
 
 _STRIP = 1024  # samples of a work-item of the vector variant: SAMPLES_PER_STRIP in range_image.cl
-_LANES = 16
+_LANES = 16  # of a vector of the vector variant: its kernel's vectors have 16 elements
 _PARALLEL = 1e-9  # volume of three unit vectors, or sine between two, below which they count as coplanar or parallel
 # A vector whose length is 1 within this rounding (two epsilon) is not normalised again, so that a written vector reads
 # back unchanged.

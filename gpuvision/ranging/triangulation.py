@@ -39,6 +39,7 @@ Along = Literal["columns", "rows"]
 Matrix = tuple[tuple[float, float, float], ...]
 Float64 = npt.NDArray[np.float64]
 
+# Lanes of a vector and work-items of a work-group (speed only; the kernel's build options).
 _LANES, _GROUP = 16, 256
 # Points of a strip in the vector variant. Long strips keep the hardware prefetchers running; several strips per core
 # balance the load.

@@ -37,7 +37,7 @@ from gpuvision.matching.field.located_robot import LocatedRobot
 Float32 = npt.NDArray[np.float32]
 
 POINT_FILES = (".npy", ".csv")
-RAYS = 128
+RAYS = 128  # default number of rays of a scan (chosen: speed against points on lines)
 _MAX_POINTS = 4096  # of `FieldPoseSearch`
 # Default range of a mounted camera [m]: farther away pixels resolve little and errors of the tilt grow (chosen).
 _MAX_RANGE = 12.0

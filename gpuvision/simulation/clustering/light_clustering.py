@@ -40,6 +40,7 @@ _POSITION_ROUNDING, _OCCLUDER_MARGIN = 4.0 * 2.0**-23, 32.0 * 2.0**-23
 # Columns of a segment in kernels/light_clustering/light_clustering.cl: normal, height of its plane, start, end.
 _SEGMENT_SIZES = {"normal": 3, "height": 1, "start": 3, "end": 3}
 _SEGMENT_COLUMNS = sum(_SEGMENT_SIZES.values())
+# Work-items of a work-group; strips of receivers per core, several to balance the load (speed only).
 _GROUP, _STRIPS_PER_CORE = 64, 8
 # Bit of a selected segment that nothing can occlude, as the kernel sets it.
 _UNOCCLUDED_BIT = 1 << 30

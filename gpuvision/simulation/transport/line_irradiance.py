@@ -23,6 +23,7 @@ from gpuvision.host import (
 )
 from gpuvision.operation import VisionOperation
 
+# Lanes of a vector and work-items of a work-group (speed only; the kernel's build options).
 _LANES, _GROUP = 16, 64
 # Strips of receivers: several per core balance the load, and each has enough pairs to outweigh its start.
 _STRIPS_PER_CORE, _PAIRS_PER_STRIP = 8, 8192

@@ -16,6 +16,7 @@ from gpuvision.simulation.transport.mirror_points import TriangleBlocks
 
 Float64 = npt.NDArray[np.float64]
 
+# Work-items of a work-group and lanes of a vector (speed only; the kernel's build options).
 _GROUP, _LANES = 64, 16
 # Facets of different directions are moved apart by this many extents before they are sorted into blocks, so that the
 # facets of a block have one direction as far as possible (speed only).

@@ -34,7 +34,7 @@ Visibility = Literal["intervals", "rays", "none"]
 SELECTION_BLOCK = 16
 """Receivers of a strip that share a list of selected segments."""
 
-_GROUP = 64
+_GROUP = 64  # work-items of a work-group (speed only)
 # Parts of the work per CPU core: enough to balance the load; few, because each groups the segments into lines anew.
 _SHARES_PER_CORE = 8
 # Least stack depth in the build options, so that all small scenes share one build.

@@ -31,6 +31,7 @@ from gpuvision.simulation.transport.patch_meshing import MeshingLimits, bisect_t
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 R = TypeVar("R", bound=tuple[Any, ...])
+# Lanes of a vector and work-items of a work-group (speed only; the kernel's build options).
 _LANES, _GROUP = 16, 64
 # In roundings of the largest coordinate: height up to which a receiver counts as in a triangle's plane, and default
 # clearance of rays (`FormFactors.clearance`). Chosen: a few times the rounding of a transformed point, and above it.

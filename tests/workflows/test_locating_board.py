@@ -269,7 +269,7 @@ def test_a_refused_pose_is_an_error_with_a_picture(folder: Path, tmp_path: Path,
         (("--board", "{board}", "--scale", "25um", "--initial-pose", "1,2"), "expected 3 numbers"),
         (("--board", "nowhere", "--scale", "25um"), "nowhere"),
         (("--board", "{board}", "--scale", "25um"), "name its files with layers"),
-        (("--board", "{board}", "--scale", "25um", "--layers", "copper"), "expected a name, or a pattern, and a layer"),
+        (("--board", "{board}", "--scale", "25um", "--layers", "copper"), "expected a file name or pattern and a layer"),
         (("--board", "{board}", "--scale", "25um", "--features", "nowhere.toml"), "nowhere.toml"),
     ],
 )
@@ -371,7 +371,7 @@ def test_floor_points_lie_on_the_lines(rng: np.random.Generator) -> None:
     assert np.hypot(*points.T).min() > 0.5
     found = locate_robot(points, field)
     assert found.candidates[0].inlier_fraction > 0.95
-    assert found.candidates[0].scale < 0.5 * scale
+    assert found.candidates[0].residual_std < 0.5 * scale
     angle = np.arctan2(points[:, 1], points[:, 0])
     for each in np.unique(np.round(angle, 3)):
         away = np.sort(np.hypot(*points[np.abs(angle - each) < 1e-3].T))

@@ -152,7 +152,7 @@ def test_another_field_is_refused(device: Device, rng: np.random.Generator) -> N
     field, pose = read_field("robocup_msl"), (-6.0, 2.0, 0.7)
     image = seen_from(grown(field, 1.33), pose, rng)
     located = locate_robot(scan_floor(image, scale=SCALE, line_width=WIDE, device=device), field, device=device)
-    assert "it does not look like this field" in located.reason
+    assert "the image does not match this field" in located.reason
     assert len(located.doubtful) == 1
     # At the scale that makes up for that it is this field.
     scan = scan_floor(image, scale=SCALE / 1.33, line_width=WIDE / 1.33, device=device)
@@ -194,7 +194,7 @@ def test_random_points_are_refused(rng: np.random.Generator) -> None:
             if located.evidence is None:  # four points may fit no pose at all
                 assert "no pose on the field fits" in located.reason
             else:
-                assert "no better than random ones" in located.reason
+                assert "no better than random points" in located.reason
                 assert located.report()["evidence"]["seen"] is None
 
 

@@ -269,7 +269,10 @@ def test_a_refused_pose_is_an_error_with_a_picture(folder: Path, tmp_path: Path,
         (("--board", "{board}", "--scale", "25um", "--initial-pose", "1,2"), "expected 3 numbers"),
         (("--board", "nowhere", "--scale", "25um"), "nowhere"),
         (("--board", "{board}", "--scale", "25um"), "name its files with layers"),
-        (("--board", "{board}", "--scale", "25um", "--layers", "copper"), "expected a file name or pattern and a layer"),
+        (
+            ("--board", "{board}", "--scale", "25um", "--layers", "copper"),
+            "expected a file name or pattern and a layer",
+        ),
         (("--board", "{board}", "--scale", "25um", "--features", "nowhere.toml"), "nowhere.toml"),
     ],
 )

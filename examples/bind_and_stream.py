@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import gpuvision as gv
-from gpuvision.host import ArraySource, PacedSource, plan
+from gpuvision.host import ArraySource, PacedSource, plan_stream
 
 # %%
 # Frames of 256 x 1024 pixels with a laser line.
@@ -44,7 +44,7 @@ for name, call in (("readout(frame)", lambda: readout(frames[0])), ("bound.run()
 # %%
 # Stream at 2000 frames per second: the plan measures which batch keeps up with the sensor.
 source = PacedSource(ArraySource(np.concatenate([frames] * 16)), rate=2000.0)
-chosen = plan(source, readout, device=device)
+chosen = plan_stream(source, readout, device=device)
 latency = []
 with gv.Pipeline(source, readout, device=device, batch=chosen.batch, ring=chosen.ring, policy="drop_oldest") as stream:
     for batch in stream:

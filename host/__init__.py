@@ -15,7 +15,7 @@ from gpuvision.host.launch import Launch, Precision, Spec, Variant, real_defines
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, table_offsets, type_defines
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Batch, Pipeline, PipelineLimits
-from gpuvision.host.plan import Plan, PlanLimits, plan
+from gpuvision.host.planning import Plan, PlanLimits, plan_stream
 from gpuvision.host.program import Define
 from gpuvision.host.recordings import open_recording
 from gpuvision.host.report import StreamReport
@@ -76,7 +76,7 @@ __all__ = [
     "open_recording",
     "opencl_type",
     "padded_groups",
-    "plan",
+    "plan_stream",
     "real_defines",
     "real_of",
     "round_up",

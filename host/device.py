@@ -78,7 +78,7 @@ class Device:
     @staticmethod
     def all() -> tuple[Device, ...]:
         """Return all healthy devices, best first; see `best` for the order."""
-        healthy = [each for each in discovery.candidates() if each.healthy]
+        healthy = [each for each in discovery.probed_devices() if each.healthy]
         return tuple(_open(each) for each in sorted(healthy, key=lambda each: each.rank))
 
     @staticmethod
@@ -102,7 +102,7 @@ class Device:
             return Device.named(asked)
         healthy = Device.all()
         if not healthy:
-            listed = discovery.candidates()
+            listed = discovery.probed_devices()
             seen = "; ".join(f"{each.label}: {each.reason}" for each in listed) or "no OpenCL platform"
             raise NoDeviceError(f"no healthy OpenCL device ({seen}); {discovery.INSTALL_HINT}")
         return healthy[0]
@@ -127,7 +127,7 @@ class Device:
         DeviceUnusableError
             The device exists, and its probe failed.
         """
-        listed = discovery.candidates()
+        listed = discovery.probed_devices()
         asked = name.strip().lower()
         matching = [each for each in listed if each.label == asked] or [
             each for each in listed if asked and asked in f"{each.label} {each.name} {each.platform}".lower()
@@ -282,7 +282,7 @@ _opened: dict[str, Device] = {}
 _opening = threading.Lock()
 
 
-def _open(listed: discovery.Listed) -> Device:
+def _open(listed: discovery.ListedDevice) -> Device:
     with _opening:
         if listed.label not in _opened:
             _opened[listed.label] = Device(listed.handle, listed.label, listed.kind, inline_device=listed.inline_device)
@@ -300,7 +300,7 @@ def _adopt(queue: Any) -> Device:
     for each in _opened.values():
         if each.queue == queue:
             return each
-    for listed in discovery.listing():
+    for listed in discovery.listed_devices():
         if listed.handle == queue.device:
             return Device(queue.device, listed.label, listed.kind, queue=queue)
     kind = discovery.kind_of(queue.device)

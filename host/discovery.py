@@ -1,4 +1,4 @@
-"""Which devices are there, and which of them work."""
+"""List of the OpenCL devices, and whether each of them works."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 
 import pyopencl as cl
 
-from gpuvision.host.files import write_whole
+from gpuvision.host.files import write_text_atomic
 from gpuvision.host.runtime import (
     cache_folder,
     expose_installed_runtime,
@@ -44,21 +44,21 @@ _SIMULATORS = ("oclgrind",)
 
 
 @dataclass(frozen=True)
-class Listed:
-    """A device as the OpenCL loader lists it; nothing is known yet about whether it works.
+class ListedDevice:
+    """OpenCL device as the loader lists it, before its probe.
 
     Attributes
     ----------
     label : str
-        Short unique name: the kind (``pocl``, ``intel``, ``nvidia``, ...), with ``:0``, ``:1`` behind it where
-        several devices are of one kind. `Device.named` takes it.
+        Short unique name: the kind (``pocl``, ``intel``, ``nvidia``, ...), followed by ``:0``, ``:1`` where there are
+        several devices of one kind. `Device.named` takes it.
     platform_index, device_index : int
-        The loader's own indices; platforms may share a name, so a name identifies nothing.
+        Indices of the loader. Names do not identify a platform, because two platforms may have the same name.
     handle : pyopencl.Device
     key : str
-        Names what a verdict depends on: the driver, the device, and the probe itself.
+        Hash of the driver, the device and the source of the probe: the key of the cached verdict.
     inline_device : pyopencl.Device or None
-        The same processor as PoCL offers it to the thread that enqueues: no worker has to wake up.
+        PoCL's second device on the same processor, which runs kernels in the thread that enqueues them.
     """
 
     label: str
@@ -71,45 +71,45 @@ class Listed:
 
     @property
     def name(self) -> str:
-        """The device's full name."""
+        """Full name of the device."""
         return str(self.handle.name).strip()
 
     @property
     def platform(self) -> str:
-        """The platform's name."""
+        """Name of the platform."""
         return str(self.handle.platform.name).strip()
 
     @property
     def driver(self) -> str:
-        """The driver's version."""
+        """Version of the driver."""
         return str(self.handle.driver_version).strip()
 
     @property
     def is_gpu(self) -> bool:
-        """Whether it is a GPU."""
+        """Whether the device is a GPU."""
         return bool(self.handle.type & cl.device_type.GPU)
 
 
 @dataclass(frozen=True)
-class Candidate(Listed):
-    """A listed device with the verdict of its probe.
+class ProbedDevice(ListedDevice):
+    """OpenCL device with the verdict of its probe.
 
     Attributes
     ----------
     reason : str
-        Why the device is not healthy; empty when it is.
+        Reason why the device is not healthy; empty for a healthy device.
     """
 
     reason: str
 
     @property
     def healthy(self) -> bool:
-        """Whether a kernel was built, launched and checked on the device."""
+        """Whether the probe built and ran its kernel on the device with correct results."""
         return not self.reason
 
     @property
     def advice(self) -> str:
-        """What a user can do about an unhealthy device."""
+        """Advice to the user about an unhealthy device."""
         if self.healthy:
             return ""
         if self.kind == "pocl" and "debian" not in self.driver:
@@ -121,13 +121,13 @@ class Candidate(Listed):
 
     @property
     def rank(self) -> tuple[bool, int, str]:
-        """Sorts by preference: a GPU, else PoCL, else Intel's CPU runtime, else any other; simulators last."""
+        """Sort key of the preference: GPUs, PoCL, Intel's CPU runtime, other devices, simulators."""
         place = _PREFERRED.index(self.kind) if self.kind in _PREFERRED else len(_PREFERRED)
         return (not self.is_gpu, place + len(_PREFERRED) * (self.kind in _SIMULATORS), self.label)
 
 
 def kind_of(handle: Any) -> str:
-    """Return a device's maker in a word: ``pocl``, ``intel``, ``intel-gpu``, ``nvidia``, ..."""
+    """Return the kind of a device: ``pocl``, ``intel``, ``intel-gpu``, ``nvidia``, ..."""
     words = f"{handle.platform.name} {handle.platform.vendor} {handle.vendor}".lower()
     other = (handle.platform.name.lower().split() or ["unknown"])[0]
     kind = next((short for word, short in _KINDS.items() if word in words), other)
@@ -135,7 +135,7 @@ def kind_of(handle: Any) -> str:
 
 
 def _key(handle: Any, twin: int) -> str:
-    """Name what a verdict depends on; `twin` counts the devices before it that are the same in everything."""
+    """Return the key of a device's verdict; `twin` counts the equal devices listed before it."""
     platform = handle.platform
     parts = (platform.name, platform.version, handle.name, handle.driver_version, handle.extensions, twin)
     source = Path(__file__).with_name("probe.py").read_bytes()
@@ -156,14 +156,14 @@ def _read_verdicts() -> dict[str, str]:
 
 
 def _keep_verdicts(fresh: dict[str, str]) -> None:
-    # An unwritable cache costs a second at the next start, nothing else.
+    # Without a writable cache the next start probes again, which takes about a second per device.
     with contextlib.suppress(OSError):
-        write_whole(_verdicts_file(), json.dumps(_read_verdicts() | fresh, indent=1))
+        write_text_atomic(_verdicts_file(), json.dumps(_read_verdicts() | fresh, indent=1))
 
 
 def _ask_probe(platform_index: int, device_index: int) -> str:
-    """Run the probe in its own process; a crash or a hang is a verdict too."""
-    # -P: a folder named gpuvision where the user stands is not the package.
+    """Run the probe in a process of its own and return its verdict; a crash or a hang is a verdict, too."""
+    # -P keeps a folder named gpuvision in the working directory from hiding the package.
     command = [sys.executable, "-P", "-m", "gpuvision.host.probe", str(platform_index), str(device_index)]
     try:
         ran = subprocess.run(
@@ -185,14 +185,14 @@ def _ask_probe(platform_index: int, device_index: int) -> str:
 
 @functools.cache
 def platforms() -> tuple[Any, ...]:
-    """Return the OpenCL platforms, Intel's pip-installed runtime among them; empty where there are none."""
+    """Return the OpenCL platforms, with Intel's pip-installed runtime; an empty tuple where there are none."""
     provide_cache()
     pin_workers()
     expose_installed_runtime()
     request_inline_device()
     try:
         return tuple(cl.get_platforms())
-    except cl.Error:  # PLATFORM_NOT_FOUND_KHR is how the loader says "none"
+    except cl.Error:  # PLATFORM_NOT_FOUND_KHR: there is no platform
         return ()
 
 
@@ -204,14 +204,14 @@ def _devices_of(platform: Any) -> list[Any]:
 
 
 def _inline_device(devices: Sequence[Any]) -> Any:
-    """Return PoCL's device without worker threads where it is there beside the one with them."""
+    """Return PoCL's device without worker threads, if PoCL also lists its device with worker threads."""
     with_workers = any(each.name.startswith("pthread-") for each in devices)
     return next((each for each in devices if with_workers and each.name.startswith("basic-")), None)
 
 
 @functools.cache
-def listing() -> tuple[Listed, ...]:
-    """List every device by its label, without asking whether it works."""
+def listed_devices() -> tuple[ListedDevice, ...]:
+    """Return all devices without probing them."""
     found = []
     for p, platform in enumerate(platforms()):
         devices = _devices_of(platform)
@@ -224,34 +224,45 @@ def listing() -> tuple[Listed, ...]:
         label = kind if count[kind] == 1 else f"{kind}:{seen[kind]}"
         seen[kind] += 1
         first = _key(handle, 0)
-        listed.append(Listed(label, kind, p, d, handle, _key(handle, twins[first]), beside))
+        listed.append(ListedDevice(label, kind, p, d, handle, _key(handle, twins[first]), beside))
         twins[first] += 1
     return tuple(listed)
 
 
-def candidates(*, probe_again: bool = False) -> tuple[Candidate, ...]:
-    """List every device with its verdict.
+def probed_devices(*, probe_again: bool = False) -> tuple[ProbedDevice, ...]:
+    """Return all devices with the verdicts of their probes.
 
-    A verdict is kept in the user's cache under the driver's version; `probe_again` asks anew where the last one was
-    bad. The first call on a machine takes about a second per device.
+    Parameters
+    ----------
+    probe_again : bool
+        Whether to probe devices again whose cached verdict is bad.
+
+    Returns
+    -------
+    tuple of ProbedDevice
+
+    Notes
+    -----
+    Verdicts are cached in the user's cache folder for each driver version. The first call on a machine takes about a
+    second per device.
     """
     if probe_again:
-        _candidates.cache_clear()
-    return _candidates(trust_bad=not probe_again)
+        _probed_devices.cache_clear()
+    return _probed_devices(trust_bad=not probe_again)
 
 
 @functools.cache
-def _candidates(*, trust_bad: bool) -> tuple[Candidate, ...]:
+def _probed_devices(*, trust_bad: bool) -> tuple[ProbedDevice, ...]:
     known = {key: reason for key, reason in _read_verdicts().items() if trust_bad or not reason}
     fresh: dict[str, str] = {}
-    for each in listing():
+    for each in listed_devices():
         if each.key not in known:
             fresh[each.key] = _ask_probe(each.platform_index, each.device_index)
     if fresh:
         _keep_verdicts(fresh)
     verdicts = known | fresh
-    return tuple(_judged(each, verdicts[each.key]) for each in listing())
+    return tuple(_with_verdict(each, verdicts[each.key]) for each in listed_devices())
 
 
-def _judged(listed: Listed, reason: str) -> Candidate:
-    return Candidate(**{field.name: getattr(listed, field.name) for field in fields(Listed)}, reason=reason)
+def _with_verdict(listed: ListedDevice, reason: str) -> ProbedDevice:
+    return ProbedDevice(**{field.name: getattr(listed, field.name) for field in fields(ListedDevice)}, reason=reason)

@@ -1,22 +1,22 @@
-"""What can go wrong below the vision: one line that says what was wrong, what was expected, what to do."""
+"""Exceptions of gpuvision; each message says what was wrong, what was expected, and what to do."""
 
 from __future__ import annotations
 
 
 class GpuVisionError(Exception):
-    """Base of every error that is gpuvision's own; wrong arguments are ``TypeError`` and ``ValueError``."""
+    """Base class of gpuvision's exceptions; wrong arguments raise ``TypeError`` and ``ValueError``."""
 
 
 class NoDeviceError(GpuVisionError):
-    """No healthy OpenCL device exists, or none of the name that was asked for."""
+    """There is no healthy OpenCL device, or none with the requested name."""
 
 
 class DeviceUnusableError(GpuVisionError):
-    """The device that was asked for exists, but its probe failed."""
+    """The requested device exists, and its probe failed."""
 
 
 class BuildError(GpuVisionError):
-    """A kernel did not compile; the message carries the compiler's log."""
+    """A kernel does not compile; the message contains the compiler's log."""
 
 
 class StreamError(GpuVisionError):
@@ -24,4 +24,4 @@ class StreamError(GpuVisionError):
 
 
 class RecordingError(GpuVisionError):
-    """A recording cannot be read: missing, truncated, empty, or of frames that change their size."""
+    """A recording cannot be read: it is missing, truncated or empty, or its frames change their size."""

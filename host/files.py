@@ -1,4 +1,4 @@
-"""Files, and folders of them, that are written whole or not at all; and checks that they can be."""
+"""Atomic writing of files and folders, and checks that a file or folder can be written."""
 
 from __future__ import annotations
 
@@ -12,11 +12,19 @@ from typing import BinaryIO
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """Open a file that takes the place of `path` when the block ends well, and vanishes when it does not.
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a temporary file that replaces `path` when the block succeeds, and is deleted when the block fails.
 
-    The bytes are on the disk before the name is: whoever opens `path` sees the old file or the whole new one. A link
-    stays, and leads to the new file; a device or a pipe (``/dev/null``, ``/dev/stdout``) is written into.
+    Parameters
+    ----------
+    path : path
+        A symbolic link stays and leads to the new file. A device or a pipe (``/dev/null``, ``/dev/stdout``) is written
+        directly.
+
+    Yields
+    ------
+    binary file
+        Its bytes are on the disk before the file gets its name: readers of `path` see the old or the complete new file.
 
     Raises
     ------
@@ -42,22 +50,22 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         beside.unlink(missing_ok=True)
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a text in place of what `path` holds, and make its folder where that is missing."""
+def write_text_atomic(path: Path, text: str) -> None:
+    """Write a text file atomically, and make its folder where it is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         file.write(text.encode())
 
 
-def check_folder(folder: str | Path) -> None:
-    """Check that a folder is there to write into, or can be made.
+def check_writable_folder(folder: str | Path) -> None:
+    """Check that a folder exists and can be written, or that it can be made.
 
     Raises
     ------
     ValueError
         The name is empty.
     OSError
-        There is a file of that name, or one in its place on the way there; or nothing can be written there.
+        The path or one of its parents is a file, or the folder cannot be written.
     """
     if not os.fspath(folder):
         raise ValueError("the name of the folder to write into is empty; give one, or . for this folder")
@@ -66,7 +74,7 @@ def check_folder(folder: str | Path) -> None:
         if os.path.lexists(each) and not each.is_dir():
             raise NotADirectoryError(f"cannot write into {folder}: {each} is a file, expected a folder")
     place = next(each for each in (path, *path.parents) if each.is_dir())
-    # Rights do not tell: who may do everything still cannot write into a read-only or a virtual file system.
+    # Access rights are not enough: even root cannot write into a read-only or a virtual file system.
     trial = _beside(place)
     try:
         trial.mkdir()
@@ -75,37 +83,47 @@ def check_folder(folder: str | Path) -> None:
         raise type(error)(f"cannot write into {folder}: {place}: {error.strerror}; give another folder") from error
 
 
-def check_file(file: str | Path) -> None:
-    """Check that a file can be written there.
+def check_writable_file(file: str | Path) -> None:
+    """Check that a file can be written at a path.
 
     Raises
     ------
     ValueError
         The name is empty.
     OSError
-        There is a folder of that name, or its folder cannot be written.
+        The path is a folder, or the folder of the file cannot be written.
     """
     if not os.fspath(file):
         raise ValueError("the name of the file to write is empty; give one")
     if Path(file).is_dir():
         raise IsADirectoryError(f"cannot write {file}: it is a folder, expected a file")
-    check_folder(Path(file).parent)
+    check_writable_folder(Path(file).parent)
 
 
 @contextlib.contextmanager
-def whole_folder(folder: str | Path) -> Iterator[Path]:
-    """Give a folder to write into whose files appear in `folder` when the block ends well, and vanish if not.
+def atomic_folder(folder: str | Path) -> Iterator[Path]:
+    """Open a temporary folder whose files move to `folder` when the block succeeds, and are deleted when it fails.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of the files; made where it is missing. Its other files stay.
+
+    Yields
+    ------
+    pathlib.Path
+        The temporary folder.
 
     Raises
     ------
     ValueError, OSError
-        See `check_folder`; or something in the folder is in the way of a file.
+        As `check_writable_folder`; or a file would have to replace a folder, or a folder a file.
     """
-    check_folder(folder)
+    check_writable_folder(folder)
     folder = Path(folder).absolute()
     made = [each for each in (folder.parent, *folder.parent.parents) if not each.exists()]
     folder.parent.mkdir(parents=True, exist_ok=True)
-    # Within a folder that is there: it may be a mounted one, and the one above not ours.
+    # Inside the target folder where it exists: it may be a mount point with a parent that cannot be written.
     inside = _beside(folder if folder.is_dir() else folder.parent)
     try:
         inside.mkdir()
@@ -124,7 +142,7 @@ def _beside(place: Path) -> Path:
 
 
 def _check_room(inside: Path, folder: Path) -> None:
-    """Check that nothing stands in the way of a file, before the first one is moved."""
+    """Check before any move that no file would replace a folder and no folder a file."""
     for each in sorted(inside.rglob("*")):
         target = folder / each.relative_to(inside)
         if each.is_dir() and target.exists() and not target.is_dir():
@@ -132,11 +150,11 @@ def _check_room(inside: Path, folder: Path) -> None:
         if not each.is_dir() and target.is_dir():
             raise IsADirectoryError(f"cannot write {target}: it is a folder, expected a file; move it away")
         if target.is_dir():
-            check_folder(target)
+            check_writable_folder(target)
 
 
 def _move(inside: Path, folder: Path) -> None:
-    """Move files over those of the same name, and leave the others."""
+    """Move files into a folder, over files of the same name."""
     folder.mkdir(exist_ok=True)
     for each in list(inside.iterdir()):
         if each.is_dir():

@@ -1,10 +1,10 @@
-"""Stream frames: source -> upload -> operations -> download -> consumer, over a fixed ring of slots.
+"""Streams of frames: source -> upload -> operations -> download -> consumer, over a fixed ring of slots.
 
-Two threads and two queues of slots. The *producer* (the stream's own thread) takes a free slot, lets the source fill
-it, launches the slot's operations and hands it on. The *consumer* (the caller's thread) takes the oldest launched
-slot, waits for its device event, reads the results, and gives the slot back with its next step. Slots carry their
-events and times; nothing is allocated, compiled or bound per frame. Where host and device share memory the source
-writes into what the kernel reads and the consumer reads what the kernel wrote.
+A stream has two threads and two queues of slots. The *producer* (a thread of the stream) takes a free slot, lets the
+source fill it, launches its operations, and puts it into the queue of launched slots. The *consumer* (the caller's
+thread) takes the oldest launched slot, waits for its device event, and reads the results; its next step gives the slot
+back. Slots carry their events and times, and no frame allocates, compiles or binds anything. Where host and device
+share memory, the source writes the kernel's input and the consumer reads the kernel's output.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from gpuvision.host.arrays import HostArray
 from gpuvision.host.device import Device
 from gpuvision.host.errors import StreamError
 from gpuvision.host.operation import Operation
-from gpuvision.host.report import Account, StreamReport
-from gpuvision.host.ring import Queues, SharedSlot, Slot, StagedSlot, Step, check_chain, rebuilt
+from gpuvision.host.report import StreamReport, StreamStatistics
+from gpuvision.host.ring import Queues, SharedSlot, Slot, StagedSlot, Step, check_chain, map_arrays
 from gpuvision.host.sources import ArraySource, Clock, Source
 from gpuvision.host.trace import Trace
 
@@ -54,23 +54,23 @@ class PipelineLimits:
 
 @dataclass(slots=True)
 class Batch(Generic[R]):
-    """Some consecutive frames and their results, in the stream's own memory.
+    """Consecutive frames and their results in the memory of the stream.
 
-    The arrays are good until the next batch is asked for; `copy` keeps them.
+    The arrays are valid until the next batch is requested; `copy` keeps them.
 
     Attributes
     ----------
     number : int
-        Of the first frame, counted by the source from 0.
+        Number of the first frame, counted from 0.
     frames : (count, ...) array
     result : Result of arrays
-        As the operation returns it, with the frames along the first axis.
+        Result of the last operation, with the frames along the first axis.
     arrived : (count,) int64 array
-        When each frame came [ns of the stream's clock], as the other times.
+        Arrival time of each frame [ns of the stream's clock], as all times here.
     launched, delivered : int
-        When the batch was given to the device, and when its results were in host memory.
+        Times of the launch, and of the arrival of the results in host memory.
     started, ended : int or None
-        When the device computed it, on the host's clock, where the stream profiles.
+        Start and end of the computation on the device, on the host's clock, where the stream profiles.
     """
 
     number: int
@@ -86,43 +86,43 @@ class Batch(Generic[R]):
         return len(self.frames)
 
     def copy(self) -> Batch[R]:
-        """Return the batch with arrays of its own."""
-        result = rebuilt(self.result, np.copy)
+        """Return a copy of the batch that stays valid."""
+        result = map_arrays(self.result, np.copy)
         times = (self.launched, self.started, self.ended, self.delivered)
         return Batch(self.number, self.frames.copy(), result, self.arrived.copy(), *times)
 
 
 class Pipeline(Generic[R]):
-    """A stream of frames through operations: ``with Pipeline(source, operation) as stream: for batch in stream: ...``.
+    """Stream of frames through operations: ``with Pipeline(source, operation) as stream: for batch in stream: ...``.
 
     Parameters
     ----------
     source : Source or array
         An array holds frames along its first axis. The stream closes the source.
     operation : Operation or sequence of Operation and Step
-        A chain hands its arrays on in device memory; the last operation's results are delivered. Every result must
-        have the batch as its first axis.
+        Operations of a chain pass their arrays on in device memory; the stream delivers the result of the last one.
+        Each result must have the batch as its first axis.
     device : Device, optional
-        `Device.best` otherwise.
+        `Device.best` by default.
     batch : int, optional
-        Frames per launch, see `plan`; otherwise what makes some 4 MB, the right size for a recording that has no
-        rate.
+        Frames per launch, see `plan_stream`. Default: about 4 MB of frames, for recordings without a rate.
     ring : int
-        Slots, at least 2: one is the consumer's, the others are filled, computed, or wait. Under ``"drop_oldest"``
-        they bound the age of what the consumer gets.
+        Number of slots, at least 2: the consumer holds one, the others are filled, computed, or wait. Under
+        ``"drop_oldest"`` the ring bounds the age of the delivered frames.
     policy : {"block", "drop_oldest", "raise"}
-        What happens to a frame that arrives when no slot is free: it waits; or the oldest batch that the consumer has
-        not asked for is given up; or the stream ends with a `StreamError`.
+        Action when a frame arrives and no slot is free: ``"block"`` makes the frame wait, ``"drop_oldest"`` discards
+        the oldest batch that the consumer has not requested, ``"raise"`` ends the stream with a `StreamError`.
     zero_copy : bool, optional
-        Host and device use the same memory; otherwise pinned memory and copies. As the device can, unless given.
+        Whether host and device use the same memory; otherwise pinned memory and copies. Default: True where the device
+        shares memory.
     profile : bool
-        Take the times of the device.
+        Whether to measure the times on the device.
     trace : Trace, optional
-        Gets the timeline, written at the end; asks for ``profile`` by itself.
+        Timeline, written at the end; turns ``profile`` on.
     warm_up : int, optional
-        Batches at the start that the report leaves out; otherwise one per slot.
+        Number of batches at the start that the report leaves out; one per slot by default.
     clock : callable
-        Nanoseconds; the same as the source's.
+        Clock in nanoseconds, the same as that of the source.
     limits : PipelineLimits
         Limits of waiting.
 
@@ -158,7 +158,7 @@ class Pipeline(Generic[R]):
         self._steps = _steps(operation)
         self._clock = clock
         self._check()
-        self._account = Account(self.ring if warm_up is None else warm_up)
+        self._statistics = StreamStatistics(self.ring if warm_up is None else warm_up)
         self._dropped = 0
         self._state: Literal["new", "open", "closed"] = "new"
 
@@ -187,7 +187,8 @@ class Pipeline(Generic[R]):
             self._state = "closed"
             source.close()
             raise
-        # The slot given back last is taken first, while it is in the cache; a token per free slot is what to wait for.
+        # The producer takes the slot that was given back last, which is still in the cache. It waits for tokens, of which
+        # there is one per free slot.
         self._free: list[Slot[R]] = []
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._ready: queue.SimpleQueue[Slot[R] | None] = queue.SimpleQueue()
@@ -197,7 +198,7 @@ class Pipeline(Generic[R]):
         self._held_spans: dict[str, tuple[int, int]] = {}
         self._failure: StreamError | None = None
         self._stopping = self._ended = False
-        self._account.started = self._clock()
+        self._statistics.started = self._clock()
         self._producer = threading.Thread(target=self._produce, name="gpuvision stream", daemon=True)
         self._producer.start()
         return self
@@ -205,25 +206,25 @@ class Pipeline(Generic[R]):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the stream, whatever happened."""
+        """Close the stream, also after an exception."""
         self.close()
 
     def stop(self) -> None:
-        """Take no more frames; what is under way is still delivered, then the loop ends. From any thread."""
+        """Stop reading frames; batches in the ring are still delivered, then the loop ends. For any thread."""
         if self._state == "open":
             self._stopping = True
             self._tokens.put(None)
             self.source.stop()
 
     def close(self) -> None:
-        """Stop the source and the producer, wait for the device, and free both; the report stays.
+        """Stop the source and the producer, wait for the device, and free the slots; the report remains.
 
-        From the consumer's thread, as ``with`` does it; another thread may `stop` the stream.
+        For the consumer's thread, as in ``with``; other threads may call `stop`.
 
         Raises
         ------
         StreamError
-            The source does not come back from a read.
+            The source does not return from a read.
         """
         if self._state != "open":
             self._state = "closed"
@@ -240,7 +241,7 @@ class Pipeline(Generic[R]):
             self._queues.finish()
         finally:
             self._release(self._clock())
-            # Slots hold device memory: with the last reference it goes, whoever keeps the stream for its report.
+            # Slots hold device memory: free it even where the caller keeps the stream for its report.
             del self._queues
             self._free.clear()
             self._ready = queue.SimpleQueue()
@@ -251,7 +252,7 @@ class Pipeline(Generic[R]):
     # The producer's side ---------------------------------------------------------------------------------------
 
     def _produce(self) -> None:
-        """Fill and launch slots until the source ends, fails, or the stream is closed."""
+        """Fill and launch slots until the source ends or fails, or the stream is closed."""
         number, stage = 0, "source"
         clock, source, ready = self._clock, self.source, self._ready
         try:
@@ -273,13 +274,13 @@ class Pipeline(Generic[R]):
                 stage = "source"
                 number += slot.count
                 ready.put(slot)
-        except BaseException as error:  # whatever it is, the consumer's thread raises it
+        except BaseException as error:  # raised again in the consumer's thread
             self._failure = _stopped(number, stage, error)
             self._failure.__cause__ = error
         ready.put(None)
 
     def _free_slot(self, number: int) -> Slot[R] | None:
-        """Take a slot as the policy says; ``None`` at shutdown."""
+        """Take a slot according to the policy; return None at shutdown."""
         if self.policy == "block":
             self._tokens.get()
             return None if self._stopping else self._free.pop()
@@ -296,9 +297,9 @@ class Pipeline(Generic[R]):
                 )
             try:
                 oldest = self._ready.get_nowait()
-            except queue.Empty:  # the consumer took it just now and gave another one back
+            except queue.Empty:  # the consumer has just taken it and given another one back
                 continue
-            assert oldest is not None  # only the producer's own end is
+            assert oldest is not None  # the producer puts None at its end only
             oldest.wait()
             self._dropped += oldest.count
             return oldest
@@ -310,12 +311,12 @@ class Pipeline(Generic[R]):
         return self
 
     def __next__(self) -> Batch[R]:
-        """Give the last batch's memory back and deliver the next one.
+        """Give the memory of the last batch back and deliver the next one.
 
         Raises
         ------
         StreamError
-            A stage failed (the cause is chained, the frame is named), or the stream is not open.
+            A stage failed (the message names the frame, the cause is chained), or the stream is not open.
         """
         if self._state != "open":
             raise StreamError("the stream is not open; use `with Pipeline(...) as stream`")
@@ -341,19 +342,19 @@ class Pipeline(Generic[R]):
 
     def _delivered(self, slot: Slot[R], taken: int, delivered: int) -> Batch[R]:
         arrived = slot.arrived[: slot.count]
-        account = self._account
-        account.book(delivered, delivered - arrived, self._ready.qsize() + 1)
-        account.add("slot", slot.taken - slot.asked)
-        account.add("source", slot.filled - slot.taken)
-        account.add("launch", slot.enqueued - slot.filled)
-        account.add("queue", taken - slot.enqueued)
-        account.add("wait", delivered - taken)
+        statistics = self._statistics
+        statistics.add_batch(delivered, delivered - arrived, self._ready.qsize() + 1)
+        statistics.add_stage("slot", slot.taken - slot.asked)
+        statistics.add_stage("source", slot.filled - slot.taken)
+        statistics.add_stage("launch", slot.enqueued - slot.filled)
+        statistics.add_stage("queue", taken - slot.enqueued)
+        statistics.add_stage("wait", delivered - taken)
         started = ended = None
         spans: dict[str, tuple[int, int]] = {}
         if self.profile:
             spans = self._device_spans(slot, delivered)
             for stage, (start, end) in spans.items():
-                account.add(stage, end - start)
+                statistics.add_stage(stage, end - start)
             started, ended = spans["compute"]
         if self.trace is not None and not self.trace.is_full:
             spans["slot"] = (slot.asked, slot.taken)
@@ -363,16 +364,16 @@ class Pipeline(Generic[R]):
         self._held_spans = spans
         slot.delivered = delivered
         frames = slot.frames if slot.count == self.batch else slot.frames[: slot.count]
-        return Batch(slot.number, frames, slot.cut(), arrived, slot.filled, started, ended, delivered)
+        return Batch(slot.number, frames, slot.trimmed_result(), arrived, slot.filled, started, ended, delivered)
 
     def _release(self, now: int) -> None:
-        """Give the slot in the consumer's hands back to the producer."""
+        """Give the slot that the consumer holds back to the producer."""
         slot = self._held
         if slot is None:
             return
         self._held = None
         if slot.delivered:
-            self._account.add("sink", now - slot.delivered)
+            self._statistics.add_stage("sink", now - slot.delivered)
             if self.trace is not None:
                 self.trace.add({**self._held_spans, "sink": (slot.delivered, now)}, slot.number, slot.count)
             slot.delivered = 0
@@ -383,7 +384,7 @@ class Pipeline(Generic[R]):
         self._tokens.put(None)
 
     def run(self, sink: Callable[[Batch[R]], object] | None = None) -> StreamReport:
-        """Open the stream, hand every batch to `sink`, close it, and return the report.
+        """Open the stream, pass every batch to `sink`, close the stream, and return the report.
 
         Raises
         ------
@@ -401,8 +402,8 @@ class Pipeline(Generic[R]):
         return self.report()
 
     def report(self) -> StreamReport:
-        """Return the account of the stream so far; from the consumer's thread."""
-        return self._account.report(
+        """Return the report of the stream up to now; for the consumer's thread."""
+        return self._statistics.report(
             dropped=self._dropped,
             batch=self.batch,
             ring=self.ring,
@@ -414,7 +415,7 @@ class Pipeline(Generic[R]):
     # The device's clock ----------------------------------------------------------------------------------------
 
     def _calibrated(self, slot: Slot[R]) -> int:
-        """Return what to add to the device's times to have the host's, from a few empty launches."""
+        """Return the offset from the device's clock to the host's [ns], measured with a few empty launches."""
         offsets = []
         for _ in range(_CLOCK_LAUNCHES):
             slot.launch()
@@ -426,8 +427,8 @@ class Pipeline(Generic[R]):
     def _device_spans(self, slot: Slot[R], delivered: int) -> dict[str, tuple[int, int]]:
         """Return the device's stages on the host's clock.
 
-        A stage cannot end after its wait returned: what remains of the clocks' difference shows there, and the
-        smallest one that was seen is the best.
+        No stage ends after the wait for it has returned, so each delivery gives an upper bound of the clocks' offset.
+        The smallest bound is the estimate.
         """
         spans = slot.spans()
         self._offset = min(self._offset, delivered - max(end for _, end in spans.values()))
@@ -436,7 +437,7 @@ class Pipeline(Generic[R]):
 
 
 def default_batch(source: Source, ring: int) -> int:
-    """Return a batch of some 4 MB, not so large that a short recording would not use the ring."""
+    """Return a batch size of about 4 MB, smaller where a short recording would not fill the ring."""
     size = max(math.prod(source.shape) * source.dtype.itemsize, 1)
     batch = max(_DEFAULT_BATCH_BYTES // size, 1)
     return batch if source.length is None else max(min(batch, -(-source.length // ring)), 1)

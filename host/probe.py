@@ -1,7 +1,7 @@
-"""Does a device really work? Build, launch and check kernels on it, in a process of its own.
+"""Probe of a device: build, launch and check a kernel in a process of its own.
 
-A runtime may list itself and fail every build, compute wrongly, or abort the process: run as
-``python -m gpuvision.host.probe PLATFORM DEVICE``, only this process is lost. Prints a line of JSON.
+A runtime may list a device and then fail every build, compute wrong results, or abort the process. Run as
+``python -m gpuvision.host.probe PLATFORM DEVICE``, an abort ends this process only. Prints one line of JSON.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import pyopencl as cl
 
 from gpuvision.host.runtime import expose_installed_runtime
 
-# Everything that the library's kernels lean on: wide vectors and their built-in functions (the PoCL of PyPI aborts in
+# The language features that the kernels need: vectors of 16 and their built-in functions (the PoCL of PyPI aborts in
 # fabs(float16) on new processors), a loop, local memory with a barrier, saturation.
 _SOURCE = """
 kernel void probe(global const uchar *bytes, global uint *sums, local uint *shared, int rows)
@@ -37,8 +37,8 @@ kernel void probe(global const uchar *bytes, global uint *sums, local uint *shar
 _ROWS, _ITEMS, _GROUP = 37, 64, 16
 
 
-def probe(device: Any) -> str:
-    """Return why `device` is not healthy; an empty string when it is."""
+def probe_device(device: Any) -> str:
+    """Return the reason why a device is not healthy; an empty string for a healthy device."""
     try:
         context = cl.Context([device])
         queue = cl.CommandQueue(context)
@@ -62,10 +62,10 @@ def probe(device: Any) -> str:
 
 
 def main() -> None:
-    """Probe the device of the two indices on the command line."""
+    """Probe the device whose platform and device index are on the command line."""
     expose_installed_runtime()
     platform, device = (int(word) for word in sys.argv[1:3])
-    print(json.dumps({"reason": probe(cl.get_platforms()[platform].get_devices()[device])}))
+    print(json.dumps({"reason": probe_device(cl.get_platforms()[platform].get_devices()[device])}))
 
 
 if __name__ == "__main__":

@@ -29,15 +29,12 @@ _NPY, _ZIP = b"\x93NUMPY", b"PK"
 _PLACES = {"blue": 0, "green": 1, "red": 2}
 
 
-# What is wrong with a file is in our own line; who wants tifffile's words too sets up logging, and gets them.
+# Exceptions name the defect of a file. Messages of tifffile itself appear only where the application sets up logging.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
 def open_recording(path: str | Path, *, channel: Channel = "grey", key: str | None = None) -> Source:
-    """Open a recording by what it is: a folder of images, or a file by its suffix.
-
-    A video that is damaged in its middle is not refused: the decoder conceals the damage, and such frames look like
-    others.
+    """Open a recording: a folder of images, or a file whose suffix names its format.
 
     Parameters
     ----------
@@ -45,22 +42,27 @@ def open_recording(path: str | Path, *, channel: Channel = "grey", key: str | No
         ``.npy`` or ``.npz`` (frames along the first axis), ``.tif``, a video, or a folder of images of one size, taken
         in natural order (``img2`` before ``img10``).
     channel : {"grey", "red", "green", "blue", "max"}
-        Which channel of colour frames to take; ``"grey"`` weighs them by luminance, ``"max"`` takes the brightest.
+        Channel of colour frames: ``"grey"`` is the luminance, ``"max"`` the brightest channel of each pixel.
     key : str, optional
-        Which array of an ``.npz`` file, if it holds more than one.
+        Name of the array in an ``.npz`` file that holds more than one.
 
     Returns
     -------
     Source
-        Not-finite values are passed on: the operations flag them.
+        NaN and infinite values are passed on: the operations flag them.
 
     Raises
     ------
     ValueError
-        No such channel.
+        The channel is unknown.
     RecordingError
-        Missing, empty, truncated, of an unknown kind, or of frames that are not alike. What shows only while reading
-        is raised then.
+        The recording is missing, empty, truncated, of an unknown format, or its frames differ in size or dtype. Defects
+        that show only while reading are raised by `Source.wait` and `Source.read_into`.
+
+    Notes
+    -----
+    A video that is damaged in its middle raises no exception: the decoder conceals the damage, and the concealed frames
+    look like others.
     """
     if channel not in CHANNELS:
         raise ValueError(f"channel is {channel!r}, expected one of {', '.join(CHANNELS)}")
@@ -124,7 +126,7 @@ def _tiff_source(path: Path, channel: Channel) -> Source:
     if planes and series[0].ndim >= 3 and series[0].dataoffset is not None:
         file.close()
         try:
-            # They lie one after the other in the file, and not each need have a page of its own.
+            # The planes are contiguous in the file, and several planes may share one page.
             stack = tifffile.memmap(path, mode="r")
             return ArraySource(stack.reshape(-1, *stack.shape[-2:]))
         except (OSError, ValueError) as error:
@@ -145,14 +147,14 @@ def _open_tiff(path: Path) -> tifffile.TiffFile:
 
 
 def _next_page(file: tifffile.TiffFile) -> bytes:
-    """Return the link after the last page: zeros, unless the file breaks off and the reader has given up there."""
+    """Return the link after the last page: zeros in a complete file, other bytes where the file is truncated."""
     file.filehandle.seek(file.pages.next_page_offset or 0)
     link: bytes = file.filehandle.read(file.tiff.offsetsize)
     return link
 
 
 class TiffStack(FrameSource):
-    """The pages of a TIFF file, decoded one by one."""
+    """Pages of a TIFF file, decoded one by one."""
 
     def __init__(self, path: Path, file: tifffile.TiffFile, channel: Channel) -> None:
         self._path, self._file, self._channel = path, file, channel
@@ -164,7 +166,7 @@ class TiffStack(FrameSource):
         self._pick = _picker(channel, self._page_shape, str(path))
 
     def _ready(self) -> bool:
-        """Say whether a page is left."""
+        """Return whether a page is left."""
         return self._next < self.length
 
     def _decode(self, out: HostArray) -> None:
@@ -174,7 +176,7 @@ class TiffStack(FrameSource):
         except (OSError, ValueError, RuntimeError, zlib.error) as error:
             raise RecordingError(f"{what}: cannot be decoded: {_line(error)}") from error
         check_frame(page, self._page_shape, self.dtype, what)
-        # TIFF has red first, the picker blue.
+        # The channel order is red, green, blue in TIFF, and blue, green, red in the channel functions.
         self._pick(page if page.ndim == 2 else np.ascontiguousarray(page[:, :, 2::-1]), out)
         self._next += 1
 
@@ -184,7 +186,7 @@ class TiffStack(FrameSource):
 
 
 class Video(FrameSource):
-    """The frames of a video, one channel of them; a video that ends before its announced end is an error."""
+    """One channel of the frames of a video; a video that ends before its announced length raises `RecordingError`."""
 
     def __init__(self, path: str | Path, channel: Channel = "grey") -> None:
         self._path = Path(path)
@@ -196,14 +198,14 @@ class Video(FrameSource):
         announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         _, self._colour = self._capture.retrieve()
         super().__init__(self._colour.shape[:2], self._colour.dtype)
-        # A container that does not know how many frames it has says a number below 1.
+        # Containers of unknown length report a number of frames below 1.
         self.length = announced if announced > 0 else None
         self.rate = float(self._capture.get(cv2.CAP_PROP_FPS)) or None
         self._pick = _picker(channel, self._colour.shape, str(path))
         self._next = 0
 
     def _ready(self) -> bool:
-        """Advance to the next frame, if there is one."""
+        """Grab the next frame and return whether there is one."""
         if not self._grabbed:
             self._grabbed = self._capture.grab()
             if not self._grabbed and self.length is not None and self._next < self.length:
@@ -227,7 +229,7 @@ class Video(FrameSource):
 
 
 class ImageFolder(FrameSource):
-    """The images of a folder in natural order; other files are passed over."""
+    """Images of a folder in natural order; other files are ignored."""
 
     def __init__(self, path: str | Path, channel: Channel = "grey") -> None:
         path = Path(path)
@@ -242,7 +244,7 @@ class ImageFolder(FrameSource):
         self._next = 0
 
     def _ready(self) -> bool:
-        """Say whether an image is left."""
+        """Return whether an image is left."""
         return self._next < self.length
 
     def _decode(self, out: HostArray) -> None:
@@ -254,17 +256,22 @@ class ImageFolder(FrameSource):
 
 
 def _natural(path: Path) -> list[Any]:
-    """Sort key that counts: img2 before img10."""
+    """Return the sort key of the natural order: img2 before img10."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def read_image(path: Path) -> HostArray:
-    """Read an image: grey, or blue, green, red.
+    """Read an image file.
+
+    Returns
+    -------
+    numpy.ndarray
+        (rows, columns) for a grey image, (rows, columns, 3 or 4) in the order blue, green, red (, alpha) for colour.
 
     Raises
     ------
     RecordingError
-        It is none that can be read, or it holds several.
+        The file is not a readable image, or it holds several images.
     """
     if path.is_dir():
         raise RecordingError(f"{path}: a folder, expected an image; name the images in it")
@@ -279,7 +286,7 @@ def read_image(path: Path) -> HostArray:
 
 
 def _picker(channel: Channel, shape: tuple[int, ...], what: str) -> Callable[[HostArray, HostArray], object]:
-    """Return what puts one channel of a frame (blue, green, red, ...) into place."""
+    """Return the function that copies one channel of a frame (blue, green, red, ...) to an array."""
     if len(shape) == 2:
         if channel in _PLACES:
             raise RecordingError(f"{what}: has no {channel} channel, the frames are grey; use channel 'grey'")
@@ -295,5 +302,5 @@ def _picker(channel: Channel, shape: tuple[int, ...], what: str) -> Callable[[Ho
 
 
 def _line(error: BaseException) -> str:
-    """Return the first line of a foreign error."""
+    """Return the first line of the message of another library's exception."""
     return str(error).splitlines()[0] if str(error) else type(error).__name__

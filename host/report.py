@@ -1,4 +1,4 @@
-"""What a stream has to say for itself: how many frames, how fast, how late, and where the time went."""
+"""Report of a stream: number of frames, throughput, latency, and time of each stage."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# A bin is a float32's exponent and 7 bits of its mantissa, less than a hundredth of the value wide; up to five hours.
+# A bin is the exponent of a float32 and 7 bits of its mantissa: narrower than 1/100 of the value. The last bin ends at
+# 2**44 ns, five hours.
 _DROPPED_BITS = 16
 _LOWEST = int(np.float32(1.0).view(np.int32)) >> _DROPPED_BITS
 _BINS = (int(np.float32(2.0**44).view(np.int32)) >> _DROPPED_BITS) - _LOWEST
@@ -17,8 +18,18 @@ _PENDING = 1024  # durations that are collected before they are sorted into bins
 
 
 @dataclass(frozen=True)
-class Spread:
-    """How a duration was spread [s]; quantiles are right to a hundredth. NaN where nothing was counted."""
+class DurationStatistics:
+    """Statistics of a duration [s]; NaN where nothing was counted.
+
+    Attributes
+    ----------
+    count : int
+        Number of durations.
+    mean, maximum : float
+        Mean and largest duration [s].
+    p50, p99, p999 : float
+        Quantiles 0.5, 0.99 and 0.999 [s], with a relative error below 1/100.
+    """
 
     count: int = 0
     mean: float = math.nan
@@ -28,8 +39,8 @@ class Spread:
     maximum: float = math.nan
 
 
-class Durations:
-    """Counts durations in bounded memory, however long the stream runs."""
+class DurationHistogram:
+    """Histogram of durations with logarithmic bins, in memory that does not grow with their number."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS, np.int64)
@@ -38,14 +49,14 @@ class Durations:
         self._total = self._maximum = 0
 
     def add(self, nanoseconds: int) -> None:
-        """Count a duration [ns]."""
+        """Add a duration [ns]."""
         self._pending[self._filled] = nanoseconds
         self._filled += 1
         if self._filled == _PENDING:
             self._fold()
 
     def add_all(self, nanoseconds: NDArray[np.int64]) -> None:
-        """Count at most as many durations [ns] as are kept pending, 1024."""
+        """Add durations [ns], at most 1024 in a call."""
         count = len(nanoseconds)
         if self._filled + count > _PENDING:
             self._fold()
@@ -60,13 +71,13 @@ class Durations:
         self._maximum = max(self._maximum, int(values.max()))
         self._filled = 0
 
-    def spread(self) -> Spread:
-        """Return the spread of what was counted so far."""
+    def statistics(self) -> DurationStatistics:
+        """Return the statistics of all durations so far."""
         if self._filled:
             self._fold()
         count = int(self._counts.sum())
         if not count:
-            return Spread()
+            return DurationStatistics()
         upto = np.cumsum(self._counts)
 
         def quantile(share: float) -> float:
@@ -75,7 +86,7 @@ class Durations:
             middle = 0.5 * (float(low.view(np.float32)) + float(high.view(np.float32)))
             return min(middle, self._maximum) * 1e-9
 
-        return Spread(
+        return DurationStatistics(
             count=count,
             mean=self._total / count * 1e-9,
             p50=quantile(0.5),
@@ -87,32 +98,33 @@ class Durations:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamReport:
-    """The account of a stream, so far or in all.
+    """Report of a stream up to now.
 
     Attributes
     ----------
-    frames, batches
-        Delivered to the consumer.
-    dropped
-        Frames that arrived and were given up for newer ones.
-    throughput
-        Delivered frames per second, `warm_up` frames excluded.
-    seconds
-        From the start to the last delivery, warm-up included [s].
-    latency
-        From a frame's arrival to its result in host memory, warm-up excluded; of batches of more than 1024 frames,
-        so many of them, the oldest one among them.
-    warm_up
-        Frames at the start that `throughput`, `latency` and `stages` leave out; 0 where the stream was no longer
-        than that.
+    frames, batches : int
+        Number of frames and batches delivered to the consumer.
+    dropped : int
+        Number of frames that arrived and were discarded for newer ones.
+    throughput : float
+        Delivered frames per second, without the warm-up.
+    seconds : float
+        Time from the start to the last delivery, with the warm-up [s].
+    latency : DurationStatistics
+        Time from the arrival of a frame to its result in host memory, without the warm-up. Batches of more than 1024
+        frames are sampled: at most 1024 frames count, the oldest one among them.
+    warm_up : int
+        Number of frames at the start that `throughput`, `latency` and `stages` leave out; 0 in a stream that was not
+        longer than its warm-up.
     batch, ring, policy, device, zero_copy
-        How the stream was set up.
-    fill_mean, fill_maximum
-        Batches under way or waiting for the consumer, when one is delivered.
-    stages
-        Time per batch: on the host ``slot`` (wait for a free one), ``source``, ``launch``, ``queue`` (launched, not
-        yet asked for by the consumer), ``wait`` (the consumer waits for the device) and ``sink``; on the device,
-        where the stream profiles, ``upload``, ``compute``, ``download``.
+        Settings of the stream.
+    fill_mean : float
+    fill_maximum : int
+        Mean and largest number of launched batches at a delivery, the delivered one included.
+    stages : dict of str to DurationStatistics
+        Time per batch. On the host: ``slot`` (wait for a free slot), ``source``, ``launch``, ``queue`` (launched, not
+        yet requested by the consumer), ``wait`` (the consumer waits for the device) and ``sink``. On the device, where
+        the stream profiles: ``upload``, ``compute``, ``download``.
     """
 
     frames: int
@@ -120,7 +132,7 @@ class StreamReport:
     dropped: int
     throughput: float
     seconds: float
-    latency: Spread
+    latency: DurationStatistics
     warm_up: int
     batch: int
     ring: int
@@ -129,10 +141,10 @@ class StreamReport:
     zero_copy: bool
     fill_mean: float
     fill_maximum: int
-    stages: dict[str, Spread] = field(default_factory=dict)
+    stages: dict[str, DurationStatistics] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the report as what JSON can hold; what was not counted is ``None``."""
+        """Return the report as dictionaries, lists and numbers for JSON; ``None`` for NaN."""
         plain: dict[str, Any] = _without_nan(asdict(self))
         return plain
 
@@ -143,8 +155,8 @@ def _without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-class Account:
-    """Books the delivered batches; forgets the durations of the warm-up when it is over."""
+class StreamStatistics:
+    """Running statistics of a stream, which forget the durations of the warm-up at its end."""
 
     def __init__(self, warm_up: int) -> None:
         self._left = warm_up
@@ -155,12 +167,22 @@ class Account:
 
     def _restart(self, now: int) -> None:
         self._since, self._warm = now, self.frames
-        self._latency = Durations()
-        self._stages: dict[str, Durations] = {}
+        self._latency = DurationHistogram()
+        self._stages: dict[str, DurationHistogram] = {}
         self._fill = self._fill_maximum = self._fill_count = 0
 
-    def book(self, delivered: int, latencies: NDArray[np.int64], fill: int) -> None:
-        """Book a batch at its delivery."""
+    def add_batch(self, delivered: int, latencies: NDArray[np.int64], fill: int) -> None:
+        """Add a batch at its delivery.
+
+        Parameters
+        ----------
+        delivered : int
+            Time of the delivery [ns].
+        latencies : (frames,) int64 array
+            Latencies of its frames [ns].
+        fill : int
+            Number of launched batches, this one included.
+        """
         if self._left == 0 and self.batches:
             self._restart(self.last)
         self._left -= 1
@@ -173,15 +195,15 @@ class Account:
         if fill > self._fill_maximum:
             self._fill_maximum = fill
 
-    def add(self, stage: str, nanoseconds: int) -> None:
-        """Book the time of a stage."""
+    def add_stage(self, stage: str, nanoseconds: int) -> None:
+        """Add the duration of a stage [ns]."""
         durations = self._stages.get(stage)
         if durations is None:
-            durations = self._stages[stage] = Durations()
+            durations = self._stages[stage] = DurationHistogram()
         durations.add(nanoseconds)
 
     def report(self, **setup: Any) -> StreamReport:
-        """Return the report so far."""
+        """Return the report up to now, with the settings of the stream."""
         since = self._since or self.started
         span = (self.last - since) * 1e-9
         return StreamReport(
@@ -189,10 +211,10 @@ class Account:
             batches=self.batches,
             throughput=(self.frames - self._warm) / span if span > 0 else math.nan,
             seconds=max(self.last - self.started, 0) * 1e-9,
-            latency=self._latency.spread(),
+            latency=self._latency.statistics(),
             warm_up=self._warm,
             fill_mean=self._fill / self._fill_count if self._fill_count else math.nan,
             fill_maximum=self._fill_maximum,
-            stages={stage: durations.spread() for stage, durations in self._stages.items()},
+            stages={stage: durations.statistics() for stage, durations in self._stages.items()},
             **setup,
         )

@@ -1,4 +1,4 @@
-"""The slots of a stream: each owns bound operations and the memory that they and the host use, made once."""
+"""Slots of a stream: bound operations and the memory of one batch, allocated once."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ R = TypeVar("R", bound=tuple[Any, ...])
 
 @dataclass(frozen=True)
 class Step:
-    """An operation in a chain and which results of the one before it takes.
+    """Operation of a chain, and the fields of the previous result that are its inputs.
 
     Attributes
     ----------
     operation : Operation
     takes : tuple of str
-        Fields of the previous result, in the order of this operation's inputs. May be left out for an operation of
-        one input: it takes the first field that is computed.
+        Fields of the previous result, in the order of the operation's inputs. Default: an operation of one input takes
+        the first computed field.
     """
 
     operation: Operation[Any]
@@ -35,7 +35,7 @@ class Step:
 
 
 class Queues:
-    """The command queues of a stream: one where memory is shared; else uploads and downloads have their own."""
+    """Command queues of a stream: one queue where memory is shared, else one each for upload, compute and download."""
 
     def __init__(self, device: Device, *, zero_copy: bool, profiling: bool) -> None:
         self.compute = device.new_queue(profiling=profiling)
@@ -45,21 +45,21 @@ class Queues:
             self.download = device.new_queue(profiling=profiling)
 
     def finish(self) -> None:
-        """Wait for everything that was enqueued."""
+        """Wait until all queues are empty."""
         for queue in (self.upload, self.compute, self.download):
             queue.finish()
 
 
 def check_chain(steps: Sequence[Step], device: Device, batch: int, shape: tuple[int, ...], dtype: Any) -> None:
-    """Check that a chain takes such frames and that the batch is the leading axis of what comes out.
+    """Check that a chain takes such frames and that its results have the batch as their first axis.
 
-    The last batch of a recording may be short: it is computed whole and its results are cut. That needs results
-    that grow with the batch.
+    The last batch of a recording may be short: the slot computes the whole batch and trims the results. So results
+    must grow with the batch.
 
     Raises
     ------
     TypeError, ValueError
-        An operation does not take what it would be given.
+        An operation does not take its input, or a result has another first axis.
     """
     for size in (batch, batch + 1):
         for name, spec in _specs(steps, device, (size, *shape), np.dtype(dtype)).items():
@@ -88,7 +88,7 @@ def _specs(
 
 
 def _taken(step: Step, fields: Mapping[str, Any]) -> list[Any]:
-    """Pick what a step takes from the computed fields of the result before it."""
+    """Return the inputs of a step: fields of the previous result."""
     computed = [name for name, value in fields.items() if value is not None]
     takes = step.takes or tuple(computed[:1])
     for name in takes:
@@ -101,27 +101,29 @@ def _named(step: Step) -> str:
     return type(step.operation).__name__
 
 
-def rebuilt(result: R, change: Callable[[Any], Any]) -> R:
-    """Return the result with each of its arrays changed; what is not computed stays ``None``."""
+def map_arrays(result: R, change: Callable[[Any], Any]) -> R:
+    """Apply a function to each array of a result; fields that are not computed stay ``None``."""
     kind: Any = type(result)
     new: R = kind(*(None if array is None else change(array) for array in result))
     return new
 
 
 class Slot(Generic[R]):
-    """A place for one batch on its way from the source to the consumer.
+    """Memory and bound operations of one batch.
 
     Attributes
     ----------
-    frames : (batch, ...) array
-        The source writes here.
+    frames : (batch, *shape) array
+        Host memory that the source writes.
     result : Result of arrays
-        The consumer reads here when `wait` has returned.
+        Host memory that the consumer reads after `wait`.
     arrived : (batch,) int64 array
+        Arrival times [ns].
     number, count : int
-        Of the first frame, and how many there are.
+        Number of the first frame, and number of frames.
     asked, taken, filled, enqueued, delivered : int
-        When the producer asked for a slot, had it, had filled it, had launched it; when the consumer had it [ns].
+        Times at which the producer requested a slot, got it, had filled it and had launched it, and at which the
+        consumer got it [ns].
     """
 
     def __init__(
@@ -147,7 +149,7 @@ class Slot(Generic[R]):
         raise NotImplementedError
 
     def launch(self) -> None:
-        """Enqueue everything that the batch needs, and return."""
+        """Enqueue copies and operations of the batch without waiting."""
         raise NotImplementedError
 
     def _compute(self, wait_for: Sequence[Any] | None = None) -> None:
@@ -165,22 +167,22 @@ class Slot(Generic[R]):
         """Return start and end of each device stage on the device's clock [ns]; only after `wait`."""
         return {"compute": (self._begun.profile.start, self._done.profile.end)}
 
-    def cut(self) -> R:
-        """Return the results of the frames that are there."""
+    def trimmed_result(self) -> R:
+        """Return the result for the frames of the batch, which the last batch may not fill."""
         result = self.result
         if self.count == len(self.frames):
             return result
-        return rebuilt(result, lambda array: array[: self.count])
+        return map_arrays(result, lambda array: array[: self.count])
 
 
 class SharedSlot(Slot[R]):
-    """Host and device read and write the same memory: nothing is copied."""
+    """Slot in memory that host and device share: nothing is copied."""
 
     def _host_side(self) -> tuple[HostArray, R]:
-        return host_view(self._first.inputs[0]), rebuilt(self._outputs, host_view)
+        return host_view(self._first.inputs[0]), map_arrays(self._outputs, host_view)
 
     def launch(self) -> None:
-        """Launch the operations on the slot's own memory."""
+        """Enqueue the operations."""
         self._compute()
 
     def wait(self) -> None:
@@ -189,15 +191,15 @@ class SharedSlot(Slot[R]):
 
 
 class StagedSlot(Slot[R]):
-    """Pinned host memory beside the device's, with copies on queues of their own."""
+    """Slot with pinned host memory and device memory, and copies in separate queues."""
 
     def _host_side(self) -> tuple[HostArray, R]:
         self._uploaded: Any = None
         self._downloaded: list[Any] = []
-        return self._pinned(self._first.inputs[0]), rebuilt(self._outputs, self._pinned)
+        return self._pinned(self._first.inputs[0]), map_arrays(self._outputs, self._pinned)
 
     def _pinned(self, array: Any) -> HostArray:
-        """Map page-locked memory for good; the mapping ends with the last NumPy array that shows it."""
+        """Return page-locked host memory, mapped until the last NumPy array over it is freed."""
         queue = self._queues.compute
         access: Any = cl.map_flags.READ | cl.map_flags.WRITE
         page_locked = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
@@ -207,7 +209,7 @@ class StagedSlot(Slot[R]):
         return host
 
     def launch(self) -> None:
-        """Enqueue upload, operations and downloads; events keep their order."""
+        """Enqueue upload, operations and downloads, ordered by events."""
         queues = self._queues
         target: Any = self._first.inputs[0].base_data
         self._uploaded = cl.enqueue_copy(queues.upload, target, self.frames, is_blocking=False)

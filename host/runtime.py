@@ -1,9 +1,8 @@
-"""Make the OpenCL runtime that pip installed visible to the loader.
+"""Settings of the OpenCL runtimes before the first platform query.
 
-Intel's CPU runtime comes as two wheels (``intel-opencl-rt``, ``intel-cmplr-lib-rt``) that put bare libraries
-into the environment and register nothing: the loader looks into ``/etc/OpenCL/vendors``, where only root may
-write. So a folder of our own, with the system's entries and one for the wheel, is named in ``OCL_ICD_VENDORS``
-before the first platform query.
+Intel's CPU runtime comes as two wheels (``intel-opencl-rt``, ``intel-cmplr-lib-rt``) that install bare libraries and
+register nothing: the loader reads ``/etc/OpenCL/vendors``, where only root may write. `expose_installed_runtime` makes
+a folder with the system's entries and one for the wheel, and names it in ``OCL_ICD_VENDORS``.
 """
 
 from __future__ import annotations
@@ -22,26 +21,26 @@ from pathlib import Path
 
 import platformdirs
 
-from gpuvision.host.files import write_whole
+from gpuvision.host.files import write_text_atomic
 
 SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
 _VARIABLE = "OCL_ICD_VENDORS"
 _ENTRY = "gpuvision-intel.icd"
 _DRIVER = "libintelocl.so"
 _POCL_3 = re.compile(r"libpocl\.so\.2\.(9|10)\.")  # 3.0 and 3.1
-# The driver finds its siblings by name only; they must be in the process before it is opened.
+# The driver finds these libraries by name only: they must be loaded before the driver is.
 _SIBLINGS = ("libintlc.so.5", "libirng.so", "libimf.so", "libsvml.so")
 
 
 def cache_folder() -> Path:
-    """Return the folder for what may be lost: verdicts on devices, lists of vendors."""
+    """Return the user's cache folder of gpuvision: verdicts of devices, lists of vendors."""
     return platformdirs.user_cache_path("gpuvision")
 
 
 def provide_cache() -> None:
-    """Give this process a cache folder of its own where the user's cannot be written.
+    """Set a temporary cache folder for this process where the user's cache folder cannot be written.
 
-    pyopencl keeps compiled kernels there, and fails rather than does without on a home that is missing or read-only.
+    pyopencl keeps compiled kernels in the user's cache folder, and fails where the home folder is missing or read-only.
     Must run before the first platform query.
     """
     try:
@@ -55,20 +54,21 @@ def provide_cache() -> None:
 
 
 def pin_workers() -> None:
-    """Have PoCL keep each worker thread on a core of its own, unless the user decided otherwise.
+    """Make PoCL pin each worker thread to a core, unless the user has set ``POCL_AFFINITY``.
 
-    After a while of Python's own work on one core, Linux puts both workers of a two-core machine on the other one,
-    where they take turns: kernels took 1.7 times as long. Must run before the first platform query.
+    While Python works on one core of a two-core machine, Linux puts both worker threads on the other core, where they
+    take turns: kernels took 1.7 times as long (measured). Must run before the first platform query.
     """
     os.environ.setdefault("POCL_AFFINITY", "1")
 
 
 def request_inline_device() -> None:
-    """Have PoCL list the device that runs kernels in the caller's thread beside the one with worker threads.
+    """Make PoCL list its inline device, which runs kernels in the calling thread, beside the one with worker threads.
 
-    To wake a worker takes longer than a frame takes to compute. Left alone where the user decided, and where there is
-    a PoCL of another series than 3: others name their devices otherwise, and a PoCL that is asked for a name that it
-    does not know has none. Must run before the first platform query, after `expose_installed_runtime`.
+    Waking a worker thread takes longer than computing a small frame. The function does nothing where the user has set
+    ``POCL_DEVICES``, and where a PoCL of another series than 3 is installed: other series use other device names, and
+    PoCL lists no device at all for an unknown name. Must run before the first platform query, after
+    `expose_installed_runtime`.
     """
     folder = Path(os.environ.get(_VARIABLE, SYSTEM_VENDORS))
     installed = [text for text in _entries(folder).values() if "pocl" in text]
@@ -78,7 +78,7 @@ def request_inline_device() -> None:
 
 
 def _wheel_libraries() -> dict[str, Path]:
-    """Find the libraries of the two wheels; empty where either is not installed."""
+    """Return the libraries of the two wheels by name; empty unless both wheels are installed."""
     found: dict[str, Path] = {}
     for wheel in ("intel-opencl-rt", "intel-cmplr-lib-rt"):
         try:
@@ -97,32 +97,32 @@ def _load_siblings(libraries: dict[str, Path]) -> bool:
             if name in libraries:
                 ctypes.CDLL(str(libraries[name]), mode=ctypes.RTLD_GLOBAL)
     except OSError:
-        return False  # another machine's wheel: the system's runtimes stay as they are
+        return False  # a wheel for another machine: leave the system's runtimes unchanged
     return True
 
 
 def _entries(folder: Path) -> dict[str, str]:
     entries = {}
     for path in folder.glob("*.icd"):
-        with contextlib.suppress(OSError):  # what this user may not read, the loader may not either
+        with contextlib.suppress(OSError):  # the loader cannot read such a file either
             entries[path.name] = path.read_text()
     return entries
 
 
 def _vendors_folder(entries: dict[str, str]) -> Path:
-    # The folder's name is its content: a change of drivers makes another folder, never half of one.
+    # The folder is named by a hash of its content: other drivers give another folder, and no folder is ever changed.
     digest = hashlib.sha256(repr(sorted(entries.items())).encode()).hexdigest()[:12]
     folder = cache_folder() / "vendors" / digest
     for name, text in entries.items():
         if not (folder / name).exists():
-            write_whole(folder / name, text)
+            write_text_atomic(folder / name, text)
     return folder
 
 
 def expose_installed_runtime() -> None:
-    """Name Intel's runtime to the OpenCL loader where its wheels are installed; else do nothing.
+    """Register Intel's CPU runtime with the OpenCL loader, if its wheels are installed.
 
-    Leaves alone an ``OCL_ICD_VENDORS`` that the user has set. Must run before the first platform query.
+    The function does nothing where the user has set ``OCL_ICD_VENDORS``. Must run before the first platform query.
     """
     named = os.environ.get(_VARIABLE)
     if named is not None and not Path(named, _ENTRY).exists():
@@ -130,5 +130,5 @@ def expose_installed_runtime() -> None:
     libraries = _wheel_libraries()
     if not libraries or not _load_siblings(libraries):
         return
-    if named is None:  # else it is inherited from a process of ours
+    if named is None:  # otherwise a parent process of gpuvision has set it
         os.environ[_VARIABLE] = str(_vendors_folder(_entries(SYSTEM_VENDORS) | {_ENTRY: str(libraries[_DRIVER])}))

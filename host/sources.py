@@ -1,6 +1,6 @@
-"""Where frames come from: arrays in memory, anything that can be iterated, and a true rate clock over either.
+"""Sources of frames: arrays in memory, iterables, and frames at the rate of a clock.
 
-`recordings` has the sources that read files.
+`gpuvision.host.recordings` has the sources that read files.
 """
 
 from __future__ import annotations
@@ -28,20 +28,21 @@ _yield = getattr(os, "sched_yield", lambda: time.sleep(0))
 
 
 class Source:
-    """Base of the sources; a camera needs `read_into` and, if it can block for long, `stop`.
+    """Base class of the sources of frames.
 
-    One thread reads: a `Pipeline` calls `wait`, then `read_into`, from its producer thread, and at its end `stop`
-    (from the consumer's thread) and `close` (when the producer has ended).
+    A camera implements `read_into` and, if a read can block for long, `stop`. One thread reads: a `Pipeline` calls
+    `wait`, then `read_into`, in its producer thread. At its end it calls `stop` in the consumer's thread, and `close`
+    after the producer has ended.
 
     Attributes
     ----------
     shape : tuple of int
-        Of one frame.
+        Shape of one frame.
     dtype : numpy.dtype
     length : int or None
-        How many frames there are in all, where that is known beforehand.
+        Number of frames in all; ``None`` where it is not known beforehand.
     rate : float or None
-        Frames per second, where the source has a rate.
+        Frame rate [1/s]; ``None`` where the source has none.
     """
 
     shape: tuple[int, ...]
@@ -50,10 +51,16 @@ class Source:
     rate: float | None = None
 
     def wait(self) -> bool:
-        """Wait until a frame is there; ``False`` at the end.
+        """Wait until a frame has arrived.
 
-        The stream takes a slot for the frame only after that: what makes a drop count exact. A source that cannot
-        know says ``True``.
+        Returns
+        -------
+        bool
+            False at the end of the frames. A source that cannot know returns True.
+
+        Notes
+        -----
+        A stream takes a slot for the frame only after this call, which makes its count of dropped frames exact.
         """
         return True
 
@@ -63,14 +70,14 @@ class Source:
         Parameters
         ----------
         out : (batch, ...) array
-            Memory of the stream; the device may read it directly.
+            Memory of the stream, which the device may read directly.
         arrived : (batch,) int64 array
-            When each frame came [ns of `time.perf_counter_ns`].
+            Arrival times of the frames to fill in [ns of `time.perf_counter_ns`].
 
         Returns
         -------
         int
-            Frames filled; fewer than the batch: no more are there just now; 0: the source has ended.
+            Number of frames filled; below the batch size where no more frames have arrived, 0 at the end.
 
         Raises
         ------
@@ -83,24 +90,24 @@ class Source:
         """Make a blocked `wait` or `read_into` return soon; called from another thread."""
 
     def close(self) -> None:
-        """Release what the source holds."""
+        """Release the resources of the source."""
 
 
 class ArraySource(Source):
-    """Frames that lie in memory, or in a mapped file, along the first axis.
+    """Frames of an array in memory or of a memory-mapped file.
 
     Parameters
     ----------
     frames : (frames, ...) array
     count : int, optional
-        How many to give; more than there are: over and over again.
+        Number of frames to give; a number above that of the array repeats its frames. Default: each frame once.
     clock : callable
-        Nanoseconds.
+        Clock in nanoseconds.
 
     Raises
     ------
     ValueError
-        There is no frame, or no frame axis.
+        The array has fewer than 2 axes, or it has no frame to repeat.
     """
 
     def __init__(self, frames: HostArray, count: int | None = None, *, clock: Clock = time.perf_counter_ns) -> None:
@@ -113,11 +120,11 @@ class ArraySource(Source):
         self.length: int = len(frames) if count is None else count
 
     def wait(self) -> bool:
-        """Say whether a frame is left."""
+        """Return whether a frame is left."""
         return self._next < self.length
 
     def read_into(self, out: HostArray, arrived: Arrivals) -> int:
-        """Copy the next frames; they arrive when they are copied."""
+        """Copy the next frames; their arrival time is the time of the copy."""
         frames, filled = self._frames, 0
         wanted = min(len(out), self.length - self._next)
         while filled < wanted:
@@ -131,10 +138,10 @@ class ArraySource(Source):
 
 
 class FrameSource(Source):
-    """Base of the sources that get one frame at a time: `_ready` says whether one is there, `_decode` puts it in place.
+    """Base class of sources that get one frame at a time: `_ready` waits for a frame, `_decode` writes it.
 
-    An error in the middle of a batch does not lose the frames before it: the batch is cut short there, and the
-    error comes with the next call, of `wait` or of `read_into`.
+    An error in the middle of a batch does not lose the frames before it: the batch ends there, and the next call of
+    `wait` or `read_into` raises the error.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any], *, clock: Clock = time.perf_counter_ns) -> None:
@@ -143,17 +150,17 @@ class FrameSource(Source):
         self._error: Exception | None = None
 
     def wait(self) -> bool:
-        """Wait for the next frame; ``False`` at the end.
+        """Wait for the next frame; return False at the end.
 
         Raises
         ------
         RecordingError
-            The next frame cannot be read: found out now, or while the frames before it were.
+            The next frame cannot be read. The error may have occurred in an earlier read.
         """
         if self._error is None:
             try:
                 return self._ready()
-            except Exception as error:  # it stays: a generator that has raised would only say that it is at its end
+            except Exception as error:  # kept: a generator that has raised only reports its end afterwards
                 self._error = error
         raise self._error
 
@@ -164,7 +171,7 @@ class FrameSource(Source):
                 if not self.wait():
                     return filled
                 self._decode(out[filled])
-            except Exception as error:  # whatever a decoder or a camera says, the frames before are good
+            except Exception as error:  # decoders and cameras raise anything; the frames before are good
                 self._error = error
                 if not filled:
                     raise
@@ -173,31 +180,31 @@ class FrameSource(Source):
         return len(out)
 
     def _ready(self) -> bool:
-        """Wait until a frame is there; ``False`` at the end."""
+        """Wait until a frame has arrived; return False at the end."""
         return True
 
     def _decode(self, out: HostArray) -> None:
-        """Put the next frame, which `_ready` has promised, into `out`."""
+        """Write the next frame to `out`; called after `_ready` has returned True."""
         raise NotImplementedError
 
 
 class IteratedSource(FrameSource):
-    """Frames from anything that can be iterated: a generator, a camera's buffers.
+    """Frames of an iterable: a generator, the buffers of a camera.
 
     Parameters
     ----------
     frames : iterable of array
-        All of the shape and dtype of the first one, which is taken at once. What the iterator raises becomes a
-        `RecordingError` that names the frame, with the cause chained.
+        Arrays with the shape and dtype of the first one, which is read at once. Exceptions of the iterator become a
+        `RecordingError` that names the frame and chains the cause.
     rate : float, optional
-        Frames per second, if they come at a rate.
+        Frame rate [1/s].
     stop : callable, optional
-        Makes the iterator return if it is blocked; called from another thread.
+        Function that makes a blocked iterator return; called from another thread.
 
     Raises
     ------
     TypeError
-        Not something to iterate.
+        `frames` is not iterable.
     RecordingError
         There is no first frame.
     """
@@ -218,7 +225,7 @@ class IteratedSource(FrameSource):
         self.rate, self._stop = rate, stop
 
     def _ready(self) -> bool:
-        """Get the next frame from the iterator, if there is none in hand."""
+        """Get the next frame from the iterator, unless one is waiting."""
         if self._frame is None:
             self._frame = self._taken()
         return self._frame is not None
@@ -228,7 +235,7 @@ class IteratedSource(FrameSource):
             frame = next(self._iterator)
         except StopIteration:
             return None
-        except Exception as error:  # a camera's driver raises what it likes
+        except Exception as error:  # drivers of cameras raise anything
             name = type(error).__name__
             raise RecordingError(f"frame {self._number} did not come: {name}: {error}".rstrip(": ")) from error
         if not isinstance(frame, np.ndarray):
@@ -238,37 +245,42 @@ class IteratedSource(FrameSource):
 
     def _decode(self, out: HostArray) -> None:
         frame, self._frame = self._frame, None
-        assert frame is not None  # `_ready` has said so
+        assert frame is not None  # `_ready` has returned True
         check_frame(frame, self.shape, self.dtype, f"frame {self._number}")
         np.copyto(out, frame)
         self._number += 1
 
     def stop(self) -> None:
-        """Call what was given to end a blocked iterator."""
+        """Call the function that ends a blocked iterator."""
         if self._stop is not None:
             self._stop()
 
 
 class PacedSource(Source):
-    """Another source's frames on a true rate clock: frame k is due at ``start + k / rate``, whatever happened before.
+    """Frames of another source at the rate of a clock: frame k is due at ``start + k / rate``, without drift.
 
-    With an `ArraySource` that repeats it is the synthetic sensor. A frame arrives when the clock says so if the
-    reader waited for it, and counts from when it was due if the reader came late.
+    With a repeating `ArraySource` it is a synthetic sensor. The arrival time of a frame is the time at which a waiting
+    reader wakes, or the due time where the reader comes late.
 
     Parameters
     ----------
     source : Source
     rate : float
-        Frames per second.
+        Frame rate [1/s].
     clock : callable
-        Nanoseconds.
+        Clock in nanoseconds.
     sleep : callable
-        Takes seconds.
+        Function that sleeps for a number of seconds.
 
     Attributes
     ----------
     late : int
-        The longest that a frame was overdue when it was read [ns].
+        Longest delay of a read after the due time of its frame [ns].
+
+    Raises
+    ------
+    ValueError
+        The rate is not between 0 and 1e9.
     """
 
     def __init__(
@@ -292,7 +304,7 @@ class PacedSource(Source):
         self._error: Exception | None = None
 
     def wait(self) -> bool:
-        """Wait until the next frame is due; an error as `FrameSource.wait`."""
+        """Wait until the next frame is due; errors are raised as by `FrameSource.wait`."""
         if self._error is not None:
             raise self._error
         if self._arrived is None and self._source.wait():
@@ -300,9 +312,9 @@ class PacedSource(Source):
         return self._arrived is not None
 
     def read_into(self, out: HostArray, arrived: Arrivals) -> int:
-        """Fill a batch as its frames fall due; frames that are overdue are read in one go.
+        """Fill a batch as its frames fall due; overdue frames are read in one call.
 
-        An error does not lose the frames of its batch, as with `FrameSource`.
+        Errors do not lose the frames of their batch, as with `FrameSource`.
         """
         if self._error is not None:
             raise self._error
@@ -327,7 +339,7 @@ class PacedSource(Source):
         wanted = max(min(len(out), due), 1)
         read = self._source.read_into(out[:wanted], arrived[:wanted])
         for k in range(read):
-            # The reader may oversleep: frames that fall due before it wakes come when it does.
+            # The reader may oversleep: frames that fall due before it wakes arrive when it wakes.
             self._last = arrived[k] = max(self._due(first + k), self._last, self._arrived or 0)
             self._arrived = None
         self._taken += read
@@ -343,7 +355,7 @@ class PacedSource(Source):
         return self._start + round(number / self._rate_ns)
 
     def _arrival(self) -> int | None:
-        """Wait for the next frame and return when it arrived; ``None`` when stopped."""
+        """Wait for the next frame and return its arrival time; None when the source is stopped."""
         now = self._clock()
         if self._start is None:
             self._start = now
@@ -361,22 +373,22 @@ class PacedSource(Source):
         return now
 
     def stop(self) -> None:
-        """End a wait for the clock."""
+        """End a wait for the due time."""
         self._stopped.set()
         self._source.stop()
 
     def close(self) -> None:
-        """Close the source under the clock."""
+        """Close the underlying source."""
         self._source.close()
 
 
 def check_frame(frame: HostArray, shape: tuple[int, ...], dtype: np.dtype[Any], what: str) -> None:
-    """Check that a frame is like the first one.
+    """Check that a frame has the shape and dtype of the first one.
 
     Raises
     ------
     RecordingError
-        It changed its size or its dtype.
+        The shape or the dtype differs.
     """
     if frame.shape != shape or frame.dtype != dtype:
         raise RecordingError(

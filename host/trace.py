@@ -1,4 +1,4 @@
-"""The timeline of a stream, for chrome://tracing or ui.perfetto.dev."""
+"""Timeline of a stream in Chrome's trace format, for chrome://tracing or ui.perfetto.dev."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from gpuvision.host.files import write_whole
+from gpuvision.host.files import write_text_atomic
 
 _PRODUCER, _DEVICE, _CONSUMER = "producer", "device", "consumer"
 _LANES = {
@@ -22,14 +22,14 @@ _LANES = {
 
 
 class Trace:
-    """Collects the spans of a stream's first batches and writes them as Chrome's trace format.
+    """Timeline of the first batches of a stream: start and end of each stage.
 
     Parameters
     ----------
     path : path
-        JSON file to write when the stream closes.
+        JSON file that is written when the stream closes.
     limit : int
-        Batches to keep: a long stream stays bounded.
+        Number of batches to keep, which bounds the memory of a long stream.
     """
 
     def __init__(self, path: str | Path, limit: int = 20_000) -> None:
@@ -39,18 +39,18 @@ class Trace:
 
     @property
     def is_full(self) -> bool:
-        """Whether the limit is reached."""
+        """Whether the limit of batches is reached."""
         return self._batches >= self.limit
 
     def add(self, spans: dict[str, tuple[int, int]], number: int, count: int) -> None:
-        """Add the stages of a batch: start and end [ns], all on the host's clock."""
+        """Add the stages of a batch with their start and end on the host's clock [ns]."""
         if self.is_full:
             return
         self._batches += 1
         self._spans.extend((stage, start, end, number, count) for stage, (start, end) in spans.items())
 
     def write(self) -> None:
-        """Write the file, whole or not at all."""
+        """Write the file atomically."""
         lanes = list(dict.fromkeys(_LANES.values()))
         origin = min((start for _, start, *_ in self._spans), default=0)
         events: list[dict[str, Any]] = [
@@ -61,4 +61,4 @@ class Trace:
             event = {"ph": "X", "name": stage, "pid": 1, "tid": lanes.index(_LANES[stage])}
             event |= {"ts": (start - origin) / 1e3, "dur": (end - start) / 1e3}
             events.append(event | {"args": {"frame": number, "frames": count}})
-        write_whole(self.path, json.dumps({"traceEvents": events, "displayTimeUnit": "ns"}))
+        write_text_atomic(self.path, json.dumps({"traceEvents": events, "displayTimeUnit": "ns"}))

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from gpuvision.host import Device
-from gpuvision.host.files import write_whole
+from gpuvision.host.files import write_text_atomic
 from gpuvision.profiling import ceiling
 
 OPERATIONS = (
@@ -155,7 +155,7 @@ class Run:
 
     def write(self, path: Path) -> None:
         """Write the run as JSON; on an error no file is written."""
-        write_whole(path, self.to_json())
+        write_text_atomic(path, self.to_json())
 
 
 def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:

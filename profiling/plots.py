@@ -10,7 +10,7 @@ from typing import Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gpuvision.host.files import replacing
+from gpuvision.host.files import atomic_write
 from gpuvision.profiling.harness import Row
 
 _SIZE, _DPI = (8.0, 3.6), 150
@@ -47,7 +47,7 @@ def _draw(path: Path, draw: Callable[[Any, Sequence[Row]], None], rows: Sequence
         draw(axes, [row for row in rows if row.device == device])
         axes.grid(which="both", alpha=0.2)
         axes.legend(fontsize=6.5, frameon=False)
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         figure.savefig(file, format="png")
 
 

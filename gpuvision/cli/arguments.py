@@ -60,10 +60,10 @@ def check_report_file(path: Path | None) -> None:
     OSError
         The file cannot be written.
     """
-    from gpuvision.host.files import check_file
+    from gpuvision.host.files import check_writable_file
 
     if path is not None and not prints_report(path):
-        check_file(path)
+        check_writable_file(path)
 
 
 def prints_report(path: Path | None) -> bool:
@@ -77,7 +77,7 @@ def write_report(path: Path | None, report: object) -> None:
     Infinities and NaN become null: JSON has no such numbers.
     """
     from gpuvision.formats.json import json_tree
-    from gpuvision.host.files import write_whole
+    from gpuvision.host.files import write_text_atomic
 
     if path is None:
         return
@@ -85,7 +85,7 @@ def write_report(path: Path | None, report: object) -> None:
     if prints_report(path):
         typer.echo(text, nl=False)
     else:
-        write_whole(path, text)
+        write_text_atomic(path, text)
 
 
 def reject_unused(reason: str, **given: object) -> None:

@@ -114,7 +114,7 @@ def calibrate(
     parameters that the images do not determine.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    from gpuvision.host.files import check_file
+    from gpuvision.host.files import check_writable_file
     from gpuvision.workflows.calibrating import calibrate as run
     from gpuvision.workflows.calibrating import write_calibration
 
@@ -132,7 +132,7 @@ def calibrate(
             "lens.toml"
         )
     for place in (out, out.with_suffix(".json"), out.with_suffix(".png")):
-        check_file(place)
+        check_writable_file(place)
     with progress_bar(f"detecting {pattern.value}") as progress:
         done = run(
             images,

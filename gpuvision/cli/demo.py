@@ -28,16 +28,16 @@ def demo(
 
     from gpuvision.cli.scan import progress_bar
     from gpuvision.host import Device
-    from gpuvision.host.files import check_folder, whole_folder
+    from gpuvision.host.files import atomic_folder, check_writable_folder
     from gpuvision.workflows.demo import SENSORS, make_part, make_scan_task
     from gpuvision.workflows.scanning import scan
     from gpuvision.workflows.simulating import simulate, simulate_recording
 
-    check_folder(out)
+    check_writable_folder(out)
     chosen = Device.best() if device is None else Device.named(device)
     typer.echo(f"device {chosen.label}: {chosen.name}")
     results: dict[str, Any] = {}
-    with whole_folder(out) as inside, tempfile.TemporaryDirectory() as light_folder:
+    with atomic_folder(out) as inside, tempfile.TemporaryDirectory() as light_folder:
         make_part().export(inside / "part.ply")
         for name in SENSORS:
             task = make_scan_task(name)

@@ -9,7 +9,7 @@ import typer
 from gpuvision.cli.arguments import ReportFile, check_report_file, prints_report, write_report
 
 if TYPE_CHECKING:
-    from gpuvision.host.discovery import Candidate
+    from gpuvision.host.discovery import ProbedDevice
 
 
 def devices(
@@ -23,7 +23,7 @@ def devices(
     from gpuvision.host import discovery
 
     check_report_file(as_json)
-    listed = sorted(discovery.candidates(probe_again=probe), key=lambda each: each.rank)
+    listed = sorted(discovery.probed_devices(probe_again=probe), key=lambda each: each.rank)
     write_report(as_json, [_described(each) for each in listed])
     if not prints_report(as_json):
         _show(listed)
@@ -31,7 +31,7 @@ def devices(
         raise typer.Exit(1)
 
 
-def _described(device: Candidate) -> dict[str, str | bool]:
+def _described(device: ProbedDevice) -> dict[str, str | bool]:
     return {
         "label": device.label,
         "kind": device.kind,
@@ -45,7 +45,7 @@ def _described(device: Candidate) -> dict[str, str | bool]:
     }
 
 
-def _show(listed: list[Candidate]) -> None:
+def _show(listed: list[ProbedDevice]) -> None:
     """Print a table of the devices; below it the reason and the advice for each broken one."""
     from rich.console import Console
     from rich.table import Table

@@ -131,7 +131,7 @@ def locate(
     from gpuvision.formats.camera_file import read_lens
     from gpuvision.formats.features_file import read_features
     from gpuvision.host import Device
-    from gpuvision.host.files import check_folder
+    from gpuvision.host.files import check_writable_folder
     from gpuvision.host.recordings import read_image
     from gpuvision.plots.board import draw_located_board
     from gpuvision.workflows.locating_board import locate_board
@@ -139,7 +139,7 @@ def locate(
     check_image(image)
     check_report_file(as_json)
     if out is not None:
-        check_folder(out)
+        check_writable_folder(out)
     chosen = None if features is None else read_features(features)
     if chosen is not None:
         reject_unused("with --features, a file with a fixed selection of calipers", budget=budget)

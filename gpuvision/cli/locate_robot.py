@@ -87,7 +87,7 @@ def locate_robot(
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.field_file import read_field
     from gpuvision.host import Device
-    from gpuvision.host.files import check_folder
+    from gpuvision.host.files import check_writable_folder
     from gpuvision.plots.field import draw_located_robot
     from gpuvision.workflows.locating_robot import POINT_FILES, read_floor, read_points
     from gpuvision.workflows.locating_robot import locate_robot as locate
@@ -95,7 +95,7 @@ def locate_robot(
     check_image(source)
     check_report_file(as_json)
     if out is not None:
-        check_folder(out)
+        check_writable_folder(out)
     pose = initial_pose_of(initial_pose)
     pixel = None if scale is None else quantities(scale, "--scale", "m")[0]
     described = read_field(field)

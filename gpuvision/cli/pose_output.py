@@ -64,13 +64,13 @@ def report_pose(located: Located, draw: Callable[[Path], None], out: Path | None
     ValueError
         The pose was refused.
     """
-    from gpuvision.host.files import whole_folder
+    from gpuvision.host.files import atomic_folder
 
     report = located.report()
     write_report(as_json, report)
     shown = ""
     if out is not None:
-        with whole_folder(out) as inside:
+        with atomic_folder(out) as inside:
             (inside / "pose.json").write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
             draw(inside / "located.png")
         shown = f"look at {out / 'located.png'} and {out / 'pose.json'}"

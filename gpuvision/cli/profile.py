@@ -48,12 +48,12 @@ def profile(
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the peer numba is missing; install it: pip install 'gpuvision[profile]'")
     from gpuvision.host import Device
-    from gpuvision.host.files import check_folder
+    from gpuvision.host.files import check_writable_folder
     from gpuvision.profiling import harness
 
     check_report_file(as_json)
     if plots is not None:
-        check_folder(plots)
+        check_writable_folder(plots)
     for name in operations or ():
         if name not in harness.OPERATIONS:
             raise ValueError(f"no operation {name!r} to profile; expected some of {', '.join(harness.OPERATIONS)}")

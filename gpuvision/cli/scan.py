@@ -87,15 +87,15 @@ def scan(
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host import Device
-    from gpuvision.host.files import check_file, check_folder
+    from gpuvision.host.files import check_writable_file, check_writable_folder
     from gpuvision.sensor.sensor import Sensor
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor)
-    check_folder(out)
+    check_writable_folder(out)
     check_report_file(as_json)
     if trace is not None:
-        check_file(trace)
+        check_writable_file(trace)
         if trace.absolute() in (out.absolute(), *out.absolute().parents):
             raise ValueError(f"--trace is {trace}, the folder of --out or one above it; give a file")
     chosen = None if device is None else Device.named(device)

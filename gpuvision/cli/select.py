@@ -97,7 +97,7 @@ def select(
     """
     from gpuvision.formats.features_file import write_features
     from gpuvision.host import Device
-    from gpuvision.host.files import check_folder, whole_folder
+    from gpuvision.host.files import atomic_folder, check_writable_folder
     from gpuvision.matching.artwork.artwork import read_artwork
     from gpuvision.matching.features.feature_set import choose_features, edge_clearance
     from gpuvision.matching.features.imaging import Imaging
@@ -122,7 +122,7 @@ def select(
         angle=angle,
     )
     at = None if placement is None else quantities(placement, "--placement", "m,m")
-    check_folder(out)
+    check_writable_folder(out)
     artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=edge_clearance(imaging))
     box = ((left, bottom), (right, top))
     features = choose_features(
@@ -135,7 +135,7 @@ def select(
         missing=missing,
         device=None if device is None else Device.named(device),
     )
-    with whole_folder(out) as inside:
+    with atomic_folder(out) as inside:
         write_features(features, inside / "features.toml")
         draw_features(inside / "features.png", artwork, features, box)
     typer.echo(

@@ -139,7 +139,7 @@ def simulate(
     """
     from gpuvision.formats.materials_file import read_materials
     from gpuvision.host import Device
-    from gpuvision.host.files import check_folder
+    from gpuvision.host.files import check_writable_folder
     from gpuvision.sensor.sensor import Sensor
     from gpuvision.workflows.simulating import load_part, prepare_simulation
 
@@ -155,7 +155,7 @@ def simulate(
     check_report_file(as_json)
     described = Sensor.load(sensor)
     beside = None if second is None else Sensor.load(second)
-    check_folder(out)
+    check_writable_folder(out)
     before = _mask(mask)
     given = None if materials is None else read_materials(materials)
     scene, made_of = load_part(part, _METRES[unit], given, 0.5 if albedo is None else albedo)

@@ -70,7 +70,7 @@ def undistort(
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.camera_file import read_lens
     from gpuvision.host import Device
-    from gpuvision.host.files import check_folder
+    from gpuvision.host.files import check_writable_folder
     from gpuvision.workflows.undistorting import undistort_files
 
     if border is not Border.constant:
@@ -79,7 +79,7 @@ def undistort(
         reason = "for points, only for images"
         reject_unused(reason, interpolation=interpolation, border=border, region=region)
     model = read_lens(lens)
-    check_folder(out)
+    check_writable_folder(out)
     chosen = Device.best() if device is None else Device.named(device)
     part = None if region is None else _region(region)
     with progress_bar("undistorting") as progress:

@@ -18,7 +18,7 @@ import tomli_w
 from gpuvision.camera.camera import COEFFICIENT_NAMES, Camera
 from gpuvision.camera.ground_plane import MountedCamera
 from gpuvision.camera.lens import Lens
-from gpuvision.host.files import replacing
+from gpuvision.host.files import atomic_write
 from gpuvision.schema import Section, read_toml
 
 _UNREAD_TABLES = ("image", "uncertainty", "fit", "mount")
@@ -77,7 +77,7 @@ def write_lens(path: str | Path, model: Lens | Camera, documentation: Mapping[st
         Tables ``image``, ``uncertainty`` and ``fit``, which no reader uses.
     """
     table = {"lens" if isinstance(model, Lens) else "camera": model.to_dict(), **documentation}
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         tomli_w.dump(table, file)
 
 

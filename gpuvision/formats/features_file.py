@@ -10,7 +10,7 @@ from typing import Any, get_args
 import numpy as np
 import tomli_w
 
-from gpuvision.host.files import replacing
+from gpuvision.host.files import atomic_write
 from gpuvision.matching.artwork.artwork import Side
 from gpuvision.matching.features.feature_set import MAX_ROWS, FeatureSet
 from gpuvision.matching.features.fiducials import Fiducials
@@ -65,7 +65,7 @@ def write_features(features: FeatureSet, path: str | Path) -> None:
             for point, radius, hole, sigma in zip(*features.fiducials, strict=True)
         ],
     }
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         tomli_w.dump(table, file)
 
 

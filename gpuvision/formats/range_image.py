@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
-from gpuvision.host.files import replacing
+from gpuvision.host.files import atomic_write
 from gpuvision.ranging.regrid import Grid
 
 _GRID_KEYS = ("left", "top", "cell_x", "cell_y")
@@ -101,7 +101,7 @@ def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None) -
     cells: dict[str, Any] = (
         {} if grid is None else {"resolution": (_CENTIMETRE / grid.cell_x, _CENTIMETRE / grid.cell_y)}
     )
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         tifffile.imwrite(
             file,
             z,
@@ -173,7 +173,7 @@ def write_png16(
         "Scale": repr(scale),
         **{key: repr(value) for key, value in _grid_table(grid).items()},
     }
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         encoded = image.tobytes()
         file.write(encoded[:_PNG_HEAD])
         for key, value in text.items():
@@ -271,7 +271,7 @@ def write_ply(
         *(f"property {_PLY_TYPES[each.dtype.name]} {name}" for name, each in fields.items()),
         "end_header",
     ]
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
         file.write(vertices.tobytes())
 
@@ -324,7 +324,7 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], units: Ma
     if _UNITS_KEY in arrays or set(units) != set(arrays):
         odd = ", ".join(sorted(set(units) ^ set(arrays))) or _UNITS_KEY
         raise ValueError(f"arrays and units do not belong together: {odd}; expected one unit for every array")
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         held: dict[str, Any] = {**arrays, _UNITS_KEY: np.array(json.dumps(dict(units)))}
         np.savez(file, **held)
 

@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
 from gpuvision.camera.orthographic import BoardView
-from gpuvision.host.files import replacing
+from gpuvision.host.files import atomic_write
 from gpuvision.matching.artwork.artwork import Artwork
 from gpuvision.matching.artwork.shapes import Shape, capsule
 from gpuvision.matching.board.located_board import LocatedBoard
@@ -197,5 +197,5 @@ def _page(size: tuple[float, float]) -> tuple[Figure, Any]:
 
 
 def _write(figure: Figure, path: str | Path) -> None:
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         figure.savefig(file, format="png")

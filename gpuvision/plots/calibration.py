@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gpuvision.camera.calibration import Calibration
-from gpuvision.host.files import replacing
+from gpuvision.host.files import atomic_write
 
 _DPI = 150
 # Length of the arrow of a 98th percentile residual, as a fraction of the image's width.
@@ -44,7 +44,7 @@ def draw_calibration(path: str | Path, calibration: Calibration) -> None:
         axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal")
         axes.set(xlabel="column [px]", ylabel="row [px]")
     figure.suptitle(calibration.summary(), fontsize=9, x=0.01, ha="left")
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         figure.savefig(file, format="png")
 
 

@@ -14,7 +14,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from gpuvision.host.files import replacing
+from gpuvision.host.files import atomic_write
 from gpuvision.matching.field.distance_map import Field
 from gpuvision.matching.field.located_robot import LocatedRobot
 
@@ -43,7 +43,7 @@ def draw_located_robot(path: str | Path, located: LocatedRobot, image: npt.NDArr
     _draw_view(left, located, image)
     _draw_field(right, located)
     figure.suptitle(located.summary(), fontsize=8, x=0.01, ha="left")
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         figure.savefig(file, format="png")
 
 

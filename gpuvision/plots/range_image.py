@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from gpuvision.host import to_numpy
-from gpuvision.host.files import replacing
+from gpuvision.host.files import atomic_write
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.status import Status
 
@@ -425,5 +425,5 @@ class _Page:
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the page as PNG."""
-        with replacing(path) as file:
+        with atomic_write(path) as file:
             self.figure.savefig(file, format="png", dpi=_DPI, facecolor=_PAPER)

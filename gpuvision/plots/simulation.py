@@ -12,7 +12,7 @@ from matplotlib.colors import ListedColormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from gpuvision.host.files import replacing
+from gpuvision.host.files import atomic_write
 from gpuvision.plots.range_image import length_unit, round_length
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution
 
@@ -100,5 +100,5 @@ def _page(title: str) -> tuple[Figure, Any]:
 
 
 def _write(figure: Figure, path: Path) -> None:
-    with replacing(path) as file:
+    with atomic_write(path) as file:
         figure.savefig(file, format="png")

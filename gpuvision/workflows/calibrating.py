@@ -29,7 +29,7 @@ from gpuvision.camera.views.target_views import make_view
 from gpuvision.formats.camera_file import write_lens
 from gpuvision.formats.json import json_tree
 from gpuvision.host.errors import RecordingError
-from gpuvision.host.files import write_whole
+from gpuvision.host.files import write_text_atomic
 from gpuvision.host.recordings import read_image
 from gpuvision.plots.calibration import draw_calibration
 
@@ -182,7 +182,7 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
         raise ValueError("the lines are straight without a lens; no correction is needed, nothing was written")
     # The covariance of parameters that the data do not fix is infinite; json_tree replaces it, since JSON has no
     # infinity.
-    write_whole(path.with_suffix(".json"), json.dumps(json_tree(calibration.report()), indent=1) + "\n")
+    write_text_atomic(path.with_suffix(".json"), json.dumps(json_tree(calibration.report()), indent=1) + "\n")
     draw_calibration(path.with_suffix(".png"), calibration)
     write_lens(
         path,

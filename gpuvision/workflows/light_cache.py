@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from gpuvision.host import Device
 from gpuvision.host.errors import RecordingError
-from gpuvision.host.files import replacing
+from gpuvision.host.files import atomic_write
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import make_light_sheet, make_sensor_view, minimum_sample_power, require_light
@@ -180,7 +180,7 @@ class LightStore:
     def write(self, number: int, content: bytes) -> None:
         """Write the file of a block."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        with replacing(self.path(number)) as file:
+        with atomic_write(self.path(number)) as file:
             file.write(content)
 
     def __iter__(self) -> Iterator[LightBlock]:

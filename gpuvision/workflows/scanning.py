@@ -20,9 +20,9 @@ import numpy.typing as npt
 
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
 from gpuvision.host import Device, Operation, Precision, to_numpy
-from gpuvision.host.files import check_file, whole_folder
+from gpuvision.host.files import atomic_folder, check_writable_file
 from gpuvision.host.pipeline import Pipeline, Policy
-from gpuvision.host.plan import plan
+from gpuvision.host.planning import plan_stream
 from gpuvision.host.recordings import open_recording
 from gpuvision.host.report import StreamReport
 from gpuvision.host.sources import ArraySource, PacedSource, Source
@@ -168,7 +168,7 @@ class Scan:
         OSError
             The folder cannot be written.
         """
-        with whole_folder(folder) as inside:
+        with atomic_folder(folder) as inside:
             start = time.perf_counter()
             z, points = self.heights.z, self.points
             write_tiff(inside / "range_image.tiff", z, self.grid)
@@ -291,7 +291,7 @@ class _DeferredTrace(Trace):
     """
 
     def __init__(self, path: str | Path) -> None:
-        check_file(path)
+        check_writable_file(path)
         super().__init__(path)
 
     def write(self) -> None:
@@ -343,7 +343,7 @@ def _pipeline(
         stream = Pipeline(source, operation, device=device, profile=True, trace=timeline, policy=policy or "block")
         return source, stream
     paced = PacedSource(source, rate)
-    planned = plan(paced, operation, device=device)
+    planned = plan_stream(paced, operation, device=device)
     setup: dict[str, Any] = {"policy": policy or "drop_oldest", "batch": planned.batch, "ring": planned.ring}
     return paced, Pipeline(paced, operation, device=device, profile=True, trace=timeline, **setup)
 

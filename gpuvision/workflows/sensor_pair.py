@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gpuvision.formats.json import json_tree
-from gpuvision.host.files import whole_folder
+from gpuvision.host.files import atomic_folder
 from gpuvision.plots.simulation import draw_causes, draw_errors
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution
 from gpuvision.simulation.errors.recommendations import SensorFusion, attribute_pair_errors, rank_candidates
@@ -109,7 +109,7 @@ class SensorPair:
         """
         self.second.write(Path(folder) / "second")
         both = self.errors["both"]
-        with whole_folder(Path(folder) / "both") as inside:
+        with atomic_folder(Path(folder) / "both") as inside:
             draw_errors(inside / "errors.png", both, "Both sensors")
             draw_causes(inside / "causes.png", both, self.limit, "Both sensors")
             report = {

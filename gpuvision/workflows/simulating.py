@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
 from gpuvision.host import Device
-from gpuvision.host.files import whole_folder
+from gpuvision.host.files import atomic_folder
 from gpuvision.plots.range_image import draw_height_map
 from gpuvision.plots.simulation import draw_causes, draw_errors
 from gpuvision.ranging.range_image import RangePoints, StraightTransport
@@ -159,7 +159,7 @@ class Simulation:
         """
         attribution = self.attribution
         title = self.task.sensor.name or "Simulation"
-        with whole_folder(folder) as inside:
+        with atomic_folder(folder) as inside:
             write_tiff(inside / "range_image.tiff", self.heights.z, self.grid)
             write_png16(inside / "range_image.png", self.heights.z, self.grid)
             write_ply(inside / "range_image.ply", *self.points[:3], _strength(attribution.reading), self.points.status)

@@ -17,7 +17,7 @@ from gpuvision.camera.undistort_image import Border, Interpolation, UndistortIma
 from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.errors import RecordingError
-from gpuvision.host.files import whole_folder
+from gpuvision.host.files import atomic_folder
 from gpuvision.host.recordings import read_image
 
 Progress = Callable[[int, int | None], object]
@@ -71,7 +71,7 @@ def undistort_files(
     if duplicates:
         raise RecordingError(f"several inputs have the name {min(duplicates)}; undistort them into separate folders")
     written = []
-    with whole_folder(out) as folder:
+    with atomic_folder(out) as folder:
         for number, file in enumerate(inputs):
             progress(number, len(inputs))
             if not file.exists():

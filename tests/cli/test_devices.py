@@ -26,14 +26,14 @@ def paper(monkeypatch: pytest.MonkeyPatch) -> Paper:
         listed = []
         for label, reason in reasons.items():
             handle = FakePlatform(f"Platform of {label}", devices=[FakeDevice(f"Name of {label}")]).devices[0]
-            listed.append(discovery.Candidate(label, label, 0, 0, handle, "", None, reason))
+            listed.append(discovery.ProbedDevice(label, label, 0, 0, handle, "", None, reason))
         asked: list[bool] = []
 
-        def candidates(*, probe_again: bool = False) -> tuple[discovery.Candidate, ...]:
+        def probed_devices(*, probe_again: bool = False) -> tuple[discovery.ProbedDevice, ...]:
             asked.append(probe_again)
             return tuple(listed)
 
-        monkeypatch.setattr(discovery, "candidates", candidates)
+        monkeypatch.setattr(discovery, "probed_devices", probed_devices)
         return asked
 
     return install

@@ -27,8 +27,8 @@ def paper(monkeypatch: pytest.MonkeyPatch) -> Paper:
         for label, reason in reasons.items():
             label = label.replace("_", ":")
             handle = FakePlatform(f"Platform of {label}", devices=[FakeDevice(f"Name of {label}")]).devices[0]
-            listed.append(discovery.Candidate(label, label.split(":")[0], 0, 0, handle, "", None, reason))
-        monkeypatch.setattr(discovery, "candidates", lambda: tuple(listed))
+            listed.append(discovery.ProbedDevice(label, label.split(":")[0], 0, 0, handle, "", None, reason))
+        monkeypatch.setattr(discovery, "probed_devices", lambda: tuple(listed))
         monkeypatch.setattr(module, "_open", lambda candidate: candidate.label)
         monkeypatch.delenv(module.VARIABLE, raising=False)
 
@@ -117,7 +117,7 @@ def test_one_device_one_object(device: Device) -> None:
 
 def test_threads_that_open_together_share_a_context(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_opened", {})
-    (listed,) = [each for each in discovery.listing() if each.label == device.label]
+    (listed,) = [each for each in discovery.listed_devices() if each.label == device.label]
     barrier, found = threading.Barrier(4), []
 
     def open_it() -> None:
@@ -160,13 +160,13 @@ def test_second_queue_of_our_context(device: Device) -> None:
 
 def test_taking_over_asks_nothing(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """A handle that the caller owns works or not; other devices are none of its business."""
-    monkeypatch.setattr(discovery, "candidates", lambda: pytest.fail("nothing is to be probed"))
+    monkeypatch.setattr(discovery, "probed_devices", lambda: pytest.fail("nothing is to be probed"))
     context = cl.Context([device.handle])
     assert Device.of(context).label == device.label
 
 
 def test_device_that_the_loader_does_not_list(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(discovery, "listing", tuple)
+    monkeypatch.setattr(discovery, "listed_devices", tuple)
     context = cl.Context([device.handle])
     mine = Device.of(context)
     assert mine.label == mine.kind == device.kind

@@ -19,8 +19,8 @@ Probe = Callable[[int, int], str]
 
 
 def _forget() -> None:
-    discovery.listing.cache_clear()
-    discovery._candidates.cache_clear()
+    discovery.listed_devices.cache_clear()
+    discovery._probed_devices.cache_clear()
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_platforms_of_one_name_are_told_apart(see: Any) -> None:
         FakePlatform(version="3.0", devices=[FakeDevice(driver_version="3.0")]),
         probe=lambda p, d: "cannot compile" if p == 1 else "",
     )
-    good, bad = discovery.candidates()
+    good, bad = discovery.probed_devices()
     assert (good.label, good.healthy, good.platform_index) == ("pocl:0", True, 0)
     assert (bad.label, bad.healthy, bad.reason) == ("pocl:1", False, "cannot compile")
 
@@ -72,7 +72,7 @@ def test_twins_are_each_asked(see: Any) -> None:
     """Two devices that agree in every string may still differ in health: two cards, two installations."""
     twins = FakePlatform("NVIDIA CUDA", vendor="NVIDIA", devices=[FakeDevice(), FakeDevice()])
     asked = see(twins, probe=lambda p, d: "broken" if d == 1 else "")
-    assert [each.healthy for each in discovery.candidates()] == [True, False]
+    assert [each.healthy for each in discovery.probed_devices()] == [True, False]
     assert asked == [(0, 0), (0, 1)]
 
 
@@ -98,48 +98,48 @@ def test_order_of_preference(see: Any) -> None:
     names = ["Oclgrind", "Intel(R) OpenCL", "Other", "Portable Computing Language"]
     gpu = FakePlatform("NVIDIA CUDA", devices=[FakeDevice(type=cl.device_type.GPU)])
     see(*(FakePlatform(name, vendor="") for name in names), gpu)
-    ranked = sorted(discovery.candidates(), key=lambda each: each.rank)
+    ranked = sorted(discovery.probed_devices(), key=lambda each: each.rank)
     assert [each.kind for each in ranked] == ["nvidia", "pocl", "intel", "other", "oclgrind"]
 
 
 def test_inline_device_is_listed_with_the_device_it_belongs_to(see: Any) -> None:
     basic, workers = FakeDevice("basic-cpu"), FakeDevice("pthread-cpu")
     see(FakePlatform(devices=[basic, workers]))
-    (only,) = discovery.candidates()
+    (only,) = discovery.probed_devices()
     assert (only.label, only.handle, only.inline_device, only.device_index) == ("pocl", workers, basic, 1)
     see(FakePlatform(devices=[basic]))
-    (only,) = discovery.candidates()
+    (only,) = discovery.probed_devices()
     assert (only.handle, only.inline_device) == (basic, None), "asked for alone, it is the device"
 
 
 def test_platform_without_devices(see: Any) -> None:
     see(FakePlatform(devices=[]), FakePlatform())
-    (only,) = discovery.candidates()
+    (only,) = discovery.probed_devices()
     assert (only.label, only.platform_index) == ("pocl", 1)
 
 
 def test_verdicts_are_kept_by_driver(see: Any) -> None:
     asked = see(FakePlatform())
-    discovery.candidates()
+    discovery.probed_devices()
     assert asked == [(0, 0)]
     asked = see(FakePlatform())
-    discovery.candidates()
+    discovery.probed_devices()
     assert asked == [], "the verdict is in the cache"
     asked = see(FakePlatform(devices=[FakeDevice(driver_version="1.1")]))
-    discovery.candidates()
+    discovery.probed_devices()
     assert asked == [(0, 0)], "another driver is another question"
 
 
 def test_probing_again_asks_only_the_unhealthy(see: Any) -> None:
     two = FakePlatform(devices=[FakeDevice("good"), FakeDevice("bad")])
     see(two, probe=lambda p, d: "broken" if d == 1 else "")
-    discovery.candidates()
+    discovery.probed_devices()
     asked = see(two)
-    assert [each.healthy for each in discovery.candidates()] == [True, False]
+    assert [each.healthy for each in discovery.probed_devices()] == [True, False]
     assert asked == []
-    assert [each.healthy for each in discovery.candidates(probe_again=True)] == [True, True]
+    assert [each.healthy for each in discovery.probed_devices(probe_again=True)] == [True, True]
     assert asked == [(0, 1)]
-    assert [each.healthy for each in discovery.candidates()] == [True, True], "the better verdict stays"
+    assert [each.healthy for each in discovery.probed_devices()] == [True, True], "the better verdict stays"
 
 
 @pytest.mark.parametrize("content", ["", "{", "[1]", '{"a": 1}', '"text"', "\x00"])
@@ -147,7 +147,7 @@ def test_corrupt_cache_is_asked_anew(see: Any, cache: Path, content: str) -> Non
     cache.mkdir()
     (cache / "devices.json").write_text(content)
     asked = see(FakePlatform())
-    assert discovery.candidates()[0].healthy
+    assert discovery.probed_devices()[0].healthy
     assert asked == [(0, 0)]
     assert list(json.loads((cache / "devices.json").read_text()).values()) == [""]
 
@@ -155,15 +155,15 @@ def test_corrupt_cache_is_asked_anew(see: Any, cache: Path, content: str) -> Non
 def test_unwritable_cache_costs_only_the_question(see: Any, cache: Path) -> None:
     cache.write_text("a file where the folder should be")
     asked = see(FakePlatform())
-    assert discovery.candidates()[0].healthy
+    assert discovery.probed_devices()[0].healthy
     _forget()
-    assert discovery.candidates()[0].healthy
+    assert discovery.probed_devices()[0].healthy
     assert asked == [(0, 0), (0, 0)]
 
 
 def test_no_platform(see: Any) -> None:
     see()
-    assert discovery.candidates() == ()
+    assert discovery.probed_devices() == ()
 
 
 def test_loader_without_platforms(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,10 +185,10 @@ def test_loader_without_platforms(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_advice_for_the_unhealthy(see: Any, driver: str, platform: str, advice: str) -> None:
     device = FakeDevice(driver_version=driver)
     see(FakePlatform(platform, vendor="", devices=[device]), probe=lambda p, d: "unknown target CPU 'generic'")
-    (broken,) = discovery.candidates()
+    (broken,) = discovery.probed_devices()
     assert advice in broken.advice
     see(FakePlatform(platform, vendor="", version="good"))
-    assert discovery.candidates()[0].advice == ""
+    assert discovery.probed_devices()[0].advice == ""
 
 
 @pytest.mark.parametrize(
@@ -215,5 +215,5 @@ def test_probe_in_its_own_process(device: Device, monkeypatch: pytest.MonkeyPatc
     (tmp_path / "gpuvision").mkdir()
     (tmp_path / "gpuvision" / "__init__.py").write_text("raise SystemExit('not the package')")
     monkeypatch.chdir(tmp_path)
-    (listed,) = [each for each in discovery.listing() if each.label == device.label]
+    (listed,) = [each for each in discovery.listed_devices() if each.label == device.label]
     assert discovery._ask_probe(listed.platform_index, listed.device_index) == ""

@@ -19,7 +19,7 @@ def test_a_failure_leaves_what_was_there(tmp_path, old):
     before = sorted(os.listdir(tmp_path))
 
     def write_half() -> None:
-        with files.replacing(path) as file:
+        with files.atomic_write(path) as file:
             file.write(b"half of it")
             assert sorted(os.listdir(tmp_path)) != before
             raise KeyboardInterrupt
@@ -31,7 +31,7 @@ def test_a_failure_leaves_what_was_there(tmp_path, old):
 
 
 def test_a_file_is_as_open_to_others_as_any_new_one(tmp_path):
-    with files.replacing(tmp_path / "a") as file:
+    with files.atomic_write(tmp_path / "a") as file:
         file.write(b"x")
     (tmp_path / "b").write_bytes(b"x")
     assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
@@ -39,20 +39,20 @@ def test_a_file_is_as_open_to_others_as_any_new_one(tmp_path):
 
 def test_written_whole_or_not_at_all(monkeypatch, tmp_path):
     path = tmp_path / "folder" / "file"
-    files.write_whole(path, "old")
+    files.write_text_atomic(path, "old")
 
     def fail(source, target):
         raise OSError("disk full")
 
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
-        files.write_whole(path, "new")
+        files.write_text_atomic(path, "new")
     assert [each.name for each in path.parent.iterdir()] == ["file"]
     assert path.read_text() == "old"
 
 
 def half_way(out: Path) -> None:
-    with files.whole_folder(out) as inside:
+    with files.atomic_folder(out) as inside:
         (inside / "first").write_text("new")
         (inside / "nowhere" / "second").write_text("new")
 
@@ -68,7 +68,7 @@ def test_a_folder_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         half_way(out)
     assert (out / "first").read_text() == "old"
-    with files.whole_folder(out) as inside:
+    with files.atomic_folder(out) as inside:
         (inside / "first").write_text("new")
         (inside / "sub").mkdir()
         (inside / "sub" / "third").write_text("3")
@@ -81,7 +81,7 @@ def test_a_folder_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
 
 
 def two_files(out: Path) -> None:
-    with files.whole_folder(out) as inside:
+    with files.atomic_folder(out) as inside:
         (inside / "first").write_text("new")
         (inside / "sub").mkdir()
         (inside / "sub" / "second").write_text("new")
@@ -101,7 +101,7 @@ def test_a_link_stays_and_leads_to_the_new_file(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "elsewhere" / "file")
     for text in ("a", "b"):
-        files.write_whole(tmp_path / "link", text)
+        files.write_text_atomic(tmp_path / "link", text)
         assert (tmp_path / "link").is_symlink()
         assert (tmp_path / "elsewhere" / "file").read_text() == text
 
@@ -111,7 +111,7 @@ def test_a_pipe_is_written_into(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
-    with files.replacing(pipe) as file:
+    with files.atomic_write(pipe) as file:
         file.write(b"told")
     assert os.read(reader, 10) == b"told"
     os.close(reader)

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from gpuvision.host import Device, StreamError
 from gpuvision.host.pipeline import Pipeline
-from gpuvision.host.plan import plan
-from gpuvision.host.report import Durations
+from gpuvision.host.planning import plan_stream
+from gpuvision.host.report import DurationHistogram
 from gpuvision.host.sources import ArraySource, PacedSource, Source
 from gpuvision.host.trace import Trace
 from streams import READOUT, currents_of
@@ -78,10 +78,10 @@ def test_a_short_stream_is_reported_whole(device: Device) -> None:
 
 @given(st.lists(st.integers(0, 10**12), min_size=1, max_size=300), st.integers(1, 40))
 def test_quantiles_are_right_to_a_hundredth(values: list[int], split: int) -> None:
-    durations = Durations()
+    durations = DurationHistogram()
     for start in range(0, len(values), split):
         durations.add_all(np.array(values[start : start + split]))
-    spread = durations.spread()
+    spread = durations.statistics()
     assert spread.count == len(values)
     assert spread.maximum == pytest.approx(max(values) * 1e-9)
     assert spread.mean == pytest.approx(np.mean(values) * 1e-9, rel=1e-9)
@@ -92,13 +92,13 @@ def test_quantiles_are_right_to_a_hundredth(values: list[int], split: int) -> No
 
 def test_single_durations_count_like_many(rng: np.random.Generator) -> None:
     values = rng.integers(1, 10**6, 5000)
-    one, many = Durations(), Durations()
+    one, many = DurationHistogram(), DurationHistogram()
     for value in values:
         one.add(int(value))
     for part in values.reshape(5, 1000):
         many.add_all(part)
-    assert one.spread() == many.spread()
-    assert one.spread().count == 5000
+    assert one.statistics() == many.statistics()
+    assert one.statistics().count == 5000
 
 
 def test_large_batches_are_thinned_and_their_oldest_frame_counts(device: Device) -> None:
@@ -138,21 +138,21 @@ def frames_source(rate: float | None = None) -> Source:
 
 def test_the_plan_takes_the_smallest_batch_that_keeps_up() -> None:
     measured = {1: (800.0, 1e-3), 2: (1240.0, 1.5e-3), 4: (3000.0, 1.5e-3), 8: (9000.0, 1.6e-3)}
-    chosen = plan(frames_source(1000.0), READOUT, measure=measured.__getitem__)
+    chosen = plan_stream(frames_source(1000.0), READOUT, measure=measured.__getitem__)
     assert chosen.batch == 4  # 1240 frames/s are not 1.25 times the rate
     assert [trial.batch for trial in chosen.trials] == [1, 2, 4]
     assert chosen.trials[-1].latency == pytest.approx(3 / 1000.0 + 1.5e-3)
     assert chosen.ring == 27  # 100 frames of a stall of 0.1 s in batches of 4, the consumer's and the source's
-    assert plan(frames_source(), READOUT, rate=100.0, measure=measured.__getitem__).batch == 1
+    assert plan_stream(frames_source(), READOUT, rate=100.0, measure=measured.__getitem__).batch == 1
     assert json.loads(json.dumps(chosen.to_dict()))["trials"][2]["service_rate"] == 3000.0
 
 
 def test_a_plan_that_fails_says_what_is_possible() -> None:
     measured = {1: (800.0, 1e-3), 2: (1240.0, 1.5e-3), 4: (3000.0, 1.5e-3), 8: (9000.0, 1.6e-3)}
     with pytest.raises(StreamError, match=r"1000 frames/s with a margin of 1\.25 within 2 ms: the fastest, 2 frames"):
-        plan(frames_source(1000.0), READOUT, latency=2e-3, measure=measured.__getitem__)
+        plan_stream(frames_source(1000.0), READOUT, latency=2e-3, measure=measured.__getitem__)
     with pytest.raises(StreamError, match=r"keeps up with 1e\+?06|1000000 frames/s"):
-        plan(frames_source(1e6), READOUT, batches=(1, 2, 4, 8), measure=measured.__getitem__)
+        plan_stream(frames_source(1e6), READOUT, batches=(1, 2, 4, 8), measure=measured.__getitem__)
     asked: list[int] = []
 
     def saturated(batch: int) -> tuple[float, float]:
@@ -160,14 +160,14 @@ def test_a_plan_that_fails_says_what_is_possible() -> None:
         return min(1000.0 * batch, 4000.0), batch / 4000.0
 
     with pytest.raises(StreamError, match="the fastest, 4 frames, does 4000 frames/s"):
-        plan(frames_source(1e6), READOUT, measure=saturated)
+        plan_stream(frames_source(1e6), READOUT, measure=saturated)
     assert asked == [1, 2, 4, 8, 16, 32]  # it gives up when larger batches gain nothing
     with pytest.raises(ValueError, match="rate is None"):
-        plan(frames_source(), READOUT)
+        plan_stream(frames_source(), READOUT)
 
 
 def test_a_measured_plan_runs(device: Device) -> None:
-    chosen = plan(frames_source(10.0), READOUT, device=device)
+    chosen = plan_stream(frames_source(10.0), READOUT, device=device)
     assert chosen.batch == 1
     assert chosen.trials[0].service_rate > 12.5
     source = PacedSource(ArraySource(currents_of(4), 20), 2000.0)

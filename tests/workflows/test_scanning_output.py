@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpuvision.host.files import check_file, check_folder, whole_folder
+from gpuvision.host.files import atomic_folder, check_writable_file, check_writable_folder
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused, currents
@@ -64,7 +64,7 @@ def test_a_folder_that_is_there_needs_nothing_of_the_one_above(shut: Path) -> No
     """A mounted folder is on another file system than the one above it, which may belong to somebody else."""
     out = shut / "out"
     os.mkdir(out)
-    with whole_folder(out) as inside:
+    with atomic_folder(out) as inside:
         assert inside.parent == out
         (inside / "first").write_text("new")
     assert [each.name for each in out.iterdir()] == ["first"]
@@ -89,7 +89,7 @@ def test_what_cannot_be_written_is_known_before_the_scan(plane: Path, shut: Path
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a file system into which nobody can write")
 def test_a_virtual_file_system_takes_nothing() -> None:
     with pytest.raises(OSError, match=r"cannot write into /proc/gpuvision: /proc: "):
-        check_folder("/proc/gpuvision")
+        check_writable_folder("/proc/gpuvision")
 
 
 def test_an_empty_name_is_not_this_folder(plane: Path, tmp_path: Path, run: Any) -> None:
@@ -103,7 +103,7 @@ def test_an_empty_name_is_not_this_folder(plane: Path, tmp_path: Path, run: Any)
         ran = run(*args)
         assert ran.code == 2
         assert "is empty" in ran.err
-    for check in (check_folder, check_file):
+    for check in (check_writable_folder, check_writable_file):
         with pytest.raises(ValueError, match="is empty; give one"):
             check("")
     with pytest.raises(ValueError, match="is empty"):

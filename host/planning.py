@@ -1,4 +1,4 @@
-"""Fit a stream to a sensor: the smallest batch that keeps up with its rate, within the latency that is asked for."""
+"""Choice of the batch size of a stream: the smallest batch that keeps up with the sensor within a latency."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BATCHES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096)
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLimits:
-    """Limits of `plan`.
+    """Limits of `plan_stream`.
 
     Attributes
     ----------
@@ -57,16 +57,16 @@ class PlanLimits:
 
 @dataclass(frozen=True)
 class Trial:
-    """What was measured for a batch size.
+    """Measurement of one batch size.
 
     Attributes
     ----------
     batch : int
     service_rate : float
-        Frames per second when they come without pause.
+        Throughput when frames come without pause [frames/s].
     latency : float
-        From the first frame's arrival to its result: the wait for the batch to fill at the sensor's rate, and the
-        median time of one batch through source, device and consumer [s].
+        Time from the arrival of the first frame to its result [s]: the time in which the batch fills at the sensor's
+        rate, and the median time of one batch through source, device and consumer.
     """
 
     batch: int
@@ -76,15 +76,16 @@ class Trial:
 
 @dataclass(frozen=True)
 class Plan:
-    """How to set up a stream: ``Pipeline(source, operation, batch=plan.batch, ring=plan.ring)``.
+    """Settings of a stream: ``Pipeline(source, operation, batch=plan.batch, ring=plan.ring)``.
 
     Attributes
     ----------
     batch, ring : int
+        Frames per launch, and slots.
     rate : float
-        Of the sensor [frames/s].
+        Frame rate of the sensor [1/s].
     trials : tuple of Trial
-        The last one is the chosen one.
+        Measurements; the last one is that of the chosen batch.
     """
 
     batch: int
@@ -93,11 +94,11 @@ class Plan:
     trials: tuple[Trial, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the plan as what JSON can hold."""
+        """Return the plan as dictionaries, lists and numbers for JSON."""
         return asdict(self)
 
 
-def plan(
+def plan_stream(
     source: Source,
     operation: Operation[Any] | Sequence[Operation[Any] | Step],
     *,
@@ -111,27 +112,28 @@ def plan(
     measure: Callable[[int], tuple[float, float]] | None = None,
     limits: PlanLimits = PlanLimits(),
 ) -> Plan:
-    """Choose batch and ring by measuring on blank frames, before one is taken from the source.
+    """Choose batch size and ring by measurements on blank frames, before the stream reads from the source.
 
     Parameters
     ----------
     source : Source
-        Says shape, dtype, and rate; nothing is read from it.
+        Gives shape, dtype and rate; no frame is read.
     operation : Operation or sequence of Operation and Step
     rate : float, optional
-        Frames per second; the source's own otherwise.
+        Frame rate [1/s]; the rate of the source by default.
     latency : float, optional
-        Longest acceptable time from a frame's arrival to its result, when nothing disturbs the stream [s].
+        Longest acceptable time from the arrival of a frame to its result in an undisturbed stream [s].
     margin : float
-        How many times the sensor's rate the measured service rate must be.
+        Least ratio of the measured service rate to the frame rate.
     stall : float
-        Pause of the machine or the consumer that the ring must hold the frames of [s], within 256 MB.
+        Pause of the machine or the consumer whose frames the ring must hold [s], within ``limits.max_bytes``.
     device, zero_copy
         As for `Pipeline`.
     batches : sequence of int
-        What to try, ascending.
+        Batch sizes to try, ascending.
     measure : callable, optional
-        Takes a batch size, returns service rate [frames/s] and time of one batch [s]; instead of the device.
+        Function that takes a batch size and returns service rate [frames/s] and time of one batch [s]; it replaces the
+        measurement on the device.
     limits : PlanLimits
         Limits of the measurements and of the memory.
 
@@ -142,9 +144,9 @@ def plan(
     Raises
     ------
     ValueError
-        There is no rate to plan for.
+        Neither the source nor the caller gives a rate.
     StreamError
-        No batch keeps up with the rate within the latency; says what the best one does.
+        No batch keeps up with the rate within the latency; the message gives the figures of the fastest batch.
     """
     rate = source.rate if rate is None else rate
     if rate is None or not rate > 0.0:
@@ -160,7 +162,7 @@ def plan(
         service_rate, seconds = measure(batch)
         trials.append(Trial(batch, service_rate, (batch - 1) / rate + seconds))
         if latency is not None and trials[-1].latency > latency:
-            break  # larger ones are only later
+            break  # larger batches have longer latencies
         if service_rate >= margin * rate:
             return Plan(batch, _ring_for(stall, rate, batch, source, limits), rate, tuple(trials))
     asked = f"{rate:.0f} frames/s with a margin of {margin:g}"
@@ -176,7 +178,7 @@ def _too_slow(trials: Sequence[Trial], asked: str) -> StreamError:
 
 
 def _is_gaining(trials: Sequence[Trial], limits: PlanLimits) -> bool:
-    """Say whether the last trials served more than those before: beyond some size a batch is no faster."""
+    """Return whether the last trials were faster than all before: beyond some size a larger batch is not."""
     rates = [trial.service_rate for trial in trials]
     patience = limits.patience
     return len(rates) <= patience or max(rates[-patience:]) > limits.min_gain * max(rates[:-patience])
@@ -187,13 +189,13 @@ def _frame_bytes(source: Source) -> int:
 
 
 def _ring_for(stall: float, rate: float, batch: int, source: Source, limits: PlanLimits) -> int:
-    """Return the slots that hold the frames of a stall, beside the consumer's and the source's."""
+    """Return the number of slots for the frames of a stall, one for the consumer and one for the source."""
     wanted = math.ceil(stall * rate / batch) + 2
     return max(min(wanted, limits.max_bytes // (batch * _frame_bytes(source))), limits.min_ring)
 
 
 class _Measurement:
-    """Runs blank frames through streams of the same make."""
+    """Measurement of batch sizes on streams of blank frames."""
 
     def __init__(
         self, source: Source, operation: Any, device: Device, zero_copy: bool | None, limits: PlanLimits
@@ -206,7 +208,7 @@ class _Measurement:
     def __call__(self, batch: int) -> tuple[float, float]:
         seconds = self._one_by_one(batch)
         batches = max(int(self._limits.trial_seconds / seconds), 2 * self._limits.min_ring)
-        # A shared machine pauses now and then; the best round is what the stream itself can do.
+        # Pauses of a shared machine slow down some of the rounds: the best round measures the stream itself.
         return max(self._unpaused(batch, batches) for _ in range(self._limits.rounds)), seconds
 
     def _unpaused(self, batch: int, batches: int) -> float:
@@ -215,7 +217,7 @@ class _Measurement:
         return stream.run().throughput
 
     def _one_by_one(self, batch: int) -> float:
-        """Return the median time of a batch that finds the stream empty."""
+        """Return the median time of a batch through an empty stream [s]."""
         source = _Stepped(self._blank, batch * self._limits.latency_batches)
         with Pipeline(source, self._operation, batch=batch, ring=2, warm_up=2, **self._setup) as stream:
             for _ in stream:
@@ -224,14 +226,14 @@ class _Measurement:
 
 
 class _Stepped(ArraySource):
-    """Gives the next batch when the one before was delivered."""
+    """Source that gives the next batch after the delivery of the one before."""
 
     def __init__(self, frames: Any, count: int) -> None:
         super().__init__(frames, count)
         self.released = threading.Semaphore(1)
 
     def read_into(self, out: Any, arrived: Any) -> int:
-        """Wait for the consumer, then copy; the frames arrive before they are copied."""
+        """Wait for the consumer, then copy; the arrival time is that before the copy."""
         self.released.acquire()
         now = time.perf_counter_ns()
         count = super().read_into(out, arrived)

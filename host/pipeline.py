@@ -187,8 +187,8 @@ class Pipeline(Generic[R]):
             self._state = "closed"
             source.close()
             raise
-        # The producer takes the slot that was given back last, which is still in the cache. It waits for tokens, of which
-        # there is one per free slot.
+        # The producer takes the slot that was given back last, because it is still in the cache. Each free slot has a
+        # token, for which the producer waits.
         self._free: list[Slot[R]] = []
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._ready: queue.SimpleQueue[Slot[R] | None] = queue.SimpleQueue()

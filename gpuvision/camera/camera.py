@@ -26,6 +26,7 @@ import numpy.typing as npt
 from gpuvision.camera.fold import InvertibleRegion, invertible_region
 from gpuvision.camera.inverse_start import InverseStart
 from gpuvision.camera.newton import determinant, invert_displacement
+from gpuvision.host import Define, flags
 from gpuvision.validation import check_keys, numbers
 
 Matrix = tuple[tuple[float, float, float], ...]
@@ -84,21 +85,20 @@ class Camera:
 
     # ---- kernel tables and defines -------------------------------------------------------------------------
 
-    def defines(self, matrix: npt.ArrayLike | None = None) -> dict[str, int | None]:
+    def defines(self, matrix: npt.ArrayLike | None = None) -> dict[str, Define]:
         """Return the defines of ``kernels/common/camera.h``; ``matrix`` is the camera matrix of the ideal pixels."""
         k = self._radial
-        defines = {
+        return {
             "CAMERA": None,
             "CAMERA_RADIAL": _polynomial_order(k[:3]),
             "CAMERA_RATIONAL": _polynomial_order(k[3:]),
+            **flags(
+                CAMERA_DECENTRED=self._is_decentred,
+                CAMERA_PRISM=any(self._prism[1::2]),
+                CAMERA_TILTED=any(self.distortion[12:]),
+                CAMERA_MATRICES=self._ideal_matrix(matrix) != self.matrix,
+            ),
         }
-        present = {
-            "CAMERA_DECENTRED": self._is_decentred,
-            "CAMERA_PRISM": any(self._prism[1::2]),
-            "CAMERA_TILTED": any(self.distortion[12:]),
-            "CAMERA_MATRICES": self._ideal_matrix(matrix) != self.matrix,
-        }
-        return defines | {name: None for name, is_present in present.items() if is_present}
 
     def packed(
         self, real: npt.DTypeLike, direction: Direction, matrix: npt.ArrayLike | None = None

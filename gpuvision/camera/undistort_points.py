@@ -13,6 +13,7 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.host import (
+    Define,
     Device,
     FloatArray,
     Launch,
@@ -119,7 +120,7 @@ class UndistortPoints(VisionOperation[UndistortedPoints]):
             arguments=[self._packed(build.real), np.uint64(count), np.uint64(work.each)],
         )
 
-    def _model_defines(self, real: np.dtype[Any]) -> dict[str, int | None]:
+    def _model_defines(self, real: np.dtype[Any]) -> dict[str, Define]:
         if isinstance(self.model, Camera):
             steps = {} if self.inverse else {"CAMERA_STEPS": self.model.newton_steps(real)}
             return {**self.model.defines(self.matrix), **steps}

@@ -373,7 +373,7 @@ class RulerEdges(VisionOperation[Edges]):
         }
 
     @staticmethod
-    def _model_defines(model: Lens | Camera) -> dict[str, int | None]:
+    def _model_defines(model: Lens | Camera) -> dict[str, Define]:
         return dict(model.defines() if isinstance(model, Camera) else model.defines)
 
     def _packed_model(self) -> npt.NDArray[Any] | None:

@@ -262,7 +262,7 @@ def test_what_is_refused() -> None:
         Patches.from_scene(room(1.0, 1.0, 1.0), size=0.0)
     with pytest.raises(ValueError, match="no triangles"):
         Patches.from_scene(Scene(np.zeros((0, 3, 3))), size=1.0)
-    with pytest.raises(ValueError, match="which patches"):
+    with pytest.raises(ValueError, match=r"mask \(1,\) of patches, got shape \(2,\)"):
         patches.bisected(np.zeros(2, bool))
 
 

@@ -135,6 +135,29 @@ def test_every_reason_is_told(device, variant):
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize(
+    ("pair", "status"),
+    [
+        ((1000, 4094), Status.OK),
+        ((1000, 4095), Status.SATURATED),
+        ((4095, 1000), Status.SATURATED),
+        ((50, 51), Status.OK),
+        ((51, 49), Status.LOW_SIGNAL),
+    ],
+)
+def test_one_code_at_a_limit_among_good_codes(device, variant, pair, status):
+    """The limits are inclusive for saturation and exclusive for the smallest sum, in a block of good samples too."""
+    codes = np.full((4999, 2), (700, 1300), np.uint16)
+    codes[3001] = pair
+    readout = PsdReadout(strip_length=2.0, saturation=4095.0, minimum_total=100.0, variant=variant)
+    reading = readout(codes, device=device)
+    expected = np.zeros(4999, np.uint8)
+    expected[3001] = status
+    np.testing.assert_array_equal(reading.status, expected)
+    np.testing.assert_array_equal(np.isnan(reading.position), expected != 0)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 def test_a_sum_that_overflows_is_flagged(device, variant, real):
     largest = np.finfo(real).max

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.ranging.psd import ELECTRON, PsdReadout
+from gpuvision.ranging.psd import PsdReadout
 from gpuvision.status import Status
+
+ELECTRON = 1.602176634e-19  # elementary charge [C], exact by definition of the SI
 
 
 @dataclass

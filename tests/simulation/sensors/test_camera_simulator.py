@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from gpuvision.host import Device
-from gpuvision.ranging.psd import ELECTRON
 from gpuvision.ranging.triangulation import SampleAxes
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.readings import height_secant, sheet_point, stack_profiles
@@ -14,6 +13,7 @@ from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
 from lights import camera, camera_view, gaussian, pixel_axes
 
+ELECTRON = 1.602176634e-19  # elementary charge [C], exact by definition of the SI
 PIXEL = 10e-6
 
 

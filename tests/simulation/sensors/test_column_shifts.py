@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from gpuvision.host import Device
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.psd import ELECTRON, PsdReadout
+from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.simulation.scene.material import Material
@@ -31,6 +31,7 @@ from gpuvision.simulation.transport.illumination import LightSheet
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
 
+ELECTRON = 1.602176634e-19  # elementary charge [C], exact by definition of the SI
 PIXEL, PIXELS = 1e-5, 1024
 HALF = 0.5 * PIXELS * PIXEL
 LENS = np.array([0.0, 0.2, 0.2])

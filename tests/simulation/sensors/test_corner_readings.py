@@ -9,7 +9,7 @@ import pytest
 
 from gpuvision.host import Device
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.psd import ELECTRON, PsdReadout
+from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 from gpuvision.simulation.errors.error_attribution import attribute_errors
@@ -28,6 +28,7 @@ from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
 
 MM = 1e-3
+ELECTRON = 1.602176634e-19  # elementary charge [C], exact by definition of the SI
 ALBEDO, PIXEL, ROWS = 0.8, 0.12 * MM, 1024
 # The camera stands at (0, 200, 200) mm and looks at the origin; rows count upwards.
 EYE = np.array([0.0, 0.2, 0.2])

@@ -1,7 +1,7 @@
 # `make demo`, `make test` and `make docs` set up what they need in .venv (see setup.sh); a second call starts at once.
 
 SHELL := /bin/bash
-# CI empties it, to run the slow tests too.
+# CI sets it to the empty string, to include the slow tests.
 PYTEST_ARGS ?= -m "not slow"
 
 .PHONY: demo test lint docs clean
@@ -12,8 +12,8 @@ demo: .venv/ready
 test: .venv/ready-tests
 	.venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
 
-# Type checkers follow neither setuptools' package-dir nor its hook for editable installs. The package is laid out
-# for them in links, as a wheel would install it: no build, no network, and messages lead to the real file.
+# Type checkers do not understand setuptools' package-dir or its import hook for editable installs. Symbolic links in
+# build/lint give the package the layout of an installed wheel, so that messages name the real files.
 lint: .venv/ready-tests
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
@@ -22,8 +22,9 @@ lint: .venv/ready-tests
 	ln -s "$(CURDIR)"/{gpuvision/*,host,kernels,profiling} build/lint/gpuvision
 	cd build/lint && "$(CURDIR)/.venv/bin/mypy" --config-file "$(CURDIR)/pyproject.toml"
 
-# Warnings are errors. Changed examples run, on the best device; the pages are in build/docs. Every page is read anew:
-# Sphinx drops the index entries of the others from the search index.
+# Warnings are errors. Sphinx-gallery runs the examples that changed since the last build, on the best device. The pages
+# are in build/docs. --fresh-env reads every page again: an incremental build would drop the index entries of unchanged
+# pages from the search index.
 docs: .venv/ready-docs
 	.venv/bin/python -m sphinx --fresh-env --fail-on-warning --keep-going --quiet -d build/doctrees docs build/docs
 	@echo "open build/docs/index.html"

@@ -8,8 +8,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")"
 say() { echo "setup: $*"; }
 fail() { echo "setup: $*" >&2; exit 1; }
 
-# The first Python on PATH that really runs, is new enough, and has the modules named: what comes first on PATH may
-# be too old, or lie in a folder that this user may not read.
+# Print the first Python on PATH that runs, is new enough, and has the given modules. The first Python on PATH may be
+# too old, or in a folder that this user cannot read.
 find_python() {
   local name path
   for name in python3 python3.{14,13,12,11}; do

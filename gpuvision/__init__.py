@@ -16,8 +16,8 @@ import lazy_loader
 
 __version__ = "0.2.0"  # the only place: the wheel, the command and the documentation read it here
 
-# In a checkout the packages `host`, `kernels` and `profiling` lie beside this folder; a wheel has them inside it.
-# Extending the search path makes `import gpuvision.host` work when Python starts in the repository's root.
+# In a checkout the packages `host`, `kernels` and `profiling` are siblings of this folder; in a wheel they are inside
+# it. Extending the search path makes `import gpuvision.host` work when Python starts in the repository's root.
 if not os.path.isdir(os.path.join(__path__[0], "host")):
     __path__.append(os.path.dirname(__path__[0]))
 

@@ -6,7 +6,7 @@ import enum
 
 
 class Status(enum.IntFlag):
-    """Bits of the ``status`` array (uint8) that every operation returns beside its values; 0 means a good sample.
+    """Bits of the ``status`` array (uint8) that every operation returns with its values; 0 means a valid sample.
 
     A flagged value is NaN, with exceptions that the docstring of each result names: a sample with ``SATURATED`` or
     ``AMBIGUOUS`` may keep its value.

@@ -23,7 +23,7 @@ SHARED_FLAGS = cl.svm_mem_flags.READ_WRITE | cl.svm_mem_flags.SVM_FINE_GRAIN_BUF
 
 
 class _Shared:
-    """Shared memory as NumPy sees it. The NumPy array keeps this object and so the memory alive."""
+    """NumPy view of shared memory. The NumPy array keeps this object and so the memory alive."""
 
     def __init__(self, array: DeviceArray, memory: cl.SVMPointer) -> None:
         self.memory = memory

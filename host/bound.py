@@ -57,7 +57,8 @@ class Bound(Generic[R]):
         self._launch = launch
         self._computed_specs = {name: spec for name, spec in launch.outputs.items() if spec is not None}
         self._global, self._local = launch.global_size, launch.local_size
-        # `Device.wait` with its branch on the runtime resolved here: short calls take a few microseconds in all.
+        # `Device.wait` with its branch on the runtime resolved here: a short call takes only a few microseconds in
+        # total.
         self._wait: Callable[[Any], object] = device.wait if device.kind == "pocl" else cl.Event.wait
         self._empty = not all(launch.global_size)
         self.inputs = tuple(device.empty(shape, dtype, self.queue) for shape, dtype in launch.inputs)
@@ -68,7 +69,8 @@ class Bound(Generic[R]):
         # Indices of the input and output arrays among the kernel's arguments.
         self._places = [*range(len(launch.inputs)), *(place for place, spec in after_inputs if spec is not None)]
         self._own = (*self.inputs, *self._computed(self.outputs))
-        # Intel's runtime searches for the allocation of an SVM pointer at every launch, but not for that of a buffer.
+        # Intel's runtime searches for the allocation of an SVM pointer at every launch, but not for the allocation of a
+        # buffer.
         known = self._own if device.kind == "intel" and device.shares_memory else ()
         self._known = {id(each): _buffer_over(device.context, each) for each in known}
         self._queue_site = self._site_on(self.queue)
@@ -109,7 +111,7 @@ class Bound(Generic[R]):
         Raises
         ------
         TypeError, ValueError
-            Shape, dtype or device of an array differ from those of the instance.
+            Shape, dtype or device of an array differ from the bound shape, dtype or device.
         """
         return self._enqueue(self._own if not frames and out is None else self._given(frames, out), wait_for)
 
@@ -121,7 +123,7 @@ class Bound(Generic[R]):
         return self.outputs if out is None else out
 
     def _given(self, frames: tuple[DeviceArray, ...], out: R | None) -> tuple[Any, ...]:
-        """Return the arrays of a call in the kernel's order; the instance's arrays where none are given."""
+        """Return the arrays of a call in the kernel's order; the instance's arrays if no arrays are given."""
         if out is not None and out is not self.outputs:
             self._check_fields(out)
         return (*(frames or self.inputs), *self._computed(self.outputs if out is None else out))

@@ -52,9 +52,9 @@ def flatten_includes(folder: Path, source: str, include_folders: Sequence[Path] 
     Returns
     -------
     str
-        OpenCL C. ``#line`` directives name the original files, so that compiler messages point into them. A header
-        that includes itself through others is left out at the inner place, where its include guard makes it empty.
-        The line of a header that does not exist stays, for the compiler to report.
+        OpenCL C. ``#line`` directives name the original files, so that compiler messages point into them. A header that
+        includes itself indirectly is omitted at the inner include, where the include guard would make it empty. The
+        line of a header that does not exist stays, for the compiler to report.
     """
     return "".join(_flattened(folder / source, source, (folder, *include_folders), ()))
 
@@ -66,7 +66,7 @@ def _flattened(path: Path, name: str, folders: Sequence[Path], including: tuple[
         if found is None:
             yield f"{line}\n"
             continue
-        # The main file is compiled from memory: only a header is searched beside the including file.
+        # The main file is compiled from memory: only headers are searched in the folder of the including file.
         own = [path.parent] if including else []
         header = next((each / found[1] for each in (*own, *folders) if (each / found[1]).is_file()), None)
         if header is None:
@@ -123,7 +123,7 @@ def dump_arrays(name: str, **values: Any) -> Path | None:
     **values
         NumPy arrays, device arrays (copied to the host), scalars, and named tuples, sequences or mappings of them,
         such as results of operations: the field ``g`` of ``result`` is stored as ``result.g``. Other values and
-        ``None`` are left out.
+        ``None`` are skipped.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""OpenCL devices: the best one, one by name, or the one behind a handle that the caller owns."""
+"""OpenCL devices: selection of the best device, by name, or from a handle that the caller owns."""
 
 from __future__ import annotations
 

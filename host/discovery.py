@@ -29,7 +29,7 @@ INSTALL_HINT = (
     "install one: `apt-get install pocl-opencl-icd` (as root), or `pip install 'gpuvision[cpu]'` "
     "(Intel's CPU runtime, no root needed), or your GPU maker's OpenCL driver"
 )
-# Time-out of the probe's process [s] (chosen): a first build by a driver on a busy machine takes its time.
+# Time-out of the probe's process [s] (chosen): a first build by a driver on a busy machine is slow.
 _PROBE_SECONDS = 120
 _KINDS = {
     "portable computing language": "pocl",
@@ -162,7 +162,7 @@ def _keep_verdicts(fresh: dict[str, str]) -> None:
 
 
 def _ask_probe(platform_index: int, device_index: int) -> str:
-    """Run the probe in a process of its own and return its verdict; a crash or a hang is a verdict, too."""
+    """Run the probe in a separate process and return its verdict; a crash or a hang is also a verdict."""
     # -P keeps a folder named gpuvision in the working directory from hiding the package.
     command = [sys.executable, "-P", "-m", "gpuvision.host.probe", str(platform_index), str(device_index)]
     try:
@@ -185,7 +185,7 @@ def _ask_probe(platform_index: int, device_index: int) -> str:
 
 @functools.cache
 def platforms() -> tuple[Any, ...]:
-    """Return the OpenCL platforms, with Intel's pip-installed runtime; an empty tuple where there are none."""
+    """Return the OpenCL platforms, with Intel's pip-installed runtime; an empty tuple if no platform exists."""
     provide_cache()
     pin_workers()
     expose_installed_runtime()

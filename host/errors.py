@@ -1,4 +1,4 @@
-"""Exceptions of gpuvision; each message says what was wrong, what was expected, and what to do."""
+"""Exceptions of gpuvision; each message states the error, the expected value and a remedy."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ class GpuVisionError(Exception):
 
 
 class NoDeviceError(GpuVisionError):
-    """There is no healthy OpenCL device, or none with the requested name."""
+    """No healthy OpenCL device exists, or no healthy device has the requested name."""
 
 
 class DeviceUnusableError(GpuVisionError):

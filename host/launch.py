@@ -67,7 +67,7 @@ class Launch:
 
 
 def nbytes_of(specs: Iterable[Spec | None]) -> int:
-    """Return the bytes of arrays of these shapes and dtypes; ``None`` counts nothing."""
+    """Return the bytes of arrays of these shapes and dtypes; ``None`` counts as 0 bytes."""
     return sum(math.prod(spec[0]) * spec[1].itemsize for spec in specs if spec is not None)
 
 
@@ -116,7 +116,7 @@ def real_defines(device: Device, real: np.dtype[Any]) -> dict[str, Define]:
 
 
 class Launchable(Protocol):
-    """Operation as a bound instance sees it: a result type, a kernel folder, and a description of the launch."""
+    """Interface of an operation to a bound instance: result type, kernel folder, and description of the launch."""
 
     Result: ClassVar[type[Any]]
     kernel_folder: ClassVar[Path | None]

@@ -183,7 +183,7 @@ class LaunchBuilder:
         more_inputs : sequence of (shape, dtype)
             Inputs after the first one.
         defines : mapping
-            Macros besides those of the real type and of the kernel variant.
+            Macros in addition to the macros of the real type and of the kernel variant.
         streams : bool
             Whether the vector variant of the kernel writes past the caches of a CPU (macro ``PAST_CACHES``) when the
             launch moves more bytes than the last cache holds.

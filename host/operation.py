@@ -112,7 +112,8 @@ class Operation(Generic[R]):
         *inputs : numpy.ndarray or pyopencl.array.Array
             C-contiguous arrays, all NumPy arrays or all device arrays.
         device : Device, optional
-            Device to run on; `Device.best` by default. Device arrays run on their own device, in their own queue.
+            Device to run on; `Device.best` by default. Device arrays are processed on the device and in the queue of
+            the array.
         out : Result, optional
             Arrays of the same kind as the inputs to write into; the same object is returned. Fields that the
             operation does not compute are ``None``.
@@ -150,7 +151,7 @@ class Operation(Generic[R]):
         return result
 
     def _bound(self, device: Device, queue: Any, first: HostArray | DeviceArray) -> Bound[R]:
-        """Return this thread's bound instance for a first input; bind a new one where none is kept."""
+        """Return this thread's bound instance for a first input; bind a new instance if no cached instance fits."""
         kept: collections.OrderedDict[Any, Bound[R]] = _kept_bound()
         key = (self, device, queue, first.shape, first.dtype)
         if key not in kept:
@@ -161,7 +162,7 @@ class Operation(Generic[R]):
         return kept[key]
 
 
-# OpenCL kernel objects are not thread-safe: each thread keeps its own bound instances.
+# OpenCL kernel objects are not thread-safe: each thread has separate bound instances.
 _thread = threading.local()
 
 

@@ -1,7 +1,7 @@
 """Streams of frames: source -> upload -> operations -> download -> consumer, over a fixed ring of slots.
 
-A stream has two threads and two queues of slots. The *producer* (a thread of the stream) takes a free slot, lets the
-source fill it, launches its operations, and puts it into the queue of launched slots. The *consumer* (the caller's
+A stream has two threads and two queues of slots. The *producer* (a thread of the stream) takes a free slot, asks the
+source to fill it, launches its operations, and puts it into the queue of launched slots. The *consumer* (the caller's
 thread) takes the oldest launched slot, waits for its device event, and reads the results; its next step gives the slot
 back. Slots carry their events and times, and no frame allocates, compiles or binds anything. Where host and device
 share memory, the source writes the kernel's input and the consumer reads the kernel's output.
@@ -122,7 +122,7 @@ class Pipeline(Generic[R]):
     warm_up : int, optional
         Number of batches at the start that the report leaves out; one per slot by default.
     clock : callable
-        Clock in nanoseconds, the same as that of the source.
+        Clock in nanoseconds, the same clock as the clock of the source.
     limits : PipelineLimits
         Limits of waiting.
 
@@ -299,7 +299,7 @@ class Pipeline(Generic[R]):
                 oldest = self._ready.get_nowait()
             except queue.Empty:  # the consumer has just taken it and given another one back
                 continue
-            assert oldest is not None  # the producer puts None at its end only
+            assert oldest is not None  # the producer puts None only at its end
             oldest.wait()
             self._dropped += oldest.count
             return oldest

@@ -29,7 +29,7 @@ class PlanLimits:
     Attributes
     ----------
     min_ring : int
-        Least number of slots of the ring, also that of the trials. Chosen: one slot each for the source, the device and
+        Least number of slots of the ring, also used in the trials. Chosen: one slot each for the source, the device and
         the consumer, and one spare.
     rounds : int
         Number of throughput measurements of a batch size, of which the best one counts. Chosen: pauses of a shared
@@ -63,7 +63,7 @@ class Trial:
     ----------
     batch : int
     service_rate : float
-        Throughput when frames come without pause [frames/s].
+        Throughput when frames arrive without pause [frames/s].
     latency : float
         Time from the arrival of the first frame to its result [s]: the time in which the batch fills at the sensor's
         rate, and the median time of one batch through source, device and consumer.
@@ -85,7 +85,7 @@ class Plan:
     rate : float
         Frame rate of the sensor [1/s].
     trials : tuple of Trial
-        Measurements; the last one is that of the chosen batch.
+        Measurements; the last one measured the chosen batch.
     """
 
     batch: int
@@ -226,7 +226,7 @@ class _Measurement:
 
 
 class _Stepped(ArraySource):
-    """Source that gives the next batch after the delivery of the one before."""
+    """Source that gives the next batch after the delivery of the previous batch."""
 
     def __init__(self, frames: Any, count: int) -> None:
         super().__init__(frames, count)

@@ -1,4 +1,4 @@
-"""Probe of a device: build, launch and check a kernel in a process of its own.
+"""Probe of a device: build, launch and check a kernel in a separate process.
 
 A runtime may list a device and then fail every build, compute wrong results, or abort the process. Run as
 ``python -m gpuvision.host.probe PLATFORM DEVICE``, an abort ends this process only. Prints one line of JSON.

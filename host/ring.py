@@ -176,7 +176,7 @@ class Slot(Generic[R]):
 
 
 class SharedSlot(Slot[R]):
-    """Slot in memory that host and device share: nothing is copied."""
+    """Slot in memory that host and device share, without copies."""
 
     def _host_side(self) -> tuple[HostArray, R]:
         return host_view(self._first.inputs[0]), map_arrays(self._outputs, host_view)

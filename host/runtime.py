@@ -1,8 +1,9 @@
 """Settings of the OpenCL runtimes before the first platform query.
 
-Intel's CPU runtime comes as two wheels (``intel-opencl-rt``, ``intel-cmplr-lib-rt``) that install bare libraries and
-register nothing: the loader reads ``/etc/OpenCL/vendors``, where only root may write. `expose_installed_runtime` makes
-a folder with the system's entries and one for the wheel, and names it in ``OCL_ICD_VENDORS``.
+Intel's CPU runtime comes as two wheels (``intel-opencl-rt``, ``intel-cmplr-lib-rt``) that install bare libraries and do
+not register them with the ICD loader: the loader reads ``/etc/OpenCL/vendors``, where only root may write.
+`expose_installed_runtime` makes a folder with the system's entries and one for the wheel, and names it in
+``OCL_ICD_VENDORS``.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def pin_workers() -> None:
 
 
 def request_inline_device() -> None:
-    """Make PoCL list its inline device, which runs kernels in the calling thread, beside the one with worker threads.
+    """Make PoCL also list its inline device, which runs kernels in the calling thread instead of worker threads.
 
     Waking a worker thread takes longer than computing a small frame. The function does nothing where the user has set
     ``POCL_DEVICES``, and where a PoCL of another series than 3 is installed: other series use other device names, and

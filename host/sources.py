@@ -100,7 +100,8 @@ class ArraySource(Source):
     ----------
     frames : (frames, ...) array
     count : int, optional
-        Number of frames to give; a number above that of the array repeats its frames. Default: each frame once.
+        Number of frames to give; a larger number than the length of the array repeats its frames. Default: each frame
+        once.
     clock : callable
         Clock in nanoseconds.
 
@@ -160,7 +161,7 @@ class FrameSource(Source):
         if self._error is None:
             try:
                 return self._ready()
-            except Exception as error:  # kept: a generator that has raised only reports its end afterwards
+            except Exception as error:  # stored, because a generator that has raised reports only its end afterwards
                 self._error = error
         raise self._error
 
@@ -171,7 +172,7 @@ class FrameSource(Source):
                 if not self.wait():
                     return filled
                 self._decode(out[filled])
-            except Exception as error:  # decoders and cameras raise anything; the frames before are good
+            except Exception as error:  # decoders raise any exception; the previous frames are valid
                 self._error = error
                 if not filled:
                     raise
@@ -235,7 +236,7 @@ class IteratedSource(FrameSource):
             frame = next(self._iterator)
         except StopIteration:
             return None
-        except Exception as error:  # drivers of cameras raise anything
+        except Exception as error:  # camera drivers raise exceptions of any type
             name = type(error).__name__
             raise RecordingError(f"frame {self._number} did not come: {name}: {error}".rstrip(": ")) from error
         if not isinstance(frame, np.ndarray):
@@ -260,7 +261,7 @@ class PacedSource(Source):
     """Frames of another source at the rate of a clock: frame k is due at ``start + k / rate``, without drift.
 
     With a repeating `ArraySource` it is a synthetic sensor. The arrival time of a frame is the time at which a waiting
-    reader wakes, or the due time where the reader comes late.
+    reader wakes, or the due time if the reader is late.
 
     Parameters
     ----------

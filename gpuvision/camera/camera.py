@@ -63,10 +63,10 @@ class Camera:
 
     Notes
     -----
-    The lens terms fold the plane where the determinant of their Jacobian vanishes. Ideal points past the fold, seen
-    from the centre, have no measured point. Measured points outside the image of the region before the fold have no
-    ideal point. Both directions return NaN there. Elsewhere ``distort(undistort(p))`` equals p up to rounding; the
-    inverse magnifies rounding errors by 1 / det.
+    The lens terms fold the plane where the determinant of their Jacobian vanishes. Ideal points beyond the fold
+    (counted from the centre) have no measured point. Measured points outside the image of the region before the fold
+    have no ideal point. Both directions return NaN there. Elsewhere ``distort(undistort(p))`` equals p up to rounding;
+    the inverse magnifies rounding errors by 1 / det.
 
     References
     ----------
@@ -374,7 +374,7 @@ class Camera:
         return np.array(self.matrix), np.array(self.distortion)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the camera as a table of numbers and lists for TOML; coefficients by name, zeros left out."""
+        """Return the camera as a table of numbers and lists for TOML; coefficients by name, without zeros."""
         named = {name: value for name, value in zip(COEFFICIENT_NAMES, self.distortion, strict=True) if value != 0.0}
         return {"matrix": [list(row) for row in self.matrix], **named}
 

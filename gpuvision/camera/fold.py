@@ -44,8 +44,8 @@ def invertible_region(radial: Sequence[float], tangential: Sequence[float], pris
     terms = np.array([*radial, *tangential, *prism])
     with np.errstate(divide="ignore", over="ignore"):
         radii = np.abs(terms) ** (-1.0 / _ORDERS)
-    # Drop terms that reach 1 beyond the search radius only: they would spoil the polynomials' conditioning. The unit of
-    # length is the smallest radius at which one of the other terms reaches 1.
+    # Drop terms that reach 1 only beyond the search radius: they would degrade the conditioning of the polynomials. The
+    # unit of length is the smallest radius at which one of the other terms reaches 1.
     terms = np.where(radii < _FARTHEST, terms, 0.0)
     unit = min(float(radii.min()), _FARTHEST)
     k, p, s = np.split(terms * unit**_ORDERS, [6, 8])
@@ -98,7 +98,7 @@ def _in_radius(terms: Any) -> Float64:
 def _along_ray(over: Float64, under: Float64, p: Float64, s: Float64, c: float, d: float) -> Any:
     """Return the determinant along the ray (c, d), times the denominator to the power 4, as a polynomial in the radius.
 
-    The terms are those of kernels/common/camera.h, each multiplied by the squared denominator.
+    The terms match kernels/common/camera.h, each multiplied by the squared denominator.
     """
     add, mul = polynomial.polyadd, polynomial.polymul
     square = _in_radius(mul(under, under))

@@ -31,7 +31,7 @@ _CUBIC_TOLERANCE = 1e-5
 _ON_PIXEL = 1e-6
 # Positions are clamped to this magnitude [px]: the largest range of integers that a float holds exactly.
 _FARTHEST = 2.0**24
-# Rows packed at a time, so that the intermediate arrays fit into the caches.
+# Rows packed in one pass, so that the intermediate arrays fit into the caches.
 _ROWS_AT_ONCE = 32
 
 
@@ -163,7 +163,7 @@ class Packer:
         window = fits & inside & (self.channels * spans <= _LOADED - self.channels + 1) & (intervals_y <= _MAX_BANDS)
         last = (row + intervals_y - 1 + after) * columns + column + starts.max(axis=0) + after
         window &= self.channels * last + np.where(wide, _LOADED, _NARROW_SPAN) <= self.channels * rows * columns
-        # Single precision may round an offset up to the next pixel; in a window that is held back.
+        # Single precision may round an offset up to the next pixel; inside a window the offset is clamped.
         roomy = inside & (column + intervals_x + after < columns) & (row + intervals_y + after < rows)
         what = np.where(
             window, _WINDOW + _WIDE * wide + _BANDED * (intervals_y > 1), np.where(roomy, _SCATTERED, _POINTS)

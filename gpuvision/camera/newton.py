@@ -39,7 +39,7 @@ def invert_displacement(displacement: Displacement, moved: Float64) -> Float64:
     The iteration starts at the origin, so that the first step leads to the given point itself. A step that leaves the
     invertible region or does not reduce the residual is halved. The unknown is the negative displacement: it is small
     against the point, so its rounding error is small. A point is found if its residual or its next step is at rounding
-    level. For points past the fold the iteration ends at the fold, where neither holds.
+    level. For points past the fold the iteration ends at the fold, where both conditions fail.
     """
     target = moved.reshape(-1, 2)
     correction, step = -target, target.copy()

@@ -300,7 +300,7 @@ def _least_squares(design: Float64, values: Float64, sigma: float | None) -> tup
 
 
 def _substitute(powers: Float64, origin: Float64, unit: Float64) -> Float64:
-    """Rewrite coefficients (..., 4, 4) of c^i r^j for c = origin + unit x, r likewise."""
+    """Rewrite coefficients (..., 4, 4) of c^i r^j for c = origin + unit x and r = origin + unit y."""
     along, across = (
         np.array([[comb(i, k) * o ** (i - k) * u**k if k <= i else 0.0 for k in range(4)] for i in range(4)])
         for o, u in zip(origin, unit, strict=True)
@@ -309,7 +309,7 @@ def _substitute(powers: Float64, origin: Float64, unit: Float64) -> Float64:
 
 
 def _in_sensor_units(values: Float64, middle: Float64, half: Float64, axis: int) -> tuple[float, ...]:
-    """Convert coefficients over conditioned coordinates to those of eq. 3.6 (axis 0) or 3.7 (axis 1)."""
+    """Convert coefficients over conditioned coordinates to the coefficients of eq. 3.6 (axis 0) or 3.7 (axis 1)."""
     powers = np.zeros((4, 4))
     order = [(i, j) if axis == 0 else (j, i) for i, j in _TERMS]
     for place, value in zip(order, values, strict=True):

@@ -43,7 +43,7 @@ _BORDERS = {
 }
 # Samples of a frame: indices into frames and maps are 32-bit int on the device.
 _LARGEST_FRAME = 2**30
-# Rows of a map computed at a time: the intermediate arrays of a camera model then fit into the caches.
+# Rows of a map computed in one pass, so that the intermediate arrays of a camera model fit into the caches.
 _ROWS_AT_ONCE = 32
 # Columns and rows of a work-group; one work-item computes one pixel.
 _GROUP = (32, 4)

@@ -183,7 +183,7 @@ def _show(done: Calibration, to_stderr: bool) -> None:
 
 
 def _digits(value: float, error: float) -> int:
-    """Return the number of significant digits to print: those above the uncertainty, and one more."""
+    """Return the number of significant digits to print: one more than the digits above the uncertainty."""
     if not 0.0 < error < math.inf or value == 0.0:
         return 6
     return min(max(math.ceil(math.log10(abs(value) / error)) + 2, 2), 10)

@@ -24,7 +24,7 @@ Float64 = npt.NDArray[np.float64]
 
 _DPI = 150
 _LAMINATE, _COPPER, _OPEN, _SILK, _HOLE = "#1f3d2b", "#4f8a5b", "#d9b75f", "#f4f4f0", "#111111"
-# The colours differ in lightness too, for colour-blind readers.
+# The colours also differ in lightness, for colour-blind readers.
 _USED, _REJECTED, _MISSING, _ARTWORK = "#00e5ff", "#ff9f1c", "#ff3366", "#ffe14d"
 _MM = 1e3
 

@@ -48,7 +48,7 @@ def draw_located_robot(path: str | Path, located: LocatedRobot, image: npt.NDArr
 
 
 def _draw_view(axes: Axes, located: LocatedRobot, image: npt.NDArray[Any] | None) -> None:
-    """Draw the robot's frame: the image, its points, and the field's lines as seen from the best candidate."""
+    """Draw the robot's frame: the image, its points, and the field lines transformed by the best candidate."""
     reach = float(np.abs(located.points).max()) * 1.05 if len(located.points) else 1.0
     axes.set_facecolor(_CARPET if image is None else "black")
     if image is not None and located.scale is not None:

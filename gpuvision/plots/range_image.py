@@ -43,7 +43,7 @@ _AMBIENT, _FLAT = 0.3, 0.95
 _MAX_SLOPE = 4.0  # steeper slopes are clipped before smoothing, so that a cliff does not darken its surroundings
 _SHOWN_SLOPE = 0.33  # slope after exaggeration, chosen by eye: 90 % of the slopes stay below it
 _GREY = 0.78  # brightness of a flat surface in the grey relief
-# Status flag, colour, text. A cell with several flags gets the first: rare and severe flags come before common ones.
+# Status flag, colour, text. A cell with several flags gets the first: rare and severe flags precede common flags.
 _REASONS = (
     (Status.NO_DATA, "#cbd5e1", "hole: no measurement within the gap limit"),
     (Status.NOT_INVERTIBLE, "#e0218a", "folded: two surfaces share a cell"),
@@ -54,7 +54,7 @@ _REASONS = (
     (Status.SATURATED, "#bcbd22", "saturated"),
     (Status.LOW_SIGNAL, "#4b5563", "low signal: below the threshold"),
 )
-# Cells with these flags may have a height, which is shown with a tint. SATURATED needs none: its heights are valid.
+# Cells with these flags may have a height, which is shown with a tint. SATURATED has no tint: its heights are valid.
 _TINTED = Status.NOT_INVERTIBLE | Status.AMBIGUOUS
 _TINT = 0.45  # weight of the tint
 _LENGTHS = ((1e-6, "µm"), (1e-3, "mm"), (1.0, "m"), (1e3, "km"))

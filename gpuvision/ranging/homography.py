@@ -1,7 +1,7 @@
 """Plane-to-plane homographies between sensor and sheet of light: a nested family of models, their fit and F tests.
 
 The models map the sheet to the sensor, ``(u, v, 1) ~ N (G, H, 1)``, because the noise of a calibration is on the sensor
-coordinates. Each model fixes some elements of N at 0; the inverse of N has as many zeros, see
+coordinates. Each model fixes some elements of N at 0; the inverse of N has the same number of zeros, see
 `homography_from_constants`.
 
 - C3: ``u = (a H + b)/(c H + 1)``. A single beam: only u and H.
@@ -9,7 +9,7 @@ coordinates. Each model fixes some elements of N at 0; the inverse of N has as m
   ``H = (C1 u + C2)/(u + C3)``, ``G = C4 v/(u + C3)``.
 - D6: also ``v = (d G + e H + f)/(c H + 1)``. Sensor and sheet are offset along the profile, and the profile axis is not
   perpendicular to the measuring axis; H still depends on u alone.
-- H8: all elements. Any pinhole sensor and any sheet; if the sensor is rolled about its axis, H depends on v too.
+- H8: all elements. Any pinhole sensor and any sheet; if the sensor is rolled about its axis, H also depends on v.
 
 The thesis lists C1-C4 and D1-D6 among its symbols without their equations. The equations are derived here: C4 is the
 only model with four constants for a symmetric setup. D6 is its smallest extension by offsets that keeps H independent
@@ -63,7 +63,7 @@ class HomographyLimits:
     ----------
     rank_tolerance : float
         Singular values and denominators below this fraction of the largest one count as 0. Chosen: well above the
-        rounding of float64 (2e-16), well below those of a setup that can be built.
+        rounding of float64 (2e-16), well below the values of a setup that can be built.
     residual_rounding : float
         Residuals below this fraction of the largest coordinate are rounding errors, which an F test must not compare.
         Chosen: 64 roundings of float64.
@@ -142,7 +142,7 @@ def to_displacement(
 ) -> Float64:
     """Return the displacement parameters of a homography: value at the centre, gradients, and denominator.
 
-    They are (g0, gx, gy, h0, hx, hy, dx, dy) of ``G = g0 + (gx x + gy y)/(1 + dx x + dy y)``, and likewise for H.
+    They are (g0, gx, gy, h0, hx, hy, dx, dy) of ``G = g0 + (gx x + gy y)/(1 + dx x + dy y)``, and the same form for H.
 
     Parameters
     ----------
@@ -503,7 +503,7 @@ def _fit_model(data: _Calibration, model: Model, frame: Float64, rank_tolerance:
 
 
 def _conditioning(points: Float64, fixed: tuple[float | None, float | None]) -> Float64:
-    """Return the matrix that maps coordinates in -1 to 1 to those of the points; a fixed origin keeps a symmetry."""
+    """Return the matrix from normalised coordinates (-1 to 1) to points; a fixed origin preserves a symmetry."""
     origin = [np.mean(column) if value is None else value for column, value in zip(points.T, fixed, strict=True)]
     unit = np.max(np.abs(points - origin), axis=0)
     return shift_and_scale(origin, np.where(unit > 0.0, unit, 1.0))
@@ -524,7 +524,7 @@ def _direct_linear(
         equations[:, row] = points
         equations[:, 2] = -x[:, row, None] * points
         blocks.append(equations[:, free])
-    # With one equation less than elements, the row of zeros makes the decomposition return the null vector too.
+    # With one equation fewer than elements, a row of zeros makes the decomposition also return the null vector.
     blocks.append(np.zeros((1, np.count_nonzero(free))))
     _, values, vectors = np.linalg.svd(np.concatenate(blocks), full_matrices=False)
     if values[np.count_nonzero(free) - 2] <= rank_tolerance * values[0]:
@@ -541,7 +541,7 @@ def _invert_model(
 ) -> tuple[Float64, Float64]:
     """Return the homography from sensor to sheet, and its derivatives (p, 3, 3) by the p parameters of N."""
     if model == "C3":
-        # A single beam does not determine v: any nonzero element makes N invertible, and G is set to that of the
+        # A single beam does not determine v: any nonzero element makes N invertible, and G is set to the G of the
         # points.
         matrix = matrix.copy()
         matrix[1, 0] = 1.0

@@ -63,7 +63,7 @@ class LineReading(NamedTuple):
     status
         uint8 `Status` flags, 0 where the position is good. The position is NaN under:
 
-        - LOW_SIGNAL: no peak meets the minimum level and the width limits, or the samples beside the peak have too
+        - LOW_SIGNAL: no peak meets the minimum level and the width limits, or the neighbours of the peak have too
           little light for the method.
         - OUT_OF_RANGE: the image border cuts the window, or cuts a flat top wider than the window. For ``"centroid"``:
           the first or last sample has at least half of the peak's light.
@@ -75,7 +75,7 @@ class LineReading(NamedTuple):
         - AMBIGUOUS: a second peak is comparable, a flat top is wider than the window, or the fit did not converge and
           the middle of the flat top or the centroid is returned.
 
-        HORIZON and NOT_INVERTIBLE come from the triangulation and make only ``g`` and ``h`` NaN.
+        HORIZON and NOT_INVERTIBLE are set by the triangulation and make only ``g`` and ``h`` NaN.
     g, h
         Point in the sheet of light [m], if the readout has a triangulation.
     """
@@ -157,7 +157,7 @@ class LineReadout(VisionOperation[LineReading]):
     Notes
     -----
     Error: integer samples are summed exactly. The rounding errors of float32 sums are kept in a second number
-    (compensated summation). The position has an error of a few roundings of its own size.
+    (compensated summation). The rounding error of the position is a few ulp.
 
     References
     ----------
@@ -296,7 +296,7 @@ class LineReadout(VisionOperation[LineReading]):
 
     def _fits_strip(self, rows: int, columns: int, dtype: np.dtype[Any]) -> bool:
         if self._has_candidates:
-            # Along rows both variants read one profile at a time; dark parts of it are skipped in vectors of samples.
+            # Along rows, both variants process one profile after the other and skip dark parts in vectors of samples.
             return self.along == "columns" and columns >= _LANES
         return columns >= _WIDE_BYTES // dtype.itemsize and (self.along == "columns" or rows >= _LANES)
 

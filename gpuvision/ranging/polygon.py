@@ -7,7 +7,7 @@ the hit point to the surface and phi the rotation, 0 where the facet lies at 45 
     x_h = R (1 + sin(psi)/sqrt(2)) / cos(psi),  psi = phi - pi/4
     x = x_h(phi) - x_h(0) + D tan(2 phi)
 
-The difference ``x_h(phi) - x_h(0)`` comes from the motion of the hit point; it makes the scan asymmetric in second
+The difference ``x_h(phi) - x_h(0)`` is due to the motion of the hit point; it makes the scan asymmetric in second
 order.
 
 References

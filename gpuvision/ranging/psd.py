@@ -48,7 +48,7 @@ class PsdReading(NamedTuple):
         Sum of both currents, after dark level and gain correction [A].
     status
         uint8 `Status` flags: LOW_SIGNAL (total not above the minimum), SATURATED (either channel), OUT_OF_RANGE (beyond
-        the ends of the strip), NOT_FINITE (a current is NaN or infinite). HORIZON and NOT_INVERTIBLE come from the
+        the ends of the strip), NOT_FINITE (a current is NaN or infinite). HORIZON and NOT_INVERTIBLE are set by the
         triangulation.
     sigma
         Predicted standard deviation of the position [m].
@@ -253,7 +253,7 @@ class PsdReadout(VisionOperation[PsdReading]):
         many = samples >= _STRIPS_PER_CORE * _LONG_STRIP * device.compute_units
         each = _LONG_STRIP if many else _SHORT_STRIP
         if build.uses_vectors and samples >= _LANES:
-            # The last work-item takes the remainder too.
+            # The last work-item also processes the remainder.
             work = WorkSize((max(samples // each, 1),), (1,), each, vectors=True)
         else:
             work = WorkSize((samples,), None, each)

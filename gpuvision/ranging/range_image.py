@@ -3,7 +3,7 @@
 The sheet moves over the scene in one of two ways:
 
 - `StraightTransport`: the scene moves past a fixed sensor (conveyor belt, linear stage). A profile is a row of points
-  (G, H) in the sheet of light; the transport L comes from an encoder or has a uniform step.
+  (G, H) in the sheet of light; the transport L is read from an encoder or has a uniform step.
 - `RotatingSheet`: camera and scene are fixed, the sheet turns about an axis (rotating mirror, motor). A profile is a
 row
   of line positions in the camera image; the transport is the angle of the sheet.
@@ -207,7 +207,7 @@ class StraightTransport:
 
 @dataclass(frozen=True, kw_only=True)
 class RotatingSheet:
-    """Sheet of light that turns about an axis, seen by a fixed camera.
+    """Sheet of light that rotates about an axis, in view of a fixed camera.
 
     Camera frame: x right, y down, z forward, pinhole at 0. At angle 0 the sheet is the plane
     ``sheet_normal . (X - axis_point) = sheet_offset``; it turns right-handed about the axis. With n the turned normal,

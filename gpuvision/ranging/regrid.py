@@ -1,9 +1,9 @@
 """Resampling of an organised range image (point cloud) to a height map over regular cells in x and y.
 
 A range scan samples a surface at irregular places (F. de Jong, Figure 2.5), while standard image processing needs
-regular cells. Resampling runs twice: along the samples of every profile, where the other coordinate is interpolated
-too, and then along the profiles. Interpolation between neighbours is linear. Holes remain holes, and height steps
-remain steps.
+regular cells. Resampling runs twice: along the samples of every profile, where the other coordinate is also
+interpolated, and then along the profiles. Interpolation between neighbours is linear. Holes remain holes, and height
+steps remain steps.
 """
 
 from __future__ import annotations
@@ -356,7 +356,7 @@ class _Pass(VisionOperation[R]):
     def _resample(
         self, build: LaunchBuilder, lines: int, made: tuple[int, int], counts: RegridCounts, *, carries: bool
     ) -> Launch:
-        """Describe the launch that resamples lines; `carries`: interpolate the other coordinate too.
+        """Describe the launch that resamples lines; `carries`: also interpolate the other coordinate.
 
         Parameters
         ----------
@@ -382,7 +382,7 @@ class _Pass(VisionOperation[R]):
 
 @dataclass(frozen=True, kw_only=True)
 class _AlongSamples(_Pass[_Lines]):
-    """First pass: a line is a profile; the other coordinate is interpolated too."""
+    """First pass: a line is a profile; the other coordinate is also interpolated."""
 
     Result: ClassVar[type[Any]] = _Lines
 

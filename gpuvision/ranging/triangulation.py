@@ -265,9 +265,9 @@ class Triangulation(VisionOperation[SheetPoints]):
     def conditioned(self) -> Float64:
         """(g0, gx, gy, h0, hx, hy, dx, dy) of the displacement form over ``region``.
 
-        ``G = g0 + (gx x + gy y) / (1 + dx x + dy y)``, H likewise. x and y are the undistorted u and v, shifted and
-        scaled to about -1 to 1: ``x = (u - u_middle) / half``, where ``half`` is half of the larger extent of the
-        region.
+        ``G = g0 + (gx x + gy y) / (1 + dx x + dy y)``, and the same form for H. x and y are the undistorted u and v,
+        shifted and scaled to about -1 to 1: ``x = (u - u_middle) / half``, where ``half`` is half of the larger extent
+        of the region.
         """
         return self._displacement(*self._centre_and_half_extent())
 
@@ -549,7 +549,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         return cls(homography=rows, model=model, **more)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers, strings and lists, as in a TOML file; parameters that are None are left out."""
+        """Return plain numbers, strings and lists, as in a TOML file; parameters that are None are omitted."""
         table: dict[str, Any] = {"homography": [list(row) for row in self.homography]}
         table["region"] = [list(bounds) for bounds in self.region]
         table |= {"model": self.model, "along": self.along, "horizon": self.horizon}

@@ -61,7 +61,7 @@ def make_light_sheet(sensor: Sensor) -> LightSheet:
     Returns
     -------
     LightSheet
-        Power [W], thickness sigma [m] and limits [m] are those of the table ``[light]``.
+        Power [W], thickness sigma [m] and limits [m] are read from the table ``[light]``.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Prediction of what a sensor will measure, and where it will be wrong."""
+"""Prediction of the measurements of a sensor, and of their errors."""

@@ -37,7 +37,7 @@ class ProfileLight(NamedTuple):
     truth
         True position of the lit line, (samples,).
     statistics
-        Numbers by name: segments, power [W], and the pairs and paths that were modelled or left out, with their bounds.
+        Numbers by name: segments, power [W], and the pairs and paths that were modelled or omitted, with their bounds.
     """
 
     exposures: dict[str, Exposure]
@@ -61,8 +61,8 @@ class LightPaths:
         after a diffuse surface), "diffuse-diffuse" (two diffuse reflections), "multi-bounce" (three or more, by
         radiosity). Without "direct" there is no reading.
     sub_sheets
-        Number of thin sheets that represent a thick one on the direct path, 1 or more. Secondary light comes from the
-        middle of the sheet: the sheet is thin as seen from other surfaces.
+        Number of thin sheets that represent a thick one on the direct path, 1 or more. Secondary light is emitted from
+        the middle of the sheet: for other surfaces the sheet is thin.
     blur
         Standard deviation of the image of a point along u [sensor unit]. It is not applied to diffuse secondary light,
         which varies slowly.
@@ -71,7 +71,7 @@ class LightPaths:
     patch_size
         Largest edge of the patches of the radiosity solution [m]; None: a sixteenth of the scene's diagonal.
     tolerance
-        Range error that the secondary light left out may make [m], 0 or more; 0: nothing is left out. See the notes.
+        Range error that omitted secondary light may cause [m], 0 or more; 0: all light is computed. See the notes.
     min_power
         Power of a sample below which it is not read [W].
     device
@@ -90,8 +90,8 @@ class LightPaths:
     Notes
     -----
     The tolerance holds for a reading that is the mean of u over the light of a sample (a PSD, or a centroid in a fixed
-    window), and covers pairs of a segment and a receiver that are left out or clustered (`LightClustering`) and
-    "multi-bounce" light that is left out. At most half of it is spent on the latter. It does not cover the
+    window), and covers pairs of a segment and a receiver that are omitted or clustered (`LightClustering`), and omitted
+    "multi-bounce" light. At most half of the tolerance is spent on "multi-bounce" light. It does not cover the
     discretisation of the surface, of the sheet and of the patches, nor rounding, nor light paths that are not modelled.
 
     The bound of multi-bounce light assumes diffuse reflection with the scene's largest albedo, and the solid angle of
@@ -192,7 +192,7 @@ class LightPaths:
     # ---- secondary light -------------------------------------------------------------------------------------
 
     def _multi_bounce_exposure(self, seen: VisibleSurface, segments: LitSegments) -> Exposure:
-        assert self._radiosity is not None  # asked for
+        assert self._radiosity is not None  # the path is requested
         exitance = self._radiosity.solve(self._radiosity.direct_irradiance(segments))
         light = self._radiosity.irradiance(seen.receivers, exitance)
         return self.view_rays.exposure(seen, np.asarray(to_numpy(light.irradiance), np.float64))
@@ -219,7 +219,7 @@ class LightPaths:
     def _diffuse_irradiance(
         self, seen: VisibleSurface, segments: LitSegments, reading: StripErrorModel, tolerance: float
     ) -> tuple[Float64, dict[str, float]]:
-        """Return the irradiance of the seen surface by lit segments, and numbers of the pairs that were modelled."""
+        """Return the irradiance of the visible surface by lit segments, and the counts of the modelled pairs."""
         if tolerance == 0.0:
             pairs = float(len(segments.exitance) * np.count_nonzero(seen.weights))
             return self.irradiance(seen, segments), {"pairs": pairs, "pairs exact": pairs}
@@ -232,7 +232,7 @@ class LightPaths:
         return light, {"pairs": float(cut.counts["pairs"])} | counts | bound
 
     def irradiance(self, seen: VisibleSurface, segments: LitSegments) -> Float64:
-        """Return the irradiance of the seen surface by all pairs with lit segments, (samples, n) [W/m^2].
+        """Return the irradiance of the visible surface by all pairs with lit segments, (samples, n) [W/m^2].
 
         Parameters
         ----------

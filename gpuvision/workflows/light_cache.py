@@ -68,7 +68,7 @@ class SimulationTask:
     paths
         Light paths, out of `gpuvision.simulation.sensors.readings.PATHS`.
     tolerance
-        Range error that light which is left out may make [m]; 0: nothing is left out.
+        Range error that omitted light may cause [m]; 0: all light is computed.
     """
 
     part: Scene
@@ -86,7 +86,7 @@ class SimulationTask:
         length = readout.strip_length if isinstance(readout, PsdReadout) else readout.along
         optics = [readout.triangulation, readout.axes, length, sensor.transport, sensor.frame]
         light = [getattr(sensor.light, name) for name in _OPTICAL]
-        # The light that may be left out depends on the least readable power, and so on the electronics.
+        # The light that may be omitted depends on the least readable power, which depends on the electronics.
         least = minimum_sample_power(sensor) if self.tolerance > 0.0 else None
         words = repr([version("gpuvision"), self.materials, optics, light, self.paths, self.tolerance, least])
         digest = hashlib.sha256(words.encode())

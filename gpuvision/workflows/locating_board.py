@@ -51,11 +51,11 @@ class LocalizationLimits:
     known_range
         Default search range [m], [rad] with an initial pose (chosen).
     known_range_px
-        The same shift in pixels, where that is more [px] (chosen).
+        The shift as a number of pixels [px]; the larger of the two is used (chosen).
     unknown_range
         Default search range [m], [rad] without an initial pose (chosen).
     ruler_range
-        Largest search range [m], [rad] without a coarse registration: rulers alone reach so far (chosen).
+        Largest search range [m], [rad] without a coarse registration: rulers alone find the board within it (chosen).
     ruler_range_px
         The same shift in pixels, where that is more [px].
     registered_range
@@ -100,10 +100,10 @@ def locate_board(
     Parameters
     ----------
     image
-        Grey or colour (blue, green, red) image, uint8, uint16 or float32; the camera looks at right angles at the
+        Grey or colour (blue, green, red) image, uint8, uint16 or float32; the optical axis is perpendicular to the
         board.
     artwork
-        The side that the camera sees.
+        Artwork of the side that faces the camera.
     scale
         Size of a pixel on the board [m].
     initial_pose
@@ -112,7 +112,7 @@ def locate_board(
     search_range
         Largest offset of the board from the expected pose, along x and along y [m], and largest angle [rad]. None: 0.1
         mm (or 4 pixels) and 0.3 degrees; without ``initial_pose`` 2 mm and 5 degrees; the range of the features where
-        they are given. Beyond 0.25 mm (or 10 pixels) or 1 degree a coarse registration comes first.
+        they are given. Beyond 0.25 mm (or 10 pixels) or 1 degree a coarse registration is done first.
     features
         Features to measure, with their search range. None: fiducials, and as many rulers as the budget allows, are
         selected now.
@@ -129,7 +129,8 @@ def locate_board(
     noise
         Standard deviation of a pixel [grey levels]; None: estimated from the image.
     copper
-        Whether copper is "bright" or "dark" relative to its surroundings; "auto": what more rulers agree with.
+        Whether copper is "bright" or "dark" relative to its surroundings; "auto": the polarity with more agreeing
+        rulers.
     device
         Where to run; None: `Device.best`.
     limits

@@ -85,8 +85,8 @@ def locate_robot(
     Parameters
     ----------
     points
-        float32 (points, 2) in the robot's frame: x ahead, y to its left [m]; or the result of `scan_floor`: then lines
-        that should be seen and are missing count too.
+        float32 (points, 2) in the robot's frame: x ahead, y to its left [m]; or the result of `scan_floor`: then
+        expected lines that are missing also count.
     field
         The field.
     initial_pose
@@ -128,7 +128,7 @@ def locate_robot(
         reason = f"{len(used)} points on lines, expected {limits.min_points} or more"
         return LocatedRobot(candidates=(), doubtful=(), evidence=None, reason=reason, seconds={}, **kept)
     size = max(field.length, field.width)
-    cost_scale = min(0.25, 0.02 * size)  # [m], that of `DistanceMap` in a field of 20 m
+    cost_scale = min(0.25, 0.02 * size)  # [m], the value of `DistanceMap` for a field of 20 m
     margin = 0.05 * size if margin is None else margin
     max_range = min(float(np.hypot(*used.T).max()) * 1.001 + cost_scale, 1.5 * size)
     field_map = DistanceMap(
@@ -170,7 +170,7 @@ def _usable(points: Float32) -> Float32:
 def _order(
     found: tuple[PoseCandidate, ...], weights: list[Evidence], max_candidates: int
 ) -> tuple[tuple[PoseCandidate, ...], list[Evidence]]:
-    """Return candidates by how little is missing that they would show; of those that are alike in that, by score."""
+    """Return candidates sorted by their share of missing expected lines, then by score."""
     order = sorted(range(len(found)), key=lambda number: (round(max(weights[number].missing, 0.0), 1), number))[
         :max_candidates
     ]
@@ -245,7 +245,7 @@ def scan_floor(
 ) -> FloorScan:
     """Find the centres of white stripes on the floor, along rays from the robot's place.
 
-    Through a tilted camera, lines across the rays are scanned too.
+    Through a tilted camera, lines across the rays are also scanned.
 
     Parameters
     ----------

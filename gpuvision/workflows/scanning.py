@@ -1,7 +1,7 @@
 """Scan of a recording: range image, height map, files and a report.
 
 The frames stream through the readout (`gpuvision.host.pipeline`). The profiles are then assembled to a range image and
-resampled to a height map (`gpuvision.ranging`). `Scan.write` writes the files: all of them, or none after an error.
+resampled to a height map (`gpuvision.ranging`). `Scan.write` writes all files, or no file after an error.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ class Scan:
         }
 
     def write(self, folder: str | Path) -> None:
-        """Write the range image, pictures and the report into a folder; after an error none of the files is left.
+        """Write the range image, pictures and the report into a folder; after an error no file remains.
 
         ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` show the height map. ``range_image.ply``
         and ``scan.png`` show the organised points. ``range_image.npz`` holds both. ``report.json`` holds the report.
@@ -295,7 +295,7 @@ class _DeferredTrace(Trace):
         super().__init__(path)
 
     def write(self) -> None:
-        """Do nothing: the end of the stream is before the end of the scan."""
+        """Ignore the end of the stream: the scan ends later."""
 
     def write_file(self) -> None:
         """Write the file."""

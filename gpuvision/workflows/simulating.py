@@ -208,8 +208,8 @@ def prepare_simulation(
     paths
         Light paths, out of `gpuvision.simulation.sensors.readings.PATHS`; "direct" is required.
     tolerance
-        Range error that light which is left out may make [m], 0 or more; 0: nothing is left out. See `LightPaths` for
-        the errors that it covers.
+        Range error that omitted light may cause [m], 0 or more; 0: nothing is left out. See `LightPaths` for the errors
+        that it covers.
     profiles
         Number of profiles, about the middle of the part; None: all profiles that meet the part.
     transports

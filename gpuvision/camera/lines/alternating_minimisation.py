@@ -191,7 +191,7 @@ def minimise_alternating(packed: PackedLines, order: int, solver: str, *, max_ro
 
 
 def _fit_vanishing_points(objective: _Objective, lens: Float64, points: Float64) -> Float64:
-    """Estimate the vanishing points one by one: the distances of a family depend on its own point only."""
+    """Estimate the vanishing points one by one: a family's distances depend on no other vanishing point."""
     points = points.copy()
     for number in range(len(points)):
 

@@ -21,7 +21,7 @@ _MARGIN = (1.0, 4.0)
 # sizes].
 _BACKGROUND_BOX = 0.25
 _DOT_BOX = 0.5
-# Pixels processed at a time (memory only).
+# Pixels processed in one pass; limits the memory only.
 _CHUNK_PIXELS = 1 << 17
 
 

@@ -41,7 +41,7 @@ _LEAST_BLUR = 0.5
 _ITERATIONS = 20
 _SETTLED = 1e-4
 _SINGULAR = 1e-9
-# Pixels processed at a time (memory only).
+# Pixels processed in one pass; limits the memory only.
 _CHUNK_PIXELS = 1 << 17
 
 
@@ -235,7 +235,7 @@ def _foerstner_points(slope: list[Float32], start: Float64, to_steps: Float64, r
         s, t = (to_steps[:, k, 0, None, None] * dx + to_steps[:, k, 1, None, None] * dy for k in (0, 1))
         window = np.maximum(1.0 - (s / _WINDOW) ** 2, 0.0) * np.maximum(1.0 - (t / _WINDOW) ** 2, 0.0)
         normal = _window_sums(window * xx, window * xy, window * xy, window * yy).reshape(-1, 2, 2)
-        # The regularisation keeps the point fixed if all edges are parallel, or if the window has none.
+        # The regularisation keeps the point fixed if all edges are parallel, or if the window has no edge.
         normal += (_SINGULAR * np.trace(normal, axis1=1, axis2=2) + np.finfo(float).tiny)[:, None, None] * np.eye(2)
         right = _window_sums(window * (xx * dx + xy * dy), window * (xy * dx + yy * dy))
         move = np.linalg.solve(normal, right[..., None])[..., 0]
@@ -254,8 +254,7 @@ def _window_sums(*parts: Float64) -> Float64:
 def _find_saddles(grey: Float32, limits: ChessboardLimits) -> tuple[Float64, Float64]:
     """Return saddle points (n, 2) of the blurred image [whole px], and unit vectors (n, 2) at twice their angle."""
     smooth = cv2.GaussianBlur(grey, (0, 0), _BLUR)
-    # The Sobel kernels scale the pure second derivatives by 4, and the mixed one likewise: one scale of 0.25 serves
-    # all.
+    # The Sobel kernels scale all second derivatives, pure and mixed, by 4: a scale of 0.25 corrects all.
     xx, xy, yy = (cv2.Sobel(smooth, cv2.CV_32F, *orders, ksize=3, scale=0.25) for orders in ((2, 0), (1, 1), (0, 2)))
     strength = xy * xy - xx * yy
     reach = 2 * math.ceil(_BLUR) + 1

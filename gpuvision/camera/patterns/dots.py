@@ -116,7 +116,8 @@ def _agrees_with_neighbours(found: Centroids, model: GridPolynomial, limits: Dot
     u, v = model.derivative(1, 0), model.derivative(0, 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         sound = agrees_with_grid(found.points, limits.max_deviation_medians, limits.min_position_tolerance)
-        # Area, width and height of a disc over those of its grid cell are about the same everywhere.
+        # The ratios of a disc's area, width and height to the area, width and height of its grid cell are nearly
+        # constant over the image.
         disc = np.stack([found.dot_area / np.abs(cross(u, v)), *np.moveaxis(found.variance / (u**2 + v**2), -1, 0)])
         for each in disc:
             change = np.abs(np.log(each / _neighbourhood_median(each)))

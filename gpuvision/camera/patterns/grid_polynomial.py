@@ -76,7 +76,7 @@ def agrees_with_grid(points: Float64, max_medians: float, min_tolerance: float) 
         distance = np.nan_to_num(_distance_from_prediction(rest))
         if distance.any():
             limit = max(limit, max_medians * float(np.median(distance[distance > 0.0])))
-        # An outlier spoils the predictions of its neighbours: remove the worst point of a neighbourhood first.
+        # An outlier distorts the predictions of its neighbours: remove the worst point of a neighbourhood first.
         worst = (distance > limit) & (last | (distance == maximum_filter(distance, _NEIGHBOURHOOD)))
         good &= ~worst
         rest[worst] = np.nan

@@ -25,7 +25,7 @@ _ACROSS = 1.5
 _ALONG = 0.7
 # Coverage below which a sample counts as background, as for dots: noise of the background gets no weight.
 _BACKGROUND_COVER = 0.2
-# Samples processed at a time (memory only).
+# Samples processed in one pass; limits the memory only.
 _CHUNK_SAMPLES = 1 << 18
 
 

@@ -1,9 +1,9 @@
 """Tilt and focal length of a Scheimpflug camera with a known lens.
 
-The lens (distortion and centre) is known, for example from vanishing points. Undistorted points are those of the
+The lens (distortion and centre) is known, for example from vanishing points. Undistorted points are image points of the
 virtual pinhole camera (fig. 3.3), whose principal point lies at a distance f' sin(alpha) from the centre, in the
 direction of the tilt. For a known direction one view of a flat target determines alpha and f' by linear equations in f'
-sin(alpha) and f'^2. The pose comes from the first stage of Tsai's method. Both are refined together.
+sin(alpha) and f'^2. The pose is computed by the first stage of Tsai's method. Both are refined together.
 
 Limits: The lens model is radial in the sensor plane. The distortion of a real lens is radial in the plane of the lens;
 the difference increases with tilt and distortion. `fit_camera` with ``model="tilt"`` applies distortion and tilt in the

@@ -287,7 +287,7 @@ def _starting_state(task: _Task, free_parameters: FreeParameters, f: float, aspe
 
 
 def _fit_from_starts(task: _Task, model: str) -> _Candidate:
-    """Fit a model; try further starts until the residual is close to that of free homographies."""
+    """Fit a model; try further starts until the residual is close to the residual of free homographies."""
     free_parameters = task.free_parameters(model)
     best: _Candidate | None = None
     for start in _starting_states(task, free_parameters):
@@ -317,7 +317,7 @@ def _minimise_loss(task: _Task, candidate: _Candidate) -> _Candidate:
         loss = loss._replace(scale=robust_scale(task.views, state))
         if abs(loss.scale - used.scale) <= _SAME_SCALE * used.scale:
             break
-    # The cost is that of the last scale used.
+    # The cost belongs to the last scale that was used.
     return replace(candidate, state=state, loss=used)
 
 

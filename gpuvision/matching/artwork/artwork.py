@@ -1,8 +1,8 @@
-"""Artwork of a board from its Gerber and Excellon files: measurable edges and pads, and what may hide them.
+"""Artwork of a board from its Gerber and Excellon files: measurable edges and pads, and the areas that may hide them.
 
-Positions are in metres in the files' frame, x to the right and y up as the board is seen from its *top*. The bottom
-side is in the same frame (seen through the board), so that a camera below sees a mirror image of it. gerbonara reads
-RS-274X with and without the attributes of X2, and Excellon.
+Positions are in metres in the files' frame, x to the right and y up in a view of the *top* side. The bottom side is in
+the same frame (seen through the board), so that a camera below sees a mirror image of it. gerbonara reads RS-274X with
+and without the attributes of X2, and Excellon.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ _CONCENTRIC = 50e-6
 # Least mask opening of a fiducial in diameters: IPC-7351 requires 2 or more; a component pad's opening is about 0.1 mm
 # larger than the pad.
 _FIDUCIAL_OPENING = 1.5
-# Least area over that of the enclosing circle: a polygon of 16 corners has 0.974, one of 24 has 0.989.
+# Least ratio of the area to the area of the enclosing circle: a polygon of 16 corners has 0.974, one of 24 has 0.989.
 _ROUND_AREA = 0.985
-_RECTANGLE_AREA = 0.995  # least area over that of the enclosing rectangle
+_RECTANGLE_AREA = 0.995  # least ratio of the area to the area of the enclosing rectangle
 
 
 class Holes(NamedTuple):
@@ -73,7 +73,7 @@ class Pad:
     centre : (2,)
         Centre of the bounding box [m].
     size : (2,)
-        Extent along its own axes [m], of the smallest rectangle around it; of a circle twice the diameter.
+        Side lengths of the smallest enclosing rectangle [m]; for a circle twice the diameter.
     angle
         Angle of its first axis [rad], in [0, pi/2); 0 for a circle.
     outline : (n, 2)
@@ -381,7 +381,7 @@ def _counter_clockwise(outline: Float64) -> Float64:
 
 
 def _described(outline: Float64) -> tuple[Literal["circle", "rectangle", "other"], Float64, float]:
-    """Return shape, size along its own axes, and angle, from the smallest enclosing rectangle.
+    """Return shape, size and angle, from the smallest enclosing rectangle.
 
     One side of that rectangle lies on a side of the convex hull.
     """

@@ -14,8 +14,8 @@ from gpuvision.matching.artwork.shapes import SAGITTA, Crossings, DrawnObject, F
 # Lines are equal where their angle [rad], distance from the origin and width [m] round to the same multiple of this
 # number. It is not a decimal fraction, so that the lengths in files never lie between two multiples.
 _QUANTUM = math.pi * 1e-8
-_CLOSE = 2 * SAGITTA  # distance of the lines along which the copper beside an edge is checked [m]
-_MIN_LENGTH = 100e-6  # of an edge [m]: a ruler of five lines at 20 um
+_CLOSE = 2 * SAGITTA  # distance from an edge of the lines on which the copper is checked [m]
+_MIN_LENGTH = 100e-6  # least length of an edge [m]: a ruler of five lines at 20 um
 
 
 class BoardEdges(NamedTuple):

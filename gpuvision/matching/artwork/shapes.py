@@ -19,7 +19,7 @@ Crossings = list[tuple[bool, Float64]]
 
 SAGITTA = 0.5e-6
 """Largest distance [m] between an arc and the chord that stands for it."""
-_METRE = 1e-3  # per unit: all calls of gerbonara ask for millimetres
+_METRE = 1e-3  # all calls of gerbonara use millimetres
 _UNSUPPORTED_MACROS = {6: "moiré", 7: "thermal"}  # gerbonara 1.5 reads them and cannot draw them
 
 
@@ -71,7 +71,7 @@ class DrawnObject:
 
     @cached_property
     def bounds(self) -> Float64:
-        """(2, 2) least and greatest x, y [m] of the added areas (of all areas where none is added)."""
+        """(2, 2) least and greatest x, y [m] of the added areas (of all areas if no area is added)."""
         dark = [each.outline for each in self.shapes if each.dark] or [each.outline for each in self.shapes]
         points = np.concatenate(dark)
         return np.stack([points.min(axis=0), points.max(axis=0)])
@@ -105,7 +105,7 @@ class Layer:
     def crossings(self, start: Float64, end: Float64) -> Crossings:
         """Return the shapes near a segment, in drawing order: whether dark, and where the infinite line crosses them.
 
-        A shape is near where its bounding box meets that of the segment.
+        A shape is near if its bounding box overlaps the bounding box of the segment.
 
         Parameters
         ----------

@@ -29,7 +29,7 @@ from gpuvision.status import Status
 Copper = Literal["auto", "bright", "dark"]
 Float64 = npt.NDArray[np.float64]
 
-_MAX_SEARCH_PX = 190.0  # of fiducials: their rulers fit `MAX_LENGTH` samples
+_MAX_SEARCH_PX = 190.0  # largest search range of fiducials: their rulers fit into `MAX_LENGTH` samples
 # Start candidates of the robust pose: with 50 % outliers all four rows of a candidate are good often enough, so that
 # all candidates contain an outlier on 7 of 1e8 boards (derived).
 _TRIALS = 256
@@ -71,7 +71,7 @@ class MeasurementLimits:
 
 
 class RulerMeasurements(NamedTuple):
-    """Measurements of calipers (rulers), (n, ...); pixels are those of the undistorted image.
+    """Measurements of calipers (rulers), (n, ...); pixel coordinates refer to the undistorted image.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ class PoseSolution(NamedTuple):
 
 
 class BoardMeasurement(NamedTuple):
-    """Result of two passes, or of one that was refused: the camera's pose after and before the last pass."""
+    """Result of two passes, or of a refused first pass: the camera's pose after and before the last pass."""
 
     view: BoardView
     before: BoardView
@@ -215,7 +215,7 @@ class BoardMeasurer:
     def _measure_once(
         self, view: BoardView, copper: Copper, length_px: Float64, search_range: tuple[float, float] | None = None
     ) -> PoseSolution:
-        """Measure all features at one view and solve the pose; the search range [m], [rad] is that of a first pass."""
+        """Measure all features at one view and solve the pose; the search range [m], [rad] applies to a first pass."""
         rulers = self._measure_rulers(view, copper, length_px)
         fiducials = self._find_fiducials(view, copper, is_first=search_range is not None)
         what = "rulers and fiducials" if len(fiducials.in_image) else "rulers"
@@ -271,7 +271,8 @@ class BoardMeasurer:
         status = np.zeros(count, np.uint8)
         spacing_px = features.spacing / view.scale
         smoothing = best_smoothing(self.blur_px)
-        # One length for all, a multiple of 16: every other length would be another build of the kernel.
+        # All rulers have the same length, a multiple of 16: every further length would need another build of the
+        # kernel.
         longest = max(float(length_px.max(initial=0.0)), 2 * math.ceil(3 * smoothing) + 3)
         length = min(16 * math.ceil(longest / 16), MAX_LENGTH)
         for low, high in _group_spacings(spacing_px):
@@ -407,7 +408,7 @@ def _about_origin(pose: Float64, point: Float64) -> Float64:
 
 
 def move_view(view: BoardView, pose: npt.ArrayLike) -> BoardView:
-    """Return the view of the camera over a board that is seen moved by a pose of its artwork: q = R p + t."""
+    """Return the view of the camera over a board whose artwork is moved by a pose: q = R p + t."""
     x, y, theta = (float(each) for each in np.asarray(pose, np.float64))
     c, s = math.cos(theta), math.sin(theta)
     off = np.array(view.pose[:2]) - (x, y)

@@ -32,7 +32,7 @@ class LocatedBoard:
     covariance : (3, 3)
         Covariance of the pose's x, y [m] and theta [rad]; NaN where the pose is refused.
     placement, placement_px : (2,)
-        Placement point in the artwork [m], and where it is seen in the measured image [px].
+        Placement point in the artwork [m], and its position in the measured image [px].
     placement_covariance : (3, 3)
         Covariance of the board's position at the placement point, x, y [m], and of theta [rad].
     rulers
@@ -40,7 +40,7 @@ class LocatedBoard:
     fiducials
         `FoundFiducials` of the last pass.
     features
-        Features that were looked for.
+        Features that were searched.
     etch_bias
         Distance by which copper reaches beyond its drawn edges [m], negative for over-etched copper, solved together
         with the pose; NaN where only centres of traces and fiducials were measured.
@@ -55,9 +55,9 @@ class LocatedBoard:
     reason
         Why the pose is refused; ``""`` where it is accepted.
     coarse_registration
-        Result of the coarse registration; None where none was needed.
+        Result of the coarse registration; None if it was not needed.
     device
-        Where it ran.
+        Device of the computation.
     seconds
         Duration of each step, by name [s].
     """

@@ -1,4 +1,4 @@
-"""Choice of rulers and fiducials that a camera sees at an expected pose over a board."""
+"""Selection of the rulers and fiducials in view of a camera at an expected pose over a board."""
 
 from __future__ import annotations
 
@@ -16,24 +16,22 @@ from gpuvision.matching.features.ruler import MAX_LENGTH
 
 # Candidates of a view; with more expected, five windows of the view are examined instead of the whole (cost).
 _USUAL_CANDIDATES = 2500
-_MAX_FIDUCIALS = 40  # cost of the first pass
+_MAX_FIDUCIALS = 40  # number of rulers of the first pass (cost)
 
 
 def select_features_in_view(artwork: Artwork, view: BoardView, imaging: Imaging, budget: float = 60) -> FeatureSet:
-    """Select rulers and fiducials that lie in the image wherever the board is within ``imaging.shift``.
+    """Select rulers and fiducials that lie in the image at every board position within ``imaging.shift``.
 
     In a view with thousands of candidates, rulers are taken from five windows of it only: its corners and its centre.
 
     Parameters
     ----------
     artwork
-        The side that the camera sees.
-    view
-        Expected pose of the camera over the board.
+        The side in view of the camera. view Expected pose of the camera over the board.
     imaging
         Image quality and search range.
     budget
-        Number of rulers, default 60; fiducials come in addition.
+        Number of rulers, default 60; fiducials are selected in addition.
 
     Raises
     ------

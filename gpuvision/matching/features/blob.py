@@ -84,7 +84,7 @@ class Blobs(NamedTuple):
     distance : float32
         Distance from the expected place [px].
     contrast : float32
-        Grey level of the blob minus that of its background.
+        Grey level of the blob minus the grey level of its background.
     blur : float32
         Standard deviation of the edges' blur [px]; without ``match`` the blur of bilinear sampling (0.4 px on average)
         is included.
@@ -172,7 +172,7 @@ class FindBlobs(VisionOperation[Blobs]):
     -----
     The fit starts from the shape, through three edges, that most edges agree with. Gauss-Newton with Tukey's weights
     follows; the range of accepted edges shrinks to the scale of the residuals (from their median). In every pass, edges
-    farther than the search distance from the *expected* contour are left out, so that the fit cannot drift to another
+    farther than the search distance from the *expected* contour are excluded, so that the fit cannot drift to another
     blob.
 
     The match has these unknowns: centre, size and angle, blur, contrast, and level and slopes of the background. It
@@ -182,10 +182,10 @@ class FindBlobs(VisionOperation[Blobs]):
     deviation is 1.0 to 1.25 times the Cramer-Rao bound of a disc on a known background, and the radius is right to 0.01
     px. A blur over a third of the radius makes the radius undetermined.
 
-    To second order, a blurred edge of radius R is measured at sqrt(R^2 - v), with v the variance of the blur plus that
-    of the averaged lines: the mean of sqrt(R^2 - u^2) over the position u across the ruler. The fit corrects the radius
-    by it, with the mean blur of the blob's own edges. The match uses the profile of a blurred disc, to first order in
-    blur over radius.
+    To second order, a blurred edge of radius R is measured at sqrt(R^2 - v), with v the variance of the blur plus the
+    variance of the averaged lines: the mean of sqrt(R^2 - u^2) over the position u across the ruler. The fit corrects
+    the radius by it, with the mean blur of the blob's own edges. The match uses the profile of a blurred disc, to first
+    order in blur over radius.
 
     References
     ----------
@@ -291,9 +291,9 @@ class FindBlobs(VisionOperation[Blobs]):
     def _table(self, edges: Launch) -> npt.NDArray[Any]:
         """Return the table of ``ruler.h`` with the smoothing's variance as it acts on the maximum of an edge.
 
-        The filter is cut at three standard deviations, which reduces its own variance, but not the curvature at the
-        maximum. With the filter's variance, the curvature correction would take the difference for blur. The value is
-        exact for the blur whose best smoothing this is.
+        The filter is cut at three standard deviations, which reduces the variance of the filter, but not the curvature
+        at the maximum. With the filter's variance, the curvature correction would take the difference for blur. The
+        value is exact for the blur whose best smoothing this is.
         """
         table = np.array(edges.arguments[0])
         taps, blur = table[len(RulerTable._fields) :].astype(np.float64), self.smoothing_px / math.sqrt(5.0)
@@ -327,7 +327,8 @@ class FindBlobs(VisionOperation[Blobs]):
 
     def _overlap(self) -> float:
         """Return the size of a blob below which neighbouring rulers share pixels, and so their noise."""
-        # Bilinear lines share noise with their neighbours: the average of `width` lines has the noise of this many.
+        # Neighbouring lines share noise through the bilinear interpolation: the average of `width` lines has the noise
+        # of this number of independent lines.
         lines = self.width**2 / (self.width - 1.0 / 3.0)
         return self.spokes * lines / self._contour()
 

@@ -69,9 +69,9 @@ def find_ruler_candidates(
 ) -> FeatureCandidates:
     """Return rulers across every edge of a region, side by side, and across both edges of traces.
 
-    The whole width of a ruler stays on the edge wherever the board is within ``imaging.shift``. The artwork has edges
+    The whole width of a ruler stays on the edge at every board position within ``imaging.shift``. The artwork has edges
     cut where the mask, silk or other copper ends them (its clearance should be ``imaging.registration`` and two blurs,
-    see `edge_clearance`). Edges are left out where another border of copper, ink, a hole or a mask opening is nearer
+    see `edge_clearance`). Edges are excluded where another border of copper, ink, a hole or a mask opening is nearer
     than 3 times the best smoothing plus ``registration``: it would shift the measurement. All rulers may have the
     length of the longest.
 
@@ -148,7 +148,7 @@ def _pair_rows(artwork: Artwork, imaging: Imaging) -> list[_Row]:
         opposite = (edges.trace == edges.trace[first]) & (edges.normal @ normal < 0) & (edges.bare == edges.bare[first])
         span = np.sort([0.0, float((edges.end[first] - origin) @ axis)])
         if normal[0] < 0 or (normal[0] == 0 and normal[1] < 0):
-            continue  # its opposite edge comes with the other normal
+            continue  # the opposite edge is a candidate with the other normal
         for second in np.flatnonzero(opposite):
             ends = np.sort([(edges.start[second] - origin) @ axis, (edges.end[second] - origin) @ axis])
             low, high = max(span[0], ends[0]), min(span[1], ends[1])
@@ -161,7 +161,7 @@ def _pair_rows(artwork: Artwork, imaging: Imaging) -> list[_Row]:
 
 
 def _ruler_centres(start: Float64, end: Float64, imaging: Imaging) -> Float64:
-    """Return (k, 2) centres of rulers side by side that stay on an edge wherever the board is."""
+    """Return (k, 2) centres of rulers side by side that stay on an edge at every board position."""
     length = math.dist(start, end)
     width = imaging.width_px * imaging.pixel
     free = length - width - 2 * imaging.shift
@@ -188,7 +188,7 @@ def _is_isolated(layers: tuple[VisibleLayer, ...], row: _Row, imaging: Imaging) 
 
 
 def _ambiguity(layers: tuple[VisibleLayer, ...], point: Float64, normal: Float64, reach: float, found: float) -> float:
-    """Return the probability that another edge of the same sense comes within the range of detection.
+    """Return the probability that another edge of the same polarity lies within the range of detection.
 
     An edge at the distance a from the right one does so where the shift exceeds a minus the range, for shifts equally
     distributed over the search range.

@@ -1,4 +1,4 @@
-"""Feature sets: rulers and fiducials of a board, selected from its artwork before the board is seen.
+"""Feature sets: rulers and fiducials of a board, selected from its artwork before an image is taken.
 
 ``gpuvision select`` writes a feature set and the imaging for which it was selected; ``gpuvision locate --features``
 reads it.
@@ -26,8 +26,8 @@ Float64 = npt.NDArray[np.float64]
 BudgetUnit = Literal["rulers", "px", "us"]
 UNITS: tuple[str, ...] = get_args(BudgetUnit)
 _TIMED_RULERS, _TIMED_CALLS = 256, 20
-_PER_SOURCE = 4  # as in `select_rulers`
-_FREE_COST = 1e-9  # of a free fiducial, relative to the budget: costs must be positive
+_PER_SOURCE = 4  # default of `select_rulers`
+_FREE_COST = 1e-9  # cost of a free fiducial relative to the budget: costs must be positive
 MAX_ROWS = 1000
 """Largest number of rows of one pose: one of a ruler, two of a fiducial (`SolvePose` takes 1024)."""
 
@@ -57,7 +57,7 @@ class FeatureSet:
     condition
         Largest over smallest standard deviation.
     region : (2, 2)
-        Least and greatest x, y [m] that the features sample: what the camera must read.
+        Least and greatest x, y [m] that the features sample: the region that the camera must read.
     fiducials
         Fiducials, vias and other round pads.
     """
@@ -206,7 +206,7 @@ def select_feature_set(
     missing: float = 0.0,
     device: Device | None = None,
 ) -> FeatureSet:
-    """Select among rulers and fiducials; with ``are_free`` the fiducials cost nothing. See `choose_features`."""
+    """Select among rulers and fiducials; with ``are_free`` the fiducials have no cost. See `choose_features`."""
     if unit not in UNITS:
         raise ValueError(f"the budget's unit is {unit!r}, expected one of {', '.join(UNITS)}")
     fiducials = Fiducials.empty() if fiducials is None else fiducials

@@ -1,4 +1,4 @@
-"""Round fiducials of a board: fiducials, vias and other round pads whose copper contour a camera sees."""
+"""Round fiducials of a board: fiducials, vias and other round pads with a visible copper contour."""
 
 from __future__ import annotations
 
@@ -73,9 +73,10 @@ def select_fiducials(
 ) -> Fiducials:
     """Return round pads of a region whose contour is visible for three quarters or more, with free space around it.
 
-    Inside the contour there is only copper, or a concentric hole far enough from it. Outside lies bare laminate, or
-    laminate under the mask where the pad is under the mask too; pads that a mask opening cuts, or that lie near the
-    edge of one, are left out. Where another round pad is so near that the two may be confused, both are left out.
+    Inside the contour there is only copper, or a concentric hole far enough from it. The surroundings are bare
+    laminate, or laminate under the mask if the pad is also under the mask. Pads that a mask opening cuts, or that lie
+    near the edge of a mask opening, are excluded. Where another round pad is so near that the two may be confused, both
+    are excluded.
 
     Parameters
     ----------
@@ -116,7 +117,7 @@ def select_fiducials(
 
 
 def _spread(pads: list[Pad], centres: Float64, placement: Float64) -> Iterator[int]:
-    """Yield indices: fiducials first, then other pads, each time the one farthest from those before."""
+    """Yield indices: fiducials first, then other pads, each time the one farthest from the previous ones."""
     away = np.hypot(*(centres - placement).T)
     for is_fiducial in (True, False):
         left = np.array([(each.role == "fiducial") == is_fiducial for each in pads], np.bool_)
@@ -153,13 +154,13 @@ def _is_free(layers: tuple[VisibleLayer, ...], pad: Pad, radius: float, imaging:
 
 
 def _contours(layers: tuple[VisibleLayer, ...], point: Float64, way: Float64, low: float, high: float) -> int | None:
-    """Return 1 where copper ends at the contour, 0 where a trace continues it, None where another edge is seen."""
+    """Return 1 where copper ends at the contour, 0 where a trace continues it, None where another edge is found."""
     contours = 0
     for number, visible in enumerate(layers):
         off = math.sqrt(2.0) * visible.max_offset
         place, ends = layer_edges_along(visible.layer, point, way, max(-low, high) + off)
         near = (place > low - off) & (place < high + off)
-        # Beyond the centre of a pad without a hole its other side would be seen.
+        # A search beyond the centre of a pad without a hole would find the opposite side of the contour.
         place, ends = place[near], ends[near]
         if number == 0 and len(place) == 1 and ends[0] and place[0] > -SAME_EDGE:
             contours = int(place[0] < SAME_EDGE)

@@ -169,7 +169,7 @@ class RulerEdges(VisionOperation[Edges]):
         Standard deviation of the Gaussian whose derivative is taken [px], above 0, default 2. `best_smoothing` gives
         the optimum for isolated edges. A second edge nearer than 3 times this value shifts the result.
     polarity : {"any", "rising", "falling"}
-        Sign of the step along the ruler; with ``pairs`` that of the first edge ("rising": a bright stripe).
+        Sign of the step along the ruler; with ``pairs`` the sign of the first edge ("rising": a bright stripe).
     edge_selection : {"strongest", "first", "last", "all"}
         Which edge to return where there are several.
     max_edges : int
@@ -191,8 +191,8 @@ class RulerEdges(VisionOperation[Edges]):
         where it lies behind. The operation then corrects the bias towards the centre that blur and the averaged lines
         cause. None: straight edges.
     model : Lens or Camera, optional
-        Lens model. Rulers and positions are then in undistorted pixels (of a `Camera`: under its own matrix), and the
-        image is as measured. None: no distortion.
+        Lens model. Rulers and positions are then in undistorted pixels (of a `Camera`: with the camera matrix of the
+        model), and the image is the measured one. None: no distortion.
     count : int, optional
         Number of rulers, n. None takes the number from the rulers of a call; `bind` needs a number.
     variant : {"auto", "vector", "work_item"}
@@ -210,7 +210,7 @@ class RulerEdges(VisionOperation[Edges]):
     -----
     Error: the samples are taken relative to a pixel at the ruler, so that single precision costs the position less than
     1e-4 px at contrasts above 10 times the threshold. Centres above 1024 px are rounded to 6e-5 px by their float32
-    format. With a model the samples have this rounding too.
+    format. With a model the samples also have this rounding.
 
     Linear interpolation moves the maximum of the sampled gradient by up to 0.013 px along the pixels for a smoothing of
     1 px, and by 0.004 px at `best_smoothing`, both for a blur of 1.2 px. The operation corrects this for a Gaussian

@@ -43,7 +43,7 @@ class Selection(NamedTuple):
     condition : float
         Largest over smallest standard deviation; the angle's is taken at the mean distance of the selected points.
     region : (2, 2)
-        Least and greatest x, y [m] that the rulers sample: what the camera must read.
+        Least and greatest x, y [m] that the rulers sample: the region that the camera must read.
     """
 
     chosen: npt.NDArray[np.int64]

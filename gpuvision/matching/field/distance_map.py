@@ -125,8 +125,8 @@ class DistanceMapCells(NamedTuple):
     distance : float32
         Distance from the cell's centre to the nearest line [m].
     nearest : uint8, (rows, columns, 4)
-        Indices of the lines (arcs after the straight lines) that may be the nearest one in the cell, that of its centre
-        first; it is repeated where there are fewer than four.
+        Indices of the lines (arcs after the straight lines) that may be the nearest one in the cell, the nearest line
+        of its centre first; it is repeated where there are fewer than four.
     level : uint16
         Cost d^2 / (c^2 + d^2) of a point in `COST_LEVELS` steps, rounded.
     """
@@ -243,7 +243,7 @@ class DistanceMap:
         rows, columns = self.positions
         border = self.border
         x0, y0 = self.first
-        # A whole block of positions is read.
+        # The kernel reads complete blocks of positions.
         wide = max(columns, _BLOCK) + 2 * border
         x = (x0 + self.cell * np.arange(wide)).astype(np.float32)
         op = DistanceMapBuilder(field=self.field, first_y=y0, cell=self.cell, rows=rows + 2 * border, scale=self.scale)

@@ -1,4 +1,4 @@
-"""Evidence that a robot sees its field: more points on lines than by chance, and lines where they must be seen.
+"""Evidence that a robot sees its field: more points on lines than by chance, and the expected lines in view.
 
 `log_nfa` rates the number of points on lines at a pose, however that pose was found: the number of false alarms of an
 a-contrario test [1]_. `expected_crossings` predicts where scan lines cross the field's lines, so that missing lines
@@ -66,7 +66,7 @@ class Evidence(NamedTuple):
 
     @property
     def missing(self) -> float:
-        """Share of expected crossings not seen, over the share of points on lines; 0 or less where all are seen."""
+        """Share of missing expected crossings, over the share of points on lines; 0 or less if all are found."""
         return (1.0 - self.seen) / max(self.on_lines, 1e-3) if self.expected else 0.0
 
 
@@ -98,7 +98,7 @@ def evidence(
     """
     found = np.asarray(points, np.float64)
     away = distances_to_lines(field, robot_to_field(found, pose))
-    # Points close together belong to one object, on a line or not: one of them counts.
+    # Points close together belong to one object: only one of them counts, on a line or not.
     _, alone = np.unique(np.floor(found / scale), axis=0, return_index=True)
     nfa = log_nfa(away[alone], field, scale=scale, max_range=max_range, margin=margin)
     on_lines = float(np.mean(away <= half_line_width))
@@ -127,7 +127,7 @@ def log_nfa(distances: npt.ArrayLike, field: Field, *, scale: float, max_range: 
     scale
         Largest distance of a point that counts as on a line [m].
     max_range
-        Range at which points are seen [m].
+        Largest range of the points [m].
     margin
         Border around the field in which poses were searched [m]; None: only near one pose, up to ``scale``.
 
@@ -209,7 +209,7 @@ def expected_crossings(field: Field, pose: npt.ArrayLike, paths: npt.ArrayLike, 
     paths
         (paths, 4) both ends of the scan lines in the robot's frame [m].
     line_width
-        Width of the stripes [m]: crossings nearer than 3 widths to another one are left out.
+        Width of the stripes [m]: crossings nearer than 3 widths to another one are excluded.
     """
     ends = np.asarray(paths, np.float64).reshape(-1, 2, 2)
     start, end = np.moveaxis(robot_to_field(ends, pose), 1, 0)

@@ -43,7 +43,8 @@ from gpuvision.status import Status
 from gpuvision.validation import finite
 
 _BLOCK, _MOST_POINTS = 64, 4096
-# Shares of the rows per core, so that the cores end together, and rows for which a point's shift is worth its work.
+# Shares of the rows per core, so that the cores finish together, and number of rows above which shifting a point takes
+# less time.
 _SHARES_PER_CORE, _FEWEST_ROWS = 4, 4
 # Ratio of eigenvalues of the information below which the points do not determine the pose (chosen).
 _MIN_EIGENVALUE_RATIO = 1e-3
@@ -61,7 +62,7 @@ class PoseCosts(NamedTuple):
     column : int32, (headings, rows, blocks)
         Column of the least score; the first one of equal scores.
     seen : int32, (headings,)
-        Number of points used: those that are finite and within the range of the map.
+        Number of points used: finite points within the range of the map.
     """
 
     scores: FloatArray | None
@@ -233,10 +234,10 @@ class FieldPoses(NamedTuple):
     inlier_fraction : float32, (starts,)
         Share of the points within the scale of the map from a line.
     status : uint8, (starts,)
-        `Status` flags. AMBIGUOUS (with a pose): the points determine a part of the pose only, like those of one line or
-        of one circle; the rest of the pose stays near the start. Otherwise all fields are NaN: LOW_SIGNAL (fewer than
-        four points on lines), OUT_OF_RANGE (the pose left the map), NOT_FINITE (the start is not finite, or beyond 1e6
-        m).
+        `Status` flags. AMBIGUOUS (with a pose): the points determine only a part of the pose, for example points on a
+        single line or circle; the rest of the pose stays near the start. Otherwise all fields are NaN: LOW_SIGNAL
+        (fewer than four points on lines), OUT_OF_RANGE (the pose left the map), NOT_FINITE (the start is not finite, or
+        beyond 1e6 m).
     """
 
     poses: FloatArray
@@ -272,10 +273,11 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
     Notes
     -----
     Error: distances to lines are exact; the map only gives the lines to consider (four for each cell: where five lines
-    meet in one cell, the wrong one may be taken). The pose is that of least cost to 3e-5 m and rad, the rounding in a
-    field of 20 m. The covariance is that of an M-estimator, from the curvature of the cost and the residuals of the
-    points: over random poses on the middle-size field, with 128 points of 1 to 3 cm noise, its standard deviations are
-    right to 5 %. It does not contain errors that the points have in common, such as a wrong scale of the camera.
+    meet in one cell, the wrong one may be taken). The pose minimises the cost to 3e-5 m and rad, the rounding in a
+    field of 20 m. The covariance is the covariance of an M-estimator, from the curvature of the cost and the residuals
+    of the points: over random poses on the middle-size field, with 128 points of 1 to 3 cm noise, its standard
+    deviations are right to 5 %. It does not contain errors that the points have in common, such as a wrong scale of the
+    camera.
     """
 
     Result: ClassVar[type[Any]] = FieldPoses
@@ -368,7 +370,7 @@ def find_pose_candidates(
     """Return the poses that fit the points, best first; an empty tuple where no pose does.
 
     A robot that sees 6 m of a middle-size field is found with 70 % of its points in clutter (150 of 150 trials, up to
-    the field's symmetry). One that sees 3 m is often not found: another place fits as well, and is among the
+    the field's symmetry). A robot that sees 3 m is often not found: another place fits equally well, and is among the
     candidates.
 
     Parameters

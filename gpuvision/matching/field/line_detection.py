@@ -26,9 +26,9 @@ Float64 = npt.NDArray[np.float64]
 
 MIN_LINE_WIDTH_PX = 3.0
 """Least width of a line in the image [px]: below, its two edges blur into one another."""
-_RULER_LENGTH = 128  # samples of a piece of a scan line
-_TAPS_PER_SIGMA = 3.0  # of `RulerEdges`
-_MARGIN_PX = 3.0  # between rulers and the image's border
+_RULER_LENGTH = 128  # samples of a part of a scan line
+_TAPS_PER_SIGMA = 3.0  # largest length of a ruler of `RulerEdges`
+_MARGIN_PX = 3.0  # distance of rulers from the image border
 # Widths of accepted stripes relative to the expected width (chosen).
 _MIN_WIDTH_RATIO, _MAX_WIDTH_RATIO = 0.4, 3.0
 
@@ -156,7 +156,7 @@ def place_rulers_along(
 ) -> tuple[Float32, npt.NDArray[np.intp]]:
     """Return rulers (n, 4) along scan lines, and the scan line of each ruler.
 
-    The rulers overlap so that each stripe lies wholly on one of them. Scan lines shorter than a ruler get none.
+    The rulers overlap so that each stripe lies wholly on one of them. Scan lines shorter than a ruler have no rulers.
     """
     length = (rulers.length - 1) * rulers.step_px
     hop = max(length - 2.0 * end_margin_px(rulers) - 3.0 * width_px, 0.25 * length)
@@ -227,7 +227,7 @@ def scan_tilted_view(
     line_width
         Width of the stripes [m].
     lines
-        Number of rays, and twice as many lines across them.
+        Number of rays; the number of lines across them is twice as large.
     max_range
         Largest distance from the camera [m].
     threshold
@@ -322,7 +322,7 @@ def _octave(
     threshold: float,
     device: Device | None,
 ) -> FloorScan | None:
-    """Scan the parts of one octave of line width; None where none of them has room for a ruler."""
+    """Scan the parts of one octave of line width; None if no scan line has room for a ruler."""
     wide = MIN_LINE_WIDTH_PX * 2.0 ** (runs[0].octave + 0.5)
     rulers = replace(stripe_ruler(white, wide, threshold, camera.model), length=_SHORT_LENGTH)
     edge, length = end_margin_px(rulers), (rulers.length - 1) * rulers.step_px
@@ -366,7 +366,7 @@ def _octave(
 def _room(run: _Run, edge: float, over: float, length: float) -> tuple[float, float, float, float] | None:
     """Return where rulers along a part begin and end, and the range that they scan [px]; None: no room.
 
-    Where the image goes on, the rulers extend beyond the part, so that a stripe between two parts is seen whole.
+    Inside the image the rulers extend beyond the part, so that a stripe between two parts is sampled completely.
     """
     far = float(np.linalg.norm(run.end - run.start))
     begin, end = (0.0 if run.cut[0] else -over), far + (0.0 if run.cut[1] else over)

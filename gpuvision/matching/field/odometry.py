@@ -62,8 +62,8 @@ def squared_mahalanobis_distance(estimate: PoseEstimate, pose: npt.ArrayLike, in
     NIS is the normalised innovation squared.
 
     Its mean is 3 for a consistent filter; it exceeds 16.3 with a probability of 0.001 (chi square with 3 degrees of
-    freedom): then the measurement is another candidate or a symmetric twin, or the robot was carried. An
-    ``information`` of lower rank has as many degrees of freedom as its rank.
+    freedom): then the measurement is another candidate or a symmetric twin, or the robot was carried. The number of
+    degrees of freedom is the rank of ``information``.
 
     Parameters
     ----------
@@ -91,8 +91,8 @@ def correct(estimate: PoseEstimate, pose: npt.ArrayLike, information: npt.ArrayL
     pose
         (3,) measured pose, as in a `PoseCandidate`.
     information
-        (3, 3) inverse of the covariance of the measured pose. With a lower rank (one line or one circle seen) the pose
-        is corrected only in the directions that were measured.
+        (3, 3) inverse of the covariance of the measured pose. With a lower rank (a single line or circle in view) the
+        pose is corrected only in the directions that were measured.
     """
     view, measured = np.array(numbers(pose, (3,), "pose")), np.array(numbers(information, (3, 3), "information"))
     off = view - estimate.pose

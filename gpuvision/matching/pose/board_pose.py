@@ -30,7 +30,7 @@ _GROUP, _MAX_RULERS = 64, 2048
 
 
 class BoardPoseEstimate(NamedTuple):
-    """Pose of a board, and the measurements that it is made from.
+    """Pose of a board, and the measurements that determine it.
 
     Attributes
     ----------
@@ -128,8 +128,8 @@ class BoardPoseEstimator(VisionOperation[BoardPoseEstimate]):
     """Fused board pose: ``op(image, rulers, lines) -> BoardPoseEstimate``.
 
     The image is as `RulerEdges` takes it. The rulers, float32 (lines, rulers_per_line, 9), and the lines, float32
-    (lines, 6), are those of `place_rulers`. The pose is the motion of the artwork on the board's plane, from where it
-    was expected to where it is seen; 0 where the board is as expected.
+    (lines, 6), are results of `place_rulers`. The pose is the motion of the artwork on the board's plane, from the
+    expected to the measured position; 0 if the board is at the expected position.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class BoardPoseEstimator(VisionOperation[BoardPoseEstimate]):
     rulers_per_line : int
         Number of rulers of each line, 1 to 256; 2048 rulers in all at most.
     solver : SolvePose
-        Pose solver. Its loss, tuning constant and scale apply to the line fits too. Its precision must be single, and
+        Pose solver. Its loss, tuning constant and scale also apply to the line fits. Its precision must be single, and
         ``with_initial_pose`` false.
 
     Raises

@@ -5,7 +5,7 @@
 3. Verify: count the rulers that find an edge where the candidate has one.
 4. Measure the best candidate again along shorter rulers, and compare it with the runner-up.
 
-The known edges are those of a board or of another image (`gpuvision.matching.pose.registration`).
+The known edges are edges of a board or of another image (`gpuvision.matching.pose.registration`).
 
 References
 ----------
@@ -47,12 +47,12 @@ from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
 
-MAX_RULERS = 1024  # rows of one `SolvePose`
-_VERIFICATION_RULERS = 512  # of each candidate: cost of step 3
-_REFINEMENT_ROWS = 128  # of each candidate: cost of step 2
+MAX_RULERS = 1024  # largest number of rows of one `SolvePose`
+_VERIFICATION_RULERS = 512  # rulers of each candidate in step 3 (cost)
+_REFINEMENT_ROWS = 128  # rulers of each candidate in step 2 (cost)
 # Start candidates of a robust pose: of half bad rows all contain an outlier with a probability of 6e-8 (derived).
 _TRIALS = {"rigid": 128, "similarity": 256, "affine": 512}
-_SEPARATION = (3, 2)  # cells and headings within which two candidates of the grid are the same
+_SEPARATION = (3, 2)  # distances in cells and headings within which two candidates of the grid count as the same
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,8 @@ class RegistrationLimits:
         more edges in the image would win over the right one; below 0.5, poses that keep few edges in the image would
         win.
     refinements
-        Number of measurements of the best pose along short rulers, each placed at the pose of the one before (chosen).
+        Number of measurements of the best pose along short rulers, each placed at the pose of the previous one
+        (chosen).
     """
 
     min_rulers: int = 12
@@ -91,12 +92,12 @@ class Registration(NamedTuple):
     Attributes
     ----------
     pose : (3,)
-        x, y, theta [rad]: a known point p is seen at R(theta) (I + D) p + (x, y). Where the pose is refused, NaN like
+        x, y, theta [rad]: a known point p appears at R(theta) (I + D) p + (x, y). Where the pose is refused, NaN like
         ``deformation``, ``placement`` and ``covariance``.
     deformation : (3,)
         Scales along the known axes less 1, and shear: I + D = ((1 + kx, shear), (0, 1 + ky)); 0 for a rigid transform.
     placement : (2,)
-        Where the placement point is seen.
+        Measured position of the placement point.
     covariance : (f, f)
         Covariance of the placement point's x, y, of theta, and of the free deformation parameters, from the residuals
         of the edges.
@@ -144,10 +145,10 @@ class _ScoredMotion(NamedTuple):
     def is_better_than(self, other: _ScoredMotion, limits: RegistrationLimits) -> bool:
         """Return whether the rulers prefer this motion significantly.
 
-        Counted are the rulers in the image for both motions that agree with only one of them. Of two right motions (a
-        repeated pattern) about as many agree with either. An edge agrees with a wrong motion by chance only: the counts
-        must differ by three standard deviations of their difference, and by a factor of two. A factor of two between
-        the scores is enough too, for images with few rulers in common.
+        Counted are the rulers in the image for both motions that agree with only one of them. With two valid motions (a
+        repeated pattern), about the same number of rulers agrees with each. An edge agrees with a wrong motion by
+        chance only: the counts must differ by three standard deviations of their difference, and by a factor of two. A
+        factor of two between the scores is also sufficient, for images with few rulers in common.
         """
         if self.score >= limits.min_ratio * other.score:
             return True
@@ -382,7 +383,7 @@ class CoarseRegistration:
         return [each for each in scored if each.rulers >= self.limits.min_rulers]
 
     def _distinct_from(self, best: _ScoredMotion, tried: list[_ScoredMotion]) -> list[_ScoredMotion]:
-        """Return the motions whose rulers lie elsewhere than those of the best one, best first."""
+        """Return the motions whose rulers lie at other places than the rulers of the best motion, best first."""
         limit = (2.0 * self.tolerance_px + 1.0) / self._pixels_per_unit
         change = np.stack([each.motion for each in tried]) - best.motion
         points = (self.rulers.point - self.placement) @ change[..., :2].swapaxes(1, 2) + change[:, None, :, 2]
@@ -451,7 +452,7 @@ class CoarseRegistration:
 
 
 def _checked_edges(edges: KnownEdges, name: str, max_count: int) -> KnownEdges:
-    """Return known edges as float64 arrays, or raise what is wrong with them."""
+    """Return known edges as float64 arrays, or raise an error that states the defect."""
     point, normal = (np.asarray(each, np.float64) for each in edges)
     if point.shape != normal.shape or point.ndim != 2 or point.shape[1] != 2 or len(point) > max_count:
         raise ValueError(f"CoarseRegistration.{name} must have up to {max_count} points (n, 2) and as many normals")
@@ -473,7 +474,7 @@ def _fill_border(level: npt.NDArray[np.uint16], border: int, border_cost: float)
 
 
 def _select_found(rows: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Return the same number of rows for each start, evenly picked from those with an edge.
+    """Return the same number of rows for each start, evenly picked from the rows with an edge.
 
     Missing rows would waste start candidates of the robust fit.
     """

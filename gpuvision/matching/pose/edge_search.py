@@ -1,9 +1,9 @@
 """Exhaustive search of a grid of poses: known edges against the edges of an image, by position and direction.
 
-`CellMeans` reduces the image to cells. `EdgeCostMap` computes what an edge costs in each cell for eight directions of
-its normal: little where the gradient is strong and parallel to the normal (either sign), whatever the contrast.
+`CellMeans` reduces the image to cells. `EdgeCostMap` computes the cost of an edge in each cell for eight directions of
+its normal: low where the gradient is strong and parallel to the normal (either sign), independent of the contrast.
 `EdgeSearch` sums these costs over the known edges for every shift and heading of the grid; `cell_offsets` gives the
-cells on which the known edges lie. The cost is that of chamfer matching [1]_ with a truncated orientation-dependent
+cells on which the known edges lie. The cost is the cost of chamfer matching [1]_ with a truncated orientation-dependent
 distance.
 
 References
@@ -186,7 +186,7 @@ class EdgeSearch(VisionOperation[PoseCosts]):
 
     Notes
     -----
-    The sums are exact; the error of a score is that of `EdgeCostMap`.
+    The sums are exact; a score has the error of `EdgeCostMap`.
     """
 
     Result: ClassVar[type[Any]] = PoseCosts
@@ -208,7 +208,7 @@ class EdgeSearch(VisionOperation[PoseCosts]):
         build = LaunchBuilder(self, device, shape, dtype, variant=self.variant)
         build.check_dtype("uint16", of="levels")
         build.check_shape(len(shape) == 3, "levels (channels, rows, columns)")
-        # A whole block of positions is read.
+        # The kernel reads complete blocks of positions.
         limit = math.prod(shape) - (self.rows - 1) * shape[2] - max(self.columns, _BLOCK) + 1
         if shape[1] < self.rows or shape[2] < self.columns or limit < 1:
             raise ValueError(

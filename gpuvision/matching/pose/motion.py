@@ -1,7 +1,7 @@
 """Motions in the plane: homographies, rotations, known edges under a motion, composition with a measured pose.
 
-A motion is a (2, 3) matrix that takes points, relative to the placement point, to where they are seen: its first two
-columns are the linear part, its last one is the place where the placement point is seen.
+A motion is a (2, 3) matrix that maps points, relative to the placement point, to their measured positions: its first
+two columns are the linear part, its last column is the measured position of the placement point.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def project_edges(
 
 
 def compose(motion: Float64, pose: npt.ArrayLike, deformation: npt.ArrayLike) -> Float64:
-    """Return a motion followed by a pose (3,) with a deformation (3,), both about the seen placement point."""
+    """Return a motion followed by a pose (3,) with a deformation (3,), both about the measured placement point."""
     x, y, theta = np.asarray(pose, np.float64)
     kx, ky, shear = np.asarray(deformation, np.float64)
     turn = rotation(theta) @ np.array([[1.0 + kx, shear], [0.0, 1.0 + ky]])

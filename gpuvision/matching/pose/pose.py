@@ -1,8 +1,8 @@
 """Robust pose of a board from feature rows: edges at rulers, fitted lines and points, some of them wrong.
 
-A pose takes a point p of the artwork to the place where it is seen, q = T(p) = (I + D) p + t. I + D is a rotation, and
-a deformation where the transform has one. A feature is one equation or two. An edge with the unit normal n through p
-that is seen to run through q gives n . (T^-1(q) - p) = 0, to first order n . (t + theta J p) = n . (q - p) with J the
+A pose maps a point p of the artwork to its measured position, q = T(p) = (I + D) p + t. I + D is a rotation, and a
+deformation where the transform has one. A feature is one equation or two. An edge with the unit normal n through p
+whose measured position is q gives n . (T^-1(q) - p) = 0, to first order n . (t + theta J p) = n . (q - p) with J the
 rotation by 90 degrees. A point gives this equation for two normals at right angles. Copper that is etched wider or
 narrower than drawn moves all edges along their normals by the etch bias e, one more unknown: n . (T^-1(q) - p) = g e.
 The etch factor g is 1 for an edge whose normal points out of the copper.
@@ -42,7 +42,7 @@ TRANSFORM_PARAMETERS = {"rigid": 3, "similarity": 4, "affine": 6}
 ROW = ("normal_x", "normal_y", "x", "y", "displacement_x", "displacement_y", "sigma")
 _LANES, _GROUP = 16, 64
 _MOST_ROWS = 1024
-_START_STEPS = 3  # of Gauss and Newton, for the pose through a few features
+_START_STEPS = 3  # Gauss-Newton iterations for the pose through a few features
 
 
 class BoardPose(NamedTuple):
@@ -56,7 +56,7 @@ class BoardPose(NamedTuple):
     deformation : float, (..., 3)
         Scales along the artwork's axes less 1, and shear: I + D = R(theta) ((1 + kx, shear), (0, 1 + ky)).
     placement : float, (..., 2)
-        Where the placement point is seen [m].
+        Measured position of the placement point [m].
     covariance : float, (..., f, f)
         Covariance of the placement point's x, y [m], of theta [rad], and of the free deformation parameters.
     residuals : float, (..., rows)
@@ -85,7 +85,7 @@ class BoardPose(NamedTuple):
         Distance by which copper reaches beyond its drawn edges, all over the board [m]; 0 without ``etch_bias_sigma``.
     inlier_fraction : float, (...,)
         Share of the information of all rows that agrees with the pose, for the parameter combination with the least
-        share, 0 to 1. Valid also where it is the reason of a refusal, like ``leverage``.
+        share, 0 to 1. Also valid where it is the reason of a refusal, like ``leverage``.
     leverage : float, (...,)
         Largest leverage of an inlier: the share of its own error by which a row moves the pose. 1 where an unknown
         depends on this row alone; 0 for ``"least_squares"``.
@@ -144,7 +144,7 @@ def point_rows(point: Any, seen: Any, sigma: Any) -> Float64:
     Parameters
     ----------
     point, seen : array_like, (..., 2)
-        Position in the artwork, and where the point was seen [m].
+        Position in the artwork, and measured position [m].
     sigma : array_like, (...,)
         Standard deviation of each coordinate [m].
 
@@ -161,14 +161,14 @@ def fitted_line_rows(normal: Any, point: Any, centre: Any, covariance: Any, angl
     """Make two feature rows for each fitted line (`LineFits`): they carry its offset and its angle.
 
     Offset and angle are uncorrelated at the centre of the fitted points. The offsets at two places on either side of
-    it, at the distance sigma(offset) / sigma(angle), are therefore uncorrelated too; these offsets are the rows.
+    it, at the distance sigma(offset) / sigma(angle), are therefore also uncorrelated; these offsets are the rows.
 
     Parameters
     ----------
     normal, point : array_like, (..., 2)
         Unit normal of the line in the artwork, and a point on it [m].
     centre, covariance : array_like, (..., 2) and (..., 2, 2)
-        Results of the fit, in metres in the frame where the lines are seen.
+        Results of the fit, in metres in the frame of the measurement.
     angle : array_like, (...,)
         Angle of the fitted line minus that of the artwork's line [rad], small.
 
@@ -196,9 +196,9 @@ class SolvePose(VisionOperation[BoardPose]):
     """Robust least-squares pose from feature rows: ``op(rows) -> BoardPose``.
 
     Rows are float32 or float64 of shape (..., rows, 7), or (..., rows, 8) with ``etch_bias_sigma``. The columns are:
-    unit normal (2), place in the artwork (2) [m], displacement from there to where the feature was seen (2) [m],
-    standard deviation along the normal [m], and, with ``etch_bias_sigma``, the etch factor. `line_rows`, `point_rows`
-    and `fitted_line_rows` make them. A row with a non-finite number, or with a sigma that is not positive, counts as
+    unit normal (2), place in the artwork (2) [m], displacement from there to the measured position (2) [m], standard
+    deviation along the normal [m], and, with ``etch_bias_sigma``, the etch factor. `line_rows`, `point_rows` and
+    `fitted_line_rows` make them. A row with a non-finite number, or with a sigma that is not positive, counts as
     missing.
 
     The start is the pose through a minimal subset of the rows that has the least loss over all rows (the least median
@@ -238,7 +238,7 @@ class SolvePose(VisionOperation[BoardPose]):
         outliers may agree by chance. 1 turns both checks off. Losses other than ``"least_squares"`` only.
     search_range : (float, float), optional
         Largest accepted shift of the placement point [m] and turn [rad]: where features were searched within this range
-        only, a pose beyond it is made of wrong features. None: no limit.
+        only, a pose beyond it follows from wrong features. None: no limit.
     max_trials : int
         Number of start candidates, a multiple of 16, default 64. With 50 % outliers, 64 candidates of three rows all
         contain an outlier on 2 of 1e4 boards, 256 on 1e-15; with ``etch_bias_sigma`` a candidate has four rows, and 256

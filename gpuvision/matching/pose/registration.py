@@ -28,13 +28,13 @@ from gpuvision.matching.pose.motion import KnownEdges, apply_homography
 from gpuvision.matching.pose.pose import Transform
 
 Float64 = npt.NDArray[np.float64]
-_MAX_RULERS, _MAX_POINTS = 512, 512  # cost: known edges of the rulers and of the grid search
+_MAX_RULERS, _MAX_POINTS = 512, 512  # known edges for the rulers and for the grid search (cost)
 # With fewer rulers at the best smoothing, a smaller one is used, which needs less room between edges (chosen).
 _MIN_RULERS = 128
-# Verified candidates of an image: its cells are larger than those of a board, so that there are fewer candidates.
+# Verified candidates of an image: its grid cells are larger than for a board, so that there are fewer candidates.
 _IMAGE_CANDIDATES = 24
-_TILE_PX = 8  # a template gives one edge in each square of this side
-_MAX_OFFSET_PX = 1.5  # a template's edge farther from the steepest pixel is another edge
+_TILE_PX = 8  # side of the squares of a template that give one edge each
+_MAX_OFFSET_PX = 1.5  # largest distance of a template's edge from the steepest pixel; beyond it, it is another edge
 
 __all__ = [
     "CoarseRegistration",
@@ -67,9 +67,8 @@ def prepare_board_registration(
     Parameters
     ----------
     artwork
-        The side that the camera sees.
-    board_to_image
-        3 x 3 homography from the board, where it is nominally, to the (undistorted) image [m to px].
+        The side in view of the camera. board_to_image 3 x 3 homography from the board, where it is nominally, to the
+        (undistorted) image [m to px].
     shape
         Rows and columns of the images.
     placement
@@ -109,7 +108,7 @@ def prepare_board_registration(
     single = _singles(artwork, region, place, Imaging(pixel=pixel, blur_px=blur_px, shift=2.0 * pixel, angle=0.0))
     if len(single.point) < _MIN_RULERS:
         # Other edges are too near for the best smoothing, sqrt(5) times the blur. Smooth by the blur itself: blur and
-        # smoothing are then sqrt(2) blurs together, instead of sqrt(6), as those of an `Imaging` of blur / sqrt(3).
+        # smoothing are then sqrt(2) blurs together, instead of sqrt(6), as in an `Imaging` of blur / sqrt(3).
         smoothing_px = blur_px
         narrow = Imaging(pixel=pixel, blur_px=blur_px / math.sqrt(3.0), shift=2.0 * pixel, angle=0.0)
         single = _singles(artwork, region, place, narrow)
@@ -183,7 +182,7 @@ def register_images(
     cell_px: int = 4,
     device: Device | None = None,
 ) -> Registration:
-    """Find where the points of a template image are seen in an image; lengths are pixels, theta turns from x towards y.
+    """Find the points of a template image in another image; lengths are pixels, theta turns from x towards y.
 
     Parameters
     ----------
@@ -197,8 +196,8 @@ def register_images(
     blur_px, threshold
         As in `prepare_board_registration`.
     transform, tolerance_px, cell_px
-        As in `CoarseRegistration`. Images of two line cameras, or of two boards, differ in their scales along x and y
-        too, hence the default "affine".
+        As in `CoarseRegistration`. Images of two line cameras, or of two boards, also differ in their scales along x
+        and y; the default is therefore "affine".
     device
         Where to run; None: `Device.best`.
 

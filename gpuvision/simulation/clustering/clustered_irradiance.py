@@ -20,7 +20,7 @@ Reals = npt.NDArray[np.float64]
 # Smallest input sizes [rows]. Sizes are rounded up to powers of two from there, so that few kernels are bound.
 _MIN_SEGMENTS, _MIN_SELECTED = 64, 4096
 # Measured: the traversal of the tree takes as long as the exact computation of a quarter of all pairs, plus an overhead
-# of 2^16 pairs. Pairs that do not face each other cost next to nothing in the exact computation.
+# of 2^16 pairs. Pairs that do not face each other cost almost no time in the exact computation.
 _TRAVERSAL_COST, _MIN_FACING_PAIRS = 4, 1 << 16
 # Sample sizes of `estimate_facing_pairs`: primes, so that the samples do not follow a period of the data.
 _SAMPLED_RECEIVERS, _SAMPLED_SEGMENTS = 127, 61
@@ -122,7 +122,7 @@ class ClusteredIrradiance:
         receivers
             (strips, n, 6): position [m] and normal.
         """
-        # The kernel reads empty rows, too. Rounding up to eighths of a power of two limits them to an eighth.
+        # The kernel also reads empty rows. Rounding up to eighths of a power of two limits them to an eighth.
         step = max(_MIN_SEGMENTS // 2, (1 << max(len(segments) - 1, 0).bit_length()) // 8)
         rows = np.zeros((max(-(-len(segments) // step), 1) * step, 10), self._real)
         rows[: len(segments)] = segments

@@ -42,7 +42,7 @@ _SEGMENT_SIZES = {"normal": 3, "height": 1, "start": 3, "end": 3}
 _SEGMENT_COLUMNS = sum(_SEGMENT_SIZES.values())
 # Work-items of a work-group; strips of receivers per core, several to balance the load (speed only).
 _GROUP, _STRIPS_PER_CORE = 64, 8
-# Bit of a selected segment that nothing can occlude, as the kernel sets it.
+# Bit of a selected segment that no surface can occlude, as the kernel sets it.
 _UNOCCLUDED_BIT = 1 << 30
 # Entries of a block that fit at first. If a block needs more, the capacity grows to the next power of two and the
 # kernel runs again.
@@ -58,9 +58,10 @@ _ERROR_CLASSES = 64
 class LightClustering:
     """Error-bounded clustering of lights in the manner of lightcuts: ``clustering(segments, ...) -> LightCut``.
 
-    Each block of 16 receivers descends the tree of lit segments (`LightTree`) from its root. A node is left out where
-    the bound of its light stays below its share of the tolerance; it is replaced by its representative segment where
-    the bound of that error does and nothing can occlude it; otherwise its children are visited.
+    Each block of 16 receivers descends the tree of lit segments (`LightTree`) from its root. A node is omitted if the
+    bound of its light is below its share of the tolerance. It is replaced by its representative segment if the bound of
+    the error of this replacement is below that share and no surface can occlude the node. Otherwise its children are
+    visited.
 
     Parameters
     ----------
@@ -91,13 +92,13 @@ class LightClustering:
     `StripErrorModel.error_per_irradiance` turns irradiance into metres of range; errors of pairs are added without
     cancellation.
 
-    The tolerance is shared among pairs by power times cost. What the shares leave over is then spent on the pairs with
-    the least bounds.
+    The tolerance is shared among pairs by power times cost. The unused part of the tolerance is then spent on the pairs
+    with the least bounds.
 
     Covered by the bound: omission, clustering, and the rounding of positions to single about the scene's middle (5e-7
     of the reach). Not covered: the rounding of `OccludedIrradiance`, which computes the pairs that are kept; light that
-    arrives within that rounding of a surface's own plane, which is taken as none; the discretisation of the surface by
-    receivers; readings other than the mean of u in a fixed window (`StripErrorModel`).
+    arrives within that rounding of the plane of the receiving surface, which counts as 0; the discretisation of the
+    surface by receivers; readings other than the mean of u in a fixed window (`StripErrorModel`).
 
     References
     ----------
@@ -193,7 +194,7 @@ class _Selection(NamedTuple):
         int32 (blocks, capacity): position of a segment in the tree, with the bit `_UNOCCLUDED_BIT` if nothing can
         occlude it, or ~node of a cluster.
     errors
-        float32 (blocks, capacity): bound of the range error if that entry were left out [m].
+        float32 (blocks, capacity): bound of the range error if that entry were omitted [m].
     counts
         int32 (blocks,): entries that the block needs; more than the capacity are not written.
     error_sums
@@ -321,7 +322,7 @@ def _drop_smallest(
     """Return which entries are kept after the rest of the tolerance is spent on the smallest, and the error sums.
 
     Single segments are dropped from the smallest error on, as long as the error sum of their strip stays within the
-    tolerance. A strip whose light can be left out altogether keeps no entry.
+    tolerance. A strip whose light can be omitted completely has no entry.
     """
     strips = len(error_sums)
     out = worst <= tolerance

@@ -40,7 +40,7 @@ class LightCut:
         float64 (strips,), metres: bound of the range error by all pairs that are left out or clustered; 0 where there
         are none. See the notes of `LightClustering` for the errors that it does not cover.
     bound_if_omitted
-        float64 (strips,), metres: the same bound if the light of all segments were left out.
+        float64 (strips,), metres: the same bound if the light of all segments were omitted.
     counts
         Number of "segments", of all "pairs" of a receiver and a segment, and of the pairs that are computed exactly
         ("exact"; of these "clear" cannot be occluded), represented by a cluster ("clustered"), or "left out". "work" is

@@ -9,7 +9,7 @@ k-th term of the series in s has a norm of at most (k + 1) |s|^k / |d|^(k + 2).
 The representative segment has the cluster's sum of power times normal, its first moment, and the largest part of its
 second moment. The error bound is the sum of the norms of the rest: first moments of the normals' parts aside of the
 mean normal, the rest of the second moment, and the remainders of third and fourth order. It holds where all of the
-cluster faces all receivers and nothing occludes; the traversal checks both.
+cluster faces all receivers without occlusion; the traversal checks both conditions.
 
 References: B. Walter et al., *Lightcuts: a scalable approach to illumination*, ACM Transactions on Graphics 24(3),
 2005. Their representative light is one light of the cluster, with a bound of zeroth order; this one matches moments.
@@ -165,8 +165,8 @@ def _fill_nodes(
     facing, effective = _mean_direction(sums(weight[:, None] * normal), normal[begin])
     face = facing[owner]
     cosine = _dot(normal, face)
-    # The centre is the mean of positions weighted by power times cosine: the first moment of the representative is then
-    # that of the cluster. Where normals spread too far, the node has no representative and the centre is any mean.
+    # The centre is the mean of positions weighted by power times cosine: the representative then has the first moment
+    # of the cluster. Where normals spread too far, the node has no representative and the centre is any mean.
     lean = np.minimum.reduceat(cosine, begin)
     parallel = np.where(lean[owner] > _MIN_COSINE, weight * cosine, weight)
     centre = sums(parallel[:, None] * middle) / sums(parallel)[:, None]

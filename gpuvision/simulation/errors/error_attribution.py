@@ -1,7 +1,7 @@
 """Range errors of simulated readings, attributed to causes: occlusion, reflectivity, secondary light, noise, ...
 
 Two methods split the range error of a sample into contributions of causes. With both methods the contributions add up
-to the error exactly, and neither depends on an order of the causes.
+to the error exactly, and the contributions do not depend on an order of the causes.
 
 - ``"moments"``, for PSDs. A PSD reads the centroid of all light. Light of power P at position u moves the centroid by
   P (u - u_true) / P_total. The contribution of a cause is the sum of these shifts over its light, times the slope of
@@ -225,7 +225,7 @@ def attribute_errors(
         The sensor, with its mask and its ambient light.
     exposures
         Light by path, (..., samples, bins). With all three variants of the direct light (`UNIFORM`, `UNOCCLUDED`,
-        `UNIFORM_UNOCCLUDED`), occlusion and reflectivity are causes beside shape.
+        `UNIFORM_UNOCCLUDED`), occlusion and reflectivity are causes in addition to shape.
     truth
         Ground truth of the same samples.
     seed, first_profile
@@ -305,7 +305,7 @@ def _paths_of(cause: str, secondary_by_path: bool) -> tuple[str, ...]:
 
 
 def _additional_causes(light: Mapping[str, Exposure], secondary_by_path: bool) -> list[str]:
-    """Return the causes that add light to the direct light, also those without light."""
+    """Return the causes that add light to the direct light, including causes without light."""
     ambient = [AMBIENT] if AMBIENT in light else []
     return ["specular", *(_SECONDARY if secondary_by_path else ["secondary"]), *ambient]
 

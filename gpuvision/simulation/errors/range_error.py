@@ -140,8 +140,8 @@ class StripErrorModel:
     def error_per_irradiance(self, weights: npt.NDArray[Any]) -> Reals:
         """Return the range error per irradiance that is missing or additional at each receiver.
 
-        Light of power p at u beside light of power P at x: the reading without p is off by p (u - x) / P, where x is
-        within `max_shift` of the direct light's position and within the limits.
+        For light of power p at u in addition to light of power P at x, the reading without p has the error p (u - x) /
+        P, where x is within `max_shift` of the direct light's position and within the limits.
 
         Parameters
         ----------
@@ -181,7 +181,7 @@ class PathSelection(NamedTuple):
 
 
 def select_paths(error_bounds: Mapping[str, npt.ArrayLike], tolerance: float) -> PathSelection:
-    """Select the light paths to simulate: omit those with the smallest bounds, up to half the tolerance in sum.
+    """Select the light paths to simulate: omit the paths with the smallest bounds, up to half the tolerance in sum.
 
     A path with the bound 0 is always omitted. The error of several omitted paths is at most the sum of their bounds.
 
@@ -210,12 +210,12 @@ def interreflection_power_bound(received: float, albedo: float, solid_angle: flo
     Parameters
     ----------
     received
-        Power that surfaces receive from the lit surfaces directly; at most the power that these send out [W], 0 or
-        more.
+        Power that surfaces receive from the lit surfaces directly; at most the power that the lit surfaces emit [W], 0
+        or more.
     albedo
         Largest albedo of the scene, 0 to 1.
     solid_angle
-        Largest solid angle under which a surface sees the lens [sr], 0 or more.
+        Largest solid angle of the lens from a surface [sr], 0 or more.
 
     Returns
     -------

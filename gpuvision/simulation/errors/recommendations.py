@@ -380,7 +380,7 @@ def _median_positions(attribution: ErrorAttribution) -> Float64:
 def _resample_attribution(
     attribution: ErrorAttribution, truth: GroundTruth, positions: Float64, max_gap: float
 ) -> ErrorAttribution:
-    """Return the readings at other positions, with their errors against the ground truth of those positions."""
+    """Return the readings at other positions, with their errors against the ground truth at these positions."""
     reading = resample_reading(attribution.reading, positions, max_gap=max_gap)
     error = reading.h - truth.h
     lines = _Interpolation.between(attribution.reading.g, np.isfinite(attribution.reading.h), positions, max_gap)
@@ -400,7 +400,7 @@ def _resample_attribution(
 def resample_reading(reading: Reading, g: npt.ArrayLike, *, max_gap: float) -> Reading:
     """Resample profiles at other positions along the sheet, by linear interpolation between neighbouring points.
 
-    Beside a gap and at both ends of a profile, the nearest point is used up to half the median distance of points.
+    Next to a gap and at both ends of a profile, the nearest point is used up to half the median distance of points.
 
     Parameters
     ----------
@@ -415,7 +415,7 @@ def resample_reading(reading: Reading, g: npt.ArrayLike, *, max_gap: float) -> R
     Returns
     -------
     Reading
-        (..., k). Sigma, strength and width are interpolated too; the flags are those of both neighbours.
+        (..., k). Sigma, strength and width are also interpolated; the flags of both neighbours are combined.
     """
     at = np.broadcast_to(np.asarray(g, np.float64), (*reading.h.shape[:-1], np.shape(g)[-1]))
     lines = _Interpolation.between(reading.g, np.isfinite(reading.h), at, max_gap)

@@ -215,7 +215,7 @@ def _morton_order(extents: Reals) -> Integers:
 def radix_argsort(key: Integers) -> Integers:
     """Return the stable ascending order of keys >= 0, by a radix sort with digits of 16 bits.
 
-    NumPy's stable sort of 16-bit integers is many times faster than that of 64-bit integers.
+    NumPy's stable sort of 16-bit integers is many times faster than the sort of 64-bit integers.
     """
     order = np.argsort(key.astype(np.uint16), kind="stable")
     for shift in range(16, int(key.max(initial=0)).bit_length(), 16):

@@ -1,4 +1,4 @@
-"""Closed surfaces of a scene: a view point outside sees their outer sides only."""
+"""Closed surfaces of a scene: only their outer sides are visible from a view point outside."""
 
 from __future__ import annotations
 

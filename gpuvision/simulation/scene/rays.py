@@ -94,7 +94,7 @@ class _Rays(VisionOperation[R]):
         of : str
             Name of the input in messages.
         shapes : dict of str to tuple of int
-            Shapes of the outputs, without those of the rays.
+            Shapes of the outputs, without the shape of the rays.
         **types : type
             Dtypes of outputs that are not of the real type.
         """

@@ -184,9 +184,9 @@ class OrenNayar(Brdf):
         Notes
         -----
         The roughness is B / A of the qualitative model of Oren and Nayar (1994); sigma = pi / 2 gives 0.776. The
-        reflectance, divided by its value at normal incidence and view, then equals theirs wherever light and viewer
-        are on the same side of the normal. On opposite sides their reflectance is constant, and this one decreases,
-        which keeps the reflected light within the albedo.
+        reflectance, divided by its value at normal incidence and view, then equals their ratio wherever light and
+        viewer are on the same side of the normal. On opposite sides their reflectance is constant, and this one
+        decreases, which keeps the reflected light within the albedo.
         """
         angle = finite(sigma, "OrenNayar.from_slope_sigma: sigma")
         if not 0.0 <= angle <= math.pi / 2.0:

@@ -38,12 +38,9 @@ class Defects:
     Attributes
     ----------
     not_finite
-        Triangles with a corner that is NaN or infinite. They are left out of the BVH.
-    degenerate
-        Triangles without area: two corners coincide, or all three are collinear. They are left out of the BVH.
-    non_manifold
-        Triangles on an edge of three or more triangles, or on a surface that cannot be oriented (a Moebius strip). They
-        are kept unchanged.
+        Triangles with a corner that is NaN or infinite. They are not in the BVH. degenerate Triangles without area: two
+        corners coincide, or all three are collinear. They are not in the BVH. non_manifold Triangles on an edge of
+        three or more triangles, or on a surface that cannot be oriented (a Moebius strip). They are kept unchanged.
     inverted
         Triangles with the opposite winding to most of their connected neighbours. They are flipped, so that the
         winding of `Scene.corners` is consistent.
@@ -120,7 +117,7 @@ class Scene:
     def of(cls, meshes: Any, *, metres: float = 1.0) -> Scene:
         """Make a scene of a `trimesh.Trimesh`, a `trimesh.Scene`, or several meshes.
 
-        Each mesh has its own material, numbered in the order of the meshes. All instances of a mesh in a
+        Each mesh has a separate material, numbered in the order of the meshes. All instances of a mesh in a
         `trimesh.Scene` share its material.
 
         Parameters
@@ -144,7 +141,7 @@ class Scene:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, metres: float = 1.0) -> Scene:
-        """Read a scene from an STL, PLY, OBJ or GLB file; each mesh of the file has its own material.
+        """Read a scene from an STL, PLY, OBJ or GLB file; each mesh of the file has a separate material.
 
         Parameters
         ----------

@@ -44,7 +44,7 @@ class VisibleIntervals(VisionOperation[Intervals]):
     A fan is the set of rays from an apex to the points of a segment. Its 11 numbers are the apex, the two ends of the
     segment [m], and for each end the fraction of the ray, 0 to 1, from which on triangles can occlude. Fractions of 0
     describe a direct view. A view in a plane mirror has its apex at the mirror image of the lens, behind the mirror;
-    the fractions are then those at which the rays pass the mirror.
+    the fractions then tell where the rays pass the mirror.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Simulated sensors: what they see, how they collect light, and what they read."""
+"""Simulated sensors: visible surfaces, collection of light, and readings."""

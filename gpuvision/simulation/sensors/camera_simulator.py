@@ -30,7 +30,7 @@ from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 
 Float64 = npt.NDArray[np.float64]
 _ALIGNMENT_LIMITS = AlignmentLimits()
-# Largest mean for which Poisson numbers are drawn [electrons]; no well holds as many, and NumPy's limit is 9e18.
+# Largest mean for which Poisson numbers are drawn [electrons]; no well holds this number, and NumPy's limit is 9e18.
 _MAX_ELECTRONS = 1e15
 
 
@@ -43,7 +43,7 @@ class CameraSimulator:
     view
         View of the camera; its bins along u are the pixels of a profile.
     readout
-        Readout of the line. Without a triangulation it takes that of the view.
+        Readout of the line. Without a triangulation it takes the triangulation of the view.
     exposure_time
         Exposure time [s], 0 or more.
     responsivity

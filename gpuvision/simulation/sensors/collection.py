@@ -11,7 +11,7 @@ _PLANCK, _LIGHT, _CHARGE = 6.62607015e-34, 299792458.0, 1.602176634e-19
 
 
 def lens_solid_angle(radius: npt.ArrayLike, distance: npt.ArrayLike) -> Array:
-    """Return the solid angle of a round aperture seen from a point on its axis: 2 pi (1 - cos) [sr].
+    """Return the solid angle of a round aperture from a point on its axis: 2 pi (1 - cos) [sr].
 
     Parameters
     ----------

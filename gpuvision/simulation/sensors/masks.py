@@ -32,7 +32,7 @@ from gpuvision.validation import finite
 Float64 = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 
-# Candidates for each end of a window in one step of the grid search (speed only: the search goes on to single bins).
+# Candidates for each end of a window in one step of the grid search (speed only: the search continues to single bins).
 _CANDIDATES = 16
 # Pairs of window ends per batch: bounds the memory of a batch, 8 bytes a pair.
 _PAIRS_PER_BATCH = 4_000_000
@@ -241,7 +241,7 @@ class MaskOptimisation(NamedTuple):
         Error of the light's centroid without and with the mask, (profiles, samples) [m of height]; NaN where there is
         no valid light.
     passed_fraction
-        Fraction of the valid light that passes, (profiles, samples); NaN where there is none.
+        Fraction of the valid light that passes, (profiles, samples); NaN where there is no valid light.
     """
 
     mask: Mask
@@ -295,8 +295,8 @@ def optimise_mask(
     Notes
     -----
     Window ends lie at edges of bins. A grid search over all pairs of ends is refined from 16 candidates for each end
-    down to single bins. Where the error has several local minima, the search can miss one that lies between two
-    candidates of the first grid.
+    down to single bins. Where the error has several local minima, the search can miss a minimum between two candidates
+    of the first grid.
     """
     if objective not in ("max", "rms"):
         raise ValueError(f"objective is {objective!r}, expected 'max' or 'rms'")
@@ -339,7 +339,7 @@ def _widest_cuts(
     below = np.cumsum(direct.power, axis=-1)
     spare = 0.5 * (1.0 - min_passed_fraction) * below[..., -1:]
     low = np.sum(below <= spare, axis=-1)
-    # Summed from the upper end: a spare power near 0 would be lost in the rounding of a sum from the lower end.
+    # Summed from the upper end: an excess power near 0 would be lost in the rounding of a sum from the lower end.
     high = len(edges) - 1 - np.sum(np.cumsum(direct.power[..., ::-1], axis=-1) <= spare, axis=-1)
     if margin:
         low = np.searchsorted(edges, edges[np.minimum(low, len(edges) - 1)] - margin, side="right") - 1

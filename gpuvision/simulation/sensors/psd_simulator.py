@@ -47,7 +47,7 @@ class PsdSimulator:
         strips. Light outside the edges is lost.
     readout
         Readout of the currents, layout "pairs". Dark level, gain, load, linearity and noise of the readout are
-        simulated. Without a triangulation it takes that of the view.
+        simulated. Without a triangulation it takes the triangulation of the view.
     responsivity
         Responsivity of the strips [A/W], 0 or more.
     ambient
@@ -106,7 +106,8 @@ class PsdSimulator:
     ) -> npt.NDArray[Any]:
         """Return the currents (left, right) of the strips, (..., strips, 2), in units of `readout.ampere`.
 
-        The strips are in the order of the readout: opposite to that of the view if the pitch of the axes is negative.
+        The strips are in the order of the readout: opposite to the order of the view if the pitch of the axes is
+        negative.
 
         Parameters
         ----------
@@ -149,7 +150,7 @@ class PsdSimulator:
         Parameters
         ----------
         exposures, seed, first_profile
-            As for `currents`. Without a seed, the reading is that of the noiseless currents; sigma is the same.
+            As for `currents`. Without a seed, the noiseless currents are read; sigma is the same.
         device
             Device of the readout; None: `Device.best`.
 

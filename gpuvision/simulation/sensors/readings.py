@@ -261,7 +261,7 @@ def make_reading(view: SensorView, readout: Any, u: Float64, sigma_u: Float64, *
     u, sigma_u
         Position and its standard deviation [sensor unit].
     backward
-        True: the samples of the readout are in the opposite order to those of the view.
+        True: the samples of the readout are in the opposite order to the samples of the view.
     """
     step = -1 if backward else 1
     width = getattr(readout, "width", np.full(u.shape, np.nan))

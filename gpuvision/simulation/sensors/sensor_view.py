@@ -2,8 +2,8 @@
 
 The sheet of light and the sensor move together along the transport; methods take the transport L of a profile. The
 image of a point is found in two steps. The ray from the lens through the point meets the sheet of light at (G, H). The
-triangulation gives the position on the sensor that sees (G, H). This holds for every pinhole sensor, tilted or not,
-because the sheet and the sensor are planes.
+triangulation gives the position of the image of (G, H) on the sensor. This holds for every pinhole sensor, tilted or
+not, because the sheet and the sensor are planes.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class ViewLimits:
     Attributes
     ----------
     spot_radius : float
-        Radius of a blurred spot [standard deviations]; the light beyond is left out. Derived: less than 3e-12 of a
+        Radius of a blurred spot [standard deviations]; light beyond it is omitted. Derived: less than 3e-12 of a
         Gaussian is farther away.
     min_off_sheet : float
         Least distance of the lens from the sheet of light, as a fraction of its distance from the sheet's origin.
@@ -239,7 +239,7 @@ class SensorView:
         return Exposure(np.zeros((self.samples, self.bins)), np.zeros((self.samples, self.bins)))
 
     def deposit_spots(self, u: npt.ArrayLike, v: npt.ArrayLike, power: npt.ArrayLike) -> Exposure:
-        """Return the exposure by point-like spots of light; light beside the sensor is lost.
+        """Return the exposure by point-like spots of light; light outside the sensor is lost.
 
         Parameters
         ----------

@@ -321,9 +321,9 @@ class DirectLight:
     def truth(self, L: float) -> GroundTruth:
         """Return the true position of the sheet's middle at a transport L [m], at the middle of each sample.
 
-        The position is that of a lit point that the lens sees and the sensor images. Status: LOW_SIGNAL, there is no
-        such point; OUT_OF_RANGE, the point is imaged beyond the sensor's ends in u, and is not given; AMBIGUOUS, there
-        are several, and the one with the most light is given.
+        The position belongs to a lit point that is visible from the lens and imaged on the sensor. Status: LOW_SIGNAL,
+        there is no such point; OUT_OF_RANGE, the point is imaged beyond the sensor's ends in u, and is not given;
+        AMBIGUOUS, there are several, and the one with the most light is given.
         """
         found = self.truths_of_profiles([L])
         return GroundTruth(found.g[0], found.h[0], found.status[0])
@@ -336,7 +336,7 @@ class DirectLight:
         parts = images.clip_to_view(self._visible_parts(lit))
         v = images.image_points(parts.segment, np.stack([parts.start, parts.end]))[..., 1]
         low, high = v.min(axis=0), v.max(axis=0)
-        # Half-open intervals: of two parts that touch in a sample's middle, one gets the sample.
+        # Half-open intervals: a sample whose middle lies on the border of two parts belongs to one of them.
         first = np.searchsorted(view.v_centres, low, side="left")
         count = np.maximum(np.searchsorted(view.v_centres, high, side="left") - first, 0)
         owner, sample = np.repeat(np.arange(len(count)), count), concatenated_ranges(first, count)
@@ -440,7 +440,7 @@ def _slabs(given: int | Sequence[float]) -> Slabs:
 def _strongest_points(
     samples: int, sample: Integers, places: Float64, on: npt.NDArray[np.bool_], light: Float64, same: float
 ) -> GroundTruth:
-    """Return for each sample the position (G, H) with the most light among those on the sensor, with status flags."""
+    """Return for each sample the position (G, H) with the most light on the sensor, with status flags."""
     order = np.lexsort((-light, ~on, sample))
     sample, places, on = sample[order], places[order], on[order]
     best = np.flatnonzero(np.diff(sample, prepend=-1))

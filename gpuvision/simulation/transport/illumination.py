@@ -196,8 +196,8 @@ class LightSheet:
         Returns
         -------
         line, first
-            All segments, those of one sheet in the order of its rays; and (k + 1,) indices of each sheet's first
-            segment, with the end of the last.
+            All segments; the segments of a sheet are in the order of its rays; and (k + 1,) indices of each sheet's
+            first segment, with the end of the last.
         """
         transports = np.atleast_1d(np.asarray(transports, np.float64))
         cuts = SheetIndex.of(scene, self.transport).cuts(transports)
@@ -215,7 +215,7 @@ class LightSheet:
     def direction_to_light(self, points: npt.ArrayLike) -> Float64:
         """Return unit vectors (..., 3) from points (..., 3) towards the light.
 
-        The light of a fan comes from its source in the sheet that the point lies in.
+        The light of a fan is emitted by its source, in the sheet that contains the point.
         """
         points = np.asarray(points, np.float64)
         if self.source is None:

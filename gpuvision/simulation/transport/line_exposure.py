@@ -20,7 +20,7 @@ _WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 
 
 def expose_lines(view: SensorView, L: float, ends: Float64, power_on_line: PowerOnLine) -> Exposure:
-    """Return the exposure of a sensor by lines that it sees from end to end.
+    """Return the exposure of a sensor by completely visible lines.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def expose_lines(view: SensorView, L: float, ends: Float64, power_on_line: Power
         Transport [m].
     ends
         (k, 2, 3): ends of the lines, or of their images behind plane mirrors [m]. Parts behind the lens or beyond the
-        sheet's horizon are left out.
+        sheet's horizon are omitted.
     power_on_line
         Function of the index of a line (n,) and the fraction of its length (n,), 0 to 1, that returns the power on the
         sensor per unit of the fraction [W].

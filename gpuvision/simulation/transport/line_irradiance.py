@@ -152,7 +152,7 @@ class LineIrradiance(VisionOperation[Irradiance]):
     """Diffuse irradiance by lit segments: ``op(receivers) -> Irradiance``, receivers float32 or float64 (..., 6).
 
     A receiver is a position [m] and a normal of any length, in the frame of the segments. Parts of a segment behind the
-    receiver's plane do not count, nor does a segment whose emitting side faces away. Nothing occludes.
+    receiver's plane do not count, nor does a segment whose emitting side faces away. Occlusion is not computed.
 
     Parameters
     ----------
@@ -173,10 +173,10 @@ class LineIrradiance(VisionOperation[Irradiance]):
     -----
     The closed form of a differential receiver and a line in a diffuse surface, in a form without cancellation
     (kernels/line_irradiance/line_irradiance.h): one form serves near, far and end-on receivers. Let E0 = M h / pi times
-    the integral of dt / r^3, the irradiance if the whole segment stood in the receiver's normal; E <= E0. The error per
+    the integral of dt / r^3, the irradiance if the whole segment were on the receiver's normal; E <= E0. The error per
     segment is below 2e-6 E0 in single and 1e-14 (1 + D / h) E0 in double, at any distance: h is the receiver's height
     above the lit surface, D the distance of the segment's far end or of the middle of all segments. So the error is
-    relative except where the receiver sees the segment at a grazing angle. On a device without double, positions are
+    relative except where the segment is at a grazing angle to the receiver. On a device without double, positions are
     single, which adds 1.2e-7 of the largest coordinate over h. The tests hold these limits at random and extreme
     configurations.
 
@@ -210,7 +210,7 @@ class LineIrradiance(VisionOperation[Irradiance]):
         firsts = tables[3]
         count = math.prod(shape[:-1])
         share = build.share(count, per_core=_STRIPS_PER_CORE, multiple=_LANES)
-        # Fewer receivers than this are not worth a work-item.
+        # With fewer receivers the start of a work-item would cost more time than it saves.
         least = ceil_div(_PAIRS_PER_STRIP, max(int(firsts[-1]), 1) * _LANES) * _LANES
         work = build.work(count, each=max(share, least), group=_GROUP, least=_LANES, grouping="fitted")
         return build.launch(

@@ -42,7 +42,7 @@ class VisibilityLimits:
         Number of visible intervals of a segment that one run of the kernel returns. Chosen for speed: a segment with
         more intervals is halved.
     max_halvings : int
-        Largest number of times that a segment is halved; what then still has too many intervals counts as hidden.
+        Largest number of times that a segment is halved; a part that still has too many intervals counts as hidden.
         Derived: 2^-20 is a millionth of the segment.
     """
 
@@ -116,7 +116,7 @@ class LensVisibility:
         object.__setattr__(self, "_bound", fans.bind(self.device, (_FANS_PER_LAUNCH, 11), real))
 
     def visible_parts(self, line: LitLine, lens: Float64, *, with_hidden: bool = False) -> Parts:
-        """Return the parts of segments that the lens sees, and the hidden parts too if asked.
+        """Return the parts of segments that are visible from the lens, and on request the hidden parts.
 
         Parameters
         ----------

@@ -57,7 +57,7 @@ class MirrorFacets(VisionOperation[NearFacets]):
 
     Notes
     -----
-    The test is conservative: no block that shows a part of the line is left out. A block is represented by a ball and a
+    The test is conservative: no block that shows a part of the line is omitted. A block is represented by a ball and a
     cone of normals (`TriangleBlocks`), widened by more than rounding; the line is tested against the cone of all points
     that these may show, bounded by tangents. Occlusion is not considered.
     """

@@ -165,7 +165,7 @@ class TriangleBlocks(NamedTuple):
         away = np.linalg.norm(points - middle[each][:, None], axis=2).max(axis=1) + max_bulge(points, directions)
         axis = np.add.reduceat(directions.sum(axis=1), start[:-1])
         length = np.linalg.norm(axis, axis=1, keepdims=True)
-        # Where the normals cancel any axis will do: the cone is wide.
+        # Where the normals cancel, the cone is wide and its axis is arbitrary.
         axis = np.where(length > 0.0, axis / np.where(length > 0.0, length, 1.0), (0.0, 0.0, 1.0))
         lean = np.arctan2(
             np.linalg.norm(np.cross(directions, axis[each][:, None]), axis=2),
@@ -219,7 +219,7 @@ class MirrorPoints(VisionOperation[MirrorImages]):
     Points are float32 or float64 (..., 6): a position and a step (any vector) [m]. The lens is a position (3,) [m]. On
     each triangle Newton's method finds the point at which the half vector between the directions to the lens and to the
     point is parallel to the normal, interpolated from the corners. The point is lifted off the flat triangle by the
-    bulge that the normals imply. Nothing occludes.
+    bulge that the normals imply. Occlusion is not computed.
 
     Parameters
     ----------
@@ -245,8 +245,8 @@ class MirrorPoints(VisionOperation[MirrorImages]):
     -----
     Normal and surface are exact to second degree, so the error of an image is of third power in the triangles' size
     over the radius of curvature, that of its density of first. One image per triangle is found: triangles must be small
-    beside distances and radii, at least a few across each image. An image on the edge of two triangles is found on
-    both. At grazing incidence, within about the angle that a triangle turns, an image may be missed (measured on a
+    compared with distances and radii, at least a few across each image. An image on the edge of two triangles is found
+    on both. At grazing incidence, within about the angle that a triangle turns, an image may be missed (measured on a
     sphere of 1280 triangles: 1 point in 300). Near a caustic the density is unbounded.
 
     References

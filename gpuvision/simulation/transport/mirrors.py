@@ -1,4 +1,4 @@
-"""Specular interreflection of lit lines: lines seen in mirrors, and lines that mirrors light on other surfaces."""
+"""Specular interreflection of lit lines: mirror images of lines, and lines that mirrors project on other surfaces."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class MirrorLimits:
 
 
 class _MirroredParts(NamedTuple):
-    """Parts of lines that are seen in mirrors: index of the line, of the mirror, and fractions of the line (k, 2)."""
+    """Parts of lines visible in mirrors: index of the line, of the mirror, and fractions of the line (k, 2)."""
 
     line: Integers
     mirror: Integers
@@ -80,10 +80,10 @@ class _MirroredParts(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mirrors:
-    """Mirrors of a scene as a sensor sees them; compared by identity.
+    """Mirrors of a scene in view of a sensor; compared by identity.
 
     A triangle whose material has a `mirror` share reflects on both sides. Where the normals at its corners agree with
-    its own it is a plane mirror, and its images are exact. Otherwise it is part of a curved mirror.
+    the normal of the triangle, it is a plane mirror, and its images are exact. Otherwise it is part of a curved mirror.
 
     Parameters
     ----------
@@ -242,7 +242,7 @@ class Mirrors:
         near = up[:, None] / (up[:, None] + away)
         row, behind = self._visible(apex, ends, near, np.tile([0.0, 1.0], (len(line), 1)))
         line, mirror, share, apex, near = line[row], mirror[row], share[row], apex[row], near[row]
-        # Points of the mirror through which the ends are seen from the lens' mirror image (the apex).
+        # Points where the lines from the lens' mirror image (the apex) to the ends cross the mirror.
         ends = _between(ends[row], behind)
         near = 1.0 / ((1.0 - behind) / near[:, :1] + behind / near[:, 1:])
         on_mirror = apex[:, None] + near[..., None] * (ends - apex[:, None])
@@ -257,7 +257,7 @@ class Mirrors:
         return _MirroredParts(line[row], mirror[row], share[:, :1] + np.diff(share) * before)
 
     def _candidate_pairs(self, lit: LitLine, lens: Float64) -> tuple[Integers, Integers]:
-        """Return the pairs of a line and a plane mirror in which it may be seen."""
+        """Return the pairs of a line and a plane mirror in which it may be visible."""
         blocks = self._facets.blocks
         line, block = np.nonzero(self._run(self._facets, lit.ends.reshape(-1, 6), lens).near)
         count = np.diff(blocks.start)[block]
@@ -334,7 +334,7 @@ class Mirrors:
     def _is_unobstructed(
         self, origin: Float64, spot: Float64, lens: Float64, triangle: Integers
     ) -> npt.NDArray[np.bool_]:
-        """Return whether nothing occludes the ways from points to spots on curved mirrors and on to the lens.
+        """Return whether the paths from points to spots on curved mirrors and on to the lens are free of occluders.
 
         The smooth surface bulges out of its triangle: that part of the way at the mirror is not tested.
         """
@@ -400,7 +400,7 @@ class Mirrors:
 
     @functools.cached_property
     def _normals(self) -> Float64:
-        """Return normals at the corners, of closed surfaces outwards; only those of mirrors are used."""
+        """Return normals at the corners, of closed surfaces outwards; only the normals of mirrors are used."""
         if self.normals is not None:
             found = np.array(self.normals, np.float64)
         else:

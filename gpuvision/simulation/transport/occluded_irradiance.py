@@ -35,12 +35,13 @@ SELECTION_BLOCK = 16
 """Receivers of a strip that share a list of selected segments."""
 
 _GROUP = 64  # work-items of a work-group (speed only)
-# Parts of the work per CPU core: enough to balance the load; few, because each groups the segments into lines anew.
+# Parts of the work per CPU core: enough to balance the load, but few, because each part groups the segments into lines
+# again.
 _SHARES_PER_CORE = 8
 # Least stack depth in the build options, so that all small scenes share one build.
 _MIN_STACK_DEPTH = 4
-# Default clearance in parts of the scene's reach, by bytes of the type: below it, the rounding of positions (of the
-# caller's, too) decides on which side of a surface a point lies.
+# Default clearance in parts of the scene's reach, by bytes of the type: below it, the rounding of positions (including
+# the caller's) decides on which side of a surface a point lies.
 _CLEARANCE = {4: 4e-6, 8: 1e-12}
 
 
@@ -77,7 +78,7 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
     receivers (strips, n, 6)
         Position [m] and normal of any length; a normal of zero marks an entry without receiver.
     weights (strips, n, 2)
-        What 1 W/m^2 adds to `left` and `right`.
+        Contributions of 1 W/m^2 to `left` and `right`.
     segments (segments, 10)
         Start, end [m], normal of the lit surface on the side that emits, exitance [W/m] (`segment_rows`). A row with an
         exitance of 0 or less is no segment.

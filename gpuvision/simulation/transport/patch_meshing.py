@@ -150,7 +150,7 @@ def _connected_components(count: int, one: Integers, other: Integers) -> Integer
 
 
 def _faces_outwards(corners: Reals) -> Flags:
-    """Return whether triangles belong to closed surfaces with their front outside, whose backs nobody outside sees."""
+    """Return whether triangles belong to closed surfaces with their front outside: their backs are never visible."""
     edge, face = _edge_keys(corners)
     order = np.argsort(edge, kind="stable")
     edge, face = edge[order], face[order]

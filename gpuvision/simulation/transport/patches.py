@@ -57,11 +57,11 @@ class Patches:
     origin
         (m,) integers: triangle of a scene that each triangle is a part of. Default: the triangle's own index.
     slack
-        (count,) metres: distance before a patch within which nothing occludes it, because the patch stands for a
+        (count,) metres: distance before a patch within which no surface occludes it, because the patch represents a
         surface there. Default 0.
     nodes
         Receivers (r, 6), their patches (r,), and weights (r,) that add up to 1 for each patch: quadrature nodes for the
-        light that arrives on some patches, in place of the nodes on their own triangles (`quadrature`).
+        light that arrives on some patches, which replace the nodes on the triangles of the patches (`quadrature`).
 
     Raises
     ------
@@ -116,19 +116,19 @@ class Patches:
 
         Triangles are halved at their longest edge, so that long thin ones give few patches. Triangles smaller than half
         the size are joined where they are connected, have one material, lie in one cell of that size, and face roughly
-        one way. More than eight triangles joined so are replaced by an octagon of the same area if they are nearly
-        flat, so that a fine mesh costs no more than a coarse one; the light that arrives is still sampled on the
-        triangles.
+        one way. More than eight triangles that are joined this way are replaced by an octagon of the same area if they
+        are nearly flat, so that a fine mesh costs no more than a coarse one; the light that arrives is still sampled on
+        the triangles.
 
         Parameters
         ----------
         scene
-            Surfaces; degenerate triangles are left out.
+            Surfaces; degenerate triangles are omitted.
         size
             Largest edge of a patch [m], more than 0.
         both_sides
-            Whether the back of every triangle is a surface, too. None: all backs except those of closed surfaces whose
-            front is outside.
+            Whether the back of every triangle is also a surface. None: all backs except the backs of closed surfaces
+            whose front is outside.
         limits
             Limits of joining and outlining.
 
@@ -353,11 +353,11 @@ class FormFactors(_PatchOperation[Factors]):
     Notes
     -----
     Lambert's sum over the edges of each triangle, clipped at the receiver's plane, in a form without cancellation for
-    triangles that are small beside their distance (kernels/patches/patches.h). The error is below 32 f (s + c / d + c /
-    h) roundings: f is the factor that a receiver in that position would have if it faced the triangle best, s the
-    longest edge over the smallest altitude, c the distance of the farthest corner, d that of the nearest line through
-    an edge, h the height above the triangle. Below a height of 16 roundings of the largest coordinate the receiver
-    counts as in the triangle's plane, where the factor is 0. The tests hold these limits.
+    triangles that are small compared with their distance (kernels/patches/patches.h). The error is below 32 f (s + c /
+    d + c / h) roundings: f is the factor that a receiver in that position would have if it faced the triangle best, s
+    the longest edge over the smallest altitude, c the distance of the farthest corner, d that of the nearest line
+    through an edge, h the height above the triangle. Below a height of 16 roundings of the largest coordinate the
+    receiver counts as in the triangle's plane, where the factor is 0. The tests hold these limits.
 
     Rays go to the middles of equal cells of the part of a triangle above the receiver's plane. The share of them that
     reach it, weighted by the cells' factors, times the exact factor is the result. A triangle that is entirely visible
@@ -383,7 +383,7 @@ class PatchLight(_PatchOperation[Irradiance]):
     """Irradiance by patches: ``op(receivers, exitance) -> Irradiance``, receivers (..., 6), exitance (count,) [W/m^2].
 
     The sum of `FormFactors` times exitances without the matrix. The exitance has the type of the arithmetic.
-    Parameters, exceptions and errors are those of `FormFactors`.
+    Parameters, exceptions and errors are the same as for `FormFactors`.
     """
 
     Result: ClassVar[type[Any]] = Irradiance

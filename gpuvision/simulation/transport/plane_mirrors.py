@@ -1,4 +1,4 @@
-"""Windows of plane mirrors: the part of a line that a lens sees in a triangle, without occlusion."""
+"""Windows of plane mirrors: the part of a line that the lens can see in a mirror triangle, without occlusion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MIN_HEIGHT = 1e-12
 
 
 class MirrorWindows(NamedTuple):
-    """Parts of lines that a lens sees in mirrors.
+    """Parts of lines that are visible from the lens in mirrors.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ def mirror_windows(
     *,
     min_height: float = MIN_HEIGHT,
 ) -> MirrorWindows:
-    """Return the parts of lines that a lens sees in triangles.
+    """Return the parts of lines that are visible from the lens in mirror triangles.
 
     The ray from the lens to the mirror image of the point meets the triangle. Line and lens lie on the same side of the
     mirror; both sides reflect. Exact to rounding. Occlusion is not considered.

@@ -19,8 +19,8 @@ from gpuvision.simulation.transport.patches import FormFactors, Patches, PatchLi
 
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
-# Receivers whose form factors are in memory at a time. Batches are padded to multiples of the second number, so that
-# few kernels are bound.
+# Receivers per batch: the form factors of a batch are in memory together. Batches are padded to multiples of the second
+# number, so that few kernels are bound.
 _ROWS_PER_BATCH, _ROW_MULTIPLE = 2048, 128
 # Gauss-Legendre nodes of a segment: a base number, and more per patch size of its length.
 _NODES_PER_SEGMENT, _NODES_PER_PATCH = 8, 2.0
@@ -92,9 +92,9 @@ class Radiosity:
     Exitance is constant on a patch, arriving light is averaged over three nodes of it, form factors are exact apart
     from partly hidden triangles (`FormFactors`). In a closed convex room the factors of each point add up to 1 to
     rounding, so that energy is conserved for any number of bounces. Errors are of second order in the patches' size
-    where the light is smooth, of first order at shadow edges. Beside a lit line that runs into a wall light grows as 1
-    / distance: `direct_irradiance` is the exact mean over each patch, and `refine_corners` makes the patches in corners
-    smaller.
+    where the light is smooth, of first order at shadow edges. Next to a lit line that runs into a wall, the light is
+    proportional to 1 / distance: `direct_irradiance` is the exact mean over each patch, and `refine_corners` makes the
+    patches in corners smaller.
 
     References
     ----------
@@ -214,7 +214,7 @@ class Radiosity:
         exitance
             (count,): exitance of the patches [W/m^2].
         min_exitance
-            Patches of less exitance are left out [W/m^2]. With exact visibility no receiver loses more than this,
+            Patches of less exitance are omitted [W/m^2]. With exact visibility no receiver loses more than this,
             because its form factors to patches that do not overlap add up to at most 1; sampled visibility
             (`FormFactors`) may exceed that.
         """
@@ -368,8 +368,8 @@ def refine_corners(
 def _line_samples(lit: LitSegments, size: float, short_segment: float) -> tuple[Reals, Reals]:
     """Return points along segments as receivers (n, 6), and the power that each stands for [W].
 
-    Long segments get Gauss-Legendre nodes that are denser towards the ends. Of segments that are short beside the
-    patches, one stands for all in its neighbourhood that face roughly the same way.
+    Long segments get Gauss-Legendre nodes that are denser towards the ends. Segments that are short compared with the
+    patches are grouped: one segment represents all segments in its neighbourhood that face roughly the same way.
     """
     length = np.linalg.norm(lit.ends[:, 1] - lit.ends[:, 0], axis=1)
     power = lit.exitance * length

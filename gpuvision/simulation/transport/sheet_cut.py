@@ -56,7 +56,7 @@ class Cuts(NamedTuple):
 class SheetIndex:
     """Triangles of a scene in the transport's coordinates, sorted so that a sheet's cuts are found quickly.
 
-    A triangle with a corner in the sheet is cut as if the sheet stood just before the corner. A triangle that lies in
+    A triangle with a corner in the sheet is cut as if the sheet were just before the corner. A triangle that lies in
     the sheet is not cut. Instances are compared by identity.
 
     Attributes

@@ -47,7 +47,7 @@ def _crossings(line: LitLine, sheet: LightSheet, view: SensorView, L: float) -> 
         mirrored = light - 2.0 * np.sum(light * normal, axis=-1, keepdims=True) * normal
         weight = -(mirrored @ axis)
         return weight[..., None] * ends + (ends @ axis)[..., None] * mirrored, weight
-    # The mirrored light comes from the source's mirror image.
+    # The mirrored light is emitted by the mirror image of the source.
     source = sheet.source_positions(line.ends) - view.lens_at(L)
     source = source + 2.0 * np.sum((ends - source) * normal, axis=-1, keepdims=True) * normal
     mirrored = ends - source

@@ -334,7 +334,7 @@ class _MirroredSheets(NamedTuple):
 
     @property
     def is_point(self) -> npt.NDArray[np.bool_]:
-        """Whether the light comes from a point source, (f,)."""
+        """Whether the light is emitted by a point source, (f,)."""
         return np.asarray(self.light[:, 3] != 0.0)
 
     def places(self, fan: Integers, x: Float64, height: Float64) -> Float64:

@@ -125,7 +125,7 @@ class Row:
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the columns by name, with those of the metadata after the others."""
+        """Return the columns by name; the columns of the metadata are the last ones."""
         table = asdict(self)
         return {key: value for key, value in table.items() if key != "metadata"} | dict(self.metadata)
 

@@ -93,7 +93,7 @@ class Part:
 
     @classmethod
     def board(cls, **more: int) -> Part:
-        """Return the board of the operation `reflections`, with 4 times as many lit segments."""
+        """Return the board of the operation `reflections`, with four times the number of lit segments."""
         board = Board.of(parts_of_segments=4, **more)
         count = board.receivers[..., 0].size
         area, width = 0.1 * 0.08 / count, 0.1 / len(board.receivers)

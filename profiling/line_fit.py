@@ -22,7 +22,7 @@ from gpuvision.profiling.harness import Case
 from gpuvision.profiling.pose import STEPS, TRIALS, fit_line
 
 _LINES, _SIGMA = 10_000, 0.05  # px
-_FEW = 100  # lines that OpenCV fits; its time for all lines is extrapolated, since the lines are alike
+_FEW = 100  # lines that OpenCV fits; its time is extrapolated to all lines (equal numbers of points)
 _ONE = np.float32(1.0)
 
 

@@ -4,7 +4,7 @@
 equations, in double like ours, compiled by Numba on all cores; quantities that do not depend on the point are computed
 beforehand. `error` is the largest distance between its images and ours [m].
 
-``facets/N``: light of a line on a floor, seen in the sides of boxes. The peer takes N samples of each lit segment,
+``facets/N``: mirror images of a line on a floor in the sides of boxes. The peer takes N samples of each lit segment,
 finds their mirror images in all facets, and traces both paths of each image with Embree. Our result is exact;
 `peer_error` is the median error of the peer over the samples of the sensor.
 """
@@ -215,7 +215,7 @@ def _facets(device: Device, samples: int) -> Case:
 
 
 def _box_scene() -> tuple[Scene, SensorView, LitLine]:
-    """Return boxes with mirroring sides on a floor, a sensor beside a sheet of light, and the lit line."""
+    """Return boxes with mirroring sides on a floor, a sensor, a sheet of light, and the lit line."""
     rng = np.random.default_rng(1)
     floor = np.array(
         [[[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0]], [[-0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]]]

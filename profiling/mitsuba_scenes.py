@@ -50,7 +50,7 @@ class Receivers(NamedTuple):
     weights
         (nodes squared,): weights of the mean over a pixel.
     whole
-        bool (rows, columns): the pixel sees one plane and is some pixels away from every strip.
+        bool (rows, columns): the pixel images a single plane and is some pixels away from every strip.
     """
 
     rows: Float64
@@ -166,7 +166,7 @@ def groove(angle: float, pixels: tuple[int, int] = (64, 64)) -> LitScene:
 
 
 def board(pixels: tuple[int, int] = (40, 184)) -> LitScene:
-    """Return a board with parts and a line of strips over them, seen at 45 degrees: the sides that face the line."""
+    """Return a board with parts and a line of strips over them, viewed at 45 degrees: the sides that face the line."""
     of = Board.of()
     slope = math.sqrt(0.5)
     return LitScene(

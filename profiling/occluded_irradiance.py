@@ -1,10 +1,10 @@
 """Light of a lit line on a board with parts, with occlusion: OccludedIrradiance compared with NumPy and Embree.
 
 The peer samples the line, keeps the pairs that face each other (by matrix products, in blocks), traces a shadow ray for
-each pair with Embree on all cores, and sums. It computes one profile at a time; we compute eight profiles in sequence.
-Both errors are medians over the receivers that get light, relative to OccludedIrradiance in double, which the tests
-compare with rays in float64; they are NaN on a device without double. Cases ``growth/...`` have four times the segments
-or receivers of the board, or four and sixteen times its triangles.
+each pair with Embree on all cores, and sums. The peer computes one profile per call; gpuvision computes eight profiles
+in sequence. Both errors are medians over the receivers that get light, relative to OccludedIrradiance in double, which
+the tests compare with rays in float64; they are NaN on a device without double. Cases ``growth/...`` have four times
+the segments or receivers of the board, or four and sixteen times its triangles.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gpuvision.simulation.transport.line_irradiance import LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance, segment_rows
 
 _PARTS, _STRIPS, _EACH = 40, 100, 30
-_LIFT = 1e-6  # clearance from a surface [m], also that of the ends of the rays of the peer
+_LIFT = 1e-6  # clearance from a surface [m]; the rays of the peer use the same clearance at their ends
 _PROFILES = 8  # profiles in sequence, as in a scan; the peer gains nothing from a sequence
 _BLOCK = 1 << 22  # pairs per block of the peer
 _BASE = "board/1024"  # case that the sizes of growth/... refer to

@@ -1,9 +1,9 @@
 """Light of patches on points: form factors in a room, and a board with occlusion, compared with NumPy and Embree.
 
 In the room the peer is Lambert's sum over edges in NumPy, float64. There is no occlusion, and no wall crosses the
-horizon of a receiver; neither side clips patches or traces rays. On the board the peer is the usual approximation: a
-patch is a point at its centroid, and Embree tests its visibility. Errors are relative to the largest irradiance,
-compared with double precision and sixteen times as many rays; `peer_error` is that of the peer.
+horizon of a receiver; gpuvision and the peer do not clip patches or trace rays. On the board the peer is the usual
+approximation: a patch is a point at its centroid, and Embree tests its visibility. Errors are relative to the largest
+irradiance, compared with double precision and sixteen times the number of rays; `peer_error` is the error of the peer.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 A hundred calipers (rulers) of 64 samples and 5 lines, ten across each of ten edges of the artwork, in an 8-bit frame of
 640 x 480: edge positions, a robust line through the edge points of each artwork edge, a robust pose from the lines, and
-its covariance at the placement point. One line is displaced, and every tenth ruler sees a spot brighter than its edge.
+its covariance at the placement point. One line is displaced, and every tenth ruler crosses a spot brighter than its
+edge.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ Numba).
 
 ``pair`` is a complete registration of two binary images of 640 x 640 with realistic noise and defects, without an
 initial pose. OpenCV's findTransformECC starts within 2 px and 0.2 degrees of the true pose, because it does not
-converge without an initial pose. ``error`` is the largest error of the four corners [px], ``opencv_error_px`` that of
-OpenCV.
+converge without an initial pose. ``error`` is the largest error of the four corners [px], ``opencv_error_px`` the error
+of OpenCV.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ _LIFT = 1e-5  # distance of a fan's apex from the surface [m]
 
 
 def cases(device: Device) -> Iterator[Case]:
-    """Yield a board, and the same board with 64 times as many triangles."""
+    """Yield a board, and the same board with 64 times the number of triangles."""
     for name, finer in (("board", 0), ("board-fine", 3)):
         yield _case(device, name, board(finer))
 

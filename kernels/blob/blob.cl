@@ -9,8 +9,8 @@
 // Options: ROUND: the contour is one circle or two, FREEDOMS is 3: x, y, size; else straight edges, FREEDOMS is 4: x, y,
 //          size, angle. EITHER: fiducials may be brighter or darker than the background. MATCH: refine by grey levels.
 //          SPOKES: number of rulers, even; opposite rulers are SPOKES / 2 apart. ROOM: SPOKES rounded up to whole vectors.
-// Variants: vector: a work-item takes `each` fiducials, 16 rulers at a time; work-item: a work-group of RULER_GROUP items
-//          per fiducial, one ruler after the other.
+// Variants: vector: a work-item processes `each` fiducials, 16 rulers in a vector; work-item: a work-group of
+//          RULER_GROUP items per fiducial, one ruler after the other.
 #include "blob/blob_match.h"
 #include "ruler/ruler.h"
 
@@ -111,8 +111,8 @@ static inline void take_edges(ruler_edge edge, int i, blob_layout layout, blob_s
     }
 }
 
-// Reject edges further than `search` from the nominal contour and, with EITHER, those of the minority polarity. Return the
-// number of edges kept, and their mean variances.
+// Reject edges further than `search` from the nominal contour and, with EITHER, edges of the minority polarity. Return
+// the number of edges kept, and their mean variances.
 static inline int keep_edges(private blob_edges *edges, blob_layout layout, blob_shape nominal, real cosine, real sine,
                       real search, private real *noise, private real *blur) {
 #ifdef EITHER
@@ -274,7 +274,7 @@ static inline laned_shape shape_through(private const blob_circuit *circuit, int
     return shape;
 }
 
-// Start shape: of the shapes through three edges the one with the least sum of truncated squares.
+// Start shape: among the shapes through three edges, the shape with the least sum of truncated squares.
 static inline blob_shape start_of(private const blob_edges *edges, blob_layout layout, blob_shape near, real reach) {
     blob_circuit circuit;
     wrap(edges, layout, cos(near.angle), sin(near.angle), &circuit);
@@ -369,7 +369,7 @@ static inline blob_quality quality_of(private blob_edges *edges, blob_layout lay
     quality.inliers = (int)count;
     quality.residual = scale * sqrt(sum_of(squares) / sum_of(weights));
     quality.contrast = -sum_of(amplitudes) / sum_of(weights);
-    // Variance of an edge: predicted from the noise, or measured from the residuals, whichever is larger.
+    // Variance of an edge: the larger one of the variance predicted from the noise and the variance of the residuals.
     const real measured = scale * scale * sum_of(squares) / (free * mean * mean);
     const real predicted = sum_of(noises) / (count * (real)EFFICIENCY);
     const real variance = fmax(measured, predicted) * fmax(overlap / shape.size, (real)1);

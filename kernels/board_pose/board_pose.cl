@@ -8,11 +8,11 @@
 //          residuals [m] and weights (lines, EACH_ROWS); scale, residual_scale, condition, rank, inliers,
 //          status, etch [m], inlier_fraction, leverage: one number each (pose/pose.cl); edges [px], edge_status,
 //          edge_weights (lines, each).
-// Options: those of ruler/ruler.h, line_fit/line_fit.h and pose/pose.h; EACH: capacity for the rulers of a line; ROOM:
-//          capacity for all rulers.
-// Variants: vector: one work-item does everything, 16 rulers or lines at a time (to start a second core takes longer
-//          than the computation); work-item: one work-group: all items together for each ruler, then an item per line,
-//          then item 0 for the pose.
+// Options: the options of ruler/ruler.h, line_fit/line_fit.h and pose/pose.h; EACH: capacity for the rulers of a line;
+//          ROOM: capacity for all rulers.
+// Variants: vector: one work-item computes everything, 16 rulers or lines in a vector (starting a second core would
+//          take longer than the computation); work-item: one work-group: all items together for each ruler, then an
+//          item per line, then item 0 for the pose.
 //
 // A ruler has RULER numbers: centre (2) [px] and direction (2) in the image, u0, v0, du, dv, k. They take the position
 // s [px] on the ruler to the frame of its line [m], u along the line and v along its normal, exactly for a homography:
@@ -65,7 +65,7 @@ typedef struct {
     SHARED real *etch_factor;
 } line_rows;
 
-// Store row i: at u along the line, the line was seen displaced by v along its normal, with the given variance [m2].
+// Store row i: at u along the line, the measured line is displaced by v along its normal, with the given variance [m2].
 // The variance of the line's position on the board is added. A variance that is not finite makes a missing row.
 static inline void put_row(line_rows rows, int i, global const real *line, real u, real v, real variance) {
     const int good = variance > 0 && !not_finite(variance) && !not_finite(u + v);

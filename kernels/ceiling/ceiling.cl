@@ -1,8 +1,8 @@
-// What a device can do at best: kernels that only move bytes, and one that only computes.
+// Peak performance of a device: kernels that only move bytes, and a kernel that only computes.
 
 typedef float16 vector_at __attribute__((aligned(4)));
 
-// Reads `reads` and writes `writes` vectors of 64 bytes, each work-item its own even share, in order.
+// Reads `reads` and writes `writes` vectors of 64 bytes; every work-item processes a contiguous share of equal size.
 kernel void move(global const float *from, global float *to, long reads, long writes) {
     const long item = get_global_id(0), items = get_global_size(0);
     float16 sum = 0;
@@ -10,7 +10,7 @@ kernel void move(global const float *from, global float *to, long reads, long wr
         sum += *(global const vector_at *)(from + 16 * i);
     const long first = writes * item / items, end = writes * (item + 1) / items;
     for (long i = first; i < end; i++) *(global vector_at *)(to + 16 * i) = sum;
-    // Nothing is written by an item with nothing to write: its sum must still be wanted.
+    // A work-item without writes must still use its sum, or the compiler would remove the reads.
     if (first == end && sum.s0 == 1.0e30f) to[0] = sum.s1;
 }
 

@@ -1,4 +1,5 @@
-// Bounding volume hierarchy (BVH): nodes with 16 children, leaves with 16 triangles; one ray at a time.
+// Bounding volume hierarchy (BVH): nodes with 16 children, leaves with 16 triangles; rays are traced one after the
+// other.
 //
 // One ray is tested against 16 boxes or 16 triangles at once, so unrelated rays cost as much as neighbouring rays. The 16
 // are a vector in the vector variant, else a loop. gpuvision/simulation/scene/bvh.py builds the tree.

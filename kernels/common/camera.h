@@ -1,7 +1,7 @@
 // OpenCV's camera model with 14 coefficients, in displacement form.
 //
-// The ideal position of a point is its image by a pinhole camera; its measured position is that with lens distortion
-// and tilted sensor:
+// The ideal position of a point is its image by a pinhole camera; its measured position includes lens distortion and
+// the tilt of the sensor:
 //
 //     x = (column - cx) / f                                  normalised ideal place, y likewise; q = x^2 + y^2
 //     bent x - x = x e + q (a0 + a1 q)                       with e = stretch(q) + 2 (p1 y + p2 x),
@@ -28,9 +28,9 @@
 #define CAMERA_PER_Y 3
 #define CAMERA_FOCAL_X 4   // focal length of the output pixels [px]
 #define CAMERA_FOCAL_Y 5
-#define CAMERA_SHIFT_X 6   // principal point of the output less that of the input, as rounded [px]
+#define CAMERA_SHIFT_X 6   // rounded difference of the principal points, output minus input [px]
 #define CAMERA_SHIFT_Y 7
-#define CAMERA_GROWTH_X 8  // focal length of the output over that of the input, less 1
+#define CAMERA_GROWTH_X 8  // ratio of the focal lengths, output over input, minus 1
 #define CAMERA_GROWTH_Y 9
 #define CAMERA_TILT 10     // H less the identity: xx, xy, yx, yy, then wx, wy; undistortion: the inverse of H
 #define CAMERA_K 16        // k1 .. k6
@@ -41,7 +41,7 @@
 #define CAMERA_B0 26
 #define CAMERA_B1 27
 #define CAMERA_SAFE 28     // q below which every point is invertible
-#define CAMERA_LIMIT 29    // q from which no point is invertible; in between, those with a Jacobian determinant > 0
+#define CAMERA_LIMIT 29    // q from which no point is invertible; below, invertible where the Jacobian determinant is > 0
 #define CAMERA_BENT 30       // q of bent points from which no inverse is searched: beyond the fold's image, or 1e6 f
 #define CAMERA_PER_REACH 31  // 1 / (q of bent points up to which the start polynomials hold)
 #define CAMERA_FIRST 32      // squared length of a virtual step before the first one, relative to q
@@ -248,7 +248,7 @@ static inline __attribute__((always_inline)) masks LANED(camera_approach)(reals 
     slope = g + z * slope;
     g *= z;
 #ifdef CAMERA_DECENTRED
-    c += CAMERA_GUESS_TERMS;  // coefficients v0x, v0y, v1x, ... of v, then those of w, v' and 2 (z w)'
+    c += CAMERA_GUESS_TERMS;  // coefficients v0x, v0y, v1x, ... of v, then the coefficients of w, v' and 2 (z w)'
     const reals v_x = c[0] + z * (c[2] + z * c[4]), v_y = c[1] + z * (c[3] + z * c[5]);
     const reals w_x = c[6] + z * (c[8] + z * c[10]), w_y = c[7] + z * (c[9] + z * c[11]);
     const reals turn_x = c[16] + z * (c[18] + z * c[20]), turn_y = c[17] + z * (c[19] + z * c[21]);
@@ -303,8 +303,8 @@ static inline __attribute__((always_inline)) masks LANED(camera_undistort)(reals
 #endif
     const masks open = LANED(camera_approach)(x, y, camera, &back_x, &back_y) & ~folded;
     if (any_lane(open)) {
-        // The bit patterns of non-negative reals have the order of the reals, and those of infinity and NaN are larger:
-        // one comparison of bits finds points that are too far or not finite.
+        // The bit patterns of non-negative reals have the order of the reals, and the patterns of infinity and NaN are
+        // larger: one comparison of bits finds points that are too far or not finite.
         const masks far = mask_of(as_masks(x * x + y * y) >= as_bits(camera[CAMERA_BENT]));
         folded |= far | LANED(newton_back)(x, y, open & ~far, camera, &back_x, &back_y);
     }

@@ -163,7 +163,7 @@ INLINE uint lane_bits(masks mask) {
     return (ushort)__builtin_ia32_cvtd2mask512(mask);
 }
 #else
-// Each lane keeps the bit of its own number; a tree of "or" joins them.
+// Each lane keeps the bit of its lane number; a tree of "or" operations joins the bits.
 INLINE uint lane_bits(masks mask) {
     const masks weights = {1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768};
     const masks set = mask & weights;
@@ -195,8 +195,9 @@ INLINE int any_compared(masks mask) { return lane_bits(mask) != 0; }
 
 // ---- samples of a work-item --------------------------------------------------------------------------------------------
 
-// Samples [begin, end) of a work-item, LANES at a time. Vector variant: `each` consecutive samples. Work-item variant:
-// one sample; the last group moves back to end with the last sample. `count` is at least LANES, or the group's size.
+// Samples [begin, end) of a work-item, LANES in a vector. Vector variant: `each` consecutive samples. Work-item
+// variant: one sample; the last group moves back to end with the last sample. `count` is at least LANES, or the group's
+// size.
 typedef struct {
     ulong begin, end;
 } sample_range;

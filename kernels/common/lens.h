@@ -78,8 +78,8 @@ static inline masks LANED(lens_newton)(reals square, reals e, constant real *len
     return mask_of(measured < lens[LENS_FOLD_SQUARE]);
 }
 
-// Find e from the centre (e = -1) on for the lanes that are `wanted`; the others keep `found`. A step that leaves the
-// rising part of the polynomial, or does not reduce the residual, is halved.
+// Find e, starting at the centre (e = -1), for the lanes that are `wanted`; the other lanes keep `found`. A step that
+// leaves the rising part of the polynomial, or does not reduce the residual, is halved.
 static inline reals LANED(lens_find)(reals square, masks wanted, constant real *lens, reals found) {
     const reals searched = zero_where(~wanted, square);
     reals e = -1, step = 1, residual = 1;

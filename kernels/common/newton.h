@@ -19,12 +19,12 @@
 //
 // The search starts at the centre, where the displacement is 0, with a step to the start value. A step that leaves the
 // invertible region, or does not reduce the distance, is halved. The search converges where the remaining distance or the
-// next step is rounding. For a point beyond the fold of the lens the search ends at the fold, where neither is.
-// Returns the mask of points without a solution.
+// next step is rounding. For a point beyond the fold of the lens the search ends at the fold, where neither condition
+// holds. Returns the mask of points without a solution.
 static inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant real *table, reals *back_x, reals *back_y) {
     const reals own_x = zero_where(~wanted, x), own_y = zero_where(~wanted, y), square = own_x * own_x + own_y * own_y;
     reals at_x = -own_x, at_y = -own_y, left = square, ahead = square;
-    // A start value is NaN where it comes from a search that did not converge: the comparison rejects it.
+    // A start value is NaN if the search that computed it did not converge: the comparison rejects it.
     const masks guessed = wanted & mask_of(*back_x * *back_x + *back_y * *back_y < square);
     reals step_x = own_x + zero_where(~guessed, *back_x), step_y = own_y + zero_where(~guessed, *back_y);
     masks open = wanted;
@@ -43,7 +43,7 @@ static inline masks LANED(newton_back)(reals x, reals y, masks wanted, constant 
         open = mask_of(left > NEWTON_ROUNDING * square) & mask_of(ahead > NEWTON_ROUNDING * square) &
                mask_of(size > NEWTON_STUCK * square);
     }
-    // Apply the last step; it is rounding where the search converged.
+    // Apply the last step, which is at rounding level where the search converged.
     *back_x = wanted ? at_x + step_x : *back_x;
     *back_y = wanted ? at_y + step_y : *back_y;
     return wanted & mask_of(left > NEWTON_ROUNDING * square) & mask_of(ahead > NEWTON_ROUNDING * square);

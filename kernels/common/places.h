@@ -31,7 +31,7 @@ INLINE reals convert_to_reals(places value) { return LANED(convert_real)(value);
 INLINE places load_places(const place *from) { return *(const places_at *)from; }
 INLINE void store_places(places value, place *to) { *(places_at *)to = value; }
 
-// The mask of a comparison of places, with as many bits per lane as a real.
+// The mask of a comparison of places, with the number of bits per lane of a real.
 #ifdef VECTOR_VARIANT
 #define mask_of_places(comparison) convert_bits16(comparison)
 #else

@@ -1,7 +1,7 @@
 // Loss functions of M-estimators (Huber, 1981) and medians, for residuals in units of their scale.
 //
-// Options: LOSS_HUBER, LOSS_TUKEY (biweight) or LOSS_CUT (truncated squares); none: least squares. TUNING_CONSTANT: residual
-// at which the loss departs from least squares.
+// Options: LOSS_HUBER, LOSS_TUKEY (biweight) or LOSS_CUT (truncated squares); without any: least squares.
+// TUNING_CONSTANT: residual at which the loss departs from least squares.
 #ifndef ROBUST_H
 #define ROBUST_H
 
@@ -86,7 +86,8 @@ static inline reals loss_of(reals z) {
 #endif
 }
 
-// Order statistic of each lane: the smallest value with at least `rank` values at or below it; infinity if there is none.
+// Order statistic of each lane: the smallest value with at least `rank` values at or below it; infinity if no such
+// value exists.
 //
 // Built bit by bit from the top: the bit patterns of non-negative reals have the order of the reals, so counting the values
 // below a pattern decides each bit. The `lowest` bits stay zero, which rounds the result down.

@@ -19,7 +19,7 @@
 
 // Parameters, in the order of SheetTable in triangulation.py (tests/ranging/test_tables.py compares them).
 typedef struct {
-    real position_origin, position_scale;  // x0, sx: position in its own unit -> about -1 .. 1
+    real position_origin, position_scale;  // x0, sx: position in the unit of the sensor -> about -1 .. 1
     real sample_origin, sample_scale;      // y0, sy
     real horizon;                          // smallest denominator w that counts
     real w_terms[2];                       // dx, dy
@@ -65,7 +65,7 @@ static inline bytes sheet_point(reals position, reals sample, constant SheetTabl
 #endif
     const masks flagged = lost | hidden | folded;
     bytes status = STATUS_OK;
-    // Flags are rare, and computing them takes half as long as the geometry: skip it where no lane has one.
+    // Flags are rare, and computing them takes half as long as the geometry: skip it where no lane has a flag.
     if (any_lane(flagged)) {
         *g = nan_where(flagged, *g);
         *h = nan_where(flagged, *h);

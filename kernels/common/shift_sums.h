@@ -50,9 +50,9 @@ static inline uint min_of_lanes(uint16 of) {
 
 // Sum all positions of the rows `first` to `end` - 1, for the shifts of one heading (index `turn`).
 //
-// Chunks of CHUNK points are summed in 16 bits, then added to sums of 32 bits: twice as many lanes per instruction as
-// with 32 bits throughout. A map narrower than a block is read beyond its columns (the host provides the cells), but
-// only `columns` positions count.
+// Chunks of CHUNK points are summed in 16 bits, then added to sums of 32 bits: this doubles the lanes per instruction,
+// compared with 32 bits throughout. A map narrower than a block is read beyond its columns (the host provides the
+// cells), but only `columns` positions count.
 static inline void sum_rows(global const ushort *restrict level, private const int *shifts, int used, int turn,
                             int first, int end, int rows, int columns, int stride, global float *restrict scores,
                             global float *restrict least, global int *restrict column) {

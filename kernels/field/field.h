@@ -24,7 +24,7 @@ static inline field_offset end_distance(float2 to, float c, float s) {
 //
 // Segment: the distance across it, or to its nearer end. Arc: distance to the centre less the radius within the opening
 // angle, otherwise the distance to its nearer end. A point is within the opening if the cosine of its angle from the
-// arc's midpoint is at least that of half the opening; a cosine of -2 accepts all angles (full circle).
+// arc's midpoint is at least the cosine of half the opening; a cosine of -2 accepts all angles (full circle).
 static inline field_offset field_distance(constant float *shape, float x, float y) {
     const float c = shape[2], s = shape[3], radius = shape[6], dx = x - shape[0], dy = y - shape[1];
     const float along = c * dx + s * dy, across = c * dy - s * dx;

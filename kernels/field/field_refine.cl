@@ -59,7 +59,7 @@ static inline int point_counts(float2 point, float max_range_squared) {
 // Sum cost and normal equations at a pose.
 //
 // With share = c^2 / (c^2 + r^2) the cost of a point is 1 - share, and its derivative by r is 2 r share^2 / c^2: the
-// weight of iteratively reweighted least squares is share^2. The factor 2 / c^2 is left out: it does not change the
+// weight of iteratively reweighted least squares is share^2. The factor 2 / c^2 is omitted: it does not change the
 // step.
 static inline normal_equations equations_at(global const float *points, int count, float3 pose, constant float *shapes,
                                             global const uchar *nearest, field_grid grid, float scale_squared,
@@ -100,7 +100,7 @@ static inline normal_equations cofactors(normal_equations of) {
 // Solve (M + damping trace(M) I) step = -g by cofactors.
 //
 // The heading is scaled to a length, t / lever, with lever = 1 / (root-mean-square distance of the points): the damping
-// then affects all three unknowns alike.
+// then affects all three unknowns equally.
 static inline float3 damped_step(normal_equations of, float damping, float lever) {
     const float more = damping * (of.xx + of.yy + of.tt * lever * lever) + 1e-20f;
     of.xx += more;

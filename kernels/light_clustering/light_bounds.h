@@ -40,7 +40,7 @@ static inline void cross3(const real *a, const real *b, real *c) {
     c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-// Skip receivers without cost, which do not affect the reading, and those with a zero normal.
+// Skip receivers without cost, which do not affect the reading, and receivers with a zero normal.
 static inline receivers_block block_of(global const INPUT *receivers, global const real *costs, int count,
                                 global const INPUT *middle) {
     receivers_block block;

@@ -8,19 +8,19 @@
 // Options: OCCLUDERS (a scene can hide light), CLUSTERS (clusters may be represented), BLOCK (receivers per block), INPUT,
 //          REAL_IS_DOUBLE, BVH_DEPTH. Variants: vector: `each` blocks per work-item; work-item: one block per item.
 //
-// From the root down, a cluster is (1) left out if the light that it can send is below its share; (2) represented by one
-// segment if the bound of the error is below its share and nothing can occlude it; (3) else opened.
+// From the root down, a cluster is (1) omitted if the light that it can send is below its share; (2) represented by one
+// segment if the bound of the error is below its share and no surface can occlude it; (3) else opened.
 #include "light_clustering/light_bounds.h"
 #include "light_clustering/shaft.h"
 
-// Flag of a pick: a segment that nothing can occlude. A picked cluster is ~node.
+// Flag of a pick: no surface can occlude the segment. A picked cluster is ~node.
 #define CLEAR (1 << 30)
 // Occlusion is tested for clusters of at most this many segments, not for single ones: the test costs as much as the exact
 // visibility of one segment. PATIENCE: failed tests per block before it gives up; each success adds PATIENCE_WON.
 #define MOST_LOOKED_AT 16
 #define PATIENCE 32
 #define PATIENCE_WON 2
-// Counts of a block: segments left out, segments represented by a cluster.
+// Counts of a block: omitted segments, and segments represented by a cluster.
 #define OUT 0
 #define TOGETHER 1
 #define TALLIES 2
@@ -84,9 +84,10 @@ INLINE void between(const extent *many, vectors n, reals size, reals level, real
     *low = middle + lane_max(back, -disc), *high = middle + lane_min(front, disc);
 }
 
-// Which triangles of a leaf may hide some of the lit from a receiver: they meet the hull of both; rise above a plane of
-// each; have the receiver on one side of their own plane and something lit on the other; and, seen from the receiver,
-// none of their edges has all that is lit on its outer side.
+// Return the triangles of a leaf that may hide a part of the lit cluster from a receiver. Such a triangle intersects
+// the convex hull of both, rises above the plane of each, and has the receiver on one side of its plane and a part of
+// the cluster on the other side. In projection from the receiver, no edge of the triangle has the whole cluster on its
+// outer side.
 INLINE int hides(const shaft *hull, const receivers_block *block, const extent *got, const extent *out,
                      global const real *lit, int count, real margin, global const real *leaf) {
     masks left = shaft_leaf(hull, leaf);
@@ -152,7 +153,7 @@ static inline int leaf_hides(const shaft *hull, const receivers_block *block, co
 #endif
 }
 
-// Whether nothing can stand between a block and a cluster. A leaf that hides some of one cluster may hide some of the
+// Whether no triangle can lie between a block and a cluster. A leaf that hides some of one cluster may hide some of the
 // next: it is tried first.
 static inline int is_clear(const bvh_tree *tree, const receivers_block *block, global const real *row, global const real *lit,
                     int count, real margin, int *culprit) {
@@ -239,7 +240,7 @@ kernel void select_lights(global const INPUT *restrict receivers, global const r
         global float *error = errors + (size_t)b * capacity;
         uint found = 0;
         int out = 0, together = 0, culprit = -1, patience = PATIENCE;
-        // Level of the ancestor that nothing can occlude; OPEN_LEVEL if there is none.
+        // Level of the ancestor that no surface can occlude; OPEN_LEVEL if no such ancestor exists.
         int open_level = OPEN_LEVEL;
         real lost = 0, whole = 0;
         uint node = block.count ? 1 : 0;

@@ -12,7 +12,7 @@
 #include "line/line_profiles.h"
 
 // Samples of a profile in a block, summed in lanes of twice the sample's width. Bytes: s <= 20 * 255, and
-// m <= 255 * (20 * 21 / 2) = 53550 < 2^16 (22 steps would fit too, 23 not).
+// m <= 255 * (20 * 21 / 2) = 53550 < 2^16 (22 steps would also fit, 23 would not).
 #define STEPS 20
 
 typedef struct {
@@ -55,7 +55,8 @@ static inline Sums zero_sums(void) {
     return sums;
 }
 
-// The moment is taken about `centre`, a whole number near the position: what is left is small and loses nothing.
+// The moment is taken about `centre`, an integer near the position: the remaining moment is small, so its rounding
+// error is negligible.
 static inline Centroid centroid_of(const Sums *sums) {
     Centroid centroid;
     centroid.total = sums->total + sums->total_error;

@@ -14,7 +14,7 @@
 #define ML_UNKNOWNS 4
 #define ML_SETTLED 1e-4f   // px: largest last step of a converged fit; the next step would be about its square
 #define ML_DAMPING 1e-4f   // fraction of the diagonal added to it: if all light falls on one pixel, sigma and
-                           // amplitude cannot be told apart
+                           // amplitude cannot be separated
 #define ML_NARROWEST 0.15f  // px: smallest sigma; narrower lines fall on one or two pixels
 
 typedef struct {

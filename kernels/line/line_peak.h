@@ -59,7 +59,8 @@ static inline int any_light(CODE16 samples, CODE threshold) {
 #endif
 }
 
-// Skip samples without light, 16 at a time; return the index of the next sample to look at. Keep the highest of them.
+// Skip samples without light, in vectors of 16; return the index of the next sample to examine. Keep the highest of
+// them.
 static inline int skip_dark(const Profiles *profiles, int k, CODE16 *highest) {
     for (; k + 16 <= profiles->length; k += 16) {
         const CODE16 samples = *(global const code16_at *)(profiles->first + k);

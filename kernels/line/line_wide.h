@@ -41,7 +41,8 @@ static inline void prefetch_line(global const CODE *at) {
 #endif
 }
 
-// The next addresses of a block to prefetch, row by row in the order of memory, whatever the order of the computation.
+// The next addresses of a block to prefetch, row by row in the order of memory, independent of the order of the
+// computation.
 typedef struct {
     global const CODE *at, *end;  // next address, and end of the current row of the block
     int gap, extent;              // elements from the end of a row to the next row, and elements of a row

@@ -1,7 +1,7 @@
 // Strongest samples of WIDE profiles at once (every method but the centroid), and the windowed centroid of 16 of them.
 //
 // Down the columns the walk keeps two numbers per profile: the largest sample, and the number of the block of rows
-// where it first occurred. Then 16 profiles at a time are read again in the few rows around their peaks; together,
+// where it first occurred. Then groups of 16 profiles are read again in the few rows around their peaks; together,
 // unless the peaks lie far apart.
 #ifndef LINE_WIDE_PEAK_H
 #define LINE_WIDE_PEAK_H
@@ -116,7 +116,7 @@ static inline ints first_row(const Profiles *profiles, codes level, Span span) {
     return convert_int16(at);
 }
 
-// The same for lanes whose peaks lie far apart: each lane searches its own block of `tall` rows.
+// The same for lanes whose peaks lie far apart: each lane searches a separate block of `tall` rows.
 static inline ints first_row_apart(const Profiles *profiles, codes level, ints block, int tall) {
     int first[LANES];
     CODE levels[LANES];
@@ -130,7 +130,7 @@ static inline ints first_row_apart(const Profiles *profiles, codes level, ints b
     return *(const ints_at *)first;
 }
 
-// Windowed centroid of all lanes over one span of rows. Each lane takes the rows of its own window by a mask. A signed
+// Windowed centroid of all lanes over one span of rows. A mask selects the rows of the window of each lane. A signed
 // offset o is in the window where o + RADIUS <= 2 * RADIUS as unsigned numbers. Also count the flat top: the first
 // offset past it is the smallest unsigned offset whose sample differs from the peak (negative offsets are large
 // unsigned numbers; an equal sample has all bits set by the OR with its mask).

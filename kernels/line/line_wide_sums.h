@@ -1,7 +1,7 @@
 // Sums of WIDE profiles of integer samples for their centroid, down the columns (WideSums) or along a row (RowSums).
 //
 // Two neighbouring samples of b bits, e (even lane) and o (odd lane), are read as one number of 2b bits, p = e + 2^b o.
-// Sums need 2b bits, and a vector has room for half as many numbers of 2b bits. Two sums are kept:
+// Sums need 2b bits, and a vector holds half the number of 2b-bit values. Two sums are kept:
 //     S = sum p = sum e + 2^b sum o  (mod 2^2b)   and   O = sum (p >> b) = sum o,
 // so that sum e = S - (O << b) (mod 2^2b). This is exact, because sum e and sum o of a block fit 2b bits (STEPS). It
 // saves the instructions that would separate the even lanes of every sample. The moments are summed in the same way.

@@ -196,7 +196,7 @@ static inline laned_fit line_fit(laned_points all, constant const int *pairs, in
     fit.scale = line_scale(fit.line, all, (reals)INFINITY, FEW_TRIED, min_scale);
 #endif
     for (int step = 0; step < steps; step++) {
-        // Estimate the scale again: residuals of a line fitted to all points are more accurate than those of a line
+        // Estimate the scale again: residuals of a line fitted to all points are more accurate than residuals of a line
         // through two points.
         if (RESCALED_AT(step))
             fit.scale = line_scale(fit.line, all, (reals)2.5f * fit.scale, FEW_FITTED, min_scale);

@@ -8,7 +8,7 @@
 //          `starts` (segments, 4) shift from the frame to the segment, and its length; `lines` (segments, 3) length,
 //          its square, exitance / (2 pi). `middle`: subtracted from positions first.
 // Options: INPUT, REAL_IS_DOUBLE, WIDE_PLACES (positions in double, see common/places.h).
-// Variants: vector: 16 receivers at a time, `each` per work-item; work-item: one receiver per item.
+// Variants: vector: 16 receivers in a vector, `each` receivers per work-item; work-item: one receiver per item.
 //
 // A receiver is transformed into a frame once and shifted to each of its segments: most of the arithmetic is shared.
 #include "line_irradiance/line_irradiance.h"

@@ -60,13 +60,13 @@ static inline __attribute__((always_inline)) reals LANED(arc_less_sine)(reals w)
 // above the lit surface and across the line; by_u: component of the receiver's normal along the line; foot: distance of
 // the foot in front of the receiver's plane.
 //
-// With theta, the angle under which the receiver sees the part of the segment in front of its plane, and sigma, the sum of
-// the angles of both ends from the foot,
+// With theta, the angle that the part of the segment in front of the receiver's plane subtends at the receiver, and
+// sigma, the sum of the angles of both ends from the foot,
 //     2 int (foot + by_u tau) / (tau^2 + rho^2)^2 dtau
 //         = foot / rho^3 (theta - sin theta + sin theta (1 + cos sigma)) + by_u / rho^2 sin theta sin sigma.
 // Both terms of the bracket are >= 0, and each is computed without a difference: the first from tan(theta / 2), the second
-// as sin^2 sigma / (1 - cos sigma) where cos sigma < 0. So one form is accurate near, far and end-on. The cost is products
-// and sums; divisions run beside them on current CPUs.
+// as sin^2 sigma / (1 - cos sigma) where cos sigma < 0. So one form is accurate near, far and end-on. Products and sums
+// determine the cost; current CPUs execute the divisions in parallel.
 static inline __attribute__((always_inline)) reals LANED(end_factor)(reals tau1, reals tau2, reals length, reals length2,
                                                              reals height, reals aside, reals by_u, reals foot) {
     const reals zero = (reals)0;
@@ -94,7 +94,7 @@ static inline __attribute__((always_inline)) reals LANED(end_factor)(reals tau1,
     const reals both = cosine * cosine + length2 * square, reach = sqrt(both);
     const reals tangent = length / (reach + fabs(cosine)), sine = length / both;
     const reals w = tangent * square * tangent, wide = reach + fabs(flat);
-    // reach (1 + cos sigma), and that of theta - sin theta
+    // reach (1 + cos sigma), and the same for theta - sin theta
     const reals above = flat < zero ? sum * sum * square / wide : wide;
     reals cube = tangent * w, bracket = sine * above;
     if (any_compared(mask_of(cosine < zero))) {

@@ -1,5 +1,5 @@
-// Reflections in curved mirrors: positions on the mirror at which a lens sees given points, and the mirrors that may show
-// given lines.
+// Reflections in curved mirrors: positions on the mirror at which given points appear from the lens, and the mirrors
+// that may show given lines.
 //
 // mirror_points: Inputs:  points (count, 6): position and step [m], type INPUT; lens_place (3,).
 //                Outputs: per point up to `kept` reflections: places, moves (derivative by the step) (count, kept, 3),
@@ -120,8 +120,8 @@ INLINE Reflection reflection_at(reals x, reals y, Vector point, Vector lens, glo
     return it;
 }
 
-// R at a corner. The side of the surface on which the lens lies is added to `lens_sides` (1: above, 2: below), that of the
-// points to `above` and `below`.
+// R at a corner. The side of the surface on which the lens lies is added to `lens_sides` (1: above, 2: below), the
+// sides of the points to `above` and `below`.
 INLINE void at_corner(Vector point, Fixed lens, global const real *row, int corner, reals *r1, reals *r2,
                       int *lens_sides, masks *above, masks *below) {
     global const real *edge = corner == 0 ? row : row + 3 * corner;
@@ -158,8 +158,8 @@ INLINE masks guessed(Vector point, Fixed lens, global const real *row, reals *x,
 }
 
 // Whether a block of triangles may show a point (conservative). Tilting the normal by an angle turns the reflected ray by
-// twice that angle, so the point lies in a cone around the ray reflected at the block's centre, with a half angle of twice
-// that of the normals plus the angles that the block subtends at the lens and at the point.
+// twice that angle, so the point lies in a cone around the ray reflected at the block's centre, with a half angle of
+// twice the half angle of the normals plus the angles that the block subtends at the lens and at the point.
 INLINE masks may_show(Vector point, Fixed lens, global const real *block) {
     const Fixed middle = fixed_at(block), axis = fixed_at(block + 4);
     const real radius = block[3], cx = lens.x - middle.x, cy = lens.y - middle.y, cz = lens.z - middle.z;
@@ -170,7 +170,7 @@ INLINE masks may_show(Vector point, Fixed lens, global const real *block) {
     if (block[9] > 0 && facing < -(block[10] + sine + SLACK)) return mask_of((reals)(real)0 > (reals)(real)0);
     const Vector q = moved(point, middle, -1);
     const reals far = dot_of(q, q), room = far - radius * radius, zero = (real)0;
-    // Cones beyond a right angle exclude nothing.
+    // Cones with half angles beyond 90 degrees do not exclude any point.
     if (!(sine < (real)1 && block[7] > (real)0 && cos_all > (real)0)) return mask_of(far >= zero);
     const real up = (real)2 * facing;
     const Fixed on = {up * axis.x - cx * per, up * axis.y - cy * per, up * axis.z - cz * per};
@@ -214,7 +214,7 @@ INLINE masks solved(masks near, Vector point, Vector lens, global const real *ro
     const reals least = -EDGE, most = (real)1 + EDGE;
     const masks inside = mask_of(*x >= least) & mask_of(*y >= least) & mask_of(*x + *y <= most);
     const masks outside = mask_of(it->up_lens > zero) | mask_of((reals)row[26] == zero);
-    // R is also zero where the surface is seen edge-on from both sides: reject grazing solutions.
+    // R is also zero where lens and point are in the plane of the surface: reject grazing solutions.
     const reals ways = sqrt(dot_of(it->to_lens, it->to_lens) * dot_of(it->to_point, it->to_point));
     const masks sides = positive(it->up_lens * it->up_point - GRAZING * GRAZING * ways);
     return near & inside & sides & outside & mask_of(step <= NEAR_ENOUGH);

@@ -1,6 +1,7 @@
 // Lit segments in structure-of-arrays form, grouped by the line on which they lie.
 //
-// Segments on one line, such as those of a sheet of light on a board between its parts, share one visibility traversal.
+// Segments on one line, such as the segments of a sheet of light on a board between its parts, share one visibility
+// traversal.
 #ifndef LIT_LINES_H
 #define LIT_LINES_H
 #include "common/places.h"
@@ -31,7 +32,7 @@ typedef struct {
     real exitance[SEGMENTS];             // exitance / (2 pi)
     real begin[SEGMENTS], end[SEGMENTS]; // position of a segment on its line, which runs from 0 to 1
     uint members[SEGMENTS];              // set of segments of a line
-    uint lit, unseen, is_good; // segments that emit; that nothing can hide; whether all numbers are finite
+    uint lit, unseen, is_good; // segments that emit; segments that no surface can hide; whether all numbers are finite
     int line_count;
 } chunk;
 
@@ -70,7 +71,7 @@ static void load_frames(global const INPUT *rows, const uint *numbers, uint coun
     store_private(exitance, all->exitance + first);
 }
 
-// Absolute difference of a component of LANES segments from that of segment `one`.
+// Absolute difference of a component of LANES segments from the component of segment `one`.
 static inline reals change_of(const place *component, uint first, int one) {
     return fabs(convert_to_reals(load_places(component + first) - component[one]));
 }

@@ -1,21 +1,21 @@
 // Irradiance of the receivers of a sensor strip from all lit segments, with occlusion, and the strip's two currents.
 //
-// E = sum over segments of the closed form of line_irradiance.h, over the part of each segment that the receiver sees.
-// The currents are sums of E times two weights per receiver.
+// E = sum over segments of the closed form of line_irradiance.h, over the part of each segment that is visible from the
+// receiver. The currents are sums of E times two weights per receiver.
 //
 // Inputs:  receivers (strips, each, 6) position [m] and normal; weights (strips, each, 2); segments (n, 10) start, end,
 //          surface normal, exitance [W/m2]; with SELECTED also starts (lists + 1) and selected, the segments of each list
-//          (list: SELECTION_BLOCK receivers; a pick ~k is segment k, which nothing can hide).
+//          (list: SELECTION_BLOCK receivers; a pick ~k is segment k, which no surface can hide).
 // Outputs: irradiance (strips, each) [W/m2]; left, right (strips,); status (strips, each) flags.
 // Options: INPUT (type of the inputs), REAL_IS_DOUBLE, WIDE_PLACES, SELECTED, GROUP (size of a work-group), BVH_DEPTH;
-//          INTERVALS (exact visibility, visible.h), RAYS (shadow rays to `samples` parts of a segment), or neither
-//          (no occlusion).
-// Variants: vector: a work-item per share of the strips, 16 receivers at a time; work-item: a work-group per strip, an
-//          item per receiver.
+//          INTERVALS (exact visibility, visible.h), RAYS (shadow rays to `samples` parts of a segment); without both:
+//          no occlusion.
+// Variants: vector: a work-item per share of the strips, 16 receivers in a vector; work-item: a work-group per strip,
+//          an item per receiver.
 //
 // Order of work: (1) facing tests of 16 receivers with a line reject most pairs; (2) the visible parts of the remaining
-// pairs are found one pair at a time; (3) the visible parts of any receivers and segments are collected until 16 of them
-// fill the vectors of the closed form.
+// pairs are found pair by pair; (3) the visible parts of any receivers and segments are collected until 16 of them fill
+// the vectors of the closed form.
 #include "line_irradiance/line_irradiance.h"
 #include "occluded_irradiance/lit_lines.h"
 #include "common/status.h"
@@ -32,7 +32,8 @@ typedef struct {
     real toward[LANES], toward_end[LANES]; // height of the segment's ends above the receiver's plane
 } facing;
 
-// Receivers in front of a line, in the line's frame and in those of its segments, and the lanes that face each segment.
+// Receivers in front of a line, in the line's frame and in the frames of its segments, and the lanes that face each
+// segment.
 typedef struct {
     facing whole, own[SEGMENTS];
     uint lanes[SEGMENTS];
@@ -59,7 +60,7 @@ static __attribute__((noinline)) void finish(pieces *waiting, place *sums) {
     waiting->count = 0;
 }
 
-// Append the part of segment k from fraction `start` to `stop` that the receiver of a lane sees.
+// Append the part of segment k from fraction `start` to `stop`, which is visible from the receiver of a lane.
 static __attribute__((noinline)) void add_piece(const chunk *lit, int k, const facing *all, int lane, real start, real stop,
                                          pieces *waiting, place *sums) {
     if (!(start < stop)) return;
@@ -246,7 +247,7 @@ static void add_sampled(const bvh_tree *tree, const chunk *lit, int k, const fac
 }
 #endif
 
-// Append what the receiver of a lane gets from a line that it faces.
+// Append the visible parts of a line that the receiver of a lane faces.
 static void add_light(const bvh_tree *tree, const chunk *lit, int line, const before *all, int lane, real clearance,
                uint samples, int *hint, block *here, pieces *waiting) {
     const uint members = lit->members[line];
@@ -273,7 +274,7 @@ static void add_light(const bvh_tree *tree, const chunk *lit, int line, const be
     }
 }
 
-// Append what all receivers of a block get from a line.
+// Append the visible parts of a line for all receivers of a block.
 static void light_block(const bvh_tree *tree, const chunk *lit, int line, real clearance, uint samples, int *hint, block *here,
                  pieces *waiting) {
     before all;

@@ -4,9 +4,9 @@
 // that line is hidden. One traversal of the tree (common/bvh.h) finds all such lines, 16 boxes or 16 triangles at once.
 //
 // Coordinates in the plane, relative to the point: `deep` towards the segment's line, and `along`, such that along / deep
-// is the position on the segment (0 at its start, 1 at its end) at which a place is seen. Only the ratio matters: both may
-// be scaled by a common factor, so the cut between two corners needs no division. The cut of an edge is bit-equal for
-// both triangles that share the edge: adjacent triangles leave no gap.
+// is the position on the segment (0 at its start, 1 at its end) at which the ray through a place arrives. Only the
+// ratio matters: both may be scaled by a common factor, so the cut between two corners needs no division. The cut of an
+// edge is bit-equal for both triangles that share the edge: adjacent triangles leave no gap.
 #ifndef VISIBLE_H
 #define VISIBLE_H
 
@@ -90,7 +90,7 @@ INLINE void view_set_plane(view *view) {
     view->halves[3] = view_half_of(view, -view->across_x, -view->across_y, -view->across_z, 0);
 }
 
-// Largest distance by which a box reaches into a half-space.
+// Largest depth of a box in a half-space.
 INLINE reals view_reach(const view_half *half_space, global const real *node) {
     const reals x = half_space->x, y = half_space->y, z = half_space->z;
     return lane_fma(x, load_reals(node + half_space->at_x),

@@ -5,7 +5,7 @@
 // Tables:  triangles (t, 12) first corner, two edges, unit normal; starts (patches + 1,) first triangle of each patch;
 //          slacks (patches,) [m] added to the clearance at the patch; the tree of common/bvh.h.
 // Options: FACTORS (form_factors), OCCLUSION (shadow rays), INPUT, PLACE (type of `middle`), REAL_IS_DOUBLE, BVH_DEPTH.
-// Variants: vector: 16 receivers at a time, `each` per work-item; work-item: one receiver per item.
+// Variants: vector: 16 receivers in a vector, `each` receivers per work-item; work-item: one receiver per item.
 //
 // A triangle's hidden fraction is estimated with shadow rays; the larger its form factor, the more rays.
 #include "patches/patches.h"
@@ -35,7 +35,7 @@ typedef struct {
 
 INLINE real dot_of(const real *a, const real *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-// Whether nothing is hit on the way; the first `after` and the last `before` metres are skipped (surfaces at the ends).
+// Whether the ray is free; the first `after` and the last `before` metres are skipped (surfaces at the ends).
 static inline int is_free(const bvh_tree *tree, const real *place, const real *way, real after, real before) {
     const real per = after + before > 0 ? (real)1 / sqrt(dot_of(way, way)) : 0;
     const real start = after * per, end = 1 - before * per;

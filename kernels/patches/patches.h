@@ -31,7 +31,7 @@ INLINE polygon patch_cut(const vector *corner, const vector *edge, const reals *
     const vector none = {(reals)0, (reals)0, (reals)0};
     const polygon whole = {{corner[0], corner[1], corner[2], corner[2]}, {edge[0], edge[1], none, edge[2]}, 1};
     if (!any_lane(~all)) return whole;
-    // Rotate the corners so that the single corner on one side of the plane comes first.
+    // Rotate the corners so that the single corner on one side of the plane is the first.
     const masks second = (in0 ^ in1) & ~(in0 ^ in2), third = (in0 ^ in2) & ~(in0 ^ in1);
     const vector a = patch_choose(second, corner[1], patch_choose(third, corner[2], corner[0]));
     const vector b = patch_choose(second, corner[2], patch_choose(third, corner[0], corner[1]));
@@ -66,7 +66,8 @@ INLINE polygon patch_cut(const vector *corner, const vector *edge, const reals *
     return cut;
 }
 
-// Form factor of a polygon above the plane of a receiver with this unit normal; counter-clockwise seen from the receiver.
+// Form factor of a polygon above the plane of a receiver with this unit normal; counter-clockwise in the view from the
+// receiver.
 INLINE reals patch_factor(const polygon *shape, vector normal) {
     reals size[4], weight[4], excess[4];
     masks near_by = (masks)0;
@@ -88,7 +89,7 @@ INLINE reals patch_factor(const polygon *shape, vector normal) {
         const reals acute = steep ? (reals)(real)1.57079632679489661923 - low : low;
         const reals angle = cosine < (reals)0 ? (reals)(real)3.14159265358979323846 - acute : acute;
         weight[n] = patch_dot(normal, turn);
-        // A receiver on the line of an edge gets nothing from it (0 / 0).
+        // An edge contributes 0 to a receiver on its line (0 / 0).
         sum += zero_where(~mask_of(sine > (reals)0), weight[n] * angle / sine);
         near_by |= steep | ~mask_of(cosine > (reals)0);
         // angle / sin(angle) - 1, for angles up to 45 degrees.

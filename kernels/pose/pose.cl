@@ -4,8 +4,8 @@
 // sum rho(residual / (sigma scale)) with the loss rho of common/robust.h.
 //
 // Inputs:  rows (poses, count, ROW), type INPUT: unit normal n (2), place p in the artwork (2) [m], displacement e from
-//          there to where the feature was seen (2) [m], sigma along the normal [m], and with ETCHED the etch factor g;
-//          start (poses, 3) with WITH_NEAR: initial pose x, y [m], theta [rad].
+//          there to the measured position (2) [m], sigma along the normal [m], and with ETCHED the etch factor g; start
+//          (poses, 3) with WITH_NEAR: initial pose x, y [m], theta [rad].
 // Tables:  subsets (trials / LANES, FREEDOMS, LANES): rows of the start candidates.
 // Outputs: pose (poses, 3) x, y [m], theta [rad]; deformation (poses, 3); placement (poses, 2) [m]; covariance (poses,
 //          OF_POSE, OF_POSE) of the placement point [m2, m rad, rad2]; residuals (poses, count) [m]; weights (poses,
@@ -13,7 +13,8 @@
 //          inliers, status, inlier_fraction, leverage. Refused poses are NaN.
 // Options: INPUT, REAL_IS_DOUBLE, WITH_NEAR (initial pose; otherwise no motion), OF_POSE, FREEDOMS, ETCHED, CAPACITY,
 //          START_STEPS, GIVEN_SCALE, EFFICIENCY (pose.h), loss options (common/robust.h).
-// Variants: vector: 16 rows, or 16 start candidates, at a time; work-item: one at a time.
+// Variants: vector: 16 rows, or 16 start candidates, in a vector; work-item: one row or start candidate after the
+//           other.
 //
 // One work-item solves one pose.
 #include "pose/pose_result.h"
@@ -48,7 +49,7 @@ kernel void pose_sets(global const INPUT *restrict rows,
 #else
     private real *etch_factor = 0;
 #endif
-    // The row count is padded with rows of certainty 0 to whole vectors. Missing rows get certainty 0, too.
+    // The row count is padded with rows of certainty 0 to whole vectors. Missing rows also get certainty 0.
     const int padded = (count + LANES - 1) / LANES * LANES;
     global const INPUT *row = rows + item * count * ROW;
     real sum = 0, sum_x = 0, sum_y = 0;

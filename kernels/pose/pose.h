@@ -1,7 +1,8 @@
 // Pose of a board by iteratively reweighted Gauss-Newton from scalar equations, and its covariance.
 //
-// A point p of the artwork is seen at q = p + e. The pose is T(p) = (I + D) p + t. A feature with the unit normal n
-// gives the equation n . (T^-1(q) - p) = 0: an edge one equation, a point two with normals at right angles.
+// The measured position of a point p of the artwork is q = p + e. The pose is T(p) = (I + D) p + t. A feature with the
+// unit normal n gives the equation n . (T^-1(q) - p) = 0: an edge one equation, a point two with normals at right
+// angles.
 //
 // Residual: T^-1(q) - p = (I + D)^-1 w with w = e - t - D p. All terms of w are small displacements, so that no large
 // coordinates are subtracted and single precision keeps the digits of the displacement.
@@ -273,7 +274,7 @@ typedef struct {
 #define EVENLY 1     // 1 for rows with a robust weight above 0 (inliers), 0 for others
 #define EVERY_ROW 2  // 1
 
-// Sum the normal equations of all rows. Padding rows add nothing: their certainty is 0.
+// Sum the normal equations of all rows. Padding rows have certainty 0 and do not contribute.
 static inline void pose_summed(laned_pose pose, pose_rows all, real per_scale, int how, private pose_sums *sums) {
     masks inliers = 0;
     reals slopes = 0, squares = 0;

@@ -15,7 +15,7 @@
 //          GAIN (equalise the channels), LINEARITY, SIGNED (a current can be negative or not finite, or the load
 //          resistors shrink the range), WITH_POSITION/TOTAL/STATUS/SIGMA/SHEET/G/H, LENS, LENS_K2, PAST_CACHES,
 //          VECTOR_VARIANT.
-// Work:    vector variant: a work-item processes `each` consecutive samples, the last one up to twice as many less one.
+// Work:    vector variant: a work-item processes `each` consecutive samples, the last one up to 2 `each` - 1.
 //          Otherwise: one work-item per sample.
 #include "common/load.h"
 #include "common/sheet.h"
@@ -84,8 +84,9 @@ static inline reals corrected(reals u, int sample, const Readout *io) {
 #endif
 
 #ifdef WITH_SIGMA
-// Standard deviation of the position. Independent noise grows towards the ends of the strip. Opposed noise is the same
-// everywhere. Common noise (the electrons of one light spot divide together) leaves the width of the spot.
+// Standard deviation of the position. The effect of independent noise increases towards the ends of the strip. Opposed
+// noise is the same everywhere. Common noise (the electrons of one light spot divide together) leaves the width of the
+// spot.
 static inline reals sigma_of(reals balance, reals sum, constant PsdTable *table) {
     const reals spread = table->independent * (1 + balance * balance) / 2 + table->opposed;
     const real length = 4 * table->half_length * table->half_length;
@@ -94,7 +95,7 @@ static inline reals sigma_of(reals balance, reals sum, constant PsdTable *table)
 #endif
 
 // Flags of samples that are not good; a later assignment has priority. Integer codes without a dark level are finite
-// and not negative, so the tests under SIGNED are left out for them.
+// and not negative, so the tests under SIGNED are not compiled for them.
 static inline masks flags_of(reals left, reals right, masks saturated, reals sum, reals difference,
                              constant PsdTable *table) {
     masks flags = STATUS_OK;
@@ -182,7 +183,7 @@ static inline void read_samples(const int careful, int sample, const Readout *io
     const reals strip = to_reals((sample + LANE_NUMBERS) % io->strips);
     reals at_g, at_h;
     const bytes lost = sheet_point(u, strip, io->sheet, &at_g, &at_h);
-    // A bad reading is NaN for the sheet; its own flag is the reason, not the sheet's.
+    // An invalid reading enters the sheet as NaN; its status is the flag of the reading, not the flag of the sheet.
     flags |= LANED(convert_bits)(lost) & good;
 #ifdef WITH_G
     store_reals(at_g, io->g + sample);
@@ -206,9 +207,9 @@ static inline int read_block(const int careful, int first, const Readout *io) {
     return has_bad(verdict, io->table);
 }
 
-// Read the samples begin <= sample < end. Blocks with bad samples come in runs and are rare. Blocks are read quickly,
-// in groups of up to 32; the blocks with a bad sample are noted in the bits of `troubled` and read again with care.
-// Where all blocks of a group were bad, the next group is read with care at once.
+// Read the samples begin <= sample < end. Blocks with bad samples are rare and contiguous. Blocks are read quickly, in
+// groups of up to 32; the blocks with a bad sample are noted in the bits of `troubled` and read again with care. Where
+// all blocks of a group were bad, the next group is read with care at once.
 static inline void read_range(int begin, int end, const Readout *io) {
     int sample = begin, all_troubled = 0;
     while (sample + BLOCK * LANES <= end) {
@@ -236,8 +237,8 @@ kernel void psd_readout(global const INPUT *currents, global real *position, glo
     const Readout io = {currents, position, total,   status, sigma, g,        h,
                         table,    samples,  strips, knots,  linearity, sheet};
 #ifdef VECTOR_VARIANT
-    // The last work-item takes the remainder too, and its last vector overlaps the one before: every sample is covered,
-    // and no other work-item writes there.
+    // The last work-item also processes the remainder, and its last vector overlaps the previous vector: every sample
+    // is covered, and no other work-item writes there.
     const int begin = get_global_id(0) * each;
     read_range(begin, get_global_id(0) + 1 == get_global_size(0) ? samples : begin + each, &io);
 #else

@@ -68,7 +68,7 @@ static inline Pose pose_of(real angle, constant RangeTable *table) {
                  turned(reach[0], reach[1], reach[2], cosine, sine),
                  table->horizon,
                  not_finite(angle)};
-    // The camera sees a sheet through its pinhole edge-on: no ray meets it.
+    // A sheet of light through the pinhole is edge-on for the camera: no ray intersects it in a point.
     if (pose.reach == 0) pose.horizon = INFINITY;
     // In front of the camera the depth is > 0: turn the normal so that the denominator is > 0 there as well.
     if (pose.reach < 0) {
@@ -211,8 +211,8 @@ kernel void assemble_profiles(
     global const INPUT *first = g, *second = h;
 #endif
 #ifdef VECTOR_VARIANT
-    // The last strip takes the remainder too, and its last vector overlaps the one before: every sample is covered, and
-    // no other work-item writes there.
+    // The last strip also contains the remainder, and its last vector overlaps the previous vector: every sample is
+    // covered, and no other work-item writes there.
     uint sample = get_global_id(0) * SAMPLES_PER_STRIP;
     const uint end = get_global_id(0) + 1 == get_global_size(0) ? samples : sample + SAMPLES_PER_STRIP;
     for (; sample + BLOCK * LANES <= end; sample += BLOCK * LANES) {

@@ -4,7 +4,7 @@
 // Outputs: value (count,) [1/sr], NaN where a direction is not finite or zero; status (count,) flags.
 // Tables:  model, the parameters of the BRDF (brdf.h).
 // Options: BRDF_LAMBERT, _PHONG, _OREN_NAYAR, _GGX or _WARD; INPUT; REAL_IS_DOUBLE.
-// Variants: vector: 16 pairs at a time, `each` per work-item; work-item: one pair per item.
+// Variants: vector: 16 pairs in a vector, `each` pairs per work-item; work-item: one pair per item.
 #include "reflectance/brdf.h"
 #include "common/status.h"
 

@@ -3,8 +3,8 @@
 //
 // A line has a coordinate `along`, a height, the intensity, and under CARRY the other coordinate. All are linear in the
 // coordinate between two neighbouring good samples. Two samples are not joined if they are further apart than max_gap,
-// or if their heights differ by more than max_step. Where the coordinate has fallen back by at least fold_tolerance
-// behind the furthest coordinate reached, all cells up to that point are NOT_INVERTIBLE: two surfaces share them.
+// or if their heights differ by more than max_step. Where the coordinate has decreased by at least fold_tolerance below
+// the largest previous coordinate, all cells up to that point are NOT_INVERTIBLE: two surfaces share them.
 //
 // Inputs:  along, height, intensity  lines of INPUT [m, m, any];  given  status flags (uchar);  other INPUT [m], under
 // CARRY
@@ -63,8 +63,8 @@ typedef struct {
 #define SET_OTHER(i, value)
 #endif
 
-// First and last cell whose centre lies in [low, high]; there is none if first > last. Casts instead of ceil, floor and
-// fmax: these library functions take longer on PoCL than the rest of the kernel.
+// First and last cell whose centre lies in [low, high]; no cell if first > last. Casts instead of ceil, floor and fmax:
+// these library functions take longer on PoCL than the rest of the kernel.
 static inline int first_cell(real low, int cells) {
     const real kept = low < 0 ? 0 : low < cells ? low : cells;
     const int cell = (int)kept;

@@ -3,7 +3,8 @@
 // Inputs:  image (rows, columns), type CODE; rulers (count, 4): x, y [px], cos, sin of the direction.
 // Outputs: position, width, sigma, spacing [px], amplitude [grey levels], status: (count,) or (count, MOST).
 // Tables:  table, parameters (ruler.h); model, lens or camera (LENS, CAMERA).
-// Variants: vector: a work-item takes `each` rulers, 16 at a time; work-item: a group of RULER_GROUP items per ruler.
+// Variants: vector: a work-item processes `each` rulers, with vectors of 16 samples; work-item: a group of RULER_GROUP
+//           items per ruler.
 #include "ruler/ruler.h"
 
 // Store the edges of LANES rulers from `ruler` on, as far as they exist.

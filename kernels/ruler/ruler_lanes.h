@@ -19,8 +19,9 @@ typedef masks ruler_levels;
 #define RULER_REAL(levels) LANED(convert_real)(levels)
 #endif
 
-// The grey levels about a sample: a and b above, c and d below. Integers come 32 bits at a time; of bytes those are two
-// too many, behind the pixels above and before those below, so that none is out of the image.
+// The grey levels about a sample: a and b above, c and d below. Integers are loaded as 32-bit words. For 8-bit pixels a
+// word holds two bytes more than needed: the extra bytes follow the pixels of the upper row and precede the pixels of
+// the lower row, so that no byte is outside the image.
 #ifdef CODE_float
 #define RULER_FOUR(row, k) \
     vload2(0, (row) + RULER_FIRST(k)), vload2(0, (row) + RULER_SECOND(k)), vload2(0, (row) + RULER_FIRST(k + 2)), \

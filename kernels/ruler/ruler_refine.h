@@ -12,7 +12,7 @@ typedef struct {
     masks status;
 } ruler_edge;
 
-// A peak of the gradient: its index and value, and the values beside it.
+// A peak of the gradient: its index and value, and the values of its neighbours.
 typedef struct {
     reals at, before, here, after;
 } ruler_peak;
@@ -39,9 +39,9 @@ static inline reals ruler_sine(reals x) {
 
 // Bias of an edge position from linear interpolation along one image axis [samples].
 //
-// A sample at fraction f beyond a pixel sees the edge through a kernel of variance f (1 - f) and third moment
-// f (1 - f) (1 - 2 f). The bias is the displacement of the zero of the smoothed second derivative of a Gaussian edge; the
-// moments enter by their Fourier series in f, of which the smoothing leaves RULER_HARMONICS terms.
+// A sample at fraction f beyond a pixel is the convolution of the edge with a kernel of variance f (1 - f) and third
+// moment f (1 - f) (1 - 2 f). The bias is the displacement of the zero of the smoothed second derivative of a Gaussian
+// edge; the moments enter by their Fourier series in f, of which the smoothing leaves RULER_HARMONICS terms.
 //
 //     phase           position of the edge on the middle line along the axis [px]
 //     along, across   steps along the axis from sample to sample and from line to line [px]
@@ -89,7 +89,8 @@ static inline ruler_edge ruler_refine(ruler_peak peak, private const ruler_place
     edge.amplitude = peak.here * exp((real)0.5f * tilt * shift) *
                      ((real)RULER_ROOT_TWO_PI * table[RULER_PER_LINE]) * sqrt(variance);
     edge.width = sqrt(fmax(variance - table[RULER_SMOOTHING], (reals)0)) * table[RULER_STEP];
-    // Noise of the logarithms beside the peak: the noise over the gradients there, exp(-1 / (2 variance)) of the peak.
+    // Noise of the logarithms at the neighbours of the peak: the noise over the gradients there, exp(-1 / (2 variance))
+    // of the peak.
     edge.sigma = table[RULER_NOISE] * table[RULER_STEP] * variance * exp((real)0.5f / variance) / size;
     edge.spacing = REAL_NAN;
     edge.status = 0;

@@ -1,7 +1,7 @@
 // Undistortion of images: each output pixel is interpolated at its source position in the measured image.
 //
 // made(row, column) = sum over taps of w_x w_y image(tap), bilinear or bicubic (undistort_image_pixel.h). The source
-// positions come from a packed map (undistort_image_map.h), or with COMPUTED from the camera model.
+// positions are read from a packed map (undistort_image_map.h), or with COMPUTED computed from the camera model.
 //
 // Inputs:  image (frames, source rows, source columns[, CHANNELS]), type CODE.
 // Outputs: made (frames, made rows, made columns[, CHANNELS]), type CODE; status (made rows, made columns), the
@@ -12,7 +12,7 @@
 // Options: CODE, LARGEST (largest value of an integer CODE), CHANNELS (1 or 3, interleaved), BICUBIC (otherwise
 //          bilinear), BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT, COMPUTED, LENS or CAMERA,
 //          PAST_CACHES.
-// Variants: vector: a work-item per row and frame, a run of 16 pixels at a time; work-item: one pixel per item.
+// Variants: vector: a work-item per row and frame, in runs of 16 pixels; work-item: one pixel per item.
 #include "common/camera.h"
 #include "common/lanes.h"
 #include "common/lens.h"

@@ -1,4 +1,4 @@
-// Runs of 16 output pixels along a row. The last run moves back to end with the row and overlaps the one before it.
+// Runs of 16 output pixels along a row. The last run moves back to end with the row and overlaps the previous run.
 #ifndef UNDISTORT_IMAGE_RUN_H
 #define UNDISTORT_IMAGE_RUN_H
 

@@ -124,7 +124,7 @@ INLINED void interpolate_samples(const int span, const int single_band, global c
     store_codes(made, to);
 }
 
-// Compute sixteen pixels. With three channels these are 48 samples in three vectors, each with its own window that
+// Compute sixteen pixels. With three channels these are 48 samples in three vectors, each with a separate window that
 // starts `starts` pixels after `from`.
 INLINED void interpolate_window(const int span, const int single_band, global const CODE *from, size_t pitch, float16 x,
                                 float16 y, int bands, int3 starts, global CODE *to) {

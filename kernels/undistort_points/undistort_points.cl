@@ -6,7 +6,7 @@
 // Tables:  model: parameters of the model.
 // Options: INPUT, REAL_IS_DOUBLE, INVERSE; the model: CAMERA (common/camera.h), LENS (common/lens.h) or PLANE
 //          (plane.h).
-// Variants: vector: a work-item takes `each` points, 16 at a time; work-item: one point per item, `each` per
+// Variants: vector: a work-item processes `each` points, 16 in a vector; work-item: one point per item, `each` per
 //          work-group.
 #include "common/camera.h"
 #include "common/lens.h"

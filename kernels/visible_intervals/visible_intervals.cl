@@ -5,7 +5,7 @@
 //          the lens), type INPUT.
 // Outputs: intervals (count, kept, 2) fractions of the segment, NaN behind the last; counts (count,); status (count,).
 // Tables:  the tree of common/bvh.h; middle. Options: INPUT, REAL_IS_DOUBLE, BVH_DEPTH. Variants: vector: boxes and
-//          triangles 16 at a time; work-item: one at a time. One fan per work-item in both.
+//          triangles in vectors of 16; work-item: one after the other. One fan per work-item in both.
 //
 // Coordinates in the plane of the fan: place = apex + a (end 0 - apex) + b (end 1 - apex). The fan is a >= 0, b >= 0; the
 // segment is a + b = 1, at the fraction b / (a + b) of its length; rays begin where a / near 0 + b / near 1 = 1. All these
@@ -37,7 +37,7 @@ static inline Vector combined(real a, Vector u, real b, Vector v) {
     return (Vector){a * u.x + b * v.x, a * u.y + b * v.y, a * u.z + b * v.z};
 }
 
-// Set up a fan; return 0 for a segment that is seen end-on.
+// Set up a fan; return 0 for a segment on a line through the apex.
 static inline int fan_of(const Vector *corners, real near_0, real near_1, real least_near, Fan *fan) {
     const Vector one = minus(corners[1], corners[0]), two = minus(corners[2], corners[0]);
     const Vector normal = cross_of(one, two);
@@ -130,7 +130,7 @@ typedef struct {
     int count, lost;
 } Hidden;
 
-// Insert an interval into the sorted, disjoint intervals; merge those that it touches.
+// Insert an interval into the sorted, disjoint intervals; merge the intervals that it touches.
 static inline void hide(Hidden *hidden, real from, real to, real gap) {
     int first = 0;
     while (first < hidden->count && hidden->to[first] < from - gap) first++;

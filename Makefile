@@ -19,7 +19,7 @@ lint: .venv/ready-tests
 	.venv/bin/ruff format --check .
 	rm -rf build/lint/gpuvision
 	mkdir -p build/lint/gpuvision
-	ln -s "$(CURDIR)"/{gpuvision/*,host,kernels,profiling} build/lint/gpuvision
+	ln -s "$(CURDIR)"/{gpuvision/*,host,kernels,profiling,tests/reference} build/lint/gpuvision
 	cd build/lint && "$(CURDIR)/.venv/bin/mypy" --config-file "$(CURDIR)/pyproject.toml"
 
 # Warnings are errors. Sphinx-gallery runs the examples that changed since the last build, on the best device. The pages

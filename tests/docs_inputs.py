@@ -10,17 +10,18 @@ import cv2
 import numpy as np
 import trimesh
 
+import board_images
 import gpuvision as gv
+import target_images
 from boards import LAYERS, board_folder
 from floors import floor_image
-from reference import board_images, patterns
 from scanning import line_frames
 
 
 def _dots(tilt: float, towards: float) -> np.ndarray[Any, Any]:
     """Image of 18 x 14 dots through a lens."""
-    camera = patterns.view((640, 480), 14, 18, 30.0, tilt=tilt, towards=towards, barrel=4.0)
-    covered = patterns.dots(camera, np.ones((14, 18), np.bool_))
+    camera = target_images.view((640, 480), 14, 18, 30.0, tilt=tilt, towards=towards, barrel=4.0)
+    covered = target_images.dots(camera, np.ones((14, 18), np.bool_))
     return np.rint(220.0 - 180.0 * covered).astype(np.uint8)
 
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from board_images import BoardPicture, View
 from boards import BOARD_MIDDLE, LAYERS
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
-from reference.board_images import BoardPicture, View
 
 PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0
 LANDS = ((4, 4), (7, 5), (13, 4.5), (15.5, 7), (5, 9), (9, 11), (12.3, 9.4), (15, 12), (16.6, 10), (16.4, 4))

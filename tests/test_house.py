@@ -26,6 +26,7 @@ ROOMS = {
     "host": "gpuvision/host",
     "kernels": "gpuvision/kernels",
     "profiling": "gpuvision/profiling",
+    "tests/reference": "gpuvision/reference",
 }
 SHIPPED = {".py", ".pyi", ".cl", ".h", ".toml", ".typed"}
 
@@ -103,7 +104,6 @@ def test_installed_wheel_runs_outside_the_tree(wheel: zipfile.ZipFile, tmp_path:
 def test_source_distribution_holds_what_a_build_needs(tmp_path: Path) -> None:
     """Packages, kernels, presets, README and licence; tests and documentation stay in the repository."""
     source = _copy_of_the_sources(tmp_path / "source")
-    (source / "tests").mkdir()
     (source / "tests" / "test_something.py").write_text("")  # setuptools would take it by itself
     build = f"from setuptools.build_meta import build_sdist; build_sdist({os.fspath(tmp_path)!r})"
     subprocess.run([sys.executable, "-c", build], cwd=source, check=True, capture_output=True)
@@ -112,7 +112,8 @@ def test_source_distribution_holds_what_a_build_needs(tmp_path: Path) -> None:
         names = {name.partition("/")[2] for name in opened.getnames()}
     expected = {path.relative_to(ROOT).as_posix() for room in ROOMS for path in _files(room) if path.suffix in SHIPPED}
     assert expected | {"pyproject.toml", "README.md", "LICENSE"} <= names
-    assert not any(name.startswith(("tests", "docs", "examples")) for name in names)
+    others = {name for name in names if not name.startswith("tests/reference")}
+    assert not any(name.startswith(("tests/", "docs", "examples")) for name in others - {"tests/"})
 
 
 def test_wheel_installs_one_package(wheel: zipfile.ZipFile) -> None:
@@ -154,7 +155,7 @@ def test_kernel_includes_are_not_circular() -> None:
 # Floors of the packages, bottom to top. A name with a dot is a sub-package, or a module that stands above its package's
 # sub-packages. A module imports from lower floors and from its own package only.
 FLOORS = (
-    ("kernels", "host", "status", "validation", "schema"),
+    ("kernels", "host", "reference", "status", "validation", "schema"),
     ("operation",),
     ("camera",),
     ("camera.patterns",),
@@ -221,6 +222,21 @@ def test_imports_run_down_the_floors() -> None:
     assert wrong == []
 
 
+def test_references_are_independent() -> None:
+    """A reference that shared code, or a constant, with the operation would share its faults."""
+    room = "gpuvision.reference"
+    wrong = [
+        f"{module} imports {name}"
+        for module, name in _gpuvision_imports()
+        if _package(module) == "reference" and not f"{name}.".startswith(f"{room}.")
+    ]
+    assert wrong == []
+    users = [path for path in _files("tests") if path.suffix == ".py" and path.parent.name != "reference"]
+    names = {name.split(".")[0] for path in users for name in _imported(ast.parse(path.read_text()))}
+    assert "gpuvision" in names
+    assert "reference" not in names, "tests import references from gpuvision.reference only"
+
+
 def test_no_import_is_circular() -> None:
     modules = {module for module, _ in _modules()}
     graph: dict[str, set[str]] = {module: set() for module in modules}
@@ -240,13 +256,14 @@ def test_no_module_imports_private_names_of_another() -> None:
     assert wrong == []
 
 
-@pytest.mark.parametrize("top", ["numba", "pytest", "hypothesis"])
+@pytest.mark.parametrize("top", ["numba", "pytest", "hypothesis", "mpmath"])
 def test_the_library_needs_no_extra(top: str) -> None:
-    """What comes with the extras `test` and `profile` is imported by neither the library nor the command."""
+    """What comes with the extras `test`, `profile` and `reference` is imported by neither library nor command."""
+    with_extras = ("gpuvision.profiling", "gpuvision.reference")
     users = [
         module
         for module, path in _modules()
-        if not module.startswith("gpuvision.profiling")
+        if not module.startswith(with_extras)
         and any(name.split(".")[0] == top for name in _imported(ast.parse(path.read_text())))
     ]
     assert users == []
@@ -271,8 +288,9 @@ def test_no_file_knows_a_machine() -> None:
 
 def test_package_works_from_the_repository_root() -> None:
     """Python started in the root finds the bare folder ``gpuvision/`` before the installed package."""
-    code = "import gpuvision.host, gpuvision.kernels, gpuvision.profiling; print(gpuvision.host.__file__)"
+    code = "import gpuvision.host, gpuvision.kernels, gpuvision.profiling, gpuvision.reference"
+    code += "; print(gpuvision.host.__file__, gpuvision.reference.__file__)"
     run = subprocess.run([sys.executable, "-S", "-c", code], cwd=ROOT, capture_output=True, text=True)
     hidden = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert "No module named 'gpuvision" not in run.stderr
-    assert Path(hidden.stdout.strip()) == ROOT / "host" / "__init__.py"
+    assert hidden.stdout.split() == [str(ROOT / room / "__init__.py") for room in ("host", "tests/reference")]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gpuvision.camera.camera import Camera
-from reference import camera as reference
+from gpuvision.reference import camera as reference
 
 MATRIX = ((1700.0, 0.0, 642.5), (0.0, 1650.0, 509.25), (0.0, 0.0, 1.0))
 ANOTHER = ((1500.0, 0.0, 600.0), (0.0, 1480.0, 500.0), (0.0, 0.0, 1.0))
@@ -64,7 +64,7 @@ FEW_ROUNDINGS = 4e-12
 
 def test_forward_against_the_equations(any_camera: Camera) -> None:
     points = image_points()
-    expected = reference.measured(points, any_camera.matrix, any_camera.distortion).astype(np.float64)
+    expected = reference.distort_pixels(points, any_camera.matrix, any_camera.distortion).astype(np.float64)
     np.testing.assert_allclose(any_camera.distort(points), expected, rtol=0, atol=FEW_ROUNDINGS)
 
 
@@ -76,7 +76,7 @@ def test_forward_against_opencv(any_camera: Camera) -> None:
 def test_backward_of_what_the_equations_say(any_camera: Camera) -> None:
     """From the oracle's own forward, not ours: a mistake made both ways would not cancel."""
     points = image_points()
-    measured = reference.measured(points, any_camera.matrix, any_camera.distortion).astype(np.float64)
+    measured = reference.distort_pixels(points, any_camera.matrix, any_camera.distortion).astype(np.float64)
     np.testing.assert_allclose(any_camera.undistort(measured), points, rtol=0, atol=1e-9)
 
 
@@ -118,7 +118,7 @@ def test_any_camera_inverts_before_its_fold(radial, decentred, tilt, part, turn)
     point = np.array([642.5 + 1700.0 * radius * math.cos(turn), 509.25 + 1650.0 * radius * math.sin(turn)])
     measured = given_.distort(point)
     if np.isnan(measured).any():  # behind a sensor so tilted
-        x, y = reference.bent(*((point - [642.5, 509.25]) / [1700.0, 1650.0]), given_.distortion)
+        x, y = reference.distort(*((point - [642.5, 509.25]) / [1700.0, 1650.0]), given_.distortion)
         a, b = np.radians(tilt)
         assert math.sin(b) * x - math.cos(b) * math.sin(a) * y + math.cos(b) * math.cos(a) <= 1e-12
         return
@@ -219,7 +219,7 @@ def test_covers() -> None:
 
 def test_another_matrix_for_the_ideal_pixels(any_camera: Camera) -> None:
     points = image_points()
-    expected = reference.measured(points, MATRIX, any_camera.distortion, ANOTHER).astype(np.float64)
+    expected = reference.distort_pixels(points, MATRIX, any_camera.distortion, ANOTHER).astype(np.float64)
     measured = any_camera.distort(points, matrix=ANOTHER)
     np.testing.assert_allclose(measured, expected, rtol=0, atol=FEW_ROUNDINGS)
     np.testing.assert_allclose(any_camera.undistort(measured, matrix=ANOTHER), points, rtol=0, atol=1e-9)

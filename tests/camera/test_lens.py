@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpuvision.camera.lens import Lens
-from reference import triangulation as reference
+from gpuvision.reference import triangulation as reference
 
 CENTRE = (650.0, 500.0)
 LENSES = [

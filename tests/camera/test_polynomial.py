@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.polynomial import PlanePolynomial
-from reference import plane_polynomial as reference
+from gpuvision.reference import plane_polynomial as reference
 
 REGION = ((0.0, 1279.0), (0.0, 1023.0))
 # 0.1 mm per pixel, turned by a degree, a little perspective and barrel distortion, seen as in a mirror or not.

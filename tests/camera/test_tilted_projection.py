@@ -14,7 +14,7 @@ from gpuvision.camera.views.parameters import (
     internal_parameters,
     opencv_parameters,
 )
-from reference.tilted_camera import project_virtual, tilt
+from tilted_camera import project_virtual, tilt
 
 VIEWS, POINTS = 3, 7
 CAMERAS = {

@@ -19,8 +19,8 @@ from gpuvision.camera.image_map import RUN, PackedMap, Packer, PixelMap, Taps
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.undistort_image import UndistortImage
 from gpuvision.host import Device
+from gpuvision.reference import undistort_image as reference
 from gpuvision.status import Status
-from reference import undistort_image as reference
 
 ON_DEVICES = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 VARIANTS = ["vector", "work_item"]

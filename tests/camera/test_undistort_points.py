@@ -21,8 +21,8 @@ from gpuvision.camera.lens import Lens
 from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.camera.undistort_points import UndistortedPoints, UndistortPoints
 from gpuvision.host import Device
+from gpuvision.reference import camera as reference
 from gpuvision.status import Status
-from reference import camera as reference
 
 ON_DEVICES = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 MATRIX = ((1700.0, 0.0, 642.5), (0.0, 1650.0, 509.25), (0.0, 0.0, 1.0))

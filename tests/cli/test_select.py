@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from board_images import View, board_image
 from boards import BOARD_MIDDLE, LAYERS, board_folder
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.cli import main as cli
@@ -22,7 +23,6 @@ from gpuvision.matching.features.feature_set import FeatureSet, choose_features
 from gpuvision.matching.features.imaging import Imaging
 from gpuvision.schema import DescriptionError
 from gpuvision.workflows.locating_board import locate_board
-from reference.board_images import View, board_image
 
 PIXEL, SHAPE, NOISE = 25e-6, (480, 640), 2.0
 # Steps of 110 in the open and of 50 under the mask; a pixel's own extent blurs, too.

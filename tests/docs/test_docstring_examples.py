@@ -9,7 +9,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-FOLDERS = {"gpuvision": "gpuvision", "host": "gpuvision.host", "profiling": "gpuvision.profiling"}
+FOLDERS = {
+    "gpuvision": "gpuvision",
+    "host": "gpuvision.host",
+    "profiling": "gpuvision.profiling",
+    "tests/reference": "gpuvision.reference",
+}
 
 
 def _modules_with_examples() -> list[str]:

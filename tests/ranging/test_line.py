@@ -15,9 +15,9 @@ from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.reference.line import AMBIGUOUS, LOW_SIGNAL, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
+from gpuvision.reference.triangulation import triangulate
 from gpuvision.status import Status
-from reference.line import AMBIGUOUS, LOW_SIGNAL, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
-from reference.triangulation import triangulate
 
 TOP = {"uint8": 180.0, "uint16": 40_000.0, "float32": 100.0}
 LEVEL = {"uint8": 20, "uint16": 4000, "float32": 8.5}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gpuvision.ranging.line import LineReadout
-from reference.line import cramer_rao, pixel_gaussian
+from gpuvision.reference.line import cramer_rao, pixel_gaussian
 
 TRIALS, LENGTH, BACKGROUND, READ_NOISE = 4000, 41, 20.0, 10.0
 

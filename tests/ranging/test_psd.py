@@ -14,8 +14,8 @@ from canary import Guarded
 from gpuvision.host import host_view
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.reference import psd as reference
 from gpuvision.status import Status
-from reference import psd as reference
 
 VARIANTS = ("vector", "work_item")
 LENGTH = 6e-3

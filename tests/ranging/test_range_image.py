@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from gpuvision import Device, Status
 from gpuvision.camera.lens import Lens
 from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet, StraightTransport
-from reference import range_image as reference
+from gpuvision.reference import range_image as reference
 
 VARIANTS = ("vector", "work_item")
 DTYPES = (np.float32, np.float64)
@@ -52,17 +52,17 @@ def close(made: RangePoints, points: np.ndarray, status: np.ndarray, tolerance: 
 
 
 def expect_straight(op: RangeImage, g, h, transport, given):
-    points = reference.straight(op.geometry, g, h, transport)
+    points = reference.points_of_straight_transport(op.geometry, g, h, transport)
     unknown = ~np.isfinite(g) | ~np.isfinite(h) | ~np.isfinite(transport)[:, None]
     none = np.zeros(g.shape, bool)
-    return reference.judged(points, given, unknown, none, none, op.limits)
+    return reference.apply_status(points, given, unknown, none, none, op.limits)
 
 
 def expect_rotating(op: RangeImage, position, transport, given):
-    points, facing, folded = reference.rotating(op.geometry, position, transport)
+    points, facing, folded = reference.points_of_rotating_sheet(op.geometry, position, transport)
     unknown = ~np.isfinite(position) | ~np.isfinite(transport)[:, None]
     missed = ~(facing > op.geometry.horizon)
-    return (*reference.judged(points, given, unknown, missed, folded, op.limits), facing)
+    return (*reference.apply_status(points, given, unknown, missed, folded, op.limits), facing)
 
 
 def depth_tolerance(op: RangeImage, points: np.ndarray, facing: np.ndarray, dtype: type) -> np.ndarray:

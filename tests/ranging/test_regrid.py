@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from gpuvision import Device, Status
 from gpuvision.ranging.regrid import Grid, HeightMap, Regrid
-from reference import regrid as reference
+from gpuvision.reference import regrid as reference
 
 DTYPES = (np.float32, np.float64)
 GRID = Grid(left=-1.0, top=2.0, cell_x=0.125, cell_y=0.25, columns=17, rows=13)

@@ -18,8 +18,8 @@ from gpuvision.host import Device
 from gpuvision.host.program import options
 from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.ranging.triangulation import SampleAxes, SheetPoints, Triangulation
+from gpuvision.reference import triangulation as reference
 from gpuvision.status import Status
-from reference import triangulation as reference
 
 REGION = ((0.0, 1023.0), (0.0, 1279.0))
 CAMERA = np.array([[1700.0, 0.0, 640.0], [0.0, 1700.0, 512.0], [0.0, 0.0, 1.0]])

@@ -1,16 +1,22 @@
-"""OpenCV's 14 coefficients written out as its documentation does, in extended precision; complex numbers pass through.
+"""Reference of OpenCV's lens model with 14 coefficients, written out as its documentation does, in extended precision.
 
-``distortion`` is (k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tauX, tauY).
+``distortion`` is (k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tauX, tauY). Coordinates may be
+complex, for derivatives by complex steps.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Points = NDArray[Any]
 
 
-def bent(x, y, distortion):
+def distort(x: Points, y: Points, distortion: ArrayLike) -> tuple[Points, Points]:
     """Return (x', y') of normalised ideal coordinates, before the tilt."""
-    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = (np.longdouble(c) for c in distortion[:12])
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = np.asarray(distortion, np.longdouble)[:12]
     r2 = x * x + y * y
     radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     return (
@@ -19,8 +25,8 @@ def bent(x, y, distortion):
     )
 
 
-def tilted(x, y, tau_x, tau_y):
-    """Return (x'', y''): projection of the rotated (x, y, 1) along the new axis, element by element."""
+def tilt(x: Points, y: Points, tau_x: float, tau_y: float) -> tuple[Points, Points]:
+    """Return (x'', y''): the projection of the rotated (x, y, 1) along the new axis, element by element."""
     cx, sx, cy, sy = (f(np.longdouble(t)) for t in (tau_x, tau_y) for f in (np.cos, np.sin))
     # R = Ry(tauY) Rx(tauX).
     r = [[cy, sy * sx, -sy * cx], [0, cx, sx], [sy, -cy * sx, cy * cx]]
@@ -28,24 +34,39 @@ def tilted(x, y, tau_x, tau_y):
     return (r[2][2] * u - r[0][2] * w) / w, (r[2][2] * v - r[1][2] * w) / w
 
 
-def measured(points, matrix, distortion, ideal_matrix=None):
-    """Return measured pixels (n, 2) of ideal ones under ``ideal_matrix``."""
+def distort_pixels(
+    points: ArrayLike, matrix: ArrayLike, distortion: ArrayLike, ideal_matrix: ArrayLike | None = None
+) -> Points:
+    """Return the measured pixels of ideal pixels.
+
+    Parameters
+    ----------
+    points : array
+        Pixels of a camera without distortion, (n, 2).
+    matrix : array
+        Camera matrix, (3, 3).
+    distortion : array
+        The 14 coefficients.
+    ideal_matrix : array, optional
+        Camera matrix of the ideal pixels; default ``matrix``.
+    """
+    coefficients = np.asarray(distortion, np.longdouble)
     (fx, _, cx), (_, fy, cy), _ = np.asarray(matrix, np.longdouble)
     (gx, _, dx), (_, gy, dy), _ = np.asarray(matrix if ideal_matrix is None else ideal_matrix, np.longdouble)
-    points = np.asarray(points, np.longdouble)
-    x, y = tilted(*bent((points[:, 0] - dx) / gx, (points[:, 1] - dy) / gy, distortion), *distortion[12:])
+    u, v = np.asarray(points, np.longdouble).T
+    x, y = tilt(*distort((u - dx) / gx, (v - dy) / gy, coefficients), *coefficients[12:])
     return np.stack([fx * x + cx, fy * y + cy], -1)
 
 
-def determinant(x, y, distortion):
+def determinant(x: Points, y: Points, distortion: ArrayLike) -> Points:
     """Return the determinant of d(x', y') / d(x, y), by complex steps."""
     tiny = np.longdouble(1e-30)
-    by_x, by_y = bent(x + 1j * tiny, y + 0j, distortion), bent(x + 0j, y + 1j * tiny, distortion)
-    return (by_x[0].imag * by_y[1].imag - by_y[0].imag * by_x[1].imag) / tiny**2
+    by_x, by_y = distort(x + 1j * tiny, y + 0j, distortion), distort(x + 0j, y + 1j * tiny, distortion)
+    return np.asarray((by_x[0].imag * by_y[1].imag - by_y[0].imag * by_x[1].imag) / tiny**2)
 
 
-def fold_radius(angle, distortion, farthest, steps=20_000):
-    """Return the radius at which the determinant first turns negative along a ray; inf if not before ``farthest``."""
+def fold_radius(angle: float, distortion: ArrayLike, farthest: float, steps: int = 20_000) -> float:
+    """Return the radius along a ray at which the determinant turns negative, or inf if beyond ``farthest``."""
     radii = np.linspace(0.0, farthest, steps).astype(np.longdouble)
     negative = determinant(radii * np.cos(angle), radii * np.sin(angle), distortion) <= 0
     return float(radii[np.argmax(negative)]) if negative.any() else np.inf

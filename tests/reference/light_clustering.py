@@ -1,4 +1,4 @@
-"""Reference light between pairs of segments and receivers by quadrature, and readings of strips, in NumPy."""
+"""Reference of light clustering: light from every segment to every receiver by quadrature, and positions of strips."""
 
 from __future__ import annotations
 
@@ -35,10 +35,12 @@ def pair_irradiance(receivers: NDArray[Any], segments: NDArray[Any]) -> NDArray[
             cosine = np.maximum(above + slope * rho * np.sinh(x), 0.0)
             total += weight * cosine / (rho * np.cosh(x)) ** 3
     factor = np.maximum(height, 0.0) * segments[None, :, 9] / np.pi
-    return factor * total * (last - first) * 0.5 / _PANELS
+    return np.asarray(factor * total * (last - first) * 0.5 / _PANELS)
 
 
-def hidden(origins: NDArray[Any], targets: NDArray[Any], triangles: NDArray[Any], clearance: float) -> NDArray[Any]:
+def is_occluded(
+    origins: NDArray[Any], targets: NDArray[Any], triangles: NDArray[Any], clearance: float
+) -> NDArray[Any]:
     """Return whether any triangle (t, 3, 3) lies between points (k, 3), ends excluded (Moeller and Trumbore)."""
     way = targets - origins
     length = np.linalg.norm(way, axis=1)
@@ -61,7 +63,7 @@ def visibility(
 ) -> NDArray[np.float64]:
     """Return the visible part (n, m) of each segment, by rays to the middles of its parts.
 
-    Parts under the receiver's plane count as visible: they send no light anyway.
+    Parts below the receiver's plane count as visible: they contribute no light.
     """
     n, m = len(receivers), len(segments)
     at = (np.arange(points) + 0.5) / points
@@ -69,13 +71,13 @@ def visibility(
     to = np.broadcast_to(on.reshape(1, -1, 3), (n, m * points, 3)).reshape(-1, 3)
     origin = np.repeat(receivers[:, :3].astype(float), m * points, axis=0)
     seen = np.concatenate(
-        [~hidden(origin[k : k + 20000], to[k : k + 20000], triangles, 1e-7) for k in range(0, len(origin), 20000)]
+        [~is_occluded(origin[k : k + 20000], to[k : k + 20000], triangles, 1e-7) for k in range(0, len(origin), 20000)]
     )
     under = np.einsum("kx,kx->k", np.repeat(receivers[:, 3:], m * points, axis=0), to - origin) <= 0.0
-    return (seen | under).reshape(n, m, points).mean(axis=2)
+    return np.asarray((seen | under).reshape(n, m, points).mean(axis=2))
 
 
-def reading(power: Any, moment: Any, weights: NDArray[Any], irradiance: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the mean u of strips from their direct light and the light that receivers (strips, n) add."""
+def mean_position(power: Any, moment: Any, weights: NDArray[Any], irradiance: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the mean position of strips from their direct light and the light of receivers (strips, n)."""
     more = np.sum(weights * irradiance[..., None], axis=1)
     return np.asarray((moment + more[:, 1]) / (power + more[:, 0]))

@@ -1,15 +1,40 @@
-"""Line readout in float64 NumPy, one profile at a time, written from the definitions."""
+"""Reference of the line readout: one profile at a time, written from the definitions."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, special
 
 LOW_SIGNAL, SATURATED, OUT_OF_RANGE, NOT_FINITE, AMBIGUOUS = 1, 2, 4, 8, 16
 
+Float64 = NDArray[np.float64]
+Reading = tuple[float, float, float, float, int]  # position, peak, width, total, status
 
-def read_lines(frames, *, along="columns", previous=None, **settings):
-    """Dictionary of position, peak, width, total (float64) and status (uint8) of shape (..., samples)."""
+
+def read_lines(
+    frames: NDArray[Any], *, along: str = "columns", previous: ArrayLike | None = None, **settings: Any
+) -> dict[str, NDArray[Any]]:
+    """Read the position of the laser line in each profile.
+
+    Parameters
+    ----------
+    frames : numpy.ndarray
+        Images (..., rows, columns).
+    along : str
+        "columns" or "rows": direction of a profile.
+    previous : array, optional
+        Position of the last frame's line in each profile [px], for ``peak_selection="nearest"``.
+    **settings
+        Parameters of `gpuvision.LineReadout`.
+
+    Returns
+    -------
+    dict
+        position, peak, width and total (float64) and status (uint8), each of shape (..., samples).
+    """
     profiles = np.asarray(frames)
     if along == "columns":
         profiles = np.swapaxes(profiles, -1, -2)
@@ -25,8 +50,17 @@ def read_lines(frames, *, along="columns", previous=None, **settings):
     return out
 
 
-def read_profile(x, *, saturation, previous, method="windowed", threshold=0.0, window=8, **settings):
-    """(position, peak, width, total, status) of one float64 profile."""
+def read_profile(
+    x: Float64,
+    *,
+    saturation: float,
+    previous: float,
+    method: str = "windowed",
+    threshold: float = 0.0,
+    window: int = 8,
+    **settings: Any,
+) -> Reading:
+    """Return position, peak, width, total and status of one profile."""
     if not np.all(np.isfinite(x)):
         known = x[~np.isnan(x)]
         bright = len(known) and known.max() >= saturation
@@ -36,7 +70,17 @@ def read_profile(x, *, saturation, previous, method="windowed", threshold=0.0, w
     return read_peak(x, method, threshold, window, saturation, previous, **settings)
 
 
-def read_centroid(x, threshold, saturation, *, minimum_peak=-np.inf, minimum_width=1, maximum_width=None, **_):
+def read_centroid(
+    x: Float64,
+    threshold: float,
+    saturation: float,
+    *,
+    minimum_peak: float = -np.inf,
+    minimum_width: int = 1,
+    maximum_width: int | None = None,
+    **_: Any,
+) -> Reading:
+    """Return the reading by the centroid of all light above the threshold."""
     v = np.maximum(x - threshold, 0.0)
     lit = int(np.sum(v > 0.0))
     status = SATURATED if x.max() >= saturation else 0
@@ -48,15 +92,23 @@ def read_centroid(x, threshold, saturation, *, minimum_peak=-np.inf, minimum_wid
     return np.sum(v * np.arange(len(x))) / v.sum(), x.max(), lit, v.sum(), status
 
 
-def runs_of(x, threshold):
-    """(begin, end) of the runs of samples over the threshold."""
+def runs_of(x: Float64, threshold: float) -> list[tuple[int, int]]:
+    """Return (begin, end) of each run of samples above the threshold."""
     lit = np.concatenate([[False], x > threshold, [False]])
     steps = np.flatnonzero(lit[1:] != lit[:-1])
-    return list(zip(steps[::2], steps[1::2], strict=True))
+    return [(int(begin), int(end)) for begin, end in zip(steps[::2], steps[1::2], strict=True)]
 
 
-def choose(x, threshold, previous, peak_selection, minimum_peak, minimum_width, maximum_width):
-    """(index of the peak, width of its run), or None."""
+def select_peak(
+    x: Float64,
+    threshold: float,
+    previous: float,
+    peak_selection: str,
+    minimum_peak: float,
+    minimum_width: int,
+    maximum_width: int | None,
+) -> tuple[int, int] | None:
+    """Return the index of the selected peak and the width of its run, or None."""
     widest = len(x) if maximum_width is None else maximum_width
     peaks = [(b + int(np.argmax(x[b:e])), e - b) for b, e in runs_of(x, threshold) if minimum_width <= e - b <= widest]
     peaks = [(at, width) for at, width in peaks if x[at] >= minimum_peak]
@@ -72,10 +124,24 @@ def choose(x, threshold, previous, peak_selection, minimum_peak, minimum_width, 
 
 
 def read_peak(
-    x, method, threshold, window, saturation, previous, *, peak_selection="strongest", minimum_peak=-np.inf,
-    minimum_width=1, maximum_width=None, ambiguity=None, fir_length=4, read_noise=1.0, gain=0.0,
-):  # fmt: skip
-    found = choose(x, threshold, previous, peak_selection, minimum_peak, minimum_width, maximum_width)
+    x: Float64,
+    method: str,
+    threshold: float,
+    window: int,
+    saturation: float,
+    previous: float,
+    *,
+    peak_selection: str = "strongest",
+    minimum_peak: float = -np.inf,
+    minimum_width: int = 1,
+    maximum_width: int | None = None,
+    ambiguity: float | None = None,
+    fir_length: int = 4,
+    read_noise: float = 1.0,
+    gain: float = 0.0,
+) -> Reading:
+    """Return the reading by a window around the selected peak."""
+    found = select_peak(x, threshold, previous, peak_selection, minimum_peak, minimum_width, maximum_width)
     if found is None:
         return np.nan, x.max(), 0, 0.0, LOW_SIGNAL | (SATURATED if x.max() >= saturation else 0)
     at, width = found
@@ -97,7 +163,7 @@ def read_peak(
     near = x[at - window : at + window + 1]
     total = v[inside].sum()
     if is_wide:
-        offset, flag = (equals - 1) % 2 / 2.0, 0
+        offset, flag = ((equals - 1) % 2) / 2.0, 0
     elif method == "windowed":
         offset, flag = np.sum(v[inside] * np.arange(-window, window + 1)) / total, 0
     elif method == "gauss3":
@@ -105,11 +171,12 @@ def read_peak(
     elif method == "fir":
         offset, flag = fir(x, at, window, fir_length // 2)
     else:
-        offset, flag = likeliest(near, window, saturation, read_noise, gain), 0
+        offset, flag = fit_gaussian(near, window, saturation, read_noise, gain), 0
     return (np.nan if flag & LOW_SIGNAL else at + offset), top, width, total, status | flag
 
 
-def gauss3(v, at, equals):
+def gauss3(v: Float64, at: int, equals: int) -> tuple[float, int]:
+    """Return the offset and a flag by a parabola through the logarithms of three samples."""
     if v[at - 1] <= 0.0 or v[at + 1] <= 0.0:
         return np.nan, LOW_SIGNAL
     a, b, c = np.log(v[at - 1 : at + 2])
@@ -119,7 +186,8 @@ def gauss3(v, at, equals):
     return 0.5 * (a - c) / bend, 0
 
 
-def fir(x, at, window, half):
+def fir(x: Float64, at: int, window: int, half: int) -> tuple[float, int]:
+    """Return the offset and a flag by the zero crossing of a derivative filter."""
     padded = np.pad(x, half + window, mode="edge")
     index = np.arange(at - window, at + window + 1) + half + window
     g = np.array([padded[i - half : i].sum() - padded[i + 1 : i + half + 1].sum() for i in index])
@@ -130,17 +198,18 @@ def fir(x, at, window, half):
             return np.nan, LOW_SIGNAL
         places = k[crosses] + g[:-1][crosses] / (g[:-1] - g[1:])[crosses]
         nearest.append(places[np.argmin(np.abs(places))])
-    return np.mean(nearest), 0
+    return float(np.mean(nearest)), 0
 
 
-def pixel_gaussian(k, place, sigma, amplitude, background):
-    """Light of a Gaussian in whole pixels."""
+def pixel_gaussian(k: ArrayLike, place: float, sigma: float, amplitude: float, background: float) -> Float64:
+    """Return the light of a Gaussian line in each pixel ``k``, integrated over the pixel."""
+    k = np.asarray(k)
     low, high = ((k + half - place) / (sigma * np.sqrt(2.0)) for half in (-0.5, 0.5))
-    return background + amplitude * sigma * np.sqrt(np.pi / 2.0) * (special.erf(high) - special.erf(low))
+    return np.asarray(background + amplitude * sigma * np.sqrt(np.pi / 2.0) * (special.erf(high) - special.erf(low)))
 
 
-def likeliest(y, window, saturation, read_noise, gain):
-    """Weighted least squares, the weights those of the fitted model: repeated until nothing changes."""
+def fit_gaussian(y: Float64, window: int, saturation: float, read_noise: float, gain: float) -> float:
+    """Return the offset of a Gaussian by maximum likelihood: least squares, weighted anew by the fit until it stays."""
     k = np.arange(-window, window + 1)
     good = y < saturation
     background = (y[0] + y[-1]) / 2.0
@@ -156,14 +225,16 @@ def likeliest(y, window, saturation, read_noise, gain):
         if np.max(np.abs(fit.x - guess)) < 1e-9:
             break
         guess = fit.x
-    return guess[0]
+    return float(guess[0])
 
 
-def cramer_rao(sigma, amplitude, background, read_noise, length, places):
-    """Root mean square over the places of the bound on the deviation of the place, all four parameters unknown."""
+def cramer_rao(
+    sigma: float, amplitude: float, background: float, read_noise: float, length: int, places: ArrayLike
+) -> float:
+    """Return the Cramer-Rao bound of a line's position [px], root mean square over places; all parameters unknown."""
     k = np.arange(length)
     variances = []
-    for place in places:
+    for place in np.asarray(places):
         truth = np.array([place, sigma, amplitude, background])
         slopes = []
         for i, size in enumerate((1e-5, 1e-5 * sigma, 1e-5 * amplitude, 1e-3)):
@@ -173,4 +244,4 @@ def cramer_rao(sigma, amplitude, background, read_noise, length, places):
         design = np.array(slopes)
         variance = read_noise**2 + pixel_gaussian(k, *truth)
         variances.append(np.linalg.inv((design / variance) @ design.T)[0, 0])
-    return np.sqrt(np.mean(variances))
+    return float(np.sqrt(np.mean(variances)))

@@ -1,4 +1,4 @@
-"""Reference irradiance by lit segments: quadrature in NumPy, and the closed form in mpmath with 60 digits."""
+"""Reference of the irradiance by lit segments: quadrature in NumPy, and the closed form in mpmath with 60 digits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,22 @@ _PANELS = 32
 
 
 def irradiance(receivers: NDArray[Any], ends: Any, normals: Any, exitance: Any) -> tuple[Any, Any]:
-    """Return the irradiance (n,) of receivers (n, 6), and the sum of E0 = M h / pi * integral of dt / r^3."""
+    """Return the irradiance of receivers by segments without occlusion, by quadrature.
+
+    Parameters
+    ----------
+    receivers : numpy.ndarray
+        Position and normal, (n, 6).
+    ends, normals, exitance : array
+        Ends (m, 2, 3) [m], normals (m, 3) and radiant exitance (m,) [W/m] of the segments.
+
+    Returns
+    -------
+    irradiance : numpy.ndarray
+        (n,) [W/m^2].
+    scale : numpy.ndarray
+        (n,), the sum of E0 = M h / pi * integral of dt / r^3: the irradiance of a receiver that faces each element.
+    """
     total, largest = np.zeros(len(receivers)), np.zeros(len(receivers))
     place, normal = receivers[:, :3].astype(float), receivers[:, 3:].astype(float)
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)

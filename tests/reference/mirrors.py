@@ -1,12 +1,15 @@
-"""Reference images in a unit sphere and in an ellipsoid about the origin, in float64."""
+"""Reference of mirror images: reflection in the unit sphere and in an ellipsoid about the origin."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+Float64 = NDArray[np.float64]
 
-def in_sphere(point: np.ndarray, lens: np.ndarray) -> tuple[np.ndarray, float]:
+
+def reflect_in_sphere(point: Float64, lens: Float64) -> tuple[Float64, float]:
     """Return the reflection point of a point on the outside of the unit sphere (Alhazen's problem), and its density.
 
     The density is 1 / ((d + e + 2 d e / cos i) (d + e + 2 d e cos i)), with the distances d and e of the reflection
@@ -17,7 +20,7 @@ def in_sphere(point: np.ndarray, lens: np.ndarray) -> tuple[np.ndarray, float]:
     two = point - (point @ one) * one
     two /= np.linalg.norm(two)
 
-    def parts(angle: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def parts(angle: float) -> tuple[Float64, Float64, Float64]:
         normal = np.cos(angle) * one + np.sin(angle) * two
         return normal, lens - normal, point - normal
 
@@ -33,8 +36,8 @@ def in_sphere(point: np.ndarray, lens: np.ndarray) -> tuple[np.ndarray, float]:
     return normal, float(1.0 / ((d + e + 2.0 * d * e / cosine) * (d + e + 2.0 * d * e * cosine)))
 
 
-def past_ellipsoid(
-    shape: tuple[float, ...], lens: np.ndarray, place: np.ndarray, point: np.ndarray, apart: float = 1e-5
+def reflect_past_ellipsoid(
+    shape: tuple[float, ...], lens: Float64, place: Float64, point: Float64, apart: float = 1e-5
 ) -> tuple[float, float]:
     """Return the distance at which a ray off an ellipsoid passes a point, and its bundle's area per solid angle."""
     middle = place - lens

@@ -1,20 +1,39 @@
-"""Reference visibility of a segment from a point: all critical points, and a ray into each part between them."""
+"""Reference of occluded irradiance: visible parts of a segment by critical points and one ray into each part."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from reference import line_irradiance, rays
+from gpuvision.reference import line_irradiance, rays
+
+Float64 = NDArray[np.float64]
+RayOf = Callable[[Float64], tuple[Float64, Float64]]
 
 
-def intervals(corners: np.ndarray, ray_of: object, points: tuple[np.ndarray, ...], planes: list[tuple]) -> np.ndarray:
-    """Return the visible intervals (k, 2), 0 to 1, of a segment seen from a point.
+def intervals(
+    corners: Float64, ray_of: RayOf, points: tuple[Float64, ...], planes: list[tuple[Float64, Float64]]
+) -> Float64:
+    """Return the visible intervals of a segment seen from a point.
 
-    The segment goes from ``points[1]`` to ``points[2]``, the point is ``points[0]``. ``ray_of(t)`` gives the ends (n,
-    3) of the rays to t between which triangles occlude; ``planes`` (point, normal) are the planes at which that range
-    begins or ends.
+    Parameters
+    ----------
+    corners : numpy.ndarray
+        Triangles (n, 3, 3).
+    ray_of : callable
+        Function of t (k,) that returns the two ends (k, 3) of the rays to t; triangles between the ends occlude.
+    points : tuple
+        The point, and the start and the end of the segment.
+    planes : list
+        Planes (point, normal) at which the rays begin or end.
+
+    Returns
+    -------
+    numpy.ndarray
+        (k, 2), fractions of the segment, 0 to 1.
     """
     point, start, stop = points
     along = stop - start
@@ -40,7 +59,7 @@ def intervals(corners: np.ndarray, ray_of: object, points: tuple[np.ndarray, ...
             critical.append(across @ (point - start) / (across @ along))
     cuts = np.concatenate(critical)
     cuts = np.unique([*np.clip(cuts[np.isfinite(cuts)], 0.0, 1.0), 0.0, 1.0])
-    origins, ends = ray_of(0.5 * (cuts[1:] + cuts[:-1]))  # type: ignore[operator]
+    origins, ends = ray_of(0.5 * (cuts[1:] + cuts[:-1]))
     seen = ~rays.occluded(corners, np.hstack([origins, ends])) if len(corners) else np.ones(len(cuts) - 1, bool)
     found: list[list[float]] = []
     for low, high, is_seen in zip(cuts[:-1], cuts[1:], seen, strict=True):
@@ -51,7 +70,7 @@ def intervals(corners: np.ndarray, ray_of: object, points: tuple[np.ndarray, ...
     return np.array(found).reshape(-1, 2)
 
 
-def from_receiver(corners: np.ndarray, receiver: np.ndarray, segment: np.ndarray, clearance: float) -> np.ndarray:
+def visible_from_receiver(corners: Float64, receiver: Float64, segment: Float64, clearance: float) -> Float64:
     """Return the visible intervals of a segment (10,) from a receiver (6,); triangles above both planes occlude."""
     point, facing = receiver[:3].astype(float), receiver[3:].astype(float)
     start, stop, lit = segment[:9].astype(float).reshape(3, 3)
@@ -59,7 +78,7 @@ def from_receiver(corners: np.ndarray, receiver: np.ndarray, segment: np.ndarray
     lit = lit - (lit @ along) * along
     facing, lit = facing / np.linalg.norm(facing), lit / np.linalg.norm(lit)
 
-    def ray_of(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def ray_of(t: Float64) -> tuple[Float64, Float64]:
         toward = start + t[:, None] * (stop - start) - point
         height, above = -(toward @ lit), toward @ facing
         end = 1.0 - clearance / height[:, None]
@@ -70,7 +89,7 @@ def from_receiver(corners: np.ndarray, receiver: np.ndarray, segment: np.ndarray
     return intervals(corners, ray_of, (point, start, stop), planes)
 
 
-def light(corners: np.ndarray, receivers: np.ndarray, segments: np.ndarray, clearance: float) -> tuple:
+def irradiance(corners: Float64, receivers: Float64, segments: Float64, clearance: float) -> tuple[Float64, Float64]:
     """Return the irradiance (n,) of receivers (n, 6) by segments (m, 10), and the sum of E0 of those that face them."""
     total, largest = np.zeros(len(receivers)), np.zeros(len(receivers))
     for number, receiver in enumerate(receivers):
@@ -80,13 +99,13 @@ def light(corners: np.ndarray, receivers: np.ndarray, segments: np.ndarray, clea
                 continue
             one = receiver[None]
             largest[number] += line_irradiance.irradiance(one, ends[None], lit[None], segment[9:])[1][0]
-            for low, high in from_receiver(corners, receiver, segment, clearance):
+            for low, high in visible_from_receiver(corners, receiver, segment, clearance):
                 part = ends[0] + np.array([[low], [high]]) * (ends[1] - ends[0])
                 total[number] += line_irradiance.irradiance(one, part[None], lit[None], segment[9:])[0][0]
     return total, largest
 
 
-def difference(some: np.ndarray, others: np.ndarray) -> float:
+def symmetric_difference(some: Float64, others: Float64) -> float:
     """Return the length of the points that are in only one of two sets of intervals."""
     edges = np.unique(np.concatenate([some.ravel(), others.ravel(), [0.0, 1.0]]))
     middles = 0.5 * (edges[1:] + edges[:-1])
@@ -96,17 +115,17 @@ def difference(some: np.ndarray, others: np.ndarray) -> float:
     return float(np.sum((edges[1:] - edges[:-1])[inside[0] != inside[1]]))
 
 
-def single(values: Any) -> np.ndarray:
+def single(values: Any) -> Float64:
     """Return numbers rounded to float32, so that both precisions see the same scene."""
     return np.asarray(values).astype(np.float32).astype(np.float64)
 
 
-def soup(rng: np.random.Generator, count: int, size: float = 0.2) -> np.ndarray:
+def soup(rng: np.random.Generator, count: int, size: float = 0.2) -> Float64:
     """Return random triangles in a cube."""
     return single(rng.uniform(-1.0, 1.0, (count, 1, 3)) + rng.normal(0.0, size, (count, 3, 3)))
 
 
-def comb(teeth: int) -> np.ndarray:
+def comb(teeth: int) -> Float64:
     """Return thin triangles side by side that hide half of a unit segment at twice their distance."""
     at = (np.arange(teeth) + 0.25) / teeth - 0.5
     x = 0.5 * np.stack([at, at + 0.5 / teeth, at], axis=1)

@@ -1,4 +1,4 @@
-"""Reference form factors of receivers and triangles: Lambert's sum over edges in mpmath with 60 digits."""
+"""Reference of the form factors of receivers and triangles: Lambert's sum over edges in mpmath with 60 digits."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import mpmath
 DIGITS = 60
 
 
-def factor(receiver: Any, corners: Any) -> tuple[float, float]:
-    """Return the form factor of a receiver (position, normal) to a triangle, and the factor if it faced it best."""
+def form_factor(receiver: Any, corners: Any) -> tuple[float, float]:
+    """Return the form factor of a receiver (position, normal) to a triangle, and the largest over all normals."""
     with mpmath.workdps(DIGITS):
         place, normal = _vector(receiver[:3]), _vector(receiver[3:])
         normal /= mpmath.norm(normal)

@@ -1,28 +1,60 @@
-"""The PSD readout in float64, sample by sample as domain equations say it."""
+"""Reference of the PSD readout: positions, sums, status flags and standard deviations of each sample.
+
+References
+----------
+F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 4.2.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpuvision.ranging.psd import PsdReadout
-from gpuvision.status import Status
+ELECTRON = 1.602176634e-19  # elementary charge [C], exact since the SI of 2019 (CODATA 2018)
+LOW_SIGNAL, SATURATED, OUT_OF_RANGE, NOT_FINITE = 1, 2, 4, 8
 
-ELECTRON = 1.602176634e-19  # elementary charge [C], exact by definition of the SI
+Float64 = NDArray[np.float64]
 
 
-@dataclass
-class Reading:
-    position: NDArray[np.float64]
-    total: NDArray[np.float64]
+class Reading(NamedTuple):
+    """Readings of PSD strips, of the currents' shape.
+
+    Attributes
+    ----------
+    position
+        Position of the light spot along the strip [m]; NaN where the status is not 0.
+    total
+        Sum of the currents [A].
+    status
+        Flags of `gpuvision.Status`.
+    sigma
+        Standard deviation of the position [m]; NaN where the status is not 0.
+    """
+
+    position: Float64
+    total: Float64
     status: NDArray[np.uint8]
-    sigma: NDArray[np.float64]
+    sigma: Float64
 
 
-def read_out(readout: PsdReadout, left: NDArray, right: NDArray) -> Reading:
-    """Read out currents of shape (..., strips), as they come (codes or amperes)."""
+def read_out(readout: Any, left: NDArray[Any], right: NDArray[Any]) -> Reading:
+    """Read out the currents of PSD strips.
+
+    Parameters
+    ----------
+    readout : gpuvision.PsdReadout
+        Parameters of the readout.
+    left, right : numpy.ndarray
+        Currents of the two electrodes, (..., strips): ADC codes (unsigned integers), or floats in units of
+        ``readout.ampere``.
+
+    Returns
+    -------
+    Reading
+        Float64 arrays of the same shape.
+    """
     codes = left.dtype.kind == "u"
     highest = np.iinfo(left.dtype).max * readout.ampere if codes else np.inf
     saturation = highest if readout.saturation is None else readout.saturation
@@ -44,20 +76,22 @@ def read_out(readout: PsdReadout, left: NDArray, right: NDArray) -> Reading:
     return Reading(np.where(good, position, np.nan), total, status, np.where(good, sigma, np.nan))
 
 
-def _status(readout, raw_left, raw_right, a, b, saturation, load) -> NDArray[np.uint8]:
+def _status(
+    readout: Any, raw_left: Float64, raw_right: Float64, a: Float64, b: Float64, saturation: float, load: float
+) -> NDArray[np.uint8]:
     status = np.zeros(a.shape, np.uint8)
     with np.errstate(all="ignore"):
         total = a + b
         dark = total <= readout.minimum_total
         outside = (np.abs(b - a) * load > total) & ~dark
-        status[outside] = Status.OUT_OF_RANGE
-        status[dark] = Status.LOW_SIGNAL
-        status[(raw_left >= saturation) | (raw_right >= saturation)] |= np.uint8(Status.SATURATED)
-    status[~(np.isfinite(raw_left) & np.isfinite(raw_right))] = Status.NOT_FINITE
+        status[outside] = OUT_OF_RANGE
+        status[dark] = LOW_SIGNAL
+        status[(raw_left >= saturation) | (raw_right >= saturation)] |= np.uint8(SATURATED)
+    status[~(np.isfinite(raw_left) & np.isfinite(raw_right))] = NOT_FINITE
     return status
 
 
-def _sigma(readout, balance, total, load, codes) -> NDArray[np.float64]:
+def _sigma(readout: Any, balance: Float64, total: Float64, load: float, codes: bool) -> Float64:
     noise = readout.noise
     independent, opposed, spot, bandwidth = (
         (noise.independent, noise.opposed, noise.spot, noise.bandwidth) if noise else (0.0, 0.0, 0.0, 0.0)
@@ -66,10 +100,10 @@ def _sigma(readout, balance, total, load, codes) -> NDArray[np.float64]:
     length = readout.strip_length * load
     variance = (length / total) ** 2 * (each * (1.0 + balance**2) / 2.0 + opposed**2)
     electrons = total / (2.0 * ELECTRON * bandwidth) if bandwidth else np.inf
-    return np.sqrt(variance + spot**2 / electrons)
+    return np.asarray(np.sqrt(variance + spot**2 / electrons))
 
 
-def _correction(readout, position) -> NDArray[np.float64]:
+def _correction(readout: Any, position: Float64) -> Float64:
     knots = np.linspace(-0.5, 0.5, len(readout.linearity[0])) * readout.strip_length
     correction = np.zeros_like(position)
     for strip, row in enumerate(readout.linearity):

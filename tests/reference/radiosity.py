@@ -1,4 +1,4 @@
-"""Reference radiosity between long surfaces: a convolution solved by Fourier transform; and strips of triangles."""
+"""Reference of radiosity between the walls of a long corner: a convolution, solved by Fourier transform."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def corner(albedo: float, where: NDArray[np.float64]) -> NDArray[np.float64]:
+def corner_irradiance(albedo: float, where: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return E a / M at b / a on the other wall of a right-angled corner with a line of diffuse power M.
 
     The line lies at the distance a from the corner. In t = ln b each bounce convolves the light times b with

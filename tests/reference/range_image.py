@@ -1,28 +1,46 @@
-"""Range image assembly in float64: planes that are turned and met by rays, written from the geometry's parameters."""
+"""Reference of range image assembly: points of a straight transport and of a rotating sheet, and their status."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gpuvision import Status
-from gpuvision.ranging.range_image import Limits, RotatingSheet, StraightTransport
+from gpuvision.reference.triangulation import is_beyond_fold, undistort
 
-_INFORMS = Status.SATURATED | Status.AMBIGUOUS
+SATURATED, OUT_OF_RANGE, NOT_FINITE, AMBIGUOUS, HORIZON, NOT_INVERTIBLE = 2, 4, 8, 16, 32, 128
+_VALUE_KEPT = SATURATED | AMBIGUOUS  # flags under which a point keeps its value
+
+Float64 = NDArray[np.float64]
 
 
-def rotation(axis: Any, angle: float) -> np.ndarray:
-    """Right-handed rotation about a unit axis (Rodrigues)."""
+def rotation(axis: Any, angle: float) -> Float64:
+    """Return the matrix of a right-handed rotation about a unit axis (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
 
 
-def straight(geometry: StraightTransport, g: np.ndarray, h: np.ndarray, transport: np.ndarray) -> np.ndarray:
-    """Points (profiles, samples, 3)."""
+def points_of_straight_transport(geometry: Any, g: NDArray[Any], h: NDArray[Any], transport: NDArray[Any]) -> Float64:
+    """Return the scene points of a part on a straight transport.
+
+    Parameters
+    ----------
+    geometry : gpuvision.StraightTransport
+        Origin, axes of the sheet and direction of the transport.
+    g, h : numpy.ndarray
+        Coordinates in the sheet [m], (profiles, samples).
+    transport : numpy.ndarray
+        Travelled distance of each profile [m], (profiles,).
+
+    Returns
+    -------
+    numpy.ndarray
+        (profiles, samples, 3) [m].
+    """
     g, h, travelled = (np.asarray(each, np.float64)[..., None] for each in (g, h, transport))
-    return (
+    return np.asarray(
         np.array(geometry.origin)
         + g * np.array(geometry.g_axis)
         + h * np.array(geometry.h_axis)
@@ -30,10 +48,29 @@ def straight(geometry: StraightTransport, g: np.ndarray, h: np.ndarray, transpor
     )
 
 
-def rotating(
-    geometry: RotatingSheet, position: np.ndarray, transport: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (profiles, samples, 3), n . r signed so that it is positive in front, and whether beyond the fold."""
+def points_of_rotating_sheet(
+    geometry: Any, position: NDArray[Any], angles: NDArray[Any]
+) -> tuple[Float64, Float64, NDArray[np.bool_]]:
+    """Return the scene points at which view rays meet a rotating sheet of light.
+
+    Parameters
+    ----------
+    geometry : gpuvision.RotatingSheet
+        Camera, axis and sheet.
+    position : numpy.ndarray
+        Position of the line in each profile [px], (profiles, samples).
+    angles : numpy.ndarray
+        Angle of the sheet at each profile [rad], (profiles,).
+
+    Returns
+    -------
+    points : numpy.ndarray
+        (profiles, samples, 3) [m].
+    facing : numpy.ndarray
+        Scalar product of the sheet's normal and the ray (x, y, 1), positive where the point is in front of the camera.
+    folded : numpy.ndarray
+        Whether the pixel lies beyond the radius at which the lens polynomial folds.
+    """
     profiles, samples = position.shape
     across = np.broadcast_to(np.arange(samples, dtype=np.float64), position.shape)
     pixels = [position.astype(np.float64), across]
@@ -42,39 +79,56 @@ def rotating(
     pixel = np.stack(pixels, axis=-1)
     folded = np.zeros(position.shape, bool)
     if geometry.lens is not None:
-        radius = np.linalg.norm(pixel - geometry.lens.centre, axis=-1)
-        folded = radius >= geometry.lens.fold_radius
-        pixel = geometry.lens.undistort(pixel)
+        lens = (geometry.lens.k1, geometry.lens.k2, geometry.lens.centre)
+        folded = is_beyond_fold(pixel[..., 0], pixel[..., 1], *lens)
+        pixel = np.stack(undistort(pixel[..., 0], pixel[..., 1], *lens), axis=-1)
     rays = np.ones((profiles, samples, 3))
     rays[..., :2] = (pixel - geometry.principal_point_px) / geometry.focal_length_px
 
     points, facing = np.empty_like(rays), np.empty(position.shape)
-    for profile, angle in enumerate(transport.astype(np.float64)):
+    for profile, angle in enumerate(angles.astype(np.float64)):
         normal = rotation(geometry.axis_direction, angle) @ geometry.sheet_normal
         reach = normal @ geometry.axis_point + geometry.sheet_offset
         toward = rays[profile] @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
             points[profile] = (reach / toward)[:, None] * rays[profile]
         facing[profile] = toward * np.sign(reach)
-    return (points - geometry.scene_origin) @ np.array(geometry.scene_axes).T, facing, folded
+    return np.asarray((points - geometry.scene_origin) @ np.array(geometry.scene_axes).T), facing, folded
 
 
-def judged(
-    points: np.ndarray, given: np.ndarray, unknown: np.ndarray, missed: np.ndarray, folded: np.ndarray, limits: Limits
-) -> tuple[np.ndarray, np.ndarray]:
-    """Apply the flags: points with NaN, and the status."""
+def apply_status(
+    points: Float64,
+    given: NDArray[np.uint8],
+    unknown: NDArray[np.bool_],
+    missed: NDArray[np.bool_],
+    folded: NDArray[np.bool_],
+    limits: Any,
+) -> tuple[Float64, NDArray[np.uint8]]:
+    """Return points, NaN where they are not known, and their status.
+
+    Parameters
+    ----------
+    points
+        (profiles, samples, 3) [m].
+    given
+        Status of the input; a flag other than SATURATED and AMBIGUOUS makes the point NaN.
+    unknown, missed, folded
+        Where the input is not finite, the ray misses the sheet, and the lens folds.
+    limits
+        Smallest and largest x, y and z, (3, 2) [m].
+    """
     low, high = np.array(limits).T
     status = given.astype(np.uint8)
     with np.errstate(invalid="ignore"):
         outside = np.any((points < low) | (points > high), axis=-1)
     causes = [
-        (unknown, Status.NOT_FINITE),
-        (folded, Status.NOT_INVERTIBLE),
-        (missed, Status.HORIZON),
-        (~np.isfinite(points).all(axis=-1), Status.NOT_FINITE),
-        (outside, Status.OUT_OF_RANGE),
+        (unknown, NOT_FINITE),
+        (folded, NOT_INVERTIBLE),
+        (missed, HORIZON),
+        (~np.isfinite(points).all(axis=-1), NOT_FINITE),
+        (outside, OUT_OF_RANGE),
     ]
-    free = (given & ~np.uint8(_INFORMS)) == 0
+    free = (given & ~np.uint8(_VALUE_KEPT)) == 0
     for where, flag in causes:
         status[where & free] |= np.uint8(flag)
         free &= ~where

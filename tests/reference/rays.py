@@ -1,4 +1,4 @@
-"""Reference for rays and segments: intersection with every triangle in float64.
+"""Reference of rays and segments: intersection with every triangle.
 
 References
 ----------
@@ -8,9 +8,12 @@ T. Moeller and B. Trumbore, "Fast, minimum storage ray/triangle intersection", J
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
 
 
-def crossings(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
+def crossings(corners: Float64, origins: Float64, directions: Float64) -> tuple[Float64, ...]:
     """Intersect rays with triangles (n, 3, 3).
 
     Returns
@@ -32,7 +35,7 @@ def crossings(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) 
     return np.where(meets, t, np.nan), u, v
 
 
-def closest(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, ...]:
+def closest(corners: Float64, rays: Float64) -> tuple[Float64, ...]:
     """Return the closest hits of rays (n, 6): triangle (-1: none), distance [m], u and v."""
     lengths = np.linalg.norm(rays[:, 3:], axis=1, keepdims=True)
     t, u, v = crossings(corners, rays[:, :3], rays[:, 3:] / lengths)
@@ -44,8 +47,8 @@ def closest(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, ...]:
     return np.where(met, triangle, -1), *values
 
 
-def occluded(corners: np.ndarray, segments: np.ndarray, margin: float = 0.0) -> np.ndarray:
+def occluded(corners: Float64, segments: Float64, margin: float = 0.0) -> NDArray[np.bool_]:
     """Return whether segments (n, 6) are occluded, except within a fraction of the length at both ends (may be < 0)."""
     t = crossings(corners, segments[:, :3], segments[:, 3:] - segments[:, :3])[0]
     with np.errstate(invalid="ignore"):
-        return ((t > margin) & (t < 1.0 - margin)).any(axis=1)
+        return np.asarray(((t > margin) & (t < 1.0 - margin)).any(axis=1))

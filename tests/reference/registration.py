@@ -1,4 +1,4 @@
-"""Reference of the coarse registration in float64: cells, costs of edges, and costs of poses, by definition."""
+"""Reference of the coarse registration: cell means, costs of edges, and costs of poses, by definition."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ Float64 = NDArray[np.float64]
 
 
 def cell_means(image: NDArray[Any], cell: int) -> Float64:
-    """Means of cell x cell pixels."""
+    """Return the means of squares of ``cell`` x ``cell`` pixels."""
     rows, columns = (each // cell for each in image.shape)
     cut = image[: rows * cell, : columns * cell].astype(np.float64)
-    return cut.reshape(rows, cell, columns, cell).mean(axis=(1, 3))
+    return np.asarray(cut.reshape(rows, cell, columns, cell).mean(axis=(1, 3)))
 
 
 def edge_costs(means: Float64, threshold: float, border: int, channels: int = 8) -> Float64:
-    """What an edge costs, (channels, rows, columns), not rounded."""
+    """Return the cost of an edge, (channels, rows, columns), 0 to 1, not rounded."""
     rows, columns = means.shape
-    # By hand, where all neighbours are there and finite.
+    # Only where all eight neighbours exist and are finite.
     share = np.zeros((channels, rows + 2 * border, columns + 2 * border))
     for y in range(1, rows - 1):
         for x in range(1, columns - 1):
@@ -38,7 +38,7 @@ def edge_costs(means: Float64, threshold: float, border: int, channels: int = 8)
 
 
 def pose_costs(level: NDArray[np.uint16], shifts: NDArray[np.int32], rows: int, columns: int) -> Float64:
-    """(headings, rows, columns), mean level over the points that are used, in whole numbers."""
+    """Return the mean cost over the points with a shift >= 0, summed in integers: (headings, rows, columns)."""
     flat, stride = level.ravel().astype(np.int64), level.shape[2]
     at = np.arange(rows)[:, None] * stride + np.arange(columns)
     scores = np.full((len(shifts), rows, columns), np.nan)

@@ -1,15 +1,18 @@
-"""Reference of robust fits in float64: a general minimiser of the loss whose minimum the kernels iterate to."""
+"""Reference of robust fits: a general minimiser of the same loss."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 
+Float64 = NDArray[np.float64]
 
-def loss(z: np.ndarray, name: str, tuning_constant: float) -> np.ndarray:
-    """Return the loss of residuals in units of their scale."""
+
+def loss(z: Float64, name: str, tuning_constant: float) -> Float64:
+    """Return the loss of residuals in units of their scale: "huber", "tukey", "ransac" or least squares."""
     if name == "huber":
         return np.where(np.abs(z) <= tuning_constant, 0.5 * z**2, tuning_constant * (np.abs(z) - 0.5 * tuning_constant))
     if name == "tukey":
@@ -20,11 +23,11 @@ def loss(z: np.ndarray, name: str, tuning_constant: float) -> np.ndarray:
 
 
 def fit_line(
-    points: np.ndarray, sigma: np.ndarray, scale: float, name: str, tuning_constant: float, start: tuple[float, float]
+    points: Float64, sigma: Float64, scale: float, name: str, tuning_constant: float, start: tuple[float, float]
 ) -> tuple[float, float]:
     """Return angle and distance from the origin (along (-sin, cos)) of the line of least loss near a start."""
 
-    def total(parameters: np.ndarray) -> float:
+    def total(parameters: Float64) -> float:
         angle, distance = parameters
         across = points @ [-np.sin(angle), np.cos(angle)] - distance
         return float(np.sum(loss(across / (sigma * scale), name, tuning_constant)))
@@ -33,8 +36,8 @@ def fit_line(
     return float(found.x[0]), float(found.x[1])
 
 
-def moved(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return matrix and shift of x, y, theta and the scales and shear that follow."""
+def transform_of(parameters: Float64) -> tuple[Float64, Float64]:
+    """Return matrix and shift of 3 (rigid), 4 (similarity) or 6 (affine) parameters."""
     x, y, theta = parameters[:3]
     deformation = np.eye(2)
     if len(parameters) == 4:
@@ -45,23 +48,23 @@ def moved(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return turned @ deformation, np.array([x, y])
 
 
-def residuals(parameters: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the residual of every row along its normal in the artwork, at a pose."""
-    matrix, shift = moved(parameters)
+def residuals(parameters: Float64, rows: Float64) -> Float64:
+    """Return the residual [m] of every feature row (n, 7) along its normal in the artwork, at a pose."""
+    matrix, shift = transform_of(parameters)
     seen = rows[:, 2:4] + rows[:, 4:6]
     artwork = np.linalg.solve(matrix, (seen - shift).T).T
-    return np.sum(rows[:, :2] * (artwork - rows[:, 2:4]), axis=-1)
+    return np.asarray(np.sum(rows[:, :2] * (artwork - rows[:, 2:4]), axis=-1))
 
 
 def solve_pose(
-    rows: np.ndarray, freedoms: int, scale: float, name: str, tuning_constant: float, start: np.ndarray
-) -> np.ndarray:
-    """Return the parameters of least loss near a start: least squares of the loss' square roots."""
+    rows: Float64, freedoms: int, scale: float, name: str, tuning_constant: float, start: Float64
+) -> Float64:
+    """Return the parameters of least loss near a start: least squares of the square roots of the losses."""
     size = np.array([1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 1e-2])[:freedoms]
 
-    def roots(scaled: np.ndarray) -> np.ndarray:
+    def roots(scaled: Float64) -> Float64:
         z = residuals(scaled * size, rows) / (rows[:, 6] * scale)
         return np.sqrt(2.0 * loss(z, name, tuning_constant))
 
     found: Any = least_squares(roots, start / size, xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=2000)
-    return np.asarray(found.x) * size
+    return np.asarray(np.asarray(found.x) * size)

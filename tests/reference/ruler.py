@@ -1,4 +1,4 @@
-"""Reference caliper (ruler) in float64: edges along one ruler, sample by sample, as `RulerEdges` defines them."""
+"""Reference of the caliper (ruler): edges along one ruler, sample by sample, as `gpuvision.RulerEdges` defines them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.special import ndtr
 
 Float64 = NDArray[np.float64]
 
 
 def straight(points: Float64) -> Float64:
-    """No lens."""
+    """Return the points themselves: no lens."""
     return points
 
 
@@ -26,7 +27,28 @@ def profile(
     step: float = 1.0,
     distort: Callable[[Float64], Float64] = straight,
 ) -> tuple[Float64, Float64]:
-    """Return the grey levels averaged over the lines, and all samples (width, length); NaN out of the image."""
+    """Sample an image along a ruler.
+
+    Parameters
+    ----------
+    image : numpy.ndarray
+        (rows, columns).
+    ruler : numpy.ndarray
+        x, y of the centre [px], cosine and sine of the direction.
+    length, width : int
+        Number of samples along the ruler, and of lines side by side.
+    step : float
+        Distance between samples [px].
+    distort : callable
+        Function from ideal to measured pixels (..., 2).
+
+    Returns
+    -------
+    grey : numpy.ndarray
+        Mean over the lines, (length,); NaN outside the image.
+    samples : numpy.ndarray
+        (width, length).
+    """
     x, y, cosine, sine = np.asarray(ruler, np.float64)
     along = (np.arange(length) - 0.5 * (length - 1)) * step
     across = (np.arange(width) - 0.5 * (width - 1))[:, None]
@@ -38,30 +60,42 @@ def profile(
     return samples.mean(axis=0), samples
 
 
-def taps(smoothing: float, step: float = 1.0) -> Float64:
-    """Derivative of a Gaussian at whole samples to 3 sigma, as `numpy.correlate` takes it; 1 for a ramp of 1."""
+def derivative_filter(smoothing: float, step: float = 1.0) -> Float64:
+    """Return the taps of a derivative of a Gaussian to 3 sigma, for `numpy.correlate`; a ramp of slope 1 gives 1."""
     reach = math.ceil(3.0 * smoothing / step)
     k = np.arange(-reach, reach + 1)
     values = k * np.exp(-0.5 * (k * step / smoothing) ** 2)
-    return values / np.sum(k * values)
+    return np.asarray(values / np.sum(k * values))
 
 
 def smoothing_variance(filter_: Float64) -> float:
-    """Of the smoothing that goes with a derivative filter [samples^2]: a third of its third moment."""
+    """Return the variance of the smoothing in a derivative filter [samples^2]: a third of its third moment."""
     k = np.arange(filter_.size) - filter_.size // 2
     return float(np.sum(filter_ * k**3)) / 3.0
 
 
-def pull(
+def interpolation_shift(
     ruler: NDArray[Any], size: tuple[int, int], step: float, position: float, variance: float, smoothing: float
 ) -> float:
-    """Return what linear interpolation moves an edge by [px], on a ruler of so many lines and samples.
+    """Return the displacement [px] of an edge by linear interpolation.
 
-    The variances are those of the edge's gradient and of the smoothing [px^2].
+    Parameters
+    ----------
+    ruler : numpy.ndarray
+        x, y of the centre [px], cosine and sine of the direction.
+    size : tuple
+        Number of lines and of samples.
+    step, position : float
+        Distance between samples, and position of the edge from the centre [px].
+    variance, smoothing : float
+        Variance of the edge's gradient and of the smoothing [px^2].
 
-    Along each axis a sample a fraction f beyond a pixel sees the edge by a kernel of variance f (1 - f) = 1/6 -
-    sum cos(2 pi k f) / (pi k)^2, and third moment f (1 - f) (1 - 2 f) = 3 sum sin(2 pi k f) / (pi k)^3; the place where
-    the smoothed curvature is zero moves by the integrals of these, k = 1 and 2, with it.
+    Notes
+    -----
+    Along each axis a sample at a fraction f beyond a pixel sees the edge through a kernel with the variance
+    f (1 - f) = 1/6 - sum cos(2 pi k f) / (pi k)^2 and the third moment
+    f (1 - f) (1 - 2 f) = 3 sum sin(2 pi k f) / (pi k)^3. The zero of the smoothed curvature moves by the integrals of
+    these over the smoothed edge. The terms k = 1 and 2 are summed.
     """
     x, y, cosine, sine = np.asarray(ruler, np.float64)
     samples = position / step + 0.5 * (size[1] - 1)
@@ -82,7 +116,7 @@ def pull(
     return moved
 
 
-def edges(
+def find_edges(
     grey: Float64,
     smoothing: float,
     threshold: float,
@@ -90,11 +124,24 @@ def edges(
     ruler: NDArray[Any] | None = None,
     width: int = 1,
 ) -> list[dict[str, float]]:
-    """Return every edge over the threshold in order: position [px], amplitude, width [px], gradient.
+    """Find the edges of a profile.
 
-    With the ruler and its lines the positions are freed from what the interpolation does to them.
+    Parameters
+    ----------
+    grey : numpy.ndarray
+        Grey levels along the ruler.
+    smoothing, threshold, step
+        As for `gpuvision.RulerEdges` [px, grey levels, px].
+    ruler, width
+        Ruler and number of lines, to correct the positions for the interpolation; without them no correction.
+
+    Returns
+    -------
+    list of dict
+        Position from the centre [px], amplitude [grey levels], width [px], gradient and variance of each edge, in order
+        of position.
     """
-    filter_ = taps(smoothing, step)
+    filter_ = derivative_filter(smoothing, step)
     reach, variance = filter_.size // 2, smoothing_variance(filter_)
     slopes = np.correlate(grey, filter_, "valid")
     least = threshold / math.sqrt(2.0 * math.pi * variance)
@@ -108,7 +155,7 @@ def edges(
         found[-1]["position"] += (i + reach - 0.5 * (grey.size - 1)) * step
         if ruler is not None:
             at, peak = found[-1]["position"], found[-1]["variance"] * step**2
-            found[-1]["position"] -= pull(ruler, (width, grey.size), step, at, peak, variance * step**2)
+            found[-1]["position"] -= interpolation_shift(ruler, (width, grey.size), step, at, peak, variance * step**2)
     return found
 
 
@@ -130,34 +177,32 @@ def _refined(three: Float64, sign: float, smoothing: float, step: float) -> dict
 def step_image(
     shape: tuple[int, int], angle: float, distance: float, blur: float, low: float = 50.0, high: float = 150.0
 ) -> Float64:
-    """Grey levels of a straight edge, blurred: high where x cos + y sin is beyond the distance."""
-    from scipy.special import ndtr
-
+    """Return grey levels of a blurred straight edge: ``high`` where x cos + y sin exceeds the distance."""
     row, column = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
-    return low + (high - low) * ndtr((column * math.cos(angle) + row * math.sin(angle) - distance) / blur)
+    return np.asarray(low + (high - low) * ndtr((column * math.cos(angle) + row * math.sin(angle) - distance) / blur))
 
 
 def stripe_image(
     shape: tuple[int, int], angle: float, distance: float, spacing: float, blur: float, high: float = 150.0
 ) -> Float64:
-    """Grey levels of a bright stripe about the distance."""
+    """Return grey levels of a bright stripe centred on the distance."""
     first = step_image(shape, angle, distance - 0.5 * spacing, blur, 50.0, high)
     return first - step_image(shape, angle, distance + 0.5 * spacing, blur, 0.0, high - 50.0)
 
 
 def disc_image(shape: tuple[int, int], centre: tuple[float, float], radius: float, blur: float) -> Float64:
-    """Grey levels of a dark disc, by 15 x 15 points of each pixel, blurred."""
-    from scipy.ndimage import gaussian_filter
-
+    """Return grey levels of a blurred dark disc, supersampled 15 x 15 in each pixel."""
     fine = 15
     row, column = ((np.arange(n * fine) + 0.5) / fine - 0.5 for n in shape)
     inside = np.hypot(row[:, None] - centre[1], column - centre[0]) < radius
     coarse = inside.reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3))
-    return 150.0 - 100.0 * gaussian_filter(coarse, math.sqrt(blur**2 - 1.0 / 12.0), truncate=6.0)
+    return np.asarray(150.0 - 100.0 * gaussian_filter(coarse, math.sqrt(blur**2 - 1.0 / 12.0), truncate=6.0))
 
 
-def across(angle: float, distance: float, count: int, rng: np.random.Generator, middle: tuple[float, float]) -> Float64:
-    """Return rulers at right angles to an edge, about the middle of an image, up to 8 px beside the edge."""
+def random_rulers(
+    angle: float, distance: float, count: int, rng: np.random.Generator, middle: tuple[float, float]
+) -> Float64:
+    """Draw rulers (count, 4) at right angles to an edge, near the middle of an image, up to 8 px off the edge."""
     direction, along = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
     foot = np.array(middle) + (distance - np.array(middle) @ direction) * direction
     centres = foot + rng.uniform(-20, 20, (count, 1)) * along + rng.uniform(-8, 8, (count, 1)) * direction

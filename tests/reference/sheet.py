@@ -1,19 +1,30 @@
-"""What a sheet of light lights, by rays of light against every triangle, in float64."""
+"""Reference of the illumination by a sheet of light: rays of the sheet against every triangle."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from reference import rays as reference
+from gpuvision.reference import rays
+
+Float64 = NDArray[np.float64]
 
 
-def first_met(sheet: Any, corners: np.ndarray, L: float, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangle that the sheet's rays meet first (-1: none), and where, (n, 3).
+def first_hits(sheet: Any, corners: Float64, L: float, x: Float64) -> tuple[Float64, Float64]:
+    """Return the first triangle that each ray of the sheet hits (-1: none), and the point (n, 3).
 
-    ``x`` is G of parallel rays, and where those of a fan meet H = 0. A fan's begin a thousandth of the way there from
-    its source: what is nearer does not stop them.
+    Parameters
+    ----------
+    sheet : gpuvision.LightSheet
+        Sheet of light: parallel rays, or a fan from a source.
+    corners : numpy.ndarray
+        Triangles (t, 3, 3) [m].
+    L : float
+        Transport [m].
+    x : numpy.ndarray
+        G at which each ray crosses H = 0 [m], (n,). A fan's rays begin at 0.001 of the way from the source to H = 0.
     """
     move = sheet.transport
     g_axis, h_axis = np.array(move.g_axis), np.array(move.h_axis)
@@ -25,7 +36,6 @@ def first_met(sheet: Any, corners: np.ndarray, L: float, x: np.ndarray) -> tuple
         source = place + sheet.source[0] * g_axis + sheet.source[1] * h_axis
         way = foot - source
         start = source + 1e-3 * way
-    rays = np.hstack([start, way])
-    triangle, distance, _, _ = reference.closest(corners, rays)
+    triangle, distance, _, _ = rays.closest(corners, np.hstack([start, way]))
     unit = way / np.linalg.norm(way, axis=1, keepdims=True)
     return triangle, start + distance[:, None] * unit

@@ -1,30 +1,75 @@
-"""Triangulation in float64 NumPy, from the equations: undo the lens, multiply by the homography, divide."""
+"""Reference of the triangulation: undo the lens, multiply by the homography, divide.
+
+References
+----------
+F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, equations 3.11-3.13.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float64 = NDArray[np.float64]
 NOT_FINITE, HORIZON, NOT_INVERTIBLE = 8, 32, 128
 
 
-def undistort(column, row, k1, k2, centre):
-    """F. de Jong, eq. 3.11-3.13."""
+def undistort(
+    column: Float64, row: Float64, k1: float, k2: float, centre: tuple[float, float]
+) -> tuple[Float64, Float64]:
+    """Return the undistorted column and row of measured points (F. de Jong, equations 3.11-3.13)."""
     square = (column - centre[0]) ** 2 + (row - centre[1]) ** 2
     factor = 1.0 + k1 * square + k2 * square**2
     return centre[0] + (column - centre[0]) * factor, centre[1] + (row - centre[1]) * factor
 
 
-def beyond_fold(column, row, k1, k2, centre):
-    """True where some radius up to the point's own has the polynomial's slope at or below zero."""
+def is_beyond_fold(
+    column: Float64, row: Float64, k1: float, k2: float, centre: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Return where the slope of the lens polynomial is zero or negative at the radius of the point or before."""
     square = (column - centre[0]) ** 2 + (row - centre[1]) ** 2
     roots = np.roots([5.0 * k2, 3.0 * k1, 1.0])
     real = roots[np.abs(roots.imag) < 1e-12].real if len(roots) else roots
     positive = real[real > 0.0]
-    return square >= (positive.min() if len(positive) else np.inf)
+    return np.asarray(square >= (positive.min() if len(positive) else np.inf))
 
 
-def triangulate(u, v, homography, region, *, horizon=1e-3, lens=None, along="columns"):
-    """(G, H, status) of float64 arrays; lens = (k1, k2, (C_c, R_c))."""
+def triangulate(
+    u: ArrayLike,
+    v: ArrayLike,
+    homography: ArrayLike,
+    region: Any,
+    *,
+    horizon: float = 1e-3,
+    lens: tuple[float, float, tuple[float, float]] | None = None,
+    along: str = "columns",
+) -> tuple[Float64, Float64, NDArray[np.uint8]]:
+    """Return the coordinates in the sheet of light, and the status.
+
+    Parameters
+    ----------
+    u, v : array
+        Position of the line along the profile, and number of the profile [px].
+    homography : array
+        (3, 3), from (u, v, 1) to multiples of (G, H, 1).
+    region : sequence
+        Range of u and range of v [px], two pairs. The homography's denominator is positive in its middle.
+    horizon : float
+        Smallest denominator, as a fraction of that in the middle of the region; below it the status is HORIZON.
+    lens : tuple, optional
+        k1, k2, (C_c, R_c).
+    along : str
+        "columns" or "rows": direction of a profile in the image.
+
+    Returns
+    -------
+    G, H : numpy.ndarray
+        Coordinates [m]; NaN where the status is not 0.
+    status : numpy.ndarray
+        Flags of `gpuvision.Status`.
+    """
     u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
     matrix = np.asarray(homography, dtype=np.float64)
     status = np.zeros(u.shape, dtype=np.uint8)
@@ -34,7 +79,7 @@ def triangulate(u, v, homography, region, *, horizon=1e-3, lens=None, along="col
         if lens is not None:
             k1, k2, centre = lens
             column, row = (v, u) if along == "columns" else (u, v)
-            status = np.where(beyond_fold(column, row, k1, k2, centre), NOT_INVERTIBLE, status)
+            status = np.where(is_beyond_fold(column, row, k1, k2, centre), NOT_INVERTIBLE, status)
             column, row = undistort(column, row, k1, k2, centre)
             straight_u, straight_v = (row, column) if along == "columns" else (column, row)
         g, h, w = (line[0] * straight_u + line[1] * straight_v + line[2] for line in matrix)

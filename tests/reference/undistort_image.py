@@ -1,13 +1,18 @@
-"""Interpolation in an image by its definition: taps, weights and borders in float64."""
+"""Reference of image undistortion: interpolation by its definition, with taps, weights and borders."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
 
 NO_DATA, NOT_INVERTIBLE = 64, 128
 
 
-def cubic(distance: np.ndarray) -> np.ndarray:
+def cubic(distance: Float64) -> Float64:
     """Return the weight of a tap at a distance: cubic convolution with slope -0.75 at 1."""
     a, d = -0.75, np.abs(distance)
     near = (a + 2) * d**3 - (a + 3) * d**2 + 1
@@ -15,21 +20,23 @@ def cubic(distance: np.ndarray) -> np.ndarray:
     return np.where(d <= 1, near, np.where(d < 2, far, 0.0))
 
 
-def linear(distance: np.ndarray) -> np.ndarray:
-    return np.maximum(1.0 - np.abs(distance), 0.0)
+def linear(distance: Float64) -> Float64:
+    """Return the weight of a tap at a distance: linear interpolation."""
+    return np.asarray(np.maximum(1.0 - np.abs(distance), 0.0))
 
 
-def border_index(place: np.ndarray, size: int, border: str) -> np.ndarray:
+def border_index(place: NDArray[np.int_], size: int, border: str) -> NDArray[np.int_]:
+    """Return the row or column that a place takes its value from; places beyond the image depend on the border."""
     if border != "reflect":
         return np.clip(place, 0, size - 1)
     period = max(2 * (size - 1), 1)
     folded = np.abs(place) % period
-    return np.minimum(folded, period - folded)
+    return np.asarray(np.minimum(folded, period - folded))
 
 
 def interpolate(
-    image: np.ndarray, positions: np.ndarray, *, interpolation: str, border: str, border_value: float
-) -> np.ndarray:
+    image: NDArray[Any], positions: Float64, *, interpolation: str, border: str, border_value: float
+) -> Float64:
     """Return the values of one image (rows, columns, channels) at positions (..., 2) that are finite."""
     kernel, taps = (cubic, range(-1, 3)) if interpolation == "bicubic" else (linear, range(2))
     rows, columns = image.shape[:2]
@@ -50,15 +57,34 @@ def interpolate(
 
 
 def undistort(
-    image: np.ndarray,
-    positions: np.ndarray,
+    image: NDArray[Any],
+    positions: Float64,
     *,
     interpolation: str = "bilinear",
     border: str = "mask",
     border_value: float = 0.0,
     missing: int = NO_DATA,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return values of one image (rows, columns, channels) at positions (r, c, 2), NaN where undefined, and status."""
+) -> tuple[Float64, NDArray[np.uint8]]:
+    """Return the values of one image at positions, and the status.
+
+    Parameters
+    ----------
+    image : numpy.ndarray
+        (rows, columns, channels).
+    positions : numpy.ndarray
+        Measured (column, row) of each pixel of the result [px], (r, c, 2); NaN where the lens has none.
+    interpolation, border, border_value
+        As for `gpuvision.UndistortImage`.
+    missing : int
+        Status where the position is not finite.
+
+    Returns
+    -------
+    values : numpy.ndarray
+        (r, c, channels); NaN where undefined, or ``border_value``.
+    status : numpy.ndarray
+        (r, c), flags of `gpuvision.Status`.
+    """
     rows, columns = image.shape[:2]
     x, y = np.moveaxis(positions, -1, 0)
     with np.errstate(invalid="ignore"):

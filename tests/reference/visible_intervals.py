@@ -1,11 +1,14 @@
-"""Reference for visible intervals: complement of the union of all occluded intervals, in float64."""
+"""Reference of visible intervals: complement of the union of all occluded intervals."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
 
 
-def visible(corners: np.ndarray, fan: np.ndarray, least: float = 1e-9) -> np.ndarray:
+def visible_parts(corners: Float64, fan: Float64, least: float = 1e-9) -> Float64:
     """Return the visible parts (k, 2) of the segment of one fan (11,), as fractions of its length.
 
     The intersection of each triangle with the plane of the fan is a segment. It is clipped to the fan; its ends, seen

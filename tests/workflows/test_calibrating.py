@@ -23,7 +23,7 @@ from gpuvision.schema import DescriptionError
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.calibrating import calibrate, write_calibration
 from gpuvision.workflows.undistorting import undistort_files
-from reference.patterns import View, dots, photo, view
+from target_images import View, dots, photo, view
 
 CAMERA = Camera(
     matrix=((900.0, 0.0, 330.0), (0.0, 900.0, 235.0), (0.0, 0.0, 1.0)),

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
+from board_images import BoardPicture, View
 from boards import BOARD_MIDDLE, LAYERS, board_folder
 from floors import floor_image
 from gpuvision.camera.image import estimate_pixel_noise, grey_image
@@ -29,7 +30,6 @@ from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.workflows.locating_board import locate_board
 from gpuvision.workflows.locating_robot import default_line_width, floor_points, locate_robot
-from reference.board_images import BoardPicture, View
 
 PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0
 FINE, FINE_SHAPE = 25e-6, (480, 640)  # for boards of narrow traces, and few of them

@@ -14,7 +14,7 @@ from gpuvision.camera.lines.alternating_minimisation import (
 )
 from gpuvision.camera.lines.line_families import PackedLines, grid_lines, pack
 from gpuvision.camera.lines.vanishing_points import fit_lens
-from reference.straight_lines import plane_grid, radial_lens
+from straight_lines import plane_grid, radial_lens
 
 
 @pytest.fixture

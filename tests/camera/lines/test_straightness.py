@@ -9,7 +9,7 @@ from gpuvision.camera.lines import straightness
 from gpuvision.camera.lines.line_families import PackedLines, grid_lines, pack
 from gpuvision.camera.lines.straightness import LineSet, Parameters
 from gpuvision.camera.lines.variable_projection import apply_step, farthest_corner_square
-from reference.straight_lines import plane_grid, radial_lens
+from straight_lines import plane_grid, radial_lens
 
 STEP = 1e-6
 # Central differences of functions of about 1: their own error is about STEP^2, and rounding over STEP.

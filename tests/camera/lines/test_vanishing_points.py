@@ -13,7 +13,7 @@ from gpuvision.camera.lines.line_families import grid_lines
 from gpuvision.camera.lines.vanishing_points import LensFit, fit_lens, straightness_px
 from gpuvision.camera.patterns.dots import find_dots
 from gpuvision.camera.patterns.line_pattern import find_lines
-from reference.straight_lines import bound, plane_grid, radial_lens, straightness
+from straight_lines import bound, plane_grid, radial_lens, straightness
 
 NAMES = ("k1", "k2", "C_c", "R_c")
 

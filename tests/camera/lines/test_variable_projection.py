@@ -9,7 +9,7 @@ from gpuvision.camera.lens import Lens
 from gpuvision.camera.lines.line_families import grid_lines, pack
 from gpuvision.camera.lines.straightness import Parameters, evaluate, is_monotonic
 from gpuvision.camera.lines.variable_projection import farthest_corner_square, linear_start, minimise, vanishing_start
-from reference.straight_lines import plane_grid, radial_lens
+from straight_lines import plane_grid, radial_lens
 
 
 @pytest.mark.parametrize("border", [0.1, -0.1])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.patterns.chessboard import find_chessboard
-from reference.patterns import View, chessboard, matched, photo, view
+from target_images import View, chessboard, matched, photo, view
 
 Float64 = np.ndarray
 SIZE = (640, 480)

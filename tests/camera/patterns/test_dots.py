@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gpuvision.camera.patterns.dots import find_dots
-from reference.patterns import View, dots, matched, photo, view
+from target_images import View, dots, matched, photo, view
 
 Float64 = np.ndarray
 SIZE = (700, 600)

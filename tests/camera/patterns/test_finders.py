@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gpuvision.camera.patterns.chessboard import find_chessboard
 from gpuvision.camera.patterns.dots import find_dots
 from gpuvision.camera.patterns.line_pattern import find_lines
-from reference.patterns import chessboard, dots, line_grid, photo, view
+from target_images import chessboard, dots, line_grid, photo, view
 
 
 def _noise(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gpuvision.camera.patterns.grid_polynomial import agrees_with_grid
 from gpuvision.camera.patterns.lattice import index_grid, index_patches
-from reference.patterns import view
+from target_images import view
 
 
 def _consistent(grid: np.ndarray, names: np.ndarray) -> bool:

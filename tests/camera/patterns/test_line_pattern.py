@@ -10,7 +10,7 @@ import pytest
 
 from gpuvision.camera.patterns.line_pattern import find_lines
 from gpuvision.camera.patterns.pattern import LineFamilies
-from reference.patterns import View, dots, line_grid, photo, view
+from target_images import View, dots, line_grid, photo, view
 
 Float64 = np.ndarray
 SIZE = (640, 480)

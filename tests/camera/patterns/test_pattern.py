@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gpuvision.camera.patterns.grid_polynomial import GridPolynomial, agrees_with_grid
 from gpuvision.camera.patterns.pattern import estimate_localisation_noise, finder_image, nan_median, trim_empty_border
-from reference.patterns import view
+from target_images import view
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])

@@ -9,7 +9,7 @@ import pytest
 
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.views.known_lens import fit_tilt
-from reference.tilted_camera import scene
+from tilted_camera import scene
 
 
 def _views(rng, tilt, direction, count, sigma=0.0, kappa=0.0):

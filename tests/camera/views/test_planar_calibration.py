@@ -11,7 +11,7 @@ import pytest
 from gpuvision.camera.patterns.pattern import PatternGrid
 from gpuvision.camera.views.planar_calibration import fit_camera
 from gpuvision.camera.views.target_views import make_view
-from reference.tilted_camera import (
+from tilted_camera import (
     KINDS,
     TILTED,
     calibrate_with_opencv,

@@ -7,7 +7,7 @@ import pytest
 
 from gpuvision.camera.lens import Lens
 from gpuvision.camera.views.tsai import fit_tsai, radial_alignment
-from reference.tilted_camera import scene
+from tilted_camera import scene
 
 CENTRE = (640.0, 500.0)
 

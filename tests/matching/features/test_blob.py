@@ -17,8 +17,8 @@ from canary import Guarded
 from gpuvision.host import Device
 from gpuvision.matching.features.blob import FindBlobs
 from gpuvision.matching.features.ruler import RulerEdges
+from gpuvision.reference import blob as reference
 from gpuvision.status import Status
-from reference import blob as reference
 
 SHAPE, TRUE = (80, 96), np.array([48.7, 39.4])
 VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
@@ -67,7 +67,7 @@ def test_every_shape_without_noise(device: Device, variant: Any, shape: Any) -> 
     """Exact but for the profile of an edge, 2.4e-4 of the contrast, and the bend of a disc's to first order."""
     straight, polarity = shape in ("square", "cross"), POLARITY[shape]
     numbers = np.array([*TRUE, 14.0, 0.35, 1.1] if straight else [*TRUE, 14.0, 1.1])
-    level = reference.image_of(shape, SHAPE, numbers, RATIO[shape])
+    level = reference.render(shape, SHAPE, numbers, RATIO[shape])
     image = (50.0 + 100.0 * level if polarity == "bright" else 150.0 - 100.0 * level).astype(np.float32)
     operation = replace(PLAIN, shape=shape, ratio=RATIO[shape], polarity=polarity, variant=variant)
     blobs = operation(image, place(48.0, 40.0, 14.5, *((0.3,) if straight else ())), device=device)
@@ -91,9 +91,9 @@ def test_matched_as_least_squares_have_it(device: Device, variant: Any, shape: A
     straight = shape in ("square", "cross")
     numbers = np.array([*TRUE, 13.0, 0.2, 1.0] if straight else [*TRUE, 13.0, 1.0])
     sign = 1.0 if POLARITY[shape] == "bright" else -1.0
-    image = 150.0 + sign * 100.0 * reference.image_of(shape, SHAPE, numbers, RATIO[shape]) + rng.normal(0.0, 3.0, SHAPE)
+    image = 150.0 + sign * 100.0 * reference.render(shape, SHAPE, numbers, RATIO[shape]) + rng.normal(0.0, 3.0, SHAPE)
     extent = {"square": math.sqrt(2.0), "cross": math.hypot(1.0, 0.3)}.get(shape, 1.0)
-    exact = reference.matched(image, shape, numbers, RATIO[shape], 13.0 * extent + 7.0)
+    exact = reference.fit(image, shape, numbers, RATIO[shape], 13.0 * extent + 7.0)
     operation = replace(PLAIN, shape=shape, ratio=RATIO[shape], polarity=POLARITY[shape], noise=3.0, variant=variant)
     blobs = operation(image.astype(np.float32), place(48.0, 40.0, 13.0, *((0.2,) if straight else ())), device=device)
     assert blobs.status[0] == 0

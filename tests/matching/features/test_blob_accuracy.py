@@ -10,7 +10,7 @@ import pytest
 
 from gpuvision.host import Device
 from gpuvision.matching.features.blob import FindBlobs
-from reference import blob as reference
+from gpuvision.reference import blob as reference
 
 CONTRAST, DRAWS = 100.0, 200
 SLOW = pytest.mark.slow

@@ -11,8 +11,8 @@ from canary import Guarded
 from gpuvision.host import Device
 from gpuvision.matching.features.line_fit import FitLines, LineFits
 from gpuvision.matching.robust import efficiency
+from gpuvision.reference import robust
 from gpuvision.status import Status
-from reference import robust
 
 VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
 NOISE = 0.05

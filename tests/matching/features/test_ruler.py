@@ -18,8 +18,8 @@ from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.matching.features.ruler import RulerEdges, best_smoothing
+from gpuvision.reference import ruler as reference
 from gpuvision.status import Status
-from reference import ruler as reference
 
 SHAPE, MIDDLE = (120, 150), (75.0, 60.0)
 VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
@@ -39,7 +39,7 @@ def step(rng: np.random.Generator, angle: float = 0.4, noise: float = 2.0, **mor
     """A noisy edge in the middle, and 40 rulers across it."""
     distance = float(np.dot(MIDDLE, (math.cos(angle), math.sin(angle))))
     image = reference.step_image(SHAPE, angle, distance, 1.2, **more) + rng.normal(0.0, noise, SHAPE)
-    return image, reference.across(angle, distance, 40, rng, MIDDLE)
+    return image, reference.random_rulers(angle, distance, 40, rng, MIDDLE)
 
 
 def expected(operation: RulerEdges, image: np.ndarray, rulers: np.ndarray) -> list[list[dict[str, float]]]:
@@ -48,7 +48,7 @@ def expected(operation: RulerEdges, image: np.ndarray, rulers: np.ndarray) -> li
     for ruler in rulers:
         grey, _ = reference.profile(image, ruler, operation.length, operation.width, operation.step_px)
         options = (operation.smoothing_px, operation.threshold, operation.step_px)
-        found.append(reference.edges(grey, *options, ruler, operation.width))
+        found.append(reference.find_edges(grey, *options, ruler, operation.width))
     return found
 
 
@@ -96,7 +96,7 @@ def test_long_and_wide_ones(
     image = (reference.step_image((320, 340), angle, distance, 3.0) + rng.normal(0.0, 2.0, (320, 340))).astype(
         np.float32
     )
-    rulers = reference.across(angle, distance, 5, rng, (170.0, 160.0))
+    rulers = reference.random_rulers(angle, distance, 5, rng, (170.0, 160.0))
     smoothing = 2.0 * step_px
     operation = RulerEdges(threshold=20.0, length=length, width=width, step_px=step_px, smoothing_px=smoothing)
     ours = operation(image, rulers, device=device)
@@ -155,7 +155,7 @@ def test_any_direction(device: Device, angle: float, x: float, y: float) -> None
 def test_choices(device: Device, variant: Any, edge_selection: Any, rng: np.random.Generator) -> None:
     image = reference.stripe_image(SHAPE, 0.3, 90.0, 16.0, 1.0) + rng.normal(0.0, 1.0, SHAPE)
     image += 0.4 * reference.step_image(SHAPE, 0.3, 112.0, 1.0)
-    rulers = reference.across(0.3, 94.0, 10, rng, MIDDLE)
+    rulers = reference.random_rulers(0.3, 94.0, 10, rng, MIDDLE)
     operation = RulerEdges(
         threshold=15.0, length=80, smoothing_px=1.5, edge_selection=edge_selection, max_edges=5, variant=variant
     )
@@ -203,7 +203,7 @@ def test_polarity(device: Device, variant: Any, polarity: Any, sign: float, plac
 @pytest.mark.parametrize("spacing", [9.3, 14.0])
 def test_pairs_have_the_middle_whatever_the_width(device: Device, variant: Any, spacing: float) -> None:
     image = reference.stripe_image(SHAPE, 0.6, 95.5, spacing, 1.0).astype(np.float32)
-    rulers = reference.across(0.6, 95.5, 12, np.random.default_rng(3), MIDDLE)
+    rulers = reference.random_rulers(0.6, 95.5, 12, np.random.default_rng(3), MIDDLE)
     true = 95.5 - np.einsum("ij,ij->i", rulers[:, :2].astype(float), rulers[:, 2:].astype(float))
     operation = RulerEdges(threshold=15.0, pairs=True, polarity="rising", smoothing_px=1.2, variant=variant)
     ours = operation(image, rulers, device=device)
@@ -267,7 +267,7 @@ def test_through_a_lens(device: Device, variant: Any, model: Any, rng: np.random
     angle, distance = 0.5, float(np.dot((30.0, 90.0), (math.cos(0.5), math.sin(0.5))))
     place = ideal @ [math.cos(angle), math.sin(angle)] - distance
     image = (100.0 + 50.0 * np.tanh(place / 1.5)).astype(np.float32)
-    rulers = reference.across(angle, distance, 20, rng, (30.0, 90.0))
+    rulers = reference.random_rulers(angle, distance, 20, rng, (30.0, 90.0))
     operation = replace(STRONGEST, length=33, smoothing_px=1.5, model=model, variant=variant)
     ours = operation(image, rulers, device=device)
     inside = ours.status == 0
@@ -279,7 +279,7 @@ def test_through_a_lens(device: Device, variant: Any, model: Any, rng: np.random
     assert np.nanmax(np.abs(ignored.position - true)) > 0.2
     for k in np.flatnonzero(inside)[:5]:
         grey, _ = reference.profile(image, rulers[k], 33, operation.width, 1.0, model.distort)
-        theirs = max(reference.edges(grey, 1.5, 20.0), key=lambda edge: abs(edge["gradient"]))
+        theirs = max(reference.find_edges(grey, 1.5, 20.0), key=lambda edge: abs(edge["gradient"]))
         assert abs(ours.position[k] - theirs["position"]) < 5e-4
 
 
@@ -361,7 +361,7 @@ def test_no_contrast(device: Device, variant: Any, dtype: Any, level: float) -> 
 @VARIANTS
 def test_all_levels_of_16_bits(device: Device, variant: Any) -> None:
     image = np.rint(reference.step_image(SHAPE, 0.2, 86.0, 1.2, 0.0, 65535.0)).astype(np.uint16)
-    rulers = reference.across(0.2, 86.0, 5, np.random.default_rng(1), MIDDLE)
+    rulers = reference.random_rulers(0.2, 86.0, 5, np.random.default_rng(1), MIDDLE)
     operation = replace(STRONGEST, width=16, variant=variant)
     ours = operation(image, rulers, device=device)
     assert (ours.status == 0).all()
@@ -372,7 +372,7 @@ def test_all_levels_of_16_bits(device: Device, variant: Any) -> None:
 @pytest.mark.parametrize("scale", [1e-30, 1e-3, 1e6, 1e30])
 def test_any_scale_of_grey_levels(device: Device, scale: float) -> None:
     image = (reference.step_image(SHAPE, 0.2, 86.0, 1.2) * scale).astype(np.float32)
-    rulers = reference.across(0.2, 86.0, 5, np.random.default_rng(1), MIDDLE)
+    rulers = reference.random_rulers(0.2, 86.0, 5, np.random.default_rng(1), MIDDLE)
     ours = replace(STRONGEST, threshold=20.0 * scale)(image, rulers, device=device)
     true = 86.0 - np.einsum("ij,ij->i", rulers[:, :2].astype(float), rulers[:, 2:].astype(float))
     np.testing.assert_allclose(ours.position, true, rtol=0, atol=0.01)

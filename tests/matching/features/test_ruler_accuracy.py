@@ -11,7 +11,7 @@ import pytest
 
 from gpuvision.host import Device
 from gpuvision.matching.features.ruler import RulerEdges, best_smoothing
-from reference import ruler as reference
+from gpuvision.reference import ruler as reference
 
 SHAPE, MIDDLE, BLUR = (140, 140), (70.0, 70.0), 1.2
 ANGLES = tuple(np.linspace(0.05, 2.0 * math.pi, 9))

@@ -19,8 +19,8 @@ from gpuvision.matching.field.field_pose import (
     find_pose_candidates,
     symmetric_twin,
 )
+from gpuvision.reference import field as reference
 from gpuvision.status import Status
-from reference import field as reference
 
 VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
 POSE = np.array([3.1, -2.2, 0.7])
@@ -46,7 +46,7 @@ def view(
     sigma: float = 0.03,
     reach: float = 5.0,
 ) -> np.ndarray:
-    return reference.seen(field_map.field, pose, rng, count, reach, sigma).astype(np.float32)
+    return reference.draw_line_points(field_map.field, pose, rng, count, reach, sigma).astype(np.float32)
 
 
 def off(pose: Any, other: Any) -> np.ndarray:
@@ -292,7 +292,7 @@ def test_poses_are_of_least_cost(device: Device, rng: np.random.Generator) -> No
         points = view(field_map, pose, rng, 96)
         start = (pose + rng.uniform(-1.0, 1.0, 3) * [0.1, 0.1, 0.05]).astype(np.float32)
         fit = FieldPoseRefinement(map=field_map)(points, start[None], device=device)
-        expected = reference.refined(field_map.field, start, points.astype(np.float64), field_map.scale)
+        expected = reference.refine_pose(field_map.field, start, points.astype(np.float64), field_map.scale)
         # Where two lines are as near as one another the cost has an edge, at which SciPy stops now and then: then it
         # may not be better, and finds nothing better from the pose that was found.
         least, other = (
@@ -302,7 +302,7 @@ def test_poses_are_of_least_cost(device: Device, rng: np.random.Generator) -> No
         assert least <= other + 1e-8
         if other < least + 1e-6:
             np.testing.assert_allclose(off(fit.poses[0], expected), 0.0, atol=3e-5)
-        again = reference.refined(field_map.field, fit.poses[0], points.astype(np.float64), field_map.scale)
+        again = reference.refine_pose(field_map.field, fit.poses[0], points.astype(np.float64), field_map.scale)
         np.testing.assert_allclose(off(fit.poses[0], again), 0.0, atol=3e-5)
         assert fit.score[0] == pytest.approx(least, abs=2e-6)
 

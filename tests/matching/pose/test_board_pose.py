@@ -12,8 +12,8 @@ from gpuvision.host import Device
 from gpuvision.matching.features.ruler import RulerEdges
 from gpuvision.matching.pose.board_pose import BoardPoseEstimator, place_rulers
 from gpuvision.matching.pose.pose import SolvePose, line_rows
+from gpuvision.reference import robust
 from gpuvision.status import Status
-from reference import robust
 
 VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
 PIXEL, NOISE = 10e-6, 2.0
@@ -42,7 +42,7 @@ def picture(rng: np.random.Generator, pose: np.ndarray = POSE, shifted: tuple[in
     """Edges of the artwork at a pose, each in its patch; some lie 10 px aside."""
     normal, point, _ = artwork()
     row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    matrix, shift = robust.moved(pose)
+    matrix, shift = robust.transform_of(pose)
     back = (on_board(np.stack([column, row], axis=-1)) - shift) @ np.linalg.inv(matrix).T
     which = row // PATCH * 4 + column // PATCH
     away = np.sum((back - point[which]) * normal[which], axis=-1) / PIXEL - 10.0 * np.isin(which, shifted)
@@ -61,7 +61,7 @@ def laid(sigma: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def error(result: Any, pose: np.ndarray = POSE) -> np.ndarray:
-    matrix, shift = robust.moved(pose)
+    matrix, shift = robust.transform_of(pose)
     return np.array([*(result.placement - (matrix @ PLACE + shift)), result.pose[2] - pose[2]])
 
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from board_fixes import GROSS, KINDS, BoardFix
+from board_images import SAMPLES, BoardPicture, View, board_image
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
-from reference.board_fixes import GROSS, KINDS, BoardFix
-from reference.board_images import SAMPLES, BoardPicture, View, board_image
 
 PIXEL = 25e-6
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from board_fixes import GROSS, PIXEL, BoardFix
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import read_artwork
 from gpuvision.matching.artwork.shapes import Shape
@@ -17,7 +18,6 @@ from gpuvision.matching.features.selection import select_rulers
 from gpuvision.matching.pose.board_pose import BoardPoseEstimator
 from gpuvision.matching.pose.pose import SolvePose
 from gpuvision.status import Status
-from reference.board_fixes import GROSS, PIXEL, BoardFix
 
 
 @pytest.fixture(scope="module")

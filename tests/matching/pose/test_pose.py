@@ -12,8 +12,8 @@ from canary import Guarded
 from gpuvision.host import Device
 from gpuvision.matching.features.line_fit import FitLines
 from gpuvision.matching.pose.pose import BoardPose, SolvePose, fitted_line_rows, line_rows, point_rows
+from gpuvision.reference import robust
 from gpuvision.status import Status
-from reference import robust
 
 VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
 SIGMA = 2e-6
@@ -45,7 +45,7 @@ def scene(
     moved = point + error[..., None] * normal + rng.uniform(-3e-4, 3e-4, (boards, count, 1)) * along
     rows = np.empty((boards, count, 7))
     for number, parameters in enumerate(truth):
-        matrix, shift = robust.moved(parameters)
+        matrix, shift = robust.transform_of(parameters)
         seen = moved[number] @ matrix.T + shift
         rows[number] = line_rows(normal[number], point[number], seen, SIGMA)
     return truth, rows
@@ -55,7 +55,7 @@ def placed(truth: np.ndarray) -> np.ndarray:
     """Return where the placement point is, and theta."""
     rows = []
     for parameters in truth:
-        matrix, shift = robust.moved(parameters)
+        matrix, shift = robust.transform_of(parameters)
         rows.append([*(matrix @ PLACE + shift), parameters[2]])
     return np.array(rows)
 
@@ -152,13 +152,13 @@ def test_single_follows_double(device: Device, rng: np.random.Generator) -> None
 @VARIANTS
 def test_points_of_a_board_turned_far(device: Device, variant: Any, rng: np.random.Generator) -> None:
     point = MIDDLE + rng.uniform(-0.01, 0.01, (6, 2))
-    matrix, shift = robust.moved(np.array([0.02, -0.03, 1.2]))
+    matrix, shift = robust.transform_of(np.array([0.02, -0.03, 1.2]))
     rows = point_rows(point, point @ matrix.T + shift, SIGMA)
     assert rows.shape == (12, 7)
     result = SolvePose(variant=variant, max_iterations=20)(rows, device=device)
     np.testing.assert_allclose(result.pose, [0.02, -0.03, 1.2], atol=1e-10)
     # The other way round, started nearby.
-    matrix, shift = robust.moved(np.array([0.02, -0.03, -3.0]))
+    matrix, shift = robust.transform_of(np.array([0.02, -0.03, -3.0]))
     rows = point_rows(point, point @ matrix.T + shift, SIGMA)
     result = SolvePose(variant=variant, with_initial_pose=True)(rows, np.array([0.0, 0.0, 3.0]), device=device)
     np.testing.assert_allclose(result.pose, [0.02, -0.03, -3.0], atol=1e-10)
@@ -233,7 +233,7 @@ def test_fitted_lines_carry_their_angle(device: Device, rng: np.random.Generator
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     point = MIDDLE + rng.uniform(-0.01, 0.01, (lines, 2))
     on = point[:, None] + rng.uniform(-0.004, 0.004, (lines, each, 1)) * along[:, None]
-    matrix, shift = robust.moved(np.array([2e-4, -1e-4, 0.01]))
+    matrix, shift = robust.transform_of(np.array([2e-4, -1e-4, 0.01]))
     seen = (on + rng.normal(0.0, SIGMA, (lines, each, 1)) * normal[:, None]) @ matrix.T + shift
     fits = FitLines(loss="least_squares", scale=SIGMA)(seen, device=device)
     way = fits.normal * np.sign(np.sum(fits.normal * (normal @ matrix.T), axis=-1))[:, None]
@@ -255,7 +255,7 @@ def etched(rng: np.random.Generator, boards: int, count: int, bad: float) -> tup
     etch = rng.normal(0.0, ETCH, boards)
     etch_factor = np.where(np.arange(count) % 4, 1.0, 0.0) * np.ones((boards, 1))
     for number, parameters in enumerate(truth):
-        matrix, _ = robust.moved(parameters)
+        matrix, _ = robust.transform_of(parameters)
         out = rows[number, :, :2] @ matrix.T
         rows[number, :, 4:6] += etch[number] * etch_factor[number][:, None] * out
     return truth, etch, np.concatenate([rows, etch_factor[..., None]], axis=-1)

@@ -15,6 +15,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
+from board_images import View, board_image
 from canary import Guarded
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
@@ -31,9 +32,8 @@ from gpuvision.matching.pose.edge_search import (
     find_best_shifts,
 )
 from gpuvision.matching.pose.registration import CoarseRegistration, prepare_board_registration, register_images
+from gpuvision.reference import registration as reference
 from gpuvision.status import Status
-from reference import registration as reference
-from reference.board_images import View, board_image
 
 VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
 PIXEL, NOISE = 25e-6, 3.0

@@ -10,12 +10,12 @@ import pytest
 
 from gpuvision.host import Device
 from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.reference import light_clustering as reference
 from gpuvision.simulation.clustering.clustered_irradiance import ClusteredIrradiance, estimate_facing_pairs
 from gpuvision.simulation.errors.range_error import StripErrorModel
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradiance
-from reference import light_clustering as reference
 from sensor_views import sensor_view
 
 
@@ -65,7 +65,7 @@ def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
     exact = OccludedIrradiance(scene=scene, segments=len(segments), precision="single")(
         receivers, np.zeros_like(weights), segments, device=device
     ).irradiance
-    shift = [reference.reading(direct, 0.005 * direct, weights, light) for light in (ours.irradiance, exact)]
+    shift = [reference.mean_position(direct, 0.005 * direct, weights, light) for light in (ours.irradiance, exact)]
     # The kernel's own rounding on top.
     assert np.all(np.abs(shift[0] - shift[1]) <= ours.cut.bound + 1e-9)
     assert np.all(ours.cut.bound <= tolerance)
@@ -141,7 +141,7 @@ def test_what_faces_each_other_decides_whether_there_is_a_plan(device: Device) -
     ]
     assert [each.cut.traversed for each in results] == [True, False]
     assert results[0].cut.counts["work"] < pairs // 2
-    shift = [reference.reading(reading.power, reading.moment, weights, each.irradiance) for each in results]
+    shift = [reference.mean_position(reading.power, reading.moment, weights, each.irradiance) for each in results]
     # Both ways agree to the bound; the kernel's own rounding on top.
     assert np.all(np.abs(shift[0] - shift[1]) <= results[0].cut.bound + 1e-9)
     assert np.all(results[0].cut.bound <= 1e-4)

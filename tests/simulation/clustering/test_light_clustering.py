@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from gpuvision.host import Device
+from gpuvision.reference import light_clustering as reference
 from gpuvision.simulation.clustering.light_clustering import LightClustering
 from gpuvision.simulation.clustering.light_cut import BLOCK, LightCut
 from gpuvision.simulation.clustering.light_tree import LightTree
 from gpuvision.simulation.errors.range_error import StripErrorModel, interreflection_power_bound, select_paths
 from gpuvision.simulation.scene.scene import Scene
-from reference import light_clustering as reference
 
 ON_DEVICES = settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 ANYWHERE = settings(max_examples=40, deadline=None)
@@ -79,7 +79,7 @@ def by_cut(cut: LightCut, receivers: NDArray[Any], triangles: Any = None) -> Any
 def off_by(cut: LightCut, receivers: Any, weights: Any, reading: StripErrorModel, segments: Any) -> Any:
     everything = reference.pair_irradiance(receivers.reshape(-1, 6), segments).sum(axis=1).reshape(receivers.shape[:2])
     readings = [
-        reference.reading(reading.power, reading.moment, weights, light)
+        reference.mean_position(reading.power, reading.moment, weights, light)
         for light in (everything, by_cut(cut, receivers))
     ]
     return SLOPE * np.abs(readings[0] - readings[1])
@@ -275,8 +275,8 @@ def test_what_is_clear_is_seen(device: Device, variant: Any, rng: Any, exponent:
         used = weights[here].any(axis=1)
         hidden = (seen[here] < 1.0) & (light[here] > 1e-9 * light.max())
         assert not np.any(hidden[used][:, clear])
-    exact = reference.reading(reading.power, reading.moment, weights, np.sum(seen * light, axis=2))
-    ours = reference.reading(reading.power, reading.moment, weights, by_cut(cut, receivers, triangles))
+    exact = reference.mean_position(reading.power, reading.moment, weights, np.sum(seen * light, axis=2))
+    ours = reference.mean_position(reading.power, reading.moment, weights, by_cut(cut, receivers, triangles))
     assert np.all(SLOPE * np.abs(exact - ours) <= cut.bound + 1e-15)
 
 

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from canary import Guarded
 from gpuvision.host import Device
+from gpuvision.reference import rays as reference
 from gpuvision.simulation.scene.rays import AnyHit, ClosestHit
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.status import Status
-from reference import rays as reference
 
 ON_DEVICES = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 WAYS = pytest.mark.parametrize(

@@ -10,11 +10,11 @@ import trimesh
 
 from canary import Guarded
 from gpuvision.host import Device
+from gpuvision.reference import visible_intervals as reference
 from gpuvision.simulation.scene.rays import AnyHit
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.scene.visible_intervals import VisibleIntervals
 from gpuvision.status import Status
-from reference import visible_intervals as reference
 
 WAYS = pytest.mark.parametrize(
     ("variant", "dtype"),
@@ -50,7 +50,7 @@ def test_parts_as_the_reference_says(
     least, within = (1e-9, 1e-8) if dtype == np.float64 else (1e-5, 2e-3)
     same, several = 0, 0
     for n, fan in enumerate(fans.astype(np.float64)):
-        expected = reference.visible(corners, fan, least)
+        expected = reference.visible_parts(corners, fan, least)
         if len(expected) != result.interval_count[n]:
             continue
         same += bool(np.all(np.abs(parts(result, n) - expected) < within))

@@ -11,11 +11,11 @@ import pytest
 import trimesh
 
 from gpuvision.host import Device
+from gpuvision.reference import radiosity as reference
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 from gpuvision.simulation.transport.patches import FormFactors, Patches
 from gpuvision.simulation.transport.radiosity import Radiosity
-from reference import radiosity as reference
 
 PRECISIONS = pytest.mark.parametrize("precision", ["single", "double"])
 TO = {"single": 1e-6, "double": 1e-11}
@@ -228,7 +228,7 @@ def test_parallel_plates_with_all_bounces(device: Device, albedo: float) -> None
 def test_corner_with_all_bounces(device: Device, albedo: float) -> None:
     """The table, to its last digit, and the convolution solved; it is regular for white walls too."""
     light = extrapolated([corner(count, albedo, device) for count in (100, 200, 400)])
-    np.testing.assert_allclose(light, reference.corner(albedo, AT_CORNER), rtol=2e-6)
+    np.testing.assert_allclose(light, reference.corner_irradiance(albedo, AT_CORNER), rtol=2e-6)
     if albedo in CORNER:
         np.testing.assert_allclose(light, CORNER[albedo], atol=6e-7, rtol=0)
 

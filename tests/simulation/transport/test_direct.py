@@ -12,6 +12,7 @@ import trimesh
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.reference.rays import occluded
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.rays import AnyHit
 from gpuvision.simulation.scene.reflectance import Ggx, Lambert, OrenNayar, Phong, Ward
@@ -22,7 +23,6 @@ from gpuvision.simulation.transport.illumination import LightSheet
 from gpuvision.simulation.transport.specular_highlights import find_specular_highlights
 from gpuvision.status import Status
 from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sensor_view, two_plates, u_of
-from reference.rays import occluded
 
 # ---- power, bins, samples ----------------------------------------------------------------------------------
 

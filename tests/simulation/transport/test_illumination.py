@@ -12,11 +12,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gpuvision.ranging.range_image import StraightTransport
+from gpuvision.reference.sheet import first_hits
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.envelope import upper_envelope
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
 from gpuvision.simulation.transport.sheet_cut import SheetIndex
-from reference.sheet import first_met
 
 UPRIGHT = StraightTransport()
 TILTED = StraightTransport(
@@ -71,7 +71,7 @@ def assert_as_rays(sheet: LightSheet, scene: Scene, L: float, lit: LitLine, rng:
     assert np.all(gap > -1e-12 * (1.0 + x[1:, 0] ** 2))
     rays = rng.uniform(-2.0, 2.0, 300)
     rays = rays[np.abs(rays[:, None] - x.ravel()).min(axis=1, initial=np.inf) > 1e-9]
-    triangle, point = first_met(sheet, scene.corners, L, rays)
+    triangle, point = first_hits(sheet, scene.corners, L, rays)
     of = np.searchsorted(x[:, 0], rays, side="right") - 1
     found = np.where((of >= 0) & (rays < x[np.maximum(of, 0), 1]), of, -1) if len(x) else np.full(len(rays), -1)
     np.testing.assert_array_equal(np.where(found >= 0, np.append(lit.triangle, -1)[found], -1), triangle)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from canary import Guarded
 from gpuvision.host import Device
+from gpuvision.reference import line_irradiance as reference
 from gpuvision.simulation.transport.line_irradiance import Irradiance, LineIrradiance, LitSegments
 from gpuvision.status import Status
-from reference import line_irradiance as reference
 
 ON_DEVICES = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 VARIANTS = ("vector", "work_item")

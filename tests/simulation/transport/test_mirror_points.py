@@ -10,10 +10,10 @@ import trimesh
 
 from canary import Guarded
 from gpuvision.host import Device
+from gpuvision.reference import mirrors as reference
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.mirror_points import MirrorPoints, smooth_normals
 from gpuvision.status import Status
-from reference import mirrors as reference
 
 WAYS = pytest.mark.parametrize(
     ("variant", "dtype"),
@@ -56,7 +56,7 @@ def test_a_sphere_shows_points_where_alhazen_says(
     result = mirrors(3, variant=variant)(points, LENS.astype(dtype), device=device)
     place, _, density = outside(result)
     for n, point in enumerate(points[:, :3].astype(np.float64)):
-        expected, concentration = reference.in_sphere(point, LENS.astype(dtype).astype(np.float64))
+        expected, concentration = reference.reflect_in_sphere(point, LENS.astype(dtype).astype(np.float64))
         assert np.linalg.norm(place[n] - expected) < 2e-4
         assert abs(density[n] / concentration - 1.0) < 1.5e-2
     assert not result.status.any()
@@ -71,7 +71,7 @@ def test_images_converge_to_the_third_order_and_density_to_the_first_or_better(
     far, thin = [], []
     for fineness in (2, 3, 4):
         place, _, density = outside(mirrors(fineness)(points, LENS, device=device))
-        truth = [reference.in_sphere(point, LENS) for point in points[:, :3]]
+        truth = [reference.reflect_in_sphere(point, LENS) for point in points[:, :3]]
         far.append(max(np.linalg.norm(at - one[0]) for at, one in zip(place, truth, strict=True)))
         thin.append(max(abs(value / one[1] - 1.0) for value, one in zip(density, truth, strict=True)))
     # Triangles of half the size.
@@ -87,7 +87,7 @@ def test_an_ellipsoid_shows_points_as_rays_that_it_reflects(device: Device, rng:
     points = some_points(rng, 16)
     place, _, density = outside(mirrors(5, shape)(points, LENS, device=device))
     for n, point in enumerate(points[:, :3]):
-        away, area_per_angle = reference.past_ellipsoid(shape, LENS, place[n], point)
+        away, area_per_angle = reference.reflect_past_ellipsoid(shape, LENS, place[n], point)
         assert away < 5e-4
         assert abs(density[n] * area_per_angle - 1.0) < 5e-3
 

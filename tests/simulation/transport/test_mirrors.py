@@ -10,6 +10,7 @@ import trimesh
 from scipy.integrate import quad as integral
 
 from gpuvision.host import Device
+from gpuvision.reference import mirrors as reference
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.rays import AnyHit
 from gpuvision.simulation.scene.reflectance import Lambert
@@ -19,7 +20,6 @@ from gpuvision.simulation.transport.direct import DirectLight
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
 from gpuvision.simulation.transport.mirrors import Mirrors
 from mirror_scenes import mirrors_of, quad, sensor_view
-from reference import mirrors as reference
 
 ALBEDO, SHARE = 0.5, 0.8
 MATERIALS = (
@@ -207,7 +207,7 @@ def test_a_ball_shows_a_line_as_alhazen_says(device: Device) -> None:
     spots, power = np.empty((len(x), 3)), np.empty(len(x))
     for n, at in enumerate(x):
         point = np.array([at, 0.0, 0.0])
-        spot, density = reference.in_sphere((point - middle) / radius, (lens - middle) / radius)
+        spot, density = reference.reflect_in_sphere((point - middle) / radius, (lens - middle) / radius)
         spots[n] = middle + radius * spot
         cosine = spots[n, 2] / np.linalg.norm(spots[n] - point)
         square = np.sum((lens - spots[n]) ** 2) * density / radius**2

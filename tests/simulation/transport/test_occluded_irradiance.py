@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 
 from canary import Guarded
 from gpuvision.host import Device
+from gpuvision.reference import occluded_irradiance as reference
+from gpuvision.reference.occluded_irradiance import comb, single, soup
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import LineIrradiance, LitSegments
 from gpuvision.simulation.transport.occluded_irradiance import (
@@ -24,8 +26,6 @@ from gpuvision.simulation.transport.occluded_irradiance import (
     segment_rows,
 )
 from gpuvision.status import Status
-from reference import occluded_irradiance as reference
-from reference.occluded_irradiance import comb, single, soup
 
 ON_DEVICES = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 # Builds are what takes time: each variant in one of the two types here, hypothesis and the rest in the device's own.
@@ -74,7 +74,7 @@ def lit_soup(count: int) -> tuple[np.ndarray, ...]:
     rng = np.random.default_rng(count)
     corners = soup(rng, count, 0.6 if count < 20 else 0.3)
     segments, receivers = segments_of(rng, 5), receivers_of(rng, 3, 23)
-    return corners, segments, receivers, *reference.light(corners, receivers.reshape(-1, 6), segments, 1e-5)
+    return corners, segments, receivers, *reference.irradiance(corners, receivers.reshape(-1, 6), segments, 1e-5)
 
 
 @WAYS
@@ -110,7 +110,7 @@ def lit_board() -> tuple[np.ndarray, ...]:
         for each in everywhere
     ]
     receivers = everywhere[facing][::20][:24]
-    value, most = reference.light(board.scene.corners, receivers, segments, 1e-6)
+    value, most = reference.irradiance(board.scene.corners, receivers, segments, 1e-6)
     return board.scene.corners, receivers[None], segments, value, most
 
 
@@ -128,7 +128,7 @@ def test_light_in_any_soup(device: Device, seed: int, count: int, size: float) -
     rng = np.random.default_rng(seed)
     corners, segments, receivers = soup(rng, count, size), segments_of(rng, 2), receivers_of(rng, 1, 5)
     result = light_of(corners, receivers, segments, device, clearance=1e-7)
-    value, most = reference.light(corners, receivers[0], segments, 1e-7)
+    value, most = reference.irradiance(corners, receivers[0], segments, 1e-7)
     assert np.all(np.abs(result.irradiance[0] - value) <= 1e-8 * most)
 
 
@@ -317,7 +317,7 @@ def lit_line(count: int, receivers: int, dtype: Any) -> tuple[np.ndarray, ...]:
     corners, places, rows = soup(rng, 30, 0.4), receivers_of(rng, 1, receivers), on_one_line(rng, count)
     rows[2, 9], rows[4, 6:9], rows[5, :6] = 0.0, -rows[4, 6:9], np.roll(rows[5, :6], 3)
     rows = rows.astype(dtype).astype(float)
-    return corners, places, rows, *reference.light(corners, places[0], rows, 1e-5)
+    return corners, places, rows, *reference.irradiance(corners, places[0], rows, 1e-5)
 
 
 @WAYS

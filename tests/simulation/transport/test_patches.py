@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from canary import Guarded
 from gpuvision.host import Device
+from gpuvision.reference import patches as reference
 from gpuvision.simulation.scene.rays import AnyHit
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.patches import Factors, FormFactors, Patches, PatchLight
 from gpuvision.status import Status
-from reference import patches as reference
 
 ON_DEVICES = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 TWO_WAYS = pytest.mark.parametrize("variant", ["vector", "work_item"])
@@ -39,7 +39,7 @@ def draws() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     values, bounds = np.zeros((2, RECEIVERS, len(triangles)))
     for i, receiver in enumerate(receivers):
         for k, corners in enumerate(triangles.astype(float)):
-            values[i, k], facing = reference.factor(receiver, corners)
+            values[i, k], facing = reference.form_factor(receiver, corners)
             if facing > 0.0:
                 bounds[i, k] = 32.0 * facing * _conditioning(receiver[:3].astype(float), corners)
     return receivers, triangles.astype(float), values, bounds

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from board_images import BoardPicture, View
 from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.artwork.shapes import Shape
@@ -21,7 +22,6 @@ from gpuvision.matching.features.ruler import Polarity, RulerEdges
 from gpuvision.matching.features.selection import Selection, predict_selection, select_rulers
 from gpuvision.matching.pose.board_pose import BoardPoseEstimator, place_rulers
 from gpuvision.matching.pose.pose import SolvePose
-from reference.board_images import BoardPicture, View
 
 Float64 = npt.NDArray[np.float64]
 

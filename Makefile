@@ -1,16 +1,25 @@
 # `make demo`, `make test` and `make docs` set up what they need in .venv (see setup.sh); a second call starts at once.
 
 SHELL := /bin/bash
-# CI sets it to the empty string, to include the slow tests.
-PYTEST_ARGS ?= -m "not slow"
+# Compiled kernels and other caches: in the clone, so that a second run is warm and nothing is written in the home.
+CACHES := XDG_CACHE_HOME="$(CURDIR)/build/cache" MPLCONFIGDIR="$(CURDIR)/build/cache/matplotlib"
+# PYTEST_ARGS: more options, such as PYTEST_ARGS="-k line"
+PYTEST = .venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
 
-.PHONY: demo test lint docs clean
+.PHONY: demo test test-full nightly lint docs clean
 
 demo: .venv/ready
 	.venv/bin/gpuvision demo
 
+# The tiers are explained in tests/conftest.py.
 test: .venv/ready-tests
-	.venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
+	$(PYTEST) --tier fast
+
+test-full: .venv/ready-tests
+	$(PYTEST) --tier full
+
+nightly: .venv/ready-tests
+	$(PYTEST) --tier nightly
 
 # Type checkers do not understand setuptools' package-dir or its import hook for editable installs. Symbolic links in
 # build/lint give the package the layout of an installed wheel, so that messages name the real files.
@@ -26,7 +35,7 @@ lint: .venv/ready-tests
 # are in build/docs. --fresh-env reads every page again: an incremental build would drop the index entries of unchanged
 # pages from the search index.
 docs: .venv/ready-docs
-	.venv/bin/python -m sphinx --fresh-env --fail-on-warning --keep-going --quiet -d build/doctrees docs build/docs
+	$(CACHES) .venv/bin/python -m sphinx --fresh-env --fail-on-warning --keep-going --quiet -d build/doctrees docs build/docs
 	@echo "open build/docs/index.html"
 
 .venv/ready: pyproject.toml setup.sh
@@ -42,5 +51,5 @@ docs: .venv/ready-docs
 	touch $@
 
 clean:
-	rm -rf .venv build out docs/gallery docs/reference/api docs/reference/commands docs/results/runs *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv build out docs/gallery docs/reference/api docs/reference/commands docs/results/runs *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,22 +1,119 @@
-"""Devices for the tests: every healthy one, and failure rather than silence where there is none."""
+"""Devices, tiers and caches of the tests; a test that needs a device fails where there is none.
+
+The option ``--tier`` selects the tests. ``fast`` runs all tests without the mark ``slow`` on the best device, and a
+smoke set on every other device: the first case of each test function. ``full`` runs all tests on every device.
+``nightly`` is ``full`` with more hypothesis examples.
+"""
 
 from __future__ import annotations
 
+import os
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import hypothesis
+import hypothesis.configuration
 import numpy as np
 import pytest
 
 from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
 
+ROOT = Path(__file__).resolve().parents[1]
+# Compiled kernels of all runtimes, verdicts of devices, fonts of matplotlib: kept in the clone, so that a second run is
+# warm and nothing is written in the home. Each of these folders is read when it is first needed, after this line.
+CACHE = ROOT / "build" / "cache"
+os.environ |= {"XDG_CACHE_HOME": str(CACHE), "MPLCONFIGDIR": str(CACHE / "matplotlib")}
+hypothesis.configuration.set_hypothesis_home_dir(CACHE / "hypothesis")
+
+LEFT = pytest.StashKey[dict[str, int]]()
+TIERS = ("fast", "full", "nightly")
+# Factor on the examples of every hypothesis test in the tier "nightly".
+NIGHTLY_EXAMPLES = 20
 # New draws in every run; what fails prints how to repeat it. Without a clock: a busy machine is no fault of the code.
 hypothesis.settings.register_profile("unhurried", deadline=None, print_blob=True)
 hypothesis.settings.load_profile("unhurried")
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = ROOT.parent / "shared" / "data"
+# Reasons of skips that are right on a machine with all extras and both CPU runtimes; ``--strict-skips`` refuses others.
+ALLOWED_SKIPS = (
+    "the recordings in ../shared/data are not here",
+    "only PoCL 3 has such a device",
+    "only Intel's runtime does so by the work's groups",
+)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--tier", choices=TIERS, default="full", help="which tests run: see tests/conftest.py")
+    parser.addoption("--strict-skips", action="store_true", help="fail when a test is skipped for an unexpected reason")
+
+
+@pytest.hookimpl(trylast=True)  # after -m and -k: the smoke set is the first of what they leave
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what the tier leaves out; draw more hypothesis examples in the tier "nightly"."""
+    tier = config.getoption("tier")
+    if tier == "nightly":
+        _draw_more_examples(items)
+    if tier != "fast":
+        return
+    left = list(_left_to_full_tier(items))
+    if left:
+        config.hook.pytest_deselected(items=left)
+        labels = ((_device_of(item), item.get_closest_marker("slow")) for item in left)
+        config.stash[LEFT] = dict(Counter("slow" if slow else device.label for device, slow in labels))
+        out = set(left)
+        items[:] = [item for item in items if item not in out]
+
+
+def _left_to_full_tier(items: list[pytest.Item]) -> Iterator[pytest.Item]:
+    """Yield slow tests and, on all devices but the best, all cases of a test function but its first."""
+    best = Device.all()[:1]
+    seen = set()
+    for item in items:
+        device = _device_of(item)
+        case = (item.parent, getattr(item, "originalname", item.name), device)
+        if item.get_closest_marker("slow") is not None or (device is not None and device not in best and case in seen):
+            yield item
+        else:
+            seen.add(case)
+
+
+def _device_of(item: pytest.Item) -> Device | None:
+    return item.callspec.params.get("device") if hasattr(item, "callspec") else None
+
+
+def _draw_more_examples(items: list[pytest.Item]) -> None:
+    """Multiply the number of examples of each hypothesis test, also where the test states the number."""
+    for function in {getattr(item, "obj", None) for item in items}:
+        if hypothesis.is_hypothesis_test(function):
+            # Hypothesis has no public name for the settings of a test.
+            stated = function._hypothesis_internal_use_settings
+            more = hypothesis.settings(stated, max_examples=NIGHTLY_EXAMPLES * stated.max_examples)
+            function._hypothesis_internal_use_settings = more
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Hand the counts of a worker to the main process; fail there for skips that hide a missing extra or device."""
+    config = session.config
+    if hasattr(config, "workeroutput"):
+        config.workeroutput["left"] = config.stash.get(LEFT, {})
+    elif config.getoption("strict_skips") and _unexpected_skips(config) and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Take the counts of a worker; every worker collects the same tests."""
+    node.config.stash[LEFT] = getattr(node, "workeroutput", {}).get("left", {})
+
+
+def _unexpected_skips(config: pytest.Config) -> list[str]:
+    skipped = config.pluginmanager.getplugin("terminalreporter").getreports("skipped")
+    places = [each.longrepr for each in skipped if isinstance(each.longrepr, tuple)]
+    reasons = {(path, reason.removeprefix("Skipped: ")) for path, _, reason in places}
+    return sorted(f"{path}: {reason}" for path, reason in reasons if reason not in ALLOWED_SKIPS)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -48,11 +145,21 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say how many tests passed on which device; CI reads it."""
+    """Say how many tests passed on which device, which CI reads, and how many were left to the full tier."""
+    config = terminalreporter.config
     passed = terminalreporter.getreports("passed")
     labels = Counter(label for each in passed for name, label in each.user_properties if name == "device")
-    counts = ", ".join(f"{label} {count}" for label, count in sorted(labels.items())) or "on no device"
-    terminalreporter.write_line(f"kernel tests passed: {counts}")
+    terminalreporter.write_line(f"kernel tests passed: {_counts(labels) or 'on no device'}")
+    left = config.stash.get(LEFT, {})
+    if left:
+        terminalreporter.write_line(f"left to the full tier (make test-full): {_counts(left)}")
+    if config.getoption("strict_skips"):
+        for each in _unexpected_skips(config):
+            terminalreporter.write_line(f"unexpected skip: {each}", red=True)
+
+
+def _counts(labels: Mapping[str, int]) -> str:
+    return ", ".join(f"{label} {count}" for label, count in sorted(labels.items()))
 
 
 @pytest.fixture

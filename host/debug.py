@@ -113,7 +113,7 @@ def dump_program(
     return path
 
 
-def dump_arrays(name: str, **values: Any) -> Path | None:
+def dump_arrays(name: str, /, **values: Any) -> Path | None:
     """Write arrays to a new ``.npz`` file in the debug folder and return its path; None where no debug folder is set.
 
     Parameters
@@ -146,7 +146,7 @@ def dump_arrays(name: str, **values: Any) -> Path | None:
 
 
 @contextlib.contextmanager
-def dump_on_failure(name: str, **values: Any) -> Iterator[None]:
+def dump_on_failure(name: str, /, **values: Any) -> Iterator[None]:
     """Write arrays with `dump_arrays` when the block fails, and name the file in the exception.
 
     Parameters

@@ -448,8 +448,13 @@ static __attribute__((noinline)) solved_pose pose_solved(laned_pose start, pose_
     fit.scale = pose_scale(fit.pose, all, room, INFINITY, FEW_TRIED, min_scale);
 #endif
     for (int step = 0; step < steps; step++) {
+#ifdef ROBUST
         if (RESCALED_AT(step))
             fit.scale = pose_scale(fit.pose, all, room, (real)2.5f * fit.scale, FEW_FITTED, min_scale);
+#elif defined(ETCHED)
+        // The prior of the etch bias is weighed against residuals in units of their scale.
+        fit.scale = pose_scale(fit.pose, all, room, INFINITY, FEW_FITTED, min_scale);
+#endif
         reals change[FREEDOMS];
         pose_summed(fit.pose, all, 1 / fit.scale, WEIGHTED, &sums);
         if (any_lane(factored(sums.matrix))) break;

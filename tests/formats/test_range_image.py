@@ -131,6 +131,18 @@ def test_a_ply_of_valid_points_has_no_nan(tmp_path, rng):
     assert "obj_info" not in (tmp_path / "points.ply").read_bytes()[:400].decode("latin-1")
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_point_without_x_y_or_z_is_not_valid(tmp_path, rng, bad):
+    points = rng.normal(size=(3, 5, 7)).astype(np.float32)
+    for axis in range(3):
+        points[axis, axis, 2 * axis] = bad
+    export.write_ply(tmp_path / "points.ply", *points, organised=False)
+    back = export.read_ply(tmp_path / "points.ply")
+    valid = [k for k in range(35) if k not in (0, 9, 18)]
+    for name, values in zip("xyz", points, strict=True):
+        np.testing.assert_array_equal(back[name], values.ravel()[valid])
+
+
 def test_a_cut_ply_is_refused(tmp_path):
     x = np.zeros((4, 6), np.float32)
     export.write_ply(tmp_path / "points.ply", x, x, x)

@@ -151,6 +151,16 @@ def test_arrays_are_stored_by_their_names(device: Device, folder: Path) -> None:
     assert (float(found["inputs.1"]), float(found["options.k1"])) == (2.5, 7.0)
 
 
+def test_an_array_may_be_called_name(folder: Path) -> None:
+    path = debug.dump_arrays("stem", name=np.arange(3))
+    assert path == folder / "stem.npz"
+    with np.load(path) as stored:
+        np.testing.assert_array_equal(stored["name"], np.arange(3))
+    with pytest.raises(ValueError, match="wrong"), debug.dump_on_failure("stem", name=np.arange(4)):
+        raise ValueError("wrong")
+    assert (folder / "stem-2.npz").exists()
+
+
 def test_files_are_never_overwritten(folder: Path) -> None:
     paths = [debug.dump_arrays("name", value=number, file=number) for number in range(3)]
     assert paths == [folder / "name.npz", folder / "name-2.npz", folder / "name-3.npz"]

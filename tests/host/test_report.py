@@ -90,6 +90,19 @@ def test_quantiles_are_right_to_a_hundredth(values: list[int], split: int) -> No
         assert value == pytest.approx(exact, rel=0.0101, abs=1.01e-9)
 
 
+def test_quantiles_of_a_long_tail() -> None:
+    """The quantiles are far apart: 10 000 durations of which one in a hundred and one in a thousand are long."""
+    durations = DurationHistogram()
+    for nanoseconds, count in ((10**9, 5), (10**3, 9895), (10**6, 95), (10**4, 5)):
+        for start in range(0, count, 1000):
+            durations.add_all(np.full(min(1000, count - start), nanoseconds))
+    statistics = durations.statistics()
+    assert statistics.p50 == pytest.approx(1e-6, rel=0.01)
+    assert statistics.p99 == pytest.approx(1e-5, rel=0.01)
+    assert statistics.p999 == pytest.approx(1e-3, rel=0.01)
+    assert statistics.maximum == 1.0
+
+
 def test_single_durations_count_like_many(rng: np.random.Generator) -> None:
     values = rng.integers(1, 10**6, 5000)
     one, many = DurationHistogram(), DurationHistogram()

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import rel_entr
 
 from gpuvision.formats.field_file import read_field
 from gpuvision.matching.field.distance_map import Arc, Field
@@ -112,3 +113,34 @@ def test_missing_is_what_is_not_seen_beside_what_is_explained() -> None:
     assert evidence(elsewhere, paths, CROSS, pose, **told).missing > 0.8
     unknown = evidence(places[::2], None, CROSS, pose, **told)
     assert (unknown.expected, unknown.missing) == (0, 0.0)
+
+
+@pytest.mark.parametrize("margin", [None, 1.0])
+@pytest.mark.parametrize("near", [0, 1, 4, 17, 50])
+def test_false_alarms_in_closed_form(near: int, margin: float | None) -> None:
+    """Only more points near lines than chance are evidence: with fewer, the number of tests is all that is left."""
+    distances = np.array([-0.003] * near + [3.0] * (50 - near))
+    expected = []
+    for t in (0.012, 0.024, 0.05, 0.1, 0.2):
+        # 12 m of lines on 10 m x 6 m; poses on 0.4 m x 0.4 m and 0.4 rad, or on 12 m x 8 m and all round at 3 m.
+        chance, share = 2 * t * 12 / 60, near / 50
+        tests = (
+            5 * max((0.16 if margin is None else 96) / t**2, 1) * max((0.4 if margin is None else 6 * math.pi) / t, 1)
+        )
+        information = rel_entr(share, chance) + rel_entr(1 - share, 1 - chance) if share > chance else 0.0
+        expected.append(math.log(tests) - 50 * information)
+    found = log_nfa(distances, CROSS, scale=0.2, max_range=3.0, margin=margin)
+    assert found == pytest.approx(min(expected), rel=1e-12)
+
+
+def test_seen_is_corrected_for_points_that_meet_crossings_by_chance() -> None:
+    upright = [(x, -1.0, x, 1.0) for x in (-3.5, -3.0, -2.5, -2.0, -1.5)]
+    paths = [*upright, (2.0, -1.0, 4.0, 1.0)]
+    on_lines = [(-3.5, 0.03), (-3.0, -0.03), (-2.0, 0.0), (3.0, 0.0)]
+    points = np.array([*on_lines, (-3.5, 0.7), (-1.5, 0.5), (-1.5, -0.4)])
+    found = evidence(points, paths, CROSS, (0.0, 0.0, 0.0), half_line_width=0.05, scale=0.2, max_range=3.0, margin=0.5)
+    assert (found.expected, found.on_lines) == (6, pytest.approx(4 / 7))
+    # 7 points on 10 m and 2.83 m of scan lines; a crossing is 0.1 m long, 0.141 m on the oblique one.
+    density, window = 7 / (10 + 2 * math.sqrt(2)), 0.1 * (5 + math.sqrt(2)) / 6
+    by_chance = 1 - math.exp(-density * window)
+    assert found.seen == pytest.approx((4 / 6 - by_chance) / (1 - by_chance), rel=1e-12)

@@ -307,6 +307,27 @@ def test_poses_are_of_least_cost(device: Device, rng: np.random.Generator) -> No
         assert fit.score[0] == pytest.approx(least, abs=2e-6)
 
 
+def test_the_fourth_nearest_line_of_a_cell_can_be_the_nearest_of_a_point(device: Device) -> None:
+    """Four lines about the centre of one coarse cell; points on each of them are on a line, not beside one."""
+    cell = 0.5
+    empty = DistanceMap(field=Field(length=7.0, width=5.0, lines=((0, 0, 1, 0),)), cell=cell, device=device)
+    x, y = np.array(empty.first) + cell * np.array([empty.border + 5, empty.border + 4])
+    offsets = (-0.10, 0.12, -0.15, 0.19)
+    upright = [(x + each, y - 0.9, x + each, y + 0.9) for each in offsets[:2]]
+    level = [(x - 0.9, y + each, x + 0.9, y + each) for each in offsets[2:]]
+    field = Field(length=7.0, width=5.0, lines=(*upright, *level))
+    field_map = DistanceMap(field=field, cell=cell, device=device)
+    along = np.linspace(-0.08, 0.08, 5)
+    places = [np.column_stack([np.full(5, x + each), y + along]) for each in offsets[:2]]
+    places += [np.column_stack([x + along, np.full(5, y + each)]) for each in offsets[2:]]
+    pose = np.array([0.4, -0.3, 0.2])
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    points = ((np.concatenate(places) - pose[:2]) @ np.array([[c, -s], [s, c]])).astype(np.float32)
+    fit = FieldPoseRefinement(map=field_map)(points, pose[None].astype(np.float32), device=device)
+    assert fit.score[0] < 1e-8
+    np.testing.assert_allclose(off(fit.poses[0], pose), 0.0, atol=1e-5)
+
+
 def test_covariance_is_the_scatter(device: Device, rng: np.random.Generator) -> None:
     """Normalised errors of 200 views: a chi squared of three degrees, mean 3 within 4 standard errors of 0.17."""
     field_map = large(device)

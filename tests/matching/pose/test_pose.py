@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.linalg import eigh
+from scipy.optimize import least_squares
 
 from canary import Guarded
 from gpuvision.host import Device
@@ -292,6 +293,43 @@ def test_an_etching_takes_as_much_as_least_squares_say(device: Device, rng: np.r
     matrix = equations.T @ equations / SIGMA**2 + np.diag([0.0, 0.0, 0.0, 1.0 / ETCH**2])
     # To the pose's own size: lengths turn by 0.03, and shifts are a thousandth.
     np.testing.assert_allclose(found.covariance[0], np.linalg.inv(matrix)[:3, :3], rtol=0.1)
+
+
+@VARIANTS
+@pytest.mark.parametrize("sigma", [3e-7, 20e-6])
+def test_an_etch_bias_is_at_the_minimum_of_loss_and_prior(
+    device: Device, variant: Any, sigma: float, rng: np.random.Generator
+) -> None:
+    """The smaller standard deviation of the etch bias is as certain as the 27 rows, and halves the estimate."""
+    truth, _, rows = etched(rng, 3, 27, 0.0)
+    operation = SolvePose(loss="least_squares", etch_bias_sigma=sigma, variant=variant, max_iterations=30)
+    found = operation(rows, device=device)
+    scale = np.array([1e-3, 1e-3, 1e-2, 1e-5])
+    for board in range(3):
+
+        def equations(unknowns: np.ndarray, given: np.ndarray = rows[board]) -> np.ndarray:
+            pose, etch_bias = unknowns[:3] * scale[:3], unknowns[3] * scale[3]
+            across = robust.residuals(pose, given[:, :7]) - given[:, 7] * etch_bias
+            return np.append(across / given[:, 6], etch_bias / sigma)
+
+        start = np.append(truth[board, :3], 0.0) / scale
+        expected = scale * least_squares(equations, start, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+        assert found.etch_bias[board] == pytest.approx(expected[3], abs=1e-9)
+        np.testing.assert_allclose(found.pose[board], expected[:3], atol=1e-8)
+
+
+@VARIANTS
+def test_the_condition_is_compared_with_its_limit(device: Device, variant: Any, rng: np.random.Generator) -> None:
+    """Edges fix y 50 times worse than x: accepted up to this ratio of standard deviations."""
+    _, rows = scene(rng, 1, 37)
+    rows[0, ::2, :2], rows[0, 1::2, :2] = (1.0, 0.0), (0.0, 1.0)
+    rows[..., 4:6] = 0.0
+    rows[0, 1::2, 6] *= 50.0
+    for limit, status, rank in ((60.0, Status.OK, 3), (42.0, Status.AMBIGUOUS, 2)):
+        found = SolvePose(max_condition=limit, variant=variant)(rows, device=device)
+        assert found.condition[0] == pytest.approx(50.0, rel=0.1)
+        assert (found.status[0], found.rank[0]) == (status, rank)
+        assert np.isnan(found.pose).all() == (status != Status.OK)
 
 
 @VARIANTS

@@ -352,6 +352,13 @@ def test_paths_with_the_least_bounds_are_left_out() -> None:
     assert select_paths({"specular": 0.0, "multi-bounce": 1e-9}, 0.0).omitted == {"specular": 0.0}
 
 
+def test_paths_are_left_out_up_to_half_the_tolerance() -> None:
+    """The other half is left for the paths that are computed, so that both together stay within the tolerance."""
+    assert select_paths({"mirrors": 2.0}, 4.0).omitted == {"mirrors": 2.0}
+    assert select_paths({"mirrors": 2.1}, 4.0) == ({"mirrors": 2.1}, {}, 4.0)
+    assert select_paths({"mirrors": 1.5, "multi-bounce": 1.0}, 4.0) == ({"mirrors": 1.5}, {"multi-bounce": 1.0}, 3.0)
+
+
 def test_bounces_sum_to_a_geometric_series() -> None:
     assert interreflection_power_bound(2.0, 0.5, 0.1) == pytest.approx(
         2.0 * sum(0.5**k for k in range(1, 60)) * 0.5 / np.pi * 0.1

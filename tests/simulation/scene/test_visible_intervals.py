@@ -128,6 +128,25 @@ def test_more_parts_than_are_kept_and_numbers_that_are_none(device: Device, vari
         assert np.isnan(result.intervals[result.interval_count == 0]).all()
 
 
+@WAYS
+def test_more_hidden_intervals_than_there_is_room_for(device: Device, variant: Any, dtype: Any) -> None:
+    """48 bars apart fit, and leave 49 parts; with one more bar nothing is claimed."""
+    fan = np.array([[0.0, 0.0, 0.0, -1.0, 0.0, 2.0, 1.0, 0.0, 2.0, *NO_MIRROR]], dtype)
+    for count in (47, 48, 49, 61):
+        at = np.linspace(-0.48, 0.47, count)
+        bars = np.array([[[x, -1, 1], [x + 0.009, -1, 1], [x + 0.0045, 2, 1]] for x in at])
+        result = VisibleIntervals(scene=Scene(bars), max_intervals=49, variant=variant)(fan, device=device)
+        assert result.status[0] == (0 if count <= 48 else Status.AMBIGUOUS), count
+        assert result.interval_count[0] == (count + 1 if count <= 48 else 0)
+        # A third of the way up the triangle it is two thirds as wide; from the apex on the line it is twice that.
+        hidden = 0.5 + np.stack([at + 0.0015, at + 0.0075], axis=-1)
+        expected = np.concatenate([[0.0], hidden.ravel(), [1.0]]).reshape(-1, 2)
+        if count <= 48:
+            np.testing.assert_allclose(parts(result, 0), expected, atol=1e-5 if dtype == np.float32 else 1e-12)
+        else:
+            assert np.isnan(result.intervals).all()
+
+
 def test_writes_only_its_outputs(device: Device, rng: np.random.Generator) -> None:
     op = VisibleIntervals(scene=Scene(soup(rng, 50)))
     for shape in ((0,), (1,), (3, 7), (65,)):

@@ -1,4 +1,4 @@
-"""The documentation as HTML: the build of ``make docs`` where it is up to date, otherwise one without the examples."""
+"""HTML documentation: the build of ``make docs`` if it is up to date, otherwise a new build without the examples."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def gallery_picture(example: str) -> Path:
 
 
 def built_docs() -> Path:
-    """Return the folder of the HTML pages; build them if there are none, or if a source is newer."""
+    """Return the folder of the HTML pages; build them if they do not exist or a source is newer."""
     if importlib.util.find_spec("sphinx") is None:
         pytest.skip("sphinx is missing; `bash setup.sh docs` installs it")
     made = ROOT / "build" / "docs"
@@ -45,7 +45,7 @@ def built_docs() -> Path:
         return made
     folder = ROOT / "build" / "docs-of-the-tests"
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "lock").open("w") as lock:  # several workers may want the pages
+    with (folder / "lock").open("w") as lock:  # several test processes may build the pages
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not _is_current(folder):
             _build(folder)

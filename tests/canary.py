@@ -1,4 +1,4 @@
-"""Arrays between guards: a kernel that writes beyond its output is found out."""
+"""Arrays between guard bytes: detect kernels that write outside their outputs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Guarded:
         return whole[_GUARD : _GUARD + like.nbytes].view(like.dtype).reshape(like.shape)
 
     def assert_intact(self) -> None:
-        """Assert that nothing was written before or behind any output."""
+        """Assert that the guard bytes before and after every output are unchanged."""
         for whole in self._whole:
             assert (whole[:_GUARD] == _BYTE).all()
             assert (whole[-_GUARD:] == _BYTE).all()

@@ -117,7 +117,7 @@ def _unexpected_skips(config: pytest.Config) -> list[str]:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run a test that asks for a ``device`` on every healthy one."""
+    """Run a test that has the argument ``device`` on every healthy device."""
     if "device" in metafunc.fixturenames:
         devices = Device.all()
         metafunc.parametrize("device", devices or [None], ids=lambda each: each.label if each else "none")

@@ -1,4 +1,4 @@
-"""Files and variables that the code blocks of the documentation name but do not make."""
+"""Files and variables that the code blocks of the documentation use without creating them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Platforms and devices that exist on paper, for what no machine at hand has."""
+"""Fake platforms and devices, for properties that the test machine does not have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views of a field's floor, as a robot on it sees them: from above, and through a tilted camera."""
+"""Simulated views of a robot's field: from above, and through a tilted camera."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gpuvision.matching.field.distance_map import Field
 from gpuvision.matching.field.evidence import robot_to_field
 from gpuvision.plots.field import field_lines
 
-_FINE = 4  # samples of a pixel, along each side
+_FINE = 4  # samples along each side of a pixel
 _SHIFT = 6  # bits of a fine pixel
 GREEN, WHITE = (60.0, 120.0, 40.0), (235.0, 240.0, 238.0)
 
@@ -30,7 +30,7 @@ def floor_image(
     noise: float = 3.0,
     rng: np.random.Generator,
 ) -> npt.NDArray[np.uint8]:
-    """uint8 (rows, columns, 3): blue, green, red; the robot in the middle, heading to the right."""
+    """Return a top view, uint8 (rows, columns, 3: blue, green, red); the robot in the middle heads to the right."""
     rows, columns = (_FINE * each for each in shape)
     white = np.zeros((rows, columns), np.uint8)
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -47,7 +47,7 @@ def floor_image(
 
 
 def carpet_of(field: Field, line_width: float, pixel: float = 0.01, margin: float = 3.0) -> npt.NDArray[np.float32]:
-    """Whiteness 0 to 1 of a field and its surroundings from above, x to the right and y up."""
+    """Return the whiteness, 0 to 1, of a field and its surroundings from above, x to the right and y up."""
     columns, rows = (math.ceil((size + 2.0 * margin) / pixel) for size in (field.length, field.width))
     white = np.zeros((rows, columns), np.uint8)
     for line in field_lines(field):
@@ -68,7 +68,7 @@ def seen_ahead(
     samples: int = 5,
     rng: np.random.Generator,
 ) -> npt.NDArray[np.uint8]:
-    """uint8 (rows, columns): a carpet through a tilted camera and its lens, samples of each pixel traced to it."""
+    """Return the view of a carpet through a tilted camera and its lens, uint8 (rows, columns), by ray tracing."""
     pixels = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1).astype(np.float64)
     ideal = pixels if camera.model is None else camera.model.undistort(pixels)
     down, across = np.gradient(ideal, axis=0), np.gradient(ideal, axis=1)

@@ -1,4 +1,4 @@
-"""Secondary light beside a laser line in the corner of a room: recorded, and predicted by the simulator.
+"""Secondary light near a laser line in the corner of a room: recorded, and predicted by the simulator.
 
 The recording is corner_scene_sweep.mp4, with the geometry of the sensor file "corner_scene": a camera at rest sees the
 wall (z = 0) and the ceiling, 2 m above the floor. The line on the ceiling illuminates the wall, and the line on the
@@ -89,7 +89,7 @@ class Room:
         return np.array([self.pivot[0] + self.pivot[2] * normal[2] / normal[0], CEILING, 0.0])
 
     def pixels(self, rows: NDArray[np.int64], columns: NDArray[np.int64], axis: int, level: float) -> Float64:
-        """Return the points of a plane, in which one coordinate has a constant value, that pixels see."""
+        """Return the points that pixels image on a plane with one constant coordinate."""
         (middle, centre), focal = self.geometry.principal_point_px, self.geometry.focal_length_px
         column, row = np.meshgrid(columns, rows)
         rays = (
@@ -143,8 +143,8 @@ class Room:
     def _bounces(self, frame: int, wall: LitSegments, ceiling: LitSegments) -> dict[str, Callable[[Float64], Float64]]:
         """Return the irradiance by the second and all further reflections, as a function of (x, corner distance).
 
-        Solved by a midpoint rule with cells that are smaller near the meeting point of the lines. Where cells are too
-        close for the rule, the form factors are scaled to the limit of a perpendicular plane, 1/2.
+        Solved by a midpoint rule with smaller cells near the intersection of the lines. Where cells are too close for
+        the rule, the form factors are scaled to the limit of a perpendicular plane, 1/2.
         """
         x = self.foot(frame)[0] + 1.5 * np.sinh(np.linspace(-6.0, 6.0, 71)) / math.sinh(6.0)
         away = np.append(0.0, np.geomspace(3e-3, CEILING, 51))

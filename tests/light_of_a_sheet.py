@@ -1,4 +1,4 @@
-"""Common part of the tests of direct light: a sheet of light, a lens beside it, and simple surfaces."""
+"""Common part of the tests of direct light: a sheet of light, a lens, and simple surfaces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Light on simulated sensors whose power and moments are known in closed form."""
+"""Light on simulated sensors with power and moments in closed form."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def camera(view: SensorView | None = None, *, readout: dict | None = None, **mor
 
 
 def gaussian(view: SensorView, u, power, sigma: float) -> Exposure:
-    """Return spots of a Gaussian profile, exact in every bin: u and power broadcast to (..., samples)."""
+    """Return spots of a Gaussian profile, integrated exactly over bins; u and power broadcast to (..., samples)."""
     u, power = np.broadcast_arrays(np.asarray(u, float), np.asarray(power, float))
     u, power = (np.array(np.broadcast_to(each, (*u.shape[:-1], view.samples)))[..., None] for each in (u, power))
     x = (view.u_edges - u) / sigma

@@ -1,4 +1,4 @@
-"""A sensor beside a sheet of light, and mirrors before it."""
+"""A sensor, a sheet of light, and mirrors in front of the sensor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LENS = (0.0, 0.08, 0.15)
 
 
 def sensor_view(samples: int = 120, bins: int = 240) -> SensorView:
-    """Return a sensor of 12 mm x 12 mm that sees some 50 mm of the sheet, from 80 mm beside it and 150 mm above."""
+    """Return a sensor of 12 mm x 12 mm, 80 mm beside the sheet and 150 mm above; it views some 50 mm of the sheet."""
     geometry = Triangulation.from_stand_off(
         baseline=LENS[1],
         stand_off=LENS[2],
@@ -37,7 +37,7 @@ def sensor_view(samples: int = 120, bins: int = 240) -> SensorView:
 
 
 def mirrors_of(scene: Scene, materials: Sequence[Material], device: Device, **more: Any) -> Mirrors:
-    """Return the mirrors of a scene before that sensor."""
+    """Return the mirrors of a scene in front of that sensor."""
     return Mirrors(view=more.pop("view", sensor_view()), scene=scene, materials=materials, device=device, **more)
 
 

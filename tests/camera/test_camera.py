@@ -1,4 +1,4 @@
-"""OpenCV's camera on the host: against its equations in extended precision and OpenCV itself, to the fold."""
+"""OpenCV's camera on the host: against its equations in extended precision and OpenCV, up to the fold."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CAMERAS = {
 
 @pytest.fixture(params=CAMERAS.values(), ids=CAMERAS)
 def any_camera(request: pytest.FixtureRequest) -> Camera:
-    """Each of them."""
+    """Return each test camera."""
     return request.param
 
 
@@ -58,7 +58,7 @@ def by_opencv(points: np.ndarray, given_: Camera) -> np.ndarray:
     return cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
 
 
-# A tilt by 45 degrees magnifies up to 3 times here, so pixels are up to 4000: a few of their roundings.
+# A tilt by 45 degrees magnifies up to 3 times, so coordinates reach 4000 px: a few roundings of 4000.
 FEW_ROUNDINGS = 4e-12
 
 
@@ -74,7 +74,7 @@ def test_forward_against_opencv(any_camera: Camera) -> None:
 
 
 def test_backward_of_what_the_equations_say(any_camera: Camera) -> None:
-    """From the oracle's own forward, not ours: a mistake made both ways would not cancel."""
+    """Measured points from the oracle's forward model: an error in both directions would not cancel."""
     points = image_points()
     measured = reference.distort_pixels(points, any_camera.matrix, any_camera.distortion).astype(np.float64)
     np.testing.assert_allclose(any_camera.undistort(measured), points, rtol=0, atol=1e-9)
@@ -91,7 +91,7 @@ def test_round_trips(any_camera: Camera) -> None:
 
 @pytest.mark.parametrize("degrees", [-45.0, -10.0, 5.0, 20.0, 45.0])
 def test_a_tilt_in_closed_form(degrees: float) -> None:
-    """About x alone: x cos t / (cos t - y sin t), y / (cos t - y sin t). A turn the other way round is no solution."""
+    """About x alone: x cos t / (cos t - y sin t), y / (cos t - y sin t). The opposite tilt is not a solution."""
     points = image_points()
     x, y = ((points - [642.5, 509.25]) / [1700.0, 1650.0]).T
     sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
@@ -111,13 +111,13 @@ def test_a_tilt_in_closed_form(degrees: float) -> None:
     turn=st.floats(0.0, 2.0 * math.pi),
 )
 def test_any_camera_inverts_before_its_fold(radial, decentred, tilt, part, turn) -> None:
-    """At a place before the fold and in front of the sensor; 1e-9 px where the inverse does not magnify."""
+    """Points before the fold and in front of the sensor are inverted to 1e-9 px where the inverse does not magnify."""
     (k1, k2, k3, k4, k5, k6), (p1, p2, *s) = radial, decentred
     given_ = camera(k1, k2, p1, p2, k3, k4, k5, k6, *s, tilt=tilt)
     radius = part * min(given_.invertible_radius, 0.6)
     point = np.array([642.5 + 1700.0 * radius * math.cos(turn), 509.25 + 1650.0 * radius * math.sin(turn)])
     measured = given_.distort(point)
-    if np.isnan(measured).any():  # behind a sensor so tilted
+    if np.isnan(measured).any():  # behind the tilted sensor
         x, y = reference.distort(*((point - [642.5, 509.25]) / [1700.0, 1650.0]), given_.distortion)
         a, b = np.radians(tilt)
         assert math.sin(b) * x - math.cos(b) * math.sin(a) * y + math.cos(b) * math.cos(a) <= 1e-12
@@ -128,7 +128,7 @@ def test_any_camera_inverts_before_its_fold(radial, decentred, tilt, part, turn)
 
 
 def test_where_opencv_fails() -> None:
-    """Its default five steps end tens of pixels off here, and it does not say so."""
+    """OpenCV's default of five steps has errors of tens of pixels here, without a warning."""
     matrix = ((800.0, 0.0, 640.0), (0.0, 800.0, 512.0), (0.0, 0.0, 1.0))
     given_ = camera(-0.4, tilt=(20.0, 0.0), matrix=matrix)
     radius = np.linspace(0.0, 0.912, 50)[:, None, None] * 800.0
@@ -151,7 +151,7 @@ def test_fold_in_closed_form() -> None:
     inside, outside = np.array([[fold * (1.0 - 1e-9), 0.0]]), np.array([[fold * (1.0 + 1e-9), 0.0]])
     assert np.isfinite(unit.distort(inside)).all()
     assert np.isnan(unit.distort(outside)).all()
-    # The fold's image is at two thirds; the inverse has a root there, so half the digits are left.
+    # The image of the fold is at 2/3; the inverse has a square-root singularity there, so half of the digits remain.
     np.testing.assert_allclose(unit.undistort([[fold / 1.5 * (1.0 - 1e-12), 0.0]]), [[fold, 0.0]], rtol=2e-6)
     assert np.isnan(unit.undistort([[fold / 1.5 * (1.0 + 1e-9), 0.0], [5.0, 0.0], [-1.0, 30.0]])).all()
 
@@ -214,7 +214,7 @@ def test_covers() -> None:
     assert not camera(-0.4, matrix=wide).covers((1280, 1024))
 
 
-# ---- what else it says ---------------------------------------------------------------------------------------
+# ---- other properties ---------------------------------------------------------------------------------------
 
 
 def test_another_matrix_for_the_ideal_pixels(any_camera: Camera) -> None:
@@ -229,7 +229,7 @@ def test_jacobian_against_differences(any_camera: Camera) -> None:
     points, step = any_camera.distort(image_points()[::7]), 1e-3
     for axis, offset in enumerate(step * np.eye(2)):
         difference = (any_camera.undistort(points + offset) - any_camera.undistort(points - offset)) / (2.0 * step)
-        # Rounding of 1e-12 pixels over the step, and third derivatives times its square.
+        # Rounding of 1e-12 pixels divided by the step, plus third derivatives times the squared step.
         np.testing.assert_allclose(any_camera.jacobian(points)[:, :, axis], difference, rtol=0, atol=1e-8)
 
 
@@ -251,7 +251,7 @@ def test_project_and_rays(any_camera: Camera, rng: np.random.Generator) -> None:
 def test_not_finite_stays_so(any_camera: Camera, points: list[list[float]]) -> None:
     for result in (any_camera.distort(points), any_camera.undistort(points)):
         assert result.shape == (1, 2)
-        # A pinhole takes even 1e300 where it belongs.
+        # A pinhole camera maps even 1e300 correctly.
         assert np.isnan(result).any() or np.isfinite(points).all()
 
 

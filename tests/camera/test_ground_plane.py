@@ -1,4 +1,4 @@
-"""Cameras above a floor: geometry, files, what they scan, and robots located through them."""
+"""Cameras above a floor: geometry, files, scan lines, and localisation of robots."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def carpet() -> np.ndarray:
 
 def test_straight_down_is_a_top_view() -> None:
     camera = MountedCamera(height=2.0, tilt=0.5 * math.pi, focal_px=400.0, centre_px=(300.0, 200.0))
-    # A pixel is 5 mm; up in the image is ahead, and left is left.
+    # A pixel is 5 mm; image rows decrease ahead, image columns increase to the right.
     places = camera.to_floor([(300.0, 200.0), (300.0, 100.0), (200.0, 200.0)])
     np.testing.assert_allclose(places, [(0.0, 0.0), (0.5, 0.0), (0.0, 0.5)], atol=1e-12)
     turned = MountedCamera(height=2.0, tilt=0.5 * math.pi, roll=0.5 * math.pi, focal_px=400.0, centre_px=(300.0, 200.0))
-    # Turned clockwise, its left looks ahead.
+    # Rotated clockwise: the left of the image is ahead.
     np.testing.assert_allclose(turned.to_floor([(200.0, 200.0)]), [(0.5, 0.0)], atol=1e-12)
 
 
@@ -84,13 +84,13 @@ def test_stripes_are_found_on_their_lines(camera: MountedCamera, rng: np.random.
     scan = scan_floor(image, line_width=WIDE, model=camera, device=device)
     assert len(scan.points) > 60
     away = distances_to_lines(field, robot_to_field(scan.points, POSE))
-    # Lines end and meet here and there; else it is a few millimetres, some centimetres at 10 m.
+    # The error is a few millimetres, and some centimetres at 10 m; it is larger where lines end or meet.
     assert np.median(away) < 0.005
     assert np.mean(away < 0.06) > 0.95
     crossings = expected_crossings(field, POSE, scan.paths, line_width=WIDE)
     assert len(crossings.places) > 40
     assert detected_fraction(crossings, scan.points, 0.06) > 0.9
-    # Far points are known less well.
+    # Far points have larger standard deviations.
     far = np.hypot(*scan.points.T)
     assert np.median(scan.sigmas[far > 5.0]) > 3.0 * np.median(scan.sigmas[far < 3.0])
 
@@ -103,7 +103,7 @@ def test_a_robot_is_located_through_its_camera(camera: MountedCamera, rng: np.ra
     assert located.reason == ""
     best = min((each.pose for each in located.candidates[:2]), key=lambda pose: np.hypot(*(pose[:2] - POSE[:2])))
     np.testing.assert_allclose(best, POSE, atol=0.05)
-    # A tilt that is wrong by 4 degrees bends what is seen: far lines are metres off.
+    # A tilt error of 4 degrees distorts the view: far lines are metres off.
     wrong = MountedCamera(
         height=0.8,
         tilt=camera.tilt - 0.07,

@@ -24,7 +24,7 @@ LENSES = [
 
 
 def field(lens: Lens, reach: float = 0.999) -> np.ndarray:
-    """Points all over a 1280 x 1024 image, inside a part of the fold radius."""
+    """Points in a 1280 x 1024 image, within a fraction of the fold radius."""
     columns, rows = np.meshgrid(np.linspace(0.0, 1279.0, 41), np.linspace(0.0, 1023.0, 33))
     points = np.stack([columns, rows], axis=-1).reshape(-1, 2)
     radius = np.hypot(*(points - lens.centre).T)
@@ -35,7 +35,7 @@ def field(lens: Lens, reach: float = 0.999) -> np.ndarray:
 def test_polynomial(lens: Lens) -> None:
     points = field(lens)
     expected = reference.undistort(points[:, 0], points[:, 1], lens.k1, lens.k2, lens.centre)
-    # Two ways to write a cubic of 1e3 pixels: a few roundings of 1e-13.
+    # Two forms of a cubic of 1e3 pixels agree to a few roundings of 1e-13.
     np.testing.assert_allclose(lens.undistort(points), np.stack(expected, -1), rtol=0, atol=1e-12)
 
 
@@ -50,7 +50,8 @@ def test_round_trip_close_to_the_fold() -> None:
     lens = Lens(k1=-4e-7)
     radius = lens.fold_radius * (1.0 - np.array([1e-2, 1e-4, 1e-6]))
     points = np.stack([radius, np.zeros(3)], -1)
-    # Towards the fold the slope of the polynomial vanishes with the distance, and the inverse loses as many digits.
+    # Towards the fold the slope of the polynomial vanishes with the distance, and the inverse loses the same number of
+    # digits.
     slope = 6.0 * -lens.k1 * lens.fold_radius * (lens.fold_radius - radius)
     error = np.abs(lens.distort(lens.undistort(points))[:, 0] - radius)
     assert np.all(error < 4.0 * np.spacing(lens.fold_radius) / slope)

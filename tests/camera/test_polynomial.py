@@ -1,4 +1,4 @@
-"""The measurement-plane polynomial: against its equations, what its fit promises, and where it says no."""
+"""The measurement-plane polynomial: equations, predicted uncertainties of the fit, and refusals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gpuvision.camera.polynomial import PlanePolynomial
 from gpuvision.reference import plane_polynomial as reference
 
 REGION = ((0.0, 1279.0), (0.0, 1023.0))
-# 0.1 mm per pixel, turned by a degree, a little perspective and barrel distortion, seen as in a mirror or not.
+# 0.1 mm per pixel, turned by a degree, a little perspective and barrel distortion, mirrored or not.
 P = (-0.064, 1.02e-4, -1.7e-6, 4e-9, 3e-9, -1e-9, 4e-12, 4e-12)
 Q = (-0.051, 1.01e-4, 1.8e-6, -2e-9, 5e-9, 1e-9, 4e-12, 4e-12)
 POLYNOMIAL = PlanePolynomial(p=P, q=Q, region=REGION)
@@ -64,7 +64,7 @@ def test_fit_finds_what_is_exact() -> None:
     sensor = grid()
     sensor[40, 0] = math.nan
     fitted = PlanePolynomial.fit(sensor, plane, region=REGION)
-    # Of each term's part of the plane, at the far corner.
+    # Relative to each term's contribution at the far corner.
     reach = np.array([1.0, 1279.0, 1023.0, 1279.0**2, 1279.0 * 1023.0, 1023.0**2, 1023.0**2 * 1279.0, 1279.0**3])
     swapped = np.array([1.0, 1023.0, 1279.0, 1023.0**2, 1279.0 * 1023.0, 1279.0**2, 1279.0**2 * 1023.0, 1023.0**3])
     np.testing.assert_allclose(np.array(fitted.p) * reach, np.array(P) * reach, rtol=0, atol=1e-14)
@@ -93,7 +93,7 @@ def test_covariance_covers_the_truth(sigma: float | None, rng: np.random.Generat
         fitted = PlanePolynomial.fit(grid(), noisy, sigma=sigma)
         spread = np.sqrt(np.diagonal(fitted.covariance_at(places), axis1=-2, axis2=-1))
         inside = inside + (np.abs(fitted.to_plane(places) - truth) <= 1.96 * spread)
-    # 95 % of 400, and three standard deviations of such a count.
+    # 95 % of 400, minus three standard deviations of the count.
     assert np.all(np.abs(np.asarray(inside) / 400.0 - 0.95) < 0.033)
 
 
@@ -102,7 +102,7 @@ def test_covariance_covers_the_truth(sigma: float | None, rng: np.random.Generat
     [(-0.05, (0, 0), 0.04), (-0.2, (0, 0), 0.6), (0.0, (0, 10), 0.05), (0.0, (0, 20), 0.4), (0.0, (10, 10), 3.0)],
 )
 def test_what_it_cannot_do(k1: float, tilt: tuple[int, int], pixels: float) -> None:
-    """The errors that its documentation states."""
+    """Invalid use raises the documented errors."""
     matrix = ((1700.0, 0.0, 640.0), (0.0, 1700.0, 512.0), (0.0, 0.0, 1.0))
     plane = (grid() - [640.0, 512.0]) * 1e-4
     sensor = Camera(matrix=matrix, distortion=(k1, *(0.0,) * 11, *np.radians(tilt))).distort(grid())

@@ -17,7 +17,7 @@ ANGLES = {"alpha": st.floats(0.0, 1.3), "direction": st.floats(-math.pi, math.pi
 
 @pytest.mark.parametrize(("degrees", "f", "row"), [(10.0, 1674.17, 216.80), (20.0, 1597.48, -69.43)])
 def test_the_virtual_camera_of_two_known_tilts(degrees, f, row):
-    """f' = 1700 px, the centre at row 512: a plain fit finds f' cos(alpha) and a centre f' sin(alpha) aside."""
+    """f' = 1700 px, centre at row 512: a fit without tilt finds f' cos(alpha), and the centre shifted by f' sin(alpha)."""
     sensor = TiltedSensor(
         focal_length=1700.0, centre=(640.0, 512.0), alpha=math.radians(degrees), direction=0.5 * math.pi
     )
@@ -38,7 +38,7 @@ def test_angles_round_trip(alpha, direction):
 
 @given(**ANGLES)
 def test_without_distortion_the_virtual_camera_sees_the_same(alpha, direction):
-    """Fig. 3.3: S' is S turned by alpha about the pinhole."""
+    """Fig. 3.3: S' is S rotated by alpha about the pinhole."""
     sensor = TiltedSensor(focal_length=1700.0, centre=(640.0, 512.0), alpha=alpha, direction=direction)
     matrix = ((1700.0, 0.0, 640.0), (0.0, 1700.0, 512.0), (0.0, 0.0, 1.0))
     camera = Camera(matrix=matrix, distortion=(*(0.0,) * 12, *sensor.tau))
@@ -48,13 +48,13 @@ def test_without_distortion_the_virtual_camera_sees_the_same(alpha, direction):
     there = np.isfinite(seen[:, 0])
     np.testing.assert_allclose(seen[there], turned[there], rtol=1e-9, atol=1e-7)
     assert there.any()
-    # The turn takes the optical axis alpha away from the normal.
+    # The rotation moves the optical axis by alpha from the normal.
     assert sensor.rotation[2, 2] == pytest.approx(math.cos(alpha), abs=1e-15)
 
 
 @given(**ANGLES, pitch=st.floats(1e-6, 2e-5))
 def test_object_lens_and_sensor_planes_meet_in_one_line(alpha, direction, pitch):
-    """Fig. 3.1, and every point of the sharp plane obeys the equation of the thin lens."""
+    """Fig. 3.1, and every point of the plane of focus obeys the thin-lens equation."""
     sensor = TiltedSensor(focal_length=5000.0, centre=(640.0, 512.0), alpha=alpha, direction=direction)
     image = 5000.0 * pitch
     lens = 0.8 * image

@@ -34,7 +34,7 @@ def scene(rng):
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_it_is_opencvs_camera(name, scene):
-    """Seen from the lens: poses turned by the tilt, f' = f / cos(alpha), the centre where the axis meets the sensor."""
+    """In the lens' frame: poses rotated by the tilt, f' = f / cos(alpha), centre where the axis meets the sensor."""
     internal = np.array(CAMERAS[name])
     rotations, translations, target = scene
     projected = project(internal, rotations, translations, target)

@@ -27,9 +27,9 @@ VARIANTS = ["vector", "work_item"]
 BORDERS = ["mask", "constant", "replicate", "reflect"]
 DTYPES = [np.uint8, np.uint16, np.float32]
 LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): 1.0}
-# A cubic may miss a place by 1e-5 px, and single precision by four roundings of an offset below 32.
+# Position error: 1e-5 px of a cubic, plus four single-precision roundings of an offset below 32.
 PLACE_ERROR = 1e-5 + 4 * 32 * 6e-8
-# Status is not compared nearer to the image's edge than this.
+# Distance from the image border within which the status is not compared.
 EDGE = 1e-3
 
 
@@ -42,7 +42,7 @@ def pixels(rng: np.random.Generator, shape: tuple[int, ...], dtype: Any) -> np.n
 def map_of(
     shape: tuple[int, int], source: tuple[int, int], *, turn: float = 0.0, scale: float = 1.0, mirrored: bool = False
 ) -> np.ndarray:
-    """A slightly bent map, turned about the middles of both images."""
+    """Return a slightly bent map that rotates about the centres of both images."""
     rows, columns = shape
     x, y = np.meshgrid(np.arange(columns) - (columns - 1) / 2, np.arange(rows) - (rows - 1) / 2)
     bend = scale * (1.0 - 1e-5 * (x**2 + y**2))
@@ -74,7 +74,7 @@ def assert_right(
     frames = image.astype(np.float64).reshape(-1, *source, channels)
     outcome = result.image.reshape(len(frames), *made, channels)
     largest = LARGEST[image.dtype]
-    # A place's error in x and y times the steepest slope (twice the range for a cubic), and ten roundings.
+    # Position error in x and y times the largest slope (twice the range for a cubic), plus ten roundings.
     slack = largest * (2 * 2 * PLACE_ERROR + 10 * 6e-8)
     for frame, values in zip(frames, outcome, strict=True):
         expected, status = reference.undistort(frame, positions, missing=missing, **options)
@@ -94,7 +94,7 @@ def test_a_batch_against_the_oracle(
     device: Device, dtype: Any, interpolation: Any, channels: int, variant: Any, rng: np.random.Generator
 ) -> None:
     lens = Lens(k1=4e-6, k2=1e-11, centre=(60.0, 41.0))
-    # Borders are the same code for every type.
+    # The code for borders is the same for every type.
     for border in BORDERS if dtype == np.float32 else ["mask", "constant"]:
         op = UndistortImage(
             model=lens,
@@ -115,7 +115,7 @@ def test_a_batch_against_the_oracle(
         assert_right(op(image, device=device), image, positions, channels=channels, **options)
 
 
-# name: (map options, what the packer must make of the runs in the middle)
+# name: (map options, expected kind of the runs in the middle)
 WINDOWS = {
     "narrow": ({"scale": 0.97}, 2),
     "wide": ({"scale": 1.4}, 3),
@@ -279,7 +279,7 @@ def test_past_the_fold(device: Device, coordinates: Any, variant: Any, rng: np.r
     image = pixels(rng, (61, 101), np.uint8)
     result = op(image, device=device)
     folded = np.isnan(op.source_positions(image.shape)).any(-1)
-    # In single precision the fold itself is known to a rounding.
+    # In single precision the position of the fold has a rounding error.
     reach = np.hypot(*np.moveaxis(np.argwhere(np.ones_like(folded)) - (30.0, 50.0), -1, 0)).reshape(folded.shape)
     clear = np.abs(reach - lens.undistort([50.0 + 0.999999 * lens.fold_radius, 30.0])[0] + 50.0) > 0.01
     assert folded.any()

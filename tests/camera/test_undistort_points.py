@@ -1,4 +1,4 @@
-"""UndistortPoints on devices: as the models on the host say, in both directions, to half a float's spacing."""
+"""UndistortPoints on devices: agreement with the host models in both directions, to half the spacing of floats."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MATRIX = ((1700.0, 0.0, 642.5), (0.0, 1650.0, 509.25), (0.0, 0.0, 1.0))
 ANOTHER = ((1500.0, 0.0, 600.0), (0.0, 1480.0, 500.0), (0.0, 0.0, 1.0))
 FULL = (-0.12, 0.08, 1e-3, -2e-3, 0.01, 0.02, 0.03, 0.001, 1e-3, 2e-3, -1e-3, 3e-3)
 VARIANTS = ("vector", "work_item")
-# Every model in these two; all four where it is not the model that is tested.
+# All models run with these two options; tests that do not depend on the model run with all four.
 TWO_WAYS = pytest.mark.parametrize(("variant", "dtype"), [("vector", np.float32), ("work_item", np.float64)])
 
 
@@ -57,7 +57,7 @@ MODELS = CAMERAS | LENSES
 
 @pytest.fixture(params=MODELS.values(), ids=MODELS)
 def model(request: pytest.FixtureRequest) -> Camera | Lens:
-    """Each of them."""
+    """Return each test model."""
     return request.param
 
 
@@ -78,7 +78,7 @@ def half_spacing(values: np.ndarray) -> np.ndarray:
 
 
 def tolerance(given_: np.ndarray, expected: np.ndarray, real: Any) -> np.ndarray:
-    """Sixteen half-roundings of what moves the point, and the result's own; in double the host's as well."""
+    """Return 16 half-roundings of the displacement plus rounding of the result; in double also of the host."""
     eps = float(np.finfo(real).eps)
     with np.errstate(invalid="ignore"):
         moved = np.abs(expected - given_).max(axis=-1, keepdims=True)
@@ -152,7 +152,7 @@ def test_round_trip_in_double(device: Device, name: str, rng: np.random.Generato
 def test_a_sensor_of_8000_pixels_in_single(
     device: Device, variant: Any, inverse: bool, rng: np.random.Generator
 ) -> None:
-    """The correction is good to 1e-4 px; the result's own rounding, up to 2.4e-4 px, comes on top."""
+    """The correction is accurate to 1e-4 px; rounding of the result adds up to 2.4e-4 px."""
     matrix = ((9000.0, 0.0, 4012.3), (0.0, 9000.0, 2987.7), (0.0, 0.0, 1.0))
     big = camera(-0.1, 0.05, 2e-4, -3e-4, 0.01, tilt=(5.0, -2.0), matrix=matrix)
     points = (rng.uniform(0.0, 1.0, (20_001, 2)) * [7999.0, 5999.0]).astype(np.float32)
@@ -176,7 +176,7 @@ def test_a_sensor_of_8000_pixels_in_single(
     ids=["k1", "k1 k2", "tangential", "rational decentred"],
 )
 def test_at_the_fold(device: Device, coefficients: tuple[float, ...], variant: Any, dtype: Any) -> None:
-    """Rays from the centre through the fold: ideal points behind it are flagged, and so is what lies past its image."""
+    """On rays through the fold, ideal points beyond it and measured points beyond its image are flagged."""
     wide = camera(*coefficients, matrix=((800.0, 0.0, 640.0), (0.0, 800.0, 512.0), (0.0, 0.0, 1.0)))
     rays = []
     for angle in np.linspace(0.1, 6.3, 23):
@@ -195,7 +195,7 @@ def test_at_the_fold(device: Device, coefficients: tuple[float, ...], variant: A
     exact = wide.undistort(measured)
     np.testing.assert_array_equal(result.status[known] == 0, np.isfinite(exact[known, 0]))
     good = known & np.isfinite(exact[:, 0])
-    # The inverse magnifies the measured point's rounding and the correction's.
+    # The inverse magnifies the rounding of the measured point and of the correction.
     magnified = np.linalg.norm(wide.jacobian(measured[good]), 2, axis=(-2, -1))[:, None]
     error = np.abs(result.points[good] - exact[good])
     # Three roundings of up to 2700 pixels.
@@ -218,7 +218,7 @@ def test_lens_at_its_fold(device: Device) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_wild_cameras_agree_with_the_host(device: Device, seed: int) -> None:
-    """Folds anywhere, from random coefficients: the same points are flagged, the others are where the host has them."""
+    """Random coefficients with arbitrary folds: kernel and host flag the same points and agree on the others."""
     rng = np.random.default_rng(seed)
     for _ in range(3):
         radial, decentred = rng.normal(0.0, 0.3, 6), rng.normal(0.0, 0.02, 6)
@@ -228,7 +228,7 @@ def test_wild_cameras_agree_with_the_host(device: Device, seed: int) -> None:
             operation = UndistortPoints(model=wild, inverse=inverse)
             result, expected = operation(points, device=device), expected_of(operation, points)
             good = np.isfinite(expected[:, 0])
-            # A point within rounding of the fold is on either side of it.
+            # A point at the fold within rounding may be on either side.
             assert np.mean((result.status == 0) == good) > 0.999
             both = good & (result.status == 0)
             ideal = points[both] if inverse else expected[both]
@@ -238,7 +238,7 @@ def test_wild_cameras_agree_with_the_host(device: Device, seed: int) -> None:
             assert np.all(error <= 1e-10 * np.maximum(magnified, 1.0) ** 2)
 
 
-# ---- what comes in -------------------------------------------------------------------------------------------
+# ---- inputs -------------------------------------------------------------------------------------------
 
 
 @ON_DEVICES
@@ -273,7 +273,7 @@ def test_sizes_around_the_groups_and_canaries(
 
 @pytest.mark.parametrize("shift", [1, 3])
 def test_arrays_anywhere(device: Device, shift: int, rng: np.random.Generator) -> None:
-    """Aligned to their elements only."""
+    """Arrays that are aligned only to their element size are accepted."""
     points = image_points(rng, 1000).astype(np.float32)
     given_, moved = (np.zeros(2000 + 16, np.float32)[shift:][:2000].reshape(1000, 2) for _ in range(2))
     given_[...] = points
@@ -364,7 +364,7 @@ def test_plane_polynomial(device: Device, dtype: Any, variant: Any, rng: np.rand
     np.testing.assert_array_equal(lost.status, 5 * (3 * [Status.OUT_OF_RANGE] + [0]))
 
 
-# ---- what is refused -----------------------------------------------------------------------------------------
+# ---- errors -----------------------------------------------------------------------------------------
 
 
 def test_wrong_inputs(device: Device) -> None:

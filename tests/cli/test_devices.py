@@ -1,4 +1,4 @@
-"""``gpuvision devices`` and how the command line reports what goes wrong."""
+"""``gpuvision devices`` and the error messages of the command line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Paper = Callable[..., list[bool]]
 
 @pytest.fixture
 def paper(monkeypatch: pytest.MonkeyPatch) -> Paper:
-    """Make the machine have devices of these labels, each with the reason why it does not work."""
+    """Replace the devices by fakes with the given labels; a reason marks a device that does not work."""
 
     def install(**reasons: str) -> list[bool]:
         listed = []

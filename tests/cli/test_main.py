@@ -1,4 +1,4 @@
-"""The command from its first moment to its last: interrupts, terminations, and what loads when."""
+"""Start and end of the command: interrupts, termination, and lazy imports."""
 
 from __future__ import annotations
 

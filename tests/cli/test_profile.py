@@ -1,4 +1,4 @@
-"""``gpuvision profile``: hands over what was asked for, shows the rows, says what is missing."""
+"""``gpuvision profile``: passes its arguments on, prints the rows, names missing packages."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ROW = Row(
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Stand in for the measurement; tell what it was asked for."""
+    """Replace the measurement; return the arguments of its calls."""
     seen: dict[str, Any] = {}
 
     def profile(operations: Sequence[str], devices: Sequence[Device], **options: Any) -> Run:

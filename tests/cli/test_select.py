@@ -1,4 +1,4 @@
-"""Choosing features of a board: the file, the picture, and that a camera is located with them as they promise."""
+"""Choosing features of a board: the file, the picture, and the accuracy of poses from the selected features."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from gpuvision.schema import DescriptionError
 from gpuvision.workflows.locating_board import locate_board
 
 PIXEL, SHAPE, NOISE = 25e-6, (480, 640), 2.0
-# Steps of 110 in the open and of 50 under the mask; a pixel's own extent blurs, too.
+# Steps of 110 in the open and of 50 under the mask; the extent of a pixel adds to the blur.
 IMAGING = Imaging(pixel=PIXEL, blur_px=1.04, contrast_bare=110 / NOISE, contrast_masked=50 / NOISE)
 REGION = ((3e-3, 2.5e-3), (17e-3, 13.5e-3))
 ROI = "3mm,2.5mm,17mm,13.5mm"
@@ -94,7 +94,7 @@ def test_budgets_are_kept(artwork: Artwork, device: Device) -> None:
     assert len(choose_features(artwork, REGION, IMAGING, budget=17).length) == 17
     in_pixels = choose_features(artwork, REGION, IMAGING, budget=5000, unit="px")
     assert 3 <= np.ceil(in_pixels.length / PIXEL).sum() * IMAGING.width_px <= 5000
-    # A launch takes some microseconds before the first ruler; a second is enough for all that may be.
+    # A launch takes some microseconds before the first ruler; a budget of one second admits all candidates.
     with pytest.raises(ValueError, match="budget"):
         choose_features(artwork, REGION, IMAGING, budget=1e-3, unit="us", device=device)
     assert len(choose_features(artwork, REGION, IMAGING, budget=2000, unit="us", device=device).length) > 10
@@ -111,7 +111,7 @@ def test_what_a_board_lacks_is_told(artwork: Artwork) -> None:
 
 
 def test_a_camera_is_located_as_promised(artwork: Artwork, features: FeatureSet, device: Device) -> None:
-    """Errors at the placement point, of 8 images, against the deviations that were predicted before."""
+    """Errors of 8 images at the placement point agree with the deviations that were predicted before."""
     scores = []
     rng = np.random.default_rng(7)
     for _ in range(8):
@@ -140,7 +140,7 @@ def test_features_of_a_view_lie_in_it(artwork: Artwork) -> None:
     for sign in (-1.0, 1.0):
         pixels = view.to_pixels(chosen.point + sign * ends)
         assert np.all((pixels >= 0) & (pixels <= np.array(SHAPE[::-1]) - 1))
-    # Thousands of places: the corners and the middle of the view stand for all of it.
+    # Of thousands of places, only the corners and the middle of the view are tested.
     coarse = replace(IMAGING, pixel=5e-6, shift=20e-6)
     fine = BoardView(scale=5e-6, shape=(2400, 3200), pose=(*BOARD_MIDDLE, 0.0))
     spread = np.ptp(select_features_in_view(artwork, fine, coarse, budget=40).point, axis=0)

@@ -1,4 +1,4 @@
-"""Options that would have no effect are refused: a user must not believe that they did something."""
+"""Options that would have no effect are refused: otherwise a user would believe that they had one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The README and the pages of the documentation are right: their Python runs, and their commands exist."""
+"""README and documentation pages: their Python blocks run, and their commands exist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Examples in docstrings are right."""
+"""Examples in docstrings give the printed results."""
 
 from __future__ import annotations
 

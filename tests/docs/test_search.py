@@ -1,4 +1,4 @@
-"""Words of the field lead to the right page: in the search index that the reader's browser uses."""
+"""Search terms lead to the right page in the search index of the documentation."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if importlib.util.find_spec("sphinx") is None:
 
 from search_index import SearchIndex
 
-# Among so many first results a page must be.
+# Number of first search results that must contain the page.
 FIRST = 3
 
-# What a user types, and the page that should come up.
+# Query, and the page that the search must find.
 QUERIES = {
     "caliper": "concepts/matching",
     "edge detection": "concepts/matching",

@@ -1,4 +1,4 @@
-"""The examples run as a user runs them, and each draws its picture."""
+"""The examples run as scripts, and each draws its picture."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_examples_are_here() -> None:
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_example_runs(name: str, tmp_path: Path) -> None:
-    """`make docs` runs the examples too: an example whose picture is newer than the library has just run."""
+    """`make docs` also runs the examples: an example whose picture is newer than the library is skipped."""
     picture = gallery_picture(name)
     if picture.exists() and picture.stat().st_mtime >= newest(*LIBRARY, f"examples/{name}"):
         return

@@ -1,4 +1,4 @@
-"""Fields as TOML: those that come with the package, and messages that name the key."""
+"""Field files (TOML): the fields of the package, and error messages that name the key."""
 
 from __future__ import annotations
 

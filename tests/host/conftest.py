@@ -1,4 +1,4 @@
-"""Memory paths for the tests of the stream, and a watch for threads that it leaves."""
+"""Memory paths for the stream tests, and a check for threads that outlive a test."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpuvision.host import Device
 
 @pytest.fixture(params=["shared", "staged", "separate"])
 def memory(request: pytest.FixtureRequest, device: Device) -> dict[str, Any]:
-    """Options for a device and a memory path: shared, copied within shared memory, or copied to memory of its own."""
+    """Options for a device and a memory path: shared, copied within shared memory, or copied to separate memory."""
     if request.param == "separate":
         device = copy.copy(device)
         device.shares_memory = False

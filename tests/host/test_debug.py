@@ -38,14 +38,14 @@ def test_fine():
 
 @pytest.fixture
 def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """The debug folder, which the switch makes itself."""
+    """Return the debug folder, which the debug switch creates."""
     monkeypatch.setenv(debug.VARIABLE, str(tmp_path / "made" / "debug"))
     return tmp_path / "made" / "debug"
 
 
 @pytest.fixture
 def kernels(tmp_path: Path) -> Path:
-    """Kernels with headers beside each other, in another folder, and in a circle."""
+    """Kernels with headers in the same folder, in another folder, and with circular includes."""
     files = {
         "kernels/scale/scale.cl": KERNEL,
         "kernels/scale/common.h": '#ifndef COMMON\n#define COMMON\n#include "beside.h"\n#include "far.h"\n#endif\n',

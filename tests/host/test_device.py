@@ -1,4 +1,4 @@
-"""Devices chosen, named and taken over; what is asked for and missing is an error, never another device."""
+"""Devices: selection, names, and adopted handles; a missing requested device is an error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Paper = Callable[..., None]
 
 @pytest.fixture
 def paper(monkeypatch: pytest.MonkeyPatch) -> Paper:
-    """Make the machine have devices of these labels, each with the reason why it does not work."""
+    """Replace the devices by fakes with the given labels; a reason marks a device that does not work."""
 
     def install(**reasons: str) -> None:
         listed = []
@@ -159,7 +159,7 @@ def test_second_queue_of_our_context(device: Device) -> None:
 
 
 def test_taking_over_asks_nothing(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A handle that the caller owns works or not; other devices are none of its business."""
+    """Adopting a handle that the caller owns does not probe any device."""
     monkeypatch.setattr(discovery, "probed_devices", lambda: pytest.fail("nothing is to be probed"))
     context = cl.Context([device.handle])
     assert Device.of(context).label == device.label

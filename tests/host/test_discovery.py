@@ -1,4 +1,4 @@
-"""Which devices are there, which work: labels, verdicts and their cache, on platforms made of paper."""
+"""Discovery of devices: labels, health verdicts and their cache, on fake platforms."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def _forget() -> None:
 
 @pytest.fixture
 def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty cache folder."""
+    """Return an empty cache folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "gpuvision"
 
 
 @pytest.fixture
 def see(monkeypatch: pytest.MonkeyPatch, cache: Path) -> Iterator[Callable[..., list[tuple[int, int]]]]:
-    """Make the loader list the platforms given; returns the log of what is probed."""
+    """Make the loader list the given platforms; return the log of the probes."""
 
     def install(*platforms: FakePlatform, probe: Probe = lambda p, d: "") -> list[tuple[int, int]]:
         asked: list[tuple[int, int]] = []
@@ -69,7 +69,7 @@ def test_platforms_of_one_name_are_told_apart(see: Any) -> None:
 
 
 def test_twins_are_each_asked(see: Any) -> None:
-    """Two devices that agree in every string may still differ in health: two cards, two installations."""
+    """Two devices with equal strings (two cards, two installations) may differ in health."""
     twins = FakePlatform("NVIDIA CUDA", vendor="NVIDIA", devices=[FakeDevice(), FakeDevice()])
     asked = see(twins, probe=lambda p, d: "broken" if d == 1 else "")
     assert [each.healthy for each in discovery.probed_devices()] == [True, False]
@@ -211,7 +211,7 @@ def test_crash_and_hang_are_verdicts(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 
 def test_probe_in_its_own_process(device: Device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Also where the user stands beside a folder that bears the package's name."""
+    """The probe also works in a folder that contains a folder named like the package."""
     (tmp_path / "gpuvision").mkdir()
     (tmp_path / "gpuvision" / "__init__.py").write_text("raise SystemExit('not the package')")
     monkeypatch.chdir(tmp_path)

@@ -32,11 +32,11 @@ SINGLE, DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 
 
 class Scale:
-    """Stands for an operation: the builder takes its name only."""
+    """Fake operation: the builder uses only its name."""
 
 
 class Machine:
-    """Stands for a device with the properties that a launch asks for."""
+    """Fake device with the properties that a launch queries."""
 
     label = "machine"
 
@@ -74,7 +74,7 @@ def test_a_dtype_without_an_opencl_type_is_refused() -> None:
 
 
 def test_opencl_types_have_the_size_of_their_dtypes(device: Device) -> None:
-    """Asked of the compiler itself: ``sizeof`` and the sign of -1."""
+    """A kernel checks ``sizeof`` and the sign of -1."""
     names = [name for name in TYPES if device.has_double or name != "float64"]
     words = [opencl_type(name) for name in names]
     lines = [
@@ -174,7 +174,7 @@ def test_the_launch_of_a_builder_is_the_one_written_by_hand() -> None:
 
 @pytest.mark.parametrize("rows", [1 << 20, 4 << 20])
 def test_only_a_cpu_writes_much_data_past_its_caches(rows: int) -> None:
-    """One input and one output of 4 bytes a row: 8 MB fit into the cache of 32 MB, 32 MB and a status do not."""
+    """One input and one output of 4 bytes a row: 8 MB fit into a cache of 32 MB; 32 MB plus a status array do not."""
     for machine, variant in ((Machine(), "vector"), (Machine(), "work_item"), (Machine(is_cpu=False), "vector")):
         build = builder((rows,), machine=machine, variant=variant)
         outputs = build.outputs({"value": (rows,), "status": (rows,)})

@@ -25,7 +25,7 @@ def pairs(rng):
 
 @pytest.fixture(params=["shared", "copied"])
 def memory(request, device):
-    """The device as it is, and as if it had memory of its own, like a graphics card."""
+    """The device as it is, and as a device with separate memory like a graphics card."""
     if request.param == "shared" and not device.shares_memory:
         pytest.skip("this device has memory of its own")
     if request.param == "shared":
@@ -103,7 +103,7 @@ def test_calls_wait_for_events(device, pairs):
 
 
 def test_short_work_runs_inline(device, pairs):
-    """There it is done on return, and only there; long work goes to the workers."""
+    """Only short inline work is finished on return; long work runs in the worker threads."""
     if device.inline_device is None:
         pytest.skip("only PoCL 3 has such a device")
     complete = cl.command_execution_status.COMPLETE
@@ -212,7 +212,7 @@ def test_another_dtype_shape_kind_or_number_is_told(device, pairs):
         READOUT(pairs, pairs, device=device)
     with pytest.raises(TypeError, match="all of one kind"):
         READOUT(pairs, bound.inputs[0], device=device)
-    bound().wait()  # what was refused has not spoilt it
+    bound().wait()  # the refused call has not changed the bound instance
 
 
 def test_run_waits_and_returns_what_was_written(memory, pairs):
@@ -318,7 +318,7 @@ def test_host_view_is_the_memory_itself(device):
     np.testing.assert_array_equal(array.get(), 7.0)
     del array
     gc.collect()
-    view[...] = 8.0  # the view keeps the memory
+    view[...] = 8.0  # the view keeps the memory alive
     assert (view == 8.0).all()
 
 

@@ -20,7 +20,7 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_operation.py"
 
 @pytest.fixture(scope="module")
 def example() -> dict[str, Any]:
-    """What the example defines, after it has run."""
+    """Run the example and return its global names."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plt, "show", lambda: None)
         patch.setenv("MPLBACKEND", "Agg")
@@ -123,7 +123,7 @@ def test_an_operation_needs_a_kernel_folder(device: Device, example: dict[str, A
 def test_a_kernel_of_ones_own_that_does_not_compile(
     example: dict[str, Any], correct: Any, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The error and the debug folder show the user's own file."""
+    """The error and the debug folder name the user's file."""
     monkeypatch.setenv(debug.VARIABLE, str(tmp_path / "debug"))
     (tmp_path / "scale_offset").mkdir()
     (tmp_path / "scale_offset" / "scale_offset.cl").write_text('#include "common/real.h"\nkernel void wrong(\n')

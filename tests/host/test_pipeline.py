@@ -1,4 +1,4 @@
-"""The stream: every frame once and in order whatever happens, on both memory paths of every device."""
+"""The stream delivers every frame once and in order, on both memory paths of every device."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_results_are_those_of_direct_calls(memory: dict[str, Any], count: int, b
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(count=st.integers(0, 40), batch=st.integers(1, 9), ring=st.integers(2, 5), short=st.integers(1, 9))
 def test_any_batch_ring_and_short_reads(device: Device, count: int, batch: int, ring: int, short: int) -> None:
-    """A source that gives fewer frames than asked for, now and then."""
+    """The source sometimes gives fewer frames than requested."""
 
     class Short(ArraySource):
         def read_into(self, out: np.ndarray, arrived: np.ndarray) -> int:
@@ -124,11 +124,11 @@ def test_drop_oldest_keeps_the_newest(memory: dict[str, Any], ring: int) -> None
         source.let(10)  # 9 frames and the end
         source.drained(40)
         batches += [each.copy() for each in stream]
-    # The consumer's slot is not the producer's: the others hold the newest, none older than the ring is long.
+    # The consumer holds one slot; the other slots hold the newest frames, at most as old as the length of the ring.
     assert numbers(batches) == [0, *range(40 - (ring - 1), 40)]
     assert stream.report().dropped == 40 - ring
     for batch in batches:
-        assert batch.frames[0, 1] == 1.0 + batch.number  # the number is the frame's own
+        assert batch.frames[0, 1] == 1.0 + batch.number  # the number belongs to the frame
 
 
 def test_a_burst_that_fits_the_ring_loses_nothing(device: Device) -> None:
@@ -138,7 +138,7 @@ def test_a_burst_that_fits_the_ring_loses_nothing(device: Device) -> None:
             source.let(1)
             seen = [next(stream).number]
             for _ in range(2):
-                source.let(4)  # four slots are the producer's while the consumer holds one
+                source.let(4)  # the producer has four slots while the consumer holds one
                 source.drained(1 + len(seen) + 3)
                 seen += [next(stream).number for _ in range(4)]
             source.let(4)
@@ -167,7 +167,7 @@ def test_block_makes_the_source_wait(device: Device) -> None:
         source.drained(2)
         first = next(stream)
         source.drained(3)
-        assert source.waiting == 4  # three slots are filled; the fourth frame is there and has none
+        assert source.waiting == 4  # three slots are filled; the fourth frame has no slot
         assert first.number == 0
         assert numbers(list(stream)) == list(range(1, 40))
     assert stream.report().dropped == 0
@@ -190,7 +190,7 @@ def test_after_a_stall_the_stream_is_fresh(device: Device) -> None:
 
 
 class FailingSource(ArraySource):
-    """Raises at a batch."""
+    """Source that raises at a batch."""
 
     def read_into(self, out: np.ndarray, arrived: np.ndarray) -> int:
         if self._next >= 6:
@@ -199,7 +199,7 @@ class FailingSource(ArraySource):
 
 
 class Worn(PsdReadout):
-    """Fails at the second launch of each bound instance."""
+    """Operation that fails at the second launch of each bound instance."""
 
     def bind(self, *args: Any, **kwargs: Any) -> Any:
         return FailingBound(super().bind(*args, **kwargs))
@@ -233,7 +233,7 @@ def test_a_failing_operation_is_named(memory: dict[str, Any]) -> None:
     with pytest.raises(StreamError, match=r"stopped at frame \d \(operation\): out of resources") as caught:
         pipeline.run(lambda each: seen.append(each.number))
     assert isinstance(caught.value.__cause__, RuntimeError)
-    assert 1 <= len(seen) <= 2  # each slot went round once at most
+    assert 1 <= len(seen) <= 2  # each slot was used once at most
 
 
 def test_a_failing_sink_is_named(memory: dict[str, Any]) -> None:
@@ -272,7 +272,7 @@ def test_shutdown_while_the_producer_waits_for_a_slot(device: Device) -> None:
     source = Gated(30)
     with Pipeline(source, READOUT, device=device, batch=1, ring=2) as stream:
         source.let(30)
-        source.drained(2)  # both slots are filled; the third frame is there and has none
+        source.drained(2)  # both slots are filled; the third frame has no slot
         stream.close()
     assert source.closed
 
@@ -340,7 +340,7 @@ def test_the_device_is_free_after_the_stream(device: Device) -> None:
         list(stream)
     del held
     gc.collect()
-    assert memory() is None  # though the stream itself is still here, for its report
+    assert memory() is None  # although the stream object still exists, for its report
     assert stream.report().frames == 3
 
 
@@ -392,7 +392,7 @@ def test_an_error_in_the_last_frame_is_not_taken_for_the_end(device: Device, bat
 def test_what_a_stream_cannot_run_is_said_before_a_frame_is_taken(device: Device) -> None:
     source = ArraySource(np.zeros((4, 2, 6), np.float32))
     planar = PsdReadout(strip_length=6e-3, layout="planar")
-    # For a batch of two the frame axis would pass for the pair's.
+    # For a batch of two, the frame axis could be mistaken for the axis of the pair.
     with pytest.raises(ValueError, match=r"shape|first axis"):
         Pipeline(source, planar, device=device, batch=2)
     with pytest.raises(TypeError, match="float32, float64 or uint16"):

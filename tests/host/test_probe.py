@@ -1,4 +1,4 @@
-"""The probe: a device that works passes; one that does not build, or computes wrongly, gives its reason."""
+"""Probe of a device: a working device passes; a build failure or a wrong result gives a reason."""
 
 from __future__ import annotations
 

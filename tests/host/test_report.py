@@ -1,4 +1,4 @@
-"""What a stream says of itself: times, report, timeline; what it plans; and that it does not grow."""
+"""Times, report and timeline of a stream; its plan; constant memory of a long run."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_the_report_leaves_out_the_warm_up_and_counts_by_the_clock(device: Devic
     assert (report.frames, report.batches, report.warm_up) == (100, 20, 10)
     assert report.latency.count == 90
     assert report.stages["source"].count == 18
-    assert report.stages["source"].maximum >= 2e-6  # the source's own look at the clock lies between
+    assert report.stages["source"].maximum >= 2e-6  # the time stamp of the source lies between
     assert report.latency.maximum <= report.seconds < 1.0
     assert report.throughput > 0
     assert 1 <= report.fill_mean <= report.fill_maximum <= 3
@@ -133,7 +133,7 @@ def test_the_trace_is_chrome_json(memory: dict[str, Any], tmp_path: Path) -> Non
     assert {span["args"]["frame"] for span in spans} == {0, 4, 8, 12, 16}
     assert all(span["ts"] >= 0 and span["dur"] >= 0 for span in spans)
     lanes = {event["tid"]: event["args"]["name"] for event in events if event["ph"] == "M"}
-    one_by_one = ("producer", "consumer")  # the device's times are off by the clocks' difference
+    one_by_one = ("producer", "consumer")  # device times differ by the offset of the clocks
     for tid in lanes:
         own = sorted((span["ts"], span["ts"] + span["dur"]) for span in spans if span["tid"] == tid)
         assert all(end <= start + 1e-3 for (_, end), (start, _) in itertools.pairwise(own) if lanes[tid] in one_by_one)
@@ -155,7 +155,7 @@ def test_the_plan_takes_the_smallest_batch_that_keeps_up() -> None:
     assert chosen.batch == 4  # 1240 frames/s are not 1.25 times the rate
     assert [trial.batch for trial in chosen.trials] == [1, 2, 4]
     assert chosen.trials[-1].latency == pytest.approx(3 / 1000.0 + 1.5e-3)
-    assert chosen.ring == 27  # 100 frames of a stall of 0.1 s in batches of 4, the consumer's and the source's
+    assert chosen.ring == 27  # 100 frames of a stall of 0.1 s in batches of 4, plus two slots
     assert plan_stream(frames_source(), READOUT, rate=100.0, measure=measured.__getitem__).batch == 1
     assert json.loads(json.dumps(chosen.to_dict()))["trials"][2]["service_rate"] == 3000.0
 
@@ -174,7 +174,7 @@ def test_a_plan_that_fails_says_what_is_possible() -> None:
 
     with pytest.raises(StreamError, match="the fastest, 4 frames, does 4000 frames/s"):
         plan_stream(frames_source(1e6), READOUT, measure=saturated)
-    assert asked == [1, 2, 4, 8, 16, 32]  # it gives up when larger batches gain nothing
+    assert asked == [1, 2, 4, 8, 16, 32]  # it stops when larger batches are not faster
     with pytest.raises(ValueError, match="rate is None"):
         plan_stream(frames_source(), READOUT)
 

@@ -1,4 +1,4 @@
-"""What is done before the loader is asked: Intel's wheels made visible, a cache where the home has none."""
+"""Set-up before the ICD loader is used: Intel's wheels, and a cache folder if the home has no cache."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gpuvision.host import runtime
 
 @pytest.fixture
 def vendors(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A system with one driver and an installed wheel, a user with an empty cache; returns the system's folder."""
+    """Simulate a system with one driver and an installed wheel, and an empty user cache; return the system's folder."""
     system = tmp_path / "system"
     system.mkdir()
     (system / "pocl.icd").write_text("libpocl.so.2\n")
@@ -55,7 +55,7 @@ def test_users_own_choice_is_left_alone(vendors: Path, monkeypatch: pytest.Monke
 
 
 def test_inherited_folder_still_loads_the_siblings(vendors: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The probe's process inherits the variable and needs the driver's siblings as its parent does."""
+    """The process of the probe inherits the variable and also needs the libraries of the driver."""
     folder = _exposed()
     loaded = []
     monkeypatch.setattr(runtime, "_load_siblings", lambda libraries: loaded.append(libraries) or True)

@@ -1,4 +1,4 @@
-"""Sources: every frame once, in order, in place; and one line for whatever cannot be read."""
+"""Sources: every frame once, in order, in place; and errors of one line for unreadable files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gpuvision.host.sources import ArraySource, FrameSource, IteratedSource, Pac
 
 
 def read_all(source: Source, batch: int = 3) -> np.ndarray:
-    """Read to the end in batches, as a stream does."""
+    """Read all frames in batches, as a stream does."""
     out = np.zeros((batch, *source.shape), source.dtype)
     arrived = np.zeros(batch, np.int64)
     parts = [out[:0].copy()]
@@ -37,13 +37,13 @@ def read_all(source: Source, batch: int = 3) -> np.ndarray:
 
 
 class ManualClock:
-    """Time that passes only in `sleep` and by hand."""
+    """Clock that advances only in `sleep` and by assignment."""
 
     def __init__(self) -> None:
         self.now = 1_000_000_000
 
     def __call__(self) -> int:
-        self.now += 1000  # so that yielding the processor ends
+        self.now += 1000  # so that the loop that yields the processor ends
         return self.now
 
     def sleep(self, seconds: float) -> None:
@@ -51,7 +51,7 @@ class ManualClock:
 
 
 class Broken(FrameSource):
-    """Fails at one frame."""
+    """Source that fails at one frame."""
 
     def __init__(self, fails_at: int) -> None:
         super().__init__((2, 2), np.dtype(np.uint8))
@@ -148,7 +148,7 @@ def no_array(good: int) -> Iterator[Any]:
 def test_an_error_in_the_last_frame_comes_after_the_good_ones(
     frames: Any, message: str, batch: int, paced: bool
 ) -> None:
-    """As a stream reads: `wait` first. The end of the iterator must not hide the error before it."""
+    """A stream calls `wait` first: the end of the iterator must not hide the preceding error."""
     source: Source = IteratedSource(frames(2))
     if paced:
         source = PacedSource(source, 1e6)
@@ -157,7 +157,7 @@ def test_an_error_in_the_last_frame_comes_after_the_good_ones(
     while got < 2:
         assert source.wait()
         got += source.read_into(out, arrived)
-    for _ in range(2):  # and it stays
+    for _ in range(2):  # and the error stays
         with pytest.raises(RecordingError, match=message) as caught:
             source.wait() and source.read_into(out, arrived)
     assert got == 2
@@ -178,14 +178,14 @@ def test_frames_are_due_by_the_clock_and_not_by_the_reader() -> None:
     arrived, out = np.zeros(1, np.int64), np.zeros((1, 2, 2))
     times = []
     for k in range(100):
-        clock.now += 100_000 * (k % 7)  # a reader who takes his time, less than a period
+        clock.now += 100_000 * (k % 7)  # a slow reader, still faster than a period
         assert source.wait()
         assert source.read_into(out, arrived) == 1
         times.append(int(arrived[0]))
     assert not source.wait()
     overdue = np.array(times) - times[0] - np.arange(100) * 1_000_000
     assert overdue.min() >= 0
-    assert overdue.max() < 10_000  # no drift: nothing of one frame's delay reaches the next
+    assert overdue.max() < 10_000  # no drift: the delay of a frame does not affect the next
     assert source.late < 10_000
 
 
@@ -200,7 +200,7 @@ def test_a_late_reader_gets_what_is_overdue_at_once_and_it_counts_from_when_it_w
     assert np.array_equal(out[:, 0], np.arange(1, 9))
     assert np.array_equal(arrived, start + np.arange(1, 9) * 1_000_000)
     assert 19_500_000 <= source.late < 19_510_000
-    assert clock.now - start < 20_600_000  # it did not sleep
+    assert clock.now - start < 20_600_000  # the source did not sleep
 
 
 def test_a_rate_must_be_one() -> None:
@@ -309,7 +309,7 @@ def test_a_folder_is_read_in_natural_order(tmp_path: Path) -> None:
 
 @pytest.fixture
 def video(tmp_path: Path) -> Path:
-    """A video of 40 even frames, 5 grey levels apart."""
+    """A video of 40 uniform frames, 5 grey levels apart."""
     path = tmp_path / "line.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 50.0, (64, 48))
     for k in range(40):
@@ -322,7 +322,7 @@ def test_a_video_is_read_to_its_end(video: Path) -> None:
     source = open_recording(video)
     assert (source.shape, source.dtype, source.length, source.rate) == ((48, 64), np.uint8, 40, 50.0)
     levels = read_all(source, 7).mean(axis=(1, 2))
-    assert np.abs(levels - 5 * np.arange(40)).max() <= 2.0  # what JPEG leaves of an even frame
+    assert np.abs(levels - 5 * np.arange(40)).max() <= 2.0  # tolerance of JPEG for a uniform frame
 
 
 def test_a_truncated_video_names_the_frame(video: Path) -> None:
@@ -341,7 +341,7 @@ def test_the_real_video(data: Path) -> None:
     assert frames.max(axis=(1, 2)).min() > 150  # the laser is in every frame
 
 
-# What cannot be read ----------------------------------------------------------------------------------------------
+# Unreadable files ----------------------------------------------------------------------------------------------
 
 
 def test_what_is_not_there_or_not_a_recording(tmp_path: Path) -> None:
@@ -394,7 +394,7 @@ def test_truncated_files(tmp_path: Path, rng: np.random.Generator, name: str, sh
 
 
 def test_the_library_that_reads_tiff_keeps_quiet(tmp_path: Path, rng: np.random.Generator) -> None:
-    """In a process of its own: a test's log handlers would swallow what the library says."""
+    """Run in a separate process: the log handlers of pytest would capture the library's messages."""
     path = tmp_path / "cut.tif"
     tifffile.imwrite(path, rng.integers(0, 60000, (12, 40, 50), dtype=np.uint16), compression="zlib")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])

@@ -59,7 +59,7 @@ def test_relief_is_a_slope_not_a_number_of_cells():
 def test_gentle_slopes_are_exaggerated(slope, times):
     z = slope * 0.01 * np.tile(np.arange(20.0), (15, 1))
     z[3, 4:9] = np.nan
-    z[10, 10] += 5.0  # an edge is no slope to go by
+    z[10, 10] += 5.0  # an edge does not count as a slope
     assert picture.choose_exaggeration(z, 0.01, 0.01) == times
 
 
@@ -143,7 +143,7 @@ def test_a_scan_is_drawn_as_it_came(tmp_path):
         picture.draw_scan(tmp_path / f"{samples}.png", z, status, samples=samples, aspect=0.5)
     down, across = (cv2.imread(str(tmp_path / f"{each}.png")).astype(float) for each in ("down", "across"))
     rows, columns = (slice(200, 1000), slice(250, 600))
-    # Heights grow with the profile: along the picture where samples run down it, down it where they run across.
+    # Heights increase with the profile number: across the picture if samples run down, down if samples run across.
     assert np.ptp(down[rows, columns], axis=0).max() == 0
     assert np.ptp(down[rows, columns], axis=1).max() > 50
     assert np.ptp(across[rows, columns], axis=1).max() == 0

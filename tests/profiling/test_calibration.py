@@ -1,4 +1,4 @@
-"""The calibration benchmark: both sides get the same lines, and a result that says how straight they became."""
+"""The calibration benchmark: gpuvision and the peer get the same lines; the result is their straightness."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_cases_without_recordings(device: Device) -> None:
     for case in cases:
         assert set(case.peers) == {"discorpy"}
         assert case.metadata["data"] == "synthetic"
-        # The noise is 0.05 px; four parameters and the lines take up little of it.
+        # The noise is 0.05 px; four parameters and the lines reduce the residual only slightly.
         assert 0.045 < case.error < 0.051
         assert case.error < case.metadata["error_discorpy"] < case.metadata["error_raw"]
 

@@ -1,4 +1,4 @@
-"""What a device can do at best."""
+"""Peak performance of a device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The harness: ratios within rounds, runs that are voided, and the file it writes."""
+"""Benchmark harness: ratios within rounds, invalid runs, and the result file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def case(**changes):
 def test_a_row_holds_a_peer_against_us(device):
     (row,) = harness.measure(case(), device, seconds=0.01)
     assert (row.peer, row.peer_version, row.case) == ("numpy", np.__version__, "float32/16")
-    assert row.ratio > 1.0  # summing 2000 numbers takes longer than nothing
+    assert row.ratio > 1.0  # summing 2000 numbers takes measurable time
     assert row.fraction is None
 
 
@@ -44,7 +44,7 @@ def test_the_ceiling_moves_the_bytes_of_the_case(monkeypatch, device):
     slow = case(ours=lambda: time.sleep(20e-3), traffic=(3 << 20, 1 << 20), repeats=8)
     (row,) = harness.measure(slow, device, seconds=0.05)
     assert asked == [(device, 3 << 20, 1 << 20, 8)]
-    assert 0.0 < row.fraction < 1.0  # of the device's limit
+    assert 0.0 < row.fraction < 1.0  # fraction of the device's limit
 
 
 def test_what_moves_bytes_runs(device):

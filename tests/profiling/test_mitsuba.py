@@ -1,4 +1,4 @@
-"""Mitsuba as a peer: left out where it is missing, and no worse for an LLVM that does not know the processor."""
+"""Mitsuba as a peer: skipped if it is missing; works with an LLVM that does not know the processor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stream's benchmark: what a row says about a rate, and the search for the highest one."""
+"""The stream's benchmark: the row of a rate, and the search for the highest rate."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gpuvision.profiling import stream
 
 
 class Machine:
-    """Holds every rate up to a limit, but for a stall now and then."""
+    """Fake machine that keeps up with every rate up to a limit, with occasional stalls."""
 
     def __init__(self, limit: float, stalls: tuple[int, ...] = ()) -> None:
         self.limit, self.stalls, self.asked = limit, stalls, []
@@ -62,5 +62,5 @@ def test_rows_for_each_rate_and_the_highest(device):
         assert 0.0 < metadata["p50_us"] <= metadata["p99_us"] <= metadata["p999_us"] <= metadata["max_us"]
         case.peers["pyopencl"]()
     with pytest.raises(StreamError, match="not open"):
-        cases[0].ours()  # its stream was closed when the next case was asked for
+        cases[0].ours()  # its stream was closed when the next case was requested
     assert cases[2].metadata["holds"]

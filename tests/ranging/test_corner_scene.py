@@ -1,4 +1,4 @@
-"""A real recording: a sheet of light turning over a room's corner with boxes, a cylinder and a sphere."""
+"""A real recording: a sheet of light rotates over a room's corner with boxes, a cylinder and a sphere."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Scan(NamedTuple):
     points: RangePoints
 
     def inside(self, parts: tuple[tuple[int, int, int, int], ...]) -> np.ndarray:
-        """Good points of parts of the frame, (n, 3)."""
+        """Return the valid points of parts of the frame, (n, 3)."""
         row = np.arange(self.points.z.shape[1])
         column = self.reading.position
         within = np.zeros(self.points.z.shape, bool)
@@ -59,7 +59,7 @@ def scan() -> Scan:
         pytest.skip("the recordings in ../shared/data are not here")
     video, frames = cv2.VideoCapture(str(path)), []
     while (frame := video.read()[1]) is not None:
-        # Red is at its limit along the whole line.
+        # Red is saturated along the whole line.
         frames.append(np.ascontiguousarray(frame[..., 1]))
     readout = LineReadout(
         method="ml",
@@ -78,7 +78,7 @@ def scan() -> Scan:
 
 
 def plane(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Normal of the plane through points, and their distance from it (root mean square)."""
+    """Return the normal of the plane through points, and their root-mean-square distance from it."""
     centred = points.astype(np.float64) - points.mean(axis=0)
     _, spread, axes = np.linalg.svd(centred, full_matrices=False)
     return axes[2], float(spread[2] / np.sqrt(len(points)))
@@ -130,7 +130,7 @@ def test_the_sphere_is_one(scan):
 
     fit = scipy.optimize.least_squares(misfit, [0.23, 1.07, 0.6, 0.2], loss="soft_l1", f_scale=0.003)
     assert len(points) > 5000
-    # Its outline in the frame, 165 pixels, says 0.224 m: depth and breadth agree, which no part of the fit asked for.
+    # Its outline in the frame, 165 pixels, says 0.224 m: depth and width agree, although the fit did not require it.
     assert abs(fit.x[3] - 0.222) < 0.005
     assert np.sqrt(np.mean(misfit(fit.x) ** 2)) < 4e-3
 
@@ -142,7 +142,7 @@ def test_the_cylinder_is_one(scan):
         return np.hypot(points[:, 0] - cylinder[0], points[:, 2] - cylinder[1]) - cylinder[2]
 
     fit = scipy.optimize.least_squares(misfit, [-0.2, 0.5, 0.15], loss="soft_l1", f_scale=0.003)
-    # Its outline: 100 pixels either side.
+    # Its outline: 100 pixels on either side.
     assert abs(fit.x[2] - 0.137) < 0.003
     assert np.median(np.abs(misfit(fit.x))) < 3e-3
 
@@ -161,6 +161,6 @@ def test_the_height_map_shows_them(scan):
     ):
         column, row = round((x - grid.left) / grid.cell_x), round((grid.top - y) / grid.cell_y)
         assert abs(np.nanmedian(made.z[row - 2 : row + 3, column - 2 : column + 3]) - height) < 0.01
-    # In the sphere's shadow nothing is invented.
+    # The shadow of the sphere has no points.
     column, row = round((0.23 - grid.left) / grid.cell_x), round((grid.top - 1.35) / grid.cell_y)
     assert np.all(made.status[row - 3 : row + 4, column - 3 : column + 4] == Status.NO_DATA)

@@ -16,7 +16,7 @@ FOCAL, FIRST, SPACING = 0.05, 0.06, 1e-3
 
 
 def behind(count: int, peak: np.ndarray | float, width: float = 1.5e-3, level: float = 1000.0) -> np.ndarray:
-    """Intensities of a Gaussian with its peak at an image distance, behind ``count`` pinholes."""
+    """Return intensities of a Gaussian with its peak at an image distance, behind ``count`` pinholes."""
     place = FIRST + SPACING * np.arange(count)
     return level * np.exp(-0.5 * ((place - np.asarray(peak)[..., None]) / width) ** 2)
 
@@ -64,7 +64,7 @@ def test_predicted_sigma_is_the_spread_of_noisy_readings(count: int, rng: np.ran
     reading = system(sigma_intensity=sigma)(light)
     assert reading.sigma_image is not None
     assert reading.sigma_object is not None
-    # Weighted by I^2: its own noise enters the weights in second order only. 20000 trials know a spread to 0.5 %.
+    # Weighted by I^2: the noise affects the weights only in second order. 20000 trials determine a deviation to 0.5 %.
     assert np.std(reading.image_distance) == pytest.approx(np.mean(reading.sigma_image), rel=0.03)
     assert np.std(reading.object_distance) == pytest.approx(np.mean(reading.sigma_object), rel=0.03)
 

@@ -1,4 +1,4 @@
-"""Where a triangulation comes from: geometry, calibration points, tables; and its inverse."""
+"""Construction of a triangulation from geometry, calibration points or tables; and its inverse."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_stand_off_against_rays_in_space(tilt: float | None) -> None:
 
 
 def test_scheimpflug_is_the_default() -> None:
-    # tan(alpha) = m tan(omega), omega the sheet's tilt against the plane across the axis.
+    # tan(alpha) = m tan(omega), omega the tilt of the sheet against the plane perpendicular to the axis.
     omega, magnification = math.atan2(0.2, 0.1), 0.016 / math.hypot(0.1, 0.2)
     tilted = psd(tilt=math.atan(magnification * math.tan(omega)))
     np.testing.assert_allclose(psd().homography, tilted.homography, rtol=1e-12, atol=1e-15)
@@ -165,7 +165,7 @@ def test_parameter_covariance_is_the_spread_of_fits(model: Any, rng: np.random.G
     guessed = Triangulation.fit(seen + rng.normal(0.0, SIGMA, seen.shape), SHEET, **options)
     predicted = np.sqrt(np.diag(known.covariance))
     free = predicted > 1e-12 * np.max(predicted)
-    # A spread from 300 trials is known to 4 %, one from the residuals of a single fit to 7 %: four sigmas each.
+    # A deviation from 300 trials is known to 4 %, from the residuals of a single fit to 7 %: four sigmas each.
     np.testing.assert_allclose(spread[free], predicted[free], rtol=0.16)
     np.testing.assert_allclose(np.sqrt(np.diag(guessed.covariance))[free], predicted[free], rtol=0.28)
     assert np.all(spread[~free] <= 1e-9 * np.max(spread))
@@ -192,7 +192,7 @@ def test_covariance_of_a_point_is_the_spread_of_measurements(rng: np.random.Gene
 
 
 def on_sheet(operation: Triangulation, point: np.ndarray) -> np.ndarray:
-    """(G, H) of a measured point, on the host."""
+    """Return (G, H) of a measured point, on the host."""
     lens = operation.lens.swapped()
     return homography.project(np.array(operation.homography), lens.undistort(point))
 
@@ -230,7 +230,7 @@ def test_residuals_are_told_in_sigmas(rng: np.random.Generator) -> None:
     seen = psd().to_sensor(SHEET)
     noisy = seen + rng.normal(0.0, (SIGMA, 3.0 * SIGMA), seen.shape)
     full = homography.fit_models(noisy, SHEET, sigma=(SIGMA, 3.0 * SIGMA))[-1]
-    # Of 126 residuals 8 are spent; a root mean square from the rest is known to 6.5 %.
+    # 126 residuals have 118 degrees of freedom; their root mean square is known to 6.5 %.
     assert full.degrees_of_freedom == 126 - 8
     assert full.rms == pytest.approx(math.sqrt(118 / 126), rel=0.26)
 

@@ -1,4 +1,4 @@
-"""Line readout against the float64 oracle: both axes, both walks, every dtype, odd shapes and extremes."""
+"""Line readout against the float64 oracle: both axes, both kernel variants, every dtype, odd shapes and extremes."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def line_frames(rng, dtype, shape, along="columns", sigma=1.7):
 
 
 def assert_same(reading, expected, precision=np.float32, slack=1.0):
-    """Status, peak and width equal; the position within roundings of its own size."""
+    """Assert that status, peak and width are equal, and the position within a few ulp."""
     np.testing.assert_array_equal(reading.status, expected["status"])
     np.testing.assert_array_equal(reading.peak, expected["peak"])
     np.testing.assert_array_equal(reading.width, expected["width"])
     eps = np.finfo(precision).eps
-    # Three roundings of the position itself, and those of some ten sums of light in the window.
+    # Three roundings of the position, and the roundings of about ten sums over the window.
     np.testing.assert_allclose(reading.position, expected["position"], rtol=3 * eps, atol=slack * 40 * eps)
     np.testing.assert_allclose(reading.total, expected["total"], rtol=20 * eps)
 

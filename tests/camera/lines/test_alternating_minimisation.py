@@ -25,11 +25,11 @@ def points(rng: np.random.Generator) -> np.ndarray:
 
 
 def test_centre_from_curvature(rng: np.random.Generator) -> None:
-    """On strong distortion without noise the extremes of curvature point at the centre."""
+    """For strong distortion without noise, the extremes of curvature indicate the centre."""
     lens = Lens(k1=-2e-7, centre=(480.0, 530.0))
     packed = pack(grid_lines(lens.distort(plane_grid(rng, 0.0))))
     centre = packed.origin + packed.unit * centre_from_curvature(packed)
-    # A quartic is not the curve: a few pixels are left.
+    # A quartic only approximates the curve: an error of a few pixels remains.
     assert np.hypot(*(centre - lens.centre)) < 10.0
 
 
@@ -48,7 +48,7 @@ def test_points_from_intersections(rng: np.random.Generator) -> None:
 
 
 def distance_sum(packed: PackedLines, lens: np.ndarray, points: np.ndarray) -> float:
-    """Eq. 3.10 to 3.15 as they are written, each line's angle by the scatter about its vanishing point."""
+    """Compute the sum of eq. 3.10 to 3.15; the angle of a line follows from the scatter about its vanishing point."""
     total = 0.0
     place = np.stack([packed.x, packed.y], axis=-1)
     offset = place - lens[2:]
@@ -71,13 +71,13 @@ def test_solvers_minimise_what_the_thesis_says(points: np.ndarray, solver: str) 
     )
     start = np.concatenate([np.zeros(2), centre_from_curvature(packed)])
     before = distance_sum(packed, start, mean_intersections(packed))
-    # Alternating, three rounds are far from the end.
+    # Three rounds of alternating fits are far from convergence.
     assert distance_sum(packed, lens, places) < 0.5 * before
     assert found.evaluations > found.minimum.iterations == 3
 
 
 def test_fit_by_a_solver(points: np.ndarray) -> None:
-    """A fit reports what the solver reached, in its own rounds; variable projection is never worse."""
+    """A fit reports the result and the rounds of its solver; variable projection is never worse."""
     families = grid_lines(points)
     ours, theirs = (
         fit_lens(families, model="k1", lines="vanishing", solver=each)
@@ -92,7 +92,7 @@ def test_the_simplex_ends_where_ours_does(points: np.ndarray) -> None:
     families = grid_lines(points)
     ours = fit_lens(families, model="k1", lines="vanishing")
     theirs = fit_lens(families, model="k1", lines="vanishing", solver="nelder_mead")
-    # The thesis' distances shrink with the lens, which pulls it off by less than its uncertainty.
+    # The distances of the thesis shrink with the lens scale: the bias is less than the uncertainty.
     sigma = np.sqrt(np.diag(ours.covariance))
     assert np.all(np.abs(theirs.values - ours.values)[:3] < 0.5 * sigma[:3])
     scale = np.outer(sigma, sigma)

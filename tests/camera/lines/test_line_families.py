@@ -1,4 +1,4 @@
-"""Families of lines from grids and labels, and what is packed of them."""
+"""Families of lines from grids and labels, and their packed arrays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gpuvision.camera.lines.line_families import grid_lines, group_lines, pack
 
 
 def numbered(rows: int, columns: int) -> np.ndarray:
-    """Grid whose points tell their index."""
+    """Return a grid whose point coordinates are the indices."""
     return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(np.float64)
 
 

@@ -1,4 +1,4 @@
-"""Distances from straight lines: their slopes, the lines line_coefficients out of them, pencils at infinity."""
+"""Distances from straight lines: derivatives, eliminated line parameters, pencils at infinity."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from gpuvision.camera.lines.variable_projection import apply_step, farthest_corn
 from straight_lines import plane_grid, radial_lens
 
 STEP = 1e-6
-# Central differences of functions of about 1: their own error is about STEP^2, and rounding over STEP.
+# Central differences of functions of about 1: the error is about STEP^2 plus rounding / STEP.
 CLOSE = 1e-8
 
 
 @pytest.fixture
 def packed(rng: np.random.Generator) -> PackedLines:
-    """Lines bent by 20 pixels, with errors as large, so that no term is too small to be tested."""
+    """Lines bent by 20 pixels, with errors of the same size, so that every term is large enough for the test."""
     points = radial_lens(20.0).distort(plane_grid(rng, 30.0, rows=7, columns=9))
     return pack(grid_lines(points + rng.normal(0.0, 15.0, points.shape), diagonals=True))
 
 
 @pytest.fixture
 def anywhere(rng: np.random.Generator) -> Parameters:
-    """A lens and vanishing points that are the best for nothing; one point is at infinity."""
+    """An arbitrary lens and arbitrary vanishing points (not a minimum); one point is at infinity."""
     points = rng.normal(size=(4, 3)) * [1.0, 1.0, 0.4]
     points[2, 2] = 0.0
     points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -33,7 +33,7 @@ def anywhere(rng: np.random.Generator) -> Parameters:
 
 
 def distances(packed: PackedLines, k: np.ndarray, centre: np.ndarray, lines: LineSet) -> np.ndarray:
-    """(n.u + rho)/|J'n| with J by the chain rule as it is written on paper."""
+    """Compute (n.u + rho)/|J'n| with J by the chain rule."""
     d = np.stack([packed.x, packed.y], axis=-1) - centre
     s = np.sum(d**2, axis=-1)
     growth, slope = 1.0 + s * (k[0] + k[1] * s), k[0] + 2.0 * k[1] * s
@@ -63,7 +63,7 @@ def test_slopes_are_those_of_the_distances(packed: PackedLines, anywhere: Parame
 
 
 def test_lines_move_with_their_points(packed: PackedLines, anywhere: Parameters) -> None:
-    """A line's slopes by the vanishing point's tangents are those of a line that stays in the point's pencil."""
+    """The derivatives of a line by its vanishing point keep the line in the pencil of the point."""
     lines = straightness.evaluate(packed, anywhere).lines
     change = straightness.pencil_changes(anywhere.vanishing, packed.family, lines)
     for axis in (0, 1):
@@ -81,7 +81,7 @@ def test_lines_move_with_their_points(packed: PackedLines, anywhere: Parameters)
 
 @pytest.mark.parametrize("free", [False, True])
 def test_lines_are_projected_out(packed: PackedLines, anywhere: Parameters, free: bool) -> None:
-    """The small normal equations are those of the whole Jacobian, a column for each line's own parameters."""
+    """The reduced normal equations agree with the full Jacobian that has columns for the parameters of each line."""
     parameters = anywhere._replace(vanishing=None) if free else anywhere
     evaluation = straightness.evaluate(packed, parameters)
     slopes = straightness.residual_jacobian(2, evaluation)
@@ -119,7 +119,7 @@ def test_pencil_lines_are_the_best(packed: PackedLines, anywhere: Parameters) ->
         each = np.cos(angle)[packed.line] * packed.x + np.sin(angle)[packed.line] * packed.y + offset[packed.line]
         return packed.sums(each**2)
 
-    # The first-order turn leaves the pencil by 1e-8, which changes no sum of squares by 1e-10 of it.
+    # The first-order rotation leaves the pencil by 1e-8, which changes a sum of squares by less than 1e-10 of it.
     assert np.all(cost(0.0) < cost(1e-4) * (1.0 + 1e-10))
     assert np.all(cost(0.0) < cost(-1e-4) * (1.0 + 1e-10))
 

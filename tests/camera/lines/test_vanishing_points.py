@@ -1,4 +1,4 @@
-"""Lenses from straight lines: exact data, errors against the Cramer-Rao bound, choice of model, what data lack."""
+"""Lenses from straight lines: exact data, Cramer-Rao bound, choice of model, undetermined parameters."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAMES = ("k1", "k2", "C_c", "R_c")
 
 
 def seen(rng: np.random.Generator, tilt: float, border: float, sigma: float) -> tuple[np.ndarray, Lens]:
-    """Noisy grid of 23 x 31 points, and the lens it was seen through."""
+    """Return a noisy grid of 23 x 31 points, and its true lens."""
     lens = radial_lens(border)
     points = lens.distort(plane_grid(rng, tilt))
     return points + rng.normal(0.0, sigma, points.shape), lens
@@ -37,7 +37,7 @@ def errors(fit: LensFit, lens: Lens) -> np.ndarray:
 def test_exact_lines_give_the_lens(rng: np.random.Generator, border: float, tilt: float, lines: str) -> None:
     points, lens = seen(rng, tilt, border, 0.0)
     fit = fit_lens(grid_lines(points, diagonals=True), model="k1,k2", lines=lines)
-    # Rounding of the points, 1e-13 pixels, over the distortion they see: 1e-12 of it at the smallest.
+    # Rounding of the points, 1e-13 pixels, relative to the distortion: 1e-12 for the smallest distortion.
     np.testing.assert_allclose(fit.values[:4], [lens.k1, lens.k2, *lens.centre], rtol=1e-9)
     assert fit.rms_px < 1e-12
     assert fit.warnings == ()
@@ -56,7 +56,7 @@ def test_exact_lines_give_the_lens(rng: np.random.Generator, border: float, tilt
 @pytest.mark.parametrize("tilt", [0.0, 20.0, 45.0])
 @pytest.mark.parametrize("border", [0.3, 3.0, 20.0])
 def test_predicted_errors_are_the_bound(rng: np.random.Generator, border: float, tilt: float, lines: str) -> None:
-    """At most a tenth above what any estimator could reach."""
+    """Predicted errors are at most 10 % above the Cramer-Rao bound."""
     lens = radial_lens(border)
     ideal = plane_grid(rng, tilt)
     fit = fit_lens(grid_lines(lens.distort(ideal)), model="k1,k2", lines=lines, sigma=0.05)
@@ -76,14 +76,14 @@ def coverage(rng: np.random.Generator, draws: int, cases: list[tuple[float, floa
 
 
 def test_errors_are_as_predicted(rng: np.random.Generator) -> None:
-    """Cold starts, none of which fails: every error within six standard deviations, their mean square 1."""
+    """No cold start fails: every error is within six standard deviations, and the mean square is 1."""
     cases = [
         (tilt, border, sigma) for tilt in (0.0, 20.0, 45.0) for border, sigma in ((0.3, 0.02), (3.0, 0.2), (20.0, 0.2))
     ]
     found = coverage(rng, 180, cases)
     assert np.all(np.abs(found) < 6.0)
     # 720 errors: the mean of their squares has a standard deviation of sqrt(2/720) = 0.053 if they were independent,
-    # and about twice that as the four of a fit are not.
+    # and about twice that because the four errors of a fit are correlated.
     assert abs(np.mean(found**2) - 1.0) < 0.4
 
 
@@ -98,7 +98,7 @@ def test_uncertainties_cover_the_truth(rng: np.random.Generator) -> None:
 
 
 def test_vanishing_points_have_errors_as_predicted(rng: np.random.Generator) -> None:
-    """Their three components lie in a plane, so a draw has two degrees of freedom per point."""
+    """The three components have a singular covariance, so a draw has two degrees of freedom per point."""
     ideal, lens = plane_grid(rng, 30.0), radial_lens(10.0)
     exact = fit_lens(grid_lines(lens.distort(ideal)), model="k1,k2", lines="vanishing").values
     squares = []
@@ -122,7 +122,7 @@ def test_rms_is_of_the_measured_image(rng: np.random.Generator) -> None:
     freedom = len(np.concatenate([np.concatenate(family) for family in fit.residuals_px]))
     assert fit.rms_px == pytest.approx(0.1, rel=0.1)
     assert fit.sigma_px == pytest.approx(fit.rms_px * np.sqrt(freedom / fit.degrees_of_freedom))
-    # On an undistorted line through the centre of the image both agree to the scale of the lens, 3 % at the border.
+    # For an undistorted line through the image centre both agree up to the scale of the lens, 3 % at the border.
     straight = straightness_px(grid_lines(points), fit.lens)
     assert straight == pytest.approx(fit.rms_px, rel=0.03)
     corrected = fit.lens.undistort(points)
@@ -170,7 +170,7 @@ def test_the_smallest_sufficient_model(border: float, k2_part: float, sigma: flo
         fit = fit_lens(grid_lines(points + rng.normal(0.0, sigma, points.shape)))
         chosen.append(fit.model)
         assert {(fit.model, fit.lines)}.isdisjoint((other.model, other.lines) for other in fit.alternatives)
-    # One in twenty may be larger than needed, at a probability of 0.05.
+    # At a significance of 0.05, one model in twenty may be larger than needed.
     assert chosen.count(model) >= 16
     assert "none" not in chosen or model == "none"
 
@@ -212,7 +212,7 @@ def test_no_distortion_leaves_no_centre(rng: np.random.Generator) -> None:
     fit = fit_lens(grid_lines(points), model="k1")
     assert any("as straight without a lens" in each for each in fit.warnings)
     assert any("fix the centre only to" in each for each in fit.warnings)
-    # What is measured is still within its own, large, uncertainty.
+    # The estimate is still within its (large) uncertainty.
     assert abs(fit.lens.k1) < 4.0 * fit.uncertainties["k1"]
     assert max(fit.uncertainties["C_c"], fit.uncertainties["R_c"]) > 100.0
     exact = fit_lens(grid_lines(plane_grid(rng, 20.0)), model="k1")
@@ -221,7 +221,7 @@ def test_no_distortion_leaves_no_centre(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize(("sigma", "faint"), [(0.2, True), (0.01, False)])
 def test_a_faint_distortion_is_said_to_be_faint(rng: np.random.Generator, sigma: float, faint: bool) -> None:
-    """0.3 pixels of distortion under 0.2 pixels of noise: no linear uncertainty holds, and each fit says so."""
+    """0.3 pixels of distortion under 0.2 pixels of noise: the linear uncertainty is not valid, and each fit warns."""
     for _ in range(20):
         points, _ = seen(rng, 20.0, 0.3, sigma)
         fit = fit_lens(grid_lines(points), model="k1,k2")
@@ -261,7 +261,7 @@ def test_any_unit(rng: np.random.Generator, factor: float) -> None:
 
 @pytest.mark.parametrize("part", [0.8, 0.95])
 def test_near_the_fold(rng: np.random.Generator, part: float) -> None:
-    """The image reaches out to that part of the radius at which the lens turns back."""
+    """The image extends to the given fraction of the fold radius."""
     lens = Lens(k1=-1.0 / (3.0 * 700.0**2), centre=(512.0, 512.0))
     radius = part * lens.fold_radius
     grid = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 21), np.linspace(-1.0, 1.0, 21)), axis=-1) / np.sqrt(2.0)
@@ -273,7 +273,7 @@ def test_near_the_fold(rng: np.random.Generator, part: float) -> None:
 
 
 def test_points_beyond_a_fold_are_never_the_answer(rng: np.random.Generator) -> None:
-    """Random points want no lens; the one that is forced on them is monotone over all of them."""
+    """Random points need no lens; a lens that is forced on them is monotone over all points."""
     for seed in range(20):
         scattered = np.random.default_rng(seed).uniform(0.0, 1000.0, (6, 8, 2))
         fit = fit_lens(grid_lines(scattered), model="k1,k2", lines="free")
@@ -282,7 +282,7 @@ def test_points_beyond_a_fold_are_never_the_answer(rng: np.random.Generator) -> 
 
 
 def test_one_family_of_parallel_lines(rng: np.random.Generator) -> None:
-    """A flat object moved along H in front of a PSD camera: few points on each line, a vanishing point at infinity."""
+    """A flat object moves along H in front of a PSD camera: few points on a line, vanishing point at infinity."""
     lens = Lens(k1=-2e-7, k2=1e-14, centre=(530.0, 500.0))
     along = np.linspace(60.0, 960.0, 16)
     lines = [np.column_stack([along, np.full(16, height)]) for height in np.linspace(80.0, 900.0, 12)]
@@ -296,7 +296,7 @@ def test_one_family_of_parallel_lines(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("loss", ["huber", "tukey"])
 def test_outliers(loss: str) -> None:
-    """Two in a hundred points are 5 to 50 pixels off; the errors stay near those of the clean data."""
+    """Two in a hundred points are 5 to 50 pixels off; the errors stay near the errors of clean data."""
     rng = np.random.default_rng(3)
     squares = []
     for _ in range(30):
@@ -305,7 +305,7 @@ def test_outliers(loss: str) -> None:
         angle = rng.uniform(0.0, 2.0 * np.pi, np.count_nonzero(wrong))
         points[wrong] += rng.uniform(5.0, 50.0, len(angle))[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         squares.append(errors(fit_lens(grid_lines(points), model="k1,k2", lines="free", loss=loss), lens) ** 2)
-    # Rows and columns of an outlier are down-weighted each for itself: predicted errors hold to about a third.
+    # The row and the column of an outlier are down-weighted independently: predicted errors hold to about a third.
     assert 0.6 < np.sqrt(np.mean(squares)) < 1.5
 
 
@@ -321,7 +321,7 @@ def test_outliers_are_pointed_out(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("loss", ["huber", "tukey"])
 def test_a_line_of_outliers(rng: np.random.Generator, loss: str) -> None:
-    """A row that belongs to something else: it is a line, but no straight one."""
+    """A row of points on a curve instead of a straight line."""
     points, lens = seen(rng, 20.0, 20.0, 0.1)
     rows, columns = grid_lines(points)
     zigzag = rows[5] + np.where(np.arange(len(rows[5])) % 2, 30.0, -30.0)[:, None] * [0.0, 1.0]
@@ -346,7 +346,7 @@ def test_known_centre(rng: np.random.Generator) -> None:
     assert fit.lens.centre == pytest.approx(lens.centre, rel=1e-12)
     assert fit.uncertainties["C_c"] == fit.uncertainties["R_c"] == 0.0
     assert np.all(np.abs(fit.values[:2] - [lens.k1, lens.k2]) < 5.0 * np.sqrt(np.diag(fit.covariance))[:2])
-    # One line is enough then.
+    # A single line is sufficient here.
     single = fit_lens([[points[3]]], model="k1", centre=lens.centre)
     assert single.lens.k1 == pytest.approx(lens.k1, abs=5.0 * single.uncertainties["k1"] + 0.15 * lens.k1)
 
@@ -411,7 +411,7 @@ def test_a_family_of_one_line_is_free(rng: np.random.Generator) -> None:
     ],
 )
 def test_real_targets(data: Path, name: str, raw: float, best: float, centre: tuple[float, float] | None) -> None:
-    """As straight as the best known, and nearly as well with the model chosen from the data."""
+    """The residual is as small as the best published one, and nearly as small with the automatic model."""
     image = cv2.imread(str(data / "calibration" / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
     families = find_lines(image) if name.startswith("line") else grid_lines(find_dots(image).points)
     assert straightness_px(families) == pytest.approx(raw, rel=0.2)

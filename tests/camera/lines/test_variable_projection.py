@@ -1,4 +1,4 @@
-"""The start in closed form, and the way from there, or from anywhere, to the minimum."""
+"""Closed-form start, and convergence to the minimum from that start or from any other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_start_is_right_to_first_order(rng: np.random.Generator, border: float) 
     packed = pack(grid_lines(lens.distort(plane_grid(rng, 20.0))))
     start = linear_start(packed)
     assert start.rank == 3
-    # What is left out is of second order: the distortion, 0.1 of 600 pixels, times itself.
+    # The neglected terms are of second order: the square of the relative distortion, 0.1 of 600 pixels.
     assert start.parameters.k[0] == pytest.approx(lens.k1 * packed.unit**2, rel=1e-3)
     assert packed.origin + packed.unit * start.parameters.centre == pytest.approx(lens.centre, abs=0.3)
 
@@ -35,7 +35,7 @@ def test_gain_and_distances_are_those_of_the_linear_model(rng: np.random.Generat
 
 @pytest.mark.parametrize(("rows", "rank"), [([5], 1), ([5, 5], 1), ([2, 9], 2), ([0, 4, 8, 12], 2)])
 def test_rank_of_parallel_lines(rows: list[int], rank: int) -> None:
-    """One line has one bend; parallel ones leave the centre free along them."""
+    """A single line determines one curvature; parallel lines do not determine the centre along them."""
     along = np.linspace(0.0, 600.0, 15)
     rng = np.random.default_rng(1)
     lines = [np.column_stack([along, 40.0 * row + rng.normal(0.0, 0.01, 15)]) for row in rows]
@@ -75,7 +75,7 @@ def test_vanishing_points_of_straight_lines(rng: np.random.Generator) -> None:
 
 
 def test_a_lens_that_would_fold_stays_just_inside(rng: np.random.Generator) -> None:
-    """The lens of the points turns back inside them where one coefficient has to do for two."""
+    """A model with one coefficient instead of two would fold inside the points."""
     lens = Lens(k1=-9e-7, k2=4e-13, centre=(512.0, 512.0))
     packed = pack(grid_lines(lens.distort(512.0 + (plane_grid(rng, 0.0) - 512.0) * 0.8)))
     found = minimise(packed, linear_start(packed).parameters)

@@ -1,4 +1,4 @@
-"""Chessboards: all inner corners, in place, and sub-pixel."""
+"""Chessboards: all inner corners, with correct indices and sub-pixel accuracy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ INNER = (9, 6)
 
 
 def _errors(found: Float64, truth: Float64, start: tuple[int, int] | None = (0, 0)) -> Float64:
-    """Errors (n, 2) of the corners found; every one of them must have its place."""
+    """Return errors (n, 2) of the detected corners; check that every corner has the correct index."""
     where, errors = matched(found, truth)
     assert start is None or where == start
     errors = errors[~np.isnan(errors[..., 0])]
@@ -41,7 +41,7 @@ VIEWS = {
 
 @pytest.mark.parametrize("camera", VIEWS.values(), ids=VIEWS.keys())
 def test_whatever_the_view(camera: View, rng: np.random.Generator) -> None:
-    """A point of two crossing edges, each with about 20 px in its window, at 1 % of noise: 0.01 px."""
+    """Two crossing edges of about 20 px in the window, with 1 % noise: 0.01 px."""
     found = find_chessboard(photo(chessboard(camera, INNER), rng))
     truth = camera.nodes(6, 9)
     errors = _errors(found.points, truth[:, ::-1] if camera is VIEWS["mirrored"] else truth)
@@ -66,7 +66,7 @@ def test_types_and_colours(dtype: type, rng: np.random.Generator) -> None:
 
 
 def test_not_worse_than_opencv(rng: np.random.Generator) -> None:
-    """In the same images: its corners refined in windows of 11 pixels, and those of its newer detector."""
+    """On the same images as OpenCV, with cornerSubPix in windows of 11 pixels and with the sector-based detector."""
     ours, theirs = [], {"classic": [], "sector": []}
     for name in ("tilted", "barrel", "far tilted"):
         camera = VIEWS[name]
@@ -86,7 +86,7 @@ def test_not_worse_than_opencv(rng: np.random.Generator) -> None:
 
 
 def test_a_slope_of_the_light_moves_no_corner(rng: np.random.Generator) -> None:
-    """Large windows, and light that falls to a fifth: without that the gradients turn by up to 0.2 px."""
+    """Large windows and light that falls to a fifth: without the correction the error would be up to 0.2 px."""
     camera = view((1280, 1024), 6, 9, 120.0, turn=7.0)
     found = find_chessboard(photo(chessboard(camera, INNER), rng, shade=0.8))
     assert _rms(_errors(found.points, camera.nodes(6, 9))) < 0.03
@@ -157,7 +157,7 @@ def test_what_is_no_chessboard_is_told(image: np.ndarray) -> None:
 
 @pytest.mark.realdata
 def test_real_boards(data: Path) -> None:
-    """All 54 corners of 13 views, amid clutter, and a reprojection rms below that of OpenCV's corners (0.18 px)."""
+    """All 54 corners of 13 views, amid clutter, and a reprojection rms below the rms of OpenCV's corners (0.18 px)."""
     names = sorted((data / "calibration" / "chessboard").glob("*.jpg"))
     grids = [find_chessboard(cv2.imread(str(name), cv2.IMREAD_GRAYSCALE)).points for name in names]
     assert len(grids) == 13

@@ -1,4 +1,4 @@
-"""Dot grids: found whole, in place, and sub-pixel."""
+"""Dot grids: found completely, with correct indices and sub-pixel accuracy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _all(rows: int, columns: int) -> np.ndarray:
 
 
 def _errors(found: Float64, truth: Float64, start: tuple[int, int] | None = (0, 0)) -> Float64:
-    """Errors (n, 2) of the points found; every one of them must have its place."""
+    """Return errors (n, 2) of the detected points; check that every point has the correct index."""
     where, errors = matched(found, truth)
     assert start is None or where == start
     errors = errors[~np.isnan(errors[..., 0])]
@@ -46,7 +46,8 @@ def test_error_follows_the_noise(noise: float, limit: float, pitch: float, rng: 
     assert _rms(errors) < limit * (1.0 if pitch > 20 else 1.5)
     assert np.abs(errors.mean(axis=0)).max() < 4.0 * limit / np.sqrt(len(errors)) + 3e-4
     if noise:
-        # The noise that neighbours do not share: what pixels' places do to sharp edges is partly shared.
+        # The estimate contains only noise that neighbours do not share; sampling errors of sharp edges are partly
+        # shared.
         assert found.sigma == pytest.approx(_rms(errors), rel=0.25)
 
 
@@ -87,7 +88,7 @@ def test_blur_of_half_a_dot(rng: np.random.Generator) -> None:
 
 
 def test_large_discs_seen_askew_have_no_bias(rng: np.random.Generator) -> None:
-    """Their centres of gravity are off by up to 0.2 px; to second order that is taken off."""
+    """The centres of gravity have a bias of up to 0.2 px, which is corrected to second order."""
     camera = view((900, 800), 8, 8, 90.0, turn=10.0, tilt=40.0, focal=1.5)
     found = find_dots(photo(dots(camera, _all(8, 8), radius=0.35), rng, noise=0.0))
     assert _rms(_errors(found.points, camera.nodes(8, 8), None)) < 0.015
@@ -115,9 +116,9 @@ def test_half_of_the_grid_is_missing(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("level", [20, 128, 215])
 def test_what_hides_dots_moves_none(level: int, rng: np.random.Generator) -> None:
-    """A patch, a disc and a stroke of any grey level: dots that they cut or touch are left out.
+    """A patch, a disc and a stroke of any grey level: dots that they cut or touch are rejected.
 
-    What takes 6 % off a dot's area stays below what its neighbours tell, and moves its centre by 0.25 px at most.
+    An overlap of 6 % of a dot's area is below the detection limit, and moves the centre by 0.25 px at most.
     """
     image = photo(dots(VIEWS["barrel"], _all(18, 21)), rng)
     cv2.rectangle(image, (150, 150), (260, 230), level, -1)
@@ -153,7 +154,7 @@ def test_blobs_between_dots_are_left_out(rng: np.random.Generator) -> None:
 
 
 def test_twelve_thousand_dots(rng: np.random.Generator) -> None:
-    """Through a lens that moves the corners by 10 % of the image, tilted, a twentieth missing."""
+    """Tilted view through a lens that moves the corners by 10 % of the image; 5 % of the dots are missing."""
     camera = view((1400, 1400), 110, 110, 12.5, turn=5.0, tilt=15.0, barrel=140.0)
     present = rng.random((110, 110)) >= 0.05
     truth = camera.nodes(110, 110)
@@ -164,7 +165,7 @@ def test_twelve_thousand_dots(rng: np.random.Generator) -> None:
 
 
 def test_eight_thousand_pixels(rng: np.random.Generator) -> None:
-    """The same dots, enlarged: coordinates of 8000 px keep their hundredths in single precision's images."""
+    """The same dots, enlarged: coordinates up to 8000 px keep an accuracy of 0.01 px in single-precision images."""
     camera = view((8000, 300), 4, 130, 60.0)
     errors = _errors(find_dots(photo(dots(camera, _all(4, 130)), rng)).points, camera.nodes(4, 130))
     assert len(errors) > 510
@@ -190,7 +191,7 @@ def test_what_is_no_grid_is_told(image: np.ndarray, message: str) -> None:
 @pytest.mark.realdata
 @pytest.mark.parametrize(
     ("name", "shape", "fewest", "sigma"),
-    # discorpy 1.7.0 finds 6368 and 1305. The second target's dots lie off their grid themselves.
+    # discorpy 1.7.0 finds 6368 and 1305. The dots of the second target are not on a regular grid.
     [("dot_pattern_01", (68, 98), 6340, 0.01), ("dot_pattern_02", (35, 41), 1300, 0.15)],
 )
 def test_real_grids(data: Path, name: str, shape: tuple[int, int], fewest: int, sigma: float) -> None:

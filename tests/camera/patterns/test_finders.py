@@ -1,4 +1,4 @@
-"""Whatever is in the picture: a grid, or one line that says what was found."""
+"""Detectors on arbitrary images: a grid, or an error message of one line."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _blobs(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _pattern(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    """A pattern of a few points, half of them covered perhaps."""
+    """Draw a pattern of a few points; half of it may be covered."""
     rows, columns = (int(each) for each in rng.integers(1, 6, 2))
     camera = view((shape[1] + 40, shape[0] + 40), rows, columns, rng.uniform(12, 50), turn=rng.uniform(0, 45))
     covers = [
@@ -49,7 +49,7 @@ def _pattern(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
 @pytest.mark.parametrize("find", [find_dots, find_chessboard, find_lines])
 @pytest.mark.parametrize("picture", [_noise, _clouds, _blobs, _pattern])
 @settings(deadline=None, max_examples=40)
-@example(seed=1968334978, height=237, width=97)  # clouds: dots in single file, no two of them side by side
+@example(seed=1968334978, height=237, width=97)  # clouds: dots in a single row
 @given(seed=st.integers(0, 2**32 - 1), height=st.integers(1, 250), width=st.integers(1, 250))
 def test_ends_in_a_grid_or_a_line(
     find: Callable[[np.ndarray], object],

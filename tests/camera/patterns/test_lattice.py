@@ -13,14 +13,14 @@ from target_images import view
 
 
 def _consistent(grid: np.ndarray, names: np.ndarray) -> bool:
-    """Whether a grid's points are all in the place that their names (row, column) say, but for one shift."""
+    """Return whether all points have their true indices (row, column), up to a common shift."""
     i, j = np.nonzero(grid >= 0)
     shift = names[grid[i, j]] - np.stack([i, j], axis=1)
     return bool((shift == shift[0]).all())
 
 
 _NAMES = ("turn", "tilt", "towards", "barrel", "mirrored", "missing", "seed")
-# Where spurious points beside missing ones led the walk astray: whole parts of the grid, or a few points, a place off.
+# Regression cases: spurious points next to missing points shifted the indices of parts of the grid by one.
 _DRAWN = [
     dict(zip(_NAMES, each, strict=True))
     for each in (
@@ -55,7 +55,7 @@ _DRAWN = [
 def test_every_point_has_its_place(
     turn: float, tilt: float, towards: float, barrel: float, mirrored: bool, missing: float, seed: int
 ) -> None:
-    """Turned, tilted, bent by 10 % of the image, mirrored, a fifth missing, spurious ones among them, shuffled."""
+    """Rotated, tilted, distorted by 10 %, mirrored, shuffled points; 20 % are missing, some are spurious."""
     rng = np.random.default_rng(seed)
     camera = view((1000, 1000), 20, 24, 32.0, turn=turn, tilt=tilt, towards=towards, barrel=barrel, mirrored=mirrored)
     nodes = camera.nodes(20, 24)[:, :: -1 if mirrored else 1]
@@ -67,7 +67,7 @@ def test_every_point_has_its_place(
     far = np.linalg.norm(spurious[:, None] - nodes.reshape(-1, 2), axis=-1).min(axis=1) > 12.0
     points = np.concatenate([points, spurious[far]])
     grid = index_grid(points, 9, "points")
-    # What a spurious point leads astray lies off the grid, as it does itself; so finders tell it.
+    # Points that are indexed wrongly because of a spurious point lie off the grid, so the detectors reject them.
     grid[~agrees_with_grid(np.where(grid[..., None] < 0, np.nan, points[grid]), 7.0, 0.02)] = -1
     grid[grid >= len(names)] = -1
     assert np.count_nonzero(grid >= 0) > 0.9 * len(names)

@@ -1,4 +1,4 @@
-"""Line grids: both families, whole, and sub-pixel."""
+"""Line grids: both families, complete, with sub-pixel accuracy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROWS, COLUMNS = 10, 14
 
 
 def _checked(families: LineFamilies, camera: View) -> tuple[list[int], list[int], Float64]:
-    """Check which rows and columns were found, each once and in order along the line; return those, and all errors."""
+    """Check that rows and columns are unique and in order along the line; return rows, columns and all errors."""
     numbers: list[list[int]] = []
     errors = []
     assert len(families) == 2
@@ -29,7 +29,7 @@ def _checked(families: LineFamilies, camera: View) -> tuple[list[int], list[int]
             number = int(np.rint(np.median(at[:, axis])))
             found.append(number)
             assert (np.diff(line[:, 1 - axis]) > 0).all()
-            # Distance from the true line, across it.
+            # Distance perpendicular to the true line.
             nearest = at.copy()
             nearest[:, axis] = number
             ahead = nearest.copy()
@@ -57,7 +57,7 @@ VIEWS = {
 @pytest.mark.parametrize("camera", VIEWS.values(), ids=VIEWS.keys())
 @pytest.mark.parametrize("dark", [True, False])
 def test_whatever_the_view(camera: View, dark: bool, rng: np.random.Generator) -> None:
-    """A point is the mean over some twenty profiles, noise 1 % of the contrast: 0.01 px."""
+    """A point is the mean of about twenty profiles; noise of 1 % of the contrast gives 0.01 px."""
     rows, columns, errors = _checked(
         find_lines(photo(line_grid(camera, ROWS, COLUMNS), rng, dark=dark, shade=0.5)), camera
     )
@@ -144,6 +144,6 @@ def test_real_grid(data: Path) -> None:
     assert sum(map(len, columns)) > 1320
     for axis, family in ((0, rows), (1, columns)):
         for line in family:
-            # A lens bends these lines by a pixel; a cubic takes that off.
+            # A lens bends these lines by a pixel; a cubic removes this curvature.
             curve = np.polynomial.Polynomial.fit(line[:, axis], line[:, 1 - axis], 3)
             assert np.std(line[:, 1 - axis] - curve(line[:, axis])) < 0.08

@@ -48,7 +48,7 @@ def test_pixels_that_are_no_numbers_are_refused() -> None:
 def test_noise_is_found_whatever_the_lens(
     rows: int, columns: int, within: float, barrel: float, rng: np.random.Generator
 ) -> None:
-    """A fine grid tells it to some percent, one of 54 points to a third: the median of about as many differences."""
+    """A fine grid gives the noise to some percent, 54 points to a third (median of about 54 differences)."""
     points = view((1000, 1000), rows, columns, 800 / columns, barrel=barrel, tilt=20).nodes(rows, columns)
     points += rng.normal(0.0, 0.1, points.shape)
     points[rng.random((rows, columns)) < 0.05] = np.nan
@@ -77,7 +77,7 @@ def test_trimmed_cuts_the_border_only() -> None:
 @settings(deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_derivatives_of_a_polynomial_are_exact(seed: int) -> None:
-    """Any polynomial of degree 3 goes through the fit unchanged: to rounding of its largest term."""
+    """The fit reproduces any polynomial of degree 3 up to rounding of its largest term."""
     a = np.random.default_rng(seed).normal(size=(2, 4, 4))
     v, u = np.indices((9, 11)) / 10.0
     points = np.stack([np.polynomial.polynomial.polyval2d(u, v, each) for each in a], axis=-1)
@@ -96,7 +96,7 @@ def test_points_off_the_grid_are_told_also_at_its_border(rng: np.random.Generato
         points[node] += 0.8, -0.6
     points[4, 4] = np.nan
     told = {(int(i), int(j)) for i, j in np.argwhere(~agrees_with_grid(points, 7.0, 0.003))}
-    # In a corner, what is off is as likely one point as its neighbour.
+    # In a corner an outlier cannot be distinguished from its neighbour.
     assert told >= set(off)
     assert len(told) <= len(off) + 3
     assert not agrees_with_grid(np.full((3, 3, 2), np.nan), 7.0, 0.003).any()

@@ -1,4 +1,4 @@
-"""alpha and f' once the lens is known."""
+"""Estimation of alpha and f' for a known lens."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tilted_camera import scene
 
 
 def _views(rng, tilt, direction, count, sigma=0.0, kappa=0.0):
-    """Views through a tilted sensor, distorted in the sensor as the thesis' model has it."""
+    """Views through a tilted sensor, distorted in the sensor plane as in the model of the thesis."""
     made = scene(rng, "grid", tilt, corner_px=0.0, views=count, weakest=10.0, direction=direction)
     lens = Lens(k1=kappa, centre=(float(made.matrix[0, 2]), float(made.matrix[1, 2])))
     return made, lens, [(target, lens.distort(image)) for target, image in made.views(rng, sigma)]
@@ -41,7 +41,7 @@ def _axis(alpha, direction):
 
 
 def test_deviations_cover_the_truth(rng):
-    """60 draws: the mean squared error in deviations is 1 within 4 of its own deviations."""
+    """60 draws: the mean squared normalised error is 1 within 4 of its standard deviations."""
     errors = []
     for _ in range(60):
         _, lens, views = _views(rng, 20.0, 0.7, 1, sigma=0.1)
@@ -56,7 +56,7 @@ def test_what_the_views_lack(rng):
     _, lens, views = _views(rng, 20.0, 0.7, 1)
     with pytest.raises(ValueError, match="one view"):
         fit_tilt(views, lens)
-    # A target square to the axis of an untilted sensor tells nothing of f'.
+    # A target perpendicular to the axis of an untilted sensor does not determine f'.
     row, column = np.indices((9, 12)).reshape(2, -1)
     with pytest.raises(ValueError, match="oblique"):
         fit_tilt([(np.stack([column, row], 1) * 0.01, np.stack([column, row], 1) * 50.0 + 300.0)], lens, direction=0.7)

@@ -23,13 +23,13 @@ TILTS = (0, 10, 20, 30, 40, 45)
 
 
 def found(fit):
-    """Numbers in the order of Scene.truth."""
+    """Return the parameters in the order of Scene.truth."""
     matrix, distortion = fit.camera.to_opencv()
     return np.array([matrix[0, 0], matrix[0, 2], matrix[1, 2], *distortion[[0, 1, 12, 13]]])
 
 
 def random_scene(kind, tilt, seed):
-    """A draw of the whole range: corner 0.3 to 20 px, noise 0.02 to 0.2 px."""
+    """Draw a scene: distortion of 0.3 to 20 px at the corner, noise of 0.02 to 0.2 px."""
     rng = np.random.default_rng([seed, tilt, len(kind), ord(kind[0])])
     corner = None if kind == "grid" and seed % 2 else 10.0 ** rng.uniform(math.log10(0.3), math.log10(20.0))
     sigma = 10.0 ** rng.uniform(math.log10(0.02), math.log10(0.2))
@@ -38,13 +38,13 @@ def random_scene(kind, tilt, seed):
 
 
 def check(made, fit, sigma):
-    """The global minimum, and the truth within its uncertainty."""
+    """Check that the fit is the global minimum, and that the truth is within the uncertainty."""
     free = 2 * sum(map(len, made.targets)) - 6 * len(made.targets) - 7
-    # The residual of the right minimum is chi-squared: 5 of its deviations.
+    # The residual of the global minimum has a chi-squared distribution: within 5 standard deviations.
     assert fit.sigma_px == pytest.approx(sigma, rel=5.0 / math.sqrt(2.0 * free))
     at_truth = [cv2.Rodrigues(rotation)[0] for rotation in made.rotations]
     assert len(fit.poses) == len(at_truth)
-    # The virtual camera is well known even where the centre is not: chi-squared of three, 1e-9.
+    # The virtual camera is well determined even if the centre is not: chi-squared of 3 degrees of freedom, 1e-9.
     error = found(fit) - made.truth
     spread = fit.covariance
     f, v = fit.sensor.virtual_focal_length, np.array(fit.sensor.virtual_centre)
@@ -52,7 +52,7 @@ def check(made, fit, sigma):
     true_f = made.truth[0] * math.cos(made.truth[5]) * math.cos(made.truth[6])
     assert abs(f - true_f) < 0.05 * true_f
     assert np.linalg.norm(v - (made.truth[1:3] - made.truth[0] * axis)) < 0.05 * true_f
-    # A poorly known centre is not normally distributed; then it is not held to the ellipsoid.
+    # A poorly known centre is not normally distributed; its ellipsoid is then not checked.
     if spread[1, 1] + spread[2, 2] < 25.0:
         assert error @ np.linalg.solve(spread, error) < 60.0
 
@@ -76,7 +76,7 @@ def test_200_cold_starts_never_fail(kind, tilt):
 
 @pytest.mark.parametrize(("tilt", "draws"), [(0, 3), (20, 3), pytest.param(30, 25, marks=pytest.mark.slow)])
 def test_never_worse_than_opencv(tilt, draws):
-    """On the same points, in the single precision that OpenCV takes; it may be as good."""
+    """On the same points, in single precision as OpenCV requires; equal residuals are accepted."""
     stuck = 0
     for seed in range(draws):
         made, views, sigma = random_scene("grid", tilt, seed)
@@ -114,7 +114,7 @@ def test_residuals_and_rms_are_those_of_the_camera(rng):
 
 
 def test_predicted_covariance_is_the_bound(rng):
-    """Cramer and Rao's, from OpenCV's derivatives."""
+    """The Cramer-Rao bound is computed from OpenCV's derivatives."""
     for tilt in (0, 20, 45):
         made = scene(rng, "grid", tilt)
         fit = fit_camera(made.views(rng, 0.0), made.size, model="tilt", sigma=0.1)
@@ -127,7 +127,7 @@ def test_predicted_covariance_is_the_bound(rng):
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "tilt", "corner"), [("grid", 20, None), ("grid", 45, None), ("dots", 10, 10.0)])
 def test_errors_reach_the_bound_and_deviations_cover_them(kind, tilt, corner, rng):
-    """600 draws: a coverage of 95 % is known to 0.9 %, an rms error to 2.9 %."""
+    """600 draws determine a coverage of 95 % to 0.9 %, and an rms error to 2.9 %."""
     made = scene(rng, kind, tilt, corner_px=corner, views=10 if kind == "grid" else 5)
     errors, covered, poses = [], [], []
     for _ in range(600):
@@ -143,7 +143,7 @@ def test_errors_reach_the_bound_and_deviations_cover_them(kind, tilt, corner, rn
 
 
 def _pose_in_deviations(fit, made):
-    """Error of the first pose over its predicted deviation."""
+    """Return the error of the first pose divided by its predicted standard deviation."""
     turn = cv2.Rodrigues(made.rotations[0] @ fit.poses[0].rotation.T)[0].ravel()
     error = np.array([*turn, *(made.translations[0] - fit.poses[0].translation)])
     return error / np.sqrt(np.diag(fit.pose_covariance[0]))
@@ -224,7 +224,7 @@ def test_alpha_has_a_deviation_even_where_it_is_0(rng):
 
 
 def test_tukey_on_clean_points_costs_five_percent(rng):
-    """95 % efficiency is what its constant is for."""
+    """The tuning constant is chosen for 95 % efficiency."""
     made = scene(rng, "grid", 20)
     views = made.views(rng, 0.1)
     plain, robust = (fit_camera(views, made.size, model="tilt", loss=loss) for loss in ("squared", "tukey"))
@@ -243,7 +243,7 @@ def test_one_view_with_a_known_focal_length(kind, tilt):
         free = 2 * len(made.targets[0]) - 12
         assert fit.sigma_px == pytest.approx(0.05, rel=5.0 / math.sqrt(2.0 * free))
         error = (found(fit) - made.truth)[1:]
-        # Chi-squared of six: 1e-6, and some for one view's poorer knowledge of the centre.
+        # Chi-squared of 6 degrees of freedom at 1e-6, with a margin for the less certain centre of a single view.
         assert error @ np.linalg.solve(fit.covariance, error) < 45.0
 
 
@@ -257,7 +257,7 @@ def test_a_known_centre_fixes_the_tilt_without_distortion(rng):
 
 
 def test_it_says_when_tilt_and_centre_cannot_be_told_apart(rng):
-    """Corner 10 px: no doubt. 0.3 px: some 20 px of centre at the same residual. None: only the virtual camera."""
+    """Corner distortion 10 px: determined. 0.3 px: 20 px of centre at equal residual. 0: the virtual camera only."""
     said = {}
     for corner in (10.0, 0.3, 0.0):
         made = scene(rng, "dots", 10, corner_px=corner, direction=1.0)
@@ -274,7 +274,7 @@ def test_it_says_when_tilt_and_centre_cannot_be_told_apart(rng):
     assert 3.0 < said[0.3][1] < 60.0
     assert said[0.0][0]
     np.testing.assert_allclose([each[2] for each in said.values()], 0.05 * math.sqrt(2.0), rtol=0.05)
-    # And the untilted camera that fits as well says what it may be.
+    # The alternatives contain the untilted camera that fits equally well.
     chosen = fit_camera(views, made.size)
     assert chosen.model == "none"
     assert any("a sensor tilted by" in each for each in chosen.warnings)
@@ -317,7 +317,7 @@ def test_mirrored_images(rng):
     plain = fit_camera(views, made.size, model="tilt")
     flipped = [(target, image * [-1.0, 1.0] + [made.size[0] - 1.0, 0.0]) for target, image in views]
     fit = fit_camera(flipped, made.size, model="tilt")
-    # The camera is the mirrored one, and that is said, for its targets are numbered left-handed.
+    # The fit finds the mirrored camera and warns, because the targets have left-handed coordinates.
     expected = found(plain) * [1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0] + [0.0, made.size[0] - 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     np.testing.assert_allclose(found(fit), expected, rtol=1e-5, atol=1e-7)
     assert any("mirrored" in each for each in fit.warnings)
@@ -420,5 +420,5 @@ def test_chessboards_as_well_as_opencv(data):
             rms, matrix, _ = calibrate_with_opencv(views, size, flags | (0 if free_aspect else square))
             assert fit.rms_px <= rms * (1.0 + 1e-9)
             assert fit.camera.matrix[0][0] == pytest.approx(matrix[0, 0], rel=1e-4)
-    # The tilt that fits best is .4 degrees, and p1, p2 fit as well.
+    # The best tilt is 0.4 degrees, and p1, p2 fit equally well.
     assert any("no proof of a tilted sensor" in each for each in fit.warnings)

@@ -13,7 +13,7 @@ CENTRE = (640.0, 500.0)
 
 
 def _view(rotation, translation, f=1700.0, kappa=0.0, noise=0.0, seed=1):
-    """A grid that an untilted camera sees, distorted by eq. 3.9."""
+    """Return a view of a grid by an untilted camera, distorted by eq. 3.9."""
     row, column = np.indices((9, 12)).reshape(2, -1) * 0.01
     target = np.stack([column, row, 0.0 * row], axis=1)
     placed = target @ rotation.T + translation
@@ -44,7 +44,7 @@ def test_exact_points_give_the_exact_camera(name, kappa):
     target, image = _view(rotation, np.array(translation), kappa=kappa)
     fit = fit_tsai(target, image, CENTRE)
     assert fit.focal_length == pytest.approx(1700.0, rel=1e-8)
-    # In pixel at the corner: r = 800.
+    # In pixels at the corner: r = 800.
     assert fit.lens.k1 * 800.0**3 == pytest.approx(kappa * 800.0**3, abs=1e-6)
     np.testing.assert_allclose(fit.pose.rotation, rotation, atol=1e-8)
     np.testing.assert_allclose(fit.pose.translation, translation, atol=1e-8)
@@ -71,7 +71,7 @@ def test_noise_moves_the_focal_length_by_its_deviation():
         fit = fit_tsai(target, image, CENTRE)
         errors.append(fit.focal_length - 1700.0)
         deviations.append(fit.focal_length_sigma)
-    # The rotation is the first stage's and not refined, which costs accuracy that the deviation does not hold.
+    # The rotation is the result of the first stage and is not refined: the predicted deviation excludes this error.
     assert np.sqrt(np.mean(np.square(errors))) < 3.0 * np.mean(deviations)
     assert abs(np.mean(errors)) < 0.01 * 1700.0
 
@@ -86,7 +86,7 @@ def test_a_known_focal_length_gives_the_distance_of_a_parallel_target():
 
 
 def test_a_tilted_sensor_is_beyond_it(rng):
-    """Its stated limit: at 20 degrees the pose is wrong by degrees, where fit_camera's is by hundredths."""
+    """Documented limit: at 20 degrees the pose error is degrees, with fit_camera hundredths of a degree."""
     made = scene(rng, "grid", 20.0, views=1, weakest=15.0)
     fit = fit_tsai(made.targets[0], made.exact[0], tuple(made.matrix[:2, 2]), focal_length=1700.0)
     turn = fit.pose.rotation @ made.rotations[0].T

@@ -1,4 +1,4 @@
-"""Artwork: a small board written here, where every number is known, and the boards of three tools."""
+"""Artwork: a small synthetic board with known numbers, and boards of three CAD tools."""
 
 from __future__ import annotations
 
@@ -125,7 +125,8 @@ def test_says_what_each_spot_is_for(tmp_path: Path) -> None:
     assert sorted(pad.size) == pytest.approx([0.9e-3, 1.5e-3])
     assert (fiducial.role, fiducial.opening) == ("fiducial", pytest.approx(0.5e-3, abs=SAGITTA))
     assert fiducial.size == pytest.approx([1e-3, 1e-3], abs=SAGITTA)
-    # A rectangle's longer side lies at 30 degrees: its own axes are at 30 and 120, the first within a quarter turn.
+    # A rectangle's longer side lies at 30 degrees: its axes are at 30 and 120, and the first axis is within a quarter
+    # turn.
     assert (turned.shape, turned.angle, *turned.size) == ("rectangle", *map(pytest.approx, (math.pi / 6, 2e-3, 1e-3)))
     assert board.bounds == pytest.approx(np.array([[0, 0], [20e-3, 10e-3]]), abs=1e-9)
     assert (board.vias, board.fiducials) == ((via,), (fiducial,))
@@ -206,7 +207,7 @@ def test_areas_that_the_mask_opens_are_pads_and_pours_are_not(tmp_path: Path) ->
 
 
 def test_what_is_cleared_hides_no_edge(tmp_path: Path) -> None:
-    """A pour over a trace, and the trace's surroundings cleared in it: the trace is as visible as without."""
+    """A copper pour with a clearance around a trace: the trace is as visible as without the pour."""
     alone = "%ADD10C,0.4*%\n%ADD11C,1.2*%\nD10*\n" + line(4, 5, 12, 5)
     pour = "G36*\n" + line(0, 0, 20, 0) + at(20, 10, "D01") + at(0, 10, "D01") + at(0, 0, "D01") + "G37*\n"
     cleared = alone.replace("D10*\n", pour + "%LPC*%\nD11*\n" + line(4, 5, 12, 5) + "%LPD*%\nD10*\n")
@@ -287,7 +288,7 @@ def test_capsules_have_straight_sides() -> None:
 
 
 def test_what_lies_along_a_line_is_what_lies_at_its_points(rng: np.random.Generator) -> None:
-    """Random polygons, dark and clear over each other, against another's test of points."""
+    """Random polygons, dark and clear over each other, against an independent point-in-polygon test."""
     for _ in range(40):
         shapes = tuple(Shape(star(rng), bool(rng.random() < 0.7)) for _ in range(6))
         start, end = rng.uniform(-2, 2, (2, 2))
@@ -300,7 +301,7 @@ def test_what_lies_along_a_line_is_what_lies_at_its_points(rng: np.random.Genera
 
 
 def star(rng: np.random.Generator) -> np.ndarray:
-    """Corners in the order of their angles: no side crosses another, where rules of filling differ."""
+    """Corners in the order of their angles: the sides do not cross, so that all fill rules agree."""
     count = rng.integers(3, 9)
     angle = np.sort(rng.uniform(0, 2 * math.pi, count))
     return rng.uniform(-1, 1, 2) + rng.uniform(0.1, 1, (count, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -363,7 +364,7 @@ def test_edges_lie_between_copper_and_laminate_in_a_picture(data: Path, name: st
 
 @pytest.mark.realdata
 def test_one_board_written_four_ways_is_one_board(data: Path) -> None:
-    """KiCad wrote it with and without X2's attributes, with and without macros of apertures."""
+    """KiCad files with and without X2 attributes, with and without aperture macros."""
     first, *others = (real_board(data / "gerber" / name) for name in BOARDS[2:])
     order = np.lexsort(np.round(np.array([each.centre for each in first.pads]).T, 5))
     for other in others:

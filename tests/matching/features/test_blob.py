@@ -1,4 +1,4 @@
-"""FindBlobs on devices: marks of every shape where they are, as float64 references have it, and flagged where not."""
+"""FindBlobs on devices: fiducials of every shape against float64 references, and flags for missing ones."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_disc(device: Device, dtype: Any, variant: Any) -> None:
 @VARIANTS
 @pytest.mark.parametrize("shape", ["circle", "ring", "square", "cross"])
 def test_every_shape_without_noise(device: Device, variant: Any, shape: Any) -> None:
-    """Exact but for the profile of an edge, 2.4e-4 of the contrast, and the bend of a disc's to first order."""
+    """Exact except for the edge profile (2.4e-4 of the contrast) and the first-order curvature of a disc."""
     straight, polarity = shape in ("square", "cross"), POLARITY[shape]
     numbers = np.array([*TRUE, 14.0, 0.35, 1.1] if straight else [*TRUE, 14.0, 1.1])
     level = reference.render(shape, SHAPE, numbers, RATIO[shape])
@@ -84,9 +84,9 @@ def test_every_shape_without_noise(device: Device, variant: Any, shape: Any) -> 
 @VARIANTS
 @pytest.mark.parametrize("shape", ["circle", "ring", "square", "cross"])
 def test_matched_as_least_squares_have_it(device: Device, variant: Any, shape: Any, rng: np.random.Generator) -> None:
-    """The same pixels by SciPy, exact profiles: apart by half the deviation that the noise makes, or less.
+    """SciPy's least squares, same pixels, exact profiles: the difference is at most half the deviation by noise.
 
-    Tukey's weights, which the reference lacks, make a part of that, and steps that end once they are short.
+    Tukey's weights, which the reference lacks, and the stopping criterion contribute to the difference.
     """
     straight = shape in ("square", "cross")
     numbers = np.array([*TRUE, 13.0, 0.2, 1.0] if straight else [*TRUE, 13.0, 1.0])
@@ -106,9 +106,9 @@ def test_matched_as_least_squares_have_it(device: Device, variant: Any, shape: A
 @VARIANTS
 @pytest.mark.parametrize("radius", [7.0, 15.0])
 def test_edges_alone_as_their_circle_has_it(device: Device, variant: Any, radius: float) -> None:
-    """Without the match: edges along the same rulers, SciPy's circle through them, moved out by the bend.
+    """Without the match: edges along the same rulers, SciPy's circle through them, corrected for curvature.
 
-    Edges that are off by interpolation between pixels weigh less here: that is what the two differ by.
+    FindBlobs gives less weight to edges with interpolation errors, which explains the difference.
     """
     image = a_disc(radius).astype(np.float32)
     operation = replace(PLAIN, match=False, passes=1, variant=variant)
@@ -129,7 +129,7 @@ def test_edges_alone_as_their_circle_has_it(device: Device, variant: Any, radius
 
 @pytest.mark.parametrize(("spokes", "match"), [(8, True), (20, True), (44, False)])
 def test_any_number_of_rulers(device: Device, spokes: int, match: bool) -> None:
-    """To whole vectors and not."""
+    """Numbers that fill vectors, and numbers that do not."""
     blobs = replace(PLAIN, spokes=spokes, match=match)(a_disc().astype(np.float32), place(), device=device)
     assert blobs.status[0] == 0
     assert blobs.inliers[0] == spokes
@@ -158,7 +158,7 @@ def occluded(image: np.ndarray, kind: str, rng: np.random.Generator) -> np.ndarr
 def test_what_hides_a_part_of_the_mark(device: Device, kind: str, rng: np.random.Generator) -> None:
     """30 % of the contour gone, silk over it, a brighter disc within the search radius, 25 specks: within 0.05 px.
 
-    The centre of gravity is drawn away by all but the specks, and the symmetry says so.
+    All disturbances except the specks bias the centre of gravity, and `symmetry` shows it.
     """
     plain = PLAIN(a_disc().astype(np.float32), place(), device=device)
     image = occluded(a_disc(), kind, rng) + rng.normal(0.0, 2.0, SHAPE)
@@ -195,7 +195,7 @@ def test_a_wedge_anywhere(device: Device, angle: float, share: float, grey: floa
 
 
 def test_not_chasing_what_lies_beyond(device: Device, rng: np.random.Generator) -> None:
-    """A mark 5 px away is found with passes to spare, one 9 px away is not, nor after many passes."""
+    """A fiducial 5 px away is found; a fiducial 9 px away is not found, even after many passes."""
     image = (a_disc() + rng.normal(0.0, 2.0, SHAPE)).astype(np.float32)
     for match in (True, False):
         operation = replace(PLAIN, passes=6, match=match)
@@ -209,7 +209,7 @@ def test_not_chasing_what_lies_beyond(device: Device, rng: np.random.Generator) 
 
 
 def test_contrast_reversed(device: Device) -> None:
-    """Refused, or found where either is allowed, each mark for itself."""
+    """Reversed contrast is refused, or found if both polarities are allowed, for each fiducial separately."""
     bright, dark = a_disc().astype(np.float32), (200.0 - a_disc()).astype(np.float32)
     either = replace(PLAIN, polarity="either")
     for image, polarity, sign in ((bright, "bright", 1.0), (dark, "dark", -1.0)):
@@ -259,7 +259,7 @@ def test_what_is_not_trusted(device: Device, variant: Any) -> None:
 
 
 def test_specks_all_over_are_no_marks(device: Device, rng: np.random.Generator) -> None:
-    """Few of the edges agree anywhere, or few of the pixels: of 117 places one at most is taken for a mark."""
+    """Too few edges or pixels agree: at most one of 117 places is accepted as a fiducial."""
     image = np.full(SHAPE, 100.0)
     for _ in range(220):
         x, y, grey = rng.uniform(0.0, 96.0), rng.uniform(0.0, 80.0), rng.uniform(0.0, 250.0)
@@ -272,7 +272,7 @@ def test_specks_all_over_are_no_marks(device: Device, rng: np.random.Generator) 
 
 
 def test_a_mark_that_leaves_the_image(device: Device) -> None:
-    """Some rulers leave it: found, but for the centre of gravity. Most of them: refused."""
+    """If some rulers leave the image, the fiducial is found without a centre of gravity; if most do, it is refused."""
     for x, status in ((10.5, 0), (-3.0, Status.OUT_OF_RANGE)):
         image = (50.0 + 100.0 * reference.disc(SHAPE, x, 40.2, 10.0, 1.0)).astype(np.float32)
         blobs = PLAIN(image, place(x + 0.4, 40.0), device=device)
@@ -290,7 +290,7 @@ def test_saturated_marks_come_with_a_value(device: Device) -> None:
 
 
 def test_a_slope_of_the_lighting(device: Device) -> None:
-    """One grey level in ten pixels moves the match by nothing, and the centre of gravity by a tenth of a pixel."""
+    """A slope of 0.1 grey levels per pixel does not move the match, and moves the centre of gravity by 0.1 px."""
     image = (a_disc() + 0.1 * np.arange(SHAPE[1])).astype(np.float32)
     blobs = PLAIN(image, place(), device=device)
     assert np.hypot(*(centre(blobs) - TRUE)) < 1e-3
@@ -307,7 +307,7 @@ def test_any_scale_of_grey_levels(device: Device, scale: float) -> None:
 
 
 def test_smallest_images(device: Device) -> None:
-    """Rows of one vector, and fewer rows than a mark is high."""
+    """Images one vector wide, and images with fewer rows than the height of a fiducial."""
     image = (50.0 + 100.0 * reference.disc((17, 16), 7.6, 8.3, 2.4, 0.6)).astype(np.float32)
     operation = FindBlobs(threshold=20.0, search_px=1.0, smoothing_px=0.8)
     blobs = operation(image, place(7.5, 8.2, 2.4), device=device)

@@ -1,4 +1,4 @@
-"""How well marks are located in noise: against the Cramer-Rao bound, and against the covariance they come with."""
+"""Accuracy of fiducials in noise: against the Cramer-Rao bound and against the reported covariance."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def operation_for(radius: float, blur: float, snr: float, **more: Any) -> FindBl
 def errors(
     device: Device, operation: FindBlobs, radius: float, blur: float, snr: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of x, y, radius of discs anywhere on the pixels' grid, up to 1 px from their places, and covariances."""
+    """Return errors of x, y, radius, and covariances, of discs up to 1 px from their nominal positions."""
     cell = int(2.0 * (radius + operation.search_px + 5.0 * blur + 3.0 * operation.smoothing_px)) + 8
     across = max(min(10, 700 // cell), 1)
     found, covariances = [], []
@@ -54,10 +54,10 @@ def errors(
 @pytest.mark.parametrize("snr", [6.0, 12.0, 50.0, 200.0])
 @pytest.mark.parametrize(("radius", "blur"), DISCS)
 def test_close_to_the_bound(device: Device, radius: float, blur: float, snr: float, rng: np.random.Generator) -> None:
-    """Within 1.2 of the bound, which knows the background: 400 numbers have their deviation to 3.5 %, twice granted.
+    """Within 1.2 of the bound, which assumes a known background: a deviation of 400 numbers is known to 3.5 %, and twice that is granted.
 
-    The bias is below 0.002 px, besides what the draws leave open, three times for each of x, y and the radius; the
-    radius has the square of blur over radius on top, which the profile's bend is not taken to.
+    The bias is below 0.002 px plus three standard errors, for each of x, y and the radius. The radius has an additional
+    error of (blur / radius)^2, because curvature is corrected to first order only.
     """
     error, covariance = errors(device, operation_for(radius, blur, snr), radius, blur, snr, rng)
     bound = reference.cramer_rao(radius, blur, 1.0 / snr)
@@ -73,9 +73,9 @@ def test_close_to_the_bound(device: Device, radius: float, blur: float, snr: flo
 @pytest.mark.parametrize("snr", [12.0, 50.0])
 @pytest.mark.parametrize(("radius", "blur"), [(10.0, 1.0), pytest.param(20.0, 2.0, marks=SLOW)])
 def test_edges_alone(device: Device, radius: float, blur: float, snr: float, rng: np.random.Generator) -> None:
-    """At the best smoothing 1.204 times the bound for an edge, 1.01 for the weights; lines that overlap count twice.
+    """Factors on the bound: 1.204 for an edge at the best smoothing, 1.01 for the weights; overlapping lines count twice.
 
-    The last makes 10 % at most. The deviation is what the covariance says to 15 %.
+    Overlapping lines contribute at most 10 %. The measured deviation agrees with the covariance to 15 %.
     """
     width = round(2.0 * math.pi * radius / 32)
     operation = operation_for(radius, blur, snr, match=False, spokes=32, width=width)
@@ -88,7 +88,7 @@ def test_edges_alone(device: Device, radius: float, blur: float, snr: float, rng
 
 
 def test_better_than_its_centre_of_gravity(device: Device, rng: np.random.Generator) -> None:
-    """What a second estimate is for: to disagree. It has 1.5 times the deviation or more."""
+    """The centre of gravity is an independent second estimate with at least 1.5 times the deviation."""
     operation = operation_for(10.0, 1.0, 25.0)
     image = 50.0 + CONTRAST * reference.disc((48, 48), 23.7, 24.2, 10.0, 1.0)
     matched, heavy = [], []

@@ -1,4 +1,4 @@
-"""Which round lands are marks, and what they are worth among rulers."""
+"""Selection of round pads as fiducials, and their gain relative to rulers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def names(fiducials: Fiducials) -> set[tuple[float, float]]:
 def test_round_lands_are_marks(tmp_path: Path) -> None:
     fiducials = found(round_artwork(round_board(tmp_path)))
     assert names(fiducials) == {*LANDS, *FIDUCIALS}
-    # Centres to a hundredth of a micrometre: a tenth of what the best of them measure is 10 nm.
+    # Centres to a hundredth of a micrometre: 10 nm is a tenth of the best standard deviation.
     np.testing.assert_allclose(
         sorted(fiducials.point.tolist()), sorted(np.multiply([*LANDS, *FIDUCIALS], 1e-3).tolist()), atol=1e-8
     )
@@ -44,18 +44,18 @@ def test_round_lands_are_marks(tmp_path: Path) -> None:
     ("more", "is_mark"),
     [
         ({}, True),
-        # Its mask ends 0.1 mm beside it, or covers its rim, or is open 0.5 mm around it.
+        # The mask opening is 0.1 mm wider, or covers the rim of the pad, or is 0.5 mm wider.
         ({"openings": ((7, 5, 1.2),)}, False),
         ({"openings": ((7, 5, 0.9),)}, False),
         ({"openings": ((7, 5, 2.0),)}, True),
-        # A trace ends in it, two wider ones do, a line passes by.
+        # A trace ends in the pad, two wider traces do, a line passes by.
         ({"traces": ((7, 5, 9, 6),), "width": 0.25}, True),
         ({"traces": ((7, 5, 9, 6), (7, 5, 5, 5)), "width": 0.5}, False),
         ({"traces": ((5, 5.8, 9, 5.8),), "width": 0.4}, False),
-        # A hole that leaves 0.3 mm and one that leaves 0.1 mm.
+        # A hole that leaves a ring of 0.3 mm, and a hole that leaves a ring of 0.1 mm.
         ({"holes": ((7, 5, 0.4),)}, True),
         ({"holes": ((7, 5, 0.8),)}, False),
-        # Another land that it may be taken for.
+        # Another pad with which it may be confused.
         ({"pads": (*LANDS, (7.0, 5.25))}, False),
         ({"pads": (*LANDS, (7.0, 6.6))}, True),
     ],
@@ -108,21 +108,21 @@ def test_a_mark_is_worth_two_rulers_across_its_middle(tmp_path: Path) -> None:
     mine = predict_selection(both, IMAGING, [*some, *range(len(rulers.radius), len(both.radius))])
     theirs = predict_selection(as_rulers, IMAGING, [*some, *range(len(rulers.radius), len(as_rulers.radius))])
     np.testing.assert_allclose(mine.covariance, theirs.covariance, rtol=1e-9)
-    # The mark's whole extent is read, in x and y.
+    # The region contains the whole fiducial in x and y.
     alone = predict_selection(both, IMAGING, np.arange(len(rulers.radius), len(both.radius)))
     assert np.all(alone.region[0] < (fiducials.point - fiducials.radius[:, None] - 100e-6).min(axis=0))
 
 
 @pytest.mark.parametrize("criterion", ["determinant", "placement"])
 def test_the_greediest_choice_is_taken(tmp_path: Path, criterion: Any) -> None:
-    """Each next one gains most for its cost: told by all promises that one more would make."""
+    """Each selected feature has the largest gain for its cost among all possible next features."""
     artwork = round_artwork(round_board(tmp_path, traces=TRACES))
     rulers = candidates_of(artwork)
     few = FeatureCandidates._make([*(each[::9] for each in rulers[:-1]), rulers.placement])
     both = append_fiducials(few, found(artwork), IMAGING)
     both = both._replace(ambiguity=np.zeros(len(both.radius)))
     costs = np.where(both.radius > 0, 6.0, 1.0)
-    # No prior worth the name, so that gains are those of the promises.
+    # A negligible prior, so that the gains follow from the predicted covariances.
     wide = Imaging(pixel=25e-6, shift=1.0, angle=3.0, etch_bias_sigma=0.0)
     chosen = select_rulers(both, wide, 30, costs=costs, criterion=criterion, per_source=99).chosen
     assert np.sum(both.radius[chosen] > 0) > 0

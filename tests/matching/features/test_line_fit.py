@@ -1,4 +1,4 @@
-"""Robust lines on devices: at the minimum of their loss, in spite of outliers, with a covariance that holds."""
+"""Robust lines on devices: minimum of the loss, robustness against outliers, validity of the covariance."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NOISE = 0.05
 def scene(
     rng: np.random.Generator, lines: int, count: int, bad: float = 0.0, size: float = 1000.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return normals, points of the lines, and noisy points along them, the first ones far aside."""
+    """Return normals, points of the lines, and noisy points along them, the first ones are gross errors."""
     angle, middle = rng.uniform(-np.pi / 2, np.pi / 2, lines), rng.uniform(0.0, size, (lines, 2))
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)
@@ -64,13 +64,14 @@ def test_covariance_is_what_is_measured(
 ) -> None:
     normal, middle, points = scene(rng, 1000, 20, bad)
     fits = FitLines(loss=loss, scale=scale, variant=variant)(points, device=device)
-    # Where twelve good points happen to make a small scale, some of them weigh nothing.
+    # If twelve good points have a small scale by chance, some of them get weight 0.
     assert np.mean(fits.status != 0) < 0.01
     sigma = np.sqrt(fits.covariance[:, [0, 1], [0, 1]])
     found = errors(fits, normal, middle)
-    # A thousand draws say a standard deviation to 2 %; the asymptotic formula is good to 15 % at twelve good points.
+    # A thousand draws determine a standard deviation to 2 %; the asymptotic formula is good to 15 % at twelve good
+    # points.
     np.testing.assert_allclose(np.std(found, axis=0) / np.sqrt(np.mean(sigma**2, axis=0)), 1.0, atol=0.15)
-    # None follows its outliers: they are at least 20 sigma away, and pull by that over their number.
+    # No line follows its outliers: they are at least 20 sigma away.
     assert np.abs(found[:, 1]).max() < 8.0 * sigma[:, 1].mean()
     if scale is None:
         assert np.median(fits.scale) == pytest.approx(NOISE, rel=0.2)
@@ -82,7 +83,7 @@ def test_single_follows_double(device: Device, rng: np.random.Generator) -> None
     single = FitLines()(points, device=device)
     double = FitLines()(points.astype(np.float64), device=device)
     np.testing.assert_allclose(single.normal, double.normal, atol=2e-6)
-    # A thousand pixels have a spacing of 6e-5 px; distances from the origin carry the angle's rounding as well.
+    # Floats near 1000 px have a spacing of 6e-5 px; distances from the origin also contain the rounding of the angle.
     np.testing.assert_allclose(single.centre, double.centre, atol=1e-4)
     np.testing.assert_allclose(single.distance, double.distance, atol=2e-3)
     np.testing.assert_allclose(single.covariance, double.covariance, rtol=1e-2, atol=1e-12)
@@ -117,9 +118,9 @@ def test_what_is_missing(device: Device, variant: Any, rng: np.random.Generator)
     np.testing.assert_array_equal(fits.status, expected)
     np.testing.assert_array_equal(fits.weights[0, 5:9], 0.0)
     without = FitLines(variant=variant)(np.delete(points[:1], slice(5, 9), axis=1), device=device)
-    # Other pairs to start from make the scale another one, a little.
+    # Other start pairs change the scale slightly.
     np.testing.assert_allclose(fits.centre[0], without.centre[0], atol=0.1 * NOISE)
-    # Two points make a line, and no covariance.
+    # Two points determine a line, but no covariance.
     assert np.isfinite(fits.normal[1]).all()
     assert np.isnan(fits.covariance[1, 0, 0])
     for bad in (2, 3, 4):

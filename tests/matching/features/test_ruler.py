@@ -1,4 +1,4 @@
-"""RulerEdges on devices: as the float64 reference says, on every kind of image, and flagged where it cannot be."""
+"""RulerEdges on devices: against the float64 reference on every kind of image, and flags."""
 
 from __future__ import annotations
 
@@ -53,9 +53,10 @@ def expected(operation: RulerEdges, image: np.ndarray, rulers: np.ndarray) -> li
 
 
 def assert_like(ours: Any, theirs: list[dict[str, float]], scale: float = 100.0) -> None:
-    """Samples are relative to a pixel of the ruler's own: a few roundings of 64 px in place, and of the grey levels.
+    """Sample positions, relative to a pixel of the ruler, have a few roundings of 64 px; so have the grey levels.
 
-    A step's position has those of its samples over its slope, magnified by the logarithms' difference.
+    The error of an edge is the error of its samples divided by its slope, magnified by the difference of the
+    logarithms.
     """
     for name, tolerance in (("position", 1e-4), ("amplitude", 2e-4 * scale), ("width", 5e-4)):
         values = [each[name] for each in theirs]
@@ -91,7 +92,7 @@ def test_odd_sizes_and_steps(device: Device, variant: Any, rng: np.random.Genera
 def test_long_and_wide_ones(
     device: Device, length: int, width: int, step_px: float, angle: float, rng: np.random.Generator
 ) -> None:
-    """Places in fixed point have fewer digits there, and still enough."""
+    """Fixed-point positions have fewer digits there, which are still sufficient."""
     distance = float(np.dot((170.0, 160.0), (math.cos(angle), math.sin(angle))))
     image = (reference.step_image((320, 340), angle, distance, 3.0) + rng.normal(0.0, 2.0, (320, 340))).astype(
         np.float32
@@ -108,7 +109,7 @@ def test_long_and_wide_ones(
 @pytest.mark.parametrize("angle", [0.0, math.pi / 2, math.pi, -math.pi / 2, math.pi / 4])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_all_of_an_image(device: Device, dtype: Any, angle: float) -> None:
-    """Samples and lines from the first pixel to the last, whatever the rounding: nothing beside them is read."""
+    """Samples and lines from the first to the last pixel: rounding never causes a read outside the image."""
     turned, diagonal = abs(math.sin(angle)) > 0.9, abs(math.sin(2.0 * angle)) > 0.9
     shape = (64, 16) if turned else (16, 64)
     length, width = (45, 12) if diagonal else (64, 16)
@@ -118,7 +119,7 @@ def test_all_of_an_image(device: Device, dtype: Any, angle: float) -> None:
     distance = float(np.dot(middle, (math.cos(angle), math.sin(angle)))) + 0.25
     inner = image_of(reference.step_image(shape, angle, distance, 1.2), dtype)
     operation = RulerEdges(threshold=20.0, length=length, width=width)
-    ruler = np.round(one_ruler(*middle, angle), 7)  # along the pixels without what pi lacks
+    ruler = np.round(one_ruler(*middle, angle), 7)  # along the pixels, without the rounding error of pi
     ours = operation(inner, ruler, device=device)
     assert ours.status[0] == 0
     theirs = max(expected(operation, inner, ruler)[0], key=lambda edge: abs(edge["gradient"]))
@@ -136,7 +137,7 @@ def test_shortest_and_a_single_line(device: Device) -> None:
 @ON_DEVICES
 @given(angle=st.floats(0.0, 2.0 * math.pi), x=st.floats(60.0, 90.0), y=st.floats(45.0, 75.0))
 def test_any_direction(device: Device, angle: float, x: float, y: float) -> None:
-    """An image that is linear along an edge: the reference at any direction, on and off the grid."""
+    """For an image that is linear along an edge, the reference holds in any direction, on and off the grid."""
     image = reference.step_image(SHAPE, 0.0, 75.2, 2.0).astype(np.float32)
     image += reference.step_image(SHAPE, math.pi / 2, 60.4, 2.0).astype(np.float32)
     ruler = one_ruler(x, y, angle)
@@ -144,7 +145,7 @@ def test_any_direction(device: Device, angle: float, x: float, y: float) -> None
     (theirs,) = expected(STRONGEST, image, ruler)
     ranked = sorted(theirs, key=lambda edge: -abs(edge["gradient"]))
     if len(ranked) > 1 and abs(ranked[1]["gradient"]) > 0.9999 * abs(ranked[0]["gradient"]):
-        return  # either may come first
+        return  # the order may differ
     if not ranked or abs(abs(ranked[0]["amplitude"]) - STRONGEST.threshold) < 5.0:
         return  # about the threshold
     np.testing.assert_allclose(ours.position, [ranked[0]["position"]], rtol=0, atol=2e-3)
@@ -192,7 +193,7 @@ def test_polarity(device: Device, variant: Any, polarity: Any, sign: float, plac
     ours = RulerEdges(threshold=15.0, polarity=polarity, variant=variant)(image, one_ruler(), device=device)
     assert np.sign(ours.amplitude) == sign
     assert abs(ours.position[0] - place) < 0.01
-    # A ruler that points the other way sees the signs swapped, not the places in the image.
+    # A reversed ruler changes the signs of the edges, but not their places in the image.
     back = RulerEdges(threshold=15.0, polarity=polarity, variant=variant)(
         image, one_ruler(angle=math.pi), device=device
     )
@@ -212,13 +213,13 @@ def test_pairs_have_the_middle_whatever_the_width(device: Device, variant: Any, 
     np.testing.assert_allclose(ours.spacing, spacing, rtol=0, atol=0.02)
     single = replace(operation, pairs=False)(image, rulers, device=device)
     np.testing.assert_allclose(ours.sigma, single.sigma / math.sqrt(2.0), rtol=0.05)
-    # The same stripe is no dark one.
+    # The same stripe is not found as a dark stripe.
     none = replace(operation, polarity="falling")(image, rulers, device=device)
     assert (none.status == Status.LOW_SIGNAL).all()
 
 
 def test_pairs_of_a_spacing(device: Device) -> None:
-    """Two stripes: the one whose width was asked for."""
+    """Of two stripes, the stripe with the requested width is found."""
     image = reference.stripe_image(SHAPE, 0.0, 60.0, 8.0, 0.8) + reference.stripe_image(SHAPE, 0.0, 90.0, 14.0, 0.8)
     for limits, place in (((6.0, 10.0), -15.0), ((12.0, 16.0), 15.0)):
         operation = RulerEdges(threshold=15.0, pairs=True, polarity="rising", spacing_px=limits, length=72)
@@ -229,9 +230,9 @@ def test_pairs_of_a_spacing(device: Device) -> None:
 @VARIANTS
 @pytest.mark.parametrize("radius", [12.0, 25.0])
 def test_curved_edges(device: Device, variant: Any, radius: float) -> None:
-    """Radial rulers on a disc: off by (blur^2 + lines) / (2 radius) when taken for straight, and right when not.
+    """Radial rulers on a disc: the straight model has a bias of (blur^2 + lines) / (2 radius), the curved one none.
 
-    What is left is the second order, (variance / radius^2) of that.
+    The second order remains, a fraction (variance / radius^2) of that.
     """
     image = reference.disc_image(SHAPE, MIDDLE, radius, 1.2).astype(np.float32)
     angle = np.linspace(0.0, 2.0 * math.pi, 60, endpoint=False)
@@ -261,7 +262,7 @@ LENSES = {
 @VARIANTS
 @pytest.mark.parametrize("model", LENSES.values(), ids=LENSES)
 def test_through_a_lens(device: Device, variant: Any, model: Any, rng: np.random.Generator) -> None:
-    """A straight edge of the scene is bent in the image: found where it is straight."""
+    """A straight edge of the scene is bent in the image; the ruler finds it in undistorted coordinates."""
     row, column = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(np.float64)
     ideal = model.undistort(np.stack([column, row], axis=-1))
     angle, distance = 0.5, float(np.dot((30.0, 90.0), (math.cos(0.5), math.sin(0.5))))
@@ -325,7 +326,7 @@ def test_what_cannot_be_read_is_flagged(device: Device, variant: Any) -> None:
 @VARIANTS
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_up_to_the_border(device: Device, variant: Any, dtype: Any) -> None:
-    """The outermost pixels belong to the image, and nothing behind them is read."""
+    """The outermost pixels belong to the image, and pixels beyond them are never read."""
     image = image_of(reference.step_image((5, 64), 0.0, 33.25, 1.0), dtype)
     operation = replace(STRONGEST, variant=variant)
     ruler = one_ruler(31.5, 2.0)
@@ -451,6 +452,6 @@ def test_wrong_parameters(options: dict[str, Any], error: type[Exception], messa
 
 
 def test_the_recommended_smoothing() -> None:
-    """The least variance of a gradient's peak, (a^2 + s^2)^3 / (a^5 s), over a."""
+    """The recommended smoothing minimises the variance of the gradient peak, (a^2 + s^2)^3 / (a^5 s), over a."""
     a = np.linspace(0.5, 5.0, 4501)
     assert abs(a[np.argmin((a**2 + 1.0) ** 3 / a**5)] - best_smoothing(1.0)) < 1e-3

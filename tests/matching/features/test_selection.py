@@ -1,4 +1,4 @@
-"""Selections of rulers: what they promise is what least squares deliver, and others do no better."""
+"""Selection of rulers: predicted deviations agree with least squares, and other selections are not better."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def rulers_of(artwork: Artwork, imaging: Imaging = IMAGING) -> FeatureCandidates
 
 
 def seen_offsets(rulers: FeatureCandidates, shift: np.ndarray, angle: float) -> np.ndarray:
-    """How far along each ruler the edge is met, of a board turned about the placement point and shifted."""
+    """Return the edge offset on each ruler for a board that is rotated about the placement point and shifted."""
     cos, sin = math.cos(angle), math.sin(angle)
     turn = np.array([[cos, -sin], [sin, cos]])
     point = rulers.placement + (rulers.point - rulers.placement) @ turn.T + shift
@@ -48,7 +48,7 @@ def seen_offsets(rulers: FeatureCandidates, shift: np.ndarray, angle: float) -> 
 
 
 def covariance_of(rulers: FeatureCandidates, chosen: np.ndarray, imaging: Imaging) -> np.ndarray:
-    """Of generalised least squares: derivatives by differences, the etching as noise that all edges share."""
+    """Return the covariance of generalised least squares; the etch bias is noise common to all edges."""
     step = 1e-7
     columns = [
         (seen_offsets(rulers, step * np.array(shift), step * angle) - seen_offsets(rulers, np.zeros(2), 0)) / step
@@ -164,7 +164,7 @@ def test_repeated_edges_on_a_ruler_are_ambiguous(tmp_path: Path, rng: np.random.
     apart = tuple((12.0, y, 18.0, y) for y in (10.0, 13.0))
     imaging = replace(IMAGING, shift=400e-6, angle=0.0)
     rulers = rulers_of(board(tmp_path, *comb, *apart, (10, 2, 10, 8)), imaging)
-    # Edges are found on a ruler less the smoothing's reach at either end.
+    # Edges are found on a ruler, except within the extent of the smoothing filter at both ends.
     found = np.max(rulers.length[~rulers.pair]) / 2 - 3 * math.sqrt(5.0) * imaging.pixel
     up = (rulers.normal[:, 1] > 0.9) & (rulers.point[:, 0] < 9e-3)
     shifts = rng.uniform(-400e-6, 400e-6, 20000)
@@ -192,8 +192,8 @@ def test_ink_and_holes_are_ambiguous_too_and_may_lie_off(tmp_path: Path) -> None
         x, y = rulers.point.T * 1e3
         return rulers.ambiguity[(x > low) & (x < high) & np.isclose(y, 10.15) & ~rulers.pair]
 
-    # A ruler finds edges as far as 0.1 mm, a turn by 5 mrad about up to 8 mm, and 0.06 mm; the board itself lies off by
-    # the former two. The ink ends 0.5 mm from the edge, the hole begins 0.45 mm from it.
+    # Search range of a ruler: 0.1 mm of shift, a rotation by 5 mrad at up to 8 mm, and 0.06 mm. The board moves by the
+    # shift and the rotation only. The ink ends 0.5 mm from the edge, the hole begins 0.45 mm from it.
     assert upper(far, 12.2, 15.8).max() == 0.0 == upper(far, 6.2, 7.8).max()
     assert upper(near, 12.2, 15.8).min() > 0.1
     assert upper(near, 6.2, 7.8).min() > 0.1
@@ -220,7 +220,7 @@ def test_rulers_stay_on_their_edges_and_in_the_region_to_read(tmp_path: Path, rn
         point, normal = rulers.point[index], rulers.normal[index]
         ends = point + np.array([[-0.5], [0.5]]) * rulers.length[index] * normal
         assert ((ends >= low - 1e-12) & (ends <= high + 1e-12)).all()
-        # The edge, shifted and turned anyhow, crosses the ruler within its ends.
+        # The edge crosses the ruler between its ends for every shift and rotation.
         offsets = [
             seen_offsets(rulers, rng.choice([-1, 1], 2) * IMAGING.shift, sign * IMAGING.angle)[index]
             for sign in (-1, 1)
@@ -244,7 +244,7 @@ def test_keeps_to_its_budget_and_to_few_rulers_on_each_side(tmp_path: Path) -> N
     assert (costs[left][~np.isin(rulers.source[left], full)] > 3000 - found.cost).all()
     counts = [np.sum(rulers.source[found.chosen] == each) for each in set(rulers.source)]
     assert max(counts) <= 4
-    # The board is as it is when mirrored in its diagonal: x may be y.
+    # The board is symmetric about its diagonal: x and y may be exchanged.
     assert np.sort(select_rulers(rulers, IMAGING, 12, missing=0.19).sigmas) == pytest.approx(
         np.sort(select_rulers(rulers, IMAGING, 12).sigmas) / 0.9, rel=0.01
     )

@@ -1,4 +1,4 @@
-"""What speaks for a pose: chance, and lines that must be seen."""
+"""Evidence for a pose: number of false alarms, and expected lines."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ def test_distances_are_those_to_dense_samples(name: str, rng: np.random.Generato
             samples.append(start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start))
     every = np.concatenate(samples)
     nearest = np.array([np.hypot(*(every - place).T).min() for place in places])
-    # Samples up to 0.11 m apart, chords of arcs of 0.08 rad: half a step aside, and r (1 - cos(0.04)) within.
+    # Samples up to 0.11 m apart, chords of arcs of 0.08 rad: errors of half a step along the line, and r (1 -
+    # cos(0.04)) across it.
     np.testing.assert_allclose(distances_to_lines(field, places), nearest, atol=0.06)
     assert distances_to_lines(field, every[::50]).max() < 0.002
 
@@ -46,7 +47,7 @@ def test_crossings_are_where_scan_lines_meet_lines() -> None:
     found = expected_crossings(CROSS, (0.0, 0.0, 0.0), paths, line_width=0.1)
     np.testing.assert_allclose(found.places, [(-3.0, 0.0), (-2.5, 0.0), (0.0, 1.0)], atol=1e-12)
     np.testing.assert_allclose(found.sines, [1.0, math.sqrt(0.5), 1.0])
-    # As a robot that is turned and elsewhere has the same paths.
+    # A robot at another pose has the same paths in its frame.
     pose = (0.7, -0.4, 1.1)
     c, s = math.cos(pose[2]), math.sin(pose[2])
     seen = (np.reshape(paths, (-1, 2, 2)) - pose[:2]) @ np.array([[c, -s], [s, c]])
@@ -79,7 +80,7 @@ def test_seen_is_what_has_a_point() -> None:
 
 
 def test_chance_bounds_what_random_points_reach(rng: np.random.Generator) -> None:
-    """One pose of all is the same as none looked for: a thousandth is reached at most once in a thousand draws."""
+    """The best of all poses is tested: a number of false alarms of 1/1000 occurs at most once in a thousand draws."""
     field = read_field("robocup_msl")
     # Straight ones; goal and penalty areas; the circle; corners of 79.568 degrees.
     straight, areas = 2 * 21.875 + 3 * 13.875, 2 * (2 * 0.625 + 3.775 + 2 * 2.125 + 6.775)
@@ -93,7 +94,7 @@ def test_chance_bounds_what_random_points_reach(rng: np.random.Generator) -> Non
     assert np.sum(np.array(reached) < math.log(0.01)) < 10 + 4 * math.sqrt(10)
     assert log_nfa([], field, scale=0.25, max_range=6.0, margin=None) == math.inf
     on_lines = log_nfa(np.zeros(60), field, scale=0.25, max_range=6.0, margin=1.0)
-    # All 60 points within 15 mm, but for what the poses' number takes from it.
+    # All 60 points lie within 15 mm; the number of poses reduces the evidence.
     assert on_lines == pytest.approx(60 * math.log(2 * 0.015 * total_line_length(field) / 308), rel=0.15)
 
 

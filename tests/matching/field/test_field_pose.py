@@ -1,4 +1,4 @@
-"""A robot on its field: scores against their definition, poses against SciPy, and views that say too little."""
+"""Pose of a robot on its field: scores by definition, poses by SciPy, and insufficient views."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def large(device: Device) -> DistanceMap:
 
 @cache
 def small(device: Device, columns: int = 7) -> DistanceMap:
-    """A field of few columns, that no block fills."""
+    """Return a field with fewer columns than a block."""
     field = Field(length=0.1 * columns, width=0.9, lines=((-1.0, 0.13, 2.0, 0.41),), arcs=(Arc(0.2, -0.3, 0.5, -1, 2),))
     return DistanceMap(field=field, cell=0.1, max_range=2.0, device=device)
 
@@ -116,7 +116,7 @@ def test_wrong_maps_are_refused() -> None:
 
 
 def expected_scores(search: FieldPoseSearch, points: np.ndarray) -> np.ndarray:
-    """From the map, point by point, in whole numbers."""
+    """Return scores from the map, point by point, in integers."""
     field_map, (rows, columns) = search.map, search.map.positions
     result = np.zeros((len(search.angles), rows, columns))
     for turn, heading in enumerate(search.angles):
@@ -134,11 +134,11 @@ def expected_scores(search: FieldPoseSearch, points: np.ndarray) -> np.ndarray:
 def test_scores_are_sums_over_the_map(device: Device, variant: Any, count: int, rng: np.random.Generator) -> None:
     for field_map in (small(device), small(device, 64), small(device, 131)):
         search = FieldPoseSearch(map=field_map, headings=(0.3, -2.0, 1.1), with_scores=True, variant=variant)
-        # Not so near the half of a cell that a fused multiplication rounds to another one.
+        # Not close to half a cell, where a fused multiplication could round to another cell.
         points = rng.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
         expected = expected_scores(search, points)
         costs = search(points, device=device)
-        # One point in another cell, at most.
+        # At most one point is in another cell.
         assert np.mean(np.abs(costs.scores - expected) < 1e-6) > 0.99 if count > 1 else True
         np.testing.assert_allclose(costs.scores, expected, atol=1.0 / count)
         assert (costs.seen == count).all()
@@ -164,7 +164,7 @@ def test_points_that_are_none_do_not_count(device: Device, variant: Any, rng: np
     search = FieldPoseSearch(map=small(device), headings=(0.3, -2.0, 1.1), with_scores=True, variant=variant)
     points = rng.uniform(-1.0, 1.0, (63, 2)).astype(np.float32)
     worse = np.concatenate([points, points[:3]])
-    # The last one is beyond the reach by less than a cell.
+    # The last point is less than a cell beyond the range.
     worse[7], worse[64], worse[65] = (np.nan, 0.0), (1e30, np.inf), (2.01, 0.0)
     alike = np.delete(worse, [7, 64, 65], axis=0)
     costs, expected = search(worse, device=device), search(alike, device=device)
@@ -215,7 +215,7 @@ def test_kidnapped_robots_are_found(device: Device, rng: np.random.Generator) ->
 
 
 def test_clutter_of_70_percent(device: Device, rng: np.random.Generator) -> None:
-    """Most points are on lines painted in the hall, people, and the ball; no robot is taken for elsewhere."""
+    """Most points are on other lines, people and the ball; every robot is found at its true place."""
     field_map = large(device)
     for _ in range(40):
         pose = rng.uniform([-10.5, -6.5, -np.pi], [10.5, 6.5, np.pi])
@@ -253,7 +253,7 @@ def test_points_twice_are_the_same_pose(device: Device, rng: np.random.Generator
 
 
 def test_a_mirrored_view_is_a_mirrored_pose(device: Device, rng: np.random.Generator) -> None:
-    """The field is its own mirror image, so a mirrored camera finds the mirrored pose: no score can tell that."""
+    """The field is mirror symmetric, so a mirrored camera finds the mirrored pose with the same score."""
     field_map = large(device)
     points = view(field_map, POSE, rng)
     right, mirrored = (
@@ -293,8 +293,8 @@ def test_poses_are_of_least_cost(device: Device, rng: np.random.Generator) -> No
         start = (pose + rng.uniform(-1.0, 1.0, 3) * [0.1, 0.1, 0.05]).astype(np.float32)
         fit = FieldPoseRefinement(map=field_map)(points, start[None], device=device)
         expected = reference.refine_pose(field_map.field, start, points.astype(np.float64), field_map.scale)
-        # Where two lines are as near as one another the cost has an edge, at which SciPy stops now and then: then it
-        # may not be better, and finds nothing better from the pose that was found.
+        # Where two lines are equally near, the cost has a kink at which SciPy sometimes stops. SciPy's result is then
+        # not better, and SciPy does not improve the pose of the kernel.
         least, other = (
             reference.cost(field_map.field, each, points.astype(np.float64), field_map.scale)
             for each in (fit.poses[0], expected)
@@ -369,7 +369,7 @@ def test_poses_that_are_none(device: Device, rng: np.random.Generator) -> None:
     points = view(field_map, POSE, rng)
     starts = np.float32([[np.nan, 0, 0], [0, np.inf, 0], POSE, [1e5, 0.0, 0.0]])
     fit = FieldPoseRefinement(map=field_map)(points, starts, device=device)
-    # Far away nothing is near a line.
+    # Far away no point is near a line.
     assert fit.status.tolist() == [Status.NOT_FINITE, Status.NOT_FINITE, Status.OK, Status.LOW_SIGNAL]
     for values in (fit.poses, fit.covariance, fit.information, fit.score, fit.residual_std, fit.inlier_fraction):
         np.testing.assert_array_equal(np.isfinite(values.reshape(4, -1)).all(axis=1), [False, False, True, False])

@@ -1,4 +1,4 @@
-"""Odometry and views together: against many robots, against Kalman's equations, and with views that say little."""
+"""Odometry and views together: against simulated robots, Kalman's equations, and with insufficient views."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_correction_is_kalmans() -> None:
 
 
 def test_one_line_corrects_what_it_says() -> None:
-    """A line along x says y and the heading; x stays as it was."""
+    """A line along x determines y and the heading; x does not change."""
     estimate = PoseEstimate(np.array([1.0, 2.0, 0.0]), np.diag([0.04, 0.04, 0.01]))
     corrected = correct(estimate, (50.0, 2.1, 0.05), np.diag([0.0, 1e8, 1e8]))
     np.testing.assert_allclose(corrected.pose, [1.0, 2.1, 0.05], atol=1e-6)

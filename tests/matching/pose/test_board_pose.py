@@ -1,4 +1,4 @@
-"""The local fix on devices: rendered edges to a pose, as its parts make it one after the other."""
+"""BoardPoseEstimator on devices: the fused launch gives the same pose as its parts in sequence."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ VARIANTS = pytest.mark.parametrize("variant", ["vector", "work_item"])
 PIXEL, NOISE = 10e-6, 2.0
 SHAPE, PATCH, LINES, EACH = (360, 480), 120, 12, 6
 PLACE = (3e-3, -1e-3)
-# An oblique camera that sees y upwards.
+# An oblique camera with y upwards in the image.
 MATRIX = np.array([[1.0 / PIXEL, 0.0, 240.0], [0.0, -1.0 / PIXEL, 180.0], [6.0, 3.0, 1.0]])
 POSE = np.array([3e-5, -2e-5, 0.006])
 
 
 def on_board(points: np.ndarray) -> np.ndarray:
-    """Pixels to the board's plane."""
+    """Return points on the board's plane for pixels."""
     lifted = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1) @ np.linalg.inv(MATRIX).T
     return np.asarray(lifted[..., :2] / lifted[..., 2:])
 
 
 def artwork() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normals and points of the lines, one in the middle of each patch, and where the rulers lie along them."""
+    """Return normals and points of the lines, one in the middle of each patch, and the offsets of their rulers."""
     angle = np.arange(LINES) * np.pi / LINES + 0.1
     middle = [((i % 4 + 0.5) * PATCH, (i // 4 + 0.5) * PATCH) for i in range(LINES)]
     along = np.tile(np.linspace(-20.0, 20.0, EACH) * PIXEL, (LINES, 1))
@@ -39,7 +39,7 @@ def artwork() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def picture(rng: np.random.Generator, pose: np.ndarray = POSE, shifted: tuple[int, ...] = ()) -> np.ndarray:
-    """Edges of the artwork at a pose, each in its patch; some lie 10 px aside."""
+    """Return an image of the artwork's edges at a pose, each in its patch; some are displaced by 10 px."""
     normal, point, _ = artwork()
     row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
     matrix, shift = robust.transform_of(pose)
@@ -91,7 +91,7 @@ def test_as_its_parts(device: Device, variant: Any, rng: np.random.Generator) ->
     edges = fix.ruler(image, plain, device=device)
     np.testing.assert_allclose(result.edges.ravel(), edges.position, atol=1e-4)
     np.testing.assert_array_equal(result.edge_status.ravel(), edges.status)
-    # Without outliers lines lose nothing: the pose is that from all edges, but for a little of the weights.
+    # Without outliers the pose from lines agrees with the pose from all edges, up to small differences of the weights.
     seen = on_board(plain[:, :2] + edges.position[:, None] * plain[:, 2:].astype(float))
     normal, point, _ = artwork()
     sigma = edges.sigma.astype(float) * PIXEL
@@ -111,12 +111,12 @@ def test_covariance_is_what_is_measured(device: Device, variant: Any, rng: np.ra
         pose = np.array([*rng.uniform(-5e-5, 5e-5, 2), rng.uniform(-0.01, 0.01)])
         result = fix(picture(rng, pose, (number % LINES,)), rulers, lines, device=device)
         assert result.status == Status.OK
-        # The line that lies aside has no say.
+        # The displaced line has weight 0.
         assert not result.weights[number % LINES].any()
         found.append(error(result, pose))
         covariance.append(result.covariance)
     deviation = np.sqrt(np.mean(covariance, axis=0)[[0, 1, 2], [0, 1, 2]])
-    # Sixty draws say a standard deviation to 9 %.
+    # Sixty draws determine a standard deviation to 9 %.
     ratio = np.std(found, axis=0) / deviation
     assert (ratio < 1.3).all()
     assert (ratio > 0.7).all()
@@ -162,7 +162,7 @@ def test_refuses(device: Device, variant: Any, rng: np.random.Generator) -> None
 
 
 def test_place_of_lines_on_the_board(device: Device, rng: np.random.Generator) -> None:
-    """A line that was etched only so well is not better than that."""
+    """The position error of a line on the board limits its weight."""
     image, (rulers, lines) = picture(rng), laid(1e-6)
     result = operation()(image, rulers, lines, device=device)
     # Two rows of a line, 24 in all: about sigma^2 / 12 in each direction, taken for independent.

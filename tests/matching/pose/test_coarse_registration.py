@@ -1,4 +1,4 @@
-"""From files to a pose: artwork, selection, a picture of the board, edges, and what was promised."""
+"""From files to a pose: artwork, selection, image of the board, edges, and predicted deviations."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_pictures_hold_what_is_on_the_board(tmp_path: Path) -> None:
         middle = np.array([np.sum(picture * columns), np.sum(picture * rows)]) / max(picture.sum(), 1e-9)
         return picture.sum() * PIXEL**2, view.corner + middle * (PIXEL, -PIXEL)
 
-    # 2 x 2 mm less 0.25 x 2 mm of silk; an eighth of a pixel all round is what sampling may cost.
+    # 2 x 2 mm minus 0.25 x 2 mm of silk; sampling may cause an error of an eighth of a pixel along the outline.
     inside, around = 3.5e-6, 7.5e-3 * PIXEL / SAMPLES
     for pose in ((0.0, 0.0, 0.0), (0.13e-3, -0.2e-3, 0.3)):
         seen, middle = copper_of(view, pose=pose, about=(5e-3, 5e-3))
@@ -67,7 +67,7 @@ def of_tool(path: Path, middle: tuple[float, float]) -> BoardFix:
 
 
 def band(count: int) -> np.ndarray:
-    """Ratios of standard deviations: within 15 %, and what so many draws leave open, to one in 1e4 either side."""
+    """Return limits of a ratio of standard deviations: 15 % plus the sampling error at 1e-4 on each side."""
     return np.array([0.85, 1.15]) * np.sqrt(chi2.ppf([1e-4, 1 - 1e-4], count) / count)
 
 
@@ -92,10 +92,10 @@ def test_no_wrong_pose_of_a_disturbed_board(
     pictures = [board.disturbed(kind, rng) for _ in range(1 if kind in ("motion", "reversed") else 4)]
     fixes = board.fixes(pictures, 60, device, rng)
     if kind == "reversed":
-        # Dark copper, where bright was looked for: nothing is said, and all where dark was.
+        # Dark copper: no pose if bright copper is searched, all poses if dark copper is searched.
         assert not fixes.good.any()
         fixes = board.fixes(pictures, 60, device, rng, polarity="rising")
-    # Boards on which a freedom is left to few rulers are refused, in all of their pictures.
+    # Boards on which few rulers determine a degree of freedom are refused in all images.
     assert np.mean(fixes.good) > (0.2 if kind in ("missing", "outliers") else 0.99)
     assert fixes.squares.max() < GROSS
     assert_as_promised(fixes.scatter / fixes.said, band(int(fixes.good.sum())))
@@ -111,7 +111,7 @@ def test_chosen_rulers_beat_others_as_promised(drawn: BoardFix, device: Device, 
 def assert_beats_random_sets(
     board: BoardFix, pictures: list[BoardPicture], draws: int, device: Device, rng: np.random.Generator
 ) -> None:
-    """By the sixth root of the determinants: standard deviations, in the mean over all combinations."""
+    """Compare sixth roots of the determinants of the covariances: mean standard deviations over all combinations."""
     sets = [board.at_random(rng) for _ in range(8)]
     promised = np.mean([each.covariance for each in sets], axis=0)
     fixes = [board.fixes(pictures, draws, device, rng, selection=each) for each in sets]
@@ -125,7 +125,7 @@ def assert_beats_random_sets(
     expected = size(promised) / size(board.chosen.covariance)
     measured = size(errors.T @ errors / len(errors)) / size(chosen.errors.T @ chosen.errors / (4 * draws))
     assert expected > 1.1
-    # Three standard deviations of so many draws, twice: that of the sixth root is one of 6 n numbers.
+    # Three standard deviations of the draws, for both sides; the sixth root averages 6 n numbers.
     left = 3 / math.sqrt(6 * 4 * draws) + 3 / math.sqrt(6 * len(errors))
     assert measured == pytest.approx(expected, rel=0.15 + left)
 

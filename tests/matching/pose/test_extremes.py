@@ -1,4 +1,4 @@
-"""Boards that nobody wants: fixes of them are right, or refused."""
+"""Difficult boards: their poses are correct or refused."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> BoardFix:
 
 
 def test_a_camera_that_looks_past_the_board(board: BoardFix, device: Device, rng: np.random.Generator) -> None:
-    """Further off than it was looked for: nothing is found, or other edges, and no pose."""
+    """Beyond the search range, no edges or other edges are found, and the pose is refused."""
     x, y = board.view.corner
     for off in ((40e-3, 0.0), (0.0, -2e-3)):
         picture = board.painted(replace(board.view, corner=(x + off[0], y + off[1])))
@@ -36,7 +36,7 @@ def test_a_camera_that_looks_past_the_board(board: BoardFix, device: Device, rng
 
 
 def test_a_picture_that_shows_a_part(board: BoardFix, device: Device, rng: np.random.Generator) -> None:
-    """Rulers beyond its right border have no edges; the others have the pose all the same."""
+    """Rulers beyond the right image border have no edges; the other rulers determine the pose."""
     narrow = replace(board.view, shape=(480, 500))
     fixes = board.fixes([board.painted(narrow)], 20, device, rng)
     assert fixes.good.all()
@@ -50,7 +50,7 @@ def test_no_contrast_no_pose(board: BoardFix, device: Device, rng: np.random.Gen
 
 
 def test_only_parallel_traces_are_left(board: BoardFix, device: Device, rng: np.random.Generator) -> None:
-    """Chosen were edges all around, seen are level ones: x is open."""
+    """Edges of all directions were selected, but only horizontal edges are visible: x is undetermined."""
     level = [
         number
         for number, each in enumerate(board.artwork.copper)
@@ -64,7 +64,7 @@ def test_only_parallel_traces_are_left(board: BoardFix, device: Device, rng: np.
 
 @pytest.mark.parametrize("share", [0.5, 0.7])
 def test_mostly_clutter(board: BoardFix, share: float, device: Device, rng: np.random.Generator) -> None:
-    """Half of the rulers, and most of them, on wrong edges: none is wrong where each row must have four others."""
+    """50 % or more of the rulers are on wrong edges: no pose is wrong if four other rows must support each row."""
     careful = replace(board, max_leverage=0.5)
     pictures = [board.painted(board.view, more=board.splashes(rng, share)) for _ in range(3)]
     fixes = careful.fixes(pictures, 30, device, rng)
@@ -72,7 +72,7 @@ def test_mostly_clutter(board: BoardFix, share: float, device: Device, rng: np.r
 
 
 def test_glare(board: BoardFix, device: Device, rng: np.random.Generator) -> None:
-    """Tin that blinds the camera over a third of the picture."""
+    """Specular highlights saturate a third of the image."""
     x, y = board.middle
     glare = Shape(np.array([[x - 8e-3, y - 6e-3], [x - 3e-3, y - 6e-3], [x - 2.4e-3, y + 6e-3], [x - 8e-3, y + 6e-3]]))
     blinded = replace(board, artwork=replace(board.artwork, silk=(*board.artwork.silk, glare)))
@@ -83,7 +83,7 @@ def test_glare(board: BoardFix, device: Device, rng: np.random.Generator) -> Non
 
 
 def test_a_comb_of_one_pitch_is_not_chosen(tmp_path: Path) -> None:
-    """Where every edge has another of its kind as near as the board may be off, none says where the board is."""
+    """If every edge has a similar edge within the search range, no edge determines the pose."""
     head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n%ADD10C,0.2*%\nD10*\n"
     lines = []
     for place in range(2_000_000, 14_000_000, 400_000):
@@ -111,7 +111,7 @@ def test_two_rulers_are_too_few() -> None:
 def test_a_board_that_lies_further_off_than_it_was_looked_for(
     board: BoardFix, device: Device, rng: np.random.Generator
 ) -> None:
-    """By 0.3 mm, three times the most: rulers see other edges, and poses that far off are not believed."""
+    """Displaced by 0.3 mm, three times the range: rulers find other edges, and poses beyond the range are refused."""
     x, y = board.view.corner
     picture = board.painted(replace(board.view, corner=(x + 12 * PIXEL, y)))
     fixes = board.fixes([picture], 10, device, rng)

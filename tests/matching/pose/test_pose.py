@@ -1,4 +1,4 @@
-"""Poses on devices: at the minimum of their loss, with a covariance that holds, or refused."""
+"""Poses on devices: minimum of the loss, validity of the covariance, refusals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def scene(
     turn: float = 0.03,
     deformation: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return true parameters (boards, 6), and rows of edges in all directions, the first ones far off."""
+    """Return true parameters (boards, 6), and rows of edges in all directions, the first ones are gross errors."""
     angle = rng.uniform(0.0, np.pi, (boards, count))
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     along = np.stack([normal[..., 1], -normal[..., 0]], axis=-1)
@@ -42,7 +42,7 @@ def scene(
     error = rng.normal(0.0, SIGMA, (boards, count))
     far = int(bad * count)
     error[:, :far] += rng.uniform(2e-5, 4e-4, (boards, far)) * rng.choice([-1.0, 1.0], (boards, far))
-    # Seen anywhere along the edge.
+    # Measured anywhere along the edge.
     moved = point + error[..., None] * normal + rng.uniform(-3e-4, 3e-4, (boards, count, 1)) * along
     rows = np.empty((boards, count, 7))
     for number, parameters in enumerate(truth):
@@ -53,7 +53,7 @@ def scene(
 
 
 def placed(truth: np.ndarray) -> np.ndarray:
-    """Return where the placement point is, and theta."""
+    """Return the placement point and theta."""
     rows = []
     for parameters in truth:
         matrix, shift = robust.transform_of(parameters)
@@ -83,7 +83,7 @@ def test_lies_at_the_minimum_of_its_loss(
         start = truth[number, :freedoms]
         found = robust.solve_pose(each, freedoms, 1.0, loss, operation.tuning_constant, start)
         ours = np.concatenate([result.pose[number], result.deformation[number]])[:freedoms]
-        # A hundredth of their standard deviations (of the shifts, 0.1 m from the origin).
+        # A hundredth of the standard deviations (of the shifts, 0.1 m from the origin).
         np.testing.assert_allclose(ours[:2], found[:2], atol=5e-8)
         np.testing.assert_allclose(ours[2:], found[2:], atol=5e-7)
         np.testing.assert_allclose(result.residuals[number], robust.residuals(ours, each), atol=1e-11)
@@ -91,7 +91,7 @@ def test_lies_at_the_minimum_of_its_loss(
 
 
 def carried(rows: np.ndarray, bad: int, transform: str) -> tuple[float, float]:
-    """The least share of what all rows say that those behind the bad ones say, and the largest leverage of these."""
+    """Return the least share of the total information in the good rows, and their largest leverage."""
     nx, ny, px, py = rows[:, :4].T
     px, py = 100.0 * (px - px.mean()), 100.0 * (py - py.mean())
     moves = [nx * px, nx * py, ny * px, ny * py] if transform == "affine" else [ny * px - nx * py]
@@ -121,7 +121,7 @@ def test_covariance_is_what_is_measured(
     operation = SolvePose(transform=transform, scale=scale, placement=PLACE, variant=variant, max_trials=256)
     result = operation(rows, device=device)
     good = result.status == Status.OK
-    # What is refused is what the good rows do not carry, to what their weights make of it.
+    # Refused are poses that the good rows do not support, up to the effect of the weights.
     agreement, leverage = np.transpose([carried(each, int(bad * count), transform) for each in rows])
     allowed = np.where(agreement > 0.75, 1.0, 0.5) * operation.max_leverage
     spare = np.minimum(agreement - operation.min_inlier_fraction, allowed - leverage)
@@ -130,7 +130,7 @@ def test_covariance_is_what_is_measured(
     assert np.mean(np.abs(spare) > 0.02) > 0.9
     found = errors(result, truth)[good]
     covariance = result.covariance[good, :3, :3]
-    # 500 draws say a standard deviation to 3 %.
+    # 500 draws determine a standard deviation to 3 %.
     ratio = np.std(found, axis=0) / np.sqrt(np.mean(covariance[:, [0, 1, 2], [0, 1, 2]], axis=0))
     np.testing.assert_allclose(ratio, 1.0, atol=0.15)
     # No gross errors: 7 sigma have a chance of 1e-9 in three freedoms.
@@ -158,7 +158,7 @@ def test_points_of_a_board_turned_far(device: Device, variant: Any, rng: np.rand
     assert rows.shape == (12, 7)
     result = SolvePose(variant=variant, max_iterations=20)(rows, device=device)
     np.testing.assert_allclose(result.pose, [0.02, -0.03, 1.2], atol=1e-10)
-    # The other way round, started nearby.
+    # The opposite sign, with a start nearby.
     matrix, shift = robust.transform_of(np.array([0.02, -0.03, -3.0]))
     rows = point_rows(point, point @ matrix.T + shift, SIGMA)
     result = SolvePose(variant=variant, with_initial_pose=True)(rows, np.array([0.0, 0.0, 3.0]), device=device)
@@ -176,7 +176,7 @@ def test_covariance_of_points_in_closed_form(device: Device, variant: Any) -> No
     expected = np.diag([SIGMA**2 / 8, SIGMA**2 / 8, SIGMA**2 / 8 / 1e-4])
     np.testing.assert_allclose(result.covariance, expected, rtol=1e-9, atol=1e-22)
     np.testing.assert_allclose(result.condition, 1.0, rtol=1e-9)
-    # A lever arm adds theta's part across it.
+    # A lever arm adds a contribution of theta perpendicular to it.
     away = SolvePose(loss="least_squares", placement=(PLACE[0] + 0.05, PLACE[1]), variant=variant)(rows, device=device)
     np.testing.assert_allclose(away.covariance[1, 1], SIGMA**2 / 8 * (1 + 25), rtol=1e-9)
     np.testing.assert_allclose(away.covariance[0, 0], SIGMA**2 / 8, rtol=1e-9)
@@ -194,7 +194,7 @@ def test_refuses_what_the_features_cannot_carry(
     rows[1, :, :2] = from_middle / np.linalg.norm(from_middle, axis=-1)[:, None]  # all edges lie about one point
     rows[:2, :, 4:6] = rng.normal(0.0, SIGMA, (2, 32, 1)) * rows[:2, :, :2]
     rows[2, 2:, 4] = np.nan  # two rulers
-    rows[3, :, 6] = 0.0  # none
+    rows[3, :, 6] = 0.0  # no rows
     rows[4, :, 4:6] = rng.uniform(-1e-3, 1e-3, (32, 2))  # clutter
     result = SolvePose(variant=variant)(rows.astype(dtype), device=device)
     expected = [Status.AMBIGUOUS, Status.AMBIGUOUS, Status.NO_DATA, Status.NO_DATA, Status.AMBIGUOUS, Status.OK]
@@ -227,7 +227,7 @@ def test_missing_rows_are_as_if_they_were_not_there(device: Device, rng: np.rand
 
 
 def test_fitted_lines_carry_their_angle(device: Device, rng: np.random.Generator) -> None:
-    """Poses from lines that were fitted to edges are the poses from those edges."""
+    """Poses from fitted lines agree with poses from the edges of the lines."""
     lines, each = 12, 20
     angle = np.arange(lines) * np.pi / lines
     normal = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
@@ -251,7 +251,7 @@ ETCH = 20e-6
 
 
 def etched(rng: np.random.Generator, boards: int, count: int, bad: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A scene whose edges all lie further out by what each board was etched; a fourth of them are no single edges."""
+    """A scene whose edges are displaced by the etch bias of the board; a quarter of them are not single edges."""
     truth, rows = scene(rng, boards, count, bad=bad)
     etch = rng.normal(0.0, ETCH, boards)
     etch_factor = np.where(np.arange(count) % 4, 1.0, 0.0) * np.ones((boards, 1))
@@ -265,7 +265,7 @@ def etched(rng: np.random.Generator, boards: int, count: int, bad: float) -> tup
 @VARIANTS
 def test_an_etching_is_one_more_unknown(device: Device, variant: Any, rng: np.random.Generator) -> None:
     truth, etch, rows = etched(rng, 500, 40, 0.3)
-    # Normals all over the upper half of the circle: without it the etching is a shift.
+    # Normals over the upper half circle: without this range the etch bias would be a shift.
     plain = SolvePose(placement=PLACE, max_trials=256, variant=variant)(
         np.ascontiguousarray(rows[..., :7]), device=device
     )
@@ -274,7 +274,7 @@ def test_an_etching_is_one_more_unknown(device: Device, variant: Any, rng: np.ra
     assert np.mean(good) > 0.97
     found, covariance = errors(result, truth)[good], result.covariance[good]
     ratio = np.std(found, axis=0) / np.sqrt(np.mean(covariance[:, [0, 1, 2], [0, 1, 2]], axis=0))
-    # 500 draws say a standard deviation to 3 %.
+    # 500 draws determine a standard deviation to 3 %.
     np.testing.assert_allclose(ratio, 1.0, atol=0.15)
     assert np.std(result.etch_bias[good] - etch[good]) < 0.25 * ETCH
     squares = np.einsum("bi,bij,bj->b", found, np.linalg.inv(covariance), found)
@@ -334,7 +334,7 @@ def test_the_condition_is_compared_with_its_limit(device: Device, variant: Any, 
 
 @VARIANTS
 def test_refuses_what_nothing_checks(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    """x hangs on few edges among many: on one, on two of which one is wrong, on three."""
+    """Few edges among many determine x: one edge, two edges of which one is wrong, three edges."""
     _, rows = scene(rng, 5, 32)
     rows[:, :, :2] = [0.0, 1.0]
     upright = {0: 1, 1: 2, 2: 4, 3: 4, 4: 4}
@@ -346,7 +346,7 @@ def test_refuses_what_nothing_checks(device: Device, variant: Any, rng: np.rando
     rows[3, 0, 4] += 1e-4  # three that agree, of four
     result = SolvePose(variant=variant)(rows, device=device)
     np.testing.assert_array_equal(result.status, [Status.AMBIGUOUS] * 3 + [Status.OK] * 2)
-    # About these shares: a turn takes part of what these edges say.
+    # Approximate shares: the rotation uses a part of the information of these edges.
     np.testing.assert_allclose(result.inlier_fraction, [1.0, 0.5, 0.5, 0.75, 1.0], atol=0.1)
     np.testing.assert_allclose(result.leverage[[0, 1]], 1.0, atol=0.01)
     assert (result.leverage[2:] < 0.7).all()

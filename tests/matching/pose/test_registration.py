@@ -1,4 +1,4 @@
-"""First fixes from far away: the search against its definition, poses of boards, real pictures with their defects."""
+"""Coarse registration: the search by definition, poses of boards, real images with defects."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_cells_and_levels_are_those_of_their_definition(device: Device, dtype: A
         op(image, device=device, out=means.out)
         means.assert_intact()
         exact = reference.cell_means(image, cell)
-        # As many roundings as pixels.
+        # One rounding per pixel.
         np.testing.assert_allclose(means.out.means, exact, rtol=cell**2 * 2.0**-24)
         cells = tuple(each + 2 * border for each in exact.shape)
         level = Guarded(EdgeCosts(np.empty((8, *cells), np.uint16)))
@@ -81,7 +81,7 @@ def test_scores_are_sums_of_levels(
     shifts[0, ::5], shifts[2] = -1, -1
     op = EdgeSearch(rows=rows, columns=columns, headings=headings, points=points, with_scores=True, variant=variant)
     expected = reference.pose_costs(level, shifts, rows, columns)
-    # Beyond the last cell from which all positions lie in the map: not used.
+    # Points beyond the last cell from which all positions lie in the map are not used.
     shifts[0, 0], shifts[0, 5] = limit, 2**31 - 1
     blocks = -(-columns // 64)
     guarded = Guarded(
@@ -106,7 +106,7 @@ def test_scores_are_sums_of_levels(
 
 
 def test_a_shift_is_where_its_edge_is_cheap(device: Device) -> None:
-    """A bright square, seen 3 cells to the right and 2 up of where it is looked for; its sides cost nothing there."""
+    """A bright square, 3 cells to the right of and 2 cells above its nominal position; its sides have cost 0 there."""
     image = np.zeros((90, 121), np.uint8)
     image[30:60, 40:80] = 200
     cell, border, positions = 2, 9, (13, 11)
@@ -119,7 +119,7 @@ def test_a_shift_is_where_its_edge_is_cheap(device: Device) -> None:
     shifts = cell_offsets((edges[:, :2] + off)[None], edges[None, :, 2:], cell, border, level.shape, positions)
     op = EdgeSearch(rows=13, columns=11, headings=1, points=len(edges))
     best = find_best_shifts(op(level, shifts, device=device), positions, 3, (3, 1))
-    # An edge costs as little in the cells beside its own.
+    # An edge has the same low cost in the neighbouring cells.
     assert np.abs(best.cells[0] - [3, -2]).max() <= 1
     assert best.scores[0] < 0.02 < 0.2 < best.scores[1]
     assert np.all(np.abs(best.cells[1:] - best.cells[0]).max(axis=1) > 3)
@@ -131,7 +131,7 @@ def test_a_shift_is_where_its_edge_is_cheap(device: Device) -> None:
 
 
 def board(folder: Path, lines: list[tuple[float, float, float, float, float]]) -> Artwork:
-    """Traces: x, y, x, y of their ends and their widths [mm]."""
+    """Return a board with traces: x, y, x, y of their ends and their widths [mm]."""
     widths = sorted({each[4] for each in lines})
     text = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
     text += "".join(f"%ADD{10 + number}C,{width}*%\n" for number, width in enumerate(widths))
@@ -144,7 +144,7 @@ def board(folder: Path, lines: list[tuple[float, float, float, float, float]]) -
 
 @cache
 def scattered(folder: Path) -> Artwork:
-    """Traces this way and that, 0.2 to 0.4 mm wide, nowhere alike; all over 24 x 20 mm."""
+    """Return random traces of 0.2 to 0.4 mm width without repetition, over 24 x 20 mm."""
     rng = np.random.default_rng(4)
     lines = []
     for x in range(0, 24, 2):
@@ -162,7 +162,7 @@ def artwork(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
 
 
 def looking_at(middle: Any, shape: tuple[int, int], **arguments: Any) -> tuple[View, np.ndarray]:
-    """A view, and the nominal map from board to image."""
+    """Return a view, and the nominal map from board to image."""
     corner = np.array(middle) + (np.array(shape[::-1]) - 1) / 2 * PIXEL * (-1, 1)
     view = View(corner=tuple(corner), pixel=PIXEL, shape=shape, noise=NOISE, **arguments)
     x, y = corner / PIXEL
@@ -179,13 +179,13 @@ def prepared(artwork: Artwork, shape: tuple[int, int] = (301, 407)) -> tuple[Vie
 
 
 def off(found: Any, pose: Any) -> np.ndarray:
-    """Errors of the placement point [px] and of the angle [rad]."""
+    """Return the errors of the placement point [px] and of the angle [rad]."""
     return np.array([*(found.placement - MIDDLE - pose[:2]) / PIXEL, found.pose[2] - pose[2]])
 
 
 @cache
 def owners(artwork: Artwork) -> np.ndarray:
-    """Whose copper each ruler of the prepared fix lies on."""
+    """Return the trace on which each ruler of the prepared registration lies."""
     outlines = [each.outline.astype(np.float32) for each in artwork.copper]
     points = np.asarray(prepared(artwork)[1].rulers.point).astype(np.float32).tolist()
     off_outline = [[abs(cv2.pointPolygonTest(each, point, True)) for each in outlines] for point in points]
@@ -193,7 +193,7 @@ def owners(artwork: Artwork) -> np.ndarray:
 
 
 def there(artwork: Artwork, pose: Any, gone: set[int]) -> tuple[float, int]:
-    """The share of the rulers in the picture whose copper is there, and how many lie in the picture."""
+    """Return the share of the rulers in the image whose copper is present, and the number of rulers in the image."""
     view, fix = prepared(artwork)
     turn = rotation(pose[2]).T
     seen = (np.asarray(fix.rulers.point) - MIDDLE) @ turn + MIDDLE + pose[:2]
@@ -207,7 +207,7 @@ def there(artwork: Artwork, pose: Any, gone: set[int]) -> tuple[float, int]:
 
 
 @settings(max_examples=6, deadline=None)
-@example(x=0.0, y=0.0, degrees=0.0, missing=0.125, seed=24145)  # of what is in view more than a third
+@example(x=0.0, y=0.0, degrees=0.0, missing=0.125, seed=24145)  # more than a third of the traces in view
 @example(x=0.0, y=0.0, degrees=0.0, missing=0.25, seed=3902)
 @example(x=0.0, y=0.0019167218494290034, degrees=-4.25, missing=0.0, seed=1)
 @example(x=-0.001934151639503977, y=0.001953125, degrees=0.0, missing=0.125, seed=0)
@@ -228,11 +228,11 @@ def test_a_board_is_found_wherever_it_lies(
     rng, pose = np.random.default_rng(seed), (x, y, math.radians(degrees))
     gone = set(np.flatnonzero(rng.uniform(size=len(artwork.copper)) < missing))
     found = fix(board_image(artwork, view, pose, MIDDLE, missing=gone, rng=rng), device=device)
-    # Rulers whose copper is there agree, and no others. Two that touch the picture's border may lie in it or not.
+    # Exactly the rulers whose copper is present agree. Two rulers touch the image border and may be in or out.
     share, count = there(artwork, pose, gone)
     enough, slack = fix.min_score + 1.5 / math.sqrt(count), 2.0 / count
     if found.status == Status.LOW_SIGNAL:
-        # In view more may be missing than of all: too much to be sure of what is left.
+        # In view, the missing share may be larger than on the whole board: too large for a certain pose.
         assert share < enough + slack
         assert np.isnan(found.pose).all()
         return
@@ -240,11 +240,11 @@ def test_a_board_is_found_wherever_it_lies(
     assert share > enough - slack
     assert found.score == pytest.approx(share, abs=slack)
     assert abs(found.rulers - count) <= 2
-    # Noise is worth 0.01 px; what the neighbours of a ruler do to it, where copper is missing, stays below 0.1 px.
+    # Noise causes 0.01 px; neighbouring edges near missing copper cause less than 0.1 px.
     error = off(found, pose)
     assert np.hypot(*error[:2]) < 0.1
     assert abs(error[2]) < 0.1 / 200
-    # The origin's pose and the placement point's are one.
+    # The pose at the origin and the pose at the placement point describe the same motion.
     turned = rotation(found.pose[2]) @ MIDDLE + found.pose[:2]
     np.testing.assert_allclose(turned, found.placement, atol=1e-12)
     assert found.covariance.shape == (3, 3)
@@ -255,7 +255,7 @@ def test_a_board_is_found_wherever_it_lies(
 def pictured(
     artwork: Artwork, shape: tuple[int, int], pose: tuple[float, float, float]
 ) -> tuple[CoarseRegistration, np.ndarray]:
-    """A first fix and a picture."""
+    """Return a registration and an image."""
     view, fix = prepared(artwork, shape)
     return fix, board_image(artwork, view, pose, MIDDLE, rng=np.random.default_rng(5))
 
@@ -273,7 +273,7 @@ def test_images_of_any_size_and_type(artwork: Artwork, device: Device, shape: tu
 
 @cache
 def tilted(artwork: Artwork, pose: tuple[float, float, float]) -> tuple[CoarseRegistration, np.ndarray]:
-    """Copper darker than laminate, and a camera that is turned by 30 degrees and sees a mild perspective."""
+    """Copper darker than laminate, and a camera rotated by 30 degrees with a mild perspective."""
     shape, levels = (300, 400), (210.0, 160.0, 230.0, 60.0, 240.0, 15.0)
     view, matrix = looking_at(MIDDLE, (520, 520), levels=levels)
     wide = board_image(artwork, view, pose, MIDDLE, rng=np.random.default_rng(5))
@@ -295,7 +295,7 @@ def test_another_camera_and_reversed_contrast(artwork: Artwork, device: Device) 
 
 @pytest.fixture(scope="module")
 def bars(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
-    """Bars like a connector's, 0.8 mm apart, farther than the camera sees, and a trace that says where y is."""
+    """Bars like a connector, 0.8 mm apart, beyond the field of view, and a trace that determines y."""
     lines = [(0.8 * number, 5.0, 0.8 * number, 8.0, 0.3) for number in range(-3, 34)]
     return board(tmp_path_factory.mktemp("bars"), [*lines, (-8.0, 12.0, 32.0, 12.0, 0.3)])
 
@@ -312,7 +312,7 @@ def test_a_repeated_pitch_is_ambiguous(bars: Artwork, device: Device, rng: np.ra
     found = bars_fix(bars)(image, device=device)
     assert found.status == Status.AMBIGUOUS
     assert found.runner_up > 0.9 * found.score
-    # Both are the pose but for whole pitches.
+    # Both are the true pose up to integer multiples of the pitch.
     for placement in (found.placement, rotation(found.runner_up_pose[2]) @ MIDDLE + found.runner_up_pose[:2]):
         x, y = rotation(pose[2]).T @ (placement - MIDDLE - pose[:2]) / PIXEL
         assert abs(y) < 1.0
@@ -354,7 +354,7 @@ def test_a_board_that_is_elsewhere_is_refused(artwork: Artwork, device: Device) 
 def pictures(
     folder: Path, middle: tuple[float, float]
 ) -> tuple[CoarseRegistration, list[tuple[np.ndarray, tuple[float, ...]]]]:
-    """A first fix, and pictures with their poses."""
+    """Return a registration, and images with their poses."""
     artwork, shape, rng = read_artwork(folder), (480, 640), np.random.default_rng(8)
     view, matrix = looking_at(middle, shape, mask_shift=(60e-6, -40e-6), silk_shift=(1e-4, 1e-4))
     poses = [(*rng.uniform(-2e-3, 2e-3, 2), math.radians(rng.uniform(-5, 5))) for _ in range(3)]
@@ -376,7 +376,7 @@ def test_real_boards_are_found(data: Path, name: str, middle: tuple[float, float
         found = fix(image, device=device)
         assert found.status == Status.OK
         error = np.array([*(found.placement - middle - pose[:2]) / PIXEL, found.pose[2] - pose[2]])
-        # A first fix: edges of the mask lie 3 px off, and pull at copper's.
+        # Coarse registration: mask edges are 3 px away and bias the copper edges.
         assert np.hypot(*error[:2]) < 0.25
         assert abs(error[2]) < 1e-3
 
@@ -384,12 +384,12 @@ def test_real_boards_are_found(data: Path, name: str, middle: tuple[float, float
 TOOLS = {"upverter": (-59.3e-3, 6.2e-3), "fritzing": (20e-3, 25e-3), "kicad-x2-tests/x2ap": (60e-3, -45e-3)}
 
 
-# In a corner of the range, four pictures of the third board, which repeats itself, lie a pitch off more easily.
+# In a corner of the range, four images of the third board, which has a periodic layout, may be off by a pitch.
 SEEDS = {"upverter": (0, 2, 3), "fritzing": (0, 3), "kicad-x2-tests/x2ap": (2, 4, 9, 21, 37, 69)}
 
 
 class DrawnObject(NamedTuple):
-    """A picture of a real board, and where it lies."""
+    """Image of a real board, and its pose."""
 
     fix: CoarseRegistration
     image: np.ndarray
@@ -411,9 +411,9 @@ def fix_of(folder: Path, middle: tuple[float, float], blur_px: float) -> CoarseR
 
 @cache
 def drawn(data: Path, name: str, seed: int) -> DrawnObject:
-    """Any shift, turn, blur, noise, etching, offset of mask and silk; up to 30 % of the copper is missing.
+    """Draw shift, rotation, blur, noise, etch bias, offset of mask and silk; up to 30 % of the copper is missing.
 
-    With odd seeds it is shifted into a corner of the range, where most leaves the picture.
+    With odd seeds the board is in a corner of the range, where most of it is outside the image.
     """
     rng, middle = np.random.default_rng(seed), TOOLS[name]
     artwork = artwork_of(data / "gerber" / name)
@@ -436,7 +436,7 @@ def drawn(data: Path, name: str, seed: int) -> DrawnObject:
 @pytest.mark.slow
 @pytest.mark.realdata
 def test_a_real_board_is_found_or_refused(data: Path, device: Device) -> None:
-    """No pose of a real board is said to be sure that is not right, whatever its picture lacks."""
+    """No pose of a real board with status OK is wrong, for any defect of the image."""
     good = 0
     draws = [(name, seed) for name, seeds in SEEDS.items() for seed in seeds]
     for name, seed in draws:
@@ -446,10 +446,10 @@ def test_a_real_board_is_found_or_refused(data: Path, device: Device) -> None:
             assert found.status in (Status.LOW_SIGNAL, Status.AMBIGUOUS)
             continue
         good += 1
-        # Of 1000 such draws all that were OK were off by less than 0.41 px; edges are looked for within 2 px.
+        # In 1000 such draws, every pose with status OK had an error below 0.41 px; edges are searched within 2 px.
         assert np.hypot(*(found.placement - middle - pose[:2])) / PIXEL < 1.0, (name, seed)
         assert abs(found.pose[2] - pose[2]) < 5e-3, (name, seed)
-    # Of 1000 three quarters were, and of that third board two fifths.
+    # In 1000 draws, 75 % had status OK; for the third board 40 %.
     assert good >= len(draws) / 2
 
 
@@ -459,20 +459,20 @@ PAIRS = [f"0004100{number}" for number in range(6)]
 
 
 class Moved:
-    """A picture turned about its middle and shifted, by a cubic spline; NaN where nothing is known."""
+    """Image that is rotated about its centre and shifted, by a cubic spline; NaN outside."""
 
     def __init__(self, image: np.ndarray, shape: tuple[int, int]) -> None:
         self.image, self.shape = image, shape
         self._spline = ndimage.spline_filter(image.astype(np.float64), 3, mode="nearest")
 
     def motion(self, angle: float, shift: np.ndarray) -> np.ndarray:
-        """(2, 3) of x, y: from the picture to the other one."""
+        """Return the motion (2, 3) in x, y from the image to the moved image."""
         middle, other = ((np.array(each[::-1]) - 1) / 2 for each in (self.image.shape, self.shape))
         turn = rotation(angle)
         return np.column_stack([turn, other + shift - turn @ middle])
 
     def moved(self, motion: np.ndarray) -> np.ndarray:
-        """The picture at its new place."""
+        """Return the moved image."""
         back = np.linalg.inv(motion[:, :2])
         start = -back @ motion[:, 2]
         return np.asarray(
@@ -489,7 +489,7 @@ class Moved:
         )
 
     def seen(self, motion: np.ndarray) -> np.ndarray:
-        """What the other picture shows of this one, at its own place."""
+        """Return the moved image, resampled at the original position."""
         y, x = np.indices(self.image.shape)
         at = np.tensordot(motion[:, :2], np.stack([x, y]), 1) + motion[:, 2, None, None]
         rows, columns = self.shape
@@ -498,7 +498,7 @@ class Moved:
 
 
 def agreement(pair: Path, shape: tuple[int, int], draws: int, device: Device) -> np.ndarray:
-    """Worst disagreement [px, degrees] of what was applied and what is recovered, the pair's own offset taken out."""
+    """Return the largest difference [px, degrees] of applied and recovered motion, minus the offset of the pair."""
     template, image = (cv2.imread(f"{pair}_{each}.jpg", cv2.IMREAD_GRAYSCALE) for each in ("temp", "test"))
     mover, rng, worst = Moved(image, shape), np.random.default_rng(6), np.zeros(2)
     for _ in range(draws):
@@ -516,7 +516,7 @@ def agreement(pair: Path, shape: tuple[int, int], draws: int, device: Device) ->
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", PAIRS)
 def test_what_was_applied_to_a_real_picture_is_recovered(data: Path, name: str, device: Device) -> None:
-    # All of the picture is kept.
+    # The complete image is used.
     miss, turn = agreement(data / "pcb" / "deeppcb" / name, (860, 860), 2, device)
     assert miss <= 0.05
     assert turn <= 0.01
@@ -526,7 +526,7 @@ def test_what_was_applied_to_a_real_picture_is_recovered(data: Path, name: str, 
 @pytest.mark.realdata
 @pytest.mark.parametrize("name", PAIRS)
 def test_what_leaves_the_picture_does_not_count(data: Path, name: str, device: Device) -> None:
-    # A part is lost; the pair's own offset is that of the rest.
+    # A part is outside the image; the offset of the pair is measured on the remaining part.
     miss, turn = agreement(data / "pcb" / "deeppcb" / name, (640, 640), 2, device)
     assert miss <= 0.05
     assert turn <= 0.01

@@ -17,7 +17,7 @@ ANGLES = {"alpha": st.floats(0.0, 1.3), "direction": st.floats(-math.pi, math.pi
 
 @pytest.mark.parametrize(("degrees", "f", "row"), [(10.0, 1674.17, 216.80), (20.0, 1597.48, -69.43)])
 def test_the_virtual_camera_of_two_known_tilts(degrees, f, row):
-    """f' = 1700 px, centre at row 512: a fit without tilt finds f' cos(alpha), and the centre shifted by f' sin(alpha)."""
+    """f' = 1700 px, centre in row 512: an untilted fit finds f' cos(alpha), and the centre shifted by f' sin(alpha)."""
     sensor = TiltedSensor(
         focal_length=1700.0, centre=(640.0, 512.0), alpha=math.radians(degrees), direction=0.5 * math.pi
     )

@@ -54,10 +54,11 @@ def errors(
 @pytest.mark.parametrize("snr", [6.0, 12.0, 50.0, 200.0])
 @pytest.mark.parametrize(("radius", "blur"), DISCS)
 def test_close_to_the_bound(device: Device, radius: float, blur: float, snr: float, rng: np.random.Generator) -> None:
-    """Within 1.2 of the bound, which assumes a known background: a deviation of 400 numbers is known to 3.5 %, and twice that is granted.
+    """Within 1.2 of the bound, which assumes a known background: a deviation of 400 numbers is known to 3.5 %.
 
-    The bias is below 0.002 px plus three standard errors, for each of x, y and the radius. The radius has an additional
-    error of (blur / radius)^2, because curvature is corrected to first order only.
+    The margin is twice this uncertainty. The bias is below 0.002 px plus three standard errors, for each of x, y and
+    the radius. The radius has an additional error of (blur / radius)^2, because curvature is corrected to first order
+    only.
     """
     error, covariance = errors(device, operation_for(radius, blur, snr), radius, blur, snr, rng)
     bound = reference.cramer_rao(radius, blur, 1.0 / snr)
@@ -73,7 +74,7 @@ def test_close_to_the_bound(device: Device, radius: float, blur: float, snr: flo
 @pytest.mark.parametrize("snr", [12.0, 50.0])
 @pytest.mark.parametrize(("radius", "blur"), [(10.0, 1.0), pytest.param(20.0, 2.0, marks=SLOW)])
 def test_edges_alone(device: Device, radius: float, blur: float, snr: float, rng: np.random.Generator) -> None:
-    """Factors on the bound: 1.204 for an edge at the best smoothing, 1.01 for the weights; overlapping lines count twice.
+    """Factors on the bound: 1.204 for an edge at the best smoothing, 1.01 for weights; overlapping lines count twice.
 
     Overlapping lines contribute at most 10 %. The measured deviation agrees with the covariance to 15 %.
     """

@@ -1,6 +1,7 @@
-"""Plane-to-plane homographies between sensor and sheet of light: a nested family of models, their fit and F tests.
+"""Plane-to-plane homographies between sensor and sheet of light: a nested family of models.
 
-The models map the sheet to the sensor, ``(u, v, 1) ~ N (G, H, 1)``, because the noise of a calibration is on the sensor
+`gpuvision.ranging.homography_fit` fits them to calibration points. The models map the sheet to the sensor,
+``(u, v, 1) ~ N (G, H, 1)``, because the noise of a calibration is on the sensor
 coordinates. Each model fixes some elements of N at 0; the inverse of N has the same number of zeros, see
 `homography_from_constants`.
 
@@ -18,8 +19,7 @@ of v.
 References
 ----------
 F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 2.3.3 and the
-list of symbols. R. Hartley and A. Zisserman, *Multiple View Geometry in Computer Vision*, 2nd ed. 2004, chapter 4
-(direct linear transform, maximum likelihood estimate of a homography).
+list of symbols.
 """
 
 from __future__ import annotations
@@ -27,14 +27,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-import scipy.optimize
-import scipy.special
 
-from gpuvision.camera.lens import Lens
 from gpuvision.validation import finite
 
 Model = Literal["C3", "C4", "D6", "H8"]
@@ -51,8 +48,6 @@ MODELS: dict[str, npt.NDArray[np.bool_]] = {
     }.items()
 }
 """Free elements of N (sheet to sensor) by model name; one of them is the scale."""
-
-_BOTH_SIDES_MESSAGE = "points lie on both sides of the horizon; expected points in front of the sensor"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,38 +68,7 @@ class HomographyLimits:
     residual_rounding: float = 64.0 * float(np.finfo(np.float64).eps)
 
 
-class DegenerateError(ValueError):
-    """Error: the calibration points do not determine the parameters of the model."""
-
-
-class ModelFit(NamedTuple):
-    """Fit of one model of the family.
-
-    Attributes
-    ----------
-    model : {"C3", "C4", "D6", "H8"}
-        Name of the model.
-    homography : numpy.ndarray
-        Homography from the undistorted sensor to the sheet, (3, 3).
-    covariance : numpy.ndarray or None
-        Covariance of the displacement parameters over the region (`to_displacement`), (8, 8). None without a given
-        sigma if there are no degrees of freedom to estimate it.
-    rms : float
-        Root mean square residual of a sensor coordinate: in standard deviations, or in sensor units without a given
-        sigma.
-    degrees_of_freedom : int
-        Number of residuals minus number of parameters.
-    p_value : float
-        p-value of the F test against the largest model that the points determine, 0 to 1. A small value rejects this
-        model.
-    """
-
-    model: Model
-    homography: Float64
-    covariance: Float64 | None
-    rms: float
-    degrees_of_freedom: int
-    p_value: float
+DEFAULT_LIMITS = HomographyLimits()
 
 
 def shift_and_scale(origin: npt.ArrayLike, unit: npt.ArrayLike) -> Float64:
@@ -312,245 +276,3 @@ def bounding_box(points: Float64) -> Region:
     """Return the smallest region that contains points (n, 2)."""
     (u_min, v_min), (u_max, v_max) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
     return (u_min, u_max), (v_min, v_max)
-
-
-def fit_models(
-    sensor_points: npt.ArrayLike,
-    sheet_points: npt.ArrayLike,
-    *,
-    sigma: npt.ArrayLike | None = None,
-    models: Sequence[Model] | None = None,
-    symmetry: float = 0.0,
-    region: Region | None = None,
-    lens: Lens | None = None,
-    limits: HomographyLimits = HomographyLimits(),
-) -> tuple[ModelFit, ...]:
-    """Fit every model that the points determine; test each against the largest of them.
-
-    Parameters
-    ----------
-    sensor_points, sheet_points : array_like
-        Measured (u, v) [sensor units] and known (G, H) [m], each (n, 2).
-    sigma : array_like, optional
-        Standard deviation of the sensor coordinates: a number, (sigma_u, sigma_v), or (n, 2). Default: equal for all
-        coordinates and estimated from the residuals.
-    models : sequence of str, optional
-        Names, from small to large. Default: "C3" for a single beam (all v, or all G, are equal), otherwise "C4", "D6",
-        "H8".
-    symmetry : float
-        v of the plane of symmetry, for C4. Default 0.
-    region : ((u_min, u_max), (v_min, v_max)), optional
-        Region that defines the parameters of the covariance (`to_displacement`). Default: the bounding box of the
-        points.
-    lens : Lens, optional
-        Distortion that is removed before the fit; its centre in (u, v) order.
-    limits : HomographyLimits, optional
-        Limits of rank and rounding.
-
-    Returns
-    -------
-    tuple of ModelFit
-        From small to large, without the models that the points do not determine.
-
-    Raises
-    ------
-    ValueError
-        Shapes differ, a point is not finite or lies beyond the fold of the lens polynomial, or the points determine no
-        model.
-
-    Notes
-    -----
-    The fit minimises the sensor residuals, divided by their standard deviations: direct linear transform, then
-    Levenberg-Marquardt. The F test compares the sums of squares of the small and the large model.
-    """
-    sensor, sheet = _points(sensor_points, "sensor_points"), _points(sheet_points, "sheet_points")
-    if len(sensor) != len(sheet):
-        raise ValueError(f"got {len(sensor)} sensor points and {len(sheet)} sheet points, expected pairs")
-    undistorted = sensor if lens is None else lens.undistort(sensor)
-    if not np.all(np.isfinite(undistorted)):
-        raise ValueError("a sensor point lies beyond the fold of the lens polynomial; check the lens, or drop it")
-    deviation = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, dtype=np.float64), sensor.shape)
-    if not np.all(deviation > 0.0):
-        raise ValueError("sigma must be positive everywhere, got a value that is not")
-    single_beam = np.ptp(sensor[:, 1]) == 0.0 or np.ptp(sheet[:, 0]) == 0.0
-    family: tuple[Model, ...] = ("C3",) if single_beam else ("C4", "D6", "H8")
-    undistortion = np.eye(2) if lens is None else lens.jacobian(sensor)
-    data = _Calibration(undistorted, sheet, undistortion * deviation[:, None, :], symmetry)
-    frame = shift_and_scale(*centre_and_half_extent(bounding_box(sensor) if region is None else region))
-    fits: list[tuple[ModelFit, float]] = []
-    reasons: list[DegenerateError] = []
-    for model in family if models is None else models:
-        try:
-            fits.append(_fit_model(data, model, frame, limits.rank_tolerance))
-        except DegenerateError as error:
-            reasons.append(error)
-    if not fits:
-        raise reasons[0]
-    return _add_f_tests(fits, data, sigma is not None, limits.residual_rounding)
-
-
-class _Calibration(NamedTuple):
-    """Data of a fit.
-
-    Attributes
-    ----------
-    sensor, sheet
-        Undistorted (u, v) [sensor units] and (G, H) [m], (n, 2) each.
-    sigma_factor
-        Factors (n, 2, 2) of the covariances of the undistorted sensor points: factor times its transpose.
-    symmetry
-        v of the plane of symmetry.
-    """
-
-    sensor: Float64
-    sheet: Float64
-    sigma_factor: Float64
-    symmetry: float
-
-
-def _points(values: npt.ArrayLike, name: str) -> Float64:
-    points = np.asarray(values, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 2 or not len(points):
-        raise ValueError(f"{name} has shape {points.shape}, expected (n, 2)")
-    if not np.all(np.isfinite(points)):
-        raise ValueError(f"{name} has a value that is not finite; drop such points first")
-    return points
-
-
-def _add_f_tests(
-    fits: Sequence[tuple[ModelFit, float]], data: _Calibration, sigma_known: bool, residual_rounding: float
-) -> tuple[ModelFit, ...]:
-    """Add the F test against the last fit; without a given sigma, scale the covariances by the residual variance."""
-    largest = np.max(np.abs(np.linalg.solve(data.sigma_factor, data.sensor[..., None])))
-    floor = (residual_rounding * float(largest)) ** 2
-    full, full_sum = fits[-1]
-    variance = max(full_sum / max(full.degrees_of_freedom, 1), floor)
-    tested = []
-    for fit, squares in fits:
-        freedom = fit.degrees_of_freedom
-        extra = freedom - full.degrees_of_freedom
-        # Without degrees of freedom the largest model fits any points, and no test is possible.
-        if extra and full.degrees_of_freedom:
-            ratio = max(squares - full_sum, 0.0) / (extra * variance)
-            fit = fit._replace(p_value=float(scipy.special.fdtrc(extra, full.degrees_of_freedom, ratio)))
-        if not sigma_known and fit.covariance is not None:
-            fit = fit._replace(covariance=fit.covariance * (squares / freedom) if freedom else None)
-        tested.append(fit)
-    return tuple(tested)
-
-
-def _fit_model(data: _Calibration, model: Model, frame: Float64, rank_tolerance: float) -> tuple[ModelFit, float]:
-    """Fit a model: direct linear transform, then Levenberg-Marquardt on the sensor residuals.
-
-    Return the fit and its weighted sum of squared residuals.
-    """
-    free = MODELS[model]
-    rows = (0,) if model == "C3" else (0, 1)
-    to_sensor = _conditioning(data.sensor, (None, data.symmetry if model == "C4" else None))
-    to_sheet = _conditioning(data.sheet, (0.0 if model == "C4" else None, None))
-    x = project(inverse(to_sensor), data.sensor)
-    points = np.column_stack([project(inverse(to_sheet), data.sheet), np.ones(len(data.sheet))])
-    # The scale is fixed by a denominator of 1 at the centre of the points.
-    elements = np.argwhere(free)[:-1]
-    excess = len(x) * len(rows) - len(elements)
-    if excess < 0:
-        raise DegenerateError(f"{len(x)} points are too few for the model {model}; measure more")
-    start = _direct_linear(x, points, free, rows, model, rank_tolerance)
-    if model == "C3":
-        # Marginal standard deviation of u: the v of a single beam has no residual.
-        whitening = to_sensor[0, 0] / np.linalg.norm(data.sigma_factor[:, :1], axis=-1, keepdims=True)
-    else:
-        whitening = np.linalg.inv(data.sigma_factor) * np.diag(to_sensor)[:2]
-
-    def assemble(values: Float64) -> Float64:
-        matrix = np.zeros((3, 3))
-        matrix[2, 2] = 1.0
-        matrix[elements[:, 0], elements[:, 1]] = values
-        return matrix
-
-    def residuals(values: Float64) -> Float64:
-        lifted = points @ assemble(values).T
-        difference = (lifted[:, :2] / lifted[:, 2:] - x)[:, rows]
-        return np.asarray(np.einsum("nij,nj->ni", whitening, difference)).ravel()
-
-    def jacobian(values: Float64) -> Float64:
-        lifted = points @ assemble(values).T
-        change = np.zeros((len(points), 3, len(elements)))
-        change[:, elements[:, 0], np.arange(len(elements))] = points[:, elements[:, 1]]
-        moved = change[:, :2] - (lifted[:, :2] / lifted[:, 2:])[:, :, None] * change[:, 2:]
-        moved = (moved / lifted[:, 2:, None])[:, rows]
-        return np.asarray(np.einsum("nij,njp->nip", whitening, moved)).reshape(-1, len(elements))
-
-    solution = scipy.optimize.least_squares(
-        residuals,
-        start[elements[:, 0], elements[:, 1]],
-        jac=jacobian,
-        method="lm",
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-15,
-    )
-    squares = 2.0 * float(solution.cost)
-    matrix = assemble(solution.x)
-    if np.any(points @ matrix[2] <= 0.0):
-        raise DegenerateError(_BOTH_SIDES_MESSAGE)
-    homography, changes = _invert_model(matrix, elements, to_sensor, to_sheet, model)
-    gradient = displacement_jacobian(homography @ frame, changes @ frame)
-    # (J^T J)^-1 from the triangular factor of J: the product J^T J would square the condition number.
-    factor = gradient.T @ np.linalg.inv(np.linalg.qr(solution.jac, mode="r"))
-    rms = float(np.sqrt(squares / (len(x) * len(rows))))
-    return ModelFit(model, homography, factor @ factor.T, rms, excess, 1.0), squares
-
-
-def _conditioning(points: Float64, fixed: tuple[float | None, float | None]) -> Float64:
-    """Return the matrix from normalised coordinates (-1 to 1) to points; a fixed origin preserves a symmetry."""
-    origin = [np.mean(column) if value is None else value for column, value in zip(points.T, fixed, strict=True)]
-    unit = np.max(np.abs(points - origin), axis=0)
-    return shift_and_scale(origin, np.where(unit > 0.0, unit, 1.0))
-
-
-def _direct_linear(
-    x: Float64,
-    points: Float64,
-    free: npt.NDArray[np.bool_],
-    rows: tuple[int, ...],
-    model: Model,
-    rank_tolerance: float,
-) -> Float64:
-    """Return N (sheet to sensor) from the right singular vector of the smallest singular value (algebraic error)."""
-    blocks = []
-    for row in rows:
-        equations = np.zeros((len(points), 3, 3))
-        equations[:, row] = points
-        equations[:, 2] = -x[:, row, None] * points
-        blocks.append(equations[:, free])
-    # With one equation fewer than elements, a row of zeros makes the decomposition also return the null vector.
-    blocks.append(np.zeros((1, np.count_nonzero(free))))
-    _, values, vectors = np.linalg.svd(np.concatenate(blocks), full_matrices=False)
-    if values[np.count_nonzero(free) - 2] <= rank_tolerance * values[0]:
-        raise DegenerateError(f"the points do not fix the model {model}; spread them over the sheet")
-    matrix = np.zeros((3, 3))
-    matrix[free] = vectors[-1]
-    if abs(matrix[2, 2]) <= rank_tolerance:
-        raise DegenerateError(_BOTH_SIDES_MESSAGE)
-    return np.asarray(matrix / matrix[2, 2])
-
-
-def _invert_model(
-    matrix: Float64, elements: npt.NDArray[np.intp], to_sensor: Float64, to_sheet: Float64, model: Model
-) -> tuple[Float64, Float64]:
-    """Return the homography from sensor to sheet, and its derivatives (p, 3, 3) by the p parameters of N."""
-    if model == "C3":
-        # A single beam does not determine v: any nonzero element makes N invertible, and G is set to the G of the
-        # points.
-        matrix = matrix.copy()
-        matrix[1, 0] = 1.0
-    inverted = inverse(matrix)
-    unit = np.zeros((len(elements), 3, 3))
-    unit[np.arange(len(elements)), elements[:, 0], elements[:, 1]] = 1.0
-    changes = -inverted @ unit @ inverted
-    if model == "C3":
-        inverted[0] = 0.0
-        changes[:, 0] = 0.0
-    from_sensor = inverse(to_sensor)
-    return to_sheet @ inverted @ from_sensor, np.asarray(to_sheet @ changes @ from_sensor)

@@ -32,7 +32,8 @@ from gpuvision.host import (
 )
 from gpuvision.operation import VisionOperation
 from gpuvision.ranging import homography
-from gpuvision.ranging.homography import HomographyLimits, Model
+from gpuvision.ranging.homography import DEFAULT_LIMITS, HomographyLimits, Model
+from gpuvision.ranging.homography_fit import fit_models
 from gpuvision.validation import check_keys, finite, numbers
 
 Along = Literal["columns", "rows"]
@@ -44,7 +45,6 @@ _LANES, _GROUP = 16, 256
 # Points of a strip in the vector variant. Long strips keep the hardware prefetchers running; several strips per core
 # balance the load.
 _SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
-_FIT_LIMITS = HomographyLimits()
 _KEYS = ("homography", "region", "model", "along", "lens", "covariance", "sigma", "horizon")
 
 
@@ -395,7 +395,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         region: tuple[tuple[float, float], tuple[float, float]] | None = None,
         along: Along = "columns",
         lens: Lens | None = None,
-        limits: HomographyLimits = _FIT_LIMITS,
+        limits: HomographyLimits = DEFAULT_LIMITS,
     ) -> Triangulation:
         """Calibrate: fit calibration points, and select the smallest sufficient model of the family.
 
@@ -429,7 +429,7 @@ class Triangulation(VisionOperation[SheetPoints]):
             the model.
         """
         sensor = np.asarray(sensor_points, dtype=np.float64)
-        fits = homography.fit_models(
+        fits = fit_models(
             sensor,
             sheet_points,
             sigma=sigma,

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from gpuvision.camera.lens import Lens
 from gpuvision.ranging import homography
+from gpuvision.ranging.homography_fit import fit_models
 from gpuvision.ranging.triangulation import SampleAxes, Triangulation
 
 REGION = ((-3e-3, 3e-3), (-3e-3, 3e-3))
@@ -209,7 +210,7 @@ def test_lens_is_undone_in_the_fit(rng: np.random.Generator) -> None:
     assert fitted.model == "C4"
     np.testing.assert_allclose(fitted.to_sensor(SHEET), seen, rtol=0, atol=1e-14)
     noisy = seen + rng.normal(0.0, 0.01 * SIGMA, seen.shape)
-    without, with_lens = homography.fit_models(noisy, SHEET), homography.fit_models(noisy, SHEET, lens=lens.swapped())
+    without, with_lens = fit_models(noisy, SHEET), fit_models(noisy, SHEET, lens=lens.swapped())
     assert without[-1].rms > 10.0 * with_lens[-1].rms
 
 
@@ -229,7 +230,7 @@ def test_sigma_weighs_the_points(rng: np.random.Generator) -> None:
 def test_residuals_are_told_in_sigmas(rng: np.random.Generator) -> None:
     seen = psd().to_sensor(SHEET)
     noisy = seen + rng.normal(0.0, (SIGMA, 3.0 * SIGMA), seen.shape)
-    full = homography.fit_models(noisy, SHEET, sigma=(SIGMA, 3.0 * SIGMA))[-1]
+    full = fit_models(noisy, SHEET, sigma=(SIGMA, 3.0 * SIGMA))[-1]
     # 126 residuals have 118 degrees of freedom; their root mean square is known to 6.5 %.
     assert full.degrees_of_freedom == 126 - 8
     assert full.rms == pytest.approx(math.sqrt(118 / 126), rel=0.26)
@@ -240,7 +241,7 @@ def test_single_beam_is_a_moebius_map(rng: np.random.Generator) -> None:
     sheet = np.stack([np.full(21, 0.003), heights], -1)
     seen = psd().to_sensor(sheet) + rng.normal(0.0, SIGMA, (21, 1)) * (1.0, 0.0)
     seen[:, 1] = 4e-4
-    fits = homography.fit_models(seen, sheet)
+    fits = fit_models(seen, sheet)
     assert [each.model for each in fits] == ["C3"]
     fitted = Triangulation.fit(seen, sheet, sigma=SIGMA)
     assert fitted.model == "C3"

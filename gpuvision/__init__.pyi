@@ -240,10 +240,10 @@ from .ranging.regrid import (
 from .ranging.regrid import (
     Regrid as Regrid,
 )
-from .ranging.triangulation import (
+from .ranging.sheet import (
     SampleAxes as SampleAxes,
 )
-from .ranging.triangulation import (
+from .ranging.sheet import (
     SheetPoints as SheetPoints,
 )
 from .ranging.triangulation import (
@@ -255,7 +255,7 @@ from .simulation.errors.error_attribution import (
 from .simulation.errors.error_attribution import (
     attribute_errors as attribute_errors,
 )
-from .simulation.errors.recommendations import (
+from .simulation.errors.sensor_fusion import (
     SensorFusion as SensorFusion,
 )
 from .simulation.light_paths import (

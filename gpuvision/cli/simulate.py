@@ -202,7 +202,7 @@ def _run(
     task: SimulationTask, other: SimulationTask | None, rule: Rule, out: Path, made: dict[str, Any], description: str
 ) -> tuple[str, dict[str, Any]]:
     """Simulate one sensor or two, write the results, and return the summary and the first sensor's report."""
-    from gpuvision.simulation.errors.recommendations import SensorFusion
+    from gpuvision.simulation.errors.sensor_fusion import SensorFusion
     from gpuvision.workflows.sensor_pair import SensorPair
     from gpuvision.workflows.simulating import simulate as run
 

@@ -153,6 +153,24 @@ def displacement_jacobian(matrix: Float64, changes: Float64) -> Float64:
     return np.concatenate(blocks, axis=-1)
 
 
+def displacement_design(x: Float64, displacement: Float64) -> Float64:
+    """Return the derivatives (..., 2, 8) of (G, H) by the displacement parameters.
+
+    Parameters
+    ----------
+    x : numpy.ndarray
+        Coordinates (x, y) / (1 + dx x + dy y), (..., 2).
+    displacement : numpy.ndarray
+        (G - g0, H - h0), (..., 2).
+    """
+    design = np.zeros((*x.shape[:-1], 2, 8))
+    for row in (0, 1):
+        design[..., row, 3 * row] = 1.0
+        design[..., row, 3 * row + 1 : 3 * row + 3] = x
+    design[..., 6:] = -displacement[..., None] * x[..., None, :]
+    return design
+
+
 def packed_covariance_factor(covariance: npt.ArrayLike, which: Sequence[int]) -> Float64:
     """Return the lower triangular factor of a block of a covariance, packed by columns; the block may be singular.
 

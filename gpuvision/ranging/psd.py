@@ -28,7 +28,8 @@ from gpuvision.host import (
     type_defines,
 )
 from gpuvision.operation import VisionOperation
-from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.ranging.sheet import SampleAxes
+from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.validation import finite
 
 ELECTRON = 1.602176634e-19  # elementary charge [C]

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,11 +21,9 @@ import numpy.typing as npt
 from gpuvision.camera.lens import Lens
 from gpuvision.host import (
     Device,
-    FloatArray,
     Launch,
     LaunchBuilder,
     Precision,
-    StatusArray,
     Variant,
     flags,
     type_defines,
@@ -34,6 +32,7 @@ from gpuvision.operation import VisionOperation
 from gpuvision.ranging import homography
 from gpuvision.ranging.homography import DEFAULT_LIMITS, HomographyLimits, Model
 from gpuvision.ranging.homography_fit import fit_models
+from gpuvision.ranging.sheet import SampleAxes, SheetPoints, SheetTable
 from gpuvision.validation import check_keys, finite, numbers
 
 Along = Literal["columns", "rows"]
@@ -46,83 +45,6 @@ _LANES, _GROUP = 16, 256
 # balance the load.
 _SHORTEST_STRIP, _LONGEST_STRIP, _STRIPS_PER_CORE = 1024, 16384, 8
 _KEYS = ("homography", "region", "model", "along", "lens", "covariance", "sigma", "horizon")
-
-
-class SheetPoints(NamedTuple):
-    """Points in the sheet of light, each array of the input's shape.
-
-    Attributes
-    ----------
-    g, h
-        Coordinates along the sheet and up in the sheet [m]; NaN where the status is not OK.
-    status
-        uint8 `Status` flags: NOT_FINITE (u or v is not finite, or lies more than 1e6 half extents of the region away),
-        NOT_INVERTIBLE (beyond the fold of the lens polynomial), HORIZON (the ray does not meet the sheet in front of
-        the sensor, or meets it too far away).
-    sigma_g, sigma_h
-        Standard deviations of g and h [m]; ``None`` unless the triangulation has the ``sigma`` of the sensor.
-    """
-
-    g: FloatArray
-    h: FloatArray
-    status: StatusArray
-    sigma_g: FloatArray | None = None
-    sigma_h: FloatArray | None = None
-
-
-class SheetTable(NamedTuple):
-    """Parameters of ``kernels/common/sheet.h``, in the order of its struct ``SheetTable``."""
-
-    position_origin: float
-    position_scale: float
-    sample_origin: float
-    sample_scale: float
-    horizon: float
-    w_terms: npt.ArrayLike
-    g_terms: npt.ArrayLike
-    h_terms: npt.ArrayLike
-    lens: npt.ArrayLike
-    factor_g: npt.ArrayLike
-    factor_h: npt.ArrayLike
-
-
-@dataclass(frozen=True, kw_only=True)
-class SampleAxes:
-    """Affine map from the output of a readout to sensor coordinates.
-
-    ``u = position_origin + position_pitch * position`` and ``v = sample_origin + sample_pitch * sample``, with the
-    sample index counted from 0. By default position and sample index are the sensor coordinates.
-
-    Parameters
-    ----------
-    sample_origin, sample_pitch : float
-        v of sample 0 and distance between samples [sensor unit], default 0 and 1. The pitch is not 0.
-    position_origin, position_pitch : float
-        u of position 0 and size of a position unit [sensor unit], default 0 and 1. The pitch is not 0.
-
-    Raises
-    ------
-    ValueError
-        A pitch is 0, or a number is not finite.
-
-    Examples
-    --------
-    A region of interest that begins at column 100, and a PSD of 64 strips 0.1 mm apart, in metres from the middle:
-
-    >>> roi = SampleAxes(sample_origin=100.0)
-    >>> psd = SampleAxes(sample_pitch=1e-4, sample_origin=-31.5e-4)
-    """
-
-    sample_origin: float = 0.0
-    sample_pitch: float = 1.0
-    position_origin: float = 0.0
-    position_pitch: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name in ("sample_origin", "sample_pitch", "position_origin", "position_pitch"):
-            finite(getattr(self, name), f"SampleAxes.{name}")
-        if self.sample_pitch == 0.0 or self.position_pitch == 0.0:
-            raise ValueError("SampleAxes: a pitch is 0, expected the distance between samples in sensor units")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -365,14 +287,9 @@ class Triangulation(VisionOperation[SheetPoints]):
         slopes = (slopes / w[..., None, None]) @ lens_slopes / unit
         scaled = slopes * np.array(self.sigma or (0.0, 0.0))
         total: Float64 = scaled @ np.swapaxes(scaled, -1, -2)
-        if self.covariance is None:
-            return total
-        design = np.zeros((*points.shape[:-1], 2, 8))
-        for row in (0, 1):
-            design[..., row, 3 * row] = 1.0
-            design[..., row, 3 * row + 1 : 3 * row + 3] = p
-        design[..., 6:] = -values[..., None] * p[..., None, :]
-        total += design @ np.array(self.covariance) @ np.swapaxes(design, -1, -2)
+        if self.covariance is not None:
+            design = homography.displacement_design(p, values)
+            total += design @ np.array(self.covariance) @ np.swapaxes(design, -1, -2)
         return total
 
     @property

@@ -37,7 +37,8 @@ from gpuvision.host.recordings import CHANNELS, Channel
 from gpuvision.ranging.line import METHODS, WIDEST_WINDOW, LineReadout, Method
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
 from gpuvision.ranging.range_image import Limits, RotatingSheet, StraightTransport, Vector
-from gpuvision.ranging.triangulation import Along, SampleAxes, Triangulation
+from gpuvision.ranging.sheet import SampleAxes
+from gpuvision.ranging.triangulation import Along, Triangulation
 from gpuvision.schema import DescriptionError, Section, read_toml
 from gpuvision.sensor.light_source import Light, read_light
 

@@ -12,8 +12,10 @@ from gpuvision.formats.json import json_tree
 from gpuvision.host.files import atomic_folder
 from gpuvision.plots.simulation import draw_causes, draw_errors
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution
-from gpuvision.simulation.errors.recommendations import SensorFusion, attribute_pair_errors, rank_candidates
-from gpuvision.workflows.simulating import Simulation
+from gpuvision.simulation.errors.recommendations import rank_candidates
+from gpuvision.simulation.errors.sensor_fusion import SensorFusion
+from gpuvision.simulation.errors.sensor_pair import attribute_pair_errors
+from gpuvision.workflows.simulation_result import Simulation
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,24 +6,17 @@ sensor's electronics, with or without a mask, are computed from the stored light
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
 from gpuvision.host import Device
-from gpuvision.host.files import atomic_folder
-from gpuvision.plots.range_image import draw_height_map
-from gpuvision.plots.simulation import draw_causes, draw_errors
 from gpuvision.ranging.range_image import RangePoints, StraightTransport
-from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import make_sensor_view, make_simulator, require_light
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution, attribute_errors
@@ -31,13 +24,14 @@ from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Lambert
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.camera_simulator import CameraSimulator
-from gpuvision.simulation.sensors.masks import Mask, MaskOptimisation, optimise_mask
+from gpuvision.simulation.sensors.masks import Mask, optimise_mask
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
 from gpuvision.simulation.sensors.readings import PATHS, GroundTruth, Reading
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
 from gpuvision.workflows.light_cache import LightBlock, LightStore, Progress, SimulationTask, compute_missing_blocks
 from gpuvision.workflows.scanning import ScanLimits, assemble_points, resample_heights
+from gpuvision.workflows.simulation_result import Simulation, light_strength
 
 DEFAULT_PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse")
 
@@ -63,128 +57,6 @@ class SimulationLimits:
     limit_sigmas: float = 5.0
     max_mask_bins: int = 1 << 26
     max_cells: int = ScanLimits.max_cells
-
-
-@dataclass(frozen=True, kw_only=True)
-class Simulation:
-    """Simulated scan of a part.
-
-    Attributes
-    ----------
-    task
-        Part, sensor and light paths.
-    attribution
-        Readings, truth, errors and their causes, (profiles, samples).
-    points
-        Organised range image that the sensor makes.
-    heights, grid
-        Height map over regular cells, and the position of the cells.
-    limit
-        Smallest error that counts as wrong [m].
-    mask
-        Optimised mask, if one was requested; else None.
-    statistics
-        Numbers of segments, pairs and bounds (`ProfileLight.statistics`), summed over the profiles; of bounds the
-        largest.
-    device
-        Device on which the readings were computed.
-    seconds
-        Duration of the steps by name [s].
-    computed_blocks
-        Number of blocks of profiles that were computed, and not read from the store.
-    """
-
-    task: SimulationTask
-    attribution: ErrorAttribution
-    points: RangePoints
-    heights: HeightMap
-    grid: Grid
-    limit: float
-    mask: MaskOptimisation | None
-    statistics: dict[str, float]
-    device: Device
-    seconds: dict[str, float]
-    computed_blocks: int
-
-    def summary(self) -> str:
-        """Return a summary of errors in one line, and one more line for a mask."""
-        errors = self.attribution.summary(self.limit)
-        worst = max(errors["causes"], key=lambda name: errors["causes"][name]["dominant"])
-        um = 1e6
-        text = (
-            f"{len(self.task.transports)} profiles, {errors['valid']} of {errors['surface']} samples read, errors "
-            f"{um * (errors['median'] or 0.0):.1f} µm median, {um * (errors['p95'] or 0.0):.0f} µm p95, "
-            f"{errors['beyond_limit']} beyond {um * self.limit:.1f} µm (mostly {worst}), {errors['spurious']} spurious "
-            "(a reading, but no lit surface in view)"
-        )
-        if self.mask is None:
-            return text
-        before, after = (float(np.nanmax(np.abs(each))) for each in (self.mask.error_before, self.mask.error_after))
-        return (
-            f"{text}\nmask: worst error of the light's centre {um * before:.0f} µm without, {um * after:.0f} µm with it"
-        )
-
-    def report(self) -> dict[str, Any]:
-        """Return the content of ``report.json``: lengths in metres, times in seconds."""
-        task = self.task
-        return {
-            "gpuvision": version("gpuvision"),
-            "sensor": task.sensor.name,
-            "kind": task.sensor.kind,
-            "profiles": len(task.transports),
-            "triangles": len(task.part.corners),
-            "defects": {each.name: len(getattr(task.part.defects, each.name)) for each in fields(task.part.defects)},
-            "paths": list(task.paths),
-            "tolerance": task.tolerance,
-            "errors": self.attribution.summary(self.limit),
-            "mask": None if self.mask is None else _mask_report(self.mask),
-            "light_statistics": self.statistics,
-            "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
-            "light_fingerprint": task.fingerprint,
-            "computed_blocks": self.computed_blocks,
-            "seconds": self.seconds,
-        }
-
-    def write(self, folder: str | Path) -> None:
-        """Write the range image, pictures and the report into a folder, all or nothing.
-
-        ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` hold the height map as it will be
-        measured, ``range_image.ply`` the organised points, ``errors.png`` and ``causes.png`` the errors and their
-        causes, ``simulation.npz`` the arrays, ``report.json`` the report.
-
-        Raises
-        ------
-        OSError
-            The folder cannot be written.
-        """
-        attribution = self.attribution
-        title = self.task.sensor.name or "Simulation"
-        with atomic_folder(folder) as inside:
-            write_tiff(inside / "range_image.tiff", self.heights.z, self.grid)
-            write_png16(inside / "range_image.png", self.heights.z, self.grid)
-            write_ply(inside / "range_image.ply", *self.points[:3], _strength(attribution.reading), self.points.status)
-            write_npz(inside / "simulation.npz", *self._arrays())
-            draw_height_map(inside / "picture.png", self.heights, self.grid, title=f"{title}: as measured")
-            draw_errors(inside / "errors.png", attribution, title)
-            draw_causes(inside / "causes.png", attribution, self.limit, title)
-            if self.mask is not None:
-                self.mask.mask.save(inside / "mask.txt")
-            (inside / "report.json").write_text(json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
-
-    def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
-        attribution = self.attribution
-        held: dict[str, tuple[Any, str]] = {
-            **{name: (getattr(self.points, name), "m") for name in ("x", "y", "z")},
-            "status": (self.points.status, "flags"),
-            "true_g": (attribution.truth.g, "m"),
-            "true_h": (attribution.truth.h, "m"),
-            "error": (attribution.error, "m"),
-            "category": (attribution.category, "flags"),
-            **{f"cause_{name}": (part, "m") for name, part in attribution.causes.items()},
-            "sigma": (attribution.reading.sigma, "m"),
-            "transport": (self.task.transports, "m"),
-        }
-        return {name: array for name, (array, _) in held.items()}, {name: unit for name, (_, unit) in held.items()}
 
 
 def prepare_simulation(
@@ -300,7 +172,7 @@ def simulate(
     if task.sensor.output.ambiguous == "drop":
         attribution = attribution.without_flagged(Status.AMBIGUOUS)
     heights, grid = resample_heights(
-        task.sensor, points, _strength(attribution.reading), device, max_cells=limits.max_cells
+        task.sensor, points, light_strength(attribution.reading), device, max_cells=limits.max_cells
     )
     return Simulation(
         task=task,
@@ -489,20 +361,3 @@ def _describe_position(part: Scene) -> str:
     return "the part lies at " + ", ".join(
         f"{name} {a:.4g} to {b:.4g} mm" for name, a, b in zip("xyz", low, high, strict=True)
     )
-
-
-def _strength(reading: Reading) -> Array:
-    return np.nan_to_num(reading.strength).astype(np.float32)
-
-
-def _mask_report(plan: MaskOptimisation) -> dict[str, Any]:
-    def worst(values: Array) -> float | None:
-        known = np.abs(values[np.isfinite(values)])
-        return float(known.max()) if known.size else None
-
-    kept = plan.passed_fraction[np.isfinite(plan.passed_fraction)]
-    return {
-        "worst_without": worst(plan.error_before),
-        "worst_with": worst(plan.error_after),
-        "light_kept": float(kept.min()) if kept.size else None,
-    }

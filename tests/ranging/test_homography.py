@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from gpuvision.camera.lens import Lens
 from gpuvision.ranging import homography
 from gpuvision.ranging.homography_fit import fit_models
-from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.ranging.sheet import SampleAxes
+from gpuvision.ranging.triangulation import Triangulation
 
 REGION = ((-3e-3, 3e-3), (-3e-3, 3e-3))
 SIGMA = 2e-6

@@ -14,7 +14,8 @@ from canary import Guarded
 from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.ranging.line import LineReadout
-from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.ranging.sheet import SampleAxes
+from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.reference.line import AMBIGUOUS, LOW_SIGNAL, NOT_FINITE, OUT_OF_RANGE, SATURATED, read_lines
 from gpuvision.reference.triangulation import triangulate
 from gpuvision.status import Status

@@ -13,7 +13,8 @@ import gpuvision as gv
 from canary import Guarded
 from gpuvision.host import host_view
 from gpuvision.ranging.psd import PsdNoise, PsdReadout
-from gpuvision.ranging.triangulation import SampleAxes, Triangulation
+from gpuvision.ranging.sheet import SampleAxes
+from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.reference import psd as reference
 from gpuvision.status import Status
 

@@ -12,7 +12,7 @@ from gpuvision.ranging.line import LineTable
 from gpuvision.ranging.psd import PsdTable
 from gpuvision.ranging.range_image import RotatingTable, StraightTable
 from gpuvision.ranging.regrid import RegridCounts, RegridTable
-from gpuvision.ranging.triangulation import SheetTable
+from gpuvision.ranging.sheet import SheetTable
 
 
 def fields_of(file: str, struct: str) -> tuple[str, ...]:

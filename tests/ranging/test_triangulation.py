@@ -17,7 +17,8 @@ from gpuvision.camera.lens import Lens
 from gpuvision.host import Device
 from gpuvision.host.program import options
 from gpuvision.operation import KERNEL_FOLDER
-from gpuvision.ranging.triangulation import SampleAxes, SheetPoints, Triangulation
+from gpuvision.ranging.sheet import SampleAxes, SheetPoints
+from gpuvision.ranging.triangulation import Triangulation
 from gpuvision.reference import triangulation as reference
 from gpuvision.status import Status
 

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.simulation.scene.closed_surfaces import visible_sides
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.rays import AnyHit
 from gpuvision.simulation.scene.row_padding import run_with_row_padding
@@ -22,14 +21,12 @@ from gpuvision.simulation.sensors.sensor_view import Exposure, SensorView
 from gpuvision.simulation.sensors.view_rays import check_materials
 from gpuvision.simulation.transport.illumination import LightSheet, LitLine
 from gpuvision.simulation.transport.line_exposure import expose_lines
-from gpuvision.simulation.transport.mirror_facets import MirrorFacets
-from gpuvision.simulation.transport.mirror_points import CREASE, MirrorPoints, max_bulge, smooth_normals
+from gpuvision.simulation.transport.mirror_points import MirrorPoints
+from gpuvision.simulation.transport.mirror_surfaces import DEFAULT_LIMITS, MirrorLimits, MirrorSurfaces
 from gpuvision.simulation.transport.plane_mirrors import (
-    MIN_HEIGHT,
     heights_above,
     mirror_windows,
     reflect_points,
-    triangle_planes,
 )
 from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
 from gpuvision.simulation.transport.specular_interreflection import SpecularInterreflection
@@ -40,34 +37,6 @@ Integers = npt.NDArray[np.int64]
 
 # Images of a point in curved mirrors that the kernel has room for: at first, and at most (the count is one byte).
 _FIRST_IMAGES, _MAX_IMAGES = 32, 255
-
-
-@dataclass(frozen=True, kw_only=True)
-class MirrorLimits:
-    """Numerical limits of `Mirrors`.
-
-    Attributes
-    ----------
-    flat_angle
-        Sine of the angle between a corner's normal and the triangle's above which the triangle is part of a curved
-        mirror; rounding of normals with a wide margin.
-    max_halvings
-        Number of times that a segment with more visible parts than the kernel returns is halved.
-    clearance
-        Distance from a surface within which nothing occludes a ray, as part of the scene's reach; about one rounding in
-        single.
-    crease
-        Angle between neighbouring triangles above which their edge is sharp [rad], of `smooth_normals`; chosen.
-    min_height
-        Least height of the lens above a mirror's plane, and of a point relative to that of the lens; in parts of the
-        lens' distance. Lower ones count as in the plane; derived: some thousand roundings of double.
-    """
-
-    flat_angle: float = 1e-6
-    max_halvings: int = 12
-    clearance: float = 1e-7
-    crease: float = CREASE
-    min_height: float = MIN_HEIGHT
 
 
 class _MirroredParts(NamedTuple):
@@ -124,7 +93,7 @@ class Mirrors:
     steps_per_sample: float = 2.0
     max_reflections: int = 2
     device: Device | None = None
-    limits: MirrorLimits = MirrorLimits()
+    limits: MirrorLimits = DEFAULT_LIMITS
 
     def __post_init__(self) -> None:
         check_materials(self.scene, self.materials)
@@ -161,7 +130,7 @@ class Mirrors:
     @functools.cached_property
     def has_mirrors(self) -> bool:
         """Whether any triangle reflects."""
-        return bool(self._reflects.any())
+        return bool(self._surfaces.reflects.any())
 
     # ---- diffuse lines ---------------------------------------------------------------------------------------
 
@@ -191,7 +160,7 @@ class Mirrors:
     def _exitance(self, lit: LitLine) -> Float64:
         """Return the diffuse exitance of the lines [W/m]."""
         albedos = np.array([each.albedo for each in self.materials])
-        return np.asarray(lit.power * albedos[self._material[lit.triangle]])
+        return np.asarray(lit.power * albedos[self._surfaces.material[lit.triangle]])
 
     def _expose(self, ends: Float64, normals: Float64, exitance: Float64, L: float) -> Exposure:
         """Return the exposure by diffuse lines, or their mirror images, that are visible from end to end."""
@@ -210,16 +179,17 @@ class Mirrors:
     # ---- plane mirrors ---------------------------------------------------------------------------------------
 
     def _plane_exposure(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
-        if not len(self._flat):
+        if not len(self._surfaces.flat):
             return self.view.dark()
         seen = self._visible_in_planes(lit, L)
         if not len(seen.line):
             return self.view.dark()
-        planes = self._planes[seen.mirror]
+        planes = self._surfaces.planes[seen.mirror]
         ends = reflect_points(_between(lit.ends[seen.line], seen.share), planes[:, None])
+        reflectance = self._surfaces.reflectance_of(self._surfaces.flat[seen.mirror])
         normals = lit.normals[seen.line]
         turned = normals - 2.0 * np.sum(normals * planes[:, :3], axis=1, keepdims=True) * planes[:, :3]
-        return self._expose(ends, turned, exitance[seen.line] * self._reflectance_of(self._flat[seen.mirror]), L)
+        return self._expose(ends, turned, exitance[seen.line] * reflectance, L)
 
     def _visible_in_planes(self, lit: LitLine, L: float) -> _MirroredParts:
         """Return the parts of lines that the lens sees in plane mirrors, unoccluded before and after the reflection."""
@@ -227,18 +197,18 @@ class Mirrors:
         line, mirror, share = mirror_windows(
             lens,
             lit.ends,
-            self._facets.corners,
-            self._planes,
+            self._surfaces.facets.corners,
+            self._surfaces.planes,
             *self._candidate_pairs(lit, lens),
             min_height=self.limits.min_height,
         )
         # The lit side of the line must face the mirror image of the lens.
-        apex = reflect_points(lens, self._planes[mirror])
+        apex = reflect_points(lens, self._surfaces.planes[mirror])
         facing = np.sum((apex - lit.ends[line].mean(axis=1)) * lit.normals[line], axis=1) > 0.0
         line, mirror, share, apex = line[facing], mirror[facing], share[facing], apex[facing]
-        up = np.abs(heights_above(lens, self._planes[mirror]))
+        up = np.abs(heights_above(lens, self._surfaces.planes[mirror]))
         ends = _between(lit.ends[line], share)
-        away = np.abs(heights_above(ends, self._planes[mirror][:, None]))
+        away = np.abs(heights_above(ends, self._surfaces.planes[mirror][:, None]))
         near = up[:, None] / (up[:, None] + away)
         row, behind = self._visible(apex, ends, near, np.tile([0.0, 1.0], (len(line), 1)))
         line, mirror, share, apex, near = line[row], mirror[row], share[row], apex[row], near[row]
@@ -258,11 +228,11 @@ class Mirrors:
 
     def _candidate_pairs(self, lit: LitLine, lens: Float64) -> tuple[Integers, Integers]:
         """Return the pairs of a line and a plane mirror in which it may be visible."""
-        blocks = self._facets.blocks
-        line, block = np.nonzero(self._run(self._facets, lit.ends.reshape(-1, 6), lens).near)
+        blocks = self._surfaces.facets.blocks
+        line, block = np.nonzero(self._run(self._surfaces.facets, lit.ends.reshape(-1, 6), lens).near)
         count = np.diff(blocks.start)[block]
         line, mirror = np.repeat(line, count), blocks.order[concatenated_ranges(blocks.start[block], count)]
-        seen = heights_above(lens, self._planes) * self._sides[self._flat] >= 0.0
+        seen = heights_above(lens, self._surfaces.planes) * self._surfaces.sides[self._surfaces.flat] >= 0.0
         return line[seen[mirror]], mirror[seen[mirror]]
 
     def _visible(self, apex: Float64, ends: Float64, near: Float64, share: Float64) -> tuple[Integers, Float64]:
@@ -289,7 +259,7 @@ class Mirrors:
     # ---- curved mirrors --------------------------------------------------------------------------------------
 
     def _curved_exposure(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
-        if not len(self._curved):
+        if not len(self._surfaces.curved):
             return self.view.dark()
         line, share = _steps(lit.lengths, self.step)
         place = _between(lit.ends[line], share)
@@ -309,7 +279,7 @@ class Mirrors:
         intensity = exitance[source] / math.pi * cosine * np.linalg.norm(move[point], axis=1)
         # Aperture and cosine at the lens follow from the spot's direction; the mirror changes the solid angle.
         square = np.sum((spot - lens) ** 2, axis=1) * density
-        power = intensity * self._reflectance_of(triangle) * self.view.aperture_solid_angle(spot, L) * square
+        power = intensity * self._surfaces.reflectance_of(triangle) * self.view.aperture_solid_angle(spot, L) * square
         ends = np.stack([spot - 0.5 * spot_move, spot + 0.5 * spot_move], axis=1)
         return expose_lines(self.view, L, ends, lambda line, at: power[line])
 
@@ -327,7 +297,7 @@ class Mirrors:
         point, spot, move, density, triangle = (np.concatenate(each) for each in zip(*found, strict=True))
         # An image on the edge of two triangles is found on both; one is kept.
         order = np.lexsort((*spot.T, point))
-        near = np.abs(np.diff(spot[order], axis=0)).max(axis=1, initial=0.0) <= self._clearance
+        near = np.abs(np.diff(spot[order], axis=0)).max(axis=1, initial=0.0) <= self._surfaces.clearance
         once = order[np.append(True, ~near | (np.diff(point[order]) != 0))[: len(order)]]
         return point[once], spot[once], move[once], density[once], triangle[once]
 
@@ -338,14 +308,14 @@ class Mirrors:
 
         The smooth surface bulges out of its triangle: that part of the way at the mirror is not tested.
         """
-        bulge = self._bulge[triangle]
+        bulge = self._surfaces.bulge[triangle]
         free = np.ones(len(spot), bool)
         for other in (origin, np.broadcast_to(lens, spot.shape)):
             way = other - spot
             length = np.linalg.norm(way, axis=1)
             along = way / length[:, None]
-            rise = np.abs(np.sum(along * self._normal_of[triangle], axis=1))
-            left_out = np.minimum(2.0 * bulge / np.maximum(rise, 1e-9) + self._clearance, 0.5 * length)
+            rise = np.abs(np.sum(along * self._surfaces.normal_of[triangle], axis=1))
+            left_out = np.minimum(2.0 * bulge / np.maximum(rise, 1e-9) + self._surfaces.clearance, 0.5 * length)
             start = spot + left_out[:, None] * along
             free &= self._run(self._any_hit, np.hstack([start, other])).occluded == 0
         return free
@@ -387,79 +357,18 @@ class Mirrors:
         return Device.best() if self.device is None else self.device
 
     @functools.cached_property
-    def _material(self) -> npt.NDArray[np.int32]:
-        assert self.scene.material is not None  # set by Scene itself
-        return self.scene.material
-
-    @functools.cached_property
-    def _reflects(self) -> npt.NDArray[np.bool_]:
-        mirror = np.array([each.mirror for each in self.materials] or [0.0])
-        there = np.zeros(len(self._material), bool)
-        there[self.scene.bvh.numbers] = True
-        return there & (mirror[self._material] > 0.0)
-
-    @functools.cached_property
-    def _normals(self) -> Float64:
-        """Return normals at the corners, of closed surfaces outwards; only the normals of mirrors are used."""
-        if self.normals is not None:
-            found = np.array(self.normals, np.float64)
-        else:
-            found = np.zeros(self.scene.corners.shape)
-            some = np.flatnonzero(self._reflects)
-            if len(some):
-                found[some] = smooth_normals(Scene(self.scene.corners[some]), self.limits.crease)
-        with np.errstate(invalid="ignore"):
-            inward = np.sum(found.sum(axis=1) * self._normal_of, axis=1) * self._sides < 0.0
-        found[inward] *= -1.0
-        return found
-
-    @functools.cached_property
-    def _sides(self) -> npt.NDArray[np.int8]:
-        return visible_sides(self.scene, self.view.lens, self.view.transport.direction)
-
-    @functools.cached_property
-    def _is_curved(self) -> npt.NDArray[np.bool_]:
-        lean = np.linalg.norm(np.cross(self._normals, self._normal_of[:, None]), axis=2).max(axis=1, initial=0.0)
-        return np.asarray(self._reflects & (lean > self.limits.flat_angle))
-
-    @functools.cached_property
-    def _normal_of(self) -> Float64:
-        with np.errstate(all="ignore"):
-            return triangle_planes(self.scene.corners)[:, :3]
-
-    @functools.cached_property
-    def _flat(self) -> Integers:
-        return np.flatnonzero(self._reflects & ~self._is_curved)
-
-    @functools.cached_property
-    def _curved(self) -> Integers:
-        return np.flatnonzero(self._is_curved)
-
-    @functools.cached_property
-    def _planes(self) -> Float64:
-        return triangle_planes(self._facets.corners)
-
-    @functools.cached_property
-    def _bulge(self) -> Float64:
-        return max_bulge(self.scene.corners, self._normals)
-
-    @functools.cached_property
-    def _clearance(self) -> float:
-        corners = self.scene.bvh.corners
-        return self.limits.clearance * float(np.abs(corners).max(initial=0.0))
-
-    def _reflectance_of(self, triangle: Integers) -> Float64:
-        return np.array([each.mirror for each in self.materials])[self._material[triangle]]
+    def _surfaces(self) -> MirrorSurfaces:
+        return MirrorSurfaces(self.view, self.scene, self.materials, self.normals, self.limits)
 
     @functools.cached_property
     def _interreflection(self) -> SpecularInterreflection:
         return SpecularInterreflection(
             scene=self.scene,
-            reflectance=np.array([each.mirror for each in self.materials])[self._material],
-            normals=self._normals,
-            is_curved=self._is_curved,
+            reflectance=np.array([each.mirror for each in self.materials])[self._surfaces.material],
+            normals=self._surfaces.normals,
+            is_curved=self._surfaces.is_curved,
             step=self.step,
-            clearance=self._clearance,
+            clearance=self._surfaces.clearance,
             device=self._device,
         )
 
@@ -468,21 +377,17 @@ class Mirrors:
         return VisibleIntervals(scene=self.scene)
 
     @functools.cached_property
-    def _facets(self) -> MirrorFacets:
-        return MirrorFacets(corners=self.scene.corners[self._flat])
-
-    @functools.cached_property
     def _any_hit(self) -> AnyHit:
-        return AnyHit(scene=self.scene, clearance=self._clearance)
+        return AnyHit(scene=self.scene, clearance=self._surfaces.clearance)
 
     def _points(self, kept: int) -> MirrorPoints:
         if kept not in self._by_kept:
-            some = self._curved
+            some = self._surfaces.curved
             self._by_kept[kept] = MirrorPoints(
                 corners=self.scene.corners[some],
-                normals=self._normals[some],
+                normals=self._surfaces.normals[some],
                 numbers=some.astype(np.int32),
-                outside=self._sides[some] != 0,
+                outside=self._surfaces.sides[some] != 0,
                 kept=kept,
             )
         return self._by_kept[kept]

@@ -12,17 +12,10 @@ from gpuvision.host import Device
 from gpuvision.ranging.psd import PsdNoise
 from gpuvision.ranging.range_image import StraightTransport
 from gpuvision.simulation.errors.error_attribution import attribute_errors
-from gpuvision.simulation.errors.recommendations import (
-    BOTH,
-    FIRST,
-    NONE,
-    SECOND,
-    SensorFusion,
-    attribute_pair_errors,
-    compare_peak_selections,
-    rank_candidates,
-    resample_reading,
-)
+from gpuvision.simulation.errors.recommendations import compare_peak_selections, rank_candidates
+from gpuvision.simulation.errors.resampling import resample_reading
+from gpuvision.simulation.errors.sensor_fusion import BOTH, FIRST, NONE, SECOND, SensorFusion
+from gpuvision.simulation.errors.sensor_pair import attribute_pair_errors
 from gpuvision.simulation.sensors.readings import (
     GroundTruth,
     Reading,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gpuvision.host import Device
-from gpuvision.ranging.triangulation import SampleAxes
+from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.readings import height_secant, sheet_point, stack_profiles
 from gpuvision.simulation.sensors.sensor_view import Exposure

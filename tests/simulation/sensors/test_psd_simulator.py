@@ -10,7 +10,7 @@ from scipy.special import ndtr
 
 from gpuvision.host import Device
 from gpuvision.ranging.psd import PsdNoise
-from gpuvision.ranging.triangulation import SampleAxes
+from gpuvision.ranging.sheet import SampleAxes
 from gpuvision.simulation.sensors.masks import Mask
 from gpuvision.simulation.sensors.psd_simulator import PsdSimulator
 from gpuvision.simulation.sensors.readings import height_secant, sheet_point, stack_profiles

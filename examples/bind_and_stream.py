@@ -42,16 +42,17 @@ for name, call in (("readout(frame)", lambda: readout(frames[0])), ("bound.run()
     print(f"{name:15} {1e6 * np.median(times):6.0f} µs")
 
 # %%
-# Stream at 2000 frames per second: the plan measures which batch keeps up with the sensor.
+# Stream at 2000 frames per second: the plan measures which batch keeps up with the sensor, and sizes the ring for a
+# stall of half a second.
 source = PacedSource(ArraySource(np.concatenate([frames] * 16)), rate=2000.0)
 chosen = plan_stream(source, readout, device=device)
+print(chosen)
 latency = []
-with gv.Pipeline(source, readout, device=device, batch=chosen.batch, ring=chosen.ring, policy="drop_oldest") as stream:
+with gv.Pipeline(source, readout, device=device, policy="drop_oldest", **chosen.settings) as stream:
     for batch in stream:
         latency.extend(1e-6 * (batch.delivered - batch.arrived))
 report = stream.report()
-print(f"batch {chosen.batch}: {report.throughput:.0f} frames/s, {report.dropped} dropped, ", end="")
-print(f"latency p50 {1e3 * report.latency.p50:.2f} ms, p99 {1e3 * report.latency.p99:.2f} ms")
+print(report)
 
 # %%
 # The latency of every frame, from its arrival to its positions in host memory.

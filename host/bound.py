@@ -85,6 +85,11 @@ class Bound(Generic[R]):
             self._set_arrays(self._queue_site, self._own)
             cl.enqueue_nd_range_kernel(self.queue, self._queue_site.kernel, self._global, self._local).wait()
 
+    @property
+    def inline(self) -> bool:
+        """Whether a call runs the kernel in the calling thread, unless it must wait for an event."""
+        return self._queue_site.inline or self._inline_site is not None
+
     def allocate(self) -> R:
         """Return new device arrays for the outputs."""
         arrays = {

@@ -235,6 +235,11 @@ class Device:
             return bool(queue.device == self.inline_device)
         return _LOCAL_THREAD_QUEUE in queue.get_info(cl.command_queue_info.PROPERTIES_ARRAY)
 
+    @property
+    def has_inline_queues(self) -> bool:
+        """Whether `new_queue` makes queues whose kernels run in the thread that enqueues them."""
+        return self.inline_device is not None or _LOCAL_THREAD in self.handle.extensions.split()
+
     def _new_inline_queue(self, properties: Any) -> Any:
         if self.inline_device is not None:
             return self._queue(self.inline_device, properties)

@@ -26,8 +26,9 @@ from gpuvision.host.device import Device
 from gpuvision.host.errors import StreamError
 from gpuvision.host.operation import Operation
 from gpuvision.host.report import StreamReport, StreamStatistics
-from gpuvision.host.ring import Queues, SharedSlot, Slot, StagedSlot, Step, check_chain, map_arrays
+from gpuvision.host.ring import SharedSlot, Slot, StagedSlot, Step, check_chain, map_arrays, queues_of
 from gpuvision.host.sources import ArraySource, Clock, Source
+from gpuvision.host.stalls import StallRecorder
 from gpuvision.host.trace import Trace
 
 Policy = Literal["block", "drop_oldest", "raise"]
@@ -115,6 +116,10 @@ class Pipeline(Generic[R]):
     zero_copy : bool, optional
         Whether host and device use the same memory; otherwise pinned memory and copies. Default: True where the device
         shares memory.
+    inline : bool
+        Whether kernels run in the stream's thread (`Device.new_queue`) instead of the worker threads of the device.
+        Small frames take less processor time so, and the stream does not wait for threads that compete with the
+        producer for the processor; `plan_stream` measures both. Short launches run inline in any case.
     profile : bool
         Whether to measure the times on the device.
     trace : Trace, optional
@@ -142,6 +147,7 @@ class Pipeline(Generic[R]):
         ring: int = 4,
         policy: Policy = "block",
         zero_copy: bool | None = None,
+        inline: bool = False,
         profile: bool = False,
         trace: Trace | None = None,
         warm_up: int | None = None,
@@ -154,11 +160,13 @@ class Pipeline(Generic[R]):
         self.batch = default_batch(self.source, self.ring) if batch is None else _whole(batch, "batch", 1)
         self.device = Device.best() if device is None else device
         self.zero_copy = self.device.shares_memory if zero_copy is None else zero_copy
+        self.inline = inline
         self.profile = profile or trace is not None
-        self._steps = _steps(operation)
+        self._steps = steps_of(operation)
         self._clock = clock
         self._check()
         self._statistics = StreamStatistics(self.ring if warm_up is None else warm_up)
+        self._stalls = StallRecorder(self._clock)
         self._dropped = 0
         self._state: Literal["new", "open", "closed"] = "new"
 
@@ -167,6 +175,8 @@ class Pipeline(Generic[R]):
             raise ValueError(f"Pipeline.policy is {self.policy!r}, expected 'block', 'drop_oldest' or 'raise'")
         if self.zero_copy and not self.device.shares_memory:
             raise ValueError(f"device {self.device.label} does not share memory with the host; use zero_copy=None")
+        if self.inline and not self.device.has_inline_queues:
+            raise ValueError(f"device {self.device.label} has no inline queues; use inline=False")
         check_chain(self._steps, self.device, self.batch, self.source.shape, self.source.dtype)
 
     def __enter__(self) -> Pipeline[R]:
@@ -177,11 +187,14 @@ class Pipeline(Generic[R]):
         kind = SharedSlot if self.zero_copy else StagedSlot
         source = self.source
         try:
-            self._queues = Queues(self.device, zero_copy=self.zero_copy, profiling=self.profile)
+            self._queues = queues_of(
+                self.device, self.ring, zero_copy=self.zero_copy, profiling=self.profile, inline=self.inline
+            )
             slots: list[Slot[R]] = [
-                kind(self._steps, self.device, self._queues, self.batch, source.shape, source.dtype)
-                for _ in range(self.ring)
+                kind(self._steps, self.device, queues, self.batch, source.shape, source.dtype)
+                for queues in self._queues
             ]
+            self._computes_inline = slots[0].inline
             self._offset = self._calibrated(slots[0]) if self.profile else 0
         except BaseException:
             self._state = "closed"
@@ -199,6 +212,7 @@ class Pipeline(Generic[R]):
         self._failure: StreamError | None = None
         self._stopping = self._ended = False
         self._statistics.started = self._clock()
+        self._stalls.start(self._statistics.started)
         self._producer = threading.Thread(target=self._produce, name="gpuvision stream", daemon=True)
         self._producer.start()
         return self
@@ -231,6 +245,7 @@ class Pipeline(Generic[R]):
             return
         self.stop()
         self._state = "closed"
+        self._stalls.stop()
         self._producer.join(self._limits.stop_timeout)
         if self._producer.is_alive():
             raise StreamError(
@@ -238,7 +253,8 @@ class Pipeline(Generic[R]):
                 "stream's end; give it a stop() that ends the read"
             )
         try:
-            self._queues.finish()
+            for queues in dict.fromkeys(self._queues):
+                queues.finish()
         finally:
             self._release(self._clock())
             # Slots hold device memory: free it even where the caller keeps the stream for its report.
@@ -338,9 +354,9 @@ class Pipeline(Generic[R]):
         except cl.Error as error:
             self._ended = True
             raise _stopped(slot.number, "operation", error) from error
-        return self._delivered(slot, taken, clock())
+        return self._delivered(slot, now, taken, clock())
 
-    def _delivered(self, slot: Slot[R], taken: int, delivered: int) -> Batch[R]:
+    def _delivered(self, slot: Slot[R], requested: int, taken: int, delivered: int) -> Batch[R]:
         arrived = slot.arrived[: slot.count]
         statistics = self._statistics
         statistics.add_batch(delivered, delivered - arrived, self._ready.qsize() + 1)
@@ -356,6 +372,17 @@ class Pipeline(Generic[R]):
             for stage, (start, end) in spans.items():
                 statistics.add_stage(stage, end - start)
             started, ended = spans["compute"]
+        self._stalls.add(
+            slot.number,
+            slot.count,
+            arrived=int(arrived[-1]),
+            requested=requested,
+            launching=slot.filled if self._computes_inline else slot.enqueued,
+            launched=slot.enqueued,
+            taken=taken,
+            computed=min(max(end for _, end in spans.values()), delivered) if spans else delivered,
+            delivered=delivered,
+        )
         if self.trace is not None and not self.trace.is_full:
             spans["slot"] = (slot.asked, slot.taken)
             spans["source"] = (slot.taken, slot.filled)
@@ -410,6 +437,8 @@ class Pipeline(Generic[R]):
             policy=self.policy,
             device=self.device.label,
             zero_copy=self.zero_copy,
+            inline=self.inline,
+            longest_stall=self._stalls.longest,
         )
 
     # The device's clock ----------------------------------------------------------------------------------------
@@ -467,7 +496,8 @@ def _stopped(number: int, stage: str, error: BaseException) -> StreamError:
     return StreamError(f"the stream stopped at frame {number} ({stage}): {error or type(error).__name__}")
 
 
-def _steps(operation: Operation[Any] | Sequence[Operation[Any] | Step]) -> list[Step]:
+def steps_of(operation: Operation[Any] | Sequence[Operation[Any] | Step]) -> list[Step]:
+    """Return the steps of an operation or a chain."""
     given = [operation] if isinstance(operation, Operation) else list(operation)
     if not given:
         raise ValueError("expected an operation, or a chain of at least one")

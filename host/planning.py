@@ -1,21 +1,28 @@
-"""Choice of the batch size of a stream: the smallest batch that keeps up with the sensor within a latency."""
+"""Choice of the settings of a stream: batch size, threads of the kernels, and a ring that outlasts a stall.
+
+The batch is the smallest one that keeps up with the sensor within a latency. Kernels run in the stream's thread
+(inline) where a batch is small and this takes no more processor time per frame than the worker threads of the device: a
+stream that waits for fewer threads has fewer stalls beside other processes.
+"""
 
 from __future__ import annotations
 
 import math
+import os
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gpuvision.host.device import Device
 from gpuvision.host.errors import StreamError
 from gpuvision.host.operation import Operation
-from gpuvision.host.pipeline import Pipeline
-from gpuvision.host.ring import Step
+from gpuvision.host.pipeline import Pipeline, steps_of
+from gpuvision.host.ring import Step, slot_bytes
 from gpuvision.host.sources import ArraySource, Source
 
 # Default batch sizes [frames] that are tried, doubling: the chosen one is at most twice the smallest that suffices.
@@ -42,8 +49,16 @@ class PlanLimits:
         Number of batch sizes without a gain after which the search ends. Chosen.
     min_gain : float
         Least ratio of service rates that counts as a gain. Chosen: above the scatter of the measurements.
-    max_bytes : int
-        Largest memory of the frames of a ring [bytes]. Chosen.
+    max_inline_seconds : float
+        Longest time of a batch that runs inline although worker threads keep up, too [s]. Chosen: a fifth of the time
+        after which Python switches threads, because no Python code runs during an inline kernel.
+    max_inline_cost : float
+        Largest ratio of the processor times per frame, inline to worker threads, at which kernels run inline although
+        worker threads keep up, too. Chosen: above the scatter of the measurements, so that equal costs give the same
+        plan each time.
+    max_bytes : int or None
+        Largest memory of a ring [bytes]. ``None``: half of the free memory of the machine, and at most half of the
+        memory of the device. Chosen: the other half is for the results of the user.
     """
 
     min_ring: int = 4
@@ -52,7 +67,30 @@ class PlanLimits:
     trial_seconds: float = 0.05
     patience: int = 3
     min_gain: float = 1.05
-    max_bytes: int = 1 << 28
+    max_inline_seconds: float = 1e-3
+    max_inline_cost: float = 1.1
+    max_bytes: int | None = None
+
+
+class Cost(NamedTuple):
+    """Measured cost of a batch size.
+
+    Attributes
+    ----------
+    service_rate : float
+        Throughput when frames come without pause [frames/s].
+    seconds : float
+        Median time of one batch through source, device and consumer [s].
+    processor_time : float
+        Processor time per frame, summed over all threads of the process [s].
+    """
+
+    service_rate: float
+    seconds: float
+    processor_time: float
+
+
+Measure = Callable[[int, bool], Cost]
 
 
 @dataclass(frozen=True)
@@ -66,32 +104,68 @@ class Trial:
         Throughput when frames arrive without pause [frames/s].
     latency : float
         Time from the arrival of the first frame to its result [s]: the time in which the batch fills at the sensor's
-        rate, and the median time of one batch through source, device and consumer.
+        rate, and `seconds`.
+    inline : bool
+        Whether the kernels ran in the stream's thread.
+    seconds : float
+        Median time of one batch through source, device and consumer [s].
+    processor_time : float
+        Processor time per frame, summed over all threads of the process [s].
     """
 
     batch: int
     service_rate: float
     latency: float
+    inline: bool
+    seconds: float
+    processor_time: float
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Settings of a stream: ``Pipeline(source, operation, batch=plan.batch, ring=plan.ring)``.
+    """Settings of a stream: ``Pipeline(source, operation, **plan.settings)``.
+
+    ``str(plan)`` states the plan in one line.
 
     Attributes
     ----------
     batch, ring : int
         Frames per launch, and slots.
+    inline : bool
+        Whether the kernels run in the stream's thread.
     rate : float
         Frame rate of the sensor [1/s].
+    stall : float
+        Pause whose frames the ring holds [s].
+    ring_bytes : int
+        Memory of the slots, on host and device together [bytes].
     trials : tuple of Trial
-        Measurements; the last one measured the chosen batch.
+        Measurements; the last ones measured the chosen batch.
     """
 
     batch: int
     ring: int
+    inline: bool
     rate: float
+    stall: float
+    ring_bytes: int
     trials: tuple[Trial, ...]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Return the parameters of `Pipeline`: batch, ring and inline."""
+        return {"batch": self.batch, "ring": self.ring, "inline": self.inline}
+
+    def __str__(self) -> str:
+        costs = {each.inline: each.processor_time for each in self.trials if each.batch == self.batch}
+        names = {True: "inline", False: "in worker threads"}
+        chosen = f"kernels {names[self.inline]}, {1e6 * costs[self.inline]:.3g} us of processor time per frame"
+        other = costs.get(not self.inline)
+        against = "" if other is None else f" ({1e6 * other:.3g} us {names[not self.inline]})"
+        return (
+            f"batches of {self.batch}, a ring of {self.ring} slots ({_in_words(self.ring_bytes)}) for stalls of "
+            f"{self.stall:g} s at {self.rate:g} frames/s, {chosen}{against}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as dictionaries, lists and numbers for JSON."""
@@ -105,14 +179,15 @@ def plan_stream(
     rate: float | None = None,
     latency: float | None = None,
     margin: float = 1.25,
-    stall: float = 0.1,
+    stall: float = 0.5,
+    inline: bool | None = None,
     device: Device | None = None,
     zero_copy: bool | None = None,
     batches: Sequence[int] = BATCHES,
-    measure: Callable[[int], tuple[float, float]] | None = None,
+    measure: Measure | None = None,
     limits: PlanLimits = PlanLimits(),
 ) -> Plan:
-    """Choose batch size and ring by measurements on blank frames, before the stream reads from the source.
+    """Choose batch size, ring and threads by measurements on blank frames, before the stream reads from the source.
 
     Parameters
     ----------
@@ -126,13 +201,18 @@ def plan_stream(
     margin : float
         Least ratio of the measured service rate to the frame rate.
     stall : float
-        Pause of the machine or the consumer whose frames the ring must hold [s], within ``limits.max_bytes``.
+        Pause of the machine or the consumer whose frames the ring must hold [s]. A source that knows its length needs
+        no more slots than it has batches.
+    inline : bool, optional
+        Whether kernels run in the stream's thread instead of the worker threads of the device. Default: inline where
+        this keeps up, a batch takes at most ``limits.max_inline_seconds``, and the processor time per frame is at most
+        ``limits.max_inline_cost`` times that of the worker threads; inline, too, where only this keeps up.
     device, zero_copy
         As for `Pipeline`.
     batches : sequence of int
         Batch sizes to try, ascending.
     measure : callable, optional
-        Function that takes a batch size and returns service rate [frames/s] and time of one batch [s]; it replaces the
+        Function that takes a batch size and whether kernels run inline, and returns a `Cost`; it replaces the
         measurement on the device.
     limits : PlanLimits
         Limits of the measurements and of the memory.
@@ -144,29 +224,68 @@ def plan_stream(
     Raises
     ------
     ValueError
-        Neither the source nor the caller gives a rate.
+        Neither the source nor the caller gives a rate, the stall is negative or not finite, or the device has no inline
+        queues.
     StreamError
-        No batch keeps up with the rate within the latency; the message gives the figures of the fastest batch.
+        No batch keeps up with the rate within the latency (the message gives the figures of the fastest batch), or the
+        ring takes more memory than the limit.
+
+    Notes
+    -----
+    The ring has ``stall * rate / batch`` slots, one for the consumer and one for the source.
     """
     rate = source.rate if rate is None else rate
-    if rate is None or not rate > 0.0:
+    if rate is None or not 0.0 < rate < math.inf:
         raise ValueError(f"rate is {rate}, expected the sensor's frames per second, > 0")
-    if measure is None:
-        device = Device.best() if device is None else device
-        measure = _Measurement(source, operation, device, zero_copy, limits)
+    if not 0.0 <= stall < math.inf:
+        raise ValueError(f"stall is {stall}, expected seconds >= 0")
+    device = Device.best() if device is None else device
+    zero_copy = device.shares_memory if zero_copy is None else zero_copy
+    modes = _modes(inline, device)
+    steps = steps_of(operation)
+    measure = _Measurement(source, steps, device, zero_copy, limits) if measure is None else measure
+    max_bytes = _free_bytes(device) // 2 if limits.max_bytes is None else limits.max_bytes
     trials: list[Trial] = []
     for batch in batches:
-        ring_bytes = batch * limits.min_ring * _frame_bytes(source)
-        if trials and (ring_bytes > limits.max_bytes or not _is_gaining(trials, limits)):
+        ring = _ring_for(stall, rate, batch, source, limits)
+        ring_bytes = ring * slot_bytes(steps, device, batch, source.shape, source.dtype, zero_copy=zero_copy)
+        if ring_bytes > max_bytes and not trials:
+            raise _too_large(ring, batch, ring_bytes, max_bytes, f"stalls of {stall:g} s at {rate:g} frames/s")
+        if ring_bytes > max_bytes or not _is_gaining(trials, limits):
             break
-        service_rate, seconds = measure(batch)
-        trials.append(Trial(batch, service_rate, (batch - 1) / rate + seconds))
-        if latency is not None and trials[-1].latency > latency:
+        new = [_tried(measure, batch, mode, rate) for mode in modes]
+        trials += new
+        quick = [each for each in new if latency is None or each.latency <= latency]
+        if not quick:
             break  # larger batches have longer latencies
-        if service_rate >= margin * rate:
-            return Plan(batch, _ring_for(stall, rate, batch, source, limits), rate, tuple(trials))
+        sufficient = [each for each in quick if each.service_rate >= margin * rate]
+        if sufficient:
+            return Plan(batch, ring, _runs_inline(sufficient, limits), rate, stall, ring_bytes, tuple(trials))
     asked = f"{rate:.0f} frames/s with a margin of {margin:g}"
     raise _too_slow(trials, asked if latency is None else f"{asked} within {latency * 1e3:.3g} ms")
+
+
+def _modes(inline: bool | None, device: Device) -> tuple[bool, ...]:
+    """Return the values of `inline` to try."""
+    if inline is None:
+        return (False, True) if device.has_inline_queues else (False,)
+    return (inline,)
+
+
+def _tried(measure: Measure, batch: int, inline: bool, rate: float) -> Trial:
+    cost = measure(batch, inline)
+    latency = (batch - 1) / rate + cost.seconds
+    return Trial(batch, cost.service_rate, latency, inline, cost.seconds, cost.processor_time)
+
+
+def _runs_inline(sufficient: Sequence[Trial], limits: PlanLimits) -> bool:
+    """Decide between inline and worker threads for the trials of a batch size that keep up."""
+    by_mode = {trial.inline: trial for trial in sufficient}
+    if len(by_mode) == 1:
+        return sufficient[0].inline
+    inline, workers = by_mode[True], by_mode[False]
+    is_small = inline.seconds <= limits.max_inline_seconds
+    return is_small and inline.processor_time <= limits.max_inline_cost * workers.processor_time
 
 
 def _too_slow(trials: Sequence[Trial], asked: str) -> StreamError:
@@ -177,49 +296,82 @@ def _too_slow(trials: Sequence[Trial], asked: str) -> StreamError:
     )
 
 
+def _too_large(ring: int, batch: int, ring_bytes: int, max_bytes: int, asked: str) -> StreamError:
+    return StreamError(
+        f"a ring for {asked} has {ring} x {batch} frames and takes {_in_words(ring_bytes)}, the limit is "
+        f"{_in_words(max_bytes)}; plan for a shorter stall, or raise PlanLimits.max_bytes"
+    )
+
+
+def _in_words(size: int) -> str:
+    """Return a number of bytes with a decimal unit."""
+    for unit, name in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if size >= unit:
+            return f"{size / unit:.3g} {name}"
+    return f"{size} bytes"
+
+
+def _free_bytes(device: Device) -> int:
+    """Return the memory that the system can give away without swapping, and the device has, at most [bytes]."""
+    device_bytes = int(device.handle.global_mem_size)
+    try:
+        fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        return min(int(fields["MemAvailable"].split()[0]) << 10, device_bytes)
+    except (OSError, KeyError, ValueError):  # not Linux
+        return min(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"), device_bytes)
+
+
 def _is_gaining(trials: Sequence[Trial], limits: PlanLimits) -> bool:
-    """Return whether the last trials were faster than all before: beyond some size a larger batch is not."""
-    rates = [trial.service_rate for trial in trials]
-    patience = limits.patience
+    """Return whether the last batches were faster than all before: beyond some size a larger batch is not."""
+    best: dict[int, float] = {}
+    for trial in trials:
+        best[trial.batch] = max(best.get(trial.batch, 0.0), trial.service_rate)
+    rates, patience = list(best.values()), limits.patience
     return len(rates) <= patience or max(rates[-patience:]) > limits.min_gain * max(rates[:-patience])
-
-
-def _frame_bytes(source: Source) -> int:
-    return max(math.prod(source.shape) * source.dtype.itemsize, 1)
 
 
 def _ring_for(stall: float, rate: float, batch: int, source: Source, limits: PlanLimits) -> int:
     """Return the number of slots for the frames of a stall, one for the consumer and one for the source."""
     wanted = math.ceil(stall * rate / batch) + 2
-    return max(min(wanted, limits.max_bytes // (batch * _frame_bytes(source))), limits.min_ring)
+    if source.length is not None:
+        wanted = min(wanted, -(-source.length // batch) + 1)
+    return max(wanted, limits.min_ring)
 
 
 class _Measurement:
     """Measurement of batch sizes on streams of blank frames."""
 
     def __init__(
-        self, source: Source, operation: Any, device: Device, zero_copy: bool | None, limits: PlanLimits
+        self, source: Source, steps: Sequence[Step], device: Device, zero_copy: bool, limits: PlanLimits
     ) -> None:
-        self._operation = operation
+        self._steps = steps
         self._limits = limits
         self._setup: dict[str, Any] = {"device": device, "zero_copy": zero_copy}
         self._blank = np.zeros((1, *source.shape), source.dtype)
 
-    def __call__(self, batch: int) -> tuple[float, float]:
-        seconds = self._one_by_one(batch)
+    def __call__(self, batch: int, inline: bool) -> Cost:
+        seconds = self._one_by_one(batch, inline)
         batches = max(int(self._limits.trial_seconds / seconds), 2 * self._limits.min_ring)
+        rounds = [self._round(batch, batches, inline) for _ in range(self._limits.rounds)]
         # Pauses of a shared machine slow down some of the rounds: the best round measures the stream itself.
-        return max(self._unpaused(batch, batches) for _ in range(self._limits.rounds)), seconds
+        return Cost(max(rate for rate, _ in rounds), seconds, min(spent for _, spent in rounds))
 
-    def _unpaused(self, batch: int, batches: int) -> float:
+    def _round(self, batch: int, batches: int, inline: bool) -> tuple[float, float]:
+        """Return the throughput [frames/s] and the processor time per frame [s]."""
         source = ArraySource(self._blank, batch * batches)
-        stream = Pipeline(source, self._operation, batch=batch, ring=self._limits.min_ring, **self._setup)
-        return stream.run().throughput
+        ring = self._limits.min_ring
+        with Pipeline(source, self._steps, batch=batch, ring=ring, inline=inline, **self._setup) as stream:
+            begun = time.process_time()
+            for _ in stream:
+                pass
+            spent = time.process_time() - begun
+        return stream.report().throughput, spent / (batch * batches)
 
-    def _one_by_one(self, batch: int) -> float:
+    def _one_by_one(self, batch: int, inline: bool) -> float:
         """Return the median time of a batch through an empty stream [s]."""
         source = _Stepped(self._blank, batch * self._limits.latency_batches)
-        with Pipeline(source, self._operation, batch=batch, ring=2, warm_up=2, **self._setup) as stream:
+        setup = {"batch": batch, "ring": 2, "warm_up": 2, "inline": inline, **self._setup}
+        with Pipeline(source, self._steps, **setup) as stream:
             for _ in stream:
                 source.released.release()
         return stream.report().latency.p50

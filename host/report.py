@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpuvision.host.stalls import Stall
+
 # A bin is the exponent of a float32 and 7 bits of its mantissa: narrower than 1/100 of the value. The last bin ends at
 # 2**44 ns, five hours.
 _DROPPED_BITS = 16
@@ -116,11 +118,14 @@ class StreamReport:
     warm_up : int
         Number of frames at the start that `throughput`, `latency` and `stages` leave out; 0 in a stream that was not
         longer than its warm-up.
-    batch, ring, policy, device, zero_copy
+    batch, ring, policy, device, zero_copy, inline
         Settings of the stream.
     fill_mean : float
     fill_maximum : int
         Mean and largest number of launched batches at a delivery, the delivered one included.
+    longest_stall : Stall or None
+        Longest time without a delivery although a batch of frames had arrived, and the parts of the stream that spent
+        it. The warm-up counts, because a stall loses frames there as well. ``None`` before the first delivery.
     stages : dict of str to DurationStatistics
         Time per batch. On the host: ``slot`` (wait for a free slot), ``source``, ``launch``, ``queue`` (launched, not
         yet requested by the consumer), ``wait`` (the consumer waits for the device) and ``sink``. On the device, where
@@ -141,11 +146,23 @@ class StreamReport:
     zero_copy: bool
     fill_mean: float
     fill_maximum: int
+    inline: bool = False
+    longest_stall: Stall | None = None
     stages: dict[str, DurationStatistics] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        latency = self.latency
+        stall = "" if self.longest_stall is None else f"; longest stall {self.longest_stall}"
+        return (
+            f"{self.frames} frames, {self.dropped} dropped, latency p50 {1e3 * latency.p50:.3g} ms, "
+            f"p99 {1e3 * latency.p99:.3g} ms{stall}"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as dictionaries, lists and numbers for JSON; ``None`` for NaN."""
         plain: dict[str, Any] = _without_nan(asdict(self))
+        if self.longest_stall is not None:
+            plain["longest_stall"]["place"] = self.longest_stall.place
         return plain
 
 

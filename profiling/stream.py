@@ -3,12 +3,19 @@
 A thread delivers frames of 512 x 1024 pixels at a fixed rate. The stream holds a rate if no frame is dropped and no
 frame waits longer for its slot than the buffers of a sensor last. Latency is the time from the arrival of a frame until
 its positions are in host memory.
+
+One case runs beside a second process that loads one core half of the time. Its settings are those of `plan_stream`,
+planned before the load begins. ``python -m gpuvision.profiling.stream`` repeats this case.
 """
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import copy
-from collections.abc import Callable, Iterator, Mapping
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +25,7 @@ from numpy.typing import NDArray
 
 from gpuvision.host import Device, DeviceArray
 from gpuvision.host.pipeline import Pipeline
+from gpuvision.host.planning import Plan, plan_stream
 from gpuvision.host.report import StreamReport
 from gpuvision.host.sources import ArraySource, PacedSource
 from gpuvision.profiling.harness import Case
@@ -36,15 +44,29 @@ _BATCHES = (1, 2, 4, 8, 16)
 _RESOLUTION = 0.03  # relative width of the interval at which the search stops
 _MARGIN = 1.25  # throughput of the chosen batch size over the rate
 _RING_FRAMES = 512  # 256 MB
+_LOADED_RATE = 4000  # [frames/s]
+_LOAD_PERIOD = 0.1  # the second process computes for half of this time, then sleeps [s]
+# Processor time counts, so that the process loads half a core even where it must share the core. It ends with the
+# benchmark, whose end closes its input.
+_LOAD_CODE = """
+import select, sys, time
+half = float(sys.argv[1]) / 2
+print("ready", flush=True)
+while not select.select([sys.stdin], [], [], half)[0]:
+    end = time.process_time() + half
+    while time.process_time() < end:
+        pass
+"""
 
 
 @dataclass(frozen=True)
 class Held:
-    """Result of a stream at a rate [frames/s]."""
+    """Result of a stream at a rate [frames/s], with the plan of its settings where it has one."""
 
     rate: float
     report: StreamReport
     late: float
+    plan: Plan | None = None
 
     @property
     def holds(self) -> bool:
@@ -53,7 +75,7 @@ class Held:
 
     def metadata(self) -> dict[str, Any]:
         """Return the additional columns of a row."""
-        latency = self.report.latency
+        latency, stall = self.report.latency, self.report.longest_stall
         micro = {"p50": latency.p50, "p99": latency.p99, "p999": latency.p999, "max": latency.maximum}
         return {
             "rate": round(self.rate),
@@ -64,18 +86,28 @@ class Held:
             "late_ms": round(self.late * 1e3, 3),
             "batch": self.report.batch,
             "ring": self.report.ring,
+            "inline": self.report.inline,
             **{f"{name}_us": round(value * 1e6, 1) for name, value in micro.items()},
+            "stall_ms": None if stall is None else round(stall.seconds * 1e3, 3),
+            "stall_place": None if stall is None else stall.place,
+            **({} if self.plan is None else {"ring_bytes": self.plan.ring_bytes}),
         }
 
 
 def cases(device: Device, *, run_seconds: float = 60.0) -> Iterator[Case]:
-    """Yield `1000` and `4000` [frames/s], each for `run_seconds`, and `highest`: the highest rate without loss."""
+    """Yield the cases of the stream.
+
+    `1000` and `4000` [frames/s] and `4000_loaded` run for `run_seconds` each, the last one beside a process that loads
+    one core half of the time. `highest` is the highest rate without loss.
+    """
     frames = line_frames()
     error = _error(frames, device)
     rates = service_rates(frames, device)
     for rate in RATES:
         held = hold(frames, device, rate, run_seconds, _batch_for(rate, rates))
         yield from _case(str(rate), frames, device, held, error)
+    loaded = hold_loaded(frames, device, _LOADED_RATE, run_seconds)
+    yield from _case(f"{_LOADED_RATE}_loaded", frames, device, loaded, error)
     yield from _case("highest", frames, device, highest(frames, device, rates, min(run_seconds, _TRIAL_S)), error)
 
 
@@ -110,6 +142,29 @@ def hold(frames: NDArray[np.uint8], device: Device, rate: float, seconds: float,
     ring = max(min(int(_STALL_S * rate), _RING_FRAMES) // batch, 4)
     stream = Pipeline(source, READOUT, device=device, batch=batch, ring=ring, policy="drop_oldest")
     return Held(rate, stream.run(), source.late * 1e-9)
+
+
+def hold_loaded(frames: NDArray[np.uint8], device: Device, rate: float, seconds: float) -> Held:
+    """Run the planned stream at a rate [frames/s] beside a second process that loads one core half of the time."""
+    source = PacedSource(ArraySource(frames, max(int(rate * seconds), 1)), rate)
+    plan = plan_stream(source, READOUT, device=device)
+    stream = Pipeline(source, READOUT, device=device, policy="drop_oldest", **plan.settings)
+    with _half_loaded_core():
+        return Held(rate, stream.run(), source.late * 1e-9, plan)
+
+
+@contextlib.contextmanager
+def _half_loaded_core() -> Iterator[None]:
+    """Run a second process that loads one core half of the time."""
+    command = [sys.executable, "-c", _LOAD_CODE, str(_LOAD_PERIOD)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as load:
+        assert load.stdin is not None
+        assert load.stdout is not None
+        load.stdout.readline()
+        try:
+            yield
+        finally:
+            load.stdin.close()
 
 
 def highest(
@@ -172,3 +227,26 @@ def _error(frames: NDArray[np.uint8], device: Device) -> float:
             part = exact[batch.number : batch.number + len(batch)]
             error = max(error, float(np.abs(batch.result.position - part).max()))
     return error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Repeat the case beside a half-loaded core, print a line for each run, and return 1 if a run lost frames."""
+    parser = argparse.ArgumentParser(prog="python -m gpuvision.profiling.stream", description=main.__doc__)
+    parser.add_argument("--device", action="append", help="label of a device; repeat for several; default: all")
+    parser.add_argument("--runs", type=int, default=5, help="number of runs on each device")
+    parser.add_argument("--seconds", type=float, default=60.0, help="duration of a run [s]")
+    asked = parser.parse_args(arguments)
+    frames = line_frames()
+    lost = 0
+    for device in [Device.named(each) for each in asked.device] if asked.device else Device.all():
+        for number in range(asked.runs):
+            held = hold_loaded(frames, device, _LOADED_RATE, asked.seconds)
+            if not number:
+                print(f"{device.label}: {held.plan}", flush=True)
+            print(f"{device.label} run {number + 1}: {held.report}, frames read up to {1e3 * held.late:.3g} ms late")
+            lost += held.report.dropped
+    return int(lost > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -19,6 +19,20 @@ def currents_of(count: int, strips: int = 5) -> np.ndarray:
     return rng.uniform(1e-8, 1e-6, (count, strips, 2)).astype(np.float32)
 
 
+class ManualClock:
+    """Clock that advances only in `sleep`, by assignment, and by a step at each reading, so that loops end."""
+
+    def __init__(self, step: int = 1000) -> None:
+        self.now, self.step = 1_000_000_000 if step else 0, step
+
+    def __call__(self) -> int:
+        self.now += self.step
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += round(seconds * 1e9)
+
+
 class Gated(Source):
     """Frames that tell their number and arrive when the test says so."""
 

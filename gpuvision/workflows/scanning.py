@@ -109,7 +109,10 @@ class Scan:
         return {"OK": int(np.count_nonzero(status == 0))} | flags
 
     def summary(self) -> str:
-        """Return one line: frames, throughput, fraction of valid samples, size of the height map."""
+        """Return one line: frames, throughput, fraction of valid samples, size of the height map.
+
+        A replay at a rate also names its longest stall and the part of the stream that spent it.
+        """
         stream, sensor_rate, delay = self.stream, self.sensor.recording.rate, self.metadata["late"]
         dropped = f" ({stream.dropped} dropped)" if stream.dropped else ""
         speed = f"{self.throughput:,.0f} frames/s on {self.device.label}"
@@ -119,8 +122,10 @@ class Scan:
         overdue = (
             f"; frames were read up to {1e3 * delay:.0f} ms late" if delay and delay > self.limits.max_delay else ""
         )
+        stall = stream.longest_stall if self.metadata["rate"] is not None else None
+        stalled = "" if stall is None else f"; longest stall {stall}"
         size = f"{self.grid.columns} x {self.grid.rows} cells"
-        return f"{stream.frames} frames{dropped} at {speed}, {valid}, {size}{overdue}"
+        return f"{stream.frames} frames{dropped} at {speed}, {valid}, {size}{overdue}{stalled}"
 
     @property
     def throughput(self) -> float:
@@ -344,8 +349,8 @@ def _pipeline(
         return source, stream
     paced = PacedSource(source, rate)
     planned = plan_stream(paced, operation, device=device)
-    setup: dict[str, Any] = {"policy": policy or "drop_oldest", "batch": planned.batch, "ring": planned.ring}
-    return paced, Pipeline(paced, operation, device=device, profile=True, trace=timeline, **setup)
+    setup: dict[str, Any] = {"profile": True, "trace": timeline, "policy": policy or "drop_oldest"}
+    return paced, Pipeline(paced, operation, device=device, **setup, **planned.settings)
 
 
 def _read_frames(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import json
+import math
 import resource
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +19,7 @@ from hypothesis import strategies as st
 
 from gpuvision.host import Device, StreamError
 from gpuvision.host.pipeline import Pipeline
-from gpuvision.host.planning import plan_stream
+from gpuvision.host.planning import Cost, Plan, PlanLimits, plan_stream
 from gpuvision.host.report import DurationHistogram
 from gpuvision.host.sources import ArraySource, PacedSource, Source
 from gpuvision.host.trace import Trace
@@ -143,49 +146,166 @@ def test_the_trace_is_chrome_json(memory: dict[str, Any], tmp_path: Path) -> Non
 # Plan -------------------------------------------------------------------------------------------------------------
 
 
+class Sensor(Source):
+    """Frames without an end, as a sensor gives them; a plan reads none."""
+
+    def __init__(self, rate: float | None) -> None:
+        self.shape, self.dtype, self.rate = (64, 2), np.dtype(np.float32), rate
+
+
 def frames_source(rate: float | None = None) -> Source:
-    source = ArraySource(np.zeros((1, 64, 2), np.float32))
-    source.rate = rate
-    return source
+    return Sensor(rate)
+
+
+MEASURED = {1: (800.0, 1e-3), 2: (1240.0, 1.5e-3), 4: (3000.0, 1.5e-3), 8: (9000.0, 1.6e-3)}
+
+
+def measured(batch: int, inline: bool) -> Cost:
+    return Cost(*MEASURED[batch], processor_time=1e-4)
 
 
 def test_the_plan_takes_the_smallest_batch_that_keeps_up() -> None:
-    measured = {1: (800.0, 1e-3), 2: (1240.0, 1.5e-3), 4: (3000.0, 1.5e-3), 8: (9000.0, 1.6e-3)}
-    chosen = plan_stream(frames_source(1000.0), READOUT, measure=measured.__getitem__)
+    chosen = plan_stream(frames_source(1000.0), READOUT, stall=0.1, inline=False, measure=measured)
     assert chosen.batch == 4  # 1240 frames/s are not 1.25 times the rate
     assert [trial.batch for trial in chosen.trials] == [1, 2, 4]
     assert chosen.trials[-1].latency == pytest.approx(3 / 1000.0 + 1.5e-3)
     assert chosen.ring == 27  # 100 frames of a stall of 0.1 s in batches of 4, plus two slots
-    assert plan_stream(frames_source(), READOUT, rate=100.0, measure=measured.__getitem__).batch == 1
+    assert plan_stream(frames_source(), READOUT, rate=100.0, measure=measured).batch == 1
     assert json.loads(json.dumps(chosen.to_dict()))["trials"][2]["service_rate"] == 3000.0
 
 
 def test_a_plan_that_fails_says_what_is_possible() -> None:
-    measured = {1: (800.0, 1e-3), 2: (1240.0, 1.5e-3), 4: (3000.0, 1.5e-3), 8: (9000.0, 1.6e-3)}
     with pytest.raises(StreamError, match=r"1000 frames/s with a margin of 1\.25 within 2 ms: the fastest, 2 frames"):
-        plan_stream(frames_source(1000.0), READOUT, latency=2e-3, measure=measured.__getitem__)
+        plan_stream(frames_source(1000.0), READOUT, latency=2e-3, measure=measured)
     with pytest.raises(StreamError, match=r"keeps up with 1e\+?06|1000000 frames/s"):
-        plan_stream(frames_source(1e6), READOUT, batches=(1, 2, 4, 8), measure=measured.__getitem__)
+        plan_stream(frames_source(1e6), READOUT, batches=(1, 2, 4, 8), measure=measured)
     asked: list[int] = []
 
-    def saturated(batch: int) -> tuple[float, float]:
+    def saturated(batch: int, inline: bool) -> Cost:
         asked.append(batch)
-        return min(1000.0 * batch, 4000.0), batch / 4000.0
+        return Cost(min(1000.0 * batch, 4000.0), batch / 4000.0, 1e-4)
 
     with pytest.raises(StreamError, match="the fastest, 4 frames, does 4000 frames/s"):
-        plan_stream(frames_source(1e6), READOUT, measure=saturated)
+        plan_stream(frames_source(1e6), READOUT, inline=False, measure=saturated)
     assert asked == [1, 2, 4, 8, 16, 32]  # it stops when larger batches are not faster
     with pytest.raises(ValueError, match="rate is None"):
         plan_stream(frames_source(), READOUT)
 
 
-def test_a_measured_plan_runs(device: Device) -> None:
-    chosen = plan_stream(frames_source(10.0), READOUT, device=device)
+@pytest.mark.parametrize("inline", [None, False, True])
+def test_a_measured_plan_runs(device: Device, inline: bool | None) -> None:
+    if inline and not device.has_inline_queues:
+        pytest.skip(f"{device.label} has no inline queues")
+    chosen = plan_stream(frames_source(10.0), READOUT, inline=inline, device=device)
     assert chosen.batch == 1
-    assert chosen.trials[0].service_rate > 12.5
+    tried = {False, device.has_inline_queues} if inline is None else {inline}
+    assert {each.inline for each in chosen.trials} == tried
+    for trial in chosen.trials:
+        assert trial.service_rate > 12.5
+        assert 0.0 < trial.processor_time < 0.1
     source = PacedSource(ArraySource(currents_of(4), 20), 2000.0)
-    report = Pipeline(source, READOUT, device=device, batch=chosen.batch, ring=chosen.ring).run()
+    report = Pipeline(source, READOUT, device=device, **chosen.settings).run()
     assert report.frames == 20
+    assert (report.batch, report.ring, report.inline) == (chosen.batch, chosen.ring, chosen.inline)
+
+
+FREE = PlanLimits(max_bytes=1 << 40)
+
+
+def planned(rate: float = 1000.0, **options: Any) -> Plan:
+    options = {"measure": measured, "inline": False, "limits": FREE, **options}
+    return plan_stream(frames_source(rate), READOUT, **options)
+
+
+@pytest.mark.parametrize(
+    ("stall", "ring"),
+    [(0.5, 127), (0.1, 27), (0.101, 28), (1.0, 252), (0.0, 4)],  # 1000 frames/s in batches of 4, and two slots
+)
+def test_the_ring_holds_the_frames_of_a_stall(stall: float, ring: int) -> None:
+    chosen = planned(stall=stall)
+    assert (chosen.batch, chosen.ring, chosen.stall) == (4, ring, stall)
+    assert planned().ring == 127
+
+
+def test_a_recording_needs_no_more_slots_than_it_has_batches() -> None:
+    source = ArraySource(np.zeros((30, 64, 2), np.float32))
+    assert plan_stream(source, READOUT, rate=1000.0, inline=False, measure=measured).ring == 9  # 8 batches of 4
+
+
+@pytest.mark.parametrize("zero_copy", [False, True])
+def test_the_plan_states_the_memory_of_the_ring(zero_copy: bool, device: Device) -> None:
+    chosen = planned(stall=1.0, device=device, zero_copy=zero_copy)
+    frame = 64 * 2 * 4  # float32 currents
+    results = 64 * (4 + 4 + 1)  # position, total and status
+    assert chosen.ring_bytes == 252 * 4 * ((frame + results) * (1 if zero_copy else 2) + 8)
+    text = str(chosen)
+    assert "a ring of 252 slots" in text
+    assert f"({chosen.ring_bytes / 1e6:.3g} MB) for stalls of 1 s at 1000 frames/s" in text
+
+
+def test_a_ring_that_memory_cannot_hold_is_refused_before_anything_is_measured() -> None:
+    asked: list[int] = []
+
+    def counted(batch: int, inline: bool) -> Cost:
+        asked.append(batch)
+        return measured(batch, inline)
+
+    message = r"stalls of 1e\+06 s at 1000 frames/s .* takes 1\.1 TB, the limit is 1 GB"
+    with pytest.raises(StreamError, match=message) as caught:
+        planned(stall=1e6, measure=counted, limits=PlanLimits(max_bytes=10**9))
+    assert "\n" not in str(caught.value)
+    assert asked == []
+    with pytest.raises(StreamError, match=r"takes 1\.1e\+03 TB, the limit is"):  # of the memory of this machine
+        planned(stall=1e9, limits=PlanLimits())
+
+
+@pytest.mark.parametrize("stall", [-0.1, math.nan, math.inf])
+def test_a_stall_is_a_duration(stall: float) -> None:
+    with pytest.raises(ValueError, match=r"stall is .*, expected seconds >= 0"):
+        planned(stall=stall)
+
+
+@pytest.mark.parametrize(
+    ("workers", "inline", "is_inline", "batch"),
+    [
+        (Cost(5000.0, 1e-4, 3e-4), Cost(2000.0, 2e-4, 1e-4), True, 1),  # both keep up: inline is cheaper
+        (Cost(5000.0, 1e-4, 1e-4), Cost(2000.0, 2e-4, 1.09e-4), True, 1),  # equal within the scatter
+        (Cost(5000.0, 1e-4, 1e-4), Cost(2000.0, 2e-4, 1.2e-4), False, 1),
+        (Cost(5000.0, 1e-4, 3e-4), Cost(2000.0, 1.1e-3, 1e-4), False, 1),  # a large frame
+        (Cost(5000.0, 1e-4, 3e-4), Cost(1200.0, 2e-4, 1e-4), False, 1),  # inline has no margin
+        (Cost(1200.0, 1e-4, 1e-4), Cost(2000.0, 1.1e-3, 9e-4), True, 1),  # only inline has one
+        (Cost(600.0, 1e-4, 3e-4), Cost(500.0, 2e-4, 1e-4), False, 8),  # the first batch at which one keeps up
+    ],
+)
+def test_small_frames_run_inline_by_the_measured_cost(workers: Cost, inline: Cost, is_inline: bool, batch: int) -> None:
+    device = copy.copy(Device.best())
+    device.inline_device = device.handle  # as on PoCL
+
+    def cost(batch: int, is_inline: bool) -> Cost:
+        one = inline if is_inline else workers
+        return one._replace(service_rate=one.service_rate * (1.0 + 0.4 * math.log2(batch)))
+
+    chosen = planned(inline=None, measure=cost, device=device)
+    assert (chosen.inline, chosen.batch) == (is_inline, batch)
+    assert [each.inline for each in chosen.trials] == [False, True] * (len(chosen.trials) // 2)
+    place, other = ("inline", "in worker threads") if is_inline else ("in worker threads", "inline")
+    spent, instead = (inline, workers) if is_inline else (workers, inline)
+    assert f"kernels {place}, {1e6 * spent.processor_time:.3g} us of processor time per frame" in str(chosen)
+    assert f"({1e6 * instead.processor_time:.3g} us {other})" in str(chosen)
+    for forced in (False, True):
+        only = planned(rate=100.0, inline=forced, measure=cost, device=device)
+        assert only.inline == forced
+        assert {each.inline for each in only.trials} == {forced}
+        assert only.settings == {"batch": 1, "ring": 52, "inline": forced}
+
+
+def test_a_device_without_inline_queues_is_measured_with_its_worker_threads() -> None:
+    device = copy.copy(Device.best())
+    device.inline_device = None
+    device.handle = SimpleNamespace(extensions="cl_khr_fp64", global_mem_size=1 << 40)
+    assert {each.inline for each in planned(inline=None, device=device).trials} == {False}
+    with pytest.raises(ValueError, match=r"has no inline queues; use inline=False"):
+        Pipeline(currents_of(3), READOUT, device=device, inline=True)
 
 
 # A long run -------------------------------------------------------------------------------------------------------

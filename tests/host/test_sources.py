@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from gpuvision.host import RecordingError
 from gpuvision.host.recordings import CHANNELS, open_recording
 from gpuvision.host.sources import ArraySource, FrameSource, IteratedSource, PacedSource, Source
+from streams import ManualClock
 
 
 def read_all(source: Source, batch: int = 3) -> np.ndarray:
@@ -34,20 +35,6 @@ def read_all(source: Source, batch: int = 3) -> np.ndarray:
         parts.append(out[:count].copy())
     source.close()
     return np.concatenate(parts)
-
-
-class ManualClock:
-    """Clock that advances only in `sleep` and by assignment."""
-
-    def __init__(self) -> None:
-        self.now = 1_000_000_000
-
-    def __call__(self) -> int:
-        self.now += 1000  # so that the loop that yields the processor ends
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += round(seconds * 1e9)
 
 
 class Broken(FrameSource):

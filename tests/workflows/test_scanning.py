@@ -115,22 +115,28 @@ def test_more_than_one_line_is_flagged_and_dropped_unless_asked_for(kept: bool) 
 
 def test_dropped_frames_do_not_shift_the_transport() -> None:
     sensor = Sensor.load("psd_line")
+    stalls = iter((1.0,))  # twice as long as the ring holds
     done = scan(
-        ArraySource(currents(2), count=2000),
+        ArraySource(currents(2), count=300),
         sensor,
-        rate=2000.0,
-        progress=lambda done, of: time.sleep(0.01),
+        rate=200.0,
+        progress=lambda done, of: time.sleep(next(stalls, 0.0)),
     )
     report = done.report()
     assert report["dropped"] > 0
-    assert report["frames"] + report["dropped"] == 2000
+    assert report["frames"] + report["dropped"] == 300
+    assert report["stream"]["longest_stall"]["place"] == "consumer"
+    assert report["stream"]["longest_stall"]["consumer"] > 0.9
+    assert "; longest stall " in done.summary()
+    assert done.summary().endswith("most of it in the consumer")
     assert report["stream"]["policy"] == "drop_oldest"
     assert len(done.frame_numbers) == report["frames"]
     assert np.all(np.diff(done.frame_numbers) > 0)
     np.testing.assert_allclose(done.points.y[:, 0], 0.25e-3 * done.frame_numbers, atol=1e-8)
     endless = ArraySource(currents(2), count=10**9)
+    stalls = iter((1.0,))
     with pytest.raises(StreamError, match="no slot was free"):
-        scan(endless, sensor, rate=4e3, policy="raise", progress=lambda done, of: time.sleep(5e-3))
+        scan(endless, sensor, rate=400.0, policy="raise", progress=lambda done, of: time.sleep(next(stalls, 0.0)))
 
 
 def test_files_hold_what_was_scanned(tmp_path: Path) -> None:

@@ -9,10 +9,14 @@ from __future__ import annotations
 import difflib
 import math
 import operator
+import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, overload
+
+from gpuvision.host.errors import GpuVisionError
+from gpuvision.host.reading import FileLimits, check_limit, printable, reading, reason_of
 
 Choice = TypeVar("Choice", bound=str)
 _REQUIRED: Any = object()
@@ -22,7 +26,17 @@ _LARGEST_NUMBER = 1e20  # for all other units
 _LARGEST_INTEGER = (1 << 31) - 1  # of a 32-bit integer
 
 
-class DescriptionError(ValueError):
+# Tokens of TOML that matter for the depth of its tables. Possessive quantifiers keep the scan linear in the size.
+_TOKEN = re.compile(
+    r"""(?P<part>\"{3}(?:[^"\\]++|\\.|"(?!""))*+\"{3}|'{3}(?:[^']++|'(?!''))*+'{3}"""
+    r"""|"(?:[^"\\\n]++|\\.)*+"|'[^'\n]*+'|[\w+-]++)"""
+    r"|(?P<dot>\.)|(?P<open>[\[{])|(?P<close>[\]}])|#[^\n]*+|[=,\n]",
+    re.DOTALL,
+)
+_LONGEST_SHOWN = 60  # characters of a key or a value in a message
+
+
+class DescriptionError(GpuVisionError, ValueError):
     """Error in a TOML description; the message is one line with file, key, value and expected range."""
 
 
@@ -197,8 +211,9 @@ class Section:
         for key in self._table:
             if key not in self._queried:
                 close = difflib.get_close_matches(key, self._queried, 1)
-                hint = f"did you mean '{self.dotted(close[0])}'?" if close else f"known: {', '.join(self._queried)}"
-                raise self.error(f"unknown key '{self.dotted(key)}'; {hint}")
+                known = ", ".join(dict.fromkeys(self._queried)) or "none"
+                hint = f"did you mean '{self.dotted(close[0])}'?" if close else f"known: {known}"
+                raise self.error(f"unknown key '{_shown(self.dotted(key))}'; {hint}")
 
     def _value(self, key: str, expected: str, default: Any) -> Any:
         self._queried.append(key)
@@ -207,7 +222,7 @@ class Section:
         if default is _REQUIRED:
             unknown = [each for each in self._table if each not in self._queried]
             close = difflib.get_close_matches(key, unknown, 1)
-            hint = f" (is it '{self.dotted(close[0])}'?)" if close else ""
+            hint = f" (is it '{_shown(self.dotted(close[0]))}'?)" if close else ""
             raise self.error(f"the key '{self.dotted(key)}' is missing, expected {expected}{hint}")
         return default
 
@@ -223,9 +238,7 @@ class Section:
         return float(value)
 
     def _value_error(self, key: str, value: Any, unit: str, expected: str) -> DescriptionError:
-        shown = f"{value!r} {unit}".rstrip()
-        if len(shown) > 60:
-            shown = f"{shown[:56]} ..."
+        shown = _shown(f"{_represented(value)} {unit}".rstrip())
         return self.error(f"{self.dotted(key)} is {shown}, expected {expected}")
 
 
@@ -248,10 +261,56 @@ def read_toml(path: Path) -> Section:
     DescriptionError
         The file is not valid TOML; the message has line and column.
     """
+    limit = FileLimits.current().max_description_bytes
+    with reading(path.name, "TOML file", DescriptionError):
+        try:
+            with path.open("rb") as file:
+                content = file.read(int(limit) + 1)
+            check_limit("max_description_bytes", len(content), f"{path.name}: {len(content)} bytes", DescriptionError)
+            text = content.decode("utf-8")
+            _check_nesting(text, path.name)
+            return Section(tomllib.loads(text), path.name)
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise DescriptionError(f"{path.name}: not valid TOML: {reason_of(error)}") from None
+
+
+def _check_nesting(text: str, source: str) -> None:
+    """Check the depth of a TOML file before it is parsed: the parser's time and memory grow with its square.
+
+    Raises
+    ------
+    DescriptionError
+        Arrays and tables are nested, or a key has parts, beyond `FileLimits.max_nesting`.
+    """
+    depth = deepest = parts = longest = 0
+    before = None
+    for token in _TOKEN.finditer(text):
+        kind = token.lastgroup
+        if kind == "open":
+            depth += 1
+            deepest = max(deepest, depth)
+        elif kind == "close":
+            depth -= 1
+        if kind == "part":
+            parts = parts + 1 if before == "dot" else 1
+            longest = max(longest, parts)
+        before = kind
+    check_limit("max_nesting", deepest, f"{source}: nested {deepest} deep", DescriptionError)
+    check_limit("max_nesting", longest, f"{source}: a key of {longest} parts", DescriptionError)
+
+
+def _shown(text: str) -> str:
+    """Return a key or a value for a message: printable, and cut where it is long."""
+    short = text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 4]} ..."
+    return printable(short)
+
+
+def _represented(value: Any) -> str:
+    """Return the representation of a value; of an integer beyond Python's limit of digits its number of bits."""
     try:
-        return Section(tomllib.loads(path.read_text(encoding="utf-8")), path.name)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DescriptionError(f"{path.name}: not valid TOML: {error}") from None
+        return repr(value)
+    except ValueError:
+        return f"a number of {value.bit_length()} bits" if isinstance(value, int) else "a list of very large numbers"
 
 
 _TESTS: dict[str, tuple[str, Callable[[float, float], bool]]] = {

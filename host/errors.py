@@ -25,3 +25,7 @@ class StreamError(GpuVisionError):
 
 class RecordingError(GpuVisionError):
     """A recording cannot be read: it is missing, truncated or empty, or its frames change their size."""
+
+
+class ReadError(GpuVisionError, ValueError):
+    """A file cannot be read: it is damaged, of another format, or larger than a limit of `FileLimits`."""

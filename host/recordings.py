@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import lzma
+import math
 import os
 import re
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +20,8 @@ import tifffile
 
 from gpuvision.host.arrays import HostArray
 from gpuvision.host.errors import RecordingError
+from gpuvision.host.image_header import image_size, is_tiff
+from gpuvision.host.reading import check_archive, check_pixels, reading
 from gpuvision.host.sources import ArraySource, FrameSource, Source, check_frame
 
 Channel = Literal["grey", "red", "green", "blue", "max"]
@@ -27,6 +32,12 @@ _IMAGES = (".png", ".bmp", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".webp", *_T
 _VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv", ".ts")
 _NPY, _ZIP = b"\x93NUMPY", b"PK"
 _PLACES = {"blue": 0, "green": 1, "red": 2}
+_LZMA = 34925
+# Largest ratio of unpacked to packed bytes, by the number of the TIFF compression: Deflate (RFC 1951) stores 258 bytes
+# in 2 bits; LZMA has no fixed bound, 10 000 exceeds measured ones.
+_LARGEST_RATIO = {8: 1032, 32946: 1032, 50013: 1032, _LZMA: 10_000}
+_SMALL_SEGMENT = 1 << 26  # bytes: smaller segments are not counted before they are decoded
+_CHUNK = 1 << 20
 
 
 # Exceptions name the defect of a file. Messages of tifffile itself appear only where the application sets up logging.
@@ -85,65 +96,139 @@ def open_recording(path: str | Path, *, channel: Channel = "grey", key: str | No
 
 
 def _array_source(path: Path, key: str | None) -> Source:
-    try:
+    with reading(path, f"{path.suffix} file", RecordingError):
         with path.open("rb") as file:
             begin = file.read(len(_NPY))
         if begin[:2] == _ZIP:
-            frames = _member(path, key)
-        elif begin == _NPY:
-            frames = np.lib.format.open_memmap(path, mode="r")
-        else:
+            return _archive_source(path, key)
+        if begin != _NPY:
             raise RecordingError(f"{path}: not a readable {path.suffix} file: it does not begin as NumPy writes them")
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise RecordingError(f"{path}: not a readable {path.suffix} file: {_line(error)}") from error
-    if frames.ndim < 2 or not frames.size:
-        raise RecordingError(f"{path}: expected frames along the first of 2 or more axes, got shape {frames.shape}")
-    return ArraySource(frames)
+        frames = np.lib.format.open_memmap(path, mode="r")
+        _check_frames(path, frames.shape)
+        return ArraySource(frames)
 
 
-def _member(path: Path, key: str | None) -> HostArray:
-    with np.load(path, allow_pickle=False) as archive:
-        names = list(archive.files)
+def read_array(path: Path) -> HostArray:
+    """Read an NPY file of numbers; its size is that of its array.
+
+    Raises
+    ------
+    RecordingError
+        The file is damaged, holds objects, or is no NPY file.
+    """
+    with reading(path, "NPY array", RecordingError):
+        if path.stat().st_size == 0:
+            raise RecordingError(f"{path}: not a readable NPY array: it is empty")
+        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+        if not isinstance(mapped, np.ndarray):
+            raise RecordingError(f"{path}: not a readable NPY array: it is an archive")
+        return np.array(mapped)
+
+
+def _check_frames(path: Path, shape: tuple[int, ...]) -> None:
+    if len(shape) < 2 or 0 in shape:
+        raise RecordingError(f"{path}: expected frames along the first of 2 or more axes, got shape {shape}")
+    check_pixels(shape[1:], f"{path}: a frame", RecordingError)
+
+
+def _archive_source(path: Path, key: str | None) -> Source:
+    """Return the frames of an array in an NPZ file."""
+    archive = zipfile.ZipFile(path)
+    try:
+        names = {name.removesuffix(".npy"): name for name in archive.namelist()}
         if not names:
             raise RecordingError(f"{path}: holds no array, expected one of frames")
         if key is None and len(names) == 1:
-            key = names[0]
+            (key,) = names
         if key not in names:
             wanted = "several arrays" if key is None else f"no array {key!r}"
             raise RecordingError(
                 f"{path}: holds {wanted}; name one of {', '.join(names)} as key, in a sensor file under [recording]"
             )
-        member: object = archive[key]
-        if not isinstance(member, np.ndarray):
+        member = archive.open(names[key])
+        if member.peek(len(_NPY))[: len(_NPY)] != _NPY:
             raise RecordingError(f"{path}: {key} in it is not an array")
-        return member
+        shape, is_fortran, dtype = _array_header(member, f"{path}: {key}")
+        _check_frames(path, shape)
+        wanted_bytes, held = math.prod(shape) * dtype.itemsize, archive.getinfo(names[key]).file_size - member.tell()
+        if dtype.hasobject or held != wanted_bytes:
+            raise RecordingError(
+                f"{path}: {key} holds {held} bytes, expected {wanted_bytes}: {'x'.join(map(str, shape))} {dtype}"
+            )
+        if not is_fortran:
+            return PackedFrames(path, archive, member, shape, dtype)
+        # The first axis is the fastest in the file: the array is unpacked as a whole.
+        check_archive(path, RecordingError)
+        frames = np.frombuffer(member.read(), dtype).reshape(shape[::-1]).T
+        archive.close()
+        return ArraySource(frames)
+    except BaseException:
+        archive.close()
+        raise
+
+
+def _array_header(file: Any, what: str) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, whether the first axis is the fastest, and dtype from the header of an NPY file."""
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise RecordingError(f"{what}: NPY version {version[0]}.{version[1]}, expected an array of plain numbers")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, is_fortran, dtype = read(file)
+    return tuple(shape), bool(is_fortran), dtype
+
+
+class PackedFrames(FrameSource):
+    """Frames of an array in an NPZ file, unpacked one by one."""
+
+    def __init__(
+        self, path: Path, archive: zipfile.ZipFile, member: Any, shape: tuple[int, ...], dtype: np.dtype[Any]
+    ) -> None:
+        super().__init__(shape[1:], dtype.newbyteorder("="))
+        self.length: int = shape[0]
+        self._path, self._archive, self._member, self._stored = path, archive, member, dtype
+        self._next = 0
+
+    def _ready(self) -> bool:
+        """Return whether a frame is left."""
+        return self._next < self.length
+
+    def _decode(self, out: HostArray) -> None:
+        wanted = math.prod(self.shape) * self._stored.itemsize
+        with reading(f"{self._path}, frame {self._next}", "frame", RecordingError):
+            packed = self._member.read(wanted)
+            if len(packed) != wanted:
+                raise RecordingError(f"{self._path}: frame {self._next} of {self.length} is truncated")
+            np.copyto(out, np.frombuffer(packed, self._stored).reshape(self.shape))
+        self._next += 1
+
+    def close(self) -> None:
+        """Close the file."""
+        self._archive.close()
 
 
 def _tiff_source(path: Path, channel: Channel) -> Source:
     file = _open_tiff(path)
-    series = file.series
-    planes = len(series) == 1 and series[0].axes.endswith("YX") and set(series[0].axes[:-2]) <= set("TZQI")
-    if planes and series[0].ndim >= 3 and series[0].dataoffset is not None:
+    with reading(path, "TIFF file", RecordingError):
+        series = file.series
+        planes = len(series) == 1 and series[0].axes.endswith("YX") and set(series[0].axes[:-2]) <= set("TZQI")
+        if not (planes and series[0].ndim >= 3 and series[0].dataoffset is not None):
+            return TiffStack(path, file, channel)
+        _check_frames(path, (1, *series[0].shape[-2:]))
         file.close()
-        try:
-            # The planes are contiguous in the file, and several planes may share one page.
-            stack = tifffile.memmap(path, mode="r")
-            return ArraySource(stack.reshape(-1, *stack.shape[-2:]))
-        except (OSError, ValueError) as error:
-            raise RecordingError(f"{path}: truncated TIFF: {_line(error)}") from error
-    return TiffStack(path, file, channel)
+    with reading(path, "TIFF file", RecordingError, hint="is it truncated?"):
+        # The planes are contiguous in the file, and several planes may share one page.
+        stack = tifffile.memmap(path, mode="r")
+        return ArraySource(stack.reshape(-1, *stack.shape[-2:]))
 
 
 def _open_tiff(path: Path) -> tifffile.TiffFile:
-    try:
+    with reading(path, "TIFF file", RecordingError):
         file = tifffile.TiffFile(path)
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{path}: not a readable TIFF file: {_line(error)}") from error
-    pages = len(file.pages)
-    if pages and not any(_next_page(file)):
-        return file
-    file.close()
-    raise RecordingError(f"{path}: {f'truncated TIFF: no page after number {pages - 1}' if pages else 'no frames'}")
+        pages = len(file.pages)
+        if pages and not any(_next_page(file)):
+            return file
+        file.close()
+        raise RecordingError(f"{path}: {f'truncated TIFF: no page after number {pages - 1}' if pages else 'no frames'}")
 
 
 def _next_page(file: tifffile.TiffFile) -> bytes:
@@ -160,6 +245,7 @@ class TiffStack(FrameSource):
         self._path, self._file, self._channel = path, file, channel
         self._next = 0
         first = file.pages[0]
+        check_tiff_page(first, f"{path}, page 0")
         self._page_shape, page_dtype = first.shape, np.dtype(first.dtype)
         super().__init__(self._page_shape[:2], page_dtype)
         self.length: int = len(file.pages)
@@ -171,13 +257,13 @@ class TiffStack(FrameSource):
 
     def _decode(self, out: HostArray) -> None:
         what = f"{self._path}, page {self._next}"
-        try:
-            page = self._file.pages[self._next].asarray()
-        except (OSError, ValueError, RuntimeError, zlib.error) as error:
-            raise RecordingError(f"{what}: cannot be decoded: {_line(error)}") from error
-        check_frame(page, self._page_shape, self.dtype, what)
+        with reading(what, "TIFF page", RecordingError):
+            page = self._file.pages[self._next]
+            check_tiff_page(page, what)
+            frame = page.asarray()
+        check_frame(frame, self._page_shape, self.dtype, what)
         # The channel order is red, green, blue in TIFF, and blue, green, red in the channel functions.
-        self._pick(page if page.ndim == 2 else np.ascontiguousarray(page[:, :, 2::-1]), out)
+        self._pick(frame if frame.ndim == 2 else np.ascontiguousarray(frame[:, :, 2::-1]), out)
         self._next += 1
 
     def close(self) -> None:
@@ -185,18 +271,59 @@ class TiffStack(FrameSource):
         self._file.close()
 
 
+def check_tiff_page(page: Any, what: str) -> None:
+    """Check before decoding the pixels of a TIFF page, and the bytes to which its segments unpack.
+
+    Raises
+    ------
+    RecordingError
+        The page or a tile of it is larger than `FileLimits.max_pixels`, or a segment unpacks to more than its pixels.
+    """
+    if page.dtype is None:
+        raise RecordingError(f"{what}: pixels of an unknown type")
+    check_pixels(page.shape, what, RecordingError)
+    unit = page.chunks
+    check_pixels(unit, f"{what}: a tile or strip", RecordingError)
+    expected = max(2 * math.prod(unit) * page.dtype.itemsize, _SMALL_SEGMENT)
+    for offset, count in zip(page.dataoffsets, page.databytecounts, strict=False):
+        ratio = _LARGEST_RATIO.get(int(page.compression))
+        if ratio is not None and count * ratio > expected:
+            page.parent.filehandle.seek(offset)
+            if _unpacks_beyond(page.parent.filehandle.read(count), int(page.compression), expected):
+                raise RecordingError(f"{what}: a segment unpacks to more than the {expected} bytes expected")
+
+
+def _unpacks_beyond(packed: bytes, compression: int, size: int) -> bool:
+    """Return whether a compressed segment unpacks to more bytes than a size."""
+    unpacker: Any = lzma.LZMADecompressor() if compression == _LZMA else zlib.decompressobj()
+    total = 0
+    while total <= size and not unpacker.eof:
+        part = unpacker.decompress(packed, _CHUNK)
+        packed = b"" if compression == _LZMA else unpacker.unconsumed_tail
+        if not part:
+            break
+        total += len(part)
+    return total > size
+
+
 class Video(FrameSource):
     """One channel of the frames of a video; a video that ends before its announced length raises `RecordingError`."""
 
     def __init__(self, path: str | Path, channel: Channel = "grey") -> None:
         self._path = Path(path)
-        self._capture = cv2.VideoCapture(str(path))
-        self._grabbed = self._capture.isOpened() and self._capture.grab()
+        with reading(path, "video", RecordingError):
+            self._capture = cv2.VideoCapture(str(path))
+            self._grabbed = self._capture.isOpened() and self._capture.grab()
         if not self._grabbed:
             self._capture.release()
             raise RecordingError(f"{path}: no frame of this video can be decoded: damaged, or of an unknown codec")
         announced = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        _, self._colour = self._capture.retrieve()
+        sides = (self._capture.get(each) for each in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
+        check_pixels(tuple(map(int, sides)), f"{path}: a frame", RecordingError)
+        with reading(path, "video", RecordingError):
+            decoded, self._colour = self._capture.retrieve()
+        if not decoded or self._colour.ndim != 3:
+            raise RecordingError(f"{path}: the first frame of this video cannot be decoded")
         super().__init__(self._colour.shape[:2], self._colour.dtype)
         # Containers of unknown length report a number of frames below 1.
         self.length = announced if announced > 0 else None
@@ -215,7 +342,8 @@ class Video(FrameSource):
         return self._grabbed
 
     def _decode(self, out: HostArray) -> None:
-        decoded, self._colour = self._capture.retrieve(self._colour)
+        with reading(f"{self._path}, frame {self._next}", "frame", RecordingError):
+            decoded, self._colour = self._capture.retrieve(self._colour)
         self._grabbed = False
         if not decoded:
             raise RecordingError(f"{self._path}: frame {self._next} cannot be decoded")
@@ -275,14 +403,41 @@ def read_image(path: Path) -> HostArray:
     """
     if path.is_dir():
         raise RecordingError(f"{path}: a folder, expected an image; name the images in it")
-    if path.suffix.lower() in _TIFF:
-        with _open_tiff(path) as file:
-            if len(file.pages) != 1:
-                raise RecordingError(f"{path}: {len(file.pages)} pages in one image; open the file by itself instead")
-    image: HostArray | None = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    with reading(path, "image", RecordingError):
+        _check_image(path)
+        with _silent_opencv():
+            image: HostArray | None = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise RecordingError(f"{path}: not a readable image")
     return image
+
+
+def _check_image(path: Path) -> None:
+    """Check the size of an image before it is decoded, by its content: OpenCV ignores the suffix, too."""
+    with path.open("rb") as file:
+        head = file.read(4)
+        file.seek(0)
+        size = image_size(file)
+    if path.suffix.lower() in _TIFF or is_tiff(head):
+        with _open_tiff(path) as stack:
+            if len(stack.pages) != 1:
+                raise RecordingError(f"{path}: {len(stack.pages)} pages in one image; open the file by itself instead")
+            check_tiff_page(stack.pages[0], str(path))
+        return
+    if size is None:
+        raise RecordingError(f"{path}: not a readable image; expected the content of a {' '.join(_IMAGES)} file")
+    check_pixels(size, str(path), RecordingError)
+
+
+@contextlib.contextmanager
+def _silent_opencv() -> Iterator[None]:
+    """Suppress the messages of OpenCV, which raises or returns nothing for the same defect."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 def _picker(channel: Channel, shape: tuple[int, ...], what: str) -> Callable[[HostArray, HostArray], object]:
@@ -299,8 +454,3 @@ def _picker(channel: Channel, shape: tuple[int, ...], what: str) -> Callable[[Ho
     if channel == "max":
         return lambda frame, out: np.max(frame[:, :, :3], axis=2, out=out)
     return lambda frame, out: cv2.extractChannel(frame, _PLACES[channel], out)
-
-
-def _line(error: BaseException) -> str:
-    """Return the first line of the message of another library's exception."""
-    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -25,7 +25,10 @@ import numpy as np
 import numpy.typing as npt
 import tifffile
 
+from gpuvision.host.errors import ReadError
 from gpuvision.host.files import atomic_write
+from gpuvision.host.reading import check_archive, reading
+from gpuvision.host.recordings import check_tiff_page, read_image
 from gpuvision.ranging.regrid import Grid
 
 _GRID_KEYS = ("left", "top", "cell_x", "cell_y")
@@ -37,6 +40,7 @@ _PNG_HEAD = 8 + 25  # signature and IHDR
 _PLY_TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "uint16": "ushort", "uint32": "uint"}
 _PLY_DTYPES = {name: np.dtype(dtype).newbyteorder("<") for dtype, name in _PLY_TYPES.items()}
 _UNITS_KEY = "units"
+_LONGEST_LINE, _MOST_LINES = 1000, 100  # characters and lines of the header of a PLY file; write_ply writes 15 lines
 
 Array = npt.NDArray[Any]
 
@@ -116,9 +120,16 @@ def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None) -
 
 
 def read_tiff(path: str | os.PathLike[str]) -> HeightFile:
-    """Read heights from a TIFF file of `write_tiff`."""
-    with tifffile.TiffFile(path) as file:
+    """Read heights from a TIFF file of `write_tiff`.
+
+    Raises
+    ------
+    ReadError
+        The file is not such a TIFF file, or larger than a limit of `gpuvision.host.reading.FileLimits`.
+    """
+    with reading(path, "TIFF file of heights"), tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
+        check_tiff_page(page, str(path))
         z = page.asarray()
         return HeightFile(z, _grid_of(json.loads(page.description), z.shape))
 
@@ -202,16 +213,17 @@ def read_png16(path: str | os.PathLike[str]) -> HeightFile:
 
     Raises
     ------
-    ValueError
-        The file is not a 16-bit PNG, or has no Offset or Scale.
+    ReadError
+        The file is not a 16-bit PNG, or has no Offset or Scale, or is larger than a limit of
+        `gpuvision.host.reading.FileLimits`.
     """
-    encoded = Path(path).read_bytes()
-    codes = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
-    text = _text_chunks(encoded)
-    if codes is None or codes.dtype != np.uint16 or "Scale" not in text or "Offset" not in text:
-        raise ValueError(f"{path} is no 16-bit PNG with Offset and Scale; expected one that write_png16 wrote")
-    z = float(text["Offset"]) + float(text["Scale"]) * (codes.astype(np.float64) - 1)
-    return HeightFile(np.where(codes == 0, np.nan, z), _grid_of(text, z.shape))
+    with reading(path, "16-bit PNG"):
+        codes = read_image(Path(path))
+        text = _text_chunks(Path(path).read_bytes())
+        if codes.dtype != np.uint16 or codes.ndim != 2 or "Scale" not in text or "Offset" not in text:
+            raise ReadError(f"{path} is no 16-bit PNG with Offset and Scale; expected one that write_png16 wrote")
+        z = float(text["Offset"]) + float(text["Scale"]) * (codes.astype(np.float64) - 1)
+        return HeightFile(np.where(codes == 0, np.nan, z), _grid_of(text, z.shape))
 
 
 # ---- PLY -------------------------------------------------------------------------------------------------------
@@ -281,20 +293,27 @@ def read_ply(path: str | os.PathLike[str]) -> dict[str, Array]:
 
     Raises
     ------
-    ValueError
+    ReadError
         The file is not a binary little-endian PLY of points, or its size differs from that in its header.
     """
-    with Path(path).open("rb") as file:
+    with reading(path, "PLY file of points"):
+        return _points_of_ply(Path(path))
+
+
+def _points_of_ply(path: Path) -> dict[str, Array]:
+    with path.open("rb") as file:
         lines = []
-        while (line := file.readline().decode("ascii", "replace").strip()) not in ("end_header", ""):
+        while (line := file.readline(_LONGEST_LINE).decode("ascii", "replace").strip()) not in ("end_header", ""):
             lines.append(line.split())
+            if len(lines) > _MOST_LINES:
+                raise ReadError(f"{path}: its header does not end; expected a PLY file that write_ply wrote")
         content = file.read()
     if ["format", "binary_little_endian", "1.0"] not in lines or any("list" in each for each in lines):
-        raise ValueError(f"{path} is no binary little-endian PLY of points; expected one that write_ply wrote")
+        raise ReadError(f"{path} is no binary little-endian PLY of points; expected one that write_ply wrote")
     layout = [(each[2], _PLY_DTYPES[each[1]]) for each in lines if each[0] == "property"]
     (count,) = (int(each[2]) for each in lines if each[:2] == ["element", "vertex"])
     if len(content) != count * np.dtype(layout).itemsize:
-        raise ValueError(f"{path} holds {len(content)} bytes of points, its header says {count} points; it was cut")
+        raise ReadError(f"{path} holds {len(content)} bytes of points, its header says {count} points; it was cut")
     vertices = np.frombuffer(content, layout)
     sides = {each[1]: int(each[2]) for each in lines if each[0] == "obj_info"}
     shape = (sides["num_rows"], sides["num_cols"]) if sides else (count,)
@@ -330,7 +349,15 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], units: Ma
 
 
 def read_npz(path: str | os.PathLike[str]) -> tuple[dict[str, Array], dict[str, str]]:
-    """Read the arrays and their units, by name, from an NPZ file of `write_npz`."""
-    with np.load(path) as file:
-        units: dict[str, str] = json.loads(str(file[_UNITS_KEY]))
-        return {name: file[name] for name in file.files if name != _UNITS_KEY}, units
+    """Read the arrays and their units, by name, from an NPZ file of `write_npz`.
+
+    Raises
+    ------
+    ReadError
+        The file is not such an NPZ file, or unpacks to more than a limit of `gpuvision.host.reading.FileLimits`.
+    """
+    with reading(path, "NPZ file of arrays and units"):
+        check_archive(Path(path))
+        with np.load(path, allow_pickle=False) as file:
+            units: dict[str, str] = json.loads(str(file[_UNITS_KEY]))
+            return {name: file[name] for name in file.files if name != _UNITS_KEY}, units

@@ -20,8 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host import Device
-from gpuvision.host.errors import RecordingError
+from gpuvision.host.errors import ReadError, RecordingError
 from gpuvision.host.files import atomic_write
+from gpuvision.host.reading import check_archive, reading
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import make_light_sheet, make_sensor_view, minimum_sample_power, require_light
@@ -140,18 +141,22 @@ class LightBlock(NamedTuple):
             The file has other content.
         """
         parts: dict[str, dict[str, Any]] = {"truth": {}, "statistics": {}, "power": {}, "moment": {}}
-        try:
-            with np.load(path) as file:
-                for name in file.files:
-                    kind, key = name.split("/", 1)
-                    parts[kind][key] = file[name]
-            exposures = {
-                name: Exposure(power.astype(np.float64), parts["moment"][name].astype(np.float64))
-                for name, power in parts["power"].items()
-            }
-            return cls(exposures, GroundTruth(**parts["truth"]), parts["statistics"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise RecordingError(f"{path}: holds no simulated light; delete it, and it is computed again") from error
+        with reading(path, "file of simulated light", RecordingError):
+            check_archive(path)
+            try:
+                with np.load(path, allow_pickle=False) as file:
+                    for name in file.files:
+                        kind, key = name.split("/", 1)
+                        parts[kind][key] = file[name]
+                exposures = {
+                    name: Exposure(power.astype(np.float64), parts["moment"][name].astype(np.float64))
+                    for name, power in parts["power"].items()
+                }
+                return cls(exposures, GroundTruth(**parts["truth"]), parts["statistics"])
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                raise RecordingError(
+                    f"{path}: holds no simulated light; delete it, and it is computed again"
+                ) from error
 
 
 class LightStore:
@@ -300,7 +305,9 @@ def _cached_light_paths(task: SimulationTask, device: Device | None) -> LightPat
 
 def _is_intact(path: Path) -> bool:
     try:
-        with zipfile.ZipFile(path) as file:
-            return file.testzip() is None
-    except (OSError, zipfile.BadZipFile):
+        with reading(path, "file of simulated light"):
+            check_archive(path)
+            with zipfile.ZipFile(path) as file:
+                return file.testzip() is None
+    except (OSError, ReadError):
         return False

@@ -27,7 +27,8 @@ from gpuvision.camera.lens import Lens
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host import Device
 from gpuvision.host.errors import RecordingError
-from gpuvision.host.recordings import read_image
+from gpuvision.host.reading import reading
+from gpuvision.host.recordings import read_array, read_image
 from gpuvision.matching.field.distance_map import DistanceMap, Field
 from gpuvision.matching.field.evidence import Evidence, evidence
 from gpuvision.matching.field.field_pose import PoseCandidate, find_pose_candidates
@@ -207,13 +208,8 @@ def read_points(path: Path) -> Float32:
     RecordingError
         The file has another content.
     """
-    try:
-        if path.suffix.lower() == ".npy":
-            points = np.load(path, allow_pickle=False)
-        else:
-            points = np.loadtxt(path, delimiter=",", ndmin=2)
-    except ValueError as error:
-        raise RecordingError(f"{path}: no points: {error}") from error
+    with reading(path, "list of points", RecordingError):
+        points = read_array(path) if path.suffix.lower() == ".npy" else np.loadtxt(path, delimiter=",", ndmin=2)
     if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind not in "fiu":
         raise RecordingError(f"{path}: {points.dtype} of shape {points.shape}, expected points (n, 2) in metres")
     return np.ascontiguousarray(points, np.float32)

@@ -18,7 +18,7 @@ from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import atomic_folder
-from gpuvision.host.recordings import read_image
+from gpuvision.host.recordings import read_array, read_image
 
 Progress = Callable[[int, int | None], object]
 
@@ -98,10 +98,7 @@ def undistort_files(
 
 def _undistorted_points(file: Path, model: Lens | Camera, device: Device) -> npt.NDArray[Any]:
     """Read points of an NPY file and undistort them."""
-    try:
-        points = np.load(file, allow_pickle=False)
-    except (EOFError, ValueError) as error:
-        raise RecordingError(f"{file}: not a readable NPY array: {error}") from error
+    points = read_array(file)
     if points.ndim < 1 or points.shape[-1] != 2 or points.dtype not in (np.float32, np.float64):
         raise RecordingError(
             f"{file}: {points.dtype} of shape {points.shape}, expected float32 or float64 points of shape (..., 2)"

@@ -8,7 +8,6 @@ and without the attributes of X2, and Excellon.
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,9 @@ from gerbonara.graphic_objects import Flash, Line
 from gerbonara.utils import MM
 from scipy.spatial import cKDTree
 
+from gpuvision.host.errors import ReadError
+from gpuvision.host.reading import reading
+from gpuvision.matching.artwork.board_files import open_board, parsed
 from gpuvision.matching.artwork.edges import BoardEdges, board_edges
 from gpuvision.matching.artwork.shapes import DrawnObject, Float64, Layer, Shape, area, drawn_objects, hull
 
@@ -215,63 +217,55 @@ def read_artwork(
     Raises
     ------
     ValueError
-        The layers of the files cannot be determined, the side has no copper, or gerbonara cannot read a file.
+        An argument is out of range.
+    FileNotFoundError
+        There is no such folder or file.
+    ReadError
+        The layers of the files cannot be determined, the side has no copper, gerbonara cannot read a file of the side,
+        or the board exceeds a limit of `gpuvision.host.reading.FileLimits`.
     """
     if side not in ("top", "bottom"):
         raise ValueError(f"side must be 'top' or 'bottom', not {side!r}")
     if not (clearance > 0 and math.isfinite(clearance) and via_drill >= 0):
         raise ValueError(f"clearance must be positive and via_drill not negative, not {clearance} and {via_drill}")
-    stack = _opened(Path(path), layers)
-    drawn = {use: _layer(stack, side, use) for use in ("copper", "mask", "silk", "paste")}
-    if not drawn["copper"]:
-        raise ValueError(f"{path}: no copper on the {side} side; name the file of '{side} copper' with layers")
-    holes = _holes(stack)
-    pads = _pads(drawn["copper"], _Finder(holes, drawn["mask"], drawn["paste"], via_drill))
-    shapes = {use: tuple(shape for each in objects for shape in each.shapes) for use, objects in drawn.items()}
-    masked = (side, "mask") in stack.graphic_layers
-    edges = board_edges(
-        [each for each in drawn["copper"] if each.kind == "stroke"],
-        [each.outline for each in pads],
-        Layer(shapes["copper"]),
-        Layer(shapes["mask"]) if masked else None,
-        Layer(shapes["silk"]),
-        clearance,
-    )
-    return Artwork(
-        side=side,
-        copper=shapes["copper"],
-        mask=shapes["mask"],
-        silk=shapes["silk"],
-        holes=holes,
-        pads=pads,
-        edges=edges,
-        bounds=_bounds(stack, drawn["copper"]),
-    )
-
-
-def _opened(path: Path, layers: Mapping[str, str] | None) -> LayerStack:
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such folder or ZIP of Gerber files")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of old spellings, and of layers determined by contents
-            return LayerStack.open(path, overrides=dict(layers) if layers else None, autoguess=not layers)
-    except (ValueError, SyntaxError, SystemError, KeyError, IndexError, UnicodeDecodeError) as problem:
-        reason = " ".join(str(problem).split())[:300]
-        raise ValueError(
-            f"{path}: gerbonara cannot read this board ({reason}); name its files with layers"
-        ) from problem
+    path = Path(path)
+    with open_board(path, layers) as stack, reading(path, "board"):
+        drawn = {use: _layer(stack, side, use) for use in ("copper", "mask", "silk", "paste")}
+        if not drawn["copper"]:
+            raise ReadError(f"{path}: no copper on the {side} side; name the file of '{side} copper' with layers")
+        holes = _holes(stack)
+        pads = _pads(drawn["copper"], _Finder(holes, drawn["mask"], drawn["paste"], via_drill))
+        shapes = {use: tuple(shape for each in objects for shape in each.shapes) for use, objects in drawn.items()}
+        masked = (side, "mask") in stack.graphic_layers
+        edges = board_edges(
+            [each for each in drawn["copper"] if each.kind == "stroke"],
+            [each.outline for each in pads],
+            Layer(shapes["copper"]),
+            Layer(shapes["mask"]) if masked else None,
+            Layer(shapes["silk"]),
+            clearance,
+        )
+        return Artwork(
+            side=side,
+            copper=shapes["copper"],
+            mask=shapes["mask"],
+            silk=shapes["silk"],
+            holes=holes,
+            pads=pads,
+            edges=edges,
+            bounds=_bounds(stack, drawn["copper"]),
+        )
 
 
 def _layer(stack: LayerStack, side: str, use: str) -> tuple[DrawnObject, ...]:
     found = stack.graphic_layers.get((side, use))
-    return () if found is None else drawn_objects(found)
+    return () if found is None else drawn_objects(parsed(found))
 
 
 def _bounds(stack: LayerStack, copper: tuple[DrawnObject, ...]) -> Float64:
     """Return the bounds of the centre line of the outline, along which the board is cut."""
     found = stack.graphic_layers.get(("mechanical", "outline"))
-    ends = [] if found is None else [point for each in found.objects for point in _outline_points(each)]
+    ends = [] if found is None else [point for each in parsed(found).objects for point in _outline_points(each)]
     if not ends:
         ends = [point for each in copper for point in each.bounds]
     return np.stack([np.min(ends, axis=0), np.max(ends, axis=0)])
@@ -290,7 +284,7 @@ def _outline_points(item: Any) -> list[Float64]:
 
 def _holes(stack: LayerStack) -> Holes:
     files = [(stack.drill_pth, 1), (stack.drill_npth, 0), *((each, -1) for each in stack._drill_layers)]
-    rows = [row for layer, plated in files if layer is not None for row in _drilled(layer, plated)]
+    rows = [row for layer, plated in files if layer is not None for row in _drilled(parsed(layer), plated)]
     table = np.array(rows).reshape(-1, 6)
     keep = _first_of_equals(np.concatenate([(table[:, :2] + table[:, 2:4]) / 2, table[:, 4:5]], axis=1))
     table = table[keep]

@@ -14,12 +14,19 @@ from gerbonara import graphic_objects, graphic_primitives
 from gerbonara.apertures import ApertureMacroInstance, CircleAperture, ExcellonTool
 from gerbonara.utils import MM
 
+from gpuvision.host.errors import ReadError
+from gpuvision.host.reading import check_limit
+
 Float64 = npt.NDArray[np.float64]
 Crossings = list[tuple[bool, Float64]]
 
 SAGITTA = 0.5e-6
 """Largest distance [m] between an arc and the chord that stands for it."""
 _METRE = 1e-3  # all calls of gerbonara use millimetres
+_MOST_CHORDS = 100_000  # of one arc; a full circle with a radius of 10 m has 10 000
+_MOST_CORNERS = 20_000_000  # of a layer: 1 GiB with the arrays of `Layer`; the largest board in the tests has 300 000
+_MOST_VERTICES = 1000  # of a regular polygon; the Gerber format allows 12
+_POLYGON_CODE = 5
 _UNSUPPORTED_MACROS = {6: "moiré", 7: "thermal"}  # gerbonara 1.5 reads them and cannot draw them
 
 
@@ -141,10 +148,22 @@ def drawn_objects(layer: Any) -> tuple[DrawnObject, ...]:
 
     Raises
     ------
-    ValueError
-        An aperture macro has a moiré or a thermal: these are obsolete or for inner layers, and are not supported.
+    ReadError
+        An aperture macro has a moiré or a thermal: these are obsolete or for inner layers, and are not supported. Or an
+        object lies or extends beyond `FileLimits.max_board_size`, or the layer has too many corners.
     """
-    return tuple(each for item in layer.objects if (each := _drawn(item)) is not None)
+    drawn, corners = [], 0
+    for item in layer.objects:
+        each = _drawn(item)
+        if each is None:
+            continue
+        corners += sum(len(shape.outline) for shape in each.shapes)
+        if corners > _MOST_CORNERS:
+            raise ReadError(f"a layer of more than {_MOST_CORNERS} corners; are its arcs and apertures too large?")
+        farthest = float(np.max(np.abs(each.bounds))) if corners else 0.0
+        check_limit("max_board_size", farthest, f"an object that extends to {farthest:.4g} m")
+        drawn.append(each)
+    return tuple(drawn)
 
 
 def _drawn(item: Any) -> DrawnObject | None:
@@ -155,6 +174,8 @@ def _drawn(item: Any) -> DrawnObject | None:
     if isinstance(item, graphic_objects.Flash):
         place = np.array([MM(item.x, item.unit), MM(item.y, item.unit)]) * _METRE
         return DrawnObject("flash", tuple(_flashed(item.aperture, place, bool(item.polarity_dark))), **attributes)
+    if not isinstance(item, graphic_objects.Line):
+        _chords(math.hypot(MM(item.cx, item.unit), MM(item.cy, item.unit)) * _METRE, 2 * math.pi)
     lines = [item] if isinstance(item, graphic_objects.Line) else item.approximate(SAGITTA / _METRE, MM)
     ends = [np.array([[MM(x, item.unit), MM(y, item.unit)] for x, y in (each.p1, each.p2)]) * _METRE for each in lines]
     shapes = tuple(shape for each in ends for shape in _swept(item.aperture, each, bool(item.polarity_dark)))
@@ -177,13 +198,24 @@ def _round_width(aperture: Any) -> float:
 
 
 def _flashed(aperture: Any, place: Float64, dark: bool) -> Iterator[Shape]:
-    if isinstance(aperture, ApertureMacroInstance):
-        for primitive in aperture.macro.primitives:
-            if name := _UNSUPPORTED_MACROS.get(getattr(primitive, "code", 0)):
-                raise ValueError(f"aperture macro {aperture.macro.name}: a {name} is not supported; draw it as regions")
     # Draw at the origin and move afterwards: gerbonara 1.5 ignores the position of regular polygons in macros.
-    for primitive in aperture.flash(0.0, 0.0, MM, dark):
+    for primitive in _primitives(aperture, dark):
         yield Shape(_outline(primitive) + place, bool(primitive.polarity_dark))
+
+
+def _primitives(aperture: Any, dark: bool) -> Any:
+    """Return the primitives of an aperture at the origin."""
+    if isinstance(aperture, ApertureMacroInstance):
+        values = dict(enumerate(aperture.parameters, start=1))
+        for primitive in aperture.macro.primitives:
+            code = getattr(primitive, "code", 0)
+            if name := _UNSUPPORTED_MACROS.get(code):
+                raise ReadError(f"aperture macro {aperture.macro.name}: a {name} is not supported; draw it as regions")
+            if code == _POLYGON_CODE and not primitive.n_vertices.calculate(values) <= _MOST_VERTICES:
+                raise ReadError(
+                    f"aperture macro {aperture.macro.name}: a polygon of more than {_MOST_VERTICES} corners"
+                )
+    return aperture.flash(0.0, 0.0, MM, dark)
 
 
 def _swept(aperture: Any, ends: Float64, dark: bool) -> Iterator[Shape]:
@@ -194,7 +226,7 @@ def _swept(aperture: Any, ends: Float64, dark: bool) -> Iterator[Shape]:
         return
     if aperture is None:
         return
-    for primitive in aperture.flash(0.0, 0.0, MM, dark):
+    for primitive in _primitives(aperture, dark):
         outline = _outline(primitive)
         yield Shape(hull(np.concatenate([outline + ends[0], outline + ends[1]])), dark)
 
@@ -266,7 +298,10 @@ def area(outline: Float64) -> float:
 
 def _chords(radius: float, angle: float) -> int:
     """Return the number of chords of an arc."""
-    return max(math.ceil(angle / (2 * math.acos(1 - min(SAGITTA / max(radius, SAGITTA), 0.05)))), 1)
+    half = math.acos(1 - min(SAGITTA / max(radius, SAGITTA), 0.05))
+    if not angle <= 2 * half * _MOST_CHORDS:
+        raise ReadError(f"an arc or aperture with a radius of {radius:.4g} m, which is too large for a board")
+    return max(math.ceil(angle / (2 * half)), 1)
 
 
 def _arc(start: Float64, end: Float64, centre: Float64, clockwise: bool) -> Float64:

@@ -6,27 +6,19 @@ import functools
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.host.errors import ReadError
+from gpuvision.host.reading import reading
 from gpuvision.simulation.scene.bvh import Bvh, radix_argsort
+from gpuvision.simulation.scene.mesh_file import SUFFIXES, check_mesh
 
 # Multiplier of the hash: 2^64 over the golden ratio, made odd (Fibonacci hashing, Knuth).
 _MIXER = 0x9E3779B97F4A7C15
-
-# Exceptions of trimesh's readers for damaged or truncated files (ImportError: of an optional encoding detector).
-_READ_ERRORS = (
-    ArithmeticError,
-    AttributeError,
-    ImportError,
-    LookupError,
-    NameError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
 
 Integers = npt.NDArray[np.int64]
 
@@ -156,25 +148,25 @@ class Scene:
             The file does not exist.
         IsADirectoryError
             The path is a folder.
-        ValueError
-            The file has another format, is damaged, or contains no triangles.
+        ReadError
+            The file has another format, is damaged, contains no triangles, or has more than
+            `gpuvision.host.reading.FileLimits.max_triangles`.
         """
         import trimesh
 
-        if os.path.isdir(path):
-            raise IsADirectoryError(f"{os.fspath(path)}: a folder, expected a file with a mesh")
-        if not os.path.isfile(path):
-            raise FileNotFoundError(f"{os.fspath(path)}: no such file")
-        if os.path.splitext(path)[1].lower() not in (".stl", ".ply", ".obj", ".glb"):
-            raise ValueError(f"{os.fspath(path)}: expected a mesh as .stl, .ply, .obj or .glb")
-        try:
-            scene = cls.of(trimesh.load(os.fspath(path), process=False), metres=metres)
-        except _READ_ERRORS as error:
-            raise ValueError(
-                f"{os.fspath(path)}: not a readable mesh (damaged, truncated or another format)"
-            ) from error
+        path = Path(path)
+        if path.is_dir():
+            raise IsADirectoryError(f"{path}: a folder, expected a file with a mesh")
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file")
+        if path.suffix.lower() not in SUFFIXES:
+            raise ReadError(f"{path}: expected a mesh as {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+        with reading(path, "mesh", hint="is it damaged, truncated or of another format?"):
+            check_mesh(path)
+            # Materials of the file are not used, and may refer to files of any size.
+            scene = cls.of(trimesh.load(path, process=False, skip_materials=True), metres=metres)
         if not len(scene.corners):
-            raise ValueError(f"{os.fspath(path)}: contains no triangles")
+            raise ReadError(f"{path}: contains no triangles")
         return scene
 
 

@@ -19,6 +19,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.host.errors import ReadError
+from gpuvision.host.reading import reading
 from gpuvision.simulation.sensors.readings import (
     GroundTruth,
     dark_exposure,
@@ -184,18 +186,19 @@ class Mask:
 
         Raises
         ------
-        ValueError
+        ReadError
             The file does not hold two numbers in each line.
         OSError
             The file cannot be read.
         """
         expected = f"{path}: expected two numbers a line, the lower and the upper end of a sample's window"
-        try:
-            windows = np.loadtxt(path, delimiter=",", ndmin=2)
-        except ValueError:
-            raise ValueError(expected) from None
-        if windows.shape[1:] != (2,):
-            raise ValueError(expected)
+        with reading(path, "mask"):
+            try:
+                windows = np.loadtxt(path, delimiter=",", ndmin=2)
+            except ValueError:
+                raise ReadError(expected) from None
+            if windows.shape[1:] != (2,):
+                raise ReadError(expected)
         return cls(windows=windows)
 
 

@@ -253,7 +253,7 @@ def test_a_moire_is_refused(tmp_path: Path) -> None:
         ({"clearance": 0.0}, "clearance must be positive"),
         ({"clearance": math.nan}, "clearance must be positive"),
         ({"via_drill": -1.0}, "via_drill not negative"),
-        ({"layers": None}, "cannot read this board"),
+        ({"layers": None}, "not a readable board"),
     ],
 )
 def test_refuses_what_it_cannot_use(tmp_path: Path, arguments: dict[str, object], message: str) -> None:

@@ -145,7 +145,7 @@ def _archive_source(path: Path, key: str | None) -> Source:
             raise RecordingError(
                 f"{path}: holds {wanted}; name one of {', '.join(names)} as key, in a sensor file under [recording]"
             )
-        member = archive.open(names[key])
+        member: Any = archive.open(names[key])
         if member.peek(len(_NPY))[: len(_NPY)] != _NPY:
             raise RecordingError(f"{path}: {key} in it is not an array")
         shape, is_fortran, dtype = _array_header(member, f"{path}: {key}")

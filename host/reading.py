@@ -64,9 +64,9 @@ class FileLimits:
         ReadError
             The value of a variable is not a positive number.
         """
-        return cls(
-            **{each.name: _of_environment(each.name) for each in fields(cls) if _variable(each.name) in os.environ}
-        )
+        names = [each.name for each in fields(cls) if _variable(each.name) in os.environ]
+        given: dict[str, Any] = {name: _of_environment(name) for name in names}
+        return cls(**given)
 
 
 def _variable(name: str) -> str:

@@ -26,13 +26,13 @@ from gpuvision.matching.pose.pose import SolvePose
 Float64 = npt.NDArray[np.float64]
 
 PIXEL, NOISE, SHAPE = 25e-6, 2.0, (480, 640)
-SHIFT, ANGLE = 80e-6, 4e-3  # that boards lie off by; they are looked for within 100 um and 5 mrad
-GROSS = 40.0  # squared distance in standard deviations: of three Gaussian numbers one in 1e8 is beyond
+SHIFT, ANGLE = 80e-6, 4e-3  # largest offset of the boards; the search range is 100 um and 5 mrad
+GROSS = 40.0  # squared Mahalanobis distance that three Gaussian numbers exceed with a probability of 1e-8
 KINDS = ("missing", "outliers", "motion", "reversed")
 
 
 class Fixes(NamedTuple):
-    """Of pictures: errors (n, 3) about the placement point, and covariances, NaN where refused; and the status."""
+    """Poses of n images: errors (n, 3) about the placement point, covariances (NaN where refused), and status."""
 
     errors: Float64
     covariances: Float64
@@ -44,33 +44,33 @@ class Fixes(NamedTuple):
 
     @property
     def squares(self) -> Float64:
-        """(good,) squared errors in units of what each fix itself says."""
+        """Squared Mahalanobis distances (accepted,) of the errors, with the covariance of each pose."""
         found = self.errors[self.good]
         return np.asarray(np.einsum("bi,bij,bj->b", found, np.linalg.inv(self.covariances[self.good]), found))
 
     @property
     def said(self) -> Float64:
-        """(3,) standard deviations that the fixes say, in the mean."""
+        """Mean predicted standard deviations (3,)."""
         return np.asarray(np.sqrt(np.mean(self.covariances[self.good][:, [0, 1, 2], [0, 1, 2]], axis=0)))
 
     @property
     def scatter(self) -> Float64:
-        """(3,) standard deviations of the errors, about 0."""
+        """Standard deviations (3,) of the errors about 0."""
         return np.asarray(np.sqrt(np.mean(self.errors[self.good] ** 2, axis=0)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoardFix:
-    """A board, the part of it that a camera sees, and rulers on single edges there.
+    """Board, the part of it in view of a camera, and rulers on single edges there.
 
     Parameters
     ----------
     artwork, middle
-        What is seen, and about which point [m]: the placement point, too.
+        Board in view, and the point [m] about which it rotates, which is also the placement point.
     budget
-        How many rulers.
+        Number of rulers.
     motion_px
-        By which the picture is smeared along the rows, and is expected to be.
+        Length of the motion blur along the rows, which the imaging model also expects.
     max_leverage
         As in `SolvePose`.
     """
@@ -83,7 +83,7 @@ class BoardFix:
 
     @classmethod
     def drawn(cls, folder: Path) -> BoardFix:
-        """Traces in four directions and pads in the open, 16 mm x 12 mm, and a frame of silk."""
+        """Return traces in four directions and uncovered pads, 16 mm x 12 mm, and a frame of silk."""
         head = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
 
         def at(x: float, y: float, how: str) -> str:
@@ -119,7 +119,7 @@ class BoardFix:
 
     @cached_property
     def imaging(self) -> Imaging:
-        """Steps of 50 under the mask and of 110 in the open, over the noise."""
+        """Return the image quality: steps of 50 under the mask and 110 without mask, relative to the noise."""
         return Imaging(
             pixel=PIXEL,
             blur_px=self.view.edge_blur_px,
@@ -140,7 +140,7 @@ class BoardFix:
         return select_rulers(self.rulers, self.imaging, self.budget, per_source=8)
 
     def at_random(self, rng: np.random.Generator) -> Selection:
-        """As many rulers as were chosen, any that fix a pose."""
+        """Return random rulers, equal in number to the selected ones, that determine a pose."""
         while True:
             try:
                 some = rng.choice(len(self.rulers.sigma), len(self.chosen.chosen), replace=False)
@@ -158,7 +158,7 @@ class BoardFix:
         selection: Selection | None = None,
         polarity: Polarity = "falling",
     ) -> Fixes:
-        """Poses of boards that lie anywhere within reach, one picture after the other, as bytes."""
+        """Return poses of boards anywhere within the search range, image by image, in 8 bits."""
         which = (selection or self.chosen).chosen
         normal, point = self.rulers.normal[which], self.rulers.point[which] - self.middle
         per, (x, y) = 1 / PIXEL, np.array(self.view.corner) - self.middle
@@ -172,7 +172,7 @@ class BoardFix:
             polarity=polarity,
             noise=NOISE,
         )
-        # Boards lie within a circle about the square of what was asked for.
+        # Offsets of boards lie in a circle around the square of the search range.
         search_range = (1.5 * self.imaging.shift, 1.5 * self.imaging.angle)
         solver = SolvePose(
             etch_bias_sigma=self.imaging.etch_bias_sigma,
@@ -195,7 +195,7 @@ class BoardFix:
         return Fixes(errors, covariances, status)
 
     def sharp(self, count: int, rng: np.random.Generator) -> list[BoardPicture]:
-        """Boards etched wider or narrower all over, mask and silk printed off."""
+        """Return poses of boards with a random etch bias and displaced mask and silk."""
         off = self.imaging.registration
         return [
             self.painted(
@@ -210,7 +210,7 @@ class BoardFix:
         ]
 
     def disturbed(self, kind: str, rng: np.random.Generator) -> BoardPicture:
-        """A board with 30 % of the areas with rulers gone, 30 % of the rulers on wrong edges, or dark copper."""
+        """Return poses with 30 % of the measured areas missing, 30 % of the rulers on wrong edges, or dark copper."""
         view = replace(self.view, etch_bias=self.imaging.etch_bias_sigma * float(rng.normal()))
         if kind == "reversed":
             return self.painted(replace(view, levels=(110.0, 60.0, 200.0, 90.0, 20.0, 240.0)))
@@ -226,14 +226,14 @@ class BoardFix:
 
     @cached_property
     def _areas(self) -> list[int]:
-        """Areas of copper whose borders carry chosen rulers."""
+        """Return the copper areas with selected rulers on their borders."""
         points = self.rulers.point[self.chosen.chosen]
         return [number for number, each in enumerate(self.artwork.copper) if _near(each.outline, points).any()]
 
     def splashes(self, rng: np.random.Generator, share: float = 0.3) -> list[Shape]:
-        """Too much copper, or too little, across edges of which a share of the rulers see nothing else."""
+        """Return splashes (copper added) or bites (copper removed) that cover a share of the rulers completely."""
         points, normals = self.rulers.point[self.chosen.chosen], self.rulers.normal[self.chosen.chosen]
-        # Half of a ruler's width more, and what boards lie off along their edges.
+        # Enlarged by half the width of a ruler and by the offset of boards along their edges.
         half, seen = 6 * PIXEL, (6 + 2.6) * PIXEL + math.sqrt(2.0) * SHIFT
         hit: set[int] = set()
         shapes = []
@@ -253,7 +253,7 @@ class BoardFix:
 
 
 def _near(outline: Float64, points: Float64) -> npt.NDArray[np.bool_]:
-    """Which points lie on an outline, to 3 micrometres."""
+    """Return which points lie on an outline, to 3 micrometres."""
     side = np.roll(outline, -1, axis=0) - outline
     away = points[:, None] - outline
     share = np.clip(np.sum(away * side, axis=-1) / np.maximum(np.sum(side**2, axis=-1), 1e-30), 0, 1)

@@ -1,4 +1,4 @@
-"""Simulated images of boards from their artwork: 8 x 8 samples in a pixel, blurred, then seen with many motions."""
+"""Simulated images of boards from their artwork: 8 x 8 samples per pixel, blurred, then resampled for many poses."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from gpuvision.matching.artwork.shapes import Shape, area, capsule
 Float64 = npt.NDArray[np.float64]
 
 SAMPLES = 8
-FINE = 4  # values in a pixel that are kept of the samples
-# Eight rows of samples stand aside by eighths of a sample, in this order, and eight columns by eighths in theirs: an
-# edge along a row or a column passes 64 different places in a pixel, not 8.
+FINE = 4  # stored values per pixel side
+# Eight rows of samples are shifted by multiples of 1/8 sample, in this order, and eight columns likewise: an edge along
+# a row or a column then crosses a pixel at 64 different places instead of 8.
 _ASIDE = (np.array([0, 4, 2, 6, 1, 5, 3, 7]) + 0.5) / SAMPLES
 
 
@@ -29,19 +29,17 @@ class View:
     Parameters
     ----------
     corner
-        x, y [m] that the first pixel's centre sees: the picture's upper left.
-    pixel
-        On the board [m].
-    shape
+        x, y [m] at the centre of the first pixel (upper left).
+    pixel Size on the board [m]. shape
         Rows and columns.
     blur_px, motion_px
         Standard deviation of the Gaussian blur, and length of a smear along the rows.
     noise
         Standard deviation [grey levels].
     mask_shift, silk_shift
-        x, y [m] by which the mask's openings and the silk are printed off.
+        x, y [m] Displacement of the mask openings and of the silk.
     etch_bias
-        How far copper reaches beyond its drawn edge [m], below 0 where too much was etched.
+        Distance by which copper extends beyond its drawn edge [m]; < 0 for over-etching.
     levels
         Grey levels of laminate and copper under the mask, laminate and copper in its openings, silk, holes.
     """
@@ -59,27 +57,27 @@ class View:
 
     @property
     def edge_blur_px(self) -> float:
-        """Standard deviation of an edge's blur without the smear, a pixel's own included."""
+        """Standard deviation of an edge's blur without motion blur, including the extent of a pixel."""
         return math.hypot(self.blur_px, math.sqrt(1 / 12))
 
 
 class BoardPicture:
-    """A board in front of a camera, painted once: seen with other small motions and other noise in a millisecond.
+    """Image of a board, rendered once: images with other small motions and noise take a millisecond.
 
     Parameters
     ----------
     artwork, view
-        What is seen, and how.
+        Board and camera.
     pose, about
-        x, y [m] and theta [rad] of the board, turned about a point [m].
+        x, y [m] and theta [rad] of the board, rotated about a point [m].
     missing
-        Numbers of the copper's areas of which none is left.
+        Numbers of the copper areas that are missing.
     more
         Areas that are drawn over the copper: splashes (dark), and scratches (not dark).
     growths
-        How much further than ``view.etch_bias`` the edges of each of the copper's areas lie [m].
+        Additional displacement of the edges of each copper area beyond ``view.etch_bias`` [m].
     margin
-        Pixels beside the picture that motions may bring into it.
+        Pixels outside the image that motions may move into it.
     """
 
     def __init__(
@@ -119,9 +117,9 @@ class BoardPicture:
     def seen(
         self, pose: tuple[float, float, float] = (0.0, 0.0, 0.0), rng: np.random.Generator | None = None
     ) -> npt.NDArray[np.float32]:
-        """float32 picture of the board when it has moved on by a small pose, about the same point; noise with a rng."""
+        """Return the float32 image after a further small motion about the same point; with rng, add noise."""
         view, per = self.view, FINE / self.view.pixel
-        # From the picture's pixels to the board, back by the motion, to the painted values.
+        # From image pixels to the board, back by the motion, to the rendered values.
         away = np.array(view.corner) - self._about - self._pose[:2] - pose[:2]
         cos, sin = math.cos(pose[2]), math.sin(pose[2])
         back = np.array([[cos, sin], [-sin, cos]])
@@ -151,12 +149,12 @@ def board_image(
     missing: Collection[int] = (),
     rng: np.random.Generator | None = None,
 ) -> npt.NDArray[np.float32]:
-    """float32 picture of a board that is turned about a point and shifted; of some of its copper areas none is left."""
+    """Return a float32 image of a board that is rotated about a point and shifted; some copper areas are missing."""
     return BoardPicture(artwork, view, pose, about, missing=missing).seen(rng=rng)
 
 
 def grown(outline: Float64, by: float) -> Float64:
-    """Corners of an outline whose sides lie further out [m]; sharp corners at most twice as far."""
+    """Return the corners of an outline with sides displaced outwards [m]; sharp corners move at most twice as far."""
     if by == 0.0:
         return outline
     kept = outline[np.any(outline != np.roll(outline, 1, axis=0), axis=1)]
@@ -168,7 +166,7 @@ def grown(outline: Float64, by: float) -> Float64:
 
 
 def _blurs(blur_px: float, smear_px: float) -> npt.NDArray[np.float32]:
-    """Gaussian blur, the extent of a pixel, and a smear, one after the other, on the painted values."""
+    """Return the filters of Gaussian blur, pixel extent and motion blur for the rendered values."""
     reach = math.ceil(4 * blur_px * FINE)
     places = np.arange(-reach, reach + 1)
     kernel = np.exp(-0.5 * (places / (blur_px * FINE)) ** 2)
@@ -188,15 +186,15 @@ class _Painter:
         self._turn = np.array([[cos, -sin], [sin, cos]])
 
     def samples(self, points: Float64) -> Float64:
-        """Where points lie, in samples from the picture's upper left corner, to the right and down."""
+        """Return points in samples from the upper left corner of the image, to the right and down."""
         seen = self._about + (points - self._about) @ self._turn.T + self._shift - self._view.corner
         pixels = seen * (1 / self._view.pixel, -1 / self._view.pixel)
         return np.asarray((pixels + 0.5 + self._margin) * SAMPLES)
 
     def painted(self, shapes: Collection[Shape], shift: tuple[float, float]) -> npt.NDArray[np.bool_]:
-        """Which samples are laid, (rows, columns).
+        """Return which samples a shape covers, (rows, columns).
 
-        A row of samples goes down by one at every eighth column: pixel by pixel the columns are moved up again.
+        A row of samples descends by one sample every eighth column: the columns of each pixel are moved up again.
         """
         rows, columns = (SAMPLES * each for each in self.shape)
         slanted = np.zeros((rows + self.shape[1], columns), dtype=bool)
@@ -219,7 +217,7 @@ class _Painter:
 
 
 def _inside(corners: Float64, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Which samples an odd number of turns of a polygon goes round: crossings to the left of each, in each row."""
+    """Return which samples are inside a polygon by the odd-even rule: crossings to the left of each, in each row."""
     columns, rows = high - low
     line = np.arange(low[1], high[1])
     aside = _ASIDE[line % SAMPLES]

@@ -31,9 +31,9 @@ def round_board(
     openings: Sequence[tuple[float, float, float]] = (),
     holes: Sequence[tuple[float, float, float]] = (),
 ) -> Path:
-    """Write a board of 20 x 16 mm: covered lands of 1 mm, fiducials of 1 mm in openings of 2.6 mm, traces [mm].
+    """Write a board of 20 x 16 mm: covered pads of 1 mm, fiducials of 1 mm in openings of 2.6 mm, traces [mm].
 
-    ``openings`` and ``holes`` have a diameter each beside their x, y.
+    ``openings`` and ``holes`` are rows of x, y and diameter.
     """
 
     def at(x: float, y: float, code: str) -> str:
@@ -60,12 +60,12 @@ def _flashes(spots: Sequence[tuple[float, float, float]]) -> str:
 
 
 def round_artwork(folder: Path) -> Artwork:
-    """Read what `round_board` wrote."""
+    """Read the files that `round_board` wrote."""
     return read_artwork(folder, layers=LAYERS | {"holes.gbr": "drill plated"})
 
 
 def round_picture(artwork: Artwork, **more: Any) -> BoardPicture:
-    """Return the board under a camera over its middle, about which it may move."""
+    """Return the board under a camera over its centre, about which it may move."""
     corner = np.array(BOARD_MIDDLE) + (np.array(SHAPE[::-1]) - 1) / 2 * PIXEL * (-1, 1)
     view = View(corner=tuple(corner), pixel=PIXEL, shape=SHAPE, noise=NOISE)
     return BoardPicture(artwork, view, about=BOARD_MIDDLE, **more)
@@ -74,7 +74,7 @@ def round_picture(artwork: Artwork, **more: Any) -> BoardPicture:
 def moved_picture(
     picture: BoardPicture, rng: np.random.Generator, shift: float = 60e-6, angle: float = 3e-3
 ) -> tuple[np.ndarray, np.ndarray]:
-    """uint8 picture of the board moved at random about its middle, and the camera's pose over it."""
+    """Return a uint8 image of the board, moved at random about its centre, and the camera's pose over it."""
     x, y = rng.uniform(-shift, shift, 2)
     turn = float(rng.uniform(-angle, angle))
     seen = np.clip(np.rint(picture.seen((x, y, turn), rng)), 0, 255).astype(np.uint8)

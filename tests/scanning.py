@@ -30,7 +30,7 @@ def line_frames(rows: Any, sigma: float = 1.2, peak: float = 200.0) -> Any:
 
 
 class Ran:
-    """A run of the command ``gpuvision``: exit code, standard output and standard error."""
+    """Result of the command ``gpuvision``: exit code, standard output and standard error."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *args: object) -> None:
         monkeypatch.setattr(sys, "argv", ["gpuvision", *map(str, args)])

@@ -1,4 +1,4 @@
-"""A search in Sphinx's ``searchindex.js``, ranked as ``searchtools.js`` of Sphinx 9 ranks it for the reader."""
+"""Search in Sphinx's ``searchindex.js`` with the ranking of ``searchtools.js`` of Sphinx 9."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PRIORITY = {0: 15.0, 1: 5.0, 2: -5.0}
 
 
 class SearchIndex:
-    """The index of a build.
+    """Search index of a build.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class SearchIndex:
         self._language = SearchEnglish({})
 
     def search(self, query: str) -> list[str]:
-        """Return the pages that a reader gets for a query, best first."""
+        """Return the pages that the search finds for a query, best first."""
         asked = query.lower().strip()
         scores: dict[str, float] = {}
         minor: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""A sensor beside a sheet of light whose tilt, lens and edges a test chooses."""
+"""Sensor for a sheet of light, with selectable tilt, lens and edges."""
 
 from __future__ import annotations
 

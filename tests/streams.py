@@ -1,4 +1,4 @@
-"""What the tests of the stream share: small frames, and a source that the test opens and shuts."""
+"""Common parts of the stream tests: small frames, and a source that the test opens and closes."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class ManualClock:
 
 
 class Gated(Source):
-    """Frames that tell their number and arrive when the test says so."""
+    """Source of frames that contain their number and arrive when the test releases them."""
 
     def __init__(self, count: int) -> None:
         self.shape, self.dtype, self.length = (2,), np.dtype(np.float32), count
-        self.waiting = 0  # frames that wait() has asked for
+        self.waiting = 0  # frames that wait() has requested
         self.closed = False
         self._next = 0
         self._gate = threading.Semaphore(0)
@@ -50,7 +50,7 @@ class Gated(Source):
         self._gate.release(frames)
 
     def drained(self, frames: int) -> None:
-        """Wait until the producer has read so many frames and is back to wait for the next."""
+        """Wait until the producer has read a number of frames and waits for the next."""
         with self._idle:
             assert self._idle.wait_for(lambda: self.waiting > frames, timeout=30)
 
@@ -80,7 +80,7 @@ def numbers(batches: list[Batch[Any]]) -> list[int]:
 
 
 def producer_ended() -> None:
-    """Wait until the stream's thread has ended by itself."""
+    """Wait until the stream's thread has ended."""
     for thread in threading.enumerate():
         if thread.name == "gpuvision stream":
             thread.join(30)

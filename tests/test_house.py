@@ -1,4 +1,4 @@
-"""The house is in order: what the wheel holds, who imports whom, what kernels and Python must agree on."""
+"""Structure of the project: contents of the wheel, imports between packages, consistency of kernels and Python."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ import gpuvision
 from gpuvision.status import Status
 
 ROOT = Path(__file__).resolve().parents[1]
-# Where a room of the tree is installed.
+# Installed package of each folder of the tree.
 ROOMS = {
     "gpuvision": "gpuvision",
     "host": "gpuvision/host",
@@ -57,7 +57,7 @@ def _copy_of_the_sources(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Iterator[zipfile.ZipFile]:
-    """The wheel, built from a copy: what an earlier build left in the tree would get into it."""
+    """Return the wheel, built from a copy, because files of earlier builds in the tree would get into it."""
     source, target = _copy_of_the_sources(tmp_path_factory.mktemp("source")), tmp_path_factory.mktemp("wheel")
     build = f"from setuptools.build_meta import build_wheel; build_wheel({os.fspath(target)!r})"
     subprocess.run([sys.executable, "-c", build], cwd=source, check=True, capture_output=True)
@@ -82,7 +82,7 @@ def test_wheel_holds_everything(wheel: zipfile.ZipFile) -> None:
 def test_installed_wheel_runs_outside_the_tree(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
     """The installed package finds its kernels, presets and version; the tree is not on the path."""
     target = tmp_path / "site"
-    wheel.extractall(target)  # what `pip install --target` does with a wheel of pure Python
+    wheel.extractall(target)  # equivalent to `pip install --target` for a pure Python wheel
     environment = os.environ | {"PYTHONPATH": os.fspath(target)}
     code = "import gpuvision, gpuvision.host; print(gpuvision.__file__, gpuvision.host.__file__)"
     code += "; from gpuvision import LineReadout; import numpy; LineReadout()(numpy.zeros((1, 16, 32), numpy.uint8))"
@@ -104,7 +104,7 @@ def test_installed_wheel_runs_outside_the_tree(wheel: zipfile.ZipFile, tmp_path:
 def test_source_distribution_holds_what_a_build_needs(tmp_path: Path) -> None:
     """Packages, kernels, presets, README and licence; tests and documentation stay in the repository."""
     source = _copy_of_the_sources(tmp_path / "source")
-    (source / "tests" / "test_something.py").write_text("")  # setuptools would take it by itself
+    (source / "tests" / "test_something.py").write_text("")  # setuptools would include it automatically
     build = f"from setuptools.build_meta import build_sdist; build_sdist({os.fspath(tmp_path)!r})"
     subprocess.run([sys.executable, "-c", build], cwd=source, check=True, capture_output=True)
     (path,) = tmp_path.glob("gpuvision-*.tar.gz")
@@ -152,8 +152,8 @@ def test_kernel_includes_are_not_circular() -> None:
     assert list(TopologicalSorter(graph).static_order())
 
 
-# Floors of the packages, bottom to top. A name with a dot is a sub-package, or a module that stands above its package's
-# sub-packages. A module imports from lower floors and from its own package only.
+# Floors of the packages, bottom to top. A name with a dot is a sub-package, or a module on a higher floor than the
+# sub-packages of its package. A module imports only from lower floors and from its package.
 FLOORS = (
     ("kernels", "host", "reference"),
     ("status", "validation", "schema"),
@@ -193,14 +193,14 @@ def _imported(tree: ast.AST) -> Iterator[str]:
 
 
 def _package(name: str) -> str:
-    """Return the package with a floor that a module, or a name in it, belongs to: the longest that fits."""
+    """Return the package with a floor that contains a module or a name in it: the longest match."""
     parts = name.split(".")[1:]
     fitting = [".".join(parts[:count]) for count in range(len(parts), 0, -1) if ".".join(parts[:count]) in FLOOR]
     return fitting[0] if fitting else ""
 
 
 def _gpuvision_imports() -> Iterator[tuple[str, str]]:
-    """Yield (module, imported name) for every import within gpuvision, those for type checkers included."""
+    """Yield (module, imported name) for every import within gpuvision, including imports for type checkers."""
     for module, path in _modules():
         for name in _imported(ast.parse(path.read_text())):
             if name.split(".")[0] == "gpuvision":
@@ -259,7 +259,7 @@ def test_no_module_imports_private_names_of_another() -> None:
 
 @pytest.mark.parametrize("top", ["numba", "pytest", "hypothesis", "mpmath"])
 def test_the_library_needs_no_extra(top: str) -> None:
-    """What comes with the extras `test`, `profile` and `reference` is imported by neither library nor command."""
+    """Library and command do not import packages of the extras `test`, `profile` and `reference`."""
     with_extras = ("gpuvision.profiling", "gpuvision.reference")
     users = [
         module
@@ -271,7 +271,7 @@ def test_the_library_needs_no_extra(top: str) -> None:
 
 
 def test_no_file_knows_a_machine() -> None:
-    """Neither a path of somebody's machine nor a package registry: pip and apt are configured outside."""
+    """No file contains a path of a machine or the address of a package registry: pip and apt are configured outside."""
     known = re.compile(r"(?<![\w.~}])/(work|root|home|Users)/|\bpypi\.org\b|--(extra-)?index-url")
     kinds = SHIPPED | {".md", ".sh"}
     folders = (*ROOMS, "tests", "docs", "examples", ".ci")

@@ -89,7 +89,7 @@ def test_fits(device, rng, method, dtype, along, variant):
         assert settled.mean() > 0.95
         np.testing.assert_allclose(reading.position[settled], expected["position"][settled], atol=1e-4)
     else:
-        # A logarithm's or a quotient's roundings grow where the peak is flat.
+        # The rounding errors of a logarithm or quotient are larger where the peak is flat.
         assert_same(reading, expected, slack=20.0)
 
 
@@ -162,7 +162,7 @@ def test_outputs(device, rng):
 
 
 def column(*values, dtype=np.uint8):
-    """A frame of 64 equal columns."""
+    """Return a frame of 64 equal columns."""
     return np.repeat(np.array(values, dtype)[:, None], 64, axis=1)
 
 
@@ -194,7 +194,7 @@ def test_extremes(device, variant, along):
     for name, (frame, status) in EXTREMES.items():
         frame = frame if along == "columns" else np.ascontiguousarray(np.pad(frame.T, ((0, 0), (0, 64))))
         if along == "rows" and name in ("last row", "all saturated", "wide top at the end"):
-            continue  # the padding takes the border away
+            continue  # the padding removes the effect of the border
         reading = readout(frame, device=device)
         assert_same(reading, read_lines(frame, threshold=5, window=4, ambiguity=0.8, along=along))
         assert set(reading.status.ravel()) == {status}, name
@@ -245,7 +245,7 @@ def test_only_neighbours_make_a_flat_top(device, variant, peak_selection):
 
 @pytest.mark.parametrize(("dtype", "gain"), [("uint8", 0.0), ("float32", 0.3)])
 def test_fit_of_noise_stays_at_its_peak(device, rng, dtype, gain):
-    """Where the fit does not settle inside the window, the centre of gravity stands in."""
+    """If the fit does not converge inside the window, the centre of gravity is returned."""
     frame = rng.integers(0, 255, (70, 400)).astype(dtype)
     gravity = LineReadout(threshold=20, window=5)(frame, device=device)
     readings = []
@@ -259,7 +259,7 @@ def test_fit_of_noise_stays_at_its_peak(device, rng, dtype, gain):
         assert 0.2 < fallen.sum() / given.sum() < 0.9
         np.testing.assert_allclose(fit.position[fallen], gravity.position[fallen], atol=1e-5)
         readings.append(fit)
-    # A fit at the brink of settling may go either way by a rounding.
+    # Rounding decides about a fit at the limit of convergence.
     same = readings[0].status == readings[1].status
     assert same.mean() > 0.98
     np.testing.assert_allclose(readings[0].position[same], readings[1].position[same], atol=0.01)
@@ -303,7 +303,7 @@ def test_not_finite(device, rng, variant, along):
 @pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
 @pytest.mark.parametrize("method", ["centroid", "windowed", "fir"])
 def test_nothing_finite(device, along, variant, method):
-    """Profiles without any number have no peak whose place could be looked up."""
+    """Profiles of NaN only have no peak."""
     second = {} if method == "centroid" else {"ambiguity": 0.5}
     readout = LineReadout(along=along, variant=variant, method=method, threshold=1, **second)
     for value in (np.nan, -np.inf, np.inf):
@@ -315,7 +315,7 @@ def test_nothing_finite(device, along, variant, method):
 @pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
 @pytest.mark.parametrize("peak_selection", ["strongest", "last"])
 def test_sums_beyond_the_largest_number(device, along, variant, peak_selection):
-    """Samples that are numbers, but their light is none in single precision."""
+    """Finite samples whose sum overflows in single precision."""
     frame = column(*[0.0] * 20, 2e38, 3e38, 2e38, *[0.0] * 41, dtype=np.float32)
     for threshold, method in itertools.product((-1e38, 1.0), ("windowed", "centroid", "gauss3")):
         if method == "centroid" and peak_selection == "last":
@@ -331,7 +331,7 @@ def test_sums_beyond_the_largest_number(device, along, variant, peak_selection):
 @pytest.mark.parametrize(("along", "variant"), list(itertools.product(("columns", "rows"), VARIANTS)))
 @pytest.mark.parametrize("method", ["centroid", "windowed"])
 def test_faintest_light(device, along, variant, method):
-    """Light whose reciprocal is infinite: read, or dark on a device that takes such numbers for zero."""
+    """Sums with an infinite reciprocal: read, or dark on a device that flushes denormal numbers."""
     frame = column(*[0.0] * 20, 1e-40, 2e-40, 1e-40, *[0.0] * 41, dtype=np.float32)
     readout = LineReadout(method=method, along=along, variant=variant)
     reading = readout(frame if along == "columns" else np.ascontiguousarray(frame.T), device=device)
@@ -360,7 +360,7 @@ def test_wide_window_of_16_bits(device, rng):
 
 
 def test_tall_frames(device, rng):
-    """More blocks of rows than a byte counts, and peaks far apart within a group."""
+    """More than 256 blocks of rows, and peaks far apart within a group."""
     frame = np.zeros((9000, 70), np.uint8)
     frame[rng.integers(20, 8980, 70), np.arange(70)] = 200
     parameters = {"threshold": 5, "window": 4}
@@ -459,7 +459,7 @@ def test_triangulates_in_the_same_pass(device, rng, along, variant):
         assert good.any()
         assert not status[good].any()
         np.testing.assert_array_equal(reading.status, expected["status"])
-        # 0.2 mm a pixel, of which single precision knows 4e-5 at 400 px.
+        # 0.2 mm per pixel; single precision resolves 4e-5 px at 400 px.
         np.testing.assert_allclose(reading.g[good], g[good], atol=2e-8)
         np.testing.assert_allclose(reading.h[good], h[good], atol=2e-8)
         lost = np.isnan(expected["position"])
@@ -468,7 +468,7 @@ def test_triangulates_in_the_same_pass(device, rng, along, variant):
 
 
 def test_triangulation_flags_its_own(device):
-    """Beyond the horizon: H and G are lost, the position is not."""
+    """Beyond the horizon, H and G are NaN, but the position is valid."""
     sheet = Triangulation(
         homography=((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (-1.0 / 30.0, 0.0, 1.0)), region=((0.0, 40.0), (0.0, 64.0))
     )
@@ -482,7 +482,7 @@ def test_triangulation_flags_its_own(device):
 
 @pytest.mark.parametrize("name", ["g", "h", "position"])
 def test_one_output_of_the_sheet(device, rng, name):
-    """What is not asked for is not written, with a triangulation too."""
+    """Outputs that are not requested are not written, also with a triangulation."""
     frames = line_frames(rng, "uint8", (2, 99, 130), "columns")
     readout = LineReadout(threshold=20, triangulation=SHEET)
     whole, alone = (each(frames, device=device) for each in (readout, replace(readout, outputs=(name,))))

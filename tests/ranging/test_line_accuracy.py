@@ -1,4 +1,4 @@
-"""Noise of the line methods: the Cramer-Rao bound for the likelihood fit, published-style figures for the others.
+"""Noise of the line methods: the Cramer-Rao bound for the likelihood fit, published figures for the others.
 
 A column of 41 pixels with 20 electrons of background and 10 electrons of read noise, the line near its middle.
 """
@@ -25,7 +25,7 @@ FIGURES = {
 
 
 def trials(rng, sigma, peak):
-    """(true places, frame of float32 electrons)."""
+    """Return the true positions and the frame of float32 electrons."""
     places = LENGTH // 2 + rng.uniform(-0.5, 0.5, TRIALS)
     light = pixel_gaussian(np.arange(LENGTH)[:, None], places, sigma, peak, BACKGROUND)
     return places, (rng.poisson(light) + rng.normal(0.0, READ_NOISE, light.shape)).astype(np.float32)
@@ -43,7 +43,7 @@ def test_likelihood_reaches_the_bound(device, rng, sigma, peak):
     places, frame = trials(rng, sigma, peak)
     readout = LineReadout(method="ml", threshold=BACKGROUND, window=16, read_noise=READ_NOISE, gain=1.0)
     bound = cramer_rao(sigma, peak, BACKGROUND, READ_NOISE, LENGTH, LENGTH // 2 + np.linspace(-0.5, 0.5, 41))
-    # Of 4000 trials the deviation itself is known to 1.1 %.
+    # 4000 trials determine a standard deviation to 1.1 %.
     assert deviation(readout, frame, places, device) < 1.05 * bound
 
 
@@ -59,7 +59,7 @@ def test_classical_methods(device, rng, sigma, peak):
     )
     for method, figure in zip(methods, FIGURES[sigma, peak], strict=True):
         measured = deviation(LineReadout(threshold=BACKGROUND, **method), frame, places, device)
-        # Both the figure and the measurement stand on 4000 trials; outliers of three-point fits add to that.
+        # Figure and measurement are based on 4000 trials each; outliers of three-point fits add uncertainty.
         assert measured == pytest.approx(figure, rel=0.08), method
 
 

@@ -1,4 +1,4 @@
-"""The polygon mirror and the slanted beam."""
+"""Polygon mirror with an inclined beam."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ ROTATIONS = np.array([-0.3, -0.1, 0.1, 0.3])
 
 
 def traced(mirror: PolygonMirror, phi: float) -> tuple[float, float]:
-    """(x, place on the facet) by tracing the ray: an independent way to the same numbers."""
+    """Return x and the place on the facet by ray tracing: an independent computation."""
     normal = np.array([math.cos(0.25 * math.pi - phi), math.sin(0.25 * math.pi - phi)])
     height = mirror.apothem * math.sqrt(0.5)
     hit = np.array([(mirror.apothem - height * normal[1]) / normal[0], height])
     beam = np.array([-1.0, 0.0])
     out = beam - 2.0 * (beam @ normal) * normal
     tangent = np.array([-normal[1], normal[0]])
-    # The outgoing beam goes up here; the surface lies a drop away along it.
+    # The outgoing beam points up here; the surface is at the distance `drop` along it.
     landed = hit[0] + mirror.drop * out[0] / out[1]
     middle = mirror.apothem * math.sqrt(0.5)
     return landed - middle, float(hit @ tangent)
@@ -58,7 +58,7 @@ def test_both_conventions_of_height_agree() -> None:
     np.testing.assert_allclose(hit.position(ROTATIONS), centre.position(ROTATIONS), rtol=1e-14)
 
 
-@example(ratio=0.72, facets=11, part=1e-15, apothem=1.0)  # beside the fold position rounds to less than at it
+@example(ratio=0.72, facets=11, part=1e-15, apothem=1.0)  # rounding: the position is smaller than at the fold
 @example(ratio=0.72, facets=52, part=1e-12, apothem=0.8157179605993068)
 @given(ratio=st.floats(0.72, 1e4), facets=st.integers(3, 60), part=st.floats(0.0, 1.0), apothem=st.floats(1e-3, 1.0))
 def test_round_trip(ratio: float, facets: int, part: float, apothem: float) -> None:
@@ -66,7 +66,7 @@ def test_round_trip(ratio: float, facets: int, part: float, apothem: float) -> N
     low, high = mirror.limits
     phi = low + part * (high - low)
     x = mirror.position(phi)
-    # A last bit of phi moves x by the slope times it: no inverse comes closer. Near a fold the slope itself vanishes.
+    # One ulp of phi moves x by the slope times one ulp: no inverse is more accurate. Near a fold the slope vanishes.
     exact = max(1e-12 * mirror.height, 4.0 * float(mirror.slope(phi)) * np.spacing(abs(phi)))
     assert abs(mirror.position(mirror.rotation(x)) - x) <= exact
 
@@ -119,7 +119,7 @@ def test_facet_limits() -> None:
 def test_facet_crossing_jumps_back() -> None:
     mirror = PolygonMirror(apothem=0.02, facets=12, height=0.1)
     low, high = mirror.limits
-    # The next facet is one facet angle behind: at the jump both are at an edge.
+    # The next facet follows by one facet angle: at the jump both are at an edge.
     assert mirror.position(high - 2.0 * math.pi / 12 + 1e-12) < 0.0 < mirror.position(high)
     assert low == pytest.approx(high - 2.0 * math.pi / 12, abs=1e-13)
 
@@ -127,7 +127,7 @@ def test_facet_crossing_jumps_back() -> None:
 def test_scan_ends_where_x_turns_back() -> None:
     mirror = PolygonMirror(apothem=0.02, facets=3, height=0.02 * math.sqrt(0.5) + 1e-3)
     low, high = mirror.limits
-    # With so small a drop the polygon's own term overtakes the tangent: the slope vanishes at the lower limit.
+    # With a drop this small the polygon term exceeds the tangent: the slope vanishes at the lower limit.
     assert mirror.slope(low) == pytest.approx(0.0, abs=1e-9 * mirror.apothem)
     inside = np.linspace(low, high, 1001)[1:-1]
     assert np.all(mirror.slope(inside) > 0.0)
@@ -172,9 +172,9 @@ def test_fold_over_where_the_surface_falls_faster_than_the_beam() -> None:
     x0 = np.arange(6) * 1e-3
     height = np.array([2e-3, 2e-3, 0.0, 0.0, 0.0, 0.0])
     np.testing.assert_array_equal(shear_profile(x0, height).status, [0, 0, Status.NOT_INVERTIBLE, 0, 0, 0])
-    # The other way round the beam and the scan run together: no fold, a gap.
+    # In the opposite sense beam and scan move together: no fold, but a gap.
     assert not shear_profile(x0, height[::-1].copy()).status.any()
-    # A scan that runs backwards folds on the other flank.
+    # A reversed scan folds on the other flank.
     np.testing.assert_array_equal(shear_profile(x0[::-1], height[::-1]).status, [0, 0, 0, 0, Status.NOT_INVERTIBLE, 0])
     np.testing.assert_array_equal(shear_profile(x0[::-1], height).status, [0] * 6)
     np.testing.assert_array_equal(shear_profile(x0[::-1], -height).status, [0, 0, Status.NOT_INVERTIBLE, 0, 0, 0])

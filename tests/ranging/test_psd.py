@@ -1,4 +1,4 @@
-"""PSD readout against the float64 oracle, on every device and in both walks."""
+"""PSD readout against the float64 oracle, on every device and in both kernel variants."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from gpuvision.status import Status
 
 VARIANTS = ("vector", "work_item")
 LENGTH = 6e-3
-# Roundings of L/2 in the position: of the difference, the sum, the quotient and the product, and of the packed
-# constant itself; and of the parameters where they act.
+# Roundings of the position in units of L/2: of difference, sum, quotient, product and the packed constant; and of the
+# parameters where they are used.
 POSITION_ULPS = {np.dtype(np.float32): 4, np.dtype(np.float64): 4}
 
 
@@ -63,7 +63,7 @@ def test_like_float64(device, rng, variant, dtype, layout, batch):
 
 @pytest.mark.parametrize("shift", [0, 1])
 def test_more_than_the_caches_hold(device, rng, shift):
-    """Outputs go past the caches, to addresses that are and are not aligned to a vector."""
+    """Outputs bypass the caches, at addresses that are aligned to a vector and at other addresses."""
     samples = 2 + device.cache_bytes // 13 * 16 // 15
     readout = PsdReadout(strip_length=LENGTH, layout="planar", saturation=float(np.float32(0.9e-6)))
     values = currents(rng, (2, samples))
@@ -92,7 +92,7 @@ def test_everything_at_once(device, rng, variant):
         variant=variant,
     )
     codes = rng.integers(0, 65_536, (200, strips, 2)).astype(np.uint16)
-    # A code that float32 and float64 put on two sides of a limit is no test of either.
+    # Exclude codes that float32 and float64 round to different sides of a limit.
     reading = readout(codes, device=device)
     expected = reference.read_out(readout, codes[..., 0], codes[..., 1])
     agree = reading.status == expected.status
@@ -147,7 +147,7 @@ def test_every_reason_is_told(device, variant):
     ],
 )
 def test_one_code_at_a_limit_among_good_codes(device, variant, pair, status):
-    """The limits are inclusive for saturation and exclusive for the smallest sum, in a block of good samples too."""
+    """The limits are inclusive for saturation and exclusive for the smallest sum, also in a block of valid samples."""
     codes = np.full((4999, 2), (700, 1300), np.uint16)
     codes[3001] = pair
     readout = PsdReadout(strip_length=2.0, saturation=4095.0, minimum_total=100.0, variant=variant)
@@ -173,7 +173,7 @@ def test_denormal_currents_keep_their_ratio_or_are_dark(device, variant):
     tiny = np.full((32, 2), 1e-40, np.float32) * np.array([1.0, 3.0], np.float32)
     reading = PsdReadout(strip_length=2.0, variant=variant)(tiny, device=device)
     good = reading.status == 0
-    # A runtime may flush denormals: then the light is dark, not anywhere.
+    # A runtime may flush denormal numbers: the status is then LOW_SIGNAL, never an arbitrary position.
     np.testing.assert_allclose(reading.position[good], 0.5, rtol=1e-4)
     assert (reading.status[~good] == Status.LOW_SIGNAL).all()
 
@@ -197,13 +197,13 @@ def test_two_lights_meet_at_their_centre_of_gravity(device):
 def test_quantised_codes_err_within_their_predicted_sigma(device, rng, bits):
     steps = 2**bits
     place = rng.uniform(-0.45, 0.45, 20_000)
-    total = steps * rng.uniform(0.6, 0.9, place.size)  # a fixed total would tie the two roundings together
+    total = steps * rng.uniform(0.6, 0.9, place.size)  # a constant total would correlate the two rounding errors
     codes = np.round(np.stack([total * (0.5 - place), total * (0.5 + place)], axis=-1)).astype(np.uint16)
     readout = PsdReadout(strip_length=1.0, saturation=float(steps), noise=PsdNoise())
     reading = readout(codes, device=device)
     assert (reading.status == 0).all()
     scaled = (reading.position - place) / reading.sigma
-    # 20 000 draws know a standard deviation to 0.5 %; three of these.
+    # 20 000 draws determine a standard deviation to 0.5 %; three times this margin.
     assert np.std(scaled) == pytest.approx(1.0, abs=0.015)
 
 
@@ -224,7 +224,7 @@ def test_noise_models_predict_what_draws_scatter(device, rng, model, xi):
         pairs = total * np.stack([0.5 - place, 0.5 + place], axis=-1)
     reading = PsdReadout(strip_length=LENGTH, noise=noise)(pairs, device=device)
     good = reading.status == 0
-    # 40 000 draws know a standard deviation to 0.35 %; three of these.
+    # 40 000 draws determine a standard deviation to 0.35 %; three times this margin.
     assert np.std(reading.position[good]) == pytest.approx(np.mean(reading.sigma[good]), rel=0.0125)
 
 
@@ -298,7 +298,7 @@ def test_outputs_are_chosen(device, rng):
 
 @pytest.mark.parametrize("name", ["g", "h", "position"])
 def test_one_output_of_the_sheet(device, rng, name):
-    """What is not asked for is not written, with a triangulation too."""
+    """Outputs that are not requested are not written, also with a triangulation."""
     sheet = Triangulation(homography=((1, 0, 0), (0, 1, 0), (5.0, 0, 1)), region=((-3e-3, 3e-3), (-4e-3, 4e-3)))
     pairs = currents(rng, (40, 2))
     whole = PsdReadout(strip_length=LENGTH, triangulation=sheet)(pairs, device=device)

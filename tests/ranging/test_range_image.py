@@ -66,7 +66,7 @@ def expect_rotating(op: RangeImage, position, transport, given):
 
 
 def depth_tolerance(op: RangeImage, points: np.ndarray, facing: np.ndarray, dtype: type) -> np.ndarray:
-    """Rounding of n . r (some five terms of at most 2) turns into depth by 1 / (n . r)."""
+    """Return the depth error by rounding of n . r (about five terms of at most 2), magnified by 1 / (n . r)."""
     pinhole = op.geometry.packed()[:3]
     distance = np.linalg.norm(points - pinhole, axis=-1)
     with np.errstate(divide="ignore"):
@@ -74,7 +74,7 @@ def depth_tolerance(op: RangeImage, points: np.ndarray, facing: np.ndarray, dtyp
 
 
 def beside_an_edge(op: RangeImage, position: np.ndarray, facing: np.ndarray) -> np.ndarray:
-    """Samples so near the horizon or the lens' fold that rounding decides."""
+    """Return the samples at the horizon or the lens' fold within rounding."""
     near = np.abs(facing - op.geometry.horizon) < 1e-5
     if op.geometry.lens is None:
         return near
@@ -93,7 +93,7 @@ def test_a_straight_transport_lays_profiles_side_by_side(device, rng, shape, dty
     transport = TILTED.transport(shape[0]).astype(dtype)
     given = rng.choice(np.array([0, 0, 0, 1, 2, 16, 32], np.uint8), shape)
     op = RangeImage(geometry=TILTED, variant=variant)
-    # Terms are below 0.1 m, of which a handful are added.
+    # Sums of about five terms below 0.1 m.
     close(
         op(g, h, transport, given, device=device),
         *expect_straight(op, g, h, transport, given),
@@ -128,7 +128,7 @@ def test_a_point_of_the_scene_comes_back_from_where_the_camera_sees_it(device, r
     geometry = dataclasses.replace(
         HEAD, axis_direction=(0.0, 1.0, 0.0), axis_point=(0.1, 0.0, 0.0), sheet_normal=(1.0, 0.0, 0.0), sheet_offset=0.0
     )
-    # One profile per point: the angle at which the sheet through the axis holds it.
+    # One profile per point: the angle at which the sheet through the axis contains the point.
     for x, y, z in points.reshape(-1, 3)[:20]:
         angle = np.array([math.atan2(x - 0.1, z)])
         column, row = 511.5 + 900.0 * x / z, 380.25 + 900.0 * y / z
@@ -146,7 +146,7 @@ def test_what_cannot_be_trusted_is_flagged_and_nan(device, variant):
     made = RangeImage(geometry=geometry, variant=variant)(
         bad[None], np.zeros((1, 8), np.float32), np.zeros(1, np.float32), given[None], device=device
     )
-    # Flags that came with a value, and those without, pass; a result that overflows is no number.
+    # Flags of samples with and without a value are kept; a result that overflows is NaN.
     assert made.status[0].tolist() == [8, 8, 1, 1, 2, 16, 18, 8]
     assert np.isfinite(made.z[0]).tolist() == [False] * 4 + [True] * 3 + [False]
     assert np.array_equal(np.isfinite(made.x), np.isfinite(made.z))
@@ -194,7 +194,7 @@ def test_nothing_is_written_beyond_the_image(device, variant):
     bound = op.bind(device, shape, np.float32)
     room = [cl.array.zeros(device.queue, (5, 37), np.float32) + canary for _ in range(3)]
     status = cl.array.zeros(device.queue, (5, 37), np.uint8) + 77
-    # The first three profiles of larger arrays: what lies behind them stays.
+    # Only the first three profiles of larger arrays are written; the rest does not change.
     small = [cl.array.Array(device.queue, shape, each.dtype, data=each.base_data) for each in (*room, status)]
     bound(out=RangePoints(*small)).wait()
     for each in room:

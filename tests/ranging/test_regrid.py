@@ -21,7 +21,7 @@ OP = Regrid(grid=GRID, max_gap=0.5, max_step=0.25)
 
 
 def flat(shape: tuple[int, int], dtype: type = np.float64) -> list[np.ndarray]:
-    """A scan of samples along x and profiles along y, over GRID and a little more, at height x + y / 2."""
+    """Return a scan of samples along x and profiles along y, slightly larger than GRID, with height x + y / 2."""
     x, y = np.meshgrid(np.linspace(-1.05, 1.05, shape[1]), np.linspace(-1.1, 2.1, shape[0]))
     return [each.astype(dtype) for each in (x, y, x + y / 2, 10 * x)] + [np.zeros(shape, np.uint8)]
 
@@ -43,7 +43,7 @@ def test_a_plane_is_resampled_exactly(device, dtype, transposed):
     made = op(*frames, device=device)
     x, y = np.meshgrid(GRID.x, GRID.y)
     assert np.all(made.status == 0)
-    # Linear interpolation has no error on a plane but rounding of numbers up to 10, by a few operations.
+    # On a plane, linear interpolation has only rounding errors: a few operations with numbers up to 10.
     np.testing.assert_allclose(made.z, x + y / 2, rtol=0, atol=8 * 2 * np.finfo(dtype).eps)
     np.testing.assert_allclose(made.intensity, 10 * x, rtol=0, atol=8 * 10 * np.finfo(dtype).eps)
 
@@ -110,7 +110,7 @@ def test_flags_that_inform_ride_along(device):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_a_scan_that_turns_back_is_folded_where_it_does(device, dtype):
-    # x rises to 0.5, falls to -0.5 and rises again: what lies between was passed three times.
+    # x rises to 0.5, falls to -0.5 and rises again: the values between are passed three times.
     turns = np.concatenate([np.arange(-72, 32), np.arange(32, -32, -1), np.arange(-32, 72)]) / 64
     shape = (20, len(turns))
     x = np.broadcast_to(turns, shape).astype(dtype)
@@ -157,11 +157,11 @@ def test_samples_on_one_place_are_folded_there(device):
 
 
 def test_a_fold_is_known_on_the_row_beside_it(device):
-    """Cells on the very place of a row lie between it and both its neighbours: what is folded in one is not trusted."""
+    """Cells exactly at a row use its intervals to both neighbours: a fold in either one flags the cell."""
     x, y, z, intensity, status = flat((7, 11))
     x[:] = np.linspace(-1.0, 1.0, 11).round(2)
     y[:] = np.arange(7)[:, None] / 4 - 0.5
-    x[4, 9] = x[4, 10]  # = 1.0, the centre of a cell; rows 3 and 5 are whole
+    x[4, 9] = x[4, 10]  # = 1.0, the centre of a cell; rows 3 and 5 have no fold
     op = dataclasses.replace(OP, grid=GRID, max_gap=0.25, max_step=1.0, folded="drop")
     frames = x, y, z, intensity, status
     made = op(*frames, device=device)
@@ -172,7 +172,7 @@ def test_a_fold_is_known_on_the_row_beside_it(device):
 @hypothesis.settings(max_examples=60, deadline=None)
 @hypothesis.given(data=st.data(), shape=hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12))
 def test_as_the_oracle(data, shape):
-    # Places on a fine dyadic raster are exact, and no difference of heights is near max_step: all decisions are clear.
+    # Coordinates on a dyadic grid are exact, and no height difference is close to max_step: rounding decides nothing.
     def numbers(low, high, part):
         return data.draw(hnp.arrays(np.float32, shape, elements=st.integers(low, high).map(lambda n: n / part)))
 
@@ -208,7 +208,7 @@ def test_a_large_scan_as_the_oracle(device, rng, dtype):
     status[rng.random(shape) < 0.1] = Status.LOW_SIGNAL
     frames = [each.astype(dtype) for each in (x, y, z, intensity)] + [status]
     made, truth = OP(*frames, device=device), reference.regrid(OP, *frames)
-    # In single precision a sample next to a cell's centre may fall on its other side: the value is the same there.
+    # In single precision a sample may be on the other side of a cell's centre: the value is the same.
     assert np.mean(made.status != truth.status) <= (0.0 if dtype is np.float64 else 0.01)
     both = np.isfinite(made.z) & np.isfinite(truth.z)
     assert both.mean() > 0.9

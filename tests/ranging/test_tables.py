@@ -16,7 +16,7 @@ from gpuvision.ranging.sheet import SheetTable
 
 
 def fields_of(file: str, struct: str) -> tuple[str, ...]:
-    """Names of the members of a struct in a kernel file."""
+    """Return the names of the members of a struct in a kernel file."""
     source = re.sub(r"//[^\n]*|^#[^\n]*", "", (KERNEL_FOLDER / file).read_text(), flags=re.MULTILINE)
     found = re.search(r"typedef struct \{([^}]*)\} " + struct + ";", source)
     assert found is not None

@@ -1,4 +1,4 @@
-"""Triangulation on devices: against the float64 oracle, at the extremes, fused as readouts use it."""
+"""Triangulation on devices: against the float64 oracle, at the extremes, and fused into readouts."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ REGION = ((0.0, 1023.0), (0.0, 1279.0))
 CAMERA = np.array([[1700.0, 0.0, 640.0], [0.0, 1700.0, 512.0], [0.0, 0.0, 1.0]])
 LENSES = [None, Lens(k1=-2e-7, centre=(650.0, 500.0)), Lens(k1=-2e-7, k2=5e-14, centre=(650.0, 500.0))]
 ON_DEVICES = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-# x, w, p (two roundings), the products, their sum and the offset: about eight half-ulps of the largest value in play.
+# x, w, p (two roundings), the products, their sum and the offset: about eight half-ulps of the largest value.
 ROUNDINGS = 8.0
 
 
 def scanner(**more: Any) -> Triangulation:
-    """A camera 0.3 m away which looks at the sheet from 35 degrees aside, rolled by 2 degrees."""
+    """Return a camera at 0.3 m that views the sheet at 35 degrees, rolled by 2 degrees."""
     tilt, roll = math.radians(35.0), math.radians(2.0)
     down = np.array([[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]])
     turn = np.array([[math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1]])
@@ -56,7 +56,7 @@ def oracle(operation: Triangulation, u: np.ndarray, v: np.ndarray) -> tuple[np.n
 def assert_close(result: SheetPoints, operation: Triangulation, u: np.ndarray, v: np.ndarray) -> None:
     g, h, status = oracle(operation, u.astype(np.float64), v.astype(np.float64))
     np.testing.assert_array_equal(result.status, status)
-    # In double the oracle rounds as often as the kernel does.
+    # In double precision the oracle has the same number of roundings as the kernel.
     eps = np.finfo(result.g.dtype).eps * (1.0 if result.g.dtype == np.float32 else 2.0)
     for value, expected in ((result.g, g), (result.h, h)):
         largest = np.nanmax(np.abs([g, h]), initial=0.0)
@@ -136,7 +136,8 @@ def test_double_arithmetic_on_single_coordinates(device: Device, rng: np.random.
 
 
 def test_single_precision_stays_near_rounding_far_from_the_origin(device: Device, rng: np.random.Generator) -> None:
-    # A small window far away from pixel 0 and around the sheet's origin: only conditioning saves the digits.
+    # A small window far away from pixel 0 and around the sheet's origin: only conditioned coordinates keep the
+    # accuracy.
     region = ((3000.0, 3255.0), (4000.0, 4063.0))
     moved = np.array([[1.0, 0.0, 3400.0], [0.0, 1.0, 2600.0], [0.0, 0.0, 1.0]]) @ CAMERA
     operation = scanner(region=region, camera=moved)
@@ -145,7 +146,7 @@ def test_single_precision_stays_near_rounding_far_from_the_origin(device: Device
     v = (rng.integers(16000, 16252, 4000) / 4.0).astype(np.float32)
     result = operation(u, v, device=device)
     g, h, _ = oracle(operation, u.astype(np.float64), v.astype(np.float64))
-    # One half-ulp for the last addition, and a few of the part that varies over the window.
+    # One half-ulp for the last addition, and a few half-ulps of the part that varies over the window.
     for value, expected in ((result.g, g), (result.h, h)):
         atol = 0.5 * np.finfo(np.float32).eps * (np.max(np.abs(expected)) + 6.0 * np.ptp(expected))
         np.testing.assert_allclose(value, expected, rtol=0, atol=atol)
@@ -235,7 +236,7 @@ def test_sigmas_against_the_host(
     result = operation(u, v, device=device)
     points = np.stack([u, v], -1).astype(np.float64)
     full = operation.covariance_at(points)
-    # About thirty roundings, most of them under a root; in double also those of the covariance's factors.
+    # About thirty roundings, most of them under a root; in double also the roundings of the covariance factors.
     rtol = 32.0 * np.finfo(dtype).eps * (1.0 if dtype == np.float32 else 10.0)
     np.testing.assert_allclose(result.sigma_g, np.sqrt(full[:, 0, 0]), rtol=rtol)
     np.testing.assert_allclose(result.sigma_h, np.sqrt(full[:, 1, 1]), rtol=rtol)
@@ -284,7 +285,7 @@ def test_fused_strips_take_positions_and_sample_numbers(
     v = 1100.0 - 4.0 * np.arange(256.0)
     result = SheetPoints(g.get(), h.get(), status.get())
     assert_close(result, operation, u, v)
-    # 0.1 positions of half a pixel are 0.05 pixels, 0.05 samples of four pixels 0.2: the operation's own sigma.
+    # 0.1 positions of half a pixel are 0.05 pixels, 0.05 samples of four pixels are 0.2: the sigma of the operation.
     expected = np.sqrt(operation.covariance_at(np.stack([u, v], -1))[:, 1, 1])
     good = result.status == 0
     np.testing.assert_allclose(sigma.get()[good], expected[good], rtol=64.0 * np.finfo(dtype).eps)

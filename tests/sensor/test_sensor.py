@@ -1,4 +1,4 @@
-"""Sensor files: what they say becomes operations; what they cannot say is refused with key, unit and range."""
+"""Sensor files: operations from files; errors with key, unit and range."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def sensor_of(table: dict[str, Any]) -> Sensor:
 
 
 def changed(name: str, **values: Any) -> dict[str, Any]:
-    """A shipped table with other values; dots in the keys are double underscores, None takes the key away."""
+    """Return a shipped table with changed values; double underscores are dots in the keys, None removes a key."""
     table = copy.deepcopy(TABLES[name])
     for dotted, value in values.items():
         *way, key = dotted.split("__")
@@ -98,7 +98,7 @@ def test_ways_to_say_the_same_triangulation_agree() -> None:
         told = sensor_of(empty | {"triangulation": way}).readout.triangulation
         assert told is not None
         np.testing.assert_allclose(told.to_sensor(points), sensor, rtol=0, atol=1e-6, err_msg=name)
-    # A camera's own coordinates are columns and rows: no axes between them and u, v.
+    # Without [axes], u and v are the columns and rows of the camera.
     posed = changed("camera_line", triangulation=None, axes=None, lens=None) | {
         "triangulation": {
             "focal_length_px": 1600.0,
@@ -198,7 +198,7 @@ def test_what_a_file_cannot_say(name: str, values: dict[str, Any], message: str)
 
 
 def places(table: dict[str, Any], way: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
-    """All tables of a description."""
+    """Yield all tables of a description."""
     inner = [places(value, (*way, key)) for key, value in table.items() if isinstance(value, dict)]
     return [way, *(each for found in inner for each in found)]
 

@@ -19,7 +19,7 @@ PATHS = ("direct", "diffuse-diffuse")
 
 
 def corner(moved: float = 0.0) -> Scene:
-    """A floor and a wall across the sheet's end: the line on the floor runs into the wall x = 20 mm."""
+    """Return a floor and a wall across the end of the sheet: the line on the floor ends at the wall x = 20 mm."""
     floor = np.array([[-0.1, -0.1, 0.0], [0.02, -0.1, 0.0], [0.02, 0.1, 0.0], [-0.1, 0.1, 0.0]])
     wall = np.array([[0.02, -0.1, 0.0], [0.02, 0.1, 0.0], [0.02, 0.1, 0.05], [0.02, -0.1, 0.05]])
     corners = np.concatenate([floor, wall])
@@ -28,7 +28,7 @@ def corner(moved: float = 0.0) -> Scene:
 
 
 def trough(facets: int) -> Scene:
-    """A floor bent upwards to both sides, along y: all of it faces all of it, and is lit facet by facet."""
+    """Return a floor along y, bent upwards on both sides: all facets face each other, and each is lit."""
     x = np.linspace(-0.03, 0.03, facets + 1)
     edge = np.column_stack([x, np.full_like(x, 0.1), x * x / 0.1])
     a, b = edge * [1.0, -1.0, 1.0], edge
@@ -44,7 +44,7 @@ def paths(scene, device, **more):
 
 
 def glow(places, normal, length, power, x0):
-    """Irradiance from a line on the floor, from x0 - length to x0, y = 0: points of 1 um, in double."""
+    """Return the irradiance by a line on the floor, x0 - length to x0, y = 0: points every 1 um, in double."""
     t = x0 - (np.arange(round(length / 1e-6)) + 0.5) * 1e-6
     line = np.stack([t, np.zeros_like(t), np.zeros_like(t)], axis=-1)
     got = []
@@ -66,7 +66,7 @@ def test_a_wall_glows_as_the_line_before_it_says(device):
     chosen = wall[:: max(len(wall) // 8, 1)]
     at = tuple(chosen.T)
     expected = glow(seen.receivers[at][:, :3], np.array([-1.0, 0.0, 0.0]), 0.04, 3.0, 0.02)
-    # One node a bin: the power of a bin is its element's.
+    # One node per bin: the power of a bin is the power of its element.
     np.testing.assert_allclose(light.power[at], expected * seen.weights[at], rtol=2e-5)
     floor = np.argwhere(seen.triangle[..., :] < 2)
     assert not light.power[tuple(floor.T)].any()
@@ -85,7 +85,7 @@ def test_light_is_proportional_to_power_and_albedo(device):
     white = Material(diffuse=Lambert(albedo=1.0))
     more = paths(corner(), device, sheet=sheet, materials=[white]).profile(0.0).exposures
     np.testing.assert_allclose(more["direct"].power, 4.0 * one["direct"].power, rtol=1e-12)
-    # Diffused twice.
+    # Two diffuse reflections.
     np.testing.assert_allclose(more["diffuse-diffuse"].power, 8.0 * one["diffuse-diffuse"].power, rtol=1e-5)
 
 
@@ -93,13 +93,13 @@ def test_further_bounces_come_on_top(device):
     model = paths(corner(), device, paths=(*PATHS, "multi-bounce"), patch_size=0.02)
     light = model.profile(0.0).exposures
     first, further = light["diffuse-diffuse"].power.sum(), light["multi-bounce"].power.sum()
-    # The wall throws light back onto the floor, and so on; each bounce loses half and what leaves the corner.
+    # The wall reflects light to the floor, and so on; each bounce loses half, and the light that leaves the corner.
     assert 0.05 * first < further < first
 
 
 def test_nothing_lit_is_dark_and_not_zero(device):
     model = paths(corner(), device)
-    # Far beyond the part: the sheet meets nothing.
+    # Far beyond the part, the sheet intersects no surface.
     profile = model.profile(0.5)
     assert np.isnan(profile.truth.h).all()
     assert (profile.truth.status != 0).all()
@@ -126,7 +126,7 @@ def test_a_tolerance_is_kept(device, tolerance):
 
     lit = exact.exposures["direct"].total() > 0.0
     error = np.abs(place(about) - place(exact))[lit] * slope[lit]
-    # The kernel's rounding on top.
+    # Plus the rounding of the kernel.
     assert error.max() <= about.statistics["bound of pairs left out [m]"] * (1.0 + 1e-6) + 1e-9
     assert about.statistics["bound of pairs left out [m]"] <= tolerance
     assert about.statistics["profiles without clustering (cheaper)"] == 0.0

@@ -39,7 +39,7 @@ def seen() -> View:
 
 @pytest.fixture(scope="module")
 def image(seen: View, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A grid of dots through a lens, as a file."""
+    """Write an image of a grid of dots through a lens."""
     return photographed(seen, tmp_path_factory.mktemp("images") / "grid.png")
 
 
@@ -49,7 +49,7 @@ def done(image: Path) -> Calibration:
 
 
 def photographed(seen: View, path: Path) -> Path:
-    """Photograph 12 x 16 dots through the view's lens, into a file."""
+    """Write an image of 12 x 16 dots through the lens of a view."""
     cover = dots(seen, np.ones((12, 16), bool))
     cv2.imwrite(str(path), photo(cover, np.random.default_rng(3)))
     return path
@@ -85,7 +85,7 @@ def test_commands_make_bent_dots_straight(image: Path, tmp_path: Path) -> None:
     run("calibrate", image, "--out", tmp_path / "lens.toml")
     run("undistort", image, "--lens", tmp_path / "lens.toml", "--out", tmp_path / "straight")
     again = calibrate([tmp_path / "straight" / "grid.png"], model="none")
-    # The pixels were interpolated, which moves a dot's centre by less than a hundredth.
+    # Interpolation of pixels moves a dot's centre by less than 0.01 px.
     assert again.straightness_px[0] < 0.03
 
 
@@ -168,7 +168,7 @@ def test_images_keep_their_type(device: Device, kind: str, channels: int, tmp_pa
     np.testing.assert_array_equal(again, image)
 
 
-# ---- what goes wrong ------------------------------------------------------------------------------------------
+# ---- errors ------------------------------------------------------------------------------------------
 
 
 def test_image_without_a_pattern(image: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The demonstration: a part with a known shape, two simulated sensors, and scans that find the shape again."""
+"""The demonstration: a part with a known shape, two simulated sensors, and scans that recover the shape."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ PROFILES = 72  # the middle of the part: a half of the box, the cylinder and the
 
 @pytest.fixture(scope="module")
 def light(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the tests share: the light of all profiles."""
+    """Common input of the tests: the light of all profiles."""
     return tmp_path_factory.mktemp("light")
 
 
 def away_from_edges(height: Any) -> Any:
-    """Where the truth does not step, for two samples and profiles around; (profiles, samples)."""
+    """Return where the true height has no step within two samples and profiles; (profiles, samples)."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     known = np.nan_to_num(height, nan=1.0)
@@ -49,7 +49,7 @@ def test_a_camera_finds_the_part_again(light: Path) -> None:
     told = simulate(make_scan_task("camera_line", PROFILES), light, seed=7).attribution
     smooth = away_from_edges(told.truth.h) & np.isfinite(told.error)
     assert smooth.sum() > 15_000
-    # 0.03 pixel at 0.24 mm a pixel; a windowed centre of gravity of this line reaches 0.01 to 0.02.
+    # 0.03 pixel at 0.24 mm per pixel; a windowed centre of gravity of this line reaches 0.01 to 0.02.
     assert np.sqrt(np.mean(told.error[smooth] ** 2)) < 0.03 * 0.24e-3
 
 

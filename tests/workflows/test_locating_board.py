@@ -34,7 +34,7 @@ from gpuvision.workflows.locating_robot import default_line_width, floor_points,
 PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0
 FINE, FINE_SHAPE = 25e-6, (480, 640)  # for boards of narrow traces, and few of them
 TOLD = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
-# Of 3 numbers one in 1e5 boards is beyond 4.5 sigmas, were they Gaussian.
+# For three Gaussian numbers, one in 1e5 boards exceeds 4.5 sigmas.
 SIGMAS = 4.5
 
 
@@ -52,7 +52,7 @@ def artwork(folder: Path) -> Artwork:
 def painted(
     artwork: Artwork, place: tuple[float, float], turn: float, pixel: float, shape: tuple[int, int], **more: Any
 ) -> BoardPicture:
-    """Paint a board about where a camera sees it, once for all that look there."""
+    """Render a board around the field of view of a camera, once for all tests with that view."""
     corner = np.array(place) + (np.array(shape[::-1]) - 1) / 2 * pixel * (-1, 1)
     view = View(corner=tuple(corner), pixel=pixel, shape=shape, noise=NOISE, **more)
     return BoardPicture(artwork, view, (0.0, 0.0, -turn), place, margin=16)
@@ -65,7 +65,7 @@ def seen(
     shape: tuple[int, int] = SHAPE,
     **more: Any,
 ) -> np.ndarray:
-    """uint8 image of a camera at a pose: what it sees in its middle, and how its columns are turned."""
+    """Return the uint8 image of a camera at a pose: board point at the image centre, and direction of the columns."""
     place, turn = np.round(np.array(pose[:2]) / 0.5e-3) * 0.5e-3, round(20 * pose[2]) / 20
     picture = painted(artwork, tuple(place.tolist()), turn, pixel, shape, **more)
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
@@ -75,7 +75,7 @@ def seen(
 
 
 def off(located: LocatedBoard, pose: tuple[float, float, float]) -> np.ndarray:
-    """How far a pose is from the true one, in its sigmas."""
+    """Return the error of a pose in units of its sigmas."""
     return (np.array(located.pose) - pose) / located.sigmas
 
 
@@ -95,7 +95,7 @@ def test_a_view_s_places_and_pixels_are_each_other_s() -> None:
 
 def test_noise_is_that_of_the_image(rng: np.random.Generator) -> None:
     steps = np.repeat(np.repeat(rng.uniform(0, 200, (12, 16)), 40, axis=0), 40, axis=1)
-    # The median of 3e5 values is right to 0.2 %; they are not independent, and a tenth of them lie on a step.
+    # The median of 3e5 values is accurate to 0.2 %; they are correlated, and a tenth of them lie on a step.
     assert estimate_pixel_noise(steps + rng.normal(0, 3.0, steps.shape)) == pytest.approx(3.0, rel=0.15)
     assert estimate_pixel_noise(np.zeros((40, 40), np.uint8)) == 0.0
 
@@ -129,7 +129,7 @@ def test_etching_is_solved_for(artwork: Artwork, etch_bias: float) -> None:
         seen(artwork, pose, etch_bias=etch_bias), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0), budget=120
     )
     assert np.abs(off(located, pose)).max() < SIGMAS
-    # Edges are rendered to a hundredth of a pixel, all of them alike, and 40 of them are measured to 0.03.
+    # Edges are rendered to 0.01 px with a common error, and 40 edges are measured to 0.03 px.
     assert np.sum(located.features.spacing == 0) > 20
     assert located.etch_bias == pytest.approx(etch_bias, abs=0.04 * PIXEL)
 
@@ -152,7 +152,7 @@ def test_a_lens_is_undone(artwork: Artwork) -> None:
     at = lens.undistort(np.stack([columns, rows], axis=-1)).astype(np.float32)
     bent = cv2.remap(straight, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     near = (*BOARD_MIDDLE, 0.0)
-    # What the image was sampled from was noisy pixels; cubic interpolation leaves them so to some percent.
+    # The image is resampled from noisy pixels; cubic interpolation preserves the noise to some percent.
     located = locate_board(bent, artwork, scale=PIXEL, initial_pose=near, model=lens)
     assert np.abs(off(located, pose)).max() < SIGMAS + 1.0
     bare = locate_board(bent, artwork, scale=PIXEL, initial_pose=near)
@@ -351,17 +351,17 @@ def test_a_robot_is_located_with_its_twin(
     assert (first.symmetric_twin, second.symmetric_twin) == (1, 0)
     twins = [each.pose for each in (first, second)]
     true = min(twins, key=lambda each: abs(math.remainder(each[2] - pose[2], 2 * math.pi)))
-    # A tenth of a pixel, and what 200 px away makes of it: 80 points, each found to a few tenths.
+    # 0.1 px, and its effect at a distance of 200 px: 80 points, each accurate to a few tenths of a pixel.
     np.testing.assert_allclose(true[:2], pose[:2], atol=0.2 * scale)
     assert math.remainder(true[2] - pose[2], 2 * math.pi) == pytest.approx(0.0, abs=2e-3)
-    # Where it is known about where it is, its twin is not looked at.
+    # With an initial pose the twin is not examined.
     near = locate_robot(points, field, initial_pose=(pose[0] + 0.02, pose[1], pose[2] + 0.05), device=device)
     assert len(near.candidates) == 1
     np.testing.assert_allclose(near.candidates[0].pose[:2], pose[:2], atol=0.2 * scale)
 
 
 def test_floor_points_lie_on_the_lines(rng: np.random.Generator) -> None:
-    """Through a lens, beside a robot that hides the middle: every stripe once along each ray."""
+    """Through a lens, with the robot hiding the middle of the image: every stripe is found once along each ray."""
     field = read_field("robocup_msl")
     pose, scale = (1.0, 3.0, 0.3), 0.02
     image = floor_image(field, pose, scale=scale, shape=(500, 500), line_width=0.125, rng=rng)
@@ -449,7 +449,7 @@ def test_a_lens_file_goes_with_the_command(folder: Path, artwork: Artwork, tmp_p
 
 
 def test_a_mirrored_side_is_seen_from_below(artwork: Artwork) -> None:
-    """The bottom as a camera below sees it: the top's image in a mirror."""
+    """The bottom side in view of a camera below: a mirror image of the top view."""
     pose = (BOARD_MIDDLE[0] + 20e-6, BOARD_MIDDLE[1] + 10e-6, 2e-3)
     below = np.ascontiguousarray(seen(artwork, pose)[:, ::-1])
     located = locate_board(below, replace(artwork, side="bottom"), scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0))

@@ -1,4 +1,4 @@
-"""Locating a camera over boards by round marks, alone and beside rulers."""
+"""Locating a camera over boards by round fiducials, alone and together with rulers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from round_boards import (
 )
 
 NEAR = (*BOARD_MIDDLE, 0.0)
-# Steps of 110 in the open and of 50 under the mask; a pixel's own extent blurs, too.
+# Steps of 110 in the open and of 50 under the mask; the extent of a pixel adds to the blur.
 IMAGING = Imaging(pixel=PIXEL, blur_px=1.04, contrast_bare=110 / NOISE, contrast_masked=50 / NOISE, angle=5.3e-3)
 VIEW = BoardView(scale=PIXEL, shape=SHAPE, pose=NEAR)
 DRAWS = 40
@@ -46,13 +46,13 @@ DRAWS = 40
 
 @pytest.fixture(scope="module")
 def rounds(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
-    """Round lands and fiducials, and not one straight edge."""
+    """Return round pads and fiducials without straight edges."""
     return round_artwork(round_board(tmp_path_factory.mktemp("rounds")))
 
 
 @pytest.fixture(scope="module")
 def mixed(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
-    """Traces, too: some free, and one that ends in a land."""
+    """Return a board that also has traces: some free, and one that ends in a pad."""
     traces = (*TRACES, (*LANDS[5], LANDS[5][0] + 2.5, LANDS[5][1] + 0.5))
     return round_artwork(round_board(tmp_path_factory.mktemp("mixed"), traces=traces))
 
@@ -62,14 +62,14 @@ def located(image: np.ndarray, artwork: Artwork, **more: object) -> LocatedBoard
 
 
 def squares(errors: list[np.ndarray], covariances: list[np.ndarray]) -> float:
-    """Sum of squared errors in units of covariances."""
+    """Return the squared Mahalanobis distance of the errors."""
     return float(sum(e @ np.linalg.inv(c) @ e for e, c in zip(errors, covariances, strict=True)))
 
 
 def agree(total: float, numbers: int) -> bool:
-    """Whether squared errors are as many Gaussian numbers': in all but 2 of 1e4 boards.
+    """Return whether squared errors agree with Gaussian numbers, for all but 2 of 1e4 boards.
 
-    The deviations themselves are within 10 %: marks have 1.0 to 1.2 times the bound's, of which 1.1 is promised.
+    The deviations themselves are within 10 %: fiducials have 1.0 to 1.2 times the bound, and 1.1 is predicted.
     """
     low, high = chi2.ppf([1e-4, 1 - 1e-4], numbers)
     return bool(0.9**2 * low <= total <= 1.1**2 * high)
@@ -77,7 +77,7 @@ def agree(total: float, numbers: int) -> bool:
 
 @pytest.mark.parametrize("board", ["rounds", "mixed"])
 def test_errors_are_as_promised(board: str, device: Device, request: pytest.FixtureRequest) -> None:
-    """Before any image is seen, and with each pose."""
+    """Errors agree with the predictions of the selection and with the covariance of each pose."""
     artwork, rng = request.getfixturevalue(board), np.random.default_rng(5)
     features = select_features_in_view(artwork, VIEW, IMAGING, 40)
     assert len(features.fiducials.radius) == len(LANDS) + len(FIDUCIALS)
@@ -115,9 +115,9 @@ def shifted(artwork: Artwork, which: np.ndarray, by: np.ndarray) -> list[Shape]:
     [("missing", "rounds"), ("apart", "rounds"), ("together", "rounds"), ("far", "rounds"), ("apart", "mixed")],
 )
 def test_bad_marks_do_not_spoil_a_pose(board: str, how: str, device: Device, request: pytest.FixtureRequest) -> None:
-    """Of 16 marks five are missing, or moved: each its own way, all of them alike, or beyond what is searched.
+    """Five of 16 fiducials are missing or displaced: individually, all equally, or beyond the search range.
 
-    One of the two fiducials is among them; one of them says more than half of all the others.
+    One of the two uncovered fiducials is among them; it has more information than half of all others.
     """
     artwork, rng = request.getfixturevalue(board), np.random.default_rng(11)
     first = len(artwork.copper) - len(LANDS) - len(FIDUCIALS)
@@ -145,7 +145,7 @@ def test_bad_marks_do_not_spoil_a_pose(board: str, how: str, device: Device, req
 
 
 def test_fiducials_that_agree_with_nothing_are_no_pose(rounds: Artwork, device: Device) -> None:
-    """Two fiducials in the open say more than a few lands under the mask; moved together they are not believed."""
+    """Two uncovered fiducials outweigh a few pads under the mask; displaced together they are rejected."""
     both = np.arange(len(LANDS), len(LANDS) + len(FIDUCIALS))
     board = replace(rounds, copper=tuple(shifted(rounds, both, np.tile([50e-6, -40e-6], (len(both), 1)))))
     picture, rng = round_picture(board), np.random.default_rng(12)
@@ -158,14 +158,14 @@ def test_fiducials_that_agree_with_nothing_are_no_pose(rounds: Artwork, device: 
 
 
 def test_a_board_of_marks_is_not_searched(rounds: Artwork) -> None:
-    """The search looks at straight edges, of which there are none: it says what to do."""
+    """The search needs straight edges; without straight edges the message names the remedy."""
     image, _ = moved_picture(round_picture(rounds), np.random.default_rng(13))
     found = locate_board(image, rounds, scale=PIXEL)
     assert "too few straight edges are in view; give an initial pose" in found.reason
 
 
 def test_two_marks_are_too_few(tmp_path: Path) -> None:
-    """Nothing would check them."""
+    """Two fiducials leave no redundancy."""
     artwork = round_artwork(round_board(tmp_path, pads=((6, 6), (14, 10)), fiducials=()))
     with pytest.raises(ValueError, match=r"0 edges .* and 2 round pads can serve as fiducials, expected 3"):
         located(np.zeros(SHAPE, np.uint8), artwork)
@@ -195,7 +195,7 @@ def test_marks_are_seen_through_a_lens(rounds: Artwork) -> None:
         straight.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
     )
     found = located(image, rounds, model=lens)
-    # What the image was sampled from was noisy pixels; cubic interpolation leaves them so to some percent.
+    # The image is resampled from noisy pixels; cubic interpolation preserves the noise to some percent.
     assert np.abs((np.array(found.pose) - true) / found.sigmas).max() < 4.5 + 1.0
     assert found.fiducials.used.sum() == len(LANDS) + len(FIDUCIALS)
     # 2e-7 px^-2 moves the outer marks by a pixel.
@@ -214,7 +214,7 @@ def test_a_mirrored_side_is_seen_from_below(rounds: Artwork) -> None:
 
 
 def test_marks_are_chosen_for_their_cost(mixed: Artwork, tmp_path: Path) -> None:
-    """A mark costs 16 rulers; fiducials in the open are worth it, and more is promised than by rulers."""
+    """A fiducial costs 16 rulers; uncovered fiducials are selected, and the predicted pose is better than by rulers."""
     region = ((2.5e-3, 2.5e-3), (17e-3, 13.9e-3))
     features = choose_features(mixed, region, IMAGING, budget=80)
     fiducials = len(features.fiducials.radius)

@@ -1,4 +1,4 @@
-"""Robots on fields, and pictures that are none: found with clutter and with robots in the way, refused otherwise."""
+"""Robots on fields: found with clutter and occluding robots; images without a field are refused."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def carpet(rng: np.random.Generator) -> Image:
 
 
 def spotted(image: Image, count: int, rng: np.random.Generator) -> Image:
-    """White things on the floor, 5 to 30 cm."""
+    """Return an image with white objects of 5 to 30 cm on the floor."""
     image = image.copy()
     for _ in range(count):
         (x, y), size = rng.uniform(0, SHAPE[::-1]), rng.uniform(1.5, 3.5)
@@ -49,7 +49,7 @@ def spotted(image: Image, count: int, rng: np.random.Generator) -> Image:
 
 
 def hidden(image: Image, share: float, rng: np.random.Generator) -> Image:
-    """Five robots stand in the way of a share of all directions."""
+    """Return an image in which five robots occlude a share of all directions."""
     image, middle = image.copy(), np.array(SHAPE[::-1]) / 2
     for first in rng.uniform(0.0, 2.0 * math.pi, 5):
         turn = first + np.linspace(0.0, 2.0 * math.pi * share / 5.0, 6)
@@ -94,7 +94,7 @@ NO_FIELDS: dict[str, Callable[[np.random.Generator], Image]] = {
 
 
 def right(found: np.ndarray, pose: tuple[float, float, float]) -> bool:
-    """Whether a pose, or its twin, is within 10 cm of what it should be."""
+    """Return whether a pose or its twin is within 10 cm of the true pose."""
     return bool(min(np.hypot(found[0] - s * pose[0], found[1] - s * pose[1]) for s in (1, -1)) < 0.1)
 
 
@@ -111,7 +111,7 @@ def test_what_is_no_field_is_refused(kind: str, rng: np.random.Generator) -> Non
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(NO_FIELDS))
 def test_of_many_that_are_no_field_all_are_refused(kind: str, rng: np.random.Generator) -> None:
-    """All that have no lines; tiles and lines are fields of another kind, and a view of a few may fit this one, too."""
+    """All images without lines are refused; views of few tiles or random lines may fit the field."""
     field = read_field("robocup_msl")
     scans = (scan_floor(NO_FIELDS[kind](rng), scale=SCALE, line_width=WIDE) for _ in range(35))
     refused = sum(bool(locate_robot(scan, field).reason) for scan in scans)
@@ -120,7 +120,7 @@ def test_of_many_that_are_no_field_all_are_refused(kind: str, rng: np.random.Gen
 
 @pytest.mark.slow
 def test_of_many_fields_nearly_all_are_found(rng: np.random.Generator) -> None:
-    """With up to 80 things on the floor; where the image shows few lines another place may look like it."""
+    """With up to 80 objects on the floor; if the image shows few lines, another place may match."""
     field = read_field("robocup_msl")
     found = []
     for number in range(150):
@@ -133,7 +133,7 @@ def test_of_many_fields_nearly_all_are_found(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize(("spots", "share"), [(0, 0.0), (60, 0.0), (0, 0.2), (20, 0.1)])
 def test_fields_are_found(spots: int, share: float, device: Device, rng: np.random.Generator) -> None:
-    """With things on the floor, and robots in the way."""
+    """With objects on the floor, and occluding robots."""
     field = read_field("robocup_msl")
     for pose in ((-6.0, 2.0, 0.7), (3.0, -1.5, -2.0), (0.5, 4.0, 1.2)):
         image = hidden(spotted(seen_from(field, pose, rng), spots, rng), share, rng)
@@ -148,19 +148,19 @@ def test_fields_are_found(spots: int, share: float, device: Device, rng: np.rand
 
 
 def test_another_field_is_refused(device: Device, rng: np.random.Generator) -> None:
-    """Its lines do not fit, and lines are missing: not even a field of the same shape, a third larger."""
+    """Another field is refused, because lines do not fit or are missing; also the same field, a third larger."""
     field, pose = read_field("robocup_msl"), (-6.0, 2.0, 0.7)
     image = seen_from(grown(field, 1.33), pose, rng)
     located = locate_robot(scan_floor(image, scale=SCALE, line_width=WIDE, device=device), field, device=device)
     assert "the image does not match this field" in located.reason
     assert len(located.doubtful) == 1
-    # At the scale that makes up for that it is this field.
+    # At a scale that compensates the size it is the same field.
     scan = scan_floor(image, scale=SCALE / 1.33, line_width=WIDE / 1.33, device=device)
     assert right(locate_robot(scan, field, device=device).candidates[0].pose, (-6.0 / 1.33, 2.0 / 1.33, 0.7))
 
 
 def test_every_stripe_along_a_ray_is_found(rng: np.random.Generator) -> None:
-    """From the robot's own place to the image's border: between them no line is lost."""
+    """From the position of the robot to the image border, no line is lost."""
     field = read_field("robocup_msl")
     for pose in ((2.08, -0.31, -0.83), (-8.95, -2.24, 1.98), (-4.59, -0.4, -1.32)):
         scan = scan_floor(seen_from(field, pose, rng), scale=SCALE, line_width=WIDE)
@@ -172,7 +172,7 @@ def test_every_stripe_along_a_ray_is_found(rng: np.random.Generator) -> None:
 
 
 def test_one_line_tells_a_part(device: Device, rng: np.random.Generator) -> None:
-    """A robot that sees one line only: candidates along it, flagged, are no refusal."""
+    """With a single line in view, the result is flagged candidates along the line, not a refusal."""
     field = Field(length=22.0, width=14.0, lines=((-11.0, 0.0, 11.0, 0.0),))
     image = seen_from(field, (1.0, 2.0, 0.4), rng)
     located = locate_robot(scan_floor(image, scale=SCALE, line_width=WIDE, device=device), field, device=device)
@@ -183,7 +183,7 @@ def test_one_line_tells_a_part(device: Device, rng: np.random.Generator) -> None
 
 
 def test_random_points_are_refused(rng: np.random.Generator) -> None:
-    """Points of another camera: no scan lines are known, and chance alone decides."""
+    """Points from another camera have no scan lines: only the test against chance applies."""
     field = read_field("robocup_msl")
     for count in (4, 8, 30, 200, 1000):
         for _ in range(6):

@@ -1,4 +1,4 @@
-"""Recordings become range images, files and a report; bad input becomes a line, and nothing half-written."""
+"""Scans: range images, files and report from recordings; one-line errors, and no partial output."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ FILES = {
 }
 
 
-# ---- what comes out -------------------------------------------------------------------------------------------------
+# ---- output -------------------------------------------------------------------------------------------------
 
 
 def test_a_plane_before_psd_strips(device: Device) -> None:
     done = scan(currents(20), Sensor.load("psd_line"), device=device)
     assert done.valid_fraction == 1.0
-    # A code is 50 pA of 1 uA, the position is off by 6 mm / 2e4 / 4 at most, and dH/du is about 9 at this setup.
+    # A code is 50 pA of 1 uA: the position error is at most 6 mm / 2e4 / 4, and dH/du is about 9 in this setup.
     np.testing.assert_allclose(done.points.z, 2e-3, rtol=0, atol=6e-3 / 2e4 / 4 * 10)
     np.testing.assert_allclose(done.points.y, np.broadcast_to(0.25e-3 * np.arange(20)[:, None], (20, 96)), atol=1e-9)
     assert np.all(np.diff(done.points.x, axis=1) > 0)
@@ -61,7 +61,7 @@ def test_a_tilted_line_before_a_camera(device: Device) -> None:
     lifted = straight @ np.array(sheet.homography)[:, :2].T + np.array(sheet.homography)[:, 2]
     expected = lifted[..., 1] / lifted[..., 2]
     assert done.valid_fraction == 1.0
-    # Grey levels are rounded and the threshold cuts the tails: 0.03 pixel, at 0.24 mm a pixel.
+    # Grey levels are rounded and the threshold cuts the tails: 0.03 pixel, at 0.24 mm per pixel.
     np.testing.assert_allclose(done.points.z, expected, rtol=0, atol=0.03 * 0.24e-3)
     assert np.all(done.intensity >= 180)
 
@@ -95,7 +95,7 @@ def test_currents_that_are_no_numbers_are_flagged(device: Device) -> None:
 
 
 def two_lines() -> Any:
-    """A line at row 40, and in columns 100 to 149 a second one of nearly the same strength."""
+    """Return frames with a line at row 40, and in columns 100 to 149 a second line of nearly the same strength."""
     frames = line_frames(np.full((6, 480), 40.0))
     frames[:, :, 100:150] += line_frames(np.full((6, 50), 12.0), peak=190.0)
     return frames
@@ -274,7 +274,7 @@ def test_a_bad_recording_is_a_line_and_leaves_nothing(make: Any, message: str, t
 
 
 def test_the_decoder_of_videos_keeps_quiet(tmp_path: Path) -> None:
-    """Everything on stderr is one line, what the libraries below write there included."""
+    """Standard error contains exactly one line, including output of the video libraries."""
     whole = video(tmp_path / "whole.mp4", two_lines().repeat(8, 0), "mp4v")
     cut = tmp_path / "cut.mp4"
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
@@ -347,9 +347,9 @@ def corner() -> Scan:
     return scan(recording, Sensor.load("corner_scene"))
 
 
-# Which surface the light meets is read off scan.png; where the surfaces stand was found by a fit of the whole scene in
-# which sphere and cylinder took no part. A pixel is z^2/(b f) of depth: 57 mm at the wall, 27 mm at the large box. The
-# line is held to 0.063 pixel rms by that fit; a tenth of a pixel is what a plane may show.
+# The surface of each region was read from scan.png; the positions of the surfaces follow from a fit of the whole scene
+# without sphere and cylinder. A pixel is z^2/(b f) of depth: 57 mm at the wall, 27 mm at the large box. That fit has a
+# residual of 0.063 pixel rms; 0.1 pixel is granted for a plane.
 PLANES = {
     "wall": ((slice(64, 118), slice(200, 480)), "z", 0.0, 5.7e-3),
     "large box": ((slice(32, 80), slice(1140, 1560)), "z", 1.104, 2.7e-3),
@@ -370,7 +370,7 @@ def test_planes_of_the_corner_scene(corner: Scan, name: str) -> None:
 
 
 def sphere_of(x: Any, y: Any, z: Any) -> tuple[Any, float]:
-    """Centre and radius by linear least squares."""
+    """Return centre and radius by linear least squares."""
     A = np.column_stack([2 * x, 2 * y, 2 * z, np.ones_like(x)])
     (a, b, c, d), *_ = np.linalg.lstsq(A, x**2 + y**2 + z**2, rcond=None)
     return np.array([a, b, c]), float(np.sqrt(d + a * a + b * b + c * c))
@@ -378,7 +378,7 @@ def sphere_of(x: Any, y: Any, z: Any) -> tuple[Any, float]:
 
 @pytest.mark.realdata
 def test_sphere_and_cylinder_of_the_corner_scene(corner: Scan) -> None:
-    """Their outlines in the image say 0.224 and 0.137 m; the depths that were scanned say the same within 4 %."""
+    """The outlines in the image give radii of 0.224 and 0.137 m; the scanned depths agree within 4 %."""
     x, y, z = (each[70:98, 560:800].astype(np.float64) for each in corner.points[:3])
     on = np.isfinite(z) & (np.hypot(x - 0.232, y - 1.071) < 0.19) & (z > 0.55)
     assert np.count_nonzero(on) > 3000
@@ -395,7 +395,7 @@ def test_sphere_and_cylinder_of_the_corner_scene(corner: Scan) -> None:
 
 
 def runs_of(row: Any, threshold: int) -> list[tuple[int, int]]:
-    """First and last sample of each run over the threshold."""
+    """Return the first and last sample of each run over the threshold."""
     lit = np.flatnonzero(row > threshold)
     breaks = np.flatnonzero(np.diff(lit) > 1)
     return list(zip(lit[np.r_[0, breaks + 1]], lit[np.r_[breaks, len(lit) - 1]], strict=True)) if len(lit) else []
@@ -427,7 +427,7 @@ def test_rows_without_a_clear_line_are_flagged_not_invented(corner: Scan, data: 
 
 @pytest.mark.realdata
 def test_nothing_hangs_in_the_air_before_the_back_wall(corner: Scan) -> None:
-    """Between objects there is the wall, a hole, or a flag; a line that is half covered is off by a pixel at most."""
+    """Between objects: points of the wall, holes, or flags; a half covered line is off by at most one pixel."""
     x, y, z = (np.where(np.isfinite(corner.points.z), each, 9.0) for each in corner.points[:3])
     between = (x > 0.5) & (x < 0.95) & (y > 0.8) & (y < 1.9)
     assert np.count_nonzero(between) > 10_000

@@ -1,4 +1,4 @@
-"""Where a scan is written: known to be possible before it is run, and one line where it is not."""
+"""Output folder of a scan: checked before the scan, with a one-line error."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def plane(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def shut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder in which none can be made, whoever asks; rights would not stop every user."""
+    """Return a folder in which no user, including root, can create folders."""
     folder = tmp_path / "shut"
     folder.mkdir()
     make = Path.mkdir
@@ -61,7 +61,7 @@ def test_a_folder_in_the_way_of_a_file_is_named_and_nothing_is_written(
 
 
 def test_a_folder_that_is_there_needs_nothing_of_the_one_above(shut: Path) -> None:
-    """A mounted folder is on another file system than the one above it, which may belong to somebody else."""
+    """A mounted folder is on another file system than its parent, which may be read-only."""
     out = shut / "out"
     os.mkdir(out)
     with atomic_folder(out) as inside:
@@ -71,7 +71,7 @@ def test_a_folder_that_is_there_needs_nothing_of_the_one_above(shut: Path) -> No
 
 
 def test_what_cannot_be_written_is_known_before_the_scan(plane: Path, shut: Path, tmp_path: Path, run: Any) -> None:
-    plane.write_bytes(b"")  # reading it would be the first thing that fails
+    plane.write_bytes(b"")  # reading it would fail first
     before = all_of(tmp_path)
     for args, message in (
         (("--out", shut / "deep" / "out"), rf"cannot write into {shut / 'deep' / 'out'}: {shut}: Permission denied"),

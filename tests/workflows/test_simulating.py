@@ -1,4 +1,4 @@
-"""A part and a sensor become readings, errors and causes; what was stopped goes on."""
+"""Simulation of a part and a sensor: readings, errors, causes; interrupted runs continue."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MM = 1e-3
 
 
 def mesh() -> trimesh.Trimesh:
-    """A plate with a block on it: beside the block the plate glows."""
+    """Return a plate with a block on it; the block reflects secondary light to the plate."""
     plate = trimesh.creation.box((40 * MM, 20 * MM, 2 * MM))
     plate.apply_translation((0, 0, -1 * MM))
     block = trimesh.creation.box((10 * MM, 8 * MM, 5 * MM))
@@ -52,7 +52,7 @@ def task_of(part_file: Path, sensor: str = "psd_line", **more: Any) -> Any:
 
 def test_a_part_is_scanned_from_end_to_end(part_file: Path) -> None:
     task = task_of(part_file, profiles=None)
-    # 20 mm of the plate at 0.25 mm a profile; those that touch its ends are none.
+    # 20 mm of the plate at 0.25 mm a profile; profiles that only touch its ends do not count.
     assert len(task.transports) == 79
     np.testing.assert_allclose(task.transports[[0, -1]], [-9.75 * MM, 9.75 * MM], atol=1e-12)
 
@@ -63,7 +63,7 @@ def test_what_is_read_is_told_apart_by_cause(part_file: Path, tmp_path: Path) ->
     assert attribution.error.shape == (40, 96)
     total = np.sum(list(attribution.causes.values()), axis=0)
     np.testing.assert_allclose(total, attribution.error, atol=1e-12)
-    # Before the lit block's wall the plate's reading is pulled up by the glow, on the side that the lens sees.
+    # Secondary light of the block's wall raises the reading of the plate on the side in view of the lens.
     flat = np.abs(attribution.truth.h) < 1e-9
     assert np.nanmax(np.abs(attribution.causes["secondary"][flat])) > 20e-6
     away = flat & (np.abs(attribution.truth.g + 15 * MM) < 2 * MM)
@@ -261,7 +261,7 @@ def test_a_second_sensor_sees_what_is_hidden_from_the_first(
     report = json.loads((tmp_path / "both" / "report.json").read_text())
     ranked = {each["name"]: each["failed_fraction"] for each in report["ranking"]}
     assert report["ranking"][0]["name"] == "both"
-    # Behind the block each one alone misses as much as the other.
+    # Behind the block, both single sensors miss the same number of samples.
     assert ranked["both"] < 0.5 * min(ranked["first"], ranked["second"])
     assert (tmp_path / "second" / "errors.png").stat().st_size > 1000
 

@@ -1,5 +1,4 @@
-"""ClusteredIrradiance: what the cut leaves is computed, and readings keep the tolerance, with everything in the
-way."""
+"""ClusteredIrradiance: the pairs of the cut are computed, and readings keep the tolerance, with occlusion."""
 
 from __future__ import annotations
 
@@ -20,7 +19,7 @@ from sensor_views import sensor_view
 
 
 def boxes(rng: np.random.Generator, count: int) -> Any:
-    """Boxes on a board: triangles; and lit lines over all of it along y = 0, on the tops and on the board."""
+    """Return the triangles of boxes on a board, and lit lines along y = 0 on the tops and on the board."""
     low = np.column_stack([np.linspace(-0.09, 0.08, count), np.full((count, 2), [-0.01, 0.0])])
     high = low + np.column_stack([np.full(count, 0.008), np.full(count, 0.02), rng.uniform(0.002, 0.012, count)])
     corner = np.stack([np.where(np.array(bits), high, low) for bits in np.ndindex(2, 2, 2)], axis=1)
@@ -35,7 +34,7 @@ def boxes(rng: np.random.Generator, count: int) -> Any:
 
 
 def strips(triangles: Any, count: int, each: int) -> Any:
-    """Receivers on the boxes' sides that look along x, and on the board, by strips."""
+    """Return receivers by strips, on the sides of the boxes that face along x, and on the board."""
     rng = np.random.default_rng(1)
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -66,7 +65,7 @@ def test_readings_keep_the_tolerance(device: Device, tolerance: float) -> None:
         receivers, np.zeros_like(weights), segments, device=device
     ).irradiance
     shift = [reference.mean_position(direct, 0.005 * direct, weights, light) for light in (ours.irradiance, exact)]
-    # The kernel's own rounding on top.
+    # Plus the rounding of the kernel.
     assert np.all(np.abs(shift[0] - shift[1]) <= ours.cut.bound + 1e-9)
     assert np.all(ours.cut.bound <= tolerance)
     if tolerance == 0.0:
@@ -85,9 +84,9 @@ def test_pairs_that_are_left_out_are_dark(device: Device) -> None:
 
 
 def groove(strips: int, each: int, segments: int) -> Any:
-    """A groove of 90 degrees: triangles, lit segments along its line y = 0, receivers on both sides, their reading.
+    """Return a groove of 90 degrees: triangles, lit segments along y = 0, receivers on both sides, their reading.
 
-    Half of the pairs face each other: those of two sides.
+    Half of the pairs face each other: the pairs with segment and receiver on different sides.
     """
     a, b, c, d, e, f = ([x, y, abs(x)] for y in (-0.05, 0.05) for x in (-0.12, 0.0, 0.12))
     x = np.linspace(-0.1, 0.1, segments + 1)
@@ -112,7 +111,7 @@ def test_where_clustering_costs_more_all_pairs_are_computed(device: Device) -> N
     ).irradiance
     light = ClusteredIrradiance(scene=scene, tolerance=1e-4, device=device)
     ours = light(segments, receivers, weights, reading)
-    # Rows without exitance behind the last segment add nothing at all.
+    # Rows without exitance after the last segment do not contribute.
     np.testing.assert_array_equal(ours.irradiance, exact)
     np.testing.assert_array_equal(light.compute_all(segments, receivers), exact)
     report = ours.cut.report()
@@ -120,11 +119,11 @@ def test_where_clustering_costs_more_all_pairs_are_computed(device: Device) -> N
     assert report["has pairs"]
     assert report["bound"] == report["left out"] == report["clustered"] == 0
     assert report["exact"] == report["work"] == report["pairs"] == receivers[..., 0].size * len(segments)
-    # What the cut says is what was computed.
+    # The report of the cut agrees with the computed pairs.
     rows, starts, selected = ours.cut.padded_tables(np.float64)
     selected_of = OccludedIrradiance(scene=scene, segments=len(rows), selected=len(selected), precision="single")
     by_cut = selected_of(receivers, np.zeros_like(weights), rows, starts, selected, device=device).irradiance
-    # The same sums in another order.
+    # The same sums in a different order.
     np.testing.assert_allclose(by_cut, exact, rtol=2e-5, atol=1e-6 * exact.max())
 
 
@@ -142,7 +141,7 @@ def test_what_faces_each_other_decides_whether_there_is_a_plan(device: Device) -
     assert [each.cut.traversed for each in results] == [True, False]
     assert results[0].cut.counts["work"] < pairs // 2
     shift = [reference.mean_position(reading.power, reading.moment, weights, each.irradiance) for each in results]
-    # Both ways agree to the bound; the kernel's own rounding on top.
+    # Both computations agree within the bound plus the rounding of the kernel.
     assert np.all(np.abs(shift[0] - shift[1]) <= results[0].cut.bound + 1e-9)
     assert np.all(results[0].cut.bound <= 1e-4)
     nothing = ClusteredIrradiance(scene=scene, tolerance=0.0, min_facing_pairs=gain, device=device)
@@ -161,7 +160,7 @@ def test_few_pairs_face_each_other_on_a_board() -> None:
     )
     expected = int(np.count_nonzero(faces[:100]))
     weights[2:] = 0.0
-    # Of 100 receivers and 23 segments each is looked at.
+    # The sample contains all of 100 receivers and 23 segments.
     assert estimate_facing_pairs(segments, receivers, weights) == expected
     assert 0 < expected < faces[:100].size // 4
 
@@ -169,7 +168,7 @@ def test_few_pairs_face_each_other_on_a_board() -> None:
 def test_facing_pairs_are_estimated_where_there_are_many() -> None:
     _, segments, receivers, weights, _ = groove(40, 40, 200)
     pairs = receivers[..., 0].size * len(segments)
-    # Half of them, and each side's receivers and segments are counted to one.
+    # Half of the pairs; the counts of receivers and segments of each side are exact to one.
     assert abs(estimate_facing_pairs(segments, receivers, weights) - pairs / 2) <= pairs * (1 / 127 + 1 / 61)
 
 

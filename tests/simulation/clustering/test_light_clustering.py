@@ -1,5 +1,4 @@
-"""LightClustering: bounds hold, always; the tolerance is kept; work falls with it; nothing hidden is taken for
-clear."""
+"""LightClustering: validity of the bounds, tolerance, amount of work, and conservative occlusion."""
 
 from __future__ import annotations
 
@@ -36,7 +35,7 @@ def random_segments(rng: np.random.Generator, count: int, *, spread: float = 0.1
 
 
 def random_strips(rng: np.random.Generator, count: int = COUNT) -> Any:
-    """Strips along lines, the normals of each much alike."""
+    """Return strips along lines; the normals within a strip are similar."""
     place = rng.normal(size=(STRIPS, 1, 3)) * [0.1, 0.1, 0.03]
     place = place + np.linspace(-0.05, 0.05, count)[:, None] * rng.normal(size=(STRIPS, 1, 3))
     normal = rng.normal(size=(STRIPS, 1, 3)) + rng.uniform(0.0, 0.3) * rng.normal(size=(STRIPS, count, 3))
@@ -59,7 +58,7 @@ def selected_of(cut: LightCut, block: int) -> Any:
 
 
 def by_cut(cut: LightCut, receivers: NDArray[Any], triangles: Any = None) -> Any:
-    """Irradiance (strips, n) from what each block is to get."""
+    """Return the irradiance (strips, n) by the selected segments of each block."""
     strips, count, _ = receivers.shape
     irradiance = np.zeros((strips, count))
     of_strip = -(-count // BLOCK)
@@ -107,7 +106,7 @@ def test_bounds_hold(device: Device, variant: Any, rng: Any, exponent: float, co
 @given(rng=PLACES, count=st.integers(2, 24), distance=st.floats(1.2, 20.0), turned=st.floats(0.0, 0.7))
 @ANYWHERE
 def test_a_cluster_is_off_by_its_bound_at_most(rng: Any, count: int, distance: float, turned: float) -> None:
-    """Wherever all of it faces a receiver that faces all of it."""
+    """The error of a cluster is within its bound wherever cluster and receiver face each other completely."""
     segments = random_segments(rng, count, spread=0.02, length=0.01)
     along = segments[:, 3:6] - segments[:, :3]
     normal = np.array([0.0, 0.0, 1.0]) + turned * rng.uniform(-1.0, 1.0, (count, 3))
@@ -157,7 +156,7 @@ def test_tolerance_zero_leaves_out_nothing_that_shines(device: Device, variant: 
 
 
 def valley(count: int, strips: int, each: int) -> tuple[Any, Any, Any, StripErrorModel]:
-    """A lit line into a groove of 90 degrees and out of it, and strips across."""
+    """Return a lit line into and out of a groove of 90 degrees, and strips across it."""
     x = np.linspace(-0.1, 0.1, count + 1)
     ends = np.zeros((count, 2, 3))
     ends[:, 0, 0], ends[:, 1, 0] = x[:-1], x[1:]
@@ -176,7 +175,7 @@ def valley(count: int, strips: int, each: int) -> tuple[Any, Any, Any, StripErro
 
 
 def planes(*, wall: bool = False) -> Scene:
-    """The groove as four triangles, and a wall that stands in it."""
+    """Return the groove as four triangles, and a wall in it."""
     a, b, c, d, e, f = ([x, y, abs(x)] for y in (-0.05, 0.05) for x in (-0.12, 0.0, 0.12))
     corners = [[a, b, e], [a, e, d], [b, c, f], [b, f, e]]
     if wall:
@@ -203,7 +202,7 @@ def test_work_falls_as_the_tolerance_rises(device: Device, variant: Any) -> None
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("with_scene", [False, True])
 def test_bounds_hold_far_from_the_origin(device: Device, dtype: Any, with_scene: bool) -> None:
-    """Places are rounded about the middle of what there is; micrometres stand beside metres."""
+    """Positions are rounded relative to the centre of the scene: details of micrometres in a scene of metres."""
     rng = np.random.default_rng(8)
     segments, receivers, weights, reading = (
         random_segments(rng, 20),
@@ -214,7 +213,7 @@ def test_bounds_hold_far_from_the_origin(device: Device, dtype: Any, with_scene:
     segments[:10, 3:6] = segments[:10, :3] + 1e-3 * (segments[:10, 3:6] - segments[:10, :3])
     segments[:, :6] += 7.0
     receivers[..., :3] += 7.0
-    # Far below all: it hides nothing.
+    # Far below the scene: it does not occlude.
     scene = Scene(np.array([[[0.0, 0.0, 0.0], [14.0, 0.0, 0.0], [14.0, 14.0, 0.0]]])) if with_scene else None
     given = receivers.astype(dtype)
     cut = LightClustering(tolerance=1e-8, scene=scene)(segments, given, weights, reading, device=device)
@@ -225,7 +224,7 @@ def test_bounds_hold_far_from_the_origin(device: Device, dtype: Any, with_scene:
 
 @TWO_WAYS
 def test_nothing_hides_in_an_empty_groove(device: Device, variant: Any) -> None:
-    """Its own walls stand in the hulls, but between no receiver and no lit line."""
+    """The walls of the groove are within the hulls, but never between a receiver and a lit line."""
     segments, receivers, weights, reading = valley(32, 4, 32)
     clustering = LightClustering(tolerance=0.0, scene=planes(), variant=variant)
     cut = clustering(segments, receivers, weights, reading, device=device)
@@ -233,7 +232,7 @@ def test_nothing_hides_in_an_empty_groove(device: Device, variant: Any) -> None:
 
 
 def pyramids(rng: np.random.Generator, count: int) -> Any:
-    """Triangles of pyramids on the floor z = 0."""
+    """Return the triangles of pyramids on the floor z = 0."""
     base = rng.uniform(-0.1, 0.1, (count, 1, 3)) * [1.0, 1.0, 0.0]
     turn = rng.uniform(0.0, np.pi, (count, 1)) + np.array([0.0, 2.1, 4.2])
     feet = base + 0.03 * np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=2)
@@ -242,7 +241,7 @@ def pyramids(rng: np.random.Generator, count: int) -> Any:
 
 
 def on_triangles(rng: np.random.Generator, triangles: Any, count: int) -> tuple[Any, Any]:
-    """Places on triangles, near each other by pairs, and normals upwards."""
+    """Return points on triangles, in pairs close to each other, and upward normals."""
     number = rng.integers(len(triangles), size=count)
     weights = rng.dirichlet([1.0, 1.0, 1.0], size=(count, 2)) * 0.9 + 1.0 / 30.0
     corners = triangles[number]

@@ -1,4 +1,4 @@
-"""Causes of errors from the mesh on: steps of reflectivity, blades that hide a beam, and steps of the surface."""
+"""Causes of errors, simulated from meshes: reflectivity steps, blades that occlude a beam, surface steps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gpuvision.simulation.transport.illumination import LightSheet
 from lights import psd, psd_view
 
 SIGMA = 5e-5
-# The lens stands 80 mm beside the sheet and 150 mm above.
+# The lens is 80 mm beside the sheet and 150 mm above the plane.
 TAN = 0.08 / 0.15
 WIDE = 0.05
 
@@ -30,7 +30,7 @@ def flat(y0: float, y1: float, z: float = 0.0) -> list[list[tuple[float, float, 
 
 
 def found(scene: Scene, albedos: list[float], slabs, device: Device) -> ErrorAttribution:
-    """Explain what strips read of a thick sheet at y = 0."""
+    """Attribute the errors of PSD strips with a thick sheet at y = 0."""
     view = psd_view(240)
     light = DirectLight(
         view=view,
@@ -46,7 +46,7 @@ def found(scene: Scene, albedos: list[float], slabs, device: Device) -> ErrorAtt
 
 
 def test_reflectivity_step(device: Device) -> None:
-    """The error is sigma (k - 1) phi(x) / (Phi(x) + k (1 - Phi(x))) over tan(theta), and reflectivity's alone."""
+    """The error is sigma (k - 1) phi(x) / (Phi(x) + k (1 - Phi(x))) over tan(theta), by reflectivity only."""
     x, k = 0.6, 5.0
     edge = x * SIGMA
     scene = Scene(corners=np.array(flat(-0.01, edge) + flat(edge, 0.01)), material=np.array([0, 0, 1, 1], np.int32))
@@ -57,12 +57,12 @@ def test_reflectivity_step(device: Device) -> None:
     np.testing.assert_allclose(np.abs(told.error), shift / TAN, rtol=2e-3)
     np.testing.assert_allclose(told.causes["reflectivity"], told.error, rtol=5e-3)
     np.testing.assert_allclose(told.causes["occlusion"], 0.0, atol=1e-9)
-    # Strips average over a line that is straight: what is left is perspective.
+    # Strips average over a straight line: only perspective remains.
     np.testing.assert_allclose(told.causes["shape"], 0.0, atol=3e-3 * shift)
 
 
 def test_blade_before_the_lens(device: Device) -> None:
-    """A blade that hides the beam up to x sigma from the lens: occlusion, sigma phi(x) / (1 - Phi(x)) over tan."""
+    """A blade hides the beam up to x sigma from the lens: error sigma phi(x) / (1 - Phi(x)) / tan, by occlusion."""
     x = 0.4
     # An upright blade between the line and the lens, low enough for the ray from x sigma just to pass under it.
     lens, foot = np.array([0.0, 0.08, 0.15]), np.array([0.0, x * SIGMA, 0.0])
@@ -77,7 +77,7 @@ def test_blade_before_the_lens(device: Device) -> None:
 
 
 def test_step_of_the_surface(device: Device) -> None:
-    """Half the beam on either level: read in the middle, by the shape; from the other side the step hides some, too."""
+    """Half of the beam on each level: read in the middle (shape); from the other side the step also occludes."""
     rise = 2e-4
     seen = found(Scene(corners=np.array(flat(-0.01, 0.0, rise) + flat(0.0, 0.01))), [0.5], [-1.0, 0.0, 1.0], device)
     np.testing.assert_allclose(seen.error, 0.5 * rise, rtol=5e-3)
@@ -88,7 +88,7 @@ def test_step_of_the_surface(device: Device) -> None:
 
 
 def test_part_in_the_shadow(device: Device) -> None:
-    """Under a roof nothing is lit: no reading, and that is known."""
+    """Under a roof no surface is lit: no reading, category NO_SURFACE."""
     scene = Scene(corners=np.array(flat(-0.01, 0.01) + flat(-0.02, 0.02, 0.2)))
     told = found(scene, [0.5], 9, device)
     assert (told.category == ReadingCategory.MISSING).all()

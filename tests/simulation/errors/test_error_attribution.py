@@ -1,4 +1,4 @@
-"""Errors and their causes: parts that are known in closed form, and that add up."""
+"""Attribution of errors: contributions in closed form, and their sum."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_secondary_light(method: str, device: Device) -> None:
 
 
 def test_moments_are_shares_of_the_light(device: Device) -> None:
-    """Every light moves the reading by its share of the light times its distance, ambient light by its own."""
+    """Every light source, ambient light included, shifts the reading by its share of the light times its distance."""
     view = psd_view()
     u = np.full(view.samples, 5e-4)
     lights = {"specular": (8e-4, 2e-7), "diffuse-specular": (-2e-3, 5e-8), "diffuse-diffuse": (2.5e-3, 3e-8)}
@@ -104,7 +104,7 @@ METHODS = ("moments", "shapley")
 
 @pytest.mark.parametrize("method", METHODS)
 def test_occlusion(method: str, device: Device) -> None:
-    """What hides a spot beyond x sigma moves its centre by -sigma phi(x) / Phi(x)."""
+    """An occluder that hides a spot beyond x sigma moves its centre by -sigma phi(x) / Phi(x)."""
     view, sigma = psd_view(600), 1e-4
     x = np.array([-0.5, 0.0, 0.5, 1.0, 1.5])
     u = np.full(view.samples, 2e-4)
@@ -127,7 +127,7 @@ def test_occlusion(method: str, device: Device) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_reflectivity_step(method: str, device: Device) -> None:
-    """A step of ratio k moves it by sigma (k - 1) phi(x) / (Phi(x) + k (1 - Phi(x))), whatever the surface's albedo."""
+    """A step of ratio k moves it by sigma (k - 1) phi(x) / (Phi(x) + k (1 - Phi(x))), for any albedo."""
     view, sigma, k = psd_view(600), 1e-4, 5.0
     x = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
     u = np.full(view.samples, -3e-4)
@@ -146,7 +146,7 @@ def test_reflectivity_step(method: str, device: Device) -> None:
 
 
 def test_all_causes_at_once(device: Device, rng: np.random.Generator) -> None:
-    """Whatever the light, the parts add up to the error, noise among them."""
+    """For any light, the contributions, noise included, add up to the error."""
     view = psd_view(60)
     u = rng.uniform(-1e-3, 1e-3, (4, view.samples))
     light = {
@@ -176,7 +176,7 @@ def test_all_causes_at_once(device: Device, rng: np.random.Generator) -> None:
 
 
 def test_a_camera_with_a_window(device: Device) -> None:
-    """Secondary light beside the line moves a windowed reading only where it falls into the window."""
+    """Secondary light shifts a windowed reading only if it is inside the window."""
     view = camera_view()
     pixels = np.full(view.samples, 24.0)
     u = view.u_centres[0] + PIXEL * pixels
@@ -198,7 +198,7 @@ def test_a_camera_with_a_window(device: Device) -> None:
 
 
 def test_categories(device: Device) -> None:
-    """A surface without a reading, a reading without a surface, neither, and several surfaces."""
+    """A surface without a reading, a reading without a surface, no surface and no reading, several surfaces."""
     view = psd_view()
     u = np.array([0.0, 0.0, np.nan, np.nan, np.nan])
     power = np.array([1e-6, 0.0, 0.0, 0.0, 0.0])
@@ -253,7 +253,7 @@ def test_summary_counts_causes(device: Device) -> None:
 
 
 def test_what_flags_take_out(device: Device) -> None:
-    """A reading that is dropped for a flag is a missing one."""
+    """A reading that is dropped because of a flag counts as missing."""
     view = psd_view()
     u = np.zeros(view.samples)
     light = {"direct": gaussian(view, u, [1e-6, 1e-6, 2e-5, 1e-6, 1e-6], 4e-5)}
@@ -280,7 +280,7 @@ def test_signals_add_up_to_the_reading(device: Device) -> None:
 
 
 def test_a_part_in_shadow_says_nothing(device: Device) -> None:
-    """No light at all: flagged, not zero, and a report can still be made."""
+    """Without light the errors are flagged, not zero, and a report can still be written."""
     view = psd_view()
     found = attribute_errors(psd(view), {"direct": view.dark()}, truth_at(view, np.nan), device=device)
     assert (found.category == ReadingCategory.NO_SURFACE).all()

@@ -1,4 +1,4 @@
-"""What helps against artifacts: the reflection that is read, and two sensors."""
+"""Countermeasures against errors: choice of a reflection, and two sensors."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def facing(view: SensorView) -> SensorView:
 
 
 def thick_line(view: SensorView, sigma: float, factor: np.ndarray, across: np.ndarray) -> Exposure:
-    """Return light of a sheet with a Gaussian across on the plane H = 0, scaled by a factor at every place across."""
+    """Return light of a sheet with a Gaussian across on the plane H = 0, times a factor at every position across."""
     weight = np.exp(-0.5 * (across / sigma) ** 2) * factor
     points = np.stack(np.broadcast_arrays(0.0, across, 0.0), axis=-1)
     u, _ = np.moveaxis(view.project(points), -1, 0)
@@ -63,7 +63,7 @@ def thick_line(view: SensorView, sigma: float, factor: np.ndarray, across: np.nd
 
 
 SIGMA, X = 5e-5, 0.4
-# Where strips see the plane H = 0: 0.1 mm times 170 mm over 40 mm.
+# Scale on the plane H = 0: 0.1 mm times 170 mm over 40 mm.
 PLACES = np.arange(-2, 3) * PITCH * 0.17 / 0.04
 ACROSS = (np.arange(-4000, 4000) + 0.5) * (6.0 * SIGMA / 4000)
 
@@ -78,7 +78,7 @@ def level() -> GroundTruth:
 
 
 def test_reflectivity_step_seen_from_both_sides(level: GroundTruth, device: Device) -> None:
-    """Each errs by shift / tan(theta), to its own side: the mean is right. Nothing else of the rules is."""
+    """Errors of shift / tan(theta) with opposite signs: the mean is correct, no other rule is."""
     view, k = psd_view(), 4.0
     factor = np.where(ACROSS > X * SIGMA, k, 1.0)
     share = float(ndtr(X))
@@ -103,7 +103,7 @@ def test_reflectivity_step_seen_from_both_sides(level: GroundTruth, device: Devi
 
 
 def test_half_a_beam_hidden_from_one(level: GroundTruth, device: Device) -> None:
-    """The sensor that sees the whole beam is right and has more light; the mean is half wrong."""
+    """The sensor with the complete beam in view is correct and has more light; the mean has half the error."""
     view = psd_view()
     hidden = (ACROSS < X * SIGMA).astype(float)
     whole, half = (
@@ -124,7 +124,7 @@ def test_half_a_beam_hidden_from_one(level: GroundTruth, device: Device) -> None
 
 
 def test_a_part_seen_by_two(level: GroundTruth, device: Device) -> None:
-    """A pair is ranked beside either sensor alone: half of a beam is hidden from one here, from the other there."""
+    """Rank a pair together with its single sensors: occlusion hides half of the beam from each at other places."""
     view = psd_view()
     hidden = (ACROSS < X * SIGMA).astype(float)
     found = []
@@ -153,7 +153,7 @@ def test_a_part_seen_by_two(level: GroundTruth, device: Device) -> None:
 
 
 def test_what_one_does_not_see_the_other_does(device: Device) -> None:
-    """Surfaces that are hidden from the first sensor count for it as missing, and the second one fills them."""
+    """Surfaces hidden from the first sensor count as missing for it, and the second sensor supplies them."""
     view = psd_view()
     u = np.zeros(5)
     truth = GroundTruth(*sheet_point(view.triangulation, u, view.v_centres), np.zeros(5, np.uint8))
@@ -200,14 +200,14 @@ def test_one_reading_alone() -> None:
 
 
 def test_doubtful_readings_give_way() -> None:
-    """Of two that disagree, a saturated or ambiguous one has no say."""
+    """If two readings disagree, a saturated or ambiguous reading is not used."""
     one = reading([1e-3, 1e-3], status=[Status.SATURATED, 0])
     other = reading([2e-3, 2e-3], status=[0, Status.AMBIGUOUS])
     assert SensorFusion().fuse(one, other).source.tolist() == [SECOND, FIRST]
 
 
 def test_min_ratio() -> None:
-    """Where neither is clearly better there is no value."""
+    """If neither sensor is clearly better, there is no value."""
     one, other = reading([1e-3] * 3, strength=[1.0, 1.4, 2.0]), reading([2e-3] * 3, strength=[2.0, 1.0, 1.0])
     assert SensorFusion(rule="stronger").fuse(one, other).source.tolist() == [SECOND, NONE, FIRST]
     one, other = reading([1e-3] * 3, width=[3.0, 4.0, 9.0]), reading([2e-3] * 3, width=[6.0, 5.0, 3.0])
@@ -234,7 +234,7 @@ def test_what_fusion_refuses() -> None:
 
 
 def test_resampling() -> None:
-    """A straight profile stays one, between its points and on them; holes stay holes but for half a sample."""
+    """A straight profile stays straight, between its points and at them; holes shrink by at most half a sample."""
     g = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 7.0]) * 1e-4
     h = 2.0 * g + 1e-3
     h[3] = np.nan
@@ -244,7 +244,7 @@ def test_resampling() -> None:
     np.testing.assert_allclose(made.h, 2.0 * at + 1e-3, rtol=1e-12)
     np.testing.assert_array_equal(made.g, at)
     assert made.status.tolist() == [0, 0, 0, 0, Status.SATURATED, Status.SATURATED, 0]
-    # Points are 0.15 mm apart in the median.
+    # The median distance of points is 0.15 mm.
     beside = resample_reading(given, np.array([-0.7, -0.8, 4.7, 4.8, 6.3, 7.8, np.nan]) * 1e-4, max_gap=2.5e-4)
     np.testing.assert_array_equal(beside.h, [h[0], np.nan, h[4], np.nan, h[5], np.nan, np.nan])
     assert beside.status.tolist() == [
@@ -285,7 +285,7 @@ def test_choice_of_a_peak(device: Device) -> None:
 
 
 def test_rank_of_directions(device: Device) -> None:
-    """The place from which less gloss is seen comes first; false readings count as much as missing ones."""
+    """The position with less gloss in view is ranked first; spurious and missing readings have equal weight."""
     view = psd_view()
     u = np.zeros(view.samples)
     truth = GroundTruth(*sheet_point(view.triangulation, u, view.v_centres), np.zeros(5, np.uint8))

@@ -1,4 +1,4 @@
-"""The tree over triangles: each in one leaf, each within the boxes above it."""
+"""BVH: every triangle is in one leaf and within all boxes above it."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_only_those_wanted_under_their_own_numbers(rng: np.random.Generator) -> 
 
 
 def test_a_tree_is_good_where_triangles_are_spread(rng: np.random.Generator) -> None:
-    """Boxes cannot undercut the sphere's projections along three axes; tilted squares fill half of theirs."""
+    """The boxes of a sphere have at least its projected areas; tilted squares fill half of their boxes."""
     tree = Bvh.build(corners_of("sphere", rng))
     size = tree.boxes[:, 3:] - tree.boxes[:, :3]
     leaf = (tree.children < 0) & (size[:, 0] >= 0.0)

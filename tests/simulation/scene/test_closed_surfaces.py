@@ -1,4 +1,4 @@
-"""Which sides of closed surfaces an eye may see."""
+"""Sides of closed surfaces that are visible from a view point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ClosestHit and AnyHit on devices: as every triangle says in float64, as Embree says, without a gap."""
+"""ClosestHit and AnyHit on devices: against all triangles in float64, against Embree, and without gaps at edges."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TRIANGLE = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]])
 
 
 def soup(rng: np.random.Generator, count: int, size: float = 0.2) -> np.ndarray:
-    """Triangles all over a cube, in numbers that a float holds exactly."""
+    """Return random triangles in a cube; all coordinates are exact in single precision."""
     corners = rng.uniform(-1.0, 1.0, (count, 1, 3)) + rng.normal(0.0, size, (count, 3, 3))
     return corners.astype(np.float32).astype(np.float64)
 
@@ -36,7 +36,7 @@ def some_rays(rng: np.random.Generator, count: int = 500) -> np.ndarray:
 
 
 def far_from_edges(corners: np.ndarray, rays: np.ndarray, by: float = 1e-4) -> np.ndarray:
-    """Whether rounding cannot decide whether a ray meets any triangle."""
+    """Return whether rays are so far from all edges that rounding does not change the hits."""
     _, u, v = reference.crossings(corners, rays[:, :3], rays[:, 3:])
     return (np.minimum.reduce([np.abs(u), np.abs(v), np.abs(1.0 - u - v)]) > by).all(axis=1)
 
@@ -130,7 +130,7 @@ def test_as_embree_says(device: Device, rng: np.random.Generator) -> None:
 
 @WAYS
 def test_nothing_slips_through_an_edge(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
-    """From within a closed surface, rays straight at its corners and at points of its edges."""
+    """Rays from inside a closed surface, aimed exactly at its corners and at points of its edges."""
     mesh = trimesh.creation.icosphere(3)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [0.1, 0.7, 0.3]))
     corners = mesh.vertices.astype(np.float32).astype(float)[mesh.faces]
@@ -146,7 +146,7 @@ def test_nothing_slips_through_an_edge(device: Device, variant: Any, dtype: Any,
 
 @WAYS
 def test_axis_parallel_rays_on_the_grid_of_a_plane(device: Device, variant: Any, dtype: Any) -> None:
-    """Rays along each axis, both ways, straight at the shared corners and edges of coplanar triangles."""
+    """Rays along each axis, both ways, aimed exactly at the shared corners and edges of coplanar triangles."""
     steps = np.arange(9) / 8.0
     a, b = (each.ravel() for each in np.meshgrid(steps[:-1], steps[:-1]))
     zero, side = np.zeros_like(a), 0.125
@@ -171,7 +171,7 @@ def test_axis_parallel_rays_on_the_grid_of_a_plane(device: Device, variant: Any,
 @WAYS
 def test_a_ray_in_the_plane_passes(device: Device, variant: Any, dtype: Any) -> None:
     in_plane = np.array([[-1.0, 0.25, 0.0, 1.0, 0.0, 0.0], [0.25, 3.0, 0.0, 0.0, -1.0, 0.0]], dtype)
-    # A thousandth of a radian above it, and below: meets it at 0.25, and never.
+    # A thousandth of a radian above and below it: a hit at 0.25, and no hit.
     grazing = np.array([[-0.75, 0.25, 1e-3, 1.0, 0.0, -1e-3], [-0.75, 0.25, 1e-3, 1.0, 0.0, 1e-3]], dtype)
     operation = ClosestHit(scene=Scene(TRIANGLE), variant=variant)
     assert (operation(in_plane, device=device).status == Status.NO_DATA).all()
@@ -232,7 +232,7 @@ def test_ends_do_not_occlude_within_the_clearance(device: Device, variant: Any, 
 
 
 def test_far_from_the_origin_in_single(device: Device, rng: np.random.Generator) -> None:
-    """The scene's middle goes away in double, so kilometres off a micrometre stays one."""
+    """The centre of the scene is subtracted in double: details of a micrometre survive at distances of kilometres."""
     corners, away = soup(rng, 200), np.array([5000.0, -3000.0, 1000.0])
     rays = some_rays(rng, 300)
     rays = rays[far_from_edges(corners, rays)]
@@ -244,7 +244,7 @@ def test_far_from_the_origin_in_single(device: Device, rng: np.random.Generator)
 
 @WAYS
 def test_rays_from_afar(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
-    """From a million times the scene's size they meet it, in single, as from nearby."""
+    """Rays from a distance of a million scene sizes give the same hits in single precision as rays from nearby."""
     corners, away = soup(rng, 200), np.array([3e6, -1e6, 2e6])
     far = np.hstack([rng.normal(0.0, 1e6, (400, 3)) + away, np.zeros((400, 3))]).astype(dtype)
     targets = np.round(rng.uniform(-1.0, 1.0, (400, 3)) * 256.0) / 256.0
@@ -264,7 +264,7 @@ def test_rays_from_afar(device: Device, variant: Any, dtype: Any, rng: np.random
     sure &= reference.occluded(corners, exact, -1e-9) == reference.occluded(corners, exact, 1e-9)
     result = AnyHit(scene=Scene(corners), variant=variant)(segments, device=device)
     np.testing.assert_array_equal(result.occluded[sure], reference.occluded(corners, exact)[sure])
-    # Those that point away, and those that end before it, meet nothing.
+    # Rays that point away, and segments that end before it, have no hit.
     rays[:, 3:] *= -1.0
     assert (ClosestHit(scene=Scene(corners), variant=variant)(rays.astype(dtype), device=device).triangle == -1).all()
     segments[:, 3:] = segments[:, :3] * dtype(0.5)

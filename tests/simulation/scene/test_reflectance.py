@@ -1,4 +1,4 @@
-"""Models of reflectance: their laws and limits, and devices as the host says."""
+"""Reflectance models: laws, limits, and agreement of devices and host."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def directions(theta: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def albedo(model: Brdf, angle: float) -> float:
-    """What is reflected of light at an angle, by Gauss and Legendre over half the hemisphere.
+    """Return the albedo for light at an angle, by Gauss-Legendre quadrature over half of the hemisphere.
 
-    Nodes crowd where a lobe is narrow at grazing angles: at the horizon, and in the plane of the light.
+    Nodes are dense where a lobe is narrow at grazing angles: at the horizon, and in the plane of the light.
     """
     nodes, weights = np.polynomial.legendre.leggauss(400)
     theta, turn = (nodes + 1.0) * math.pi / 4.0, (nodes + 1.0) * math.pi / 2.0
@@ -101,7 +101,7 @@ def test_limits_to_lambert(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("sigma", [0.0, 0.1, 0.5, math.pi / 2.0])
 def test_slopes_as_oren_and_nayar_say(sigma: float, rng: np.random.Generator) -> None:
-    """Their A + B cos(phi) sin(alpha) tan(beta) over A, where light and eye stand on one side."""
+    """The formula A + B cos(phi) sin(alpha) tan(beta), divided by A, with light and viewer on one side."""
     polar, azimuth = rng.uniform(0.0, 1.5, (2, 500)), rng.uniform(-1.5, 1.5, 500)
     light = np.stack([np.sin(polar[0]), 0.0 * azimuth, np.cos(polar[0])], axis=1)
     eye = np.stack([np.sin(polar[1]) * np.cos(azimuth), np.sin(polar[1]) * np.sin(azimuth), np.cos(polar[1])], axis=1)
@@ -122,7 +122,7 @@ def test_slopes_out_of_range() -> None:
 
 @pytest.mark.parametrize("angle", [0.0, 0.5, 1.0, 1.3])
 def test_limits_to_the_mirror(angle: float) -> None:
-    """All light goes into the mirror direction, and a little aside there is none."""
+    """In the limit all light is reflected in the mirror direction, and no light at a small angle from it."""
     for model in (Ggx(alpha=1e-3), Ward(albedo=1.0, alpha_x=1e-3, alpha_y=1e-3)):
         assert abs(lobe(model, angle, 1e-3) - 1.0) < 2e-3
         light = [math.sin(angle), 0.0, math.cos(angle)]
@@ -148,7 +148,7 @@ def test_devices_as_the_host(device: Device, name: str, dtype: Any, variant: Any
     result = Reflectance(model=model, variant=variant)(pairs, device=device, out=guarded.out)
     guarded.assert_intact()
     expected = model.value(pairs)
-    # Far out in a lobe a power's or exponential's large exponent magnifies the roundings: digits down to 1e-6 only.
+    # In the tail of a lobe the large exponent of a power or exponential magnifies roundings: relative accuracy of 1e-6.
     assert np.all(np.abs(result.value - expected) <= 200 * np.finfo(dtype).eps * (expected + 1e-6))
     assert np.all(result.status == 0)
     assert np.all(result.value[:100] == 0.0)

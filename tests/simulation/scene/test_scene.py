@@ -1,4 +1,4 @@
-"""Scenes: what files and trimesh hold, and what is wrong with their triangles."""
+"""Scenes from files and trimesh, and defects of their triangles."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_a_folder_is_no_mesh(tmp_path: Path) -> None:
 
 def test_no_area(box: np.ndarray) -> None:
     flat = np.array([[[0, 0, 0], [1, 1, 1], [3, 3, 3]], [[1, 2, 3]] * 3, [[0, 0, 0], [1, 0, 0], [1, 0, 0]]], float)
-    # Slivers are triangles: a nanometre by a metre, and all of it a micrometre.
+    # Slivers are valid triangles: a nanometre by a metre, and a triangle of a micrometre.
     slivers = np.array([[[0, 0, 9], [1, 0, 9], [0, 1e-9, 9]], [[0, 0, 8], [1e-6, 0, 8], [0, 1e-6, 8]]])
     scene = Scene(np.concatenate([box, flat, slivers]))
     assert scene.defects.degenerate == (12, 13, 14)
@@ -109,7 +109,7 @@ def test_three_on_an_edge(box: np.ndarray) -> None:
 
 
 def test_the_same_points_have_the_same_number(rng: np.random.Generator) -> None:
-    """Whatever the sign of a zero, and though they differ in the last bit only."""
+    """For both signs of zero; points that differ in the last bit have different numbers."""
     some = np.array([0.0, -0.0, 1.0, -1.0, np.nextafter(1.0, 2.0), 5e-324, 1e300])
     points = rng.choice(some, (3000, 3))
     numbers = _vertex_numbers(points)
@@ -120,7 +120,7 @@ def test_the_same_points_have_the_same_number(rng: np.random.Generator) -> None:
 
 @pytest.mark.slow
 def test_a_million_triangles(device: Device, rng: np.random.Generator) -> None:
-    """A sphere of 1.3 million: each triangle once in the tree, the turned ones found, and rays that meet it."""
+    """A sphere of 1.3 million: each triangle is in the tree once, flipped ones are found, rays hit the sphere."""
     mesh = trimesh.creation.icosphere(8)
     corners = np.array(mesh.triangles)
     wrong = rng.choice(len(corners), 1000, replace=False)
@@ -143,7 +143,7 @@ def test_a_moebius_strip_has_no_winding() -> None:
     across = np.stack([np.cos(turn / 2) * np.cos(turn), np.cos(turn / 2) * np.sin(turn), np.sin(turn / 2)], axis=1)
     middle = 3.0 * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
     one, two = middle + across, middle - across
-    # After a turn the sides have changed places.
+    # After the flip the sides are exchanged.
     next_one, next_two = np.concatenate([one[1:], two[:1]]), np.concatenate([two[1:], one[:1]])
     strip = np.concatenate([np.stack([one, two, next_one], axis=1), np.stack([two, next_two, next_one], axis=1)])
     assert len(Scene(strip).defects.non_manifold) == len(strip)

@@ -1,4 +1,4 @@
-"""VisibleIntervals on devices: as the ends of all hidden intervals say, as shadow rays say, watertight."""
+"""VisibleIntervals on devices: against the ends of all hidden intervals, against shadow rays, and watertight."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_parts_as_the_reference_says(
     fans = some_fans(rng, 150, mirrors).astype(dtype)
     result = VisibleIntervals(scene=Scene(corners), variant=variant)(fans, device=device)
     assert not result.status.any()
-    # A cut's place turns with the corners' rounding over the distance of a corner from the plane.
+    # The error of a cut is the rounding of the corners divided by the distance of a corner from the plane.
     least, within = (1e-9, 1e-8) if dtype == np.float64 else (1e-5, 2e-3)
     same, several = 0, 0
     for n, fan in enumerate(fans.astype(np.float64)):
@@ -78,7 +78,7 @@ def test_parts_as_shadow_rays_say(device: Device, rng: np.random.Generator) -> N
 
 @WAYS
 def test_nothing_shows_between_neighbours(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
-    """From within a closed surface nothing outside is visible, though hidden intervals meet at hundreds of edges."""
+    """From inside a closed surface no outside point is visible, although hidden intervals meet at hundreds of edges."""
     scene = Scene.of(trimesh.creation.icosphere(3))
     fans = np.zeros((100, 11), dtype)
     fans[:, :3] = rng.uniform(-0.3, 0.3, (100, 3))
@@ -92,7 +92,7 @@ def test_nothing_shows_between_neighbours(device: Device, variant: Any, dtype: A
 
 @WAYS
 def test_a_square_before_a_line(device: Device, variant: Any, dtype: Any) -> None:
-    """A square half way hides what is twice as wide; a mirror beyond it takes it out of the way; both sides hide."""
+    """A square at half the distance hides twice its width, from both sides; not with a mirror beyond it."""
     square = np.array([[[-1, -1, 1], [1, -1, 1], [1, 1, 1]], [[-1, -1, 1], [1, 1, 1], [-1, 1, 1]]]) * [0.1, 0.1, 1.0]
     fan = [0.02, 0.01, 0.0, -1.0, 0.0, 2.0, 1.0, 0.0, 2.0]
     op = VisibleIntervals(scene=Scene(square), variant=variant)
@@ -120,7 +120,7 @@ def test_more_parts_than_are_kept_and_numbers_that_are_none(device: Device, vari
     bars = np.array([[[x, -1, 1], [x + 0.02, -1, 1], [x + 0.01, 2, 1]] for x in at])
     fans = np.tile(np.array([[0.0, 0.0, 0.0, -1.0, 0.0, 2.0, 1.0, 0.0, 2.0, *NO_MIRROR]], dtype), (4, 1))
     fans[1, 4], fans[2, 10] = np.nan, np.inf
-    fans[3, 6:9] = -fans[3, :3] + 2 * fans[3, 3:6]  # end on
+    fans[3, 6:9] = -fans[3, :3] + 2 * fans[3, 3:6]  # segment on a line through the apex
     for kept, expected in ((4, Status.AMBIGUOUS), (40, 0)):
         result = VisibleIntervals(scene=Scene(bars), max_intervals=kept, variant=variant)(fans, device=device)
         np.testing.assert_array_equal(result.status, [expected, Status.NOT_FINITE, Status.NOT_FINITE, 0])

@@ -1,4 +1,4 @@
-"""Simulated camera columns: photons, electronics and readings that are known."""
+"""Simulated camera columns: photons, electronics, and readings in closed form."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PIXEL = 10e-6
 
 
 def watts(electrons: float) -> float:
-    """Return the power that makes so many electrons in a millisecond at 0.4 A/W."""
+    """Return the power that generates a number of electrons in a millisecond at 0.4 A/W."""
     return electrons * ELECTRON / (0.4 * 1e-3)
 
 
@@ -63,7 +63,7 @@ def test_photon_and_read_noise(device: Device) -> None:
     view = camera_view(columns=16)
     one = line(view, electrons=2e4)
     for read_noise in (0.0, 20.0):
-        # The threshold lies below what noise leaves of the offset: nothing is cut.
+        # The threshold is below the offset minus its noise: no sample is cut.
         readout = {"method": "windowed", "window": 6, "threshold": 200.0 if read_noise else 300.0}
         simulator = camera(view, readout=readout, gain=0.5, bits=16, offset=300.0, read_noise=read_noise)
         reading = simulator.read(stack_profiles([one] * 120), seed=5, device=device)
@@ -73,13 +73,13 @@ def test_photon_and_read_noise(device: Device) -> None:
         if read_noise == 0.0:
             u = view.u_centres[0] + 30.3 * PIXEL
             slope = height_secant(view.triangulation, u, u, view.v_centres)
-            # A pixel blurs by itself.
+            # The extent of a pixel is a blur.
             blur = np.sqrt(1.2**2 + 1.0 / 12.0) * PIXEL
             np.testing.assert_allclose(sigma, slope * blur / np.sqrt(2e4), rtol=2e-3)
 
 
 def test_saturation_and_rounding(device: Device) -> None:
-    """A full well or the highest code holds the light back; both are flagged."""
+    """A full well or the largest code limits the signal; both are flagged."""
     view = camera_view()
     light = line(view, electrons=1e6)
     for limits, level in (({"gain": 0.01}, 255), ({"gain": 0.001, "full_well": 1e5}, 100)):
@@ -103,7 +103,7 @@ def test_noise_belongs_to_the_profile() -> None:
 
 
 def test_mask_is_a_region_of_interest(device: Device) -> None:
-    """A second line that would be the stronger one is not seen behind a mask."""
+    """A mask hides a second, stronger line."""
     view = camera_view()
     light = line(view, 20.0) | {"diffuse-specular": line(view, 50.0, electrons=2e5)["direct"]}
     mask = Mask(windows=[view.u_edges[[10, 30]]] * view.samples)
@@ -114,7 +114,7 @@ def test_mask_is_a_region_of_interest(device: Device) -> None:
 
 
 def test_axes_that_run_backwards(device: Device) -> None:
-    """A frame whose rows and columns count against the sensor's coordinates says the same, in the view's order."""
+    """A frame with axes opposite to the sensor coordinates gives the same result in the order of the view."""
     view = camera_view()
     light = line(view, 30.0 + np.arange(view.samples) * 0.37)
     axes = pixel_axes(view)

@@ -1,4 +1,4 @@
-"""The sensor side: known values and limits."""
+"""Collection of light by a sensor: known values and limits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gpuvision.simulation.sensors.collection import cos4, image_irradiance, lens
 
 
 def test_solid_angle() -> None:
-    """A hemisphere at distance 0, area over square far away, and no cancellation on the way."""
+    """A hemisphere at distance 0, area over squared distance far away, and no cancellation in between."""
     assert lens_solid_angle(1.0, 0.0) == pytest.approx(math.tau, rel=1e-15)
     assert lens_solid_angle(1.0, 1.0) == pytest.approx(math.tau * (1.0 - math.sqrt(0.5)), rel=1e-14)
     assert lens_solid_angle(1e-9, 1.0) == pytest.approx(math.pi * 1e-18, rel=1e-14)

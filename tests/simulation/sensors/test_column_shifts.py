@@ -1,8 +1,8 @@
-"""How far light between two walls moves what columns of a camera and strips of a PSD read.
+"""Shift of the readings of camera columns and PSD strips by light between two walls.
 
-A groove lit across by a sheet, seen by a camera of 1024 x 1024 pixels at 45 degrees, 0.12 mm of the scene in each. All
-is in closed form; a pixel gets what its middle does. What an independent simulation (points, rays and NumPy) found for
-such grooves, with its own choice of how far the walls reach, stands in `FOUND_ELSEWHERE`.
+A groove lit across by a sheet, viewed by a camera of 1024 x 1024 pixels at 45 degrees, 0.12 mm of the scene in each.
+The irradiance is in closed form; a pixel has the value at its centre. `FOUND_ELSEWHERE` holds the results of an
+independent simulation (points, rays and NumPy) for such grooves with walls of unknown extent.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ELECTRON = 1.602176634e-19  # elementary charge [C], exact by definition of the 
 PIXEL, PIXELS = 1e-5, 1024
 HALF = 0.5 * PIXELS * PIXEL
 LENS = np.array([0.0, 0.2, 0.2])
-# Of a wall, down it and to either side of the sheet; the sheet's full width at half of its maximum.
+# Size of a wall, down and to either side of the sheet; full width of the sheet at half maximum.
 WALL, ASIDE, FWHM = 0.1, 0.05, 0.15e-3
 ALBEDO = 0.8
 EXPOSED = 1e-3  # s
@@ -48,7 +48,7 @@ RULES = {
     "window 16": {"window": 16},
     "window 4": {"window": 4},
 }
-# Median, 95th of a hundred and largest shift in pixels; by angle in degrees.
+# Median, 95th percentile and largest shift in pixels, by angle in degrees.
 FOUND_ELSEWHERE = {
     90: {
         "whole column": (4.5, 5.2, 5.4),
@@ -70,7 +70,7 @@ PEAK_RATIO = {90: 5e-4, 60: 8e-4}
 
 
 class Shifts(NamedTuple):
-    """Of a groove: shifts in pixels by rule, of columns that see the line whole."""
+    """Shifts of a groove in pixels, by rule, of columns with the complete line in view."""
 
     camera: dict[str, np.ndarray]
     psd: np.ndarray
@@ -79,7 +79,7 @@ class Shifts(NamedTuple):
 
 
 def sensor_view(columns: int) -> SensorView:
-    """Return the camera, its columns so many times wider that they cover the frame; each is read in its middle."""
+    """Return the camera with fewer, wider columns that cover the frame; each is read at its centre."""
     forward, up = -LENS / np.linalg.norm(LENS), np.array([0.0, -1.0, 1.0]) / math.sqrt(2.0)
     focal = np.linalg.norm(LENS) / 0.12e-3 * PIXEL
     to_sensor = np.diag([focal, focal, 1.0]) @ [up, [1.0, 0.0, 0.0], forward]
@@ -115,7 +115,7 @@ def secondary(one: SensorView, scene: Scene, lit: LitSegments) -> Exposure:
 
 
 def direct(one: SensorView, lit: LitSegments) -> tuple[Exposure, np.ndarray]:
-    """Return the line itself, Gaussian across, as its middle in each column has it, and which columns see it."""
+    """Return the direct light of the Gaussian line at the centre of each column, and the columns that show it."""
     half = np.linspace(0.0, 1.0, 50_001)[1:, None]
     places = np.concatenate([(half * lit.ends[1, 1])[::-1], half * lit.ends[0, 1]])
     normals = np.repeat(lit.normals[::-1], len(half), axis=0)
@@ -124,7 +124,7 @@ def direct(one: SensorView, lit: LitSegments) -> tuple[Exposure, np.ndarray]:
     spread = np.abs(one.project(places + across)[:, 0] - one.project(places - across)[:, 0]) / 2e-6 * FWHM / 2.3548
     towards = one.lens_at(0.0) - places
     cosine = np.sum(normals * towards, axis=1) / np.linalg.norm(towards, axis=1)
-    # A metre of the sheet brings 1 W, on however much of the wall.
+    # A metre of the sheet has 1 W, independent of the lit length on the wall.
     power = (
         ALBEDO
         / math.pi
@@ -150,7 +150,7 @@ def of_groove(degrees: float, columns: int = PIXELS) -> Shifts:
 
 
 def of_board(columns: int = PIXELS) -> Shifts:
-    """Of a board with parts, which hide light from each other."""
+    """Return the shifts of a board with parts that occlude each other."""
     from gpuvision.profiling.occluded_irradiance import Board
 
     one, of = sensor_view(columns), Board.of()
@@ -165,14 +165,14 @@ def of_board(columns: int = PIXELS) -> Shifts:
     rows = segment_rows(LitSegments(lit.ends, lit.normals, ALBEDO * lit.power))
     light = OccludedIrradiance(scene=of.scene, segments=len(rows), precision="single")
     irradiance = light(receivers, np.zeros((*receivers.shape[:2], 2)), rows).irradiance
-    # A column in which the line can be read has a good part of what others have.
+    # A column is valid if its light is a substantial share of the light in other columns.
     total = line.total()
     whole = total > 0.1 * np.median(total[total > 0.0])
     return shifts(one, line, lines.exposure(seen, np.nan_to_num(irradiance)), whole)
 
 
 def shifts(one: SensorView, line: Exposure, glow: Exposure, whole: np.ndarray) -> Shifts:
-    """Read the line with and without the other light on it."""
+    """Return the shifts: readings with and without secondary light."""
     alone, together = {"direct": line}, {"direct": line, "diffuse-diffuse": glow}
     electrons = (line.power + glow.power)[whole].max() * 0.4 * EXPOSED / ELECTRON
     axes = SampleAxes(
@@ -206,7 +206,7 @@ def shifts(one: SensorView, line: Exposure, glow: Exposure, whole: np.ndarray) -
 
 
 def told(values: np.ndarray) -> np.ndarray:
-    """Median, 95th of a hundred and largest."""
+    """Return median, 95th percentile and largest shift."""
     size = np.abs(values)
     return np.array([np.median(size), np.percentile(size, 95.0), size.max()])
 
@@ -218,8 +218,9 @@ def found(request):
 
 def test_columns_of_a_camera_move_as_they_do_elsewhere(found):
     degrees, made = found
-    # How far the walls reach, which is not known of the others, is what the whole column feels; few of the pixels over
-    # a threshold decide what moves there, and they subtract it where the others do not: what is over it counts.
+    # The centroid of the whole column depends on the extent of the walls, which the other simulation does not state.
+    # With thresholds, few pixels determine the shift, and this test subtracts the threshold, the other simulation does
+    # not.
     allowed = {
         "whole column": (2.0, 2.0, 2.0),
         "threshold 5 %": (2.5, 2.0, 6.0),
@@ -235,7 +236,7 @@ def test_columns_of_a_camera_move_as_they_do_elsewhere(found):
 
 def test_strips_of_a_psd_move_as_whole_columns(found):
     _, made = found
-    # But for the place of the light within a pixel, which only the strip feels: the line is 0.9 pixels wide.
+    # Except for the position of the light within a pixel, which affects only the strip: the line is 0.9 pixels wide.
     np.testing.assert_allclose(made.psd, made.camera["whole column"], atol=0.02)
 
 
@@ -243,7 +244,7 @@ def test_secondary_light_is_a_broad_pedestal(found):
     degrees, made = found
     assert np.median(made.secondary_over_direct) == pytest.approx(SECONDARY_OVER_DIRECT[degrees], rel=0.25)
     assert np.median(made.peak_ratio) == pytest.approx(PEAK_RATIO[degrees], rel=0.7)
-    # So what looks at a window about the line hardly feels it, and what looks at everything does.
+    # A reading in a window about the line is hardly affected; a reading of the whole column is.
     assert told(made.camera["whole column"])[0] > 1000.0 * told(made.camera["window 16"])[0]
     assert told(made.camera["window 16"])[0] > 2.0 * told(made.camera["window 4"])[0]
 
@@ -261,7 +262,7 @@ def test_parts_on_a_board_move_few_columns():
     pytest.importorskip("embreex.rtcore_scene", reason="the extra 'profile' is not installed")
     pytest.importorskip("numba", reason="the extra 'profile' is not installed")
     made = of_board(256)
-    # Elsewhere, with other parts: 0.125, 2.2, 11 pixels of the whole column, 0, 0.32, 3.3 in a window of 16.
+    # Other simulation, other parts: 0.125, 2.2, 11 pixels of the whole column, 0, 0.32, 3.3 in a window of 16.
     median, high, most = told(made.camera["whole column"])
     assert 0.03 < median < 0.4
     assert 0.7 < high < 7.0
@@ -283,7 +284,7 @@ def test_the_closed_line_is_the_simulators():
     sheet = LightSheet(transport=one.transport, power=1.0, sigma=FWHM / 2.3548)
     light = DirectLight(view=one, scene=scene, materials=[Material(diffuse=Lambert(albedo=ALBEDO))], sheet=sheet)
     made = light.exposures(0.0)["direct"]
-    # A column 16 pixels wide against its middle, where the line is straight: all but the two at the edge.
+    # A column of 16 pixels against its centre, where the line is straight: all columns except two at the edge.
     whole &= np.abs(np.arange(64) - 31.5) > 1.0
     np.testing.assert_allclose(made.total()[whole], line.total()[whole], rtol=2e-3)
     middles = [each.first_moment(one.u_edges)[whole] / each.total()[whole] for each in (made, line)]

@@ -1,4 +1,4 @@
-"""A glowing groove from the mesh to the reading: against a float64 camera of its own, and what windows and masks do."""
+"""Secondary light in a groove, from mesh to reading: against a float64 camera model; effect of windows and masks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from gpuvision.simulation.transport.occluded_irradiance import OccludedIrradianc
 MM = 1e-3
 ELECTRON = 1.602176634e-19  # elementary charge [C], exact by definition of the SI
 ALBEDO, PIXEL, ROWS = 0.8, 0.12 * MM, 1024
-# The camera stands at (0, 200, 200) mm and looks at the origin; rows count upwards.
+# The camera is at (0, 200, 200) mm and looks at the origin; row numbers increase upwards.
 EYE = np.array([0.0, 0.2, 0.2])
 FOCAL = float(np.linalg.norm(EYE)) / PIXEL
 RIGHT, UP, AHEAD = np.array([[1.0, 0.0, 0.0], [0.0, -(0.5**0.5), 0.5**0.5], [0.0, -(0.5**0.5), -(0.5**0.5)]])
@@ -39,7 +39,7 @@ APERTURE = 5.0 * MM
 
 
 def groove(degrees: float, wall: float, half_width: float) -> Scene:
-    """Return two walls that rise from the y axis, so many degrees apart."""
+    """Return two walls that rise from the y axis, with an angle between them in degrees."""
     x, z = wall * math.sin(math.radians(degrees) / 2.0), wall * math.cos(math.radians(degrees) / 2.0)
     corners = []
     for side in (x, -x):
@@ -54,7 +54,7 @@ def groove(degrees: float, wall: float, half_width: float) -> Scene:
 
 
 def columns(first: int, count: int) -> SensorView:
-    """Return some of the camera's columns, numbered from the one over the groove's edge."""
+    """Return some of the camera's columns, numbered from the column over the groove's edge."""
     rotation = np.array([RIGHT, UP, AHEAD])
     camera = [[FOCAL, 0.0, 0.0], [0.0, FOCAL, 0.5 * (ROWS - 1)], [0.0, 0.0, 1.0]]
     triangulation = Triangulation.from_camera(
@@ -79,7 +79,7 @@ def columns(first: int, count: int) -> SensorView:
 def light_of(
     scene: Scene, view: SensorView, device: Device, sigma: float = 0.0
 ) -> tuple[dict[str, Exposure], GroundTruth]:
-    """Return the direct light and what is diffusely reflected once between the walls."""
+    """Return the direct light and the light after one diffuse reflection between the walls."""
     materials = (Material(diffuse=Lambert(albedo=ALBEDO)),)
     sheet = LightSheet(transport=view.transport, power=1.0, sigma=sigma)
     direct = DirectLight(view=view, scene=scene, materials=materials, sheet=sheet, device=device)
@@ -96,7 +96,7 @@ def light_of(
 
 
 def groove_irradiance(degrees: float, wall: float, b: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the irradiance at b from the edge and y beside the sheet, by a line from the edge to the other wall's rim.
+    """Return the irradiance at b from the edge and y from the sheet, by a line from the edge to the other wall's rim.
 
     ``(M b sin^2 g / pi) [s (t / (2 r^2 (t^2 + r^2)) + atan(t / r) / (2 r^3)) - 1 / (2 (t^2 + r^2))]`` from -s to
     wall - s, with s = b cos g and r^2 = y^2 + b^2 sin^2 g.
@@ -113,7 +113,7 @@ def groove_irradiance(degrees: float, wall: float, b: np.ndarray, y: np.ndarray)
 
 
 def own_camera(degrees: float, wall: float, half_width: float, first: int, count: int) -> tuple[np.ndarray, ...]:
-    """Return secondary power of every pixel, direct power and centre of every column, by other means: (x > 0 only)."""
+    """Return secondary power of pixels, direct power and centre of columns, computed independently (x > 0 only)."""
     across = np.array([math.sin(math.radians(degrees) / 2.0), 0.0, math.cos(math.radians(degrees) / 2.0)])
     normal = np.array([-across[2], 0.0, across[0]])
     opening = 0.25 * math.pi * APERTURE**2
@@ -146,13 +146,13 @@ def own_camera(degrees: float, wall: float, half_width: float, first: int, count
 
 @pytest.mark.parametrize("degrees", [90.0, 60.0])
 def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
-    """Light, full-column shift and its cause agree with a camera of this test's own, for PSD and camera alike."""
+    """Light, full-column shift and its cause agree with an independent camera model, for PSD and camera."""
     wall, half_width, first, count = 100.0 * MM, 43.0 * MM, 200, 24
     view = columns(first, count)
     light, truth = light_of(groove(degrees, wall, half_width), view, device)
     secondary, direct, centre = own_camera(degrees, wall, half_width, first, count)
     np.testing.assert_allclose(light["direct"].total(), direct, rtol=1e-3)
-    # A pixel at the wall's rim is on it or not by a rounding.
+    # Rounding decides whether a pixel at the rim is on the wall.
     off = np.abs(light["diffuse-diffuse"].power - secondary) > 1e-4 * secondary.max(axis=1, keepdims=True)
     assert off.sum() <= 4
     rows = np.arange(ROWS)
@@ -168,10 +168,10 @@ def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
     gain = 30000.0 * ELECTRON / (direct.max() * 0.4 * 1e-3)
     columns_read = CameraSimulator(view=view, readout=LineReadout(method="centroid", axes=axes), bits=16, gain=gain)
     assert np.abs(own - centre).min() > 4.0
-    # A thin line lies in one or two pixels of a column, and is read by their middles.
+    # A thin line lies in one or two pixels of a column, so that the reading depends on their centres.
     for simulator, near in ((strips, 0.01), (columns_read, 0.15)):
         np.testing.assert_allclose(simulator.read(light, device=device).position, own, atol=near)
-    # Of the error next to all is the other wall's.
+    # Light from the other wall causes nearly all of the error.
     found = attribute_errors(strips, light, truth, device=device)
     assert (found.dominant_cause() == list(found.causes).index("secondary")).all()
     np.testing.assert_allclose(found.causes["secondary"], found.error, rtol=0.01)
@@ -185,7 +185,7 @@ def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
 
 
 def test_mask_for_a_groove(device: Device) -> None:
-    """The best fixed mask takes nearly all of the error, and nothing of the line."""
+    """The best fixed mask removes nearly all of the error, and passes the whole line."""
     view = columns(12, 24)
     light, truth = light_of(groove(90.0, 100.0 * MM, 43.0 * MM), view, device, sigma=0.15 * MM / 2.3548)
     block = stack_profiles([light])
@@ -204,7 +204,7 @@ TABLE = {
 @pytest.mark.slow
 @pytest.mark.parametrize("degrees", sorted(TABLE))
 def test_size_of_the_effect(degrees: float) -> None:
-    """Shifts of a whole camera's columns are within a factor 2 of another program's, whose walls' size is not known."""
+    """Shifts of a camera's columns agree within a factor of 2 with another program, whose wall size is unknown."""
     device = Device.best()
     view = columns(-512, 1024)
     light, _ = light_of(groove(degrees, 100.0 * MM, 43.0 * MM), view, device, sigma=0.15 * MM / 2.3548)

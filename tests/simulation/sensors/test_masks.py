@@ -1,4 +1,4 @@
-"""Masks: what passes, and the windows that are best."""
+"""Masks: transmitted light, and optimal windows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpuvision.simulation.sensors.readings import GroundTruth, height_secant, sh
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from lights import LENGTH, gaussian, psd, psd_view
 
-# Where a mask of length beta a has the centre of a 90 degree corner's glow, in units of a.
+# Centroid of the secondary light of a 90 degree corner under a mask of length beta a, in units of a.
 CORNER = [(1, 0.594984), (2, 0.993527), (5, 1.656779), (10, 2.224535), (100, 4.341808)]
 
 
@@ -34,12 +34,12 @@ def centre(light: Exposure, edges: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("beta", "expected"), CORNER)
 def test_corner_through_a_mask(beta: int, expected: float) -> None:
-    """The centre of a corner's glow grows with the mask: 0.594984 a ... 4.341808 a, without end."""
+    """The centroid of a corner's secondary light increases with the mask without limit: 0.594984 a ... 4.341808 a."""
     a = 1e-3
     edges = np.linspace(0.0, 200.0 * a, 4001)
     mask = Mask(windows=[[0.0, edges[20 * beta]]])
     assert centre(mask.apply(corner_glow(edges, a), edges), edges)[0] / a == pytest.approx(expected, abs=1e-6)
-    # Within a bin, by even light in it: to the square of the bins' width.
+    # Light is uniform within a bin: the error is second order in the bin width.
     coarse = np.linspace(0.0, 200.0 * a, 777)
     assert centre(mask.apply(corner_glow(coarse, a), coarse), coarse)[0] / a == pytest.approx(expected, rel=0.01)
 
@@ -68,7 +68,7 @@ def test_windows_within_bins_converge() -> None:
     leak=st.floats(0.0, 1.0),
 )
 def test_light_through_a_window(seed: int, ends: tuple[float, float], leak: float) -> None:
-    """No light is made, none lies outside its bin, two windows side by side pass what one over both does."""
+    """Light is conserved and stays in its bin; two adjacent windows pass the same light as one window over both."""
     rng = np.random.default_rng(seed)
     edges = np.sort(rng.uniform(-3.0, 3.0, 8))
     power = rng.uniform(0.0, 1.0, (2, 7)) * (rng.uniform(size=(2, 7)) > 0.3)
@@ -125,7 +125,7 @@ def test_what_is_refused() -> None:
 
 @pytest.mark.parametrize("lens", [None, Lens(k1=-4000.0)])
 def test_mask_about_an_expected_profile(lens: Lens | None) -> None:
-    """Its ends are seen at the heights asked for, above and below; it is closed where nothing is expected."""
+    """The window ends are at the requested heights, above and below; it is closed where no line is expected."""
     view = psd_view()
     view = replace(view, triangulation=replace(view.triangulation, lens=lens))
     u = np.array([-2e-3, -1e-3, np.nan, 1e-3, 2.9e-3])
@@ -159,7 +159,7 @@ def part(profiles: int = 12) -> tuple:
 
 @pytest.mark.parametrize("objective", ["max", "rms"])
 def test_fixed_mask(objective: str) -> None:
-    """No window of bins that cuts no more does better: all of them tried."""
+    """No other window that passes the required light has a smaller error: all windows are tried."""
     view, light, truth, u = part()
     plan = optimise_mask(view, light, truth, objective=objective, min_passed_fraction=0.999)
     assert np.all(plan.passed_fraction >= 0.999)
@@ -186,7 +186,7 @@ def _tails(direct: Exposure, low: int, high: int) -> np.ndarray:
 
 
 def test_mask_that_follows_the_part() -> None:
-    """A window for every profile leaves next to nothing of a glow that lies apart."""
+    """A window for every profile removes nearly all secondary light that is separate from the line."""
     view, light, truth, u = part()
     fixed = optimise_mask(view, light, truth)
     follows = optimise_mask(view, light, truth, fixed=False)
@@ -199,13 +199,13 @@ def test_mask_that_follows_the_part() -> None:
 def test_margin_keeps_away_from_valid_light() -> None:
     view, light, truth, u = part()
     windows = optimise_mask(view, light, truth, min_passed_fraction=0.999, margin=3e-4).mask.windows
-    # 99.95 % of a Gaussian on either side are 3.29 sigma; a bin is 50 um wide.
+    # 99.95 % of a Gaussian on either side correspond to 3.29 sigma; a bin is 50 um wide.
     assert np.all(windows[:, 0] <= u.min(axis=0) - 3e-4 - 3.29 * 4e-5 + 5e-5)
     assert np.all(windows[:, 1] >= u.max(axis=0) + 3e-4 + 3.29 * 4e-5 - 5e-5)
 
 
 def test_samples_without_valid_light_are_closed() -> None:
-    """What they would read is the glow alone: better no reading."""
+    """They would read only secondary light, so no reading is better."""
     view, light, truth, u = part(4)
     dark = np.zeros(u.shape, bool)
     dark[:, 2] = dark[1, 3] = True
@@ -220,7 +220,7 @@ def test_samples_without_valid_light_are_closed() -> None:
 
 
 def test_a_camera_of_many_pixels() -> None:
-    """Narrowed down over several rounds: the same as the tightest window, where that is the best."""
+    """The search over several rounds finds the tightest window where it is optimal."""
     edges = np.linspace(-0.5 * LENGTH, 0.5 * LENGTH, 1025)
     view = psd_view(1024)
     np.testing.assert_array_equal(edges, view.u_edges)

@@ -1,4 +1,4 @@
-"""Simulated PSD strips: what is known of their readings in closed form."""
+"""Simulated PSD strips against closed forms of their readings."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_light_beyond_the_end(inside: float, signal: float, bias: float) -> None
     view, sigma = psd_view(), 1e-4
     spot = 0.5 * LENGTH - inside * sigma
     total, u = moments(psd(view, responsivity=0.5), {"direct": gaussian(view, [spot], 2e-6, sigma)})
-    # The table is good to a unit of its last digit.
+    # The table is accurate to one unit of its last digit.
     assert total[0] / 1e-6 == pytest.approx(signal, abs=1e-4)
     assert (u[0] - spot) / sigma == pytest.approx(bias, abs=1e-4)
     exact = -np.exp(-0.5 * inside**2) / np.sqrt(2.0 * np.pi) / ndtr(inside)
@@ -53,7 +53,7 @@ def test_light_beyond_the_end(inside: float, signal: float, bias: float) -> None
 
 
 def test_several_lights() -> None:
-    """The centre of gravity of all of them, whatever their shape and their bins: sum P x / sum P."""
+    """The reading is the centre of gravity of all lights, sum P x / sum P, for any shape and binning."""
     places, powers = np.array([-2e-3, 1e-4, 2.5e-3]), np.array([1e-6, 5e-6, 2e-7])
     for bins in (1, 7, 60):
         view = psd_view(bins)
@@ -74,7 +74,7 @@ def test_secondary_light() -> None:
 
 
 def test_ambient_light() -> None:
-    """It pulls to the middle, by S / (S + background); demodulated it does not."""
+    """It shifts the reading to the middle by S / (S + background), but not with demodulation."""
     view = psd_view()
     light = {"direct": gaussian(view, [1e-3], 1e-6, 5e-5)}
     _, u = moments(psd(view, ambient=100e-6), light)
@@ -121,7 +121,7 @@ def test_no_light_is_no_reading(device: Device) -> None:
 
 
 def test_codes(device: Device) -> None:
-    """Codes are within half a step of the currents; what is beyond the highest one is flagged."""
+    """Codes are within half a step of the currents; currents beyond the largest code are flagged."""
     view = psd_view()
     light = {"direct": view.deposit_spots([1e-3] * 3, view.v_centres[:3], [1e-6, 1e-7, 1e-2])}
     coded = psd(view, readout={"ampere": 1e-11, "dark": (1e-9, 1e-9)}, quantised=True)
@@ -140,7 +140,7 @@ def test_codes(device: Device) -> None:
 
 
 def test_noise_is_what_the_readout_predicts(device: Device) -> None:
-    """Over many profiles the readings scatter by the sigma that the readout gives for them, each cause by itself."""
+    """Over many profiles the readings scatter by the sigma that the readout predicts, for each cause separately."""
     view, spot, current = psd_view(), 2e-4, 0.4e-6
     places = np.linspace(-2e-3, 2e-3, view.samples)
     one = {"direct": gaussian(view, places, current / 0.4, spot)}
@@ -149,7 +149,8 @@ def test_noise_is_what_the_readout_predicts(device: Device) -> None:
         simulator = psd(view, readout={"noise": PsdNoise(**kinds)})
         reading = simulator.read(light, seed=7, device=device)
         sigma = simulator.read(one, device=device).sigma
-        # 3000 samples: 1.3 % is one standard error; shot noise knows the spot's bins only.
+        # 3000 samples: 1.3 % is one standard error; the position noise by photons is resolved only to the bins of the
+        # spot.
         assert np.sqrt(np.mean((reading.h.std(axis=0) / sigma) ** 2)) == pytest.approx(1.0, abs=0.06)
         slope = height_secant(view.triangulation, places, places, view.v_centres)
         electrons = current / (2.0 * ELECTRON * kinds.get("bandwidth", 1.0))
@@ -175,7 +176,7 @@ def test_covariance_of_the_two_currents(independent: float, opposed: float, shot
     of_centroid = (LENGTH * 12 / 30) ** 2 / 12 * 2.0 * ELECTRON * bandwidth / current * (current / LENGTH) ** 2
     alike, opposite = np.ones((2, 2)), np.array([[1.0, -1.0], [-1.0, 1.0]])
     expected = of_total / 4 * alike + (of_centroid + opposed**2) * opposite + independent**2 * np.eye(2)
-    # 22 500 draws know a variance to 0.94 % and a correlation to 0.67 %; four of these.
+    # 22 500 draws determine a variance to 0.94 % and a correlation to 0.67 %; four times this margin.
     for axes in (np.eye(2), np.array([[1.0, 1.0], [-1.0, 1.0]])):  # the currents; their sum and difference
         scatter, exact = np.cov(axes @ pairs.T), axes @ expected @ axes.T
         scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
@@ -184,7 +185,7 @@ def test_covariance_of_the_two_currents(independent: float, opposed: float, shot
 
 
 def test_noise_belongs_to_the_profile() -> None:
-    """Blocks do not matter: a profile's noise follows from its number; other profiles and strips have their own."""
+    """A profile's noise follows from its number, not from blocks; other profiles and strips are independent."""
     view = psd_view()
     light = {"direct": gaussian(view, [0.0], 1e-6, 5e-5)}
     simulator = psd(view, readout={"noise": PsdNoise(independent=1e-9, bandwidth=1e6)})
@@ -207,7 +208,7 @@ def test_ambient_light_has_shot_noise_also_where_its_mean_is_gone() -> None:
 
 
 def test_axes_that_run_backwards(device: Device) -> None:
-    """A readout whose axes point against the sensor's coordinates says the same of the light, in the view's order."""
+    """A readout with axes opposite to the sensor coordinates gives the same result in the order of the view."""
     view = psd_view()
     axes = SampleAxes(sample_origin=float(view.v_centres[-1]), sample_pitch=-PITCH, position_pitch=-1.0)
     table = tuple(tuple(1e-6 * np.arange(3) * strip) for strip in range(view.samples))

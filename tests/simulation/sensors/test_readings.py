@@ -1,4 +1,4 @@
-"""What simulated sensors share: sheet points, slopes, and light by path."""
+"""Common parts of simulated sensors: sheet points, slopes, and light by path."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_sheet_points_are_the_triangulation_s(lens: Lens | None, device: Device,
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_secants(lens: Lens | None, rng: np.random.Generator) -> None:
-    """Differences over distances, and no digit lost where the distance goes to nothing."""
+    """Difference quotients keep their accuracy for distances towards 0."""
     triangulation = with_lens(lens)
     u, other = rng.uniform(-0.5 * LENGTH, 0.5 * LENGTH, (2, 50))
     v = rng.uniform(-2 * PITCH, 2 * PITCH, 50)
@@ -52,7 +52,7 @@ def test_secants(lens: Lens | None, rng: np.random.Generator) -> None:
     step = 1e-6
     slope = (sheet_point(triangulation, u + step, v)[1] - sheet_point(triangulation, u - step, v)[1]) / (2.0 * step)
     for near in (0.0, 1e-15, 1e-11, 1e-9):
-        # Between the derivative here and the one at the other place lies that place's distance.
+        # The secant differs from the derivative by the change of the derivative over the distance.
         np.testing.assert_allclose(height_secant(triangulation, u, u + near, v), slope, rtol=1e-6)
 
 
@@ -78,7 +78,7 @@ def test_beyond_the_horizon_there_is_no_point() -> None:
 
 
 def test_light_of_profiles() -> None:
-    """Paths add up, variants of the direct light do not; a path that a profile lacks is dark there."""
+    """Paths are summed, variants of the direct light are not; a path that a profile lacks has no light."""
     view = psd_view()
     spots = [gaussian(view, [place], 1e-6, 1e-4) for place in (-1e-3, 0.0, 1e-3)]
     block = stack_profiles([{"direct": spots[0], UNIFORM: spots[2]}, {"direct": spots[1], "multi-bounce": spots[2]}])

@@ -36,7 +36,7 @@ def test_a_ray_passes_what_is_imaged_where_it_starts():
 
 def test_what_is_behind_the_lens_or_over_the_horizon_is_nowhere():
     one = sensor_view()
-    # Behind the lens; beside it, on a ray that does not come to the sheet.
+    # Behind the lens; beside it, on a ray that does not intersect the sheet.
     assert np.isnan(one.project([[0.0, 2 * BASELINE, 2 * STAND_OFF], [0.0, 0.5, 0.2]])).all()
     assert one.aperture_solid_angle([0.0, 2 * BASELINE, 2 * STAND_OFF]) == 0.0
 
@@ -52,7 +52,7 @@ def test_an_untilted_lens_loses_by_the_fourth_power_of_the_cosine():
 @pytest.mark.parametrize("tilt", [None, 0.0, 0.3])
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_patch_gives_what_its_image_gets(tilt, lens):
-    # A small patch of radiance 1 that does not lie in the sheet: what it sends to the lens is what its image holds.
+    # A small patch of radiance 1 outside the sheet: its power through the lens equals the power of its image.
     one = sensor_view(tilt=tilt, distortion=lens)
     middle, e1, e2 = np.array([4e-3, 6e-3, 3e-3]), np.array([1.0, 0.2, -0.1]), np.array([0.1, 0.9, 0.3])
     size = 1e-6

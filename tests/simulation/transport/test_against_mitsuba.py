@@ -1,4 +1,4 @@
-"""Light of lit strips against Mitsuba, a path tracer with which nothing here is shared: within its own noise."""
+"""Light of lit strips against the independent path tracer Mitsuba, within the noise of Mitsuba."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ SEEDS = 16
 
 
 class Agreement(NamedTuple):
-    """Of pictures by several seeds and one that is expected; the pixels' own spread over the seeds is the noise."""
+    """Comparison of images with several seeds and an expected image; the noise is the variation over the seeds."""
 
-    chi_square: float  # per pixel; 1 if noise is all there is
+    chi_square: float  # per pixel; 1 if there is only noise
     chi_sigma: float
-    bias: float  # of the mean of ratios
+    bias: float  # standard error of the mean ratio
     bias_sigma: float
     pixels: int
 
@@ -51,7 +51,7 @@ def render(lit: LitScene, samples: int) -> Picture:
 
 @pytest.fixture(scope="module", params=[90.0, 60.0], ids=["corner", "groove"])
 def glowing(request):
-    """The angle in degrees, Mitsuba's pictures, and ours."""
+    """Return the angle in degrees, Mitsuba's images, and gpuvision's image."""
     lit = groove(np.radians(request.param))
     return request.param, render(lit, 256), *expect(lit)
 
@@ -74,7 +74,7 @@ def test_the_comparison_sees_a_thousandth_and_a_degree(glowing):
     angle, pictures, expected, kept = glowing
     brighter = compare(pictures, 1.001 * expected, kept)
     assert abs(brighter.bias) > 3.0 * brighter.bias_sigma
-    # A wall that leans by one degree more, with the same light in all.
+    # A wall with an angle larger by one degree, with the same total light.
     other, _ = expect(groove(np.radians(angle + 1.0)))
     leaning = compare(pictures, other * (expected[kept].sum() / other[kept].sum()), kept)
     assert abs(leaning.chi_square - 1.0) > 4.0 * leaning.chi_sigma
@@ -82,7 +82,7 @@ def test_the_comparison_sees_a_thousandth_and_a_degree(glowing):
 
 @pytest.fixture(scope="module")
 def busy():
-    """Mitsuba's pictures of a board with parts, which hide parts of the line from each other."""
+    """Return Mitsuba's images of a board with parts that occlude parts of the line."""
     lit = board()
     return lit, render(lit, 512)
 

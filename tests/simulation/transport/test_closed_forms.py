@@ -1,4 +1,4 @@
-"""Closed forms of secondary light: wedges, corners, plates, rectangles, spheres; how fast what is sampled converges."""
+"""Closed forms of secondary light: wedges, corners, plates, rectangles, spheres; convergence of sampled quantities."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PRECISIONS = pytest.mark.parametrize("precision", ["single", "double"])
 TO = {"single": 1e-6, "double": 1e-11}
 WEDGES = pytest.mark.parametrize("degrees", [30.0, 60.0, 90.0, 120.0, 150.0])
 LONG = 1e7
-# E_B a / M on the other wall of a corner, E_B h / M on the other of two plates; per albedo.
+# E_B a / M on the second wall of a corner, E_B h / M on the second of two plates; per albedo.
 AT_CORNER, CORNER = (
     np.array([0.1, 0.5, 1.0, 2.0, 10.0]),
     {0.5: (0.055251, 0.184470, 0.181049, 0.092235, 0.005525), 0.8: (0.065894, 0.194054, 0.188357, 0.097027, 0.006589)},
@@ -37,14 +37,14 @@ AT_PLATES, PLATES = (
 
 
 def line(place: Any, front: Any) -> LitSegments:
-    """A line along y, as good as endless, of 1 W/m."""
+    """Return a practically infinite line along y of 1 W/m."""
     ends = np.array([[place, place]], float)
     ends[0, :, 1] = -LONG, LONG
     return LitSegments(ends, [front], [1.0])
 
 
 def on_wall(b: Any, omega: float) -> np.ndarray:
-    """Receivers at distances b from the edge, on the wall that stands on the plane z = 0 at an angle."""
+    """Return receivers at distances b from the edge, on the wall at an angle to the plane z = 0."""
     b = np.atleast_1d(np.asarray(b, float))
     c, s = math.cos(omega), math.sin(omega)
     return np.column_stack([b * c, 0.0 * b, b * s, *(np.full_like(b, v) for v in (s, 0.0, -c))])
@@ -64,7 +64,7 @@ def test_wedge_by_lines(device: Device, degrees: float, precision: Any) -> None:
 def test_wedge_by_patches(device: Device, degrees: float, precision: Any) -> None:
     """The same light, integrated over strips of the lit plane, each of which is one patch."""
     omega, b, edges = math.radians(degrees), np.geomspace(1e-1, 1e1, 64), np.array([0.0, 0.2, 1.0, 3.0, 20.0])
-    # Edges that reach 1e4 times as far as they are away cost single its last digits, and longer ones more.
+    # Edges with 1e4 times the length of their distance lose digits in single precision; longer edges lose more.
     length, close = (1e4, 4e-6) if precision == "single" else (1e8, 1e-11)
     floor = Patches(reference.strips(edges, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0), length), np.repeat(np.arange(4), 2))
     factors = FormFactors(patches=floor, precision=precision)(on_wall(b, omega), device=device).factors
@@ -77,7 +77,7 @@ def test_wedge_by_patches(device: Device, degrees: float, precision: Any) -> Non
 
 @WEDGES
 def test_power_on_the_other_wall(device: Device, degrees: float) -> None:
-    """M (1 + cos(omega)) / 2 of a line reaches an endless wall: the form factor of its points with the wall."""
+    """M (1 + cos(omega)) / 2 of a line reaches an infinite wall: the form factor from its points to the wall."""
     omega, width = math.radians(degrees), 1e4
     away = np.array([math.cos(omega), 0.0, math.sin(omega)])
     wall = reference.strips(np.array([0.0, width]), away, (math.sin(omega), 0.0, -math.cos(omega)), 1e8)
@@ -92,7 +92,7 @@ def test_power_on_the_other_wall(device: Device, degrees: float) -> None:
 
 
 def gauss_in_log(beta: float, nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return places and weights of integrals over (0, beta], by Gauss and Legendre in ln(b) on panels of width 2."""
+    """Return nodes and weights of integrals over (0, beta]: Gauss-Legendre in ln(b) on panels of width 2."""
     low, high = math.log(1e-9), math.log(beta)
     panels = np.linspace(low, high, math.ceil((high - low) / 2.0) + 1)
     x, w = np.polynomial.legendre.leggauss(nodes)
@@ -125,7 +125,7 @@ def test_brightest_place_in_a_corner(device: Device) -> None:
 
 
 def test_how_the_power_in_a_window_converges(device: Device) -> None:
-    """Midpoints leave 1 / n^2; Gauss and Legendre in ln(b) gain digits with every node."""
+    """Midpoint errors are 1 / n^2; Gauss-Legendre in ln(b) gains digits with every node."""
     light = LineIrradiance(segments=line((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
     exact = 0.5 * (1.0 - 1.0 / math.sqrt(1.0 + 5.0**2))
 
@@ -141,9 +141,9 @@ def test_how_the_power_in_a_window_converges(device: Device) -> None:
 
 @PRECISIONS
 def test_perpendicular_rectangle(device: Device, precision: Any) -> None:
-    """Of width a, height b, at distance c from an element at the foot of the corner."""
+    """Rectangle of width a and height b, at distance c from an element at the foot of the corner."""
     cases = ((1.0, 1.0, 1.0), (0.1, 3.0, 2.0), (5.0, 0.2, 0.3), (40.0, 40.0, 0.1))
-    # Beside edges that reach far away single has fewer digits.
+    # Near very long edges, single precision is less accurate.
     for a, b, c in cases[:2] if precision == "single" else cases:
         quad = np.array([[c, 0.0, 0.0], [c, 0.0, b], [c, a, b], [c, a, 0.0]])
         wall = Patches(quad[[[0, 1, 2], [0, 2, 3]]], np.zeros(2, int))
@@ -156,7 +156,7 @@ def test_perpendicular_rectangle(device: Device, precision: Any) -> None:
 
 
 def test_squares_that_face_each_other_and_that_meet(device: Device) -> None:
-    """From square to square: Gauss and Legendre over one of them. Where they meet, the light there has an edge."""
+    """Form factors between squares by Gauss-Legendre over one of them; adjacent squares have an edge singularity."""
     square = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1.0, 0.0, 1.0]])
     wall = np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
     both = FormFactors(patches=Patches(np.concatenate([square, wall])[[[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]]))
@@ -178,7 +178,7 @@ def test_squares_that_face_each_other_and_that_meet(device: Device) -> None:
 
 
 def between_walls(edges: np.ndarray, walls: Any, first: np.ndarray, albedo: float, length: float, device: Any) -> Any:
-    """Solve two walls (across, front, from) in strips; the first light arrives on the second one."""
+    """Solve two walls (across, front, from) in strips; the first light arrives on the second wall."""
     triangles = [reference.strips(edges, across, front, length) + np.asarray(start) for across, front, start in walls]
     count = len(edges) - 1
     patches = Patches(np.concatenate(triangles), np.repeat(np.arange(2 * count), 2))
@@ -187,7 +187,7 @@ def between_walls(edges: np.ndarray, walls: Any, first: np.ndarray, albedo: floa
 
 
 def plates(count: int, albedo: float, device: Device) -> tuple[np.ndarray, float]:
-    """Return E_B h / M at AT_PLATES, and the power on the plate across over M."""
+    """Return E_B h / M at AT_PLATES, and the power on the opposite plate over M."""
     edges = np.sinh(np.linspace(-1.0, 1.0, count + 1) * np.arcsinh(300.0))
     walls = [((1, 0, 0), (0, 0, 1), (0, 0, 0)), ((1, 0, 0), (0, 0, -1), (0, 0, 1))]
     solved, exitance = between_walls(edges, walls, edges / (2 * np.sqrt(1 + edges**2)), albedo, 1e5, device)
@@ -207,7 +207,7 @@ def corner(count: int, albedo: float, device: Device) -> np.ndarray:
 
 
 def extrapolated(values: list[np.ndarray]) -> np.ndarray:
-    """What values at 1, 2, 4 times as many patches tend to: twice by Richardson; they must be of second order."""
+    """Return the Richardson limit of values at 1, 2, 4 times the number of patches; check second order."""
     steps = [np.abs(fine - coarse).max() for coarse, fine in pairwise(values)]
     assert all(3.5 < coarse / fine < 4.5 for coarse, fine in pairwise(steps))
     once = [(4.0 * fine - coarse) / 3.0 for coarse, fine in pairwise(values)]
@@ -216,7 +216,7 @@ def extrapolated(values: list[np.ndarray]) -> np.ndarray:
 
 @pytest.mark.parametrize("albedo", list(PLATES))
 def test_parallel_plates_with_all_bounces(device: Device, albedo: float) -> None:
-    """The table, to its last digit; plates of 600 gaps, which leaves 1e-7 where albedos are up to 0.95."""
+    """Equal to the table to its last digit; plates 600 gaps wide leave an error of 1e-7 for albedos up to 0.95."""
     solutions = [plates(count, albedo, device) for count in (100, 200, 400)]
     light = extrapolated([each for each, _ in solutions])
     np.testing.assert_allclose(light, PLATES[albedo], atol=1.5e-6 if albedo > 0.9 else 6e-7, rtol=0)
@@ -226,7 +226,7 @@ def test_parallel_plates_with_all_bounces(device: Device, albedo: float) -> None
 
 @pytest.mark.parametrize("albedo", [*CORNER, 1.0])
 def test_corner_with_all_bounces(device: Device, albedo: float) -> None:
-    """The table, to its last digit, and the convolution solved; it is regular for white walls too."""
+    """Equal to the table to its last digit, and to the solved convolution, also for white walls."""
     light = extrapolated([corner(count, albedo, device) for count in (100, 200, 400)])
     np.testing.assert_allclose(light, reference.corner_irradiance(albedo, AT_CORNER), rtol=2e-6)
     if albedo in CORNER:
@@ -234,21 +234,21 @@ def test_corner_with_all_bounces(device: Device, albedo: float) -> None:
 
 
 def sphere(finer: int, height: float = 1.0) -> tuple[Patches, Scene]:
-    """The inside of a sphere of radius 1 up to such a height."""
+    """Return the inside of a sphere of radius 1 up to a height."""
     triangles = np.asarray(trimesh.creation.icosphere(finer).triangles)[:, ::-1]
     triangles = triangles[triangles.mean(axis=1)[:, 2] < height]
     return Patches(triangles), Scene(triangles)
 
 
 def test_any_two_places_in_a_sphere(device: Device) -> None:
-    """Each sees dA / (4 pi R^2) of the other, wherever they are; flat facets are so to first order, all to none."""
+    """The form factor is dA / (4 pi R^2) for any two places; flat facets agree to first order, the total exactly."""
     errors = []
     for finer in (2, 3):
         patches, scene = sphere(finer)
         turn = trimesh.transformations.rotation_matrix(0.7, (1.0, 2.0, 3.0))[:3, :3]
         places = np.asarray(trimesh.creation.icosphere(1).vertices) @ turn
         plain = FormFactors(patches=patches)(np.column_stack([places, -places]), device=device).factors
-        # Nothing hides anything in there.
+        # No occlusion inside a sphere.
         inside = np.column_stack([0.9 * places, -places])
         seen = FormFactors(patches=patches, scene=scene)(inside, device=device).factors
         free = FormFactors(patches=patches)(inside, device=device).factors
@@ -263,7 +263,7 @@ def test_any_two_places_in_a_sphere(device: Device) -> None:
 
 @pytest.mark.parametrize("height", [1.0, 0.6])
 def test_integrating_sphere(device: Device, height: float) -> None:
-    """One bounce: albedo * power / (4 pi R^2) everywhere; all: over 1 - albedo (1 - open part)."""
+    """One bounce: albedo * power / (4 pi R^2) everywhere; all bounces: divided by 1 - albedo (1 - open part)."""
     albedo, errors = 0.9, []
     for finer in (2, 3):
         patches, scene = sphere(finer, height)

@@ -1,4 +1,4 @@
-"""DirectLight: its power, rays against every triangle, the truth, materials and causes."""
+"""DirectLight: power, rays against every triangle, ground truth, materials and causes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from light_of_a_sheet import GREY, TRANSPORT, light_of, plate, quad, sensor_view
 @pytest.mark.parametrize("lens", [None, Lens(k1=-900.0, centre=(1e-4, -2e-4))])
 @pytest.mark.parametrize("sigma", [0.0, 1e-4])
 def test_power_of_a_plate(device: Device, lens: Lens | None, sigma: float) -> None:
-    """Each sample gets what its part of the line sends into the lens; the place is that of the line."""
+    """Each sample gets the light of its part of the line through the lens, at the position of the line."""
     seen_by = sensor_view(lens=lens, samples=16)
     light = light_of(plate(z=3e-3), seen_by=seen_by, power=2.0, sigma=sigma, sub_sheets=5, device=device)
     direct = light.exposures(0.02)["direct"]
@@ -46,7 +46,7 @@ def test_power_of_a_plate(device: Device, lens: Lens | None, sigma: float) -> No
             2.0 * 0.5 / math.pi * eye[:, 2] / np.linalg.norm(eye, axis=1) * seen_by.aperture_solid_angle(points, 0.02)
         )
         sent *= 0.5 * (end - start) * weight
-        # The reference's own interpolation is good to 1e-8; a Gaussian is a curve in perspective.
+        # The interpolation of the reference is accurate to 1e-8; perspective distorts a Gaussian.
         rough = 1e-7 if sigma == 0.0 else 1e-5
         assert direct.total()[sample] == pytest.approx(sent.sum(), rel=rough)
         place = sent @ seen_by.project(points, 0.02)[:, 0] / sent.sum()
@@ -54,7 +54,7 @@ def test_power_of_a_plate(device: Device, lens: Lens | None, sigma: float) -> No
 
 
 def test_finer_bins_and_samples_add_up(rng: np.random.Generator) -> None:
-    """A steep and broken surface: what a sample gets does not hang on how it is divided."""
+    """A steep and broken surface: the light of a sample does not depend on its subdivision."""
     mesh = trimesh.creation.icosphere(3, 0.012)
     mesh.vertices *= 1.0 + 0.05 * rng.normal(size=(len(mesh.vertices), 1))
     gloss = Material(diffuse=OrenNayar(albedo=0.4, roughness=0.5), gloss=Phong(albedo=0.3, exponent=20.0))
@@ -72,13 +72,13 @@ def test_finer_bins_and_samples_add_up(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(sums[0], sums[1], rtol=2e-2, atol=1e-14)
 
 
-# ---- what is seen: rays against every triangle -------------------------------------------------------------
+# ---- visibility: rays against every triangle -------------------------------------------------------------
 
 
 @pytest.mark.parametrize("source", [None, (0.005, 0.3)])
 @pytest.mark.parametrize("lens", [None, Lens(k1=-900.0, centre=(1e-4, -2e-4))])
 def test_as_rays_to_the_lens_say(device: Device, source: Any, lens: Lens | None, rng: np.random.Generator) -> None:
-    """Light of points on the lit line, each with a ray to the lens; truths lie on the line and are seen."""
+    """Light of points on the lit line, each with a ray to the lens; true positions are visible points of the line."""
     tips = rng.uniform(-0.02, 0.02, (150, 1, 3)) + rng.normal(0.0, 4e-3, (150, 3, 3))
     scene, seen_by, L = Scene(np.concatenate([tips, plate(0.03, 0.03, -0.02)])), sensor_view(lens=lens, bins=6), 1e-3
     light = light_of(scene, seen_by=seen_by, source=source, device=device)
@@ -111,7 +111,7 @@ def test_as_rays_to_the_lens_say(device: Device, source: Any, lens: Lens | None,
 
 
 def test_very_many_gaps() -> None:
-    """A comb in the way to the lens, of more teeth than the kernel keeps: halves are looked at."""
+    """A comb before the lens with more teeth than the kernel can store: segments are halved."""
     teeth = np.linspace(-0.01, 0.01, 201)
     screen = np.concatenate(
         [
@@ -127,13 +127,14 @@ def test_very_many_gaps() -> None:
     )
     assert parts.visible.sum() >= 100
     assert np.sum(parts.end - parts.start) == pytest.approx(parts.segment.max() + 1, rel=1e-12)
-    # The plate is 2 m wide, and the lit line is two segments of 1 m; the shadows are the teeth's, from the lens.
+    # The plate is 2 m wide, and the lit line is two segments of 1 m; the shadows are projections of the teeth from the
+    # lens.
     hidden = np.sum((parts.end - parts.start)[~parts.visible])
     assert hidden == pytest.approx(100 * (teeth[1] - teeth[0]) * 0.15 / 0.14, rel=1e-9)
 
 
 def test_coincident_faces_are_one() -> None:
-    """A face upon another, in other triangles, takes nothing and hides nothing; the first one's material counts."""
+    """Coincident faces with other triangles do not occlude or absorb; the material of the first one counts."""
     over = np.array([[(-0.1, -0.1, 0), (0.1, -0.1, 0), (0.0, 0.15, 0)]], float)
     once, twice = Scene(plate()), Scene(np.concatenate([plate(), over]), np.array([0, 0, 1]))
     other = Material(diffuse=Lambert(albedo=0.1))
@@ -146,7 +147,7 @@ def test_coincident_faces_are_one() -> None:
 
 @pytest.mark.parametrize("lean", [80.0, 89.0, 89.99])
 def test_grazing_light(lean: float) -> None:
-    """Along a wall that nearly stands upright: the power that meets it, spread over its height, as the lens sees it."""
+    """On a nearly vertical wall, the power is spread over its height, in the view of the lens."""
     tangent = math.tan(math.radians(lean))
     low, high = -2e-3 / tangent, 2e-3 / tangent
     wall = quad((low, -1, -2e-3), (high, -1, 2e-3), (high, 1, 2e-3), (low, 1, -2e-3))
@@ -163,7 +164,7 @@ def test_grazing_light(lean: float) -> None:
 
 
 def test_metres_and_micrometres() -> None:
-    """A step of a micrometre on a slab of 20 m, 100 m down the transport: the truth is good to the place's digits."""
+    """A step of a micrometre on a slab of 20 m, at L = 100 m: the true position is accurate to its rounding."""
     L, fine = 100.0, 1e-6
     ground = plate(10.0, 10.0) + np.array([0.0, L, 0.0])
     tile = plate(5e-6, 1e-5, fine) + np.array([2e-3, L, 0.0])
@@ -178,7 +179,7 @@ def test_metres_and_micrometres() -> None:
 
 @pytest.mark.parametrize("lens", [None, Lens(k1=-900.0, centre=(1e-4, -2e-4)), Lens(k1=-4e3)])
 def test_out_of_view_behind_the_lens_and_beyond_the_fold(lens: Lens | None) -> None:
-    """A ramp from below the sensor's range up to far above the lens: what has an image counts, and nothing else."""
+    """A ramp from below the sensor's range up to far above the lens: only points with an image count."""
     ramp = quad((-0.03, -1, -0.05), (0.5, -1, 1.0), (0.5, 1, 1.0), (-0.03, 1, -0.05))
     seen_by = sensor_view(
         lens=lens, bins=30, u_edges=np.linspace(-9e-3, 9e-3, 31), v_edges=np.linspace(-9e-3, 9e-3, 10)
@@ -211,7 +212,7 @@ def test_out_of_view_behind_the_lens_and_beyond_the_fold(lens: Lens | None) -> N
 def test_truth_at_a_step() -> None:
     """A narrow strip of tape over a plate: the higher surface is magnified.
 
-    Where it ends right of the middle, samples see it and the plate: ambiguous; on the left they see neither.
+    Where it ends right of the middle, samples contain both surfaces (ambiguous); on the left they contain no surface.
     """
     for at, flag in ((8e-3, Status.AMBIGUOUS), (-8e-3, Status.LOW_SIGNAL)):
         seen_by = sensor_view(samples=2000)
@@ -244,7 +245,7 @@ def test_truth_follows_the_transport(rng: np.random.Generator) -> None:
 
 
 def test_beside_the_sensor() -> None:
-    """What is imaged beyond the ends of the strips is out of range, also if a lid hides a part; nothing is dark."""
+    """Light imaged beyond the ends of the strips is out of range, also if a lid hides a part; it is not low signal."""
     for corners in (np.concatenate([plate(0.02, 0.02), plate(0.03, 0.03, 0.03)]), plate(z=-0.2)):
         light = light_of(corners)
         truth = light.truth(0.0)
@@ -258,7 +259,7 @@ def test_beside_the_sensor() -> None:
 
 @pytest.mark.parametrize("sigma", [0.0, 2e-4])
 def test_several_profiles_at_once(device: Device, sigma: float) -> None:
-    """As one by one, in any order, some beside the part; shining mirrors and lobes among them."""
+    """Profiles together, in any order, also beside the part, equal profiles one by one; with mirrors and lobes."""
     ball = trimesh.creation.icosphere(3, 0.02)
     made_of = Material(diffuse=Lambert(albedo=0.2), gloss=Phong(albedo=0.2, exponent=30.0), mirror=0.3)
     seen_by = sensor_view(bins=5, aperture=0.02)
@@ -277,7 +278,7 @@ def test_several_profiles_at_once(device: Device, sigma: float) -> None:
 
 
 def test_in_a_slit_is_dark() -> None:
-    """A part wholly in a deep slit, lit from above: the lens sees the walls' upper edges alone."""
+    """A part in a deep slit, lit from above: only the upper edges of the walls are visible from the lens."""
     walls = [quad((-1, y, -0.05), (1, y, -0.05), (1, y, 0.0), (-1, y, 0.0)) for y in (-2e-3, 2e-3)]
     scene = np.concatenate([plate(1.0, 2e-3, -0.05), *walls])
     truth = light_of(scene, seen_by=sensor_view(bins=1, u_edges=np.array([-0.1, 0.1]))).truth(0.0)
@@ -293,7 +294,7 @@ def test_in_a_slit_is_dark() -> None:
     [Phong(albedo=0.4, exponent=2000.0), Ggx(alpha=0.02, f0=0.5), Ward(albedo=0.4, alpha_x=0.02, alpha_y=0.3)],
 )
 def test_lobes_are_resolved(lobe: Any) -> None:
-    """A lobe narrower than a sample: as a sum over a million points of the line."""
+    """A lobe narrower than a sample agrees with a sum over a million points of the line."""
     tilt = 0.25
     fall = math.tan(tilt)
     slope = quad((-1, -1, fall), (1, -1, fall), (1, 1, -fall), (-1, 1, -fall))
@@ -316,7 +317,7 @@ def test_lobes_are_resolved(lobe: Any) -> None:
 
 
 def mirror_to_the_lens(turn: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """A plane through the origin that mirrors light from above to the lens, but for a turn; and its normal."""
+    """Return a plane through the origin that mirrors light from above to the lens, up to a rotation, and its normal."""
     lens = np.array([0.0, 0.08, 0.15])
     half_way = lens / np.linalg.norm(lens) + (0.0, math.sin(turn), math.cos(turn))
     normal = half_way / np.linalg.norm(half_way)
@@ -325,7 +326,7 @@ def mirror_to_the_lens(turn: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_mirror_throws_the_light_into_the_lens(device: Device) -> None:
-    """Of parallel light the width of the opening, dimmed by the mirror; a degree off, nothing."""
+    """The lens gets parallel light over its opening, times the reflectance; at one degree off, no light."""
     made_of = Material(diffuse=Lambert(albedo=0.0), mirror=0.7)
     seen_by = sensor_view(samples=9)
     corners, _ = mirror_to_the_lens()
@@ -342,13 +343,13 @@ def test_a_mirror_throws_the_light_into_the_lens(device: Device) -> None:
 
 
 def test_a_thick_sheet_in_a_mirror() -> None:
-    """The beam is wider than the opening: what goes in is the integral of its density over a disc."""
+    """The beam is wider than the opening: the light is the integral of its density over a disc."""
     made_of = Material(diffuse=Lambert(albedo=0.0), mirror=1.0)
     seen_by, sigma = sensor_view(samples=9, aperture=2e-4), 1e-4
     corners, normal = mirror_to_the_lens()
     light = light_of(corners, (made_of,), seen_by=seen_by, sigma=sigma, sub_sheets=400)
     off = np.linspace(-1e-4, 1e-4, 20001)
-    # A mirrored beam is as wide as before; across the axis, seen from the lens, no distance changes.
+    # A mirrored beam keeps its width; distances perpendicular to the axis of the lens do not change.
     chord = 2.0 * np.sqrt(np.maximum(1e-8 - off**2, 0.0))
     through = np.trapezoid(chord * np.exp(-0.5 * (off / sigma) ** 2), off) / (sigma * math.sqrt(2.0 * math.pi))
     assert light.exposures(0.0)["specular"].total().sum() == pytest.approx(through, rel=2e-3)
@@ -357,7 +358,7 @@ def test_a_thick_sheet_in_a_mirror() -> None:
 
 @pytest.mark.parametrize("source", [None, (0.01, 0.2), (-0.02, 0.1)])
 def test_glints_as_rays_say(source: Any, rng: np.random.Generator) -> None:
-    """Facets that lean any way by some degrees: of a thousand rays on each, those that meet the opening."""
+    """Facets with random tilts of some degrees: the share of a thousand rays on each that hit the opening."""
     seen_by = sensor_view(aperture=0.02)
     turns = rng.normal(0.0, 0.1, (300, 2))
     made_of = Material(diffuse=Lambert(albedo=0.0), mirror=1.0)
@@ -391,7 +392,7 @@ def test_glints_as_rays_say(source: Any, rng: np.random.Generator) -> None:
 
 
 def test_causes() -> None:
-    """Even surfaces, and nothing in the way: without a screen and with white surfaces nothing changes."""
+    """With uniform surfaces and no occluder, the variants without a screen and with white surfaces are equal."""
     scene, materials = two_plates(0.2, 0.8)
     light = light_of(scene, materials, seen_by=sensor_view(), sigma=1e-4, sub_sheets=[0.0])
     found = light.exposures(0.0, causes=True)

@@ -1,4 +1,4 @@
-"""DirectLight against closed forms of steps, corners, occlusion and spots: a lens so far that its image is parallel."""
+"""DirectLight against closed forms of steps, corners, occlusion and spots, in parallel projection."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def far_view() -> SensorView:
 
 
 def u_per_metre(seen_by: SensorView, towards: Any) -> float:
-    """How far the image of a point moves along u as the point does."""
+    """Return the motion of the image of a point along u per motion of the point."""
     ends = seen_by.project(0.5 * SIGMA * np.array([towards, towards]) * [[1.0], [-1.0]])
     return float(ends[0, 0] - ends[1, 0]) / SIGMA
 
@@ -39,7 +39,7 @@ def step_shift(k: float, x: float) -> float:
     return (k - 1.0) * bell(x) / (float(ndtr(x)) + k * float(ndtr(-x)))
 
 
-# The largest shift in sigmas of the beam, by the ratio of reflectances; it is its own offset.
+# The largest shift in sigmas of the beam, by the ratio of reflectances; it equals the offset of the step.
 STEPS = [(1.5, 0.162), (2.0, 0.276), (5.0, 0.636), (10.0, 0.902), (50.0, 1.485), (100.0, 1.721), (1000.0, 2.436)]
 
 
@@ -61,7 +61,7 @@ def test_step_of_reflectivity(k: float, largest: float) -> None:
 
 @pytest.mark.parametrize("x", [-2.0, -1.0, 0.0, 0.5, 2.0])
 def test_half_of_the_beam_hidden(device: Device, x: float) -> None:
-    """A screen in the way to the lens hides what lies beyond x sigmas: the shift is that of a step to 0."""
+    """A screen before the lens hides the beam beyond x sigmas: the shift equals the shift of a step to 0."""
     seen_by = far_view()
     lens, height = np.array(seen_by.lens), 0.01
     edge = x * SIGMA + (lens[1] - x * SIGMA) * height / lens[2]
@@ -79,7 +79,7 @@ def test_half_of_the_beam_hidden(device: Device, x: float) -> None:
 @pytest.mark.parametrize(("one", "two"), [(0.0, 0.6), (0.5, -0.5), (-0.3, 0.7), (-0.6, 0.2)])
 @pytest.mark.parametrize("x", [-1.0, 0.0, 0.4])
 def test_corner_between_slopes(one: float, two: float, x: float) -> None:
-    """Either side of a ridge or valley sends its part of the Gaussian, as it is turned to the lens."""
+    """Each side of a ridge or valley contributes its part of the Gaussian, weighted by its orientation to the lens."""
     seen_by = far_view()
     before = quad((-1, -1, -one), (1, -1, -one), (1, 0, 0), (-1, 0, 0))
     behind = quad((-1, 0, 0), (1, 0, 0), (1, 1, two), (-1, 1, two))
@@ -96,7 +96,7 @@ def test_corner_between_slopes(one: float, two: float, x: float) -> None:
 
 
 def test_order_of_convergence_in_slabs() -> None:
-    """First order where a step lies within a slab; second on a surface that bends."""
+    """First order where a step lies within a slab; second order on a curved surface."""
     seen_by = far_view()
     scene, materials = two_plates(0.1, 0.5)
     counts = np.array([8, 16, 32, 64, 128])
@@ -126,7 +126,7 @@ def test_order_of_convergence_in_slabs() -> None:
 
 
 def test_slabs_end_where_edges_lie_in_the_sheet() -> None:
-    """A turn and a change of material cut it; a diagonal, an edge in a plane, and one askew do not."""
+    """A fold and a change of material divide it; a diagonal, an edge within a plane, and a skew edge do not."""
     corners = np.concatenate(
         [
             plate(1.0, 0.5) + np.array([0.0, -0.5, 0.0]),
@@ -160,7 +160,7 @@ def test_slabs() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 9])
 def test_a_plate_gives_a_gaussian(count: int) -> None:
-    """Whatever the number of slabs: in every bin the light that falls into it. Rounding is that of 1.7 km."""
+    """For any number of slabs, every bin has the light that falls into it. The rounding is relative to 1.7 km."""
     seen_by = sensor_view(scale=FAR, bins=400, samples=1)
     light = light_of(plate(z=1e-3), seen_by=seen_by, sigma=SIGMA, sub_sheets=count)
     direct = light.exposures(0.0)["direct"]
@@ -174,7 +174,7 @@ def test_a_plate_gives_a_gaussian(count: int) -> None:
 
 
 def test_light_that_falls_beside_the_sensor_is_lost() -> None:
-    """Half of the spot over the end of the strips: half of the power, and sqrt(2 / pi) of its widths in its place."""
+    """Half of the spot is beyond the end of the strips: half of the power, shift of sqrt(2 / pi) widths."""
     whole = sensor_view(scale=FAR, bins=4, samples=1)
     middle = whole.project([0.0, 0.0, 1e-3])[0]
     cut = sensor_view(scale=FAR, samples=1, u_edges=np.array([-3e-3, 0.0, middle]))

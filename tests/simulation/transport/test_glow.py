@@ -1,4 +1,4 @@
-"""A recording's corners glow where the simulator says: beside the line, on the wall and on the ceiling."""
+"""Secondary light in the corners of a recording agrees with the simulator, on the wall and on the ceiling."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from conftest import DATA
 
 pytestmark = pytest.mark.realdata
 
-# Frames in which nothing else stands in the corner, so far to the left and to the right of the line [m].
+# Frames without other objects in the corner, up to these distances to the left and right of the line [m].
 FRAMES = {20: (-0.13, 0.14), 90: (-0.15, 0.35), 110: (-0.3, 0.15)}
 
 
@@ -61,13 +61,13 @@ def test_the_wall_glows_as_predicted(seen):
     once, all_of_it = (fits(seen, "wall", bounces=each) for each in (False, True))
     assert once.correlation > 0.965
     assert once.deviation < 0.11
-    # What bounces on between wall and ceiling takes half of the deviation away.
+    # Further bounces between wall and ceiling remove half of the deviation.
     assert all_of_it.correlation > 0.99
     assert all_of_it.deviation < 0.06
 
 
 def test_the_ceiling_glows_roughly_as_predicted(seen):
-    # It is seen at a grazing angle, 4 mm and more to a pixel, and gets light from everything below.
+    # The ceiling is viewed at a grazing angle, 4 mm and more per pixel, and gets light from everything below.
     once = fits(seen, "ceiling", bounces=False)
     assert once.correlation > 0.89
     assert once.deviation < 0.15
@@ -79,7 +79,7 @@ def test_all_frames_have_the_same_factor(frames, predicted):
 
 
 def test_the_wall_is_brightest_as_far_from_the_corner_as_beside_the_line(seen):
-    # Whatever the tone curve: a maximum stays one. A line of no end gives y = x.
+    # Any tone curve preserves a maximum. An infinite line gives y = x.
     number, red, surfaces = seen
     wall = surfaces["wall"]
     left, right = FRAMES[number]

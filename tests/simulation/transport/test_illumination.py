@@ -1,4 +1,4 @@
-"""LightSheet: what it lights, as rays of light against every triangle say; no power is lost, shadows are exact."""
+"""LightSheet: illumination against rays and all triangles; conservation of power, exact shadows."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def quad(a: Any, b: Any, c: Any, d: Any) -> np.ndarray:
 
 
 def plate(x: float, y: float, z: float = 0.0) -> np.ndarray:
-    """A rectangle about the z axis, seen from above."""
+    """Return a rectangle about the z axis that faces up."""
     return quad((-x, -y, z), (x, -y, z), (x, y, z), (-x, y, z))
 
 
 def step(height: float, at: float = 0.0) -> np.ndarray:
-    """Two plates, the left one so much higher, with a wall between them."""
+    """Return two plates, the left one higher, with a wall between them."""
     left = quad((-1, -1, height), (at, -1, height), (at, 1, height), (-1, 1, height))
     right = quad((at, -1, 0), (1, -1, 0), (1, 1, 0), (at, 1, 0))
     wall = quad((at, -1, height), (at, -1, 0), (at, 1, 0), (at, 1, height))
@@ -53,7 +53,7 @@ def step(height: float, at: float = 0.0) -> np.ndarray:
 
 
 def rays_of(sheet: LightSheet, points: np.ndarray, L: float) -> np.ndarray:
-    """On which ray of the sheet points lie, by their coordinates."""
+    """Return the ray of the sheet through points, by their coordinates."""
     move = sheet.transport
     axes = np.array([move.g_axis, move.h_axis, move.direction])
     G, H, along = np.moveaxis((points - move.origin) @ np.linalg.inv(axes), -1, 0)
@@ -67,7 +67,7 @@ def assert_as_rays(sheet: LightSheet, scene: Scene, L: float, lit: LitLine, rng:
     x = rays_of(sheet, lit.ends, L)
     assert np.all(x[:, 0] < x[:, 1])
     gap = x[1:, 0] - x[:-1, 1]
-    # A ray that is nearly flat ends far away.
+    # A nearly horizontal ray ends far away.
     assert np.all(gap > -1e-12 * (1.0 + x[1:, 0] ** 2))
     rays = rng.uniform(-2.0, 2.0, 300)
     rays = rays[np.abs(rays[:, None] - x.ravel()).min(axis=1, initial=np.inf) > 1e-9]
@@ -96,7 +96,7 @@ def test_as_rays_of_light_say(sheet: LightSheet, count: int, rng: np.random.Gene
 
 
 @settings(max_examples=60, deadline=None)
-@example(seed=82, count=24, size=3.0, name="tilted fan")  # across the fan, nearer to its source than it begins
+@example(seed=82, count=24, size=3.0, name="tilted fan")  # across the fan, nearer to its source than its start
 @example(seed=95, count=50, size=3.0, name="fan")
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -114,7 +114,7 @@ def test_soup(seed: int, count: int, size: float, name: str) -> None:
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), groups=st.integers(1, 3), count=st.integers(1, 30))
 def test_envelope_on_a_lattice(seed: int, groups: int, count: int) -> None:
-    """Ends upon ends, segments upon segments, and crossings: heights are the highest there are."""
+    """Coincident ends, coincident segments, and crossings: the envelope has the largest height everywhere."""
     rng = np.random.default_rng(seed)
     group = rng.integers(0, groups, count)
     x, height = rng.integers(0, 6, (count, 2)).astype(float), rng.integers(0, 4, (count, 2)).astype(float)
@@ -135,7 +135,7 @@ def test_envelope_on_a_lattice(seed: int, groups: int, count: int) -> None:
 
 
 def test_envelope_of_many_long_segments(rng: np.random.Generator) -> None:
-    """Each lies over all the others' ends: done by halves, with the same result as all at once."""
+    """Each segment spans the ends of all others: computed in halves, with the same result as at once."""
     count = 1500
     x = np.stack([rng.uniform(-1.0, -0.9, count), rng.uniform(0.9, 1.0, count)], axis=1)
     height = rng.normal(size=(count, 2))
@@ -149,7 +149,7 @@ def test_envelope_of_many_long_segments(rng: np.random.Generator) -> None:
 
 @BOTH
 def test_no_power_is_lost(sheet: LightSheet, rng: np.random.Generator) -> None:
-    """What passes the upper parts arrives on the plate below: to the last digits."""
+    """Light that passes the upper parts arrives on the plate below, to rounding."""
     create = trimesh.creation
     solids = [create.box((3.0, 3.0, 0.1)), create.icosphere(3, 0.3), create.annulus(0.1, 0.4, 0.3)]
     solids[0].apply_translation((0.0, 0.0, -0.5))
@@ -163,7 +163,7 @@ def test_no_power_is_lost(sheet: LightSheet, rng: np.random.Generator) -> None:
 
 
 def test_shadow_of_a_step() -> None:
-    """A fan from the left behind a step of 10 mm: the shadow ends where the ray over its edge meets the ground."""
+    """A fan from the left over a step of 10 mm: the shadow ends where the ray over the edge meets the ground."""
     sheet = LightSheet(transport=UPRIGHT, source=(-0.5, 0.2))
     lit = sheet.illuminate(Scene(step(0.01)), 0.1)
     right = lit.ends[lit.ends[:, :, 0].min(axis=1) > 1e-6]
@@ -217,12 +217,12 @@ def test_profile_along_the_sheet() -> None:
     for (a, b), power in zip(G, lit.power, strict=True):
         exact = 2.0 * np.interp(a + (b - a) * dense, *table.T)
         assert np.trapezoid(exact, dense) == pytest.approx(power, rel=1e-6)
-        # Beside the most in its triangle, cut at the table's knots.
+        # Apart from most ends within its triangle, segments are cut at the knots of the table.
         assert np.ptp(exact) <= 0.0501 * exact.max() or np.ptp(exact) <= 0.0501 * 2.0 * table[:, 1].max()
 
 
 def test_uniformity_of_a_fan() -> None:
-    """A steep slope below a fan: power per metre follows the inverse square of the depth, within 2 %."""
+    """A steep slope below a fan: power per metre is proportional to the inverse square of the depth, within 2 %."""
     slope = quad((0.0, -1.0, 0.0), (0.1, -1.0, 0.6), (0.1, 1.0, 0.6), (0.0, 1.0, 0.0))
     sheet = LightSheet(transport=UPRIGHT, source=(-1.0, 1.0), uniformity=0.02)
     lit = sheet.illuminate(Scene(slope), 0.0)
@@ -235,7 +235,7 @@ def test_uniformity_of_a_fan() -> None:
 
 
 def test_joined(rng: np.random.Generator) -> None:
-    """A finely divided box on a plate in a fine mesh: joined, as many segments as there are faces and materials."""
+    """A finely divided box on a plate in a fine mesh: after joining there is one segment per face and material."""
     ground, box = trimesh.creation.box((2.0, 2.0, 0.2)), trimesh.creation.box((0.5, 0.5, 0.5))
     for _ in range(4):
         ground, box = ground.subdivide(), box.subdivide()
@@ -265,7 +265,7 @@ def test_coincident_faces_share_nothing() -> None:
 
 
 def test_solids_that_stand_in_each_other() -> None:
-    """A ball sunk into a plate: its segments end on the circle in which they meet."""
+    """A ball that intersects a plate: its segments end on the circle of intersection."""
     ball, ground = trimesh.creation.icosphere(5, 0.3), trimesh.creation.box((2.0, 2.0, 0.2))
     scene = Scene.of([ball, ground])
     lit = LightSheet(transport=UPRIGHT).illuminate(scene, 0.05)
@@ -278,7 +278,7 @@ def test_solids_that_stand_in_each_other() -> None:
 
 
 def test_edge_in_the_sheet_and_face_in_the_sheet() -> None:
-    """At the plane of a wall the sheet lights what lies before it, and the wall itself not at all."""
+    """In the plane of a wall, the sheet lights the surfaces before the wall, but not the wall."""
     scene = Scene(_step_across(0.01))
     sheet = LightSheet(transport=UPRIGHT)
     before, at, behind = (sheet.illuminate(scene, L) for L in (-1e-9, 0.0, 1e-9))
@@ -289,12 +289,12 @@ def test_edge_in_the_sheet_and_face_in_the_sheet() -> None:
 
 
 def _step_across(height: float) -> np.ndarray:
-    """Two plates, the one at y < 0 higher."""
+    """Return two plates; the plate at y < 0 is higher."""
     return np.stack([step(height)[..., 1], step(height)[..., 0], step(height)[..., 2]], axis=-1)[:, ::-1]
 
 
 def test_long_thin_triangles(rng: np.random.Generator) -> None:
-    """Needles all along the transport, micrometres wide beside metres."""
+    """Needle triangles along the transport, micrometres wide and metres long."""
     start = rng.uniform(-1.0, 1.0, (200, 3)) * (1.0, 0.1, 0.1)
     needles = start[:, None] + np.array([[0.0, -5.0, 0.0], [1e-6, 5.0, 0.0], [-1e-6, 5.0, 1e-6]])
     scene = Scene(np.concatenate([needles, plate(2.0, 2.0, -1.0)]))
@@ -304,7 +304,7 @@ def test_long_thin_triangles(rng: np.random.Generator) -> None:
 
 
 def test_index_finds_all_that_is_cut(rng: np.random.Generator) -> None:
-    """Of sizes from micrometres to metres, against every triangle."""
+    """Triangles of micrometres to metres: the index agrees with a test of all triangles."""
     size = 10.0 ** rng.uniform(-7.0, 0.5, 5000)
     corners = rng.uniform(-1.0, 1.0, (5000, 1, 3)) + rng.normal(size=(5000, 3, 3)) * size[:, None, None]
     scene = Scene(corners)
@@ -361,7 +361,7 @@ def test_refused(wrong: dict[str, Any], message: str) -> None:
 
 @pytest.mark.slow
 def test_a_million_triangles() -> None:
-    """A rough field of heights without a gap: every profile gets all the light of its width."""
+    """A rough height field without gaps: every profile gets all the light over its width."""
     x = np.linspace(-0.05, 0.05, 708)
     X, Y = np.meshgrid(x, x)
     Z = 2e-3 * np.sin(200.0 * X) * np.cos(170.0 * Y) + 2e-5 * np.random.default_rng(1).normal(size=X.shape)

@@ -1,4 +1,4 @@
-"""LineIrradiance on devices: the closed forms, the extremes, and what comes in."""
+"""LineIrradiance on devices: closed forms, extremes, and inputs."""
 
 from __future__ import annotations
 
@@ -77,13 +77,13 @@ KNOWN = {
 
 
 def lit(*segments: Any, exitance: float = 1.0) -> LitSegments:
-    """Segments (start, end, normal)."""
+    """Return segments (start, end, normal)."""
     table = np.array(segments, float).reshape(-1, 3, 3)
     return LitSegments(table[:, :2], table[:, 2], np.full(len(table), exitance))
 
 
 def pairs(rng: np.random.Generator, count: int) -> tuple[np.ndarray, LitSegments]:
-    """Receivers and segments anywhere in a cube."""
+    """Return random receivers and segments in a cube."""
     ends = rng.uniform(-1.0, 1.0, (count, 2, 3))
     normals = np.cross(ends[:, 1] - ends[:, 0], rng.normal(size=(count, 3)))
     receivers = np.concatenate([rng.uniform(-1.0, 1.0, (count, 3)), rng.normal(size=(count, 3))], axis=1)
@@ -91,12 +91,12 @@ def pairs(rng: np.random.Generator, count: int) -> tuple[np.ndarray, LitSegments
 
 
 def turned(rng: np.random.Generator) -> np.ndarray:
-    """A rotation."""
+    """Return a random rotation."""
     return np.linalg.qr(rng.normal(size=(3, 3)))[0]
 
 
 def moved(receivers: np.ndarray, segments: Any, rotation: np.ndarray, shift: Any) -> tuple[np.ndarray, LitSegments]:
-    """The same scene elsewhere."""
+    """Return the same scene at another place."""
     receivers, table = np.array(receivers, float), np.array(segments, float).reshape(-1, 3, 3)
     there = np.concatenate([receivers[:, :3] @ rotation + shift, receivers[:, 3:] @ rotation], axis=1)
     return there, LitSegments(table[:, :2] @ rotation + shift, table[:, 2] @ rotation, np.ones(len(table)))
@@ -105,7 +105,7 @@ def moved(receivers: np.ndarray, segments: Any, rotation: np.ndarray, shift: Any
 def assert_exact(
     receivers: np.ndarray, segments: LitSegments, device: Device, variant: Any, precision: Any
 ) -> np.ndarray:
-    """The bounds that the operation states, against 60 digits; receivers repeated, so that strips are whole."""
+    """Check the documented bounds against 60 digits; receivers are repeated to fill strips."""
     each = [
         [
             reference.exact(receiver, *one)
@@ -126,7 +126,7 @@ def assert_exact(
 
 
 def reach(receivers: np.ndarray, segments: LitSegments) -> np.ndarray:
-    """1 + the farther end's distance over the height above the lit surface: what rounding of the places may do."""
+    """Return 1 + distance of the farther end / height over the lit surface: magnification of rounding."""
     d = receivers[:, None, None, :3] - segments.ends[None]
     height = np.abs(np.sum(d[:, :, 0] * segments.normals, axis=-1))
     return 1.0 + np.linalg.norm(d, axis=-1).max(axis=-1) / np.maximum(height, 1e-300)
@@ -162,7 +162,7 @@ def test_known_values(device: Device, name: str, variant: Any, precision: Any) -
     segment, receiver, table = KNOWN[name]
     receivers = np.tile(np.array([receiver(*at) for at in table]), (4, 1))
     result = LineIrradiance(segments=lit(segment), precision=precision, variant=variant)(receivers, device=device)
-    # The groove's own normal is rounded, and counts 1e2 times near its edge.
+    # The normal of the groove is rounded, which is magnified 1e2 times near its edge.
     tolerance = 5e-7 if precision == "single" else 1e-12
     np.testing.assert_allclose(result.irradiance, 4 * list(table.values()), rtol=tolerance)
 
@@ -188,7 +188,7 @@ def test_many_pairs_against_the_quadrature(device: Device, variant: Any, rng: np
 @TWO_WAYS
 @PRECISIONS
 def test_segments_that_lie_alike(device: Device, variant: Any, precision: Any, rng: np.random.Generator) -> None:
-    """On two surfaces, in directions that are one but for rounding, turned and shifted; each near some receivers."""
+    """Segments on two surfaces, directions equal up to rounding, rotated and shifted; each near some receivers."""
     start = np.column_stack([rng.uniform(-0.1, 0.1, (41, 2)), np.zeros(41)])
     ends = np.stack([start, start + rng.uniform(0.01, 0.1, (41, 1)) * [1.0, 0.0, 0.0]], axis=1)
     normals = np.tile([0.0, 0.0, 1.0], (41, 1))
@@ -213,7 +213,7 @@ FLOOR = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 def test_at_a_millionth_of_its_length(
     device: Device, variant: Any, precision: Any, distance: float, rng: np.random.Generator
 ) -> None:
-    """From above its middle, its ends, and beyond them; turned and far from the origin, and receivers single too."""
+    """Receivers above the middle and the ends of a segment, and beyond; rotated, far away; also in single."""
     near = [(x, y * distance, distance, 0.3, 0.2, -1.0) for x in (0.0, 0.5, 1.0, 1.0 + distance) for y in (0.0, 1.0)]
     near += [(1.5, 0.0, distance, -1.0, 0.0, 0.0), (-0.25, distance, distance, 0.9, 0.1, -0.3)]
     for shift in (0.0, 1.0):
@@ -224,7 +224,7 @@ def test_at_a_millionth_of_its_length(
 @TWO_WAYS
 @PRECISIONS
 def test_grazing(device: Device, variant: Any, precision: Any, rng: np.random.Generator) -> None:
-    """A millionth of a radian over the lit surface, and over the receiver's own."""
+    """Angles of a millionth of a radian above the lit surface, and above the receiver's plane."""
     low = [(0.5, 0.3, 0.3 * angle, 0.0, -1.0, 0.0) for angle in (1e-1, 1e-3, 1e-6)]
     assert np.all(assert_exact(np.array(low), lit(FLOOR), device, variant, precision) > 0.0)
     tilted = [(x, 0.3, 0.3, 0.0, -1.0, angle + 1.0) for x in (0.5, 2.0) for angle in (1e-3, 1e-6, 0.0, -1e-6)]
@@ -235,7 +235,7 @@ def test_grazing(device: Device, variant: Any, precision: Any, rng: np.random.Ge
 @TWO_WAYS
 @PRECISIONS
 def test_end_on(device: Device, variant: Any, precision: Any) -> None:
-    """Beyond an end, low over the line: the usual form loses all digits. Relative, for all is seen upright."""
+    """Receivers beyond an end, close to the line, where the common form loses all digits; relative error."""
     beyond = [(1.0 + t, 0.0, height, -1.0, 0.0, 0.0) for t in (1e-3, 1e-1, 1.0, 10.0, 1e4) for height in (1e-5, 1e-2)]
     receivers = np.array(beyond)
     value = assert_exact(receivers, lit(FLOOR), device, variant, precision)[:, 0]
@@ -260,7 +260,7 @@ def test_lengths_a_million_to_one(device: Device, variant: Any, precision: Any, 
 @TWO_WAYS
 @PRECISIONS
 def test_through_the_receivers_plane(device: Device, variant: Any, precision: Any, rng: np.random.Generator) -> None:
-    """What is behind the plane does not count, wherever the plane cuts the segment."""
+    """Parts behind the receiver's plane do not count, wherever the plane cuts the segment."""
     cuts = np.concatenate([rng.uniform(0.0, 1.0, 12), [1e-6, 1.0 - 1e-6, 0.0, 1.0, -1e-6, 1.0 + 1e-6]])
     receivers = np.column_stack([cuts, 0.0 * cuts + 0.01, 0.0 * cuts + 0.02, np.tile([[0.5, -1.0, 0.5]], (18, 1))])
     receivers[::2, 3:] = (-0.7, 0.4, -0.2)
@@ -273,7 +273,7 @@ def test_through_the_receivers_plane(device: Device, variant: Any, precision: An
 @TWO_WAYS
 @PRECISIONS
 def test_in_the_lit_plane_and_behind(device: Device, variant: Any, precision: Any) -> None:
-    """On the segment, on its line, beside it: no light, and no flag; behind the receiver or the surface none either."""
+    """Receivers on the segment, on its line, beside it, or behind the surface get no light and no flag."""
     dark = [
         (0.5, 0.0, 0.0, 0.0, 0.0, 1.0),
         (0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
@@ -304,7 +304,7 @@ def test_no_light(device: Device, variant: Any) -> None:
 @TWO_WAYS
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_not_finite(device: Device, variant: Any, dtype: Any) -> None:
-    """Also where the receiver would see nothing; neighbours keep their bits."""
+    """NaN is flagged even if the receiver would get no light; neighbours are bit-equal."""
     good = np.tile(np.array((0.5, 0.1, 0.1, 0.0, 0.0, -1.0), dtype), (48, 1))
     wrong = good.copy()
     for number, value in enumerate((math.nan, math.inf, -math.inf)):
@@ -320,14 +320,14 @@ def test_not_finite(device: Device, variant: Any, dtype: Any) -> None:
 
 @TWO_WAYS
 def test_neighbours_do_not_count(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    """A receiver's result is the same to the bit beside far ones, near ones, and cut ones."""
+    """A receiver's result is bit-equal next to far, near and clipped neighbours."""
     receivers, segments = pairs(rng, 64)
     operation = LineIrradiance(segments=segments, variant=variant, precision="single")
     alone = [operation(np.tile(each, (16, 1)), device=device).irradiance[0] for each in receivers]
     np.testing.assert_array_equal(operation(receivers, device=device).irradiance, alone)
 
 
-# ---- what comes in ---------------------------------------------------------------------------------------------
+# ---- inputs ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 31, 63, 64, 65, 257, 20_011])
@@ -356,7 +356,7 @@ def test_any_shape(device: Device, shape: list[int], variant: Any, seed: int) ->
     parts = (segments.ends[:, None], segments.normals[:, None], segments.exitance[:, None])
     each = [reference.irradiance(receivers, *one) for one in zip(*parts, strict=True)]
     value, most = np.moveaxis(np.array(each), 1, 0)
-    # What the quadrature leaves, and what the operation states.
+    # Error of the quadrature plus the documented error of the operation.
     bound = np.sum(most * (1e-12 + 1e-14 * reach(receivers, segments).T), axis=0)
     assert np.all(np.abs(result.irradiance.ravel() - value.sum(axis=0)) <= bound)
 

@@ -1,4 +1,4 @@
-"""MirrorFacets on devices: no block is left out that shows a line; windows as the law of reflection says."""
+"""MirrorFacets on devices: no block that shows a line is omitted; windows by the law of reflection."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_rays_reflect_at_the_ends_of_windows_as_they_should(rng: np.random.Gener
     weights = np.einsum("nij,nej->nei", basis, spot - triangle[:, :1])
     inside = np.concatenate([weights, 1.0 - weights.sum(axis=-1, keepdims=True)], axis=-1).min(axis=-1)
     assert np.all(inside > -1e-9)
-    # An end within the line is one on an edge, or where the line runs through the mirror.
+    # An end inside the line is on an edge, or where the line crosses the mirror.
     cut = (found.share > 0.0) & (found.share < 1.0)
     assert np.all(np.minimum(np.abs(inside), np.abs(up))[cut] < 1e-9)
     assert cut.sum() > 50

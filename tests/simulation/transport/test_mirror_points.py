@@ -41,7 +41,7 @@ def some_points(rng: np.random.Generator, count: int = 40) -> np.ndarray:
 
 
 def outside(result: Any, lens: np.ndarray = LENS) -> tuple[np.ndarray, ...]:
-    """Return place, move, density of the one image on the side of the lens; the other is within the ball."""
+    """Return place, move, density of the image on the side of the lens; the other image is inside the ball."""
     shown = result.triangle >= 0
     front = shown & (np.sum(result.place * (lens - result.place), axis=-1) > 0.0)
     assert (front.sum(axis=1) == 1).all()
@@ -74,7 +74,7 @@ def test_images_converge_to_the_third_order_and_density_to_the_first_or_better(
         truth = [reference.reflect_in_sphere(point, LENS) for point in points[:, :3]]
         far.append(max(np.linalg.norm(at - one[0]) for at, one in zip(place, truth, strict=True)))
         thin.append(max(abs(value / one[1] - 1.0) for value, one in zip(density, truth, strict=True)))
-    # Triangles of half the size.
+    # Triangles of half size.
     assert far[0] / far[1] > 6.0
     assert far[1] / far[2] > 6.0
     assert thin[0] / thin[1] > 2.0
@@ -82,7 +82,7 @@ def test_images_converge_to_the_third_order_and_density_to_the_first_or_better(
 
 
 def test_an_ellipsoid_shows_points_as_rays_that_it_reflects(device: Device, rng: np.random.Generator) -> None:
-    """Rays from the lens beside the image, reflected by the true surface, pass the point as far apart as it says."""
+    """Rays from the lens next to the image, reflected by the true surface, pass the point at the predicted distance."""
     shape = (1.0, 0.8, 1.3)
     points = some_points(rng, 16)
     place, _, density = outside(mirrors(5, shape)(points, LENS, device=device))
@@ -99,7 +99,7 @@ def test_a_hollow_mirror_concentrates_as_its_focal_length_says(device: Device, p
     corners, normals = ball(4)
     turn = trimesh.transformations.random_rotation_matrix(np.array([0.31, 0.77, 0.23]))[:3, :3]
     corners, normals = radius * corners @ turn + [0.0, 0.0, radius], -normals @ turn
-    # Further out there is a ring of images, a caustic.
+    # Farther out the images form a ring, a caustic.
     bottom = corners[..., 2].max(axis=1) < 0.1 * radius
     op = MirrorPoints(corners=corners[bottom], normals=normals[bottom], numbers=np.flatnonzero(bottom))
     points = np.array([[0.0, 0.0, point_height, 1.0, 0.0, 0.0]])
@@ -110,14 +110,14 @@ def test_a_hollow_mirror_concentrates_as_its_focal_length_says(device: Device, p
     assert np.abs(result.place[0, : result.image_count[0], 2][axial]) < 1e-6
     assert result.density[0, : result.image_count[0]][axial] == pytest.approx(spread**-2, rel=2e-2)
     move = result.move[0, : result.image_count[0], 0][axial]
-    # Of the place as the point moves aside: the lens is at e / (e - f) times its image's way.
+    # Motion of the image as the point moves sideways: the lens is at e / (e - f) times the distance of its image.
     assert move == pytest.approx(lens_height / spread, rel=1e-2)
 
 
 @WAYS
 def test_images_move_as_points_do(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
     points = some_points(rng)
-    # On one triangle: at the middle of the image's.
+    # On one triangle: at the centre of the triangle with the image.
     op, step = mirrors(2, variant=variant, precision=None), 1e-5 if dtype == np.float64 else 1e-2
     lens = LENS.astype(dtype)
     one = points.copy()
@@ -133,7 +133,7 @@ def test_images_move_as_points_do(device: Device, variant: Any, dtype: Any, rng:
 
 
 def test_a_ball_shows_all_that_it_does_not_hide(device: Device, rng: np.random.Generator) -> None:
-    """To the silhouette: a point has an image on the outside where the ball is not between it and the lens."""
+    """Up to the silhouette, a point has an image on the outside if the ball is not between it and the lens."""
     ways = rng.normal(0.0, 1.0, (3000, 3))
     points = np.zeros((3000, 6))
     points[:, :3] = rng.uniform(1.05, 4.0, (3000, 1)) * ways / np.linalg.norm(ways, axis=1, keepdims=True)
@@ -141,7 +141,7 @@ def test_a_ball_shows_all_that_it_does_not_hide(device: Device, rng: np.random.G
     share = np.clip(-np.sum(points[:, :3] * towards, axis=1) / np.sum(towards * towards, axis=1), 0.0, 1.0)
     near = np.linalg.norm(points[:, :3] + share[:, None] * towards, axis=1)
     result = mirrors(3, outside=np.ones(1280, bool))(points, LENS, device=device)
-    # Within the bulge of a triangle of the silhouette, rounding of the surface says whether.
+    # Within the bulge of a triangle at the silhouette, rounding of the surface decides.
     sure = np.abs(near - 1.0) > 3e-3
     missed = sure & (result.image_count != (near > 1.0))
     assert missed.mean() < 5e-3

@@ -1,4 +1,4 @@
-"""Lit lines in mirrors: image method, points by brute force, Alhazen's sphere; and what they do to a reading."""
+"""Lit lines in mirrors: image method, points by brute force, Alhazen's sphere; and their effect on a reading."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def sheet(**more: object) -> LightSheet:
 
 
 def before_a_wall(distance: float) -> Scene:
-    """Return a floor, and a mirror that stands on it behind the line."""
+    """Return a floor, and a vertical mirror on it behind the line."""
     wall = quad([-0.1, -distance, 0], [0.1, -distance, 0], [0.1, -distance, 0.1], [-0.1, -distance, 0.1])
     return Scene(np.array(FLOOR + wall), np.array([0, 0, 1, 1]))
 
@@ -42,7 +42,7 @@ def before_a_wall(distance: float) -> Scene:
 def expected_of_line(sensor: SensorView, y: float, power: float) -> np.ndarray:
     """Return the power on each sample of a diffuse line along x, on the floor at y."""
     u = sensor.project(np.array([0.0, y, 0.0]))[0]
-    # Where the edges of samples lie on the line.
+    # Positions of the sample edges on the line.
     rays = sensor.rays(u, sensor.v_edges)
     edges = rays[:, 0] - rays[:, 2] / rays[:, 5] * rays[:, 3]
     lens = np.array(sensor.lens)
@@ -56,7 +56,7 @@ def expected_of_line(sensor: SensorView, y: float, power: float) -> np.ndarray:
 
 
 def test_a_plane_mirror_shows_a_second_line_at_twice_its_distance(device: Device) -> None:
-    """And a PSD reads R' D / (1 + R'): the second line's share of the light, and how far off it is."""
+    """A PSD then has the error R' D / (1 + R'): the share of the second line times its distance."""
     sensor, distance = sensor_view(12, 480), 0.004
     scene = before_a_wall(distance)
     mirrors = mirrors_of(scene, MATERIALS, device, view=sensor)
@@ -76,7 +76,7 @@ def test_a_plane_mirror_shows_a_second_line_at_twice_its_distance(device: Device
 
 
 def test_a_mirror_of_micrometres_in_a_scene_of_metres(device: Device) -> None:
-    """20 um of mirror show the part of the line that the way to them and on says."""
+    """A mirror of 20 um shows the part of the line given by the path lengths before and after it."""
     sensor, distance, low, high = sensor_view(), 0.004, 3e-3, 3.02e-3
     wall = quad([low, -distance, 0], [high, -distance, 0], [high, -distance, 0.1], [low, -distance, 0.1])
     scene = Scene(np.concatenate([10.0 * np.array(FLOOR), wall]), np.array([0, 0, 1, 1]))
@@ -91,12 +91,12 @@ def test_a_mirror_of_micrometres_in_a_scene_of_metres(device: Device) -> None:
 
     expected = integral(density, low / share, high / share)[0]
     seen = mirrors_of(scene, MATERIALS, device, view=sensor).mirrored_exposure(lit, 0.0)
-    # The corners are rounded in units of 1 m where there is single only.
+    # Without double precision the corners have rounding errors relative to 1 m.
     assert seen.power.sum() == pytest.approx(expected, rel=1e-9 if device.has_double else 0.05)
 
 
 def test_a_mirror_seen_at_89_99_degrees(device: Device) -> None:
-    """A mirror 30 um under the line, which lens and line nearly lie in."""
+    """A mirror 30 um below the line; lens and line are nearly in its plane."""
     sensor, height = sensor_view(12, 480), 3e-5
     lens, point = np.array(sensor.lens), np.zeros(3)
     along = (lens - point) / np.linalg.norm(lens - point)
@@ -140,7 +140,7 @@ def test_direct_light_is_what_the_direct_path_says(device: Device, rng: np.rando
 
 
 def mirrored_points(scene: Scene, lit: LitLine, sensor: SensorView, device: Device, count: int) -> Exposure:
-    """Return the exposure by points of lines, each tried in each mirror triangle, its two ways by rays."""
+    """Return the exposure by points of lines: each point with each mirror triangle, both path segments by rays."""
     share = (np.arange(count) + 0.5) / count
     points = lit.ends[:, :1] + share[:, None] * (lit.ends[:, 1:] - lit.ends[:, :1])
     points = points.reshape(-1, 3)
@@ -187,7 +187,7 @@ def test_plane_mirrors_show_what_points_by_brute_force_say(device: Device, seed:
     theirs = mirrored_points(scene, lit, sensor, device, 3000)
     assert ours.power.sum() > 0.0
     assert ours.power.sum() == pytest.approx(theirs.power.sum(), rel=2e-3)
-    # Points on either side of an edge: of the lit segments, the longest are 3000 times their spacing.
+    # Points on both sides of an edge: the longest lit segments have 3000 points.
     assert np.abs(ours.power - theirs.power).max() < 2e-2 * ours.power.max()
     u = [each.first_moment(sensor.u_edges).sum() / each.power.sum() for each in (ours, theirs)]
     assert abs(u[0] - u[1]) < 1e-6
@@ -218,7 +218,7 @@ def test_a_ball_shows_a_line_as_alhazen_says(device: Device) -> None:
     for fineness in (3, 4):
         scene = ball_scene(fineness, radius, middle)
         mirrors = mirrors_of(scene, MATERIALS, device, view=sensor, steps_per_sample=4.0)
-        # The line's own light: the ball must not shade it.
+        # Direct light of the line: the ball must not occlude it.
         ours = mirrors.mirrored_exposure(light.illuminate(scene, 0.0), 0.0)
         assert ours.power.sum() == pytest.approx(expected.power.sum(), rel=2e-2 / 4.0 ** (fineness - 3))
         assert abs(ours.first_moment(sensor.u_edges).sum() / ours.power.sum() - middle_of_it) < 1e-7
@@ -240,7 +240,7 @@ def test_a_curved_mirror_in_steps_converges_to_the_second_order(device: Device) 
 
 
 def test_a_hollow_mirror_does_not_hide_itself(device: Device) -> None:
-    """A line over a bowl: facets stand out of the smooth surface; that costs no light, however coarse they are."""
+    """A line over a bowl: facets protrude from the smooth surface, but do not occlude, for any mesh size."""
     radius, totals = 0.08, []
     for fineness in (3, 5):
         ball = np.array(trimesh.creation.icosphere(fineness).triangles)
@@ -306,7 +306,7 @@ def test_more_images_than_there_is_room_for_are_sought_again(device: Device, mon
 
 
 def test_light_that_meets_a_mirror_head_on_comes_back_and_is_lost(device: Device) -> None:
-    """The reflected light runs into the sheet itself; there is nothing on its way, and no number that is none."""
+    """The reflected light stays in the plane of the sheet and hits no surface; all results are finite."""
     mirror = quad([-0.1, -0.05, 0], [0.1, -0.05, 0], [0.1, 0.05, 0], [-0.1, 0.05, 0])
     scene = Scene(np.array(mirror), np.array([1, 1]))
     both = (MATERIALS[0], Material(diffuse=Lambert(albedo=0.2), mirror=0.7))
@@ -319,7 +319,7 @@ def test_light_that_meets_a_mirror_head_on_comes_back_and_is_lost(device: Device
 
 
 def test_a_lens_that_looks_into_a_mirror_head_on(device: Device) -> None:
-    """A mirror square to the lens' ray: the image is behind it, as bright as its way is long."""
+    """A mirror perpendicular to the ray of the lens: the image is behind it, with the brightness of its path length."""
     sensor, width = sensor_view(24, 24), 2e-3
     lens, axis = np.array(sensor.lens), np.array(sensor.axis)
     one = np.array([1.0, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""OccludedIrradiance on devices: as a ray into every part says, in float64; extremes; what comes in."""
+"""OccludedIrradiance on devices: against rays in float64; extremes; inputs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from gpuvision.simulation.transport.occluded_irradiance import (
 from gpuvision.status import Status
 
 ON_DEVICES = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-# Builds are what takes time: each variant in one of the two types here, hypothesis and the rest in the device's own.
+# Builds take most of the time: each variant has one of the two types here; other tests use the default of the device.
 WAYS = pytest.mark.parametrize(
     ("variant", "dtype"), [("vector", np.float32), ("vector", np.float64), ("work_item", np.float32)]
 )
@@ -37,7 +37,7 @@ NO_TRIANGLES = np.zeros((0, 3, 3))
 
 
 def segments_of(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Segments anywhere in the cube, each with a normal square to it and an exitance of its own."""
+    """Return random segments in the cube, each with a perpendicular normal and a random exitance."""
     ends = single(rng.uniform(-1.0, 1.0, (count, 6)))
     normals = np.cross(ends[:, 3:] - ends[:, :3], rng.normal(size=(count, 3)))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -51,7 +51,7 @@ def receivers_of(rng: np.random.Generator, *shape: int) -> np.ndarray:
 def light_of(
     corners: np.ndarray, receivers: Any, segments: Any, device: Device, weights: Any = None, **how: Any
 ) -> Any:
-    """What OccludedIrradiance says of receivers (strips, n, 6), in their type."""
+    """Return the irradiance by OccludedIrradiance of receivers (strips, n, 6), in their type."""
     dtype = receivers.dtype
     operation = OccludedIrradiance(scene=Scene(corners), segments=len(segments), **how)
     if weights is None:
@@ -70,7 +70,7 @@ def subdivided(mesh: Any, times: int) -> Any:
 
 @functools.cache
 def lit_soup(count: int) -> tuple[np.ndarray, ...]:
-    """Triangles, segments, receivers, and their light by rays."""
+    """Return triangles, segments, receivers, and their light by rays."""
     rng = np.random.default_rng(count)
     corners = soup(rng, count, 0.6 if count < 20 else 0.3)
     segments, receivers = segments_of(rng, 5), receivers_of(rng, 3, 23)
@@ -88,7 +88,7 @@ def test_light_as_rays_say(device: Device, variant: Any, dtype: Any, count: int)
     if dtype == np.float64:
         assert error.max() <= 1e-9
     else:
-        # Of the few receivers that are near an edge of a triangle, rounding moves shadows more.
+        # For the few receivers near an edge of a triangle, rounding moves shadows more.
         assert np.quantile(error, 0.95) <= 5e-6
         assert error.max() <= 2e-3
     free = light_of(NO_TRIANGLES, receivers.astype(dtype), segments, device, variant=variant).irradiance
@@ -97,7 +97,7 @@ def test_light_as_rays_say(device: Device, variant: Any, dtype: Any, count: int)
 
 @functools.cache
 def lit_board() -> tuple[np.ndarray, ...]:
-    """The board of the benchmarks: receivers (1, 24, 6) that face it, segments, corners, and the light by rays."""
+    """Return the board of the benchmarks: receivers (1, 24, 6), segments, corners, and the light by rays."""
     pytest.importorskip("embreex", reason="the extra 'test' is not installed")
     from gpuvision.profiling.occluded_irradiance import Board
 
@@ -133,7 +133,7 @@ def test_light_in_any_soup(device: Device, seed: int, count: int, size: float) -
 
 
 def room(kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A convex surface seen from within, receivers on it, and lit segments on it: nothing hides anything."""
+    """Return the inside of a convex surface with receivers and lit segments on it: no occlusion."""
     rng = np.random.default_rng(5)
     mesh = trimesh.creation.icosphere(3) if kind == "sphere" else subdivided(trimesh.creation.box((1.0, 0.8, 0.6)), 3)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [0.1, 0.7, 0.3]))
@@ -153,14 +153,14 @@ def test_the_surfaces_that_they_lie_on_hide_nothing(device: Device, variant: Any
     corners, receivers, segments = room(kind)
     seen = light_of(corners, receivers.astype(dtype), segments, device, variant=variant)
     free = light_of(corners, receivers.astype(dtype), segments, device, variant=variant, visibility="none")
-    # But for rounding, where a segment ends in another face.
+    # Except for rounding, where a segment ends in another face.
     np.testing.assert_allclose(seen.irradiance, free.irradiance, rtol=64 * float(np.finfo(dtype).eps))
     assert np.mean(seen.irradiance > 0.0) > 0.7
 
 
 @WAYS
 def test_at_the_foot_of_a_wall(device: Device, variant: Any, dtype: Any) -> None:
-    """A line that runs into a wall, receivers on it from 1e-9 of the line's length: the closed form, nothing hides."""
+    """A line ends at a wall, receivers on the wall from 1e-9 of the line's length: closed form, no occlusion."""
     floor, wall = trimesh.creation.box((2.0, 2.0, 0.2)), trimesh.creation.box((0.2, 2.0, 2.0))
     meshes = [floor.apply_translation((0.0, 0.0, -0.1)), wall.apply_translation((-0.1, 0.0, 0.0))]
     corners = np.concatenate([subdivided(each, 2).triangles for each in meshes])
@@ -175,7 +175,7 @@ def test_at_the_foot_of_a_wall(device: Device, variant: Any, dtype: Any) -> None
 
 @WAYS
 def test_a_wall_between_is_dark(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
-    """Beside a closed surface that is cut everywhere, at its edges too: not a glimmer."""
+    """No light passes a closed surface, also through cuts at its edges."""
     corners = single(trimesh.creation.icosphere(3).triangles * 0.4)
     receivers = np.zeros((1, 40, 6))
     receivers[0, :, :2], receivers[0, :, 2] = rng.uniform(-0.01, 0.01, (40, 2)), 0.45
@@ -189,7 +189,7 @@ def test_a_wall_between_is_dark(device: Device, variant: Any, dtype: Any, rng: n
 
 @WAYS
 def test_light_through_a_comb(device: Device, variant: Any, dtype: Any) -> None:
-    """More shadows than are kept at a time: the segment is taken in parts."""
+    """More shadows than the kernel can store: the segment is processed in parts."""
     teeth = 300
     at = (np.arange(teeth) + 0.25) / teeth - 0.5
     visible = np.sort(np.concatenate([[-0.5, 0.5], at, at + 0.5 / teeth])).reshape(-1, 2)
@@ -243,7 +243,7 @@ def test_currents(device: Device, variant: Any, dtype: Any, rng: np.random.Gener
 
 @WAYS
 def test_metres_and_micrometres(device: Device, variant: Any, dtype: Any, rng: np.random.Generator) -> None:
-    """A scene a millionth as large gets the same light, a million times as much on a square metre; to the bit."""
+    """A scene scaled by 1e-6 has the same power, a million times the irradiance, bit-equal."""
     corners, receivers = soup(rng, 60, 0.3), receivers_of(rng, 2, 40).astype(dtype)
     segments, small = segments_of(rng, 4), 2.0**-20
     result = light_of(corners, receivers, segments, device, variant=variant)
@@ -256,7 +256,7 @@ def test_metres_and_micrometres(device: Device, variant: Any, dtype: Any, rng: n
 
 @pytest.mark.parametrize("variant", ["vector", "work_item"])
 def test_a_part_of_micrometres_in_a_room_of_metres(device: Device, variant: Any) -> None:
-    """A box of 20 um on the floor hides what it hides in a scene of its own; in double, single knows no such place."""
+    """A box of 20 um on the floor has the same shadow as in a scene of its size (double; single cannot resolve it)."""
     part = trimesh.creation.box((2e-5, 2e-5, 2e-5)).apply_translation((3e-5, 0.0, 1e-5)).triangles
     room = trimesh.creation.box((8.0, 6.0, 4.0)).apply_translation((0.0, 0.0, 2.0)).triangles
     receivers = np.zeros((1, 32, 6))
@@ -283,7 +283,7 @@ def test_faces_that_coincide(device: Device, variant: Any, dtype: Any, rng: np.r
 @WAYS
 @pytest.mark.parametrize("angle", [1e-2, 1.7e-4, 1e-6])
 def test_grazing(device: Device, variant: Any, dtype: Any, angle: float) -> None:
-    """A wall that stands on the floor hides half the line from a receiver low over it; 89.99 degrees is 1.7e-4."""
+    """A wall on the floor hides half of the line from a receiver close to the floor; 89.99 degrees is 1.7e-4."""
     wall = trimesh.creation.box((0.01, 1.0, 0.2)).apply_translation((0.5, 0.5, 0.1)).triangles
     floor = trimesh.creation.box((2.0, 2.0, 0.1)).apply_translation((0.0, 0.0, -0.05)).triangles
     receivers = np.array([[[1.0, 0.0, angle, -1.0, 0.0, 0.0]]], dtype)
@@ -300,7 +300,7 @@ def test_grazing(device: Device, variant: Any, dtype: Any, angle: float) -> None
 
 
 def on_one_line(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Parts of a slanting line in any order, some with nothing between and some that overlap, each of its exitance."""
+    """Return parts of an inclined line in any order, adjacent and overlapping ones, each with its exitance."""
     start, along = rng.uniform(-1.0, 0.0, 3), rng.uniform(0.5, 1.0, 3)
     cuts = np.sort(rng.uniform(0.0, 1.0, (count, 2)) * 0.8 / count + np.arange(count)[:, None] / count, axis=1)
     cuts[1, 0], cuts[3, 1] = cuts[0, 1], cuts[4, 1]
@@ -312,7 +312,7 @@ def on_one_line(rng: np.random.Generator, count: int) -> np.ndarray:
 
 @functools.cache
 def lit_line(count: int, receivers: int, dtype: Any) -> tuple[np.ndarray, ...]:
-    """Triangles, receivers, segments on one line, dark ones and turned ones among them, and their light by rays."""
+    """Return triangles, receivers, segments on one line (also dark and reversed ones), and their light by rays."""
     rng = np.random.default_rng(count)
     corners, places, rows = soup(rng, 30, 0.4), receivers_of(rng, 1, receivers), on_one_line(rng, count)
     rows[2, 9], rows[4, 6:9], rows[5, :6] = 0.0, -rows[4, 6:9], np.roll(rows[5, :6], 3)
@@ -323,7 +323,7 @@ def lit_line(count: int, receivers: int, dtype: Any) -> tuple[np.ndarray, ...]:
 @WAYS
 @pytest.mark.parametrize(("count", "receivers"), [(6, 37), (35, 7)])
 def test_segments_on_one_line(device: Device, variant: Any, dtype: Any, count: int, receivers: int) -> None:
-    """Together, as is faster, they give what rays to each say; also where they are more than are taken together."""
+    """Grouped processing agrees with rays to each segment, also for more segments than a group holds."""
     corners, places, rows, value, most = lit_line(count, receivers, dtype)
     result = light_of(corners, places.astype(dtype), rows, device, variant=variant, clearance=1e-5).irradiance[0]
     error = np.abs(result - value) / np.where(most > 0.0, most, 1.0)
@@ -352,7 +352,7 @@ def selected_of(
 
 @pytest.mark.parametrize("variant", ["vector", "work_item"])
 def test_selected_segments(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    """Each block gets its own: some seen, some taken as they are, some left out."""
+    """Each block has a list of segments: tested for visibility, taken without test, or omitted."""
     corners, segments, receivers = soup(rng, 40, 0.3), segments_of(rng, 6), receivers_of(rng, 2, 37).astype(np.float32)
     seen = [light_of(corners, receivers, segments[[k]], device, variant=variant).irradiance for k in range(6)]
     free = [
@@ -383,7 +383,7 @@ def test_selected_indices_without_a_segment(device: Device, variant: Any, rng: n
     np.testing.assert_array_equal(beyond.status[0] != 0, np.repeat([True, False, False, True], 16))
 
 
-# ---- what comes in ---------------------------------------------------------------------------------------------
+# ---- inputs ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("variant", ["vector", "work_item"])
@@ -414,7 +414,7 @@ def test_what_is_not_finite(device: Device, variant: Any, rng: np.random.Generat
 @pytest.mark.parametrize("variant", ["vector", "work_item"])
 @pytest.mark.parametrize(("strips", "each"), [(0, 5), (1, 1), (2, 15), (2, 17), (3, 64), (1, 130)])
 def test_sizes_and_canaries(device: Device, variant: Any, strips: int, each: int, rng: np.random.Generator) -> None:
-    """Also: a receiver's light is the same whatever its neighbours are."""
+    """In addition, a receiver's light does not depend on its neighbours."""
     corners, segments = soup(rng, 60, 0.3), segments_of(rng, 3).astype(np.float32)
     receivers, weights = receivers_of(rng, strips, each).astype(np.float32), np.ones((strips, each, 2), np.float32)
     operation = OccludedIrradiance(scene=Scene(corners), segments=3, variant=variant)

@@ -1,4 +1,4 @@
-"""Patches and their form factors on devices: 60 digits, closed rooms, what stands between, and what comes in."""
+"""Patches and form factors on devices: 60 digits, closed rooms, occlusion, and inputs."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ RECEIVERS, SIZES = 17, (3.0, 1.0, 0.1, 1e-3, 1e-6)
 
 @functools.cache
 def draws() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Receivers, triangles of very different size, their factors, and the bound that is stated, in roundings."""
+    """Return receivers, triangles of very different size, their factors, and the documented bound in roundings."""
     rng = np.random.default_rng(7)
     triangles = np.concatenate([rng.normal(size=(5, 3, 3)) * size for size in SIZES]).astype(np.float32)
-    # A sliver, and one that is seen at a grazing angle by a receiver that is nearly in its plane.
+    # A sliver, and a triangle at a grazing angle to a receiver nearly in its plane.
     triangles[3] = [[0.0, 0.0, 0.0], [3.0, 1.0, 0.0], [1.5, 0.5001, 0.0]]
     triangles[8] = [[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [0.0, 1.0, -1.0]]
     receivers = rng.normal(size=(RECEIVERS, 6)).astype(np.float32)
@@ -56,7 +56,7 @@ def _conditioning(place: np.ndarray, corners: np.ndarray) -> float:
 
 
 def room(*extents: float) -> Scene:
-    """The inside of a box around the origin."""
+    """Return the inside of a box around the origin."""
     box = trimesh.creation.box(extents)
     box.invert()
     return Scene.of(box)
@@ -70,7 +70,7 @@ def test_factors_are_exact_at_any_distance(device: Device, variant: Any, precisi
     result = operation(receivers, device=device)
     assert result.factors.dtype == (np.float32 if precision == "single" else np.float64)
     assert np.all(result.status == 0)
-    # Places of 17 numbers of either sign: half of the pairs face each other.
+    # Random points with coordinates of both signs: half of the pairs face each other.
     assert 0.2 < (values > 0.0).mean() < 0.4
     eps = float(np.finfo(result.factors.dtype).eps)
     assert np.all(np.abs(result.factors - values) <= bounds * eps)
@@ -78,7 +78,7 @@ def test_factors_are_exact_at_any_distance(device: Device, variant: Any, precisi
 
 
 def test_micrometres_stand_in_metres(device: Device) -> None:
-    """A corner of ten micrometres, far from the middle of a scene of metres, is as bright as one at the origin."""
+    """A corner of ten micrometres far from the centre of a scene of metres has the same light as at the origin."""
     corner = 1e-5 * np.array([[[0, 0, 0], [0, 1, 0], [0, 1, 1]], [[0, 0, 0], [0, 1, 1], [0, 0, 1]]])
     far = np.array([[[-2.0, -1.0, -3.0], [2.0, -1.0, -3.0], [0.0, 1.0, -3.0]]])
     shift = np.array([1.0, 0.5, 0.25])
@@ -116,7 +116,7 @@ def test_a_closed_room_fills_the_view(device: Device, seed: int) -> None:
 
 
 def test_a_surface_gets_nothing_from_its_own_plane(device: Device) -> None:
-    """Also where the rounding of far coordinates lifts a receiver above it."""
+    """A surface gets no light from its own plane, even if rounding of large coordinates lifts a receiver above it."""
     rng = np.random.default_rng(5)
     for offset in (0.0, 1.0, 1e3):
         corners = rng.normal(size=(200, 3, 3)) * 1e-3 + offset
@@ -131,7 +131,7 @@ def test_a_surface_gets_nothing_from_its_own_plane(device: Device) -> None:
 
 
 def test_at_an_edge_the_factor_is_that_of_the_angle(device: Device) -> None:
-    """A wall that begins at distance 0 fills (1 + cos(angle)) / 2 of the view; on the edge itself any part of it."""
+    """A wall that begins at distance 0 has the form factor (1 + cos(angle)) / 2; on the edge at most that."""
     long = 1e6
     for angle in np.radians([30.0, 90.0, 150.0]):
         out = np.array([np.cos(angle), 0.0, np.sin(angle)])
@@ -161,7 +161,7 @@ def test_light_is_the_sum_of_factors(device: Device, variant: Any) -> None:
 
 @TWO_WAYS
 def test_what_stands_between_hides(device: Device, variant: Any) -> None:
-    """A half plane hides the half of a small square patch that it covers, by rays to fields of it."""
+    """A half plane hides half of a small square patch, by rays to subdivisions of it."""
     side = 0.2
     square = side * (np.array([[0, 0], [0, 1], [1, 1], [1, 0]]) - 0.5)
     ceiling = np.column_stack([square, np.ones(4)])
@@ -197,7 +197,7 @@ def test_one_ray_agrees_with_any_hit(device: Device, rng: np.random.Generator) -
     single = Patches(patches.corners)
     free = FormFactors(patches=single)(points, device=device).factors
     seen = FormFactors(patches=single, scene=scene, rays=0.0)(points, device=device).factors
-    # Triangles wholly above the receiver's plane: the ray goes to the middle of the fields, the half-way point between.
+    # Triangles completely above the receiver's plane: rays end at the centres of the subdivisions.
     heights = np.einsum("rmkd,rd->rmk", single.corners[None] - points[:, None, None, :3], points[:, 3:])
     whole = (heights > 0.0).all(axis=2) & (free > 0.0)
     a, b, c = np.moveaxis(single.corners, 1, 0)
@@ -205,7 +205,7 @@ def test_one_ray_agrees_with_any_hit(device: Device, rng: np.random.Generator) -
     segments = np.concatenate(np.broadcast_arrays(points[:, None, :3], middles[None]), axis=2)[whole]
     occluded = AnyHit(scene=scene, clearance=1e-12)(np.ascontiguousarray(segments), device=device).occluded
     assert 0.1 < occluded.mean() < 0.9
-    # Segments along edges may be seen either way.
+    # Segments along edges may count as visible or hidden.
     assert np.mean((seen[whole] > 0.0) == (occluded == 0)) > 0.995
     np.testing.assert_array_equal(seen[seen > 0.0], free[seen > 0.0])
 
@@ -278,7 +278,8 @@ def test_patches_of_a_scene_cover_it() -> None:
     assert edges[~of_ball].max() <= size * (1.0 + 1e-12)
     pieces = np.bincount(np.asarray(patches.origin), patches._areas)[:12]
     np.testing.assert_allclose(pieces, bar.area_faces, rtol=1e-9)
-    # 20480 triangles of the ball become few; the bar's thin sides give no more than their length asks for.
+    # 20480 triangles of the ball become few patches; the thin sides of the bar give only the patches along their
+    # length.
     assert patches._areas[of_ball].sum() == pytest.approx(ball.area, rel=1e-12)
     assert np.count_nonzero(of_ball) < 2000
     assert np.count_nonzero(~of_ball) < 2500
@@ -286,7 +287,7 @@ def test_patches_of_a_scene_cover_it() -> None:
     np.testing.assert_allclose(np.bincount(owner, weight), 1.0, rtol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(points[:, 3:], axis=1), 1.0, rtol=1e-12)
     assert np.all(np.diff(owner) >= 0)
-    # On the ball itself, where its outlines are below.
+    # On the ball, above the outlines.
     of_points = of_ball[np.searchsorted(np.asarray(patches.patch), owner)]
     away = np.linalg.norm(points[of_points, :3] - [0.0, 1.0, 0.0], axis=1)
     assert away.min() > 0.0999 * np.cos(0.02)
@@ -308,7 +309,7 @@ def test_backs_of_open_surfaces() -> None:
 
 
 def test_a_fine_mesh_shines_as_a_coarse_one(device: Device) -> None:
-    """A finely meshed plate and ball, in outlines, against their own triangles: beside them, and in their shadows."""
+    """A finely meshed plate and ball: outlines against the original triangles, beside them and in their shadows."""
     plate = trimesh.creation.box((1.0, 1.0, 0.1))
     ball = trimesh.creation.icosphere(3, 0.3).apply_translation((0.0, 0.0, 0.5))
     both = trimesh.util.concatenate([plate, ball])

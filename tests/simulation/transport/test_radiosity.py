@@ -1,4 +1,4 @@
-"""All bounces in rooms and boxes: energy, white walls, what hides, ways of solving, grading, and what comes in."""
+"""Radiosity in rooms and boxes: energy, white walls, occlusion, solvers, graded patches, and inputs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpuvision.simulation.transport.radiosity import Radiosity, refine_corners
 
 
 def room(*extents: float, lid: bool = False) -> Scene:
-    """The inside of a box around the origin; its lid, if asked for, is another material."""
+    """Return the inside of a box around the origin; the lid can be another material."""
     box = trimesh.creation.box(extents)
     box.invert()
     up = np.asarray(box.triangles)[:, :, 2].min(axis=1) > 0.0
@@ -25,7 +25,7 @@ def room(*extents: float, lid: bool = False) -> Scene:
 
 
 def stripe(*, power: float = 1.0) -> LitSegments:
-    """A line on the floor of a room of 1 x 0.8 x 0.6, from wall to wall, of so much diffuse power."""
+    """Return a line on the floor of a room of 1 x 0.8 x 0.6, from wall to wall, with a diffuse power."""
     return LitSegments([[[-0.5, 0.1, -0.3], [0.5, 0.1, -0.3]]], [[0.0, 0.0, 1.0]], [power])
 
 
@@ -36,7 +36,7 @@ def solved(size: float, albedo: Any, device: Device, *, lid: bool = False) -> Ra
 
 
 def test_no_light_is_lost_in_a_closed_box(device: Device) -> None:
-    """What arrives first is what was sent, to rounding; what is absorbed in the end is the same, to second order."""
+    """The first arriving power equals the emitted power to rounding; the absorbed power equals it to second order."""
     albedo, errors = 0.9, []
     for size in (0.5, 0.25, 0.125):
         box = solved(size, [albedo], device)
@@ -51,7 +51,7 @@ def test_no_light_is_lost_in_a_closed_box(device: Device) -> None:
 
 
 def test_white_walls_send_everything_out(device: Device) -> None:
-    """Albedo 1 under a black lid: the lid gets all of the light, after however many bounces."""
+    """Albedo 1 under a black lid: the lid absorbs all light, after any number of bounces."""
     errors = []
     for size in (0.5, 0.25):
         box = solved(size, [1.0, 0.0], device, lid=True)
@@ -89,14 +89,14 @@ def test_both_ways_of_solving_agree(device: Device) -> None:
 
 
 def test_arrival_is_the_mean_over_patches(device: Device) -> None:
-    """Against receivers all over each patch, by the lines' own closed form; also beside the line's ends."""
+    """Against receivers all over each patch with the closed form of the lines; also near the ends of the line."""
     box, lit = solved(0.5, [0.5], device), stripe()
     inside = box.patches
     for _ in range(8):
         inside = inside.bisected(np.ones(inside.count, bool))
     places = np.concatenate([inside.corners.mean(axis=1), inside.normals], axis=1)
     light = LineIrradiance(segments=lit)(places, device=device).irradiance
-    # Which patch a piece lies in: the one in whose plane and corners it is.
+    # The patch of a piece: the patch whose plane and corners contain it.
     owner = _owners(box.patches.corners, places[:, :3])
     mean = np.bincount(owner, light * inside.area) / box.patches.area
     beside = np.abs(np.abs(box.patches.corners[:, :, 0]).min(axis=1) - 0.5) < 1e-9
@@ -106,7 +106,7 @@ def test_arrival_is_the_mean_over_patches(device: Device) -> None:
 
 
 def test_many_short_segments_are_as_one(device: Device) -> None:
-    """A line cut into 2000 pieces, as by a fine mesh, sends as much to every patch."""
+    """A line in 2000 pieces, as by a fine mesh, sends the same power to every patch."""
     box = solved(0.3, [0.5], device)
     cuts = np.linspace(-0.5, 0.5, 2001)
     ends = np.zeros((2000, 2, 3))
@@ -144,7 +144,7 @@ def _owners(corners: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def test_light_beside_a_screen(device: Device) -> None:
-    """A wall across the room keeps the light on its side, but for rays along its seams."""
+    """A wall across the room keeps the light on one side, except for rays along its seams."""
     scene = room(1.0, 0.8, 0.6)
     screen = np.array([[0.0, -0.4, -0.3], [0.0, 0.4, -0.3], [0.0, 0.4, 0.3], [0.0, -0.4, 0.3]])
     both = np.concatenate([screen[[[0, 1, 2], [0, 2, 3]]], screen[[[0, 2, 1], [0, 3, 2]]] + [1e-6, 0.0, 0.0]])
@@ -157,7 +157,7 @@ def test_light_beside_a_screen(device: Device) -> None:
 
 
 def test_what_a_body_stands_on_is_not_lit(device: Device) -> None:
-    """Patches that it covers in part neither lose nor make light: all of it is absorbed by what is free."""
+    """Partly covered patches conserve light: the uncovered surfaces absorb all of it."""
     part = trimesh.creation.box((0.3, 0.3, 0.3)).apply_translation((0.05, -0.1, -0.15))
     scene = Scene(np.concatenate([room(1.0, 0.8, 0.6).corners, part.triangles]))
     albedo = 0.9
@@ -177,7 +177,8 @@ def test_patches_in_corners_are_graded(device: Device) -> None:
     assert patches.count < finer.count < 8 * patches.count
     small = finer.area < 0.3 * patches.area.min()
     centres = np.abs(finer.corners.mean(axis=1)) * 2.0 / [1.0, 0.8, 0.6]
-    # How far from the nearest edge of the room: the second largest coordinate is not that of the wall itself.
+    # Distance from the nearest edge of the room: the largest coordinate belongs to the wall, the second largest to the
+    # edge.
     from_edge = 1.0 - np.sort(centres, axis=1)[:, 1]
     assert from_edge[small].mean() < 0.6 * from_edge[~small].mean()
 
@@ -189,7 +190,7 @@ def test_materials_and_receivers(device: Device) -> None:
     outside = np.sum(box.patches.normals * box.patches.corners.mean(axis=1), axis=1) > 0.0
     assert outside.mean() == pytest.approx(0.5, abs=0.2)
     exitance = box.solve(box.direct_irradiance(stripe()))
-    # Light stays inside.
+    # All light stays inside.
     np.testing.assert_allclose(exitance[outside], 0.0, atol=1e-12)
     receivers = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, -1.0], [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
     twice = box.irradiance(receivers, exitance)
@@ -224,7 +225,7 @@ def test_what_is_refused() -> None:
 
 
 def test_convergence_of_light_in_a_room(device: Device) -> None:
-    """In points of a room with grey walls: errors fall by 2 or more when the patches' size is halved."""
+    """At points of a room with grey walls, errors halve at least when the patch size is halved."""
     receivers = np.array([[0.2, 0.1, 0.0, 0.3, 0.2, 0.9], [-0.1, -0.2, 0.1, 1.0, 0.0, 0.0], [0, 0.3, -0.1, 0, -1, 1]])
     values = []
     for size in (0.5, 0.25, 0.125):

@@ -1,4 +1,4 @@
-"""All bounces in a room with a body, against Mitsuba's path tracer, with which nothing here is shared."""
+"""All bounces in a room with a body, against the independent path tracer Mitsuba."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 SEEDS, SAMPLES, VECTOR_VARIANT, METER = 8, 1 << 16, 1e-3, 1e-2
 ALBEDO_OF_ROOM, ALBEDO_OF_BODY = 0.8, 0.4
-# Place and normal of what measures: in the air, on the body's far side, below the ceiling.
+# Position and normal of the meters: in the air, on the far side of the body, below the ceiling.
 METERS = np.array(
     [
         [-0.2, 0.25, 0.1, 0.0, 0.0, 1.0],
@@ -42,7 +42,7 @@ def body() -> Any:
 
 
 def measured() -> np.ndarray:
-    """Irradiance of each meter (seeds, n) by light of a strip on the floor, 1 W/m, that went by another surface."""
+    """Return the irradiance of each meter (seeds, n) by indirect light of a strip on the floor, 1 W/m."""
     mitsuba.set_variant("scalar_rgb")
     move = mitsuba.ScalarTransform4f
 
@@ -54,7 +54,7 @@ def measured() -> np.ndarray:
         parameters.update()
         return made
 
-    # Half of the strip's length and width, above the floor by what its rays keep off surfaces.
+    # Half of the strip's length and width; height above the floor equal to the ray clearance.
     place = move().translate([0.0, 0.2, -0.3 + 2e-4]).scale([0.5, 0.5 * VECTOR_VARIANT, 1.0])
     light = {"type": "area", "radiance": {"type": "rgb", "value": 1.0 / (VECTOR_VARIANT * math.pi)}}
     scene = {
@@ -93,5 +93,5 @@ def test_all_bounces_are_what_mitsuba_finds() -> None:
     found = measured()
     noise = found.std(axis=0, ddof=1) / math.sqrt(SEEDS)
     assert np.all(noise < 5e-3 * found.mean(axis=0))
-    # Patches of 0.1 m leave some parts of a thousand.
+    # Patches of 0.1 m cause an error of some parts per thousand.
     assert np.all(np.abs(found.mean(axis=0) - bounced) < 4.0 * noise + 5e-3 * bounced)

@@ -1,4 +1,4 @@
-"""Light that mirrors throw on: where rays say, with all its energy; plane and curved, one after another."""
+"""Light reflected by mirrors: positions against rays, conservation of energy, plane and curved mirrors, sequences."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def on_mirrors(lit: LitLine, scene: Scene) -> float:
 
 
 def slanted() -> Scene:
-    """Return a mirror at 45 degrees under the sheet, and a wall that it throws the light to."""
+    """Return a mirror at 45 degrees under the sheet, and a wall that it illuminates."""
     mirror = quad([-0.01, -0.005, 0.0], [0.01, -0.005, 0.0], [0.01, 0.005, 0.01], [-0.01, 0.005, 0.01])
     wall = quad([-0.05, -0.03, 0], [0.05, -0.03, 0], [0.05, -0.03, 0.05], [-0.05, -0.03, 0.05])
     return Scene(np.array(mirror + wall), np.array([1, 1, 0, 0]))
@@ -50,7 +50,7 @@ def test_a_mirror_at_45_degrees_throws_the_sheet_onto_a_wall(
     np.testing.assert_allclose(reflected.normals, np.tile([0.0, 1.0, 0.0], (len(reflected.power), 1)), atol=1e-15)
     assert reflected.total() == pytest.approx(0.8 * on_mirrors(lit, scene), rel=1e-12)
     ends = np.sort(reflected.ends[..., 0].ravel())
-    # The light of the fan has gone 0.195 m down to the mirror, and 0.03 m on.
+    # The path of the fan's light is 0.195 m down to the mirror and 0.03 m from there.
     expected = np.array([-0.01, 0.01])
     if source:
         expected = source[0] + (expected - source[0]) * (0.195 + 0.03) / 0.195
@@ -63,7 +63,7 @@ def test_a_mirror_at_45_degrees_throws_the_sheet_onto_a_wall(
 def test_plane_mirrors_throw_where_rays_say(
     device: Device, source: tuple[float, float] | None, rng: np.random.Generator
 ) -> None:
-    """A facet over a heap of boxes: each ray lands in a lit piece, and each piece gets what the rays bring."""
+    """A facet over a heap of boxes: each ray ends in a lit piece, and each piece has the power of its rays."""
     boxes = [trimesh.creation.box((0.004, 0.004, rng.uniform(0.004, 0.02))) for _ in range(60)]
     for box in boxes:
         box.apply_translation([*rng.uniform((-0.02, -0.03), (0.02, -0.008)), rng.uniform(0.0, 0.02)])
@@ -88,7 +88,7 @@ def test_plane_mirrors_throw_where_rays_say(
     power = np.repeat((lit.power * lit.lengths)[onto] / 400 * 0.8, 400)
     by_rays = np.bincount(hits.triangle[hits.triangle >= 0], power[hits.triangle >= 0], minlength=len(corners))
     ours = np.bincount(reflected.triangle, reflected.power * reflected.lengths, minlength=len(corners))
-    # A ray more or less at either end of each of a triangle's pieces.
+    # One ray more or less at either end of each piece of a triangle.
     pieces = np.bincount(reflected.triangle, minlength=len(corners))
     assert np.all(np.abs(ours - by_rays) <= 2.0 * pieces * power.max())
     assert reflected.total() == pytest.approx(power[hits.triangle >= 0].sum(), rel=5e-3)
@@ -108,13 +108,13 @@ def _distance(lines: LitLine, spot: np.ndarray, triangle: int) -> float:
 
 @SOURCES
 def test_in_a_closed_box_no_light_is_lost(device: Device, source: tuple[float, float] | None) -> None:
-    """Walls all mirror: after k of them there is 0.8^k of the power, on the next wall."""
+    """All walls are mirrors: after k reflections, 0.8^k of the power arrives on the next wall."""
     box = trimesh.creation.box((0.03, 0.03, 0.03))
     box.apply_transform(trimesh.transformations.rotation_matrix(0.4, [0.3, 0.5, 0.2]))
     lid = np.abs(box.face_normals[:, 2]) < 2.0
     scene = Scene(np.array(box.triangles)[lid], np.ones(lid.sum(), int))
     sheet = sheet_of(source)
-    # What light is within the box comes from within: a line on a wall, lit from the sheet's side.
+    # Light inside the box is reflected from inside: a line on a wall, lit from the side of the sheet.
     entered = LightSheet(transport=TRANSPORT, g_limits=(-0.004, 0.004), source=source, power=3.0)
     through = Scene(np.array(box.triangles)[box.face_normals[:, 2] < 0.0])
     lit = entered.illuminate(through, 0.0)
@@ -127,7 +127,7 @@ def test_in_a_closed_box_no_light_is_lost(device: Device, source: tuple[float, f
 
 
 def test_a_round_mirror_throws_light_as_it_is_round(device: Device) -> None:
-    """A cylinder along y under parallel light: x at angle a from the top goes on at 2 a; the wall gets dP / dx."""
+    """A cylinder along y under parallel light: light at angle a is reflected at 2 a; the wall gets dP / dx."""
     radius, height = 5e-3, 0.03
     cylinder = trimesh.creation.cylinder(radius, 0.02, sections=240)
     cylinder.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
@@ -151,7 +151,7 @@ def test_a_round_mirror_throws_light_as_it_is_round(device: Device) -> None:
 
 
 def _between(lines: LitLine, low: float, high: float) -> float:
-    """Return the power between two heights on the wall."""
+    """Return the power between two heights of the wall."""
     z = np.sort(lines.ends[..., 2], axis=1)
     inside = np.maximum(np.minimum(z[:, 1], high) - np.maximum(z[:, 0], low), 0.0) / (z[:, 1] - z[:, 0])
     return float(np.sum(inside * lines.power * lines.lengths))
@@ -162,7 +162,7 @@ def test_without_mirrors_or_throws_there_is_none(device: Device) -> None:
     lit = sheet.illuminate(scene, 0.0)
     assert not len(mirrors_of(scene, (DULL, MIRROR), device, max_reflections=0).reflected_lines(lit, sheet, 0.0).power)
     assert not len(mirrors_of(scene, (DULL, DULL), device).reflected_lines(lit, sheet, 0.0).power)
-    # The other way round there is nothing that the light falls on.
+    # In the opposite direction the light hits no surface.
     away = sheet.illuminate(scene, 0.02)
     assert not len(mirrors_of(scene, (DULL, MIRROR), device).reflected_lines(away, sheet, 0.02).power)
     with pytest.raises(ValueError, match="max_reflections"):

@@ -1,15 +1,15 @@
 """Devices, tiers and caches of the tests; a test that needs a device fails where there is none.
 
 The option ``--tier`` selects the tests. ``fast`` runs all tests without the mark ``slow`` on the best device, and a
-smoke set on every other device: the first case of each test function. ``full`` runs all tests on every device.
-``nightly`` is ``full`` with more hypothesis examples.
+smoke set on every other device: one test for each file, kernel variant and precision. ``full`` runs all tests on every
+device. ``nightly`` is ``full`` with more hypothesis examples.
 """
 
 from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ os.environ |= {"XDG_CACHE_HOME": str(CACHE), "MPLCONFIGDIR": str(CACHE / "matplo
 hypothesis.configuration.set_hypothesis_home_dir(CACHE / "hypothesis")
 
 LEFT = pytest.StashKey[dict[str, int]]()
+WITHOUT_INLINE = pytest.StashKey[bool]()
 TIERS = ("fast", "full", "nightly")
 # Factor on the examples of every hypothesis test in the tier "nightly".
 NIGHTLY_EXAMPLES = 20
@@ -58,7 +59,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         _draw_more_examples(items)
     if tier != "fast":
         return
-    left = list(_left_to_full_tier(items))
+    best = Device.all()[:1]
+    left = list(_left_to_full_tier(items, best))
     if left:
         config.hook.pytest_deselected(items=left)
         labels = ((_device_of(item), item.get_closest_marker("slow")) for item in left)
@@ -67,17 +69,33 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if item not in out]
 
 
-def _left_to_full_tier(items: list[pytest.Item]) -> Iterator[pytest.Item]:
-    """Yield slow tests and, on all devices but the best, all cases of a test function but its first."""
-    best = Device.all()[:1]
+def _left_to_full_tier(items: list[pytest.Item], best: Sequence[Device]) -> Iterator[pytest.Item]:
+    """Yield slow tests and, on all devices but the best, the tests beyond the smoke set.
+
+    PoCL compiles each kernel once more for its inline device: beyond the smoke set, tests outside ``tests/host`` run
+    without that device.
+    """
     seen = set()
     for item in items:
         device = _device_of(item)
-        case = (item.parent, getattr(item, "originalname", item.name), device)
-        if item.get_closest_marker("slow") is not None or (device is not None and device not in best and case in seen):
+        case = _smoke_case(item)
+        is_more = device is not None and case in seen
+        if item.get_closest_marker("slow") is not None or (is_more and device not in best):
             yield item
-        else:
-            seen.add(case)
+            continue
+        seen.add(case)
+        item.stash[WITHOUT_INLINE] = is_more and "host" not in item.path.parts
+
+
+def _smoke_case(item: pytest.Item) -> tuple[Any, ...]:
+    """Return a key: file, device, kernel variant and precision; the smoke set has the first test of each key.
+
+    Runtimes differ most in queues and memory: in ``tests/host`` the key also has the test function.
+    """
+    parameters = item.callspec.params if hasattr(item, "callspec") else {}
+    chosen = (parameters.get(name) for name in ("device", "variant", "precision"))
+    function = getattr(item, "originalname", item.name) if "host" in item.path.parts else ""
+    return (item.path, function, *map(str, chosen))
 
 
 def _device_of(item: pytest.Item) -> Device | None:
@@ -124,13 +142,15 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _a_device_is_there(request: pytest.FixtureRequest) -> None:
+def _a_device_is_there(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "device" not in request.fixturenames:
         return
     device = request.getfixturevalue("device")
     if device is None:
         pytest.fail(f"this test needs a healthy OpenCL device; {INSTALL_HINT}", pytrace=False)
     request.node.user_properties.append(("device", device.label))
+    if request.node.stash.get(WITHOUT_INLINE, False):
+        monkeypatch.setattr(device, "inline_device", None)
 
 
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import DTypeLike
 from gpuvision.host import discovery
 from gpuvision.host.arrays import SHARED_FLAGS, DeviceArray
 from gpuvision.host.errors import DeviceUnusableError, NoDeviceError
+from gpuvision.host.text import printable
 
 VARIABLE = "GPUVISION_DEVICE"
 _COMPLETE = cl.command_execution_status.COMPLETE
@@ -60,7 +61,7 @@ class Device:
     def __init__(self, handle: Any, label: str, kind: str, *, queue: Any = None, inline_device: Any = None) -> None:
         self.handle = handle
         self.label, self.kind = label, kind
-        self.name, self.driver = handle.name.strip(), handle.driver_version
+        self.name, self.driver = printable(handle.name).strip(), printable(handle.driver_version)
         # The context is kept for the queue, too: Intel's runtime frees a context while a queue of it exists.
         own = [handle] if inline_device is None else [handle, inline_device]
         self.context = queue.context if queue is not None else cl.Context(own)

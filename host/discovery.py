@@ -6,6 +6,7 @@ import contextlib
 import functools
 import hashlib
 import json
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -16,14 +17,9 @@ from typing import Any
 
 import pyopencl as cl
 
-from gpuvision.host.files import write_text_atomic
-from gpuvision.host.runtime import (
-    cache_folder,
-    expose_installed_runtime,
-    pin_workers,
-    provide_cache,
-    request_inline_device,
-)
+from gpuvision.host.cache import cache_folder, provide_cache, read_private, write_private
+from gpuvision.host.runtime import expose_installed_runtime, pin_workers, request_inline_device
+from gpuvision.host.text import printable
 
 INSTALL_HINT = (
     "install one: `apt-get install pocl-opencl-icd` (as root), or `pip install 'gpuvision[cpu]'` "
@@ -31,6 +27,9 @@ INSTALL_HINT = (
 )
 # Time-out of the probe's process [s] (chosen): a first build by a driver on a busy machine is slow.
 _PROBE_SECONDS = 120
+# Longest reason that is shown [characters] (chosen).
+_MAX_REASON = 500
+_KEY = re.compile("[0-9a-f]{24}")
 _KINDS = {
     "portable computing language": "pocl",
     "oclgrind": "oclgrind",
@@ -72,17 +71,17 @@ class ListedDevice:
     @property
     def name(self) -> str:
         """Full name of the device."""
-        return str(self.handle.name).strip()
+        return printable(str(self.handle.name)).strip()
 
     @property
     def platform(self) -> str:
         """Name of the platform."""
-        return str(self.handle.platform.name).strip()
+        return printable(str(self.handle.platform.name)).strip()
 
     @property
     def driver(self) -> str:
         """Version of the driver."""
-        return str(self.handle.driver_version).strip()
+        return printable(str(self.handle.driver_version)).strip()
 
     @property
     def is_gpu(self) -> bool:
@@ -148,17 +147,17 @@ def _verdicts_file() -> Path:
 
 def _read_verdicts() -> dict[str, str]:
     try:
-        read = json.loads(_verdicts_file().read_text())
-    except (OSError, ValueError):
+        read = json.loads(read_private(_verdicts_file()) or "{}")
+    except (ValueError, RecursionError):
         return {}
     kept = read.items() if isinstance(read, dict) else ()
-    return {key: reason for key, reason in kept if isinstance(reason, str)}
+    return {key: reason for key, reason in kept if _KEY.fullmatch(key) and isinstance(reason, str)}
 
 
 def _keep_verdicts(fresh: dict[str, str]) -> None:
     # Without a writable cache the next start probes again, which takes about a second per device.
     with contextlib.suppress(OSError):
-        write_text_atomic(_verdicts_file(), json.dumps(_read_verdicts() | fresh, indent=1))
+        write_private(_verdicts_file(), json.dumps(_read_verdicts() | fresh, indent=1))
 
 
 def _ask_probe(platform_index: int, device_index: int) -> str:
@@ -253,15 +252,21 @@ def probed_devices(*, probe_again: bool = False) -> tuple[ProbedDevice, ...]:
 
 @functools.cache
 def _probed_devices(*, trust_bad: bool) -> tuple[ProbedDevice, ...]:
+    listed = listed_devices()  # first: it makes the cache folder private
     known = {key: reason for key, reason in _read_verdicts().items() if trust_bad or not reason}
     fresh: dict[str, str] = {}
-    for each in listed_devices():
+    for each in listed:
         if each.key not in known:
             fresh[each.key] = _ask_probe(each.platform_index, each.device_index)
     if fresh:
         _keep_verdicts(fresh)
     verdicts = known | fresh
-    return tuple(_with_verdict(each, verdicts[each.key]) for each in listed_devices())
+    return tuple(_with_verdict(each, _one_line(verdicts[each.key])) for each in listed)
+
+
+def _one_line(reason: str) -> str:
+    """Return a reason of a driver as one line of printable characters."""
+    return " ".join(printable(reason).split())[:_MAX_REASON]
 
 
 def _with_verdict(listed: ListedDevice, reason: str) -> ProbedDevice:

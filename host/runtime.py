@@ -8,7 +8,6 @@ not register them with the ICD loader: the loader reads ``/etc/OpenCL/vendors``,
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import ctypes
 import hashlib
@@ -16,13 +15,9 @@ import importlib.metadata
 import importlib.util
 import os
 import re
-import shutil
-import tempfile
 from pathlib import Path
 
-import platformdirs
-
-from gpuvision.host.files import write_text_atomic
+from gpuvision.host.cache import cache_folder, private_folder
 
 SYSTEM_VENDORS = Path("/etc/OpenCL/vendors")
 _VARIABLE = "OCL_ICD_VENDORS"
@@ -31,27 +26,6 @@ _DRIVER = "libintelocl.so"
 _POCL_3 = re.compile(r"libpocl\.so\.2\.(9|10)\.")  # 3.0 and 3.1
 # The driver finds these libraries by name only: they must be loaded before the driver is.
 _SIBLINGS = ("libintlc.so.5", "libirng.so", "libimf.so", "libsvml.so")
-
-
-def cache_folder() -> Path:
-    """Return the user's cache folder of gpuvision: verdicts of devices, lists of vendors."""
-    return platformdirs.user_cache_path("gpuvision")
-
-
-def provide_cache() -> None:
-    """Set a temporary cache folder for this process where the user's cache folder cannot be written.
-
-    pyopencl keeps compiled kernels in the user's cache folder, and fails where the home folder is missing or read-only.
-    Must run before the first platform query.
-    """
-    try:
-        cache_folder().mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=cache_folder()):
-            return
-    except OSError:
-        folder = tempfile.mkdtemp(prefix="gpuvision-cache-")
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        os.environ["XDG_CACHE_HOME"] = folder
 
 
 def pin_workers() -> None:
@@ -113,11 +87,8 @@ def _entries(folder: Path) -> dict[str, str]:
 def _vendors_folder(entries: dict[str, str]) -> Path:
     # The folder is named by a hash of its content: other drivers give another folder, and no folder is ever changed.
     digest = hashlib.sha256(repr(sorted(entries.items())).encode()).hexdigest()[:12]
-    folder = cache_folder() / "vendors" / digest
-    for name, text in entries.items():
-        if not (folder / name).exists():
-            write_text_atomic(folder / name, text)
-    return folder
+    # The folder is verified all the same: the loader loads every entry in it.
+    return private_folder(cache_folder() / "vendors" / digest, entries)
 
 
 def expose_installed_runtime() -> None:
@@ -132,4 +103,6 @@ def expose_installed_runtime() -> None:
     if not libraries or not _load_siblings(libraries):
         return
     if named is None:  # otherwise a parent process of gpuvision has set it
-        os.environ[_VARIABLE] = str(_vendors_folder(_entries(SYSTEM_VENDORS) | {_ENTRY: str(libraries[_DRIVER])}))
+        entries = _entries(SYSTEM_VENDORS) | {_ENTRY: str(libraries[_DRIVER])}
+        with contextlib.suppress(OSError):  # without a folder of the cache the wheel's runtime is not listed
+            os.environ[_VARIABLE] = str(_vendors_folder(entries))

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
 
 _PRODUCER, _DEVICE, _CONSUMER = "producer", "device", "consumer"
 _LANES = {
@@ -30,10 +30,12 @@ class Trace:
         JSON file that is written when the stream closes.
     limit : int
         Number of batches to keep, which bounds the memory of a long stream.
+    overwrite : bool
+        Whether an existing file may be replaced that no earlier trace wrote. Default False.
     """
 
-    def __init__(self, path: str | Path, limit: int = 20_000) -> None:
-        self.path, self.limit = Path(path), limit
+    def __init__(self, path: str | Path, limit: int = 20_000, *, overwrite: bool = False) -> None:
+        self.path, self.limit, self.overwrite = Path(path), limit, overwrite
         self._spans: list[tuple[str, int, int, int, int]] = []
         self._batches = 0
 
@@ -50,7 +52,13 @@ class Trace:
         self._spans.extend((stage, start, end, number, count) for stage, (start, end) in spans.items())
 
     def write(self) -> None:
-        """Write the file atomically."""
+        """Write the file atomically.
+
+        Raises
+        ------
+        FileExistsError
+            The file exists and is no unchanged output of a trace; see `gpuvision.host.outputs`.
+        """
         lanes = list(dict.fromkeys(_LANES.values()))
         origin = min((start for _, start, *_ in self._spans), default=0)
         events: list[dict[str, Any]] = [
@@ -61,4 +69,6 @@ class Trace:
             event = {"ph": "X", "name": stage, "pid": 1, "tid": lanes.index(_LANES[stage])}
             event |= {"ts": (start - origin) / 1e3, "dur": (end - start) / 1e3}
             events.append(event | {"args": {"frame": number, "frames": count}})
-        write_text_atomic(self.path, json.dumps({"traceEvents": events, "displayTimeUnit": "ns"}))
+        Outputs("trace", overwrite=self.overwrite).write_text(
+            self.path, json.dumps({"traceEvents": events, "displayTimeUnit": "ns"})
+        )

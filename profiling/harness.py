@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from gpuvision.host import Device
-from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
 from gpuvision.profiling import ceiling
 
 OPERATIONS = (
@@ -153,9 +153,12 @@ class Run:
         rows = [row.to_dict() for row in self.rows]
         return json.dumps({"machine": self.machine, "valid": self.valid, "rows": rows}, indent=1) + "\n"
 
-    def write(self, path: Path) -> None:
-        """Write the run as JSON; on an error no file is written."""
-        write_text_atomic(path, self.to_json())
+    def write(self, path: Path, *, overwrite: bool = False) -> None:
+        """Write the run as JSON; on an error no file is written.
+
+        With `overwrite` it may replace a file that no earlier profile wrote.
+        """
+        Outputs("profile", overwrite=overwrite).write_text(path, self.to_json())
 
 
 def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:

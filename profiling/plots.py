@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gpuvision.host.files import atomic_write
+from gpuvision.host.outputs import Outputs
 from gpuvision.profiling.harness import Row
 
 _SIZE, _DPI = (8.0, 3.6), 150
@@ -18,13 +19,18 @@ _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _GROWTH = re.compile(r"^growth/(?:(\w+)-)?x(\d+)$")
 
 
-def draw_plots(folder: str | Path, rows: Sequence[Row]) -> list[str]:
+PLOTS = ("growth.png", "tolerance.png")
+"""Names of the files that `draw_plots` writes."""
+
+
+def draw_plots(folder: str | Path, rows: Sequence[Row], *, overwrite: bool = False) -> list[str]:
     """Draw the plots of the rows into a folder, as PNG; return the names of the files.
 
     ``growth.png``: times of the cases ``growth/...`` over the amount of work, relative to the case ``base`` of their
     metadata. ``tolerance.png``: times and errors over the tolerance, of the cases that have one in their metadata.
+    With `overwrite` they may replace files that no earlier profile wrote.
     """
-    drawn = []
+    drawn: dict[str, tuple[Callable[[Any, Sequence[Row]], None], list[Row]]] = {}
     grown = [row for row in rows if _GROWTH.match(row.case)]
     bases = {row.metadata.get("base") for row in grown}
     for name, draw, chosen in (
@@ -33,9 +39,12 @@ def draw_plots(folder: str | Path, rows: Sequence[Row]) -> list[str]:
     ):
         some = [row for row in chosen if name == "growth.png" or not row.case.startswith("growth/")]
         if some:
-            _draw(Path(folder) / name, draw, some)
-            drawn.append(name)
-    return drawn
+            drawn[name] = (draw, some)
+    if drawn:
+        with Outputs("profile", overwrite=overwrite).folder(folder) as inside:
+            for name, (draw, some) in drawn.items():
+                _draw(inside / name, draw, some)
+    return list(drawn)
 
 
 def _draw(path: Path, draw: Callable[[Any, Sequence[Row]], None], rows: Sequence[Row]) -> None:

@@ -8,9 +8,12 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from gpuvision.host.outputs import Outputs
 
 DeviceLabel = Annotated[
     str | None,
@@ -52,18 +55,21 @@ ReportFile = Annotated[
 ]
 
 
-def check_report_file(path: Path | None) -> None:
-    """Check before long work that the report of ``--json`` can be written.
+Overwrite = Annotated[
+    bool,
+    typer.Option(
+        "--overwrite",
+        help="Replace existing files that no earlier run of this command wrote, or that were changed since. Input "
+        "files are never replaced.",
+    ),
+]
 
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
-    from gpuvision.host.files import check_writable_file
 
-    if path is not None and not prints_report(path):
-        check_writable_file(path)
+def echo(text: str, *, err: bool = False) -> None:
+    """Print text to standard output or standard error, without the control characters of files and drivers."""
+    from gpuvision.host.text import printable
+
+    typer.echo(printable(text), err=err)
 
 
 def prints_report(path: Path | None) -> bool:
@@ -71,13 +77,12 @@ def prints_report(path: Path | None) -> bool:
     return str(path) == "-"
 
 
-def write_report(path: Path | None, report: object) -> None:
+def write_report(path: Path | None, report: object, outputs: Outputs) -> None:
     """Write a report as JSON to the file of ``--json``, whole or not at all; ``-`` is standard output.
 
     Infinities and NaN become null: JSON has no such numbers.
     """
     from gpuvision.formats.json import json_tree
-    from gpuvision.host.files import write_text_atomic
 
     if path is None:
         return
@@ -85,7 +90,7 @@ def write_report(path: Path | None, report: object) -> None:
     if prints_report(path):
         typer.echo(text, nl=False)
     else:
-        write_text_atomic(path, text)
+        outputs.write_text(path, text)
 
 
 def reject_unused(reason: str, **given: object) -> None:

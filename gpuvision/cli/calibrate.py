@@ -14,8 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from gpuvision.cli.arguments import (
+    Overwrite,
     ReportFile,
-    check_report_file,
+    echo,
     named_path,
     prints_report,
     reject_unused,
@@ -107,6 +108,7 @@ def calibrate(
     focal_length: FocalLength = None,
     loss: Loss = RobustLoss.squared,
     as_json: ReportFile = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Calibrate a lens, or a camera with a tilted (Scheimpflug) sensor, from images of a flat target pattern.
 
@@ -114,9 +116,9 @@ def calibrate(
     parameters that the images do not determine.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    from gpuvision.host.files import check_writable_file
+    from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.calibrating import calibrate as run
-    from gpuvision.workflows.calibrating import write_calibration
+    from gpuvision.workflows.calibrating import calibration_files, write_calibration
 
     if pattern is not TargetPattern.chessboard:
         reject_unused(f"with --pattern {pattern.value}, only with chessboard", inner_corners=inner_corners)
@@ -125,14 +127,13 @@ def calibrate(
     elif method is CalibrationMethod.auto and pattern is TargetPattern.lines:
         reject_unused("with --pattern lines, which gives no poses", pitch=pitch, focal_length=focal_length)
     corners = None if inner_corners is None else _corners(inner_corners)
-    check_report_file(as_json)
     if out.suffix in (".json", ".png"):
         raise ValueError(
             f"--out is {out}, but the report and the plot get the suffixes .json and .png; give a name such as "
             "lens.toml"
         )
-    for place in (out, out.with_suffix(".json"), out.with_suffix(".png")):
-        check_writable_file(place)
+    outputs = Outputs("calibrate", inputs=images, overwrite=overwrite)
+    outputs.claim(*calibration_files(out), as_json)
     with progress_bar(f"detecting {pattern.value}") as progress:
         done = run(
             images,
@@ -140,15 +141,15 @@ def calibrate(
             method=method.value,
             model=model,
             inner_corners=corners,
-            pitch=1.0 if pitch is None else pitch,
+            pitch=pitch,
             focal_length=focal_length,
             loss=loss.value,
             progress=progress,
         )
     _show(done, to_stderr=prints_report(as_json))
-    write_calibration(done, out)
-    write_report(as_json, done.report())
-    typer.echo(
+    write_calibration(done, out, overwrite=overwrite)
+    write_report(as_json, done.report(), outputs)
+    echo(
         f"next: check {out.with_suffix('.png')}; correct images with gpuvision undistort IMAGES --lens {out} --out DIR",
         err=prints_report(as_json),
     )
@@ -166,9 +167,9 @@ def _corners(text: str) -> tuple[int, int]:
 def _show(done: Calibration, to_stderr: bool) -> None:
     """Print the summary, the parameters with uncertainties, the alternative models and the warnings."""
     console = Console(stderr=to_stderr)
-    typer.echo(done.summary(), err=to_stderr)
+    echo(done.summary(), err=to_stderr)
     for path, reason in done.skipped_images:
-        typer.echo(f"skipped {path}: {reason}", err=to_stderr)
+        echo(f"skipped {path}: {reason}", err=to_stderr)
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("parameter")
     table.add_column("value", justify="right")
@@ -179,7 +180,7 @@ def _show(done: Calibration, to_stderr: bool) -> None:
     if done.alternatives:
         console.print(_alternatives(done))
     for each in done.fit.warnings:
-        typer.echo(f"warning: {each}", err=to_stderr)
+        echo(f"warning: {each}", err=to_stderr)
 
 
 def _digits(value: float, error: float) -> int:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, named_path
+from gpuvision.cli.arguments import DeviceLabel, Overwrite, echo, named_path
 
 
 def demo(
@@ -18,6 +18,7 @@ def demo(
     ] = Path("out/demo"),
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 1,
     device: DeviceLabel = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Simulate recordings of a part with a camera and with PSD strips, scan them, and compare with the truth.
 
@@ -28,17 +29,24 @@ def demo(
 
     from gpuvision.cli.scan import progress_bar
     from gpuvision.host import Device
-    from gpuvision.host.files import atomic_folder, check_writable_folder
+    from gpuvision.host.files import atomic_write, write_text_atomic
+    from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.demo import SENSORS, make_part, make_scan_task
-    from gpuvision.workflows.scanning import scan
+    from gpuvision.workflows.scanning import SCAN_FILES, scan
     from gpuvision.workflows.simulating import simulate, simulate_recording
+    from gpuvision.workflows.simulation_result import simulation_files
 
-    check_writable_folder(out)
+    outputs = Outputs("demo", overwrite=overwrite)
+    each_sensor = {*SCAN_FILES, *simulation_files(has_mask=False), "recording.npy"}
+    names = ["part.ply", "report.json", *(f"{name}/{file}" for name in SENSORS for file in sorted(each_sensor))]
+    masked_folder = f"{SENSORS[-1]}_masked"
+    outputs.claim_folder(out, [*names, *(f"{masked_folder}/{file}" for file in simulation_files(has_mask=True))])
     chosen = Device.best() if device is None else Device.named(device)
-    typer.echo(f"device {chosen.label}: {chosen.name}")
+    echo(f"device {chosen.label}: {chosen.name}")
     results: dict[str, Any] = {}
-    with atomic_folder(out) as inside, tempfile.TemporaryDirectory() as light_folder:
-        make_part().export(inside / "part.ply")
+    with outputs.folder(out) as inside, tempfile.TemporaryDirectory() as light_folder:
+        with atomic_write(inside / "part.ply") as file:
+            file.write(make_part().export(file_type="ply"))
         for name in SENSORS:
             task = make_scan_task(name)
             with progress_bar(f"{name}: simulating") as progress:
@@ -46,22 +54,23 @@ def demo(
             recording = simulate_recording(task, light_folder, seed=seed, device=chosen)
             done = scan(recording, task.sensor, device=chosen)
             known.write(inside / name)
-            done.write(inside / name)
-            np.save(inside / name / "recording.npy", recording)
+            done.write(inside / name, overwrite=True)  # the scan's range image takes the name of the simulated one
+            with atomic_write(inside / name / "recording.npy") as file:
+                np.save(file, recording)
             results[name] = {"predicted": known.report(), **done.report()}
-            typer.echo(f"{name}: {done.summary()}\n  {known.summary()}")
+            echo(f"{name}: {done.summary()}\n  {known.summary()}")
         masked = simulate(task, light_folder, seed=seed, mask="best", device=chosen)
-        masked.write(inside / f"{name}_masked")
-        results[f"{name}_masked"] = {"predicted": masked.report()}
-        (inside / "report.json").write_text(json.dumps(results, indent=1) + "\n")
-    typer.echo(f"{name} with a mask computed for the part: {masked.summary()}")
+        masked.write(inside / masked_folder)
+        results[masked_folder] = {"predicted": masked.report()}
+        write_text_atomic(inside / "report.json", json.dumps(results, indent=1) + "\n")
+    echo(f"{name} with a mask computed for the part: {masked.summary()}")
     camera = out / "camera_line"
-    typer.echo(
+    echo(
         "next: scan a recording yourself: "
         f"gpuvision scan {camera / 'recording.npy'} --sensor camera_line --out {out / 'again'}"
     )
-    typer.echo(
+    echo(
         f"Range image of the part: {camera / 'picture.png'}. Errors of the PSD strips from light in the corners: "
         f"{out / name / 'errors.png'} and causes.png beside it; with a mask: "
-        f"{out / f'{name}_masked' / 'errors.png'}."
+        f"{out / masked_folder / 'errors.png'}."
     )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import ReportFile, check_report_file, prints_report, write_report
+from gpuvision.cli.arguments import Overwrite, ReportFile, echo, prints_report, write_report
 
 if TYPE_CHECKING:
     from gpuvision.host.discovery import ProbedDevice
@@ -15,16 +15,19 @@ if TYPE_CHECKING:
 def devices(
     as_json: ReportFile = None,
     probe: Annotated[bool, typer.Option("--probe", help="Repeat the probe of devices that failed before.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """List every OpenCL device: whether it works, why not, and what to install.
 
     A device works if a probe kernel was built, launched and checked on it. Exit code 1 if no device works.
     """
     from gpuvision.host import discovery
+    from gpuvision.host.outputs import Outputs
 
-    check_report_file(as_json)
+    outputs = Outputs("devices", overwrite=overwrite)
+    outputs.claim(as_json)
     listed = sorted(discovery.probed_devices(probe_again=probe), key=lambda each: each.rank)
-    write_report(as_json, [_described(each) for each in listed])
+    write_report(as_json, [_described(each) for each in listed], outputs)
     if not prints_report(as_json):
         _show(listed)
     if not any(each.healthy for each in listed):
@@ -48,12 +51,13 @@ def _described(device: ProbedDevice) -> dict[str, str | bool]:
 def _show(listed: list[ProbedDevice]) -> None:
     """Print a table of the devices; below it the reason and the advice for each broken one."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from gpuvision.host.discovery import INSTALL_HINT
 
     if not listed:
-        typer.echo(f"no OpenCL device; {INSTALL_HINT}")
+        echo(f"no OpenCL device; {INSTALL_HINT}")
         return
     table = Table()
     for heading in ("label", "name", "platform", "driver", "works"):
@@ -61,11 +65,11 @@ def _show(listed: list[ProbedDevice]) -> None:
         table.add_column(heading, overflow="fold", no_wrap=heading in ("label", "works"))
     for each in listed:
         works = "[green]yes[/]" if each.healthy else "[red]no[/]"
-        table.add_row(each.label, each.name, each.platform, each.driver, works)
+        table.add_row(*map(escape, (each.label, each.name, each.platform, each.driver)), works)
     Console().print(table)
     for each in listed:
         if not each.healthy:
-            typer.echo(f"{each.label} does not work: {each.reason}\n    {each.advice}")
+            echo(f"{each.label} does not work: {each.reason}\n    {each.advice}")
     healthy = [each.label for each in listed if each.healthy]
     if len(healthy) > 1:
-        typer.echo(f"choose a device with --device {healthy[0]} or with the variable GPUVISION_DEVICE={healthy[0]}")
+        echo(f"choose a device with --device {healthy[0]} or with the variable GPUVISION_DEVICE={healthy[0]}")

@@ -12,14 +12,14 @@ import typer
 from gpuvision.cli.arguments import (
     DeviceLabel,
     LayerNames,
+    Overwrite,
     ReportFile,
-    check_report_file,
     layers_of,
     named_path,
     quantities,
     reject_unused,
 )
-from gpuvision.cli.pose_output import PoseFolder, check_image, initial_pose_of, report_pose
+from gpuvision.cli.pose_output import PoseFolder, check_image, claim_outputs, initial_pose_of, report_pose
 from gpuvision.cli.select import Side
 
 if TYPE_CHECKING:
@@ -121,6 +121,7 @@ def locate(
     out: PoseFolder = None,
     as_json: ReportFile = None,
     device: DeviceLabel = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Locate a circuit board in an IMAGE: pose with standard deviations, from edges and fiducials.
 
@@ -131,15 +132,12 @@ def locate(
     from gpuvision.formats.camera_file import read_lens
     from gpuvision.formats.features_file import read_features
     from gpuvision.host import Device
-    from gpuvision.host.files import check_writable_folder
     from gpuvision.host.recordings import read_image
     from gpuvision.plots.board import draw_located_board
     from gpuvision.workflows.locating_board import locate_board
 
     check_image(image)
-    check_report_file(as_json)
-    if out is not None:
-        check_writable_folder(out)
+    outputs = claim_outputs("locate", (image, board, camera, features), out, as_json, overwrite)
     chosen = None if features is None else read_features(features)
     if chosen is not None:
         reject_unused("with --features, a file with a fixed selection of calipers", budget=budget)
@@ -169,7 +167,7 @@ def locate(
         copper=copper.value,
         device=None if device is None else Device.named(device),
     )
-    report_pose(located, lambda path: draw_located_board(path, picture, artwork, located), out, as_json)
+    report_pose(located, lambda path: draw_located_board(path, picture, artwork, located), out, as_json, outputs)
 
 
 def _search_range(text: str | None) -> tuple[float, float] | None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, ReportFile, check_report_file, named_path, quantities, reject_unused
-from gpuvision.cli.pose_output import PoseFolder, check_image, initial_pose_of, report_pose
+from gpuvision.cli.arguments import DeviceLabel, Overwrite, ReportFile, named_path, quantities, reject_unused
+from gpuvision.cli.pose_output import PoseFolder, check_image, claim_outputs, initial_pose_of, report_pose
 
 if TYPE_CHECKING:
     import numpy as np
@@ -78,6 +78,7 @@ def locate_robot(
     out: PoseFolder = None,
     as_json: ReportFile = None,
     device: DeviceLabel = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Locate a robot on a field from the white lines around it: candidate poses with standard deviations.
 
@@ -87,15 +88,12 @@ def locate_robot(
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.formats.field_file import read_field
     from gpuvision.host import Device
-    from gpuvision.host.files import check_writable_folder
     from gpuvision.plots.field import draw_located_robot
     from gpuvision.workflows.locating_robot import POINT_FILES, read_floor, read_points
     from gpuvision.workflows.locating_robot import locate_robot as locate
 
     check_image(source)
-    check_report_file(as_json)
-    if out is not None:
-        check_writable_folder(out)
+    outputs = claim_outputs("locate-robot", (source, field, camera), out, as_json, overwrite)
     pose = initial_pose_of(initial_pose)
     pixel = None if scale is None else quantities(scale, "--scale", "m")[0]
     described = read_field(field)
@@ -118,7 +116,7 @@ def locate_robot(
             picture, described, camera, pixel, line_width, blind_radius, threshold=threshold, device=chosen
         )
     located = locate(measured, described, initial_pose=pose, scale=pixel, device=chosen)
-    report_pose(located, lambda path: draw_located_robot(path, located, picture), out, as_json)
+    report_pose(located, lambda path: draw_located_robot(path, located, picture), out, as_json, outputs)
 
 
 def _scan(

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from gpuvision.cli.arguments import named_path, prints_report, quantities, write_report
+from gpuvision.cli.arguments import echo, named_path, prints_report, quantities, write_report
+
+if TYPE_CHECKING:
+    from gpuvision.host.outputs import Outputs
+
+_FILES = ("pose.json", "located.png")
 
 PoseFolder = Annotated[
     Path | None,
@@ -56,7 +61,28 @@ def initial_pose_of(text: str | None) -> tuple[float, float, float] | None:
     return x, y, theta
 
 
-def report_pose(located: Located, draw: Callable[[Path], None], out: Path | None, as_json: Path | None) -> None:
+def claim_outputs(
+    job: str, inputs: Iterable[str | Path | None], out: Path | None, as_json: Path | None, overwrite: bool
+) -> Outputs:
+    """Check that the files of ``--out`` and ``--json`` may be written, before the work.
+
+    Raises
+    ------
+    OSError
+        A file cannot be written, is an input, or exists and is no output of the command.
+    """
+    from gpuvision.host.outputs import Outputs
+
+    outputs = Outputs(job, inputs=[each for each in inputs if each is not None], overwrite=overwrite)
+    outputs.claim(as_json)
+    if out is not None:
+        outputs.claim_folder(out, _FILES)
+    return outputs
+
+
+def report_pose(
+    located: Located, draw: Callable[[Path], None], out: Path | None, as_json: Path | None, outputs: Outputs
+) -> None:
     """Print a pose and write its report and picture. A refused pose is an error; its picture shows the reason.
 
     Raises
@@ -64,16 +90,16 @@ def report_pose(located: Located, draw: Callable[[Path], None], out: Path | None
     ValueError
         The pose was refused.
     """
-    from gpuvision.host.files import atomic_folder
+    from gpuvision.host.files import write_text_atomic
 
     report = located.report()
-    write_report(as_json, report)
+    write_report(as_json, report, outputs)
     shown = ""
     if out is not None:
-        with atomic_folder(out) as inside:
-            (inside / "pose.json").write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+        with outputs.folder(out) as inside:
+            write_text_atomic(inside / "pose.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
             draw(inside / "located.png")
         shown = f"look at {out / 'located.png'} and {out / 'pose.json'}"
     if located.reason:
         raise ValueError(f"no pose: {located.reason}{'; ' + shown if shown else ''}")
-    typer.echo("\n".join(filter(None, (located.summary(), shown))), err=prints_report(as_json))
+    echo("\n".join(filter(None, (located.summary(), shown))), err=prints_report(as_json))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gpuvision.cli.arguments import ReportFile, check_report_file, named_path, prints_report
+from gpuvision.cli.arguments import Overwrite, ReportFile, echo, named_path, prints_report
 from gpuvision.host.errors import GpuVisionError
 
 if TYPE_CHECKING:
@@ -39,21 +39,25 @@ def profile(
             help="Folder for plots of time and error over the amount of work and over the tolerance.",
         ),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Measure operations against their peers: NumPy, Numba, OpenCV.
 
     Candidates run interleaved. The ratio is the time of the peer over the time of gpuvision. A run during which the
-    machine changed its speed is marked invalid.
+    machine changed its speed is marked invalid, and the exit code is 1.
     """
     if importlib.util.find_spec("numba") is None:
         raise GpuVisionError("the peer numba is missing; install it: pip install 'gpuvision[profile]'")
     from gpuvision.host import Device
-    from gpuvision.host.files import check_writable_folder
+    from gpuvision.host.outputs import Outputs
     from gpuvision.profiling import harness
 
-    check_report_file(as_json)
+    outputs = Outputs("profile", overwrite=overwrite)
+    outputs.claim(as_json)
     if plots is not None:
-        check_writable_folder(plots)
+        from gpuvision.profiling.plots import PLOTS, draw_plots
+
+        outputs.claim_folder(plots, PLOTS)
     for name in operations or ():
         if name not in harness.OPERATIONS:
             raise ValueError(f"no operation {name!r} to profile; expected some of {', '.join(harness.OPERATIONS)}")
@@ -62,21 +66,19 @@ def profile(
         operations or harness.OPERATIONS,
         devices,
         seconds=seconds,
-        progress=lambda line: typer.echo(line, err=True),
+        progress=lambda line: echo(line, err=True),
     )
     if prints_report(as_json):
         typer.echo(run.to_json(), nl=False)
     elif as_json is not None:
-        run.write(as_json)
+        run.write(as_json, overwrite=overwrite)
     _show(list(run.rows), to_stderr=prints_report(as_json))
     if plots is not None:
-        from gpuvision.profiling.plots import draw_plots
-
-        plots.mkdir(parents=True, exist_ok=True)
-        drawn = draw_plots(plots, run.rows)
-        typer.echo(f"look at {', '.join(str(plots / name) for name in drawn)}" if drawn else _NO_PLOTS, err=True)
+        drawn = draw_plots(plots, run.rows, overwrite=overwrite)
+        echo(f"look at {', '.join(str(plots / name) for name in drawn)}" if drawn else _NO_PLOTS, err=True)
     if not run.valid:
-        typer.echo("not valid: the machine changed its speed during the measurement; run the command again", err=True)
+        echo("not valid: the machine changed its speed during the measurement; run the command again", err=True)
+        raise typer.Exit(1)
 
 
 def _show(rows: list[Row], to_stderr: bool) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, ReportFile, check_report_file, named_path, prints_report, write_report
+from gpuvision.cli.arguments import DeviceLabel, Overwrite, ReportFile, echo, named_path, prints_report, write_report
 
 
 class Precision(StrEnum):
@@ -78,6 +78,7 @@ def scan(
     policy: RoomPolicy = None,
     trace: TraceFile = None,
     as_json: ReportFile = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Compute the range image of a recording; write it with pictures and a report to DIR.
 
@@ -87,17 +88,19 @@ def scan(
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     from gpuvision.host import Device
-    from gpuvision.host.files import check_writable_file, check_writable_folder
+    from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
+    from gpuvision.workflows.scanning import SCAN_FILES
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor)
-    check_writable_folder(out)
-    check_report_file(as_json)
+    outputs = Outputs("scan", inputs=(recording, sensor), overwrite=overwrite)
+    outputs.claim_folder(out, SCAN_FILES)
+    outputs.claim(as_json)
     if trace is not None:
-        check_writable_file(trace)
         if trace.absolute() in (out.absolute(), *out.absolute().parents):
             raise ValueError(f"--trace is {trace}, the folder of --out or one above it; give a file")
+        outputs.claim(trace, job="trace")
     chosen = None if device is None else Device.named(device)
     with progress_bar(f"scanning {recording.name}") as progress:
         done = run(
@@ -108,21 +111,25 @@ def scan(
             rate=rate,
             policy=None if policy is None else policy.value,
             trace=trace,
+            overwrite=overwrite,
             progress=progress,
         )
-    done.write(out)
-    write_report(as_json, done.report())
-    typer.echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}", err=prints_report(as_json))
+    done.write(out, overwrite=overwrite)
+    write_report(as_json, done.report(), outputs)
+    echo(f"{done.summary()}\nlook at {out / 'picture.png'} and {out / 'report.json'}", err=prints_report(as_json))
 
 
 @contextlib.contextmanager
 def progress_bar(description: str) -> Iterator[Callable[[int, int | None], object]]:
     """Show a progress bar on stderr if it is a terminal; yield a function (done, total) that updates it."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from gpuvision.host.text import printable
 
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(description, total=None)
+        task = bar.add_task(escape(printable(description)), total=None)
         yield lambda done, of: bar.update(task, completed=done, total=of)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.cli.arguments import LayerNames, layers_of, named_path, quantities, reject_unused
+from gpuvision.cli.arguments import LayerNames, Overwrite, echo, layers_of, named_path, quantities, reject_unused
 
 
 class Side(StrEnum):
@@ -89,6 +89,7 @@ def select(
             help="Label of the OpenCL device of a --budget in us, see `gpuvision devices`. Default: the best device.",
         ),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Choose the edges and fiducials of a board that determine its pose best, for `gpuvision locate --features`.
 
@@ -97,7 +98,7 @@ def select(
     """
     from gpuvision.formats.features_file import write_features
     from gpuvision.host import Device
-    from gpuvision.host.files import atomic_folder, check_writable_folder
+    from gpuvision.host.outputs import Outputs
     from gpuvision.matching.artwork.artwork import read_artwork
     from gpuvision.matching.features.feature_set import choose_features, edge_clearance
     from gpuvision.matching.features.imaging import Imaging
@@ -122,7 +123,8 @@ def select(
         angle=angle,
     )
     at = None if placement is None else quantities(placement, "--placement", "m,m")
-    check_writable_folder(out)
+    outputs = Outputs("select", inputs=[gerbers], overwrite=overwrite)
+    outputs.claim_folder(out, ("features.toml", "features.png"))
     artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=edge_clearance(imaging))
     box = ((left, bottom), (right, top))
     features = choose_features(
@@ -135,10 +137,10 @@ def select(
         missing=missing,
         device=None if device is None else Device.named(device),
     )
-    with atomic_folder(out) as inside:
+    with outputs.folder(out) as inside:
         write_features(features, inside / "features.toml")
         draw_features(inside / "features.png", artwork, features, box)
-    typer.echo(
+    echo(
         f"{features.summary()}\nlook at {out / 'features.png'}; next: "
         f"gpuvision locate IMAGE --board {gerbers} --features {out / 'features.toml'}"
     )

@@ -10,8 +10,9 @@ import typer
 
 from gpuvision.cli.arguments import (
     DeviceLabel,
+    Overwrite,
     ReportFile,
-    check_report_file,
+    echo,
     named_path,
     prints_report,
     reject_unused,
@@ -131,6 +132,7 @@ def simulate(
     device: DeviceLabel = None,
     scheduler: Scheduler = None,
     as_json: ReportFile = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Predict the range image that a sensor makes of a PART, its errors, and their causes.
 
@@ -139,9 +141,11 @@ def simulate(
     """
     from gpuvision.formats.materials_file import read_materials
     from gpuvision.host import Device
-    from gpuvision.host.files import check_writable_folder
+    from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
+    from gpuvision.workflows.sensor_pair import pair_files
     from gpuvision.workflows.simulating import load_part, prepare_simulation
+    from gpuvision.workflows.simulation_result import simulation_files
 
     if materials is not None:
         reject_unused("with --materials", albedo=albedo)
@@ -152,15 +156,19 @@ def simulate(
     names = _names(paths)
     if not {"diffuse-diffuse", "multi-bounce"} & set(names):
         reject_unused("without diffuse-diffuse or multi-bounce in --paths", tolerance=tolerance or None)
-    check_report_file(as_json)
     described = Sensor.load(sensor)
     beside = None if second is None else Sensor.load(second)
-    check_writable_folder(out)
+    read = [each for each in (part, sensor, second, materials, mask) if each is not None]
+    outputs = Outputs("simulate", inputs=read, overwrite=overwrite)
+    has_mask = mask == "best"
+    names_out = simulation_files(has_mask=has_mask) + (() if second is None else pair_files(has_mask=has_mask))
+    outputs.claim_folder(out, names_out)
+    outputs.claim(as_json)
     before = _mask(mask)
     given = None if materials is None else read_materials(materials)
     scene, made_of = load_part(part, _METRES[unit], given, 0.5 if albedo is None else albedo)
     if str(scene.defects) != "no defects":
-        typer.echo(f"{part.name}: {'; '.join(str(scene.defects).splitlines())}", err=True)
+        echo(f"{part.name}: {'; '.join(str(scene.defects).splitlines())}", err=True)
     task = prepare_simulation(scene, made_of, described, paths=names, tolerance=tolerance, profiles=profiles)
     other = None
     if beside is not None:
@@ -172,9 +180,9 @@ def simulate(
         "device": None if device is None else Device.named(device),
         "scheduler": scheduler,
     }
-    summary, report = _run(task, other, rule or Rule.stronger, out, made, f"simulating {part.name}")
-    write_report(as_json, report)
-    typer.echo(
+    summary, report = _run(task, other, rule or Rule.stronger, out, made, f"simulating {part.name}", overwrite)
+    write_report(as_json, report, outputs)
+    echo(
         f"{summary}\nlook at {out / 'errors.png'}, {out / 'causes.png'} and {out / 'report.json'}",
         err=prints_report(as_json),
     )
@@ -199,7 +207,13 @@ def _mask(choice: str) -> Mask | str | None:
 
 
 def _run(
-    task: SimulationTask, other: SimulationTask | None, rule: Rule, out: Path, made: dict[str, Any], description: str
+    task: SimulationTask,
+    other: SimulationTask | None,
+    rule: Rule,
+    out: Path,
+    made: dict[str, Any],
+    description: str,
+    overwrite: bool,
 ) -> tuple[str, dict[str, Any]]:
     """Simulate one sensor or two, write the results, and return the summary and the first sensor's report."""
     from gpuvision.simulation.errors.sensor_fusion import SensorFusion
@@ -212,7 +226,7 @@ def _run(
     if other is not None:
         with progress_bar(f"{description}, second sensor") as progress:
             pair = SensorPair.fuse(done, run(other, out, progress=progress, **made), SensorFusion(rule=rule.value))
-        pair.write(out)
+        pair.write(out, overwrite=overwrite)
         summary += f"\n{pair.summary()}"
-    done.write(out)
+    done.write(out, overwrite=overwrite)
     return summary, done.report()

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from gpuvision.cli.arguments import DeviceLabel, named_path, reject_unused
+from gpuvision.cli.arguments import DeviceLabel, Overwrite, echo, named_path, reject_unused
 from gpuvision.cli.scan import progress_bar
 
 
@@ -61,6 +61,7 @@ def undistort(
         typer.Option(metavar="COLUMN,ROW,COLUMNS,ROWS", help="Part of the corrected images to compute. Default: all."),
     ] = None,
     device: DeviceLabel = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Correct images and points for the distortion of a calibrated lens.
 
@@ -71,6 +72,7 @@ def undistort(
     from gpuvision.formats.camera_file import read_lens
     from gpuvision.host import Device
     from gpuvision.host.files import check_writable_folder
+    from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.undistorting import undistort_files
 
     if border is not Border.constant:
@@ -80,6 +82,8 @@ def undistort(
         reject_unused(reason, interpolation=interpolation, border=border, region=region)
     model = read_lens(lens)
     check_writable_folder(out)
+    suffixes = (".png", ".tif", ".npy")
+    Outputs("undistort", inputs=[lens]).protect(*(out / f"{each.stem}{end}" for each in inputs for end in suffixes))
     chosen = Device.best() if device is None else Device.named(device)
     part = None if region is None else _region(region)
     with progress_bar("undistorting") as progress:
@@ -92,9 +96,10 @@ def undistort(
             border=(border or Border.mask).value,
             border_value=border_value or 0.0,
             region=part,
+            overwrite=overwrite,
             progress=progress,
         )
-    typer.echo(f"{len(done)} files written to {out}; the first: {done[0]}")
+    echo(f"{len(done)} files written to {out}; the first: {done[0]}")
 
 
 def _region(text: str) -> tuple[int, int, int, int]:

@@ -64,7 +64,9 @@ def radial_lens(table: Section) -> Lens:
     return Lens(k1=k1, k2=k2, centre=(column, row))
 
 
-def write_lens(path: str | Path, model: Lens | Camera, documentation: Mapping[str, Mapping[str, Any]]) -> None:
+def write_lens(
+    path: str | Path, model: Lens | Camera, documentation: Mapping[str, Mapping[str, Any]], *, overwrite: bool = False
+) -> None:
     """Write a camera model as TOML. On an error no file is left behind.
 
     Parameters
@@ -75,9 +77,11 @@ def write_lens(path: str | Path, model: Lens | Camera, documentation: Mapping[st
         Model that `read_lens` reads back.
     documentation : mapping
         Tables ``image``, ``uncertainty`` and ``fit``, which no reader uses.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
     """
     table = {"lens" if isinstance(model, Lens) else "camera": model.to_dict(), **documentation}
-    with atomic_write(path) as file:
+    with atomic_write(path, overwrite=overwrite) as file:
         tomli_w.dump(table, file)
 
 

@@ -18,7 +18,7 @@ from gpuvision.matching.features.imaging import Imaging
 from gpuvision.schema import Section, read_toml
 
 
-def write_features(features: FeatureSet, path: str | Path) -> None:
+def write_features(features: FeatureSet, path: str | Path, *, overwrite: bool = False) -> None:
     """Write features as TOML. On an error the former file remains.
 
     Parameters
@@ -27,6 +27,8 @@ def write_features(features: FeatureSet, path: str | Path) -> None:
         Features of a board.
     path : str or Path
         Output file; its folder must exist.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
 
     Raises
     ------
@@ -65,7 +67,7 @@ def write_features(features: FeatureSet, path: str | Path) -> None:
             for point, radius, hole, sigma in zip(*features.fiducials, strict=True)
         ],
     }
-    with atomic_write(path) as file:
+    with atomic_write(path, overwrite=overwrite) as file:
         tomli_w.dump(table, file)
 
 

@@ -82,7 +82,7 @@ def _grid_table(grid: Grid | None) -> dict[str, float]:
 # ---- TIFF ------------------------------------------------------------------------------------------------------
 
 
-def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None) -> None:
+def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None, *, overwrite: bool = False) -> None:
     """Write heights as float32 TIFF: metres, NaN in holes.
 
     With a grid the resolution tags hold the cells per centimetre. The description is JSON: unit, value of a hole, grid.
@@ -95,6 +95,8 @@ def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None) -
         Heights [m], (rows, columns); NaN in holes.
     grid : Grid, optional
         Grid of the heights.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
 
     Raises
     ------
@@ -105,7 +107,7 @@ def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None) -
     cells: dict[str, Any] = (
         {} if grid is None else {"resolution": (_CENTIMETRE / grid.cell_x, _CENTIMETRE / grid.cell_y)}
     )
-    with atomic_write(path) as file:
+    with atomic_write(path, overwrite=overwrite) as file:
         tifffile.imwrite(
             file,
             z,
@@ -144,6 +146,7 @@ def write_png16(
     *,
     low: float | None = None,
     high: float | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write heights as 16-bit PNG: ``height = Offset + Scale (code - 1)`` in metres, code 0 is a hole.
 
@@ -157,6 +160,8 @@ def write_png16(
     low, high
         Heights of the first and the last code [m]. Default: lowest and highest of the heights. Heights outside become
         holes.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
 
     Raises
     ------
@@ -184,7 +189,7 @@ def write_png16(
         "Scale": repr(scale),
         **{key: repr(value) for key, value in _grid_table(grid).items()},
     }
-    with atomic_write(path) as file:
+    with atomic_write(path, overwrite=overwrite) as file:
         encoded = image.tobytes()
         file.write(encoded[:_PNG_HEAD])
         for key, value in text.items():
@@ -238,6 +243,7 @@ def write_ply(
     status: Any = None,
     *,
     organised: bool = True,
+    overwrite: bool = False,
 ) -> None:
     """Write points as binary little-endian PLY, in metres.
 
@@ -252,6 +258,8 @@ def write_ply(
     organised : bool
         True (default): all samples in scan order, with NaN in holes, and ``obj_info num_cols`` (samples) and
         ``num_rows`` (profiles). False: the valid points only, for viewers that do not support NaN.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
 
     Raises
     ------
@@ -283,7 +291,7 @@ def write_ply(
         *(f"property {_PLY_TYPES[each.dtype.name]} {name}" for name, each in fields.items()),
         "end_header",
     ]
-    with atomic_write(path) as file:
+    with atomic_write(path, overwrite=overwrite) as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
         file.write(vertices.tobytes())
 
@@ -323,7 +331,9 @@ def _points_of_ply(path: Path) -> dict[str, Array]:
 # ---- NPZ -------------------------------------------------------------------------------------------------------
 
 
-def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], units: Mapping[str, str]) -> None:
+def write_npz(
+    path: str | os.PathLike[str], arrays: Mapping[str, Any], units: Mapping[str, str], *, overwrite: bool = False
+) -> None:
     """Write arrays and their units as NPZ.
 
     Parameters
@@ -334,6 +344,8 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], units: Ma
         Arrays by name.
     units : mapping of str to str
         Unit of each array, by the same names; ``""`` for an array without a unit.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
 
     Raises
     ------
@@ -343,7 +355,7 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any], units: Ma
     if _UNITS_KEY in arrays or set(units) != set(arrays):
         odd = ", ".join(sorted(set(units) ^ set(arrays))) or _UNITS_KEY
         raise ValueError(f"arrays and units do not belong together: {odd}; expected one unit for every array")
-    with atomic_write(path) as file:
+    with atomic_write(path, overwrite=overwrite) as file:
         held: dict[str, Any] = {**arrays, _UNITS_KEY: np.array(json.dumps(dict(units)))}
         np.savez(file, **held)
 

@@ -29,7 +29,9 @@ _USED, _REJECTED, _MISSING, _ARTWORK = "#00e5ff", "#ff9f1c", "#ff3366", "#ffe14d
 _MM = 1e3
 
 
-def draw_features(path: str | Path, artwork: Artwork, features: FeatureSet, region: npt.ArrayLike) -> None:
+def draw_features(
+    path: str | Path, artwork: Artwork, features: FeatureSet, region: npt.ArrayLike, *, overwrite: bool = False
+) -> None:
     """Draw a region of the artwork with the selected features as PNG.
 
     Parameters
@@ -42,6 +44,8 @@ def draw_features(path: str | Path, artwork: Artwork, features: FeatureSet, regi
         Selected features.
     region
         (2, 2) least and greatest x, y [m].
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
     """
     box = np.asarray(region, np.float64)
     window = np.stack([np.minimum(box[0], features.region[0]), np.maximum(box[1], features.region[1])])
@@ -66,7 +70,7 @@ def draw_features(path: str | Path, artwork: Artwork, features: FeatureSet, regi
     handles = [Line2D([], [], color=_USED, label="across an edge"), Line2D([], [], color="#ff66ff", label="a trace")]
     handles.append(Line2D([], [], color="grey", marker="+", linestyle="", label="placement point"))
     figure.legend(handles=handles, loc="outside lower left", ncols=3, fontsize=8, frameon=False)
-    _write(figure, path)
+    _write(figure, path, overwrite)
 
 
 def draw_artwork(axes: Any, artwork: Artwork, window: Float64) -> None:
@@ -91,7 +95,9 @@ def _fill(
     axes.add_collection(PolyCollection([_MM * each.outline for each in near], facecolors=colours, alpha=alpha))
 
 
-def draw_located_board(path: str | Path, image: npt.NDArray[Any], artwork: Artwork, located: LocatedBoard) -> None:
+def draw_located_board(
+    path: str | Path, image: npt.NDArray[Any], artwork: Artwork, located: LocatedBoard, *, overwrite: bool = False
+) -> None:
     """Draw an image with the artwork at the located pose, the rulers with their edges, and the fiducials, as PNG.
 
     Rulers are drawn as straight lines between their ends; the distortion of a lens over a ruler is not visible.
@@ -104,6 +110,8 @@ def draw_located_board(path: str | Path, image: npt.NDArray[Any], artwork: Artwo
         The image that was measured.
     artwork, located
         Artwork, and result of `locate_board`.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
     """
     rows, columns = located.view.shape
     figure, axes = _page((10.0, min(max(10.0 * rows / columns, 3.0), 14.0) + 0.8))
@@ -131,7 +139,7 @@ def draw_located_board(path: str | Path, image: npt.NDArray[Any], artwork: Artwo
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="column [px]", ylabel="row [px]")
     axes.set_title(located.summary(), fontsize=8, loc="left")
     figure.legend(handles=handles, loc="outside lower left", ncols=4, fontsize=8, frameon=False)
-    _write(figure, path)
+    _write(figure, path, overwrite)
 
 
 def _draw_fiducials(axes: Any, located: LocatedBoard) -> list[Line2D]:
@@ -196,6 +204,6 @@ def _page(size: tuple[float, float]) -> tuple[Figure, Any]:
     return figure, figure.add_subplot()
 
 
-def _write(figure: Figure, path: str | Path) -> None:
-    with atomic_write(path) as file:
+def _write(figure: Figure, path: str | Path, overwrite: bool) -> None:
+    with atomic_write(path, overwrite=overwrite) as file:
         figure.savefig(file, format="png")

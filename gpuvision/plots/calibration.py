@@ -24,7 +24,7 @@ _MAX_POINTS = 20_000
 _SCALE_PERCENTILE = 98
 
 
-def draw_calibration(path: str | Path, calibration: Calibration) -> None:
+def draw_calibration(path: str | Path, calibration: Calibration, *, overwrite: bool = False) -> None:
     """Draw residuals and distortion side by side as PNG. On an error no file is left behind.
 
     Parameters
@@ -33,6 +33,8 @@ def draw_calibration(path: str | Path, calibration: Calibration) -> None:
         File to write.
     calibration : Calibration
         Calibration to draw.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
     """
     figure = Figure(figsize=(13.0, 5.6), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
@@ -44,7 +46,7 @@ def draw_calibration(path: str | Path, calibration: Calibration) -> None:
         axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal")
         axes.set(xlabel="column [px]", ylabel="row [px]")
     figure.suptitle(calibration.summary(), fontsize=9, x=0.01, ha="left")
-    with atomic_write(path) as file:
+    with atomic_write(path, overwrite=overwrite) as file:
         figure.savefig(file, format="png")
 
 

@@ -25,7 +25,9 @@ _CARPET, _LINE, _ON, _OFF, _BEST, _OTHER = "#2e7d4f", "#ffffff", "#00e5ff", "#ff
 _ELLIPSE = 3.0  # sigmas
 
 
-def draw_located_robot(path: str | Path, located: LocatedRobot, image: npt.NDArray[Any] | None = None) -> None:
+def draw_located_robot(
+    path: str | Path, located: LocatedRobot, image: npt.NDArray[Any] | None = None, *, overwrite: bool = False
+) -> None:
     """Draw the robot's view and the field with the candidates side by side, as PNG.
 
     Parameters
@@ -36,6 +38,8 @@ def draw_located_robot(path: str | Path, located: LocatedRobot, image: npt.NDArr
         Result of `locate_robot`.
     image
         Top view of the floor; None: draw the points alone.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
     """
     figure = Figure(figsize=(13.0, 5.8), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
@@ -43,7 +47,7 @@ def draw_located_robot(path: str | Path, located: LocatedRobot, image: npt.NDArr
     _draw_view(left, located, image)
     _draw_field(right, located)
     figure.suptitle(located.summary(), fontsize=8, x=0.01, ha="left")
-    with atomic_write(path) as file:
+    with atomic_write(path, overwrite=overwrite) as file:
         figure.savefig(file, format="png")
 
 

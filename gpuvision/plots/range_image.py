@@ -208,6 +208,7 @@ def draw_height_map(
     style: Style = "colour",
     title: str = "Height map",
     span: tuple[float, float] | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Draw a height map as PNG, with length bar, height bar and a legend of missing heights. Written atomically.
 
@@ -225,6 +226,8 @@ def draw_height_map(
         Title above the picture.
     span : (float, float), optional
         Heights of the ends of the colour scale [m]. Default: the 0.5 % and 99.5 % percentiles of the heights.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
 
     Raises
     ------
@@ -244,7 +247,7 @@ def draw_height_map(
     width, height = grid.columns * grid.cell_x, grid.rows * grid.cell_y
     page = _Page(picture, width / height, legend, title, subtitle, span if style == "colour" else None)
     page.length_bar(width)
-    page.write(path)
+    page.write(path, overwrite)
 
 
 def draw_scan(
@@ -256,6 +259,7 @@ def draw_scan(
     aspect: float = 1.0,
     title: str = "Range image as scanned",
     span: tuple[float, float] | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Draw an organised range image as PNG, one row or column of the picture per profile. Written atomically.
 
@@ -277,6 +281,8 @@ def draw_scan(
         Title above the picture.
     span : (float, float), optional
         As for `draw_height_map`.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
     """
     z, status = np.asarray(z, np.float64), np.asarray(status)
     span = _default_span(z) if span is None else span
@@ -285,7 +291,7 @@ def draw_scan(
     labels = ("sample", "profile")
     if samples == "down":
         picture, labels = picture.transpose(1, 0, 2), ("profile", "sample")
-    _Page(picture, aspect, legend, title, subtitle, span, labels=labels).write(path)
+    _Page(picture, aspect, legend, title, subtitle, span, labels=labels).write(path, overwrite)
 
 
 def _default_span(z: Array) -> tuple[float, float]:
@@ -423,7 +429,7 @@ class _Page:
         axes.tick_params(labelsize=8, colors=_INK, width=0.6, length=2.5)
         axes.set_ylabel(f"height z  [{name}]", fontsize=9, color=_INK, labelpad=6)
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], overwrite: bool) -> None:
         """Write the page as PNG."""
-        with atomic_write(path) as file:
+        with atomic_write(path, overwrite=overwrite) as file:
             self.figure.savefig(file, format="png", dpi=_DPI, facecolor=_PAPER)

@@ -24,7 +24,7 @@ _NO_READING, _GOOD = "#4b5563", "#e5e7eb"
 _COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#d55e00", "#009e73", "#56b4e9", "#f0e442", "#000000")
 
 
-def draw_errors(path: Path, attribution: ErrorAttribution, title: str) -> None:
+def draw_errors(path: Path, attribution: ErrorAttribution, title: str, *, overwrite: bool = False) -> None:
     """Draw the range error of each sample as a PNG; samples without a reading or without ground truth are dark.
 
     Parameters
@@ -35,6 +35,8 @@ def draw_errors(path: Path, attribution: ErrorAttribution, title: str) -> None:
         Errors, (profiles, samples).
     title
         Name of the part or sensor, for the heading.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
 
     Notes
     -----
@@ -55,10 +57,12 @@ def draw_errors(path: Path, attribution: ErrorAttribution, title: str) -> None:
     )
     axes.set_facecolor(_NO_READING)
     figure.colorbar(shown, label=f"height read minus true height [{name}]; dark: no reading", extend="both")
-    _write(figure, path)
+    _write(figure, path, overwrite)
 
 
-def draw_causes(path: Path, attribution: ErrorAttribution, limit: float, title: str) -> None:
+def draw_causes(
+    path: Path, attribution: ErrorAttribution, limit: float, title: str, *, overwrite: bool = False
+) -> None:
     """Draw the dominant cause of each error beyond a limit as a PNG.
 
     Parameters
@@ -71,6 +75,8 @@ def draw_causes(path: Path, attribution: ErrorAttribution, limit: float, title: 
         Errors up to this limit have no cause in the picture [m].
     title
         Name of the part or sensor, for the heading.
+    overwrite : bool
+        Whether an existing file may be replaced. Default False.
     """
     figure, axes = _page(f"{title}: dominant cause of each error")
     names = list(attribution.causes)
@@ -87,7 +93,7 @@ def draw_causes(path: Path, attribution: ErrorAttribution, limit: float, title: 
         if part > 0.0
     ]
     figure.legend(handles=handles, loc="outside lower left", ncols=3, fontsize=8, frameon=False)
-    _write(figure, path)
+    _write(figure, path, overwrite)
 
 
 def _page(title: str) -> tuple[Figure, Any]:
@@ -99,6 +105,6 @@ def _page(title: str) -> tuple[Figure, Any]:
     return figure, axes
 
 
-def _write(figure: Figure, path: Path) -> None:
-    with atomic_write(path) as file:
+def _write(figure: Figure, path: Path, overwrite: bool) -> None:
+    with atomic_write(path, overwrite=overwrite) as file:
         figure.savefig(file, format="png")

@@ -30,6 +30,7 @@ from gpuvision.formats.camera_file import write_lens
 from gpuvision.formats.json import json_tree
 from gpuvision.host.errors import RecordingError
 from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
 from gpuvision.host.recordings import read_image
 from gpuvision.plots.calibration import draw_calibration
 
@@ -47,7 +48,7 @@ def calibrate(
     method: Method = "auto",
     model: str = "auto",
     inner_corners: tuple[int, int] | None = None,
-    pitch: float = 1.0,
+    pitch: float | None = None,
     focal_length: float | None = None,
     loss: Loss = "squared",
     progress: Progress = lambda done, of: None,
@@ -69,8 +70,9 @@ def calibrate(
         "k1,k2") or of `fit_camera` ("k1,k2", "tilt", ...).
     inner_corners : (int, int), optional
         Inner corners of the chessboard along its two sides, in any order. Default: accept any number.
-    pitch : float
-        Distance between neighbouring points on the target [m]. It scales the poses only. Default 1.
+    pitch : float, optional
+        Distance between neighbouring points on the target [m]. It scales the poses only. Default 1. Method "lines" has
+        no poses.
     focal_length : float, optional
         Known focal length f' [px]. Default: estimated.
     loss : {"squared", "huber", "tukey"}
@@ -87,7 +89,8 @@ def calibrate(
     FileNotFoundError
         A file does not exist.
     ValueError
-        No target pattern was detected, or the points do not fix the model; the message says what is missing.
+        No target pattern was detected, or the points do not fix the model; the message says what is missing. Or
+        `pitch` or `focal_length` is given, and the method is "lines" or ends in it.
     RecordingError
         A file is no image, or the images differ in size.
     """
@@ -95,6 +98,13 @@ def calibrate(
     grids = [each.grid for each in detected if each.grid is not None]
     if method == "auto":
         method = "views" if len(grids) >= _MIN_VIEWS or (grids and focal_length is not None) else "lines"
+    if method == "lines":
+        for name, given in (("pitch", pitch), ("focal_length", focal_length)):
+            if given is not None:
+                raise ValueError(
+                    f"{name} has no effect with method 'lines', which finds no poses ('auto' takes it with fewer than "
+                    f"{_MIN_VIEWS} images of a grid); leave it out, give more images, or take method 'views'"
+                )
     families = tuple(family for each in detected for family in each.families)
     fit: LensFit | CameraFit
     if method == "views":
@@ -103,7 +113,7 @@ def calibrate(
                 "method 'views' needs a grid of points, a line pattern has none; use pattern 'dots' or 'chessboard', "
                 "or method 'lines'"
             )
-        views = [make_view(grid, pitch) for grid in grids]
+        views = [make_view(grid, 1.0 if pitch is None else pitch) for grid in grids]
         fit = fit_camera(views, size, model=model, focal_length=focal_length, loss=loss)
         correction: Lens | Camera | None = fit.camera
     else:
@@ -163,8 +173,13 @@ def _detect(
     return DetectedTarget(file, found.points, grid_lines(found.points))
 
 
-def write_calibration(calibration: Calibration, path: Path) -> None:
-    """Write the camera file (TOML), and beside it the report (.json) and the plot (.png).
+def calibration_files(path: Path) -> tuple[Path, Path, Path]:
+    """Return the files that `write_calibration` writes: camera file, report and plot."""
+    return path, path.with_suffix(".json"), path.with_suffix(".png")
+
+
+def write_calibration(calibration: Calibration, path: Path, *, overwrite: bool = False) -> None:
+    """Write the camera file (TOML), and beside it the report (.json) and the plot (.png); all of them or none.
 
     Parameters
     ----------
@@ -172,30 +187,38 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
         Result of `calibrate`.
     path : Path
         Camera file to write.
+    overwrite : bool
+        Whether files may be replaced that no earlier calibration wrote. Default False. The calibrated images are never
+        replaced.
 
     Raises
     ------
     ValueError
         The calibration has no model: the lines are straight without a lens.
+    FileExistsError
+        A file is an image of the calibration; or it exists and is no unchanged output of a calibration; see
+        `gpuvision.host.outputs`.
     """
     if calibration.model is None:
         raise ValueError("the lines are straight without a lens; no correction is needed, nothing was written")
     # The covariance of parameters that the data do not fix is infinite; json_tree replaces it, since JSON has no
     # infinity.
-    write_text_atomic(path.with_suffix(".json"), json.dumps(json_tree(calibration.report()), indent=1) + "\n")
-    draw_calibration(path.with_suffix(".png"), calibration)
-    write_lens(
-        path,
-        calibration.model,
-        {
-            "image": {"size": list(calibration.image_size)},
-            "uncertainty": {name: error for name, (_, error) in calibration.parameters.items()},
-            "fit": {
-                "model": calibration.fit.model,
-                "pattern": calibration.pattern,
-                "rms_px": calibration.fit.rms_px,
-                "images": [each.image.name for each in calibration.detected_targets],
-                "warnings": list(calibration.fit.warnings),
-            },
+    report = json.dumps(json_tree(calibration.report()), indent=1) + "\n"
+    documentation = {
+        "image": {"size": list(calibration.image_size)},
+        "uncertainty": {name: error for name, (_, error) in calibration.parameters.items()},
+        "fit": {
+            "model": calibration.fit.model,
+            "pattern": calibration.pattern,
+            "rms_px": calibration.fit.rms_px,
+            "images": [each.image.name for each in calibration.detected_targets],
+            "warnings": list(calibration.fit.warnings),
         },
-    )
+    }
+    images = [each.image for each in calibration.detected_targets] + [each for each, _ in calibration.skipped_images]
+    outputs = Outputs("calibrate", inputs=images, overwrite=overwrite)
+    with outputs.folder(path.parent) as inside:
+        camera_file, report_file, plot = calibration_files(inside / path.name)
+        write_text_atomic(report_file, report)
+        draw_calibration(plot, calibration)
+        write_lens(camera_file, calibration.model, documentation)

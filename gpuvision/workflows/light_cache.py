@@ -185,7 +185,7 @@ class LightStore:
     def write(self, number: int, content: bytes) -> None:
         """Write the file of a block."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        with atomic_write(self.path(number)) as file:
+        with atomic_write(self.path(number), overwrite=True) as file:
             file.write(content)
 
     def __iter__(self) -> Iterator[LightBlock]:

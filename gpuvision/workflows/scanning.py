@@ -20,7 +20,8 @@ import numpy.typing as npt
 
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
 from gpuvision.host import Device, Operation, Precision, to_numpy
-from gpuvision.host.files import atomic_folder, check_writable_file
+from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
 from gpuvision.host.pipeline import Pipeline, Policy
 from gpuvision.host.planning import plan_stream
 from gpuvision.host.recordings import open_recording
@@ -37,6 +38,18 @@ from gpuvision.status import Status
 
 Array = npt.NDArray[Any]
 Progress = Callable[[int, int | None], object]
+
+
+SCAN_FILES = (
+    "range_image.tiff",
+    "range_image.png",
+    "range_image.ply",
+    "range_image.npz",
+    "picture.png",
+    "scan.png",
+    "report.json",
+)
+"""Names of the files that `Scan.write` writes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +170,7 @@ class Scan:
             "map": dataclasses.asdict(self.grid) | {"valid_fraction": valid_cells},
         }
 
-    def write(self, folder: str | Path) -> None:
+    def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
         """Write the range image, pictures and the report into a folder; after an error no file remains.
 
         ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` show the height map. ``range_image.ply``
@@ -167,13 +180,17 @@ class Scan:
         ----------
         folder : str or Path
             Output folder; created if it is missing.
+        overwrite : bool
+            Whether files may be replaced that no earlier scan wrote. Default False.
 
         Raises
         ------
+        FileExistsError
+            A file exists and is no unchanged output of a scan; see `gpuvision.host.outputs`.
         OSError
             The folder cannot be written.
         """
-        with atomic_folder(folder) as inside:
+        with Outputs("scan", overwrite=overwrite).folder(folder) as inside:
             start = time.perf_counter()
             z, points = self.heights.z, self.points
             write_tiff(inside / "range_image.tiff", z, self.grid)
@@ -185,7 +202,7 @@ class Scan:
             draw_scan(inside / "scan.png", points.z, points.status, samples="down" if upright else "across")
             report = self.report()
             report["seconds"]["write"] = time.perf_counter() - start
-            (inside / "report.json").write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+            write_text_atomic(inside / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
 
     def _title(self) -> str:
         return self.sensor.name or "Height map"
@@ -216,6 +233,7 @@ def scan(
     rate: float | None = None,
     policy: Policy | None = None,
     trace: str | Path | None = None,
+    overwrite: bool = False,
     progress: Progress = lambda done, of: None,
     limits: ScanLimits = ScanLimits(),
 ) -> Scan:
@@ -239,6 +257,8 @@ def scan(
         Handling of a frame when the queue is full; default "block" without a rate and "drop_oldest" with one.
     trace : str or Path, optional
         Output file for the timeline of the stream. The path is checked before the scan.
+    overwrite : bool
+        Whether an existing file of `trace` may be replaced that no earlier trace wrote. Default False.
     progress : callable, optional
         Called with the number of processed frames and the number of all frames (None if unknown).
     limits : ScanLimits, optional
@@ -259,7 +279,7 @@ def scan(
     OSError
         The timeline cannot be written.
     """
-    timeline = None if trace is None else _DeferredTrace(trace)
+    timeline = None if trace is None else _DeferredTrace(trace, overwrite)
     source, name = _open_source(recording, sensor)
     sensor.check_frame(source.shape, name)
     readout = _with_range_outputs(sensor, precision)
@@ -295,9 +315,9 @@ class _DeferredTrace(Trace):
     The constructor checks that the file can be written.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        check_writable_file(path)
-        super().__init__(path)
+    def __init__(self, path: str | Path, overwrite: bool) -> None:
+        super().__init__(path, overwrite=overwrite)
+        Outputs("trace", overwrite=overwrite).claim(path)
 
     def write(self) -> None:
         """Ignore the end of the stream: the scan ends later."""

@@ -9,13 +9,20 @@ from pathlib import Path
 import numpy as np
 
 from gpuvision.formats.json import json_tree
-from gpuvision.host.files import atomic_folder
+from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
 from gpuvision.plots.simulation import draw_causes, draw_errors
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution
 from gpuvision.simulation.errors.recommendations import rank_candidates
 from gpuvision.simulation.errors.sensor_fusion import SensorFusion
 from gpuvision.simulation.errors.sensor_pair import attribute_pair_errors
-from gpuvision.workflows.simulation_result import Simulation
+from gpuvision.workflows.simulation_result import Simulation, simulation_files
+
+
+def pair_files(*, has_mask: bool) -> tuple[str, ...]:
+    """Return the names of the files that `SensorPair.write` writes, relative to the folder of the first sensor."""
+    both = ("errors.png", "causes.png", "report.json")
+    return (*(f"second/{each}" for each in simulation_files(has_mask=has_mask)), *(f"both/{each}" for each in both))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,22 +103,26 @@ class SensorPair:
         ]
         return f"surface samples read within {1e6 * self.limit:.0f} µm: {', '.join(parts)}"
 
-    def write(self, folder: str | Path) -> None:
+    def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
         """Write the second sensor's results into ``second``, and pictures and a report of both into ``both``.
 
         Parameters
         ----------
         folder
             Folder of the first sensor's results.
+        overwrite
+            Whether files may be replaced that no earlier simulation wrote. Default False.
 
         Raises
         ------
+        FileExistsError
+            A file exists and is no unchanged output of a simulation; see `gpuvision.host.outputs`.
         OSError
             The folders cannot be written.
         """
-        self.second.write(Path(folder) / "second")
+        self.second.write(Path(folder) / "second", overwrite=overwrite)
         both = self.errors["both"]
-        with atomic_folder(Path(folder) / "both") as inside:
+        with Outputs("simulate", overwrite=overwrite).folder(Path(folder) / "both") as inside:
             draw_errors(inside / "errors.png", both, "Both sensors")
             draw_causes(inside / "causes.png", both, self.limit, "Both sensors")
             report = {
@@ -120,4 +131,4 @@ class SensorPair:
                 "ranking": [each._asdict() for each in rank_candidates(self.errors, self.limit)],
                 "errors": {name: each.summary(self.limit) for name, each in self.errors.items()},
             }
-            (inside / "report.json").write_text(json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n")
+            write_text_atomic(inside / "report.json", json.dumps(json_tree(report), indent=1, allow_nan=False) + "\n")

@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
 from gpuvision.host import Device
-from gpuvision.host.files import atomic_folder
+from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
 from gpuvision.plots.range_image import draw_height_map
 from gpuvision.plots.simulation import draw_causes, draw_errors
 from gpuvision.ranging.range_image import RangePoints
@@ -24,6 +25,23 @@ from gpuvision.simulation.sensors.readings import Reading
 from gpuvision.workflows.light_cache import SimulationTask
 
 Array = npt.NDArray[Any]
+
+_FILES = (
+    "range_image.tiff",
+    "range_image.png",
+    "range_image.ply",
+    "simulation.npz",
+    "picture.png",
+    "errors.png",
+    "causes.png",
+    "report.json",
+)
+_MASK_FILE = "mask.txt"
+
+
+def simulation_files(*, has_mask: bool) -> tuple[str, ...]:
+    """Return the names of the files that `Simulation.write` writes; one more with a mask that was optimised."""
+    return (*_FILES, _MASK_FILE) if has_mask else _FILES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,21 +124,30 @@ class Simulation:
             "seconds": self.seconds,
         }
 
-    def write(self, folder: str | Path) -> None:
+    def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
         """Write the range image, pictures and the report into a folder, all or nothing.
 
         ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` hold the height map as it will be
         measured, ``range_image.ply`` the organised points, ``errors.png`` and ``causes.png`` the errors and their
         causes, ``simulation.npz`` the arrays, ``report.json`` the report.
 
+        Parameters
+        ----------
+        folder : str or Path
+            Output folder; created if it is missing.
+        overwrite : bool
+            Whether files may be replaced that no earlier simulation wrote. Default False.
+
         Raises
         ------
+        FileExistsError
+            A file exists and is no unchanged output of a simulation; see `gpuvision.host.outputs`.
         OSError
             The folder cannot be written.
         """
         attribution = self.attribution
         title = self.task.sensor.name or "Simulation"
-        with atomic_folder(folder) as inside:
+        with Outputs("simulate", overwrite=overwrite).folder(folder) as inside:
             write_tiff(inside / "range_image.tiff", self.heights.z, self.grid)
             write_png16(inside / "range_image.png", self.heights.z, self.grid)
             write_ply(
@@ -131,8 +158,8 @@ class Simulation:
             draw_errors(inside / "errors.png", attribution, title)
             draw_causes(inside / "causes.png", attribution, self.limit, title)
             if self.mask is not None:
-                self.mask.mask.save(inside / "mask.txt")
-            (inside / "report.json").write_text(json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
+                self.mask.mask.save(inside / _MASK_FILE)
+            write_text_atomic(inside / "report.json", json.dumps(self.report(), indent=1, allow_nan=False) + "\n")
 
     def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
         attribution = self.attribution

@@ -17,7 +17,8 @@ from gpuvision.camera.undistort_image import Border, Interpolation, UndistortIma
 from gpuvision.camera.undistort_points import UndistortPoints
 from gpuvision.host import Device, to_numpy
 from gpuvision.host.errors import RecordingError
-from gpuvision.host.files import atomic_folder
+from gpuvision.host.files import atomic_write
+from gpuvision.host.outputs import Outputs
 from gpuvision.host.recordings import read_array, read_image
 
 Progress = Callable[[int, int | None], object]
@@ -33,6 +34,7 @@ def undistort_files(
     border: Border = "mask",
     border_value: float = 0.0,
     region: tuple[int, int, int, int] | None = None,
+    overwrite: bool = False,
     progress: Progress = lambda done, of: None,
 ) -> tuple[Path, ...]:
     """Undistort images and NPY arrays of points into a folder. On an error no file is left behind.
@@ -49,6 +51,8 @@ def undistort_files(
         Device to run on.
     interpolation, border, border_value, region
         See `UndistortImage`; they apply to images.
+    overwrite : bool
+        Whether files may be replaced that no earlier undistortion wrote. Default False. The inputs are never replaced.
     progress : callable
         Called with the number of processed files and the number of files.
 
@@ -61,6 +65,9 @@ def undistort_files(
     ------
     FileNotFoundError
         An input does not exist.
+    FileExistsError
+        An output is an input; or it exists and is no unchanged output of an undistortion; see
+        `gpuvision.host.outputs`.
     RecordingError
         An input is neither an image nor an array of points, or two inputs have the same name.
     ValueError, TypeError
@@ -71,17 +78,23 @@ def undistort_files(
     if duplicates:
         raise RecordingError(f"several inputs have the name {min(duplicates)}; undistort them into separate folders")
     written = []
-    with atomic_folder(out) as folder:
+    outputs = Outputs("undistort", inputs=inputs, overwrite=overwrite)
+    with outputs.folder(out) as folder:
         for number, file in enumerate(inputs):
             progress(number, len(inputs))
             if not file.exists():
                 raise FileNotFoundError(f"{file}: no such file")
             if file.suffix.lower() == ".npy":
                 name = file.name
-                np.save(folder / name, _undistorted_points(file, model, device))
+                outputs.claim(out / name)
+                points = _undistorted_points(file, model, device)
+                with atomic_write(folder / name) as npy:
+                    np.save(npy, points)
             else:
                 image = read_image(file)
                 image = image[..., :3] if image.ndim == 3 else image
+                name = f"{file.stem}.tif" if image.dtype == np.float32 else f"{file.stem}.png"
+                outputs.claim(out / name)
                 operation = UndistortImage(
                     model=model,
                     interpolation=interpolation,
@@ -90,7 +103,7 @@ def undistort_files(
                     border_value=border_value,
                     region=region,
                 )
-                name = _write(folder, file, to_numpy(operation(np.ascontiguousarray(image), device=device).image))
+                _write(folder / name, to_numpy(operation(np.ascontiguousarray(image), device=device).image))
             written.append(out / name)
         progress(len(inputs), len(inputs))
     return tuple(written)
@@ -108,16 +121,17 @@ def _undistorted_points(file: Path, model: Lens | Camera, device: Device) -> npt
     return to_numpy(undistorted).reshape(points.shape)
 
 
-def _write(folder: Path, source: Path, image: npt.NDArray[Any]) -> str:
-    """Write an image in a lossless format and return its file name."""
-    if image.dtype == np.float32:
-        name = f"{source.stem}.tif"
+def _write(path: Path, image: npt.NDArray[Any]) -> None:
+    """Write an image in a lossless format: TIFF or PNG, as the suffix of the path says."""
+    if path.suffix == ".tif":
         is_colour = image.ndim == 3
-        tifffile.imwrite(
-            folder / name, image[..., ::-1] if is_colour else image, photometric="rgb" if is_colour else "minisblack"
-        )
-        return name
-    name = f"{source.stem}.png"
-    if not cv2.imwrite(str(folder / name), image):
-        raise OSError(f"cannot write {folder / name}")
-    return name
+        with atomic_write(path) as file:
+            tifffile.imwrite(
+                file, image[..., ::-1] if is_colour else image, photometric="rgb" if is_colour else "minisblack"
+            )
+        return
+    done, encoded = cv2.imencode(".png", image)
+    if not done:
+        raise ValueError(f"cannot encode an image of shape {image.shape} as PNG, the format of {path.name}")
+    with atomic_write(path) as file:
+        file.write(encoded.tobytes())

@@ -65,6 +65,78 @@ def test_a_command_that_is_ended_leaves_nothing(number: int, code: int, tmp_path
     assert [each.name for each in tmp_path.iterdir()] == ["plane.npy"]
 
 
+SWALLOWING = """
+import sys, time
+class Slow:
+    def find_spec(self, name, path=None, target=None):
+        if name == "pyopencl":
+            print("loading", flush=True)
+            {swallow}
+sys.meta_path.insert(0, Slow())
+import gpuvision.cli.main
+gpuvision.cli.main._GRACE = 0.5
+"""
+
+
+@posix
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    "swallow",
+    [
+        # an extension module that turns every exception into another one
+        "\n            try: time.sleep(60)\n            except BaseException: raise ImportError('failed') from None",
+        # a loop that goes on whatever happens
+        "\n            while True:\n                try: time.sleep(60)\n                except BaseException: pass",
+        # a library call that comes back only after a minute
+        "import ctypes; ctypes.CDLL(None).pause.restype = None; "
+        "[ctypes.CDLL(None).pause() for _ in range(2)]; time.sleep(60)",
+    ],
+    ids=["converted", "swallowed", "blocked"],
+)
+def test_code_that_swallows_the_interrupt_is_cut_off(swallow: str, number: int, code: int, tmp_path: Path) -> None:
+    ran = started(SWALLOWING.format(swallow=swallow) + MAIN, "devices")
+    assert ran.stdout is not None
+    assert ran.stdout.readline() == "loading\n"
+    ran.send_signal(number)
+    _, told = ran.communicate(timeout=30)
+    assert (ran.returncode, told) == (code, "")
+
+
+@posix
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_while_a_device_is_probed(
+    number: int, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    slow = "import subprocess, gpuvision.host.discovery\nrun = subprocess.run\n"
+    slow += "def still(*a, **k):\n    print('probing', flush=True)\n    return run(['sleep', '60'], **k)\n"
+    slow += "subprocess.run = still\n"
+    ran = started(slow + MAIN, "devices")
+    assert ran.stdout is not None
+    assert ran.stdout.readline() == "probing\n"
+    ran.send_signal(number)
+    _, told = ran.communicate(timeout=30)
+    assert (ran.returncode, told) == (code, "")
+    assert not list((tmp_path / "cache").rglob("*.part"))
+
+
+@posix
+def test_a_swallowed_signal_leaves_no_temporary_file(tmp_path: Path) -> None:
+    slow = "import gpuvision.cli.main, gpuvision.workflows.scanning, time\ngpuvision.cli.main._GRACE = 0.5\n"
+    slow += "def still(*a, **k):\n    print('writing', flush=True)\n    while True:\n"
+    slow += "        try: time.sleep(60)\n        except BaseException: pass\n"
+    slow += "gpuvision.workflows.scanning.write_npz = still\n"
+    np.save(tmp_path / "plane.npy", currents(4))
+    ran = started(slow + MAIN, "scan", tmp_path / "plane.npy", "--sensor", "psd_line", "--out", tmp_path)
+    assert ran.stdout is not None
+    assert ran.stdout.readline() == "writing\n"
+    assert list(tmp_path.glob(".*.part"))
+    ran.send_signal(signal.SIGTERM)
+    _, told = ran.communicate(timeout=30)
+    assert (ran.returncode, told) == (143, "")
+    assert [each.name for each in tmp_path.iterdir()] == ["plane.npy"]
+
+
 def test_the_handler_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(sys, "argv", ["gpuvision", "--help"])

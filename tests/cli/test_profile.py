@@ -95,6 +95,7 @@ def test_without_names_everything_is_measured_everywhere(asked: dict[str, Any]) 
     assert asked["operations"] == list(harness.OPERATIONS)
     assert asked["devices"] == [each.label for each in Device.all()]
     assert "not valid: the machine changed its speed" in ran.output
+    assert ran.exit_code == 1
 
 
 @pytest.mark.parametrize(

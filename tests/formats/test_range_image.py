@@ -62,7 +62,7 @@ def test_opencv_reads_the_tiff(tmp_path, z):
 )
 def test_a_png_is_off_by_half_a_step(tmp_path_factory, z):
     path = tmp_path_factory.getbasetemp() / "map.png"
-    export.write_png16(path, z)
+    export.write_png16(path, z, overwrite=True)
     back = export.read_png16(path).z
     good = np.isfinite(z)
     np.testing.assert_array_equal(np.isnan(back), ~good)
@@ -168,10 +168,10 @@ def test_an_npz_holds_all_arrays_and_their_units(tmp_path, rng):
 
 
 WRITERS = {
-    "tiff": lambda path: export.write_tiff(path, np.zeros((2, 2))),
-    "png": lambda path: export.write_png16(path, np.zeros((2, 2))),
-    "ply": lambda path: export.write_ply(path, *np.zeros((3, 2, 2), np.float32)),
-    "npz": lambda path: export.write_npz(path, {"x": np.zeros(2)}, {"x": "m"}),
+    "tiff": lambda path, **how: export.write_tiff(path, np.zeros((2, 2)), **how),
+    "png": lambda path, **how: export.write_png16(path, np.zeros((2, 2)), **how),
+    "ply": lambda path, **how: export.write_ply(path, *np.zeros((3, 2, 2), np.float32), **how),
+    "npz": lambda path, **how: export.write_npz(path, {"x": np.zeros(2)}, {"x": "m"}, **how),
 }
 
 
@@ -187,11 +187,14 @@ def test_every_writer_is_atomic(tmp_path, kind, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", full)
     path.write_bytes(b"old")
-    with pytest.raises(OSError, match="No space left"):
-        WRITERS[kind](path)
+    with pytest.raises(OSError, match=rf"disk full: {len(written)} bytes or more wanted, \d+ bytes free"):
+        WRITERS[kind](path, overwrite=True)
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == [path.name]
     assert len(written) > 10
+    with pytest.raises(FileExistsError, match=f"cannot write {path}: the file exists"):
+        WRITERS[kind](path)
+    assert path.read_bytes() == b"old"
 
 
 def test_a_missing_folder_is_named(tmp_path):

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import stat
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gpuvision.host import files
@@ -19,7 +25,7 @@ def test_a_failure_leaves_what_was_there(tmp_path, old):
     before = sorted(os.listdir(tmp_path))
 
     def write_half() -> None:
-        with files.atomic_write(path) as file:
+        with files.atomic_write(path, overwrite=True) as file:
             file.write(b"half of it")
             assert sorted(os.listdir(tmp_path)) != before
             raise KeyboardInterrupt
@@ -46,7 +52,7 @@ def test_written_whole_or_not_at_all(monkeypatch, tmp_path):
 
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
-        files.write_text_atomic(path, "new")
+        files.write_text_atomic(path, "new", overwrite=True)
     assert [each.name for each in path.parent.iterdir()] == ["file"]
     assert path.read_text() == "old"
 
@@ -101,7 +107,7 @@ def test_a_link_stays_and_leads_to_the_new_file(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "elsewhere" / "file")
     for text in ("a", "b"):
-        files.write_text_atomic(tmp_path / "link", text)
+        files.write_text_atomic(tmp_path / "link", text, overwrite=True)
         assert (tmp_path / "link").is_symlink()
         assert (tmp_path / "elsewhere" / "file").read_text() == text
 
@@ -116,3 +122,139 @@ def test_a_pipe_is_written_into(tmp_path: Path) -> None:
     assert os.read(reader, 10) == b"told"
     os.close(reader)
     assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_an_existing_file_is_replaced_only_on_request(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_text("a user's")
+    with pytest.raises(FileExistsError, match=f"cannot write {path}: the file exists"):
+        files.write_text_atomic(path, "ours")
+    assert path.read_text() == "a user's"
+    files.write_text_atomic(path, "ours", overwrite=True)
+    assert path.read_text() == "ours"
+
+
+def test_a_failure_while_files_move_restores_the_replaced_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "out"
+    (out / "b").mkdir(parents=True)
+    for name in ("a", "b/2", "c"):
+        (out / name).write_text("old")
+    moved, replace = [], os.replace
+
+    def fail_at_the_third(source: Path, target: Path) -> None:
+        if Path(source).read_text() == "new":
+            moved.append(target)
+            if len(moved) == 3:
+                raise OSError(5, "Input/output error")
+        replace(source, target)
+
+    def write() -> None:
+        with files.atomic_folder(out) as inside:
+            for name in ("a", "b/1", "b/2", "c", "new/3"):
+                (inside / name).parent.mkdir(exist_ok=True)
+                (inside / name).write_text("new")
+
+    monkeypatch.setattr(os, "replace", fail_at_the_third)
+    with pytest.raises(OSError, match="Input/output error"):
+        write()
+    assert len(moved) == 3
+    assert {str(each.relative_to(out)): each.read_text() for each in out.rglob("*") if each.is_file()} == {
+        "a": "old",
+        "b/2": "old",
+        "c": "old",
+    }
+    assert sorted(each.name for each in out.iterdir()) == ["a", "b", "c"]
+
+
+KILLED = """
+import sys, time
+from gpuvision.host import files
+with files.atomic_folder(sys.argv[1]) as inside, files.atomic_write(sys.argv[2]) as file:
+    (inside / "half").write_text("x")
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_what_a_killed_process_left_goes_with_the_next_one(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", KILLED, str(out), str(tmp_path / "file")]
+    foreign = [tmp_path / ".gpuvision.part", tmp_path / ".file.0123abcd.part", tmp_path / "x.gpuvision.0123abcd.part"]
+    for each in foreign:
+        each.write_text("of another program")
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as ran:
+        assert ran.stdout is not None
+        assert ran.stdout.readline() == "writing\n"
+        left = set(tmp_path.glob(".gpuvision.????????.part"))
+        assert len(left) == 3  # a file, a folder of new files, a folder of replaced files
+        files.write_text_atomic(tmp_path / "other", "while it lives")
+        assert left == set(tmp_path.glob(".gpuvision.????????.part"))
+        ran.kill()
+    assert left == set(tmp_path.glob(".gpuvision.????????.part"))
+    files.write_text_atomic(tmp_path / "other", "after its death", overwrite=True)
+    assert {each.name for each in tmp_path.iterdir()} == {"other", *(each.name for each in foreign)}
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """Yield the folder of a file system of 64 KiB."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", folder], capture_output=True, check=False)
+    if done.returncode:
+        pytest.skip("only root mounts a small file system")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_a_full_disk_is_named_with_wanted_and_free_bytes(small_disk: Path) -> None:
+    (small_disk / "old").write_bytes(bytes(8192))
+
+    def write(size: int) -> None:
+        with files.atomic_write(small_disk / "file") as file:
+            for _ in range(size // 1000):
+                file.write(bytes(1000))
+
+    with pytest.raises(files.DiskFullError) as raised:
+        write(200_000)
+    assert (raised.value.wanted, raised.value.free) == (200_000, 65536 - 8192)
+    assert raised.value.filename == str(small_disk / "file")
+    assert raised.value.strerror == f"disk full: 200000 bytes or more wanted, {65536 - 8192} bytes free"
+    assert [each.name for each in small_disk.iterdir()] == ["old"]
+    write(50_000)
+    assert (small_disk / "file").stat().st_size == 50_000
+
+
+def test_a_folder_that_does_not_fit_leaves_nothing(small_disk: Path) -> None:
+    out = small_disk / "deep" / "out"
+
+    def write() -> None:
+        with files.atomic_folder(out) as inside:
+            files.write_text_atomic(inside / "first", "x" * 40_000)
+            files.write_text_atomic(inside / "second", "x" * 50_000)
+
+    with pytest.raises(files.DiskFullError) as raised:
+        write()
+    assert (raised.value.wanted, raised.value.filename) == (90_000, str(out / "second"))
+    assert raised.value.free > 60_000
+    assert list(small_disk.iterdir()) == []
+
+
+def test_a_full_disk_of_every_kind_of_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seeking writers, such as those of ZIP and TIFF, go on to count; a quota is a disk, too."""
+
+    def full(_: int) -> None:
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    monkeypatch.setattr(os, "fsync", full)
+
+    def write() -> None:
+        with files.atomic_write(tmp_path / "a.npz") as file:
+            np.savez(file, a=np.zeros(100_000), b=np.zeros(7))
+
+    with pytest.raises(files.DiskFullError) as raised:
+        write()
+    plain = io.BytesIO()
+    np.savez(plain, a=np.zeros(100_000), b=np.zeros(7))
+    assert raised.value.wanted == len(plain.getvalue())
+    assert list(tmp_path.iterdir()) == []

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
 
-from gpuvision.host import runtime
+from gpuvision.host import cache, runtime
 
 
 @pytest.fixture
@@ -19,7 +20,8 @@ def vendors(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(runtime, "SYSTEM_VENDORS", system)
     monkeypatch.setattr(runtime, "_wheel_libraries", lambda: {"libintelocl.so": Path("/wheel/libintelocl.so")})
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.delenv("OCL_ICD_VENDORS", raising=False)
+    monkeypatch.setenv("OCL_ICD_VENDORS", "")  # removed again after the test
+    monkeypatch.delenv("OCL_ICD_VENDORS")
     return system
 
 
@@ -88,16 +90,16 @@ def test_missing_wheel_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_home_that_cannot_be_written(vendors: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file" / "below"))
-    monkeypatch.setattr(runtime.tempfile, "tempdir", str(tmp_path))
-    runtime.provide_cache()
-    cache = Path(os.environ["XDG_CACHE_HOME"])
-    assert cache.parent == tmp_path
-    assert _exposed().is_relative_to(cache)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    cache.provide_cache()
+    folder = Path(os.environ["XDG_CACHE_HOME"])
+    assert folder.parent == tmp_path
+    assert _exposed().is_relative_to(folder)
 
 
 def test_home_that_can_be_written_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "new"))
-    runtime.provide_cache()
+    cache.provide_cache()
     assert os.environ["XDG_CACHE_HOME"] == str(tmp_path / "new")
     assert list((tmp_path / "new" / "gpuvision").iterdir()) == []
 

@@ -19,6 +19,7 @@ from gpuvision.cli.main import application
 from gpuvision.formats.camera_file import read_lens, write_lens
 from gpuvision.host import Device
 from gpuvision.host.errors import RecordingError
+from gpuvision.host.outputs import MANIFEST
 from gpuvision.schema import DescriptionError
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.calibrating import calibrate, write_calibration
@@ -78,7 +79,7 @@ def test_report_says_what_the_fit_says(done: Calibration, tmp_path: Path) -> Non
     picture = cv2.imread(str(tmp_path / "lens.png"))
     assert picture is not None
     assert min(picture.shape[:2]) > 500
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["lens.json", "lens.png", "lens.toml"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == [MANIFEST, "lens.json", "lens.png", "lens.toml"]
 
 
 def test_commands_make_bent_dots_straight(image: Path, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ import pytest
 
 from gpuvision.formats.range_image import read_npz, read_ply, read_png16, read_tiff
 from gpuvision.host import Device, RecordingError, StreamError
+from gpuvision.host.outputs import MANIFEST
 from gpuvision.host.sources import ArraySource
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
@@ -25,6 +26,7 @@ from gpuvision.workflows.scanning import Scan, scan
 from scanning import Ran, check_refused, currents, line_frames
 
 FILES = {
+    MANIFEST,
     "range_image.tiff",
     "range_image.png",
     "range_image.ply",

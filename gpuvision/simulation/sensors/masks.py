@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.host.errors import ReadError
+from gpuvision.host.files import atomic_write
 from gpuvision.host.reading import reading
 from gpuvision.simulation.sensors.readings import (
     GroundTruth,
@@ -166,8 +167,15 @@ class Mask:
         kept, leak = 1.0 - self.leak, self.leak
         return Exposure(kept * passing.power + leak * exposure.power, kept * passing.moment + leak * exposure.moment)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the windows as a text file with one line "lower, upper" for each sample.
+
+        Parameters
+        ----------
+        path : str or Path
+            Output file; its folder must exist.
+        overwrite : bool
+            Whether an existing file may be replaced. Default False.
 
         Raises
         ------
@@ -178,7 +186,8 @@ class Mask:
         """
         if self.windows is None or self.windows.ndim != 2 or self.transmission is not None or self.leak:
             raise ValueError("only a mask of one window per sample (samples, 2) without leak is written as text")
-        np.savetxt(path, self.windows, fmt="%.17g", delimiter=", ", header="lower, upper end along u [sensor unit]")
+        with atomic_write(path, overwrite=overwrite) as file:
+            np.savetxt(file, self.windows, fmt="%.17g", delimiter=", ", header="lower, upper end along u [sensor unit]")
 
     @classmethod
     def load(cls, path: str | Path) -> Mask:

@@ -1,0 +1,144 @@
+"""Cache folder of gpuvision: verdicts of devices, lists of vendors. Only its user may write into it.
+
+The files in it decide which drivers are loaded and which devices are used, so that a file counts only if the user owns
+it and nobody else may write it.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import shutil
+import stat
+import sys
+import tempfile
+from pathlib import Path
+
+import platformdirs
+
+from gpuvision.host.files import write_text_atomic
+
+_VARIABLE = "XDG_CACHE_HOME"
+# Largest file that is read [bytes] (chosen): the verdicts of a thousand devices take less.
+_MAX_FILE = 1 << 20
+
+
+def cache_folder() -> Path:
+    """Return the user's cache folder of gpuvision.
+
+    A relative ``XDG_CACHE_HOME`` is ignored, as the XDG Base Directory Specification says.
+    """
+    _drop_relative()
+    return platformdirs.user_cache_path("gpuvision")
+
+
+def _drop_relative() -> None:
+    # Remove the variable itself: pyopencl and PoCL read it, too.
+    if not os.path.isabs(os.environ.get(_VARIABLE, os.sep)):
+        del os.environ[_VARIABLE]
+
+
+def provide_cache() -> None:
+    """Make the cache folder private; set a temporary one for this process where that is not possible.
+
+    The folder gets mode 0700. It must belong to the user. A folder in which other users could write is emptied.
+    pyopencl keeps compiled kernels in the user's cache folder, and fails where the home folder is missing or read-only.
+    Must run before the first platform query.
+    """
+    try:
+        folder = cache_folder()
+        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        _make_private(folder)
+        with tempfile.TemporaryFile(dir=folder):
+            return
+    except OSError:
+        temporary = tempfile.mkdtemp(prefix="gpuvision-cache-")
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        os.environ[_VARIABLE] = temporary
+
+
+def _make_private(folder: Path) -> None:
+    if sys.platform == "win32":
+        return
+    mode = folder.stat().st_mode
+    if folder.stat().st_uid != os.geteuid():
+        raise PermissionError(f"{folder} belongs to another user")
+    if mode & 0o077:
+        folder.chmod(0o700)
+    if mode & 0o022:
+        for each in folder.iterdir():
+            if each.is_dir() and not each.is_symlink():
+                shutil.rmtree(each)
+            else:
+                each.unlink()
+
+
+def is_private(path: Path) -> bool:
+    """Return whether a path is a file or folder, no link, that the user owns and nobody else may write."""
+    try:
+        info = path.lstat()
+    except OSError:
+        return False
+    if sys.platform == "win32":
+        return True
+    is_plain = stat.S_ISREG(info.st_mode) or stat.S_ISDIR(info.st_mode)
+    return is_plain and info.st_uid == os.geteuid() and not info.st_mode & 0o022
+
+
+def read_private(path: Path) -> str | None:
+    """Return the text of a private file of the cache; None if it is missing, too large, no text, or not private."""
+    if not is_private(path):
+        return None
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MAX_FILE + 1)
+        return content.decode() if len(content) <= _MAX_FILE else None
+    except (OSError, UnicodeDecodeError):
+        return None
+
+
+def write_private(path: Path, text: str) -> None:
+    """Write a private file of the cache, whole or not at all, and make its folder where it is missing."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    write_text_atomic(path, text, overwrite=True, mode=0o600)
+
+
+def private_folder(folder: Path, entries: dict[str, str]) -> Path:
+    """Return a folder of the cache with exactly the given files; replace it where it is not private or has others.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Folder whose name stands for its content.
+    entries : dict of str to str
+        Text of each file by name.
+    """
+    if not _holds(folder, entries):
+        folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(dir=folder.parent))
+        try:
+            for name, text in entries.items():
+                write_private(made / name, text)
+            _remove(folder)
+            with contextlib.suppress(OSError):  # another process made the same folder meanwhile
+                made.rename(folder)
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
+        if not _holds(folder, entries):
+            raise PermissionError(f"{folder} cannot be made private; remove it")
+    return folder
+
+
+def _remove(path: Path) -> None:
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+    elif path.is_dir():
+        shutil.rmtree(path)
+
+
+def _holds(folder: Path, entries: dict[str, str]) -> bool:
+    if not is_private(folder) or not folder.is_dir() or {each.name for each in folder.iterdir()} != set(entries):
+        return False
+    return all(read_private(folder / name) == text for name, text in entries.items())

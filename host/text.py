@@ -1,0 +1,21 @@
+"""Text from files, drivers and other programs, made safe for a terminal."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+# Escape sequences of a terminal: CSI (colours, cursor), OSC (title, links), and those of two characters.
+_ESCAPES = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)|\x1b[ -/]*[0-~]")
+_UNSAFE = ("Cc", "Cf", "Cs")  # control characters, formats such as changes of direction, half characters
+
+
+def printable(text: str) -> str:
+    """Return a text without escape sequences of terminals and with "?" for other control characters.
+
+    Line feeds and tabulators stay.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    plain = _ESCAPES.sub("", text)
+    return "".join(each if each in "\n\t" or unicodedata.category(each) not in _UNSAFE else "?" for each in plain)

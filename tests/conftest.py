@@ -26,6 +26,8 @@ ROOT = Path(__file__).resolve().parents[1]
 # warm and nothing is written in the home. Each of these folders is read when it is first needed, after this line.
 CACHE = ROOT / "build" / "cache"
 os.environ |= {"XDG_CACHE_HOME": str(CACHE), "MPLCONFIGDIR": str(CACHE / "matplotlib")}
+# For workers of pytest-xdist and subprocesses: two workers with two polling threads each would slow each other down.
+os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 hypothesis.configuration.set_hypothesis_home_dir(CACHE / "hypothesis")
 
 LEFT = pytest.StashKey[dict[str, int]]()

@@ -15,6 +15,8 @@ if importlib.util.find_spec("sphinx") is None:
 
 from search_index import SearchIndex
 
+pytestmark = pytest.mark.slow  # builds the documentation, unless `make docs` has built it
+
 # Number of first search results that must contain the page.
 FIRST = 3
 

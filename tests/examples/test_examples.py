@@ -25,7 +25,8 @@ def test_examples_are_here() -> None:
     assert len(EXAMPLES) >= 8
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+# The fast tier runs one example: `make docs` runs all of them, and each takes about ten seconds.
+@pytest.mark.parametrize("name", [EXAMPLES[0], *(pytest.param(each, marks=pytest.mark.slow) for each in EXAMPLES[1:])])
 def test_example_runs(name: str, tmp_path: Path) -> None:
     """`make docs` also runs the examples: an example whose picture is newer than the library is skipped."""
     picture = gallery_picture(name)

@@ -153,7 +153,7 @@ class Plan:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Return the parameters of `Pipeline`: batch, ring and inline."""
+        """Parameters of `Pipeline`: batch, ring and inline."""
         return {"batch": self.batch, "ring": self.ring, "inline": self.inline}
 
     def __str__(self) -> str:
@@ -360,7 +360,8 @@ class _Measurement:
         """Return the throughput [frames/s] and the processor time per frame [s]."""
         source = ArraySource(self._blank, batch * batches)
         ring = self._limits.min_ring
-        with Pipeline(source, self._steps, batch=batch, ring=ring, inline=inline, **self._setup) as stream:
+        stream: Pipeline[Any] = Pipeline(source, self._steps, batch=batch, ring=ring, inline=inline, **self._setup)
+        with stream:
             begun = time.process_time()
             for _ in stream:
                 pass
@@ -370,8 +371,10 @@ class _Measurement:
     def _one_by_one(self, batch: int, inline: bool) -> float:
         """Return the median time of a batch through an empty stream [s]."""
         source = _Stepped(self._blank, batch * self._limits.latency_batches)
-        setup = {"batch": batch, "ring": 2, "warm_up": 2, "inline": inline, **self._setup}
-        with Pipeline(source, self._steps, **setup) as stream:
+        stream: Pipeline[Any] = Pipeline(
+            source, self._steps, batch=batch, ring=2, warm_up=2, inline=inline, **self._setup
+        )
+        with stream:
             for _ in stream:
                 source.released.release()
         return stream.report().latency.p50

@@ -11,14 +11,16 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gpuvision.host import Device, RecordingError, StreamError
 from gpuvision.host.pipeline import Batch, Pipeline, PipelineLimits, default_batch
-from gpuvision.host.ring import Step
+from gpuvision.host.ring import SharedSlot, Step, queues_of
 from gpuvision.host.sources import ArraySource, IteratedSource
+from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.triangulation import Triangulation
 from streams import READOUT, Gated, currents_of, numbers, producer_ended
@@ -108,6 +110,68 @@ def test_no_frames(memory: dict[str, Any]) -> None:
     report = Pipeline(np.zeros((0, 4, 2), np.float32), READOUT, **memory).run()
     assert (report.frames, report.batches, report.dropped) == (0, 0, 0)
     assert json.loads(json.dumps(report.to_dict()))["latency"]["p50"] is None
+
+
+# Queues -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "inline", "queues"), [("intel", False, 4), ("intel", True, 1), ("pocl", False, 1)])
+def test_slots_share_a_queue_unless_waiting_would_run_later_work(kind: str, inline: bool, queues: int) -> None:
+    """A thread that waits for an event of Intel's runtime leaves when the queue of the event is idle."""
+    made: list[bool] = []
+
+    class Paper:
+        def __init__(self) -> None:
+            self.kind = kind
+
+        def new_queue(self, *, profiling: bool, inline: bool = False) -> object:
+            made.append(inline)
+            return object()
+
+    device: Any = Paper()
+    rings = queues_of(device, 4, zero_copy=True, profiling=False, inline=inline)
+    assert len(rings) == 4
+    assert len({each.compute for each in rings}) == queues
+    assert made == [inline] * queues
+
+
+@pytest.mark.parametrize("inline", [False, True])
+def test_inline_streams_give_the_same_results(memory: dict[str, Any], inline: bool) -> None:
+    device = memory["device"]
+    if inline and not device.has_inline_queues:
+        pytest.skip(f"{device.label} has no inline queues")
+    frames = np.random.default_rng(3).integers(0, 200, (9, 40, 3000), dtype=np.uint8)
+    readout = LineReadout(method="centroid", threshold=20)
+    expected = readout(frames, device=device)
+    sheet = Triangulation(homography=((1.0, 0.1, 0.0), (0.0, 1.2, 0.1), (0.0, 0.01, 1.0)), region=((-1, 1), (-1, 1)))
+    chains: list[Any] = [readout, [readout, Step(sheet, takes=("position", "peak"))]]
+    fields = ("position", "g")
+    wanted = (expected.position, sheet(expected.position, expected.peak, device=device).g)
+    for chain, field, want in zip(chains, fields, wanted, strict=True):
+        parts: list[np.ndarray] = []
+        stream: Pipeline[Any] = Pipeline(frames, chain, batch=2, ring=3, inline=inline, profile=True, **memory)
+        report = stream.run(lambda each, parts=parts, field=field: parts.append(getattr(each.result, field).copy()))
+        np.testing.assert_array_equal(np.concatenate(parts), want)
+        assert report.inline == inline
+
+
+def test_an_inline_kernel_is_complete_when_its_launch_returns(device: Device) -> None:
+    if not device.has_inline_queues:
+        pytest.skip(f"{device.label} has no inline queues")
+    source = ArraySource(np.zeros((4, 64, 3000), np.uint8))
+    states: list[int] = []
+
+    class Watched(SharedSlot[Any]):
+        def launch(self) -> None:
+            super().launch()
+            states.append(self._done.command_execution_status)
+
+    queues = queues_of(device, 1, zero_copy=True, profiling=False, inline=True)[0]
+    slot = Watched([Step(LineReadout())], device, queues, 1, source.shape, source.dtype)
+    for _ in range(20):
+        slot.launch()
+    assert slot.inline
+    assert states == [cl.command_execution_status.COMPLETE] * 20
 
 
 # Policies ---------------------------------------------------------------------------------------------------------

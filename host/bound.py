@@ -76,8 +76,8 @@ class Bound(Generic[R]):
         self._queue_site = self._site_on(self.queue)
         self._inline_site: _Site | None = None
         if not self._queue_site.inline and launch.passes_once and launch.nbytes <= _SHORT_BYTES:
-            own = device.inline_queue(self.queue, groups=launch.groups)
-            self._inline_site = None if own is None else self._site_on(own)
+            inline_queue = device.inline_queue(self.queue, groups=launch.groups)
+            self._inline_site = None if inline_queue is None else self._site_on(inline_queue)
         for array in self.inputs:
             self._clear(array)
         self().wait()
@@ -235,8 +235,8 @@ class Bound(Generic[R]):
     def _check_fields(self, out: R) -> None:
         for name, array in zip(self.operation.Result._fields, out, strict=True):
             if (array is not None) != (name in self._computed_specs):
-                what = "is missing" if array is None else "is not computed; expected None"
-                raise ValueError(f"out.{name} {what}")
+                defect = "is missing" if array is None else "is not computed; expected None"
+                raise ValueError(f"out.{name} {defect}")
 
     def _check(self, array: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
         if not isinstance(array, cl.array.Array):

@@ -67,8 +67,8 @@ def _flattened(path: Path, name: str, folders: Sequence[Path], including: tuple[
             yield f"{line}\n"
             continue
         # The main file is compiled from memory: only headers are searched in the folder of the including file.
-        own = [path.parent] if including else []
-        header = next((each / found[1] for each in (*own, *folders) if (each / found[1]).is_file()), None)
+        own_folder = [path.parent] if including else []
+        header = next((each / found[1] for each in (*own_folder, *folders) if (each / found[1]).is_file()), None)
         if header is None:
             yield f"{line}\n"
             continue

@@ -63,8 +63,8 @@ class Device:
         self.label, self.kind = label, kind
         self.name, self.driver = printable(handle.name).strip(), printable(handle.driver_version)
         # The context is kept for the queue, too: Intel's runtime frees a context while a queue of it exists.
-        own = [handle] if inline_device is None else [handle, inline_device]
-        self.context = queue.context if queue is not None else cl.Context(own)
+        handles = [handle] if inline_device is None else [handle, inline_device]
+        self.context = queue.context if queue is not None else cl.Context(handles)
         self.inline_device = inline_device
         self.queue = queue if queue is not None else cl.CommandQueue(self.context, handle)
         self.is_cpu = bool(handle.type & cl.device_type.CPU)
@@ -98,14 +98,14 @@ class Device:
         NoDeviceError
             There is no healthy device; the message names packages to install.
         """
-        asked = os.environ.get(VARIABLE)
-        if asked:
-            return Device.named(asked)
+        requested = os.environ.get(VARIABLE)
+        if requested:
+            return Device.named(requested)
         healthy = Device.all()
         if not healthy:
             listed = discovery.probed_devices()
-            seen = "; ".join(f"{each.label}: {each.reason}" for each in listed) or "no OpenCL platform"
-            raise NoDeviceError(f"no healthy OpenCL device ({seen}); {discovery.INSTALL_HINT}")
+            reasons = "; ".join(f"{each.label}: {each.reason}" for each in listed) or "no OpenCL platform"
+            raise NoDeviceError(f"no healthy OpenCL device ({reasons}); {discovery.INSTALL_HINT}")
         return healthy[0]
 
     @staticmethod
@@ -129,9 +129,9 @@ class Device:
             The device exists, and its probe failed.
         """
         listed = discovery.probed_devices()
-        asked = name.strip().lower()
-        matching = [each for each in listed if each.label == asked] or [
-            each for each in listed if asked and asked in f"{each.label} {each.name} {each.platform}".lower()
+        requested = name.strip().lower()
+        matching = [each for each in listed if each.label == requested] or [
+            each for each in listed if requested and requested in f"{each.label} {each.name} {each.platform}".lower()
         ]
         healthy = [each for each in matching if each.healthy]
         if len(healthy) == 1:

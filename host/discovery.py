@@ -214,16 +214,16 @@ def listed_devices() -> tuple[ListedDevice, ...]:
     found = []
     for p, platform in enumerate(platforms()):
         devices = _devices_of(platform)
-        beside = _inline_device(devices)
-        found += [(p, d, handle, beside) for d, handle in enumerate(devices) if handle is not beside]
+        inline = _inline_device(devices)
+        found += [(p, d, handle, inline) for d, handle in enumerate(devices) if handle is not inline]
     kinds = [kind_of(handle) for _, _, handle, _ in found]
-    count, seen, twins = Counter(kinds), Counter[str](), Counter[str]()
+    count, occurrences, twins = Counter(kinds), Counter[str](), Counter[str]()
     listed = []
-    for kind, (p, d, handle, beside) in zip(kinds, found, strict=True):
-        label = kind if count[kind] == 1 else f"{kind}:{seen[kind]}"
-        seen[kind] += 1
+    for kind, (p, d, handle, inline) in zip(kinds, found, strict=True):
+        label = kind if count[kind] == 1 else f"{kind}:{occurrences[kind]}"
+        occurrences[kind] += 1
         first = _key(handle, 0)
-        listed.append(ListedDevice(label, kind, p, d, handle, _key(handle, twins[first]), beside))
+        listed.append(ListedDevice(label, kind, p, d, handle, _key(handle, twins[first]), inline))
         twins[first] += 1
     return tuple(listed)
 

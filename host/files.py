@@ -141,14 +141,14 @@ def atomic_write(path: str | os.PathLike[str], *, overwrite: bool = False, mode:
         raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist; create it first")
     if not overwrite:
         _check_free(path)
-    with _temporary(path.parent, functools.partial(Path.touch, mode=mode)) as beside:
-        with contextlib.closing(_CountedFile(beside)) as file:
+    with _temporary(path.parent, functools.partial(Path.touch, mode=mode)) as temporary:
+        with contextlib.closing(_CountedFile(temporary)) as file:
             yield cast(BinaryIO, file)
             file.synchronise()
         if not file.is_full:
             if not overwrite:
                 _check_free(path)
-            os.replace(beside, path)
+            os.replace(temporary, path)
     if file.is_full:
         raise DiskFullError(path, file.wanted)
 

@@ -273,13 +273,13 @@ class Pipeline(Generic[R]):
         clock, source, ready = self._clock, self.source, self._ready
         try:
             while not self._stopping and source.wait():
-                asked = clock()
+                requested_at = clock()
                 stage = "ring"
                 slot = self._free_slot(number)
                 if slot is None:
                     break
                 stage = "source"
-                slot.asked, slot.taken = asked, clock()
+                slot.asked, slot.taken = requested_at, clock()
                 slot.number, slot.count = number, source.read_into(slot.frames, slot.arrived)
                 if not slot.count:
                     break
@@ -348,13 +348,13 @@ class Pipeline(Generic[R]):
                 raise self._failure from self._failure.__cause__
             raise StopIteration
         self._held = slot
-        taken = clock()
+        taken_at = clock()
         try:
             slot.wait()
         except cl.Error as error:
             self._ended = True
             raise _stopped(slot.number, "operation", error) from error
-        return self._delivered(slot, now, taken, clock())
+        return self._delivered(slot, now, taken_at, clock())
 
     def _delivered(self, slot: Slot[R], requested: int, taken: int, delivered: int) -> Batch[R]:
         arrived = slot.arrived[: slot.count]

@@ -261,8 +261,8 @@ def plan_stream(
         sufficient = [each for each in quick if each.service_rate >= margin * rate]
         if sufficient:
             return Plan(batch, ring, _runs_inline(sufficient, limits), rate, stall, ring_bytes, tuple(trials))
-    asked = f"{rate:.0f} frames/s with a margin of {margin:g}"
-    raise _too_slow(trials, asked if latency is None else f"{asked} within {latency * 1e3:.3g} ms")
+    request = f"{rate:.0f} frames/s with a margin of {margin:g}"
+    raise _too_slow(trials, request if latency is None else f"{request} within {latency * 1e3:.3g} ms")
 
 
 def _modes(inline: bool | None, device: Device) -> tuple[bool, ...]:
@@ -332,10 +332,10 @@ def _is_gaining(trials: Sequence[Trial], limits: PlanLimits) -> bool:
 
 def _ring_for(stall: float, rate: float, batch: int, source: Source, limits: PlanLimits) -> int:
     """Return the number of slots for the frames of a stall, one for the consumer and one for the source."""
-    wanted = math.ceil(stall * rate / batch) + 2
+    needed = math.ceil(stall * rate / batch) + 2
     if source.length is not None:
-        wanted = min(wanted, -(-source.length // batch) + 1)
-    return max(wanted, limits.min_ring)
+        needed = min(needed, -(-source.length // batch) + 1)
+    return max(needed, limits.min_ring)
 
 
 class _Measurement:

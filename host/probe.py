@@ -52,8 +52,8 @@ def probe_device(device: Any) -> str:
         cl.enqueue_copy(queue, sums, target)
     except cl.Error as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        said = [line for line in lines if "error" in line.lower()] or lines
-        return "; ".join(said[:2])[:300]
+        messages = [line for line in lines if "error" in line.lower()] or lines
+        return "; ".join(messages[:2])[:300]
     signed = values.astype(int)
     total = int(np.maximum(signed - 20, 0).sum() + np.abs(signed - 100).sum())
     item = np.arange(_ITEMS)

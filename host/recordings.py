@@ -141,9 +141,9 @@ def _archive_source(path: Path, key: str | None) -> Source:
         if key is None and len(names) == 1:
             (key,) = names
         if key not in names:
-            wanted = "several arrays" if key is None else f"no array {key!r}"
+            content = "several arrays" if key is None else f"no array {key!r}"
             raise RecordingError(
-                f"{path}: holds {wanted}; name one of {', '.join(names)} as key, in a sensor file under [recording]"
+                f"{path}: holds {content}; name one of {', '.join(names)} as key, in a sensor file under [recording]"
             )
         member: Any = archive.open(names[key])
         if member.peek(len(_NPY))[: len(_NPY)] != _NPY:
@@ -193,10 +193,10 @@ class PackedFrames(FrameSource):
         return self._next < self.length
 
     def _decode(self, out: HostArray) -> None:
-        wanted = math.prod(self.shape) * self._stored.itemsize
+        byte_count = math.prod(self.shape) * self._stored.itemsize
         with reading(f"{self._path}, frame {self._next}", "frame", RecordingError):
-            packed = self._member.read(wanted)
-            if len(packed) != wanted:
+            packed = self._member.read(byte_count)
+            if len(packed) != byte_count:
                 raise RecordingError(f"{self._path}: frame {self._next} of {self.length} is truncated")
             np.copyto(out, np.frombuffer(packed, self._stored).reshape(self.shape))
         self._next += 1

@@ -127,13 +127,13 @@ class ArraySource(Source):
     def read_into(self, out: HostArray, arrived: Arrivals) -> int:
         """Copy the next frames; their arrival time is the time of the copy."""
         frames, filled = self._frames, 0
-        wanted = min(len(out), self.length - self._next)
-        while filled < wanted:
+        count = min(len(out), self.length - self._next)
+        while filled < count:
             place = self._next % len(frames)
-            taken = min(wanted - filled, len(frames) - place)
-            np.copyto(out[filled : filled + taken], frames[place : place + taken])
-            filled += taken
-            self._next += taken
+            copied = min(count - filled, len(frames) - place)
+            np.copyto(out[filled : filled + copied], frames[place : place + copied])
+            filled += copied
+            self._next += copied
         arrived[:filled] = self._clock()
         return filled
 
@@ -337,8 +337,8 @@ class PacedSource(Source):
         first, now = self._taken, self._clock()
         self.late = max(self.late, now - self._due(first))
         due = int((now - self._due(0)) * self._rate_ns) + 1 - first
-        wanted = max(min(len(out), due), 1)
-        read = self._source.read_into(out[:wanted], arrived[:wanted])
+        count = max(min(len(out), due), 1)
+        read = self._source.read_into(out[:count], arrived[:count])
         for k in range(read):
             # The reader may oversleep: frames that fall due before it wakes arrive when it wakes.
             self._last = arrived[k] = max(self._due(first + k), self._last, self._arrived or 0)

@@ -125,12 +125,12 @@ class Camera:
         focal, target_focal = np.diag(source)[:2], np.diag(target)[:2]
         # Round the centre first and compute the other entries from the rounded value, so that they compensate.
         centre = source[:2, 2].astype(real).astype(np.float64)
-        growth = target_focal / focal - 1.0
-        shift = target[:2, 2] - source[:2, 2] + growth * (centre - source[:2, 2])
+        relative_focal_change = target_focal / focal - 1.0
+        shift = target[:2, 2] - source[:2, 2] + relative_focal_change * (centre - source[:2, 2])
         tilt = self._untilt if inverse else self._tilt
         (p1, p2), (s1, s2, s3, s4) = self._tangential, self._prism
         parts = [
-            *(centre, 1.0 / focal, target_focal, shift, growth),
+            *(centre, 1.0 / focal, target_focal, shift, relative_focal_change),
             *((tilt - np.eye(3))[:2, :2].ravel(), tilt[2, :2]),
             *(self._radial, (p1, p2, p2 + s1, s2, p1 + s3, s4)),
             (self._invertible_region.safe, self._invertible_region.limit),
@@ -323,11 +323,11 @@ class Camera:
         e = stretch + 2.0 * points @ np.array([[p2], [p1]])
         e_slope = 2.0 * (slope * points + np.array([p2, p1]))
         second = np.array([s2, s4])
-        aside = np.array([p2 + s1, p1 + s3]) + second * q
+        decentring = np.array([p2 + s1, p1 + s3]) + second * q
         jacobian = (1.0 + e)[..., None] * np.eye(2) + points[..., :, None] * e_slope[..., None, :]
-        jacobian += 2.0 * (aside + second * q)[..., :, None] * points[..., None, :]
+        jacobian += 2.0 * (decentring + second * q)[..., :, None] * points[..., None, :]
         inside = (q[..., 0] < self._invertible_region.limit) & (determinant(jacobian) > 0.0)
-        return points * e + q * aside, jacobian, inside
+        return points * e + q * decentring, jacobian, inside
 
     def _distorted(self, points: Float64) -> Float64:
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):

@@ -102,12 +102,12 @@ def _along_ray(over: Float64, under: Float64, p: Float64, s: Float64, c: float, 
     """
     add, mul = polynomial.polyadd, polynomial.polymul
     square = _in_radius(mul(under, under))
-    turn = mul([0.0, 2.0], _in_radius(_wronskian(over, under)))
-    growth = add(_in_radius(mul(over, under)), mul([0.0, 2.0 * (p[0] * d + p[1] * c)], square))
-    e_x, e_y = add(c * turn, 2.0 * p[1] * square), add(d * turn, 2.0 * p[0] * square)
+    tangential = mul([0.0, 2.0], _in_radius(_wronskian(over, under)))
+    radial = add(_in_radius(mul(over, under)), mul([0.0, 2.0 * (p[0] * d + p[1] * c)], square))
+    e_x, e_y = add(c * tangential, 2.0 * p[1] * square), add(d * tangential, 2.0 * p[0] * square)
     a = mul([2.0 * (p[1] + s[0]), 0.0, 4.0 * s[1]], square)
     b = mul([2.0 * (p[0] + s[2]), 0.0, 4.0 * s[3]], square)
-    xx, yy = add(growth, mul([0.0, c], add(e_x, a))), add(growth, mul([0.0, d], add(e_y, b)))
+    xx, yy = add(radial, mul([0.0, c], add(e_x, a))), add(radial, mul([0.0, d], add(e_y, b)))
     xy, yx = mul([0.0, 1.0], add(c * e_y, d * a)), mul([0.0, 1.0], add(d * e_x, c * b))
     return polynomial.polysub(mul(xx, yy), mul(xy, yx))
 
@@ -117,8 +117,8 @@ def _sign_changes(terms: Iterable[float]) -> list[float]:
     roots = polynomial.polyroots(np.trim_zeros(np.asarray(terms, dtype=np.float64), "b"))
     # Rounding can make a real root complex, and a double root does not change the sign: compare signs between the
     # roots.
-    near = roots[(roots.real > 0.0) & (np.abs(roots.imag) <= 1e-3 * roots.real) & (roots.real < _FARTHEST**2)]
-    places = np.sort(near.real)
+    candidates = roots[(roots.real > 0.0) & (np.abs(roots.imag) <= 1e-3 * roots.real) & (roots.real < _FARTHEST**2)]
+    places = np.sort(candidates.real)
     if not len(places):
         return []
     between = np.r_[0.0, 0.5 * (places[1:] + places[:-1]), 2.0 * places[-1]]

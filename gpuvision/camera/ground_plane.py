@@ -84,8 +84,8 @@ class MountedCamera:
         """Camera matrix (3, 3) of the pinhole [px]."""
         if isinstance(self.model, Camera):
             return np.array(self.model.matrix)
-        own = self.model.centre if self.model is not None else (0.0, 0.0)
-        column, row = own if self.centre_px is None else self.centre_px
+        centre = self.model.centre if self.model is not None else (0.0, 0.0)
+        column, row = centre if self.centre_px is None else self.centre_px
         focal = float(self.focal_px or 0.0)
         return np.array([[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]])
 

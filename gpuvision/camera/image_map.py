@@ -131,13 +131,13 @@ class Packer:
         base = self._bases(runs, finite)
         offsets = runs - base[:, :, None]
         curves, fits = _cubics(offsets)
-        what, bits = self._windows(base, offsets, fits)
-        what = np.where(finite.all(-1) & (positions.shape[1] >= RUN), what, _POINTS)
-        what, number = self._blanks(runs, finite, what)
-        heads = np.empty((*what.shape, 4), np.int32)
+        kind, bits = self._windows(base, offsets, fits)
+        kind = np.where(finite.all(-1) & (positions.shape[1] >= RUN), kind, _POINTS)
+        kind, number = self._blanks(runs, finite, kind)
+        heads = np.empty((*kind.shape, 4), np.int32)
         heads[..., :2] = base
-        heads[..., 2] = what | bits
-        listed = (what == _POINTS) | (what == _SCATTERED)
+        heads[..., 2] = kind | bits
+        listed = (kind == _POINTS) | (kind == _SCATTERED)
         heads[..., 3] = np.where(listed, points_before + np.cumsum(listed).reshape(listed.shape) - 1, number)
         points = np.where(finite[..., None], offsets, np.nan)[listed]
         return PackedMap(heads, curves.astype(np.float32), points.astype(np.float32))
@@ -165,13 +165,13 @@ class Packer:
         window &= self.channels * last + np.where(wide, _LOADED, _NARROW_SPAN) <= self.channels * rows * columns
         # Single precision may round an offset up to the next pixel; inside a window the offset is clamped.
         roomy = inside & (column + intervals_x + after < columns) & (row + intervals_y + after < rows)
-        what = np.where(
+        kind = np.where(
             window, _WINDOW + _WIDE * wide + _BANDED * (intervals_y > 1), np.where(roomy, _SCATTERED, _POINTS)
         )
-        bits = np.zeros_like(what)
+        bits = np.zeros_like(kind)
         for number, shift in zip((intervals_y, *starts), _SHIFTS, strict=False):
             bits |= np.where(window, number, 0) << shift
-        return what, bits
+        return kind, bits
 
     def _parts(self, x: Float64) -> tuple[Ints, Ints]:
         """Return the window start of each vector of 16 samples, (1 or 3, rows, runs), and the widest span."""

@@ -115,13 +115,15 @@ class InverseStart:
         at_v, at_w = (_values(z, each) for each in self._vectors)
         g = z * polynomial.polyval(z, terms) + _dot(m, at_v)
         slope = polynomial.polyval(z, terms * np.arange(1, _TERMS + 1)) + _dot(m, _values(z, by_v))
-        turn = _values(z, by_w)
+        cross_terms = _values(z, by_w)
         back, sizes, errors = m * g + square * at_w, [], []
         with np.errstate(all="ignore"):
             for _ in range(_MAX_STEPS):
                 left = self._lens(m + back)[0] + back
                 along = _dot(m, left)
-                step = left + g * left + m * (2.0 / self._reach * slope * along + _dot(at_v, left)) + turn * along
+                step = (
+                    left + g * left + m * (2.0 / self._reach * slope * along + _dot(at_v, left)) + cross_terms * along
+                )
                 back = back - step
                 sizes.append(_dot(step, step)[:, 0] / square[:, 0])
                 errors.append(np.sum((back - self._exact) ** 2, axis=-1) / square[:, 0])

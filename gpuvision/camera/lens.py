@@ -121,9 +121,9 @@ class Lens:
         """Return d(undistorted) / d(measured), (..., 2, 2), at measured points (..., 2)."""
         offset = np.asarray(points, dtype=np.float64) - self.centre
         square = np.sum(offset**2, axis=-1)[..., None, None]
-        growth = 1.0 + square * (self.k1 + self.k2 * square)
+        scale = 1.0 + square * (self.k1 + self.k2 * square)
         slope = 2.0 * (self.k1 + 2.0 * self.k2 * square)
-        return np.asarray(growth * np.eye(2) + slope * offset[..., :, None] * offset[..., None, :])
+        return np.asarray(scale * np.eye(2) + slope * offset[..., :, None] * offset[..., None, :])
 
     def distort(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Return the measured (column, row) of undistorted points (..., 2): the inverse of `undistort`.

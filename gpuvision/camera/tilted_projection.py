@@ -107,10 +107,10 @@ def project(
     lens_xy = 2.0 * (xy * slope + p1 * x + p2 * y)
     r4 = r2 * r2
     p1_x, p1_y, p2_x, p2_y = 2.0 * xy, r2 + 2.0 * yy, r2 + 2.0 * xx, 2.0 * xy
-    for row, (seen, focal) in enumerate(((u, f), (w, aspect * f))):
+    for row, (coordinate, focal) in enumerate(((u, f), (w, aspect * f))):
         out = jacobian[:, :, row]
         scale = focal * inverse
-        by_xd, by_yd = scale * (m[row, 0] - seen * m[2, 0]), scale * (m[row, 1] - seen * m[2, 1])
+        by_xd, by_yd = scale * (m[row, 0] - coordinate * m[2, 0]), scale * (m[row, 1] - coordinate * m[2, 1])
         along = by_xd * x + by_yd * y
         out[:, 6] = along * r2
         out[:, 7] = along * r4

@@ -151,8 +151,8 @@ def quantities(text: str, option: str, units: str) -> tuple[float, ...]:
                 float(each[1]) * _UNITS[kind][each[2]] for each, kind in zip(found, kinds, strict=True) if each
             )
     ends = {"m": "m (or cm, mm, um)", "rad": "rad (or mrad, deg)"}
-    wanted = ", ".join(ends[kind] for kind in kinds)
-    raise ValueError(f"{option} is {text!r}, expected {len(kinds)} number{'s' * (len(kinds) > 1)}: {wanted}")
+    expected = ", ".join(ends[kind] for kind in kinds)
+    raise ValueError(f"{option} is {text!r}, expected {len(kinds)} number{'s' * (len(kinds) > 1)}: {expected}")
 
 
 def layers_of(given: Sequence[str] | None) -> dict[str, str] | None:

@@ -157,7 +157,7 @@ def simulate(
     if not {"diffuse-diffuse", "multi-bounce"} & set(names):
         reject_unused("without diffuse-diffuse or multi-bounce in --paths", tolerance=tolerance or None)
     described = Sensor.load(sensor)
-    beside = None if second is None else Sensor.load(second)
+    second_sensor = None if second is None else Sensor.load(second)
     read = [each for each in (part, sensor, second, materials, mask) if each is not None]
     outputs = Outputs("simulate", inputs=read, overwrite=overwrite)
     has_mask = mask == "best"
@@ -171,8 +171,10 @@ def simulate(
         echo(f"{part.name}: {'; '.join(str(scene.defects).splitlines())}", err=True)
     task = prepare_simulation(scene, made_of, described, paths=names, tolerance=tolerance, profiles=profiles)
     other = None
-    if beside is not None:
-        other = prepare_simulation(scene, made_of, beside, paths=names, tolerance=tolerance, transports=task.transports)
+    if second_sensor is not None:
+        other = prepare_simulation(
+            scene, made_of, second_sensor, paths=names, tolerance=tolerance, transports=task.transports
+        )
     made: dict[str, Any] = {
         "mask": before,
         "seed": (1 if seed is None else seed) if noise else None,

@@ -35,7 +35,7 @@ def write_features(features: FeatureSet, path: str | Path, *, overwrite: bool = 
     OSError
         The file cannot be written.
     """
-    sx, sy, turn = (float(each) for each in features.sigmas)
+    sx, sy, sigma_theta = (float(each) for each in features.sigmas)
     table: dict[str, Any] = {
         "side": features.side,
         "placement": features.placement.tolist(),
@@ -43,7 +43,7 @@ def write_features(features: FeatureSet, path: str | Path, *, overwrite: bool = 
         "predicted": {
             "sigma_x": sx,
             "sigma_y": sy,
-            "sigma_theta": turn,
+            "sigma_theta": sigma_theta,
             "condition": features.condition,
             "covariance": features.covariance.tolist(),
         },

@@ -86,13 +86,13 @@ def draw_artwork(axes: Any, artwork: Artwork, window: Float64) -> None:
 def _fill(
     axes: Any, shapes: tuple[Shape, ...], window: Float64, dark: str, clear: str, alpha: float | None = None
 ) -> None:
-    near = [
+    visible = [
         each
         for each in shapes
         if np.all(each.outline.max(axis=0) >= window[0]) and np.all(each.outline.min(axis=0) <= window[1])
     ]
-    colours = [dark if each.dark else clear for each in near]
-    axes.add_collection(PolyCollection([_MM * each.outline for each in near], facecolors=colours, alpha=alpha))
+    colours = [dark if each.dark else clear for each in visible]
+    axes.add_collection(PolyCollection([_MM * each.outline for each in visible], facecolors=colours, alpha=alpha))
 
 
 def draw_located_board(
@@ -171,9 +171,9 @@ def _draw_outlines(axes: Any, artwork: Artwork, view: BoardView) -> None:
     edges = artwork.edges
     ends = np.stack([edges.start, edges.end], axis=1)
     low, high = view.bounds
-    near = np.all((ends.max(axis=1) >= low) & (ends.min(axis=1) <= high), axis=1)
+    visible = np.all((ends.max(axis=1) >= low) & (ends.min(axis=1) <= high), axis=1)
     axes.add_collection(
-        LineCollection(list(view.to_measured_pixels(ends[near])), colors=_ARTWORK, linewidths=0.5, alpha=0.8)
+        LineCollection(list(view.to_measured_pixels(ends[visible])), colors=_ARTWORK, linewidths=0.5, alpha=0.8)
     )
 
 

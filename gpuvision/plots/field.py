@@ -100,8 +100,8 @@ def _draw_field(axes: Axes, located: LocatedRobot) -> None:
             axes.add_patch(_ellipse(each.pose, each.covariance, colour))
     if located.candidates:
         x, y, heading = located.candidates[0].pose
-        turn = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
-        axes.plot(*(located.points @ turn.T + (x, y)).T, ".", color=_ON, markersize=3.0)
+        rotation = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
+        axes.plot(*(located.points @ rotation.T + (x, y)).T, ".", color=_ON, markersize=3.0)
     axes.set(
         aspect="equal",
         xlabel="x [m]",
@@ -123,17 +123,17 @@ def field_lines(field: Field) -> list[Float64]:
 
 def _into(line: Float64, pose: Float64) -> Float64:
     """Return places on the field in the frame of a robot."""
-    turn = np.array([[math.cos(pose[2]), -math.sin(pose[2])], [math.sin(pose[2]), math.cos(pose[2])]])
-    return np.asarray((line - pose[:2]) @ turn)
+    rotation = np.array([[math.cos(pose[2]), -math.sin(pose[2])], [math.sin(pose[2]), math.cos(pose[2])]])
+    return np.asarray((line - pose[:2]) @ rotation)
 
 
 def _distances(points: npt.NDArray[Any], lines: list[Float64]) -> Float64:
     """Return the distance of each point from the nearest line [m]."""
     start = np.concatenate([each[:-1] for each in lines])
     along = np.concatenate([each[1:] - each[:-1] for each in lines])
-    off = points[:, None] - start
-    share = np.clip(np.sum(off * along, axis=-1) / np.sum(along**2, axis=-1), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(off - share[..., None] * along, axis=-1).min(axis=1))
+    offset = points[:, None] - start
+    share = np.clip(np.sum(offset * along, axis=-1) / np.sum(along**2, axis=-1), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(offset - share[..., None] * along, axis=-1).min(axis=1))
 
 
 def _ellipse(pose: Float64, covariance: Float64, colour: str) -> Ellipse:

@@ -149,8 +149,8 @@ def _smooth_slopes(slope: Array, known: npt.NDArray[np.bool_], blur: float) -> A
 def _slope(z: Array, axis: int) -> Array:
     """Return the mean difference [m] to the known neighbours along an axis; 0 without a known neighbour."""
     ahead = np.diff(z, axis=axis, append=np.nan)
-    behind = np.diff(z, axis=axis, prepend=np.nan)
-    both = np.stack([ahead, behind])
+    backward = np.diff(z, axis=axis, prepend=np.nan)
+    both = np.stack([ahead, backward])
     count = np.isfinite(both).sum(axis=0)
     slope: Array = np.where(np.isfinite(both), both, 0.0).sum(axis=0) / np.maximum(count, 1)
     return slope

@@ -251,8 +251,8 @@ class PsdReadout(VisionOperation[PsdReading]):
         samples = math.prod(batch)
         if samples >= 2**30:
             raise ValueError(f"PsdReadout takes fewer than 2**30 samples at once, got {samples}; split the batch")
-        many = samples >= _STRIPS_PER_CORE * _LONG_STRIP * device.compute_units
-        each = _LONG_STRIP if many else _SHORT_STRIP
+        long_strips = samples >= _STRIPS_PER_CORE * _LONG_STRIP * device.compute_units
+        each = _LONG_STRIP if long_strips else _SHORT_STRIP
         if build.uses_vectors and samples >= _LANES:
             # The last work-item also processes the remainder.
             work = WorkSize((max(samples // each, 1),), (1,), each, vectors=True)

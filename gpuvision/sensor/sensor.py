@@ -261,7 +261,7 @@ def _region(
 def _triangulation(table: Section, common: dict[str, Any]) -> Triangulation:
     """Read a triangulation: a homography, constants, calibration points, a setup in metres, or a camera's pose."""
     common = common | {"horizon": table.number("horizon", "", 1e-3, above=0.0, below=1.0)}
-    given = [way for way in _WAYS if way in table]
+    given = [method for method in _WAYS if method in table]
     if len(given) != 1:
         problem = f"has {' and '.join(given)} at once" if given else "has no geometry"
         raise table.error(f"[{table.name}] {problem}, expected one of {', '.join(_WAYS)}")
@@ -418,9 +418,11 @@ def _light(top: Section, transport: StraightTransport | RotatingSheet) -> Light 
         return light
     assert isinstance(transport, StraightTransport)  # the others have no triangulation
     up = np.array(transport.h_axis) / np.linalg.norm(transport.h_axis)
-    beside = np.cross(transport.g_axis, transport.h_axis)
-    beside *= np.sign(beside @ np.array(transport.direction)) / np.linalg.norm(beside)
-    place = np.array(transport.origin) + setup.number("baseline", "m") * beside + setup.number("stand_off", "m") * up
+    sheet_normal = np.cross(transport.g_axis, transport.h_axis)
+    sheet_normal *= np.sign(sheet_normal @ np.array(transport.direction)) / np.linalg.norm(sheet_normal)
+    place = (
+        np.array(transport.origin) + setup.number("baseline", "m") * sheet_normal + setup.number("stand_off", "m") * up
+    )
     return replace(light, lens=(float(place[0]), float(place[1]), float(place[2])))
 
 

@@ -283,10 +283,10 @@ def _all_light(store: LightStore, bins: int, max_bins: int) -> tuple[dict[str, E
         for name in set(PATHS) & set(block.exposures):
             light.setdefault(name, []).append(Exposure(*(each[chosen] for each in block.exposures[name])))
         truths.append(GroundTruth(*(each[chosen] for each in block.truth)))
-    whole = {
+    exposures = {
         name: Exposure(*(np.concatenate(each) for each in zip(*parts, strict=True))) for name, parts in light.items()
     }
-    return whole, GroundTruth(*(np.concatenate(each) for each in zip(*truths, strict=True)))
+    return exposures, GroundTruth(*(np.concatenate(each) for each in zip(*truths, strict=True)))
 
 
 def _attribute_errors(

@@ -204,8 +204,8 @@ def _fit_vanishing_points(objective: _Objective, lens: Float64, points: Float64)
 
 def mean_intersections(packed: PackedLines) -> Float64:
     """Return the mean intersection (families, 2) of all pairs of measured lines of each family."""
-    none = Parameters(np.empty(0), np.zeros(2), None)
-    lines = np.stack(evaluate(packed, none).lines, axis=-1)
+    no_lens = Parameters(np.empty(0), np.zeros(2), None)
+    lines = np.stack(evaluate(packed, no_lens).lines, axis=-1)
     points = np.zeros((packed.families, 2))
     for number in range(packed.families):
         members = lines[packed.family == number]

@@ -163,8 +163,8 @@ def free_lines(moments: Float64) -> LineSet:
     """Return the lines of least squared distance: through the centre of gravity, along the scatter's longer axis."""
     total, x, y, xx, xy, yy = moments
     x, y = x / total, y / total
-    turn = 0.5 * np.arctan2(2.0 * (xy - total * x * y), (xx - total * x * x) - (yy - total * y * y))
-    nx, ny = -np.sin(turn), np.cos(turn)
+    angle = 0.5 * np.arctan2(2.0 * (xy - total * x * y), (xx - total * x * x) - (yy - total * y * y))
+    nx, ny = -np.sin(angle), np.cos(angle)
     return LineSet(nx, ny, -(nx * x + ny * y))
 
 
@@ -365,15 +365,15 @@ def normal_equations(
 ) -> NormalEquations:
     """Return the normal equations of lens and vanishing points, with the lines' columns projected out."""
     cross = np.array([packed.sums(line * slopes.lens) for line in slopes.line])
-    own = packed.sums(np.array([slopes.line[i] * slopes.line[j] for i, j in ((0, 0), (0, 1), (1, 1))]))
+    line_blocks = packed.sums(np.array([slopes.line[i] * slopes.line[j] for i, j in ((0, 0), (0, 1), (1, 1))]))
     line_coefficients = np.empty_like(cross)
-    np.subtract(own[2] * cross[0], own[1] * cross[1], out=line_coefficients[0])
-    np.subtract(own[0] * cross[1], own[1] * cross[0], out=line_coefficients[1])
-    line_coefficients /= own[0] * own[2] - own[1] ** 2
+    np.subtract(line_blocks[2] * cross[0], line_blocks[1] * cross[1], out=line_coefficients[0])
+    np.subtract(line_blocks[0] * cross[1], line_blocks[1] * cross[0], out=line_coefficients[1])
+    line_coefficients /= line_blocks[0] * line_blocks[2] - line_blocks[1] ** 2
     bound = constrained_lines(packed, parameters)
     sideways = None
     if parameters.vanishing is not None and bound.any():
-        sideways = _pencils(packed, parameters.vanishing, evaluation.lines, own, cross, bound)
+        sideways = _pencils(packed, parameters.vanishing, evaluation.lines, line_blocks, cross, bound)
         line_coefficients[..., bound] = sideways.line_coefficients
     product = inner_products(slopes.lens, slopes.lens) - sum(
         inner_products(a, b) for a, b in zip(line_coefficients, cross, strict=True)
@@ -449,13 +449,13 @@ def projected_columns(
     change[..., bound] = pencil_changes(
         parameters.vanishing, packed.family[bound], LineSet(*(n[bound] for n in evaluation.lines))
     )
-    turn, *moves = (np.sum(slopes.line * change[:, part, packed.line], axis=0) for part in range(3))
-    length = np.where(bound, packed.sums(turn * turn), 1.0)
+    rotation, *moves = (np.sum(slopes.line * change[:, part, packed.line], axis=0) for part in range(3))
+    length = np.where(bound, packed.sums(rotation * rotation), 1.0)
     tangents = np.zeros((packed.families, 2, len(packed.x)))
     points = np.arange(len(packed.x))
     for axis, move in enumerate(moves):
         tangents[packed.family[packed.line], axis, points] = (
-            move - turn * (packed.sums(turn * move) / length)[packed.line]
+            move - rotation * (packed.sums(rotation * move) / length)[packed.line]
         )
     return np.concatenate([found, tangents.reshape(-1, len(packed.x))])
 

@@ -48,8 +48,8 @@ def estimate_steps(values: Float64) -> Float64:
     steps = []
     for axis in (1, 0):
         forward = np.diff(values, axis=axis)
-        none = np.full_like(np.take(values, [0], axis), np.nan)
-        pair = np.stack([np.concatenate([forward, none], axis), np.concatenate([none, forward], axis)])
+        missing = np.full_like(np.take(values, [0], axis), np.nan)
+        pair = np.stack([np.concatenate([forward, missing], axis), np.concatenate([missing, forward], axis)])
         steps.append(_fill_missing(nan_mean(pair)))
     return np.stack(steps, axis=2)
 
@@ -117,9 +117,9 @@ def measure_dots(grey: Float32, points: Float64, size: Float64) -> Centroids:
 
 def _to_lattice(values: Float64, nodes: npt.NDArray[np.bool_]) -> Float64:
     """Write values of the known nodes into an array over the lattice; NaN elsewhere."""
-    whole = np.full((*nodes.shape, *values.shape[1:]), np.nan)
-    whole[nodes] = values
-    return whole
+    lattice = np.full((*nodes.shape, *values.shape[1:]), np.nan)
+    lattice[nodes] = values
+    return lattice
 
 
 def _smooth(grey: Float32, sides: Float64) -> Float32:
@@ -165,12 +165,12 @@ def _moments(grey: Float32, at: Float64, half: Float64, planes: list[Float64], r
     weight = (patch - background) / contrast
     weight -= _BACKGROUND_COVER
     np.maximum(weight, 0.0, out=weight)
-    within = [
+    in_window = [
         ((np.abs(d) <= half[:, each, None]) & (p >= 0) & (p < limit)).astype(np.float32)
         for each, (d, p, limit) in enumerate(zip(from_dot, (x, y), (columns, rows), strict=True))
     ]
-    by_x = np.matmul(within[1][:, None, :], weight)[:, 0] * within[0]
-    by_y = np.matmul(weight, within[0][..., None])[..., 0] * within[1]
+    by_x = np.matmul(in_window[1][:, None, :], weight)[:, 0] * in_window[0]
+    by_y = np.matmul(weight, in_window[0][..., None])[..., 0] * in_window[1]
     powers = np.stack([offsets, offsets**2], axis=1)
     (x1, x2), (y1, y2) = (by_x @ powers).T, (by_y @ powers).T
     return np.stack([by_x.sum(axis=1), x1, y1, x2, y2], axis=1) / (1.0 - _BACKGROUND_COVER)

@@ -242,8 +242,8 @@ def _foerstner_points(slope: list[Float32], start: Float64, to_steps: Float64, r
         at += move
         if np.abs(move).max() < _SETTLED:
             break
-    apart = _window_sums(window * (xx * dx * dx + 2.0 * xy * dx * dy + yy * dy * dy))[:, 0]
-    return at, apart / np.trace(normal, axis1=1, axis2=2)
+    residual = _window_sums(window * (xx * dx * dx + 2.0 * xy * dx * dy + yy * dy * dy))[:, 0]
+    return at, residual / np.trace(normal, axis1=1, axis2=2)
 
 
 def _window_sums(*parts: Float64) -> Float64:

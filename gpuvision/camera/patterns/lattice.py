@@ -95,8 +95,8 @@ def estimate_local_steps(
         (n, 2, 2); NaN where the neighbours are not symmetric.
     """
     count = min(limits.neighbours + 1, len(points))
-    _, near = tree.query(points, count)
-    steps = points[near[:, 1:]] - points[:, None]
+    _, neighbours = tree.query(points, count)
+    steps = points[neighbours[:, 1:]] - points[:, None]
     square = np.sum(steps**2, axis=-1)
     length = np.sqrt(square)
     # |s + t|^2 of all pairs of steps s, t: 0 for opposite steps.
@@ -104,7 +104,7 @@ def estimate_local_steps(
     partner = np.argmin(sums, axis=2)
     mirrored = np.take_along_axis(sums, partner[..., None], 2)[..., 0] < limits.max_asymmetry**2 * square
     if orientation is not None:
-        mirrored &= np.einsum("ij,ikj->ik", orientation, orientation[near[:, 1:]]) < limits.max_product
+        mirrored &= np.einsum("ij,ikj->ik", orientation, orientation[neighbours[:, 1:]]) < limits.max_product
     across = np.take_along_axis(steps, partner[..., None], 1)
     straight = 0.5 * (steps - across)
     rows = np.arange(len(points))
@@ -169,12 +169,12 @@ class _LatticeGrowth:
 
     def _measure(self, new: Int64) -> None:
         """Estimate the steps of new points from known neighbours; without neighbours the parent's step remains."""
-        here = self.index[new]
+        index = self.index[new]
         for axis in (0, 1):
-            ahead, behind = (self.at[tuple((here + side * _STEPS[2 * axis]).T)] for side in (1, -1))
+            ahead, previous = (self.at[tuple((index + side * _STEPS[2 * axis]).T)] for side in (1, -1))
             forward = np.where((ahead >= 0)[:, None], self.points[ahead] - self.points[new], np.nan)
-            backward = np.where((behind >= 0)[:, None], self.points[new] - self.points[behind], np.nan)
-            count = (ahead >= 0).astype(int) + (behind >= 0)
+            backward = np.where((previous >= 0)[:, None], self.points[new] - self.points[previous], np.nan)
+            count = (ahead >= 0).astype(int) + (previous >= 0)
             total = np.nan_to_num(forward) + np.nan_to_num(backward)
             known = np.flatnonzero(count)
             step, parents = total[known] / count[known, None], self.bases[new[known], axis]
@@ -253,10 +253,10 @@ def _without_overlap(patches: list[LatticePatch], min_points: int) -> list[Latti
     kept: list[LatticePatch] = []
     taken = np.empty(0, dtype=np.int64)
     for patch in sorted(patches, key=lambda each: len(each.members), reverse=True):
-        own = ~np.isin(patch.members, taken)
-        if np.count_nonzero(own) >= min_points:
-            kept.append(LatticePatch(patch.members[own], patch.nodes[own]))
-            taken = np.concatenate([taken, patch.members[own]])
+        is_new = ~np.isin(patch.members, taken)
+        if np.count_nonzero(is_new) >= min_points:
+            kept.append(LatticePatch(patch.members[is_new], patch.nodes[is_new]))
+            taken = np.concatenate([taken, patch.members[is_new]])
     return kept
 
 
@@ -319,17 +319,17 @@ def join_patches(
     patches: list[LatticePatch], points: Float64, limits: LatticeLimits = LatticeLimits()
 ) -> tuple[LatticePatch, list[LatticePatch]]:
     """Join patches that continue the lattice of the largest one; return the result and the remaining patches."""
-    whole, apart = patches[0], patches[1:]
+    joined, separate = patches[0], patches[1:]
     while True:
-        for patch in apart:
-            index = _index_in(whole, patch, points, limits)
+        for patch in separate:
+            index = _index_in(joined, patch, points, limits)
             if index is not None:
-                members, nodes = np.concatenate([whole.members, patch.members]), np.concatenate([whole.nodes, index])
-                whole = LatticePatch(members, nodes)
-                apart = [each for each in apart if each is not patch]
+                members, nodes = np.concatenate([joined.members, patch.members]), np.concatenate([joined.nodes, index])
+                joined = LatticePatch(members, nodes)
+                separate = [each for each in separate if each is not patch]
                 break
         else:
-            return whole, apart
+            return joined, separate
 
 
 def _index_in(whole: LatticePatch, patch: LatticePatch, points: Float64, limits: LatticeLimits) -> Int64 | None:
@@ -341,21 +341,23 @@ def _index_in(whole: LatticePatch, patch: LatticePatch, points: Float64, limits:
     place, other = points[whole.members], points[patch.members]
     distance, _ = cKDTree(place).query(other)
     anchor = other[np.argmin(distance)]
-    near = np.argsort(np.linalg.norm(place - anchor, axis=1))[: limits.joint_points]
+    nearest = np.argsort(np.linalg.norm(place - anchor, axis=1))[: limits.joint_points]
     ends = np.argsort(np.linalg.norm(other - anchor, axis=1))[: limits.joint_points // 4]
-    scale = np.ptp(place[near])
-    design, there = (_quadratic((each - anchor) / scale) for each in (place[near], other[ends]))
-    guess = there @ np.linalg.lstsq(design, whole.nodes[near].astype(np.float64), rcond=None)[0]
-    own = patch.nodes[ends].astype(np.float64)
-    turn = np.rint(np.linalg.lstsq(own - own.mean(axis=0), guess - guess.mean(axis=0), rcond=None)[0]).astype(np.int64)
-    if abs(round(float(np.linalg.det(turn)))) != 1:
+    scale = np.ptp(place[nearest])
+    design, design_at_ends = (_quadratic((each - anchor) / scale) for each in (place[nearest], other[ends]))
+    guess = design_at_ends @ np.linalg.lstsq(design, whole.nodes[nearest].astype(np.float64), rcond=None)[0]
+    nodes = patch.nodes[ends].astype(np.float64)
+    rotation = np.rint(np.linalg.lstsq(nodes - nodes.mean(axis=0), guess - guess.mean(axis=0), rcond=None)[0]).astype(
+        np.int64
+    )
+    if abs(round(float(np.linalg.det(rotation)))) != 1:
         return None
-    offset = guess - own @ turn
+    offset = guess - nodes @ rotation
     shift = np.rint(np.median(offset, axis=0)).astype(np.int64)
     deviation, bias = np.median(np.abs(offset - shift)), np.max(np.abs(np.median(offset, axis=0) - shift))
     if deviation > limits.joint_tolerance or bias > 2.0 * limits.joint_tolerance:
         return None
-    index = patch.nodes @ turn + shift
+    index = patch.nodes @ rotation + shift
     taken = {tuple(each) for each in whole.nodes.tolist()}
     return None if any(tuple(each) in taken for each in index.tolist()) else index
 
@@ -397,15 +399,15 @@ def index_grid(points: Float64, min_points: int, name: str, limits: LatticeLimit
     patches = index_patches(points, min_points, limits=limits)
     if not patches:
         raise ValueError(no_grid)
-    whole, apart = join_patches(patches, points, limits)
-    large = [each for each in apart if len(each.members) > limits.min_patch_share * len(whole.members)]
+    joined, separate = join_patches(patches, points, limits)
+    large = [each for each in separate if len(each.members) > limits.min_patch_share * len(joined.members)]
     if large:
-        counts = " and ".join(str(len(each.members)) for each in (whole, *large))
+        counts = " and ".join(str(len(each.members)) for each in (joined, *large))
         raise ValueError(
             f"the grid broke into {len(large) + 1} parts of {counts} {name} with too wide a gap between them; "
             "uncover what lies between them, or crop the image to one part"
         )
-    grid = patch_grid(whole, points)
+    grid = patch_grid(joined, points)
     known = grid >= 0
     # A single row is no grid: both directions must have at least one pair of neighbours.
     if not ((known[1:] & known[:-1]).any() and (known[:, 1:] & known[:, :-1]).any()):

@@ -110,10 +110,10 @@ def _measure_between_columns(grey: Float32, cells: Float64, bright: bool, limits
     """Measure the lines before, between and after columns of cells: (columns + 1, rows, 2), NaN where none is found."""
     steps = estimate_steps(cells)
     across, along = (np.concatenate([each, each[:, -1:]], axis=1) for each in (steps[:, :, 0], steps[:, :, 1]))
-    none = np.full_like(cells[:, :1], np.nan)
+    missing = np.full_like(cells[:, :1], np.nan)
     # Half a step from the cell before the line, and from the cell after it; at the border there is one cell only.
     half = 0.5 * steps[:, :, 0]
-    pair = [np.concatenate(each, axis=1) for each in ((none, cells + half), (cells - half, none))]
+    pair = [np.concatenate(each, axis=1) for each in ((missing, cells + half), (cells - half, missing))]
     centre = nan_median(np.stack(pair))
     known = np.isfinite(centre[..., 0])
     points = np.full_like(centre, np.nan)

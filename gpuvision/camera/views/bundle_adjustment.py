@@ -213,7 +213,7 @@ def adjust(views: PackedViews, free_parameters: FreeParameters, start: FitState,
     if system is None:
         return state
     state = replace(state, cost=system.cost)
-    damping, growth, polished = 1e-4, 2.0, False
+    damping, damping_factor, polished = 1e-4, 2.0, False
     for count in range(1, max(_MIN_STEPS, _STEPS_TIMES_VIEWS // len(views.image)) + 1):
         camera, poses, _ = solve_step(system, damping)
         tried = apply_step(free_parameters, state, camera, poses)
@@ -223,15 +223,15 @@ def adjust(views: PackedViews, free_parameters: FreeParameters, start: FitState,
         if next_system is not None and next_system.cost < state.cost:
             # Ratio of actual to predicted decrease; 1 for an exactly quadratic cost.
             ratio = (state.cost - next_system.cost) / gain
-            damping, growth = damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3), 2.0
+            damping, damping_factor = damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3), 2.0
             state, system = replace(tried, cost=next_system.cost, iterations=count), next_system
         else:
-            damping, growth = damping * growth, 2.0 * growth
+            damping, damping_factor = damping * damping_factor, 2.0 * damping_factor
         if (small and (polished or damping <= _UNDAMPED)) or state.cost < _EXACT_PX**2 * views.coordinates:
             return replace(state, converged=True, iterations=count)
         if small:
             # Damping can hide a remaining step along a weakly determined direction: repeat the step without damping.
-            damping, growth, polished = _UNDAMPED, 2.0, True
+            damping, damping_factor, polished = _UNDAMPED, 2.0, True
         if damping > _MAX_DAMPING:
             break
     return replace(state, iterations=count)

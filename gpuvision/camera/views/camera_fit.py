@@ -185,12 +185,12 @@ def covariances(
     system = linearise(views, free_parameters, state, loss, stiffness=True)
     assert system is not None, "the fit ended with every point in front of the camera"
     variance = residual_variance_factor(views, free_parameters, state, loss, sigma)
-    inverse, on_poses, own = _invert(system)
+    inverse, on_poses, pose_inverse = _invert(system)
     to_names = _derivative_of_names(free_parameters, state)
     camera = variance * to_names @ inverse @ to_names.T
     by_f = free_parameters.derivative(state.values)[0]
     focus = math.sqrt(max(variance * by_f @ inverse @ by_f, 0.0)) / float(state.values[0])
-    return camera, variance * _lens_pose_covariance(free_parameters, state, inverse, on_poses, own), focus
+    return camera, variance * _lens_pose_covariance(free_parameters, state, inverse, on_poses, pose_inverse), focus
 
 
 def residual_variance_factor(
@@ -213,8 +213,8 @@ def _invert(system: NormalEquations) -> tuple[Floats, Floats, Floats]:
     # Clamp the eigenvalues: an undetermined direction gets a very large, but finite variance.
     values = np.maximum(values, values[-1] * len(values) * np.finfo(float).eps)
     inverse = (vectors / values) @ vectors.T
-    own = np.linalg.inv(system.pose).astype(np.float64)
-    return inverse * np.outer(unit, unit), own @ np.swapaxes(system.mixed, 1, 2), own
+    pose_inverse = np.linalg.inv(system.pose).astype(np.float64)
+    return inverse * np.outer(unit, unit), pose_inverse @ np.swapaxes(system.mixed, 1, 2), pose_inverse
 
 
 def _derivative_of_names(free_parameters: FreeParameters, state: FitState) -> Floats:
@@ -231,11 +231,11 @@ def _lens_pose_covariance(
     tau = (turned @ free_parameters.derivative(state.values))[4:6]
     m = tilt_matrix(*internal[4:6])
     # Rotation vector of the lens' frame, with negative sign, by the free parameters.
-    turn = -np.outer(m[:, 0], tau[0]) - np.outer([0.0, 1.0, 0.0], tau[1])
+    rotation_derivative = -np.outer(m[:, 0], tau[0]) - np.outer([0.0, 1.0, 0.0], tau[1])
     count = len(state.rotations)
     by_camera = np.zeros((count, 6, len(inverse)))
-    by_camera[:, :3] = -turn
-    by_camera[:, 3:] = -np.cross(turn.T[None], state.translations[:, None]).swapaxes(1, 2)
+    by_camera[:, :3] = -rotation_derivative
+    by_camera[:, 3:] = -np.cross(rotation_derivative.T[None], state.translations[:, None]).swapaxes(1, 2)
     by_camera -= on_poses
     back = np.zeros((6, 6))
     back[:3, :3] = back[3:, 3:] = m.T

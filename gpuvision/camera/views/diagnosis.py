@@ -176,12 +176,12 @@ def _possible_tilt(fit: CameraFit, size: tuple[int, int], limits: CalibrationLim
     if "tauX" in fit.names or "cx" not in fit.names:
         return ""
     f, (column, row) = fit.camera.matrix[0][0], (fit.camera.matrix[0][2], fit.camera.matrix[1][2])
-    aside = math.hypot(column - 0.5 * (size[0] - 1), row - 0.5 * (size[1] - 1))
-    if aside < limits.max_centre_offset * math.hypot(*size) + 3.0 * _centre_deviation(fit, limits):
+    shift = math.hypot(column - 0.5 * (size[0] - 1), row - 0.5 * (size[1] - 1))
+    if shift < limits.max_centre_offset * math.hypot(*size) + 3.0 * _centre_deviation(fit, limits):
         return ""
-    tilt = math.degrees(math.atan2(aside, f))
+    tilt = math.degrees(math.atan2(shift, f))
     return (
-        f"the centre lies {aside:.0f} px from the image's middle: a sensor tilted by {tilt:.1f} degrees looks the same "
+        f"the centre lies {shift:.0f} px from the image's middle: a sensor tilted by {tilt:.1f} degrees looks the same "
         "if the distortion is small; for a tilted sensor give model='tilt' and centre="
     )
 

@@ -126,13 +126,13 @@ def _linearise(plane: Floats, measured: Floats, homographies: Floats, radial: Fl
     inverse = 1.0 / mapped[:, 2]
     x, y = mapped[:, 0] * inverse, mapped[:, 1] * inverse
     r2 = x * x + y * y
-    growth = 1.0 + r2 * (radial[0] + radial[1] * r2)
+    scale = 1.0 + r2 * (radial[0] + radial[1] * r2)
     slope = 2.0 * (radial[0] + 2.0 * radial[1] * r2)
-    residual = measured - np.stack([x * growth, y * growth], axis=1)
+    residual = measured - np.stack([x * scale, y * scale], axis=1)
     point = np.stack([x, y], axis=1)
     by_radial = np.stack([point * r2[:, None], point * (r2 * r2)[:, None]], axis=1)
-    by_x = np.stack([growth + slope * x * x, slope * x * y], axis=1) * inverse[:, None]
-    by_y = np.stack([slope * x * y, growth + slope * y * y], axis=1) * inverse[:, None]
+    by_x = np.stack([scale + slope * x * x, slope * x * y], axis=1) * inverse[:, None]
+    by_y = np.stack([slope * x * y, scale + slope * y * y], axis=1) * inverse[:, None]
     by_scale = -(by_x * x[:, None] + by_y * y[:, None])
     by_homography = [by * plane[:, None, k] for by in (by_x, by_y, by_scale) for k in range(3)]
     return residual, by_radial, np.stack(by_homography[:8], axis=1)

@@ -245,8 +245,10 @@ def _check_enough(task: _Task, models: Sequence[str]) -> list[str]:
         raise ValueError("one view of a plane does not fix the focal length: give focal_length= or more views")
     sides = np.linalg.det(task.homography_fit.homographies) > 0.0
     if sides.any() and not sides.all():
-        few = np.flatnonzero(sides == (sides.sum() < sides.size / 2)).tolist()
-        raise ValueError(f"views {few} show the target from its other side: their point order or image is mirrored")
+        minority = np.flatnonzero(sides == (sides.sum() < sides.size / 2)).tolist()
+        raise ValueError(
+            f"views {minority} show the target from its other side: their point order or image is mirrored"
+        )
     return enough
 
 
@@ -406,9 +408,9 @@ def _unpacked(task: _Task, errors: Floats) -> tuple[Floats, ...]:
     """Return the residuals of each view in the order of its points, NaN for missing points."""
     result = []
     for mask, error in zip(task.masks, errors, strict=True):
-        whole = np.full((len(mask), 2), np.nan)
-        whole[mask] = error.T[: np.count_nonzero(mask)]
-        result.append(whole)
+        unpacked = np.full((len(mask), 2), np.nan)
+        unpacked[mask] = error.T[: np.count_nonzero(mask)]
+        result.append(unpacked)
     return tuple(result)
 
 

@@ -114,5 +114,5 @@ def _check_spread(name: str, target: Floats) -> None:
 def _without_farthest(points: Floats) -> Floats:
     """Remove the point farthest from the best line."""
     offset = points - points.mean(axis=0)
-    aside = offset @ np.linalg.svd(offset, full_matrices=False)[2][1]
-    return np.delete(points, np.argmax(np.abs(aside)), axis=0)
+    distance = offset @ np.linalg.svd(offset, full_matrices=False)[2][1]
+    return np.delete(points, np.argmax(np.abs(distance)), axis=0)

@@ -307,8 +307,8 @@ def _drilled(layer: Any, plated: int) -> list[tuple[float, ...]]:
 
 def _first_of_equals(points: Float64) -> npt.NDArray[np.int64]:
     """Return the indices of the points that have no earlier point within ``_SAME_PLACE``."""
-    gone = {second for _, second in cKDTree(points).query_pairs(_SAME_PLACE)} if len(points) else set()
-    return np.array([index for index in range(len(points)) if index not in gone], dtype=np.int64)
+    duplicates = {second for _, second in cKDTree(points).query_pairs(_SAME_PLACE)} if len(points) else set()
+    return np.array([index for index in range(len(points)) if index not in duplicates], dtype=np.int64)
 
 
 def _pads(copper: tuple[DrawnObject, ...], finder: _Finder) -> tuple[Pad, ...]:

@@ -120,10 +120,10 @@ class Layer:
             (2,) ends of the segment [m]; the crossings are 0 at the start and 1 at the end.
         """
         low, high = np.minimum(start, end), np.maximum(start, end)
-        near = np.flatnonzero(np.all((self._low <= high) & (self._high >= low), axis=1))
+        overlapping = np.flatnonzero(np.all((self._low <= high) & (self._high >= low), axis=1))
         found = []
         along = end - start
-        for index in near:
+        for index in overlapping:
             span = slice(self._start[index], self._stop[index])
             a, b = self._from[span] - start, self._to[span] - start
             side_a = along[0] * a[:, 1] - along[1] * a[:, 0]

@@ -203,9 +203,11 @@ class BoardMeasurer:
         first = self._measure_once(view, copper, reach, search_range)
         if first.reason:
             return BoardMeasurement(view, view, first)
-        there = move_view(view, first.pose)
-        second = self._measure_once(there, copper, np.minimum(reach, self._second_length_px(view.scale)))
-        return BoardMeasurement(there if second.reason else move_view(there, second.pose), there, second)
+        second_view = move_view(view, first.pose)
+        second = self._measure_once(second_view, copper, np.minimum(reach, self._second_length_px(view.scale)))
+        return BoardMeasurement(
+            second_view if second.reason else move_view(second_view, second.pose), second_view, second
+        )
 
     def _second_length_px(self, scale: float) -> Float64:
         """(n,) lengths of the rulers of the second pass [px]."""
@@ -218,18 +220,18 @@ class BoardMeasurer:
         """Measure all features at one view and solve the pose; the search range [m], [rad] applies to a first pass."""
         rulers = self._measure_rulers(view, copper, length_px)
         fiducials = self._find_fiducials(view, copper, is_first=search_range is not None)
-        what = "rulers and fiducials" if len(fiducials.in_image) else "rulers"
+        features = "rulers and fiducials" if len(fiducials.in_image) else "rulers"
         in_image, found = _count(rulers.in_image, fiducials.in_image), _count(rulers.found, fiducials.found)
         least = self.limits.min_count
         if in_image < least:
             count = len(rulers.in_image) + len(fiducials.in_image)
-            reason = f"{in_image} of {count} {what} lie in the image, expected {least} or more"
+            reason = f"{in_image} of {count} {features} lie in the image, expected {least} or more"
             return _refuse(rulers, fiducials, reason)
         if found < least:
             return _refuse(
                 rulers,
                 fiducials,
-                f"{found} of {in_image} {what} found an edge of {self.threshold:.3g} grey levels or more, expected "
+                f"{found} of {in_image} {features} found an edge of {self.threshold:.3g} grey levels or more, expected "
                 f"{least}; is this the right side of the right board, near the initial pose, at this scale?",
             )
         solution = self._solve(rulers, fiducials, view.scale, search_range)
@@ -306,9 +308,9 @@ class BoardMeasurer:
         placement = self.features.placement
         is_single = self.features.spacing == 0
         has_etch_bias = bool((is_single & rulers.found).any()) and self.etch_bias_sigma > 0
-        seen = rulers.point + rulers.normal * (rulers.position_px * scale)[:, None]
+        measured = rulers.point + rulers.normal * (rulers.position_px * scale)[:, None]
         etch_factor = np.where(is_single, 1.0, 0.0)
-        edges = line_rows(rulers.normal, rulers.point - placement, seen - placement, rulers.sigma, etch_factor)
+        edges = line_rows(rulers.normal, rulers.point - placement, measured - placement, rulers.sigma, etch_factor)
         rows = np.concatenate([edges, fiducials.rows(placement)])
         fit = SolvePose(
             scale=None,
@@ -345,9 +347,9 @@ class BoardMeasurer:
         rulers, fiducials, limits = solution.rulers, solution.fiducials, self.limits
         used, in_image = _count(rulers.used, fiducials.used), _count(rulers.in_image, fiducials.in_image)
         if used < max(limits.min_count, limits.min_share * in_image):
-            what = "rulers and fiducials" if len(fiducials.in_image) else "rulers"
+            features = "rulers and fiducials" if len(fiducials.in_image) else "rulers"
             return solution._replace(
-                reason=f"{used} of {in_image} {what} agree, expected {limits.min_share:.0%} or more"
+                reason=f"{used} of {in_image} {features} agree, expected {limits.min_share:.0%} or more"
             )
         sigma = float(np.nanmedian(np.concatenate([rulers.sigma, *fiducials.axes[0].T])))
         residual_px = residual_scale * sigma / scale
@@ -411,6 +413,6 @@ def move_view(view: BoardView, pose: npt.ArrayLike) -> BoardView:
     """Return the view of the camera over a board whose artwork is moved by a pose: q = R p + t."""
     x, y, theta = (float(each) for each in np.asarray(pose, np.float64))
     c, s = math.cos(theta), math.sin(theta)
-    off = np.array(view.pose[:2]) - (x, y)
+    offset = np.array(view.pose[:2]) - (x, y)
     turned = math.remainder(view.pose[2] - theta, 2 * math.pi)
-    return replace(view, pose=(float(c * off[0] + s * off[1]), float(-s * off[0] + c * off[1]), turned))
+    return replace(view, pose=(float(c * offset[0] + s * offset[1]), float(-s * offset[0] + c * offset[1]), turned))

@@ -103,10 +103,10 @@ class LocatedBoard:
             counts = counts if rulers.in_image.any() else ""
             counts += f"; {np.sum(fiducials.used)} of {np.sum(fiducials.in_image)} fiducials agree, "
             counts += f"{np.sum(fiducials.found)} were found"
-        (x, y, theta), (sx, sy, turn) = self.pose, self.sigmas
+        (x, y, theta), (sx, sy, sigma_theta) = self.pose, self.sigmas
         return (
             f"x {1e3 * x:.4f} mm, y {1e3 * y:.4f} mm, theta {math.degrees(theta):.4f} degrees\n"
-            f"sigmas {1e6 * sx:.2f} µm, {1e6 * sy:.2f} µm, {math.degrees(turn):.5f} degrees{counts}"
+            f"sigmas {1e6 * sx:.2f} µm, {1e6 * sy:.2f} µm, {math.degrees(sigma_theta):.5f} degrees{counts}"
         )
 
     def report(self) -> dict[str, Any]:

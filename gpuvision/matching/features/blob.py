@@ -299,8 +299,8 @@ class FindBlobs(VisionOperation[Blobs]):
         taps, blur = table[len(RulerTable._fields) :].astype(np.float64), self.smoothing_px / math.sqrt(5.0)
         k = np.arange(-taps.size, taps.size + 1)
         weights = np.concatenate([-taps[::-1], [0.0], taps])
-        peak, beside = (float(np.sum(weights * ndtr((k + at) / blur))) for at in (0.0, 1.0))
-        table[RulerTable._fields.index("smoothing")] = 0.5 / math.log(peak / beside) - blur**2
+        peak, neighbour = (float(np.sum(weights * ndtr((k + at) / blur))) for at in (0.0, 1.0))
+        table[RulerTable._fields.index("smoothing")] = 0.5 / math.log(peak / neighbour) - blur**2
         return table
 
     def _defines(self, freedoms: int) -> dict[str, Define]:

@@ -195,9 +195,9 @@ def _ambiguity(layers: tuple[VisibleLayer, ...], point: Float64, normal: Float64
     """
     chance = 0.0
     for each in layers:
-        off = each.max_offset * float(np.abs(normal).sum())
-        place, ends = layer_edges_along(each.layer, point, normal, reach + found + off)
-        away = np.abs(place[(ends != each.dark) & (np.abs(place) > SAME_EDGE)]) - off
+        margin = each.max_offset * float(np.abs(normal).sum())
+        place, ends = layer_edges_along(each.layer, point, normal, reach + found + margin)
+        away = np.abs(place[(ends != each.dark) & (np.abs(place) > SAME_EDGE)]) - margin
         chance += float(np.sum(np.clip((reach + found - away) / (2 * reach), 0.0, 1.0)))
     return min(1.0, chance)
 

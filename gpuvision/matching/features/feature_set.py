@@ -118,7 +118,7 @@ class FeatureSet:
 
     def summary(self) -> str:
         """Return the selection and its predicted standard deviations, in two lines."""
-        sx, sy, turn = self.sigmas
+        sx, sy, sigma_theta = self.sigmas
         pairs = int(np.sum(self.spacing > 0))
         columns, rows = self.region_px
         fiducials = f" and {len(self.fiducials.radius)} fiducials" if len(self.fiducials.radius) else ""
@@ -127,7 +127,7 @@ class FeatureSet:
             f"a region of "
             f"{columns} x {rows} px\n"
             f"predicted at ({1e3 * self.placement[0]:.3f}, {1e3 * self.placement[1]:.3f}) mm: sigma x {1e6 * sx:.2f} "
-            f"µm, y {1e6 * sy:.2f} µm, theta {1e3 * turn:.4f} mrad"
+            f"µm, y {1e6 * sy:.2f} µm, theta {1e3 * sigma_theta:.4f} mrad"
         )
 
     def _pixels(self) -> Float64:
@@ -246,7 +246,7 @@ def _microseconds(rulers: FeatureCandidates, imaging: Imaging, device: Device | 
     ruler = RulerEdges(threshold=10.0, length=length, width=imaging.width_px, smoothing_px=smoothing)
     image = np.random.default_rng(1).integers(0, 255, (600, 800), np.uint8)
     placed = np.tile(np.array([400.3, 300.6, 0.8, 0.6], np.float32), (_TIMED_RULERS, 1))
-    taken = []
+    durations = []
     for count in (_TIMED_RULERS // 8, _TIMED_RULERS):
         bound = replace(ruler, count=count).bind(device, image.shape, image.dtype)
         bound.inputs[0].set(image)
@@ -256,6 +256,6 @@ def _microseconds(rulers: FeatureCandidates, imaging: Imaging, device: Device | 
             start = time.perf_counter()
             bound.run()
             times.append(time.perf_counter() - start)
-        taken.append(1e6 * min(times))
-    per_ruler = max((taken[1] - taken[0]) / (_TIMED_RULERS - _TIMED_RULERS // 8), 1e-3)
-    return max(taken[0] - per_ruler * (_TIMED_RULERS // 8), 0.0), per_ruler / (length * imaging.width_px)
+        durations.append(1e6 * min(times))
+    per_ruler = max((durations[1] - durations[0]) / (_TIMED_RULERS - _TIMED_RULERS // 8), 1e-3)
+    return max(durations[0] - per_ruler * (_TIMED_RULERS // 8), 0.0), per_ruler / (length * imaging.width_px)

@@ -142,9 +142,9 @@ def _is_free(layers: tuple[VisibleLayer, ...], pad: Pad, radius: float, imaging:
         return False
     outwards, hidden = max(_clear(imaging), inwards if pad.hole > 0 else 0.0), 0
     spokes = 2 * SPOKES
-    for turn in np.arange(spokes) * (2 * math.pi / spokes):
-        way = np.array([math.cos(turn), math.sin(turn)])
-        contours = _contours(layers, pad.centre + radius * way, way, -inwards, outwards)
+    for angle in np.arange(spokes) * (2 * math.pi / spokes):
+        direction = np.array([math.cos(angle), math.sin(angle)])
+        contours = _contours(layers, pad.centre + radius * direction, direction, -inwards, outwards)
         if contours is None:
             return False
         hidden += contours == 0
@@ -157,11 +157,11 @@ def _contours(layers: tuple[VisibleLayer, ...], point: Float64, way: Float64, lo
     """Return 1 where copper ends at the contour, 0 where a trace continues it, None where another edge is found."""
     contours = 0
     for number, visible in enumerate(layers):
-        off = math.sqrt(2.0) * visible.max_offset
-        place, ends = layer_edges_along(visible.layer, point, way, max(-low, high) + off)
-        near = (place > low - off) & (place < high + off)
+        margin = math.sqrt(2.0) * visible.max_offset
+        place, ends = layer_edges_along(visible.layer, point, way, max(-low, high) + margin)
+        in_region = (place > low - margin) & (place < high + margin)
         # A search beyond the centre of a pad without a hole would find the opposite side of the contour.
-        place, ends = place[near], ends[near]
+        place, ends = place[in_region], ends[in_region]
         if number == 0 and len(place) == 1 and ends[0] and place[0] > -SAME_EDGE:
             contours = int(place[0] < SAME_EDGE)
         elif len(place):
@@ -170,8 +170,8 @@ def _contours(layers: tuple[VisibleLayer, ...], point: Float64, way: Float64, lo
 
 
 def _covers(visible: VisibleLayer, point: Float64) -> bool:
-    beside = np.array([1e-6, 0.0])
-    crossings = visible.layer.crossings(point - beside, point + beside)
+    micrometre = np.array([1e-6, 0.0])
+    crossings = visible.layer.crossings(point - micrometre, point + micrometre)
     return bool(is_covered(crossings, np.array([0.5]))[0])
 
 

@@ -430,5 +430,5 @@ class RulerEdges(VisionOperation[Edges]):
 def _cubic_spline(distance: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     """Return the cubic B-spline of a distance [samples]: the overlap integral of two triangles at this distance."""
     far = np.abs(distance).astype(np.float64)
-    near = 2.0 / 3.0 - far**2 + 0.5 * far**3
-    return np.asarray(np.where(far < 1.0, near, np.maximum(2.0 - far, 0.0) ** 3 / 6.0))
+    inner = 2.0 / 3.0 - far**2 + 0.5 * far**3
+    return np.asarray(np.where(far < 1.0, inner, np.maximum(2.0 - far, 0.0) ** 3 / 6.0))

@@ -177,16 +177,19 @@ def _greedy(
         free &= price <= budget
         if not free.any():
             return np.array(chosen, dtype=np.int64)
-        seen, also = rows @ covariance, second @ covariance
+        first_gain, also = rows @ covariance, second @ covariance
         # The determinant of I + w R C R', R the two rows of a fiducial; the second row of a ruler is 0.
-        one, two = (1 + weight * np.einsum("ij,ij->i", *each) for each in ((seen, rows), (also, second)))
-        mixed = weight * np.einsum("ij,ij->i", seen, second)
+        one, two = (1 + weight * np.einsum("ij,ij->i", *each) for each in ((first_gain, rows), (also, second)))
+        mixed = weight * np.einsum("ij,ij->i", first_gain, second)
         total = one * two - mixed**2
         if criterion == "determinant":
             # Information of the pose alone: without the information of the etch bias.
             gain = np.log(total) - np.log1p(weight * rows[:, 3] ** 2 / etch_information)
         else:
-            products = [np.sum(a[:, :2] * b[:, :2], axis=1) for a, b in ((seen, seen), (seen, also), (also, also))]
+            products = [
+                np.sum(a[:, :2] * b[:, :2], axis=1)
+                for a, b in ((first_gain, first_gain), (first_gain, also), (also, also))
+            ]
             gain = weight * (two * products[0] - 2 * mixed * products[1] + one * products[2]) / total
         best = int(np.argmax(np.where(free, gain / price, -np.inf)))
         chosen.append(best)

@@ -108,9 +108,9 @@ def evidence(
     ends = np.asarray(paths, np.float64)
     density = len(found) / float(np.sum(np.hypot(*(ends[:, 2:] - ends[:, :2]).T)))
     windows = 2.0 * half_line_width * float(np.mean(1.0 / crossings.sines)) if len(crossings.sines) else 0.0
-    met = 1.0 - math.exp(-density * windows)
-    seen = (detected_fraction(crossings, found, half_line_width) - met) / max(1.0 - met, 1e-3)
-    return Evidence(nfa, on_lines, len(crossings.sines), seen)
+    by_chance = 1.0 - math.exp(-density * windows)
+    detected = (detected_fraction(crossings, found, half_line_width) - by_chance) / max(1.0 - by_chance, 1e-3)
+    return Evidence(nfa, on_lines, len(crossings.sines), detected)
 
 
 def log_nfa(distances: npt.ArrayLike, field: Field, *, scale: float, max_range: float, margin: float | None) -> float:
@@ -180,19 +180,19 @@ def distances_to_lines(field: Field, places: npt.ArrayLike) -> Float64:
         away.append(np.hypot(x - x0 - along * dx, y - y0 - along * dy).min(axis=-1))
     for each in field.arcs:
         u, v = x[..., 0] - each.x, y[..., 0] - each.y
-        within = np.mod(np.arctan2(v, u) - each.start, 2.0 * math.pi) <= each.end - each.start
+        in_opening = np.mod(np.arctan2(v, u) - each.start, 2.0 * math.pi) <= each.end - each.start
         ends = [
             np.hypot(u - each.radius * math.cos(end), v - each.radius * math.sin(end)) for end in (each.start, each.end)
         ]
-        away.append(np.where(within, np.abs(np.hypot(u, v) - each.radius), np.minimum(*ends)))
+        away.append(np.where(in_opening, np.abs(np.hypot(u, v) - each.radius), np.minimum(*ends)))
     return np.asarray(np.min(away, axis=0))
 
 
 def robot_to_field(points: npt.ArrayLike, pose: npt.ArrayLike) -> Float64:
     """Return places (..., 2) in the robot's frame as places on the field."""
     x, y, heading = np.asarray(pose, np.float64)
-    turn = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
-    return np.asarray(np.asarray(points, np.float64) @ turn.T + (x, y))
+    rotation = np.array([[math.cos(heading), -math.sin(heading)], [math.sin(heading), math.cos(heading)]])
+    return np.asarray(np.asarray(points, np.float64) @ rotation.T + (x, y))
 
 
 def expected_crossings(field: Field, pose: npt.ArrayLike, paths: npt.ArrayLike, *, line_width: float) -> Crossings:
@@ -214,10 +214,10 @@ def expected_crossings(field: Field, pose: npt.ArrayLike, paths: npt.ArrayLike, 
     ends = np.asarray(paths, np.float64).reshape(-1, 2, 2)
     start, end = np.moveaxis(robot_to_field(ends, pose), 1, 0)
     length = np.linalg.norm(end - start, axis=-1)
-    way = (end - start) / np.maximum(length, 1e-12)[:, None]
-    found = [_across_line(start, way, each, line_width) for each in field.lines]
+    direction = (end - start) / np.maximum(length, 1e-12)[:, None]
+    found = [_across_line(start, direction, each, line_width) for each in field.lines]
     found += [
-        _across_arc(start, way, (each.x, each.y, each.radius, each.start, each.end), sign, line_width)
+        _across_arc(start, direction, (each.x, each.y, each.radius, each.start, each.end), sign, line_width)
         for each in field.arcs
         for sign in (-1.0, 1.0)
     ]
@@ -236,11 +236,11 @@ def detected_fraction(crossings: Crossings, points: npt.ArrayLike, tolerance: fl
     """Return the share of the crossings with a point within ``tolerance`` [m] of the line; NaN without crossings."""
     if not len(crossings.places):
         return math.nan
-    seen = [
+    detected = [
         bool(np.any(np.hypot(*(np.asarray(points) - place).T) * sine <= tolerance))
         for place, sine in zip(crossings.places, crossings.sines, strict=True)
     ]
-    return float(np.mean(seen))
+    return float(np.mean(detected))
 
 
 _Found = tuple[npt.NDArray[np.intp], Float64, Float64, npt.NDArray[np.bool_]]
@@ -265,12 +265,12 @@ def _across_arc(start: Float64, way: Float64, arc: tuple[float, ...], sign: floa
     """Return the same for an arc: crossings into its circle (sign -1) or out of it (sign 1)."""
     x, y, radius, first, last = arc
     dx, dy = x - start[:, 0], y - start[:, 1]
-    ahead, aside = dx * way[:, 0] + dy * way[:, 1], dy * way[:, 0] - dx * way[:, 1]
-    half = np.sqrt(np.maximum(radius**2 - aside**2, 0.0))
+    ahead, across = dx * way[:, 0] + dy * way[:, 1], dy * way[:, 0] - dx * way[:, 1]
+    half = np.sqrt(np.maximum(radius**2 - across**2, 0.0))
     away = ahead + sign * half
     angle = np.arctan2(away * way[:, 1] - dy, away * way[:, 0] - dx)
     opening, ends = last - first, line_width / radius
     turned = np.mod(angle - first, 2.0 * math.pi)
-    crossed = (np.abs(aside) < radius) & (turned <= opening)
+    crossed = (np.abs(across) < radius) & (turned <= opening)
     clear = (turned > ends) & (turned < opening - ends) | (opening > 2.0 * math.pi - 1e-9)
     return np.flatnonzero(crossed), away[crossed], (half / radius)[crossed], clear[crossed]

@@ -192,10 +192,10 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
         least_of_block = to_numpy(costs.least)
         least = least_of_block.ravel().copy()
         least[~np.isfinite(least)] = np.inf
-        turn, row, _ = np.unravel_index(np.arange(least.size), least_of_block.shape)
+        heading, row, _ = np.unravel_index(np.arange(least.size), least_of_block.shape)
         x0, y0 = self.map.first_position
         x, y = x0 + self.map.cell * to_numpy(costs.column).ravel(), y0 + self.map.cell * row
-        angles = self.angles[turn]
+        angles = self.angles[heading]
         chosen: list[int] = []
         while len(chosen) < max_candidates:
             number = int(np.argmin(least))
@@ -441,8 +441,8 @@ def _index_of_twin(pose: npt.NDArray[np.float64], poses: list[npt.NDArray[np.flo
 
 def _same(pose: npt.NDArray[Any], other: npt.NDArray[Any]) -> bool:
     """Return whether two poses are equal to 3 cm and 0.02 rad (chosen: refinements of one minimum end nearer)."""
-    dx, dy, turn = np.asarray(pose, np.float64) - other
-    return bool(math.hypot(dx, dy) < 0.03 and abs(_wrapped(turn)) < 0.02)
+    dx, dy, angle = np.asarray(pose, np.float64) - other
+    return bool(math.hypot(dx, dy) < 0.03 and abs(_wrapped(angle)) < 0.02)
 
 
 def _wrapped(angle: Any) -> Any:

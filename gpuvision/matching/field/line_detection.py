@@ -96,9 +96,9 @@ def scan_top_view(
         )
     rulers = stripe_ruler(white, width_px, threshold, view.model)
     starts, ends = _rays(view, rays, blind)
-    ways = (ends - starts) / np.linalg.norm(ends - starts, axis=-1, keepdims=True)
+    directions = (ends - starts) / np.linalg.norm(ends - starts, axis=-1, keepdims=True)
     # Near a ruler's ends no edge is found: the rulers extend by this much beyond the scanned part of a ray.
-    unseen = end_margin_px(rulers) * ways
+    unseen = end_margin_px(rulers) * directions
     pieces, path = place_rulers_along(starts - unseen, ends, rulers, width_px)
     if not len(pieces):
         raise ValueError(
@@ -166,9 +166,9 @@ def place_rulers_along(
         far = float(np.linalg.norm(end - start))
         if not far >= length:
             continue
-        way = (end - start) / far
+        direction = (end - start) / far
         middles = [*np.arange(length / 2, far - length / 2, hop), far - length / 2]
-        rulers_along += [(*(start + middle * way), *way) for middle in middles]
+        rulers_along += [(*(start + middle * direction), *direction) for middle in middles]
         path += [number] * len(middles)
     return np.array(rulers_along, np.float32).reshape(-1, 4), np.array(path, np.intp)
 
@@ -177,21 +177,21 @@ def unique_points(points: Float64, path: npt.NDArray[Any], away: Float64, line_w
     """Return the indices of the points without duplicates of overlapping rulers, sorted along their scan lines."""
     order = np.lexsort((away, path))
     points, path = points[order], path[order]
-    gone = np.zeros(len(points), np.bool_)
+    removed = np.zeros(len(points), np.bool_)
     if len(points) > 1:
-        gone[1:] = (np.hypot(*(points[1:] - points[:-1]).T) < 0.5 * line_width) & (path[1:] == path[:-1])
-    return order[~gone]
+        removed[1:] = (np.hypot(*(points[1:] - points[:-1]).T) < 0.5 * line_width) & (path[1:] == path[:-1])
+    return order[~removed]
 
 
 def _rays(view: BoardView, rays: int, blind: float) -> tuple[Float64, Float64]:
     """Return where rays from the centre of a view begin and where they leave the image, (n, 2) each [px]."""
     turns = np.arange(rays) * (2 * math.pi / rays)
-    ways = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    directions = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     away = np.arange(math.ceil(0.5 * math.hypot(*view.shape)) + 2)
-    inside = view.contains(view.to_plane(view.centre_px + away[:, None, None] * ways), _MARGIN_PX)
+    inside = view.contains(view.to_plane(view.centre_px + away[:, None, None] * directions), _MARGIN_PX)
     last = np.where(inside.all(axis=0), len(away), np.argmin(inside, axis=0)) - 1.0
     first = blind / view.scale
-    starts, ends = view.centre_px + first * ways, view.centre_px + last[:, None] * ways
+    starts, ends = view.centre_px + first * directions, view.centre_px + last[:, None] * directions
     ahead = last > first
     return starts[ahead], ends[ahead]
 
@@ -271,24 +271,24 @@ def _scan_lines(camera: MountedCamera, shape: tuple[int, ...], lines: int, max_r
     """Return scan lines on the floor, (lines, samples, 2) [m]: rays from below the camera, and lines across them."""
     rows, columns = shape
     grid = np.stack(np.meshgrid(np.linspace(0, columns - 1, 64), np.linspace(0, rows - 1, 64)), axis=-1)
-    seen = (
+    on_floor = (
         camera.to_floor(grid if camera.model is None else camera.model.undistort(grid)).reshape(-1, 2) - camera.position
     )
-    far = np.hypot(*seen.T)
-    seen = seen[far <= max_range]
-    if not len(seen):
+    far = np.hypot(*on_floor.T)
+    on_floor = on_floor[far <= max_range]
+    if not len(on_floor):
         return np.empty((0, _SAMPLES, 2))
-    far = np.hypot(*seen.T)
+    far = np.hypot(*on_floor.T)
     # Evenly spaced in the angle below the camera, about as the pixels are.
     angle = np.linspace(np.arctan(far.min() / camera.height), np.arctan(far.max() / camera.height), _SAMPLES)
     c, s = math.cos(camera.heading), math.sin(camera.heading)
-    ahead, aside = seen @ (c, s), seen @ (-s, c)
-    turn = np.arctan2(aside, ahead)
-    turns = np.linspace(turn.min(), turn.max(), lines) + camera.heading
+    ahead, left = on_floor @ (c, s), on_floor @ (-s, c)
+    bearing = np.arctan2(left, ahead)
+    turns = np.linspace(bearing.min(), bearing.max(), lines) + camera.heading
     rays = camera.height * np.tan(angle)[:, None] * np.stack([np.cos(turns), np.sin(turns)], axis=-1)[:, None]
     nearest, farthest = (math.atan(each / camera.height) for each in (float(ahead.min()), float(ahead.max())))
     tilts = np.linspace(nearest, farthest, 2 * lines)
-    wide = np.linspace(aside.min(), aside.max(), _SAMPLES)
+    wide = np.linspace(left.min(), left.max(), _SAMPLES)
     across = camera.height * np.tan(tilts)[:, None, None] * np.array([c, s]) + wide[:, None] * np.array([-s, c])
     return np.asarray(camera.position + np.concatenate([rays, across]))
 
@@ -335,14 +335,16 @@ def _octave(
         return None
     starts = np.array([each.start for each in runs])
     far = np.linalg.norm([each.end - each.start for each in runs], axis=-1)
-    ways = np.array([each.end - each.start for each in runs]) / far[:, None]
+    directions = np.array([each.end - each.start for each in runs]) / far[:, None]
     room = np.array(rooms)
-    pieces, path = place_rulers_along(starts + room[:, :1] * ways, starts + room[:, 1:2] * ways, rulers, wide)
+    pieces, path = place_rulers_along(
+        starts + room[:, :1] * directions, starts + room[:, 1:2] * directions, rulers, wide
+    )
     edges = rulers(white, pieces, device=device)
     assert edges.spacing is not None
     position, sigma, spacing = to_numpy(edges.position), to_numpy(edges.sigma), to_numpy(edges.spacing)
     places = pieces[:, None, :2] + position[..., None] * pieces[:, None, 2:]
-    away = np.sum((places - starts[path][:, None]) * ways[path][:, None], axis=-1)
+    away = np.sum((places - starts[path][:, None]) * directions[path][:, None], axis=-1)
     with np.errstate(invalid="ignore"):
         found = (away >= 0.0) & (away < far[path][:, None])
     half = 0.5 * spacing[found][:, None] * np.broadcast_to(pieces[:, None, 2:], places.shape)[found]
@@ -353,12 +355,12 @@ def _octave(
     number = np.broadcast_to(path[:, None], found.shape)[found][good]
     kept = unique_points(points, number, away[found][good], line_width)
     per_px = (size / spacing[found])[good]
-    ends = [camera.to_floor(starts + room[:, which, None] * ways) for which in (2, 3)]
-    whole = room[:, 3] > room[:, 2]
+    ends = [camera.to_floor(starts + room[:, which, None] * directions) for which in (2, 3)]
+    is_valid = room[:, 3] > room[:, 2]
     return FloorScan(
         points=np.ascontiguousarray(points[kept], np.float32),
         sigmas=np.ascontiguousarray((per_px * sigma[found][good])[kept], np.float32),
-        paths=np.ascontiguousarray(np.concatenate(ends, axis=-1)[whole], np.float32),
+        paths=np.ascontiguousarray(np.concatenate(ends, axis=-1)[is_valid], np.float32),
         line_width=line_width,
     )
 

@@ -68,8 +68,8 @@ class LocatedRobot:
     def _line(self, number: int) -> str:
         each = self.candidates[number]
         x, y, heading = each.pose
-        sx, sy, turn = np.sqrt(np.diag(each.covariance))
-        sigmas = f"sigmas {1e3 * sx:.2g} mm, {1e3 * sy:.2g} mm, {math.degrees(turn):.2g} degrees"
+        sx, sy, sigma_heading = np.sqrt(np.diag(each.covariance))
+        sigmas = f"sigmas {1e3 * sx:.2g} mm, {1e3 * sy:.2g} mm, {math.degrees(sigma_heading):.2g} degrees"
         if each.status & Status.AMBIGUOUS:
             sigmas = "the points fix a part of it only"
         symmetric_twin = "" if each.symmetric_twin is None else f"; twin of {each.symmetric_twin + 1}"

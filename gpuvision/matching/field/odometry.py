@@ -45,7 +45,7 @@ def predict(estimate: PoseEstimate, motion: npt.ArrayLike, covariance: npt.Array
     -----
     The covariances are propagated with the Jacobian of the motion: to first order in the uncertainty of the heading.
     """
-    forward, left, turn = numbers(motion, (3,), "motion")
+    forward, left, rotation = numbers(motion, (3,), "motion")
     noise = np.array(numbers(covariance, (3, 3), "covariance"))
     x, y, heading = estimate.pose
     c, s = math.cos(heading), math.sin(heading)
@@ -53,7 +53,7 @@ def predict(estimate: PoseEstimate, motion: npt.ArrayLike, covariance: npt.Array
     by_pose = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     by_motion = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     moved = by_pose @ estimate.covariance @ by_pose.T + by_motion @ noise @ by_motion.T
-    return PoseEstimate(np.array([x + dx, y + dy, _wrapped(heading + turn)]), moved)
+    return PoseEstimate(np.array([x + dx, y + dy, _wrapped(heading + rotation)]), moved)
 
 
 def squared_mahalanobis_distance(estimate: PoseEstimate, pose: npt.ArrayLike, information: npt.ArrayLike) -> float:
@@ -75,10 +75,10 @@ def squared_mahalanobis_distance(estimate: PoseEstimate, pose: npt.ArrayLike, in
         (3, 3) inverse of the covariance of the measured pose.
     """
     view, measured = np.array(numbers(pose, (3,), "pose")), np.array(numbers(information, (3, 3), "information"))
-    off = view - estimate.pose
-    off[2] = _wrapped(off[2])
+    difference = view - estimate.pose
+    difference[2] = _wrapped(difference[2])
     # (P + I^-1)^-1 = (1 + I P)^-1 I, which needs no inverse of I.
-    return float(off @ np.linalg.solve(np.eye(3) + measured @ estimate.covariance, measured @ off))
+    return float(difference @ np.linalg.solve(np.eye(3) + measured @ estimate.covariance, measured @ difference))
 
 
 def correct(estimate: PoseEstimate, pose: npt.ArrayLike, information: npt.ArrayLike) -> PoseEstimate:
@@ -95,11 +95,11 @@ def correct(estimate: PoseEstimate, pose: npt.ArrayLike, information: npt.ArrayL
         pose is corrected only in the directions that were measured.
     """
     view, measured = np.array(numbers(pose, (3,), "pose")), np.array(numbers(information, (3, 3), "information"))
-    off = view - estimate.pose
-    off[2] = _wrapped(off[2])
+    difference = view - estimate.pose
+    difference[2] = _wrapped(difference[2])
     left = np.linalg.solve(np.eye(3) + estimate.covariance @ measured, estimate.covariance)
     known = 0.5 * (left + left.T)
-    corrected = estimate.pose + known @ measured @ off
+    corrected = estimate.pose + known @ measured @ difference
     corrected[2] = _wrapped(corrected[2])
     return PoseEstimate(corrected, known)
 

@@ -153,9 +153,11 @@ class _ScoredMotion(NamedTuple):
         if self.score >= limits.min_ratio * other.score:
             return True
         both = self.inside & other.inside
-        own = np.count_nonzero(both & self.agrees & ~other.agrees)
+        only_self = np.count_nonzero(both & self.agrees & ~other.agrees)
         its = np.count_nonzero(both & other.agrees & ~self.agrees)
-        return bool(own >= max(limits.min_ratio * its, its + limits.significance * math.sqrt(own + its), 1.0))
+        return bool(
+            only_self >= max(limits.min_ratio * its, its + limits.significance * math.sqrt(only_self + its), 1.0)
+        )
 
 
 class _MeasuredRulers(NamedTuple):
@@ -468,9 +470,9 @@ def _fill_border(level: npt.NDArray[np.uint16], border: int, border_cost: float)
     patterns they do so even at the mean cost. Below half the mean cost, poses that keep few edges in the image win.
     """
     inside = (slice(None), slice(border, -border), slice(border, -border))
-    own = level[inside].copy()
-    level[:] = np.rint(border_cost * own.mean(axis=(1, 2)))[:, None, None]
-    level[inside] = own
+    inside_levels = level[inside].copy()
+    level[:] = np.rint(border_cost * inside_levels.mean(axis=(1, 2)))[:, None, None]
+    level[inside] = inside_levels
 
 
 def _select_found(rows: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -478,10 +480,10 @@ def _select_found(rows: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
     Missing rows would waste start candidates of the robust fit.
     """
-    there = np.flatnonzero(np.all(np.isfinite(rows), axis=1))
-    if not len(there):
+    found_rows = np.flatnonzero(np.all(np.isfinite(rows), axis=1))
+    if not len(found_rows):
         return np.full((_REFINEMENT_ROWS, rows.shape[1]), np.nan, np.float32)
-    return rows[there[np.arange(_REFINEMENT_ROWS) * len(there) // _REFINEMENT_ROWS]]
+    return rows[found_rows[np.arange(_REFINEMENT_ROWS) * len(found_rows) // _REFINEMENT_ROWS]]
 
 
 _NOT_FOUND = Registration(

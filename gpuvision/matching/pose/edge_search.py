@@ -303,6 +303,6 @@ def find_best_shifts(
             break
         chosen.append(number)
         scores.append(float(least[number]))
-        near = (np.abs(down - down[number]) <= separation[0]) & (np.abs(right - right[number]) <= separation[0])
-        least[near & (np.abs(heading - heading[number]) <= separation[1])] = np.inf
+        neighbours = (np.abs(down - down[number]) <= separation[0]) & (np.abs(right - right[number]) <= separation[0])
+        least[neighbours & (np.abs(heading - heading[number]) <= separation[1])] = np.inf
     return GridShifts(heading[chosen], np.stack([right[chosen], down[chosen]], axis=-1), np.array(scores))

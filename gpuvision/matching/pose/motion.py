@@ -36,9 +36,9 @@ def rotation(angle: float) -> Float64:
 def move_edges(edges: KnownEdges, motions: list[Float64], placement: tuple[float, float]) -> KnownEdges:
     """Return the edges under each motion, (k, n, 2) points and unit normals."""
     motion = np.stack(motions)
-    turn = motion[..., :2]
-    normal = edges.normal @ np.linalg.inv(turn)
-    point = (edges.point - placement) @ turn.swapaxes(1, 2) + motion[:, None, :, 2]
+    linear = motion[..., :2]
+    normal = edges.normal @ np.linalg.inv(linear)
+    point = (edges.point - placement) @ linear.swapaxes(1, 2) + motion[:, None, :, 2]
     return KnownEdges(point, normal / np.hypot(normal[..., 0], normal[..., 1])[..., None])
 
 
@@ -66,8 +66,8 @@ def compose(motion: Float64, pose: npt.ArrayLike, deformation: npt.ArrayLike) ->
     """Return a motion followed by a pose (3,) with a deformation (3,), both about the measured placement point."""
     x, y, theta = np.asarray(pose, np.float64)
     kx, ky, shear = np.asarray(deformation, np.float64)
-    turn = rotation(theta) @ np.array([[1.0 + kx, shear], [0.0, 1.0 + ky]])
-    return np.column_stack([turn @ motion[:, :2], motion[:, 2] + (x, y)])
+    linear = rotation(theta) @ np.array([[1.0 + kx, shear], [0.0, 1.0 + ky]])
+    return np.column_stack([linear @ motion[:, :2], motion[:, 2] + (x, y)])
 
 
 def decompose(motion: Float64, placement: tuple[float, float]) -> tuple[Float64, Float64]:

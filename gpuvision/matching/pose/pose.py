@@ -185,9 +185,9 @@ def fitted_line_rows(normal: Any, point: Any, centre: Any, covariance: Any, angl
     angle = np.asarray(angle, np.float64)
     rows = []
     for side in (-1.0, 1.0):
-        way = (side * reach)[..., None]
+        offset = (side * reach)[..., None]
         turned = along * np.cos(angle)[..., None] + normal * np.sin(angle)[..., None]
-        rows.append(line_rows(normal, foot + way * along, centre + way * turned, np.sqrt(2.0 * variance)))
+        rows.append(line_rows(normal, foot + offset * along, centre + offset * turned, np.sqrt(2.0 * variance)))
     return np.stack(rows, axis=1).reshape(-1, len(ROW))
 
 

@@ -98,10 +98,12 @@ def prepare_board_registration(
     corners = np.array([(0, 0), (columns - 1, 0), (0, rows - 1), (columns - 1, rows - 1)], np.float64)
     if matrix.shape != (3, 3) or np.linalg.matrix_rank(matrix) < 3:
         raise ValueError("board_to_image must be 3 x 3 and invertible")
-    seen = apply_homography(np.asarray(np.linalg.inv(matrix)), np.concatenate([corners, corners.mean(axis=0)[None]]))
-    place = tuple(seen[4]) if placement is None else placement
-    pixel = math.sqrt(abs(_area(seen[:4])) / max((columns - 1) * (rows - 1), 1))
-    low, high = seen[:4].min(axis=0), seen[:4].max(axis=0)
+    view_corners = apply_homography(
+        np.asarray(np.linalg.inv(matrix)), np.concatenate([corners, corners.mean(axis=0)[None]])
+    )
+    place = tuple(view_corners[4]) if placement is None else placement
+    pixel = math.sqrt(abs(_area(view_corners[:4])) / max((columns - 1) * (rows - 1), 1))
+    low, high = view_corners[:4].min(axis=0), view_corners[:4].max(axis=0)
     reach = shift + 2.0 * math.sin(min(angle, math.pi) / 2.0) * np.hypot(*(high - low)) / 2.0
     region = (low - reach, high + reach)
     smoothing_px = best_smoothing(blur_px)
@@ -155,10 +157,10 @@ def _edge_points(artwork: Artwork, low: Float64, high: Float64, step: float) -> 
     normals = [edges.normal[which]]
     for pad in artwork.pads:
         if pad.shape == "circle" and not pad.opening < 0.0:
-            turn = np.linspace(0.0, 2.0 * math.pi, math.ceil(math.pi * pad.size[0] / step), endpoint=False)
-            way = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-            points.append(pad.centre + 0.5 * pad.size[0] * way)
-            normals.append(way)
+            angle = np.linspace(0.0, 2.0 * math.pi, math.ceil(math.pi * pad.size[0] / step), endpoint=False)
+            direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            points.append(pad.centre + 0.5 * pad.size[0] * direction)
+            normals.append(direction)
     point, normal = np.concatenate(points), np.concatenate(normals)
     inside = np.flatnonzero(np.all((point >= low) & (point <= high), axis=1))
     chosen = _some(inside, _MAX_POINTS)
@@ -254,7 +256,7 @@ def find_template_edges(template: npt.NDArray[Any], ruler: RulerEdges, *, device
         Where to run; None: `Device.best`.
     """
     smooth = cv2.GaussianBlur(template.astype(np.float32), (0, 0), ruler.smoothing_px, borderType=cv2.BORDER_REPLICATE)
-    gradient = np.stack([cv2.Scharr(smooth, cv2.CV_32F, *way, scale=1 / 32) for way in ((1, 0), (0, 1))], axis=-1)
+    gradient = np.stack([cv2.Scharr(smooth, cv2.CV_32F, *order, scale=1 / 32) for order in ((1, 0), (0, 1))], axis=-1)
     steep = np.hypot(gradient[..., 0], gradient[..., 1])
     rows, columns = (each // _TILE_PX for each in steep.shape)
     tiles = steep[: rows * _TILE_PX, : columns * _TILE_PX].reshape(rows, _TILE_PX, columns, _TILE_PX).swapaxes(1, 2)
@@ -266,13 +268,13 @@ def find_template_edges(template: npt.NDArray[Any], ruler: RulerEdges, *, device
     height = np.hypot(*slope.T)
     # Half of the gradient of a sharp step of the threshold: the ruler makes the decision.
     good = height > 0.5 * ruler.threshold / (math.sqrt(2.0 * math.pi) * ruler.smoothing_px)
-    at, way = at[good].astype(np.float64), slope[good] / height[good, None]
+    at, order = at[good].astype(np.float64), slope[good] / height[good, None]
     if not len(at):
         return KnownEdges(np.empty((0, 2)), np.empty((0, 2)))
     taps = math.ceil(3.0 * ruler.smoothing_px / ruler.step_px)
     across = replace(ruler, length=2 * taps + 9)
-    edges = across(template, np.concatenate([at, way], axis=1).astype(np.float32), device=device)
+    edges = across(template, np.concatenate([at, order], axis=1).astype(np.float32), device=device)
     position = to_numpy(edges.position)
     kept = np.flatnonzero((to_numpy(edges.status) == 0) & (np.abs(position) < _MAX_OFFSET_PX))
     kept = np.random.default_rng(len(kept)).permutation(kept)
-    return KnownEdges(at[kept] + position[kept, None] * way[kept], way[kept])
+    return KnownEdges(at[kept] + position[kept, None] * order[kept], order[kept])

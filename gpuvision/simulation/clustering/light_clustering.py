@@ -449,10 +449,10 @@ def _select_lights(
             variant=clustering.variant,
         )
         found = operation(receivers, costs, shares, rows, spans, placed, frame, device=device)
-        most = int(to_numpy(found.counts).max(initial=0))
-        if most <= clustering._capacity_used[0]:
+        max_count = int(to_numpy(found.counts).max(initial=0))
+        if max_count <= clustering._capacity_used[0]:
             return found
-        clustering._capacity_used[0] = capacity(most)
+        clustering._capacity_used[0] = capacity(max_count)
 
 
 def _segment_rows(segments: Reals, middle: Reals) -> Reals:

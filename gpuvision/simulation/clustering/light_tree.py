@@ -139,9 +139,9 @@ def _build_order(lit: _SegmentTable, levels: int) -> Integers:
         sizes = np.diff(edges)
         starts, sizes = edges[:-1][sizes > 0], sizes[sizes > 0]
         owner = np.repeat(np.arange(len(starts)), sizes)
-        here = keys[order]
-        widest = np.argmax(np.maximum.reduceat(here, starts) - np.minimum.reduceat(here, starts), axis=1)
-        order = order[np.lexsort((here[np.arange(count), widest[owner]], owner))]
+        level_keys = keys[order]
+        widest = np.argmax(np.maximum.reduceat(level_keys, starts) - np.minimum.reduceat(level_keys, starts), axis=1)
+        order = order[np.lexsort((level_keys[np.arange(count), widest[owner]], owner))]
     return order
 
 
@@ -171,10 +171,10 @@ def _fill_nodes(
     parallel = np.where(lean[owner] > _MIN_COSINE, weight * cosine, weight)
     centre = sums(parallel[:, None] * middle) / sums(parallel)[:, None]
     at = middle - centre[owner]
-    aside = normal - cosine[:, None] * face
+    tangential = normal - cosine[:, None] * face
     square, fourth = _mean_distance_powers(at, half)
-    tilt = np.sqrt(_dot(aside, aside))
-    skew = sums((weight[:, None] * aside)[:, :, None] * at[:, None, :])
+    tilt = np.sqrt(_dot(tangential, tangential))
+    skew = sums((weight[:, None] * tangential)[:, :, None] * at[:, None, :])
     spread = sums(parallel[:, None, None] * (at[:, :, None] * at[:, None, :] + half[:, :, None] * half[:, None, :] / 3))
     one, other = at - half, at + half
     reach = np.sqrt(np.maximum.reduceat(np.maximum(_dot(one, one), _dot(other, other)), begin))
@@ -184,7 +184,7 @@ def _fill_nodes(
     slab = np.maximum.reduceat(np.maximum(np.abs(_dot(one, face)), np.abs(_dot(other, face))), begin)
     low = np.minimum.reduceat(np.minimum(one, other), begin)
     high = np.maximum.reduceat(np.maximum(one, other), begin)
-    turn = normal - face
+    deviation = normal - face
     scale, each = np.where(total > 0.0, total / mass, 0.0), np.where(total > 0.0, 1.0 / mass, 0.0)
     parts = {
         "centre": centre,
@@ -192,7 +192,7 @@ def _fill_nodes(
         "high": centre + np.maximum(high, np.abs(arm)),
         "normal": facing,
         "radius": np.maximum(reach, arm_size),
-        "spread": np.sqrt(np.maximum.reduceat(_dot(turn, turn), begin)),
+        "spread": np.sqrt(np.maximum.reduceat(_dot(deviation, deviation), begin)),
         "max_height": np.maximum.reduceat(height, begin),
         "min_height": np.minimum.reduceat(height, begin),
         "slab": slab,

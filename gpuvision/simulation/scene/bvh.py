@@ -155,8 +155,8 @@ class Bvh:
         nodes = self.boxes.copy()
         nodes[:, :3] -= pad
         nodes[:, 3:] += pad
-        whole = np.concatenate([self.corners, np.zeros((1, 3, 3))])
-        leaves = whole[self.members].transpose(0, 2, 3, 1)
+        padded = np.concatenate([self.corners, np.zeros((1, 3, 3))])
+        leaves = padded[self.members].transpose(0, 2, 3, 1)
         return (
             nodes.astype(real),
             self.children,
@@ -197,8 +197,8 @@ def _bundles(extents: Reals) -> _Bundles:
     begins[::4] = True
     first = np.flatnonzero(begins[: len(order)])
     size = np.diff(first, append=len(order))
-    whole = np.where(is_four[first], fours[:, first // 4], np.where(size == 2, pairs[:, first // 2], one[:, first]))
-    return _Bundles(order, first, size, whole)
+    is_bundle = np.where(is_four[first], fours[:, first // 4], np.where(size == 2, pairs[:, first // 2], one[:, first]))
+    return _Bundles(order, first, size, is_bundle)
 
 
 def _morton_order(extents: Reals) -> Integers:

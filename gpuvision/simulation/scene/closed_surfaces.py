@@ -75,15 +75,15 @@ def visible_sides(
     one, two = face[first[joined]], face[second[joined]]
     links = coo_array((np.ones(len(one), np.int8), (one, two)), shape=(len(triangles), len(triangles)))
     count, part = connected_components(links, directed=False)
-    whole = np.bincount(part, ~closed[number].reshape(-1, 3).all(axis=1), minlength=count) == 0
+    is_closed = np.bincount(part, ~closed[number].reshape(-1, 3).all(axis=1), minlength=count) == 0
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, part, corners.min(axis=1))
     np.maximum.at(high, part, corners.max(axis=1))
     from_low = corners - low[part][:, None]
     volume = np.bincount(part, np.linalg.det(from_low) / 6.0, minlength=count)
-    whole &= np.abs(volume) > limits.min_volume_fraction * np.prod(high - low, axis=1)
-    whole &= ~_line_meets_boxes(np.asarray(eye, np.float64), np.asarray(direction, np.float64), low, high)
-    sides[triangles] = np.where(whole, np.sign(volume), 0.0)[part]
+    is_closed &= np.abs(volume) > limits.min_volume_fraction * np.prod(high - low, axis=1)
+    is_closed &= ~_line_meets_boxes(np.asarray(eye, np.float64), np.asarray(direction, np.float64), low, high)
+    sides[triangles] = np.where(is_closed, np.sign(volume), 0.0)[part]
     return sides
 
 
@@ -102,8 +102,8 @@ def vertex_numbers(corners: Float64) -> npt.NDArray[np.int64]:
 def _line_meets_boxes(eye: Float64, direction: Float64, low: Float64, high: Float64) -> npt.NDArray[np.bool_]:
     """Return whether a line meets boxes with lower and upper corners (k, 3), by the slab method."""
     moves = direction != 0.0
-    beside = ((eye < low) | (eye > high))[:, ~moves].any(axis=1)
+    outside = ((eye < low) | (eye > high))[:, ~moves].any(axis=1)
     one, two = ((each[:, moves] - eye[moves]) / direction[moves] for each in (low, high))
     enter, leave = np.minimum(one, two), np.maximum(one, two)
-    met = enter.max(axis=1, initial=-np.inf) <= leave.min(axis=1, initial=np.inf)
-    return np.asarray(met & ~beside)
+    hit = enter.max(axis=1, initial=-np.inf) <= leave.min(axis=1, initial=np.inf)
+    return np.asarray(hit & ~outside)

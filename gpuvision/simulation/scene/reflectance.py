@@ -364,8 +364,8 @@ class Reflectance(VisionOperation[Reflected]):
 
 def _set_number(model: Any, name: str, low: float, high: float) -> None:
     """Store a parameter as a float, after a check of its range."""
-    what = f"{type(model).__name__}.{name}"
-    number = finite(getattr(model, name), what)
+    label = f"{type(model).__name__}.{name}"
+    number = finite(getattr(model, name), label)
     if not low <= number <= high:
-        raise ValueError(f"{what} is {number:g}, expected {low:g} to {high:g}")
+        raise ValueError(f"{label} is {number:g}, expected {low:g} to {high:g}")
     object.__setattr__(model, name, number)

@@ -215,15 +215,15 @@ def _through_windows(exposure: Exposure, windows: Float64, edges: Float64) -> Ex
     """Return the light inside windows (..., samples, 2) over bins with the given edges."""
     low, high = windows[..., :1], windows[..., 1:]
     left, right = edges[:-1], edges[1:]
-    whole, _ = np.broadcast_arrays((low <= left) & (right <= high), exposure.power)
-    power, moment = np.where(whole, exposure.power, 0.0), np.where(whole, exposure.moment, 0.0)
-    cut = np.nonzero(~whole & np.broadcast_to((low < right) & (left < high), whole.shape))
-    low, high = (np.broadcast_to(each, (*whole.shape[:-1], 1))[(*cut[:-1], 0)] for each in (low, high))
-    light = np.broadcast_to(exposure.power, whole.shape)[cut]
+    is_inside, _ = np.broadcast_arrays((low <= left) & (right <= high), exposure.power)
+    power, moment = np.where(is_inside, exposure.power, 0.0), np.where(is_inside, exposure.moment, 0.0)
+    cut = np.nonzero(~is_inside & np.broadcast_to((low < right) & (left < high), is_inside.shape))
+    low, high = (np.broadcast_to(each, (*is_inside.shape[:-1], 1))[(*cut[:-1], 0)] for each in (low, high))
+    light = np.broadcast_to(exposure.power, is_inside.shape)[cut]
     left, right = left[cut[-1]], right[cut[-1]]
     middle, half = 0.5 * (left + right), 0.5 * (right - left)
     with np.errstate(divide="ignore", invalid="ignore"):
-        centre = np.clip(np.broadcast_to(exposure.moment, whole.shape)[cut] / light, -half, half)
+        centre = np.clip(np.broadcast_to(exposure.moment, is_inside.shape)[cut] / light, -half, half)
         reach = half - np.abs(centre)
         first, last = (np.clip(each - middle, centre - reach, centre + reach) for each in (low, high))
         share = np.where(
@@ -326,11 +326,11 @@ def optimise_mask(
     groups = _Groups.of(view, light, np.where(valid, true_u, np.nan), slope, ends, fixed)
     shape = (view.samples, 2) if fixed else (*light.power.shape[:-1], 2)
     mask = Mask(windows=view.u_edges[_best_ends(groups, objective)].reshape(shape))
-    behind, passed = (mask.apply(each, view.u_edges) for each in (light, direct))
+    masked, passed = (mask.apply(each, view.u_edges) for each in (light, direct))
     with np.errstate(invalid="ignore", divide="ignore"):
         before, after = (
             np.where(valid, (each.first_moment(view.u_edges) / each.total() - true_u) * slope, np.nan)
-            for each in (light, behind)
+            for each in (light, masked)
         )
         return MaskOptimisation(mask, before, after, np.where(valid, passed.total() / direct.total(), np.nan))
 

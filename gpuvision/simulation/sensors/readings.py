@@ -275,8 +275,8 @@ def sheet_point(triangulation: Triangulation, u: npt.ArrayLike, v: npt.ArrayLike
     """Return (G, H) [m] of positions on the sensor; NaN beyond the horizon and where the lens is not invertible."""
     lifted = _lifted(triangulation, u, v)[0] @ np.array(triangulation.homography).T
     with np.errstate(divide="ignore", invalid="ignore"):
-        seen = lifted[..., 2] * _front(triangulation) > 0.0
-        sheet = np.where(seen[..., None], lifted[..., :2] / lifted[..., 2:], np.nan)
+        in_front = lifted[..., 2] * _front(triangulation) > 0.0
+        sheet = np.where(in_front[..., None], lifted[..., :2] / lifted[..., 2:], np.nan)
     return sheet[..., 0], sheet[..., 1]
 
 
@@ -300,16 +300,16 @@ def height_secant(triangulation: Triangulation, u: npt.ArrayLike, other_u: npt.A
     matrix = np.array(triangulation.homography)
     one, sensor = _lifted(triangulation, u, v)
     other, _ = _lifted(triangulation, other_u, v)
-    apart = other_u - u
+    distance = other_u - u
     move = np.zeros((*u.shape, 2))
     lens = triangulation.sensor_lens
     if lens is None:
         move[..., 0] = 1.0
     else:
         (low, high), _ = triangulation.region
-        near = np.abs(apart) < _MIN_SECANT * (high - low)
-        safe = np.where(near, 1.0, apart)[..., None]
-        move = np.where(near[..., None], lens.jacobian(sensor)[..., 0], (other - one)[..., :2] / safe)
+        is_close = np.abs(distance) < _MIN_SECANT * (high - low)
+        safe = np.where(is_close, 1.0, distance)[..., None]
+        move = np.where(is_close[..., None], lens.jacobian(sensor)[..., 0], (other - one)[..., :2] / safe)
     turned = np.stack([move[..., 1], -move[..., 0], move[..., 0] * one[..., 1] - move[..., 1] * one[..., 0]], axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = (one @ matrix[2]) * (other @ matrix[2])

@@ -161,9 +161,11 @@ class SensorView:
         """
         rays = np.asarray(points, np.float64) - self.lens_at(L)
         with np.errstate(divide="ignore", invalid="ignore"):
-            way = self._off_sheet / (rays @ self._normal)
-            met = np.where(((way > 0.0) & (rays @ np.array(self.axis) > 0.0))[..., None], way[..., None] * rays, np.nan)
-        return self._in_sheet(met)
+            depth = self._off_sheet / (rays @ self._normal)
+            point = np.where(
+                ((depth > 0.0) & (rays @ np.array(self.axis) > 0.0))[..., None], depth[..., None] * rays, np.nan
+            )
+        return self._in_sheet(point)
 
     def project(self, points: npt.ArrayLike, L: float = 0.0) -> Float64:
         """Return the images (u, v) of points: (..., 3) [m] to (..., 2) [sensor unit]; NaN as in `sheet_coordinates`."""

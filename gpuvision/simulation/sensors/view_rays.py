@@ -102,17 +102,17 @@ class ViewRays:
         self._closest.inputs[0].set(rays.astype(self._closest.inputs[0].dtype))
         hits = self._closest.run()
         triangle = to_numpy(hits.triangle)
-        seen = triangle >= 0
-        at = np.where(seen, triangle, 0)
+        hit = triangle >= 0
+        at = np.where(hit, triangle, 0)
         corner, normal, albedo = (each[at] for each in self._table)
         origin, towards = rays[..., :3], rays[..., 3:]
         # The position is computed again in double: the tracing in single precision only selects the triangle.
         slope = np.sum(normal * towards, axis=-1)
-        way = np.sum(normal * (corner - origin), axis=-1) / np.where(seen, slope, 1.0)
-        places = origin + np.where(seen, way, 0.0)[..., None] * towards
+        distance = np.sum(normal * (corner - origin), axis=-1) / np.where(hit, slope, 1.0)
+        places = origin + np.where(hit, distance, 0.0)[..., None] * towards
         receivers = np.concatenate([places, np.where(slope[..., None] > 0.0, -normal, normal)], axis=-1)
-        receivers = np.where((seen & (self._weights > 0.0))[..., None], receivers, 0.0)
-        return VisibleSurface(receivers, np.where(seen, self._weights * albedo, 0.0), triangle)
+        receivers = np.where((hit & (self._weights > 0.0))[..., None], receivers, 0.0)
+        return VisibleSurface(receivers, np.where(hit, self._weights * albedo, 0.0), triangle)
 
     def exposure(self, seen: VisibleSurface, irradiance: Float64) -> Exposure:
         """Return the exposure of the sensor by irradiated surface elements.
@@ -126,9 +126,9 @@ class ViewRays:
         """
         power = np.where(seen.weights > 0.0, seen.weights * irradiance, 0.0)
         shape = (self.view.samples, self.view.bins, -1)
-        beside = self.u.reshape(self.view.bins, -1) - self.view.u_centres[:, None]
+        offset = self.u.reshape(self.view.bins, -1) - self.view.u_centres[:, None]
         held = power.reshape(shape)
-        return Exposure(held.sum(axis=-1), np.sum(held * beside, axis=-1))
+        return Exposure(held.sum(axis=-1), np.sum(held * offset, axis=-1))
 
 
 def _triangle_table(scene: Scene, materials: Sequence[Material]) -> tuple[Float64, Float64, Float64]:

@@ -157,8 +157,8 @@ class _SlabImage(NamedTuple):
         shape = (self.profiles, view.samples, view.bins)
         made = {}
         for name, power in lights.items():
-            here = power[on][of] * per
-            sums = [np.bincount(at, here * each, minlength=math.prod(shape)) for each in (share, moment)]
+            part_power = power[on][of] * per
+            sums = [np.bincount(at, part_power * each, minlength=math.prod(shape)) for each in (share, moment)]
             made[name] = Exposure(*(np.asarray(each, np.float64).reshape(shape) for each in sums))
         return made
 
@@ -278,17 +278,17 @@ class DirectLight:
         # Both nodes of all parts.
         arriving = (line.power * line.lengths)[parts.segment] * (parts.end - parts.start)
         share = (parts.start + _NODES[:, None] * (parts.end - parts.start)).ravel()
-        segment, seen = np.tile(parts.segment, 2), np.tile(parts.visible, 2)
+        segment, visible = np.tile(parts.segment, 2), np.tile(parts.visible, 2)
         points = points_on(line.ends[segment], share)
         sent = reflect(line, segment, points, np.tile(0.5 * arriving, 2))
-        wanted = {"direct": sent["diffuse"] * seen, "specular": sent["gloss"] * seen}
+        powers = {"direct": sent["diffuse"] * visible, "specular": sent["gloss"] * visible}
         if causes:
-            wanted |= {UNIFORM: sent["even"] * seen, UNOCCLUDED: sent["diffuse"], UNIFORM_UNOCCLUDED: sent["even"]}
+            powers |= {UNIFORM: sent["even"] * visible, UNOCCLUDED: sent["diffuse"], UNIFORM_UNOCCLUDED: sent["even"]}
         uv = images.image_points(segment, share)
         spread = np.zeros(len(share))
         if self.sheet.sigma > 0.0:
             spread = images.u_rates(segment, share, uv, self._shift_per_sigma(line.normals[segment], points))
-        return image.deposit(uv, spread, lit.sheet[segment], wanted)
+        return image.deposit(uv, spread, lit.sheet[segment], powers)
 
     def _expose_highlights(self, lit: _LitSheets, image: _SlabImage) -> Exposure:
         """Return the exposure by light that mirrors reflect straight into the lens."""
@@ -308,9 +308,9 @@ class DirectLight:
             return self._slabs
         places, lengths = SheetIndex.of(self.scene, self.sheet.transport).parallel_edges
         limits = self.limits
-        near = slice(*np.searchsorted(places, [L - limits.edge_sigmas * sigma, L + limits.edge_sigmas * sigma]))
-        longest = np.argsort(-lengths[near], kind="stable")[: limits.max_edges]
-        steps = np.sort((places[near][longest] - L) / sigma)
+        edge_range = slice(*np.searchsorted(places, [L - limits.edge_sigmas * sigma, L + limits.edge_sigmas * sigma]))
+        longest = np.argsort(-lengths[edge_range], kind="stable")[: limits.max_edges]
+        steps = np.sort((places[edge_range][longest] - L) / sigma)
         if not len(steps):
             return self._slabs
         cuts = self._slabs.high[:-1]
@@ -382,8 +382,8 @@ class DirectLight:
         width = widths[self._material(line)][parts.segment]
         ends = parts.ends(line)
         half_way = _unit(self.sheet.direction_to_light(ends) + _unit(np.array(self.view.lens) - ends))
-        turn = np.linalg.norm(half_way[:, 1] - half_way[:, 0], axis=1) / width
-        count = np.clip(np.ceil(turn / self.limits.lobe_turn), 1, self.limits.max_lobe_parts).astype(np.int64)
+        angle = np.linalg.norm(half_way[:, 1] - half_way[:, 0], axis=1) / width
+        count = np.clip(np.ceil(angle / self.limits.lobe_turn), 1, self.limits.max_lobe_parts).astype(np.int64)
         owner, number = np.repeat(np.arange(len(count)), count), concatenated_ranges(np.zeros_like(count), count)
         size = ((parts.end - parts.start) / count)[owner]
         start = parts.start[owner] + number * size
@@ -444,8 +444,8 @@ def _strongest_points(
     order = np.lexsort((-light, ~on, sample))
     sample, places, on = sample[order], places[order], on[order]
     best = np.flatnonzero(np.diff(sample, prepend=-1))
-    own = np.repeat(best, np.diff(best, append=len(sample)))
-    other = on & (np.abs(places - places[own]).max(axis=1, initial=0.0) > same * np.abs(places).max(initial=0.0))
+    group = np.repeat(best, np.diff(best, append=len(sample)))
+    other = on & (np.abs(places - places[group]).max(axis=1, initial=0.0) > same * np.abs(places).max(initial=0.0))
     g, h = np.full(samples, np.nan), np.full(samples, np.nan)
     status = np.full(samples, Status.LOW_SIGNAL, np.uint8)
     status[sample[best]] = np.where(on[best], Status.OK, Status.OUT_OF_RANGE)

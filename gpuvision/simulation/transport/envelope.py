@@ -79,13 +79,13 @@ def _envelope(group: Integers, x: Float64, height: Float64) -> Pieces:
     first_top = owner[_highest_rows(begin, count, at_left, at_right)]
     last_top = owner[_highest_rows(begin, count, at_right, at_left)]
     crossed = np.flatnonzero(first_top != last_top)
-    whole = Pieces(first_top, left, right)
+    pieces = Pieces(first_top, left, right)
     if len(crossed):
         among = _Crossings(x, height, owner, begin[crossed], count[crossed])
-        parts = among.pieces(whole, last_top, crossed)
-        whole = _concatenate([_select(whole, first_top == last_top), parts])
-        whole = _select(whole, np.lexsort((whole.left, group[whole.segment])))
-    return _merge_touching(whole)
+        parts = among.pieces(pieces, last_top, crossed)
+        pieces = _concatenate([_select(pieces, first_top == last_top), parts])
+        pieces = _select(pieces, np.lexsort((pieces.left, group[pieces.segment])))
+    return _merge_touching(pieces)
 
 
 def _envelope_of_halves(group: Integers, x: Float64, height: Float64) -> Pieces:

@@ -90,10 +90,10 @@ class LitLine(NamedTuple):
         kind = np.asarray(kind)
         gap = np.abs(self.ends[1:, 0] - self.ends[:-1, 1]).max(axis=1, initial=0.0)
         size = np.abs(self.ends[1:, 0]).max(axis=1, initial=0.0)
-        turn = np.abs(np.diff(self.normals, axis=0)).max(axis=1, initial=0.0)
-        alike = (gap <= limits.end_gap * size) & (turn <= limits.agreement) & (np.diff(kind) == 0)
-        alike &= np.abs(np.diff(self.power)) <= limits.agreement * self.power[1:]
-        first = np.flatnonzero(np.append(True, ~alike)[: len(self.power)])
+        normal_change = np.abs(np.diff(self.normals, axis=0)).max(axis=1, initial=0.0)
+        mergeable = (gap <= limits.end_gap * size) & (normal_change <= limits.agreement) & (np.diff(kind) == 0)
+        mergeable &= np.abs(np.diff(self.power)) <= limits.agreement * self.power[1:]
+        first = np.flatnonzero(np.append(True, ~mergeable)[: len(self.power)])
         last = np.append(first[1:], len(self.power))[: len(first)] - 1
         ends = np.stack([self.ends[first, 0], self.ends[last, 1]], axis=1)
         return LitLine(ends, self.normals[first], self.triangle[first], self.power[first])
@@ -297,15 +297,17 @@ class LightSheet:
 
     def _points_on_cuts(self, pieces: Pieces, cuts: Cuts, x: Float64, height: Float64) -> Float64:
         """Return (G, H) of both ends of pieces, (k, 2, 2); exact at the ends of the cuts."""
-        (a, b), whole = x[pieces.segment].T, cuts.ends[pieces.segment]
-        found = np.empty(whole.shape)
+        (a, b), ends = x[pieces.segment].T, cuts.ends[pieces.segment]
+        found = np.empty(ends.shape)
         for n, at in enumerate(pieces[1:]):
             share, rest = (at - a) / (b - a), (b - at) / (b - a)
             if self.source is not None:
                 share, rest = share * height[pieces.segment, 1], rest * height[pieces.segment, 0]
                 share, rest = share / (share + rest), rest / (share + rest)
-            near, way = share < 0.5, whole[:, 1] - whole[:, 0]
-            found[:, n] = np.where(near[:, None], whole[:, 0] + share[:, None] * way, whole[:, 1] - rest[:, None] * way)
+            from_start, direction = share < 0.5, ends[:, 1] - ends[:, 0]
+            found[:, n] = np.where(
+                from_start[:, None], ends[:, 0] + share[:, None] * direction, ends[:, 1] - rest[:, None] * direction
+            )
         return found
 
     def _cumulative_power(self, x: Float64) -> Float64:

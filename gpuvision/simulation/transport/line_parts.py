@@ -81,9 +81,9 @@ class Parts(NamedTuple):
 def points_on(ends: Float64, share: Float64) -> Float64:
     """Return the points at fractions of the lengths of segments (..., 2, 3), exact at both ends."""
     start, end = ends[..., 0, :], ends[..., 1, :]
-    near = (share < 0.5)[..., None]
+    from_start = (share < 0.5)[..., None]
     share = share[..., None]
-    return np.asarray(np.where(near, start + share * (end - start), end - (1.0 - share) * (end - start)))
+    return np.asarray(np.where(from_start, start + share * (end - start), end - (1.0 - share) * (end - start)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,9 +134,9 @@ class LensVisibility:
         for _ in range(self.limits.max_halvings):
             if not len(todo.segment):
                 break
-            shown, many = self._visible_once(line, todo, lens)
+            shown, overflowed = self._visible_once(line, todo, lens)
             found.append(shown)
-            todo = _bisect(todo.select(many))
+            todo = _bisect(todo.select(overflowed))
         shown = concatenate_parts(found)
         return concatenate_parts([shown, _hidden_parts(shown, count)]) if with_hidden else shown
 
@@ -145,18 +145,18 @@ class LensVisibility:
         count = len(parts.segment)
         fans = np.zeros((count, 11))
         fans[:, :3], fans[:, 3:9] = lens[parts.segment], parts.ends(line).reshape(-1, 6)
-        many = np.zeros(count, bool)
+        overflowed = np.zeros(count, bool)
         found = [parts.select(np.zeros(0, np.int64))]
         for first in range(0, count, _FANS_PER_LAUNCH):
             intervals, status = self._intervals(fans[first : first + _FANS_PER_LAUNCH])
-            many[first : first + _FANS_PER_LAUNCH] = (status & Status.AMBIGUOUS) != 0
+            overflowed[first : first + _FANS_PER_LAUNCH] = (status & Status.AMBIGUOUS) != 0
             owner, which = np.nonzero(np.isfinite(intervals[..., 0]))
             low, high = intervals[owner, which].T.astype(np.float64)
             owner += first
             start, size = parts.start[owner], (parts.end - parts.start)[owner]
             end = np.where(high == 1.0, parts.end[owner], start + high * size)
             found.append(Parts(parts.segment[owner], start + low * size, end, np.ones(len(owner), bool)))
-        return concatenate_parts(found), many
+        return concatenate_parts(found), overflowed
 
     def _intervals(self, fans: Float64) -> tuple[npt.NDArray[Any], npt.NDArray[np.uint8]]:
         """Return the visible intervals and status flags of at most `_FANS_PER_LAUNCH` fans."""
@@ -174,8 +174,8 @@ class LensVisibility:
 
 def concatenate_parts(parts: list[Parts]) -> Parts:
     """Concatenate lists of parts."""
-    segment, start, end, seen = zip(*parts, strict=True)
-    return Parts(np.concatenate(segment), np.concatenate(start), np.concatenate(end), np.concatenate(seen))
+    segment, start, end, visible = zip(*parts, strict=True)
+    return Parts(np.concatenate(segment), np.concatenate(start), np.concatenate(end), np.concatenate(visible))
 
 
 def parts_within_radius(start: Float64, end: Float64, low: Float64, high: Float64) -> Parts:
@@ -189,9 +189,9 @@ def parts_within_radius(start: Float64, end: Float64, low: Float64, high: Float6
         (m,): the radius at both ends.
     """
     # |start + t way|^2 = (low + t growth)^2 is quadratic in t.
-    way, growth = end - start, high - low
-    square = np.sum(way * way, axis=1) - growth**2
-    half = np.sum(start * way, axis=1) - low * growth
+    direction, radius_change = end - start, high - low
+    square = np.sum(direction * direction, axis=1) - radius_change**2
+    half = np.sum(start * direction, axis=1) - low * radius_change
     rest = np.sum(start * start, axis=1) - low**2
     with np.errstate(divide="ignore", invalid="ignore"):
         # The stable form of the quadratic formula; without a root the knots are arbitrary and the test below decides.
@@ -202,8 +202,8 @@ def parts_within_radius(start: Float64, end: Float64, low: Float64, high: Float6
     each, found = np.arange(len(low)), []
     for first, last in itertools.pairwise(knots):
         middle = 0.5 * (first + last)
-        length = np.linalg.norm(start + middle[:, None] * way, axis=1)
-        inside = (length < low + middle * growth) & (first < last)
+        length = np.linalg.norm(start + middle[:, None] * direction, axis=1)
+        inside = (length < low + middle * radius_change) & (first < last)
         found.append(Parts(each, first, last, np.ones(len(each), bool)).select(inside))
     return concatenate_parts(found)
 
@@ -239,18 +239,18 @@ class LineProjector:
         move = view.transport
         axes = np.array([move.g_axis, move.h_axis])
         normal, to_sheet = np.cross(*axes), np.array(move.origin) - np.array(view.lens)
-        off = float(to_sheet @ normal)
+        distance = float(to_sheet @ normal)
         # Maps a ray to homogeneous (G, H, 1) of the sheet, and that to homogeneous (u, v, 1) of the sensor.
-        in_sheet = (off * np.eye(3) - np.outer(normal, to_sheet)) @ np.linalg.pinv(axes)
+        in_sheet = (distance * np.eye(3) - np.outer(normal, to_sheet)) @ np.linalg.pinv(axes)
         homography = np.array(view.triangulation.homography)
         middle = np.append(np.mean(np.array(view.triangulation.region), axis=1), 1.0)
-        in_front = np.sign(off) * np.sign(homography[2] @ middle)
+        in_front = np.sign(distance) * np.sign(homography[2] @ middle)
         lifting = in_front * np.column_stack([in_sheet, normal]) @ np.linalg.inv(homography).T
         self._view, self._lens = view, view.triangulation.sensor_lens
         self._lifting = lifting
         # Linear functions of a ray that are positive where the point is in front of the lens, on the sheet's side, and
         # on the near side of the sheet's horizon.
-        self._limits = np.column_stack([np.array(view.axis), np.sign(off) * normal, lifting[:, 2]])
+        self._limits = np.column_stack([np.array(view.axis), np.sign(distance) * normal, lifting[:, 2]])
 
     def project(self, ends: Float64, L: float) -> ProjectedLines:
         """Return the projections of segments (m, 2, 3) [m] at a transport L [m]."""
@@ -314,8 +314,8 @@ class ProjectedLines:
     def _clip_to_fold(self, parts: Parts, lens: Lens) -> Parts:
         fold = lens.fold_radius
         radius = (1.0 - _VIEW_MARGIN) * fold * (1.0 + fold**2 * (lens.k1 + lens.k2 * fold**2))
-        start, way = self.start[parts.segment], self.way[parts.segment]
-        ends = [start + share[:, None] * way for share in (parts.start, parts.end)]
+        start, direction = self.start[parts.segment], self.way[parts.segment]
+        ends = [start + share[:, None] * direction for share in (parts.start, parts.end)]
         vectors = [each[:, :2] - each[:, 2:] * np.array(lens.centre) for each in ends]
         found = parts_within_radius(*vectors, *(radius * each[:, 2] for each in ends))
         size, begin = parts.end - parts.start, parts.start
@@ -348,15 +348,15 @@ class ProjectedLines:
             middle = self.image_points(parts.segment, 0.5 * (parts.start + parts.end))
             middle[:, axis] = value
             straight = self.lens.undistort(middle)[:, axis]
-        start, way = self.start[parts.segment], self.way[parts.segment]
+        start, direction = self.start[parts.segment], self.way[parts.segment]
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = (straight * start[:, 2] - start[:, axis]) / (way[:, axis] - straight * way[:, 2])
+            found = (straight * start[:, 2] - start[:, axis]) / (direction[:, axis] - straight * direction[:, 2])
         found = self._clamp(parts, found)
         for _ in range(0 if self.lens is None else _NEWTON_ITERATIONS):
             step = np.where(2.0 * found < parts.start + parts.end, 1e-4, -1e-4) * (parts.end - parts.start)
-            here, there = self.image_points(parts.segment, np.stack([found, found + step]))[..., axis]
+            image, moved_image = self.image_points(parts.segment, np.stack([found, found + step]))[..., axis]
             with np.errstate(divide="ignore", invalid="ignore"):
-                found = self._clamp(parts, found + (value - here) * step / (there - here))
+                found = self._clamp(parts, found + (value - image) * step / (moved_image - image))
         return found
 
     def _clamp(self, parts: Parts, share: Float64) -> Float64:
@@ -371,7 +371,7 @@ def _split_parts(parts: Parts, count: Integers, cuts: Float64, reverse: npt.NDAr
     last = count[owner]
     left = before[owner] + np.where(reverse[owner], last - number, number - 1)
     right = before[owner] + np.where(reverse[owner], last - 1 - number, number)
-    most = len(cuts) - 1
-    start = np.where(number == 0, parts.start[owner], cuts[np.clip(left, 0, most)])
-    end = np.where(number == last, parts.end[owner], cuts[np.clip(right, 0, most)])
+    max_parts = len(cuts) - 1
+    start = np.where(number == 0, parts.start[owner], cuts[np.clip(left, 0, max_parts)])
+    end = np.where(number == last, parts.end[owner], cuts[np.clip(right, 0, max_parts)])
     return parts.select(owner)._replace(start=start, end=end)

@@ -65,11 +65,11 @@ def smooth_normals(scene: Scene, crease: float = CREASE) -> Float64:
     place = vertex_numbers(np.where(np.isfinite(corners), corners, 0.0)).ravel()
     order, counts = np.argsort(place, kind="stable"), np.bincount(place)
     partners = counts[place]
-    own = np.repeat(np.arange(len(place)), partners)
+    corner = np.repeat(np.arange(len(place)), partners)
     other = order[concatenated_ranges((np.cumsum(counts) - counts)[place], partners)]
-    smooth = np.sum(flat[own // 3] * flat[other // 3], axis=1) > math.cos(crease)
-    own, share = own[smooth], weighted.reshape(-1, 3)[other[smooth]]
-    total = np.stack([np.bincount(own, column, minlength=len(place)) for column in share.T], axis=1)
+    smooth = np.sum(flat[corner // 3] * flat[other // 3], axis=1) > math.cos(crease)
+    corner, share = corner[smooth], weighted.reshape(-1, 3)[other[smooth]]
+    total = np.stack([np.bincount(corner, column, minlength=len(place)) for column in share.T], axis=1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     lonely = length[:, 0] == 0.0
     total[lonely], length[lonely] = np.repeat(flat, 3, axis=0)[lonely], 1.0
@@ -151,9 +151,9 @@ class TriangleBlocks(NamedTuple):
             (m,) bool: triangles that reflect only on the side of their normals; None: none.
         """
         if not len(corners):
-            none = np.zeros(0)
+            empty = np.zeros(0)
             return cls(
-                none.astype(int), np.zeros(1, int), none.reshape(0, 3), none, none.reshape(0, 3), none, none > 0.0
+                empty.astype(int), np.zeros(1, int), empty.reshape(0, 3), empty, empty.reshape(0, 3), empty, empty > 0.0
             )
         members = Bvh.build(corners if sorted_by is None else sorted_by).members
         order, count = members[members >= 0], (members >= 0).sum(axis=1)

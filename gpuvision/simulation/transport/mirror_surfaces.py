@@ -84,9 +84,9 @@ class MirrorSurfaces:
     def reflects(self) -> npt.NDArray[np.bool_]:
         """Whether each triangle is a mirror that light can meet."""
         mirror = np.array([each.mirror for each in self.materials] or [0.0])
-        there = np.zeros(len(self.material), bool)
-        there[self.scene.bvh.numbers] = True
-        return there & (mirror[self.material] > 0.0)
+        is_mirror = np.zeros(len(self.material), bool)
+        is_mirror[self.scene.bvh.numbers] = True
+        return is_mirror & (mirror[self.material] > 0.0)
 
     @functools.cached_property
     def normals(self) -> Float64:

@@ -151,9 +151,9 @@ class Mirrors:
         if not len(exitance):
             return self.view.dark()
         lens = self.view.lens_at(L)
-        whole = np.tile([0.0, 1.0], (len(exitance), 1))
+        fractions = np.tile([0.0, 1.0], (len(exitance), 1))
         apex = np.broadcast_to(lens, (len(exitance), 3))
-        row, share = self._visible(apex, lit.ends, np.zeros((len(exitance), 2)), whole)
+        row, share = self._visible(apex, lit.ends, np.zeros((len(exitance), 2)), fractions)
         ends = _between(lit.ends[row], share)
         return self._expose(ends, lit.normals[row], exitance[row], L)
 
@@ -181,15 +181,15 @@ class Mirrors:
     def _plane_exposure(self, lit: LitLine, exitance: Float64, L: float) -> Exposure:
         if not len(self._surfaces.flat):
             return self.view.dark()
-        seen = self._visible_in_planes(lit, L)
-        if not len(seen.line):
+        visible = self._visible_in_planes(lit, L)
+        if not len(visible.line):
             return self.view.dark()
-        planes = self._surfaces.planes[seen.mirror]
-        ends = reflect_points(_between(lit.ends[seen.line], seen.share), planes[:, None])
-        reflectance = self._surfaces.reflectance_of(self._surfaces.flat[seen.mirror])
-        normals = lit.normals[seen.line]
+        planes = self._surfaces.planes[visible.mirror]
+        ends = reflect_points(_between(lit.ends[visible.line], visible.share), planes[:, None])
+        reflectance = self._surfaces.reflectance_of(self._surfaces.flat[visible.mirror])
+        normals = lit.normals[visible.line]
         turned = normals - 2.0 * np.sum(normals * planes[:, :3], axis=1, keepdims=True) * planes[:, :3]
-        return self._expose(ends, turned, exitance[seen.line] * reflectance, L)
+        return self._expose(ends, turned, exitance[visible.line] * reflectance, L)
 
     def _visible_in_planes(self, lit: LitLine, L: float) -> _MirroredParts:
         """Return the parts of lines that the lens sees in plane mirrors, unoccluded before and after the reflection."""
@@ -209,20 +209,22 @@ class Mirrors:
         up = np.abs(heights_above(lens, self._surfaces.planes[mirror]))
         ends = _between(lit.ends[line], share)
         away = np.abs(heights_above(ends, self._surfaces.planes[mirror][:, None]))
-        near = up[:, None] / (up[:, None] + away)
-        row, behind = self._visible(apex, ends, near, np.tile([0.0, 1.0], (len(line), 1)))
-        line, mirror, share, apex, near = line[row], mirror[row], share[row], apex[row], near[row]
+        mirror_fraction = up[:, None] / (up[:, None] + away)
+        row, beyond_mirror = self._visible(apex, ends, mirror_fraction, np.tile([0.0, 1.0], (len(line), 1)))
+        line, mirror, share, apex, mirror_fraction = line[row], mirror[row], share[row], apex[row], mirror_fraction[row]
         # Points where the lines from the lens' mirror image (the apex) to the ends cross the mirror.
-        ends = _between(ends[row], behind)
-        near = 1.0 / ((1.0 - behind) / near[:, :1] + behind / near[:, 1:])
-        on_mirror = apex[:, None] + near[..., None] * (ends - apex[:, None])
+        ends = _between(ends[row], beyond_mirror)
+        mirror_fraction = 1.0 / (
+            (1.0 - beyond_mirror) / mirror_fraction[:, :1] + beyond_mirror / mirror_fraction[:, 1:]
+        )
+        on_mirror = apex[:, None] + mirror_fraction[..., None] * (ends - apex[:, None])
         low, width = share[:, :1], np.diff(share)
-        share = low + width * behind
+        share = low + width * beyond_mirror
         lenses = np.broadcast_to(lens, apex.shape)
         row, before = self._visible(lenses, on_mirror, np.zeros(share.shape), np.tile([0.0, 1.0], (len(row), 1)))
         # Equal fractions on the mirror are not equal on the line: a perspective map converts them.
-        near, share = near[row], share[row]
-        weight = np.stack([1.0 - before, before], axis=-1) * near[:, None, :]
+        mirror_fraction, share = mirror_fraction[row], share[row]
+        weight = np.stack([1.0 - before, before], axis=-1) * mirror_fraction[:, None, :]
         before = weight[..., 1] / weight.sum(axis=-1)
         return _MirroredParts(line[row], mirror[row], share[:, :1] + np.diff(share) * before)
 
@@ -232,8 +234,8 @@ class Mirrors:
         line, block = np.nonzero(self._run(self._surfaces.facets, lit.ends.reshape(-1, 6), lens).near)
         count = np.diff(blocks.start)[block]
         line, mirror = np.repeat(line, count), blocks.order[concatenated_ranges(blocks.start[block], count)]
-        seen = heights_above(lens, self._surfaces.planes) * self._surfaces.sides[self._surfaces.flat] >= 0.0
-        return line[seen[mirror]], mirror[seen[mirror]]
+        is_front = heights_above(lens, self._surfaces.planes) * self._surfaces.sides[self._surfaces.flat] >= 0.0
+        return line[is_front[mirror]], mirror[is_front[mirror]]
 
     def _visible(self, apex: Float64, ends: Float64, near: Float64, share: Float64) -> tuple[Integers, Float64]:
         """Return the visible parts of segments (k, 2, 3): index of the segment, and fractions of its length."""
@@ -249,10 +251,10 @@ class Mirrors:
             rows.append(row[which])
             low, width = share[which, :1], np.diff(share[which])
             parts.append(low + width * result.intervals[which, slot])
-            many = np.flatnonzero(result.status)
-            row, middle = np.tile(row[many], 2), share[many].mean(axis=1)
+            overflowed = np.flatnonzero(result.status)
+            row, middle = np.tile(row[overflowed], 2), share[overflowed].mean(axis=1)
             share = np.concatenate(
-                [np.column_stack([share[many, 0], middle]), np.column_stack([middle, share[many, 1]])]
+                [np.column_stack([share[overflowed, 0], middle]), np.column_stack([middle, share[overflowed, 1]])]
             )
         return np.concatenate(rows), np.concatenate(parts)
 
@@ -268,8 +270,8 @@ class Mirrors:
         point, spot, spot_move, density, triangle = self._images(np.hstack([middle, move]), lens)
         origin = middle[point]
         towards = spot - origin
-        way = np.linalg.norm(towards, axis=1)
-        cosine = np.sum(towards * lit.normals[line[point]], axis=1) / way
+        distance = np.linalg.norm(towards, axis=1)
+        cosine = np.sum(towards * lit.normals[line[point]], axis=1) / distance
         good = (cosine > 0.0) & np.isfinite(density)
         good[good] = self._is_unobstructed(origin[good], spot[good], lens, triangle[good])
         point, spot, spot_move, density, triangle, cosine = (
@@ -297,8 +299,8 @@ class Mirrors:
         point, spot, move, density, triangle = (np.concatenate(each) for each in zip(*found, strict=True))
         # An image on the edge of two triangles is found on both; one is kept.
         order = np.lexsort((*spot.T, point))
-        near = np.abs(np.diff(spot[order], axis=0)).max(axis=1, initial=0.0) <= self._surfaces.clearance
-        once = order[np.append(True, ~near | (np.diff(point[order]) != 0))[: len(order)]]
+        is_duplicate = np.abs(np.diff(spot[order], axis=0)).max(axis=1, initial=0.0) <= self._surfaces.clearance
+        once = order[np.append(True, ~is_duplicate | (np.diff(point[order]) != 0))[: len(order)]]
         return point[once], spot[once], move[once], density[once], triangle[once]
 
     def _is_unobstructed(
@@ -311,9 +313,9 @@ class Mirrors:
         bulge = self._surfaces.bulge[triangle]
         free = np.ones(len(spot), bool)
         for other in (origin, np.broadcast_to(lens, spot.shape)):
-            way = other - spot
-            length = np.linalg.norm(way, axis=1)
-            along = way / length[:, None]
+            direction = other - spot
+            length = np.linalg.norm(direction, axis=1)
+            along = direction / length[:, None]
             rise = np.abs(np.sum(along * self._surfaces.normal_of[triangle], axis=1))
             left_out = np.minimum(2.0 * bulge / np.maximum(rise, 1e-9) + self._surfaces.clearance, 0.5 * length)
             start = spot + left_out[:, None] * along

@@ -86,15 +86,19 @@ def mesh_scene(
     kept = ~outlined[group]
     first = len(outlined)
     fans, of_fan = _triangulate(outlines.corners)
-    whole = np.flatnonzero(outlined)
+    outlined_triangles = np.flatnonzero(outlined)
     parts = np.concatenate([corners[kept], fans, large])
-    patch = np.concatenate([group[kept], whole[of_fan], first + np.arange(len(large))])
-    start = np.searchsorted(group, whole)
+    patch = np.concatenate([group[kept], outlined_triangles[of_fan], first + np.arange(len(large))])
+    start = np.searchsorted(group, outlined_triangles)
     origin = np.concatenate([numbers[kept], numbers[start][of_fan], of_large])
     by_patch = np.argsort(patch, kind="stable")
     slack = np.zeros(first + len(large))
-    slack[whole] = outlines.slack
-    nodes = outlines.receivers.reshape(-1, 6), np.repeat(whole, 4), np.full(4 * len(whole), 0.25)
+    slack[outlined_triangles] = outlines.slack
+    nodes = (
+        outlines.receivers.reshape(-1, 6),
+        np.repeat(outlined_triangles, 4),
+        np.full(4 * len(outlined_triangles), 0.25),
+    )
     return PatchMesh(parts[by_patch], patch[by_patch], origin[by_patch], slack, nodes)
 
 
@@ -106,8 +110,8 @@ def longest_edges(corners: Reals) -> tuple[Reals, Integers]:
 
 def bisect_triangles(corners: Reals) -> Reals:
     """Return the first halves of triangles (n, 3, 3), cut at their longest edge, and then the second halves."""
-    turn = (longest_edges(corners)[1][:, None] + np.arange(3)) % 3
-    a, b, c = np.moveaxis(np.take_along_axis(corners, turn[:, :, None], axis=1), 1, 0)
+    corner_order = (longest_edges(corners)[1][:, None] + np.arange(3)) % 3
+    a, b, c = np.moveaxis(np.take_along_axis(corners, corner_order[:, :, None], axis=1), 1, 0)
     between = 0.5 * (a + b)
     return np.concatenate([np.stack([a, between, c], axis=1), np.stack([between, b, c], axis=1)])
 
@@ -185,13 +189,13 @@ def _group_small(corners: Reals, material: npt.NDArray[np.int32], size: float) -
 def _outline_groups(corners: Reals, group: Integers, size: float, limits: MeshingLimits) -> tuple[Flags, _Outlines]:
     """Return the groups (ascending numbers) that an outline replaces, as a mask, and the outlines."""
     count = int(group.max(initial=-1)) + 1
-    many = np.bincount(group, minlength=count) > limits.max_triangles
-    if not many.any():
-        return many, _Outlines(np.zeros((0, _CORNERS, 3)), np.zeros(0), np.zeros((0, 4, 6)))
-    mine = many[group]
+    is_large = np.bincount(group, minlength=count) > limits.max_triangles
+    if not is_large.any():
+        return is_large, _Outlines(np.zeros((0, _CORNERS, 3)), np.zeros(0), np.zeros((0, 4, 6)))
+    mine = is_large[group]
     corners = corners[mine]
     starts = np.flatnonzero(np.diff(group[mine], prepend=-1))
-    own = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(corners)))
+    owner = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(corners)))
     vectors = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(vectors, axis=1)
     area, vector = np.add.reduceat(areas, starts), np.add.reduceat(vectors, starts)
@@ -201,9 +205,9 @@ def _outline_groups(corners: Reals, group: Integers, size: float, limits: Meshin
     x = np.cross(n, np.eye(3)[np.argmin(np.abs(n), axis=1)])
     x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
     frame = np.stack([x, np.cross(n, x), n], axis=1)
-    local = np.einsum("tkd,tcd->tkc", corners - middle[own, None], frame[own])
+    local = np.einsum("tkd,tcd->tkc", corners - middle[owner, None], frame[owner])
     thick = np.maximum.reduceat(np.abs(local[:, :, 2]).max(axis=1), starts)
-    flat = _octagons(local[:, :, :2], own, starts)
+    flat = _octagons(local[:, :, :2], owner, starts)
     ring = np.roll(flat, -1, axis=1)
     inside = 0.5 * np.sum(flat[:, :, 0] * ring[:, :, 1] - flat[:, :, 1] * ring[:, :, 0], axis=1)
     good = (thick <= limits.thickness * size) & (one_way >= limits.one_way * area)
@@ -211,10 +215,10 @@ def _outline_groups(corners: Reals, group: Integers, size: float, limits: Meshin
     # Scaled to the area of the triangles that it replaces.
     flat *= np.sqrt(area / np.where(good, inside, area))[:, None, None]
     outline = middle[:, None] + np.einsum("gkc,gcd->gkd", flat, frame[:, :2])
-    picked = _nearest_to_quarters(local.mean(axis=1)[:, :2], flat, own, starts)
+    picked = _nearest_to_quarters(local.mean(axis=1)[:, :2], flat, owner, starts)
     places = np.concatenate([corners[picked].mean(axis=2), (vectors / areas[:, None])[picked]], axis=2)
-    many[many] = good
-    return many, _Outlines(outline[good], limits.slack * thick[good], places[good])
+    is_large[is_large] = good
+    return is_large, _Outlines(outline[good], limits.slack * thick[good], places[good])
 
 
 def _octagons(places: Reals, own: Integers, starts: Integers) -> Reals:

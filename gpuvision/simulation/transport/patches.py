@@ -165,10 +165,10 @@ class Patches:
         order = np.lexsort((-self._areas, self._patch))
         rank = np.arange(len(order)) - np.searchsorted(self._patch, self._patch)
         order = order[(rank < _TRIANGLES_PER_PATCH) & ~has_own[order]]
-        few = (np.bincount(self._patch) < _TRIANGLES_PER_PATCH)[self._patch[order]]
-        inside = np.einsum("pk,mkd->mpd", _THREE_POINTS, self.corners[order[few]]).reshape(-1, 3)
-        places = np.concatenate([self.corners[order[~few]].mean(axis=1), inside])
-        chosen = np.concatenate([order[~few], np.repeat(order[few], 3)])
+        has_few = (np.bincount(self._patch) < _TRIANGLES_PER_PATCH)[self._patch[order]]
+        inside = np.einsum("pk,mkd->mpd", _THREE_POINTS, self.corners[order[has_few]]).reshape(-1, 3)
+        places = np.concatenate([self.corners[order[~has_few]].mean(axis=1), inside])
+        chosen = np.concatenate([order[~has_few], np.repeat(order[has_few], 3)])
         share = self._areas[chosen]
         weight = share / np.bincount(self._patch[chosen], share, self.count)[self._patch[chosen]]
         receivers = np.concatenate([given[0], np.concatenate([places, self.normals[chosen]], axis=1)])
@@ -198,19 +198,19 @@ class Patches:
         """
         if np.shape(wanted) != (self.count,):
             raise ValueError(f"Patches.bisected takes a mask ({self.count},) of patches, got shape {np.shape(wanted)}")
-        apart = np.array(wanted, bool)
+        selected = np.array(wanted, bool)
         if self.nodes is not None:
-            apart[self.nodes[1]] = False
-        is_bisected = apart[self._patch]
+            selected[self.nodes[1]] = False
+        is_bisected = selected[self._patch]
         halves = bisect_triangles(self.corners[is_bisected])
-        number = np.cumsum(~apart) - 1
-        first = int(np.count_nonzero(~apart))
+        number = np.cumsum(~selected) - 1
+        first = int(np.count_nonzero(~selected))
         nodes = self.nodes
         return Patches(
             np.concatenate([self.corners[~is_bisected], halves]),
             np.concatenate([number[self._patch[~is_bisected]], first + np.arange(len(halves))]),
             np.concatenate([self._origin[~is_bisected], np.tile(self._origin[is_bisected], 2)]),
-            np.concatenate([self._slack[~apart], np.repeat(self._slack[self._patch[is_bisected]], 2)]),
+            np.concatenate([self._slack[~selected], np.repeat(self._slack[self._patch[is_bisected]], 2)]),
             None if nodes is None else (nodes[0], number[nodes[1]], nodes[2]),
         )
 

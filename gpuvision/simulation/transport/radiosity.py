@@ -232,9 +232,9 @@ class Radiosity:
         points, owner, weight, _ = self._surface
         matrix = np.zeros((self.patches.count, self.patches.count), kind)
         for rows, begin in self._form_factor_rows(points):
-            own, share = owner[begin : begin + len(rows)], weight[begin : begin + len(rows), None]
-            starts = np.flatnonzero(np.diff(own, prepend=-1))
-            matrix[own[starts]] += np.add.reduceat(share * rows, starts, axis=0)
+            patch, share = owner[begin : begin + len(rows)], weight[begin : begin + len(rows), None]
+            starts = np.flatnonzero(np.diff(patch, prepend=-1))
+            matrix[patch[starts]] += np.add.reduceat(share * rows, starts, axis=0)
         return matrix
 
     def _form_factor_rows(self, receivers: Reals) -> Iterator[tuple[Reals, int]]:
@@ -263,12 +263,12 @@ class Radiosity:
         hits = ClosestHit(scene=scene, clearance=clearance)(points.astype(self._real), device=self.device)
         hit = to_numpy(hits.triangle)
         a, b, c = np.moveaxis(scene.corners[hit], 1, 0)
-        behind = np.flatnonzero((hit >= 0) & (np.sum(np.cross(b - a, c - a) * points[:, 3:], axis=1) > 0.0))
+        back_hits = np.flatnonzero((hit >= 0) & (np.sum(np.cross(b - a, c - a) * points[:, 3:], axis=1) > 0.0))
         everything = np.ones(self.patches.count, self._real)
         light = PatchLight(patches=self.patches, scene=scene)
-        seen = light(np.ascontiguousarray(points[behind], self._real), everything, device=self.device).irradiance
+        received = light(np.ascontiguousarray(points[back_hits], self._real), everything, device=self.device).irradiance
         covered = np.zeros(len(points), bool)
-        covered[behind] = seen < self.limits.covered_view
+        covered[back_hits] = received < self.limits.covered_view
         return covered
 
     @property

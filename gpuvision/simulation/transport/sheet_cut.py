@@ -136,8 +136,10 @@ class SheetIndex:
         places, lengths = sharp[:, 0, 2], np.linalg.norm(sharp[:, 1] - sharp[:, 0], axis=1)
         order = np.argsort(places, kind="stable")
         places, lengths = places[order], lengths[order]
-        apart = np.diff(places, prepend=-np.inf) > _MAX_EDGE_SLOPE * np.abs(self.corners[..., 2]).max(initial=0.0)
-        begin = np.flatnonzero(apart)
+        is_new_place = np.diff(places, prepend=-np.inf) > _MAX_EDGE_SLOPE * np.abs(self.corners[..., 2]).max(
+            initial=0.0
+        )
+        begin = np.flatnonzero(is_new_place)
         return places[begin], np.add.reduceat(lengths, begin) if len(begin) else lengths
 
     def _edges_in_sheets(self) -> tuple[Float64, Integers]:
@@ -148,14 +150,14 @@ class SheetIndex:
         edges, rows = [], []
         for n in range(3):
             both = self.corners[:, [n, (n + 1) % 3]]
-            way = np.abs(both[:, 1] - both[:, 0])
-            found = np.flatnonzero(way[:, 2] <= _MAX_EDGE_SLOPE * np.maximum(way[:, 0], way[:, 1]))
+            span = np.abs(both[:, 1] - both[:, 0])
+            found = np.flatnonzero(span[:, 2] <= _MAX_EDGE_SLOPE * np.maximum(span[:, 0], span[:, 1]))
             edges.append(both[found])
             rows.append(found)
-        whole = np.concatenate(edges)
-        way = whole[:, 1, :2] - whole[:, 0, :2]
-        backward = (way[:, 0] < 0.0) | ((way[:, 0] == 0.0) & (way[:, 1] < 0.0))
-        return np.where(backward[:, None, None], whole[:, ::-1], whole), np.concatenate(rows)
+        all_edges = np.concatenate(edges)
+        span = all_edges[:, 1, :2] - all_edges[:, 0, :2]
+        backward = (span[:, 0] < 0.0) | ((span[:, 0] == 0.0) & (span[:, 1] < 0.0))
+        return np.where(backward[:, None, None], all_edges[:, ::-1], all_edges), np.concatenate(rows)
 
     def cuts(self, transports: npt.ArrayLike) -> Cuts:
         """Return the cuts of the sheets at transports (k,) [m], sheet by sheet."""
@@ -200,7 +202,7 @@ def concatenated_ranges(begin: Integers, count: Integers) -> Integers:
 
 def _interpolate(low: Float64, high: Float64, at: Float64) -> Float64:
     """Return (G, H) where L is ``at``, between corners ``low`` and ``high``; exact at either corner."""
-    whole = high[:, 2] - low[:, 2]
-    up, down = (at - low[:, 2]) / whole, (high[:, 2] - at) / whole
-    way = high[:, :2] - low[:, :2]
-    return np.where((up < 0.5)[:, None], low[:, :2] + up[:, None] * way, high[:, :2] - down[:, None] * way)
+    height = high[:, 2] - low[:, 2]
+    up, down = (at - low[:, 2]) / height, (high[:, 2] - at) / height
+    direction = high[:, :2] - low[:, :2]
+    return np.where((up < 0.5)[:, None], low[:, :2] + up[:, None] * direction, high[:, :2] - down[:, None] * direction)

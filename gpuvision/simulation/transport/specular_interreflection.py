@@ -199,8 +199,10 @@ class SpecularInterreflection:
         step = max(_MAX_PAIRS // max(len(blocks.radius), 1), 1)
         for first in range(0, len(fans.length), step):
             some = slice(first, first + step)
-            off = fans.across[some] @ blocks.middle.T - np.sum(fans.across * fans.start, axis=1)[some, None]
-            fan, block = np.nonzero(np.abs(off) <= blocks.radius * (1.0 + 1e-9) + self.limits.on_mirror * self._reach)
+            plane_distance = fans.across[some] @ blocks.middle.T - np.sum(fans.across * fans.start, axis=1)[some, None]
+            fan, block = np.nonzero(
+                np.abs(plane_distance) <= blocks.radius * (1.0 + 1e-9) + self.limits.on_mirror * self._reach
+            )
             fan, block = fans.reachable(fan + first, block, blocks)
             count = np.diff(blocks.start)[block]
             triangle = blocks.order[concatenated_ranges(blocks.start[block], count)]
@@ -231,11 +233,11 @@ class SpecularInterreflection:
                 found.append(
                     self._between_rays(beam, row[same], share[same], spots[same], towards[same], triangle[same])
                 )
-            apart = (triangle[:, 0] != triangle[:, 1]) & (left > 0)
-            middle = share[apart].mean(axis=1)
-            row = np.tile(row[apart], 2)
+            differs = (triangle[:, 0] != triangle[:, 1]) & (left > 0)
+            middle = share[differs].mean(axis=1)
+            row = np.tile(row[differs], 2)
             share = np.concatenate(
-                [np.column_stack([share[apart, 0], middle]), np.column_stack([middle, share[apart, 1]])]
+                [np.column_stack([share[differs, 0], middle]), np.column_stack([middle, share[differs, 1]])]
             )
         return _concatenate([_select(beam, np.zeros(0, np.int64)), *found])
 
@@ -265,8 +267,8 @@ class SpecularInterreflection:
         start = place + (2.0 * bulge / np.maximum(np.abs(slope[..., 0]), 1e-9) + self.clearance)[..., None] * towards
         rays = np.concatenate([start, towards], axis=-1).reshape(-1, 6)
         hits = run_with_row_padding(ClosestHit(scene=self.scene, clearance=self.clearance), self.device, rays)
-        met = hits.triangle >= 0
-        spots = rays[:, :3] + np.where(met, hits.distance, 0.0)[:, None] * rays[:, 3:]
+        hit = hits.triangle >= 0
+        spots = rays[:, :3] + np.where(hit, hits.distance, 0.0)[:, None] * rays[:, 3:]
         return spots.reshape(-1, 2, 3), towards, hits.triangle.reshape(-1, 2).astype(np.int64)
 
     def _on_smooth(self, flat: Float64, triangle: Integers) -> tuple[Float64, Float64, Float64]:
@@ -284,10 +286,10 @@ class SpecularInterreflection:
 
     @functools.cached_property
     def _blocks(self) -> TriangleBlocks:
-        there = self.scene.bvh.numbers
-        corners = self.scene.corners[there]
+        numbers = self.scene.bvh.numbers
+        corners = self.scene.corners[numbers]
         blocks = TriangleBlocks.of(corners, np.broadcast_to((0.0, 0.0, 1.0), corners.shape))
-        return blocks._replace(order=there[blocks.order])
+        return blocks._replace(order=numbers[blocks.order])
 
     @functools.cached_property
     def _planes(self) -> Float64:
@@ -380,20 +382,20 @@ def _cut_triangles(
     points = corners[triangle] - fans.start[fan][:, None]
     across = fans.across[fan][:, None]
     # Explicit products and not a matrix product: neighbours get the same rounding for a corner that they share.
-    off = points[..., 0] * across[..., 0] + points[..., 1] * across[..., 1] + points[..., 2] * across[..., 2]
-    below = off < 0.0
+    distance = points[..., 0] * across[..., 0] + points[..., 1] * across[..., 1] + points[..., 2] * across[..., 2]
+    below = distance < 0.0
     crossing = below.any(axis=1) & ~below.all(axis=1)
     fan, triangle, below = fan[crossing], triangle[crossing], below[crossing]
-    points, off = points[crossing], off[crossing]
+    points, distance = points[crossing], distance[crossing]
     # The corner that is alone on its side of the sheet, and the other two.
     lone = np.where(below.sum(axis=1) == 1, np.argmax(below, axis=1), np.argmin(below, axis=1))
     row, ends = np.arange(len(fan)), []
     for step in (1, 2):
         other = (lone + step) % 3
         # An edge is cut from its lower to its upper corner, so that both of its triangles get the same point.
-        swap = off[row, lone] > off[row, other]
+        swap = distance[row, lone] > distance[row, other]
         low, high = np.where(swap, other, lone), np.where(swap, lone, other)
-        share = (off[row, low] / (off[row, low] - off[row, high]))[:, None]
+        share = (distance[row, low] / (distance[row, low] - distance[row, high]))[:, None]
         ends.append(points[row, low] + share * (points[row, high] - points[row, low]))
     place, light = np.stack(ends, axis=1), fans.light[fan]
     # place = p along + q back, in the plane of the two.
@@ -415,10 +417,10 @@ def _clip_beyond(p: Float64, depth: Float64, least: Float64) -> tuple[Float64, F
     under = depth < least[:, None]
     kept = np.asarray(~under.all(axis=1))
     p, depth, least, under = p[kept].copy(), depth[kept].copy(), least[kept], under[kept]
-    rows, near = np.nonzero(under)
-    share = (least[rows] - depth[rows, near]) / (depth[rows, 1 - near] - depth[rows, near])
-    p[rows, near] += share * (p[rows, 1 - near] - p[rows, near])
-    depth[rows, near] = least[rows]
+    rows, start = np.nonzero(under)
+    share = (least[rows] - depth[rows, start]) / (depth[rows, 1 - start] - depth[rows, start])
+    p[rows, start] += share * (p[rows, 1 - start] - p[rows, start])
+    depth[rows, start] = least[rows]
     return p, depth, kept
 
 

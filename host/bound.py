@@ -90,6 +90,12 @@ class Bound(Generic[R]):
         """Whether a call runs the kernel in the calling thread, unless it must wait for an event."""
         return self._queue_site.inline or self._inline_site is not None
 
+    @property
+    def enqueue_arguments(self) -> tuple[Any, Any, tuple[int, ...], tuple[int, ...] | None]:
+        """Arguments of `pyopencl.enqueue_nd_range_kernel` for a launch: queue, kernel, global size, local size."""
+        site = self._site()
+        return site.queue, site.kernel, self._global, self._local
+
     def allocate(self) -> R:
         """Return new device arrays for the outputs."""
         arrays = {

@@ -23,12 +23,12 @@ def cases(device: Device) -> Iterator[Case]:
     for frame in frames:
         frame.set(np.ones((16, 2), np.float32))
     # The peer launches the kernel of the bound operation with the same sizes.
-    site, sizes = bound._site(), (bound._global, bound._local)
-    queue, kernel = site.queue, site.kernel
+    arguments = bound.enqueue_arguments
+    queue = arguments[0]
 
     def plain() -> None:
         for _ in range(_LAUNCHES):
-            cl.enqueue_nd_range_kernel(queue, kernel, *sizes)
+            cl.enqueue_nd_range_kernel(*arguments)
         queue.finish()
 
     def preset() -> None:

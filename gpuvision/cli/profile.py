@@ -63,7 +63,7 @@ def profile(
             raise ValueError(f"no operation {name!r} to profile; expected some of {', '.join(harness.OPERATIONS)}")
     devices = [Device.named(each) for each in device] if device else list(Device.all() or [Device.best()])
     run = harness.profile(
-        operations or harness.OPERATIONS,
+        operations or list(harness.OPERATIONS),
         devices,
         seconds=seconds,
         progress=lambda line: echo(line, err=True),

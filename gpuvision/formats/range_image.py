@@ -18,13 +18,14 @@ import struct
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import tifffile
 
+from gpuvision.host import DeviceArray, to_numpy
 from gpuvision.host.errors import ReadError
 from gpuvision.host.files import atomic_write
 from gpuvision.host.reading import check_archive, reading
@@ -43,6 +44,7 @@ _UNITS_KEY = "units"
 _LONGEST_LINE, _MOST_LINES = 1000, 100  # characters and lines of the header of a PLY file; write_ply writes 15 lines
 
 Array = npt.NDArray[Any]
+Values: TypeAlias = npt.ArrayLike | DeviceArray
 
 
 class HeightFile(NamedTuple):
@@ -60,8 +62,12 @@ class HeightFile(NamedTuple):
     grid: Grid | None
 
 
-def _heights(z: Any, grid: Grid | None) -> Array:
-    heights: Array = np.asarray(z)
+def _numpy(values: Values) -> Array:
+    return to_numpy(values) if isinstance(values, DeviceArray) else np.asarray(values)
+
+
+def _heights(z: Values, grid: Grid | None) -> Array:
+    heights = _numpy(z)
     if heights.ndim != 2 or heights.size == 0:
         raise ValueError(f"heights have shape {heights.shape}, expected (rows, columns)")
     if grid is not None and heights.shape != grid.shape:
@@ -82,7 +88,7 @@ def _grid_table(grid: Grid | None) -> dict[str, float]:
 # ---- TIFF ------------------------------------------------------------------------------------------------------
 
 
-def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None, *, overwrite: bool = False) -> None:
+def write_tiff(path: str | os.PathLike[str], z: Values, grid: Grid | None = None, *, overwrite: bool = False) -> None:
     """Write heights as float32 TIFF: metres, NaN in holes.
 
     With a grid the resolution tags hold the cells per centimetre. The description is JSON: unit, value of a hole, grid.
@@ -91,7 +97,7 @@ def write_tiff(path: str | os.PathLike[str], z: Any, grid: Grid | None = None, *
     ----------
     path : path-like
         Output file.
-    z : array_like
+    z : array_like or device array
         Heights [m], (rows, columns); NaN in holes.
     grid : Grid, optional
         Grid of the heights.
@@ -141,7 +147,7 @@ def read_tiff(path: str | os.PathLike[str]) -> HeightFile:
 
 def write_png16(
     path: str | os.PathLike[str],
-    z: Any,
+    z: Values,
     grid: Grid | None = None,
     *,
     low: float | None = None,
@@ -236,11 +242,11 @@ def read_png16(path: str | os.PathLike[str]) -> HeightFile:
 
 def write_ply(
     path: str | os.PathLike[str],
-    x: Any,
-    y: Any,
-    z: Any,
-    intensity: Any = None,
-    status: Any = None,
+    x: Values,
+    y: Values,
+    z: Values,
+    intensity: Values | None = None,
+    status: Values | None = None,
     *,
     organised: bool = True,
     overwrite: bool = False,
@@ -251,9 +257,9 @@ def write_ply(
     ----------
     path : path-like
         Output file.
-    x, y, z : array_like
+    x, y, z : array_like or device array
         Coordinates [m], (profiles, samples), float32 or float64; the file keeps the type.
-    intensity, status : array_like, optional
+    intensity, status : array_like or device array, optional
         Intensity and `Status` flags, of the same shape.
     organised : bool
         True (default): all samples in scan order, with NaN in holes, and ``obj_info num_cols`` (samples) and
@@ -269,7 +275,7 @@ def write_ply(
         PLY does not support the type of an array.
     """
     arrays = {"x": x, "y": y, "z": z, "intensity": intensity, "status": status}
-    fields = {name: np.asarray(each) for name, each in arrays.items() if each is not None}
+    fields = {name: _numpy(each) for name, each in arrays.items() if each is not None}
     shape = fields["x"].shape
     for name, each in fields.items():
         if each.ndim != 2 or each.shape != shape:
@@ -332,7 +338,7 @@ def _points_of_ply(path: Path) -> dict[str, Array]:
 
 
 def write_npz(
-    path: str | os.PathLike[str], arrays: Mapping[str, Any], units: Mapping[str, str], *, overwrite: bool = False
+    path: str | os.PathLike[str], arrays: Mapping[str, Values], units: Mapping[str, str], *, overwrite: bool = False
 ) -> None:
     """Write arrays and their units as NPZ.
 
@@ -340,7 +346,7 @@ def write_npz(
     ----------
     path : path-like
         Output file.
-    arrays : mapping of str to array_like
+    arrays : mapping of str to array_like or device array
         Arrays by name.
     units : mapping of str to str
         Unit of each array, by the same names; ``""`` for an array without a unit.
@@ -356,7 +362,8 @@ def write_npz(
         odd = ", ".join(sorted(set(units) ^ set(arrays))) or _UNITS_KEY
         raise ValueError(f"arrays and units do not belong together: {odd}; expected one unit for every array")
     with atomic_write(path, overwrite=overwrite) as file:
-        held: dict[str, Any] = {**arrays, _UNITS_KEY: np.array(json.dumps(dict(units)))}
+        held: dict[str, Any] = {name: _numpy(each) for name, each in arrays.items()}
+        held[_UNITS_KEY] = np.array(json.dumps(dict(units)))
         np.savez(file, **held)
 
 

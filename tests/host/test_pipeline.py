@@ -8,7 +8,7 @@ import json
 import threading
 import weakref
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pyopencl as cl
@@ -193,6 +193,82 @@ def test_drop_oldest_keeps_the_newest(memory: dict[str, Any], ring: int) -> None
     assert stream.report().dropped == 40 - ring
     for batch in batches:
         assert batch.frames[0, 1] == 1.0 + batch.number  # the number belongs to the frame
+
+
+class GatedInThrees(Gated):
+    """Three frames for each one that the gate lets through, two in the last batch."""
+
+    def read_into(self, out: np.ndarray, arrived: np.ndarray) -> int:
+        count = min(3, self.length - self._next)
+        for number in range(count):
+            super().read_into(out[number:], arrived[number:])
+        return count
+
+
+def test_dropped_frames_are_counted_not_batches(memory: dict[str, Any]) -> None:
+    source = GatedInThrees(38)  # 12 batches of three frames and one of two
+    with Pipeline(source, READOUT, batch=3, ring=4, policy="drop_oldest", **memory) as stream:
+        source.let(1)
+        batches = [next(stream).copy()]
+        source.let(12)  # while the consumer holds the first batch
+        source.drained(13)
+        source.let(1)
+        batches += [each.copy() for each in stream]
+    assert numbers(batches) == [0, 30, 33, 36]
+    report = stream.report()
+    assert (report.frames, report.dropped) == (11, 27)
+
+
+class Watched(PsdReadout):
+    """Notes each launch of a slot whose last results nobody has waited for."""
+
+    def bind(self, *args: Any, **kwargs: Any) -> Any:
+        return WatchedBound(super().bind(*args, **kwargs))
+
+
+class WatchedBound:
+    unfinished: ClassVar[list[int]] = []
+
+    def __init__(self, bound: Any) -> None:
+        self._bound, self._event, self._calls = bound, None, 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._bound, name)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        if self._event is not None and not self._event.waited:
+            WatchedBound.unfinished.append(self._calls)
+        self._calls += 1
+        self._event = WatchedEvent(self._bound(*args, **kwargs))
+        return self._event
+
+
+class WatchedEvent:
+    def __init__(self, event: Any) -> None:
+        self._event, self.waited = event, False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._event, name)
+
+    def wait(self) -> None:
+        self._event.wait()
+        self.waited = True
+
+
+def test_a_dropped_batch_is_computed_before_its_memory_is_filled_again(device: Device) -> None:
+    """The device may still read the frames of the oldest batch: its slot is filled only after its last launch."""
+    if not device.shares_memory:
+        pytest.skip(f"{device.label} does not share memory with the host; events of copies order the slots there")
+    WatchedBound.unfinished.clear()
+    source = Gated(20)
+    with Pipeline(source, Watched(strip_length=6e-3), device=device, batch=1, ring=3, policy="drop_oldest") as stream:
+        source.let(1)
+        next(stream)
+        source.let(20)
+        source.drained(19)
+        list(stream)
+    assert stream.report().dropped == 17
+    assert WatchedBound.unfinished == []
 
 
 def test_a_burst_that_fits_the_ring_loses_nothing(device: Device) -> None:

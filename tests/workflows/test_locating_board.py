@@ -228,6 +228,34 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> L
     return call
 
 
+POSE_KEYS = {
+    "gpuvision", "status", "reason", "side", "pose", "sigmas", "covariance", "placement", "predicted_covariance",
+    "etch_bias", "residual_scale", "condition", "scale", "copper", "noise", "threshold", "coarse_registration",
+    "counts", "rulers", "fiducials", "device", "seconds",
+}  # fmt: skip
+COUNT_KEYS = {"in_image", "found", "used", "fiducials_in_image", "fiducials_found", "fiducials_used"}
+RULER_KEYS = {"point", "image_px", "found", "weight", "residual", "sigma", "status"}
+FIDUCIAL_KEYS = {"point", "image_px", "found", "weight", "residual", "sigmas", "radius", "status"}
+
+
+def test_the_threshold_is_given_or_from_noise_and_range(artwork: Artwork) -> None:
+    """Four times the noise, a twentieth of the range between the percentiles 1 and 99; not below a millionth."""
+    image = np.full(SHAPE, 40, np.uint8)
+    image[:, 200:] = 200
+    image[0, :9] = (0, 0, 0, 0, 255, 255, 255, 255, 255)  # fewer than one in a hundred
+    how: dict[str, Any] = {"scale": PIXEL, "initial_pose": (*BOARD_MIDDLE, 0.0), "budget": 10}
+    for given, expected in (
+        ({"noise": 1.0}, 8.0),
+        ({"noise": 3.0}, 12.0),
+        ({"noise": 3.0, "threshold": 5.5}, 5.5),
+    ):
+        located = locate_board(image, artwork, **how, **given)
+        assert (located.threshold, located.noise) == (pytest.approx(expected), given["noise"])
+        assert located.report()["threshold"] == pytest.approx(expected)
+    flat = locate_board(np.full(SHAPE, 90, np.uint8), artwork, **how)
+    assert (flat.threshold, flat.noise) == (1e-6, 0.0)
+
+
 def test_the_command_writes_pose_and_picture(folder: Path, artwork: Artwork, tmp_path: Path, run: Locate) -> None:
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 2e-3)
     cv2.imwrite(str(tmp_path / "board.png"), seen(artwork, pose))
@@ -244,6 +272,21 @@ def test_the_command_writes_pose_and_picture(folder: Path, artwork: Artwork, tmp
     for name, true in zip(("x", "y", "theta"), pose, strict=True):
         assert abs(told["pose"][name] - true) < SIGMAS * told["sigmas"][name]
     assert len(told["rulers"]) >= told["counts"]["used"]
+    assert (set(told), set(told["counts"])) == (POSE_KEYS, COUNT_KEYS)
+    assert set(told["placement"]) == {"board", "image_px", "covariance"}
+    assert set(told["device"]) == {"label", "name", "driver"}
+    assert told["rulers"]
+    for ruler in told["rulers"]:
+        assert set(ruler) == RULER_KEYS
+    for fiducial in told["fiducials"]:
+        assert set(fiducial) == FIDUCIAL_KEYS
+    assert (told["side"], told["reason"], told["copper"]) == ("top", None, "bright")
+    assert told["scale"] == pytest.approx(PIXEL)
+    assert told["noise"] == pytest.approx(NOISE, rel=0.1)
+    assert told["threshold"] >= 4.0 * told["noise"]
+    np.testing.assert_allclose(list(told["sigmas"].values()), np.sqrt(np.diag(told["covariance"])), rtol=1e-12)
+    for found, name in (("found", "found"), ("weight", "used")):
+        assert sum(bool(ruler[found]) for ruler in told["rulers"]) == told["counts"][name]
     picture = cv2.imread(str(tmp_path / "out" / "located.png"))
     assert picture.shape[0] > SHAPE[0]
 

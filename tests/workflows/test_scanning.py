@@ -19,9 +19,10 @@ import pytest
 from gpuvision.formats.range_image import read_npz, read_ply, read_png16, read_tiff
 from gpuvision.host import Device, RecordingError, StreamError
 from gpuvision.host.outputs import MANIFEST
-from gpuvision.host.sources import ArraySource
+from gpuvision.host.sources import ArraySource, PacedSource
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
+from gpuvision.workflows import scanning
 from gpuvision.workflows.scanning import Scan, scan
 from scanning import Ran, check_refused, currents, line_frames
 
@@ -113,6 +114,47 @@ def test_more_than_one_line_is_flagged_and_dropped_unless_asked_for(kept: bool) 
         (done.points.status & Status.AMBIGUOUS) != 0, np.isin(np.arange(480), range(100, 150))[None].repeat(6, 0)
     )
     np.testing.assert_array_equal(np.isfinite(done.points.z[:, 100:150]), np.full((6, 50), kept))
+
+
+def test_an_ambiguous_point_has_no_coordinate() -> None:
+    points = scan(two_lines(), Sensor.load("camera_line")).points
+    ambiguous = np.zeros((6, 480), bool)
+    ambiguous[:, 100:150] = True
+    for coordinate in (points.x, points.y, points.z):
+        np.testing.assert_array_equal(np.isnan(coordinate), ambiguous)
+
+
+@pytest.mark.parametrize("step", [0.25e-3, -0.25e-3])
+def test_a_transport_that_runs_forwards_or_backwards(device: Device, step: float) -> None:
+    """A ramp of 0.1 mm a profile: the same heights at y of either sign."""
+    sensor = Sensor.load("psd_line")
+    frames = np.concatenate([currents(1, height=1e-4 * number) for number in range(13)])
+    done = scan(frames, replace(sensor, transport=replace(sensor.transport, step=step)), device=device)
+    np.testing.assert_allclose(done.points.y[:, 0], step * np.arange(13), atol=1e-9)
+    held = np.isfinite(done.heights.z)
+    assert held.mean() > 0.8
+    assert not done.heights.status[held].any()
+    height = np.broadcast_to(0.4 * np.sign(step) * done.grid.y[:, None], held.shape)
+    # Half a code of both currents, of 2e4 codes; dH/du is about 9.
+    np.testing.assert_allclose(done.heights.z[held], height[held], rtol=0, atol=6e-3 / 2e4 / 2 * 10)
+
+
+def test_a_delay_is_in_seconds_in_the_report_and_in_milliseconds_in_the_summary() -> None:
+    sensor, now = Sensor.load("psd_line"), [1_000_000_000]
+    source = PacedSource(ArraySource(currents(3)), 1000.0, clock=lambda: now[0], sleep=lambda seconds: None)
+    frame, arrived = np.zeros((1, 96, 2), np.uint16), np.zeros(1, np.int64)
+    assert source.wait()
+    now[0] += 9_000_000
+    assert source.read_into(frame, arrived) == 1
+    done = scan(currents(3), sensor)
+    punctual = replace(done, metadata=scanning._metadata("tape", sensor, 1000.0, source))
+    assert punctual.report()["late"] == pytest.approx(9e-3)
+    assert "late" not in punctual.summary()
+    now[0] += 28_000_000  # the second frame was due 1 ms after the first
+    assert source.read_into(frame, arrived) == 1
+    overdue = replace(done, metadata=scanning._metadata("tape", sensor, 1000.0, source))
+    assert overdue.report()["late"] == pytest.approx(36e-3)
+    assert "frames were read up to 36 ms late" in overdue.summary()
 
 
 def test_dropped_frames_do_not_shift_the_transport() -> None:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
+import pyopencl.array
 import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from canary import Guarded
-from gpuvision.host import Device
+from gpuvision.host import Device, flags
+from gpuvision.host.program import build
+from gpuvision.operation import KERNEL_FOLDER
 from gpuvision.reference import rays as reference
 from gpuvision.simulation.scene.rays import AnyHit, ClosestHit
 from gpuvision.simulation.scene.scene import Scene
@@ -142,6 +148,46 @@ def test_nothing_slips_through_an_edge(device: Device, variant: Any, dtype: Any,
     assert not hits.status.any()
     segments = np.hstack([origins, origins + 2.0 * (targets - origins)]).astype(dtype)
     assert AnyHit(scene=Scene(corners), variant=variant)(segments, device=device).occluded.all()
+
+
+BOXES_MET = """#include "common/bvh.h"
+kernel void boxes_met(global const real *rays, global const real *nodes, global uint *met) {
+    const size_t i = get_global_id(0);
+    global const real *at = rays + 6 * i;
+    const bvh_ray ray = bvh_ray_of(at[0], at[1], at[2], at[3], at[4], at[5], 0, INFINITY);
+    met[i] = bvh_met(&ray, INFINITY, nodes + 6 * WIDTH * i);
+}
+"""
+
+
+@WAYS
+def test_boxes_that_a_ray_touches_at_an_edge(
+    device: Device, variant: Any, dtype: Any, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """In whole numbers the ray is at an edge of the box exactly: rounding in the slab test must not cull the box."""
+    if dtype == np.float64 and not device.has_double:
+        pytest.skip(f"{device.label} has no doubles")
+    count, pairs = 301, list(itertools.permutations(range(3), 2))
+    origin, times = rng.integers(-1000, 1000, (count, 3)), rng.integers(1, 50, (count, 1))
+    way = (2 * rng.integers(1, 500, (count, 3)) + 1) * rng.choice([-1, 1], (count, 3))
+    edge, sign = origin + times * way, np.sign(way)
+    boxes = np.tile(np.repeat([np.inf, -np.inf], 3)[:, None], (count, 1, 16))
+    for number, (enters, leaves) in enumerate(pairs):
+        # The ray enters the slab of one axis where it leaves that of another; the third slab is all around.
+        near, far = edge - 4000 * sign, edge + 4000 * sign
+        near[:, enters], far[:, leaves] = edge[:, enters], edge[:, leaves]
+        late = near.copy()
+        late[:, enters] += (sign * np.maximum(np.abs(times * way) // 64, 1))[:, enters]
+        for box, start in ((number, near), (6 + number, late)):
+            boxes[:, :3, box], boxes[:, 3:, box] = np.minimum(start, far), np.maximum(start, far)
+    (tmp_path / "boxes_met.cl").write_text(BOXES_MET)
+    defines = {"BVH_DEPTH": 1, **flags(REAL_IS_DOUBLE=dtype == np.float64, VECTOR_VARIANT=variant == "vector")}
+    kernel = build(device, tmp_path, "boxes_met.cl", defines, include_folders=[KERNEL_FOLDER]).boxes_met
+    rays = cl.array.to_device(device.queue, np.hstack([origin, way]).astype(dtype))
+    nodes = cl.array.to_device(device.queue, boxes.astype(dtype))
+    met = cl.array.zeros(device.queue, count, np.uint32)
+    kernel(device.queue, (count,), None, rays.data, nodes.data, met.data)
+    np.testing.assert_array_equal(met.get(), 0b111111)
 
 
 @WAYS

@@ -178,7 +178,8 @@ def _first_line(value: Any) -> str:
 def _object_page(name: str, value: Any, documented: dict[str, Any]) -> str:
     """Return the page of one object."""
     if inspect.ismodule(value):
-        elsewhere = [each for each in vars(value) if any(name.endswith(f".{each}") for name in documented)]
+        pages = {id(each) for each in documented.values()}
+        elsewhere = [each for each, member in vars(value).items() if id(member) in pages]
         without = f"   :exclude-members: {', '.join(elsewhere)}\n" if elsewhere else ""
         return f"{title(name)}\n.. automodule:: {name}\n   :members:\n   :member-order: bysource\n{without}"
     head = title(name.rpartition(".")[2])
@@ -239,7 +240,8 @@ class OtherNames:
         """Index the documented objects by the end of their names; a name that ends alike twice is left out."""
         ends: dict[str, set[str]] = defaultdict(set)
         for name, entry in objects.items():
-            if not entry.aliased:
+            # References bear the names of the operations that they check, and are linked by their full names only.
+            if not entry.aliased and not name.startswith("gpuvision.reference."):
                 parts = name.split(".")
                 for start in range(1, len(parts)):
                     ends[".".join(parts[start:])].add(name)

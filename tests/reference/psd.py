@@ -18,7 +18,7 @@ LOW_SIGNAL, SATURATED, OUT_OF_RANGE, NOT_FINITE = 1, 2, 4, 8
 Float64 = NDArray[np.float64]
 
 
-class Reading(NamedTuple):
+class ReferenceReading(NamedTuple):
     """Readings of PSD strips, of the currents' shape.
 
     Attributes
@@ -39,7 +39,7 @@ class Reading(NamedTuple):
     sigma: Float64
 
 
-def read_out(readout: Any, left: NDArray[Any], right: NDArray[Any]) -> Reading:
+def read_out(readout: Any, left: NDArray[Any], right: NDArray[Any]) -> ReferenceReading:
     """Read out the currents of PSD strips.
 
     Parameters
@@ -52,7 +52,7 @@ def read_out(readout: Any, left: NDArray[Any], right: NDArray[Any]) -> Reading:
 
     Returns
     -------
-    Reading
+    ReferenceReading
         Float64 arrays of the same shape.
     """
     codes = left.dtype.kind == "u"
@@ -73,7 +73,7 @@ def read_out(readout: Any, left: NDArray[Any], right: NDArray[Any]) -> Reading:
     if readout.linearity is not None:
         position = position + _correction(readout, position)
     good = status == 0
-    return Reading(np.where(good, position, np.nan), total, status, np.where(good, sigma, np.nan))
+    return ReferenceReading(np.where(good, position, np.nan), total, status, np.where(good, sigma, np.nan))
 
 
 def _status(

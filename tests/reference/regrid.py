@@ -15,7 +15,7 @@ Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 
-class HeightMap(NamedTuple):
+class ReferenceHeightMap(NamedTuple):
     """Height map: arrays of shape (rows, columns).
 
     Attributes
@@ -85,7 +85,7 @@ def resample_line(
 
 def regrid(
     op: Any, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any], intensity: NDArray[Any], given: UInt8
-) -> HeightMap:
+) -> ReferenceHeightMap:
     """Resample an organised range image to a height map.
 
     Parameters
@@ -121,7 +121,7 @@ def regrid(
     if op.folded == "drop":
         folds = (status & np.uint8(NOT_INVERTIBLE)) != 0
         made[:, folds], status[folds] = np.nan, NOT_INVERTIBLE
-    return HeightMap(made[0], made[1], status)
+    return ReferenceHeightMap(made[0], made[1], status)
 
 
 def _directions(op: Any) -> tuple[str, str]:

@@ -121,10 +121,10 @@ def test_any_camera_inverts_before_its_fold(radial, decentred, tilt, part, turn)
         x, y = reference.distort(*((point - [642.5, 509.25]) / [1700.0, 1650.0]), given_.distortion)
         a, b = np.radians(tilt)
         assert math.sin(b) * x - math.cos(b) * math.sin(a) * y + math.cos(b) * math.cos(a) <= 1e-12
-        return
-    magnified = np.linalg.norm(given_.jacobian(measured), 2)
-    size = 1e-12 * np.abs(measured).max()
-    np.testing.assert_allclose(given_.undistort(measured), point, rtol=0, atol=max(1e-9, size * magnified))
+    else:
+        magnified = np.linalg.norm(given_.jacobian(measured), 2)
+        size = 1e-12 * np.abs(measured).max()
+        np.testing.assert_allclose(given_.undistort(measured), point, rtol=0, atol=max(1e-9, size * magnified))
 
 
 def test_where_opencv_fails() -> None:

@@ -72,11 +72,10 @@ def test_fold_is_where_the_slope_vanishes(lens: Lens) -> None:
     fold = lens.fold_radius
     if math.isinf(fold):
         square = np.linspace(0.0, 1e4, 100_001) ** 2
-        assert np.all(1.0 + 3.0 * lens.k1 * square + 5.0 * lens.k2 * square**2 > 0.0)
-        return
-    assert abs(1.0 + 3.0 * lens.k1 * fold**2 + 5.0 * lens.k2 * fold**4) < 1e-12
-    below = np.linspace(0.0, fold, 1000, endpoint=False) ** 2
-    assert np.all(1.0 + 3.0 * lens.k1 * below + 5.0 * lens.k2 * below**2 > 0.0)
+    else:
+        assert abs(1.0 + 3.0 * lens.k1 * fold**2 + 5.0 * lens.k2 * fold**4) < 1e-12
+        square = np.linspace(0.0, fold, 1000, endpoint=False) ** 2
+    assert np.all(1.0 + 3.0 * lens.k1 * square + 5.0 * lens.k2 * square**2 > 0.0)
 
 
 def test_beyond_the_fold_there_is_nothing() -> None:

@@ -65,6 +65,7 @@ def test_object_lens_and_sensor_planes_meet_in_one_line(alpha, direction, pitch)
     planes[:, 3] /= image
     sizes = np.linalg.svd(planes, compute_uv=False)
     assert sizes[2] <= 1e-12 * sizes[0]
+    checked = 0
     for place in ((0.0, 0.0), (1000.0, -400.0), (-500.0, 900.0)):
         # A sensor point, mirrored through the pinhole, in the lens' frame; the object point on its ray.
         on_sensor = np.array([*place, 0.0]) * pitch + sensor.focal_length * pitch * sensor.axis
@@ -73,6 +74,8 @@ def test_object_lens_and_sensor_planes_meet_in_one_line(alpha, direction, pitch)
             continue
         sharp = q * (distance / (normal @ q))
         assert 1.0 / sharp[2] + 1.0 / q[2] == pytest.approx(1.0 / lens, rel=1e-9)
+        checked += 1
+    assert checked
 
 
 @given(**ANGLES)

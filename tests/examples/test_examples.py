@@ -31,7 +31,7 @@ def test_example_runs(name: str, tmp_path: Path) -> None:
     """`make docs` also runs the examples: an example whose picture is newer than the library is skipped."""
     picture = gallery_picture(name)
     if picture.exists() and picture.stat().st_mtime >= newest(*LIBRARY, f"examples/{name}"):
-        return
+        pytest.skip("`make docs` ran this example after the last change")
     environment = os.environ | {"MPLBACKEND": "Agg"}
     command = [sys.executable, "-c", _SAVE, str(FOLDER / name)]
     run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)

@@ -459,7 +459,10 @@ def test_an_iterated_source_can_be_stopped(device: Device) -> None:
         gate.wait(30)
 
     with Pipeline(IteratedSource(blocked(), stop=gate.set), READOUT, device=device, batch=1) as stream:
-        next(stream)
+        assert next(stream).number == 0
+        assert not gate.is_set()
+    assert gate.is_set()
+    assert stream.report().frames == 1
 
 
 def test_a_stream_runs_once_and_only_when_open(device: Device) -> None:

@@ -6,10 +6,10 @@ import os
 import sys
 from pathlib import Path
 
+import gpuvision
+
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "_ext"))
-
-import gpuvision  # noqa: E402
 
 project = "gpuvision"
 author = "gpuvision developers"

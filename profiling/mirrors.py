@@ -99,7 +99,7 @@ def _corner_table(lens: Array, corners: Array, normals: Array) -> Array:
 
 
 @numba.njit(error_model="numpy", inline="always")
-def _law_at(t, k, n, x, y, z):  # type: ignore[no-untyped-def]
+def _law_at(t, k, n, x, y, z):  # type: ignore[no-untyped-def]  # Numba infers types
     qx, qy, qz = x - t[k, n, 0], y - t[k, n, 1], z - t[k, n, 2]
     up, c = qx * t[k, n, 3] + qy * t[k, n, 4] + qz * t[k, n, 5], t[k, n, 6]
     one = t[k, n, 7] * up + c * (qx * t[k, n, 9] + qy * t[k, n, 10] + qz * t[k, n, 11])
@@ -108,7 +108,7 @@ def _law_at(t, k, n, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba(points, lens, corners, normals, table, found, places):  # type: ignore[no-untyped-def]
+def _numba(points, lens, corners, normals, table, found, places):  # type: ignore[no-untyped-def]  # Numba infers types
     """Test all triangles for each point: law of reflection at the corners, then Newton's method on the candidates."""
     count, kept = found.shape
     for i in numba.prange(count):
@@ -139,7 +139,7 @@ def _numba(points, lens, corners, normals, table, found, places):  # type: ignor
 
 
 @numba.njit(error_model="numpy", inline="always")
-def _law(point, lens, place, normal, corners, out):  # type: ignore[no-untyped-def]
+def _law(point, lens, place, normal, corners, out):  # type: ignore[no-untyped-def]  # Numba infers types
     square, c, q = 0.0, 0.0, 0.0
     for j in range(3):
         square += normal[j] * normal[j]
@@ -156,7 +156,7 @@ def _law(point, lens, place, normal, corners, out):  # type: ignore[no-untyped-d
 
 
 @numba.njit(error_model="numpy")
-def _surface(corners, normals, x, y):  # type: ignore[no-untyped-def]
+def _surface(corners, normals, x, y):  # type: ignore[no-untyped-def]  # Numba infers types
     weights = (1.0 - x - y, x, y)
     flat = weights[0] * corners[0] + x * corners[1] + y * corners[2]
     place, normal = flat.copy(), np.zeros(3)
@@ -171,7 +171,7 @@ def _surface(corners, normals, x, y):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(error_model="numpy")
-def _newton(point, lens, corners, normals, x, y):  # type: ignore[no-untyped-def]
+def _newton(point, lens, corners, normals, x, y):  # type: ignore[no-untyped-def]  # Numba infers types
     here, aside, above = np.empty(2), np.empty(2), np.empty(2)
     for _ in range(16):
         for out, dx, dy in ((here, 0.0, 0.0), (aside, 1e-6, 0.0), (above, 0.0, 1e-6)):

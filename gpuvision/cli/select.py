@@ -5,11 +5,14 @@ from __future__ import annotations
 import re
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gpuvision.cli.arguments import LayerNames, Overwrite, echo, layers_of, named_path, quantities, reject_unused
+
+if TYPE_CHECKING:
+    from gpuvision.matching.features.feature_set import BudgetUnit
 
 
 class Side(StrEnum):
@@ -133,7 +136,7 @@ def select(
         imaging,
         placement=at,
         budget=amount,
-        unit=unit,  # type: ignore[arg-type]
+        unit=unit,
         missing=missing,
         device=None if device is None else Device.named(device),
     )
@@ -146,11 +149,12 @@ def select(
     )
 
 
-def _budget(text: str) -> tuple[float, str]:
+def _budget(text: str) -> tuple[float, BudgetUnit]:
+    units: dict[str, BudgetUnit] = {"rulers": "rulers", "px": "px", "us": "us", "µs": "us"}
     found = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*(rulers|px|us|µs)?\s*", text)
     if not found or not float(found[1]) > 0:
         raise ValueError(f"--budget is {text!r}, expected a number above 0 with a unit: 60rulers, 20000px or 150us")
-    return float(found[1]), (found[2] or "rulers").replace("µ", "u")
+    return float(found[1]), units[found[2] or "rulers"]
 
 
 def _contrasts(text: str) -> tuple[float, float]:

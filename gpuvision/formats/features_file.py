@@ -148,8 +148,8 @@ def _imaging(top: Section, table: Section) -> Imaging:
 
 def _ruler(table: Section) -> tuple[Any, ...]:
     point, normal = table.numbers("point", "m", (2,)), table.numbers("normal", "", (2,))
-    row = (point, normal, table.number("spacing", "m", at_least=0.0))
-    row += (table.number("length", "m", above=0.0), table.number("sigma", "m", above=0.0))  # type: ignore[assignment]
+    row: tuple[Any, ...] = (point, normal, table.number("spacing", "m", at_least=0.0))
+    row += (table.number("length", "m", above=0.0), table.number("sigma", "m", above=0.0))
     table.finish()
     if math.hypot(*normal) < 0.5:
         raise table.error(f"{table.dotted('normal')} is {normal}, expected a direction of length 1")

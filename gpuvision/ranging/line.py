@@ -193,7 +193,7 @@ class LineReadout(VisionOperation[LineReading]):
     read_noise: float = 1.0
     gain: float = 0.0
     triangulation: Triangulation | None = None
-    axes: SampleAxes = SampleAxes()  # noqa: RUF009 (frozen, no state)
+    axes: SampleAxes = SampleAxes()
     outputs: tuple[str, ...] | None = None
     precision: Precision = None
     variant: Variant = "auto"

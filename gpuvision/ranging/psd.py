@@ -183,7 +183,7 @@ class PsdReadout(VisionOperation[PsdReading]):
     linearity: tuple[tuple[float, ...], ...] | None = None
     noise: PsdNoise | None = None
     triangulation: Triangulation | None = None
-    axes: SampleAxes = SampleAxes()  # noqa: RUF009 (frozen, no state)
+    axes: SampleAxes = SampleAxes()
     layout: Literal["pairs", "planar"] = "pairs"
     outputs: tuple[str, ...] | None = None
     precision: Precision = None

@@ -129,7 +129,7 @@ def test_what_it_cannot_be_is_refused() -> None:
     ):
         given = {"height": 0.8, "tilt": 0.4, "focal_px": 500.0, "centre_px": (319.5, 239.5)} | change
         with pytest.raises(ValueError, match=words):
-            MountedCamera(**given)  # type: ignore[arg-type]
+            MountedCamera(**given)
     lens = Lens(k1=1e-8, centre=(300.0, 200.0))
     assert MountedCamera(height=1.0, tilt=0.4, focal_px=500.0, model=lens).matrix[0, 2] == 300.0
     up = MountedCamera(height=0.8, tilt=-1.0, focal_px=500.0, centre_px=(319.5, 239.5))

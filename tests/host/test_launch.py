@@ -213,7 +213,7 @@ def test_real_types() -> None:
     with pytest.raises(TypeError, match="does not take float64"):
         real_of("single", DOUBLE)
     with pytest.raises(ValueError, match="precision must be"):
-        real_of("half", SINGLE)  # type: ignore[arg-type]
+        real_of("half", SINGLE)
 
 
 def test_results_become_numpy_arrays(device: Device) -> None:

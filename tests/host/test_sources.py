@@ -340,7 +340,7 @@ def test_what_is_not_there_or_not_a_recording(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"not a recording by its suffix; expected .*\.npy"):
         open_recording(tmp_path / "notes.txt")
     with pytest.raises(ValueError, match="channel is 'pink', expected one of grey, red"):
-        open_recording(tmp_path, channel="pink")  # type: ignore[arg-type]
+        open_recording(tmp_path, channel="pink")
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.npz", "a.tif", "a.mp4", "a.avi"])

@@ -247,7 +247,7 @@ def test_wrong_region(image: Path, tmp_path: Path) -> None:
     [("dot_pattern_01", "dots", 0.079), ("dot_pattern_02", "dots", 0.691), ("line_pattern_01", "lines", 0.117)],
 )
 def test_real_patterns_are_straighter_than_known(name: str, pattern: str, best: float, data: Path) -> None:
-    done = calibrate([data / "calibration" / f"{name}.jpg"], pattern=pattern)  # type: ignore[arg-type]
+    done = calibrate([data / "calibration" / f"{name}.jpg"], pattern=pattern)
     assert done.straightness_px[1] <= best
 
 

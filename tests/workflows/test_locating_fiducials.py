@@ -58,7 +58,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Artwork:
 
 
 def located(image: np.ndarray, artwork: Artwork, **more: object) -> LocatedBoard:
-    return locate_board(image, artwork, scale=PIXEL, initial_pose=NEAR, copper="bright", **more)  # type: ignore[arg-type]
+    return locate_board(image, artwork, scale=PIXEL, initial_pose=NEAR, copper="bright", **more)
 
 
 def squares(errors: list[np.ndarray], covariances: list[np.ndarray]) -> float:

@@ -88,7 +88,7 @@ def fit_lens(
     sigma: float | None = None,
     loss: Loss = "squared",
     solver: Solver = "variable_projection",
-    limits: LensFitLimits = LensFitLimits(),  # noqa: B008
+    limits: LensFitLimits = LensFitLimits(),
 ) -> LensFit:
     """Fit the lens that makes measured lines straight.
 

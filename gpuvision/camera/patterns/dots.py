@@ -56,7 +56,7 @@ class DotLimits:
     min_shape_tolerance: float = 0.06
     min_contrast: float = 0.25
     max_background_residual: float = 0.5
-    blobs: BlobLimits = BlobLimits()  # noqa: RUF009
+    blobs: BlobLimits = BlobLimits()
 
 
 def find_dots(image: npt.NDArray[Any], *, limits: DotLimits = DotLimits()) -> PatternGrid:

@@ -61,7 +61,7 @@ class LinePatternLimits:
     min_position_tolerance: float = 0.003
     min_width_tolerance: float = 0.1
     min_contrast: float = 0.4
-    blobs: BlobLimits = BlobLimits()  # noqa: RUF009
+    blobs: BlobLimits = BlobLimits()
 
 
 def find_lines(image: npt.NDArray[Any], *, limits: LinePatternLimits = LinePatternLimits()) -> LineFamilies:

@@ -261,7 +261,7 @@ def test_refuses_what_it_cannot_use(tmp_path: Path, arguments: dict[str, object]
     for name in ("mask.gbr", "silk.gbr", "paste.gbr", "bare.drl"):
         (tmp_path / name).unlink()
     with pytest.raises(ValueError, match=message):
-        read_artwork(tmp_path, **{"layers": LAYERS, **arguments})  # type: ignore[arg-type]
+        read_artwork(tmp_path, **{"layers": LAYERS, **arguments})
 
 
 def test_says_that_a_folder_is_missing(tmp_path: Path) -> None:

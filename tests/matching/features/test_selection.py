@@ -65,7 +65,7 @@ def test_promises_what_least_squares_deliver(tmp_path: Path, criterion: str) -> 
     rulers = rulers_of(board(tmp_path, *CROSS, flashes=((5, 15), (15, 5))))
     for which in (rulers.pair, ~rulers.pair):
         some = only(rulers, which)
-        found = select_rulers(some, IMAGING, 12, criterion=criterion)  # type: ignore[arg-type]
+        found = select_rulers(some, IMAGING, 12, criterion=criterion)
         expected = covariance_of(some, found.chosen, IMAGING)
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         assert found.covariance / scale == pytest.approx(expected / scale, abs=1e-4)
@@ -277,7 +277,7 @@ def test_refuses_what_makes_no_sense(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="missing must be"):
         select_rulers(rulers, IMAGING, 5, missing=1.0)
     with pytest.raises(ValueError, match="criterion must be"):
-        select_rulers(rulers, IMAGING, 5, criterion="trace")  # type: ignore[arg-type]
+        select_rulers(rulers, IMAGING, 5, criterion="trace")
 
 
 @pytest.mark.realdata

@@ -176,7 +176,7 @@ def test_sizes_and_canaries(device: Device, count: int, variant: Any, rng: np.ra
 
 def test_wrong_inputs(device: Device) -> None:
     with pytest.raises(TypeError, match="expected a Brdf"):
-        Reflectance(model=0.5)  # type: ignore[arg-type]
+        Reflectance(model=0.5)
     with pytest.raises(TypeError, match="float32 or float64 directions, got int64"):
         Reflectance(model=MODELS["ggx"])(np.zeros((3, 6), np.int64), device=device)
     with pytest.raises(ValueError, match=r"directions \(\.\.\., 6\), got shape \(3, 5\)"):

@@ -356,7 +356,7 @@ def test_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         LightSheet(transport=UPRIGHT, **wrong)
     with pytest.raises(TypeError, match="expected a StraightTransport"):
-        LightSheet(transport="upright")  # type: ignore[arg-type]
+        LightSheet(transport="upright")
 
 
 @pytest.mark.slow

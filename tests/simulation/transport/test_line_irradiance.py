@@ -375,9 +375,9 @@ def test_wrong_inputs(device: Device) -> None:
     with pytest.raises(ValueError, match=r"\(\.\.\., 6\), place and normal, got shape \(4, 3\)"):
         operation(np.zeros((4, 3)), device=device)
     with pytest.raises(ValueError, match="precision must be"):
-        LineIrradiance(segments=lit(FLOOR), precision="half")(np.zeros((4, 6)), device=device)  # type: ignore[arg-type]
+        LineIrradiance(segments=lit(FLOOR), precision="half")(np.zeros((4, 6)), device=device)
     with pytest.raises(TypeError, match="expected LitSegments"):
-        LineIrradiance(segments=FLOOR)  # type: ignore[arg-type]
+        LineIrradiance(segments=FLOOR)
 
 
 @pytest.mark.parametrize(

@@ -455,13 +455,13 @@ def test_one_bound_instance_for_all_profiles(device: Device, rng: np.random.Gene
 def test_wrong_parameters(device: Device) -> None:
     scene = Scene(NO_TRIANGLES)
     with pytest.raises(TypeError, match=r"OccludedIrradiance\.scene is None, expected a Scene"):
-        OccludedIrradiance(scene=None, segments=1)  # type: ignore[arg-type]
+        OccludedIrradiance(scene=None, segments=1)
     with pytest.raises(TypeError, match=r"segments must be a whole number, got 1\.5"):
-        OccludedIrradiance(scene=scene, segments=1.5)  # type: ignore[arg-type]
+        OccludedIrradiance(scene=scene, segments=1.5)
     with pytest.raises(ValueError, match="samples is 0, expected 1 to"):
         OccludedIrradiance(scene=scene, segments=1, samples=0)
     with pytest.raises(ValueError, match="visibility is 'some'"):
-        OccludedIrradiance(scene=scene, segments=1, visibility="some")  # type: ignore[arg-type]
+        OccludedIrradiance(scene=scene, segments=1, visibility="some")
     with pytest.raises(ValueError, match=r"receivers \(strips, n, 6\), n at least 1, got shape \(4, 6\)"):
         light_of(NO_TRIANGLES, np.zeros((4, 6)), np.zeros((1, 10)), device, weights=np.zeros((4, 2)))
     with pytest.raises(TypeError, match="takes float32 or float64 receivers, got int64"):

@@ -247,9 +247,9 @@ def test_what_is_refused() -> None:
     with pytest.raises(ValueError, match="clearance"):
         PatchLight(patches=patches, clearance=np.nan)
     with pytest.raises(TypeError, match="expected Patches"):
-        FormFactors(patches=None)  # type: ignore[arg-type]
+        FormFactors(patches=None)
     with pytest.raises(TypeError, match="expected a Scene"):
-        FormFactors(patches=patches, scene=patches)  # type: ignore[arg-type]
+        FormFactors(patches=patches, scene=patches)
     with pytest.raises(ValueError, match="no area"):
         Patches(np.zeros((1, 3, 3)))
     with pytest.raises(ValueError, match="ascend from 0"):

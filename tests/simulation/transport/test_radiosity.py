@@ -213,7 +213,7 @@ def test_no_light_at_all(device: Device) -> None:
 def test_what_is_refused() -> None:
     patches = Patches.from_scene(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
     with pytest.raises(TypeError, match="expected Patches"):
-        Radiosity(patches=None, albedo=[0.5])  # type: ignore[arg-type]
+        Radiosity(patches=None, albedo=[0.5])
     with pytest.raises(ValueError, match=r"expected \(\d+,\)"):
         Radiosity(patches=patches, albedo=np.zeros(3))
     with pytest.raises(ValueError, match="outside 0 to 1"):

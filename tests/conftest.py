@@ -1,8 +1,9 @@
 """Devices, tiers and caches of the tests; a test that needs a device fails where there is none.
 
 The option ``--tier`` selects the tests. ``fast`` runs all tests without the mark ``slow`` on the best device, and a
-smoke set on every other device: one test for each file, kernel variant and precision. ``full`` runs all tests on every
-device. ``nightly`` is ``full`` with more hypothesis examples.
+smoke set on every other device: one test for each file, kernel variant and precision. Of a test with three parameters
+or more it runs an all-pairs design. ``full`` runs all tests on every device. ``nightly`` is ``full`` with more
+hypothesis examples.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import hypothesis.configuration
 import numpy as np
 import pytest
 
+from designs import all_pairs
 from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
 
@@ -67,27 +69,46 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left:
         config.hook.pytest_deselected(items=left)
         labels = ((_device_of(item), item.get_closest_marker("slow")) for item in left)
-        config.stash[LEFT] = dict(Counter("slow" if slow else device.label for device, slow in labels))
+        config.stash[LEFT] = dict(
+            Counter("slow" if slow else device.label if device else "without a device" for device, slow in labels)
+        )
         out = set(left)
         items[:] = [item for item in items if item not in out]
 
 
 def _left_to_full_tier(items: list[pytest.Item], best: Sequence[Device]) -> Iterator[pytest.Item]:
-    """Yield slow tests and, on all devices but the best, the tests beyond the smoke set.
+    """Yield slow tests, cases beyond an all-pairs design and, on all devices but the best, tests beyond the smoke set.
 
     PoCL compiles each kernel once more for its inline device: beyond the smoke set, tests outside ``tests/host`` run
     without that device.
     """
+    fast = [item for item in items if item.get_closest_marker("slow") is None]
+    designed = set(_designed(fast))
     seen = set()
     for item in items:
         device = _device_of(item)
         case = _smoke_case(item)
         is_more = device is not None and case in seen
-        if item.get_closest_marker("slow") is not None or (is_more and device not in best):
+        if item not in designed or (is_more and device not in best):
             yield item
             continue
         seen.add(case)
         item.stash[WITHOUT_INLINE] = is_more and "host" not in item.path.parts
+
+
+def _designed(items: list[pytest.Item]) -> Iterator[pytest.Item]:
+    """Yield the tests that have no more than two parameters, and an all-pairs design of the cases of each other test.
+
+    The device is not one of these parameters.
+    """
+    functions: dict[Any, list[pytest.Item]] = {}
+    for item in items:
+        functions.setdefault((item.parent, getattr(item, "originalname", item.name), _device_of(item)), []).append(item)
+    for cases in functions.values():
+        parameters = [
+            {name: value for name, value in _parameters_of(item).items() if name != "device"} for item in cases
+        ]
+        yield from (cases[k] for k in (all_pairs(parameters) if len(parameters[0]) > 2 else range(len(cases))))
 
 
 def _smoke_case(item: pytest.Item) -> tuple[Any, ...]:
@@ -95,14 +116,18 @@ def _smoke_case(item: pytest.Item) -> tuple[Any, ...]:
 
     Runtimes differ most in queues and memory: in ``tests/host`` the key also has the test function.
     """
-    parameters = item.callspec.params if hasattr(item, "callspec") else {}
+    parameters = _parameters_of(item)
     chosen = (parameters.get(name) for name in ("device", "variant", "precision"))
     function = getattr(item, "originalname", item.name) if "host" in item.path.parts else ""
     return (item.path, function, *map(str, chosen))
 
 
 def _device_of(item: pytest.Item) -> Device | None:
-    return item.callspec.params.get("device") if hasattr(item, "callspec") else None
+    return _parameters_of(item).get("device")
+
+
+def _parameters_of(item: pytest.Item) -> Mapping[str, Any]:
+    return item.callspec.params if hasattr(item, "callspec") else {}
 
 
 def _draw_more_examples(items: list[pytest.Item]) -> None:

@@ -21,6 +21,7 @@ from gpuvision.host import Device, StreamError
 from gpuvision.host.pipeline import Pipeline
 from gpuvision.host.planning import Cost, Plan, PlanLimits, plan_stream
 from gpuvision.host.report import DurationHistogram
+from gpuvision.host.ring import Step, slot_bytes
 from gpuvision.host.sources import ArraySource, PacedSource, Source
 from gpuvision.host.trace import Trace
 from streams import READOUT, currents_of
@@ -241,6 +242,13 @@ def test_the_plan_states_the_memory_of_the_ring(zero_copy: bool, device: Device)
     text = str(chosen)
     assert "a ring of 252 slots" in text
     assert f"({chosen.ring_bytes / 1e6:.3g} MB) for stalls of 1 s at 1000 frames/s" in text
+
+
+@pytest.mark.parametrize(("zero_copy", "expected"), [(True, 51), (False, 51 + 16 + 9)])
+def test_the_memory_of_a_slot_counts_all_operations_of_a_chain(zero_copy: bool, expected: int) -> None:
+    """Two strips: 16 bytes of currents, 2 x 9 of results; then their positions, 8 bytes, as one strip, 9 of results."""
+    size = slot_bytes([Step(READOUT), Step(READOUT)], Device.best(), 6, (2, 2), np.float32, zero_copy=zero_copy)
+    assert size == 6 * (expected + 8)  # and the arrival times
 
 
 def test_a_ring_that_memory_cannot_hold_is_refused_before_anything_is_measured() -> None:

@@ -18,6 +18,7 @@ from gpuvision.host import Device
 from gpuvision.host.pipeline import Pipeline
 from gpuvision.host.ring import SharedSlot, Slot, StagedSlot
 from gpuvision.host.stalls import CollectorPauses, Stall, StallRecorder
+from gpuvision.ranging.line import LineReadout
 from streams import READOUT, Gated, ManualClock
 
 MS = 1_000_000
@@ -76,6 +77,12 @@ def test_dropped_frames_were_due_since_the_delivery_before(recorder: StallRecord
     assert asdict(stall) == pytest.approx(
         {"seconds": 0.09, "frame": 24, "producer": 0.0, "device": 0.001, "consumer": 0.089, "collector": 0.0}
     )
+
+
+def test_a_batch_of_several_frames_is_followed_by_the_next_one(recorder: StallRecorder) -> None:
+    add(recorder, count=4, arrived=0, requested=0, launching=0, launched=0, taken=0, computed=1, delivered=1)
+    times = {"requested": 1, "launching": 81, "launched": 81, "taken": 81, "computed": 83, "delivered": 83}
+    assert add(recorder, 4, arrived=80, **times).seconds == pytest.approx(0.003)  # no frame is missing
 
 
 def test_the_longest_stall_is_the_report_s(recorder: StallRecorder) -> None:
@@ -168,10 +175,10 @@ class Timed(Gated):
         self.clock = clock
 
     def read_into(self, out: np.ndarray, arrived: np.ndarray) -> int:
-        due = self.clock.now
-        count = super().read_into(out, arrived)
-        arrived[0] = due
-        return count
+        arrived[0] = self.clock.now
+        out[0] = self._next
+        self._next += 1
+        return 1
 
 
 class RequestClock(ManualClock):
@@ -258,6 +265,79 @@ def test_a_stalled_device_is_named(memory: dict[str, Any], clock: ManualClock, m
     assert set(plain) == {"seconds", "frame", "place", "producer", "device", "consumer", "collector"}
     assert plain["place"] == "device"
     assert "longest stall 250 ms, most of it in the device" in str(report)
+
+
+@pytest.mark.parametrize("inline", [False, True])
+def test_a_slow_launch_is_the_device_s_where_kernels_run_inline(
+    device: Device, inline: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not device.has_inline_queues:
+        pytest.skip(f"{device.label} has no inline queues")
+    clock = RequestClock()
+    launch = SharedSlot.launch
+
+    def slow(slot: Slot[Any]) -> None:
+        if slot.number == 1:
+            assert clock.requested.wait(30)
+            clock.now += 90 * MS
+        launch(slot)
+
+    monkeypatch.setattr(SharedSlot, "launch", slow)
+    source = Timed(3, clock)
+    readout = LineReadout(method="centroid")
+    source.shape, source.dtype = (600, 2000), np.dtype(np.uint8)  # too large to run inline by default
+    with Pipeline(source, readout, device=device, batch=1, ring=3, inline=inline, clock=clock) as stream:
+        source.let(1)
+        next(stream)
+        clock.requested.clear()
+        source.let(3)
+        list(stream)
+    stall = stream.report().longest_stall
+    assert stall is not None
+    assert (stall.frame, stall.place) == (1, "device" if inline else "producer")
+    assert getattr(stall, stall.place) == pytest.approx(0.09, abs=1e-3)
+
+
+def test_with_device_times_the_wake_up_after_the_kernel_is_the_consumer_s(
+    device: Device, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The device computes for 10 ms, on the host's clock; the wait for it returns 240 ms later."""
+    wait = SharedSlot.wait
+
+    def slow(slot: Slot[Any]) -> None:
+        wait(slot)
+        clock.now += 250 * MS
+
+    monkeypatch.setattr(SharedSlot, "wait", slow)
+    monkeypatch.setattr(SharedSlot, "spans", lambda slot: {"compute": (clock.now - 250 * MS, clock.now - 240 * MS)})
+    source = Timed(2, clock)
+    with Pipeline(source, READOUT, device=device, batch=1, ring=2, clock=clock, profile=True) as stream:
+        stream._offset = 0
+        source.let(1)
+        next(stream)
+    stall = stream.report().longest_stall
+    assert stall is not None
+    assert stall.place == "consumer"
+    assert stall.consumer == pytest.approx(0.24, abs=1e-3)
+    assert stall.device == pytest.approx(0.01, abs=1e-3)
+
+
+def test_a_stall_begins_when_the_batch_is_complete(device: Device, clock: ManualClock) -> None:
+    class Pairs(Timed):
+        def read_into(self, out: np.ndarray, arrived: np.ndarray) -> int:
+            arrived[:] = clock.now - 60 * MS, clock.now
+            self._next += 2
+            return 2
+
+    source = Pairs(2, clock)
+    with Pipeline(source, READOUT, device=device, batch=2, ring=2, clock=clock) as stream:
+        clock.now += 100 * MS
+        source.let(1)
+        next(stream)
+    report = stream.report()
+    assert report.latency.maximum > 0.06
+    assert report.longest_stall is not None
+    assert report.longest_stall.seconds < 1e-3
 
 
 def test_a_stream_without_a_delivery_has_no_stall(device: Device) -> None:

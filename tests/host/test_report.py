@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gpuvision.host import Device, StreamError
+from gpuvision.host.outputs import MANIFEST
 from gpuvision.host.pipeline import Pipeline
 from gpuvision.host.planning import Cost, Plan, PlanLimits, plan_stream
 from gpuvision.host.report import DurationHistogram
@@ -141,7 +142,7 @@ def test_the_trace_is_chrome_json(memory: dict[str, Any], tmp_path: Path) -> Non
     for tid in lanes:
         own = sorted((span["ts"], span["ts"] + span["dur"]) for span in spans if span["tid"] == tid)
         assert all(end <= start + 1e-3 for (_, end), (start, _) in itertools.pairwise(own) if lanes[tid] in one_by_one)
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["trace.json"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [MANIFEST, "trace.json"]
 
 
 # Plan -------------------------------------------------------------------------------------------------------------

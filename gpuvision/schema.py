@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 from gpuvision.host.errors import GpuVisionError
-from gpuvision.host.reading import FileLimits, check_limit, printable, reading, reason_of
+from gpuvision.host.reading import FileLimits, check_limit, one_line, reading, reason_of
 
 Choice = TypeVar("Choice", bound=str)
 _REQUIRED: Any = object()
@@ -184,7 +184,7 @@ class Section:
         expected = "one of " + ", ".join(f'"{each}"' for each in choices)
         value: Choice | None = self._value(key, expected, default)
         if value is not default and value not in choices:
-            close = difflib.get_close_matches(str(value), choices, 1)
+            close = difflib.get_close_matches(value[:_LONGEST_SHOWN], choices, 1) if isinstance(value, str) else []
             raise self._value_error(key, value, "", expected + (f' (did you mean "{close[0]}"?)' if close else ""))
         return value
 
@@ -302,7 +302,7 @@ def _check_nesting(text: str, source: str) -> None:
 def _shown(text: str) -> str:
     """Return a key or a value for a message: printable, and cut where it is long."""
     short = text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 4]} ..."
-    return printable(short)
+    return one_line(short)
 
 
 def _represented(value: Any) -> str:

@@ -102,10 +102,12 @@ def check_host(array: HostArray, shape: tuple[int, ...], dtype: np.dtype[Any], w
     Raises
     ------
     TypeError
-        The dtype differs.
+        The dtype differs, or the array is masked: a kernel does not see the mask.
     ValueError
         The shape differs, or the array is not C-contiguous.
     """
+    if isinstance(array, np.ma.MaskedArray):
+        raise TypeError(f"{what}: expected a plain array, got a masked array; fill it with .filled(value), such as NaN")
     if array.dtype != dtype:
         raise TypeError(f"{what}: expected dtype {dtype}, got {array.dtype}; convert it with .astype")
     if array.shape != shape:

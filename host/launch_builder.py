@@ -35,6 +35,10 @@ from gpuvision.host.work_size import (
 Grouping = Literal["padded", "fitted", "per_element"]
 _GROUPINGS = {"padded": padded_groups, "fitted": fitted_groups, "per_element": group_per_element}
 
+# Least rows and columns of an image whose last axis of 3 or 4 is taken for colours. Chosen: smaller images are rare,
+# and so are larger batches of frames of 3 or 4 columns.
+_FEWEST_PIXELS = 16
+
 _OPENCL_TYPES = {
     "int8": "char",
     "uint8": "uchar",
@@ -120,6 +124,13 @@ class LaunchBuilder:
         """Raise a ValueError that names the expected input where the shape is not valid."""
         if not is_valid:
             raise ValueError(f"{self.name} takes {expected}, got shape {self.shape}")
+
+    def check_no_colour(self, of: str) -> None:
+        """Raise a ValueError where the last three axes are rows, columns and colours instead of a batch of frames."""
+        if len(self.shape) >= 3 and self.shape[-1] in (3, 4) and min(self.shape[-3:-1]) >= _FEWEST_PIXELS:
+            raise ValueError(
+                f"{self.name} takes {of} of one channel, got shape {self.shape}: its last axis looks like colours"
+            )
 
     def work(self, count: int, *, each: int, group: int, least: int = 0, grouping: Grouping = "padded") -> WorkSize:
         """Return the work size for `count` elements in the kernel variant that runs on this device.

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gpuvision.host.errors import GpuVisionError, ReadError
+from gpuvision.host.text import printable
 
 _LONGEST_REASON = 200  # characters: a reason stays readable in a line
 
@@ -176,9 +177,9 @@ def reason_of(problem: BaseException) -> str:
     if isinstance(problem, RecursionError):
         return "it is nested too deeply"
     lines = [line for line in str(problem).splitlines() if line.strip()]
-    return printable(lines[0].strip()[:_LONGEST_REASON]) if lines else type(problem).__name__
+    return one_line(lines[0][:_LONGEST_REASON]) if lines else type(problem).__name__
 
 
-def printable(text: str) -> str:
-    """Return a text with ``?`` for characters that control a terminal."""
-    return "".join(each if each.isprintable() else "?" for each in text)
+def one_line(text: str) -> str:
+    """Return a text as one line without control characters."""
+    return " ".join(printable(text).split())

@@ -262,6 +262,8 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         pixels = shape if self.channels == 1 else shape[:-1]
         is_valid = len(pixels) >= 2 and 0 not in pixels[-2:] and (self.channels == 1 or shape[-1] == 3)
         build.check_shape(is_valid, f"images {expected} with one pixel at least")
+        if self.channels == 1:
+            build.check_no_colour("images (..., rows, columns) without channels=3")
         if dtype.kind == "u" and not 0.0 <= self.border_value <= np.iinfo(dtype).max:
             raise ValueError(
                 f"UndistortImage.border_value is {self.border_value:g}, expected a value in the range of {dtype}"

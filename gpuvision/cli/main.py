@@ -58,7 +58,7 @@ def application() -> typer.Typer:
 
 
 def one_line(error: Exception) -> str:
-    """Return an error's message as a single line, with the file's name where the system gave one."""
+    """Return an error's message as a single line without control characters, with the file's name if there is one."""
     if isinstance(error, OSError) and error.strerror:
         # os.replace reports two file names; the second is the destination.
         name = error.filename2 or error.filename

@@ -67,6 +67,8 @@ def _numpy(values: Values) -> Array:
 
 
 def _heights(z: Values, grid: Grid | None) -> Array:
+    if isinstance(z, np.ma.MaskedArray):
+        raise TypeError("heights are a masked array, expected a plain array with NaN in holes; use .filled(math.nan)")
     heights = _numpy(z)
     if heights.ndim != 2 or heights.size == 0:
         raise ValueError(f"heights have shape {heights.shape}, expected (rows, columns)")

@@ -266,6 +266,7 @@ class LineReadout(VisionOperation[LineReading]):
         build = LaunchBuilder(self, device, shape, dtype, precision=self.precision, variant=self.variant)
         build.check_dtype("uint8", "uint16", "float32", of="frames")
         build.check_shape(len(shape) >= 2 and 0 not in shape[-2:], "frames (..., rows, columns) of one pixel at least")
+        build.check_no_colour("frames (..., rows, columns)")
         batch, (rows, columns) = shape[:-2], shape[-2:]
         length, samples = (rows, columns) if self.along == "columns" else (columns, rows)
         if length > LONGEST_PROFILE or rows * columns >= 2**31:

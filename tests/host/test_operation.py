@@ -13,6 +13,7 @@ from gpuvision.host import BuildError, Device, host_view
 from gpuvision.host.arrays import memory_of
 from gpuvision.host.program import build, options
 from gpuvision.operation import KERNEL_FOLDER
+from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
 
 READOUT = PsdReadout(strip_length=2.0)
@@ -348,3 +349,10 @@ def test_no_option_gives_up_on_nan():
 def test_the_memory_of_a_caller_without_contiguity_is_refused(device, pairs):
     with pytest.raises(ValueError, match="ascontiguousarray"):
         READOUT(pairs[::2], device=device)
+
+
+def test_masked_arrays_are_refused(device: Device) -> None:
+    """A kernel does not see the mask: it would read the values under it."""
+    masked = np.ma.masked_invalid(np.ones((4, 4), np.float32))
+    with pytest.raises(TypeError, match=r"input 0: expected a plain array, got a masked array; fill it with \.filled"):
+        LineReadout()(masked, device=device)

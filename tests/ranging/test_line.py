@@ -493,3 +493,12 @@ def test_one_output_of_the_sheet(device, rng, name):
 def test_triangulation_of_another_axis():
     with pytest.raises(ValueError, match="along"):
         LineReadout(along="rows", triangulation=SHEET)
+
+
+def test_colour_frames_are_refused(device: Device) -> None:
+    """A colour image has the shape of a batch of narrow frames."""
+    with pytest.raises(
+        ValueError, match=r"LineReadout takes frames .* of one channel, got shape \(16, 40, 3\): its last"
+    ):
+        LineReadout()(np.zeros((16, 40, 3), np.uint8), device=device)
+    assert LineReadout()(np.zeros((15, 40, 3), np.uint8), device=device).position.shape == (15, 3)

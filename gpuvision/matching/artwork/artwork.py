@@ -259,7 +259,10 @@ def read_artwork(
 
 def _layer(stack: LayerStack, side: str, use: str) -> tuple[DrawnObject, ...]:
     found = stack.graphic_layers.get((side, use))
-    return () if found is None else drawn_objects(parsed(found))
+    if found is None:
+        return ()
+    with reading(found.original_path.name, "Gerber file"):
+        return drawn_objects(parsed(found))
 
 
 def _bounds(stack: LayerStack, copper: tuple[DrawnObject, ...]) -> Float64:

@@ -14,7 +14,6 @@ from gerbonara import graphic_objects, graphic_primitives
 from gerbonara.apertures import ApertureMacroInstance, CircleAperture, ExcellonTool
 from gerbonara.utils import MM
 
-from gpuvision.host.errors import ReadError
 from gpuvision.host.reading import check_limit
 
 Float64 = npt.NDArray[np.float64]
@@ -148,7 +147,7 @@ def drawn_objects(layer: Any) -> tuple[DrawnObject, ...]:
 
     Raises
     ------
-    ReadError
+    ValueError
         An aperture macro has a moiré or a thermal: these are obsolete or for inner layers, and are not supported. Or an
         object lies or extends beyond `FileLimits.max_board_size`, or the layer has too many corners.
     """
@@ -159,9 +158,9 @@ def drawn_objects(layer: Any) -> tuple[DrawnObject, ...]:
             continue
         corners += sum(len(shape.outline) for shape in each.shapes)
         if corners > _MOST_CORNERS:
-            raise ReadError(f"a layer of more than {_MOST_CORNERS} corners; are its arcs and apertures too large?")
+            raise ValueError(f"a layer of more than {_MOST_CORNERS} corners; are its arcs and apertures too large?")
         farthest = float(np.max(np.abs(each.bounds))) if corners else 0.0
-        check_limit("max_board_size", farthest, f"an object that extends to {farthest:.4g} m")
+        check_limit("max_board_size", farthest, f"an object that extends to {farthest:.4g} m", ValueError)
         drawn.append(each)
     return tuple(drawn)
 
@@ -210,9 +209,9 @@ def _primitives(aperture: Any, dark: bool) -> Any:
         for primitive in aperture.macro.primitives:
             code = getattr(primitive, "code", 0)
             if name := _UNSUPPORTED_MACROS.get(code):
-                raise ReadError(f"aperture macro {aperture.macro.name}: a {name} is not supported; draw it as regions")
+                raise ValueError(f"aperture macro {aperture.macro.name}: a {name} is not supported; draw it as regions")
             if code == _POLYGON_CODE and not primitive.n_vertices.calculate(values) <= _MOST_VERTICES:
-                raise ReadError(
+                raise ValueError(
                     f"aperture macro {aperture.macro.name}: a polygon of more than {_MOST_VERTICES} corners"
                 )
     return aperture.flash(0.0, 0.0, MM, dark)
@@ -300,7 +299,7 @@ def _chords(radius: float, angle: float) -> int:
     """Return the number of chords of an arc."""
     half = math.acos(1 - min(SAGITTA / max(radius, SAGITTA), 0.05))
     if not angle <= 2 * half * _MOST_CHORDS:
-        raise ReadError(f"an arc or aperture with a radius of {radius:.4g} m, which is too large for a board")
+        raise ValueError(f"an arc or aperture with a radius of {radius:.4g} m, which is too large for a board")
     return max(math.ceil(angle / (2 * half)), 1)
 
 

@@ -86,10 +86,10 @@ def _check_glb(file: BinaryIO, size: int, path: Path) -> None:
             raise ValueError("it refers to another file, expected a GLB file that holds its data")
     accessors = tree.get("accessors", ())
     empty = sum(_count(each) for each in accessors if "bufferView" not in each)
-    check_limit("max_triangles", empty, f"{path}: claims {empty} numbers that it does not hold")
+    check_limit("max_triangles", empty, f"{path}: claims {empty:.0f} numbers that it does not hold")
     meshes = [sum(_triangles(each, accessors) for each in mesh["primitives"]) for mesh in tree.get("meshes", ())]
     triangles = sum(meshes[each["mesh"]] for each in tree.get("nodes", ()) if "mesh" in each)
-    check_limit("max_triangles", triangles, f"{path}: {triangles} triangles in all instances")
+    check_limit("max_triangles", triangles, f"{path}: {triangles:.0f} triangles in all instances")
 
 
 def _count(accessor: Mapping[str, Any]) -> float:

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Set up .venv in this clone: `setup.sh` for the command, `setup.sh tests` for the tests and the lint as well,
 # `setup.sh docs` for the documentation as well.
-# Nothing outside .venv changes, except that root gets the Debian packages that are missing.
+# It changes only .venv; as root it also installs missing Debian packages.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 

@@ -3,8 +3,8 @@ Calibrate a lens
 ================
 
 One image of a dot grid is enough to calibrate the radial distortion of a lens: the dots of a row and of a column lie
-on lines that are straight in the scene (plumb-line method). Nothing else about the target has to be known, and the
-camera may look at it at an angle.
+on lines that are straight in the scene (plumb-line method). The dimensions of the target need not be known, and the
+camera may view it at an angle.
 
 The image is rendered here with a known lens, so that the result can be compared with the truth.
 """

@@ -29,7 +29,7 @@ scene = Scene.of(trimesh.Trimesh(corners, triangles))
 material = Material(diffuse=Lambert(albedo=0.7), name="white paint")
 
 # %%
-# Simulate twice from the same light: without a mask, and with the mask that is made for this part.
+# Simulate twice from the same light: without a mask, and with the mask that is optimised for this part.
 task = prepare_simulation(scene, [material], Sensor.load("psd_line"), paths=("direct", "diffuse-diffuse"), profiles=4)
 with tempfile.TemporaryDirectory() as folder:
     without = simulate(task, folder)

@@ -46,8 +46,8 @@ with tempfile.TemporaryDirectory() as folder:
     artwork = gv.read_artwork(folder, layers=layers)
 
 # %%
-# The image that a camera takes at a known pose: 400 x 300 pixels of 40 µm, blurred, with noise. The pose is the place
-# on the board that the image centre sees, and the direction in which its columns increase.
+# The image that a camera takes at a known pose: 400 x 300 pixels of 40 µm, blurred, with noise. The pose is the point
+# of the board at the image centre, and the direction in which the image columns increase.
 pixel, true_pose = 40e-6, (10.05e-3, 7.93e-3, 0.004)
 fine, shape = 8, (300, 400)
 cos, sin = np.cos(true_pose[2]), np.sin(true_pose[2])

@@ -2,9 +2,10 @@
 Write your own operation
 ========================
 
-An operation of your own runs like those of gpuvision: on NumPy and device arrays, bound to a shape, in a stream. It
-consists of an OpenCL kernel in a folder of yours and a frozen dataclass that describes the launch. This example adds
-a flat-field correction, ``image = gain * (frame - offset)`` for each pixel, and puts it before a line readout.
+An operation that you write runs like the operations of gpuvision: on NumPy and device arrays, bound to a shape, in a
+stream. It consists of an OpenCL kernel in a folder of yours and a frozen dataclass that describes the launch. This
+example adds a flat-field correction, ``image = gain * (frame - offset)`` for each pixel, and puts it before a line
+readout.
 
 The kernel takes inputs, outputs and arguments in this order:
 
@@ -47,9 +48,9 @@ class Corrected(NamedTuple):
 
 # %%
 # The operation names its result type, the folder of its kernels, and further folders for ``#include``: gpuvision's
-# headers define the real type and the status flags. ``launch`` checks shape and dtype of the input and describes what
-# to run. Sizes are arguments of the kernel, so a new shape needs no compilation; macros (``defines``) change the code,
-# here the type of the input. Arrays among the arguments are uploaded once, when the operation is bound.
+# headers define the real type and the status flags. ``launch`` checks shape and dtype of the input and describes the
+# kernel launch. Sizes are arguments of the kernel, so a new shape needs no compilation; macros (``defines``) change the
+# code, here the type of the input. Arrays among the arguments are uploaded once, when the operation is bound.
 #
 # ``eq=False`` compares operations by identity, because this one holds arrays.
 
@@ -140,7 +141,7 @@ for name, found in (("raw", raw), ("corrected", positions)):
     print(f"{name:9} rms error {np.sqrt(np.nanmean((found - centre) ** 2)):.3f} px")
 
 # %%
-# Inputs that the operation does not take are refused with a message that names what it takes.
+# Invalid inputs are refused with a message that states the expected input.
 try:
     correct(frames.astype(np.int64))
 except TypeError as error:

@@ -16,8 +16,8 @@ from gpuvision.sensor.sensor import Sensor
 from gpuvision.workflows.scanning import scan
 
 # %%
-# The sensor is described in a TOML file. ``camera_line`` comes with gpuvision: frames of 64 x 480 pixels, one frame
-# every 0.25 mm of transport.
+# The sensor is described in a TOML file. ``camera_line`` is installed with gpuvision: frames of 64 x 480 pixels, one
+# frame every 0.25 mm of transport.
 sensor = Sensor.load("camera_line")
 readout = sensor.readout
 rows, columns = sensor.frame
@@ -34,8 +34,8 @@ def height(x, y):
 
 
 # %%
-# The row at which every column sees the line. Triangulation gives (x, z) for a sensor position; here the inverse is
-# needed. The place x at which a column looks depends on the height z there, so a few fixed-point steps find both.
+# The row of the line in every column. Triangulation gives (x, z) for a sensor position; here the inverse is needed. The
+# place x at which a column looks depends on the height z there, so a few fixed-point steps find both.
 axes, triangulation = readout.axes, readout.triangulation
 sample_v = axes.sample_origin + axes.sample_pitch * np.arange(columns)
 y = step * np.arange(96)[:, None]

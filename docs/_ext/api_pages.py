@@ -24,7 +24,7 @@ from pages import table, title, toctree, write_pages
 
 FOLDER = "reference/api"
 
-# Packages in the order of the index: title, and what a user finds there.
+# Packages in the order of the index: title and contents.
 PACKAGES = {
     "host": ("Devices, operations and streams", "Choose an OpenCL device, run an operation, stream frames through it."),
     "status": ("Status flags", "Reasons why a value is missing or doubtful."),
@@ -237,10 +237,10 @@ class OtherNames:
         self._full: dict[str, str] = {}
 
     def _read(self, objects: Any) -> None:
-        """Index the documented objects by the end of their names; a name that ends alike twice is left out."""
+        """Index the documented objects by the end of their names; ambiguous ends are omitted."""
         ends: dict[str, set[str]] = defaultdict(set)
         for name, entry in objects.items():
-            # References bear the names of the operations that they check, and are linked by their full names only.
+            # References have the names of the operations that they check; only their full names are linked.
             if not entry.aliased and not name.startswith("gpuvision.reference."):
                 parts = name.split(".")
                 for start in range(1, len(parts)):
@@ -269,13 +269,13 @@ _NDARRAY = re.compile(
 
 
 def shorten_arrays(app: Any, what: str, name: str, value: Any, options: Any, signature: str, returns: str) -> Any:
-    """Return signature and return type with ``NDArray[float64]`` for what it stands for."""
+    """Return signature and return type with the short form ``NDArray[float64]`` of array types."""
     texts = (None if each is None else _NDARRAY.sub(r"NDArray[\1]", each) for each in (signature, returns))
     return tuple(texts)
 
 
 def skip_fields(app: Any, what: str, name: str, value: Any, skip: bool, options: Any) -> bool | None:
-    """Skip the fields of a named tuple: its docstring lists them, and their own says "Alias for field number 0"."""
+    """Skip the fields of a named tuple: the tuple's docstring lists them, and a field has only "Alias for field number 0"."""
     return True if type(value).__name__ == "_tuplegetter" else None
 
 

@@ -21,7 +21,7 @@ def _prose(text: str) -> str:
 
 
 def _table(heading: str, parameters: list[Any], context: Any) -> str:
-    """Return a heading and the table of options or arguments; nothing where there are none."""
+    """Return a heading and the table of options or arguments; an empty text without options."""
     records = [each.get_help_record(context) for each in parameters]
     rows = [(f"``{record[0]}``", _prose(record[1])) for record in records if record]
     return f"{title(heading, '-')}\n{table(('name', 'meaning'), rows)}" if rows else ""

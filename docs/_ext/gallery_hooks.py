@@ -17,5 +17,5 @@ def place(file: str) -> tuple[int, str]:
 
 
 def define_file(gallery_conf: Mapping[str, Any], file: str | None) -> None:
-    """Define ``__file__`` for the next example: sphinx-gallery runs it without, and a script has one."""
+    """Define ``__file__`` for the next example: sphinx-gallery does not define it, but scripts use it."""
     vars(builtins)["__file__"] = str(Path(gallery_conf["examples_dirs"][0], file or ""))

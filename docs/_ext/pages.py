@@ -30,10 +30,10 @@ def toctree(names: Iterable[str], *, hidden: bool = True) -> str:
 
 
 def write_pages(folder: Path, pages: dict[str, str]) -> None:
-    """Write the pages, by file name, into a folder that holds nothing else.
+    """Write the pages, by file name, into a folder for these pages only.
 
-    A page with the text of the last build is left alone, so that Sphinx does not read it again; a page of an earlier
-    build that no longer exists is removed.
+    An unchanged page is not written, so that Sphinx does not read it again; a page of an earlier build that no longer
+    exists is removed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in pages.items():

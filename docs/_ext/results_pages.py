@@ -1,7 +1,6 @@
 """Sphinx extension: one page for every file of ``profiling/results``, with all of its rows.
 
-Rows are neither chosen nor sorted by their outcome: rows in which a peer is faster are printed like the others, and
-counted.
+All rows are printed in the order of the run, including the rows in which a peer is faster; their number is printed.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ def run_page(name: str, run: Mapping[str, Any]) -> str:
         title(name),
         _machine(run["machine"]),
         f"{date}- Command: ``gpuvision profile {' '.join(operations)} --json FILE``.",
-        f"- The machine held its speed during the run: {'yes' if run['valid'] else '**no**'}.",
+        f"- The speed of the machine was constant during the run: {'yes' if run['valid'] else '**no**'}.",
         f"- Rows: {len(rows)}; the peer is faster in {slower} of them (ratio in bold).\n",
         "See :doc:`../index` for the meaning of the columns.\n",
     ]

@@ -158,21 +158,21 @@ def _fit(ex, ey, there, widths, noises, shape, count, sums, room):  # type: igno
             break
         scale = _F(max(scale * _F(0.5), least))
     for _ in range(2):
-        within = 0
+        agreeing = 0
         for m in range(SPOKES):
             x, y = ex[m] - shape[0], ey[m] - shape[1]
             square = x * x + y * y
             off = abs(math.sqrt(square + blur + _F(0.5) * blur * blur / square) - shape[2])
             if there[m] > _F(0.0) and off <= _F(TUNING_CONSTANT) * scale:
-                room[within] = off
-                within += 1
-        for i in range(1, within):  # insertion sort is fastest for so few values
+                room[agreeing] = off
+                agreeing += 1
+        for i in range(1, agreeing):  # insertion sort is fastest for so few values
             value, j = room[i], i
             while j > 0 and room[j - 1] > value:
                 room[j] = room[j - 1]
                 j -= 1
             room[j] = value
-        measured = _F(1.4826) * (_F(1.0) + _F(1.0) / max(_F(within - 3), _F(1.0))) * room[within // 2]
+        measured = _F(1.4826) * (_F(1.0) + _F(1.0) / max(_F(agreeing - 3), _F(1.0))) * room[agreeing // 2]
         scale = _F(min(max(measured, predicted), least))
         blur = _circle_step(ex, ey, there, widths, shape, blur, scale, sums)
     return blur, scale
@@ -183,7 +183,7 @@ def _rows_of(pixels, pitch, x, y, shape, grey, slopes, scale, equation):  # type
     """Fill the equations of the pixels, scaled by the root of their weights; return the number of pixels."""
     reach, one = shape[2] + _F(5.0) * grey[2] + _F(2.0), _F(1.0)
     per_blur, per_size, per_scale = one / grey[2], one / shape[2], _F(1.0 / TUNING_CONSTANT) / scale
-    bend = _F(0.5) * grey[2] * per_size
+    curvature = _F(0.5) * grey[2] * per_size
     contrast, n = grey[1], 0
     c0, c1, c2 = _F(1.393465), _F(-2.767476), _F(4.513241)
     c3, c4, c5 = _F(-4.759453), _F(2.831766), _F(-0.711542)
@@ -204,7 +204,7 @@ def _rows_of(pixels, pitch, x, y, shape, grey, slopes, scale, equation):  # type
             density = _F(11.0) * c5 * q + _F(9.0) * c4
             density = ((density * q + _F(7.0) * c3) * q + _F(5.0) * c2) * q + _F(3.0) * c1
             density = (density * q + c0) * _F(1.0 / 3.5)
-            level, slope = step - density * bend, contrast * density * per_blur
+            level, slope = step - density * curvature, contrast * density * per_blur
             residual = _F(pixels[start + np.uint32(i)]) - grey[0] - contrast * level
             residual -= (slopes[0] * dx + slopes[1] * dy) * per_size
             z = residual * per_scale
@@ -322,15 +322,15 @@ def _gravity(pixels, pitch, x, y, reach):  # type: ignore[no-untyped-def]  # Num
 @numba.njit(error_model="numpy", fastmath=_SUMS)
 def _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, found):  # type: ignore[no-untyped-def]  # Numba infers types
     """Fill residual, inliers and symmetry of the fit, and the initial grey levels of the match."""
-    ex, ey, there, heights, room = edges[0], edges[1], edges[2], edges[3], edges[6]
-    weights, squares, amplitude, inside, own = _F(0.0), _F(0.0), _F(0.0), _F(0.0), _F(0.0)
+    ex, ey, is_found, heights, room = edges[0], edges[1], edges[2], edges[3], edges[6]
+    weights, squares, amplitude, inside, noise_sum = _F(0.0), _F(0.0), _F(0.0), _F(0.0), _F(0.0)
     level, reach = _F(0.0), _F(2.5) * math.sqrt(max(blur - _F(1.0 / 6.0), _F(0.09))) + _F(0.5)
     for m in range(SPOKES):
         dx, dy = ex[m] - shape[0], ey[m] - shape[1]
         square = dx * dx + dy * dy
         z = (math.sqrt(square + blur + _F(0.5) * blur * blur / square) - shape[2]) / scale
         left = max(_F(1.0) - z * z * _F(1.0 / TUNING_CONSTANT**2), _F(0.0))
-        weight = there[m] * left * left
+        weight = is_found[m] * left * left
         room[m] = weight
         weights += weight
         squares += weight * weight * z * z
@@ -340,11 +340,11 @@ def _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, 
         level += weight * _F(pixels[row * pitch + np.uint32(x + ex[m] + reach * directions[m, 0] + _F(0.5))])
     for m in range(SPOKES // 2):
         a, b = abs(heights[m]), abs(heights[m + SPOKES // 2])
-        own += math.sqrt(room[m] * room[m + SPOKES // 2]) * min(a, b) / max(a, b)
+        noise_sum += math.sqrt(room[m] * room[m + SPOKES // 2]) * min(a, b) / max(a, b)
     grey[0], grey[1] = level / weights, -amplitude / weights
     grey[2] = math.sqrt(max(blur - _F(1.0 / 6.0), _F(0.09)))
     found[3], found[4] = scale * math.sqrt(squares / weights), inside
-    found[5] = own / _F(SPOKES // 2)
+    found[5] = noise_sum / _F(SPOKES // 2)
 
 
 @numba.njit(parallel=True, error_model="numpy", fastmath=_SUMS)
@@ -354,7 +354,7 @@ def _find(image, places, table, directions, noise, found, covariance, status):  
     for n in numba.prange(places.shape[0]):
         profile, slopes = np.empty(LENGTH, np.float32), np.empty(_SLOPES, np.float32)
         edges, sums = np.empty((7, SPOKES), np.float32), np.empty(9, np.float32)
-        ex, ey, there, heights = edges[0], edges[1], edges[2], edges[3]
+        ex, ey, is_found, heights = edges[0], edges[1], edges[2], edges[3]
         widths, noises, room = edges[4], edges[5], edges[6]
         equation = np.empty((_UNKNOWNS + 1, _PIXELS), np.float32)
         matrix, right = np.empty((_UNKNOWNS, _UNKNOWNS), np.float32), np.empty(_UNKNOWNS, np.float32)
@@ -373,13 +373,13 @@ def _find(image, places, table, directions, noise, found, covariance, status):  
                 )
                 ex[m], ey[m] = at_x + place * c, at_y + place * s
                 off = abs(math.sqrt(ex[m] * ex[m] + ey[m] * ey[m]) - size)
-                there[m] = _F(1.0) if heights[m] != _F(0.0) and off <= _F(SEARCH) else _F(0.0)
-                count += there[m]
+                is_found[m] = _F(1.0) if heights[m] != _F(0.0) and off <= _F(SEARCH) else _F(0.0)
+                count += is_found[m]
             if count < _F(SPOKES // 2):
                 break
             if step == 0:
-                shape[0], shape[1], shape[2] = _start(ex, ey, there, count, shape, _F(0.6))
-            blur, scale = _fit(ex, ey, there, widths, noises, shape, count, sums, room)
+                shape[0], shape[1], shape[2] = _start(ex, ey, is_found, count, shape, _F(0.6))
+            blur, scale = _fit(ex, ey, is_found, widths, noises, shape, count, sums, room)
             if (shape[0] - from_x) ** 2 + (shape[1] - from_y) ** 2 + (shape[2] - from_r) ** 2 < _F(4.0):
                 break
         _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, found[n])

@@ -236,12 +236,12 @@ def _offsets(shapes: NDArray[Any], which: NDArray[Any], x: NDArray[Any], y: NDAr
     along, across = c * dx + s * dy, c * dy - s * dx
     far = np.hypot(dx, dy)
     over = np.where(radius > 0.0, 0.0, np.copysign(np.maximum(np.abs(along) - half, 0.0), along))
-    beside = (radius > 0.0) & (along < far * half)
-    ox = np.where(beside, along - radius * half, np.where(radius > 0.0, along, over))
-    oy = np.where(beside, across - np.copysign(radius * end, across), across)
+    on_line = (radius > 0.0) & (along < far * half)
+    ox = np.where(on_line, along - radius * half, np.where(radius > 0.0, along, over))
+    oy = np.where(on_line, across - np.copysign(radius * end, across), across)
     length = np.hypot(ox, oy) + 1e-300
     straight = (radius == 0.0) & (over == 0.0)
-    away = np.where(straight, across, np.where((radius > 0.0) & ~beside, far - radius, length))
+    away = np.where(straight, across, np.where((radius > 0.0) & ~on_line, far - radius, length))
     nx, ny = np.where(straight, 0.0, ox / length), np.where(straight, 1.0, oy / length)
     return away, c * nx - s * ny, s * nx + c * ny
 
@@ -263,9 +263,9 @@ def _local(device: Device, field_map: DistanceMap, pose: tuple[float, ...]) -> C
         x, y = at[0] + dx, at[1] + dy
         row = np.clip(np.rint((y - y0) / field_map.cell).astype(int), 0, nearest.shape[0] - 1)
         column = np.clip(np.rint((x - x0) / field_map.cell).astype(int), 0, nearest.shape[1] - 1)
-        may = _offsets(shapes, nearest[row, column].T, x, y)
-        least = np.argmin(np.abs(may[0]), axis=0)
-        return (*(each[least, np.arange(_RAYS)] for each in may), dx, dy)
+        candidates = _offsets(shapes, nearest[row, column].T, x, y)
+        least = np.argmin(np.abs(candidates[0]), axis=0)
+        return (*(each[least, np.arange(_RAYS)] for each in candidates), dx, dy)
 
     def residuals(at: NDArray[Any]) -> NDArray[Any]:
         away = rows(at)[0]

@@ -168,8 +168,8 @@ def measure(case: Case, device: Device, *, seconds: float = 2.0) -> list[Row]:
     calls: dict[str, Callable[[], object]] = {"": case.ours, **case.peers}
     if case.traffic is not None:
         calls["ceiling"] = ceiling.move(device, *case.traffic, case.repeats)
-    taken = _take_turns(calls, seconds)
-    times = {name: np.array(each) * (case.factors.get(name, 1.0) / case.repeats) for name, each in taken.items()}
+    durations = _take_turns(calls, seconds)
+    times = {name: np.array(each) * (case.factors.get(name, 1.0) / case.repeats) for name, each in durations.items()}
     ours = times.pop("")
     limit = times.pop("ceiling", None)
     fraction = None if limit is None else float(np.median(limit / ours))
@@ -200,8 +200,8 @@ def _take_turns(calls: Mapping[str, Callable[[], object]], seconds: float) -> di
     low, high = _ROUND_LIMITS
     times: dict[str, list[float]] = {name: [] for name in calls}
     for number in range(min(max(rounds, low), high)):
-        for name, taken in _round(calls, number).items():
-            times[name].append(taken)
+        for name, duration in _round(calls, number).items():
+            times[name].append(duration)
     return times
 
 

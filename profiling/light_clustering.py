@@ -112,10 +112,10 @@ class Part:
             scene=self.scene, segments=len(self.segments), clearance=self.clearance, precision="single"
         )
         bound = operation.bind(device, self.receivers.shape, real)
-        nothing = np.zeros_like(self.weights)
+        zeros = np.zeros_like(self.weights)
 
         def call() -> NDArray[Any]:
-            inputs = [each.astype(real, copy=False) for each in (self.receivers, nothing, self.segments)]
+            inputs = [each.astype(real, copy=False) for each in (self.receivers, zeros, self.segments)]
             return np.asarray(bound.on_host(inputs).irradiance)
 
         return call

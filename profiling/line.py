@@ -116,8 +116,8 @@ def _numpy_windowed(frames: Frames) -> tuple[NDArray[Any], ...]:
     at = frames.argmax(axis=1)
     around = np.arange(-WINDOW, WINDOW + 1)
     index = np.clip(at[:, None, :] + around[None, :, None], 0, frames.shape[1] - 1)
-    near = np.take_along_axis(frames, index, axis=1)
-    light = np.maximum(near, THRESHOLD).astype(np.float32) - np.float32(THRESHOLD)
+    in_window = np.take_along_axis(frames, index, axis=1)
+    light = np.maximum(in_window, THRESHOLD).astype(np.float32) - np.float32(THRESHOLD)
     total = light.sum(axis=1)
     with np.errstate(invalid="ignore"):
         return at + np.einsum("fkc,k->fc", light, around.astype(np.float32)) / total, total, total == 0
@@ -131,15 +131,15 @@ def _windows(frames: Frames, reach: int) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def _numpy_gauss3(frames: Frames) -> Any:
-    at, near = _windows(frames, 1)
+    at, in_window = _windows(frames, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        a, b, c = np.moveaxis(np.log(np.maximum(near - THRESHOLD, 0.0)), 1, 0)
+        a, b, c = np.moveaxis(np.log(np.maximum(in_window - THRESHOLD, 0.0)), 1, 0)
         return at + 0.5 * (a - c) / (a - 2.0 * b + c)
 
 
 def _numpy_fir(frames: Frames) -> Any:
-    at, near = _windows(frames, WINDOW + 2)
-    balance = near[:, :-4] + near[:, 1:-3] - near[:, 3:-1] - near[:, 4:]
+    at, in_window = _windows(frames, WINDOW + 2)
+    balance = in_window[:, :-4] + in_window[:, 1:-3] - in_window[:, 3:-1] - in_window[:, 4:]
     before, after = balance[:, :-1], balance[:, 1:]
     with np.errstate(divide="ignore", invalid="ignore"):
         place = np.arange(-WINDOW, WINDOW)[None, :, None] + before / (before - after)
@@ -150,8 +150,8 @@ def _numpy_fir(frames: Frames) -> Any:
 
 def _numpy_ml(frames: Frames, steps: int = 12) -> Any:
     """Fit a pixel-integrated Gaussian on a background by Fisher scoring, for all columns at once."""
-    at, near = _windows(frames, WINDOW)
-    y = np.moveaxis(near, 1, 2)
+    at, in_window = _windows(frames, WINDOW)
+    y = np.moveaxis(in_window, 1, 2)
     edge = np.arange(2 * WINDOW + 2) - WINDOW - 0.5
     background = (y[..., 0] + y[..., -1]) / 2.0
     amplitude = np.maximum(y.max(axis=-1) - background, 1.0)

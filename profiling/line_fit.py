@@ -73,8 +73,8 @@ def _case(device: Device, count: int) -> Case:
     bound.run()
     peers["numba"]()
     normal, centre = to_numpy(bound.outputs.normal), to_numpy(bound.outputs.centre)
-    apart = np.abs(normal[:, 0] * out[:, 1] - normal[:, 1] * out[:, 0])
-    if not np.quantile(apart, 0.99) < 1e-4:
+    difference = np.abs(normal[:, 0] * out[:, 1] - normal[:, 1] * out[:, 0])
+    if not np.quantile(difference, 0.99) < 1e-4:
         raise AssertionError("the lines of the peer numba differ from ours")
     error = np.nan
     if device.has_double:

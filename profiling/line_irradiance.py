@@ -37,12 +37,12 @@ def _numba(receivers, table, out):  # type: ignore[no-untyped-def]  # Numba infe
     for block in numba.prange((count + _BLOCK - 1) // _BLOCK):
         begin = block * _BLOCK
         n = min(_BLOCK, count - begin)
-        own = np.empty((6, _BLOCK), np.float32)
+        local = np.empty((6, _BLOCK), np.float32)
         sums = np.zeros(_BLOCK, np.float32)
         for i in range(n):
             for k in range(6):
-                own[k, i] = receivers[begin + i, k]
-        xs, ys, zs, us, vs, ws = own[0], own[1], own[2], own[3], own[4], own[5]
+                local[k, i] = receivers[begin + i, k]
+        xs, ys, zs, us, vs, ws = local[0], local[1], local[2], local[3], local[4], local[5]
         for m in range(table.shape[0]):
             px, py, pz, ux, uy, uz = table[m, 0], table[m, 1], table[m, 2], table[m, 3], table[m, 4], table[m, 5]
             lx, ly, lz, length, power = table[m, 6], table[m, 7], table[m, 8], table[m, 9], table[m, 10]

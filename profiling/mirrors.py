@@ -76,14 +76,18 @@ def _balls(device: Device) -> Case:
     peer()
     order, their_order = (np.argsort(np.where(each < 0, len(corners), each), axis=1) for each in (triangle, found))
     ours, same = np.take_along_axis(triangle, order, axis=1), np.take_along_axis(found, their_order, axis=1)
-    apart = np.take_along_axis(place, order[..., None], axis=1) - np.take_along_axis(theirs, their_order[..., None], 1)
+    difference = np.take_along_axis(place, order[..., None], axis=1) - np.take_along_axis(
+        theirs, their_order[..., None], 1
+    )
     both = (ours == same) & (ours >= 0)
     metadata = {
         "pairs": _POINTS * len(corners),
         "images": int((triangle >= 0).sum()),
         "others": int((ours != same).sum()),
     }
-    return Case("mirrors", "balls", bound.run, {"numba": peer}, float(np.abs(apart[both]).max()), metadata=metadata)
+    return Case(
+        "mirrors", "balls", bound.run, {"numba": peer}, float(np.abs(difference[both]).max()), metadata=metadata
+    )
 
 
 def _corner_table(lens: Array, corners: Array, normals: Array) -> Array:
@@ -172,15 +176,15 @@ def _surface(corners, normals, x, y):  # type: ignore[no-untyped-def]  # Numba i
 
 @numba.njit(error_model="numpy")
 def _newton(point, lens, corners, normals, x, y):  # type: ignore[no-untyped-def]  # Numba infers types
-    here, aside, above = np.empty(2), np.empty(2), np.empty(2)
+    residual, residual_x, residual_y = np.empty(2), np.empty(2), np.empty(2)
     for _ in range(16):
-        for out, dx, dy in ((here, 0.0, 0.0), (aside, 1e-6, 0.0), (above, 0.0, 1e-6)):
+        for out, dx, dy in ((residual, 0.0, 0.0), (residual_x, 1e-6, 0.0), (residual_y, 0.0, 1e-6)):
             place, normal = _surface(corners, normals, x + dx, y + dy)
             _law(point, lens, place, normal, corners, out)
-        ax, ay = (aside[0] - here[0]) * 1e6, (above[0] - here[0]) * 1e6
-        bx, by = (aside[1] - here[1]) * 1e6, (above[1] - here[1]) * 1e6
+        ax, ay = (residual_x[0] - residual[0]) * 1e6, (residual_y[0] - residual[0]) * 1e6
+        bx, by = (residual_x[1] - residual[1]) * 1e6, (residual_y[1] - residual[1]) * 1e6
         per = 1.0 / (ax * by - ay * bx)
-        dx, dy = (here[0] * by - here[1] * ay) * per, (here[1] * ax - here[0] * bx) * per
+        dx, dy = (residual[0] * by - residual[1] * ay) * per, (residual[1] * ax - residual[0] * bx) * per
         x, y = x - min(max(dx, -0.5), 0.5), y - min(max(dy, -0.5), 0.5)
         if abs(dx) + abs(dy) < 1e-9:
             break
@@ -279,8 +283,10 @@ def _by_samples(scene: Scene, view: SensorView, lit: LitLine, embree: Any, sampl
 def _free(embree: Any, start: Array, end: Array) -> NDArray[np.bool_]:
     if not len(start):
         return np.zeros(0, bool)
-    way = end - start
-    way *= 1.0 - 2.0 * _LIFT / np.linalg.norm(way, axis=1, keepdims=True)
-    lifted = start + _LIFT * way / np.linalg.norm(way, axis=1, keepdims=True)
+    direction = end - start
+    direction *= 1.0 - 2.0 * _LIFT / np.linalg.norm(direction, axis=1, keepdims=True)
+    lifted = start + _LIFT * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     ones = np.ones(len(start), np.float32)
-    return np.asarray(embree.run(lifted.astype(np.float32), way.astype(np.float32), dists=ones, query="OCCLUDED") != 0)
+    return np.asarray(
+        embree.run(lifted.astype(np.float32), direction.astype(np.float32), dists=ones, query="OCCLUDED") != 0
+    )

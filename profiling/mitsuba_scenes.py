@@ -137,8 +137,8 @@ class LitScene:
         seen = triangle >= 0
         normal, corner = unit_normals(self.scene)[triangle], self.scene.corners[triangle, 0]
         slope = np.where(seen, normal @ self.towards, -1.0)
-        way = np.where(seen, np.sum(normal * (corner - film), axis=-1) / slope, 0.0)
-        return film + way[..., None] * self.towards, normal, seen & (slope < -1e-6)
+        distance = np.where(seen, np.sum(normal * (corner - film), axis=-1) / slope, 0.0)
+        return film + distance[..., None] * self.towards, normal, seen & (slope < -1e-6)
 
 
 def groove(angle: float, pixels: tuple[int, int] = (64, 64)) -> LitScene:
@@ -270,8 +270,8 @@ def _strips(lit: LitScene) -> Float64:
     """Return two triangles for each strip, a little above the surface, wound to emit along the normal."""
     start, end = lit.segments.ends[:, 0], lit.segments.ends[:, 1]
     along = end - start
-    beside = np.cross(lit.segments.normals, along / np.linalg.norm(along, axis=1, keepdims=True))
-    lift, half = _LIFT * lit.segments.normals, 0.5 * lit.width * beside
+    across = np.cross(lit.segments.normals, along / np.linalg.norm(along, axis=1, keepdims=True))
+    lift, half = _LIFT * lit.segments.normals, 0.5 * lit.width * across
     corners = [start - half + lift, end - half + lift, end + half + lift, start + half + lift]
     return np.concatenate([np.stack([corners[k] for k in three], axis=1) for three in ((0, 1, 2), (0, 2, 3))])
 

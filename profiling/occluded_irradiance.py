@@ -105,8 +105,8 @@ def _case(device: Device, board: Board, name: str, samples: int = 1024, **more: 
     weights = np.ones((*receivers.shape[:2], 2), np.float32)
     operation = OccludedIrradiance(scene=board.scene, segments=len(rows), clearance=_LIFT)
     bound = operation.bind(device, receivers.shape, receivers.dtype)
-    for there, here in zip(bound.inputs, (receivers, weights, rows.astype(np.float32)), strict=True):
-        there.set(here)
+    for target, source in zip(bound.inputs, (receivers, weights, rows.astype(np.float32)), strict=True):
+        target.set(source)
     ours = to_numpy(bound.run().irradiance)
     truth = np.full(ours.shape, np.nan)
     if device.has_double:
@@ -154,13 +154,13 @@ def irradiance_by_samples(board: Board, samples: int, embree: Any) -> NDArray[np
     """Return the irradiance of all receivers from samples of the line."""
     points, normals, light = _samples(board.segments, samples)
     places, facing = board.receivers.reshape(-1, 6)[:, :3], board.receivers.reshape(-1, 6)[:, 3:]
-    own = np.einsum("nk,nk->n", places, facing)[:, None]
+    plane_offset = np.einsum("nk,nk->n", places, facing)[:, None]
     lit = np.einsum("nk,nk->n", points, normals)[:, None]
     total = np.zeros(len(places), np.float32)
     step = max(_BLOCK // samples, 1)
     for first in range(0, len(places), step):
         some = np.s_[first : first + step]
-        toward = facing[some] @ points.T - own[some]
+        toward = facing[some] @ points.T - plane_offset[some]
         height = (normals @ places[some].T - lit).T
         i, j = np.nonzero((toward > 0.0) & (height > 0.0))
         start = places[some][i] + _LIFT * facing[some][i]

@@ -47,12 +47,12 @@ def _room(device: Device, receivers: int) -> Case:
     bound.inputs[0].set(points.astype(np.float32))
     ours = to_numpy(bound.run().factors)
     # Exclude the wall of the receiver: it lies in the plane of the receiver.
-    way = patches.corners[None] - points[:, None, None, :3]
-    apart = np.abs(np.einsum("nmkd,nd->nmk", way, points[:, 3:])).max(axis=2) > 1e-9
+    offset = patches.corners[None] - points[:, None, None, :3]
+    off_plane = np.abs(np.einsum("nmkd,nd->nmk", offset, points[:, 3:])).max(axis=2) > 1e-9
 
     def numpy() -> NDArray[np.float64]:
         parts = [_lambert(points[i : i + _CHUNK], patches.corners) for i in range(0, len(points), _CHUNK)]
-        return np.where(apart, np.concatenate(parts), 0.0)
+        return np.where(off_plane, np.concatenate(parts), 0.0)
 
     theirs = numpy()
     metadata = {"pairs": ours.size, "peer_error": 0.0}
@@ -129,10 +129,10 @@ class _PointByPoint:
         return np.concatenate(list(self._pool.map(self._part, self._parts)))
 
     def _part(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        way = self._middles - points[:, None, :3]
-        square = np.sum(way * way, axis=2)
-        at = np.einsum("nmd,nd->nm", way, points[:, 3:])
-        out = -np.einsum("nmd,md->nm", way, self._normals)
+        offset = self._middles - points[:, None, :3]
+        square = np.sum(offset * offset, axis=2)
+        at = np.einsum("nmd,nd->nm", offset, points[:, 3:])
+        out = -np.einsum("nmd,md->nm", offset, self._normals)
         receiver, patch = np.nonzero((at > 0.0) & (out > 0.0))
         start = points[receiver, :3] + _LIFT * points[receiver, 3:]
         end = self._middles[patch] + _LIFT * self._normals[patch]

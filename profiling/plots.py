@@ -67,8 +67,8 @@ def _growth(axes: Any, rows: Sequence[Row]) -> None:
         grown = _GROWTH.match(row.case)
         if grown is None:
             continue
-        what, times = grown.groups()
-        line = lines.setdefault(what or "all, within a tolerance", {})
+        quantity, times = grown.groups()
+        line = lines.setdefault(quantity or "all, within a tolerance", {})
         line[int(times)] = row.seconds
         if "base" in row.metadata:
             line[1] = bases[row.metadata["base"]]
@@ -85,12 +85,14 @@ def _tolerance(axes: Any, rows: Sequence[Row]) -> None:
     for row in rows:
         lines.setdefault(row.case.split("/")[0], []).append(row)
     for colour, (name, line) in zip(_COLOURS, lines.items(), strict=False):
-        asked = sorted(
+        tolerances = sorted(
             (row for row in line if row.metadata["tolerance"] > 0.0), key=lambda row: row.metadata["tolerance"]
         )
-        x = [1e6 * row.metadata["tolerance"] for row in asked]
-        axes.loglog(x, [1e3 * row.seconds for row in asked], "o-", color=colour, label=f"{name}: time", markersize=3)
-        off = [1e6 * max(row.error, 1e-12) for row in asked]
+        x = [1e6 * row.metadata["tolerance"] for row in tolerances]
+        axes.loglog(
+            x, [1e3 * row.seconds for row in tolerances], "o-", color=colour, label=f"{name}: time", markersize=3
+        )
+        off = [1e6 * max(row.error, 1e-12) for row in tolerances]
         axes.loglog(x, off, "s--", color=colour, label=f"{name}: largest error", markersize=3)
     if lines:
         axes.loglog(x, x, ":", color="0.4", label="as asked")

@@ -257,8 +257,8 @@ def _fused(image, plain, rulers, lines, taps, numbers, pairs, starts, edges, sta
         x, y, c, s, of_offset, of_angle = fit_line(u, v, w, pairs)
         reach = np.sqrt(of_offset / of_angle)
         for side in range(2):
-            way = reach if side else -reach
-            on, off, at = x + way * c, y + way * s, 2 * i + side
+            offset = reach if side else -reach
+            on, off, at = x + offset * c, y + offset * s, 2 * i + side
             rows[0, at], rows[1, at] = lines[i, 0], lines[i, 1]
             rows[2, at], rows[3, at] = lines[i, 2] + on * lines[i, 1], lines[i, 3] - on * lines[i, 0]
             rows[4, at], rows[5, at] = off * lines[i, 0], off * lines[i, 1]
@@ -367,10 +367,10 @@ class _Numpy:
     def _pose(self, found: tuple[NDArray[Any], ...]) -> tuple[NDArray[Any], NDArray[Any]]:
         position, width, sigma, dark = (found[i].reshape(LINES, EACH).astype(np.float64) for i in (0, 2, 3, 4))
         sigma = sigma * np.exp(0.5 / (width * width + of_ruler._VARIANCE))
-        *_, u0, v0, du, dv, bend = np.moveaxis(self.rulers, -1, 0)
-        per = 1.0 / (1.0 + position * bend)
+        *_, u0, v0, du, dv, projective = np.moveaxis(self.rulers, -1, 0)
+        per = 1.0 / (1.0 + position * projective)
         u, v = (u0 + position * du) * per, (v0 + position * dv) * per
-        w = np.where(dark > 0, 0.0, 1.0 / (np.abs(dv - v * bend) * per * sigma * self.noise))
+        w = np.where(dark > 0, 0.0, 1.0 / (np.abs(dv - v * projective) * per * sigma * self.noise))
         x, y, c, s, of_offset, of_angle = _numpy_lines(u, v, w, self.pairs)
         reach = np.sqrt(of_offset / of_angle)[:, None] * [-1.0, 1.0]
         on, off = x[:, None] + reach * c[:, None], y[:, None] + reach * s[:, None]

@@ -51,11 +51,11 @@ def _numba(model: Any) -> Callable[..., None]:
         for block in numba.prange((count + _BLOCK - 1) // _BLOCK):
             begin = block * _BLOCK
             n = min(_BLOCK, count - begin)
-            own = np.empty((6, _BLOCK), np.float32)
+            local = np.empty((6, _BLOCK), np.float32)
             for i in range(n):
                 for k in range(6):
-                    own[k, i] = directions[begin + i, k]
-            ix, iy, iz, ox, oy, oz = own[0], own[1], own[2], own[3], own[4], own[5]
+                    local[k, i] = directions[begin + i, k]
+            ix, iy, iz, ox, oy, oz = local[0], local[1], local[2], local[3], local[4], local[5]
             for i in range(n):
                 one = ONE / np.sqrt(ix[i] * ix[i] + iy[i] * iy[i] + iz[i] * iz[i])
                 two = ONE / np.sqrt(ox[i] * ox[i] + oy[i] * oy[i] + oz[i] * oz[i])

@@ -100,8 +100,8 @@ def _search(device: Device) -> Case:
     for angle in np.linspace(-1.0, 1.0, _HEADINGS) * math.radians(5.0):
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         turned.append(((points - (319.5, 239.5)) @ turn + (319.5, 239.5), normals @ turn))
-    seen, ways = (np.stack(each) for each in zip(*turned, strict=True))
-    shifts = cell_offsets(seen, ways, _CELL, border, cells, (_ROWS, _ROWS))
+    seen, directions = (np.stack(each) for each in zip(*turned, strict=True))
+    shifts = cell_offsets(seen, directions, _CELL, border, cells, (_ROWS, _ROWS))
     op = EdgeSearch(rows=_ROWS, columns=_ROWS, headings=_HEADINGS, points=_POINTS)
     bound = op.bind(device, cells, np.uint16)
     bound.inputs[0].set(level)
@@ -135,9 +135,9 @@ def pictures() -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float64
     fine = np.full((4 * _SIDE, 4 * _SIDE), 255, np.uint8)
     for _ in range(45):
         x, y = rng.integers(0, 4 * _SIDE, 2)
-        way = [(1, 0), (0, 1), (1, 1), (1, -1)][rng.integers(4)]
+        direction = [(1, 0), (0, 1), (1, 1), (1, -1)][rng.integers(4)]
         length = int(rng.integers(200, 900))
-        end = (int(x + length * way[0]), int(y + length * way[1]))
+        end = (int(x + length * direction[0]), int(y + length * direction[1]))
         cv2.line(fine, (int(x), int(y)), end, 0, int(rng.integers(40, 110)))
         cv2.circle(fine, (int(x), int(y)), int(rng.integers(50, 110)), 0, -1)
     angle, shift = math.radians(3.7), np.array([21.3, -16.8])
@@ -165,12 +165,12 @@ def _pair(device: Device) -> Case:
     template, image, motion = pictures()
     turned = np.array([[math.cos(0.0035), -math.sin(0.0035)], [math.sin(0.0035), math.cos(0.0035)]])
     start = np.column_stack([turned @ motion[:, :2], motion[:, 2] + (1.4, -1.4)]).astype(np.float32)
-    whole = np.full(template.shape, 255, np.uint8)
+    white = np.full(template.shape, 255, np.uint8)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-6)
 
     def by_opencv() -> NDArray[Any]:
         warp = start.copy()
-        cv2.findTransformECC(template, image, warp, cv2.MOTION_EUCLIDEAN, criteria, whole, 5)
+        cv2.findTransformECC(template, image, warp, cv2.MOTION_EUCLIDEAN, criteria, white, 5)
         return warp
 
     def ours() -> NDArray[np.float64]:

@@ -134,15 +134,15 @@ def _refined(profiles: NDArray[Any], matrix: NDArray[Any]) -> tuple[NDArray[Any]
     slopes = profiles @ matrix
     at = np.argmax(np.abs(slopes[:, 1:-1]), axis=1) + 1
     each = np.arange(len(at))
-    here = slopes[each, at]
-    before = np.log(np.maximum(slopes[each, at - 1] / here, 1e-6))
-    after = np.log(np.maximum(slopes[each, at + 1] / here, 1e-6))
+    peak = slopes[each, at]
+    before = np.log(np.maximum(slopes[each, at - 1] / peak, 1e-6))
+    after = np.log(np.maximum(slopes[each, at + 1] / peak, 1e-6))
     variance, tilt = -1.0 / (before + after), 0.5 * (after - before)
     shift = tilt * variance
     position = at + shift + (_REACH - (LENGTH - 1) / 2)
-    amplitude = here * np.exp(0.5 * tilt * shift) * np.sqrt(2.0 * np.pi * variance)
+    amplitude = peak * np.exp(0.5 * tilt * shift) * np.sqrt(2.0 * np.pi * variance)
     width = np.sqrt(np.maximum(variance - _VARIANCE, 0.0))
-    return position, amplitude, width, variance / np.abs(here), np.abs(here) < _LEAST
+    return position, amplitude, width, variance / np.abs(peak), np.abs(peak) < _LEAST
 
 
 def _numpy(image: NDArray[Any], rulers: NDArray[Any], matrix: NDArray[Any]) -> tuple[NDArray[Any], ...]:
@@ -157,9 +157,9 @@ def _numpy(image: NDArray[Any], rulers: NDArray[Any], matrix: NDArray[Any]) -> t
 
 def _opencv(image: NDArray[Any], rulers: NDArray[Any], matrix: NDArray[Any]) -> tuple[NDArray[Any], ...]:
     """Measure the rulers in blocks that do not exceed the rows of remap."""
-    parts, most = [], _OPENCV_ROWS // WIDTH
-    for first in range(0, len(rulers), most):
-        x, y = (each.reshape(-1, LENGTH) for each in _places(rulers[first : first + most]))
+    parts, max_rulers = [], _OPENCV_ROWS // WIDTH
+    for first in range(0, len(rulers), max_rulers):
+        x, y = (each.reshape(-1, LENGTH) for each in _places(rulers[first : first + max_rulers]))
         samples = cv2.remap(image, x, y, cv2.INTER_LINEAR).reshape(-1, WIDTH, LENGTH)
         parts.append(samples.sum(axis=1, dtype=np.uint16).astype(np.float32))
     return _refined((parts[0] if len(parts) == 1 else np.concatenate(parts)) * np.float32(1.0 / WIDTH), matrix)
@@ -173,13 +173,13 @@ def _corrected(rulers: NDArray[np.float64], position: NDArray[Any], width: NDArr
     lines = np.arange(WIDTH)[:, None] - 0.5 * (WIDTH - 1)
     for centre, along, across in ((x, cosine, -sine), (y, sine, cosine)):
         for k in (1, 2):
-            whole = np.round(k * along)
-            square = (2.0 * np.pi * (k * along - whole)) ** 2
-            phase = k * (centre + along * position) - whole * (position + 0.5 * (LENGTH - 1))
-            alike = np.mean(np.cos(2.0 * np.pi * k * across * lines), axis=0) * np.exp(-0.5 * square * common)
-            even = 2.0 * np.pi * (k * along - whole) * (1.0 + (square * common - 3.0) * common / _VARIANCE)
+            nearest = np.round(k * along)
+            square = (2.0 * np.pi * (k * along - nearest)) ** 2
+            phase = k * (centre + along * position) - nearest * (position + 0.5 * (LENGTH - 1))
+            attenuation = np.mean(np.cos(2.0 * np.pi * k * across * lines), axis=0) * np.exp(-0.5 * square * common)
+            even = 2.0 * np.pi * (k * along - nearest) * (1.0 + (square * common - 3.0) * common / _VARIANCE)
             odd = (3.0 + square * (variance - 6.0 * common) + (square * common) ** 2) * along / (np.pi * k * variance)
-            moved += alike * np.sin(2.0 * np.pi * phase) * along**2 * (even + odd) / (2.0 * (np.pi * k) ** 2)
+            moved += attenuation * np.sin(2.0 * np.pi * phase) * along**2 * (even + odd) / (2.0 * (np.pi * k) ** 2)
     return np.asarray(position - moved)
 
 

@@ -64,8 +64,8 @@ def _peak(profiles: Float64, smoothing: float, step: float = 1.0) -> Float64:
     taps = k * np.exp(-0.5 * (k * step / smoothing) ** 2)
     slopes = np.stack([np.correlate(each, taps, "valid") for each in profiles])
     at = np.argmax(slopes[:, 1:-1], axis=1) + 1
-    before, here, after = (np.log(np.maximum(slopes[np.arange(len(at)), at + j], 1e-6)) for j in (-1, 0, 1))
-    shift = 0.5 * (before - after) / (before - 2.0 * here + after)
+    before, centre, after = (np.log(np.maximum(slopes[np.arange(len(at)), at + j], 1e-6)) for j in (-1, 0, 1))
+    shift = 0.5 * (before - after) / (before - 2.0 * centre + after)
     return np.asarray((at + shift + reach - 0.5 * (profiles.shape[1] - 1)) * step)
 
 
@@ -139,8 +139,8 @@ def table(device: Device, images: int = 40) -> list[str]:
         cells = [f"{noise:g} ({100.0 / noise:.0f})" if noise else "0", f"{bound(noise):.4f}"]
         for name, method in methods.items():
             located = method(noise)
-            few = min(images, _SLOW // (_RULERS * len(ANGLES))) if name.startswith("scikit") else images
-            found = [(located(scene), scene[2]) for scene in scenes(noise, few)]
+            image_count = min(images, _SLOW // (_RULERS * len(ANGLES))) if name.startswith("scikit") else images
+            found = [(located(scene), scene[2]) for scene in scenes(noise, image_count)]
             error = np.concatenate([position - true for (position, _), true in found])
             cell = f"{error.std():.4f} ({error.std() / bound(noise):.2f}), {error.mean():+.4f}"
             if found[0][0][1] is not None:

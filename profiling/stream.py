@@ -200,9 +200,9 @@ def _case(name: str, frames: NDArray[np.uint8], device: Device, held: Held, erro
 
 def _blocking_loop(frames: NDArray[np.uint8], device: Device) -> Callable[[], None]:
     """Return a loop without a stream: copy a frame in, run, copy the results out, and wait after each step."""
-    apart = copy.copy(device)
-    apart.shares_memory = False
-    bound = READOUT.bind(apart, SHAPE, np.uint8)
+    own_device = copy.copy(device)
+    own_device.shares_memory = False
+    bound = READOUT.bind(own_device, SHAPE, np.uint8)
     target: Any = bound.inputs[0].base_data
     outputs = [each for each in bound.outputs if isinstance(each, DeviceArray)]
     results: list[tuple[Any, Any]] = [(np.empty(each.shape, each.dtype), each.base_data) for each in outputs]
@@ -235,12 +235,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--device", action="append", help="label of a device; repeat for several; default: all")
     parser.add_argument("--runs", type=int, default=5, help="number of runs on each device")
     parser.add_argument("--seconds", type=float, default=60.0, help="duration of a run [s]")
-    asked = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     frames = line_frames()
     lost = 0
-    for device in [Device.named(each) for each in asked.device] if asked.device else Device.all():
-        for number in range(asked.runs):
-            held = hold_loaded(frames, device, _LOADED_RATE, asked.seconds)
+    for device in [Device.named(each) for each in options.device] if options.device else Device.all():
+        for number in range(options.runs):
+            held = hold_loaded(frames, device, _LOADED_RATE, options.seconds)
             if not number:
                 print(f"{device.label}: {held.plan}", flush=True)
             print(f"{device.label} run {number + 1}: {held.report}, frames read up to {1e3 * held.late:.3g} ms late")

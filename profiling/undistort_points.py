@@ -46,12 +46,12 @@ _CONVERGED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 @numba.njit(error_model="numpy")
 def _newton_step(x, y, at_x, at_y, one, k1, k2, p1, p2, k3):  # type: ignore[no-untyped-def]  # Numba infers types
     q = at_x * at_x + at_y * at_y
-    growth = one + q * (k1 + q * (k2 + q * k3)) + (one + one) * (p1 * at_y + p2 * at_x)
+    scale = one + q * (k1 + q * (k2 + q * k3)) + (one + one) * (p1 * at_y + p2 * at_x)
     slope = (one + one) * (k1 + q * (k2 + k2 + (one + one + one) * q * k3))
     by_x, by_y = slope * at_x + (p2 + p2), slope * at_y + (p1 + p1)
-    left_x, left_y = at_x * growth + q * p2 - x, at_y * growth + q * p1 - y
-    xx, xy = growth + at_x * (by_x + (p2 + p2)), at_x * by_y + at_y * (p2 + p2)
-    yx, yy = at_y * by_x + at_x * (p1 + p1), growth + at_y * (by_y + (p1 + p1))
+    left_x, left_y = at_x * scale + q * p2 - x, at_y * scale + q * p1 - y
+    xx, xy = scale + at_x * (by_x + (p2 + p2)), at_x * by_y + at_y * (p2 + p2)
+    yx, yy = at_y * by_x + at_x * (p1 + p1), scale + at_y * (by_y + (p1 + p1))
     per = one / (xx * yy - xy * yx)
     return at_x - (yy * left_x - xy * left_y) * per, at_y - (xx * left_y - yx * left_x) * per
 

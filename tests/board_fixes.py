@@ -94,8 +94,8 @@ class BoardFix:
             copper += at(x, y, "D02") + at(x + 2.5, y, "D01")
         for x, y in ((1.5, 3.6), (13.2, 3.6), (3.2, 6.2), (12.4, 6.6)):
             copper += at(x, y, "D02") + at(x, y + 2.2, "D01")
-        for x, y, way in ((5, 3.4, 1), (8, 5.6, -1), (5.2, 6.6, 1), (9.6, 3.4, 1)):
-            copper += at(x, y, "D02") + at(x + 1.8, y + 1.8 * way, "D01")
+        for x, y, sign in ((5, 3.4, 1), (8, 5.6, -1), (5.2, 6.6, 1), (9.6, 3.4, 1)):
+            copper += at(x, y, "D02") + at(x + 1.8, y + 1.8 * sign, "D01")
         copper += "D11*\n"
         for x, y in ((13.5, 1.8), (13.5, 10.4), (8.6, 8.6), (2.2, 8.9)):
             copper, mask = copper + at(x, y, "D03"), mask + at(x, y, "D03")
@@ -163,7 +163,7 @@ class BoardFix:
         normal, point = self.rulers.normal[which], self.rulers.point[which] - self.middle
         per, (x, y) = 1 / PIXEL, np.array(self.view.corner) - self.middle
         matrix = np.array([[per, 0.0, -x * per], [0.0, -per, y * per], [0.0, 0.0, 1.0]])
-        laid = place_rulers(normal, point, np.zeros((len(which), 1)), matrix, etch_factor=1.0)
+        rulers = place_rulers(normal, point, np.zeros((len(which), 1)), matrix, etch_factor=1.0)
         ruler = RulerEdges(
             threshold=15.0,
             length=math.ceil(self.rulers.length.max() / PIXEL),
@@ -189,7 +189,7 @@ class BoardFix:
         for draw in range(draws):
             pose = (*rng.uniform(-SHIFT, SHIFT, 2), rng.uniform(-ANGLE, ANGLE))
             picture = pictures[draw % len(pictures)].seen(pose, rng)
-            found = fix(np.clip(np.rint(picture), 0, 255).astype(np.uint8), *laid, device=device)
+            found = fix(np.clip(np.rint(picture), 0, 255).astype(np.uint8), *rulers, device=device)
             status[draw] = found.status
             errors[draw], covariances[draw] = found.pose - pose, found.covariance
         return Fixes(errors, covariances, status)
@@ -215,8 +215,8 @@ class BoardFix:
         if kind == "reversed":
             return self.painted(replace(view, levels=(110.0, 60.0, 200.0, 90.0, 20.0, 240.0)))
         if kind == "missing":
-            gone = rng.choice(self._areas, round(0.3 * len(self._areas)), replace=False)
-            return self.painted(view, missing=set(gone.tolist()))
+            removed = rng.choice(self._areas, round(0.3 * len(self._areas)), replace=False)
+            return self.painted(view, missing=set(removed.tolist()))
         return self.painted(view, more=self.splashes(rng) if kind == "outliers" else ())
 
     def painted(
@@ -240,8 +240,8 @@ class BoardFix:
         for index in rng.permutation(len(points)):
             normal, along = normals[index], np.array([-normals[index, 1], normals[index, 0]])
             away = points - points[index]
-            near = (np.abs(away @ along) < seen) & (np.abs(away @ normal) < 350e-6)
-            more = hit | set(np.flatnonzero(near).tolist())
+            is_near = (np.abs(away @ along) < seen) & (np.abs(away @ normal) < 350e-6)
+            more = hit | set(np.flatnonzero(is_near).tolist())
             if len(more) > round(share * len(points)):
                 continue
             hit = more

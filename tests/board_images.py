@@ -220,8 +220,8 @@ def _inside(corners: Float64, low: npt.NDArray[np.int64], high: npt.NDArray[np.i
     """Return which samples are inside a polygon by the odd-even rule: crossings to the left of each, in each row."""
     columns, rows = high - low
     line = np.arange(low[1], high[1])
-    aside = _ASIDE[line % SAMPLES]
-    height = line + (0.5 - aside) / SAMPLES + 0.0
+    shift = _ASIDE[line % SAMPLES]
+    height = line + (0.5 - shift) / SAMPLES + 0.0
     x, y = corners.T
     to_x, to_y = np.roll(corners, -1, axis=0).T
     first = np.searchsorted(height, np.minimum(y, to_y), side="right")
@@ -230,6 +230,6 @@ def _inside(corners: Float64, low: npt.NDArray[np.int64], high: npt.NDArray[np.i
     row = np.arange(len(side)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(first, count)
     where = x[side] + (height[row] - y[side]) * ((to_x - x)[side] / (to_y - y)[side])
     turns = np.zeros((rows, columns + 1), dtype=np.uint8)
-    at = np.clip(np.ceil(where - aside[row]) - low[0], 0, columns).astype(int)
+    at = np.clip(np.ceil(where - shift[row]) - low[0], 0, columns).astype(int)
     np.add.at(turns, (row, at), 1)
     return np.asarray(np.bitwise_xor.accumulate(turns[:, :columns] & 1, axis=1), dtype=bool)

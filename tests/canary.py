@@ -19,12 +19,12 @@ class Guarded:
         self.out = type(like)(*(None if each is None else self._array(each) for each in like))
 
     def _array(self, like: NDArray[Any]) -> NDArray[Any]:
-        whole = np.full(like.nbytes + 2 * _GUARD, _BYTE, np.uint8)
-        self._whole.append(whole)
-        return whole[_GUARD : _GUARD + like.nbytes].view(like.dtype).reshape(like.shape)
+        guarded = np.full(like.nbytes + 2 * _GUARD, _BYTE, np.uint8)
+        self._whole.append(guarded)
+        return guarded[_GUARD : _GUARD + like.nbytes].view(like.dtype).reshape(like.shape)
 
     def assert_intact(self) -> None:
         """Assert that the guard bytes before and after every output are unchanged."""
-        for whole in self._whole:
-            assert (whole[:_GUARD] == _BYTE).all()
-            assert (whole[-_GUARD:] == _BYTE).all()
+        for guarded in self._whole:
+            assert (guarded[:_GUARD] == _BYTE).all()
+            assert (guarded[-_GUARD:] == _BYTE).all()

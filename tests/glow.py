@@ -136,8 +136,8 @@ class Room:
             once = LineIrradiance(segments=light)(receivers).irradiance
             away = CEILING - places[..., 1] if name == "wall" else places[..., 2]
             more = others[name](np.stack([places[..., 0], away], axis=-1))
-            beside = (places - self.foot(frame)) @ self.normal(frame)
-            made[name] = Surface(slice(*rows), places, beside, away, once, more)
+            distance = (places - self.foot(frame)) @ self.normal(frame)
+            made[name] = Surface(slice(*rows), places, distance, away, once, more)
         return made
 
     def _bounces(self, frame: int, wall: LitSegments, ceiling: LitSegments) -> dict[str, Callable[[Float64], Float64]]:
@@ -198,9 +198,9 @@ def room() -> Room:
 
 def kept(surface: Surface, red: Float64, reach: tuple[float, float]) -> NDArray[np.bool_]:
     """Return a mask of the valid pixels: near the corner, beside the line, not saturated, and not occluded."""
-    near = surface.away < (WALL_DOWN if surface.rows.start else CEILING_OUT)
-    aside = (np.abs(surface.beside) > BESIDE) & (surface.beside > reach[0]) & (surface.beside < reach[1])
-    return np.asarray(near & aside & (red[surface.rows] < LIMIT))
+    near_corner = surface.away < (WALL_DOWN if surface.rows.start else CEILING_OUT)
+    off_line = (np.abs(surface.beside) > BESIDE) & (surface.beside > reach[0]) & (surface.beside < reach[1])
+    return np.asarray(near_corner & off_line & (red[surface.rows] < LIMIT))
 
 
 def fit(predicted: Float64, measured: Float64) -> Fit:
@@ -213,10 +213,10 @@ def fit(predicted: Float64, measured: Float64) -> Fit:
 
 def brightest_away(surface: Surface, light: Float64, beside: float, within: float = 0.01) -> float:
     """Return the distance from the corner of the brightest point, at a distance beside the line (< 0: left of it)."""
-    near = np.abs(surface.beside - beside) < within
+    in_stripe = np.abs(surface.beside - beside) < within
     bins = np.linspace(0.0, 0.4, 81)
-    index = np.digitize(surface.away[near], bins)
-    mean = np.array([light[near][index == n].mean() if (index == n).any() else 0.0 for n in range(1, len(bins))])
+    index = np.digitize(surface.away[in_stripe], bins)
+    mean = np.array([light[in_stripe][index == n].mean() if (index == n).any() else 0.0 for n in range(1, len(bins))])
     smooth = np.convolve(mean, np.ones(5) / 5.0, mode="same")
     return float(0.5 * (bins[1:] + bins[:-1])[np.argmax(smooth)])
 

@@ -34,12 +34,12 @@ class SearchIndex:
 
     def search(self, query: str) -> list[str]:
         """Return the pages that the search finds for a query, best first."""
-        asked = query.lower().strip()
+        text = query.lower().strip()
         scores: dict[str, float] = {}
         minor: dict[str, float] = {}
-        for page, score in (*self._in_titles(asked), *self._in_objects(asked), *self._in_terms(asked)):
+        for page, score in (*self._in_titles(text), *self._in_objects(text), *self._in_terms(text)):
             scores[page] = max(score, scores.get(page, -100.0))
-        for page, score, is_main in self._in_entries(asked):
+        for page, score, is_main in self._in_entries(text):
             table = scores if is_main else minor
             table[page] = max(score, table.get(page, -100.0))
         ranked = sorted(scores, key=lambda page: (-scores[page], page))

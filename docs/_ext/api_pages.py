@@ -275,7 +275,7 @@ def shorten_arrays(app: Any, what: str, name: str, value: Any, options: Any, sig
 
 
 def skip_fields(app: Any, what: str, name: str, value: Any, skip: bool, options: Any) -> bool | None:
-    """Skip the fields of a named tuple: the tuple's docstring lists them, and a field has only "Alias for field number 0"."""
+    """Skip the fields of a named tuple: its docstring lists them, and the fields have generated docstrings."""
     return True if type(value).__name__ == "_tuplegetter" else None
 
 

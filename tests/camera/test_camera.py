@@ -178,12 +178,12 @@ def test_fold_along_rays(coefficients: tuple[float, ...]) -> None:
             assert np.isfinite(unit.distort(5.9 * direction)).all()
             continue
         finite += 1
-        before, behind = (fold - 1e-3) * direction, (fold + 1e-3) * direction
+        before, beyond = (fold - 1e-3) * direction, (fold + 1e-3) * direction
         assert unit.invertible_radius < fold
         assert np.isfinite(unit.distort(before)).all()
-        assert np.isnan(unit.distort(behind)).all()
+        assert np.isnan(unit.distort(beyond)).all()
         np.testing.assert_allclose(unit.undistort(unit.distort(before)), before, rtol=0, atol=1e-11)
-        assert np.isnan(unit.distort(np.linspace(1.001, 5.0, 300)[:, None] * behind)).all()
+        assert np.isnan(unit.distort(np.linspace(1.001, 5.0, 300)[:, None] * beyond)).all()
     assert finite > 5
 
 
@@ -279,12 +279,12 @@ def test_table_round_trip(any_camera: Camera) -> None:
 
 
 def test_code_is_compiled_only_where_needed() -> None:
-    none = {"CAMERA": None, "CAMERA_RADIAL": 0, "CAMERA_RATIONAL": 0}
-    assert camera().defines() == none
-    assert camera(-0.1, 0.02).defines() == none | {"CAMERA_RADIAL": 2}
-    assert camera(0.0, 0.0, 0.0, 1e-3).defines(MATRIX) == none | {"CAMERA_DECENTRED": None}
+    no_terms = {"CAMERA": None, "CAMERA_RADIAL": 0, "CAMERA_RATIONAL": 0}
+    assert camera().defines() == no_terms
+    assert camera(-0.1, 0.02).defines() == no_terms | {"CAMERA_RADIAL": 2}
+    assert camera(0.0, 0.0, 0.0, 1e-3).defines(MATRIX) == no_terms | {"CAMERA_DECENTRED": None}
     full = {"CAMERA_DECENTRED", "CAMERA_PRISM", "CAMERA_TILTED", "CAMERA_MATRICES"}
-    assert set(CAMERAS["all"].defines(ANOTHER)) == set(none) | full
+    assert set(CAMERAS["all"].defines(ANOTHER)) == set(no_terms) | full
     assert CAMERAS["all"].defines()["CAMERA_RATIONAL"] == 3
 
 

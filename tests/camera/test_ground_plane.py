@@ -181,8 +181,8 @@ def test_the_command_takes_a_mounted_camera(
     with pytest.raises(SystemExit) as done:
         cli.main()
     assert not done.value.code
-    told = json.loads((tmp_path / "out" / "pose.json").read_text())
-    assert abs(abs(told["candidates"][0]["pose"]["x"]) - 6.0) < 0.05
+    report = json.loads((tmp_path / "out" / "pose.json").read_text())
+    assert abs(abs(report["candidates"][0]["pose"]["x"]) - 6.0) < 0.05
     assert (tmp_path / "out" / "located.png").exists()
     monkeypatch.setattr("sys.argv", [*call, "--scale", "1cm"])
     capfd.readouterr()

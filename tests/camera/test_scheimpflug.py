@@ -45,9 +45,9 @@ def test_without_distortion_the_virtual_camera_sees_the_same(alpha, direction):
     assert TiltedSensor.from_camera(camera).alpha == pytest.approx(alpha, abs=1e-7)
     points = np.random.default_rng(1).uniform((-0.1, -0.1, 0.9), (0.1, 0.1, 1.1), (20, 3))
     seen, turned = camera.project(points), sensor.virtual_camera.project(points, sensor.rotation)
-    there = np.isfinite(seen[:, 0])
-    np.testing.assert_allclose(seen[there], turned[there], rtol=1e-9, atol=1e-7)
-    assert there.any()
+    is_visible = np.isfinite(seen[:, 0])
+    np.testing.assert_allclose(seen[is_visible], turned[is_visible], rtol=1e-9, atol=1e-7)
+    assert is_visible.any()
     # The rotation moves the optical axis by alpha from the normal.
     assert sensor.rotation[2, 2] == pytest.approx(math.cos(alpha), abs=1e-15)
 

@@ -74,9 +74,9 @@ def test_points_behind_lens_or_sensor_are_said_to_be(scene):
     rotations, translations, target = scene
     internal = np.array(CAMERAS["tilt"])
     assert project(internal, rotations, translations, target).in_front
-    behind = project(internal, rotations, -translations, target, derivatives=True)
-    assert not behind.in_front
-    assert behind.jacobian is None
+    mirrored = project(internal, rotations, -translations, target, derivatives=True)
+    assert not mirrored.in_front
+    assert mirrored.jacobian is None
 
 
 def _numbers(rng):

@@ -45,8 +45,8 @@ def map_of(
     """Return a slightly bent map that rotates about the centres of both images."""
     rows, columns = shape
     x, y = np.meshgrid(np.arange(columns) - (columns - 1) / 2, np.arange(rows) - (rows - 1) / 2)
-    bend = scale * (1.0 - 1e-5 * (x**2 + y**2))
-    x, y = x * bend, y * bend
+    scaled = scale * (1.0 - 1e-5 * (x**2 + y**2))
+    x, y = x * scaled, y * scaled
     if mirrored:
         x = -x
     c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
@@ -82,8 +82,8 @@ def assert_right(
         if image.dtype == np.float32:
             np.testing.assert_allclose(values[clear], expected[clear], rtol=0, atol=slack)
         else:
-            whole = np.clip(np.nan_to_num(expected), 0.0, largest)
-            assert np.abs(values[clear] - whole[clear]).max(initial=0.0) <= 0.5 + slack
+            clipped = np.clip(np.nan_to_num(expected), 0.0, largest)
+            assert np.abs(values[clear] - clipped[clear]).max(initial=0.0) <= 0.5 + slack
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -131,7 +131,7 @@ WINDOWS = {
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("name", WINDOWS)
 def test_every_window(device: Device, name: str, channels: int, interpolation: Any, rng: np.random.Generator) -> None:
-    options, what = WINDOWS[name]
+    options, kind = WINDOWS[name]
     source = (300, 310)
     image = pixels(rng, (*source, 3)[: 2 + channels // 3], np.float32)
     positions = map_of((80, 80), source, **options)
@@ -139,7 +139,7 @@ def test_every_window(device: Device, name: str, channels: int, interpolation: A
     heads = Packer(source, taps, channels, Status.NO_DATA, Status.NO_DATA, (0.5, 0.5)).pack(positions).heads
     found = set(np.unique(heads[..., 2] & 255))
     # Three channels need three times the width.
-    assert found & {what, what | (channels == 3 and what < 6)}
+    assert found & {kind, kind | (channels == 3 and kind < 6)}
     op = UndistortImage(model=positions, interpolation=interpolation, channels=channels, variant="vector")
     assert_right(op(image, device=device), image, positions, channels=channels, interpolation=interpolation)
 
@@ -195,15 +195,15 @@ def test_no_window_reads_outside_the_image(
     packed = Packer(source, taps, channels, Status.NO_DATA, None, (0.5, 0.5)).pack(
         map_of((40, 48), source, turn=turn, scale=scale) + shift
     )
-    what = packed.heads[..., 2] & 255
-    scattered = packed.heads[what == 6]
+    kind = packed.heads[..., 2] & 255
+    scattered = packed.heads[kind == 6]
     positions = packed.points[scattered[:, 3]] + scattered[:, None, :2]
     assert (positions >= taps.before).all()
     assert (np.floor(positions) + taps.after < source[::-1]).all()
-    windows = (what >= 2) & (what < 6)
+    windows = (kind >= 2) & (kind < 6)
     column, row, bits, _ = np.moveaxis(packed.heads[windows], -1, 0)
     starts = [bits >> shift & 63 for shift in ((13, 19, 25) if channels == 3 else (31,))]
-    loaded = np.where(what[windows] & 1, 32, 16)
+    loaded = np.where(kind[windows] & 1, 32, 16)
     lowest = ((row - taps.before) * source[1] + column - taps.before) * channels
     last_row = row + (bits >> 8 & 31) - 1 + taps.after
     highest = (last_row * source[1] + column + np.max(starts, axis=0) + taps.after) * channels + loaded
@@ -334,14 +334,14 @@ def test_computed_places(
 
 def test_region_size_and_matrix(device: Device, rng: np.random.Generator) -> None:
     image = pixels(rng, (83, 117), np.float32)
-    whole = UndistortImage(model=CAMERA, size=(150, 90), matrix=OTHER)(image, device=device)
-    assert whole.image.shape == (90, 150)
+    full_image = UndistortImage(model=CAMERA, size=(150, 90), matrix=OTHER)(image, device=device)
+    assert full_image.image.shape == (90, 150)
     for coordinates in ("map", "computed"):
         part = UndistortImage(
             model=CAMERA, size=(150, 90), matrix=OTHER, region=(31, 20, 50, 33), coordinates=coordinates
         )(image, device=device)
-        np.testing.assert_array_equal(part.status, whole.status[20:53, 31:81])
-        np.testing.assert_allclose(part.image, whole.image[20:53, 31:81], atol=4 * 4e-5)
+        np.testing.assert_array_equal(part.status, full_image.status[20:53, 31:81])
+        np.testing.assert_allclose(part.image, full_image.image[20:53, 31:81], atol=4 * 4e-5)
     beyond = UndistortImage(model=CAMERA, region=(-60, -60, 20, 20))(image, device=device)
     assert (beyond.status == Status.NO_DATA).all()
     positions = PixelMap(map_of((40, 60), image.shape))

@@ -82,8 +82,8 @@ def tolerance(given_: np.ndarray, expected: np.ndarray, real: Any) -> np.ndarray
     eps = float(np.finfo(real).eps)
     with np.errstate(invalid="ignore"):
         moved = np.abs(expected - given_).max(axis=-1, keepdims=True)
-    own = half_spacing(expected) if real == np.float32 else 4e-12
-    return own + 8.0 * eps * (moved + 10.0)
+    rounding = half_spacing(expected) if real == np.float32 else 4e-12
+    return rounding + 8.0 * eps * (moved + 10.0)
 
 
 def assert_as_expected(operation: UndistortPoints, result: UndistortedPoints, points: np.ndarray) -> np.ndarray:

@@ -27,14 +27,14 @@ def paper(monkeypatch: pytest.MonkeyPatch) -> Paper:
         for label, reason in reasons.items():
             handle = FakePlatform(f"Platform of {label}", devices=[FakeDevice(f"Name of {label}")]).devices[0]
             listed.append(discovery.ProbedDevice(label, label, 0, 0, handle, "", None, reason))
-        asked: list[bool] = []
+        calls: list[bool] = []
 
         def probed_devices(*, probe_again: bool = False) -> tuple[discovery.ProbedDevice, ...]:
-            asked.append(probe_again)
+            calls.append(probe_again)
             return tuple(listed)
 
         monkeypatch.setattr(discovery, "probed_devices", probed_devices)
-        return asked
+        return calls
 
     return install
 
@@ -93,10 +93,10 @@ def test_no_device_says_what_to_install(paper: Paper) -> None:
 
 
 def test_probe_asks_again(paper: Paper) -> None:
-    asked = paper(pocl="")
+    calls = paper(pocl="")
     _devices()
     _devices("--probe")
-    assert asked == [False, True]
+    assert calls == [False, True]
 
 
 def test_installed_command(device: Device) -> None:

@@ -43,8 +43,8 @@ def test_an_interrupt_while_it_loads_is_an_exit_code(module: str, number: int, c
     assert ran.stdout is not None
     assert ran.stdout.readline() == "loading\n"
     ran.send_signal(number)
-    _, told = ran.communicate(timeout=30)
-    assert (ran.returncode, told) == (code, "")
+    _, stderr = ran.communicate(timeout=30)
+    assert (ran.returncode, stderr) == (code, "")
 
 
 @posix
@@ -60,8 +60,8 @@ def test_a_command_that_is_ended_leaves_nothing(number: int, code: int, tmp_path
     assert ran.stdout.readline() == "writing\n"
     assert list((tmp_path / "deep").glob(".*.part"))
     ran.send_signal(number)
-    _, told = ran.communicate(timeout=30)
-    assert (ran.returncode, told) == (code, "")
+    _, stderr = ran.communicate(timeout=30)
+    assert (ran.returncode, stderr) == (code, "")
     assert [each.name for each in tmp_path.iterdir()] == ["plane.npy"]
 
 
@@ -98,8 +98,8 @@ def test_code_that_swallows_the_interrupt_is_cut_off(swallow: str, number: int, 
     assert ran.stdout is not None
     assert ran.stdout.readline() == "loading\n"
     ran.send_signal(number)
-    _, told = ran.communicate(timeout=30)
-    assert (ran.returncode, told) == (code, "")
+    _, stderr = ran.communicate(timeout=30)
+    assert (ran.returncode, stderr) == (code, "")
 
 
 @posix
@@ -115,8 +115,8 @@ def test_an_interrupt_while_a_device_is_probed(
     assert ran.stdout is not None
     assert ran.stdout.readline() == "probing\n"
     ran.send_signal(number)
-    _, told = ran.communicate(timeout=30)
-    assert (ran.returncode, told) == (code, "")
+    _, stderr = ran.communicate(timeout=30)
+    assert (ran.returncode, stderr) == (code, "")
     assert not list((tmp_path / "cache").rglob("*.part"))
 
 
@@ -132,8 +132,8 @@ def test_a_swallowed_signal_leaves_no_temporary_file(tmp_path: Path) -> None:
     assert ran.stdout.readline() == "writing\n"
     assert list(tmp_path.glob(".*.part"))
     ran.send_signal(signal.SIGTERM)
-    _, told = ran.communicate(timeout=30)
-    assert (ran.returncode, told) == (143, "")
+    _, stderr = ran.communicate(timeout=30)
+    assert (ran.returncode, stderr) == (143, "")
     assert [each.name for each in tmp_path.iterdir()] == ["plane.npy"]
 
 
@@ -147,8 +147,8 @@ def test_the_handler_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_entry_loads_nothing_heavy() -> None:
     heavy = ("numpy", "typer", "pyopencl")
-    asked = f"import sys, gpuvision.cli.main; print(*(each for each in {heavy} if each in sys.modules))"
-    ran = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
+    program = f"import sys, gpuvision.cli.main; print(*(each for each in {heavy} if each in sys.modules))"
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == ""
 
 

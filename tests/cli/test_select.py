@@ -52,9 +52,9 @@ def test_a_file_holds_what_was_chosen(features: FeatureSet, tmp_path: Path) -> N
     assert (again.side, again.imaging) == (features.side, features.imaging)
     for name in ("placement", "point", "normal", "spacing", "length", "sigma", "covariance", "region", "condition"):
         np.testing.assert_allclose(getattr(again, name), getattr(features, name), rtol=1e-14, atol=1e-18)
-    told = tomllib.loads((tmp_path / "features.toml").read_text())
-    np.testing.assert_allclose([told["predicted"][f"sigma_{name}"] for name in ("x", "y", "theta")], features.sigmas)
-    columns, rows = told["region"]["columns_and_rows"]
+    content = tomllib.loads((tmp_path / "features.toml").read_text())
+    np.testing.assert_allclose([content["predicted"][f"sigma_{name}"] for name in ("x", "y", "theta")], features.sigmas)
+    columns, rows = content["region"]["columns_and_rows"]
     assert columns <= 14e-3 / PIXEL + 2 * features.length.max() / PIXEL
     assert rows >= np.ptp(features.point[:, 1]) / PIXEL
 
@@ -76,9 +76,9 @@ def test_a_file_that_says_something_else_is_told(
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(DescriptionError) as told:
+    with pytest.raises(DescriptionError) as error:
         read_features(path)
-    assert words in str(told.value)
+    assert words in str(error.value)
 
 
 def test_two_rulers_are_too_few(features: FeatureSet, tmp_path: Path) -> None:
@@ -120,9 +120,9 @@ def test_a_camera_is_located_as_promised(artwork: Artwork, features: FeatureSet,
         view = View(corner=tuple(corner), pixel=PIXEL, shape=SHAPE, noise=NOISE)
         picture = board_image(artwork, view, (0.0, 0.0, -pose[2]), pose[:2], rng=rng)
         image = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
-        near = (*BOARD_MIDDLE, 0.0)
+        initial_pose = (*BOARD_MIDDLE, 0.0)
         found = locate_board(
-            image, artwork, scale=PIXEL, initial_pose=near, features=features, blur_px=1.04, device=device
+            image, artwork, scale=PIXEL, initial_pose=initial_pose, features=features, blur_px=1.04, device=device
         )
         assert found.reason == ""
         true = BoardView(scale=PIXEL, shape=SHAPE, pose=pose)
@@ -152,10 +152,10 @@ Select = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], folder: Path) -> Select:
-    told = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
+    options = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
 
     def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["gpuvision", "select", str(folder), *told, *map(str, arguments)])
+        monkeypatch.setattr("sys.argv", ["gpuvision", "select", str(folder), *options, *map(str, arguments)])
         code = 0
         try:
             cli.main()

@@ -146,11 +146,11 @@ def test_a_point_without_x_y_or_z_is_not_valid(tmp_path, rng, bad):
 def test_a_cut_ply_is_refused(tmp_path):
     x = np.zeros((4, 6), np.float32)
     export.write_ply(tmp_path / "points.ply", x, x, x)
-    whole = (tmp_path / "points.ply").read_bytes()
-    (tmp_path / "cut.ply").write_bytes(whole[:-5])
+    content = (tmp_path / "points.ply").read_bytes()
+    (tmp_path / "cut.ply").write_bytes(content[:-5])
     with pytest.raises(ValueError, match="holds 283 bytes of points, its header says 24 points; it was cut"):
         export.read_ply(tmp_path / "cut.ply")
-    (tmp_path / "text.ply").write_bytes(whole.replace(b"binary_little_endian", b"ascii"))
+    (tmp_path / "text.ply").write_bytes(content.replace(b"binary_little_endian", b"ascii"))
     with pytest.raises(ValueError, match="no binary little-endian PLY"):
         export.read_ply(tmp_path / "text.ply")
 

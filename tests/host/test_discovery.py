@@ -35,16 +35,16 @@ def see(monkeypatch: pytest.MonkeyPatch, cache: Path) -> Iterator[Callable[..., 
     """Make the loader list the given platforms; return the log of the probes."""
 
     def install(*platforms: FakePlatform, probe: Probe = lambda p, d: "") -> list[tuple[int, int]]:
-        asked: list[tuple[int, int]] = []
+        probed: list[tuple[int, int]] = []
 
         def ask(p: int, d: int) -> str:
-            asked.append((p, d))
+            probed.append((p, d))
             return probe(p, d)
 
         monkeypatch.setattr(discovery, "platforms", lambda: platforms)
         monkeypatch.setattr(discovery, "_ask_probe", ask)
         _forget()
-        return asked
+        return probed
 
     yield install
     _forget()
@@ -71,9 +71,9 @@ def test_platforms_of_one_name_are_told_apart(see: Any) -> None:
 def test_twins_are_each_asked(see: Any) -> None:
     """Two devices with equal strings (two cards, two installations) may differ in health."""
     twins = FakePlatform("NVIDIA CUDA", vendor="NVIDIA", devices=[FakeDevice(), FakeDevice()])
-    asked = see(twins, probe=lambda p, d: "broken" if d == 1 else "")
+    probed = see(twins, probe=lambda p, d: "broken" if d == 1 else "")
     assert [each.healthy for each in discovery.probed_devices()] == [True, False]
-    assert asked == [(0, 0), (0, 1)]
+    assert probed == [(0, 0), (0, 1)]
 
 
 @pytest.mark.parametrize(
@@ -119,26 +119,26 @@ def test_platform_without_devices(see: Any) -> None:
 
 
 def test_verdicts_are_kept_by_driver(see: Any) -> None:
-    asked = see(FakePlatform())
+    probed = see(FakePlatform())
     discovery.probed_devices()
-    assert asked == [(0, 0)]
-    asked = see(FakePlatform())
+    assert probed == [(0, 0)]
+    probed = see(FakePlatform())
     discovery.probed_devices()
-    assert asked == [], "the verdict is in the cache"
-    asked = see(FakePlatform(devices=[FakeDevice(driver_version="1.1")]))
+    assert probed == [], "the verdict is in the cache"
+    probed = see(FakePlatform(devices=[FakeDevice(driver_version="1.1")]))
     discovery.probed_devices()
-    assert asked == [(0, 0)], "another driver is another question"
+    assert probed == [(0, 0)], "another driver is another question"
 
 
 def test_probing_again_asks_only_the_unhealthy(see: Any) -> None:
     two = FakePlatform(devices=[FakeDevice("good"), FakeDevice("bad")])
     see(two, probe=lambda p, d: "broken" if d == 1 else "")
     discovery.probed_devices()
-    asked = see(two)
+    probed = see(two)
     assert [each.healthy for each in discovery.probed_devices()] == [True, False]
-    assert asked == []
+    assert probed == []
     assert [each.healthy for each in discovery.probed_devices(probe_again=True)] == [True, True]
-    assert asked == [(0, 1)]
+    assert probed == [(0, 1)]
     assert [each.healthy for each in discovery.probed_devices()] == [True, True], "the better verdict stays"
 
 
@@ -146,19 +146,19 @@ def test_probing_again_asks_only_the_unhealthy(see: Any) -> None:
 def test_corrupt_cache_is_asked_anew(see: Any, cache: Path, content: str) -> None:
     cache.mkdir()
     (cache / "devices.json").write_text(content)
-    asked = see(FakePlatform())
+    probed = see(FakePlatform())
     assert discovery.probed_devices()[0].healthy
-    assert asked == [(0, 0)]
+    assert probed == [(0, 0)]
     assert list(json.loads((cache / "devices.json").read_text()).values()) == [""]
 
 
 def test_unwritable_cache_costs_only_the_question(see: Any, cache: Path) -> None:
     cache.write_text("a file where the folder should be")
-    asked = see(FakePlatform())
+    probed = see(FakePlatform())
     assert discovery.probed_devices()[0].healthy
     _forget()
     assert discovery.probed_devices()[0].healthy
-    assert asked == [(0, 0), (0, 0)]
+    assert probed == [(0, 0), (0, 0)]
 
 
 def test_no_platform(see: Any) -> None:
@@ -206,8 +206,8 @@ def test_crash_and_hang_are_verdicts(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setattr(sys, "executable", _program(tmp_path, script))
     if "sleep" in script:
         monkeypatch.setattr(discovery, "_PROBE_SECONDS", 0.2)
-    said = discovery._ask_probe(0, 0)
-    assert re.search(reason, said), said
+    verdict = discovery._ask_probe(0, 0)
+    assert re.search(reason, verdict), verdict
 
 
 def test_probe_in_its_own_process(device: Device, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

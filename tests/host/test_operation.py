@@ -70,12 +70,12 @@ def test_device_arrays_stay_on_the_device(memory, pairs):
 
 
 def test_a_bound_instance_keeps_what_a_running_kernel_uses(memory):
-    many = np.ones((400_000, 2), np.float32)
-    bound = READOUT.bind(memory, many.shape, many.dtype)
+    large = np.ones((400_000, 2), np.float32)
+    bound = READOUT.bind(memory, large.shape, large.dtype)
     events = []
     for number in range(20):
-        frame = memory.empty(many.shape, many.dtype)
-        frame.set(many * np.array([1, number + 1], np.float32))
+        frame = memory.empty(large.shape, large.dtype)
+        frame.set(large * np.array([1, number + 1], np.float32))
         events.append(bound(frame))
         del frame
         gc.collect()
@@ -108,26 +108,26 @@ def test_short_work_runs_inline(device, pairs):
     if device.inline_device is None:
         pytest.skip("only PoCL 3 has such a device")
     complete = cl.command_execution_status.COMPLETE
-    many = np.ones((400_000, 2), np.float32)
-    for frame, here in ((pairs, True), (many, False)):
+    large = np.ones((400_000, 2), np.float32)
+    for frame, is_inline in ((pairs, True), (large, False)):
         bound = READOUT.bind(device, frame.shape, frame.dtype)
         host_view(bound.inputs[0])[...] = frame
         event = bound()
-        assert (event.command_execution_status == complete) or not here
+        assert (event.command_execution_status == complete) or not is_inline
         event.wait()
-        assert (event.get_info(cl.event_info.COMMAND_QUEUE).device == device.inline_device) is here
+        assert (event.get_info(cl.event_info.COMMAND_QUEUE).device == device.inline_device) is is_inline
         np.testing.assert_allclose(host_view(bound.outputs.position), expected(frame), atol=5e-7)
 
 
 def test_work_of_one_group_runs_inline(device):
     if device.kind != "intel":
         pytest.skip("only Intel's runtime does so by the work's groups")
-    for count, here in ((16, True), (400_000, False)):
+    for count, is_inline in ((16, True), (400_000, False)):
         frame = np.linspace(0.1, 1.0, 2 * count, dtype=np.float32).reshape(count, 2)
         bound = READOUT.bind(device, frame.shape, frame.dtype)
         host_view(bound.inputs[0])[...] = frame
         event = bound()
-        assert (event.get_info(cl.event_info.COMMAND_QUEUE) != device.queue) is here
+        assert (event.get_info(cl.event_info.COMMAND_QUEUE) != device.queue) is is_inline
         event.wait()
         np.testing.assert_allclose(host_view(bound.outputs.position), expected(frame), atol=5e-7)
 
@@ -271,13 +271,13 @@ def test_no_input_and_no_device_are_told(memory, pairs):
 def test_an_input_that_another_queue_still_writes_is_waited_for(device):
     if not device.shares_memory:
         pytest.skip("this device has memory of its own")
-    many = np.tile(np.array([1.0, 3.0], np.float32), (200_000, 1))
+    large = np.tile(np.array([1.0, 3.0], np.float32), (200_000, 1))
     gate = cl.UserEvent(device.context)
-    frame = device.empty(many.shape, many.dtype)
-    frame.set(many * 0)
+    frame = device.empty(large.shape, large.dtype)
+    frame.set(large * 0)
     frame.add_event(gate)
     reading = READOUT(frame)
-    host_view(frame)[...] = many
+    host_view(frame)[...] = large
     gate.set_status(cl.command_execution_status.COMPLETE)
     np.testing.assert_array_equal(reading.position.get(), 0.5)
 
@@ -304,10 +304,10 @@ def test_an_array_of_another_device_is_refused(pairs):
 
 
 def test_a_part_of_an_array_is_refused(device):
-    whole = device.empty((10, 2), np.float32)
-    assert memory_of(whole) is whole.base_data
+    array = device.empty((10, 2), np.float32)
+    assert memory_of(array) is array.base_data
     with pytest.raises(ValueError, match="whole C-contiguous"):
-        memory_of(whole[2:])
+        memory_of(array[2:])
 
 
 def test_host_view_is_the_memory_itself(device):

@@ -95,8 +95,8 @@ def test_in_a_stream_before_an_operation_of_gpuvision(correct: Any, device: Devi
     readout = gv.LineReadout(threshold=3)
     with gv.Pipeline(frames, [correct, readout], batch=4, device=device) as stream:
         streamed = np.concatenate([batch.result.position.copy() for batch in stream])
-    apart = readout(correct(frames, device=device).image, device=device).position
-    np.testing.assert_array_equal(streamed, apart)
+    separate = readout(correct(frames, device=device).image, device=device).position
+    np.testing.assert_array_equal(streamed, separate)
 
 
 def test_other_inputs_are_refused(example: dict[str, Any], correct: Any, device: Device) -> None:

@@ -146,8 +146,8 @@ def test_inline_streams_give_the_same_results(memory: dict[str, Any], inline: bo
     sheet = Triangulation(homography=((1.0, 0.1, 0.0), (0.0, 1.2, 0.1), (0.0, 0.01, 1.0)), region=((-1, 1), (-1, 1)))
     chains: list[Any] = [readout, [readout, Step(sheet, takes=("position", "peak"))]]
     fields = ("position", "g")
-    wanted = (expected.position, sheet(expected.position, expected.peak, device=device).g)
-    for chain, field, want in zip(chains, fields, wanted, strict=True):
+    results = (expected.position, sheet(expected.position, expected.peak, device=device).g)
+    for chain, field, want in zip(chains, fields, results, strict=True):
         parts: list[np.ndarray] = []
         stream: Pipeline[Any] = Pipeline(frames, chain, batch=2, ring=3, inline=inline, profile=True, **memory)
         report = stream.run(lambda each, parts=parts, field=field: parts.append(getattr(each.result, field).copy()))

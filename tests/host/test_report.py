@@ -110,12 +110,12 @@ def test_quantiles_of_a_long_tail() -> None:
 
 def test_single_durations_count_like_many(rng: np.random.Generator) -> None:
     values = rng.integers(1, 10**6, 5000)
-    one, many = DurationHistogram(), DurationHistogram()
+    one, batch = DurationHistogram(), DurationHistogram()
     for value in values:
         one.add(int(value))
     for part in values.reshape(5, 1000):
-        many.add_all(part)
-    assert one.statistics() == many.statistics()
+        batch.add_all(part)
+    assert one.statistics() == batch.statistics()
     assert one.statistics().count == 5000
 
 
@@ -140,8 +140,10 @@ def test_the_trace_is_chrome_json(memory: dict[str, Any], tmp_path: Path) -> Non
     lanes = {event["tid"]: event["args"]["name"] for event in events if event["ph"] == "M"}
     one_by_one = ("producer", "consumer")  # device times differ by the offset of the clocks
     for tid in lanes:
-        own = sorted((span["ts"], span["ts"] + span["dur"]) for span in spans if span["tid"] == tid)
-        assert all(end <= start + 1e-3 for (_, end), (start, _) in itertools.pairwise(own) if lanes[tid] in one_by_one)
+        intervals = sorted((span["ts"], span["ts"] + span["dur"]) for span in spans if span["tid"] == tid)
+        assert all(
+            end <= start + 1e-3 for (_, end), (start, _) in itertools.pairwise(intervals) if lanes[tid] in one_by_one
+        )
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [MANIFEST, "trace.json"]
 
 
@@ -333,18 +335,18 @@ def test_a_million_frames_do_not_grow(memory: dict[str, Any], policy: Any) -> No
     currents = currents_of(1000, strips=1)
     expected = READOUT(currents, device=memory["device"]).total
     sizes: list[int] = []
-    taken = 0
+    count = 0
     source = ArraySource(currents, 1_000_000)
     with Pipeline(source, READOUT, batch=50, ring=4, policy=policy, **memory) as stream:
         for batch in stream:
             first = batch.number % 1000
             assert np.array_equal(batch.result.total, expected[first : first + 50])
-            taken += len(batch)
-            if taken % 100_000 < 50:
+            count += len(batch)
+            if count % 100_000 < 50:
                 sizes.append(resident_bytes())
     report = stream.report()
     assert report.frames + report.dropped == 1_000_000
-    assert report.frames == taken
+    assert report.frames == count
     assert policy == "drop_oldest" or report.dropped == 0
     if policy == "block":
         # The first tenth fills pools and counters; a byte leaked per frame would show as 0.8 MB after that.

@@ -313,8 +313,8 @@ def test_a_video_is_read_to_its_end(video: Path) -> None:
 
 
 def test_a_truncated_video_names_the_frame(video: Path) -> None:
-    whole = video.read_bytes()
-    video.write_bytes(whole[: len(whole) // 2])
+    content = video.read_bytes()
+    video.write_bytes(content[: len(content) // 2])
     with pytest.raises(RecordingError, match=r"line\.avi: truncated video: frame \d+ of 40 cannot be decoded"):
         read_all(open_recording(video))
 
@@ -374,8 +374,8 @@ def test_truncated_files(tmp_path: Path, rng: np.random.Generator, name: str, sh
         np.savez(path, frames=frames)
     else:
         tifffile.imwrite(path, frames, compression="zlib" if name == "packed.tif" else None)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(len(whole) * share)])
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * share)])
     with pytest.raises(RecordingError, match=name):
         read_all(open_recording(path))
 

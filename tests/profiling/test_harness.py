@@ -34,16 +34,16 @@ def test_a_row_holds_a_peer_against_us(device):
 
 
 def test_the_ceiling_moves_the_bytes_of_the_case(monkeypatch, device):
-    asked = []
+    calls = []
 
     def move(*bytes_and_repeats):
-        asked.append(bytes_and_repeats)
+        calls.append(bytes_and_repeats)
         return lambda: time.sleep(2e-3)
 
     monkeypatch.setattr(ceiling, "move", move)
     slow = case(ours=lambda: time.sleep(20e-3), traffic=(3 << 20, 1 << 20), repeats=8)
     (row,) = harness.measure(slow, device, seconds=0.05)
-    assert asked == [(device, 3 << 20, 1 << 20, 8)]
+    assert calls == [(device, 3 << 20, 1 << 20, 8)]
     assert 0.0 < row.fraction < 1.0  # fraction of the device's limit
 
 
@@ -58,13 +58,13 @@ def test_facts_stand_beside_the_columns(device):
 
 
 def test_a_part_of_a_peers_work_stands_for_all_of_it(device):
-    (part,), (whole,) = (
+    (part,), (complete,) = (
         harness.measure(case(peers={"numpy": lambda: time.sleep(2e-3)}, factors=factors), device, seconds=0.01)
         for factors in ({}, {"numpy": 1e3})
     )
     assert part.peer_seconds == pytest.approx(2e-3, rel=0.9)
-    assert whole.peer_seconds == pytest.approx(2.0, rel=0.9)
-    assert whole.ratio > 100.0 * part.ratio
+    assert complete.peer_seconds == pytest.approx(2.0, rel=0.9)
+    assert complete.ratio > 100.0 * part.ratio
 
 
 @pytest.fixture

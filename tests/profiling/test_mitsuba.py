@@ -49,5 +49,5 @@ def test_lines_of_a_strip_share_its_light_and_its_width():
     lit = mitsuba_scenes.groove(np.radians(60.0))
     lines = lit.lines(3)
     assert lines.exitance.sum() == pytest.approx(lit.segments.exitance.sum())
-    apart = lines.ends[:, 0] - lit.segments.ends[0, 0]
-    np.testing.assert_allclose(np.sort(apart[:, 0]), np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.6) * 0.5e-4, atol=1e-15)
+    offset = lines.ends[:, 0] - lit.segments.ends[0, 0]
+    np.testing.assert_allclose(np.sort(offset[:, 0]), np.array([-1.0, 0.0, 1.0]) * np.sqrt(0.6) * 0.5e-4, atol=1e-15)

@@ -45,11 +45,11 @@ class Scan(NamedTuple):
         """Return the valid points of parts of the frame, (n, 3)."""
         row = np.arange(self.points.z.shape[1])
         column = self.reading.position
-        within = np.zeros(self.points.z.shape, bool)
+        in_parts = np.zeros(self.points.z.shape, bool)
         for top, bottom, left, right in parts:
-            within |= (row >= top) & (row < bottom) & (column > left) & (column < right)
-        within &= np.isfinite(self.points.z) & (self.points.status == 0)
-        return np.stack([each[within] for each in self.points[:3]], axis=-1)
+            in_parts |= (row >= top) & (row < bottom) & (column > left) & (column < right)
+        in_parts &= np.isfinite(self.points.z) & (self.points.status == 0)
+        return np.stack([each[in_parts] for each in self.points[:3]], axis=-1)
 
 
 @pytest.fixture(scope="module")
@@ -122,8 +122,8 @@ def test_boxes_stand_parallel_to_the_wall(scan, box, height):
 
 def test_the_sphere_is_one(scan):
     row, column = np.arange(1920), scan.reading.position
-    within = (np.hypot(column - 712, row - 682) < 140) & np.isfinite(scan.points.z) & (row < 800)
-    points = np.stack([each[within] for each in scan.points[:3]], axis=-1).astype(np.float64)
+    on_sphere = (np.hypot(column - 712, row - 682) < 140) & np.isfinite(scan.points.z) & (row < 800)
+    points = np.stack([each[on_sphere] for each in scan.points[:3]], axis=-1).astype(np.float64)
 
     def misfit(sphere: np.ndarray) -> np.ndarray:
         return np.linalg.norm(points - sphere[:3], axis=1) - sphere[3]

@@ -185,12 +185,12 @@ def test_covariance_of_a_point_is_the_spread_of_measurements(rng: np.random.Gene
         )
         found.append(np.linalg.solve(jacobian(fitted, point), on_sheet(fitted, point + rng.normal(0.0, sigma))))
     predicted = fitted.covariance_at(point)
-    whole = jacobian(fitted, point)
-    spread = np.cov((np.array(found) @ whole.T).T)
+    derivative = jacobian(fitted, point)
+    spread = np.cov((np.array(found) @ derivative.T).T)
     # Variances from 400 trials are known to 7 %: four sigmas.
     np.testing.assert_allclose(np.diag(spread), np.diag(predicted), rtol=0.28)
     correlation = predicted[0, 1] / math.sqrt(predicted[0, 0] * predicted[1, 1])
-    assert np.corrcoef((np.array(found) @ whole.T).T)[0, 1] == pytest.approx(correlation, abs=0.2)
+    assert np.corrcoef((np.array(found) @ derivative.T).T)[0, 1] == pytest.approx(correlation, abs=0.2)
 
 
 def on_sheet(operation: Triangulation, point: np.ndarray) -> np.ndarray:

@@ -415,8 +415,8 @@ def test_widths_beyond_the_profile(device, rng, method, variant):
     free = LineReadout(**parameters)(frame, device=device)
     wide = LineReadout(maximum_width=2**31, **parameters)(frame, device=device)
     np.testing.assert_array_equal(wide.position, free.position)
-    none = LineReadout(minimum_width=2**31, **parameters)(frame, device=device)
-    assert np.all(none.status & LOW_SIGNAL)
+    too_wide = LineReadout(minimum_width=2**31, **parameters)(frame, device=device)
+    assert np.all(too_wide.status & LOW_SIGNAL)
 
 
 def test_bad_frames(device):
@@ -485,8 +485,8 @@ def test_one_output_of_the_sheet(device, rng, name):
     """Outputs that are not requested are not written, also with a triangulation."""
     frames = line_frames(rng, "uint8", (2, 99, 130), "columns")
     readout = LineReadout(threshold=20, triangulation=SHEET)
-    whole, alone = (each(frames, device=device) for each in (readout, replace(readout, outputs=(name,))))
-    np.testing.assert_array_equal(getattr(alone, name), getattr(whole, name))
+    complete, alone = (each(frames, device=device) for each in (readout, replace(readout, outputs=(name,))))
+    np.testing.assert_array_equal(getattr(alone, name), getattr(complete, name))
     assert sum(each is not None for each in alone) == 1
 
 

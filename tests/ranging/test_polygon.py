@@ -98,12 +98,12 @@ def test_slope_is_twice_the_drop_in_the_middle_and_agrees_with_differences() -> 
 
 def test_times_make_equidistant_samples() -> None:
     mirror = PolygonMirror(apothem=0.02, facets=12, height=0.1)
-    wanted = np.linspace(-0.03, 0.03, 101)
-    times = mirror.times(wanted, angular_speed=500.0)
+    positions = np.linspace(-0.03, 0.03, 101)
+    times = mirror.times(positions, angular_speed=500.0)
     assert np.all(np.diff(times) > 0.0)
     # Not uniform in time: the mirror sweeps faster towards the ends.
     assert np.ptp(np.diff(times)) > 1e-3 * np.mean(np.diff(times))
-    np.testing.assert_allclose(mirror.position(500.0 * times), wanted, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(mirror.position(500.0 * times), positions, rtol=0, atol=1e-15)
 
 
 def test_facet_limits() -> None:

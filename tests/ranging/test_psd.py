@@ -67,9 +67,9 @@ def test_more_than_the_caches_hold(device, rng, shift):
     samples = 2 + device.cache_bytes // 13 * 16 // 15
     readout = PsdReadout(strip_length=LENGTH, layout="planar", saturation=float(np.float32(0.9e-6)))
     values = currents(rng, (2, samples))
-    whole = readout(np.ascontiguousarray(values[:, :1]), device=device)
-    out = type(whole)(
-        *(None if each is None else np.zeros(samples + 16, each.dtype)[shift:][:samples] for each in whole)
+    complete = readout(np.ascontiguousarray(values[:, :1]), device=device)
+    out = type(complete)(
+        *(None if each is None else np.zeros(samples + 16, each.dtype)[shift:][:samples] for each in complete)
     )
     assert_like_reference(readout, readout(values, device=device, out=out), *values)
 
@@ -301,9 +301,9 @@ def test_one_output_of_the_sheet(device, rng, name):
     """Outputs that are not requested are not written, also with a triangulation."""
     sheet = Triangulation(homography=((1, 0, 0), (0, 1, 0), (5.0, 0, 1)), region=((-3e-3, 3e-3), (-4e-3, 4e-3)))
     pairs = currents(rng, (40, 2))
-    whole = PsdReadout(strip_length=LENGTH, triangulation=sheet)(pairs, device=device)
+    complete = PsdReadout(strip_length=LENGTH, triangulation=sheet)(pairs, device=device)
     alone = PsdReadout(strip_length=LENGTH, triangulation=sheet, outputs=(name,))(pairs, device=device)
-    np.testing.assert_array_equal(getattr(alone, name), getattr(whole, name))
+    np.testing.assert_array_equal(getattr(alone, name), getattr(complete, name))
     assert sum(each is not None for each in alone) == 1
 
 

@@ -54,8 +54,8 @@ def close(made: RangePoints, points: np.ndarray, status: np.ndarray, tolerance: 
 def expect_straight(op: RangeImage, g, h, transport, given):
     points = reference.points_of_straight_transport(op.geometry, g, h, transport)
     unknown = ~np.isfinite(g) | ~np.isfinite(h) | ~np.isfinite(transport)[:, None]
-    none = np.zeros(g.shape, bool)
-    return reference.apply_status(points, given, unknown, none, none, op.limits)
+    no_fold = np.zeros(g.shape, bool)
+    return reference.apply_status(points, given, unknown, no_fold, no_fold, op.limits)
 
 
 def expect_rotating(op: RangeImage, position, transport, given):
@@ -75,14 +75,14 @@ def depth_tolerance(op: RangeImage, points: np.ndarray, facing: np.ndarray, dtyp
 
 def beside_an_edge(op: RangeImage, position: np.ndarray, facing: np.ndarray) -> np.ndarray:
     """Return the samples at the horizon or the lens' fold within rounding."""
-    near = np.abs(facing - op.geometry.horizon) < 1e-5
+    at_horizon = np.abs(facing - op.geometry.horizon) < 1e-5
     if op.geometry.lens is None:
-        return near
+        return at_horizon
     pixels = [position, np.broadcast_to(np.arange(position.shape[1]), position.shape)]
     if op.geometry.along == "columns":
         pixels.reverse()
     column, row = op.geometry.lens.centre
-    return near | (np.abs(np.hypot(pixels[0] - column, pixels[1] - row) - op.geometry.lens.fold_radius) < 1e-2)
+    return at_horizon | (np.abs(np.hypot(pixels[0] - column, pixels[1] - row) - op.geometry.lens.fold_radius) < 1e-2)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -160,12 +160,12 @@ def test_an_unknown_transport_spoils_its_profile_only(device, geometry, variant)
     given = np.zeros(profile.shape, np.uint8)
     op = RangeImage(geometry=geometry, variant=variant)
     frames = (profile,) * geometry.inputs
-    whole = op(*frames, transport, given, device=device)
+    complete = op(*frames, transport, given, device=device)
     transport[1] = np.nan
     spoilt = op(*frames, transport, given, device=device)
     assert np.all(spoilt.status[1] == Status.NOT_FINITE)
     assert np.all(np.isnan(spoilt.x[1]))
-    np.testing.assert_array_equal(spoilt.x[::2], whole.x[::2])
+    np.testing.assert_array_equal(spoilt.x[::2], complete.x[::2])
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

@@ -76,8 +76,8 @@ def test_a_gap_stays_a_hole(device):
     made = OP(*frames, device=device)
     inside = (GRID.x > x[0, 19]) & (GRID.x < x[0, 40])
     assert inside.sum() > 3
-    within = (GRID.y > y[7, 0]) & (GRID.y < y[32, 0])
-    gap = within[:, None] & inside
+    in_gap = (GRID.y > y[7, 0]) & (GRID.y < y[32, 0])
+    gap = in_gap[:, None] & inside
     assert np.all(made.status[gap] == Status.NO_DATA)
     assert np.all(np.isnan(made.z[gap]))
     assert np.all(made.status[~gap] == 0)

@@ -22,10 +22,10 @@ def distance_to_arc(arc: Any, points: Float64) -> Float64:
     """Return the distance [m] of points (..., 2) from the arc (x, y, radius, start, end)."""
     x, y, radius, start, end = arc
     to = points - [x, y]
-    within = np.mod(np.arctan2(to[..., 1], to[..., 0]) - start, 2.0 * np.pi) <= end - start
+    in_opening = np.mod(np.arctan2(to[..., 1], to[..., 0]) - start, 2.0 * np.pi) <= end - start
     ends = [radius * np.array([np.cos(each), np.sin(each)]) for each in (start, end)]
     to_ends = np.minimum(*(np.linalg.norm(to - each, axis=-1) for each in ends))
-    return np.asarray(np.where(within, np.abs(np.linalg.norm(to, axis=-1) - radius), to_ends))
+    return np.asarray(np.where(in_opening, np.abs(np.linalg.norm(to, axis=-1) - radius), to_ends))
 
 
 def distance(field: Any, points: Float64) -> Float64:

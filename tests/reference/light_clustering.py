@@ -42,20 +42,20 @@ def is_occluded(
     origins: NDArray[Any], targets: NDArray[Any], triangles: NDArray[Any], clearance: float
 ) -> NDArray[Any]:
     """Return whether any triangle (t, 3, 3) lies between points (k, 3), ends excluded (Moeller and Trumbore)."""
-    way = targets - origins
-    length = np.linalg.norm(way, axis=1)
+    direction = targets - origins
+    length = np.linalg.norm(direction, axis=1)
     one, two = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    p = np.cross(way[:, None], two[None])
+    p = np.cross(direction[:, None], two[None])
     det = np.sum(p * one, axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         s = origins[:, None] - triangles[None, :, 0]
         u = np.sum(s * p, axis=2) / det
         q = np.cross(s, one[None])
-        v = np.sum(way[:, None] * q, axis=2) / det
+        v = np.sum(direction[:, None] * q, axis=2) / det
         t = np.sum(two * q, axis=2) / det
         margin = (clearance / length)[:, None]
-        met = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > margin) & (t < 1 - margin)
-    return np.asarray(np.any(met, axis=1))
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > margin) & (t < 1 - margin)
+    return np.asarray(np.any(hit, axis=1))
 
 
 def visibility(

@@ -160,7 +160,7 @@ def read_peak(
     status |= AMBIGUOUS if is_wide else 0
     if at < window or at + window >= len(x) or (is_wide and (begin == 0 or end == len(x))):
         return np.nan, top, width, v[inside].sum(), status | OUT_OF_RANGE
-    near = x[at - window : at + window + 1]
+    in_window = x[at - window : at + window + 1]
     total = v[inside].sum()
     if is_wide:
         offset, flag = ((equals - 1) % 2) / 2.0, 0
@@ -171,7 +171,7 @@ def read_peak(
     elif method == "fir":
         offset, flag = fir(x, at, window, fir_length // 2)
     else:
-        offset, flag = fit_gaussian(near, window, saturation, read_noise, gain), 0
+        offset, flag = fit_gaussian(in_window, window, saturation, read_noise, gain), 0
     return (np.nan if flag & LOW_SIGNAL else at + offset), top, width, total, status | flag
 
 
@@ -180,10 +180,10 @@ def gauss3(v: Float64, at: int, equals: int) -> tuple[float, int]:
     if v[at - 1] <= 0.0 or v[at + 1] <= 0.0:
         return np.nan, LOW_SIGNAL
     a, b, c = np.log(v[at - 1 : at + 2])
-    bend = a - 2.0 * b + c
-    if bend >= 0.0 or abs(0.5 * (a - c) / bend) > 1.0:
+    curvature = a - 2.0 * b + c
+    if curvature >= 0.0 or abs(0.5 * (a - c) / curvature) > 1.0:
         return ((equals - 1) % 2) / 2.0, AMBIGUOUS
-    return 0.5 * (a - c) / bend, 0
+    return 0.5 * (a - c) / curvature, 0
 
 
 def fir(x: Float64, at: int, window: int, half: int) -> tuple[float, int]:

@@ -38,9 +38,9 @@ def irradiance(receivers: NDArray[Any], ends: Any, normals: Any, exitance: Any) 
         along = (stop - start) / length
         lit = lit - (lit @ along) * along
         d = place - start
-        s, height, aside = d @ along, d @ lit / np.linalg.norm(lit), d @ np.cross(along, lit) / np.linalg.norm(lit)
+        s, height, across = d @ along, d @ lit / np.linalg.norm(lit), d @ np.cross(along, lit) / np.linalg.norm(lit)
         foot = np.sum(normal * (start + s[:, None] * along - place), axis=1)
-        rho = np.hypot(height, aside)
+        rho = np.hypot(height, across)
         with np.errstate(all="ignore"):
             parts = _integrals(-s, np.full_like(s, length), rho, foot, normal @ along)
         factor = np.where(height > 0.0, power * height / np.pi, 0.0)
@@ -103,17 +103,17 @@ def exact(receiver: Any, ends: Any, normal: Any, exitance: float) -> tuple[float
             return 0.0, 0.0
         t1, t2 = -s, length - s
         factor = exitance * height / mpmath.pi
-        most = factor * (t2 / mpmath.sqrt(t2**2 + rho**2) - t1 / mpmath.sqrt(t1**2 + rho**2)) / rho**2
+        at_best = factor * (t2 / mpmath.sqrt(t2**2 + rho**2) - t1 / mpmath.sqrt(t1**2 + rho**2)) / rho**2
         if b > 0:
             t1 = max(t1, -a / b)
         elif b < 0:
             t2 = min(t2, -a / b)
         elif a <= 0:
-            return 0.0, float(most)
+            return 0.0, float(at_best)
         if t2 <= t1:
-            return 0.0, float(most)
+            return 0.0, float(at_best)
         value = factor * (_antiderivative(t2, rho, a, b) - _antiderivative(t1, rho, a, b))
-        return float(value), float(most)
+        return float(value), float(at_best)
 
 
 def _antiderivative(t: Any, rho: Any, a: Any, b: Any) -> Any:

@@ -26,8 +26,8 @@ def reflect_in_sphere(point: Float64, lens: Float64) -> tuple[Float64, float]:
 
     def lean(angle: float) -> float:
         _, to_lens, to_point = parts(angle)
-        aside = np.cos(angle) * two - np.sin(angle) * one
-        return float(aside @ (to_lens / np.linalg.norm(to_lens) + to_point / np.linalg.norm(to_point)))
+        across = np.cos(angle) * two - np.sin(angle) * one
+        return float(across @ (to_lens / np.linalg.norm(to_lens) + to_point / np.linalg.norm(to_point)))
 
     angle = brentq(lean, 0.0, np.arctan2(point @ two, point @ one), xtol=1e-15)
     normal, to_lens, to_point = parts(angle)
@@ -48,8 +48,8 @@ def reflect_past_ellipsoid(
     found = []
     for a, b in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
         towards = middle + apart * (a * one + b * two)
-        start, way = lens / shape, towards / shape
-        half, square = start @ way, way @ way
+        start, direction = lens / shape, towards / shape
+        half, square = start @ direction, direction @ direction
         t = (-half - np.sqrt(half**2 - square * (start @ start - 1.0))) / square
         spot = lens + t * towards
         normal = spot / np.square(shape)
@@ -57,6 +57,6 @@ def reflect_past_ellipsoid(
         on = towards - 2.0 * (towards @ normal) * normal
         found.append((spot, on / np.linalg.norm(on)))
     spot, on = found[0]
-    beside = [each + ((point - each) @ on) / (ray @ on) * ray - point for each, ray in found]
-    across = np.cross(beside[1] - beside[2], beside[3] - beside[4]) / (2.0 * apart) ** 2
-    return float(np.linalg.norm(beside[0])), float(np.linalg.norm(across))
+    misses = [each + ((point - each) @ on) / (ray @ on) * ray - point for each, ray in found]
+    across = np.cross(misses[1] - misses[2], misses[3] - misses[4]) / (2.0 * apart) ** 2
+    return float(np.linalg.norm(misses[0])), float(np.linalg.norm(across))

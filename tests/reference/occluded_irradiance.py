@@ -50,11 +50,11 @@ def intervals(
         critical.append(np.sum(normals * (corners[:, 0] - start), axis=1) / (normals @ along))
     for place, normal in planes:
         systems = np.stack([normals, np.tile(view, (len(normals), 1)), np.tile(normal, (len(normals), 1))], axis=1)
-        meets = np.linalg.matrix_rank(systems) == 3
+        intersects = np.linalg.matrix_rank(systems) == 3
         right = np.column_stack(
             [np.sum(normals * corners[:, 0], axis=1), np.tile([view @ point, normal @ place], (len(normals), 1))]
         )
-        across = np.cross(view, np.linalg.solve(systems[meets], right[meets][..., None])[..., 0] - point)
+        across = np.cross(view, np.linalg.solve(systems[intersects], right[intersects][..., None])[..., 0] - point)
         with np.errstate(divide="ignore", invalid="ignore"):
             critical.append(across @ (point - start) / (across @ along))
     cuts = np.concatenate(critical)
@@ -82,8 +82,8 @@ def visible_from_receiver(corners: Float64, receiver: Float64, segment: Float64,
         toward = start + t[:, None] * (stop - start) - point
         height, above = -(toward @ lit), toward @ facing
         end = 1.0 - clearance / height[:, None]
-        near = np.minimum(clearance / np.where(above > 0.0, above, np.inf)[:, None], end)
-        return point + near * toward, point + end * toward
+        first = np.minimum(clearance / np.where(above > 0.0, above, np.inf)[:, None], end)
+        return point + first * toward, point + end * toward
 
     planes = [(point + clearance * facing, facing), (start + clearance * lit, lit)]
     return intervals(corners, ray_of, (point, start, stop), planes)

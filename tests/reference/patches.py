@@ -18,10 +18,10 @@ def form_factor(receiver: Any, corners: Any) -> tuple[float, float]:
         front = _cross(shape[1] - shape[0], shape[2] - shape[0])
         if _dot(front, shape[0]) >= 0:
             return 0.0, 0.0
-        most = mpmath.norm(_light(shape))
+        largest = mpmath.norm(_light(shape))
         above = _cut(shape, normal)
         value = -_dot(_light(above), normal) if len(above) > 2 else mpmath.mpf(0)
-        return float(value), float(most)
+        return float(value), float(largest)
 
 
 def _light(shape: list[Any]) -> Any:

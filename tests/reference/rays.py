@@ -31,8 +31,8 @@ def crossings(corners: Float64, origins: Float64, directions: Float64) -> tuple[
         normal_to = np.cross(to, one)
         v = np.sum(normal_to * directions[:, None], axis=-1) / det
         t = np.sum(normal_to * two, axis=-1) / det
-    meets = (det != 0.0) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
-    return np.where(meets, t, np.nan), u, v
+    hits = (det != 0.0) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
+    return np.where(hits, t, np.nan), u, v
 
 
 def closest(corners: Float64, rays: Float64) -> tuple[Float64, ...]:
@@ -42,9 +42,9 @@ def closest(corners: Float64, rays: Float64) -> tuple[Float64, ...]:
     t = np.where(t > 0.0, t, np.inf)
     triangle = np.argmin(t, axis=1)
     rows = np.arange(len(rays))
-    met = np.isfinite(t[rows, triangle])
-    values = (np.where(met, each[rows, triangle], np.nan) for each in (t, u, v))
-    return np.where(met, triangle, -1), *values
+    hit = np.isfinite(t[rows, triangle])
+    values = (np.where(hit, each[rows, triangle], np.nan) for each in (t, u, v))
+    return np.where(hit, triangle, -1), *values
 
 
 def occluded(corners: Float64, segments: Float64, margin: float = 0.0) -> NDArray[np.bool_]:

@@ -77,8 +77,8 @@ def resample_line(
             status[over] & np.uint8(NOT_INVERTIBLE)
         )
     for n in range(1, len(kept)):
-        behind = furthest[n] - reached[n]
-        if behind >= regrid.fold_tolerance and reached[n] <= furthest[n - 1]:
+        setback = furthest[n] - reached[n]
+        if setback >= regrid.fold_tolerance and reached[n] <= furthest[n - 1]:
             status[(sense * centres >= reached[n]) & (sense * centres <= furthest[n])] |= np.uint8(NOT_INVERTIBLE)
     return made, status
 

@@ -105,14 +105,16 @@ def interpolation_shift(
     moved = 0.0
     for centre, along, across in ((x, cosine, -sine), (y, sine, cosine)):
         for k in (1, 2):
-            whole = np.round(k * along * step)
-            omega = 2.0 * math.pi * (k * along * step - whole) / step
-            phase = k * (centre + along * position) - whole * samples
-            alike = np.mean(np.cos(2.0 * math.pi * k * across * lines)) * math.exp(-0.5 * omega**2 * common)
+            nearest = np.round(k * along * step)
+            omega = 2.0 * math.pi * (k * along * step - nearest) / step
+            phase = k * (centre + along * position) - nearest * samples
+            attenuation = np.mean(np.cos(2.0 * math.pi * k * across * lines)) * math.exp(-0.5 * omega**2 * common)
             even = omega * (1.0 + (omega**2 * common - 3.0) * common / smoothing)
             odd = 3.0 + omega**2 * (variance - 6.0 * common) + (omega**2 * common) ** 2
             odd *= along / (math.pi * k * variance)
-            moved += alike * math.sin(2.0 * math.pi * phase) * along**2 * (even + odd) / (2.0 * (math.pi * k) ** 2)
+            moved += (
+                attenuation * math.sin(2.0 * math.pi * phase) * along**2 * (even + odd) / (2.0 * (math.pi * k) ** 2)
+            )
     return moved
 
 

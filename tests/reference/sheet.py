@@ -31,11 +31,11 @@ def first_hits(sheet: Any, corners: Float64, L: float, x: Float64) -> tuple[Floa
     place = np.array(move.origin) + L * np.array(move.direction)
     foot = place + x[:, None] * g_axis
     if sheet.source is None:
-        start, way = foot + 100.0 * h_axis, np.broadcast_to(-h_axis, foot.shape)
+        start, direction = foot + 100.0 * h_axis, np.broadcast_to(-h_axis, foot.shape)
     else:
         source = place + sheet.source[0] * g_axis + sheet.source[1] * h_axis
-        way = foot - source
-        start = source + 1e-3 * way
-    triangle, distance, _, _ = rays.closest(corners, np.hstack([start, way]))
-    unit = way / np.linalg.norm(way, axis=1, keepdims=True)
+        direction = foot - source
+        start = source + 1e-3 * direction
+    triangle, distance, _, _ = rays.closest(corners, np.hstack([start, direction]))
+    unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     return triangle, start + distance[:, None] * unit

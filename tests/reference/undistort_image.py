@@ -15,9 +15,9 @@ NO_DATA, NOT_INVERTIBLE = 64, 128
 def cubic(distance: Float64) -> Float64:
     """Return the weight of a tap at a distance: cubic convolution with slope -0.75 at 1."""
     a, d = -0.75, np.abs(distance)
-    near = (a + 2) * d**3 - (a + 3) * d**2 + 1
+    inner = (a + 2) * d**3 - (a + 3) * d**2 + 1
     far = a * d**3 - 5 * a * d**2 + 8 * a * d - 4 * a
-    return np.where(d <= 1, near, np.where(d < 2, far, 0.0))
+    return np.where(d <= 1, inner, np.where(d < 2, far, 0.0))
 
 
 def linear(distance: Float64) -> Float64:

@@ -89,15 +89,15 @@ def test_ways_to_say_the_same_triangulation_agree() -> None:
     b, z0 = 0.08, 0.15
     d = math.hypot(b, z0)
     empty = changed("camera_line", triangulation=None)
-    ways = {
+    tables = {
         "homography": {"homography": h.tolist()},
         "constants": {"constants": h.ravel()[:8].tolist()},
         "points": {"points": np.column_stack([sensor, points]).tolist()},
     }
-    for name, way in ways.items():
-        told = sensor_of(empty | {"triangulation": way}).readout.triangulation
-        assert told is not None
-        np.testing.assert_allclose(told.to_sensor(points), sensor, rtol=0, atol=1e-6, err_msg=name)
+    for name, table in tables.items():
+        triangulation = sensor_of(empty | {"triangulation": table}).readout.triangulation
+        assert triangulation is not None
+        np.testing.assert_allclose(triangulation.to_sensor(points), sensor, rtol=0, atol=1e-6, err_msg=name)
     # Without [axes], u and v are the columns and rows of the camera.
     posed = changed("camera_line", triangulation=None, axes=None, lens=None) | {
         "triangulation": {
@@ -109,12 +109,14 @@ def test_ways_to_say_the_same_triangulation_agree() -> None:
             "h_axis": [0.0, -b / d, -z0 / d],
         }
     }
-    told = sensor_of(posed).readout.triangulation
+    triangulation = sensor_of(posed).readout.triangulation
     straight = sensor_of(changed("camera_line", lens=None)).readout.triangulation
-    assert told is not None
+    assert triangulation is not None
     assert straight is not None
     u, v = straight.to_sensor(points).T
-    np.testing.assert_allclose(told.to_sensor(points), np.column_stack([48.0 - u, v + 239.5]), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        triangulation.to_sensor(points), np.column_stack([48.0 - u, v + 239.5]), rtol=0, atol=1e-9
+    )
 
 
 WRONG = [
@@ -206,32 +208,32 @@ def places(table: dict[str, Any], way: tuple[str, ...] = ()) -> list[tuple[str, 
 @given(data=st.data(), key=st.from_regex(r"\A[a-z][a-z_]{0,11}\Z"))
 def test_an_unknown_key_is_refused_wherever_it_stands(data: st.DataObject, key: str) -> None:
     name = data.draw(st.sampled_from(SHIPPED))
-    way = data.draw(st.sampled_from(places(TABLES[name])))
+    path = data.draw(st.sampled_from(places(TABLES[name])))
     table = copy.deepcopy(TABLES[name])
     place = table
-    for each in way:
+    for each in path:
         place = place[each]
     key = f"x_{key}"
     place[key] = 1
-    with pytest.raises(DescriptionError, match=f"unknown key '{'.'.join((*way, key))}'"):
+    with pytest.raises(DescriptionError, match=f"unknown key '{'.'.join((*path, key))}'"):
         sensor_of(table)
 
 
 @given(data=st.data())
 def test_a_missing_table_or_key_never_is_more_than_a_line(data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(SHIPPED))
-    way = data.draw(st.sampled_from(places(TABLES[name])))
+    path = data.draw(st.sampled_from(places(TABLES[name])))
     table = copy.deepcopy(TABLES[name])
     place = table
-    for each in way:
+    for each in path:
         place = place[each]
     del place[data.draw(st.sampled_from(sorted(place)))]
-    told = ""
+    message = ""
     try:
         sensor_of(table)
     except DescriptionError as error:
-        told = str(error)
-    assert "\n" not in told
+        message = str(error)
+    assert "\n" not in message
 
 
 def test_files_that_are_no_sensor(tmp_path: Path) -> None:

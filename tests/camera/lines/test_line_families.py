@@ -61,10 +61,10 @@ def test_packed_lines_keep_what_is_finite(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(packed.counts, [5, 5])
     np.testing.assert_array_equal(packed.family, [0, 2])
     assert packed.families == 3
-    wanted = np.concatenate([lines[0], lines[3][[0, 1, 2, 3, 5]]])
+    expected = np.concatenate([lines[0], lines[3][[0, 1, 2, 3, 5]]])
     found = np.stack([packed.x, packed.y], axis=-1) * packed.unit + packed.origin
-    np.testing.assert_allclose(found, wanted, rtol=1e-14)
-    np.testing.assert_array_equal(np.concatenate(lines)[packed.used], wanted)
+    np.testing.assert_allclose(found, expected, rtol=1e-14)
+    np.testing.assert_array_equal(np.concatenate(lines)[packed.used], expected)
     assert np.max(np.hypot(packed.x, packed.y)) <= 1.0
     np.testing.assert_allclose(packed.sums(packed.x), [packed.x[:5].sum(), packed.x[5:].sum()], atol=1e-15)
 

@@ -36,10 +36,10 @@ def distances(packed: PackedLines, k: np.ndarray, centre: np.ndarray, lines: Lin
     """Compute (n.u + rho)/|J'n| with J by the chain rule."""
     d = np.stack([packed.x, packed.y], axis=-1) - centre
     s = np.sum(d**2, axis=-1)
-    growth, slope = 1.0 + s * (k[0] + k[1] * s), k[0] + 2.0 * k[1] * s
-    jacobian = growth[:, None, None] * np.eye(2) + 2.0 * slope[:, None, None] * d[:, :, None] * d[:, None, :]
+    scale, slope = 1.0 + s * (k[0] + k[1] * s), k[0] + 2.0 * k[1] * s
+    jacobian = scale[:, None, None] * np.eye(2) + 2.0 * slope[:, None, None] * d[:, :, None] * d[:, None, :]
     normal = np.stack([lines.nx, lines.ny], axis=-1)[packed.line]
-    value = np.sum(normal * (centre + d * growth[:, None]), axis=-1) + lines.offset[packed.line]
+    value = np.sum(normal * (centre + d * scale[:, None]), axis=-1) + lines.offset[packed.line]
     return value / np.linalg.norm(np.einsum("nij,ni->nj", jacobian, normal), axis=-1)
 
 
@@ -69,8 +69,8 @@ def test_lines_move_with_their_points(packed: PackedLines, anywhere: Parameters)
     for axis in (0, 1):
         step = np.zeros(2 + 2 + 8)
         step[4 + axis :: 2] = STEP
-        there, _ = apply_step(packed, anywhere, step)
-        point = there.vanishing[packed.family]
+        moved, _ = apply_step(packed, anywhere, step)
+        point = moved.vanishing[packed.family]
         offset, turn = change[:, 1 + axis] * STEP
         nx, ny = lines.nx - turn * lines.ny, lines.ny + turn * lines.nx
         missed = nx * point[:, 0] + ny * point[:, 1] + (lines.offset + offset) * point[:, 2]
@@ -86,7 +86,7 @@ def test_lines_are_projected_out(packed: PackedLines, anywhere: Parameters, free
     evaluation = straightness.evaluate(packed, parameters)
     slopes = straightness.residual_jacobian(2, evaluation)
     normal = straightness.normal_equations(packed, parameters, evaluation, slopes)
-    count_lens_parameters, own = list(slopes.lens[:4]), []
+    count_lens_parameters, line_columns = list(slopes.lens[:4]), []
     change = np.zeros((2, 3, len(packed.counts)))
     if not free:
         change = straightness.pencil_changes(parameters.vanishing, packed.family, evaluation.lines)
@@ -97,15 +97,15 @@ def test_lines_are_projected_out(packed: PackedLines, anywhere: Parameters, free
     for line in range(len(packed.counts)):
         inside = packed.line == line
         columns = slopes.line if free else [np.sum(slopes.line * change[:, 0, packed.line], axis=0)]
-        own += [inside * column for column in columns]
-    basis = np.linalg.qr(np.array(own).T)[0]
-    wanted = np.array(count_lens_parameters).T
-    wanted = wanted - basis @ (basis.T @ wanted)
+        line_columns += [inside * column for column in columns]
+    basis = np.linalg.qr(np.array(line_columns).T)[0]
+    expected = np.array(count_lens_parameters).T
+    expected = expected - basis @ (basis.T @ expected)
     scale = np.max(np.abs(normal.matrix))
-    np.testing.assert_allclose(normal.matrix, wanted.T @ wanted, atol=1e-13 * scale)
-    np.testing.assert_allclose(normal.gradient, wanted.T @ evaluation.residual, atol=1e-13 * scale)
+    np.testing.assert_allclose(normal.matrix, expected.T @ expected, atol=1e-13 * scale)
+    np.testing.assert_allclose(normal.gradient, expected.T @ evaluation.residual, atol=1e-13 * scale)
     columns = straightness.projected_columns(packed, parameters, evaluation, slopes, normal.line_coefficients)
-    np.testing.assert_allclose(columns, wanted.T, atol=1e-12 * np.sqrt(scale))
+    np.testing.assert_allclose(columns, expected.T, atol=1e-12 * np.sqrt(scale))
 
 
 def test_pencil_lines_are_the_best(packed: PackedLines, anywhere: Parameters) -> None:

@@ -151,10 +151,10 @@ def test_several_images_share_a_lens(rng: np.random.Generator) -> None:
     for tilt in (0.0, 15.0, 30.0):
         points = lens.distort(plane_grid(rng, tilt))
         families += grid_lines(points + rng.normal(0.0, 0.1, points.shape))
-    many, one = (fit_lens(each, model="k1,k2", lines="vanishing") for each in (families, families[:2]))
-    assert many.vanishing_points.shape == (6, 3)
-    assert np.all(np.abs(errors(many, lens)) < 4.0)
-    assert np.all(np.sqrt(np.diag(many.covariance))[:4] < np.sqrt(np.diag(one.covariance))[:4])
+    together, one = (fit_lens(each, model="k1,k2", lines="vanishing") for each in (families, families[:2]))
+    assert together.vanishing_points.shape == (6, 3)
+    assert np.all(np.abs(errors(together, lens)) < 4.0)
+    assert np.all(np.sqrt(np.diag(together.covariance))[:4] < np.sqrt(np.diag(one.covariance))[:4])
 
 
 @pytest.mark.parametrize(
@@ -200,10 +200,10 @@ def test_alternatives_say_how_far_their_centres_lie(rng: np.random.Generator) ->
     assert k1.p_value < 0.05 < by_model["k1,k2", "free"].p_value
     assert k1.rms_px > fit.rms_px
     assert k1.centre_distance_px == pytest.approx(np.hypot(*np.subtract(k1.centre, fit.lens.centre)))
-    none = by_model["none", "vanishing"]
-    assert none.centre is None
-    assert np.isnan(none.centre_distance_px)
-    assert none.aic > k1.aic > 0.0
+    no_lens = by_model["none", "vanishing"]
+    assert no_lens.centre is None
+    assert np.isnan(no_lens.centre_distance_px)
+    assert no_lens.aic > k1.aic > 0.0
 
 
 def test_no_distortion_leaves_no_centre(rng: np.random.Generator) -> None:
@@ -314,8 +314,8 @@ def test_outliers_are_pointed_out(rng: np.random.Generator) -> None:
     assert fit_lens(grid_lines(points)).warnings == ()
     points[5, 7] += [15.0, 0.0]
     points[10, 20] -= [0.0, 40.0]
-    (said,) = (each for each in fit_lens(grid_lines(points)).warnings if "outliers" in each)
-    assert said.endswith("there are outliers; use loss='tukey'")
+    (warning,) = (each for each in fit_lens(grid_lines(points)).warnings if "outliers" in each)
+    assert warning.endswith("there are outliers; use loss='tukey'")
     assert not any("outliers" in each for each in fit_lens(grid_lines(points), loss="tukey").warnings)
 
 

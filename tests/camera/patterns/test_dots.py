@@ -205,5 +205,7 @@ def test_real_grids(data: Path, name: str, shape: tuple[int, int], fewest: int, 
     assert np.nanmax(np.abs(back - found.points)) < 0.02
     # A row and a column are smooth curves: no step is far from its neighbours.
     for axis in (0, 1):
-        bend = np.diff(found.points, 2, axis)
-        assert np.nanmax(np.abs(bend)) < 0.12 * np.nanmedian(np.linalg.norm(np.diff(found.points, 1, axis), axis=-1))
+        second_difference = np.diff(found.points, 2, axis)
+        assert np.nanmax(np.abs(second_difference)) < 0.12 * np.nanmedian(
+            np.linalg.norm(np.diff(found.points, 1, axis), axis=-1)
+        )

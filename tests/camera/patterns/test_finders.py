@@ -59,12 +59,12 @@ def test_ends_in_a_grid_or_a_line(
     width: int,
 ) -> None:
     image = picture(np.random.default_rng(seed), (height, width))
-    told = None
+    message = None
     try:
         find(image)
     except ValueError as error:
-        told = error
-    assert told is None or type(told) is ValueError  # no LinAlgError
-    line = "found" if told is None else str(told)
+        message = error
+    assert message is None or type(message) is ValueError  # no LinAlgError
+    line = "found" if message is None else str(message)
     assert "\n" not in line
     assert any(word in line for word in ("found", "broke into", "are whole"))

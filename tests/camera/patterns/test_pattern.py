@@ -95,8 +95,8 @@ def test_points_off_the_grid_are_told_also_at_its_border(rng: np.random.Generato
     for node in off:
         points[node] += 0.8, -0.6
     points[4, 4] = np.nan
-    told = {(int(i), int(j)) for i, j in np.argwhere(~agrees_with_grid(points, 7.0, 0.003))}
+    rejected = {(int(i), int(j)) for i, j in np.argwhere(~agrees_with_grid(points, 7.0, 0.003))}
     # In a corner an outlier cannot be distinguished from its neighbour.
-    assert told >= set(off)
-    assert len(told) <= len(off) + 3
+    assert rejected >= set(off)
+    assert len(rejected) <= len(off) + 3
     assert not agrees_with_grid(np.full((3, 3, 2), np.nan), 7.0, 0.003).any()

@@ -258,22 +258,22 @@ def test_a_known_centre_fixes_the_tilt_without_distortion(rng):
 
 def test_it_says_when_tilt_and_centre_cannot_be_told_apart(rng):
     """Corner distortion 10 px: determined. 0.3 px: 20 px of centre at equal residual. 0: the virtual camera only."""
-    said = {}
+    warnings = {}
     for corner in (10.0, 0.3, 0.0):
         made = scene(rng, "dots", 10, corner_px=corner, direction=1.0)
         views = made.views(rng, 0.05)
         fit = fit_camera(views, made.size, model="tilt")
-        said[corner] = (
+        warnings[corner] = (
             any("tell tilt from centre" in each for each in fit.warnings),
             fit.uncertainties["cx"],
             fit.rms_px,
         )
-    assert not said[10.0][0]
-    assert said[10.0][1] < 1.0
-    assert said[0.3][0]
-    assert 3.0 < said[0.3][1] < 60.0
-    assert said[0.0][0]
-    np.testing.assert_allclose([each[2] for each in said.values()], 0.05 * math.sqrt(2.0), rtol=0.05)
+    assert not warnings[10.0][0]
+    assert warnings[10.0][1] < 1.0
+    assert warnings[0.3][0]
+    assert 3.0 < warnings[0.3][1] < 60.0
+    assert warnings[0.0][0]
+    np.testing.assert_allclose([each[2] for each in warnings.values()], 0.05 * math.sqrt(2.0), rtol=0.05)
     # The alternatives contain the untilted camera that fits equally well.
     chosen = fit_camera(views, made.size)
     assert chosen.model == "none"

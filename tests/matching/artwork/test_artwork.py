@@ -187,11 +187,15 @@ def test_without_a_mask_everything_is_bare(tmp_path: Path) -> None:
 
 
 def test_the_file_s_word_counts_more_than_the_look(tmp_path: Path) -> None:
-    said = COPPER.replace("%ADD14C,1.0*%", "%TA.AperFunction,SMDPad,CuDef*%\n%ADD14C,1.0*%\n%TD*%")
-    said = said.replace("%ADD13R,1.5X0.9*%", "%TA.AperFunction,FiducialPad,Local*%\n%ADD13R,1.5X0.9*%\n%TD*%")
-    said = said.replace("%ADD12C,1.6*%", "%TA.AperFunction,ViaPad*%\n%ADD12C,1.6*%\n%TD*%")
-    said = said.replace("D11*\n", "%TO.N,GND*%\n%TO.P,R7,2*%\nD11*\n").replace("D12*\n", "%TD*%\nD12*\n")
-    board = read(tmp_path, copper=said)
+    with_function = COPPER.replace("%ADD14C,1.0*%", "%TA.AperFunction,SMDPad,CuDef*%\n%ADD14C,1.0*%\n%TD*%")
+    with_function = with_function.replace(
+        "%ADD13R,1.5X0.9*%", "%TA.AperFunction,FiducialPad,Local*%\n%ADD13R,1.5X0.9*%\n%TD*%"
+    )
+    with_function = with_function.replace("%ADD12C,1.6*%", "%TA.AperFunction,ViaPad*%\n%ADD12C,1.6*%\n%TD*%")
+    with_function = with_function.replace("D11*\n", "%TO.N,GND*%\n%TO.P,R7,2*%\nD11*\n").replace(
+        "D12*\n", "%TD*%\nD12*\n"
+    )
+    board = read(tmp_path, copper=with_function)
     roles = {where: land_at(board, *where).role for where in ((2, 8), (5, 2), (17, 2))}
     assert roles == {(2, 8): "component", (5, 2): "fiducial", (17, 2): "via"}
     assert land_at(board, 2, 8).function == "SMDPad"
@@ -294,10 +298,10 @@ def test_what_lies_along_a_line_is_what_lies_at_its_points(rng: np.random.Genera
         start, end = rng.uniform(-2, 2, (2, 2))
         places = rng.uniform(0, 1, 200)
         points = start + places[:, None] * (end - start)
-        laid = np.zeros(len(points), dtype=bool)
+        covered = np.zeros(len(points), dtype=bool)
         for each in shapes:
-            laid[Outline(each.outline).contains_points(points)] = each.dark
-        np.testing.assert_array_equal(is_covered(Layer(shapes).crossings(start, end), places), laid)
+            covered[Outline(each.outline).contains_points(points)] = each.dark
+        np.testing.assert_array_equal(is_covered(Layer(shapes).crossings(start, end), places), covered)
 
 
 def star(rng: np.random.Generator) -> np.ndarray:

@@ -188,8 +188,8 @@ def test_a_wedge_anywhere(device: Device, angle: float, share: float, grey: floa
     away = np.angle(np.exp(1j * (np.arctan2(row - TRUE[1], column - TRUE[0]) - angle)))
     image[np.abs(away) < share * math.pi] = grey
     image += np.random.default_rng(3).normal(0.0, 2.0, SHAPE)
-    near = place(TRUE[0] + off * math.cos(towards), TRUE[1] + off * math.sin(towards))
-    blobs = PLAIN(image.astype(np.float32), near, device=device)
+    nominal = place(TRUE[0] + off * math.cos(towards), TRUE[1] + off * math.sin(towards))
+    blobs = PLAIN(image.astype(np.float32), nominal, device=device)
     assert blobs.status[0] == 0
     assert np.hypot(*(centre(blobs) - TRUE)) < 0.1
 
@@ -199,10 +199,10 @@ def test_not_chasing_what_lies_beyond(device: Device, rng: np.random.Generator) 
     image = (a_disc() + rng.normal(0.0, 2.0, SHAPE)).astype(np.float32)
     for match in (True, False):
         operation = replace(PLAIN, passes=6, match=match)
-        near = operation(image, place(TRUE[0] - 5.0, TRUE[1]), device=device)
-        assert near.status[0] == 0
-        assert np.hypot(*(centre(near) - TRUE)) < 0.05
-        assert abs(near.distance[0] - 5.0) < 0.05
+        close = operation(image, place(TRUE[0] - 5.0, TRUE[1]), device=device)
+        assert close.status[0] == 0
+        assert np.hypot(*(centre(close) - TRUE)) < 0.05
+        assert abs(close.distance[0] - 5.0) < 0.05
         far = operation(image, place(TRUE[0] - 9.0, TRUE[1]), device=device)
         assert far.status[0] != 0
         assert np.isnan(far.x[0])

@@ -118,8 +118,8 @@ def test_the_greediest_choice_is_taken(tmp_path: Path, criterion: Any) -> None:
     """Each selected feature has the largest gain for its cost among all possible next features."""
     artwork = round_artwork(round_board(tmp_path, traces=TRACES))
     rulers = candidates_of(artwork)
-    few = FeatureCandidates._make([*(each[::9] for each in rulers[:-1]), rulers.placement])
-    both = append_fiducials(few, found(artwork), IMAGING)
+    subset = FeatureCandidates._make([*(each[::9] for each in rulers[:-1]), rulers.placement])
+    both = append_fiducials(subset, found(artwork), IMAGING)
     both = both._replace(ambiguity=np.zeros(len(both.radius)))
     costs = np.where(both.radius > 0, 6.0, 1.0)
     # A negligible prior, so that the gains follow from the predicted covariances.

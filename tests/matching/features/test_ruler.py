@@ -214,8 +214,8 @@ def test_pairs_have_the_middle_whatever_the_width(device: Device, variant: Any, 
     single = replace(operation, pairs=False)(image, rulers, device=device)
     np.testing.assert_allclose(ours.sigma, single.sigma / math.sqrt(2.0), rtol=0.05)
     # The same stripe is not found as a dark stripe.
-    none = replace(operation, polarity="falling")(image, rulers, device=device)
-    assert (none.status == Status.LOW_SIGNAL).all()
+    dark = replace(operation, polarity="falling")(image, rulers, device=device)
+    assert (dark.status == Status.LOW_SIGNAL).all()
 
 
 def test_pairs_of_a_spacing(device: Device) -> None:

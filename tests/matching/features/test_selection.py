@@ -161,19 +161,19 @@ def test_etching_spoils_edges_that_face_one_way_and_no_others(tmp_path: Path) ->
 
 def test_repeated_edges_on_a_ruler_are_ambiguous(tmp_path: Path, rng: np.random.Generator) -> None:
     comb = tuple((2.0, y, 8.0, y) for y in (10.0, 10.7, 11.4))
-    apart = tuple((12.0, y, 18.0, y) for y in (10.0, 13.0))
+    separate = tuple((12.0, y, 18.0, y) for y in (10.0, 13.0))
     imaging = replace(IMAGING, shift=400e-6, angle=0.0)
-    rulers = rulers_of(board(tmp_path, *comb, *apart, (10, 2, 10, 8)), imaging)
+    rulers = rulers_of(board(tmp_path, *comb, *separate, (10, 2, 10, 8)), imaging)
     # Edges are found on a ruler, except within the extent of the smoothing filter at both ends.
     found = np.max(rulers.length[~rulers.pair]) / 2 - 3 * math.sqrt(5.0) * imaging.pixel
     up = (rulers.normal[:, 1] > 0.9) & (rulers.point[:, 0] < 9e-3)
     shifts = rng.uniform(-400e-6, 400e-6, 20000)
     for y, others in ((10.15e-3, (0.7e-3,)), (10.85e-3, (-0.7e-3, 0.7e-3))):
-        here = up & ~rulers.pair & np.isclose(rulers.point[:, 1], y, rtol=0, atol=1e-6)
+        on_trace = up & ~rulers.pair & np.isclose(rulers.point[:, 1], y, rtol=0, atol=1e-6)
         seen = np.sum([np.mean(np.abs(shifts + other) < found) for other in others])
-        assert here.any()
+        assert on_trace.any()
         assert 0.05 < seen < 0.95
-        assert rulers.ambiguity[here] == pytest.approx(seen, abs=0.015)
+        assert rulers.ambiguity[on_trace] == pytest.approx(seen, abs=0.015)
     assert not rulers.ambiguity[rulers.point[:, 0] > 9e-3].any()
     chosen = select_rulers(rulers, imaging, 8).chosen
     assert not rulers.ambiguity[chosen].any()

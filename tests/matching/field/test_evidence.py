@@ -75,8 +75,8 @@ def test_seen_is_what_has_a_point() -> None:
     crossings = expected_crossings(CROSS, (0.0, 0.0, 0.0), paths, line_width=0.1)
     assert detected_fraction(crossings, np.array([(-3.5, 0.04), (-2.0, -0.06), (5.0, 5.0)]), 0.05) == 0.25
     assert detected_fraction(crossings, crossings.places, 0.05) == 1.0
-    nothing = expected_crossings(CROSS, (0.0, 0.0, 0.0), [(5.0, 1.0, 5.0, 2.0)], line_width=0.1)
-    assert math.isnan(detected_fraction(nothing, crossings.places, 0.05))
+    no_crossings = expected_crossings(CROSS, (0.0, 0.0, 0.0), [(5.0, 1.0, 5.0, 2.0)], line_width=0.1)
+    assert math.isnan(detected_fraction(no_crossings, crossings.places, 0.05))
 
 
 def test_chance_bounds_what_random_points_reach(rng: np.random.Generator) -> None:
@@ -100,19 +100,19 @@ def test_chance_bounds_what_random_points_reach(rng: np.random.Generator) -> Non
 
 def test_missing_is_what_is_not_seen_beside_what_is_explained() -> None:
     turns = np.linspace(0.0, 2.0 * math.pi, 64, endpoint=False)
-    ways = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    directions = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     pose = (1.0, 1.0, 0.5)
-    paths = np.hstack([0.0 * ways, 3.0 * ways])
+    paths = np.hstack([0.0 * directions, 3.0 * directions])
     places = expected_crossings(CROSS, pose, paths, line_width=0.1).places
-    told = {"half_line_width": 0.05, "scale": 0.2, "max_range": 3.0, "margin": 0.5}
-    whole = evidence(places, paths, CROSS, pose, **told)
-    assert (whole.expected, whole.on_lines, whole.seen) == (len(places), 1.0, 1.0)
-    assert whole.missing == 0.0
-    half = evidence(places[::2], paths, CROSS, pose, **told)
+    settings = {"half_line_width": 0.05, "scale": 0.2, "max_range": 3.0, "margin": 0.5}
+    complete = evidence(places, paths, CROSS, pose, **settings)
+    assert (complete.expected, complete.on_lines, complete.seen) == (len(places), 1.0, 1.0)
+    assert complete.missing == 0.0
+    half = evidence(places[::2], paths, CROSS, pose, **settings)
     assert half.missing == pytest.approx(0.5, abs=0.1)
     elsewhere = np.concatenate([places[::2], places[::2] + 0.3])
-    assert evidence(elsewhere, paths, CROSS, pose, **told).missing > 0.8
-    unknown = evidence(places[::2], None, CROSS, pose, **told)
+    assert evidence(elsewhere, paths, CROSS, pose, **settings).missing > 0.8
+    unknown = evidence(places[::2], None, CROSS, pose, **settings)
     assert (unknown.expected, unknown.missing) == (0, 0.0)
 
 

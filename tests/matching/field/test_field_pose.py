@@ -166,15 +166,15 @@ def test_points_that_are_none_do_not_count(device: Device, variant: Any, rng: np
     worse = np.concatenate([points, points[:3]])
     # The last point is less than a cell beyond the range.
     worse[7], worse[64], worse[65] = (np.nan, 0.0), (1e30, np.inf), (2.01, 0.0)
-    alike = np.delete(worse, [7, 64, 65], axis=0)
-    costs, expected = search(worse, device=device), search(alike, device=device)
+    valid = np.delete(worse, [7, 64, 65], axis=0)
+    costs, expected = search(worse, device=device), search(valid, device=device)
     assert (costs.seen == 63).all()
     np.testing.assert_array_equal(costs.scores, expected.scores)
-    nothing = search(np.full((65, 2), np.nan, np.float32), device=device)
-    assert np.isnan(nothing.scores).all()
-    assert np.isnan(nothing.least).all()
-    assert (nothing.seen == 0).all()
-    assert len(search.best(nothing).poses) == 0
+    empty = search(np.full((65, 2), np.nan, np.float32), device=device)
+    assert np.isnan(empty.scores).all()
+    assert np.isnan(empty.least).all()
+    assert (empty.seen == 0).all()
+    assert len(search.best(empty).poses) == 0
 
 
 def test_scores_are_near_the_exact_cost(device: Device, rng: np.random.Generator) -> None:
@@ -277,9 +277,9 @@ def test_a_wrong_scale_shows_in_the_scatter(device: Device, rng: np.random.Gener
 
 
 def test_no_points_no_pose(device: Device) -> None:
-    nothing = np.full((8, 2), np.nan, np.float32)
-    assert find_pose_candidates(large(device), nothing, device=device) == ()
-    assert find_pose_candidates(large(device), nothing, initial_pose=POSE, device=device) == ()
+    invalid = np.full((8, 2), np.nan, np.float32)
+    assert find_pose_candidates(large(device), invalid, device=device) == ()
+    assert find_pose_candidates(large(device), invalid, initial_pose=POSE, device=device) == ()
 
 
 # ---- the local tier ------------------------------------------------------------------------------------------
@@ -373,8 +373,8 @@ def test_poses_that_are_none(device: Device, rng: np.random.Generator) -> None:
     assert fit.status.tolist() == [Status.NOT_FINITE, Status.NOT_FINITE, Status.OK, Status.LOW_SIGNAL]
     for values in (fit.poses, fit.covariance, fit.information, fit.score, fit.residual_std, fit.inlier_fraction):
         np.testing.assert_array_equal(np.isfinite(values.reshape(4, -1)).all(axis=1), [False, False, True, False])
-    few = FieldPoseRefinement(map=field_map)(points[:3], starts[2:3], device=device)
-    assert few.status[0] == Status.LOW_SIGNAL
+    refined = FieldPoseRefinement(map=field_map)(points[:3], starts[2:3], device=device)
+    assert refined.status[0] == Status.LOW_SIGNAL
 
 
 def test_wrong_inputs_are_refused(device: Device) -> None:

@@ -20,9 +20,9 @@ def test_a_motion_is_in_the_robots_frame() -> None:
 
 def test_the_covariance_is_that_of_many_robots(rng: np.random.Generator) -> None:
     noise = np.diag([1e-4, 4e-4, 1e-4])
-    many = rng.multivariate_normal(POSE, COVARIANCE, 40_000)
+    robots = rng.multivariate_normal(POSE, COVARIANCE, 40_000)
     motions = rng.multivariate_normal([0.5, -0.2, 0.1], noise, 40_000)
-    ends = np.array([predict(PoseEstimate(a, COVARIANCE), b, noise).pose for a, b in zip(many, motions, strict=True)])
+    ends = np.array([predict(PoseEstimate(a, COVARIANCE), b, noise).pose for a, b in zip(robots, motions, strict=True)])
     ends[:, 2] = np.where(ends[:, 2] < 0, ends[:, 2] + 2 * np.pi, ends[:, 2])
     predicted = predict(PoseEstimate(POSE, COVARIANCE), (0.5, -0.2, 0.1), noise)
     # Second order in an angle of 0.01 is 1e-4 of it; 40 000 draws give a covariance to a percent of its diagonal.

@@ -72,10 +72,10 @@ def test_rulers_lie_where_they_say() -> None:
         seen = on_board(rulers[..., :2].astype(float) + s * rulers[..., 2:4])
         per = 1.0 / (1.0 + s * rulers[..., 8])
         u, v = (rulers[..., 4] + s * rulers[..., 6]) * per, (rulers[..., 5] + s * rulers[..., 7]) * per
-        way = np.stack([normal[:, 1], -normal[:, 0]], axis=-1)
-        said = point[:, None] + u[..., None] * way[:, None] + v[..., None] * normal[:, None]
+        direction = np.stack([normal[:, 1], -normal[:, 0]], axis=-1)
+        expected = point[:, None] + u[..., None] * direction[:, None] + v[..., None] * normal[:, None]
         # The centres are rounded to a float: 3e-5 px.
-        np.testing.assert_allclose(said, seen, atol=1e-9)
+        np.testing.assert_allclose(expected, seen, atol=1e-9)
         assert (np.sign(v) == np.sign(s)).all() or s == 0.0
     np.testing.assert_allclose(lines[:, 2:4], point, atol=1e-9)
     np.testing.assert_allclose(rulers[..., 4], along, atol=1e-9)

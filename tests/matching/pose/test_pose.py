@@ -208,9 +208,9 @@ def test_refuses_what_the_features_cannot_carry(
 
 def test_a_start_that_is_no_number(device: Device, rng: np.random.Generator) -> None:
     _, rows = scene(rng, 2, 32)
-    near = np.zeros((2, 3))
-    near[1, 2] = np.nan
-    result = SolvePose(with_initial_pose=True)(rows, near, device=device)
+    initial_pose = np.zeros((2, 3))
+    initial_pose[1, 2] = np.nan
+    result = SolvePose(with_initial_pose=True)(rows, initial_pose, device=device)
     np.testing.assert_array_equal(result.status, [Status.OK, Status.NOT_FINITE])
     assert np.isnan(result.pose[1]).all()
 
@@ -237,8 +237,8 @@ def test_fitted_lines_carry_their_angle(device: Device, rng: np.random.Generator
     matrix, shift = robust.transform_of(np.array([2e-4, -1e-4, 0.01]))
     seen = (on + rng.normal(0.0, SIGMA, (lines, each, 1)) * normal[:, None]) @ matrix.T + shift
     fits = FitLines(loss="least_squares", scale=SIGMA)(seen, device=device)
-    way = fits.normal * np.sign(np.sum(fits.normal * (normal @ matrix.T), axis=-1))[:, None]
-    turned = np.arcsin(normal[:, 0] * way[:, 1] - normal[:, 1] * way[:, 0])
+    direction = fits.normal * np.sign(np.sum(fits.normal * (normal @ matrix.T), axis=-1))[:, None]
+    turned = np.arcsin(normal[:, 0] * direction[:, 1] - normal[:, 1] * direction[:, 0])
     rows = fitted_line_rows(normal, point, fits.centre, fits.covariance, turned)
     operation = SolvePose(loss="least_squares", placement=PLACE)
     by_lines = operation(rows, device=device)

@@ -226,10 +226,10 @@ def test_a_board_is_found_wherever_it_lies(
 ) -> None:
     view, fix = prepared(artwork)
     rng, pose = np.random.default_rng(seed), (x, y, math.radians(degrees))
-    gone = set(np.flatnonzero(rng.uniform(size=len(artwork.copper)) < missing))
-    found = fix(board_image(artwork, view, pose, MIDDLE, missing=gone, rng=rng), device=device)
+    removed = set(np.flatnonzero(rng.uniform(size=len(artwork.copper)) < missing))
+    found = fix(board_image(artwork, view, pose, MIDDLE, missing=removed, rng=rng), device=device)
     # Exactly the rulers whose copper is present agree. Two rulers touch the image border and may be in or out.
-    share, count = there(artwork, pose, gone)
+    share, count = there(artwork, pose, removed)
     enough, slack = fix.min_score + 1.5 / math.sqrt(count), 2.0 / count
     if found.status == Status.LOW_SIGNAL:
         # In view, the missing share may be larger than on the whole board: too large for a certain pose.
@@ -419,7 +419,7 @@ def drawn(data: Path, name: str, seed: int) -> DrawnObject:
     artwork = artwork_of(data / "gerber" / name)
     shift = rng.choice([-1.0, 1.0], 2) * rng.uniform(1.2e-3 if seed % 2 else 0.0, 2e-3, 2)
     pose = (*shift, math.radians(rng.uniform(-5, 5)))
-    gone = set(np.flatnonzero(rng.uniform(size=len(artwork.copper)) < rng.uniform(0, 0.3)))
+    removed = set(np.flatnonzero(rng.uniform(size=len(artwork.copper)) < rng.uniform(0, 0.3)))
     view, _ = looking_at(
         middle,
         (480, 640),
@@ -428,7 +428,7 @@ def drawn(data: Path, name: str, seed: int) -> DrawnObject:
         mask_shift=tuple(rng.uniform(-75e-6, 75e-6, 2)),
         silk_shift=tuple(rng.uniform(-1e-4, 1e-4, 2)),
     )
-    picture = board_image(artwork, replace(view, noise=rng.uniform(1, 6)), pose, middle, missing=gone, rng=rng)
+    picture = board_image(artwork, replace(view, noise=rng.uniform(1, 6)), pose, middle, missing=removed, rng=rng)
     image = picture.round().clip(0, 255).astype(np.uint8)
     return DrawnObject(fix_of(data / "gerber" / name, middle, view.blur_px), image, middle, pose)
 
@@ -504,11 +504,11 @@ def agreement(pair: Path, shape: tuple[int, int], draws: int, device: Device) ->
     for _ in range(draws):
         angle, shift = math.radians(rng.uniform(-8, 8)), rng.uniform(-40, 40, 2)
         motion = mover.motion(angle, shift)
-        own = register_images(mover.seen(motion), template, device=device)
+        unmoved = register_images(mover.seen(motion), template, device=device)
         found = register_images(mover.moved(motion), template, device=device)
-        assert own.status == found.status == Status.OK
-        miss = found.placement - motion[:, :2] @ own.placement - motion[:, 2]
-        turn = math.degrees(found.pose[2] - own.pose[2] - angle)
+        assert unmoved.status == found.status == Status.OK
+        miss = found.placement - motion[:, :2] @ unmoved.placement - motion[:, 2]
+        turn = math.degrees(found.pose[2] - unmoved.pose[2] - angle)
         worst = np.maximum(worst, np.abs([np.hypot(*miss), turn]))
     return worst
 

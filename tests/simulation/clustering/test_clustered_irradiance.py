@@ -144,9 +144,9 @@ def test_what_faces_each_other_decides_whether_there_is_a_plan(device: Device) -
     # Both computations agree within the bound plus the rounding of the kernel.
     assert np.all(np.abs(shift[0] - shift[1]) <= results[0].cut.bound + 1e-9)
     assert np.all(results[0].cut.bound <= 1e-4)
-    nothing = ClusteredIrradiance(scene=scene, tolerance=0.0, min_facing_pairs=gain, device=device)
-    assert not nothing(segments, receivers, weights, reading).cut.traversed
-    assert nothing(segments, receivers, weights, reading, tolerance=1e-4).cut.traversed
+    exact = ClusteredIrradiance(scene=scene, tolerance=0.0, min_facing_pairs=gain, device=device)
+    assert not exact(segments, receivers, weights, reading).cut.traversed
+    assert exact(segments, receivers, weights, reading, tolerance=1e-4).cut.traversed
 
 
 def test_few_pairs_face_each_other_on_a_board() -> None:
@@ -154,9 +154,9 @@ def test_few_pairs_face_each_other_on_a_board() -> None:
     receivers = strips(triangles, 6, 50)
     weights = np.ones((*receivers.shape[:2], 2))
     middle = 0.5 * (segments[:, :3] + segments[:, 3:6])
-    way = receivers.reshape(-1, 1, 6)[..., :3] - middle
-    faces = (np.sum(way * segments[:, 6:9], axis=2) > 0.0) & (
-        np.sum(way * receivers.reshape(-1, 1, 6)[..., 3:], axis=2) < 0.0
+    offset = receivers.reshape(-1, 1, 6)[..., :3] - middle
+    faces = (np.sum(offset * segments[:, 6:9], axis=2) > 0.0) & (
+        np.sum(offset * receivers.reshape(-1, 1, 6)[..., 3:], axis=2) < 0.0
     )
     expected = int(np.count_nonzero(faces[:100]))
     weights[2:] = 0.0

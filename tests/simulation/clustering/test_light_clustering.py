@@ -114,8 +114,8 @@ def test_a_cluster_is_off_by_its_bound_at_most(rng: Any, count: int, distance: f
     tree = LightTree.build(segments)
     row, aggregate = tree.rows[1], tree.representatives[1:2]
     assume(np.isfinite(row[22]))
-    way = rng.normal(size=(50, 3))
-    place = row[:3] + distance * row[12] * way / np.linalg.norm(way, axis=1, keepdims=True)
+    direction = rng.normal(size=(50, 3))
+    place = row[:3] + distance * row[12] * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     receivers = np.hstack([place, row[:3] - place + 0.1 * row[12] * rng.normal(size=(50, 3))])
     ends = segments[:, :6].reshape(-1, 3)
     facing = np.all(np.einsum("nk,nmk->nm", receivers[:, 3:], ends - place[:, None]) > 0.0, axis=1)

@@ -50,15 +50,15 @@ def test_reflectivity_step(device: Device) -> None:
     x, k = 0.6, 5.0
     edge = x * SIGMA
     scene = Scene(corners=np.array(flat(-0.01, edge) + flat(edge, 0.01)), material=np.array([0, 0, 1, 1], np.int32))
-    told = found(scene, [0.15, 0.15 * k], [-1.0, x, 1.5], device)
+    attribution = found(scene, [0.15, 0.15 * k], [-1.0, x, 1.5], device)
     phi = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi)
     shift = SIGMA * (k - 1.0) * phi / (ndtr(x) + k * (1.0 - ndtr(x)))
     # Perspective over the beam's width: 50 um of 170 mm.
-    np.testing.assert_allclose(np.abs(told.error), shift / TAN, rtol=2e-3)
-    np.testing.assert_allclose(told.causes["reflectivity"], told.error, rtol=5e-3)
-    np.testing.assert_allclose(told.causes["occlusion"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.abs(attribution.error), shift / TAN, rtol=2e-3)
+    np.testing.assert_allclose(attribution.causes["reflectivity"], attribution.error, rtol=5e-3)
+    np.testing.assert_allclose(attribution.causes["occlusion"], 0.0, atol=1e-9)
     # Strips average over a straight line: only perspective remains.
-    np.testing.assert_allclose(told.causes["shape"], 0.0, atol=3e-3 * shift)
+    np.testing.assert_allclose(attribution.causes["shape"], 0.0, atol=3e-3 * shift)
 
 
 def test_blade_before_the_lens(device: Device) -> None:
@@ -69,11 +69,11 @@ def test_blade_before_the_lens(device: Device) -> None:
     _, y, z = foot + 0.1 * (lens - foot)
     a, b, c, d = (-WIDE, y, z), (WIDE, y, z), (WIDE, y, z + 0.03), (-WIDE, y, z + 0.03)
     scene = Scene(corners=np.array([*flat(-0.01, 0.02), [a, b, c], [a, c, d]]))
-    told = found(scene, [0.5], [-1.0, x, 1.5], device)
+    attribution = found(scene, [0.5], [-1.0, x, 1.5], device)
     phi = np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi)
-    np.testing.assert_allclose(np.abs(told.error), SIGMA * phi / ndtr(-x) / TAN, rtol=2e-3)
-    np.testing.assert_allclose(told.causes["occlusion"], told.error, rtol=5e-3)
-    np.testing.assert_allclose(told.causes["reflectivity"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.abs(attribution.error), SIGMA * phi / ndtr(-x) / TAN, rtol=2e-3)
+    np.testing.assert_allclose(attribution.causes["occlusion"], attribution.error, rtol=5e-3)
+    np.testing.assert_allclose(attribution.causes["reflectivity"], 0.0, atol=1e-9)
 
 
 def test_step_of_the_surface(device: Device) -> None:
@@ -90,12 +90,12 @@ def test_step_of_the_surface(device: Device) -> None:
 def test_part_in_the_shadow(device: Device) -> None:
     """Under a roof no surface is lit: no reading, category NO_SURFACE."""
     scene = Scene(corners=np.array(flat(-0.01, 0.01) + flat(-0.02, 0.02, 0.2)))
-    told = found(scene, [0.5], 9, device)
-    assert (told.category == ReadingCategory.MISSING).all()
-    assert np.isnan(told.error).all()
+    attribution = found(scene, [0.5], 9, device)
+    assert (attribution.category == ReadingCategory.MISSING).all()
+    assert np.isnan(attribution.error).all()
 
 
 @pytest.mark.parametrize("albedo", [1e-3, 1.0])
 def test_even_surfaces_have_no_error(albedo: float, device: Device) -> None:
-    told = found(Scene(corners=np.array(flat(-0.01, 0.01))), [albedo], 9, device)
-    assert np.abs(told.error).max() < 1e-6
+    attribution = found(Scene(corners=np.array(flat(-0.01, 0.01))), [albedo], 9, device)
+    assert np.abs(attribution.error).max() < 1e-6

@@ -76,9 +76,9 @@ def test_moments_are_shares_of_the_light(device: Device) -> None:
         np.testing.assert_allclose(found.causes[name], slope * power * (place - 5e-4) / everything, rtol=1e-6)
         np.testing.assert_allclose(found.power[name], power, rtol=1e-9)
     check_sum(found)
-    whole = attribute_errors(psd(view, ambient=1e-7), light, truth_at(view, u), device=device)
+    complete = attribute_errors(psd(view, ambient=1e-7), light, truth_at(view, u), device=device)
     np.testing.assert_allclose(
-        whole.causes["secondary"], found.causes["diffuse-specular"] + found.causes["diffuse-diffuse"], rtol=1e-9
+        complete.causes["secondary"], found.causes["diffuse-specular"] + found.causes["diffuse-diffuse"], rtol=1e-9
     )
 
 

@@ -106,7 +106,7 @@ def test_half_a_beam_hidden_from_one(level: GroundTruth, device: Device) -> None
     """The sensor with the complete beam in view is correct and has more light; the mean has half the error."""
     view = psd_view()
     hidden = (ACROSS < X * SIGMA).astype(float)
-    whole, half = (
+    full_beam, half = (
         psd(each).read({"direct": thick_line(each, SIGMA, factor, ACROSS)}, device=device)
         for each, factor in ((view, np.ones_like(ACROSS)), (facing(view), hidden))
     )
@@ -114,12 +114,12 @@ def test_half_a_beam_hidden_from_one(level: GroundTruth, device: Device) -> None
     error = SIGMA * phi(X) / share * 0.15 / 0.08
     np.testing.assert_allclose(np.abs(half.h), error, rtol=2e-3)
     for rule, predicted in (("stronger", None), ("predicted", (1e-9, error))):
-        fused = SensorFusion(rule=rule, tolerance=1e-6).fuse(whole, half, predicted)
+        fused = SensorFusion(rule=rule, tolerance=1e-6).fuse(full_beam, half, predicted)
         assert (fused.source == FIRST).all()
         assert np.abs(fused.h).max() < 1e-3 * error
-        turned = SensorFusion(rule=rule, tolerance=1e-6).fuse(half, whole, predicted and predicted[::-1])
+        turned = SensorFusion(rule=rule, tolerance=1e-6).fuse(half, full_beam, predicted and predicted[::-1])
         assert (turned.source == SECOND).all()
-    mean = SensorFusion(rule="mean").fuse(whole, half)
+    mean = SensorFusion(rule="mean").fuse(full_beam, half)
     np.testing.assert_allclose(np.abs(mean.h), 0.5 * error, rtol=5e-3)
 
 
@@ -129,14 +129,14 @@ def test_a_part_seen_by_two(level: GroundTruth, device: Device) -> None:
     hidden = (ACROSS < X * SIGMA).astype(float)
     found = []
     for each, from_here in ((view, [0, 1]), (facing(view), [3, 4])):
-        whole, half = (thick_line(each, SIGMA, factor, ACROSS) for factor in (np.ones_like(ACROSS), hidden))
+        full_beam, half = (thick_line(each, SIGMA, factor, ACROSS) for factor in (np.ones_like(ACROSS), hidden))
         seen = np.isin(np.arange(5), from_here)[:, None]
-        light = Exposure(*(np.where(seen, one, other) for one, other in zip(half, whole, strict=True)))
+        light = Exposure(*(np.where(seen, one, other) for one, other in zip(half, full_beam, strict=True)))
         variants = {
             "direct": light,
             "direct, uniform": light,
-            "direct, unoccluded": whole,
-            "direct, uniform, unoccluded": whole,
+            "direct, unoccluded": full_beam,
+            "direct, uniform, unoccluded": full_beam,
         }
         found.append(attribute_errors(psd(each), variants, level._replace(g=PLACES), device=device))
     candidates = attribute_pair_errors(*found, SensorFusion(rule="predicted"), max_gap=1.0, g=PLACES)
@@ -169,9 +169,9 @@ def test_what_one_does_not_see_the_other_does(device: Device) -> None:
     pair = attribute_pair_errors(*found, SensorFusion(tolerance=1e-6), max_gap=1.0)
     assert [pair[name].failed_fraction(1e-6) for name in ("first", "second", "both")] == [0.4, 0.2, 0.0]
     blind = found[0].without_flagged(Status.LOW_SIGNAL)
-    nothing = GroundTruth(np.full(5, np.nan), np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL))
+    no_surface = GroundTruth(np.full(5, np.nan), np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL))
     with pytest.raises(ValueError, match="give the positions"):
-        attribute_pair_errors(replace(blind, truth=nothing), found[1], SensorFusion(), max_gap=1.0)
+        attribute_pair_errors(replace(blind, truth=no_surface), found[1], SensorFusion(), max_gap=1.0)
 
 
 # ---- the rules -------------------------------------------------------------------------------------------------
@@ -245,9 +245,9 @@ def test_resampling() -> None:
     np.testing.assert_array_equal(made.g, at)
     assert made.status.tolist() == [0, 0, 0, 0, Status.SATURATED, Status.SATURATED, 0]
     # The median distance of points is 0.15 mm.
-    beside = resample_reading(given, np.array([-0.7, -0.8, 4.7, 4.8, 6.3, 7.8, np.nan]) * 1e-4, max_gap=2.5e-4)
-    np.testing.assert_array_equal(beside.h, [h[0], np.nan, h[4], np.nan, h[5], np.nan, np.nan])
-    assert beside.status.tolist() == [
+    at_holes = resample_reading(given, np.array([-0.7, -0.8, 4.7, 4.8, 6.3, 7.8, np.nan]) * 1e-4, max_gap=2.5e-4)
+    np.testing.assert_array_equal(at_holes.h, [h[0], np.nan, h[4], np.nan, h[5], np.nan, np.nan])
+    assert at_holes.status.tolist() == [
         0,
         Status.NO_DATA,
         Status.SATURATED,
@@ -295,8 +295,8 @@ def test_rank_of_directions(device: Device) -> None:
         name: attribute_errors(psd(view), {"direct": direct, "specular": each}, truth, device=device)
         for name, each in gloss.items()
     }
-    nothing = GroundTruth(truth.g, np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL, np.uint8))
-    found["false"] = attribute_errors(psd(view), {"direct": direct}, nothing, device=device)
+    no_surface = GroundTruth(truth.g, np.full(5, np.nan), np.full(5, Status.LOW_SIGNAL, np.uint8))
+    found["false"] = attribute_errors(psd(view), {"direct": direct}, no_surface, device=device)
     order = rank_candidates(found, 1e-4)
     assert order[0].name == "dull"
     assert {each.name: (each.failed_fraction, each.spurious_fraction) for each in order} == {

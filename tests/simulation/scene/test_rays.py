@@ -56,18 +56,18 @@ def assert_closest(corners: np.ndarray, rays: np.ndarray, hits: Any) -> None:
     np.testing.assert_array_equal(hits.triangle, triangle)
     np.testing.assert_array_equal(hits.status, np.where(triangle < 0, Status.NO_DATA, 0))
     # Some roundings of coordinates up to 4 m, over the sine of incidence and the size of the triangle.
-    met = triangle >= 0
+    hit = triangle >= 0
     one, two = (corners[triangle, n] - corners[triangle, 0] for n in (1, 2))
     along = rays[:, 3:] / np.linalg.norm(rays[:, 3:], axis=1, keepdims=True)
     normal = np.cross(one, two)
     thin = np.abs(np.sum(along * normal, axis=1))
     longest = np.maximum(np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1)) + 1e-9
     bound = 64.0 * eps_of(hits.distance.dtype) * longest**2 / thin
-    assert np.all(np.abs(hits.distance - distance)[met] <= bound[met])
+    assert np.all(np.abs(hits.distance - distance)[hit] <= bound[hit])
     for got, expected in zip(hits.barycentric.T, (u, v), strict=True):
-        assert np.all(np.abs(got - expected)[met] <= (bound / longest)[met])
-    assert np.isnan(hits.distance[~met]).all()
-    assert np.isnan(hits.barycentric[~met]).all()
+        assert np.all(np.abs(got - expected)[hit] <= (bound / longest)[hit])
+    assert np.isnan(hits.distance[~hit]).all()
+    assert np.isnan(hits.barycentric[~hit]).all()
 
 
 @WAYS
@@ -169,25 +169,25 @@ def test_boxes_that_a_ray_touches_at_an_edge(
         pytest.skip(f"{device.label} has no doubles")
     count, pairs = 301, list(itertools.permutations(range(3), 2))
     origin, times = rng.integers(-1000, 1000, (count, 3)), rng.integers(1, 50, (count, 1))
-    way = (2 * rng.integers(1, 500, (count, 3)) + 1) * rng.choice([-1, 1], (count, 3))
-    edge, sign = origin + times * way, np.sign(way)
+    direction = (2 * rng.integers(1, 500, (count, 3)) + 1) * rng.choice([-1, 1], (count, 3))
+    edge, sign = origin + times * direction, np.sign(direction)
     boxes = np.tile(np.repeat([np.inf, -np.inf], 3)[:, None], (count, 1, 16))
     for number, (enters, leaves) in enumerate(pairs):
         # The ray enters the slab of one axis where it leaves that of another; the third slab is all around.
-        near, far = edge - 4000 * sign, edge + 4000 * sign
-        near[:, enters], far[:, leaves] = edge[:, enters], edge[:, leaves]
+        near, end = edge - 4000 * sign, edge + 4000 * sign
+        near[:, enters], end[:, leaves] = edge[:, enters], edge[:, leaves]
         late = near.copy()
-        late[:, enters] += (sign * np.maximum(np.abs(times * way) // 64, 1))[:, enters]
+        late[:, enters] += (sign * np.maximum(np.abs(times * direction) // 64, 1))[:, enters]
         for box, start in ((number, near), (6 + number, late)):
-            boxes[:, :3, box], boxes[:, 3:, box] = np.minimum(start, far), np.maximum(start, far)
+            boxes[:, :3, box], boxes[:, 3:, box] = np.minimum(start, end), np.maximum(start, end)
     (tmp_path / "boxes_met.cl").write_text(BOXES_MET)
     defines = {"BVH_DEPTH": 1, **flags(REAL_IS_DOUBLE=dtype == np.float64, VECTOR_VARIANT=variant == "vector")}
     kernel = build(device, tmp_path, "boxes_met.cl", defines, include_folders=[KERNEL_FOLDER]).boxes_met
-    rays = cl.array.to_device(device.queue, np.hstack([origin, way]).astype(dtype))
+    rays = cl.array.to_device(device.queue, np.hstack([origin, direction]).astype(dtype))
     nodes = cl.array.to_device(device.queue, boxes.astype(dtype))
-    met = cl.array.zeros(device.queue, count, np.uint32)
-    kernel(device.queue, (count,), None, rays.data, nodes.data, met.data)
-    np.testing.assert_array_equal(met.get(), 0b111111)
+    hit = cl.array.zeros(device.queue, count, np.uint32)
+    kernel(device.queue, (count,), None, rays.data, nodes.data, hit.data)
+    np.testing.assert_array_equal(hit.get(), 0b111111)
 
 
 @WAYS
@@ -301,10 +301,10 @@ def test_rays_from_afar(device: Device, variant: Any, dtype: Any, rng: np.random
     triangle, distance, u, v = reference.closest(corners, rays)
     hits = ClosestHit(scene=Scene(corners), variant=variant, precision="single")(rays, device=device)
     np.testing.assert_array_equal(hits.triangle[sure], triangle[sure])
-    met = sure & (triangle >= 0)
-    assert 0.3 < met.mean() < 0.99
-    np.testing.assert_allclose(hits.barycentric[met], np.column_stack([u, v])[met], atol=1e-4)
-    np.testing.assert_allclose(hits.distance[met], distance[met], rtol=4 * eps_of(np.float32))
+    hit = sure & (triangle >= 0)
+    assert 0.3 < hit.mean() < 0.99
+    np.testing.assert_allclose(hits.barycentric[hit], np.column_stack([u, v])[hit], atol=1e-4)
+    np.testing.assert_allclose(hits.distance[hit], distance[hit], rtol=4 * eps_of(np.float32))
     segments = np.hstack([far[:, :3], targets.astype(dtype)])
     exact = segments.astype(np.float64)
     sure &= reference.occluded(corners, exact, -1e-9) == reference.occluded(corners, exact, 1e-9)

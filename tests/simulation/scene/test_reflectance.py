@@ -126,8 +126,8 @@ def test_limits_to_the_mirror(angle: float) -> None:
     for model in (Ggx(alpha=1e-3), Ward(albedo=1.0, alpha_x=1e-3, alpha_y=1e-3)):
         assert abs(lobe(model, angle, 1e-3) - 1.0) < 2e-3
         light = [math.sin(angle), 0.0, math.cos(angle)]
-        mirror, aside = ([-math.sin(angle + tilt), 0.0, math.cos(angle + tilt)] for tilt in (0.0, 0.05))
-        assert model.value([*light, *aside]) < 1e-4 * model.value([*light, *mirror])
+        mirror, oblique = ([-math.sin(angle + tilt), 0.0, math.cos(angle + tilt)] for tilt in (0.0, 0.05))
+        assert model.value([*light, *oblique]) < 1e-4 * model.value([*light, *mirror])
     half = Ggx(alpha=1e-3, f0=0.04)
     schlick = 0.04 + 0.96 * (1.0 - math.cos(angle)) ** 5
     assert abs(lobe(half, angle, 1e-3) / schlick - 1.0) < 1e-2

@@ -56,8 +56,8 @@ def test_a_file_that_is_none(tmp_path: Path) -> None:
 def test_a_damaged_file_is_named(tmp_path: Path, ending: str, harm: str) -> None:
     path = tmp_path / f"box.{ending}"
     trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
-    whole = path.read_bytes()
-    path.write_bytes({"empty": b"", "cut": whole[: len(whole) // 2], "garbled": b"\x92\x00\x81mesh" * 40}[harm])
+    content = path.read_bytes()
+    path.write_bytes({"empty": b"", "cut": content[: len(content) // 2], "garbled": b"\x92\x00\x81mesh" * 40}[harm])
     with pytest.raises(ValueError, match=rf"box\.{ending}: (not a readable mesh|contains no triangles)"):
         Scene.load(path)
 

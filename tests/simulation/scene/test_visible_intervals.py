@@ -47,13 +47,13 @@ def test_parts_as_the_reference_says(
     result = VisibleIntervals(scene=Scene(corners), variant=variant)(fans, device=device)
     assert not result.status.any()
     # The error of a cut is the rounding of the corners divided by the distance of a corner from the plane.
-    least, within = (1e-9, 1e-8) if dtype == np.float64 else (1e-5, 2e-3)
+    least, tolerance = (1e-9, 1e-8) if dtype == np.float64 else (1e-5, 2e-3)
     same, several = 0, 0
     for n, fan in enumerate(fans.astype(np.float64)):
         expected = reference.visible_parts(corners, fan, least)
         if len(expected) != result.interval_count[n]:
             continue
-        same += bool(np.all(np.abs(parts(result, n) - expected) < within))
+        same += bool(np.all(np.abs(parts(result, n) - expected) < tolerance))
         several += len(expected) > 1
     assert same >= len(fans) * (0.95 if dtype == np.float32 else 1.0)
     assert several > 30

@@ -95,11 +95,11 @@ def test_saturation_and_rounding(device: Device) -> None:
 def test_noise_belongs_to_the_profile() -> None:
     view = camera_view()
     simulator = camera(view, gain=0.5, bits=12)
-    whole = simulator.frames(stack_profiles([line(view)] * 4), seed=9)
+    all_frames = simulator.frames(stack_profiles([line(view)] * 4), seed=9)
     np.testing.assert_array_equal(
-        simulator.frames(stack_profiles([line(view)] * 2), seed=9, first_profile=2), whole[2:]
+        simulator.frames(stack_profiles([line(view)] * 2), seed=9, first_profile=2), all_frames[2:]
     )
-    assert not np.array_equal(whole[0], whole[1])
+    assert not np.array_equal(all_frames[0], all_frames[1])
 
 
 def test_mask_is_a_region_of_interest(device: Device) -> None:

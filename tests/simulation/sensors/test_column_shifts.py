@@ -97,10 +97,10 @@ def sensor_view(columns: int) -> SensorView:
 def groove(angle: float) -> tuple[Scene, LitSegments]:
     """Return two walls, an edge below, and the line that 1 W per metre of sheet makes on them."""
     walls, ends, normals = [], [], []
-    before, behind = np.array([0.0, -ASIDE, 0.0]), np.array([0.0, ASIDE, 0.0])
+    before, after = np.array([0.0, -ASIDE, 0.0]), np.array([0.0, ASIDE, 0.0])
     for side in (1.0, -1.0):
         top = WALL * np.array([side * math.sin(0.5 * angle), 0.0, math.cos(0.5 * angle)])
-        walls += [[before, behind, behind + top], [before, behind + top, before + top]]
+        walls += [[before, after, after + top], [before, after + top, before + top]]
         ends.append([np.zeros(3), top])
         normals.append([-side * math.cos(0.5 * angle), 0.0, math.sin(0.5 * angle)])
     arriving = math.sin(0.5 * angle)
@@ -138,15 +138,15 @@ def direct(one: SensorView, lit: LitSegments) -> tuple[Exposure, np.ndarray]:
     share = np.where(x[:, :-1] > 0.0, -np.diff(ndtr(-x), axis=1), np.diff(ndtr(x), axis=1))
     first = -spread[:, None] * np.diff(np.exp(-0.5 * x**2) / math.sqrt(2.0 * math.pi), axis=1)
     moment = first + (middle[:, None] - one.u_centres) * share
-    whole = (one.v_centres > v[0]) & (one.v_centres < v[-1]) & (np.abs(middle) < HALF - 16.5 * PIXEL)
-    return Exposure(power[:, None] * share, power[:, None] * moment), whole
+    is_complete = (one.v_centres > v[0]) & (one.v_centres < v[-1]) & (np.abs(middle) < HALF - 16.5 * PIXEL)
+    return Exposure(power[:, None] * share, power[:, None] * moment), is_complete
 
 
 def of_groove(degrees: float, columns: int = PIXELS) -> Shifts:
     one = sensor_view(columns)
     scene, lit = groove(math.radians(degrees))
-    line, whole = direct(one, lit)
-    return shifts(one, line, secondary(one, scene, lit), whole)
+    line, is_complete = direct(one, lit)
+    return shifts(one, line, secondary(one, scene, lit), is_complete)
 
 
 def of_board(columns: int = PIXELS) -> Shifts:
@@ -167,8 +167,8 @@ def of_board(columns: int = PIXELS) -> Shifts:
     irradiance = light(receivers, np.zeros((*receivers.shape[:2], 2)), rows).irradiance
     # A column is valid if its light is a substantial share of the light in other columns.
     total = line.total()
-    whole = total > 0.1 * np.median(total[total > 0.0])
-    return shifts(one, line, lines.exposure(seen, np.nan_to_num(irradiance)), whole)
+    is_complete = total > 0.1 * np.median(total[total > 0.0])
+    return shifts(one, line, lines.exposure(seen, np.nan_to_num(irradiance)), is_complete)
 
 
 def shifts(one: SensorView, line: Exposure, glow: Exposure, whole: np.ndarray) -> Shifts:
@@ -252,10 +252,10 @@ def test_secondary_light_is_a_broad_pedestal(found):
 def test_the_direct_line_is_read_where_it_is():
     one = sensor_view(64)
     _, lit = groove(math.radians(90.0))
-    line, whole = direct(one, lit)
+    line, is_complete = direct(one, lit)
     u = line.first_moment(one.u_edges) / line.total()
     place = one.points_in_sheet(u, one.v_centres)
-    np.testing.assert_allclose(place[whole, 2], np.abs(place[whole, 0]), atol=1e-6)
+    np.testing.assert_allclose(place[is_complete, 2], np.abs(place[is_complete, 0]), atol=1e-6)
 
 
 def test_parts_on_a_board_move_few_columns():
@@ -263,14 +263,14 @@ def test_parts_on_a_board_move_few_columns():
     pytest.importorskip("numba", reason="the extra 'profile' is not installed")
     made = of_board(256)
     # Other simulation, other parts: 0.125, 2.2, 11 pixels of the whole column, 0, 0.32, 3.3 in a window of 16.
-    median, high, most = told(made.camera["whole column"])
+    median, high, largest = told(made.camera["whole column"])
     assert 0.03 < median < 0.4
     assert 0.7 < high < 7.0
-    assert 3.0 < most < 30.0
-    median, high, most = told(made.camera["window 16"])
+    assert 3.0 < largest < 30.0
+    median, high, largest = told(made.camera["window 16"])
     assert median < 1e-3
     assert high < 1.0
-    assert 0.5 < most < 10.0
+    assert 0.5 < largest < 10.0
     assert told(made.camera["threshold 5 %"])[1] == 0.0
     assert np.median(made.secondary_over_direct) == pytest.approx(1e-3, rel=2.0)
     assert np.median(made.peak_ratio) == pytest.approx(2e-4, rel=0.5)
@@ -280,12 +280,12 @@ def test_parts_on_a_board_move_few_columns():
 def test_the_closed_line_is_the_simulators():
     one = sensor_view(64)
     scene, lit = groove(math.radians(90.0))
-    line, whole = direct(one, lit)
+    line, is_complete = direct(one, lit)
     sheet = LightSheet(transport=one.transport, power=1.0, sigma=FWHM / 2.3548)
     light = DirectLight(view=one, scene=scene, materials=[Material(diffuse=Lambert(albedo=ALBEDO))], sheet=sheet)
     made = light.exposures(0.0)["direct"]
     # A column of 16 pixels against its centre, where the line is straight: all columns except two at the edge.
-    whole &= np.abs(np.arange(64) - 31.5) > 1.0
-    np.testing.assert_allclose(made.total()[whole], line.total()[whole], rtol=2e-3)
-    middles = [each.first_moment(one.u_edges)[whole] / each.total()[whole] for each in (made, line)]
+    is_complete &= np.abs(np.arange(64) - 31.5) > 1.0
+    np.testing.assert_allclose(made.total()[is_complete], line.total()[is_complete], rtol=2e-3)
+    middles = [each.first_moment(one.u_edges)[is_complete] / each.total()[is_complete] for each in (made, line)]
     np.testing.assert_allclose(middles[0], middles[1], atol=0.05 * PIXEL)

@@ -156,7 +156,7 @@ def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
     off = np.abs(light["diffuse-diffuse"].power - secondary) > 1e-4 * secondary.max(axis=1, keepdims=True)
     assert off.sum() <= 4
     rows = np.arange(ROWS)
-    own = (secondary @ rows + direct * centre) / (secondary.sum(axis=1) + direct)
+    expected = (secondary @ rows + direct * centre) / (secondary.sum(axis=1) + direct)
     axes = SampleAxes(sample_origin=float(first))
     strips = PsdSimulator(
         view=view,
@@ -167,10 +167,10 @@ def test_readings_of_a_glowing_groove(degrees: float, device: Device) -> None:
     )
     gain = 30000.0 * ELECTRON / (direct.max() * 0.4 * 1e-3)
     columns_read = CameraSimulator(view=view, readout=LineReadout(method="centroid", axes=axes), bits=16, gain=gain)
-    assert np.abs(own - centre).min() > 4.0
+    assert np.abs(expected - centre).min() > 4.0
     # A thin line lies in one or two pixels of a column, so that the reading depends on their centres.
-    for simulator, near in ((strips, 0.01), (columns_read, 0.15)):
-        np.testing.assert_allclose(simulator.read(light, device=device).position, own, atol=near)
+    for simulator, tolerance in ((strips, 0.01), (columns_read, 0.15)):
+        np.testing.assert_allclose(simulator.read(light, device=device).position, expected, atol=tolerance)
     # Light from the other wall causes nearly all of the error.
     found = attribute_errors(strips, light, truth, device=device)
     assert (found.dominant_cause() == list(found.causes).index("secondary")).all()

@@ -80,9 +80,9 @@ def test_light_through_a_window(seed: int, ends: tuple[float, float], leak: floa
     assert np.all(np.abs(passing.moment) <= 0.5 * np.diff(edges) * passing.power + 1e-15)
     middle = 0.5 * (low + high)
     halves = [Mask(windows=[pair] * 2).apply(light, edges) for pair in ([low, middle], [middle, high])]
-    whole = Mask(windows=[[low, high]] * 2).apply(light, edges)
-    np.testing.assert_allclose((halves[0] + halves[1]).power, whole.power, atol=1e-14)
-    np.testing.assert_allclose((halves[0] + halves[1]).moment, whole.moment, atol=1e-14)
+    wide = Mask(windows=[[low, high]] * 2).apply(light, edges)
+    np.testing.assert_allclose((halves[0] + halves[1]).power, wide.power, atol=1e-14)
+    np.testing.assert_allclose((halves[0] + halves[1]).moment, wide.moment, atol=1e-14)
 
 
 def test_a_point_of_light_passes_or_does_not() -> None:

@@ -174,8 +174,8 @@ def test_covariance_of_the_two_currents(independent: float, opposed: float, shot
     # left, right = total (1/2 -+ u / LENGTH).
     of_total = 2.0 * ELECTRON * bandwidth * current
     of_centroid = (LENGTH * 12 / 30) ** 2 / 12 * 2.0 * ELECTRON * bandwidth / current * (current / LENGTH) ** 2
-    alike, opposite = np.ones((2, 2)), np.array([[1.0, -1.0], [-1.0, 1.0]])
-    expected = of_total / 4 * alike + (of_centroid + opposed**2) * opposite + independent**2 * np.eye(2)
+    common, opposite = np.ones((2, 2)), np.array([[1.0, -1.0], [-1.0, 1.0]])
+    expected = of_total / 4 * common + (of_centroid + opposed**2) * opposite + independent**2 * np.eye(2)
     # 22 500 draws determine a variance to 0.94 % and a correlation to 0.67 %; four times this margin.
     for axes in (np.eye(2), np.array([[1.0, 1.0], [-1.0, 1.0]])):  # the currents; their sum and difference
         scatter, exact = np.cov(axes @ pairs.T), axes @ expected @ axes.T

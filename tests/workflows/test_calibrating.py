@@ -200,8 +200,8 @@ def test_missing_and_unreadable_files(tmp_path: Path, device: Device) -> None:
         calibrate([tmp_path / "text.png"])
     with pytest.raises(ValueError, match="no images given"):
         calibrate([])
-    for name, said in (("text.png", "not a readable image"), ("none.png", "no such file")):
-        with pytest.raises((RecordingError, FileNotFoundError), match=said):
+    for name, message in (("text.png", "not a readable image"), ("none.png", "no such file")):
+        with pytest.raises((RecordingError, FileNotFoundError), match=message):
             undistort_files([tmp_path / name], LENS, tmp_path / "out", device=device)
     (tmp_path / "nothing.npy").touch()
     with pytest.raises(RecordingError, match=r"nothing\.npy: not a readable NPY array"):

@@ -46,17 +46,17 @@ def test_a_scan_of_the_recording_is_what_was_predicted(name: str, light: Path, d
 
 
 def test_a_camera_finds_the_part_again(light: Path) -> None:
-    told = simulate(make_scan_task("camera_line", PROFILES), light, seed=7).attribution
-    smooth = away_from_edges(told.truth.h) & np.isfinite(told.error)
+    attribution = simulate(make_scan_task("camera_line", PROFILES), light, seed=7).attribution
+    smooth = away_from_edges(attribution.truth.h) & np.isfinite(attribution.error)
     assert smooth.sum() > 15_000
     # 0.03 pixel at 0.24 mm per pixel; a windowed centre of gravity of this line reaches 0.01 to 0.02.
-    assert np.sqrt(np.mean(told.error[smooth] ** 2)) < 0.03 * 0.24e-3
+    assert np.sqrt(np.mean(attribution.error[smooth] ** 2)) < 0.03 * 0.24e-3
 
 
 def test_the_noise_is_what_the_sensor_predicts(light: Path) -> None:
-    told = simulate(make_scan_task("psd_line", PROFILES), light, seed=7).attribution
-    noise, sigma = told.causes["noise"], told.reading.sigma
-    known = np.isfinite(noise) & np.isfinite(sigma) & away_from_edges(told.truth.h)
+    attribution = simulate(make_scan_task("psd_line", PROFILES), light, seed=7).attribution
+    noise, sigma = attribution.causes["noise"], attribution.reading.sigma
+    known = np.isfinite(noise) & np.isfinite(sigma) & away_from_edges(attribution.truth.h)
     assert known.sum() > 2000
     assert np.sqrt(np.mean((noise[known] / sigma[known]) ** 2)) == pytest.approx(1.0, abs=0.1)
 
@@ -65,10 +65,10 @@ def test_what_the_lens_does_not_see_is_dark(light: Path) -> None:
     """The box covers the plate on the side away from the lens."""
     done = simulate(make_scan_task("camera_line", PROFILES), light, seed=7)
     y = done.task.transports
-    behind = np.flatnonzero((y > 1.2e-3) & (y < 3.7e-3))  # the box ends at 4 mm, and covers 6 mm x 80/144
+    in_shadow = np.flatnonzero((y > 1.2e-3) & (y < 3.7e-3))  # the box ends at 4 mm, and covers 6 mm x 80/144
     columns = slice(70, 160)  # x from -18 to -8 mm
-    assert np.all(np.isnan(done.points.z[behind, columns]))
-    assert np.all(done.points.status[behind, columns] == 1)
+    assert np.all(np.isnan(done.points.z[in_shadow, columns]))
+    assert np.all(done.points.status[in_shadow, columns] == 1)
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,9 +77,9 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     with pytest.raises(SystemExit) as left:
         cli.main()
     assert left.value.code == 0
-    told = capsys.readouterr()
-    assert told.err == ""
-    last = told.out.strip().splitlines()[-1]
+    output = capsys.readouterr()
+    assert output.err == ""
+    last = output.out.strip().splitlines()[-1]
     assert str(out / "camera_line" / "picture.png") in last
     report = json.loads((out / "report.json").read_text())
     for name in SENSORS:

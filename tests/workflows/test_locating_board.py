@@ -151,11 +151,11 @@ def test_a_lens_is_undone(artwork: Artwork) -> None:
     columns, rows = np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0]))
     at = lens.undistort(np.stack([columns, rows], axis=-1)).astype(np.float32)
     bent = cv2.remap(straight, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    near = (*BOARD_MIDDLE, 0.0)
+    initial_pose = (*BOARD_MIDDLE, 0.0)
     # The image is resampled from noisy pixels; cubic interpolation preserves the noise to some percent.
-    located = locate_board(bent, artwork, scale=PIXEL, initial_pose=near, model=lens)
+    located = locate_board(bent, artwork, scale=PIXEL, initial_pose=initial_pose, model=lens)
     assert np.abs(off(located, pose)).max() < SIGMAS + 1.0
-    bare = locate_board(bent, artwork, scale=PIXEL, initial_pose=near)
+    bare = locate_board(bent, artwork, scale=PIXEL, initial_pose=initial_pose)
     # 2e-7 px^-2 moves the corners by 5 px.
     assert bare.reason or np.abs(np.array(bare.pose) - pose).max() > 10 * np.abs(np.array(located.pose) - pose).max()
 
@@ -222,8 +222,8 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> L
             cli.main()
         except SystemExit as end:
             code = int(end.code or 0)
-        told = capfd.readouterr()
-        return code, told.out, told.err
+        output = capfd.readouterr()
+        return code, output.out, output.err
 
     return call
 
@@ -259,49 +259,49 @@ def test_the_threshold_is_given_or_from_noise_and_range(artwork: Artwork) -> Non
 def test_the_command_writes_pose_and_picture(folder: Path, artwork: Artwork, tmp_path: Path, run: Locate) -> None:
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 2e-3)
     cv2.imwrite(str(tmp_path / "board.png"), seen(artwork, pose))
-    near = ",".join(f"{1e3 * each}mm" for each in BOARD_MIDDLE) + ",0deg"
+    initial_pose = ",".join(f"{1e3 * each}mm" for each in BOARD_MIDDLE) + ",0deg"
     files = ("--out", tmp_path / "out", "--json", tmp_path / "pose.json")
     code, out, _ = run(
-        tmp_path / "board.png", "--board", folder, *TOLD, "--scale", "40um", f"--initial-pose={near}", *files
+        tmp_path / "board.png", "--board", folder, *TOLD, "--scale", "40um", f"--initial-pose={initial_pose}", *files
     )
     assert code == 0
     assert "rulers agree" in out
-    told = json.loads((tmp_path / "out" / "pose.json").read_text())
-    assert told == json.loads((tmp_path / "pose.json").read_text())
-    assert told["status"] == "located"
+    report = json.loads((tmp_path / "out" / "pose.json").read_text())
+    assert report == json.loads((tmp_path / "pose.json").read_text())
+    assert report["status"] == "located"
     for name, true in zip(("x", "y", "theta"), pose, strict=True):
-        assert abs(told["pose"][name] - true) < SIGMAS * told["sigmas"][name]
-    assert len(told["rulers"]) >= told["counts"]["used"]
-    assert (set(told), set(told["counts"])) == (POSE_KEYS, COUNT_KEYS)
-    assert set(told["placement"]) == {"board", "image_px", "covariance"}
-    assert set(told["device"]) == {"label", "name", "driver"}
-    assert told["rulers"]
-    for ruler in told["rulers"]:
+        assert abs(report["pose"][name] - true) < SIGMAS * report["sigmas"][name]
+    assert len(report["rulers"]) >= report["counts"]["used"]
+    assert (set(report), set(report["counts"])) == (POSE_KEYS, COUNT_KEYS)
+    assert set(report["placement"]) == {"board", "image_px", "covariance"}
+    assert set(report["device"]) == {"label", "name", "driver"}
+    assert report["rulers"]
+    for ruler in report["rulers"]:
         assert set(ruler) == RULER_KEYS
-    for fiducial in told["fiducials"]:
+    for fiducial in report["fiducials"]:
         assert set(fiducial) == FIDUCIAL_KEYS
-    assert (told["side"], told["reason"], told["copper"]) == ("top", None, "bright")
-    assert told["scale"] == pytest.approx(PIXEL)
-    assert told["noise"] == pytest.approx(NOISE, rel=0.1)
-    assert told["threshold"] >= 4.0 * told["noise"]
-    np.testing.assert_allclose(list(told["sigmas"].values()), np.sqrt(np.diag(told["covariance"])), rtol=1e-12)
+    assert (report["side"], report["reason"], report["copper"]) == ("top", None, "bright")
+    assert report["scale"] == pytest.approx(PIXEL)
+    assert report["noise"] == pytest.approx(NOISE, rel=0.1)
+    assert report["threshold"] >= 4.0 * report["noise"]
+    np.testing.assert_allclose(list(report["sigmas"].values()), np.sqrt(np.diag(report["covariance"])), rtol=1e-12)
     for found, name in (("found", "found"), ("weight", "used")):
-        assert sum(bool(ruler[found]) for ruler in told["rulers"]) == told["counts"][name]
+        assert sum(bool(ruler[found]) for ruler in report["rulers"]) == report["counts"][name]
     picture = cv2.imread(str(tmp_path / "out" / "located.png"))
     assert picture.shape[0] > SHAPE[0]
 
 
 def test_a_refused_pose_is_an_error_with_a_picture(folder: Path, tmp_path: Path, run: Locate) -> None:
     cv2.imwrite(str(tmp_path / "board.png"), np.full(SHAPE, 77, np.uint8))
-    near = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
-    arguments = ("--scale", "40um", f"--initial-pose={near}", "--out", tmp_path / "out")
+    initial_pose = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
+    arguments = ("--scale", "40um", f"--initial-pose={initial_pose}", "--out", tmp_path / "out")
     code, out, err = run(tmp_path / "board.png", "--board", folder, *TOLD, *arguments)
     assert (code, out) == (1, "")
     assert err.count("\n") == 1
     assert "no pose: 0 of" in err
     assert (tmp_path / "out" / "located.png").exists()
-    told = json.loads((tmp_path / "out" / "pose.json").read_text())
-    assert (told["status"], told["pose"]["x"]) == ("refused", None)
+    report = json.loads((tmp_path / "out" / "pose.json").read_text())
+    assert (report["status"], report["pose"]["x"]) == ("refused", None)
 
 
 @pytest.mark.parametrize(
@@ -398,9 +398,9 @@ def test_a_robot_is_located_with_its_twin(
     np.testing.assert_allclose(true[:2], pose[:2], atol=0.2 * scale)
     assert math.remainder(true[2] - pose[2], 2 * math.pi) == pytest.approx(0.0, abs=2e-3)
     # With an initial pose the twin is not examined.
-    near = locate_robot(points, field, initial_pose=(pose[0] + 0.02, pose[1], pose[2] + 0.05), device=device)
-    assert len(near.candidates) == 1
-    np.testing.assert_allclose(near.candidates[0].pose[:2], pose[:2], atol=0.2 * scale)
+    tracked = locate_robot(points, field, initial_pose=(pose[0] + 0.02, pose[1], pose[2] + 0.05), device=device)
+    assert len(tracked.candidates) == 1
+    np.testing.assert_allclose(tracked.candidates[0].pose[:2], pose[:2], atol=0.2 * scale)
 
 
 def test_floor_points_lie_on_the_lines(rng: np.random.Generator) -> None:
@@ -443,8 +443,8 @@ def test_points_of_any_camera_will_do(tmp_path: Path, run: Locate, rng: np.rando
         )
         assert code == 0
         assert "twin of 2" in out
-        told = json.loads((tmp_path / name.replace(".", "_") / "pose.json").read_text())
-        assert abs(abs(told["candidates"][0]["pose"]["x"]) - 6.0) < 0.01
+        report = json.loads((tmp_path / name.replace(".", "_") / "pose.json").read_text())
+        assert abs(abs(report["candidates"][0]["pose"]["x"]) - 6.0) < 0.01
         assert (tmp_path / name.replace(".", "_") / "located.png").exists()
     assert "expected points (n, 2)" in run(tmp_path / "wrong.npy", "--field", "robocup_msl", command="locate-robot")[2]
     assert (
@@ -481,8 +481,8 @@ def test_a_lens_file_goes_with_the_command(folder: Path, artwork: Artwork, tmp_p
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 2e-3)
     cv2.imwrite(str(tmp_path / "board.png"), seen(artwork, pose))
     write_lens(tmp_path / "lens.toml", Lens(k1=0.0), {})
-    near = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
-    arguments = ("--scale", "40um", f"--initial-pose={near}", "--camera", tmp_path / "lens.toml")
+    initial_pose = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
+    arguments = ("--scale", "40um", f"--initial-pose={initial_pose}", "--camera", tmp_path / "lens.toml")
     code, out, _ = run(tmp_path / "board.png", "--board", folder, *TOLD, *arguments)
     assert (code, "rulers agree" in out) == (0, True)
     (tmp_path / "lens.toml").write_text("[lens]\nk1 = 'wide'\n")

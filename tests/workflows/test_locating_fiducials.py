@@ -83,16 +83,16 @@ def test_errors_are_as_promised(board: str, device: Device, request: pytest.Fixt
     assert len(features.fiducials.radius) == len(LANDS) + len(FIDUCIALS)
     assert (len(features.length) == 0) == (board == "rounds")
     picture = round_picture(artwork)
-    errors, told = [], []
+    errors, predicted = [], []
     for _ in range(DRAWS):
         image, true = moved_picture(picture, rng)
         found = located(image, artwork, features=features, device=device)
         assert found.reason == ""
         assert found.fiducials.used.sum() >= 15  # Tukey's loss rejects no more than a few of 1e3 good rows
         errors.append(np.array(found.pose) - true)
-        told.append(found.covariance)
+        predicted.append(found.covariance)
     assert agree(squares(errors, [features.covariance] * DRAWS), 3 * DRAWS)
-    assert agree(squares(errors, told), 3 * DRAWS)
+    assert agree(squares(errors, predicted), 3 * DRAWS)
     # A hundredth of a pixel: 0.4 um.
     assert np.all(features.sigmas[:2] < 0.01 * PIXEL)
 
@@ -122,11 +122,11 @@ def test_bad_marks_do_not_spoil_a_pose(board: str, how: str, device: Device, req
     artwork, rng = request.getfixturevalue(board), np.random.default_rng(11)
     first = len(artwork.copper) - len(LANDS) - len(FIDUCIALS)
     features = select_features_in_view(artwork, VIEW, IMAGING, 40)
-    errors, told = [], []
+    errors, predicted = [], []
     for _ in range(3):
         bad = np.append(rng.choice(len(LANDS), 4, replace=False), len(LANDS) + rng.integers(len(FIDUCIALS)))
-        way = rng.normal(size=(5, 2)) if how != "together" else np.tile(rng.normal(size=2), (5, 1))
-        by = way / np.hypot(*way.T)[:, None] * {"far": 700e-6, "missing": 0.0}.get(how, 60e-6)
+        direction = rng.normal(size=(5, 2)) if how != "together" else np.tile(rng.normal(size=2), (5, 1))
+        by = direction / np.hypot(*direction.T)[:, None] * {"far": 700e-6, "missing": 0.0}.get(how, 60e-6)
         changed = replace(artwork, copper=tuple(shifted(artwork, first + bad, by)))
         picture = round_picture(changed, missing=first + bad if how == "missing" else ())
         for _ in range(4):
@@ -134,14 +134,14 @@ def test_bad_marks_do_not_spoil_a_pose(board: str, how: str, device: Device, req
             found = located(image, artwork, features=features, device=device)
             assert found.reason == ""
             errors.append(np.array(found.pose) - true)
-            told.append(found.covariance)
+            predicted.append(found.covariance)
             places = np.stack([artwork.pads[n].centre for n in bad])
             mine = np.hypot(*(found.fiducials.point[:, None] - places).T).min(axis=0) < 1e-6
             assert mine.sum() == 5
             assert not found.fiducials.used[mine].any()
             assert found.fiducials.used[~mine].sum() >= 10
             assert how in ("apart", "together") or not found.fiducials.found[mine].any()
-    assert squares(errors, told) < 1.1**2 * chi2.ppf(1 - 1e-4, 3 * len(errors))
+    assert squares(errors, predicted) < 1.1**2 * chi2.ppf(1 - 1e-4, 3 * len(errors))
 
 
 def test_fiducials_that_agree_with_nothing_are_no_pose(rounds: Artwork, device: Device) -> None:
@@ -238,17 +238,17 @@ def test_the_command_tells_of_marks(
     image, true = moved_picture(picture, np.random.default_rng(9))
     cv2.imwrite(str(tmp_path / "board.png"), image)
     layers = [word for name, layer in LAYERS.items() for word in ("--layers", f"{name}={layer}")]
-    near = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
-    where = ["--scale", "40um", f"--initial-pose={near}", "--out", str(tmp_path / "out")]
+    initial_pose = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
+    where = ["--scale", "40um", f"--initial-pose={initial_pose}", "--out", str(tmp_path / "out")]
     command = ["gpuvision", "locate", str(tmp_path / "board.png"), "--board", str(folder), *layers, *where]
     monkeypatch.setattr("sys.argv", command)
     with pytest.raises(SystemExit) as end:
         cli.main()
     assert not end.value.code
     assert "15 of 16 fiducials agree, 15 were found" in capsys.readouterr().out
-    told = json.loads((tmp_path / "out" / "pose.json").read_text())
-    assert (told["counts"]["fiducials_in_image"], told["counts"]["fiducials_used"]) == (16, 15)
-    assert sum(each["found"] for each in told["fiducials"]) == 15
+    report = json.loads((tmp_path / "out" / "pose.json").read_text())
+    assert (report["counts"]["fiducials_in_image"], report["counts"]["fiducials_used"]) == (16, 15)
+    assert sum(each["found"] for each in report["fiducials"]) == 15
     for name, value in zip(("x", "y", "theta"), true, strict=True):
-        assert abs(told["pose"][name] - value) < 4.5 * told["sigmas"][name]
+        assert abs(report["pose"][name] - value) < 4.5 * report["sigmas"][name]
     assert (tmp_path / "out" / "located.png").exists()

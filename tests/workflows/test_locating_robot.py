@@ -142,9 +142,9 @@ def test_fields_are_found(spots: int, share: float, device: Device, rng: np.rand
         assert right(located.candidates[0].pose, pose)
         assert located.evidence is not None
         assert located.evidence.seen > 0.55
-        told = located.report()["evidence"]
-        assert told["log10_nfa"] < -3.0
-        assert told["expected"] > 20
+        evidence = located.report()["evidence"]
+        assert evidence["log10_nfa"] < -3.0
+        assert evidence["expected"] > 20
 
 
 def test_another_field_is_refused(device: Device, rng: np.random.Generator) -> None:
@@ -210,8 +210,8 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> C
             cli.main()
         except SystemExit as end:
             code = int(end.code or 0)
-        told = capfd.readouterr()
-        return code, told.out, told.err
+        output = capfd.readouterr()
+        return code, output.out, output.err
 
     return call
 
@@ -223,7 +223,7 @@ def test_the_command_refuses_in_a_line(tmp_path: Path, run: Command, rng: np.ran
     assert (code, out) == (1, "")
     assert err.startswith("gpuvision: no pose: ")
     assert err.count("\n") == 1
-    told = json.loads((tmp_path / "out" / "pose.json").read_text())
-    assert (told["status"], told["candidates"]) == ("refused", [])
-    assert told["evidence"]["on_lines"] < 0.6
+    report = json.loads((tmp_path / "out" / "pose.json").read_text())
+    assert (report["status"], report["candidates"]) == ("refused", [])
+    assert report["evidence"]["on_lines"] < 0.6
     assert (tmp_path / "out" / "located.png").exists()

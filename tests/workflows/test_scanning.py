@@ -251,9 +251,9 @@ def video(path: Path, frames: Any, codec: str = "MJPG") -> Path:
 
 
 def truncated_video(folder: Path) -> Path:
-    whole = video(folder / "whole.avi", two_lines().repeat(8, 0))
+    complete = video(folder / "whole.avi", two_lines().repeat(8, 0))
     cut = folder / "cut.avi"
-    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    cut.write_bytes(complete.read_bytes()[: complete.stat().st_size // 2])
     return cut
 
 
@@ -319,9 +319,9 @@ def test_a_bad_recording_is_a_line_and_leaves_nothing(make: Any, message: str, t
 
 def test_the_decoder_of_videos_keeps_quiet(tmp_path: Path) -> None:
     """Standard error contains exactly one line, including output of the video libraries."""
-    whole = video(tmp_path / "whole.mp4", two_lines().repeat(8, 0), "mp4v")
+    complete = video(tmp_path / "whole.mp4", two_lines().repeat(8, 0), "mp4v")
     cut = tmp_path / "cut.mp4"
-    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    cut.write_bytes(complete.read_bytes()[: complete.stat().st_size // 2])
     command = [sys.executable, "-c", "from gpuvision.cli.main import main; main()", "scan", str(cut)]
     command += ["--sensor", "camera_line", "--out", str(tmp_path / "out")]
     ran = subprocess.run(command, capture_output=True, text=True, check=False)

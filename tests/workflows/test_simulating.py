@@ -108,17 +108,17 @@ def test_what_was_stopped_goes_on_where_it_was(part_file: Path, tmp_path: Path) 
     assert done.computed_blocks == 1
     assert seen == [(32, 40), (40, 40)]
     assert [store.path(k).read_bytes() for k in (0, 1)] == kept
-    whole = simulate(task, tmp_path / "whole")
-    np.testing.assert_array_equal(whole.attribution.error, done.attribution.error)
-    np.testing.assert_array_equal(whole.attribution.category, done.attribution.category)
+    expected = simulate(task, tmp_path / "whole")
+    np.testing.assert_array_equal(expected.attribution.error, done.attribution.error)
+    np.testing.assert_array_equal(expected.attribution.category, done.attribution.category)
 
 
 def test_half_a_block_counts_as_none(part_file: Path, tmp_path: Path) -> None:
     task = task_of(part_file, profiles=20)
     store = LightStore(tmp_path, task)
     assert compute_missing_blocks(store) == 2
-    whole = store.path(1).read_bytes()
-    store.path(1).write_bytes(whole[: len(whole) // 2])
+    content = store.path(1).read_bytes()
+    store.path(1).write_bytes(content[: len(content) // 2])
     assert store.missing() == [1]
     assert compute_missing_blocks(store) == 1
     assert compute_missing_blocks(store) == 0
@@ -175,9 +175,9 @@ def test_what_cannot_be_simulated(part_file: Path, change: dict[str, Any], words
 
 
 def test_a_part_beside_the_sensor_is_told_where_it_is(tmp_path: Path) -> None:
-    aside = mesh()
-    aside.apply_translation((1.0, 0.0, 0.0))
-    aside.export(tmp_path / "aside.stl")
+    part = mesh()
+    part.apply_translation((1.0, 0.0, 0.0))
+    part.export(tmp_path / "aside.stl")
     with pytest.raises(ValueError, match="sees nothing lit in any of 8 profiles: the part lies at x 980 to 1020 mm"):
         simulate(task_of(tmp_path / "aside.stl", profiles=8), tmp_path)
 
@@ -205,9 +205,9 @@ def test_the_command(
     out = tmp_path / "out"
     words = [str(tmp_path / "mm.stl"), "--unit", "mm", "--sensor", "psd_line", "--out", str(out), "--profiles", "8"]
     assert command(monkeypatch, *words) == 0
-    said = capsys.readouterr()
-    assert "8 profiles" in said.out
-    assert said.err == ""
+    output = capsys.readouterr()
+    assert "8 profiles" in output.out
+    assert output.err == ""
     report = json.loads((out / "report.json").read_text())
     assert report["profiles"] == 8
     assert report["computed_blocks"] == 1
@@ -223,16 +223,16 @@ def test_the_command(
         (["--scheduler", "tcp://127.0.0.1:1", "--profiles", "7"], "127.0.0.1:1"),
     ]:
         assert command(monkeypatch, *words, *wrong) == 1
-        told = capsys.readouterr().err.strip().splitlines()
-        assert line in told[-1]
-        assert told[-1].startswith("gpuvision: ")
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert line in lines[-1]
+        assert lines[-1].startswith("gpuvision: ")
 
 
 def test_a_cluster_loses_a_worker_and_nothing_else(part_file: Path, tmp_path: Path) -> None:
     from distributed import LocalCluster
 
     task = task_of(part_file, profiles=None)
-    here = simulate(task, tmp_path / "here")
+    local = simulate(task, tmp_path / "here")
     seen: list[int] = []
     options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": ":0"}
     with LocalCluster(**options, silence_logs=50) as cluster:
@@ -243,10 +243,10 @@ def test_a_cluster_loses_a_worker_and_nothing_else(part_file: Path, tmp_path: Pa
             if len(seen) == 2:
                 os.kill(pids[0], signal.SIGKILL)
 
-        there = simulate(task, tmp_path / "there", scheduler=cluster.scheduler_address, progress=kill_one)
-    assert there.computed_blocks == len(task.blocks())
+        remote = simulate(task, tmp_path / "there", scheduler=cluster.scheduler_address, progress=kill_one)
+    assert remote.computed_blocks == len(task.blocks())
     assert seen[-1] == len(task.transports)
-    np.testing.assert_array_equal(there.attribution.error, here.attribution.error)
+    np.testing.assert_array_equal(remote.attribution.error, local.attribution.error)
 
 
 def test_a_second_sensor_sees_what_is_hidden_from_the_first(

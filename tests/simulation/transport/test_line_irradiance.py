@@ -214,11 +214,13 @@ def test_at_a_millionth_of_its_length(
     device: Device, variant: Any, precision: Any, distance: float, rng: np.random.Generator
 ) -> None:
     """Receivers above the middle and the ends of a segment, and beyond; rotated, far away; also in single."""
-    near = [(x, y * distance, distance, 0.3, 0.2, -1.0) for x in (0.0, 0.5, 1.0, 1.0 + distance) for y in (0.0, 1.0)]
-    near += [(1.5, 0.0, distance, -1.0, 0.0, 0.0), (-0.25, distance, distance, 0.9, 0.1, -0.3)]
+    receivers = [
+        (x, y * distance, distance, 0.3, 0.2, -1.0) for x in (0.0, 0.5, 1.0, 1.0 + distance) for y in (0.0, 1.0)
+    ]
+    receivers += [(1.5, 0.0, distance, -1.0, 0.0, 0.0), (-0.25, distance, distance, 0.9, 0.1, -0.3)]
     for shift in (0.0, 1.0):
-        assert_exact(*moved(np.array(near), FLOOR, turned(rng), shift), device, variant, precision)
-    assert_exact(np.array(near, np.float32), lit(FLOOR), device, variant, precision)
+        assert_exact(*moved(np.array(receivers), FLOOR, turned(rng), shift), device, variant, precision)
+    assert_exact(np.array(receivers, np.float32), lit(FLOOR), device, variant, precision)
 
 
 @TWO_WAYS
@@ -338,8 +340,8 @@ def test_sizes_and_canaries(device: Device, count: int, variant: Any, rng: np.ra
     guarded = Guarded(Irradiance(np.empty(count, np.float32), np.empty(count, np.uint8)))
     LineIrradiance(segments=segments, variant=variant)(receivers, device=device, out=guarded.out)
     guarded.assert_intact()
-    value, most = reference.irradiance(receivers, segments.ends, segments.normals, segments.exitance)
-    assert np.all(np.abs(guarded.out.irradiance - value) <= 2e-6 * most)
+    value, largest = reference.irradiance(receivers, segments.ends, segments.normals, segments.exitance)
+    assert np.all(np.abs(guarded.out.irradiance - value) <= 2e-6 * largest)
     assert np.all(guarded.out.status == 0)
 
 
@@ -355,17 +357,17 @@ def test_any_shape(device: Device, shape: list[int], variant: Any, seed: int) ->
     receivers = receivers.reshape(-1, 6)
     parts = (segments.ends[:, None], segments.normals[:, None], segments.exitance[:, None])
     each = [reference.irradiance(receivers, *one) for one in zip(*parts, strict=True)]
-    value, most = np.moveaxis(np.array(each), 1, 0)
+    value, largest = np.moveaxis(np.array(each), 1, 0)
     # Error of the quadrature plus the documented error of the operation.
-    bound = np.sum(most * (1e-12 + 1e-14 * reach(receivers, segments).T), axis=0)
+    bound = np.sum(largest * (1e-12 + 1e-14 * reach(receivers, segments).T), axis=0)
     assert np.all(np.abs(result.irradiance.ravel() - value.sum(axis=0)) <= bound)
 
 
 def test_device_arrays(device: Device, rng: np.random.Generator) -> None:
     receivers, segments = pairs(rng, 33)
     operation = LineIrradiance(segments=segments)
-    there = operation(cl.array.to_device(device.queue, receivers))
-    np.testing.assert_array_equal(there.irradiance.get(), operation(receivers, device=device).irradiance)
+    on_device = operation(cl.array.to_device(device.queue, receivers))
+    np.testing.assert_array_equal(on_device.irradiance.get(), operation(receivers, device=device).irradiance)
 
 
 def test_wrong_inputs(device: Device) -> None:

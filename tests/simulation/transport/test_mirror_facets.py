@@ -52,14 +52,14 @@ def test_no_block_is_left_out_that_shows_a_line(
     lines = lines.astype(dtype)
     found = all_windows(corners, lines.astype(np.float64))
     op = MirrorFacets(corners=corners, variant=variant)
-    near = op(lines, LENS.astype(dtype), device=device).near
+    candidates = op(lines, LENS.astype(dtype), device=device).near
     block_of = np.empty(len(corners), int)
-    block_of[op.blocks.order] = np.repeat(np.arange(near.shape[1]), np.diff(op.blocks.start))
-    assert near[found.line, block_of[found.mirror]].all()
+    block_of[op.blocks.order] = np.repeat(np.arange(candidates.shape[1]), np.diff(op.blocks.start))
+    assert candidates[found.line, block_of[found.mirror]].all()
     assert len(found.line) > (0 if kind == "one" else 50)
     if kind == "boxes":
         # TriangleBlocks of one face each: few that are looked at show nothing.
-        assert near.mean() < 0.1
+        assert candidates.mean() < 0.1
 
 
 def test_rays_reflect_at_the_ends_of_windows_as_they_should(rng: np.random.Generator) -> None:

@@ -128,24 +128,24 @@ def test_images_move_as_points_do(device: Device, variant: Any, dtype: Any, rng:
     (_, move, _), (start, _, _), (end, _, _) = map(outside, results)
     same = np.all([each.triangle[:, 0] == results[0].triangle[:, 0] for each in results], axis=0)
     assert same.sum() > 20
-    within = 1e-6 if dtype == np.float64 else 3e-3
-    np.testing.assert_allclose(((end - start) / step)[same], move[same], atol=within)
+    tolerance = 1e-6 if dtype == np.float64 else 3e-3
+    np.testing.assert_allclose(((end - start) / step)[same], move[same], atol=tolerance)
 
 
 def test_a_ball_shows_all_that_it_does_not_hide(device: Device, rng: np.random.Generator) -> None:
     """Up to the silhouette, a point has an image on the outside if the ball is not between it and the lens."""
-    ways = rng.normal(0.0, 1.0, (3000, 3))
+    directions = rng.normal(0.0, 1.0, (3000, 3))
     points = np.zeros((3000, 6))
-    points[:, :3] = rng.uniform(1.05, 4.0, (3000, 1)) * ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    points[:, :3] = rng.uniform(1.05, 4.0, (3000, 1)) * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     towards = LENS - points[:, :3]
     share = np.clip(-np.sum(points[:, :3] * towards, axis=1) / np.sum(towards * towards, axis=1), 0.0, 1.0)
-    near = np.linalg.norm(points[:, :3] + share[:, None] * towards, axis=1)
+    distance = np.linalg.norm(points[:, :3] + share[:, None] * towards, axis=1)
     result = mirrors(3, outside=np.ones(1280, bool))(points, LENS, device=device)
     # Within the bulge of a triangle at the silhouette, rounding of the surface decides.
-    sure = np.abs(near - 1.0) > 3e-3
-    missed = sure & (result.image_count != (near > 1.0))
+    sure = np.abs(distance - 1.0) > 3e-3
+    missed = sure & (result.image_count != (distance > 1.0))
     assert missed.mean() < 5e-3
-    assert np.all(near[missed] < 1.2)
+    assert np.all(distance[missed] < 1.2)
     assert sure.mean() > 0.98
 
 
@@ -212,8 +212,8 @@ def test_more_images_than_are_kept_and_numbers_that_are_none(
     result = mirrors(2, kept=1, variant=variant)(points, LENS.astype(dtype), device=device)
     np.testing.assert_array_equal(result.status, expected)
     np.testing.assert_array_equal(result.image_count, expected == Status.AMBIGUOUS)
-    none = MirrorPoints(corners=np.zeros((0, 3, 3)), normals=np.zeros((0, 3, 3)), numbers=[], variant=variant)
-    assert not none(points, LENS.astype(dtype), device=device).image_count.any()
+    no_mirrors = MirrorPoints(corners=np.zeros((0, 3, 3)), normals=np.zeros((0, 3, 3)), numbers=[], variant=variant)
+    assert not no_mirrors(points, LENS.astype(dtype), device=device).image_count.any()
 
 
 def test_writes_only_its_outputs(device: Device, rng: np.random.Generator) -> None:

@@ -159,8 +159,8 @@ def mirrored_points(scene: Scene, lit: LitLine, sensor: SensorView, device: Devi
         cosine = np.sum(towards * normals, axis=1) / np.linalg.norm(towards, axis=1)
         good &= cosine > 0.0
         for end in (points, np.broadcast_to(lens, points.shape)):
-            ways = np.ascontiguousarray(np.hstack([spot, end]))
-            good &= AnyHit(scene=scene, clearance=1e-9)(ways, device=device).occluded == 0
+            path = np.ascontiguousarray(np.hstack([spot, end]))
+            good &= AnyHit(scene=scene, clearance=1e-9)(path, device=device).occluded == 0
         power = SHARE * ALBEDO / np.pi * each * cosine * sensor.aperture_solid_angle(image)
         uv = sensor.project(image[good])
         total = total + sensor.deposit_spots(uv[:, 0], uv[:, 1], power[good])
@@ -259,13 +259,13 @@ def test_a_hollow_mirror_does_not_hide_itself(device: Device) -> None:
 def test_what_stands_before_a_curved_mirror_hides_its_image(device: Device) -> None:
     scene = ball_scene(3, 5e-3, np.array([0.0, -0.007, 5.0e-3]))
     lit = sheet(g_limits=(-0.015, 0.015)).illuminate(scene, 0.0)
-    whole = mirrors_of(scene, MATERIALS, device).mirrored_exposure(lit, 0.0).power.sum()
+    complete = mirrors_of(scene, MATERIALS, device).mirrored_exposure(lit, 0.0).power.sum()
     for screen in (
         quad([-0.05, -0.0005, 0], [0.05, -0.0005, 0], [0.05, -0.0005, 0.003], [-0.05, -0.0005, 0.003]),
         quad([-0.05, 0.03, 0.03], [0.05, 0.03, 0.03], [0.05, 0.03, 0.09], [-0.05, 0.03, 0.09]),
     ):
         hidden = Scene(np.concatenate([scene.corners, screen]), np.append(scene.material, [0, 0]))
-        assert mirrors_of(hidden, MATERIALS, device).mirrored_exposure(lit, 0.0).power.sum() < 1e-3 * whole
+        assert mirrors_of(hidden, MATERIALS, device).mirrored_exposure(lit, 0.0).power.sum() < 1e-3 * complete
 
 
 def test_an_image_on_an_edge_counts_once(device: Device) -> None:
@@ -353,9 +353,9 @@ def test_exposure_is_the_sum_of_its_ways(device: Device) -> None:
         + mirrors.direct_exposure(reflected, 0.0)
         + mirrors.mirrored_exposure(reflected, 0.0)
     )
-    whole = mirrors.exposure(lit, 0.0, sheet=light)
+    complete = mirrors.exposure(lit, 0.0, sheet=light)
     assert mirrors.direct_exposure(reflected, 0.0).power.sum() > 0.0
-    np.testing.assert_array_equal(whole.power, parts.power)
+    np.testing.assert_array_equal(complete.power, parts.power)
     matt = mirrors_of(scene, (MATERIALS[0],) * 2, device)
     assert not matt.has_mirrors
     assert not matt.exposure(lit, 0.0, sheet=light).power.any()

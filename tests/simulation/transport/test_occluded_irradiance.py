@@ -80,11 +80,11 @@ def lit_soup(count: int) -> tuple[np.ndarray, ...]:
 @WAYS
 @pytest.mark.parametrize("count", [3, 60])
 def test_light_as_rays_say(device: Device, variant: Any, dtype: Any, count: int) -> None:
-    corners, segments, receivers, value, most = lit_soup(count)
+    corners, segments, receivers, value, largest = lit_soup(count)
     result = light_of(corners, receivers.astype(dtype), segments, device, variant=variant, clearance=1e-5)
     assert result.irradiance.dtype == dtype
     assert not result.status.any()
-    error = np.abs(result.irradiance.ravel() - value) / np.where(most > 0.0, most, 1.0)
+    error = np.abs(result.irradiance.ravel() - value) / np.where(largest > 0.0, largest, 1.0)
     if dtype == np.float64:
         assert error.max() <= 1e-9
     else:
@@ -110,15 +110,15 @@ def lit_board() -> tuple[np.ndarray, ...]:
         for each in everywhere
     ]
     receivers = everywhere[facing][::20][:24]
-    value, most = reference.irradiance(board.scene.corners, receivers, segments, 1e-6)
-    return board.scene.corners, receivers[None], segments, value, most
+    value, largest = reference.irradiance(board.scene.corners, receivers, segments, 1e-6)
+    return board.scene.corners, receivers[None], segments, value, largest
 
 
 @WAYS
 def test_light_on_a_board_as_rays_say(device: Device, variant: Any, dtype: Any) -> None:
-    corners, receivers, segments, value, most = lit_board()
+    corners, receivers, segments, value, largest = lit_board()
     result = light_of(corners, receivers.astype(dtype), segments, device, variant=variant, clearance=1e-6).irradiance[0]
-    assert np.all(np.abs(result - value) <= (2e-5 if dtype == np.float32 else 1e-10) * most)
+    assert np.all(np.abs(result - value) <= (2e-5 if dtype == np.float32 else 1e-10) * largest)
     assert 0.2 < np.mean(value > 0.0) < 0.9
 
 
@@ -128,8 +128,8 @@ def test_light_in_any_soup(device: Device, seed: int, count: int, size: float) -
     rng = np.random.default_rng(seed)
     corners, segments, receivers = soup(rng, count, size), segments_of(rng, 2), receivers_of(rng, 1, 5)
     result = light_of(corners, receivers, segments, device, clearance=1e-7)
-    value, most = reference.irradiance(corners, receivers[0], segments, 1e-7)
-    assert np.all(np.abs(result.irradiance[0] - value) <= 1e-8 * most)
+    value, largest = reference.irradiance(corners, receivers[0], segments, 1e-7)
+    assert np.all(np.abs(result.irradiance[0] - value) <= 1e-8 * largest)
 
 
 def room(kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -324,9 +324,9 @@ def lit_line(count: int, receivers: int, dtype: Any) -> tuple[np.ndarray, ...]:
 @pytest.mark.parametrize(("count", "receivers"), [(6, 37), (35, 7)])
 def test_segments_on_one_line(device: Device, variant: Any, dtype: Any, count: int, receivers: int) -> None:
     """Grouped processing agrees with rays to each segment, also for more segments than a group holds."""
-    corners, places, rows, value, most = lit_line(count, receivers, dtype)
+    corners, places, rows, value, largest = lit_line(count, receivers, dtype)
     result = light_of(corners, places.astype(dtype), rows, device, variant=variant, clearance=1e-5).irradiance[0]
-    error = np.abs(result - value) / np.where(most > 0.0, most, 1.0)
+    error = np.abs(result - value) / np.where(largest > 0.0, largest, 1.0)
     assert error.max() <= (1e-9 if dtype == np.float64 else 2e-3)
     assert np.quantile(error, 0.9) <= 5e-6
     assert np.mean(value > 0.0) > 0.3
@@ -445,9 +445,9 @@ def test_one_bound_instance_for_all_profiles(device: Device, rng: np.random.Gene
     for _ in range(3):
         segments = segments_of(rng, 3).astype(np.float32)
         bound.inputs[2].set(segments)
-        there = bound.run()
+        result = bound.run()
         expected = operation(receivers, np.ones((2, 20, 2), np.float32), segments, device=device)
-        np.testing.assert_array_equal(there.irradiance.get(), expected.irradiance)
+        np.testing.assert_array_equal(result.irradiance.get(), expected.irradiance)
     given = [cl.array.to_device(device.queue, each) for each in (receivers, np.ones((2, 20, 2), np.float32), segments)]
     np.testing.assert_array_equal(operation(*given).left.get(), expected.left)
 

@@ -50,9 +50,9 @@ def _conditioning(place: np.ndarray, corners: np.ndarray) -> float:
     lengths = np.linalg.norm(edges, axis=1)
     front = np.cross(edges[0], edges[1])
     far = np.linalg.norm(corners - place, axis=1).max()
-    beside = (np.linalg.norm(np.cross(place - corners, edges), axis=1) / lengths).min()
+    edge_distance = (np.linalg.norm(np.cross(place - corners, edges), axis=1) / lengths).min()
     height = (place - corners[0]) @ front / np.linalg.norm(front)
-    return float(lengths.max() ** 2 / np.linalg.norm(front) + far / beside + far / height)
+    return float(lengths.max() ** 2 / np.linalg.norm(front) + far / edge_distance + far / height)
 
 
 def room(*extents: float) -> Scene:
@@ -98,9 +98,9 @@ def test_pieces_add_up_to_the_whole(device: Device) -> None:
     for _ in range(4):
         pieces = pieces.bisected(np.ones(pieces.count, bool))
     together = Patches(pieces.corners, np.zeros(len(pieces.corners), int))
-    whole = FormFactors(patches=Patches(triangle))(receivers, device=device).factors
-    assert whole.any()
-    np.testing.assert_allclose(FormFactors(patches=together)(receivers, device=device).factors, whole, atol=1e-14)
+    complete = FormFactors(patches=Patches(triangle))(receivers, device=device).factors
+    assert complete.any()
+    np.testing.assert_allclose(FormFactors(patches=together)(receivers, device=device).factors, complete, atol=1e-14)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -124,10 +124,10 @@ def test_a_surface_gets_nothing_from_its_own_plane(device: Device) -> None:
         receivers = np.concatenate([corners.mean(axis=1), patches.normals], axis=1)
         for dtype in (np.float32, np.float64):
             factors = FormFactors(patches=patches)(receivers.astype(dtype), device=device).factors
-            own = np.diagonal(factors)
-            assert np.all(own <= (1e-5 if dtype == np.float64 or offset == 0.0 else 1.0))
+            diagonal = np.diagonal(factors)
+            assert np.all(diagonal <= (1e-5 if dtype == np.float64 or offset == 0.0 else 1.0))
             if dtype == np.float64:
-                assert np.all(own < 1e-10)
+                assert np.all(diagonal < 1e-10)
 
 
 def test_at_an_edge_the_factor_is_that_of_the_angle(device: Device) -> None:
@@ -139,8 +139,8 @@ def test_at_an_edge_the_factor_is_that_of_the_angle(device: Device) -> None:
         quad = np.array([[a, b, b + long * out], [a, b + long * out, a + long * out]])
         wall = Patches(quad, np.zeros(2, int))
         np.testing.assert_allclose(wall.normals[0], [np.sin(angle), 0.0, -np.cos(angle)], atol=1e-12)
-        near = np.array([[10.0**-k, 0.0, 0.0, 0.0, 0.0, 1.0] for k in range(9)])
-        result = FormFactors(patches=wall)(np.concatenate([near, near * [0, 0, 0, 0, 0, 1]]), device=device)
+        receivers = np.array([[10.0**-k, 0.0, 0.0, 0.0, 0.0, 1.0] for k in range(9)])
+        result = FormFactors(patches=wall)(np.concatenate([receivers, receivers * [0, 0, 0, 0, 0, 1]]), device=device)
         np.testing.assert_allclose(result.factors[:9, 0], 0.5 * (1.0 + np.cos(angle)), rtol=0, atol=5e-6)
         assert np.all(result.status == 0)
         assert np.all((result.factors[9:] >= 0.0) & (result.factors[9:] <= 1.0))
@@ -199,14 +199,14 @@ def test_one_ray_agrees_with_any_hit(device: Device, rng: np.random.Generator) -
     seen = FormFactors(patches=single, scene=scene, rays=0.0)(points, device=device).factors
     # Triangles completely above the receiver's plane: rays end at the centres of the subdivisions.
     heights = np.einsum("rmkd,rd->rmk", single.corners[None] - points[:, None, None, :3], points[:, 3:])
-    whole = (heights > 0.0).all(axis=2) & (free > 0.0)
+    is_complete = (heights > 0.0).all(axis=2) & (free > 0.0)
     a, b, c = np.moveaxis(single.corners, 1, 0)
     middles = 0.25 * (a + b) + 0.5 * c
-    segments = np.concatenate(np.broadcast_arrays(points[:, None, :3], middles[None]), axis=2)[whole]
+    segments = np.concatenate(np.broadcast_arrays(points[:, None, :3], middles[None]), axis=2)[is_complete]
     occluded = AnyHit(scene=scene, clearance=1e-12)(np.ascontiguousarray(segments), device=device).occluded
     assert 0.1 < occluded.mean() < 0.9
     # Segments along edges may count as visible or hidden.
-    assert np.mean((seen[whole] > 0.0) == (occluded == 0)) > 0.995
+    assert np.mean((seen[is_complete] > 0.0) == (occluded == 0)) > 0.995
     np.testing.assert_array_equal(seen[seen > 0.0], free[seen > 0.0])
 
 
@@ -327,9 +327,9 @@ def test_a_fine_mesh_shines_as_a_coarse_one(device: Device) -> None:
 
 def test_halving_leaves_the_rest_alone() -> None:
     patches = Patches.from_scene(room(1.0, 1.0, 1.0), size=1.0, both_sides=False)
-    wanted = np.zeros(patches.count, bool)
-    wanted[[1, 4]] = True
-    finer = patches.bisected(wanted)
+    selected = np.zeros(patches.count, bool)
+    selected[[1, 4]] = True
+    finer = patches.bisected(selected)
     assert finer.count == patches.count + 2
     assert finer.area.sum() == pytest.approx(6.0, rel=1e-12)
     np.testing.assert_allclose(finer.area[-4:], 0.5 * patches.area[1], rtol=1e-12)

@@ -31,8 +31,8 @@ def stripe(*, power: float = 1.0) -> LitSegments:
 
 def solved(size: float, albedo: Any, device: Device, *, lid: bool = False) -> Radiosity:
     scene = room(1.0, 0.8, 0.6, lid=lid)
-    whole = Radiosity.from_scene(scene, albedo, size=size, both_sides=False, device=device)
-    return Radiosity(patches=whole.patches, albedo=whole.albedo, device=device)
+    solution = Radiosity.from_scene(scene, albedo, size=size, both_sides=False, device=device)
+    return Radiosity(patches=solution.patches, albedo=solution.albedo, device=device)
 
 
 def test_no_light_is_lost_in_a_closed_box(device: Device) -> None:
@@ -99,10 +99,10 @@ def test_arrival_is_the_mean_over_patches(device: Device) -> None:
     # The patch of a piece: the patch whose plane and corners contain it.
     owner = _owners(box.patches.corners, places[:, :3])
     mean = np.bincount(owner, light * inside.area) / box.patches.area
-    beside = np.abs(np.abs(box.patches.corners[:, :, 0]).min(axis=1) - 0.5) < 1e-9
+    near_line = np.abs(np.abs(box.patches.corners[:, :, 0]).min(axis=1) - 0.5) < 1e-9
     arrival = box.direct_irradiance(lit)
-    np.testing.assert_allclose(arrival[~beside], mean[~beside], rtol=2e-3, atol=1e-4)
-    np.testing.assert_allclose(arrival[beside], mean[beside], rtol=0.05, atol=1e-4)
+    np.testing.assert_allclose(arrival[~near_line], mean[~near_line], rtol=2e-3, atol=1e-4)
+    np.testing.assert_allclose(arrival[near_line], mean[near_line], rtol=0.05, atol=1e-4)
 
 
 def test_many_short_segments_are_as_one(device: Device) -> None:
@@ -112,9 +112,9 @@ def test_many_short_segments_are_as_one(device: Device) -> None:
     ends = np.zeros((2000, 2, 3))
     ends[:, 0, 0], ends[:, 1, 0], ends[:, :, 1], ends[:, :, 2] = cuts[:-1], cuts[1:], 0.1, -0.3
     pieces = LitSegments(ends, np.tile([0.0, 0.0, 1.0], (2000, 1)), np.ones(2000))
-    whole, arrived = box.direct_irradiance(stripe()), box.direct_irradiance(pieces)
+    expected, arrived = box.direct_irradiance(stripe()), box.direct_irradiance(pieces)
     assert arrived @ box.patches.area == pytest.approx(1.0, rel=1e-12)
-    np.testing.assert_allclose(arrived, whole, atol=0.02 * whole.max())
+    np.testing.assert_allclose(arrived, expected, atol=0.02 * expected.max())
 
 
 def test_single_precision_serves_where_there_is_no_double(device: Device) -> None:

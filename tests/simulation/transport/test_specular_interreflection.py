@@ -101,9 +101,9 @@ def _distance(lines: LitLine, spot: np.ndarray, triangle: int) -> float:
     mine = lines.triangle == triangle
     if not mine.any():
         return np.inf
-    start, way = lines.ends[mine, 0], lines.ends[mine, 1] - lines.ends[mine, 0]
-    share = np.clip(np.sum((spot - start) * way, axis=1) / np.sum(way * way, axis=1), 0.0, 1.0)
-    return float(np.linalg.norm(spot - start - share[:, None] * way, axis=1).min())
+    start, direction = lines.ends[mine, 0], lines.ends[mine, 1] - lines.ends[mine, 0]
+    share = np.clip(np.sum((spot - start) * direction, axis=1) / np.sum(direction * direction, axis=1), 0.0, 1.0)
+    return float(np.linalg.norm(spot - start - share[:, None] * direction, axis=1).min())
 
 
 @SOURCES

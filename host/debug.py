@@ -38,7 +38,7 @@ def debug_folder() -> Path | None:
 
 
 def flatten_includes(folder: Path, source: str, include_folders: Sequence[Path] = ()) -> str:
-    """Return a kernel file with the text of its headers in place of the ``#include "..."`` lines.
+    """Return a kernel file with the ``#include "..."`` lines replaced by the text of the headers.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ class DiskFullError(OSError):
 
 
 class _CountedFile(io.RawIOBase):
-    """Binary file that goes on counting its size when the disk is full: the error can then name the wanted size.
+    """Binary file that continues to count its size when the disk is full, so that the error can name the required size.
 
     It has no file descriptor for its users, so that NumPy and Pillow write through `write`, too.
     """
@@ -115,7 +115,7 @@ def atomic_write(path: str | os.PathLike[str], *, overwrite: bool = False, mode:
     overwrite : bool
         Whether an existing file may be replaced. Default False.
     mode : int
-        Access rights of the file, less those of the process's umask. Default 0o666.
+        Access rights of the file, without the bits of the process's umask. Default 0o666.
 
     Yields
     ------

@@ -56,7 +56,7 @@ class Outputs:
         Parameters
         ----------
         *files : path
-            Files to write. None and ``-`` (standard output) are left out.
+            Files to write. None and ``-`` (standard output) are skipped.
         job : str, optional
             Job whose earlier outputs may be replaced. Default: `job`.
 
@@ -186,7 +186,7 @@ class Outputs:
 
 
 def _identity(path: Path) -> tuple[int, int]:
-    """Return the numbers by which the system knows a file, under all of its names."""
+    """Return device and inode number, which identify a file under all of its names."""
     info = path.stat()
     return info.st_dev, info.st_ino
 

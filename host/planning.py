@@ -1,8 +1,8 @@
 """Choice of the settings of a stream: batch size, threads of the kernels, and a ring that outlasts a stall.
 
 The batch is the smallest one that keeps up with the sensor within a latency. Kernels run in the stream's thread
-(inline) where a batch is small and this takes no more processor time per frame than the worker threads of the device: a
-stream that waits for fewer threads has fewer stalls beside other processes.
+(inline) if a batch is small and inline kernels take no more processor time per frame than the worker threads of the
+device: a stream that waits for fewer threads has fewer stalls when other processes run.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Cost(NamedTuple):
     Attributes
     ----------
     service_rate : float
-        Throughput when frames come without pause [frames/s].
+        Throughput when frames arrive without pause [frames/s].
     seconds : float
         Median time of one batch through source, device and consumer [s].
     processor_time : float

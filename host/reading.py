@@ -28,8 +28,8 @@ class FileLimits:
         Pixels of an image or of a frame. Chosen: 16384 x 16384; the largest area sensors of industrial cameras have
         150 million. With 8 bytes per pixel such an image takes 2 GiB.
     max_unpacked_bytes : int
-        Bytes that an archive (NPZ, ZIP of Gerber files) unpacks to. An archive that unpacks to at most twice its own
-        size is not limited. Chosen: 2 GiB.
+        Bytes that an archive (NPZ, ZIP of Gerber files) unpacks to. An archive that unpacks to at most twice its size
+        is not limited. Chosen: 2 GiB.
     max_description_bytes : int
         Bytes of a TOML file. Chosen: 1 MiB, four times the largest file of features.
     max_nesting : int
@@ -95,7 +95,7 @@ def check_limit(name: str, value: float, what: str, error: type[Exception] = Rea
     value : float
         Size to check; NaN exceeds every limit.
     what : str
-        Start of the message: the file, and what has this size.
+        Start of the message: the file, and the object of this size.
     error : type
         Class of the exception.
 

@@ -109,7 +109,7 @@ def _array_source(path: Path, key: str | None) -> Source:
 
 
 def read_array(path: Path) -> HostArray:
-    """Read an NPY file of numbers; its size is that of its array.
+    """Read an NPY file of numbers; its size is the size of its array.
 
     Raises
     ------

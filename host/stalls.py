@@ -18,8 +18,8 @@ class Stall:
     """Time without a delivery, although a batch of frames had arrived.
 
     A stall begins at the arrival of the last frame of a batch, or at the delivery before, if that is later. It ends at
-    the delivery of the batch. Where frames were dropped in between, it begins at the delivery before: those frames
-    were due. The four parts add up to `seconds`.
+    the delivery of the batch. Where frames were dropped in between, it begins at the previous delivery, because the
+    dropped frames were due. The four parts add up to `seconds`.
 
     Attributes
     ----------

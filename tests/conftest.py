@@ -37,7 +37,7 @@ WITHOUT_INLINE = pytest.StashKey[bool]()
 TIERS = ("fast", "full", "nightly")
 # Factor on the examples of every hypothesis test in the tier "nightly".
 NIGHTLY_EXAMPLES = 20
-# New draws in every run; what fails prints how to repeat it. Without a clock: a busy machine is no fault of the code.
+# New draws in every run; a failure prints how to repeat it. Without a clock: a busy machine is no fault of the code.
 hypothesis.settings.register_profile("unhurried", deadline=None, print_blob=True)
 hypothesis.settings.load_profile("unhurried")
 
@@ -56,9 +56,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--strict-skips", action="store_true", help="fail when a test is skipped for an unexpected reason")
 
 
-@pytest.hookimpl(trylast=True)  # after -m and -k: the smoke set is the first of what they leave
+@pytest.hookimpl(trylast=True)  # after -m and -k: the smoke set is selected from the remaining tests
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what the tier leaves out; draw more hypothesis examples in the tier "nightly"."""
+    """Deselect the tests that the tier omits; draw more hypothesis examples in the tier "nightly"."""
     tier = config.getoption("tier")
     if tier == "nightly":
         _draw_more_examples(items)
@@ -97,7 +97,7 @@ def _left_to_full_tier(items: list[pytest.Item], best: Sequence[Device]) -> Iter
 
 
 def _designed(items: list[pytest.Item]) -> Iterator[pytest.Item]:
-    """Yield the tests that have no more than two parameters, and an all-pairs design of the cases of each other test.
+    """Yield the tests with at most two parameters, and an all-pairs design of the cases of each other test.
 
     The device is not one of these parameters.
     """
@@ -193,7 +193,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say how many tests passed on which device, which CI reads, and how many were left to the full tier."""
+    """Print the number of passed tests for every device, which CI reads, and of the tests of the full tier only."""
     config = terminalreporter.config
     passed = terminalreporter.getreports("passed")
     labels = Counter(label for each in passed for name, label in each.user_properties if name == "device")

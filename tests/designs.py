@@ -18,7 +18,7 @@ def all_pairs(cases: Sequence[Mapping[str, object]]) -> list[int]:
     -------
     list of int
         Indices in ascending order: a greedy choice, the same in every process. With two parameters or fewer each case
-        holds a pair of its own, and all cases are chosen.
+        has a unique pair, and all cases are chosen.
 
     References
     ----------

@@ -23,7 +23,7 @@ _HORIZON = 1e-9
 class MountedCamera:
     """Pinhole camera with a lens, at a known height and orientation above a floor.
 
-    Pixels are those of the undistorted image, except for the result of `distort`.
+    Pixel coordinates refer to the undistorted image, except for the result of `distort`.
 
     Parameters
     ----------

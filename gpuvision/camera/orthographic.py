@@ -18,7 +18,7 @@ Float64 = npt.NDArray[np.float64]
 class BoardView:
     """Similarity between a plane and the image of a camera perpendicular to it.
 
-    Pixels are those of the undistorted image, except for the result of `to_measured_pixels`.
+    Pixel coordinates refer to the undistorted image, except for the result of `to_measured_pixels`.
 
     Parameters
     ----------

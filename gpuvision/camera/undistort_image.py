@@ -98,9 +98,8 @@ class UndistortImage(VisionOperation[UndistortedImage]):
     border_value : float
         Value of the constant border [grey levels]. Default 0.
     size : (int, int), optional
-        Columns and rows of the ideal image. Default: those of the input, or of the map.
-    region : (int, int, int, int), optional
-        (column, row, columns, rows): part of the ideal image to compute [px]. Default: all of it.
+        Columns and rows of the ideal image. Default: the size of the input, or of the map. region : (int, int, int,
+        int), optional (column, row, columns, rows): part of the ideal image to compute [px]. Default: all of it.
     matrix : 3 x 3, optional
         ((fx, 0, cx), (0, fy, cy), (0, 0, 1)): camera matrix of the ideal image [px], for a `Camera`. Default: the
         matrix of ``model``.

@@ -1,4 +1,4 @@
-"""``gpuvision devices``: list the OpenCL devices, whether they work, and what to install."""
+"""``gpuvision devices``: list the OpenCL devices, whether they work, and remedies."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class Recording:
     key
         Name of the array in an NPZ file, if the file holds more than one.
     rate
-        Frame rate of the sensor [frames/s]; a scan reports its own rate relative to it.
+        Frame rate of the sensor [frames/s]; a scan reports its measured rate relative to it.
     """
 
     channel: Channel = "grey"

@@ -89,7 +89,7 @@ def calibrate(
     FileNotFoundError
         A file does not exist.
     ValueError
-        No target pattern was detected, or the points do not fix the model; the message says what is missing. Or
+        No target pattern was detected, or the points do not fix the model; the message names the missing data. Or
         `pitch` or `focal_length` is given, and the method is "lines" or ends in it.
     RecordingError
         A file is no image, or the images differ in size.
@@ -179,7 +179,7 @@ def calibration_files(path: Path) -> tuple[Path, Path, Path]:
 
 
 def write_calibration(calibration: Calibration, path: Path, *, overwrite: bool = False) -> None:
-    """Write the camera file (TOML), and beside it the report (.json) and the plot (.png); all of them or none.
+    """Write the camera file (TOML), report (.json) and plot (.png) into one folder; after an error no file is written.
 
     Parameters
     ----------

@@ -210,8 +210,8 @@ def compute_missing_blocks(
     device
         Device for a computation here; None: `Device.best`.
     scheduler
-        Address of a Dask scheduler whose workers compute, each on its own `Device.best`; None: compute here. The blocks
-        of a worker that dies are computed again by others.
+        Address of a Dask scheduler whose workers compute, each on the `Device.best` of its machine; None: compute here.
+        The blocks of a worker that dies are computed again by others.
     progress
         Called with the number of profiles done and the number of all profiles.
 

@@ -345,7 +345,7 @@ def _reason_of_ambiguity(
 ) -> str:
     """Return why the board may be at either of two places; empty where the rulers exclude the second one.
 
-    The rulers differ from those of the coarse registration: they were selected to determine the pose, and pairs of
+    The rulers differ from the rulers of the coarse registration: they were selected to determine the pose, and pairs of
     edges test the widths of traces.
     """
     if other.reason or other.agreeing <= max_other_share * best.agreeing:

@@ -85,9 +85,9 @@ gpuvision.cli.main._GRACE = 0.5
     [
         # an extension module that turns every exception into another one
         "\n            try: time.sleep(60)\n            except BaseException: raise ImportError('failed') from None",
-        # a loop that goes on whatever happens
+        # a loop that ignores all exceptions
         "\n            while True:\n                try: time.sleep(60)\n                except BaseException: pass",
-        # a library call that comes back only after a minute
+        # a library call that returns only after a minute
         "import ctypes; ctypes.CDLL(None).pause.restype = None; "
         "[ctypes.CDLL(None).pause() for _ in range(2)]; time.sleep(60)",
     ],

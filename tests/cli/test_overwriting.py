@@ -1,4 +1,4 @@
-"""No command writes over its inputs, nor over files that it did not write."""
+"""No command overwrites its inputs or files that it did not write."""
 
 from __future__ import annotations
 

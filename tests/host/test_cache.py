@@ -118,7 +118,7 @@ def test_a_planted_driver_is_not_loaded(
         entry.write_text("/tmp/evil.so")
     elif plant == "link":
         entry.unlink()
-        evil.write_text("/wheel/libintelocl.so")  # whoever owns the target may change it later
+        evil.write_text("/wheel/libintelocl.so")  # the owner of the target may change it later
         entry.symlink_to(evil)
     elif plant == "writable":
         entry.chmod(0o666)

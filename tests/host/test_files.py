@@ -241,7 +241,7 @@ def test_a_folder_that_does_not_fit_leaves_nothing(small_disk: Path) -> None:
 
 
 def test_a_full_disk_of_every_kind_of_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seeking writers, such as those of ZIP and TIFF, go on to count; a quota is a disk, too."""
+    """Seeking writers, such as the writers of ZIP and TIFF, continue to count; a quota counts as a disk."""
 
     def full(_: int) -> None:
         raise OSError(errno.EDQUOT, "Disk quota exceeded")

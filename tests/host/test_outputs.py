@@ -85,7 +85,7 @@ def test_an_input_is_never_replaced(tmp_path: Path, link: Link | None, is_folder
 
 
 def test_a_folder_of_inputs_that_holds_the_outputs(tmp_path: Path) -> None:
-    """A second run into the folder of its inputs takes its own outputs for outputs."""
+    """A second run into the folder of its inputs recognises the outputs of the first run."""
     (tmp_path / "board.gbr").write_text("an input")
     for _ in range(2):
         outputs = Outputs("select", inputs=[tmp_path])

@@ -196,7 +196,7 @@ def test_drop_oldest_keeps_the_newest(memory: dict[str, Any], ring: int) -> None
 
 
 class GatedInThrees(Gated):
-    """Three frames for each one that the gate lets through, two in the last batch."""
+    """Three frames for each frame that the gate passes, two in the last batch."""
 
     def read_into(self, out: np.ndarray, arrived: np.ndarray) -> int:
         count = min(3, self.length - self._next)

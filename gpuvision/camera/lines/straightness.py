@@ -463,7 +463,8 @@ def projected_columns(
 def pencil_changes(vanishing: Float64, family: npt.NDArray[np.intp], lines: LineSet) -> Float64:
     """Return derivatives (2, 3, lines) of lines' (offset, direction) by a rotation in their pencil and by two tangents.
 
-    The tangents of the vanishing point are those of `pencil_basis`; a line follows its point with the least rotation.
+    The tangents of the vanishing point are computed by `pencil_basis`; a line follows its point with the least
+    rotation.
     """
     nx, ny, offset = lines
     x, y, w = vanishing[family].T

@@ -122,7 +122,7 @@ def fit_lens(
     Raises
     ------
     ValueError
-        The lines do not determine the lens; the message says what is missing.
+        The lines do not determine the lens; the message names the missing data.
 
     References
     ----------
@@ -184,7 +184,7 @@ class _ModelSearch:
         return order + (2 if order and not self.keep_centre else 0)
 
     def parameters(self, order: int, concurrent: bool) -> int:
-        """Return the number of parameters, including those of the lines."""
+        """Return the number of parameters, including the parameters of the lines."""
         return self.count_lens_parameters(order) + count_line_parameters(
             self.packed, self.fits[order, concurrent].parameters
         )
@@ -199,7 +199,7 @@ class _ModelSearch:
         Raises
         ------
         ValueError
-            They do not; the message says what is missing.
+            They do not; the message names the missing data.
         """
         needed = 1 if self.keep_centre else 2
         if order and self.linear.rank < needed:

@@ -177,7 +177,7 @@ def covariances(
 ) -> tuple[Floats, Floats, float]:
     """Return the covariances of camera parameters and poses, and the relative standard deviation of f.
 
-    The camera parameters are those named `names` in OpenCV's order; the poses are in the lens' frame. The covariances
+    `names` are the names of the camera parameters in OpenCV's order; the poses are in the lens' frame. The covariances
     are valid to first order; under a robust loss they are Huber's, for points of equal noise. Parameters that the data
     do not determine have a very large, finite variance. f is the virtual camera's focal length: the data can determine
     it even if they do not determine tilt, centre and f'.

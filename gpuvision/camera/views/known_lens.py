@@ -103,7 +103,7 @@ def fit_tilt(
     Raises
     ------
     ValueError
-        The views do not determine the parameters; the message says what is missing.
+        The views do not determine the parameters; the message names the missing data.
 
     References
     ----------

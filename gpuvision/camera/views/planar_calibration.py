@@ -131,7 +131,7 @@ def fit_camera(
     Raises
     ------
     ValueError
-        The views do not determine the camera; the message says what is missing.
+        The views do not determine the camera; the message names the missing data.
 
     References
     ----------

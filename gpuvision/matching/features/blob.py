@@ -137,7 +137,7 @@ class FindBlobs(VisionOperation[Blobs]):
         200, default 6.
     spokes : int
         Number of rulers of a blob, evenly over its contour: a multiple of 4 (of a ring 8), 8 to 256, default 16. With
-        32, less of the contour is lost beside an object that hides a part of it.
+        32, less of the contour is lost next to an object that hides a part of it.
     width : int
         Number of lines, 1 px apart, that a ruler averages, default 1. Without ``match`` the whole contour is used where
         spokes times width equals its length. Above a third of the radius it blurs the edge.

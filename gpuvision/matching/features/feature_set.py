@@ -221,7 +221,7 @@ def select_feature_set(
         budget = min(budget, MAX_ROWS - (2 * len(fiducials.radius) if are_free else 0))
     if budget <= 0:
         raise ValueError("the budget is used up before the first ruler; give a larger one")
-    # Where there are few traces, allow as many rulers on each as the budget needs.
+    # Where there are few traces, allow the number of rulers on each that the budget needs.
     affordable = budget / float(costs[both.radius == 0].mean()) if len(rulers.radius) else 0.0
     each = max(_PER_SOURCE, math.ceil(2 * affordable / max(len(np.unique(rulers.source)), 1)))
     if are_free and len(fiducials.radius):

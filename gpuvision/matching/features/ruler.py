@@ -59,7 +59,7 @@ class RulerTable(NamedTuple):
     saturation
         Least saturated sample [grey levels].
     noise
-        Standard deviation of half the difference of the gradients beside a maximum, of sums over the lines.
+        Standard deviation of half the difference of the gradients next to a maximum, of sums over the lines.
     smoothing
         Variance of the smoothing [samples^2].
     ambiguity
@@ -413,7 +413,7 @@ class RulerEdges(VisionOperation[Edges]):
         return np.asarray(taps / np.sum(2.0 * k * taps))
 
     def _noise_gain(self, taps: npt.NDArray[np.float64]) -> float:
-        """Return the noise of half the difference of the two gradients beside a maximum, for pixel noise 1.
+        """Return the noise of half the difference of the two gradients next to a maximum, for pixel noise 1.
 
         Bilinear samples at random sub-pixel positions are correlated; the covariance of two samples is the cubic
         B-spline of their distance.

@@ -293,7 +293,7 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
             raise ValueError(f"FieldPoseRefinement.max_iterations is {self.max_iterations}, expected 1 or more")
 
     def __call__(self, *inputs: Any, device: Device | None = None, out: FieldPoses | None = None) -> FieldPoses:
-        """Run once, as every `Operation`; with ``count=None`` for as many starts as there are."""
+        """Run once, as every `Operation`; with ``count=None`` for any number of starts."""
         if self.count is None and len(inputs) == 2 and getattr(inputs[1], "ndim", 0) == 2:
             return replace(self, count=len(inputs[1]))(*inputs, device=device, out=out)
         return super().__call__(*inputs, device=device, out=out)

@@ -87,8 +87,8 @@ class BoardPose(NamedTuple):
         Share of the information of all rows that agrees with the pose, for the parameter combination with the least
         share, 0 to 1. Also valid where it is the reason of a refusal, like ``leverage``.
     leverage : float, (...,)
-        Largest leverage of an inlier: the share of its own error by which a row moves the pose. 1 where an unknown
-        depends on this row alone; 0 for ``"least_squares"``.
+        Largest leverage of an inlier: the shift of the pose by the error of a row, relative to this error. 1 where an
+        unknown depends on this row alone; 0 for ``"least_squares"``.
     """
 
     pose: FloatArray

@@ -37,9 +37,9 @@ CREASE = math.radians(40.0)
 def smooth_normals(scene: Scene, crease: float = CREASE) -> Float64:
     """Return unit normals of a smooth surface at the corners of triangles, (n, 3, 3).
 
-    The normal at a corner is the weighted mean over all triangles that share the corner, without those that lean more
-    than the crease angle from the triangle itself: a sharp edge stays sharp. With Max's weights the normals of a sphere
-    are exact; errors on other smooth surfaces are of second order in the triangles' size.
+    The normal at a corner is the weighted mean over all triangles that share the corner, without triangles that are
+    tilted by more than the crease angle against the triangle itself: a sharp edge stays sharp. With Max's weights the
+    normals of a sphere are exact; errors on other smooth surfaces are of second order in the triangles' size.
 
     Parameters
     ----------
@@ -197,8 +197,8 @@ class TriangleBlocks(NamedTuple):
 def max_bulge(corners: Float64, normals: Float64) -> Float64:
     """Return the bound of the distance between triangles and the smooth surface over them, (m,) [m].
 
-    The smooth surface is the one that `MirrorPoints` uses: the point with barycentric weights b is lifted by half the
-    weighted sum of its depths below the tangent planes at the corners, along the corners' normals.
+    The smooth surface is the surface that `MirrorPoints` uses: the point with barycentric weights b is lifted by half
+    the weighted sum of its depths below the tangent planes at the corners, along the corners' normals.
 
     Parameters
     ----------
@@ -243,11 +243,11 @@ class MirrorPoints(VisionOperation[MirrorImages]):
 
     Notes
     -----
-    Normal and surface are exact to second degree, so the error of an image is of third power in the triangles' size
-    over the radius of curvature, that of its density of first. One image per triangle is found: triangles must be small
-    compared with distances and radii, at least a few across each image. An image on the edge of two triangles is found
-    on both. At grazing incidence, within about the angle that a triangle turns, an image may be missed (measured on a
-    sphere of 1280 triangles: 1 point in 300). Near a caustic the density is unbounded.
+    Normal and surface are exact to second degree, so the error of an image is of third order in the triangles' size
+    over the radius of curvature, and the error of its density of first order. One image per triangle is found:
+    triangles must be small compared with distances and radii, at least a few across each image. An image on the edge of
+    two triangles is found on both. At grazing incidence, within about the angle that a triangle turns, an image may be
+    missed (measured on a sphere of 1280 triangles: 1 point in 300). Near a caustic the density is unbounded.
 
     References
     ----------

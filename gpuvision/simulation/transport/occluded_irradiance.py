@@ -203,7 +203,7 @@ def segment_rows(segments: LitSegments, room: int | None = None) -> npt.NDArray[
     segments
         The emitters.
     room
-        Number of rows; rows behind the segments have no exitance. None: as many rows as segments.
+        Number of rows; rows behind the segments have no exitance. None: the number of segments.
 
     Raises
     ------

@@ -173,7 +173,8 @@ def test_boxes_that_a_ray_touches_at_an_edge(
     edge, sign = origin + times * direction, np.sign(direction)
     boxes = np.tile(np.repeat([np.inf, -np.inf], 3)[:, None], (count, 1, 16))
     for number, (enters, leaves) in enumerate(pairs):
-        # The ray enters the slab of one axis where it leaves that of another; the third slab is all around.
+        # The ray enters the slab of one axis where it leaves the slab of another axis; the third slab contains the
+        # whole ray.
         near, end = edge - 4000 * sign, edge + 4000 * sign
         near[:, enters], end[:, leaves] = edge[:, enters], edge[:, leaves]
         late = near.copy()

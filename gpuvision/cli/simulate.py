@@ -224,11 +224,12 @@ def _run(
 
     with progress_bar(description) as progress:
         done = run(task, out, progress=progress, **made)
-    summary = done.summary()
+    summary, scale = done.summary(), None
     if other is not None:
         with progress_bar(f"{description}, second sensor") as progress:
             pair = SensorPair.fuse(done, run(other, out, progress=progress, **made), SensorFusion(rule=rule.value))
         pair.write(out, overwrite=overwrite)
         summary += f"\n{pair.summary()}"
-    done.write(out, overwrite=overwrite)
+        scale = pair.picture_scale
+    done.write(out, overwrite=overwrite, scale=scale)
     return summary, done.report()

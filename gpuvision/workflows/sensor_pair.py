@@ -11,7 +11,7 @@ import numpy as np
 from gpuvision.formats.json import json_tree
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
-from gpuvision.plots.simulation import draw_causes, draw_errors
+from gpuvision.plots.simulation import PictureScale, draw_causes, draw_errors
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution
 from gpuvision.simulation.errors.recommendations import rank_candidates
 from gpuvision.simulation.errors.sensor_fusion import SensorFusion
@@ -103,6 +103,11 @@ class SensorPair:
         ]
         return f"surface samples read within {1e6 * self.limit:.0f} µm: {', '.join(parts)}"
 
+    @property
+    def picture_scale(self) -> PictureScale:
+        """Scale of the pictures of both sensors and of their fused readings, for comparison."""
+        return PictureScale.of([self.first.attribution, self.second.attribution, self.errors["both"]], self.limit)
+
     def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
         """Write the second sensor's results into ``second``, and pictures and a report of both into ``both``.
 
@@ -120,11 +125,12 @@ class SensorPair:
         OSError
             The folders cannot be written.
         """
-        self.second.write(Path(folder) / "second", overwrite=overwrite)
+        self.second.write(Path(folder) / "second", overwrite=overwrite, scale=self.picture_scale)
         both = self.errors["both"]
         with Outputs("simulate", overwrite=overwrite).folder(Path(folder) / "both") as inside:
-            draw_errors(inside / "errors.png", both, "Both sensors")
-            draw_causes(inside / "causes.png", both, self.limit, "Both sensors")
+            backward = self.first.moves_backward
+            draw_errors(inside / "errors.png", both, "Both sensors", self.picture_scale, backward=backward)
+            draw_causes(inside / "causes.png", both, "Both sensors", self.picture_scale, backward=backward)
             report = {
                 "rule": self.fusion.rule,
                 "limit": self.limit,

@@ -16,7 +16,7 @@ from gpuvision.host import Device
 from gpuvision.host.files import write_text_atomic
 from gpuvision.host.outputs import Outputs
 from gpuvision.plots.range_image import draw_height_map
-from gpuvision.plots.simulation import draw_causes, draw_errors
+from gpuvision.plots.simulation import PictureScale, draw_causes, draw_errors
 from gpuvision.ranging.range_image import RangePoints
 from gpuvision.ranging.regrid import Grid, HeightMap
 from gpuvision.simulation.errors.error_attribution import ErrorAttribution
@@ -124,7 +124,12 @@ class Simulation:
             "seconds": self.seconds,
         }
 
-    def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
+    @property
+    def moves_backward(self) -> bool:
+        """Whether the transport decreases with the profile number."""
+        return bool(self.task.transports[-1] < self.task.transports[0])
+
+    def write(self, folder: str | Path, *, overwrite: bool = False, scale: PictureScale | None = None) -> None:
         """Write the range image, pictures and the report into a folder, all or nothing.
 
         ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` hold the height map as it will be
@@ -137,6 +142,8 @@ class Simulation:
             Output folder; created if it is missing.
         overwrite : bool
             Whether files may be replaced that no earlier simulation wrote. Default False.
+        scale : PictureScale, optional
+            Scale of the pictures of errors and causes. Default: that of this simulation alone.
 
         Raises
         ------
@@ -147,6 +154,7 @@ class Simulation:
         """
         attribution = self.attribution
         title = self.task.sensor.name or "Simulation"
+        scale = PictureScale.of([attribution], self.limit) if scale is None else scale
         with Outputs("simulate", overwrite=overwrite).folder(folder) as inside:
             write_tiff(inside / "range_image.tiff", self.heights.z, self.grid)
             write_png16(inside / "range_image.png", self.heights.z, self.grid)
@@ -155,8 +163,8 @@ class Simulation:
             )
             write_npz(inside / "simulation.npz", *self._arrays())
             draw_height_map(inside / "picture.png", self.heights, self.grid, title=f"{title}: as measured")
-            draw_errors(inside / "errors.png", attribution, title)
-            draw_causes(inside / "causes.png", attribution, self.limit, title)
+            draw_errors(inside / "errors.png", attribution, title, scale, backward=self.moves_backward)
+            draw_causes(inside / "causes.png", attribution, title, scale, backward=self.moves_backward)
             if self.mask is not None:
                 self.mask.mask.save(inside / _MASK_FILE)
             write_text_atomic(inside / "report.json", json.dumps(self.report(), indent=1, allow_nan=False) + "\n")

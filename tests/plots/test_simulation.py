@@ -1,0 +1,80 @@
+"""Pictures of simulations mean the same side by side: scale, unit, direction and colours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from error_maps import errors_of
+from gpuvision.plots.simulation import PictureScale, draw_causes, draw_errors
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Figures that are saved from now on."""
+    figures: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **how: figures.append(figure))
+    return figures
+
+
+def test_errors_that_are_compared_have_one_scale_and_unit(drawn: list[Figure], tmp_path: Path) -> None:
+    """One sensor errs by up to a millimetre, the other one by half of that: the same colour is the same error."""
+    large, small = errors_of(np.full((5, 7), 0.6e-3)), errors_of(np.full((4, 9), -0.3e-3))
+    scale = PictureScale.of([large, small], 20e-6)
+    assert scale == (pytest.approx(1e-3), 20e-6)
+    for number, errors in enumerate((large, small)):
+        draw_errors(tmp_path / f"{number}.png", errors, "part", scale)
+    for figure, value in zip(drawn, (0.6, -0.3), strict=True):
+        axes, bar = figure.axes
+        (image,) = axes.images
+        assert image.get_clim() == pytest.approx((-1.0, 1.0))
+        np.testing.assert_allclose(image.get_array(), value)
+        assert "true height [mm]" in bar.get_ylabel()
+    assert PictureScale.of([small], 0.0).span == pytest.approx(0.5e-3)
+    nothing = PictureScale.of([errors_of(np.full((2, 3), np.nan))], 0.0)
+    assert 0.0 < nothing.span <= 2e-9
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("backward", [False, True])
+@pytest.mark.parametrize("draw", [draw_errors, draw_causes])
+def test_pictures_have_one_orientation(
+    drawn: list[Figure], tmp_path: Path, draw: Any, mirrored: bool, backward: bool
+) -> None:
+    """g increases to the right and the transport upwards, also for a sensor that reads from the other side."""
+    errors = np.zeros((5, 7))
+    errors[4, 0] = 1e-3
+    draw(tmp_path / "a.png", errors_of(errors, mirrored=mirrored), "part", PictureScale(1e-3, 1e-5), backward=backward)
+    (axes,) = (each for each in drawn[0].axes if each.images)
+    (image,) = axes.images
+    # Place of sample 0 of profile 4 on the page.
+    x, y = axes.transAxes.inverted().transform(axes.transData.transform((0, 4)))
+    assert (x > 0.5, y > 0.5) == (mirrored, not backward)
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("sample", "profile")
+    assert np.ptp(axes.get_xlim()) == pytest.approx(7.0)
+    assert np.ptp(axes.get_ylim()) == pytest.approx(5.0)
+    # The array is in the order of samples and profiles, and the axes of the picture turn it.
+    assert not np.array_equal(np.asarray(image.get_array())[4, 0], np.asarray(image.get_array())[4, 1])
+    left, right, bottom, top = image.get_extent()
+    assert (left, right, bottom, top) == (-0.5, 6.5, -0.5, 4.5)
+
+
+def test_a_cause_has_the_same_colour_in_every_picture(drawn: list[Figure], tmp_path: Path) -> None:
+    error = np.full((3, 4), 1e-3)
+    for number, causes in enumerate((("shape", "secondary"), ("secondary",), ("shape", "occlusion", "secondary"))):
+        draw_causes(tmp_path / f"{number}.png", errors_of(error, causes=causes), "part", PictureScale(1e-3, 1e-5))
+    colours = [np.asarray(figure.axes[0].images[0].get_array())[0, 0, :3] for figure in drawn]
+    for colour in colours:
+        np.testing.assert_allclose(colour, colours[0])
+    others = ("shape", "occlusion", "reflectivity", "specular", "secondary", "ambient", "noise", "mirrors")
+    found = set()
+    for name in others:
+        draw_causes(tmp_path / f"{name}.png", errors_of(error, causes=(name,)), "part", PictureScale(1e-3, 1e-5))
+        found.add(tuple(np.asarray(drawn[-1].axes[0].images[0].get_array())[0, 0, :3]))
+    assert len(found) == len(others)
+    assert not found & {to_rgb("#4b5563"), to_rgb("#e5e7eb")}

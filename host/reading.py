@@ -173,7 +173,7 @@ def reading(what: object, kind: str, error: type[Exception] = ReadError, *, hint
 def reason_of(problem: BaseException) -> str:
     """Return the message of another library's exception as one short line of printable characters."""
     if isinstance(problem, MemoryError):
-        return "it asks for more memory than there is"
+        return "it needs more memory than is available"
     if isinstance(problem, RecursionError):
         return "it is nested too deeply"
     lines = [line for line in str(problem).splitlines() if line.strip()]

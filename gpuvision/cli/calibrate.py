@@ -60,7 +60,7 @@ LensFile = Annotated[
     typer.Option(
         metavar="FILE.toml",
         parser=named_path,
-        help="Camera file to write; the report (.json) and a plot (.png) are written beside it.",
+        help="Camera file to write; the report (.json) and a plot (.png) are written to the same folder.",
     ),
 ]
 Pattern = Annotated[

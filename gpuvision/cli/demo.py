@@ -71,6 +71,6 @@ def demo(
     )
     echo(
         f"Range image of the part: {camera / 'picture.png'}. Errors of the PSD strips from light in the corners: "
-        f"{out / name / 'errors.png'} and causes.png beside it; with a mask: "
+        f"{out / name / 'errors.png'} and causes.png in the same folder; with a mask: "
         f"{out / masked_folder / 'errors.png'}."
     )

@@ -50,7 +50,7 @@ Board = Annotated[
 Scale = Annotated[
     str | None,
     typer.Option(
-        metavar="LENGTH", help="Size of a pixel on the board: 25e-6 (m) or 25um. Default: that of --features."
+        metavar="LENGTH", help="Size of a pixel on the board: 25e-6 (m) or 25um. Default: the value in --features."
     ),
 ]
 InitialPose = Annotated[
@@ -66,7 +66,7 @@ SearchRange = Annotated[
     typer.Option(
         metavar="LENGTH,ANGLE",
         help="Largest distance and rotation from the expected pose. Default: 2mm,5deg; with "
-        "--initial-pose that of --features, or 100um,0.3deg.",
+        "--initial-pose the value in --features, or 100um,0.3deg.",
     ),
 ]
 CameraFile = Annotated[
@@ -87,7 +87,9 @@ Budget = Annotated[
 ]
 Blur = Annotated[
     float | None,
-    typer.Option(min=0.1, help=f"Edge blur, standard deviation [px]. Default: {_BLUR_PX:g}, or that of --features."),
+    typer.Option(
+        min=0.1, help=f"Edge blur, standard deviation [px]. Default: {_BLUR_PX:g}, or the value in --features."
+    ),
 ]
 EtchBias = Annotated[
     str, typer.Option(metavar="LENGTH", help="Over- or under-etch of copper edges, standard deviation.")
@@ -111,7 +113,9 @@ def locate(
     search_range: SearchRange = None,
     camera: CameraFile = None,
     features: Features = None,
-    side: Annotated[Side | None, typer.Option(help="Side of the board. Default: top, or that of --features.")] = None,
+    side: Annotated[
+        Side | None, typer.Option(help="Side of the board. Default: top, or the value in --features.")
+    ] = None,
     layers: LayerNames = None,
     budget: Budget = None,
     blur: Blur = None,

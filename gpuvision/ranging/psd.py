@@ -198,7 +198,7 @@ class PsdReadout(VisionOperation[PsdReading]):
                 raise ValueError(f"PsdReadout.{name} is {getattr(self, name)}, expected a number >= 0")
         self._check_currents()
         if self.load_resistance and not self.interelectrode_resistance:
-            raise ValueError("PsdReadout.load_resistance needs interelectrode_resistance [Ohm] beside it")
+            raise ValueError("PsdReadout.load_resistance needs interelectrode_resistance [Ohm] as well")
         if self.layout not in ("pairs", "planar"):
             raise ValueError(f"PsdReadout.layout is {self.layout!r}, expected 'pairs' or 'planar'")
         object.__setattr__(self, "outputs", self._chosen())

@@ -204,7 +204,7 @@ class _ModelSearch:
         needed = 1 if self.keep_centre else 2
         if order and self.linear.rank < needed:
             raise ValueError(
-                "all lines go through the centre, where no lens bends them; expected lines beside it"
+                "all lines go through the centre, where no lens bends them; expected lines off the centre"
                 if self.keep_centre
                 else "all points lie along one line, whose bend k1 and the centre share; expected lines at several "
                 "distances from each other, or a known centre"

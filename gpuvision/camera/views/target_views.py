@@ -108,7 +108,7 @@ def _check_spread(name: str, target: Floats) -> None:
     for points in (target, _without_farthest(target)):
         sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if sizes[1] <= _COLLINEAR * sizes[0]:
-            raise ValueError(f"{name}: all points lie on one line, points beside it are needed")
+            raise ValueError(f"{name}: all points lie on one line, points off this line are needed")
 
 
 def _without_farthest(points: Floats) -> Floats:

@@ -297,11 +297,11 @@ class UndistortImage(VisionOperation[UndistortedImage]):
         defines = type_defines("CODE", dtype, 16)
         defines |= {"CONVERT_CODES": f"convert_{defines['CODE16']}", "CHANNELS": self.channels}
         if dtype.kind == "u":
-            defines["LARGEST"] = f"{np.iinfo(dtype).max}.0f"
+            defines["MAX_CODE"] = f"{np.iinfo(dtype).max}.0f"
         if self.interpolation == "bicubic":
             defines["BICUBIC"] = None
         defines[_BORDERS[self.border]] = None
         if self.coordinates == "computed":
             model = self.model.defines if isinstance(self.model, Lens) else self.model.defines(self.matrix)
-            defines |= {"COMPUTED": None} | model
+            defines |= {"FROM_MODEL": None} | model
         return defines

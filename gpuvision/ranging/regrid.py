@@ -354,9 +354,9 @@ class _Pass(VisionOperation[R]):
         return build
 
     def _resample(
-        self, build: LaunchBuilder, lines: int, made: tuple[int, int], counts: RegridCounts, *, carries: bool
+        self, build: LaunchBuilder, lines: int, made: tuple[int, int], counts: RegridCounts, *, with_other: bool
     ) -> Launch:
-        """Describe the launch that resamples lines; `carries`: also interpolate the other coordinate.
+        """Describe the launch that resamples lines; `with_other`: also interpolate the other coordinate.
 
         Parameters
         ----------
@@ -373,10 +373,15 @@ class _Pass(VisionOperation[R]):
             "resample",
             # A CPU runtime that runs several lines in one group spills the state of each line.
             work=WorkSize((lines,), (1,) if build.device.is_cpu else None),
-            more_inputs=[value, value, (build.shape, np.dtype(np.uint8)), *([value] if carries else [])],
+            more_inputs=[value, value, (build.shape, np.dtype(np.uint8)), *([value] if with_other else [])],
             outputs=build.outputs(dict.fromkeys(self.Result._fields, made)),
-            defines=type_defines("INPUT", build.dtype) | flags(CARRY=carries),
-            arguments=[np.array(counts, np.uint32), np.array(self._table(), build.real)],
+            defines=type_defines("INPUT", build.dtype) | flags(WITH_OTHER=with_other),
+            # Without the other coordinate the kernel gets a null pointer for its output, the last one.
+            arguments=[
+                *([] if with_other else [None]),
+                np.array(counts, np.uint32),
+                np.array(self._table(), build.real),
+            ],
         )
 
 
@@ -400,7 +405,7 @@ class _AlongSamples(_Pass[_Lines]):
             out_cell_pitch=1,
             drop_folded=0,
         )
-        return self._resample(build, profiles, (profiles, cells), counts, carries=True)
+        return self._resample(build, profiles, (profiles, cells), counts, with_other=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -425,4 +430,4 @@ class _AlongProfiles(_Pass[HeightMap]):
             out_cell_pitch=cell_pitch,
             drop_folded=int(self.regrid.folded == "drop"),
         )
-        return self._resample(build, lines, self.regrid.grid.shape, counts, carries=False)
+        return self._resample(build, lines, self.regrid.grid.shape, counts, with_other=False)

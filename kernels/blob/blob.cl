@@ -4,11 +4,11 @@
 // Inputs:  image (rows, columns), type CODE; places (count, PLACE): x, y, size, and the angle of shapes that are not round.
 // Outputs: (count,) each: x, y, size, residual, distance, blur [px], angle [rad], symmetry, contrast, centroid (gravity_x,
 //          gravity_y), inliers, status; shift (count, 2); covariance (count, FREEDOMS, FREEDOMS).
-// Tables:  table: parameters of ruler.h. laid, six rows of ROOM numbers for a shape of size 1: centre of the ruler (x, y);
+// Tables:  table: parameters of ruler.h. laid, six rows of PADDED_SPOKES numbers for a shape of size 1: centre of the ruler (x, y);
 //          its direction (x, y), outwards from the fiducial; distance of the edge from the centre; 1, or 0 for padding.
 // Options: ROUND: the contour is one circle or two, FREEDOMS is 3: x, y, size; else straight edges, FREEDOMS is 4: x, y,
-//          size, angle. EITHER: fiducials may be brighter or darker than the background. MATCH: refine by grey levels.
-//          SPOKES: number of rulers, even; opposite rulers are SPOKES / 2 apart. ROOM: SPOKES rounded up to whole vectors.
+//          size, angle. EITHER_POLARITY: fiducials may be brighter or darker than the background. MATCH_IMAGE: refine by grey levels.
+//          SPOKES: number of rulers, even; opposite rulers are SPOKES / 2 apart. PADDED_SPOKES: SPOKES rounded up to whole vectors.
 // Variants: vector: a work-item processes `each` fiducials, 16 rulers in a vector; work-item: a work-group of
 //          RULER_GROUP items per fiducial, one ruler after the other.
 #include "blob/blob_match.h"
@@ -17,7 +17,7 @@
 #define LEAST_REACH (real)0.6f    // residual up to which an edge is an inlier before the scale is known [px]
 #define LEAST_SCALE (real)0.01f   // smallest scale of the residuals [px]
 // Rulers are placed again unless the shape moved by less than this [px].
-#ifdef MATCH
+#ifdef MATCH_IMAGE
 #define STILL (real)2
 #else
 #define STILL (real)0.1f
@@ -39,8 +39,8 @@
 
 // Edges of a fiducial: positions relative to the nominal one, variances of blur and of position.
 typedef struct {
-    real x[ROOM], y[ROOM], amplitude[ROOM], blur[ROOM], noise[ROOM], there[ROOM];
-    int saturated[ROOM];
+    real x[PADDED_SPOKES], y[PADDED_SPOKES], amplitude[PADDED_SPOKES], blur[PADDED_SPOKES], noise[PADDED_SPOKES], there[PADDED_SPOKES];
+    int saturated[PADDED_SPOKES];
     int outside, broken;
 } blob_edges;
 
@@ -111,20 +111,20 @@ static inline void take_edges(ruler_edge edge, int i, blob_layout layout, blob_s
     }
 }
 
-// Reject edges further than `search` from the nominal contour and, with EITHER, edges of the minority polarity. Return
+// Reject edges further than `search` from the nominal contour and, with EITHER_POLARITY, edges of the minority polarity. Return
 // the number of edges kept, and their mean variances.
 static inline int keep_edges(private blob_edges *edges, blob_layout layout, blob_shape nominal, real cosine, real sine,
                       real search, private real *noise, private real *blur) {
-#ifdef EITHER
+#ifdef EITHER_POLARITY
     reals sum = 0;
-    for (int i = 0; i < ROOM; i += LANES) sum += READ(edges->amplitude, i);
+    for (int i = 0; i < PADDED_SPOKES; i += LANES) sum += READ(edges->amplitude, i);
     const reals sign = sum_of(sum) < 0 ? (reals)-1 : (reals)1;
 #endif
     reals kept = 0, noises = 0, blurs = 0;
-    for (int i = 0; i < ROOM; i += LANES) {
+    for (int i = 0; i < PADDED_SPOKES; i += LANES) {
         const blob_equation equation = equation_of(edges, i, layout, nominal, cosine, sine, 0);
         masks near = mask_of(READ(edges->there, i) > (reals)0) & mask_of(FABS(equation.residual) <= (reals)search);
-#ifdef EITHER
+#ifdef EITHER_POLARITY
         near &= mask_of(sign * READ(edges->amplitude, i) > (reals)0);
 #endif
         kept += kept_where(near, (reals)1);
@@ -141,9 +141,9 @@ static inline int keep_edges(private blob_edges *edges, blob_layout layout, blob
 // Robust scale of the residuals within reach: their median absolute deviation.
 static inline real scale_of(private const blob_edges *edges, blob_layout layout, blob_shape shape, real bent, real reach) {
     const real cosine = cos(shape.angle), sine = sin(shape.angle);
-    real distances[ROOM];
+    real distances[PADDED_SPOKES];
     masks inside = 0;
-    for (int i = 0; i < ROOM; i += LANES) {
+    for (int i = 0; i < PADDED_SPOKES; i += LANES) {
         const reals distance = FABS(equation_of(edges, i, layout, shape, cosine, sine, bent).residual);
         const masks near = mask_of(READ(edges->there, i) > (reals)0) & mask_of(distance <= (reals)reach);
         inside -= near;
@@ -154,7 +154,7 @@ static inline real scale_of(private const blob_edges *edges, blob_layout layout,
     for (int bit = BITS_BELOW_SIGN - 1; bit >= BITS_TO_ONE_PERCENT; bit--) {
         const bits next = found | ((bits)1 << bit);
         masks below = 0;
-        for (int i = 0; i < ROOM; i += LANES) below -= mask_of(as_masks(READ(distances, i)) < (masks)next);
+        for (int i = 0; i < PADDED_SPOKES; i += LANES) below -= mask_of(as_masks(READ(distances, i)) < (masks)next);
         found = (int)sum_of(LANED(convert_real)(below)) > within / 2 ? found : next;
     }
     return MAD_TO_SIGMA * (1 + FEW_FITTED / fmax((real)(within - FREEDOMS), (real)1)) * as_real(found);
@@ -172,7 +172,7 @@ static inline int fit_step(private const blob_edges *edges, blob_layout layout, 
     reals matrix[TRIANGLE], right[FREEDOMS], step[FREEDOMS], weights = 0, blurs = 0;
     for (int j = 0; j < TRIANGLE; j++) matrix[j] = 0;
     for (int j = 0; j < FREEDOMS; j++) right[j] = 0;
-    for (int i = 0; i < ROOM; i += LANES) {
+    for (int i = 0; i < PADDED_SPOKES; i += LANES) {
         const blob_equation equation = equation_of(edges, i, layout, *shape, cosine, sine, bent);
         const reals weight = READ(edges->there, i) * loss_weight(equation.residual * (reals)per_scale);
         for (int j = 0; j < FREEDOMS; j++) {
@@ -201,7 +201,7 @@ static inline int fit_step(private const blob_edges *edges, blob_layout layout, 
 #define PATTERNS 4
 constant const int pattern[PATTERNS][2] = {{4, 8}, {5, 10}, {3, 6}, {2, 6}};
 #define START_STEPS 3
-#define WRAPPED (ROOM + SPOKES + LANES)
+#define WRAPPED (PADDED_SPOKES + SPOKES + LANES)
 
 // Edges in the order of the contour, repeated after the last one; straight edges with normals at the nominal angle.
 typedef struct {
@@ -214,7 +214,7 @@ typedef struct {
 static inline void wrap(private const blob_edges *edges, blob_layout layout, real cosine, real sine,
                  private blob_circuit *circuit) {
     for (int from = 0; from <= SPOKES; from += SPOKES)
-        for (int i = 0; i < ROOM; i += LANES) {
+        for (int i = 0; i < PADDED_SPOKES; i += LANES) {
             *(private reals_at *)(circuit->x + from + i) = READ(edges->x, i);
             *(private reals_at *)(circuit->y + from + i) = READ(edges->y, i);
             *(private reals_at *)(circuit->there + from + i) = READ(edges->there, i);
@@ -282,7 +282,7 @@ static inline blob_shape start_of(private const blob_edges *edges, blob_layout l
     blob_shape best = near;
     real least = SPOKES * reach * reach;
     for (int p = 0; p < PATTERNS; p++)
-        for (int i = 0; i < ROOM; i += LANES) {
+        for (int i = 0; i < PADDED_SPOKES; i += LANES) {
             const int j = i + pattern[p][0] * SPOKES / 16, k = i + pattern[p][1] * SPOKES / 16;
             const laned_shape tried = shape_through(&circuit, i, j, k, from);
             const reals found = READ(circuit.there, i) * READ(circuit.there, j) * READ(circuit.there, k);
@@ -333,7 +333,7 @@ static inline int fit_shape(private const blob_edges *edges, blob_layout layout,
 typedef struct {
     real covariance[FREEDOMS][FREEDOMS];
     real residual, symmetry, contrast;
-    real weights[ROOM + SPOKES / 2 + LANES];
+    real weights[PADDED_SPOKES + SPOKES / 2 + LANES];
     int inliers, saturated, regular;
 } blob_quality;
 
@@ -343,11 +343,11 @@ static inline blob_quality quality_of(private blob_edges *edges, blob_layout lay
     blob_quality quality;
     reals matrix[TRIANGLE], weights = 0, squares = 0, noises = 0, amplitudes = 0, inliers = 0;
     reals slopes = 0;
-    real height[ROOM + SPOKES / 2 + LANES];
+    real height[PADDED_SPOKES + SPOKES / 2 + LANES];
     private real *of = quality.weights;
     for (int j = 0; j < TRIANGLE; j++) matrix[j] = 0;
     quality.saturated = 0;
-    for (int i = 0; i < ROOM; i += LANES) {
+    for (int i = 0; i < PADDED_SPOKES; i += LANES) {
         const blob_equation equation = equation_of(edges, i, layout, shape, cosine, sine, bent);
         const reals z = equation.residual * (reals)per_scale, weight = READ(edges->there, i) * loss_weight(z);
         const masks is_in = mask_of(weight > (reals)0);
@@ -386,7 +386,7 @@ static inline blob_quality quality_of(private blob_edges *edges, blob_layout lay
         height[SPOKES + i] = height[i];
     }
     reals agreed = 0;
-    for (int i = 0; i < ROOM; i += LANES) {
+    for (int i = 0; i < PADDED_SPOKES; i += LANES) {
         const reals here = READ(height, i), there = READ(height, i + SPOKES / 2);
         const reals low = here < there ? here : there, high = here < there ? there : here;
         const reals product = READ(of, i) * READ(of, i + SPOKES / 2) * FROM(layout.counts, i);
@@ -480,7 +480,7 @@ static inline void measure(global const CODE *image, int rows, int columns, real
 #else
     if (get_local_id(0) == 0) edges->outside = edges->broken = 0;
 #endif
-    for (int i = 0; i < ROOM; i += LANES) {
+    for (int i = 0; i < PADDED_SPOKES; i += LANES) {
         const reals bx = FROM(layout.bx, i), by = FROM(layout.by, i), nx = FROM(layout.nx, i), ny = FROM(layout.ny, i);
         const reals from_x = shape.x + shape.size * (cosine * bx - sine * by);
         const reals from_y = shape.y + shape.size * (sine * bx + cosine * by);
@@ -506,7 +506,7 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
                        constant real *laid, const int rows, const int columns, const uint count, const uint each,
                        const real search, const int least, const real across, const real overlap, const real extent,
                        const real pixel_noise, const real spacing, const int passes) {
-    const blob_layout layout = {laid, laid + ROOM, laid + 2 * ROOM, laid + 3 * ROOM, laid + 4 * ROOM, laid + 5 * ROOM};
+    const blob_layout layout = {laid, laid + PADDED_SPOKES, laid + 2 * PADDED_SPOKES, laid + 3 * PADDED_SPOKES, laid + 4 * PADDED_SPOKES, laid + 5 * PADDED_SPOKES};
 #ifdef VECTOR_VARIANT
     const uint first = get_global_id(0) * each, end = min(first + each, count);
     const int mine = 1;
@@ -589,7 +589,7 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
             if (quality.inliers < least || !quality.regular) what = STATUS_AMBIGUOUS;
             else if (shape.x * shape.x + shape.y * shape.y > search * search) what = STATUS_OUT_OF_RANGE;
         }
-#ifdef MATCH
+#ifdef MATCH_IMAGE
         if (!what) {
             blob_grey grey = {0, quality.contrast, sqrt(fmax(variance - BILINEAR, SHARPEST * SHARPEST))};
             grey.background = background_of(image, rows, columns, place[0], place[1], shape, &edges, quality.weights,

@@ -1,4 +1,4 @@
-// Positions [m]: double wherever the device has it (build option WIDE_PLACES), independent of the real type.
+// Positions [m]: double wherever the device has it (build option DOUBLE_POSITIONS), independent of the real type.
 //
 // At 1e-6 of a segment's length from the segment a difference of two single-precision positions has no digit left.
 // Differences are taken in `place`, the rest is computed in `real`.
@@ -6,7 +6,7 @@
 #define PLACES_H
 #include "common/lanes.h"
 
-#ifdef WIDE_PLACES
+#ifdef DOUBLE_POSITIONS
 #pragma OPENCL EXTENSION cl_khr_fp64 : enable
 typedef double place;
 typedef double16 place16;

@@ -1,14 +1,14 @@
 // Costs of the poses of a grid: for each heading and position, the sum of a map's levels at the cells of all points.
 //
 // For one heading a point is a fixed offset (shift) into the map: score(row, column) = sum over points of
-// level[row stride + column + shift] / (LEVELS used). Adjacent positions read adjacent cells. The sums are of integers:
+// level[row stride + column + shift] / (COST_LEVELS used). Adjacent positions read adjacent cells. The sums are of integers:
 // exact in any order.
 //
-// Inputs:  level (map rows, stride) uint16, 0 to LEVELS; shifts (used,) of one heading.
+// Inputs:  level (map rows, stride) uint16, 0 to COST_LEVELS; shifts (used,) of one heading.
 // Outputs: scores (headings, rows, columns) float32, 0 to 1, with WITH_SCORES; least (headings, rows, blocks) float32,
 //          the least score of each block of BLOCK adjacent positions; column (headings, rows, blocks) int32, its
 //          column, the first of equal scores. NaN scores where no point is used.
-// Options: LEVELS (of the includer): the cost 1 in the map; WITH_SCORES.
+// Options: COST_LEVELS: the cost 1 in the map; WITH_SCORES.
 // Variants: vector (sum_rows): 64 positions at once in four vectors of 16, for some rows; work-item (sum_block): a
 //          group of BLOCK items per block, an item per position.
 #ifndef SHIFT_SUMS_H
@@ -23,7 +23,7 @@
 static inline int block_from(int block, int columns) { return min(block * BLOCK, max(columns - BLOCK, 0)); }
 
 // Return the factor from a sum to a score; NaN if no point is used.
-static inline float score_scale(int used) { return used ? 1.0f / (float)(LEVELS * used) : NAN; }
+static inline float score_scale(int used) { return used ? 1.0f / (float)(COST_LEVELS * used) : NAN; }
 
 // Store the least score of a block and its column from a key, sum * BLOCK + position in the block.
 //

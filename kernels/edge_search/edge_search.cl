@@ -6,7 +6,7 @@
 //   One work-item per cell.
 // edge_levels: cost 1 - (max g_k^2 / (g^2 + t^2))^2 of an edge, for 8 directions k of its normal, pi / 8 apart.
 //   Inputs: means (rows, columns); threshold_squared: t^2, t a quarter of the threshold; directions (CHANNELS, 2)
-//   cosine and sine of the normals. Outputs: level (CHANNELS, rows + 2 border, columns + 2 border) uint16 in LEVELS
+//   cosine and sine of the normals. Outputs: level (CHANNELS, rows + 2 border, columns + 2 border) uint16 in COST_LEVELS
 //   steps. One work-item per cell.
 // edge_search: mean cost of the edges at every shift and heading of the grid (shift_sums.h).
 //   Inputs: level; shifts (headings, count) int32: index into level of the cell of each edge at the first position.
@@ -15,10 +15,11 @@
 //   heading and block of positions.
 //
 // Options: one kernel per build: CODE (pixel type, cell_means), FROM_MEANS (edge_levels), or CAPACITY (size of the
-//          array of shifts, edge_search) with WITH_SCORES.
-#define LEVELS 1023
-#include "common/shift_sums.h"
+//          array of shifts, edge_search) with WITH_SCORES. COST_LEVELS: the cost 1 (edge_levels, edge_search).
 #include "common/real.h"
+#ifdef CAPACITY
+#include "common/shift_sums.h"
+#endif
 
 #define CHANNELS 8
 
@@ -64,7 +65,7 @@ kernel void edge_levels(global const float *restrict means, global ushort *restr
             }
         }
     for (int k = 0; k < CHANNELS; k++)
-        level[k * plane + at] = (ushort)((1.0f - best[k] * best[k]) * (float)LEVELS + 0.5f);
+        level[k * plane + at] = (ushort)((1.0f - best[k] * best[k]) * (float)COST_LEVELS + 0.5f);
 }
 #endif
 

@@ -14,21 +14,17 @@
 #include "line_fit/line_fit.h"
 #include "common/status.h"
 
+// Indices of elements of global memory, one per lane. gather: the value at each lane's index.
 #ifdef VECTOR_VARIANT
 typedef long16 indices;
+static inline reals gather(global const INPUT *from, indices at) {
+    return (reals)(from[at.s0], from[at.s1], from[at.s2], from[at.s3], from[at.s4], from[at.s5], from[at.s6],
+                   from[at.s7], from[at.s8], from[at.s9], from[at.sa], from[at.sb], from[at.sc], from[at.sd],
+                   from[at.se], from[at.sf]);
+}
 #else
 typedef long indices;
-#endif
-// Gather the value at each lane's index.
-#ifdef VECTOR_VARIANT
-#define AT(from, place)                                                                                                \
-    (reals)((from)[place.s0], (from)[place.s1], (from)[place.s2], (from)[place.s3], (from)[place.s4], (from)[place.s5],  \
-            (from)[place.s6], (from)[place.s7], (from)[place.s8], (from)[place.s9], (from)[place.sa], (from)[place.sb],  \
-            (from)[place.sc], (from)[place.sd], (from)[place.se], (from)[place.sf])
-#define LANE_NUMBERS (indices)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15)
-#else
-#define AT(from, place) ((real)(from)[place])
-#define LANE_NUMBERS 0L
+static inline reals gather(global const INPUT *from, indices at) { return (real)from[at]; }
 #endif
 
 kernel void line_fit_sets(global const INPUT *restrict points,
@@ -43,17 +39,17 @@ kernel void line_fit_sets(global const INPUT *restrict points,
     reals x[CAPACITY], y[CAPACITY], certainty[CAPACITY], distances[CAPACITY];
     const long first = (long)get_global_id(0) * LANES;
     if (first >= lines) return;
-    const indices line = min((indices)first + LANE_NUMBERS, (indices)(lines - 1));
+    const indices line = min((indices)first + LANED(convert_long)(LANE_NUMBERS), (indices)(lines - 1));
     const indices set = line * (indices)count;
     // Coordinates relative to the first valid point: coordinates of a large image leave few digits for distances.
     reals origin_x = 0, origin_y = 0, reach = 0;
     masks found = 0;
     for (int i = 0; i < count; i++) {
         const indices at = set + (indices)i;
-        const reals px = AT(points, 2 * at), py = AT(points, (2 * at + 1));
+        const reals px = gather(points, 2 * at), py = gather(points, 2 * at + 1);
         masks good = ~(mask_of(LANED(not_finite)(px)) | mask_of(LANED(not_finite)(py)));
 #ifdef WITH_SIGMA
-        const reals of = AT(sigma, at);
+        const reals of = gather(sigma, at);
         good &= mask_of(of > (reals)0) & ~mask_of(LANED(not_finite)(of));
         certainty[i] = kept_where(good, (reals)1 / of);
 #else

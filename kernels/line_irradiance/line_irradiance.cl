@@ -7,7 +7,7 @@
 //          same axes; `firsts` (frames + 1,) first segment of each frame, the first `alone` frames having one segment;
 //          `starts` (segments, 4) shift from the frame to the segment, and its length; `lines` (segments, 3) length,
 //          its square, exitance / (2 pi). `middle`: subtracted from positions first.
-// Options: INPUT, REAL_IS_DOUBLE, WIDE_PLACES (positions in double, see common/places.h).
+// Options: INPUT, REAL_IS_DOUBLE, DOUBLE_POSITIONS (positions in double, see common/places.h).
 // Variants: vector: 16 receivers in a vector, `each` receivers per work-item; work-item: one receiver per item.
 //
 // A receiver is transformed into a frame once and shifted to each of its segments: most of the arithmetic is shared.

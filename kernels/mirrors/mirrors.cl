@@ -5,7 +5,8 @@
 //                Outputs: per point up to `kept` reflections: places, moves (derivative by the step) (count, kept, 3),
 //                         densities (solid angle of the lens' rays per area at the point [1/m2]), triangles; counts, status.
 // mirror_facets: Inputs:  lines (count, 6), both ends [m]; lens_place (3,). Outputs: near (count, blocks) 0 or 1.
-// Tables:  table (n, ROW), triangles; block_table (blocks, BLOCK), groups of triangles; starts (blocks + 1,); numbers (n,).
+// Tables:  table (n,), MirrorTriangle; block_table (blocks,), MirrorBlock: groups of triangles; starts (blocks + 1,): first
+//          triangle of each block; numbers (n,): index of each triangle in the scene.
 // Options: INPUT, REAL_IS_DOUBLE. Variants: vector: 16 points or lines per work-item; work-item: one.
 //
 // Law of reflection. A triangle with normals n_i at its corners p_i has the normal N = sum b_i n_i and the surface
@@ -18,12 +19,6 @@
 #include "common/lanes.h"
 #include "common/status.h"
 
-// Numbers per triangle: first corner (3), two edges (6), three normals (9), products of both edges with each normal (6),
-// f of the first corner at the other two (2), whether only the side of the normals reflects (1).
-#define ROW 27
-// Numbers per block of triangles: centre and radius of its ball (4), axis of the cone of its normals (3), cosine and sine of
-// twice the cone's half angle (2), whether only that side reflects (1), sine of the half angle (1).
-#define BLOCK 11
 #define STEPS 16          // Newton steps
 #define ASTRAY ((real)5) // barycentric distance from which Newton's method does not return
 #define TANGENTS 4        // tangent refinements of the cone test
@@ -49,6 +44,25 @@ typedef struct {
     real x, y, z;
 } Fixed;
 
+// Triangle of a mirror: MirrorTriangle in mirror_points.py. f_i as above; x and y: barycentric weights of corners 1 and 2.
+typedef struct {
+    Fixed corner, edges[2];         // first corner; edges from it to corners 1 and 2
+    Fixed normals[3];               // at the three corners
+    real f_by_x[3], f_by_y[3];      // derivatives of f_0, f_1, f_2: products of the edges with the normals
+    real f1_at_first, f2_at_first;  // f_1 and f_2 at the first corner; f_0 is 0 there
+    real one_sided;                 // 1: only the side of the normals reflects
+} MirrorTriangle;
+
+// Block of triangles: MirrorBlock in mirror_points.py.
+typedef struct {
+    Fixed middle;                       // of the bounding ball
+    real radius;
+    Fixed axis;                         // of the cone of the normals
+    real cosine_of_twice, sine_of_twice;  // of twice the cone's half angle
+    real one_sided;                     // 1: only the side of the normals reflects
+    real sine;                          // of the half angle
+} MirrorBlock;
+
 typedef struct {
     Vector place, along_x, along_y;   // point of the surface and its derivatives by x and y (barycentric)
     Vector to_lens, to_point, w1, w2;
@@ -66,7 +80,6 @@ INLINE Vector mixed(reals a, Fixed u, reals b, Fixed v, reals c, Fixed w) {
 INLINE Vector cross_of(Vector a, Vector b) {
     return (Vector){a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
-INLINE Fixed fixed_at(global const real *row) { return (Fixed){row[0], row[1], row[2]}; }
 INLINE Vector moved(Vector a, Fixed by, real sign) { return (Vector){a.x + sign * by.x, a.y + sign * by.y, a.z + sign * by.z}; }
 INLINE Vector minus(Vector a, Vector b) { return (Vector){a.x - b.x, a.y - b.y, a.z - b.z}; }
 INLINE masks positive(reals value) { return mask_of(value > (reals)(real)0); }
@@ -86,18 +99,18 @@ INLINE reals slope_of(const Reflection *it, Vector n, reals square, Vector s, Ve
            (real)2 * (dot_fixed(m, edge) * c * q + ne * (cx * q + c * qx));
 }
 
-INLINE Reflection reflection_at(reals x, reals y, Vector point, Vector lens, global const real *row) {
-    const Fixed corner = fixed_at(row), e1 = fixed_at(row + 3), e2 = fixed_at(row + 6);
-    const Fixed n0 = fixed_at(row + 9), n1 = fixed_at(row + 12), n2 = fixed_at(row + 15);
-    global const real *by_1 = row + 18, *by_2 = row + 21;
+INLINE Reflection reflection_at(reals x, reals y, Vector point, Vector lens, global const MirrorTriangle *row) {
+    const Fixed corner = row->corner, e1 = row->edges[0], e2 = row->edges[1];
+    const Fixed n0 = row->normals[0], n1 = row->normals[1], n2 = row->normals[2];
+    global const real *f_x = row->f_by_x, *f_y = row->f_by_y;
     const reals b0 = (real)1 - x - y;
-    const reals f0 = by_1[0] * x + by_2[0] * y, f1 = row[24] + by_1[1] * x + by_2[1] * y;
-    const reals f2 = row[25] + by_1[2] * x + by_2[2] * y;
+    const reals f0 = f_x[0] * x + f_y[0] * y, f1 = row->f1_at_first + f_x[1] * x + f_y[1] * y;
+    const reals f2 = row->f2_at_first + f_x[2] * x + f_y[2] * y;
     const reals half_of_it = (real)-0.5;
     Reflection it;
     const Vector bend = mixed(b0 * f0, n0, x * f1, n1, y * f2, n2);
-    const Vector bend_x = mixed(b0 * by_1[0] - f0, n0, x * by_1[1] + f1, n1, y * by_1[2], n2);
-    const Vector bend_y = mixed(b0 * by_2[0] - f0, n0, x * by_2[1], n1, y * by_2[2] + f2, n2);
+    const Vector bend_x = mixed(b0 * f_x[0] - f0, n0, x * f_x[1] + f1, n1, y * f_x[2], n2);
+    const Vector bend_y = mixed(b0 * f_y[0] - f0, n0, x * f_y[1], n1, y * f_y[2] + f2, n2);
     it.place = sum_of(mixed((reals)(real)1, corner, x, e1, y, e2), scaled(bend, half_of_it));
     it.along_x = moved(scaled(bend_x, half_of_it), e1, 1);
     it.along_y = moved(scaled(bend_y, half_of_it), e2, 1);
@@ -122,26 +135,27 @@ INLINE Reflection reflection_at(reals x, reals y, Vector point, Vector lens, glo
 
 // R at a corner. The side of the surface on which the lens lies is added to `lens_sides` (1: above, 2: below), the
 // sides of the points to `above` and `below`.
-INLINE void at_corner(Vector point, Fixed lens, global const real *row, int corner, reals *r1, reals *r2,
+INLINE void at_corner(Vector point, Fixed lens, global const MirrorTriangle *row, int corner, reals *r1, reals *r2,
                       int *lens_sides, masks *above, masks *below) {
-    global const real *edge = corner == 0 ? row : row + 3 * corner;
-    const Fixed n = fixed_at(row + 9 + 3 * corner);
-    Fixed place = fixed_at(row);
-    if (corner) place = (Fixed){place.x + edge[0], place.y + edge[1], place.z + edge[2]};
-    const Fixed e1 = fixed_at(row + 3), e2 = fixed_at(row + 6);
+    const Fixed n = row->normals[corner], e1 = row->edges[0], e2 = row->edges[1];
+    Fixed place = row->corner;
+    if (corner) {
+        const Fixed edge = row->edges[corner - 1];
+        place = (Fixed){place.x + edge.x, place.y + edge.y, place.z + edge.z};
+    }
     const real cx = lens.x - place.x, cy = lens.y - place.y, cz = lens.z - place.z;
     const real c = cx * n.x + cy * n.y + cz * n.z, twice = (real)2 * c;
     const Vector q = moved(point, place, -1);
     const reals up = dot_fixed(q, n);
-    *r1 = (cx * e1.x + cy * e1.y + cz * e1.z - twice * row[18 + corner]) * up + c * dot_fixed(q, e1);
-    *r2 = (cx * e2.x + cy * e2.y + cz * e2.z - twice * row[21 + corner]) * up + c * dot_fixed(q, e2);
+    *r1 = (cx * e1.x + cy * e1.y + cz * e1.z - twice * row->f_by_x[corner]) * up + c * dot_fixed(q, e1);
+    *r2 = (cx * e2.x + cy * e2.y + cz * e2.z - twice * row->f_by_y[corner]) * up + c * dot_fixed(q, e2);
     *lens_sides |= c > 0 ? 1 : 2;
     *above |= positive(up);
     *below |= positive(-up);
 }
 
 // Start value: solution of R interpolated linearly between the corners. Returns the lanes in which it lies near the triangle.
-INLINE masks guessed(Vector point, Fixed lens, global const real *row, reals *x, reals *y) {
+INLINE masks guessed(Vector point, Fixed lens, global const MirrorTriangle *row, reals *x, reals *y) {
     reals u0, v0, u1, v1, u2, v2;
     int lens_sides = 0;
     masks above = 0, below = 0;
@@ -149,7 +163,7 @@ INLINE masks guessed(Vector point, Fixed lens, global const real *row, reals *x,
     at_corner(point, lens, row, 1, &u1, &v1, &lens_sides, &above, &below);
     at_corner(point, lens, row, 2, &u2, &v2, &lens_sides, &above, &below);
     // At a silhouette lens and point may be on one side of the surface only between the corners.
-    const masks facing = (lens_sides & 1 ? above : (masks)0) | (lens_sides & 2 && row[26] == 0 ? below : (masks)0);
+    const masks facing = (lens_sides & 1 ? above : (masks)0) | (lens_sides & 2 && row->one_sided == 0 ? below : (masks)0);
     const reals a = u1 * v2 - u2 * v1, b = u2 * v0 - u0 * v2, c = u0 * v1 - u1 * v0, whole = a + b + c;
     const reals per = (real)1 / whole, least = -MARGIN;
     *x = b * per;
@@ -160,18 +174,19 @@ INLINE masks guessed(Vector point, Fixed lens, global const real *row, reals *x,
 // Whether a block of triangles may show a point (conservative). Tilting the normal by an angle turns the reflected ray by
 // twice that angle, so the point lies in a cone around the ray reflected at the block's centre, with a half angle of
 // twice the half angle of the normals plus the angles that the block subtends at the lens and at the point.
-INLINE masks may_show(Vector point, Fixed lens, global const real *block) {
-    const Fixed middle = fixed_at(block), axis = fixed_at(block + 4);
-    const real radius = block[3], cx = lens.x - middle.x, cy = lens.y - middle.y, cz = lens.z - middle.z;
+INLINE masks may_show(Vector point, Fixed lens, global const MirrorBlock *block) {
+    const Fixed middle = block->middle, axis = block->axis;
+    const real radius = block->radius, cx = lens.x - middle.x, cy = lens.y - middle.y, cz = lens.z - middle.z;
     const real square = cx * cx + cy * cy + cz * cz, per = (real)1 / sqrt(square);
     const real sine = radius * per, cosine = sqrt(max((real)1 - sine * sine, (real)0));
-    const real cos_all = block[7] * cosine - block[8] * sine, sin_all = block[8] * cosine + block[7] * sine;
+    const real cos_all = block->cosine_of_twice * cosine - block->sine_of_twice * sine;
+    const real sin_all = block->sine_of_twice * cosine + block->cosine_of_twice * sine;
     const real facing = per * (cx * axis.x + cy * axis.y + cz * axis.z);
-    if (block[9] > 0 && facing < -(block[10] + sine + SLACK)) return mask_of((reals)(real)0 > (reals)(real)0);
+    if (block->one_sided > 0 && facing < -(block->sine + sine + SLACK)) return mask_of((reals)(real)0 > (reals)(real)0);
     const Vector q = moved(point, middle, -1);
     const reals far = dot_of(q, q), room = far - radius * radius, zero = (real)0;
     // Cones with half angles beyond 90 degrees do not exclude any point.
-    if (!(sine < (real)1 && block[7] > (real)0 && cos_all > (real)0)) return mask_of(far >= zero);
+    if (!(sine < (real)1 && block->cosine_of_twice > (real)0 && cos_all > (real)0)) return mask_of(far >= zero);
     const real up = (real)2 * facing;
     const Fixed on = {up * axis.x - cx * per, up * axis.y - cy * per, up * axis.z - cz * per};
     const reals least = cos_all * sqrt(room > zero ? room : zero) - (reals)(sin_all * radius);
@@ -193,7 +208,7 @@ INLINE reals within_triangle(reals value, masks near) {
 }
 
 // Newton's method from the start value. Returns the lanes that converged in the triangle with lens and point on one side.
-INLINE masks solved(masks near, Vector point, Vector lens, global const real *row, reals *x, reals *y,
+INLINE masks solved(masks near, Vector point, Vector lens, global const MirrorTriangle *row, reals *x, reals *y,
                     Reflection *it) {
     reals step = (real)1;
     for (int n = 0; n < STEPS; n++) {
@@ -213,7 +228,7 @@ INLINE masks solved(masks near, Vector point, Vector lens, global const real *ro
     // Widen the triangle by rounding: a point on the edge of two triangles must lie in at least one.
     const reals least = -EDGE, most = (real)1 + EDGE;
     const masks inside = mask_of(*x >= least) & mask_of(*y >= least) & mask_of(*x + *y <= most);
-    const masks outside = mask_of(it->up_lens > zero) | mask_of((reals)row[26] == zero);
+    const masks outside = mask_of(it->up_lens > zero) | mask_of((reals)row->one_sided == zero);
     // R is also zero where lens and point are in the plane of the surface: reject grazing solutions.
     const reals ways = sqrt(dot_of(it->to_lens, it->to_lens) * dot_of(it->to_point, it->to_point));
     const masks sides = positive(it->up_lens * it->up_point - GRAZING * GRAZING * ways);
@@ -249,8 +264,8 @@ INLINE void unpacked(reals value, real *to) { *(reals_at *)to = value; }
 kernel void mirror_points(global const INPUT *restrict points, global const INPUT *restrict lens_place,
                           global INPUT *restrict places, global real *restrict moves, global real *restrict densities,
                           global int *restrict triangles, global uchar *restrict counts, global uchar *restrict status,
-                          global const real *restrict table, global const int *restrict numbers,
-                          global const real *restrict block_table, global const int *restrict starts,
+                          global const MirrorTriangle *restrict table, global const int *restrict numbers,
+                          global const MirrorBlock *restrict block_table, global const int *restrict starts,
                           constant INPUT *middle, const uint blocks, const uint kept, const ulong count) {
     const ulong i = get_global_id(0) * LANES;
     if (i >= count) return;
@@ -267,10 +282,10 @@ kernel void mirror_points(global const INPUT *restrict points, global const INPU
     uint found[LANES];
     for (int n = 0; n < LANES; n++) found[n] = 0;
     for (uint b = 0; b < blocks; b++) {
-        const masks may = may_show(point, lens, block_table + (size_t)b * BLOCK) & ~bad;
+        const masks may = may_show(point, lens, block_table + b) & ~bad;
         if (!any_lane(may)) continue;
         for (uint k = starts[b]; k < (uint)starts[b + 1]; k++) {
-            global const real *row = table + (size_t)k * ROW;
+            global const MirrorTriangle *row = table + k;
             reals x, y;
             const masks near = guessed(point, lens, row, &x, &y) & may;
             if (!any_lane(near)) continue;
@@ -325,14 +340,15 @@ INLINE reals inside_cone(Vector start, Vector way, reals t, Fixed axis, real cos
 
 // Whether a lens may see a part of a line in a block of mirrors (conservative). The cone of `may_show` around a ball lies in
 // a cone with its apex before the ball; tangents bound the concave depth of the line in it from above.
-INLINE masks may_show_part(Vector start, Vector way, Fixed lens, global const real *block) {
-    const Fixed middle = fixed_at(block), axis = fixed_at(block + 4);
-    const real radius = block[3], cx = lens.x - middle.x, cy = lens.y - middle.y, cz = lens.z - middle.z;
+INLINE masks may_show_part(Vector start, Vector way, Fixed lens, global const MirrorBlock *block) {
+    const Fixed middle = block->middle, axis = block->axis;
+    const real radius = block->radius, cx = lens.x - middle.x, cy = lens.y - middle.y, cz = lens.z - middle.z;
     const real square = cx * cx + cy * cy + cz * cz, per = (real)1 / sqrt(square);
     const real sine = radius * per, cosine = sqrt(max((real)1 - sine * sine, (real)0));
-    const real cos_all = block[7] * cosine - block[8] * sine, sin_all = block[8] * cosine + block[7] * sine;
+    const real cos_all = block->cosine_of_twice * cosine - block->sine_of_twice * sine;
+    const real sin_all = block->sine_of_twice * cosine + block->cosine_of_twice * sine;
     const reals zero = (real)0, one = (real)1;
-    if (!(sine < (real)1 && block[7] > (real)0 && cos_all > (real)0)) return mask_of(way.x - way.x <= zero);
+    if (!(sine < (real)1 && block->cosine_of_twice > (real)0 && cos_all > (real)0)) return mask_of(way.x - way.x <= zero);
     const real up = (real)2 * per * (cx * axis.x + cy * axis.y + cz * axis.z), back = radius / sin_all;
     const Fixed on = {up * axis.x - cx * per, up * axis.y - cy * per, up * axis.z - cz * per};
     const Vector from = {start.x - (middle.x - back * on.x), start.y - (middle.y - back * on.y),
@@ -358,8 +374,8 @@ INLINE masks may_show_part(Vector start, Vector way, Fixed lens, global const re
 
 // Blocks of mirrors in which a lens may see each line.
 kernel void mirror_facets(global const INPUT *restrict lines, global const INPUT *restrict lens_place,
-                          global uchar *restrict near, global const real *restrict block_table, constant INPUT *middle,
-                          const uint blocks, const ulong count) {
+                          global uchar *restrict near, global const MirrorBlock *restrict block_table,
+                          constant INPUT *middle, const uint blocks, const ulong count) {
     const ulong i = get_global_id(0) * LANES;
     if (i >= count) return;
     const int last = (int)min(count - i, (ulong)LANES) - 1;
@@ -372,7 +388,7 @@ kernel void mirror_facets(global const INPUT *restrict lines, global const INPUT
     const Vector way = minus(end, start);
     for (uint b = 0; b < blocks; b++) {
         real seen[LANES];
-        unpacked(as_reals(may_show_part(start, way, lens, block_table + (size_t)b * BLOCK)), seen);
+        unpacked(as_reals(may_show_part(start, way, lens, block_table + b)), seen);
         for (int lane = 0; lane <= last; lane++) near[(i + lane) * blocks + b] = as_bits(seen[lane]) != 0;
     }
 }

@@ -7,7 +7,7 @@
 //          surface normal, exitance [W/m2]; with SELECTED also starts (lists + 1) and selected, the segments of each list
 //          (list: SELECTION_BLOCK receivers; a pick ~k is segment k, which no surface can hide).
 // Outputs: irradiance (strips, each) [W/m2]; left, right (strips,); status (strips, each) flags.
-// Options: INPUT (type of the inputs), REAL_IS_DOUBLE, WIDE_PLACES, SELECTED, GROUP (size of a work-group), BVH_DEPTH;
+// Options: INPUT (type of the inputs), REAL_IS_DOUBLE, DOUBLE_POSITIONS, SELECTED, GROUP (size of a work-group), BVH_DEPTH;
 //          INTERVALS (exact visibility, visible.h), RAYS (shadow rays to `samples` parts of a segment); without both:
 //          no occlusion.
 // Variants: vector: a work-item per share of the strips, 16 receivers in a vector; work-item: a work-group per strip,

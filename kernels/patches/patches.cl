@@ -2,9 +2,9 @@
 //
 // Inputs:  receivers (count, 6), position [m] and normal of any length, type INPUT; patch_light: exitance (patches,) [W/m2].
 // Outputs: form_factors: factors (count, patches); patch_light: irradiance (count,) [W/m2]; status (count,) flags.
-// Tables:  triangles (t, 12) first corner, two edges, unit normal; starts (patches + 1,) first triangle of each patch;
+// Tables:  triangles (t,) PatchTriangle; starts (patches + 1,) first triangle of each patch;
 //          slacks (patches,) [m] added to the clearance at the patch; the tree of common/bvh.h.
-// Options: FACTORS (form_factors), OCCLUSION (shadow rays), INPUT, PLACE (type of `middle`), REAL_IS_DOUBLE, BVH_DEPTH.
+// Options: FACTORS (form_factors), OCCLUSION (shadow rays), INPUT, POSITION (type of `middle`), REAL_IS_DOUBLE, BVH_DEPTH.
 // Variants: vector: 16 receivers in a vector, `each` receivers per work-item; work-item: one receiver per item.
 //
 // A triangle's hidden fraction is estimated with shadow rays; the larger its form factor, the more rays.
@@ -12,12 +12,14 @@
 #include "common/bvh.h"
 #include "common/status.h"
 
-// Numbers per triangle: first corner, two edges, unit normal.
-#define ROW 12
+// Triangle of a patch: PatchTriangle in patches.py.
+typedef struct {
+    real corner[3], edge_1[3], edge_2[3], normal[3]; // first corner; edges from it to the others; unit normal
+} PatchTriangle;
 
-INLINE vector vector_at(global const real *row) { return (vector){(reals)row[0], (reals)row[1], (reals)row[2]}; }
+INLINE vector vector_at(global const real *at) { return (vector){(reals)at[0], (reals)at[1], (reals)at[2]}; }
 
-static inline reals load_column(global const INPUT *receivers, int column, PLACE less) {
+static inline reals load_column(global const INPUT *receivers, int column, POSITION less) {
 #ifdef VECTOR_VARIANT
     global const INPUT *at = receivers + column;
     real values[LANES];
@@ -104,11 +106,11 @@ INLINE reals seen_part(const bvh_tree *tree, reals factor, vector place, vector 
 }
 #endif
 
-// Arguments that both kernels share.
+// Arguments that both kernels share; a macro, because a struct of pointers would lose `restrict`.
 #define SCENE_TABLES                                                                                                   \
-    global uchar *restrict status, global const real *restrict triangles, global const int *restrict starts,           \
+    global uchar *restrict status, global const PatchTriangle *restrict triangles, global const int *restrict starts,  \
         global const real *restrict slacks, global const real *nodes, global const int *children,                      \
-        global const int *axes, global const real *leaves, global const int *numbers, constant PLACE *middle,          \
+        global const int *axes, global const real *leaves, global const int *numbers, constant POSITION *middle,          \
         const real shallow, const real clearance, const real rays, const uint patches, const ulong count,              \
         const ulong each
 
@@ -117,7 +119,7 @@ typedef struct {
     masks bad;            // a number is not finite
 } receiver;
 
-INLINE receiver load_receiver(global const INPUT *at, constant PLACE *middle) {
+INLINE receiver load_receiver(global const INPUT *at, constant POSITION *middle) {
     receiver one;
     one.place = (vector){load_column(at, 0, middle[0]), load_column(at, 1, middle[1]), load_column(at, 2, middle[2])};
     vector normal = {load_column(at, 3, 0), load_column(at, 4, 0), load_column(at, 5, 0)};
@@ -130,14 +132,14 @@ INLINE receiver load_receiver(global const INPUT *at, constant PLACE *middle) {
 }
 
 // Form factor of a receiver and one triangle, with occlusion if `tree` is given.
-INLINE reals triangle_factor(const receiver *one, global const real *row, const bvh_tree *tree, real shallow, real rays,
-                             real clearance, real slack) {
+INLINE reals triangle_factor(const receiver *one, global const PatchTriangle *row, const bvh_tree *tree, real shallow,
+                             real rays, real clearance, real slack) {
     const vector place = one->place, normal = one->normal;
-    const vector first = {row[0] - place.x, row[1] - place.y, row[2] - place.z};
+    const vector first = {row->corner[0] - place.x, row->corner[1] - place.y, row->corner[2] - place.z};
     // Most pairs do not face each other. `shallow`: heights within rounding count as in the plane.
-    const masks facing = mask_of(-patch_dot(first, vector_at(row + 9)) > (reals)shallow);
+    const masks facing = mask_of(-patch_dot(first, vector_at(row->normal)) > (reals)shallow);
     if (!any_lane(facing)) return (reals)0;
-    const vector edge_1 = vector_at(row + 3), edge_2 = vector_at(row + 6);
+    const vector edge_1 = vector_at(row->edge_1), edge_2 = vector_at(row->edge_2);
     const vector back = {-edge_1.x - edge_2.x, -edge_1.y - edge_2.y, -edge_1.z - edge_2.z};
     const vector corner[3] = {first, patch_sum(first, edge_1), patch_sum(patch_sum(first, edge_1), edge_2)};
     const vector edge[3] = {edge_1, edge_2, back};
@@ -163,7 +165,7 @@ kernel void form_factors(global const INPUT *restrict receivers, global real *re
         for (uint patch = 0; patch < patches; patch++) {
             reals sum = (reals)0;
             for (int t = starts[patch]; t < starts[patch + 1]; t++)
-                sum += triangle_factor(&one, triangles + (size_t)t * ROW, &tree, shallow, rays, clearance, slacks[patch]);
+                sum += triangle_factor(&one, triangles + t, &tree, shallow, rays, clearance, slacks[patch]);
             sum = nan_where(one.bad, sum);
             for (int lane = 0; lane < LANES; lane++) factors[(i + lane) * patches + patch] = ((const real *)&sum)[lane];
         }
@@ -183,7 +185,7 @@ kernel void patch_light(global const INPUT *restrict receivers, global const rea
             if (exitance[patch] == 0) continue;
             reals sum = (reals)0;
             for (int t = starts[patch]; t < starts[patch + 1]; t++)
-                sum += triangle_factor(&one, triangles + (size_t)t * ROW, &tree, shallow, rays, clearance, slacks[patch]);
+                sum += triangle_factor(&one, triangles + t, &tree, shallow, rays, clearance, slacks[patch]);
             total += exitance[patch] * sum;
         }
         const masks wrong = one.bad | mask_of(LANED(not_finite)(total));

@@ -3,31 +3,33 @@
 // Each row is one scalar equation n . (T^-1(p + e) - p) = g etch of the pose T (pose.h). The pose minimises
 // sum rho(residual / (sigma scale)) with the loss rho of common/robust.h.
 //
-// Inputs:  rows (poses, count, ROW), type INPUT: unit normal n (2), place p in the artwork (2) [m], displacement e from
-//          there to the measured position (2) [m], sigma along the normal [m], and with ETCHED the etch factor g; start
-//          (poses, 3) with WITH_NEAR: initial pose x, y [m], theta [rad].
+// Inputs:  rows (poses, count) PoseRow; start (poses, 3) with WITH_INITIAL_POSE: initial pose x, y [m], theta [rad].
 // Tables:  subsets (trials / LANES, FREEDOMS, LANES): rows of the start candidates.
 // Outputs: pose (poses, 3) x, y [m], theta [rad]; deformation (poses, 3); placement (poses, 2) [m]; covariance (poses,
-//          OF_POSE, OF_POSE) of the placement point [m2, m rad, rad2]; residuals (poses, count) [m]; weights (poses,
-//          count), 0 to 1; etch (poses,) [m]; (poses,): scale, residual_scale, condition, rank,
+//          POSE_PARAMETERS, POSE_PARAMETERS) of the placement point [m2, m rad, rad2]; residuals (poses, count) [m];
+//          weights (poses, count), 0 to 1; etch (poses,) [m]; (poses,): scale, residual_scale, condition, rank,
 //          inliers, status, inlier_fraction, leverage. Refused poses are NaN.
-// Options: INPUT, REAL_IS_DOUBLE, WITH_NEAR (initial pose; otherwise no motion), OF_POSE, FREEDOMS, ETCHED, CAPACITY,
-//          START_STEPS, GIVEN_SCALE, EFFICIENCY (pose.h), loss options (common/robust.h).
+// Options: INPUT, REAL_IS_DOUBLE, WITH_INITIAL_POSE (initial pose; otherwise no motion), POSE_PARAMETERS, FREEDOMS,
+//          WITH_ETCH_BIAS, CAPACITY, START_STEPS, GIVEN_SCALE, EFFICIENCY (pose.h), loss options (common/robust.h).
 // Variants: vector: 16 rows, or 16 start candidates, in a vector; work-item: one row or start candidate after the
 //           other.
 //
 // One work-item solves one pose.
 #include "pose/pose_result.h"
 
-// Numbers per row: normal (2), place (2), displacement (2), sigma, and with ETCHED the etch factor.
-#ifdef ETCHED
-#define ROW 8
-#else
-#define ROW 7
+// Feature row: ROW in pose.py, and the etch factor.
+typedef struct {
+    INPUT normal_x, normal_y;             // unit normal n
+    INPUT x, y;                           // place p in the artwork [m]
+    INPUT displacement_x, displacement_y; // e, from p to the place where the feature was seen [m]
+    INPUT sigma;                          // along the normal [m]
+#ifdef WITH_ETCH_BIAS
+    INPUT etch_factor;                    // g
 #endif
+} PoseRow;
 
-kernel void pose_sets(global const INPUT *restrict rows,
-#ifdef WITH_NEAR
+kernel void pose_sets(global const PoseRow *restrict rows,
+#ifdef WITH_INITIAL_POSE
                       global const INPUT *restrict start,
 #endif
                       global real *restrict pose, global real *restrict deformation, global real *restrict placement,
@@ -44,30 +46,30 @@ kernel void pose_sets(global const INPUT *restrict rows,
     if (item >= poses) return;
     real nx[CAPACITY], ny[CAPACITY], px[CAPACITY], py[CAPACITY], ex[CAPACITY], ey[CAPACITY], certainty[CAPACITY];
     reals room[CAPACITY];
-#ifdef ETCHED
+#ifdef WITH_ETCH_BIAS
     real etch_factor[CAPACITY];
 #else
     private real *etch_factor = 0;
 #endif
     // The row count is padded with rows of certainty 0 to whole vectors. Missing rows also get certainty 0.
     const int padded = (count + LANES - 1) / LANES * LANES;
-    global const INPUT *row = rows + item * count * ROW;
     real sum = 0, sum_x = 0, sum_y = 0;
     int all_finite = 1;
     for (int i = 0; i < padded; i++) {
-        const int at = min(i, count - 1) * ROW;
+        global const PoseRow *row = rows + item * count + min(i, count - 1);
         int good = i < count;
-        for (int k = 0; k < ROW; k++) good &= !not_finite((real)row[at + k]);
-        good &= row[at + 6] > 0;
-        nx[i] = good ? row[at] : 0;
-        ny[i] = good ? row[at + 1] : 0;
-        px[i] = good ? row[at + 2] : 0;
-        py[i] = good ? row[at + 3] : 0;
-        ex[i] = good ? row[at + 4] : 0;
-        ey[i] = good ? row[at + 5] : 0;
-        certainty[i] = good ? 1 / (real)row[at + 6] : 0;
-#ifdef ETCHED
-        etch_factor[i] = good ? row[at + 7] : 0;
+        for (int k = 0; k < (int)(sizeof(PoseRow) / sizeof(INPUT)); k++)
+            good &= !not_finite((real)((global const INPUT *)row)[k]);
+        good &= row->sigma > 0;
+        nx[i] = good ? row->normal_x : 0;
+        ny[i] = good ? row->normal_y : 0;
+        px[i] = good ? row->x : 0;
+        py[i] = good ? row->y : 0;
+        ex[i] = good ? row->displacement_x : 0;
+        ey[i] = good ? row->displacement_y : 0;
+        certainty[i] = good ? 1 / (real)row->sigma : 0;
+#ifdef WITH_ETCH_BIAS
+        etch_factor[i] = good ? row->etch_factor : 0;
 #endif
         sum += good;
         sum_x += px[i];
@@ -76,7 +78,7 @@ kernel void pose_sets(global const INPUT *restrict rows,
     pose_rows all = {nx, ny, px, py, ex, ey, certainty, etch_factor, padded, etch_certainty};
     const pose_frame frame = centre_rows(&all, sum, sum_x, sum_y);
     laned_pose about = {0, 0, 0, 0, 0, 0, 0};
-#ifdef WITH_NEAR
+#ifdef WITH_INITIAL_POSE
     const real x = start[3 * item], y = start[3 * item + 1], turn = start[3 * item + 2];
     all_finite = !(not_finite(x) | not_finite(y) | not_finite(turn));
     about = pose_in_frame(x, y, turn, frame);

@@ -11,11 +11,11 @@
 // (x, y) and h = (n_x, n_y, n_y x - n_x y, ...). The further terms are n . p' for a common scale, or
 // (n_x x, n_y y, n_x y) for two scales and the shear.
 //
-// Etch bias (ETCHED): copper reaches beyond its drawn edges by one unknown distance, with a given standard deviation
+// Etch bias (WITH_ETCH_BIAS): copper reaches beyond its drawn edges by one unknown distance, with a given standard deviation
 // around 0. An edge moves along its normal by g times this distance (g: etch factor), so that h has the further term g.
 //
-// Options: OF_POSE: number of pose parameters, 3 (rigid), 4 (common scale) or 6 (two scales and shear). FREEDOMS:
-//          number of unknowns, OF_POSE and the etch bias. ETCHED: solve for the etch bias. CAPACITY: size of the row
+// Options: POSE_PARAMETERS: number of pose parameters, 3 (rigid), 4 (common scale) or 6 (two scales and shear). FREEDOMS:
+//          number of unknowns, POSE_PARAMETERS and the etch bias. WITH_ETCH_BIAS: solve for the etch bias. CAPACITY: size of the row
 //          arrays. START_STEPS: Gauss-Newton steps of a start candidate. GIVEN_SCALE: known scale of the residuals in
 //          sigmas; otherwise it is estimated from their median. EFFICIENCY: of the loss for normal residuals, for the
 //          covariance at a known scale.
@@ -35,16 +35,6 @@ typedef struct {
     reals nx, ny, px, py, ex, ey, certainty, etch_factor;
 } laned_row;
 
-#ifdef ETCHED
-#define ETCH_OF(from, i) READ((from), i)
-#define ETCH_FOR_ALL(from, i) ((reals)((from)[i]))
-#define ETCH_GATHERED(from, at) GATHERED(from, at)
-#else
-#define ETCH_OF(from, i) ((reals)0)
-#define ETCH_FOR_ALL(from, i) ((reals)0)
-#define ETCH_GATHERED(from, at) ((reals)0)
-#endif
-
 // Columns of all rows, padded with rows of certainty 0 to whole vectors.
 typedef struct {
     private const real *nx;
@@ -54,7 +44,7 @@ typedef struct {
     private const real *ex;
     private const real *ey;
     private const real *certainty;
-    private const real *etch_factor; // null without ETCHED
+    private const real *etch_factor; // null without WITH_ETCH_BIAS
     int count;
     real etch; // 1/sigma of the etch bias
 } pose_rows;
@@ -66,15 +56,24 @@ typedef struct {
 
 // Load LANES rows from row i on.
 static inline laned_row row_of(pose_rows all, int i) {
-    return (laned_row){READ(all.nx, i), READ(all.ny, i), READ(all.px, i),       READ(all.py, i),
-                       READ(all.ex, i), READ(all.ey, i), READ(all.certainty, i), ETCH_OF(all.etch_factor, i)};
+#ifdef WITH_ETCH_BIAS
+    const reals etch_factor = READ(all.etch_factor, i);
+#else
+    const reals etch_factor = 0;
+#endif
+    return (laned_row){READ(all.nx, i), READ(all.ny, i), READ(all.px, i),        READ(all.py, i),
+                       READ(all.ex, i), READ(all.ey, i), READ(all.certainty, i), etch_factor};
 }
 
 // Broadcast row i to all lanes.
 static inline laned_row row_for_all(pose_rows all, int i) {
-    return (laned_row){(reals)all.nx[i], (reals)all.ny[i], (reals)all.px[i],       (reals)all.py[i],
-                       (reals)all.ex[i], (reals)all.ey[i], (reals)all.certainty[i],
-                       ETCH_FOR_ALL(all.etch_factor, i)};
+#ifdef WITH_ETCH_BIAS
+    const reals etch_factor = all.etch_factor[i];
+#else
+    const reals etch_factor = 0;
+#endif
+    return (laned_row){(reals)all.nx[i], (reals)all.ny[i], (reals)all.px[i],        (reals)all.py[i],
+                       (reals)all.ex[i], (reals)all.ey[i], (reals)all.certainty[i], etch_factor};
 }
 
 // Compute Jacobian row and residual of a feature row at a pose.
@@ -90,15 +89,15 @@ static inline pose_equation equation_of(laned_pose pose, laned_row at) {
     equation.row[0] = at.nx;
     equation.row[1] = at.ny;
     equation.row[2] = at.ny * x - at.nx * y;
-#if OF_POSE == 4
+#if POSE_PARAMETERS == 4
     equation.row[3] = at.nx * x + at.ny * y;
-#elif OF_POSE == 6
+#elif POSE_PARAMETERS == 6
     equation.row[3] = at.nx * x;
     equation.row[4] = at.ny * y;
     equation.row[5] = at.nx * y;
 #endif
-#ifdef ETCHED
-    equation.row[OF_POSE] = at.etch_factor;
+#ifdef WITH_ETCH_BIAS
+    equation.row[POSE_PARAMETERS] = at.etch_factor;
 #endif
     return equation;
 }
@@ -112,9 +111,9 @@ static inline laned_pose pose_after(laned_pose pose, private const reals *step) 
     // cosine - 1 = -sine^2 / (1 + cosine), without cancellation.
     const reals less = -sine * sine / ((reals)1 + cosine);
     reals exx = less, exy = -sine, eyx = sine, eyy = less;
-#if OF_POSE == 4
+#if POSE_PARAMETERS == 4
     exx += cosine * step[3], exy -= sine * step[3], eyx += sine * step[3], eyy += cosine * step[3];
-#elif OF_POSE == 6
+#elif POSE_PARAMETERS == 6
     exx += cosine * step[3], exy += cosine * step[5] - sine * step[4];
     eyx += sine * step[3], eyy += sine * step[5] + cosine * step[4];
 #endif
@@ -122,8 +121,8 @@ static inline laned_pose pose_after(laned_pose pose, private const reals *step) 
     const laned_pose next = {pose.dxx + axx * exx + pose.dxy * eyx,  pose.dxy + axx * exy + pose.dxy * eyy,
                              pose.dyx + pose.dyx * exx + ayy * eyx,  pose.dyy + pose.dyx * exy + ayy * eyy,
                              pose.x + axx * step[0] + pose.dxy * step[1], pose.y + pose.dyx * step[0] + ayy * step[1],
-#ifdef ETCHED
-                             pose.etch + step[OF_POSE]};
+#ifdef WITH_ETCH_BIAS
+                             pose.etch + step[POSE_PARAMETERS]};
 #else
                              0};
 #endif
@@ -141,28 +140,40 @@ static inline void add_equation(pose_equation equation, reals weight, private re
 
 // Add the prior of the etch bias, etch = 0 with the given certainty (1/sigma), to the normal equations.
 static inline void add_etch(laned_pose pose, real certainty, private reals *matrix, private reals *right) {
-#ifdef ETCHED
+#ifdef WITH_ETCH_BIAS
     const reals square = (reals)(certainty * certainty);
-    matrix[CELL(OF_POSE, OF_POSE)] += square;
-    right[OF_POSE] -= square * pose.etch;
+    matrix[CELL(POSE_PARAMETERS, POSE_PARAMETERS)] += square;
+    right[POSE_PARAMETERS] -= square * pose.etch;
 #endif
 }
 
 // Gather the values at the indices at[0 .. LANES - 1].
 #ifdef VECTOR_VARIANT
-#define GATHERED(from, at)                                                                                             \
-    (reals)((from)[(at)[0]], (from)[(at)[1]], (from)[(at)[2]], (from)[(at)[3]], (from)[(at)[4]], (from)[(at)[5]],        \
-            (from)[(at)[6]], (from)[(at)[7]], (from)[(at)[8]], (from)[(at)[9]], (from)[(at)[10]], (from)[(at)[11]],      \
-            (from)[(at)[12]], (from)[(at)[13]], (from)[(at)[14]], (from)[(at)[15]])
+static inline reals gather(private const real *from, constant const int *at) {
+    return (reals)(from[at[0]], from[at[1]], from[at[2]], from[at[3]], from[at[4]], from[at[5]], from[at[6]],
+                   from[at[7]], from[at[8]], from[at[9]], from[at[10]], from[at[11]], from[at[12]], from[at[13]],
+                   from[at[14]], from[at[15]]);
+}
 #else
-#define GATHERED(from, at) ((from)[(at)[0]])
+static inline reals gather(private const real *from, constant const int *at) { return from[at[0]]; }
 #endif
+
+// Gather LANES rows by their indices.
+static inline laned_row gather_rows(pose_rows all, constant const int *at) {
+#ifdef WITH_ETCH_BIAS
+    const reals etch_factor = gather(all.etch_factor, at);
+#else
+    const reals etch_factor = 0;
+#endif
+    return (laned_row){gather(all.nx, at), gather(all.ny, at), gather(all.px, at),        gather(all.py, at),
+                       gather(all.ex, at), gather(all.ey, at), gather(all.certainty, at), etch_factor};
+}
 
 // Compute the score of each lane's candidate pose over all rows, least is best: the loss where the scale is given,
 // otherwise the absolute residual of rank (n + FREEDOMS + 1) / 2 in sigmas, to 1 % (least median of squares, Rousseeuw
 // and Leroy, 1987).
 static inline reals pose_score(laned_pose pose, pose_rows all, private reals *distances, int present) {
-#ifdef ETCHED
+#ifdef WITH_ETCH_BIAS
     const reals off = pose.etch * (reals)all.etch;
     reals loss = (reals)0.5f * off * off;
 #else
@@ -173,11 +184,13 @@ static inline reals pose_score(laned_pose pose, pose_rows all, private reals *di
         const reals z = residual_of(pose, at) * at.certainty;
 #ifdef GIVEN_SCALE
         loss += loss_of(z * (reals)((real)1 / (real)(GIVEN_SCALE)));
-    }
-    return loss;
 #else
         distances[i] = at.certainty > (reals)0 ? FABS(z) : (reals)INFINITY;
+#endif
     }
+#ifdef GIVEN_SCALE
+    return loss;
+#else
     return ranked_of(distances, all.count, (masks)((present + FREEDOMS + 1) / 2), BITS_TO_ONE_PERCENT);
 #endif
 }
@@ -192,12 +205,8 @@ static inline laned_pose pose_start(laned_pose start, pose_rows all, constant co
     real least = INFINITY;
     for (int trial = 0; trial < trials; trial += LANES) {
         laned_row of[FREEDOMS];
-        for (int k = 0; k < FREEDOMS; k++) {
-            constant const int *at = subsets + (size_t)trial * FREEDOMS + k * LANES;
-            of[k] = (laned_row){GATHERED(all.nx, at), GATHERED(all.ny, at), GATHERED(all.px, at),
-                                GATHERED(all.py, at), GATHERED(all.ex, at), GATHERED(all.ey, at),
-                                GATHERED(all.certainty, at), ETCH_GATHERED(all.etch_factor, at)};
-        }
+        for (int k = 0; k < FREEDOMS; k++)
+            of[k] = gather_rows(all, subsets + (size_t)trial * FREEDOMS + k * LANES);
         laned_pose candidate = start;
         masks bad = 0;
         for (int step = 0; step < START_STEPS; step++) {
@@ -205,7 +214,7 @@ static inline laned_pose pose_start(laned_pose start, pose_rows all, constant co
             for (int i = 0; i < TRIANGLE; i++) matrix[i] = 0;
             for (int i = 0; i < FREEDOMS; i++) right[i] = 0;
             for (int k = 0; k < FREEDOMS; k++) {
-#ifdef ETCHED
+#ifdef WITH_ETCH_BIAS
                 const reals weight = of[k].certainty * of[k].certainty;
 #else
                 const reals weight = mask_of(of[k].certainty > (reals)0) ? (reals)1 : (reals)0;
@@ -300,19 +309,19 @@ static inline void pose_summed(laned_pose pose, pose_rows all, real per_scale, i
 }
 
 typedef struct {
-    real cell[OF_POSE][OF_POSE];
+    real cell[POSE_PARAMETERS][POSE_PARAMETERS];
 } pose_matrix;
 
 // Return the information matrix of the pose parameters, with the etch bias b eliminated (Schur complement):
 // M_ij - M_ib M_jb / M_bb.
 static inline pose_matrix pose_part(private const reals *triangle) {
     pose_matrix of;
-    for (int i = 0; i < OF_POSE; i++)
+    for (int i = 0; i < POSE_PARAMETERS; i++)
         for (int j = 0; j <= i; j++) {
             of.cell[i][j] = FIRST(triangle[CELL(i, j)]);
-#ifdef ETCHED
-            of.cell[i][j] -= FIRST(triangle[CELL(OF_POSE, i)]) * FIRST(triangle[CELL(OF_POSE, j)]) /
-                             FIRST(triangle[CELL(OF_POSE, OF_POSE)]);
+#ifdef WITH_ETCH_BIAS
+            of.cell[i][j] -= FIRST(triangle[CELL(POSE_PARAMETERS, i)]) * FIRST(triangle[CELL(POSE_PARAMETERS, j)]) /
+                             FIRST(triangle[CELL(POSE_PARAMETERS, POSE_PARAMETERS)]);
 #endif
             of.cell[j][i] = of.cell[i][j];
         }
@@ -323,18 +332,18 @@ static inline pose_matrix pose_part(private const reals *triangle) {
 // Returns the rank: the number of eigenvalues above `rank_tolerance` times the largest.
 static inline int eigenvalues(pose_matrix of, real rank_tolerance, private real *least, private real *largest) {
     for (int sweep = 0; sweep < 5; sweep++)
-        for (int p = 0; p < OF_POSE - 1; p++)
-            for (int q = p + 1; q < OF_POSE; q++) {
+        for (int p = 0; p < POSE_PARAMETERS - 1; p++)
+            for (int q = p + 1; q < POSE_PARAMETERS; q++) {
                 if (of.cell[p][q] == 0) continue;
                 const real ratio = (of.cell[q][q] - of.cell[p][p]) / (2 * of.cell[p][q]);
                 const real t = (ratio < 0 ? -1 : 1) / (fabs(ratio) + sqrt(ratio * ratio + 1));
                 const real c = 1 / sqrt(t * t + 1), s = t * c;
-                for (int k = 0; k < OF_POSE; k++) {
+                for (int k = 0; k < POSE_PARAMETERS; k++) {
                     const real kp = of.cell[k][p], kq = of.cell[k][q];
                     of.cell[k][p] = c * kp - s * kq;
                     of.cell[k][q] = s * kp + c * kq;
                 }
-                for (int k = 0; k < OF_POSE; k++) {
+                for (int k = 0; k < POSE_PARAMETERS; k++) {
                     const real pk = of.cell[p][k], qk = of.cell[q][k];
                     of.cell[p][k] = c * pk - s * qk;
                     of.cell[q][k] = s * pk + c * qk;
@@ -342,12 +351,12 @@ static inline int eigenvalues(pose_matrix of, real rank_tolerance, private real 
                 of.cell[p][q] = of.cell[q][p] = 0;
             }
     *least = *largest = of.cell[0][0];
-    for (int i = 1; i < OF_POSE; i++) {
+    for (int i = 1; i < POSE_PARAMETERS; i++) {
         *least = min(*least, of.cell[i][i]);
         *largest = max(*largest, of.cell[i][i]);
     }
     int rank = 0;
-    for (int i = 0; i < OF_POSE; i++) rank += of.cell[i][i] > rank_tolerance * *largest;
+    for (int i = 0; i < POSE_PARAMETERS; i++) rank += of.cell[i][i] > rank_tolerance * *largest;
     return rank;
 }
 
@@ -356,21 +365,21 @@ static inline int eigenvalues(pose_matrix of, real rank_tolerance, private real 
 // It is the minimum over v of (v^T M v) / (v^T A v), with the information matrices M of the inliers and A of all rows.
 // With the Cholesky factor A = L L^T, this is the least eigenvalue of L^-1 M L^-T. 0 where A is singular.
 static inline real least_inlier_fraction(pose_matrix inlier_matrix, pose_matrix all) {
-    real factor[OF_POSE][OF_POSE];
-    for (int i = 0; i < OF_POSE; i++)
+    real factor[POSE_PARAMETERS][POSE_PARAMETERS];
+    for (int i = 0; i < POSE_PARAMETERS; i++)
         for (int j = 0; j <= i; j++) {
             real sum = all.cell[i][j];
             for (int k = 0; k < j; k++) sum -= factor[i][k] * factor[j][k];
             if (i == j && !(sum > all.cell[i][i] * (8 * REAL_EPSILON))) return 0;
             factor[i][j] = i == j ? sqrt(sum) : sum / factor[j][j];
         }
-    for (int column = 0; column < OF_POSE; column++)
-        for (int i = 0; i < OF_POSE; i++) {
+    for (int column = 0; column < POSE_PARAMETERS; column++)
+        for (int i = 0; i < POSE_PARAMETERS; i++) {
             for (int k = 0; k < i; k++) inlier_matrix.cell[i][column] -= factor[i][k] * inlier_matrix.cell[k][column];
             inlier_matrix.cell[i][column] /= factor[i][i];
         }
-    for (int row = 0; row < OF_POSE; row++)
-        for (int i = 0; i < OF_POSE; i++) {
+    for (int row = 0; row < POSE_PARAMETERS; row++)
+        for (int i = 0; i < POSE_PARAMETERS; i++) {
             for (int k = 0; k < i; k++) inlier_matrix.cell[row][i] -= factor[i][k] * inlier_matrix.cell[row][k];
             inlier_matrix.cell[row][i] /= factor[i][i];
         }

@@ -77,11 +77,11 @@ static inline laned_pose pose_in_frame(real x, real y, real turn, pose_frame fra
 // lever^T.
 static inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, int all_finite, long item, int count,
                               pose_limits limits, real place_x, real place_y, pose_outputs to) {
-    const int few = fit.present < OF_POSE;
+    const int few = fit.present < POSE_PARAMETERS;
     // Below an inlier fraction of 0.75 two outliers may agree by chance. Half the leverage limit then requires that two
     // other rows check each row.
     const real leverage = fit.inlier_fraction > 0.75f ? limits.leverage : limits.leverage / 2;
-    const int refused = fit.rank < OF_POSE || fit.inliers < OF_POSE ||
+    const int refused = fit.rank < POSE_PARAMETERS || fit.inliers < POSE_PARAMETERS ||
                         !(fit.inlier_fraction >= limits.inlier_fraction) || !(fit.leverage < leverage);
     const real axx = 1 + FIRST(fit.pose.dxx), axy = FIRST(fit.pose.dxy), ayx = FIRST(fit.pose.dyx),
                ayy = 1 + FIRST(fit.pose.dyy), length = sqrt(axx * axx + ayx * ayx), c = axx / length, s = ayx / length;
@@ -100,26 +100,26 @@ static inline void store_pose(solved_pose fit, pose_rows all, pose_frame frame, 
     to.pose[3 * item] = bad ? REAL_NAN : move_x - ((axx - 1) * frame.x + axy * frame.y);
     to.pose[3 * item + 1] = bad ? REAL_NAN : move_y - (ayx * frame.x + (ayy - 1) * frame.y);
     to.pose[3 * item + 2] = bad ? REAL_NAN : turn;
-    to.deformation[3 * item] = bad ? REAL_NAN : OF_POSE > 3 ? length - 1 : 0;
-    to.deformation[3 * item + 1] = bad ? REAL_NAN : OF_POSE > 3 ? c * ayy - s * axy - 1 : 0;
-    to.deformation[3 * item + 2] = bad ? REAL_NAN : OF_POSE == 6 ? c * axy + s * ayy : 0;
+    to.deformation[3 * item] = bad ? REAL_NAN : POSE_PARAMETERS > 3 ? length - 1 : 0;
+    to.deformation[3 * item + 1] = bad ? REAL_NAN : POSE_PARAMETERS > 3 ? c * ayy - s * axy - 1 : 0;
+    to.deformation[3 * item + 2] = bad ? REAL_NAN : POSE_PARAMETERS == 6 ? c * axy + s * ayy : 0;
     to.placement[2 * item] = bad ? REAL_NAN : place_x + shift_x;
     to.placement[2 * item + 1] = bad ? REAL_NAN : place_y + shift_y;
-    real lever[OF_POSE][OF_POSE];
-    for (int i = 0; i < OF_POSE; i++) {
+    real lever[POSE_PARAMETERS][POSE_PARAMETERS];
+    for (int i = 0; i < POSE_PARAMETERS; i++) {
         const real along_x = i == 0 ? 1 : i == 2 ? -at_y : 0, along_y = i == 1 ? 1 : i == 2 ? at_x : 0;
-        const real more_x = OF_POSE == 6 ? (i == 3 ? at_x : i == 5 ? at_y : 0) : i == 3 ? at_x : 0;
-        const real more_y = OF_POSE == 6 ? (i == 4 ? at_y : 0) : i == 3 ? at_y : 0;
+        const real more_x = POSE_PARAMETERS == 6 ? (i == 3 ? at_x : i == 5 ? at_y : 0) : i == 3 ? at_x : 0;
+        const real more_y = POSE_PARAMETERS == 6 ? (i == 4 ? at_y : 0) : i == 3 ? at_y : 0;
         lever[0][i] = (axx * (along_x + more_x) + axy * (along_y + more_y)) * frame.size;
         lever[1][i] = (ayx * (along_x + more_x) + ayy * (along_y + more_y)) * frame.size;
-        for (int k = 2; k < OF_POSE; k++) lever[k][i] = k == i;
+        for (int k = 2; k < POSE_PARAMETERS; k++) lever[k][i] = k == i;
     }
-    for (int i = 0; i < OF_POSE; i++)
-        for (int j = 0; j < OF_POSE; j++) {
+    for (int i = 0; i < POSE_PARAMETERS; i++)
+        for (int j = 0; j < POSE_PARAMETERS; j++) {
             real total = 0;
-            for (int k = 0; k < OF_POSE; k++)
-                for (int l = 0; l < OF_POSE; l++) total += lever[i][k] * fit.covariance[k][l] * lever[j][l];
-            to.covariance[(item * OF_POSE + i) * OF_POSE + j] = bad ? REAL_NAN : total;
+            for (int k = 0; k < POSE_PARAMETERS; k++)
+                for (int l = 0; l < POSE_PARAMETERS; l++) total += lever[i][k] * fit.covariance[k][l] * lever[j][l];
+            to.covariance[(item * POSE_PARAMETERS + i) * POSE_PARAMETERS + j] = bad ? REAL_NAN : total;
         }
     for (int i = 0; i < count; i += LANES) {
         const laned_row at = row_of(all, i);

@@ -3,7 +3,7 @@
 // Inputs:  rays (count, 6), closest_hit: origin [m] and direction of any length; any_hit: both ends of a segment [m].
 // Outputs: closest_hit: triangle (count,) index or -1, distance (count,) [m], barycentric (count, 2), status (count,);
 //          any_hit: occluded (count,) 0 or 1, status (count,).
-// Options: SEGMENTS (any_hit), INPUT, REAL_IS_DOUBLE, WIDE_PLACES, BVH_DEPTH.
+// Options: ANY_HIT (any_hit), INPUT, REAL_IS_DOUBLE, DOUBLE_POSITIONS, BVH_DEPTH.
 // Variants: vector: a strip of `each` rays per work-item, each ray against 16 boxes at once; work-item: a ray per item.
 //
 // Positions are relative to the scene's middle. A ray from far away is first cut to the sphere around the scene, so that
@@ -42,7 +42,7 @@ static inline part part_within(spot origin, spot direction, place radius) {
 
 static inline int is_far(spot origin, place radius) { return fabs(origin.x) + fabs(origin.y) + fabs(origin.z) > 8 * radius; }
 
-#ifdef SEGMENTS
+#ifdef ANY_HIT
 AS_IT_IS kernel void any_hit(global const INPUT *restrict rays, global uchar *restrict occluded,
                              global uchar *restrict status, global const real *nodes, global const int *children,
                              global const int *axes, global const real *leaves, global const int *triangles,

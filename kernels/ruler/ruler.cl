@@ -1,7 +1,7 @@
 // Edges along calipers (rulers): position, amplitude, width, sigma, spacing and status of each ruler.
 //
 // Inputs:  image (rows, columns), type CODE; rulers (count, 4): x, y [px], cos, sin of the direction.
-// Outputs: position, width, sigma, spacing [px], amplitude [grey levels], status: (count,) or (count, MOST).
+// Outputs: position, width, sigma, spacing [px], amplitude [grey levels], status: (count,) or (count, MAX_EDGES).
 // Tables:  table, parameters (ruler.h); model, lens or camera (LENS, CAMERA).
 // Variants: vector: a work-item processes `each` rulers, with vectors of 16 samples; work-item: a group of RULER_GROUP
 //           items per ruler.
@@ -11,9 +11,9 @@
 static inline void store_edges(private const ruler_edge *edges, uint ruler, uint count, global real *position,
                         global real *amplitude, global real *width, global real *sigma, global real *spacing,
                         global uchar *status) {
-    for (int k = 0; k < MOST; k++) {
+    for (int k = 0; k < MAX_EDGES; k++) {
         for (uint lane = 0; lane < LANES && ruler + lane < count; lane++) {
-            const ulong i = ((ulong)ruler + lane) * MOST + k;
+            const ulong i = ((ulong)ruler + lane) * MAX_EDGES + k;
             position[i] = ((private const real *)&edges[k].position)[lane];
             amplitude[i] = ((private const real *)&edges[k].amplitude)[lane];
             width[i] = ((private const real *)&edges[k].width)[lane];
@@ -31,7 +31,7 @@ kernel void ruler_edges(global const CODE *restrict image, global const real *re
                         global real *restrict sigma, global real *restrict spacing, global uchar *restrict status,
                         constant real *table, constant real *model, const int rows, const int columns,
                         const uint count, const uint each) {
-    ruler_edge edges[MOST];
+    ruler_edge edges[MAX_EDGES];
 #ifdef VECTOR_VARIANT
     const uint first = get_global_id(0) * each, end = min(first + each, count);
     for (uint ruler = first; ruler < end; ruler += LANES) {

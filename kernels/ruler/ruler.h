@@ -10,7 +10,7 @@
 //     CODE, and CODE_uchar, CODE_ushort or CODE_float   type of the pixels
 //     RISING, FALLING    polarity of the edges (of the first edge of a pair); neither: both
 //     PAIRS              an edge is a pair of edges of opposite polarity: a stripe
-//     CHOOSE_STRONGEST, CHOOSE_FIRST, CHOOSE_LAST, CHOOSE_ALL (up to MOST edges)   edge selection
+//     CHOOSE_STRONGEST, CHOOSE_FIRST, CHOOSE_LAST, CHOOSE_ALL (up to MAX_EDGES edges)   edge selection
 //     SATURATION, AMBIGUITY   flag saturated samples, and edges with a comparable second edge
 //     CURVED             correct the position for a curved edge
 //     LENS or CAMERA     rulers are straight in the undistorted image; pixels are read from the distorted image
@@ -151,7 +151,7 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
 #ifdef CHOOSE_ALL
     masks count = 0;
     edges[0] = ruler_edge_at(peak, peak, place, table);
-    for (int k = 1; k < MOST; k++) edges[k] = edges[0];
+    for (int k = 1; k < MAX_EDGES; k++) edges[k] = edges[0];
 #endif
 #ifdef PAIRS
     ruler_peak other = peak;
@@ -186,7 +186,7 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
 #endif
 #ifdef CHOOSE_ALL
             const ruler_edge edge = ruler_edge_at(from, peak, place, table);
-            for (int k = 0; k < MOST; k++) {
+            for (int k = 0; k < MAX_EDGES; k++) {
                 wins = candidate & mask_of(count == k);
                 edges[k].position = wins ? edge.position : edges[k].position;
                 edges[k].amplitude = wins ? edge.amplitude : edges[k].amplitude;
@@ -195,7 +195,7 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
                 edges[k].spacing = wins ? edge.spacing : edges[k].spacing;
             }
             count -= candidate;
-            edges[MOST - 1].status |= mask_of(count > MOST) & STATUS_AMBIGUOUS;
+            edges[MAX_EDGES - 1].status |= mask_of(count > MAX_EDGES) & STATUS_AMBIGUOUS;
 #else
 #if defined(CHOOSE_FIRST)
             wins = candidate & ~found;
@@ -217,7 +217,7 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
         peak.here = peak.after;
     }
 #ifdef CHOOSE_ALL
-    for (int k = 0; k < MOST; k++) edges[k] = ruler_flagged(edges[k], mask_of(count > k), flags);
+    for (int k = 0; k < MAX_EDGES; k++) edges[k] = ruler_flagged(edges[k], mask_of(count > k), flags);
 #else
     edges[0] = ruler_edge_at(first, second, place, table);
 #ifdef AMBIGUITY
@@ -230,7 +230,7 @@ static inline void ruler_find(RULER_SPACE const reals *values, const ruler_place
 #ifdef VECTOR_VARIANT
 #include "ruler/ruler_lanes.h"
 
-// Measure 16 rulers, one in each lane; fills edges[MOST].
+// Measure 16 rulers, one in each lane; fills edges[MAX_EDGES].
 static inline void ruler_measure_lanes(global const CODE *image, int rows, int columns, reals x, reals y, reals cosine,
                                 reals sine, constant real *table, constant real *model, private ruler_edge *edges) {
     ruler_place place;
@@ -289,7 +289,7 @@ static inline real ruler_sum(global const CODE *image, const ruler_place *place,
     return sum;
 }
 
-// Measure one ruler by a work-group; edges[MOST] are valid for its first item.
+// Measure one ruler by a work-group; edges[MAX_EDGES] are valid for its first item.
 static inline void ruler_measure(global const CODE *image, int rows, int columns, real4 ruler, constant real *table,
                           constant real *model, local real *profile, local real *slopes, local int *shared_flags,
                           private ruler_edge *edges) {

@@ -1,7 +1,7 @@
 // Undistortion of images: each output pixel is interpolated at its source position in the measured image.
 //
 // made(row, column) = sum over taps of w_x w_y image(tap), bilinear or bicubic (undistort_image_pixel.h). The source
-// positions are read from a packed map (undistort_image_map.h), or with COMPUTED computed from the camera model.
+// positions are read from a packed map (undistort_image_map.h), or with FROM_MODEL computed from the camera model.
 //
 // Inputs:  image (frames, source rows, source columns[, CHANNELS]), type CODE.
 // Outputs: made (frames, made rows, made columns[, CHANNELS]), type CODE; status (made rows, made columns), the
@@ -9,8 +9,8 @@
 // Tables:  heads (made rows, runs), curves (made rows, runs), points (n, RUN) of the packed map, or model: the table of
 //          the lens or camera model; size (7,) int32: sizes, origin of the output and status of missing pixels; fill:
 //          value of pixels without a source.
-// Options: CODE, LARGEST (largest value of an integer CODE), CHANNELS (1 or 3, interleaved), BICUBIC (otherwise
-//          bilinear), BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT, COMPUTED, LENS or CAMERA,
+// Options: CODE, MAX_CODE (largest value of an integer CODE), CHANNELS (1 or 3, interleaved), BICUBIC (otherwise
+//          bilinear), BORDER_MASK, BORDER_CONSTANT, BORDER_REPLICATE or BORDER_REFLECT, FROM_MODEL, LENS or CAMERA,
 //          PAST_CACHES.
 // Variants: vector: a work-item per row and frame, in runs of 16 pixels; work-item: one pixel per item.
 #include "common/camera.h"
@@ -21,7 +21,7 @@
 #ifdef VECTOR_VARIANT
 #include "undistort_image/undistort_image_window.h"
 #endif
-#ifdef COMPUTED
+#ifdef FROM_MODEL
 #include "undistort_image/undistort_image_model.h"
 #else
 #include "undistort_image/undistort_image_map.h"
@@ -41,7 +41,7 @@ void undistort(global const CODE *image, global CODE *made, global uchar *status
     status = frame ? 0 : status + (size_t)row * columns;
     // The status is OK except where a run changes it.
     for (int column = 0; status && column < columns; column++) status[column] = STATUS_OK;
-#ifdef COMPUTED
+#ifdef FROM_MODEL
     for (int run = 0; run < RUNS(columns); run++) computed_run(image, made, status, row, run, model, size, fill);
 #else
     const size_t first = (size_t)row * RUNS(columns);
@@ -58,7 +58,7 @@ kernel void undistort(global const CODE *image, global CODE *made, global uchar 
     if (column >= columns || row >= size[MADE_ROWS]) return;
     image += frame * size[SOURCE_ROWS] * size[SOURCE_COLUMNS] * CHANNELS;
     made += (frame * size[MADE_ROWS] * columns + pixel) * CHANNELS;
-#ifdef COMPUTED
+#ifdef FROM_MODEL
     const uchar found = computed_pixel(image, made, column, row, model, size, fill);
 #else
     const uchar found = mapped_pixel(image, made, column, row, heads, curves, points, size, fill);

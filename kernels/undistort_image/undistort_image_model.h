@@ -1,4 +1,4 @@
-// Source positions from the camera model, computed for every pixel (COMPUTED).
+// Source positions from the camera model, computed for every pixel (FROM_MODEL).
 //
 // The model moves an ideal pixel (column, row) to its measured position in the source image: camera_distort
 // (common/camera.h) or lens_distort (common/lens.h).

@@ -20,13 +20,14 @@
 #define TAPS_AFTER 2
 // Cubic convolution (Keys, 1981) with a = SLOPE, the slope of the kernel at 1, as in OpenCV. Weights of the four taps
 // for the fraction part = t: a t (1 - t)^2, 1 + t^2 ((a + 2) t - (a + 3)), the rest, a (1 - t) t^2. The third weight is
-// one less the others, so that the sum is 1 up to rounding.
+// one less the others, so that the sum is 1 up to rounding. A macro, because C has no functions of a generic type: one text
+// gives the weights of a scalar here, and of 16 lanes in undistort_image_window.h.
 #define SLOPE (-0.75f)
 #define DEFINE_CUBIC(Weights, floats, weights_of)                    \
     typedef struct {                                                 \
         floats before, at, after, last;                              \
     } Weights;                                                       \
-    inline Weights weights_of(floats part) {                         \
+    static inline Weights weights_of(floats part) {                  \
         const floats rest = 1 - part;                                \
         Weights w;                                                   \
         w.before = SLOPE * part * rest * rest;                       \
@@ -45,10 +46,10 @@ DEFINE_CUBIC(CubicWeights, float, cubic_weights)
 // to the nearest integer (half to even), and the low bits of the sum's pattern are this integer.
 #define TO_WHOLE 12582912.0f
 
-#ifdef LARGEST
+#ifdef MAX_CODE
 static inline CODE to_code(float value) {
     value = value > 0 ? value : 0;
-    value = value < LARGEST ? value : LARGEST;
+    value = value < MAX_CODE ? value : MAX_CODE;
     return (CODE)as_int(value + TO_WHOLE);
 }
 #else

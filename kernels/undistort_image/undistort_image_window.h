@@ -74,12 +74,12 @@ INLINED float16 weighted_sum(const int span, global const CODE *from, size_t pit
 
 // Round, clamp and store 16 samples. Only bicubic results can exceed the range of the type.
 INLINED void store_codes(float16 value, global CODE *to) {
-#ifdef LARGEST
+#ifdef MAX_CODE
 #ifdef BICUBIC
     value = value > 0 ? value : (float16)0;
-    value = value < LARGEST ? value : (float16)LARGEST;
+    value = value < MAX_CODE ? value : (float16)MAX_CODE;
 #endif
-    const codes made = CONVERT_CODES(as_int16(value + TO_WHOLE) & (int)LARGEST);
+    const codes made = CONVERT_CODES(as_int16(value + TO_WHOLE) & (int)MAX_CODE);
 #else
     const codes made = value;
 #endif

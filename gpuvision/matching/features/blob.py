@@ -309,9 +309,9 @@ class FindBlobs(VisionOperation[Blobs]):
             "EFFICIENCY": efficiency("tukey", TUNING_CONSTANT),
             "FREEDOMS": freedoms,
             "SPOKES": self.spokes,
-            "ROOM": round_up(self.spokes, _LANES),
+            "PADDED_SPOKES": round_up(self.spokes, _LANES),
             **({"RATIO": float(self.ratio)} if self.shape in ("ring", "cross") else {}),
-            **flags(ROUND=self._round, EITHER=self.polarity == "either", MATCH=self.match),
+            **flags(ROUND=self._round, EITHER_POLARITY=self.polarity == "either", MATCH_IMAGE=self.match),
         }
 
     def _layout(self) -> npt.NDArray[np.float64]:

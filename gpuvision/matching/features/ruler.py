@@ -360,7 +360,7 @@ class RulerEdges(VisionOperation[Edges]):
             "LENGTH": self.length,
             "WIDTH": self.width,
             "TAPS": self._reach,
-            "MOST": self._places,
+            "MAX_EDGES": self._places,
             "RULER_GROUP": _GROUP,
             "RULER_BITS": self._binary_places,
             **dict.fromkeys(chosen),

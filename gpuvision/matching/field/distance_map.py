@@ -85,7 +85,7 @@ class Field:
 
     @property
     def shapes(self) -> npt.NDArray[np.float64]:
-        """Table of ``kernels/field/field.h``, (lines + arcs, 7)."""
+        """Table of ``kernels/distance_map/field.h``, (lines + arcs, 7)."""
         rows = []
         for x0, y0, x1, y1 in self.lines:
             half = 0.5 * math.hypot(x1 - x0, y1 - y0)
@@ -174,13 +174,13 @@ class DistanceMapBuilder(VisionOperation[DistanceMapCells]):
         shapes = self.field.shapes.astype(np.float32)
         cells = (self.rows, *shape)
         return build.launch(
-            "field/distance_map.cl",
-            "field_map",
+            "distance_map/distance_map.cl",
+            "distance_map",
             work=WorkSize((shape[0], self.rows), None),
             outputs=build.outputs(
                 {"distance": cells, "nearest": (*cells, _NEAREST), "level": cells}, nearest=np.uint8, level=np.uint16
             ),
-            defines={"FIELD_LEVELS": COST_LEVELS},
+            defines={"COST_LEVELS": COST_LEVELS},
             arguments=[
                 np.float32(self.first_y),
                 np.float32(self.cell),

@@ -154,13 +154,13 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
         angles = self.angles
         work = pose_grid_work(build, len(angles), rows, columns)
         return build.launch(
-            "field/field_search.cl",
-            "field_search",
+            "field_pose/field_pose_search.cl",
+            "field_pose_search",
             work=work,
             outputs=pose_cost_outputs(build, len(angles), rows, columns, with_scores=self.with_scores),
             defines={
                 "CAPACITY": capacity(count, least=64),
-                "FIELD_LEVELS": COST_LEVELS,
+                "COST_LEVELS": COST_LEVELS,
                 **flags(WITH_SCORES=self.with_scores),
             },
             arguments=[
@@ -307,14 +307,14 @@ class FieldPoseRefinement(VisionOperation[FieldPoses]):
         cells, starts = self.map.cells.nearest, (self.count,)
         shapes = {"poses": (*starts, 3), "covariance": (*starts, 3, 3), "information": (*starts, 3, 3)}
         return build.launch(
-            "field/field_refine.cl",
-            "field_refine",
+            "field_pose/field_pose_refinement.cl",
+            "field_pose_refinement",
             work=WorkSize(starts, (1,)),
             more_inputs=[((self.count, 3), build.real)],
             outputs=build.outputs(
                 shapes | dict.fromkeys(("score", "residual_std", "inlier_fraction", "status"), starts)
             ),
-            defines={"WEAKEST": f"{_MIN_EIGENVALUE_RATIO}f"},
+            defines={"MIN_EIGENVALUE_RATIO": f"{_MIN_EIGENVALUE_RATIO}f"},
             arguments=[
                 self.map.field.shapes.astype(np.float32).ravel(),
                 cells,

@@ -228,4 +228,7 @@ class BoardPoseEstimator(VisionOperation[BoardPoseEstimate]):
 
     def _capacities(self) -> dict[str, Define]:
         """Return the sizes of the private arrays."""
-        return {"EACH": capacity(self.rulers_per_line), "ROOM": capacity(self.lines * self.rulers_per_line)}
+        return {
+            "MAX_RULERS_PER_LINE": capacity(self.rulers_per_line),
+            "MAX_RULERS": capacity(self.lines * self.rulers_per_line),
+        }

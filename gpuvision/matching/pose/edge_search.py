@@ -150,7 +150,7 @@ class EdgeCostMap(VisionOperation[EdgeCosts]):
             "edge_levels",
             work=WorkSize((columns, rows), None),
             outputs=build.outputs({"level": (CHANNELS, rows, columns)}, level=np.uint16),
-            defines=flags(FROM_MEANS=True),
+            defines={"COST_LEVELS": COST_LEVELS, **flags(FROM_MEANS=True)},
             arguments=[
                 *map(np.int32, (*shape, self.border)),
                 np.float32((0.25 * self.threshold) ** 2),
@@ -223,7 +223,11 @@ class EdgeSearch(VisionOperation[PoseCosts]):
             work=work,
             more_inputs=[((self.headings, self.points), np.dtype(np.int32))],
             outputs=pose_cost_outputs(build, *grid, with_scores=self.with_scores),
-            defines={"CAPACITY": capacity(self.points, least=64), **flags(WITH_SCORES=self.with_scores)},
+            defines={
+                "CAPACITY": capacity(self.points, least=64),
+                "COST_LEVELS": COST_LEVELS,
+                **flags(WITH_SCORES=self.with_scores),
+            },
             arguments=[*map(np.int32, (self.points, self.rows, self.columns, shape[2], limit, work.each))],
         )
 

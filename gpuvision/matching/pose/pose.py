@@ -337,7 +337,11 @@ class SolvePose(VisionOperation[BoardPose]):
             work=work,
             more_inputs=[((*batch, 3), dtype)] if self.with_initial_pose else [],
             outputs=build.outputs(self.shapes(batch, (*batch, count)), rank=np.int32, inliers=np.int32),
-            defines={**self.defines(count), **type_defines("INPUT", dtype), **flags(WITH_NEAR=self.with_initial_pose)},
+            defines={
+                **self.defines(count),
+                **type_defines("INPUT", dtype),
+                **flags(WITH_INITIAL_POSE=self.with_initial_pose),
+            },
             arguments=[
                 np.int64(poses),
                 np.int32(count),
@@ -386,11 +390,11 @@ class SolvePose(VisionOperation[BoardPose]):
             **loss_defines(self.loss, self.tuning_constant),
             **({} if self.scale is None else {"GIVEN_SCALE": self.scale}),
             "EFFICIENCY": efficiency(self.loss, self.tuning_constant),
-            "OF_POSE": TRANSFORM_PARAMETERS[self.transform],
+            "POSE_PARAMETERS": TRANSFORM_PARAMETERS[self.transform],
             "FREEDOMS": self.unknowns,
             "START_STEPS": _START_STEPS,
             "CAPACITY": capacity(count, least=_LANES),
-            **flags(ETCHED=self.etch_bias_sigma is not None),
+            **flags(WITH_ETCH_BIAS=self.etch_bias_sigma is not None),
         }
 
     def starts(self, count: int, *, vectors: bool) -> npt.NDArray[np.int32]:

@@ -111,7 +111,7 @@ class _Rays(VisionOperation[R]):
             defines={
                 **type_defines("INPUT", build.dtype),
                 "BVH_DEPTH": tree.depth,
-                **flags(SEGMENTS=kernel == "any_hit", WIDE_PLACES=build.device.has_double),
+                **flags(ANY_HIT=kernel == "any_hit", DOUBLE_POSITIONS=build.device.has_double),
             },
             arguments=[
                 *tree.tables(build.real),

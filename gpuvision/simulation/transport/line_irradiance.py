@@ -218,7 +218,7 @@ class LineIrradiance(VisionOperation[Irradiance]):
             "line_irradiance",
             work=work,
             outputs=build.outputs({"irradiance": shape[:-1], "status": shape[:-1]}),
-            defines={**type_defines("INPUT", dtype), **flags(WIDE_PLACES=device.has_double)},
+            defines={**type_defines("INPUT", dtype), **flags(DOUBLE_POSITIONS=device.has_double)},
             arguments=[
                 *tables,
                 np.uint32(np.count_nonzero(np.diff(firsts) == 1)),

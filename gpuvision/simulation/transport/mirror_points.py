@@ -28,8 +28,8 @@ from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.sheet_cut import concatenated_ranges
 
 Float64 = npt.NDArray[np.float64]
-# Columns of a triangle and of a block in kernels/mirrors/mirrors.cl; work-items of a group; lanes of a vector.
-_ROW, _BLOCK, _GROUP, _LANES = 27, 11, 64, 16
+# Work-items of a group; lanes of a vector.
+_GROUP, _LANES = 64, 16
 # Default angle between neighbouring triangles above which their edge is sharp [rad] (chosen).
 CREASE = math.radians(40.0)
 
@@ -106,6 +106,31 @@ class MirrorImages(NamedTuple):
     status: StatusArray
 
 
+class MirrorTriangle(NamedTuple):
+    """Columns of the triangles' table of ``kernels/mirrors/mirrors.cl``; its struct has the same fields."""
+
+    corner: Float64
+    edges: Float64
+    normals: Float64
+    f_by_x: Float64
+    f_by_y: Float64
+    f1_at_first: Float64
+    f2_at_first: Float64
+    one_sided: Float64
+
+
+class MirrorBlock(NamedTuple):
+    """Columns of the blocks' table of ``kernels/mirrors/mirrors.cl``; its struct has the same fields."""
+
+    middle: Float64
+    radius: Float64
+    axis: Float64
+    cosine_of_twice: Float64
+    sine_of_twice: Float64
+    one_sided: Float64
+    sine: Float64
+
+
 class TriangleBlocks(NamedTuple):
     """Blocks of triangles (the leaves of a tree), each with a bounding ball and a cone of normals.
 
@@ -176,22 +201,24 @@ class TriangleBlocks(NamedTuple):
         return cls(order, start, middle, radius, axis, cone, np.logical_and.reduceat(one_sided, start[:-1]))
 
     def table(self, middle: Float64) -> Float64:
-        """Return rows of kernels/mirrors/mirrors.cl, at least one; balls and cones are widened beyond rounding."""
-        if not len(self.radius):
-            return np.zeros((1, _BLOCK))
+        """Return the table of kernels/mirrors/mirrors.cl, one row or more (see `rows`)."""
+        rows = np.column_stack(self.rows(middle))
+        return rows if len(rows) else np.zeros((1, rows.shape[1]))
+
+    def rows(self, middle: Float64) -> MirrorBlock:
+        """Return the columns of kernels/mirrors/mirrors.cl; balls and cones are widened beyond rounding."""
         twice = np.minimum(2.0 * self.cone * (1.0 + 1e-5) + 1e-6, math.pi)
         radius = self.radius * (1.0 + 1e-5)
         one_sided = self.outside & (twice < 0.5 * math.pi)
-        columns = [
-            self.middle - middle,
-            radius,
-            self.axis,
-            np.cos(twice),
-            np.sin(twice),
-            one_sided,
-            np.sin(0.5 * twice),
-        ]
-        return np.column_stack(columns)
+        return MirrorBlock(
+            middle=self.middle - middle,
+            radius=radius,
+            axis=self.axis,
+            cosine_of_twice=np.cos(twice),
+            sine_of_twice=np.sin(twice),
+            one_sided=np.asarray(one_sided, np.float64),
+            sine=np.sin(0.5 * twice),
+        )
 
 
 def max_bulge(corners: Float64, normals: Float64) -> Float64:
@@ -280,21 +307,24 @@ class MirrorPoints(VisionOperation[MirrorImages]):
             raise ValueError(f"MirrorPoints.kept is {self.kept}, expected 1 to 255")
 
     def _table(self, middle: Float64) -> Float64:
-        """Return rows of kernels/mirrors/mirrors.cl, at least one."""
+        """Return the table of kernels/mirrors/mirrors.cl, one row or more (see `rows`)."""
+        rows = np.column_stack(self.rows(middle))
+        return rows if len(rows) else np.zeros((1, rows.shape[1]))
+
+    def rows(self, middle: Float64) -> MirrorTriangle:
+        """Return the columns of kernels/mirrors/mirrors.cl."""
         corners, normals = (self.corners - middle)[self._blocks.order], self.normals[self._blocks.order]
         first, one, two = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        columns = [
-            first,
-            one,
-            two,
-            normals.reshape(-1, 9),
-            np.einsum("mk,mnk->mn", one, normals),
-            np.einsum("mk,mnk->mn", two, normals),
-            -np.sum(one * normals[:, 1], axis=1, keepdims=True),
-            -np.sum(two * normals[:, 2], axis=1, keepdims=True),
-            np.asarray(self.outside, np.float64)[self._blocks.order, None],
-        ]
-        return np.hstack(columns) if len(corners) else np.zeros((1, _ROW))
+        return MirrorTriangle(
+            corner=first,
+            edges=np.hstack([one, two]),
+            normals=normals.reshape(-1, 9),
+            f_by_x=np.einsum("mk,mnk->mn", one, normals),
+            f_by_y=np.einsum("mk,mnk->mn", two, normals),
+            f1_at_first=-np.sum(one * normals[:, 1], axis=1),
+            f2_at_first=-np.sum(two * normals[:, 2], axis=1),
+            one_sided=np.asarray(self.outside, np.float64)[self._blocks.order],
+        )
 
     @functools.cached_property
     def _blocks(self) -> TriangleBlocks:

@@ -176,7 +176,7 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
                 "BVH_DEPTH": max(tree.depth, _MIN_STACK_DEPTH),
                 **({} if work.vectors else {"GROUP": _GROUP}),
                 **flags(
-                    WIDE_PLACES=device.has_double,
+                    DOUBLE_POSITIONS=device.has_double,
                     INTERVALS=self.visibility == "intervals",
                     RAYS=self.visibility == "rays",
                     SELECTED=self.selected is not None,

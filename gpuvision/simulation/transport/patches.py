@@ -236,10 +236,22 @@ class Patches:
 
     def tables(self, middle: Reals, real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
         """Return the triangles, the patches' starts and slacks as kernels/patches/patches.cl takes them."""
-        edges = np.diff(self.corners, axis=1).reshape(-1, 6)
-        rows = np.concatenate([self.corners[:, 0] - middle, edges, self.normals], axis=1)
+        edges = np.diff(self.corners, axis=1)
+        triangles = PatchTriangle(
+            corner=self.corners[:, 0] - middle, edge_1=edges[:, 0], edge_2=edges[:, 1], normal=self.normals
+        )
+        rows = np.concatenate(triangles, axis=1)
         starts = np.searchsorted(self._patch, np.arange(self.count + 1))
         return rows.astype(real), starts.astype(np.int32), self._slack.astype(real)
+
+
+class PatchTriangle(NamedTuple):
+    """Columns of the triangles' table of ``kernels/patches/patches.cl``, in the order of its struct `PatchTriangle`."""
+
+    corner: Reals
+    edge_1: Reals
+    edge_2: Reals
+    normal: Reals
 
 
 class Factors(NamedTuple):
@@ -304,7 +316,7 @@ class _PatchOperation(VisionOperation[R]):
             outputs=build.outputs({**shapes, "status": build.shape[:-1]}),
             defines={
                 **type_defines("INPUT", build.dtype),
-                **type_defines("PLACE", place),
+                **type_defines("POSITION", place),
                 "BVH_DEPTH": 1 if tree is None else tree.depth,
                 **flags(FACTORS=kernel == "form_factors", OCCLUSION=tree is not None),
             },

@@ -10,10 +10,10 @@
 // Outputs: poses (starts, 3); covariance, information (starts, 3, 3) [m2, m rad, rad2, and inverse]; score (starts,)
 //          mean cost, 0 to 1; scale (starts,) standard deviation of an inlier's distance [m]; share (starts,) fraction
 //          of the points within c of a line; status (starts,).
-// Options: WEAKEST: least ratio of eigenvalues of a determined pose.
+// Options: MIN_EIGENVALUE_RATIO: least ratio of eigenvalues of a determined pose.
 //
 // One work-item refines one start.
-#include "field/field.h"
+#include "distance_map/field.h"
 #include "common/status.h"
 
 // Cost; normal matrix J^T W J by (x, y, t); gradient J^T W r. t is the heading.
@@ -126,13 +126,14 @@ static inline void store_symmetric(global float *to, normal_equations of, float 
     to[8] = of.tt * scale;
 }
 
-kernel void field_refine(global const float *restrict points, global const float *restrict starts,
-                         global float *restrict poses, global float *restrict covariance,
-                         global float *restrict information, global float *restrict score,
-                         global float *restrict scale, global float *restrict share, global uchar *restrict status,
-                         constant float *shapes, global const uchar *restrict nearest, const int count,
-                         const int rows, const int columns, const float first_x, const float first_y,
-                         const float cell, const float scale_squared, const float max_range_squared, const int steps) {
+kernel void field_pose_refinement(global const float *restrict points, global const float *restrict starts,
+                                  global float *restrict poses, global float *restrict covariance,
+                                  global float *restrict information, global float *restrict score,
+                                  global float *restrict scale, global float *restrict share,
+                                  global uchar *restrict status, constant float *shapes,
+                                  global const uchar *restrict nearest, const int count, const int rows,
+                                  const int columns, const float first_x, const float first_y, const float cell,
+                                  const float scale_squared, const float max_range_squared, const int steps) {
     const size_t i = get_global_id(0);
     const field_grid grid = {first_x, first_y, 1.0f / cell, rows, columns};
     float3 pose = (float3)(starts[3 * i], starts[3 * i + 1], starts[3 * i + 2]);
@@ -189,8 +190,8 @@ kernel void field_refine(global const float *restrict points, global const float
     const int few = used < 4 || sum_curvature < 4;
     const float last_x = first_x + cell * (float)(columns - 1), last_y = first_y + cell * (float)(rows - 1);
     const int outside = !(pose.x >= first_x && pose.x <= last_x && pose.y >= first_y && pose.y <= last_y);
-    // det > WEAKEST trace (sum of principal minors): for eigenvalues l1 << l2 <= l3 this bounds l1 / l3.
-    const int weak = !(determinant > (float)WEAKEST * all * minors);
+    // det > MIN_EIGENVALUE_RATIO trace (sum of principal minors): for eigenvalues l1 << l2 <= l3 this bounds l1 / l3.
+    const int weak = !(determinant > (float)MIN_EIGENVALUE_RATIO * all * minors);
     const int bad = !finite || few || outside;
     status[i] = !finite ? STATUS_NOT_FINITE
                         : (few ? STATUS_LOW_SIGNAL

@@ -7,10 +7,9 @@
 // Tables:  level (map rows, stride) uint16 (distance_map.cl), border: cells around the positions; headings (headings,
 //          2) cosine and sine; per_cell: cells per metre; max_range_squared: square of the largest range [m2].
 // Outputs: scores, least, column (shift_sums.h); seen (headings,) number of points used.
-// Options: FIELD_LEVELS, CAPACITY (size of the array of shifts), WITH_SCORES.
+// Options: COST_LEVELS, CAPACITY (size of the array of shifts), WITH_SCORES.
 // Variants: vector: a work-item per heading and `each` rows of positions; work-item: a group of BLOCK items per heading
 //          and block of positions.
-#define LEVELS FIELD_LEVELS
 #include "common/shift_sums.h"
 
 // Return the shift of a point for a heading; -1 for a point that is not finite or out of range.
@@ -24,11 +23,11 @@ static inline int shift_of(float2 point, float2 heading, float per_cell, float m
 }
 
 #ifdef VECTOR_VARIANT
-kernel void field_search(global const float *restrict points, global float *restrict scores,
-                         global float *restrict least, global int *restrict column, global int *restrict seen,
-                         global const ushort *restrict level, constant float *headings, const int count,
-                         const int rows, const int columns, const int border, const int stride, const float per_cell,
-                         const float max_range_squared, const int each) {
+kernel void field_pose_search(global const float *restrict points, global float *restrict scores,
+                              global float *restrict least, global int *restrict column, global int *restrict seen,
+                              global const ushort *restrict level, constant float *headings, const int count,
+                              const int rows, const int columns, const int border, const int stride,
+                              const float per_cell, const float max_range_squared, const int each) {
     const int turn = (int)get_global_id(1), first = (int)get_global_id(0) * each, end = min(first + each, rows);
     const float2 heading = (float2)(headings[2 * turn], headings[2 * turn + 1]);
     int shifts[CAPACITY], used = 0;
@@ -42,11 +41,11 @@ kernel void field_search(global const float *restrict points, global float *rest
     sum_rows(level, shifts, used, turn, first, end, rows, columns, stride, scores, least, column);
 }
 #else
-kernel void field_search(global const float *restrict points, global float *restrict scores,
-                         global float *restrict least, global int *restrict column, global int *restrict seen,
-                         global const ushort *restrict level, constant float *headings, const int count,
-                         const int rows, const int columns, const int border, const int stride, const float per_cell,
-                         const float max_range_squared, const int each) {
+kernel void field_pose_search(global const float *restrict points, global float *restrict scores,
+                              global float *restrict least, global int *restrict column, global int *restrict seen,
+                              global const ushort *restrict level, constant float *headings, const int count,
+                              const int rows, const int columns, const int border, const int stride,
+                              const float per_cell, const float max_range_squared, const int each) {
     const int item = (int)get_local_id(0), turn = (int)get_group_id(2);
     local int shifts[CAPACITY], used;
     local uint key;

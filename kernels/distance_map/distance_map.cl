@@ -7,15 +7,15 @@
 //          scale_squared: c^2 [m2].
 // Tables:  shapes (count, SHAPE): lines and arcs (field.h).
 // Outputs: distance (rows, columns) float32 [m]; nearest (rows, columns, NEAREST) uint8, indices of the shapes that may
-//          be nearest to a point of the cell; level (rows, columns) uint16, the cost in FIELD_LEVELS steps.
-// Options: FIELD_LEVELS: the cost 1.
+//          be nearest to a point of the cell; level (rows, columns) uint16, the cost in COST_LEVELS steps.
+// Options: COST_LEVELS: the cost 1.
 //
 // One work-item computes one cell.
-#include "field/field.h"
+#include "distance_map/field.h"
 
-kernel void field_map(global const float *restrict at_x, global float *restrict cell_distance,
-                      global uchar *restrict nearest, global ushort *restrict level, const float first_y,
-                      const float cell, constant float *shapes, const int count, const float scale_squared) {
+kernel void distance_map(global const float *restrict at_x, global float *restrict cell_distance,
+                         global uchar *restrict nearest, global ushort *restrict level, const float first_y,
+                         const float cell, constant float *shapes, const int count, const float scale_squared) {
     const size_t column = get_global_id(0), row = get_global_id(1), i = row * get_global_size(0) + column;
     const float x = at_x[column], y = first_y + (float)row * cell;
     // The NEAREST smallest distances and their shapes, by insertion.
@@ -43,5 +43,5 @@ kernel void field_map(global const float *restrict at_x, global float *restrict 
         nearest[NEAREST * i + place] = (uchar)which[distance[place] <= limit ? place : 0];
     cell_distance[i] = distance[0];
     level[i] =
-        (ushort)(distance[0] * distance[0] / (scale_squared + distance[0] * distance[0]) * (float)FIELD_LEVELS + 0.5f);
+        (ushort)(distance[0] * distance[0] / (scale_squared + distance[0] * distance[0]) * (float)COST_LEVELS + 0.5f);
 }

@@ -11,7 +11,7 @@ from typing import Any
 
 import pyopencl as cl
 
-from gpuvision.host.debug import debug_folder, dump_program
+from gpuvision.host.debug import debug_folder, dump_program, flatten_includes
 from gpuvision.host.device import Device
 from gpuvision.host.errors import BuildError
 
@@ -75,8 +75,13 @@ def build(
 def _build(
     context: Any, handle: Any, folder: Path, source: str, words: tuple[str, ...], include_folders: tuple[Path, ...]
 ) -> Any:
-    program = cl.Program(context, (folder / source).read_text())
-    includes = [word for each in (folder, *include_folders) for word in ("-I", os.fspath(each))]
+    text = flatten_includes(folder, source, include_folders)
+    # The compilers' caches know a program by its text and options. With the headers in the text and no path in the
+    # options, all copies of the kernels (checkouts, an installed package) share the cached programs. Only the line of a
+    # header that is not found stays: the compiler reports it, or finds it by its own search.
+    folders = (folder, *include_folders) if "#include" in text else ()
+    includes = [word for each in folders for word in ("-I", os.fspath(each))]
+    program = cl.Program(context, text)
     dump = functools.partial(dump_program, handle, folder, source, words, include_folders)
     try:
         with warnings.catch_warnings():

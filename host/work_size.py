@@ -41,8 +41,12 @@ def padded_groups(count: int, group: int) -> WorkSize:
 
 
 def fitted_groups(count: int, group: int) -> WorkSize:
-    """Return the work size of `padded_groups` with a single smaller group where `count` is below `group`."""
-    each = max(min(count, group), 1)
+    """Return the work size of groups that overlap: the last group moves back to end with the last element.
+
+    Where `count` is below `group`, the group size is the largest power of two up to `count`. PoCL compiles a kernel
+    anew for each group size, so that powers of two keep the number of compilations small.
+    """
+    each = group if count >= group else 1 << max(count.bit_length() - 1, 0)
     return WorkSize((round_up(count, each),), (each,), each)
 
 

@@ -25,6 +25,7 @@ from gpuvision.host import (
     Variant,
     WorkSize,
     flags,
+    padded_groups,
     type_defines,
 )
 from gpuvision.operation import VisionOperation
@@ -36,6 +37,7 @@ ELECTRON = 1.602176634e-19  # elementary charge [C]
 # Samples of a work-item of the vector variant, multiples of 16: long, unless there are too few to keep every core busy.
 _SHORT_STRIP, _LONG_STRIP, _STRIPS_PER_CORE = 4096, 65536, 4
 _LANES = 16  # of a vector of the vector variant: its kernel's vectors have 16 elements
+_GROUP = 64  # work-items of a group of the other variant
 
 
 class PsdReading(NamedTuple):
@@ -257,7 +259,7 @@ class PsdReadout(VisionOperation[PsdReading]):
             # The last work-item also processes the remainder.
             work = WorkSize((max(samples // each, 1),), (1,), each, vectors=True)
         else:
-            work = WorkSize((samples,), None, each)
+            work = padded_groups(samples, _GROUP)
         chosen = self.outputs or ()
         sheet = self.triangulation
         table = None if self.linearity is None else np.array(self.linearity, build.real)

@@ -32,6 +32,7 @@ from gpuvision.host import (
     StatusArray,
     Variant,
     WorkSize,
+    round_up,
     type_defines,
 )
 from gpuvision.operation import VisionOperation
@@ -39,6 +40,7 @@ from gpuvision.validation import check_keys, finite, numbers
 
 _STRIP = 1024  # samples of a work-item of the vector variant: SAMPLES_PER_STRIP in range_image.cl
 _LANES = 16  # of a vector of the vector variant: its kernel's vectors have 16 elements
+_GROUP = 64  # work-items of a group of the other variant
 _PARALLEL = 1e-9  # volume of three unit vectors, or sine between two, below which they count as coplanar or parallel
 # A vector whose length is 1 within this rounding (two epsilon) is not normalised again, so that a written vector reads
 # back unchanged.
@@ -427,9 +429,9 @@ class RangeImage(VisionOperation[RangePoints]):
         build.check_shape(len(shape) == 2, "(profiles, samples)")
         profiles, samples = shape
         if build.uses_vectors and samples >= _LANES:
-            work = WorkSize((max(samples // _STRIP, 1), profiles), None, vectors=True)
+            work = WorkSize((max(samples // _STRIP, 1), profiles), (1, 1), vectors=True)
         else:
-            work = WorkSize((samples, profiles), None)
+            work = WorkSize((round_up(samples, _GROUP), profiles), (_GROUP, 1))
         more_coordinates = [(shape, dtype)] * (self.geometry.inputs - 1)
         return build.launch(
             "range_image/range_image.cl",

@@ -242,6 +242,7 @@ kernel void psd_readout(global const INPUT *currents, global real *position, glo
     const int begin = get_global_id(0) * each;
     read_range(begin, get_global_id(0) + 1 == get_global_size(0) ? samples : begin + each, &io);
 #else
+    if ((int)get_global_id(0) >= samples) return;
     Verdict unused = clean_verdict();
     read_samples(1, get_global_id(0), &io, &unused);
 #endif

@@ -226,6 +226,7 @@ kernel void assemble_profiles(
         assemble(1, row, min(sample, end - LANES), pose, first, second, given, x, y, z, status, table);
     }
 #else
+    if (get_global_id(0) >= samples) return;
     assemble(1, row, get_global_id(0), pose, first, second, given, x, y, z, status, table);
 #endif
 }

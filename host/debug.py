@@ -16,14 +16,17 @@ import re
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gpuvision.host.arrays import DeviceArray, HostArray, to_numpy
 
 VARIABLE = "GPUVISION_DEBUG"
-_INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"]+)"')
+_INCLUDE = re.compile(r'^[ \t]*#[ \t]*include[ \t]+"([^"]+)".*$', re.MULTILINE)
+_GUARD = re.compile(r"#ifndef (\w+)\n#define \1\n")
+_DIRECTIVE = re.compile(r"^[ \t]*#[ \t]*(\w+)", re.MULTILINE)
+_LINE_END = "\n"
 _UNSAFE = re.compile(r"[^\w.-]+")
 
 
@@ -52,29 +55,85 @@ def flatten_includes(folder: Path, source: str, include_folders: Sequence[Path] 
     Returns
     -------
     str
-        OpenCL C. ``#line`` directives name the original files, so that compiler messages point into them. A header that
-        includes itself indirectly is omitted at the inner include, where the include guard would make it empty. The
-        line of a header that does not exist stays, for the compiler to report.
+        OpenCL C. ``#line`` directives name the original files, so that compiler messages point into them. A header
+        is omitted where its include guard makes it empty: inside itself, and after an include without a condition.
+        The line of a header that does not exist stays, for the compiler to report.
     """
-    return "".join(_flattened(folder / source, source, (folder, *include_folders), ()))
+    return _Flattener((folder, *include_folders)).text(folder / source, source)
 
 
-def _flattened(path: Path, name: str, folders: Sequence[Path], including: tuple[Path, ...]) -> Iterator[str]:
-    yield f'#line 1 "{name}"\n'
-    for number, line in enumerate(path.read_text().splitlines(), 1):
-        found = _INCLUDE.match(line)
-        if found is None:
-            yield f"{line}\n"
-            continue
-        # The main file is compiled from memory: only headers are searched in the folder of the including file.
-        own_folder = [path.parent] if including else []
-        header = next((each / found[1] for each in (*own_folder, *folders) if (each / found[1]).is_file()), None)
-        if header is None:
-            yield f"{line}\n"
-            continue
-        if header.resolve() not in including:
-            yield from _flattened(header, found[1], folders, (*including, path.resolve()))
-        yield f'#line {number + 1} "{name}"\n'
+class _Include(NamedTuple):
+    """Line ``#include "..."`` whose header was found."""
+
+    name: str
+    header: Path
+    conditional: bool  # whether it stands between #if and #endif, apart from the include guard of its file
+
+
+class _Parts(NamedTuple):
+    """Text of a file before each include line, and after the last one."""
+
+    texts: list[str]
+    includes: list[_Include]
+    guarded: bool  # whether an include guard makes the file empty when it is included again
+
+    @classmethod
+    def of(cls, path: Path, name: str, folders: Sequence[Path]) -> _Parts:
+        """Read a file and find its headers in the folders."""
+        text = f"{path.read_text().rstrip()}\n"
+        guarded = _is_guarded(text)
+        parts, start = cls([f'#line 1 "{name}"\n'], [], guarded), 0
+        for found in _INCLUDE.finditer(text):
+            candidates = [Path(os.path.normpath(folder / found[1])) for folder in folders]
+            header = next((each for each in candidates if each.is_file()), None)
+            if header is None:
+                continue
+            before = text[: found.start()]
+            parts.includes.append(_Include(found[1], header, conditional=_depths(before)[-1] > guarded))
+            parts.texts[-1] += text[start : found.start()]
+            parts.texts.append(f'#line {before.count(_LINE_END) + 2} "{name}"')
+            start = found.end()
+        parts.texts[-1] += text[start:]
+        return parts
+
+
+def _depths(text: str) -> list[int]:
+    """Return the number of open ``#if`` conditions at the start, and after each directive."""
+    kinds = [found[1] for found in _DIRECTIVE.finditer(text)]
+    return list(itertools.accumulate((kind.startswith("if") - (kind == "endif") for kind in kinds), initial=0))
+
+
+def _is_guarded(text: str) -> bool:
+    """Return whether one include guard encloses a file: its condition is open up to the last directive."""
+    first = _DIRECTIVE.search(text)
+    starts = first is not None and _GUARD.match(text, first.start()) is not None
+    return starts and 0 not in _depths(text)[1:-1] and text.rstrip().endswith("#endif")
+
+
+class _Flattener:
+    """Writer of a file with its headers in place; a guarded header that was written before is left out."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self.folders = folders
+        self.known: dict[tuple[Path, str], _Parts] = {}
+        self.written: set[Path] = set()  # guarded headers that the compiler has seen, whatever the macros are
+
+    def text(self, path: Path, name: str, including: tuple[Path, ...] = (), *, conditional: bool = False) -> str:
+        """Return the text of a file that the files `including` include, one the other."""
+        if (path, name) not in self.known:
+            # The main file is compiled from memory: only a header is searched beside the including file.
+            places = (path.parent, *self.folders) if including else self.folders
+            self.known[path, name] = _Parts.of(path, name, places)
+        parts = self.known[path, name]
+        if parts.guarded and not conditional:
+            self.written.add(path)
+        text = parts.texts[0]
+        for include, after in zip(parts.includes, parts.texts[1:], strict=True):
+            if include.header not in (*including, path) and include.header not in self.written:
+                inside = conditional or include.conditional
+                text += self.text(include.header, include.name, (*including, path), conditional=inside)
+            text += after
+        return text
 
 
 def dump_program(

@@ -119,6 +119,28 @@ def test_lines_keep_their_numbers(device: Device, folder: Path, kernels: Path, t
         cl.Program(device.context, path.read_text()).build(cache_dir=False)
 
 
+def test_a_guarded_header_is_written_once(tmp_path: Path) -> None:
+    guarded = "#ifndef {0}\n#define {0}\n{1}\n#endif\n"
+    files = {
+        "a.h": guarded.format("A", "int a;"),
+        "b.h": guarded.format("B", '#include "a.h"\n#include "list.h"\nint b;'),
+        "list.h": "ENTRY(1)\n",
+        "once.cl": '#include "a.h"\n#include "b.h"\n#include "list.h"\n#include "a.h"\n',
+        # Without the macro the compiler sees the first header only at the second place.
+        "conditional.cl": '#ifdef FLAG\n#include "b.h"\n#endif\n#include "a.h"\n#include "b.h"\n',
+        "two.h": "#ifndef A\n#define A\n#endif\n#ifdef FLAG\nint two;\n#endif\n",
+        "twice.cl": '#include "two.h"\n#define FLAG\n#include "two.h"\n',
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    once = debug.flatten_includes(tmp_path, "once.cl")
+    assert (once.count("int a;"), once.count("int b;"), once.count("ENTRY(1)")) == (1, 1, 2)
+    assert once.endswith('#line 4 "once.cl"\n#line 5 "once.cl"\n')
+    _, behind = debug.flatten_includes(tmp_path, "conditional.cl").split('#line 3 "conditional.cl"')
+    assert (behind.count("int a;"), behind.count("int b;")) == (1, 1)
+    assert debug.flatten_includes(tmp_path, "twice.cl").count("int two;") == 2
+
+
 def test_every_kernel_of_gpuvision_is_flattened() -> None:
     sources = sorted(KERNEL_FOLDER.rglob("*.cl"))
     assert sources

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +15,8 @@ import pyopencl as cl
 from gpuvision.host.debug import debug_folder, dump_program, flatten_includes
 from gpuvision.host.device import Device
 from gpuvision.host.errors import BuildError
+
+_COMMENT = re.compile(r"[ \t]*//[^\n]*")
 
 Define = int | float | str | None
 
@@ -75,10 +78,11 @@ def build(
 def _build(
     context: Any, handle: Any, folder: Path, source: str, words: tuple[str, ...], include_folders: tuple[Path, ...]
 ) -> Any:
-    text = flatten_includes(folder, source, include_folders)
-    # The compilers' caches know a program by its text and options. With the headers in the text and no path in the
-    # options, all copies of the kernels (checkouts, an installed package) share the cached programs. Only the line of a
-    # header that is not found stays: the compiler reports it, or finds it by its own search.
+    # The compilers' caches know a program by its text and options. With the headers in the text, no comments in it and
+    # no path in the options, all copies of the kernels (checkouts, an installed package) share the cached programs, and
+    # a changed comment needs no compilation. Only the line of a header that is not found stays: the compiler reports
+    # it, or finds it by its own search.
+    text = _COMMENT.sub("", flatten_includes(folder, source, include_folders))
     folders = (folder, *include_folders) if "#include" in text else ()
     includes = [word for each in folders for word in ("-I", os.fspath(each))]
     program = cl.Program(context, text)

@@ -4,7 +4,7 @@
 // One ray is tested against 16 boxes or 16 triangles at once, so unrelated rays cost as much as neighbouring rays. The 16
 // are a vector in the vector variant, else a loop. gpuvision/simulation/scene/bvh.py builds the tree.
 //
-// Build options: BVH_DEPTH, the largest number of nodes on a path from the root; REAL_IS_DOUBLE; VECTOR_VARIANT.
+// Build options: BVH_DEPTH, not less than the number of nodes on any path from the root; REAL_IS_DOUBLE; VECTOR_VARIANT.
 //
 // Watertight intersection (Woop, Benthin, Wald: Watertight Ray/Triangle Intersection, JCGT 2013): the corners are
 // transformed into the ray's frame, and the sign of each edge function is the sign of the exact difference of products. No

@@ -460,7 +460,7 @@ static __attribute__((noinline)) solved_pose pose_solved(laned_pose start, pose_
 #ifdef ROBUST
         if (RESCALED_AT(step))
             fit.scale = pose_scale(fit.pose, all, room, (real)2.5f * fit.scale, FEW_FITTED, min_scale);
-#elif defined(ETCHED)
+#elif defined(WITH_ETCH_BIAS)
         // The prior of the etch bias is weighed against residuals in units of their scale.
         fit.scale = pose_scale(fit.pose, all, room, INFINITY, FEW_FITTED, min_scale);
 #endif

@@ -27,6 +27,7 @@ from gpuvision.validation import finite
 
 _LANES, _GROUP = 16, 64
 _LARGEST_SET = 1024
+_MIN_CAPACITY = 64  # of the point arrays on CPUs, so that sets of many sizes share programs; on GPUs it costs memory
 
 
 class LineFits(NamedTuple):
@@ -180,7 +181,7 @@ class FitLines(VisionOperation[LineFits]):
                 **flags(WITH_SIGMA=self.weighted, WITH_WEIGHTS=self.with_weights),
                 **({} if self.scale is None else {"GIVEN_SCALE": self.scale}),
                 "EFFICIENCY": efficiency(self.loss, self.tuning_constant),
-                "CAPACITY": capacity(count, least=8),
+                "CAPACITY": capacity(count, least=_MIN_CAPACITY if work.vectors else 8),
             },
             arguments=[
                 np.int64(lines),

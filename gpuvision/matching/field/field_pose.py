@@ -43,6 +43,8 @@ from gpuvision.status import Status
 from gpuvision.validation import finite
 
 _BLOCK, _MOST_POINTS = 64, 4096
+MIN_SHIFTS = 1024
+"""Least size of the kernels' array of shifts, so that searches with fewer points share programs."""
 # Shares of the rows per core, so that the cores finish together, and number of rows above which shifting a point takes
 # less time.
 _SHARES_PER_CORE, _FEWEST_ROWS = 4, 4
@@ -159,7 +161,7 @@ class FieldPoseSearch(VisionOperation[PoseCosts]):
             work=work,
             outputs=pose_cost_outputs(build, len(angles), rows, columns, with_scores=self.with_scores),
             defines={
-                "CAPACITY": capacity(count, least=64),
+                "CAPACITY": capacity(count, least=MIN_SHIFTS),
                 "COST_LEVELS": COST_LEVELS,
                 **flags(WITH_SCORES=self.with_scores),
             },

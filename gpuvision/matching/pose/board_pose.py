@@ -27,6 +27,8 @@ Float64 = npt.NDArray[np.float64]
 RULER = ("x_px", "y_px", "cosine", "sine", "u", "v", "u_per_px", "v_per_px", "projective")
 LINE = ("normal_x", "normal_y", "x", "y", "sigma", "etch_factor")
 _GROUP, _MAX_RULERS = 64, 2048
+# Least sizes of the arrays on CPUs, so that boards of many sizes share programs; on GPUs they cost local memory.
+_MIN_RULERS_PER_LINE, _MIN_RULERS = 32, 512
 
 
 class BoardPoseEstimate(NamedTuple):
@@ -203,7 +205,11 @@ class BoardPoseEstimator(VisionOperation[BoardPoseEstimate]):
             work=work,
             more_inputs=[((*found, len(RULER)), build.real), ((self.lines, len(LINE)), build.real)],
             outputs=build.outputs(shapes, rank=np.int32, inliers=np.int32, edge_status=np.uint8),
-            defines={**edges.defines, **solver.defines(count), **self._capacities()},
+            defines={
+                **edges.defines,
+                **solver.defines(count, vectors=work.vectors),
+                **self._capacities(vectors=work.vectors),
+            },
             arguments=[
                 *edges.arguments[:4],
                 np.int32(self.lines),
@@ -226,9 +232,10 @@ class BoardPoseEstimator(VisionOperation[BoardPoseEstimate]):
     def _rows_of_line(self) -> int:
         return 2 if self.rulers_per_line > 1 else 1
 
-    def _capacities(self) -> dict[str, Define]:
-        """Return the sizes of the private arrays."""
+    def _capacities(self, *, vectors: bool) -> dict[str, Define]:
+        """Return the sizes of the arrays; with one ruler per line the code differs."""
+        rulers = self.rulers_per_line
         return {
-            "MAX_RULERS_PER_LINE": capacity(self.rulers_per_line),
-            "MAX_RULERS": capacity(self.lines * self.rulers_per_line),
+            "MAX_RULERS_PER_LINE": capacity(rulers, least=_MIN_RULERS_PER_LINE if vectors and rulers > 1 else 1),
+            "MAX_RULERS": capacity(self.lines * rulers, least=_MIN_RULERS if vectors else 1),
         }

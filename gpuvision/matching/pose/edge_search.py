@@ -34,7 +34,7 @@ from gpuvision.host import (
     to_numpy,
     type_defines,
 )
-from gpuvision.matching.field.field_pose import PoseCosts, pose_cost_outputs, pose_grid_work
+from gpuvision.matching.field.field_pose import MIN_SHIFTS, PoseCosts, pose_cost_outputs, pose_grid_work
 from gpuvision.operation import VisionOperation
 from gpuvision.validation import finite
 
@@ -224,7 +224,7 @@ class EdgeSearch(VisionOperation[PoseCosts]):
             more_inputs=[((self.headings, self.points), np.dtype(np.int32))],
             outputs=pose_cost_outputs(build, *grid, with_scores=self.with_scores),
             defines={
-                "CAPACITY": capacity(self.points, least=64),
+                "CAPACITY": capacity(self.points, least=MIN_SHIFTS),
                 "COST_LEVELS": COST_LEVELS,
                 **flags(WITH_SCORES=self.with_scores),
             },

@@ -42,6 +42,7 @@ TRANSFORM_PARAMETERS = {"rigid": 3, "similarity": 4, "affine": 6}
 ROW = ("normal_x", "normal_y", "x", "y", "displacement_x", "displacement_y", "sigma")
 _LANES, _GROUP = 16, 64
 _MOST_ROWS = 1024
+_MIN_CAPACITY = 128  # of the row arrays on CPUs, so that poses of many sizes share programs; on GPUs it costs memory
 _START_STEPS = 3  # Gauss-Newton iterations for the pose through a few features
 
 
@@ -338,7 +339,7 @@ class SolvePose(VisionOperation[BoardPose]):
             more_inputs=[((*batch, 3), dtype)] if self.with_initial_pose else [],
             outputs=build.outputs(self.shapes(batch, (*batch, count)), rank=np.int32, inliers=np.int32),
             defines={
-                **self.defines(count),
+                **self.defines(count, vectors=work.vectors),
                 **type_defines("INPUT", dtype),
                 **flags(WITH_INITIAL_POSE=self.with_initial_pose),
             },
@@ -383,8 +384,8 @@ class SolvePose(VisionOperation[BoardPose]):
         """One over the standard deviation of the etch bias [1/m]; 0 where it is not solved for."""
         return 0.0 if self.etch_bias_sigma is None else 1.0 / self.etch_bias_sigma
 
-    def defines(self, count: int) -> dict[str, Define]:
-        """Return the build options of ``pose.h`` for a number of rows."""
+    def defines(self, count: int, *, vectors: bool) -> dict[str, Define]:
+        """Return the build options of ``pose.h`` for a number of rows and a kernel variant."""
         assert self.tuning_constant is not None
         return {
             **loss_defines(self.loss, self.tuning_constant),
@@ -393,7 +394,7 @@ class SolvePose(VisionOperation[BoardPose]):
             "POSE_PARAMETERS": TRANSFORM_PARAMETERS[self.transform],
             "FREEDOMS": self.unknowns,
             "START_STEPS": _START_STEPS,
-            "CAPACITY": capacity(count, least=_LANES),
+            "CAPACITY": capacity(count, least=_MIN_CAPACITY if vectors else _LANES),
             **flags(WITH_ETCH_BIAS=self.etch_bias_sigma is not None),
         }
 

@@ -27,6 +27,7 @@ from gpuvision.operation import VisionOperation
 from gpuvision.simulation.clustering.light_cut import BLOCK, LightCut
 from gpuvision.simulation.clustering.light_tree import COLUMNS, NODE_SIZES, LightTree
 from gpuvision.simulation.errors.range_error import StripErrorModel
+from gpuvision.simulation.scene.bvh import MIN_STACK_SIZE
 from gpuvision.simulation.scene.scene import Scene
 
 Reals = npt.NDArray[np.float64]
@@ -258,7 +259,7 @@ class _SelectLights(VisionOperation[_Selection]):
                 **type_defines("INPUT", dtype),
                 **table_offsets("NODE", NODE_SIZES),
                 **table_offsets("SEGMENT", _SEGMENT_SIZES),
-                "BVH_DEPTH": 1 if tree is None else tree.depth,
+                "BVH_DEPTH": MIN_STACK_SIZE if tree is None else tree.stack_size,
                 "BLOCK": BLOCK,
                 **flags(OCCLUDERS=tree is not None, CLUSTERS=self.clusters),
             },

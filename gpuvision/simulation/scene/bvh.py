@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gpuvision.host import capacity
+
 Reals = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
@@ -23,6 +25,8 @@ WIDTH = 16
 # Bins of the surface-area heuristic. Scenes of up to _FEW_TRIANGLES are split triangle by triangle with the finer bins:
 # their build time is small anyway.
 _BINS, _FINE_BINS, _FEW_TRIANGLES = 16, 64, 8192
+# Size of the stack of the kernels that serves most scenes, so that they share programs.
+MIN_STACK_SIZE = 8
 # Levels after which nodes are halved by count: bounds the depth of the tree for any distribution of triangles.
 _MAX_HEURISTIC_DEPTH = 48
 # Boxes grow by this many roundings of the largest coordinate: the conversion to the real type moves their corners.
@@ -147,6 +151,11 @@ class Bvh:
         """Radius of a sphere about `middle` that contains all triangles, with 1 % margin [m]; 0 without triangles."""
         low, high = self.boxes[0, :3].min(axis=1), self.boxes[0, 3:].max(axis=1)
         return 1.01 * float(np.linalg.norm(np.maximum(high, -low))) if len(self.corners) else 0.0
+
+    @property
+    def stack_size(self) -> int:
+        """Build option ``BVH_DEPTH``: the depth as a power of two, not below `MIN_STACK_SIZE`."""
+        return capacity(self.depth, least=MIN_STACK_SIZE)
 
     def tables(self, real: np.dtype[Any]) -> tuple[npt.NDArray[Any], ...]:
         """Return nodes, children, axes, leaves and triangle numbers for kernels/common/bvh.h, in a real type."""

@@ -110,7 +110,7 @@ class _Rays(VisionOperation[R]):
             outputs=build.outputs({name: (*where, *shape) for name, shape in shapes.items()}, **types),
             defines={
                 **type_defines("INPUT", build.dtype),
-                "BVH_DEPTH": tree.depth,
+                "BVH_DEPTH": tree.stack_size,
                 **flags(ANY_HIT=kernel == "any_hit", DOUBLE_POSITIONS=build.device.has_double),
             },
             arguments=[

@@ -97,7 +97,7 @@ class VisibleIntervals(VisionOperation[Intervals]):
             "fan_intervals",
             work=build.work(count, each=1, group=_GROUP),
             outputs=build.outputs(shapes, interval_count=np.uint8),
-            defines={**type_defines("INPUT", dtype), "BVH_DEPTH": tree.depth},
+            defines={**type_defines("INPUT", dtype), "BVH_DEPTH": tree.stack_size},
             arguments=[
                 *tree.tables(build.real),
                 tree.middle.astype(dtype),

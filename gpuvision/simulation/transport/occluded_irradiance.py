@@ -38,8 +38,6 @@ _GROUP = 64  # work-items of a work-group (speed only)
 # Parts of the work per CPU core: enough to balance the load, but few, because each part groups the segments into lines
 # again.
 _SHARES_PER_CORE = 8
-# Least stack depth in the build options, so that all small scenes share one build.
-_MIN_STACK_DEPTH = 4
 # Default clearance in parts of the scene's reach, by bytes of the type: below it, the rounding of positions (including
 # the caller's) decides on which side of a surface a point lies.
 _CLEARANCE = {4: 4e-6, 8: 1e-12}
@@ -173,7 +171,7 @@ class OccludedIrradiance(VisionOperation[StripIrradiance]):
             ),
             defines={
                 **type_defines("INPUT", dtype),
-                "BVH_DEPTH": max(tree.depth, _MIN_STACK_DEPTH),
+                "BVH_DEPTH": tree.stack_size,
                 **({} if work.vectors else {"GROUP": _GROUP}),
                 **flags(
                     DOUBLE_POSITIONS=device.has_double,

@@ -24,6 +24,7 @@ from gpuvision.host import (
     type_defines,
 )
 from gpuvision.operation import VisionOperation
+from gpuvision.simulation.scene.bvh import MIN_STACK_SIZE
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.transport.line_irradiance import Irradiance
 from gpuvision.simulation.transport.patch_meshing import MeshingLimits, bisect_triangles, mesh_scene
@@ -317,7 +318,7 @@ class _PatchOperation(VisionOperation[R]):
             defines={
                 **type_defines("INPUT", build.dtype),
                 **type_defines("POSITION", place),
-                "BVH_DEPTH": 1 if tree is None else tree.depth,
+                "BVH_DEPTH": MIN_STACK_SIZE if tree is None else tree.stack_size,
                 **flags(FACTORS=kernel == "form_factors", OCCLUSION=tree is not None),
             },
             arguments=[

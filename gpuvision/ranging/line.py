@@ -332,8 +332,10 @@ class LineReadout(VisionOperation[LineReading]):
         bits = 8 * dtype.itemsize
         defines = type_defines("CODE", dtype, 4, 8, 16) | {"CODE_BITS": bits}
         defines |= flags(**{f"METHOD_{self.method.upper()}": True, f"SELECT_{self.peak_selection.upper()}": True})
-        reach = self.window + (self.fir_length // 2 if self.method == "fir" else 0)
-        defines |= {"RADIUS": self.window, "REACH": reach, "FIR_HALF": self.fir_length // 2}
+        # The centroid method has no window, and only the FIR method a filter: readouts with other values share programs.
+        window = 1 if self.method == "centroid" else self.window
+        half = self.fir_length // 2 if self.method == "fir" else 0
+        defines |= {"RADIUS": window, "REACH": window + half, "FIR_HALF": half}
         chosen = self.outputs or ()
         defines |= flags(**{f"WITH_{name.upper()}": True for name in chosen})
         if self.triangulation is not None:

@@ -332,7 +332,7 @@ class LineReadout(VisionOperation[LineReading]):
         bits = 8 * dtype.itemsize
         defines = type_defines("CODE", dtype, 4, 8, 16) | {"CODE_BITS": bits}
         defines |= flags(**{f"METHOD_{self.method.upper()}": True, f"SELECT_{self.peak_selection.upper()}": True})
-        # The centroid method has no window, and only the FIR method a filter: readouts with other values share programs.
+        # The centroid method has no window, and only the FIR method has a filter: fewer builds for other values.
         window = 1 if self.method == "centroid" else self.window
         half = self.fir_length // 2 if self.method == "fir" else 0
         defines |= {"RADIUS": window, "REACH": window + half, "FIR_HALF": half}

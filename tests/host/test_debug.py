@@ -206,7 +206,8 @@ def test_a_failed_test_leaves_its_arrays(folder: Path, tmp_path: Path) -> None:
     """The hook of the tests' conftest dumps the arrays of the test function when a comparison fails."""
     (tmp_path / "conftest.py").write_text((Path(__file__).parents[1] / "conftest.py").read_text())
     (tmp_path / "test_sums.py").write_text(SUMS)
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path)]
+    helpers = f"pythonpath={Path(__file__).parents[1]}"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", helpers, str(tmp_path)]
     run = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert "1 failed, 1 passed" in run.stdout
     (path,) = folder.glob("*.npz")

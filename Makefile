@@ -6,7 +6,7 @@ CACHES := XDG_CACHE_HOME="$(CURDIR)/build/cache" MPLCONFIGDIR="$(CURDIR)/build/c
 # PYTEST_ARGS: more options, such as PYTEST_ARGS="-k line"
 PYTEST = .venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
 
-.PHONY: demo test test-full nightly lint docs clean
+.PHONY: demo test test-full nightly fuzz lint docs clean
 
 demo: .venv/ready
 	.venv/bin/gpuvision demo
@@ -20,6 +20,13 @@ test-full: .venv/ready-tests
 
 nightly: .venv/ready-tests
 	$(PYTEST) --tier nightly
+	$(MAKE) fuzz FUZZ_ARGS="--engine atheris --runs 20000 --seconds 60"
+
+# Fuzz the readers of files: see tests/fuzz/run.py. FUZZ_ARGS: its options, and readers such as sensor.toml.
+FUZZ_ARGS ?= --runs 100000
+fuzz: .venv/ready-tests
+	.venv/bin/python -m pip --quiet --disable-pip-version-check install --editable ".[fuzz]"
+	.venv/bin/python tests/fuzz/run.py $(FUZZ_ARGS)
 
 # Type checkers do not understand setuptools' package-dir or its import hook for editable installs. Symbolic links in
 # build/lint give the package the layout of an installed wheel, so that messages name the real files.

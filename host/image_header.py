@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 from typing import BinaryIO
@@ -27,9 +28,15 @@ def image_size(file: BinaryIO) -> tuple[int, int] | None:
     ----------
     file : binary file
         Open at the start of the image.
+
+    Raises
+    ------
+    ValueError
+        The file is truncated.
     """
     head = file.read(_HEAD_BYTES)
     if head.startswith(_PNG) and len(head) >= 24:
+        _check_png(file)
         columns, rows = struct.unpack_from(">II", head, 16)
         return rows, columns
     if head.startswith(b"BM") and len(head) >= 26:
@@ -42,6 +49,21 @@ def image_size(file: BinaryIO) -> tuple[int, int] | None:
     if found := _PNM.match(head):
         return int(found[2]), int(found[1])
     return None
+
+
+def _check_png(file: BinaryIO) -> None:
+    """Check that each chunk of a PNG file lies in the file: decoders allocate the length that a chunk claims."""
+    size = file.seek(0, os.SEEK_END)
+    at, kind = len(_PNG), b""
+    while kind != b"IEND":
+        file.seek(at)
+        chunk = file.read(8)
+        if len(chunk) < 8:
+            raise ValueError("it is truncated: there is no end chunk")
+        length, kind = int.from_bytes(chunk[:4]), chunk[4:]
+        at += length + 12
+        if at > size:
+            raise ValueError(f"a chunk claims {length} bytes, which go beyond the end of the file")
 
 
 def _jpeg_size(file: BinaryIO) -> tuple[int, int] | None:

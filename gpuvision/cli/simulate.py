@@ -143,6 +143,7 @@ def simulate(
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
+    from gpuvision.workflows.part_unit import doubt_unit
     from gpuvision.workflows.sensor_pair import pair_files
     from gpuvision.workflows.simulating import load_part, prepare_simulation
     from gpuvision.workflows.simulation_result import simulation_files
@@ -169,6 +170,8 @@ def simulate(
     scene, made_of = load_part(part, _METRES[unit], given, 0.5 if albedo is None else albedo)
     if str(scene.defects) != "no defects":
         echo(f"{part.name}: {'; '.join(str(scene.defects).splitlines())}", err=True)
+    if doubt := doubt_unit(scene, described, unit.value, {each.value: metres for each, metres in _METRES.items()}):
+        echo(f"{part.name}: {doubt}", err=True)
     task = prepare_simulation(scene, made_of, described, paths=names, tolerance=tolerance, profiles=profiles)
     other = None
     if second_sensor is not None:

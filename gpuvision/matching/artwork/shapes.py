@@ -23,6 +23,7 @@ SAGITTA = 0.5e-6
 """Largest distance [m] between an arc and the chord that stands for it."""
 _METRE = 1e-3  # all calls of gerbonara use millimetres
 _MOST_CHORDS = 100_000  # of one arc; a full circle with a radius of 10 m has 10 000
+_MOST_LINES = 10_000  # of an arc that is drawn with an aperture; a circle with a radius of 10 m has 10 000
 _MOST_CORNERS = 20_000_000  # of a layer: 1 GiB with the arrays of `Layer`; the largest board in the tests has 300 000
 _MOST_VERTICES = 1000  # of a regular polygon; the Gerber format allows 12
 _POLYGON_CODE = 5
@@ -174,7 +175,7 @@ def _drawn(item: Any) -> DrawnObject | None:
         place = np.array([MM(item.x, item.unit), MM(item.y, item.unit)]) * _METRE
         return DrawnObject("flash", tuple(_flashed(item.aperture, place, bool(item.polarity_dark))), **attributes)
     if not isinstance(item, graphic_objects.Line):
-        _chords(math.hypot(MM(item.cx, item.unit), MM(item.cy, item.unit)) * _METRE, 2 * math.pi)
+        _check_arc(item)
     lines = [item] if isinstance(item, graphic_objects.Line) else item.approximate(SAGITTA / _METRE, MM)
     ends = [np.array([[MM(x, item.unit), MM(y, item.unit)] for x, y in (each.p1, each.p2)]) * _METRE for each in lines]
     shapes = tuple(shape for each in ends for shape in _swept(item.aperture, each, bool(item.polarity_dark)))
@@ -182,6 +183,16 @@ def _drawn(item: Any) -> DrawnObject | None:
         return None
     straight = len(ends) == 1 and math.dist(*ends[0]) > 0
     return DrawnObject("stroke", shapes, ends[0] if straight else None, _round_width(item.aperture), **attributes)
+
+
+def _check_arc(item: Any) -> None:
+    """Check the number of lines that approximate an arc before gerbonara makes them."""
+    start, centre = np.array([item.x1, item.y1]), np.array([item.x1 + item.cx, item.y1 + item.cy])
+    radius, sweep = _radius_and_sweep(start, np.array([item.x2, item.y2]), centre, item.clockwise)
+    radius = float(MM(radius, item.unit)) * _METRE
+    lines = _chords(radius, abs(sweep))
+    if lines > _MOST_LINES:
+        raise ValueError(f"an arc with a radius of {radius:.4g} m takes {lines} lines, which is too large for a board")
 
 
 def _attributes(item: Any) -> dict[str, Any]:
@@ -305,12 +316,18 @@ def _chords(radius: float, angle: float) -> int:
 
 def _arc(start: Float64, end: Float64, centre: Float64, clockwise: bool) -> Float64:
     """Return the corners of an arc from its start, without its end; an arc from a point to itself is a full circle."""
+    a = start - centre
+    radius, sweep = _radius_and_sweep(start, end, centre, clockwise)
+    count = _chords(radius, abs(sweep))
+    angle = math.atan2(a[1], a[0]) + np.arange(count) * (sweep / count)
+    return np.asarray(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+
+
+def _radius_and_sweep(start: Float64, end: Float64, centre: Float64, clockwise: bool) -> tuple[float, float]:
+    """Return the radius of an arc and its angle, negative where it runs clockwise; equal ends are a full circle."""
     a, b = start - centre, end - centre
     sweep = (math.atan2(b[1], b[0]) - math.atan2(a[1], a[0])) % (2 * math.pi)
     sweep = sweep - 2 * math.pi if clockwise and sweep > 0 else sweep
     if np.allclose(start, end, rtol=0, atol=1e-9):
         sweep = -2 * math.pi if clockwise else 2 * math.pi
-    radius = math.hypot(*a)
-    count = _chords(radius, abs(sweep))
-    angle = math.atan2(a[1], a[0]) + np.arange(count) * (sweep / count)
-    return np.asarray(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    return math.hypot(*a), sweep

@@ -208,7 +208,7 @@ class Mask:
                 raise ReadError(expected) from None
             if windows.shape[1:] != (2,):
                 raise ReadError(expected)
-        return cls(windows=windows)
+            return cls(windows=windows)
 
 
 def _through_windows(exposure: Exposure, windows: Float64, edges: Float64) -> Exposure:

@@ -41,7 +41,7 @@ class FileLimits:
     max_board_objects : int
         Objects of a layer, repeated ones included. Chosen: a million, which takes about 1 GiB.
     max_board_size : float
-        Largest coordinate and aperture of a board [m]. Chosen: 10 m.
+        Largest coordinate of a board [m]. Chosen: 2 m; production panels have up to 1.5 m.
     max_triangles : int
         Triangles of a mesh, instances included. Chosen: 20 million, 1 GB as binary STL.
     """
@@ -53,7 +53,7 @@ class FileLimits:
     max_board_files: int = 1000
     max_board_bytes: int = 1 << 28
     max_board_objects: int = 1_000_000
-    max_board_size: float = 10.0
+    max_board_size: float = 2.0
     max_triangles: int = 20_000_000
 
     @classmethod

@@ -307,7 +307,7 @@ _BAD: dict[str, tuple[str, list[tuple[Callable[[Path], Path], str]]]] = {
         _READ_BOARD,
         [
             (step_repeat, rf"copper.gbr: a step-and-repeat of 10000000000 copies, .* 1000000; {_LIMIT}"),
-            (distant_pad, rf"copper.gbr: .* an object that extends to 10\d\d m, expected at most 10; {_LIMIT}"),
+            (distant_pad, rf"copper.gbr: .* an object that extends to 10\d\d m, expected at most 2; {_LIMIT}"),
             (endless_aperture, "copper.gbr: .* radius of 5e.296 m, which is too large for a board"),
             (polygon, "copper.gbr: a polygon aperture of 1000000000 corners, expected 3 to 12"),
             (macro_polygon, "copper.gbr: .* aperture macro MACRO: a polygon of more than 1000 corners"),

@@ -22,9 +22,9 @@ Crossings = list[tuple[bool, Float64]]
 SAGITTA = 0.5e-6
 """Largest distance [m] between an arc and the chord that stands for it."""
 _METRE = 1e-3  # all calls of gerbonara use millimetres
-_MOST_CHORDS = 100_000  # of one arc; a full circle with a radius of 10 m has 10 000
-_MOST_LINES = 10_000  # of an arc that is drawn with an aperture; a circle with a radius of 10 m has 10 000
-_MOST_CORNERS = 20_000_000  # of a layer: 1 GiB with the arrays of `Layer`; the largest board in the tests has 300 000
+_MOST_CHORDS = 100_000  # of one arc; a full circle with a radius of 1 m has 3200
+_MOST_LINES = 10_000  # of an arc that is drawn with an aperture; a circle with a radius of 1 m has 3200
+_MOST_CORNERS = 5_000_000  # of a layer. Chosen: they take 300 MiB with the arrays of `Layer`
 _MOST_VERTICES = 1000  # of a regular polygon; the Gerber format allows 12
 _POLYGON_CODE = 5
 _UNSUPPORTED_MACROS = {6: "moiré", 7: "thermal"}  # gerbonara 1.5 reads them and cannot draw them

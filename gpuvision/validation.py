@@ -38,29 +38,47 @@ def check_keys(
     return table
 
 
-def finite(value: Any, what: str) -> float:
-    """Return a finite number as a float.
+def finite(
+    value: Any,
+    what: str,
+    *,
+    minimum: float | None = None,
+    above: float | None = None,
+    maximum: float | None = None,
+) -> float:
+    """Return a finite number as a float; a bool or a text is not a number here.
 
     Parameters
     ----------
     value : number
-        Value to check.
+        Value to check; NumPy numbers are accepted.
     what : str
         Name of the value for the message.
+    minimum, maximum : float, optional
+        Smallest and largest allowed value.
+    above : float, optional
+        Number that the value must exceed.
 
     Raises
     ------
     TypeError
         The value is not a number.
     ValueError
-        The number is infinite or NaN.
+        The number is infinite or NaN, or out of its range.
     """
+    if isinstance(value, bool | np.bool_ | str | bytes):
+        raise TypeError(f"{what} must be a number, got {value!r}")
     try:
         number = float(value)
     except (TypeError, ValueError):
         raise TypeError(f"{what} must be a number, got {value!r}") from None
     if not math.isfinite(number):
         raise ValueError(f"{what} must be finite, got {number}")
+    limits = ((minimum, ">=", operator.ge), (above, ">", operator.gt), (maximum, "<=", operator.le))
+    given = [(limit, sign, holds) for limit, sign, holds in limits if limit is not None]
+    if not all(holds(number, limit) for limit, _, holds in given):
+        expected = " and ".join(f"{sign} {limit:g}" for limit, sign, _ in given)
+        raise ValueError(f"{what} is {value}, expected a number {expected}")
     return number
 
 
@@ -115,9 +133,12 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Any:
         The shape differs, or a number is infinite or NaN.
     """
     try:
-        array = np.asarray(values, dtype=np.float64)
+        given = np.asarray(values)
+        array = given.astype(np.float64)
     except (TypeError, ValueError):
         raise TypeError(f"{what} must be numbers of shape {shape}, got {values!r}") from None
+    if given.dtype.kind not in "iufO":  # a bool or a text is not a number
+        raise TypeError(f"{what} must be numbers of shape {shape}, got {values!r}")
     if array.shape != shape:
         raise ValueError(f"{what} has shape {array.shape}, expected {shape}")
     if not np.all(np.isfinite(array)):

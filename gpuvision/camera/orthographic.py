@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.lens import Lens
+from gpuvision.validation import finite, numbers
 
 Float64 = npt.NDArray[np.float64]
 
@@ -47,10 +48,8 @@ class BoardView:
     model: Lens | Camera | None = None
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.scale) and self.scale > 0):
-            raise ValueError(f"the scale is {self.scale}, expected metres per pixel, above 0")
-        if len(self.pose) != 3 or not all(math.isfinite(each) for each in self.pose):
-            raise ValueError(f"the pose is {self.pose}, expected x, y [m] and theta [rad], finite")
+        finite(self.scale, "BoardView.scale", above=0.0)
+        numbers(self.pose, (3,), "BoardView.pose")
 
     @property
     def centre_px(self) -> Float64:

@@ -167,9 +167,10 @@ class UndistortImage(VisionOperation[UndistortedImage]):
             "precision": ("single", "double", None),
         }
         for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
+            value = getattr(self, name)
+            if value not in allowed or isinstance(value, bool | np.bool_):
                 expected = ", ".join(map(repr, allowed))
-                raise ValueError(f"UndistortImage.{name} is {getattr(self, name)!r}, expected one of {expected}")
+                raise ValueError(f"UndistortImage.{name} is {value!r}, expected one of {expected}")
 
     def _check_model(self) -> None:
         if not isinstance(self.model, PixelMap | DistortionModel):

@@ -113,7 +113,7 @@ class LineReadout(VisionOperation[LineReading]):
     along : {"columns", "rows"}
         Image axis along which the line runs, default ``"columns"``: each column is a profile.
     threshold : float
-        Level below which a sample has no light [grey levels], default 0; an integer for integer frames.
+        Level below which a sample has no light [grey levels], 0 or more, default 0; an integer for integer frames.
     window : int
         Number of samples on either side of the peak in its window, 1 to 180, default 8.
     peak_selection : {"strongest", "first", "last", "nearest"}
@@ -122,7 +122,7 @@ class LineReadout(VisionOperation[LineReading]):
         second input of shape (..., samples) in the readout's precision; it is rounded to whole pixels; where it is NaN,
         the strongest peak is taken.
     minimum_peak : float, optional
-        Smallest sample value that can be a peak [grey levels].
+        Smallest sample value that can be a peak [grey levels], the threshold or more.
     minimum_width, maximum_width : int
         Limits on the length of the run of samples above the threshold (for ``"centroid"``: on their number) [px].
         Default 1 and no limit. A hot pixel is a run of 1.
@@ -231,10 +231,13 @@ class LineReadout(VisionOperation[LineReading]):
             )
 
     def _check_numbers(self) -> None:
-        finite(self.threshold, "LineReadout.threshold")
-        for name in ("minimum_peak", "saturation"):
-            if getattr(self, name) is not None:
-                finite(getattr(self, name), f"LineReadout.{name}")
+        finite(self.threshold, "LineReadout.threshold", minimum=0.0)
+        if self.minimum_peak is not None and finite(self.minimum_peak, "LineReadout.minimum_peak") < self.threshold:
+            raise ValueError(
+                f"LineReadout.minimum_peak is {self.minimum_peak}, expected the threshold {self.threshold} or more"
+            )
+        if self.saturation is not None:
+            finite(self.saturation, "LineReadout.saturation", above=0.0)
         for name in ("read_noise", "gain"):
             if finite(getattr(self, name), f"LineReadout.{name}") < 0.0:
                 raise ValueError(f"LineReadout.{name} is {getattr(self, name)}, expected a number >= 0")

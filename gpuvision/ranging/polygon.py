@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.status import Status
-from gpuvision.validation import finite
+from gpuvision.validation import finite, integer
 
 Float64 = npt.NDArray[np.float64]
 
@@ -69,8 +69,7 @@ class PolygonMirror:
         for name in ("apothem", "height"):
             if not finite(getattr(self, name), f"PolygonMirror.{name}") > 0.0:
                 raise ValueError(f"PolygonMirror.{name} is {getattr(self, name)}, expected a positive length [m]")
-        if self.facets < 3:
-            raise ValueError(f"PolygonMirror.facets is {self.facets}, expected at least 3")
+        integer(self.facets, "PolygonMirror.facets", minimum=3)
         if self.height_from not in ("centre", "hit"):
             raise ValueError(f"PolygonMirror.height_from is {self.height_from!r}, expected 'centre' or 'hit'")
         if not self.drop > 0.0:

@@ -29,7 +29,7 @@ from gpuvision.host import (
     type_defines,
 )
 from gpuvision.operation import VisionOperation
-from gpuvision.validation import finite
+from gpuvision.validation import finite, integer
 
 R = TypeVar("R", bound=tuple[Any, ...])
 Direction = Literal["x", "-x", "y", "-y"]
@@ -84,6 +84,8 @@ class Grid:
     def __post_init__(self) -> None:
         for name in ("left", "top", "cell_x", "cell_y"):
             object.__setattr__(self, name, finite(getattr(self, name), f"Grid.{name}"))
+        for name in ("columns", "rows"):
+            object.__setattr__(self, name, integer(getattr(self, name), f"Grid.{name}"))
         for name in ("cell_x", "cell_y", "columns", "rows"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"Grid.{name} is {getattr(self, name)}, expected a number above 0")

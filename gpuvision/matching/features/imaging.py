@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gpuvision.matching.artwork.shapes import Float64
+from gpuvision.validation import finite, integer, numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,13 +58,13 @@ class Imaging:
     angle: float = 5e-3
 
     def __post_init__(self) -> None:
-        positive = (self.pixel, self.blur_px, self.contrast_bare, self.contrast_masked, self.width_px, self.shift)
-        if not all(math.isfinite(each) and each > 0 for each in positive):
-            raise ValueError("pixel, blur, contrasts, width and shift must be positive and finite")
-        if not all(math.isfinite(each) and each >= 0 for each in (self.etch_bias_sigma, self.registration, self.angle)):
-            raise ValueError("etch_bias_sigma, registration and angle must be finite and not negative")
-        if len(self.motion_px) != 2 or not all(map(math.isfinite, self.motion_px)):
-            raise ValueError("motion_px must be a finite x, y")
+        integer(self.width_px, "Imaging.width_px", minimum=1)
+        for name in ("pixel", "blur_px", "contrast_bare", "contrast_masked", "shift"):
+            if finite(getattr(self, name), f"Imaging.{name}") <= 0.0:
+                raise ValueError(f"Imaging.{name} is {getattr(self, name)}, it must be positive")
+        for name in ("etch_bias_sigma", "registration", "angle"):
+            finite(getattr(self, name), f"Imaging.{name}", minimum=0.0)
+        numbers(self.motion_px, (2,), "Imaging.motion_px")
 
     @property
     def smoothing_px(self) -> float:

@@ -23,7 +23,7 @@ from gpuvision.host import (
 )
 from gpuvision.matching.robust import Loss, efficiency, loss_defines, resolve_tuning_constant, sample_subsets
 from gpuvision.operation import VisionOperation
-from gpuvision.validation import finite
+from gpuvision.validation import finite, integer
 
 _LANES, _GROUP = 16, 64
 _LARGEST_SET = 1024
@@ -146,8 +146,7 @@ class FitLines(VisionOperation[LineFits]):
         if finite(self.min_scale, "FitLines.min_scale") < 0.0:
             raise ValueError(f"FitLines.min_scale is {self.min_scale}, expected a number >= 0")
         for name in ("max_trials", "max_iterations"):
-            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
-                raise ValueError(f"FitLines.{name} is {getattr(self, name)!r}, expected a whole number > 0")
+            integer(getattr(self, name), f"FitLines.{name}", minimum=1)
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""

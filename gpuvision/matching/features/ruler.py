@@ -265,7 +265,7 @@ class RulerEdges(VisionOperation[Edges]):
         if finite(self.noise, "RulerEdges.noise") < 0.0:
             raise ValueError(f"RulerEdges.noise is {self.noise}, expected a number >= 0")
         if self.saturation is not None:
-            finite(self.saturation, "RulerEdges.saturation")
+            finite(self.saturation, "RulerEdges.saturation", above=0.0)
         self._check_choices()
         if self.length < 2 * self._reach + 3:
             raise ValueError(

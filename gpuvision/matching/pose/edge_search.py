@@ -36,7 +36,7 @@ from gpuvision.host import (
 )
 from gpuvision.matching.field.field_pose import MIN_SHIFTS, PoseCosts, pose_cost_outputs, pose_grid_work
 from gpuvision.operation import VisionOperation
-from gpuvision.validation import finite
+from gpuvision.validation import finite, integer
 
 CHANNELS, COST_LEVELS = 8, 1023
 """Directions of normals, pi / 8 apart, and steps of a cost."""
@@ -79,8 +79,7 @@ class CellMeans(VisionOperation[Means]):
     cell_px: int = 2
 
     def __post_init__(self) -> None:
-        if not isinstance(self.cell_px, int) or not 1 <= self.cell_px <= 64:
-            raise ValueError(f"CellMeans.cell_px is {self.cell_px!r}, expected a whole number, 1 to 64")
+        integer(self.cell_px, "CellMeans.cell_px", minimum=1, maximum=64)
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -133,8 +132,7 @@ class EdgeCostMap(VisionOperation[EdgeCosts]):
     def __post_init__(self) -> None:
         if finite(self.threshold, "EdgeCostMap.threshold") <= 0.0:
             raise ValueError(f"EdgeCostMap.threshold is {self.threshold}, expected grey levels above 0")
-        if not isinstance(self.border, int) or self.border < 0:
-            raise ValueError(f"EdgeCostMap.border is {self.border!r}, expected a whole number, 0 or more")
+        integer(self.border, "EdgeCostMap.border", minimum=0)
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""
@@ -200,8 +198,7 @@ class EdgeSearch(VisionOperation[PoseCosts]):
 
     def __post_init__(self) -> None:
         for name, limit in (("rows", 4096), ("columns", 4096), ("headings", 4096), ("points", _MOST_POINTS)):
-            if not isinstance(getattr(self, name), int) or not 1 <= getattr(self, name) <= limit:
-                raise ValueError(f"EdgeSearch.{name} is {getattr(self, name)!r}, expected 1 to {limit}")
+            integer(getattr(self, name), f"EdgeSearch.{name}", minimum=1, maximum=limit)
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""

@@ -33,7 +33,7 @@ from gpuvision.host import (
 )
 from gpuvision.matching.robust import Loss, efficiency, loss_defines, resolve_tuning_constant, sample_subsets
 from gpuvision.operation import VisionOperation
-from gpuvision.validation import finite, numbers
+from gpuvision.validation import finite, integer, numbers
 
 Transform = Literal["rigid", "similarity", "affine"]
 Float64 = npt.NDArray[np.float64]
@@ -316,10 +316,9 @@ class SolvePose(VisionOperation[BoardPose]):
                 raise ValueError(
                     f"SolvePose.search_range is {self.search_range}, expected metres and radians, not below 0"
                 )
-        if not isinstance(self.max_trials, int) or self.max_trials < 1 or self.max_trials % _LANES:
+        if integer(self.max_trials, "SolvePose.max_trials", minimum=1) % _LANES:
             raise ValueError(f"SolvePose.max_trials is {self.max_trials!r}, expected a multiple of {_LANES}")
-        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
-            raise ValueError(f"SolvePose.max_iterations is {self.max_iterations!r}, expected a whole number > 0")
+        integer(self.max_iterations, "SolvePose.max_iterations", minimum=1)
 
     def launch(self, device: Device, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Launch:
         """Describe the launch for inputs of one shape, as `Operation.launch` says."""

@@ -463,8 +463,9 @@ def board_of(folder: Path) -> Artwork:
     ("name", "middle"),
     [
         ("upverter", (-50e-3, 10e-3)),
-        ("fritzing", (20e-3, 25e-3)),
-        ("kicad-x2-tests/x2ap", (60e-3, -45e-3)),
+        # Gerbonara takes seconds for each of these.
+        pytest.param("fritzing", (20e-3, 25e-3), marks=pytest.mark.slow),
+        pytest.param("kicad-x2-tests/x2ap", (60e-3, -45e-3), marks=pytest.mark.slow),
     ],
 )
 def test_boards_of_three_tools_are_located(data: Path, name: str, middle: tuple[float, float], device: Device) -> None:

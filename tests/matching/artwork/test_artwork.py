@@ -28,6 +28,8 @@ LAYERS = {
 }
 HEAD = "%FSLAX46Y46*%\n%MOMM*%\n%LPD*%\nG01*\n"
 BOARDS = ("fritzing", "upverter", *(f"kicad-x2-tests/{each}" for each in ("x2ap", "nox2ap", "x2noap", "nox2noap")))
+# Gerbonara takes seconds for each board; the fast tier reads the smallest one.
+ONE_BOARD_FAST = [pytest.param(each, marks=[] if each == "upverter" else pytest.mark.slow) for each in BOARDS]
 
 
 def at(x: float, y: float, code: str) -> str:
@@ -312,7 +314,7 @@ def star(rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.realdata
-@pytest.mark.parametrize("name", BOARDS)
+@pytest.mark.parametrize("name", ONE_BOARD_FAST)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::SyntaxWarning", "ignore::UserWarning")
 def test_layers_are_where_gerbonara_says(data: Path, name: str) -> None:
     board = real_board(data / "gerber" / name)
@@ -343,7 +345,7 @@ def test_reads_the_boards_of_three_tools(
 
 
 @pytest.mark.realdata
-@pytest.mark.parametrize("name", ["upverter", "kicad-x2-tests/x2ap"])
+@pytest.mark.parametrize("name", ["upverter", pytest.param("kicad-x2-tests/x2ap", marks=pytest.mark.slow)])
 def test_edges_lie_between_copper_and_laminate_in_a_picture(data: Path, name: str) -> None:
     board = real_board(data / "gerber" / name)
     pixel, low = 10e-6, board.bounds[0] - 1e-3
@@ -366,6 +368,7 @@ def test_edges_lie_between_copper_and_laminate_in_a_picture(data: Path, name: st
     assert not at_side(silk, 0.0).any()
 
 
+@pytest.mark.slow
 @pytest.mark.realdata
 def test_one_board_written_four_ways_is_one_board(data: Path) -> None:
     """KiCad files with and without X2 attributes, with and without aperture macros."""

@@ -281,7 +281,14 @@ def test_refuses_what_makes_no_sense(tmp_path: Path) -> None:
 
 
 @pytest.mark.realdata
-@pytest.mark.parametrize("name", ["fritzing", "upverter", "kicad-x2-tests/x2ap"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "upverter",
+        pytest.param("fritzing", marks=pytest.mark.slow),  # gerbonara takes seconds for each of these
+        pytest.param("kicad-x2-tests/x2ap", marks=pytest.mark.slow),
+    ],
+)
 def test_finds_rulers_on_the_boards_of_three_tools(data: Path, name: str, rng: np.random.Generator) -> None:
     artwork = read_artwork(data / "gerber" / name)
     middle = artwork.bounds.mean(axis=0)

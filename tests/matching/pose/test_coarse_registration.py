@@ -131,7 +131,11 @@ def assert_beats_random_sets(
 
 
 @pytest.mark.realdata
-@pytest.mark.parametrize("name", TOOLS)
+@pytest.mark.parametrize(
+    # Gerbonara takes seconds for each board; the fast tier reads the smallest one.
+    "name",
+    [pytest.param(each, marks=[] if each == "upverter" else pytest.mark.slow) for each in TOOLS],
+)
 def test_a_real_board_s_errors_are_those_promised(
     data: Path, name: str, device: Device, rng: np.random.Generator
 ) -> None:

@@ -98,8 +98,43 @@ def project(
     in_front = bool((depth > 0.0).all() and (inverse > 0.0).all() and np.isfinite(points).all())
     if not derivatives or not in_front:
         return Projection(points, in_front, None)
+    jacobian = _jacobian(internal, m, rotated, p, _Rays(depth, x, y, radial, inverse, u, w))
+    return Projection(points, in_front, jacobian)
 
-    jacobian = np.zeros((len(target), COLUMNS, 2, target.shape[-1]))
+
+class _Rays(NamedTuple):
+    """Intermediate results of `project`, (views, n) each.
+
+    Attributes
+    ----------
+    depth
+        1 / z in the lens' frame.
+    x, y
+        Undistorted normalised coordinates.
+    radial
+        Factor of the radial distortion.
+    inverse
+        1 / denominator of the projection on the tilted sensor.
+    u, w
+        Coordinates on the tilted sensor, for f = 1.
+    """
+
+    depth: Floats
+    x: Floats
+    y: Floats
+    radial: Floats
+    inverse: Floats
+    u: Floats
+    w: Floats
+
+
+def _jacobian(internal: Floats, m: Floats, rotated: Floats, p: Floats, rays: _Rays) -> Floats:
+    """Return the derivatives (views, columns, 2, n) of the image points."""
+    f, aspect, _, _, _, _, k1, k2, p1, p2, k3 = internal.tolist()
+    depth, x, y, radial, inverse, u, w = rays
+    xx, yy, xy = x * x, y * y, x * y
+    r2 = xx + yy
+    jacobian = np.zeros((len(rotated), COLUMNS, 2, rotated.shape[-1]))
     slope = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2)
     # The 2 x 2 Jacobian of the distortion is symmetric.
     lens_xx = radial + 2.0 * xx * slope + 2.0 * p1 * y + 6.0 * p2 * x
@@ -125,7 +160,7 @@ def project(
     jacobian[:, 0, 0], jacobian[:, 0, 1] = u, aspect * w
     jacobian[:, 1, 1] = f * w
     jacobian[:, 2, 0] = jacobian[:, 3, 1] = 1.0
-    return Projection(points, in_front, jacobian)
+    return jacobian
 
 
 def _cross(a: Floats, b: Floats, out: Floats) -> None:

@@ -107,9 +107,7 @@ def select(
     from gpuvision.matching.features.imaging import Imaging
     from gpuvision.plots.board import draw_features
 
-    left, bottom, right, top = quantities(region, "--region", "m,m,m,m")
-    if not (left < right and bottom < top):
-        raise ValueError(f"--region is {region!r}, expected X0 < X1 and Y0 < Y1")
+    box = _box(region)
     amount, unit = _budget(budget)
     if unit != "us":
         reject_unused("without a --budget in us, the only one that is measured on a device", device=device)
@@ -129,7 +127,6 @@ def select(
     outputs = Outputs("select", inputs=[gerbers], overwrite=overwrite)
     outputs.claim_folder(out, ("features.toml", "features.png"))
     artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=edge_clearance(imaging))
-    box = ((left, bottom), (right, top))
     features = choose_features(
         artwork,
         box,
@@ -147,6 +144,13 @@ def select(
         f"{features.summary()}\nlook at {out / 'features.png'}; next: "
         f"gpuvision locate IMAGE --board {gerbers} --features {out / 'features.toml'}"
     )
+
+
+def _box(region: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    left, bottom, right, top = quantities(region, "--region", "m,m,m,m")
+    if not (left < right and bottom < top):
+        raise ValueError(f"--region is {region!r}, expected X0 < X1 and Y0 < Y1")
+    return (left, bottom), (right, top)
 
 
 def _budget(text: str) -> tuple[float, BudgetUnit]:

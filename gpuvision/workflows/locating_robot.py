@@ -40,6 +40,11 @@ Float32 = npt.NDArray[np.float32]
 POINT_FILES = (".npy", ".csv")
 RAYS = 128  # default number of rays of a scan (chosen: speed against points on lines)
 _MAX_POINTS = 4096  # of `FieldPoseSearch`
+# Scale of a point's cost: the default of `DistanceMap` [m]; on small fields this fraction of the field (chosen).
+_MAX_COST_SCALE, _COST_SCALE = 0.25, 0.02
+_CELL = 0.4  # cell of the distance map, as a fraction of the cost scale: 0.1 m for 0.25 m (chosen: memory and time)
+_MARGIN = 0.05  # default width of the border around the field, as a fraction of the field's length (chosen)
+_MAX_DIAGONAL = 1.5  # range of the map in lengths of the field; the diagonal of a field is at most sqrt(2) lengths
 # Default range of a mounted camera [m]: farther away pixels resolve little and errors of the tilt grow (chosen).
 _MAX_RANGE = 12.0
 # Fields shorter than the first number [m] have lines of the second width, others of the third (RoboCup rules).
@@ -128,13 +133,7 @@ def locate_robot(
     if len(used) < limits.min_points:
         reason = f"{len(used)} points on lines, expected {limits.min_points} or more"
         return LocatedRobot(candidates=(), doubtful=(), evidence=None, reason=reason, seconds={}, **kept)
-    size = max(field.length, field.width)
-    cost_scale = min(0.25, 0.02 * size)  # [m], the value of `DistanceMap` for a field of 20 m
-    margin = 0.05 * size if margin is None else margin
-    max_range = min(float(np.hypot(*used.T).max()) * 1.001 + cost_scale, 1.5 * size)
-    field_map = DistanceMap(
-        field=field, cell=0.4 * cost_scale, scale=cost_scale, max_range=max_range, margin=margin, device=device
-    )
+    field_map = _search_map(field, used, margin, device)
     mapped = time.perf_counter()
     found = find_pose_candidates(
         field_map,
@@ -145,9 +144,9 @@ def locate_robot(
     )
     paths, wide = (None, default_line_width(field)) if scan is None else (scan.paths, scan.line_width)
     how: dict[str, Any] = {
-        "scale": cost_scale,
-        "max_range": max_range,
-        "margin": margin if initial_pose is None else None,
+        "scale": field_map.scale,
+        "max_range": field_map.max_range,
+        "margin": field_map.margin if initial_pose is None else None,
     }
     weights = [evidence(used, paths, field, each.pose, half_line_width=0.5 * wide, **how) for each in found]
     ordered, weights = _order(found, weights, max_candidates)
@@ -159,6 +158,22 @@ def locate_robot(
         reason=reason,
         seconds={"map": mapped - start, "search": time.perf_counter() - mapped},
         **kept,
+    )
+
+
+def _search_map(field: Field, points: Float32, margin: float | None, device: Device) -> DistanceMap:
+    """Return the distance map for a search with points in the robot's frame."""
+    size = max(field.length, field.width)
+    cost_scale = min(_MAX_COST_SCALE, _COST_SCALE * size)
+    # The factor keeps the farthest point inside the map after rounding to single precision.
+    max_range = min(float(np.hypot(*points.T).max()) * 1.001 + cost_scale, _MAX_DIAGONAL * size)
+    return DistanceMap(
+        field=field,
+        cell=_CELL * cost_scale,
+        scale=cost_scale,
+        max_range=max_range,
+        margin=_MARGIN * size if margin is None else margin,
+        device=device,
     )
 
 

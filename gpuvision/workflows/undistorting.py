@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,7 @@ def undistort_files(
         raise RecordingError(f"several inputs have the name {min(duplicates)}; undistort them into separate folders")
     written = []
     outputs = Outputs("undistort", inputs=inputs, overwrite=overwrite)
+    image_options = {"interpolation": interpolation, "border": border, "border_value": border_value, "region": region}
     with outputs.folder(out) as folder:
         for number, file in enumerate(inputs):
             progress(number, len(inputs))
@@ -91,22 +92,27 @@ def undistort_files(
                 with atomic_write(folder / name) as npy:
                     np.save(npy, points)
             else:
-                image = read_image(file)
-                image = image[..., :3] if image.ndim == 3 else image
+                image = _image_without_alpha(file)
                 name = f"{file.stem}.tif" if image.dtype == np.float32 else f"{file.stem}.png"
                 outputs.claim(out / name)
-                operation = UndistortImage(
-                    model=model,
-                    interpolation=interpolation,
-                    channels=3 if image.ndim == 3 else 1,
-                    border=border,
-                    border_value=border_value,
-                    region=region,
-                )
-                _write(folder / name, to_numpy(operation(np.ascontiguousarray(image), device=device).image))
+                _write(folder / name, _undistorted_image(image, model, device, image_options))
             written.append(out / name)
         progress(len(inputs), len(inputs))
     return tuple(written)
+
+
+def _image_without_alpha(file: Path) -> npt.NDArray[Any]:
+    """Read a grey image, or a colour image without its alpha channel."""
+    image = read_image(file)
+    return image[..., :3] if image.ndim == 3 else image
+
+
+def _undistorted_image(
+    image: npt.NDArray[Any], model: Lens | Camera, device: Device, options: Mapping[str, Any]
+) -> npt.NDArray[Any]:
+    """Undistort an image with options of `UndistortImage`."""
+    operation = UndistortImage(model=model, channels=3 if image.ndim == 3 else 1, **options)
+    return to_numpy(operation(np.ascontiguousarray(image), device=device).image)
 
 
 def _undistorted_points(file: Path, model: Lens | Camera, device: Device) -> npt.NDArray[Any]:

@@ -128,17 +128,7 @@ def fit_lens(
     ----------
     F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, section 3.3.5-3.3.6.
     """
-    if model not in ("auto", *MODELS):
-        raise ValueError(f"model is {model!r}, expected 'auto' or one of {', '.join(map(repr, MODELS))}")
-    for name, value, choices in (
-        ("lines", lines, ("auto", "vanishing", "free")),
-        ("loss", loss, ("squared", "huber", "tukey")),
-        ("solver", solver, ("variable_projection", *ALTERNATING_SOLVERS)),
-    ):
-        if value not in choices:
-            raise ValueError(f"{name} is {value!r}, expected one of {', '.join(map(repr, choices))}")
-    if sigma is not None and not finite(sigma, "sigma") > 0.0:
-        raise ValueError(f"sigma is {sigma}, expected more than 0 pixels")
+    _check_options(model, lines, loss, solver, sigma)
     packed = pack(families)
     known = None if centre is None else (np.array(numbers(centre, (2,), "centre")) - packed.origin) / packed.unit
     search = _ModelSearch(packed, known, None if sigma is None else sigma / packed.unit, loss, limits)
@@ -151,6 +141,20 @@ def fit_lens(
     else:
         order, concurrent = search.choose(search.possible_orders() if model == "auto" else [MODELS.index(model)], lines)
     return _report(search, order, concurrent, families)
+
+
+def _check_options(model: str, lines: str, loss: str, solver: str, sigma: float | None) -> None:
+    if model not in ("auto", *MODELS):
+        raise ValueError(f"model is {model!r}, expected 'auto' or one of {', '.join(map(repr, MODELS))}")
+    for name, value, choices in (
+        ("lines", lines, ("auto", "vanishing", "free")),
+        ("loss", loss, ("squared", "huber", "tukey")),
+        ("solver", solver, ("variable_projection", *ALTERNATING_SOLVERS)),
+    ):
+        if value not in choices:
+            raise ValueError(f"{name} is {value!r}, expected one of {', '.join(map(repr, choices))}")
+    if sigma is not None and not finite(sigma, "sigma") > 0.0:
+        raise ValueError(f"sigma is {sigma}, expected more than 0 pixels")
 
 
 class _ModelSearch:

@@ -148,11 +148,17 @@ def fit_camera(
     models = _check_enough(task, models)
     largest = _fit_from_starts(task, models[-1])
     candidates = [_fit_smaller_model(task, each, largest) for each in models[:-1]] + [largest]
+    return _smallest_accepted(task, candidates, loss)
+
+
+def _smallest_accepted(task: _Task, candidates: list[_Candidate], loss: LossName) -> CameraFit:
+    """Return the smallest model that the F test accepts against the last one, with the others as alternatives."""
+    largest = candidates[-1]
     p_values = [_p_value(task, each, largest) for each in candidates]
     compared = next(
         each
         for each, p in zip(candidates, p_values, strict=True)
-        if each is largest or (p >= limits.significance and _is_invertible(task, each.state))
+        if each is largest or (p >= task.limits.significance and _is_invertible(task, each.state))
     )
     chosen = _fit_tukey(task, compared) if loss == "tukey" else compared
     alternatives = tuple(

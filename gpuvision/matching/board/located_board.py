@@ -112,7 +112,6 @@ class LocatedBoard:
     def report(self) -> dict[str, Any]:
         """Return the content of ``pose.json``: metres, radians; unknown numbers are null."""
         rulers, fiducials, coarse = self.rulers, self.fiducials, self.coarse_registration
-        points = rulers.point + rulers.normal * np.nan_to_num(rulers.position_px * self.view.scale)[:, None]
         return {
             "gpuvision": version("gpuvision"),
             "status": "refused" if self.reason else "located",
@@ -139,34 +138,45 @@ class LocatedBoard:
             else {name: _plain(getattr(coarse, name)) for name in ("score", "runner_up")},
             "counts": {name: int(np.sum(getattr(rulers, name))) for name in ("in_image", "found", "used")}
             | {f"fiducials_{name}": int(np.sum(getattr(fiducials, name))) for name in ("in_image", "found", "used")},
-            "rulers": [
-                {
-                    "point": _plain(rulers.point[number]),
-                    "image_px": _plain(self.view.to_measured_pixels(points[number])),
-                    "found": bool(rulers.found[number]),
-                    "weight": _plain(rulers.weight[number]),
-                    "residual": _plain(rulers.residual[number]),
-                    "sigma": _plain(rulers.sigma[number]),
-                    "status": str(Status(int(rulers.status[number])).name or "OK"),
-                }
-                for number in range(len(rulers.weight))
-            ],
-            "fiducials": [
-                {
-                    "point": _plain(fiducials.point[number]),
-                    "image_px": _plain(fiducials.image_px[number]),
-                    "found": bool(fiducials.found[number]),
-                    "weight": _plain(fiducials.weight[number]),
-                    "residual": _plain(fiducials.residual[number]),
-                    "sigmas": _plain(np.sqrt(np.diag(fiducials.covariance[number]))),
-                    "radius": _plain(fiducials.size[number]),
-                    "status": str(Status(int(fiducials.status[number])).name or "OK"),
-                }
-                for number in range(len(fiducials.weight))
-            ],
+            "rulers": self._ruler_reports(),
+            "fiducials": self._fiducial_reports(),
             "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
             "seconds": self.seconds,
         }
+
+    def _ruler_reports(self) -> list[dict[str, Any]]:
+        """Return the entry of each ruler in the report."""
+        rulers = self.rulers
+        points = rulers.point + rulers.normal * np.nan_to_num(rulers.position_px * self.view.scale)[:, None]
+        return [
+            {
+                "point": _plain(rulers.point[number]),
+                "image_px": _plain(self.view.to_measured_pixels(points[number])),
+                "found": bool(rulers.found[number]),
+                "weight": _plain(rulers.weight[number]),
+                "residual": _plain(rulers.residual[number]),
+                "sigma": _plain(rulers.sigma[number]),
+                "status": str(Status(int(rulers.status[number])).name or "OK"),
+            }
+            for number in range(len(rulers.weight))
+        ]
+
+    def _fiducial_reports(self) -> list[dict[str, Any]]:
+        """Return the entry of each fiducial in the report."""
+        fiducials = self.fiducials
+        return [
+            {
+                "point": _plain(fiducials.point[number]),
+                "image_px": _plain(fiducials.image_px[number]),
+                "found": bool(fiducials.found[number]),
+                "weight": _plain(fiducials.weight[number]),
+                "residual": _plain(fiducials.residual[number]),
+                "sigmas": _plain(np.sqrt(np.diag(fiducials.covariance[number]))),
+                "radius": _plain(fiducials.size[number]),
+                "status": str(Status(int(fiducials.status[number])).name or "OK"),
+            }
+            for number in range(len(fiducials.weight))
+        ]
 
 
 def _named(values: Any) -> dict[str, float | None]:

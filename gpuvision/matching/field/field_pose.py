@@ -399,14 +399,23 @@ def find_pose_candidates(
         search = FieldPoseSearch(map=field_map, headings=headings)
         starts = search.best(search(points, device=device), max_candidates).poses
     else:
-        starts = np.atleast_2d(np.asarray(initial_pose, np.float64))
-        if starts.ndim != 2 or starts.shape[1] != 3:
-            raise ValueError(
-                f"initial_pose has shape {np.shape(initial_pose)}, expected (3,) or (poses, 3): x, y, heading"
-            )
+        starts = _checked_poses(initial_pose)
     if not len(starts):
         return ()
     fits = FieldPoseRefinement(map=field_map)(points, starts.astype(np.float32), device=device)
+    return _candidates(fits, field_map.field.is_symmetric)
+
+
+def _checked_poses(initial_pose: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return one rough pose or several as (poses, 3)."""
+    poses = np.atleast_2d(np.asarray(initial_pose, np.float64))
+    if poses.ndim != 2 or poses.shape[1] != 3:
+        raise ValueError(f"initial_pose has shape {np.shape(initial_pose)}, expected (3,) or (poses, 3): x, y, heading")
+    return poses
+
+
+def _candidates(fits: FieldPoses, is_symmetric: bool) -> tuple[PoseCandidate, ...]:
+    """Return the different refined poses, best first."""
     score, fitted = to_numpy(fits.score), to_numpy(fits.poses)
     kept: list[int] = []
     for number in np.argsort(score):
@@ -423,7 +432,7 @@ def find_pose_candidates(
             score=float(score[number]),
             residual_std=float(residual_std[number]),
             inlier_fraction=float(inlier_fraction[number]),
-            symmetric_twin=_index_of_twin(pose, poses) if field_map.field.is_symmetric else None,
+            symmetric_twin=_index_of_twin(pose, poses) if is_symmetric else None,
             status=Status(int(status[number])),
         )
         for number, pose in zip(kept, poses, strict=True)

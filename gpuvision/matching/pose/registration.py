@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -94,18 +94,49 @@ def prepare_board_registration(
         The homography is not 3 x 3 and invertible.
     """
     matrix = np.asarray(board_to_image, np.float64)
-    rows, columns = shape
-    corners = np.array([(0, 0), (columns - 1, 0), (0, rows - 1), (columns - 1, rows - 1)], np.float64)
     if matrix.shape != (3, 3) or np.linalg.matrix_rank(matrix) < 3:
         raise ValueError("board_to_image must be 3 x 3 and invertible")
-    view_corners = apply_homography(
-        np.asarray(np.linalg.inv(matrix)), np.concatenate([corners, corners.mean(axis=0)[None]])
+    view = _board_in_view(matrix, shape)
+    place = view.centre if placement is None else placement
+    reach = shift + 2.0 * math.sin(min(angle, math.pi) / 2.0) * np.hypot(*(view.high - view.low)) / 2.0
+    region = (view.low - reach, view.high + reach)
+    rulers, smoothing_px = _ruler_edges(artwork, region, place, view.pixel, blur_px)
+    return CoarseRegistration(
+        search=_edge_points(artwork, view.low, view.high, cell_px * view.pixel),
+        rulers=rulers,
+        to_image=matrix,
+        placement=place,
+        shift=shift,
+        angle=angle,
+        ruler=RulerEdges(threshold=threshold, width=5, smoothing_px=smoothing_px),
+        tolerance_px=tolerance_px,
+        cell_px=cell_px,
     )
-    place = tuple(view_corners[4]) if placement is None else placement
-    pixel = math.sqrt(abs(_area(view_corners[:4])) / max((columns - 1) * (rows - 1), 1))
-    low, high = view_corners[:4].min(axis=0), view_corners[:4].max(axis=0)
-    reach = shift + 2.0 * math.sin(min(angle, math.pi) / 2.0) * np.hypot(*(high - low)) / 2.0
-    region = (low - reach, high + reach)
+
+
+class _BoardInView(NamedTuple):
+    """Part of the board in the image: bounding box [m], image centre on the board [m], mean size of a pixel [m]."""
+
+    low: Float64
+    high: Float64
+    centre: tuple[float, float]
+    pixel: float
+
+
+def _board_in_view(board_to_image: Float64, shape: tuple[int, int]) -> _BoardInView:
+    """Return the part of the board that an image of (rows, columns) shows."""
+    rows, columns = shape
+    corners = np.array([(0, 0), (columns - 1, 0), (0, rows - 1), (columns - 1, rows - 1)], np.float64)
+    to_board = np.asarray(np.linalg.inv(board_to_image))
+    seen = apply_homography(to_board, np.concatenate([corners, corners.mean(axis=0)[None]]))
+    pixel = math.sqrt(abs(_area(seen[:4])) / max((columns - 1) * (rows - 1), 1))
+    return _BoardInView(seen[:4].min(axis=0), seen[:4].max(axis=0), (seen[4, 0], seen[4, 1]), pixel)
+
+
+def _ruler_edges(
+    artwork: Artwork, region: tuple[Float64, Float64], place: Any, pixel: float, blur_px: float
+) -> tuple[KnownEdges, float]:
+    """Return edges for the rulers, at most `_MAX_RULERS`, and the smoothing of the rulers [px]."""
     smoothing_px = best_smoothing(blur_px)
     single = _singles(artwork, region, place, Imaging(pixel=pixel, blur_px=blur_px, shift=2.0 * pixel, angle=0.0))
     if len(single.point) < _MIN_RULERS:
@@ -115,17 +146,7 @@ def prepare_board_registration(
         narrow = Imaging(pixel=pixel, blur_px=blur_px / math.sqrt(3.0), shift=2.0 * pixel, angle=0.0)
         single = _singles(artwork, region, place, narrow)
     chosen = _some(np.arange(len(single.point)), _MAX_RULERS)
-    return CoarseRegistration(
-        search=_edge_points(artwork, low, high, cell_px * pixel),
-        rulers=KnownEdges(single.point[chosen], single.normal[chosen]),
-        to_image=matrix,
-        placement=place,
-        shift=shift,
-        angle=angle,
-        ruler=RulerEdges(threshold=threshold, width=5, smoothing_px=smoothing_px),
-        tolerance_px=tolerance_px,
-        cell_px=cell_px,
-    )
+    return KnownEdges(single.point[chosen], single.normal[chosen]), smoothing_px
 
 
 def _singles(artwork: Artwork, region: tuple[Float64, Float64], place: Any, imaging: Imaging) -> KnownEdges:

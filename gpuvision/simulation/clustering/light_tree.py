@@ -145,70 +145,112 @@ def _build_order(lit: _SegmentTable, levels: int) -> Integers:
     return order
 
 
+class _Members:
+    """Segments of all nodes that hold any, one node after another.
+
+    Attributes
+    ----------
+    begin, owner
+        Index of the first segment of each node, and index of the node of each segment.
+    power, normal, middle, half
+        Columns of `_SegmentTable`.
+    """
+
+    def __init__(self, lit: _SegmentTable, order: Integers, spans: Integers) -> None:
+        first, size = spans.T
+        self.begin = np.cumsum(size) - size
+        self.owner = np.repeat(np.arange(len(spans)), size)
+        members = order[np.arange(len(self.owner)) + np.repeat(first - self.begin, size)]
+        self.power, self.normal, self.middle, self.half = (
+            each[members] for each in (lit.power, lit.normal, lit.middle, lit.half)
+        )
+
+    def sums(self, values: Reals) -> Reals:
+        """Return the sum over each node."""
+        return np.asarray(np.add.reduceat(values, self.begin))
+
+    def largest(self, values: Reals) -> Reals:
+        """Return the maximum over each node."""
+        return np.asarray(np.maximum.reduceat(values, self.begin))
+
+    def smallest(self, values: Reals) -> Reals:
+        """Return the minimum over each node."""
+        return np.asarray(np.minimum.reduceat(values, self.begin))
+
+
 def _fill_nodes(
     lit: _SegmentTable, order: Integers, full: Integers, spans: Integers, rows: Reals, representatives: Reals
 ) -> None:
     """Fill the rows and the representatives of the nodes that hold segments, for all levels at once."""
-    first, size = spans[full].T
-    begin = np.cumsum(size) - size
-    owner = np.repeat(np.arange(len(full)), size)
-    members = order[np.arange(len(owner)) + np.repeat(first - begin, size)]
-
-    def sums(values: Reals) -> Reals:
-        return np.asarray(np.add.reduceat(values, begin))
-
-    power, normal, middle, half = (each[members] for each in (lit.power, lit.normal, lit.middle, lit.half))
-    total = sums(power)
+    some = _Members(lit, order, spans[full])
+    total = some.sums(some.power)
     # In a cluster without power all segments have the same weight, so that means exist.
-    weight = np.where(total[owner] > 0.0, power, 1.0)
-    mass = sums(weight)
-    facing, effective = _mean_direction(sums(weight[:, None] * normal), normal[begin])
-    face = facing[owner]
-    cosine = _dot(normal, face)
+    weight = np.where(total[some.owner] > 0.0, some.power, 1.0)
+    mass = some.sums(weight)
+    facing, effective = _mean_direction(some.sums(weight[:, None] * some.normal), some.normal[some.begin])
+    face = facing[some.owner]
+    cosine = _dot(some.normal, face)
     # The centre is the mean of positions weighted by power times cosine: the representative then has the first moment
     # of the cluster. Where normals spread too far, the node has no representative and the centre is any mean.
-    lean = np.minimum.reduceat(cosine, begin)
-    parallel = np.where(lean[owner] > _MIN_COSINE, weight * cosine, weight)
-    centre = sums(parallel[:, None] * middle) / sums(parallel)[:, None]
-    at = middle - centre[owner]
-    tangential = normal - cosine[:, None] * face
-    square, fourth = _mean_distance_powers(at, half)
-    tilt = np.sqrt(_dot(tangential, tangential))
-    skew = sums((weight[:, None] * tangential)[:, :, None] * at[:, None, :])
-    spread = sums(parallel[:, None, None] * (at[:, :, None] * at[:, None, :] + half[:, :, None] * half[:, None, :] / 3))
-    one, other = at - half, at + half
-    reach = np.sqrt(np.maximum.reduceat(np.maximum(_dot(one, one), _dot(other, other)), begin))
-    arm, rest = _principal_segment(spread, facing, effective, reach)
+    lean = some.smallest(cosine)
+    parallel = np.where(lean[some.owner] > _MIN_COSINE, weight * cosine, weight)
+    centre = some.sums(parallel[:, None] * some.middle) / some.sums(parallel)[:, None]
+    at = some.middle - centre[some.owner]
+    reach = np.sqrt(
+        some.largest(np.maximum(_dot(at - some.half, at - some.half), _dot(at + some.half, at + some.half)))
+    )
+    arm, rest = _principal_segment(_second_moments(some, at, parallel), facing, effective, reach)
     arm_size = np.linalg.norm(arm, axis=1)
-    height = -_dot(normal, at)
-    slab = np.maximum.reduceat(np.maximum(np.abs(_dot(one, face)), np.abs(_dot(other, face))), begin)
-    low = np.minimum.reduceat(np.minimum(one, other), begin)
-    high = np.maximum.reduceat(np.maximum(one, other), begin)
-    deviation = normal - face
-    scale, each = np.where(total > 0.0, total / mass, 0.0), np.where(total > 0.0, 1.0 / mass, 0.0)
+    each = np.where(total > 0.0, 1.0 / mass, 0.0)
     parts = {
         "centre": centre,
-        "low": centre + np.minimum(low, -np.abs(arm)),
-        "high": centre + np.maximum(high, np.abs(arm)),
         "normal": facing,
         "radius": np.maximum(reach, arm_size),
-        "spread": np.sqrt(np.maximum.reduceat(_dot(deviation, deviation), begin)),
-        "max_height": np.maximum.reduceat(height, begin),
-        "min_height": np.minimum.reduceat(height, begin),
-        "slab": slab,
         "power": total,
-        "first_order": 2.0 * np.sqrt(3.0) * np.linalg.norm(skew, axis=(1, 2)) * each,
-        "second_order": 3.0 * (rest + sums(weight * tilt * square)) * each,
-        "third_moment": sums(weight * np.sqrt(square * fourth)) * each,
         "fourth_moment": 0.2 * effective * arm_size**4 * each,
         "arm": np.where(lean > _MIN_COSINE, arm_size, np.inf),
-        "length": 2.0 * np.linalg.norm(half, axis=1)[begin],
+        "length": 2.0 * np.linalg.norm(some.half, axis=1)[some.begin],
+        **_extents(some, at, face, centre, arm),
+        **_moments(some, at, weight, some.normal - cosine[:, None] * face, rest, each),
     }
     rows[full] = np.column_stack([parts[name] for name in NODE_SIZES])
-    exitance = effective * scale / np.where(arm_size > 0.0, 2.0 * arm_size, 1.0)
+    exitance = effective * np.where(total > 0.0, total / mass, 0.0) / np.where(arm_size > 0.0, 2.0 * arm_size, 1.0)
     representatives[full] = np.column_stack(
         [centre - arm, centre + arm, facing, np.where(arm_size > 0.0, exitance, 0.0)]
     )
+
+
+def _second_moments(some: _Members, at: Reals, parallel: Reals) -> Reals:
+    """Return the weighted second moments (nodes, 3, 3) of the segments about the centres."""
+    outer = at[:, :, None] * at[:, None, :] + some.half[:, :, None] * some.half[:, None, :] / 3
+    return some.sums(parallel[:, None, None] * outer)
+
+
+def _extents(some: _Members, at: Reals, face: Reals, centre: Reals, arm: Reals) -> dict[str, Reals]:
+    """Return the bounds of the nodes: boxes, heights over the receivers' planes, and spread of the normals."""
+    one, other = at - some.half, at + some.half
+    height = -_dot(some.normal, at)
+    deviation = some.normal - face
+    return {
+        "low": centre + np.minimum(some.smallest(np.minimum(one, other)), -np.abs(arm)),
+        "high": centre + np.maximum(some.largest(np.maximum(one, other)), np.abs(arm)),
+        "spread": np.sqrt(some.largest(_dot(deviation, deviation))),
+        "max_height": some.largest(height),
+        "min_height": some.smallest(height),
+        "slab": some.largest(np.maximum(np.abs(_dot(one, face)), np.abs(_dot(other, face)))),
+    }
+
+
+def _moments(some: _Members, at: Reals, weight: Reals, tangential: Reals, rest: Reals, each: Reals) -> dict[str, Reals]:
+    """Return the moments that bound the error of the representatives; ``each`` is one over the nodes' weights."""
+    square, fourth = _mean_distance_powers(at, some.half)
+    tilt = np.sqrt(_dot(tangential, tangential))
+    skew = some.sums((weight[:, None] * tangential)[:, :, None] * at[:, None, :])
+    return {
+        "first_order": 2.0 * np.sqrt(3.0) * np.linalg.norm(skew, axis=(1, 2)) * each,
+        "second_order": 3.0 * (rest + some.sums(weight * tilt * square)) * each,
+        "third_moment": some.sums(weight * np.sqrt(square * fourth)) * each,
+    }
 
 
 def _dot(a: Reals, b: Reals) -> Reals:

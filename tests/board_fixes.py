@@ -49,7 +49,7 @@ class Fixes(NamedTuple):
         return np.asarray(np.einsum("bi,bij,bj->b", found, np.linalg.inv(self.covariances[self.good]), found))
 
     @property
-    def said(self) -> Float64:
+    def predicted(self) -> Float64:
         """Mean predicted standard deviations (3,)."""
         return np.asarray(np.sqrt(np.mean(self.covariances[self.good][:, [0, 1, 2], [0, 1, 2]], axis=0)))
 

@@ -4,11 +4,13 @@
 // Inputs:  image (rows, columns), type CODE; places (count, PLACE): x, y, size, and the angle of shapes that are not round.
 // Outputs: (count,) each: x, y, size, residual, distance, blur [px], angle [rad], symmetry, contrast, centroid (gravity_x,
 //          gravity_y), inliers, status; shift (count, 2); covariance (count, FREEDOMS, FREEDOMS).
-// Tables:  table: parameters of ruler.h. laid, six rows of PADDED_SPOKES numbers for a shape of size 1: centre of the ruler (x, y);
-//          its direction (x, y), outwards from the fiducial; distance of the edge from the centre; 1, or 0 for padding.
+// Tables:  table: parameters of ruler.h. ruler_table: six rows of PADDED_SPOKES numbers for a shape of size 1: centre of
+//          the ruler (x, y); its direction (x, y), outwards from the fiducial; distance of the edge from the centre; 1,
+//          or 0 for padding.
 // Options: ROUND: the contour is one circle or two, FREEDOMS is 3: x, y, size; else straight edges, FREEDOMS is 4: x, y,
-//          size, angle. EITHER_POLARITY: fiducials may be brighter or darker than the background. MATCH_IMAGE: refine by grey levels.
-//          SPOKES: number of rulers, even; opposite rulers are SPOKES / 2 apart. PADDED_SPOKES: SPOKES rounded up to whole vectors.
+//          size, angle. EITHER_POLARITY: fiducials may be brighter or darker than the background. MATCH_IMAGE: refine by
+//          grey levels. SPOKES: number of rulers, even; opposite rulers are SPOKES / 2 apart. PADDED_SPOKES: SPOKES
+//          rounded up to whole vectors.
 // Variants: vector: a work-item processes `each` fiducials, 16 rulers in a vector; work-item: a work-group of
 //          RULER_GROUP items per fiducial, one ruler after the other.
 #include "blob/blob_match.h"
@@ -503,10 +505,15 @@ kernel void find_blobs(global const CODE *restrict image, global const real *res
                        global int *restrict inliers, global real *restrict symmetry, global real *restrict gravity_x,
                        global real *restrict gravity_y, global real *restrict distance, global real *restrict contrast,
                        global real *restrict blur, global uchar *restrict status, constant real *table,
-                       constant real *laid, const int rows, const int columns, const uint count, const uint each,
+                       constant real *ruler_table, const int rows, const int columns, const uint count, const uint each,
                        const real search, const int least, const real across, const real overlap, const real extent,
                        const real pixel_noise, const real spacing, const int passes) {
-    const blob_layout layout = {laid, laid + PADDED_SPOKES, laid + 2 * PADDED_SPOKES, laid + 3 * PADDED_SPOKES, laid + 4 * PADDED_SPOKES, laid + 5 * PADDED_SPOKES};
+    const blob_layout layout = {ruler_table,
+                                ruler_table + PADDED_SPOKES,
+                                ruler_table + 2 * PADDED_SPOKES,
+                                ruler_table + 3 * PADDED_SPOKES,
+                                ruler_table + 4 * PADDED_SPOKES,
+                                ruler_table + 5 * PADDED_SPOKES};
 #ifdef VECTOR_VARIANT
     const uint first = get_global_id(0) * each, end = min(first + each, count);
     const int mine = 1;

@@ -28,7 +28,7 @@ def psd(**more: Any) -> Triangulation:
     )
 
 
-def turned(points: np.ndarray, angle: float) -> np.ndarray:
+def rotated(points: np.ndarray, angle: float) -> np.ndarray:
     return points @ np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
 
 
@@ -130,7 +130,7 @@ def offset(points: np.ndarray) -> np.ndarray:
 
 
 def rolled(points: np.ndarray) -> np.ndarray:
-    return turned(points, 0.03)
+    return rotated(points, 0.03)
 
 
 CASES = {"C4": lambda points: points, "D6": offset, "H8": rolled}
@@ -262,7 +262,7 @@ def test_single_beam_is_a_moebius_map(rng: np.random.Generator) -> None:
 )
 def test_any_geometry_is_recovered(roll: float, tilt: float, baseline: float, scale: float) -> None:
     truth = psd(tilt=tilt, baseline=baseline)
-    seen = turned(truth.to_sensor(SHEET), roll) * scale
+    seen = rotated(truth.to_sensor(SHEET), roll) * scale
     fitted = Triangulation.fit(seen, SHEET, model="H8")
     np.testing.assert_allclose(fitted.to_sensor(SHEET), seen, rtol=0, atol=1e-11 * np.max(np.abs(seen)))
 

@@ -49,7 +49,7 @@ def artwork(folder: Path) -> Artwork:
 
 
 @functools.cache
-def painted(
+def rendered_board(
     artwork: Artwork, place: tuple[float, float], turn: float, pixel: float, shape: tuple[int, int], **more: Any
 ) -> BoardPicture:
     """Render a board around the field of view of a camera, once for all tests with that view."""
@@ -58,7 +58,7 @@ def painted(
     return BoardPicture(artwork, view, (0.0, 0.0, -turn), place, margin=16)
 
 
-def seen(
+def camera_image(
     artwork: Artwork,
     pose: tuple[float, float, float],
     pixel: float = PIXEL,
@@ -67,14 +67,14 @@ def seen(
 ) -> np.ndarray:
     """Return the uint8 image of a camera at a pose: board point at the image centre, and direction of the columns."""
     place, turn = np.round(np.array(pose[:2]) / 0.5e-3) * 0.5e-3, round(20 * pose[2]) / 20
-    picture = painted(artwork, tuple(place.tolist()), turn, pixel, shape, **more)
+    picture = rendered_board(artwork, tuple(place.tolist()), turn, pixel, shape, **more)
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     shift = np.array([[cos, sin], [-sin, cos]]) @ (place - pose[:2])
     image = picture.seen((*shift, turn - pose[2]), np.random.default_rng(1))
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-def off(located: LocatedBoard, pose: tuple[float, float, float]) -> np.ndarray:
+def errors_in_sigmas(located: LocatedBoard, pose: tuple[float, float, float]) -> np.ndarray:
     """Return the error of a pose in units of its sigmas."""
     return (np.array(located.pose) - pose) / located.sigmas
 
@@ -104,11 +104,11 @@ def test_noise_is_that_of_the_image(rng: np.random.Generator) -> None:
 def test_a_camera_is_located_where_it_is(artwork: Artwork, turned: float, device: Device) -> None:
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, turned + 2e-3)
     located = locate_board(
-        seen(artwork, pose), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, turned), device=device
+        camera_image(artwork, pose), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, turned), device=device
     )
     assert located.reason == ""
     assert located.copper == "bright"
-    assert np.abs(off(located, pose)).max() < SIGMAS
+    assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS
     assert np.all(located.sigmas[:2] < 0.05 * PIXEL)
     assert located.rulers.used.sum() >= 0.9 * located.rulers.in_image.sum()
     assert located.noise == pytest.approx(NOISE, rel=0.1)
@@ -116,7 +116,7 @@ def test_a_camera_is_located_where_it_is(artwork: Artwork, turned: float, device
 
 def test_the_placement_point_is_where_it_is_seen(artwork: Artwork) -> None:
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 3e-3)
-    located = locate_board(seen(artwork, pose), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0))
+    located = locate_board(camera_image(artwork, pose), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0))
     true = BoardView(scale=PIXEL, shape=SHAPE, pose=pose).to_pixels(located.placement)
     sigmas = np.sqrt(np.diag(located.placement_covariance))[:2] / PIXEL
     assert np.abs((located.placement_px - true) / sigmas).max() < SIGMAS
@@ -126,9 +126,13 @@ def test_the_placement_point_is_where_it_is_seen(artwork: Artwork) -> None:
 def test_etching_is_solved_for(artwork: Artwork, etch_bias: float) -> None:
     pose = (BOARD_MIDDLE[0] - 30e-6, BOARD_MIDDLE[1], -2e-3)
     located = locate_board(
-        seen(artwork, pose, etch_bias=etch_bias), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0), budget=120
+        camera_image(artwork, pose, etch_bias=etch_bias),
+        artwork,
+        scale=PIXEL,
+        initial_pose=(*BOARD_MIDDLE, 0.0),
+        budget=120,
     )
-    assert np.abs(off(located, pose)).max() < SIGMAS
+    assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS
     # Edges are rendered to 0.01 px with a common error, and 40 edges are measured to 0.03 px.
     assert np.sum(located.features.spacing == 0) > 20
     assert located.etch_bias == pytest.approx(etch_bias, abs=0.04 * PIXEL)
@@ -138,23 +142,23 @@ def test_dark_copper_is_told_from_bright(artwork: Artwork) -> None:
     pose = (BOARD_MIDDLE[0] + 20e-6, BOARD_MIDDLE[1] + 35e-6, 1e-3)
     inverted = (110.0, 60.0, 200.0, 90.0, 240.0, 15.0)
     located = locate_board(
-        seen(artwork, pose, levels=inverted), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0)
+        camera_image(artwork, pose, levels=inverted), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0)
     )
     assert located.copper == "dark"
-    assert np.abs(off(located, pose)).max() < SIGMAS
+    assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS
 
 
 def test_a_lens_is_undone(artwork: Artwork) -> None:
     pose = (BOARD_MIDDLE[0] + 30e-6, BOARD_MIDDLE[1] - 25e-6, -1e-3)
     lens = Lens(k1=2e-7, centre=(200.0, 147.0))
-    straight = seen(artwork, pose).astype(np.float32)
+    straight = camera_image(artwork, pose).astype(np.float32)
     columns, rows = np.meshgrid(np.arange(SHAPE[1]), np.arange(SHAPE[0]))
     at = lens.undistort(np.stack([columns, rows], axis=-1)).astype(np.float32)
     bent = cv2.remap(straight, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     initial_pose = (*BOARD_MIDDLE, 0.0)
     # The image is resampled from noisy pixels; cubic interpolation preserves the noise to some percent.
     located = locate_board(bent, artwork, scale=PIXEL, initial_pose=initial_pose, model=lens)
-    assert np.abs(off(located, pose)).max() < SIGMAS + 1.0
+    assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS + 1.0
     bare = locate_board(bent, artwork, scale=PIXEL, initial_pose=initial_pose)
     # 2e-7 px^-2 moves the corners by 5 px.
     assert bare.reason or np.abs(np.array(bare.pose) - pose).max() > 10 * np.abs(np.array(located.pose) - pose).max()
@@ -163,11 +167,11 @@ def test_a_lens_is_undone(artwork: Artwork) -> None:
 def test_a_board_is_searched_where_it_is_not_known(artwork: Artwork, device: Device) -> None:
     pose = (BOARD_MIDDLE[0] + 1.3e-3, BOARD_MIDDLE[1] - 0.9e-3, 0.05)
     located = locate_board(
-        seen(artwork, pose), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0), search_range=(2e-3, 0.09)
+        camera_image(artwork, pose), artwork, scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0), search_range=(2e-3, 0.09)
     )
     assert located.coarse_registration is not None
     assert located.reason == ""
-    assert np.abs(off(located, pose)).max() < SIGMAS
+    assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS
 
 
 @pytest.mark.parametrize(
@@ -258,7 +262,7 @@ def test_the_threshold_is_given_or_from_noise_and_range(artwork: Artwork) -> Non
 
 def test_the_command_writes_pose_and_picture(folder: Path, artwork: Artwork, tmp_path: Path, run: Locate) -> None:
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 2e-3)
-    cv2.imwrite(str(tmp_path / "board.png"), seen(artwork, pose))
+    cv2.imwrite(str(tmp_path / "board.png"), camera_image(artwork, pose))
     initial_pose = ",".join(f"{1e3 * each}mm" for each in BOARD_MIDDLE) + ",0deg"
     files = ("--out", tmp_path / "out", "--json", tmp_path / "pose.json")
     code, out, _ = run(
@@ -471,16 +475,16 @@ def board_of(folder: Path) -> Artwork:
 def test_boards_of_three_tools_are_located(data: Path, name: str, middle: tuple[float, float], device: Device) -> None:
     board = board_of(data / "gerber" / name)
     pose = (middle[0] + 45e-6, middle[1] - 60e-6, 3e-3)
-    image = seen(board, pose, FINE, FINE_SHAPE, etch_bias=-8e-6)
+    image = camera_image(board, pose, FINE, FINE_SHAPE, etch_bias=-8e-6)
     located = locate_board(image, board, scale=FINE, initial_pose=(*middle, 0.0), device=device)
     assert located.reason == ""
-    assert np.abs(off(located, pose)).max() < SIGMAS
+    assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS
     assert np.all(located.sigmas[:2] < 0.05 * FINE)
 
 
 def test_a_lens_file_goes_with_the_command(folder: Path, artwork: Artwork, tmp_path: Path, run: Locate) -> None:
     pose = (BOARD_MIDDLE[0] + 40e-6, BOARD_MIDDLE[1] - 55e-6, 2e-3)
-    cv2.imwrite(str(tmp_path / "board.png"), seen(artwork, pose))
+    cv2.imwrite(str(tmp_path / "board.png"), camera_image(artwork, pose))
     write_lens(tmp_path / "lens.toml", Lens(k1=0.0), {})
     initial_pose = ",".join(str(each) for each in BOARD_MIDDLE) + ",0"
     arguments = ("--scale", "40um", f"--initial-pose={initial_pose}", "--camera", tmp_path / "lens.toml")
@@ -495,7 +499,7 @@ def test_a_lens_file_goes_with_the_command(folder: Path, artwork: Artwork, tmp_p
 def test_a_mirrored_side_is_seen_from_below(artwork: Artwork) -> None:
     """The bottom side in view of a camera below: a mirror image of the top view."""
     pose = (BOARD_MIDDLE[0] + 20e-6, BOARD_MIDDLE[1] + 10e-6, 2e-3)
-    below = np.ascontiguousarray(seen(artwork, pose)[:, ::-1])
+    below = np.ascontiguousarray(camera_image(artwork, pose)[:, ::-1])
     located = locate_board(below, replace(artwork, side="bottom"), scale=PIXEL, initial_pose=(*BOARD_MIDDLE, 0.0))
     assert located.reason == ""
-    assert np.abs(off(located, pose)).max() < SIGMAS
+    assert np.abs(errors_in_sigmas(located, pose)).max() < SIGMAS

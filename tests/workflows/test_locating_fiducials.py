@@ -66,7 +66,7 @@ def squares(errors: list[np.ndarray], covariances: list[np.ndarray]) -> float:
     return float(sum(e @ np.linalg.inv(c) @ e for e, c in zip(errors, covariances, strict=True)))
 
 
-def agree(total: float, numbers: int) -> bool:
+def is_consistent(total: float, numbers: int) -> bool:
     """Return whether squared errors agree with Gaussian numbers, for all but 2 of 1e4 boards.
 
     The deviations themselves are within 10 %: fiducials have 1.0 to 1.2 times the bound, and 1.1 is predicted.
@@ -91,8 +91,8 @@ def test_errors_are_as_promised(board: str, device: Device, request: pytest.Fixt
         assert found.fiducials.used.sum() >= 15  # Tukey's loss rejects no more than a few of 1e3 good rows
         errors.append(np.array(found.pose) - true)
         predicted.append(found.covariance)
-    assert agree(squares(errors, [features.covariance] * DRAWS), 3 * DRAWS)
-    assert agree(squares(errors, predicted), 3 * DRAWS)
+    assert is_consistent(squares(errors, [features.covariance] * DRAWS), 3 * DRAWS)
+    assert is_consistent(squares(errors, predicted), 3 * DRAWS)
     # A hundredth of a pixel: 0.4 um.
     assert np.all(features.sigmas[:2] < 0.01 * PIXEL)
 

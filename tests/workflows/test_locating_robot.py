@@ -93,7 +93,7 @@ NO_FIELDS: dict[str, Callable[[np.random.Generator], Image]] = {
 }
 
 
-def right(found: np.ndarray, pose: tuple[float, float, float]) -> bool:
+def is_correct(found: np.ndarray, pose: tuple[float, float, float]) -> bool:
     """Return whether a pose or its twin is within 10 cm of the true pose."""
     return bool(min(np.hypot(found[0] - s * pose[0], found[1] - s * pose[1]) for s in (1, -1)) < 0.1)
 
@@ -127,7 +127,7 @@ def test_of_many_fields_nearly_all_are_found(rng: np.random.Generator) -> None:
         pose = anywhere(rng)
         image = spotted(seen_from(field, pose, rng), number % 3 * 40, rng)
         located = locate_robot(scan_floor(image, scale=SCALE, line_width=WIDE), field)
-        found.append(not located.reason and right(located.candidates[0].pose, pose))
+        found.append(not located.reason and is_correct(located.candidates[0].pose, pose))
     assert np.mean(found) > 0.9
 
 
@@ -139,7 +139,7 @@ def test_fields_are_found(spots: int, share: float, device: Device, rng: np.rand
         image = hidden(spotted(seen_from(field, pose, rng), spots, rng), share, rng)
         located = locate_robot(scan_floor(image, scale=SCALE, line_width=WIDE, device=device), field, device=device)
         assert located.reason == ""
-        assert right(located.candidates[0].pose, pose)
+        assert is_correct(located.candidates[0].pose, pose)
         assert located.evidence is not None
         assert located.evidence.seen > 0.55
         evidence = located.report()["evidence"]
@@ -156,7 +156,7 @@ def test_another_field_is_refused(device: Device, rng: np.random.Generator) -> N
     assert len(located.doubtful) == 1
     # At a scale that compensates the size it is the same field.
     scan = scan_floor(image, scale=SCALE / 1.33, line_width=WIDE / 1.33, device=device)
-    assert right(locate_robot(scan, field, device=device).candidates[0].pose, (-6.0 / 1.33, 2.0 / 1.33, 0.7))
+    assert is_correct(locate_robot(scan, field, device=device).candidates[0].pose, (-6.0 / 1.33, 2.0 / 1.33, 0.7))
 
 
 def test_every_stripe_along_a_ray_is_found(rng: np.random.Generator) -> None:

@@ -18,7 +18,7 @@ from straight_lines import bound, plane_grid, radial_lens, straightness
 NAMES = ("k1", "k2", "C_c", "R_c")
 
 
-def seen(rng: np.random.Generator, tilt: float, border: float, sigma: float) -> tuple[np.ndarray, Lens]:
+def noisy_grid(rng: np.random.Generator, tilt: float, border: float, sigma: float) -> tuple[np.ndarray, Lens]:
     """Return a noisy grid of 23 x 31 points, and its true lens."""
     lens = radial_lens(border)
     points = lens.distort(plane_grid(rng, tilt))
@@ -35,7 +35,7 @@ def errors(fit: LensFit, lens: Lens) -> np.ndarray:
 @pytest.mark.parametrize("tilt", [0.0, 45.0])
 @pytest.mark.parametrize("border", [-20.0, 0.3, 20.0])
 def test_exact_lines_give_the_lens(rng: np.random.Generator, border: float, tilt: float, lines: str) -> None:
-    points, lens = seen(rng, tilt, border, 0.0)
+    points, lens = noisy_grid(rng, tilt, border, 0.0)
     fit = fit_lens(grid_lines(points, diagonals=True), model="k1,k2", lines=lines)
     # Rounding of the points, 1e-13 pixels, relative to the distortion: 1e-12 for the smallest distortion.
     np.testing.assert_allclose(fit.values[:4], [lens.k1, lens.k2, *lens.centre], rtol=1e-9)
@@ -69,7 +69,7 @@ def coverage(rng: np.random.Generator, draws: int, cases: list[tuple[float, floa
     """Errors in standard deviations (draws, 4), over cases (tilt, border, sigma) in turn."""
     found = []
     for number in range(draws):
-        points, lens = seen(rng, *cases[number % len(cases)])
+        points, lens = noisy_grid(rng, *cases[number % len(cases)])
         fit = fit_lens(grid_lines(points), model="k1,k2", lines=("free", "vanishing")[number % 2])
         found.append(errors(fit, lens))
     return np.array(found)
@@ -117,7 +117,7 @@ def test_vanishing_points_have_errors_as_predicted(rng: np.random.Generator) -> 
 
 
 def test_rms_is_of_the_measured_image(rng: np.random.Generator) -> None:
-    points, _ = seen(rng, 20.0, 20.0, 0.1)
+    points, _ = noisy_grid(rng, 20.0, 20.0, 0.1)
     fit = fit_lens(grid_lines(points), model="k1,k2")
     freedom = len(np.concatenate([np.concatenate(family) for family in fit.residuals_px]))
     assert fit.rms_px == pytest.approx(0.1, rel=0.1)
@@ -136,7 +136,7 @@ def test_rms_is_of_the_measured_image(rng: np.random.Generator) -> None:
 
 
 def test_distances_keep_their_place(rng: np.random.Generator) -> None:
-    points, _ = seen(rng, 10.0, 5.0, 0.1)
+    points, _ = noisy_grid(rng, 10.0, 5.0, 0.1)
     points[3, 4:9] = np.nan
     points[0, 2:] = np.nan
     rows = list(points)
@@ -192,7 +192,7 @@ def test_lines_that_do_not_meet_are_found_out(rng: np.random.Generator) -> None:
 
 
 def test_alternatives_say_how_far_their_centres_lie(rng: np.random.Generator) -> None:
-    points, _ = seen(rng, 20.0, 10.0, 0.05)
+    points, _ = noisy_grid(rng, 20.0, 10.0, 0.05)
     fit = fit_lens(grid_lines(points))
     assert fit.model == "k1,k2"
     by_model = {(each.model, each.lines): each for each in fit.alternatives}
@@ -223,13 +223,13 @@ def test_no_distortion_leaves_no_centre(rng: np.random.Generator) -> None:
 def test_a_faint_distortion_is_said_to_be_faint(rng: np.random.Generator, sigma: float, faint: bool) -> None:
     """0.3 pixels of distortion under 0.2 pixels of noise: the linear uncertainty is not valid, and each fit warns."""
     for _ in range(20):
-        points, _ = seen(rng, 20.0, 0.3, sigma)
+        points, _ = noisy_grid(rng, 20.0, 0.3, sigma)
         fit = fit_lens(grid_lines(points), model="k1,k2")
         assert any("faint" in each or "as straight" in each for each in fit.warnings) is faint
 
 
 def test_mirrored_image(rng: np.random.Generator) -> None:
-    points, _ = seen(rng, 20.0, 10.0, 0.05)
+    points, _ = noisy_grid(rng, 20.0, 10.0, 0.05)
     plain = fit_lens(grid_lines(points))
     mirrored = fit_lens(grid_lines([1023.0, 0.0] + points * [-1.0, 1.0]))
     assert mirrored.lens.centre == pytest.approx((1023.0 - plain.lens.centre[0], plain.lens.centre[1]), rel=1e-7)
@@ -238,21 +238,21 @@ def test_mirrored_image(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("share", [0.1, 0.5])
 def test_missing_points(rng: np.random.Generator, share: float) -> None:
-    points, lens = seen(rng, 20.0, 10.0, 0.05)
+    points, lens = noisy_grid(rng, 20.0, 10.0, 0.05)
     points[rng.random(points.shape[:2]) < share] = np.nan
     assert np.all(np.abs(errors(fit_lens(grid_lines(points), model="k1,k2"), lens)) < 5.0)
 
 
 @pytest.mark.parametrize("kept", [np.s_[:, :16], np.s_[12:], np.s_[12:, 16:]])
 def test_part_of_the_grid(rng: np.random.Generator, kept: tuple[slice, ...]) -> None:
-    points, lens = seen(rng, 20.0, 20.0, 0.05)
+    points, lens = noisy_grid(rng, 20.0, 20.0, 0.05)
     assert np.all(np.abs(errors(fit_lens(grid_lines(points[kept]), model="k1,k2"), lens)) < 5.0)
 
 
 @pytest.mark.parametrize("factor", [8.0, 1e-5])
 def test_any_unit(rng: np.random.Generator, factor: float) -> None:
     """8192 pixels, or metres on a PSD; also in single precision."""
-    points, _ = seen(rng, 20.0, 10.0, 0.05)
+    points, _ = noisy_grid(rng, 20.0, 10.0, 0.05)
     plain, scaled = fit_lens(grid_lines(points)), fit_lens(grid_lines(factor * points))
     assert scaled.values[:4] * factor ** np.array([2.0, 4.0, -1.0, -1.0]) == pytest.approx(plain.values[:4], rel=1e-7)
     single = fit_lens(grid_lines((factor * points).astype(np.float32)))
@@ -300,7 +300,7 @@ def test_outliers(loss: str) -> None:
     rng = np.random.default_rng(3)
     squares = []
     for _ in range(30):
-        points, lens = seen(rng, 20.0, 20.0, 0.1)
+        points, lens = noisy_grid(rng, 20.0, 20.0, 0.1)
         wrong = rng.random(points.shape[:2]) < 0.02
         angle = rng.uniform(0.0, 2.0 * np.pi, np.count_nonzero(wrong))
         points[wrong] += rng.uniform(5.0, 50.0, len(angle))[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -310,7 +310,7 @@ def test_outliers(loss: str) -> None:
 
 
 def test_outliers_are_pointed_out(rng: np.random.Generator) -> None:
-    points, _ = seen(rng, 20.0, 20.0, 0.1)
+    points, _ = noisy_grid(rng, 20.0, 20.0, 0.1)
     assert fit_lens(grid_lines(points)).warnings == ()
     points[5, 7] += [15.0, 0.0]
     points[10, 20] -= [0.0, 40.0]
@@ -322,7 +322,7 @@ def test_outliers_are_pointed_out(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("loss", ["huber", "tukey"])
 def test_a_line_of_outliers(rng: np.random.Generator, loss: str) -> None:
     """A row of points on a curve instead of a straight line."""
-    points, lens = seen(rng, 20.0, 20.0, 0.1)
+    points, lens = noisy_grid(rng, 20.0, 20.0, 0.1)
     rows, columns = grid_lines(points)
     zigzag = rows[5] + np.where(np.arange(len(rows[5])) % 2, 30.0, -30.0)[:, None] * [0.0, 1.0]
     fit = fit_lens([(*rows[:5], zigzag, *rows[6:]), columns], model="k1,k2", lines="free", loss=loss)
@@ -331,7 +331,7 @@ def test_a_line_of_outliers(rng: np.random.Generator, loss: str) -> None:
 
 
 def test_loss_without_outliers_costs_little(rng: np.random.Generator) -> None:
-    points, lens = seen(rng, 20.0, 20.0, 0.1)
+    points, lens = noisy_grid(rng, 20.0, 20.0, 0.1)
     plain = fit_lens(grid_lines(points), model="k1,k2", lines="vanishing")
     for loss in ("huber", "tukey"):
         robust = fit_lens(grid_lines(points), model="k1,k2", lines="vanishing", loss=loss)
@@ -341,7 +341,7 @@ def test_loss_without_outliers_costs_little(rng: np.random.Generator) -> None:
 
 
 def test_known_centre(rng: np.random.Generator) -> None:
-    points, lens = seen(rng, 20.0, 10.0, 0.05)
+    points, lens = noisy_grid(rng, 20.0, 10.0, 0.05)
     fit = fit_lens(grid_lines(points), model="k1,k2", centre=lens.centre)
     assert fit.lens.centre == pytest.approx(lens.centre, rel=1e-12)
     assert fit.uncertainties["C_c"] == fit.uncertainties["R_c"] == 0.0
@@ -393,7 +393,7 @@ def test_too_few_points_are_refused(rng: np.random.Generator) -> None:
 
 
 def test_a_family_of_one_line_is_free(rng: np.random.Generator) -> None:
-    points, lens = seen(rng, 20.0, 10.0, 0.05)
+    points, lens = noisy_grid(rng, 20.0, 10.0, 0.05)
     rows, columns = grid_lines(points)
     fit = fit_lens([rows, columns[:1], ()], model="k1,k2", lines="vanishing")
     assert np.all(np.isnan(fit.vanishing_points[1:]))

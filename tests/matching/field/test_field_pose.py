@@ -49,7 +49,7 @@ def view(
     return reference.draw_line_points(field_map.field, pose, rng, count, reach, sigma).astype(np.float32)
 
 
-def off(pose: Any, other: Any) -> np.ndarray:
+def pose_errors(pose: Any, other: Any) -> np.ndarray:
     difference = np.asarray(pose, np.float64) - other
     difference[..., 2] = (difference[..., 2] + np.pi) % (2.0 * np.pi) - np.pi
     return difference
@@ -201,8 +201,8 @@ def assert_found(field_map: DistanceMap, pose: Any, points: np.ndarray, device: 
     assert candidates[first.symmetric_twin].score == pytest.approx(first.score, abs=1e-6)
     assert candidates[first.symmetric_twin].symmetric_twin == 0
     assert len(candidates) == 2 or candidates[2].score > first.score + 0.005
-    right = min((candidates[number] for number in pair), key=lambda each: np.abs(off(each.pose, pose)).sum())
-    far = off(right.pose, pose)
+    right = min((candidates[number] for number in pair), key=lambda each: np.abs(pose_errors(each.pose, pose)).sum())
+    far = pose_errors(right.pose, pose)
     # Chi squared of three degrees beyond 25: one in 65 000.
     assert far @ right.information @ far < 25.0
 
@@ -223,7 +223,7 @@ def test_clutter_of_70_percent(device: Device, rng: np.random.Generator) -> None
         angle, far = rng.uniform(-np.pi, np.pi, 140), 6.0 * np.sqrt(rng.uniform(0.0, 1.0, 140))
         points[:140] = np.stack([far * np.cos(angle), far * np.sin(angle)], axis=-1)
         first = find_pose_candidates(field_map, points, device=device)[0]
-        assert min(np.abs(off(each, pose)[:2]).max() for each in (first.pose, symmetric_twin(first.pose))) < 0.3
+        assert min(np.abs(pose_errors(each, pose)[:2]).max() for each in (first.pose, symmetric_twin(first.pose))) < 0.3
 
 
 def test_a_robot_outside_the_field(device: Device, rng: np.random.Generator) -> None:
@@ -238,7 +238,7 @@ def test_a_compass_tells_twins_apart(device: Device, rng: np.random.Generator) -
     points = view(field_map, pose, rng, sigma=0.005, reach=1.2)
     first, *others = find_pose_candidates(field_map, points, headings=(0.6,), device=device)
     assert first.symmetric_twin is None
-    assert np.abs(off(first.pose, pose)).max() < 0.02
+    assert np.abs(pose_errors(first.pose, pose)).max() < 0.02
     assert all(each.score > first.score + 0.05 for each in others)
 
 
@@ -248,8 +248,8 @@ def test_points_twice_are_the_same_pose(device: Device, rng: np.random.Generator
     once, twice = (
         find_pose_candidates(field_map, each, device=device)[0] for each in (points, np.repeat(points, 2, axis=0))
     )
-    other = twice.pose if np.abs(off(twice.pose, once.pose)).sum() < 1.0 else symmetric_twin(twice.pose)
-    np.testing.assert_allclose(off(other, once.pose), 0.0, atol=3e-5)
+    other = twice.pose if np.abs(pose_errors(twice.pose, once.pose)).sum() < 1.0 else symmetric_twin(twice.pose)
+    np.testing.assert_allclose(pose_errors(other, once.pose), 0.0, atol=3e-5)
 
 
 def test_a_mirrored_view_is_a_mirrored_pose(device: Device, rng: np.random.Generator) -> None:
@@ -261,7 +261,10 @@ def test_a_mirrored_view_is_a_mirrored_pose(device: Device, rng: np.random.Gener
     )
     assert mirrored.score == pytest.approx(right.score, abs=1e-5)
     mirror_pose = POSE * [1.0, -1.0, -1.0]
-    assert min(np.abs(off(each, mirror_pose)).max() for each in (mirrored.pose, symmetric_twin(mirrored.pose))) < 0.05
+    assert (
+        min(np.abs(pose_errors(each, mirror_pose)).max() for each in (mirrored.pose, symmetric_twin(mirrored.pose)))
+        < 0.05
+    )
 
 
 def test_a_wrong_scale_shows_in_the_scatter(device: Device, rng: np.random.Generator) -> None:
@@ -272,7 +275,7 @@ def test_a_wrong_scale_shows_in_the_scatter(device: Device, rng: np.random.Gener
         for s in (1.0, 1.05)
     )
     assert wrong.residual_std > 1.5 * right.residual_std
-    assert np.abs(off(wrong.pose, POSE)[:2]).max() < 0.3
+    assert np.abs(pose_errors(wrong.pose, POSE)[:2]).max() < 0.3
     np.testing.assert_array_less(np.diag(right.covariance), np.diag(wrong.covariance))
 
 
@@ -301,9 +304,9 @@ def test_poses_are_of_least_cost(device: Device, rng: np.random.Generator) -> No
         )
         assert least <= other + 1e-8
         if other < least + 1e-6:
-            np.testing.assert_allclose(off(fit.poses[0], expected), 0.0, atol=3e-5)
+            np.testing.assert_allclose(pose_errors(fit.poses[0], expected), 0.0, atol=3e-5)
         again = reference.refine_pose(field_map.field, fit.poses[0], points.astype(np.float64), field_map.scale)
-        np.testing.assert_allclose(off(fit.poses[0], again), 0.0, atol=3e-5)
+        np.testing.assert_allclose(pose_errors(fit.poses[0], again), 0.0, atol=3e-5)
         assert fit.score[0] == pytest.approx(least, abs=2e-6)
 
 
@@ -325,7 +328,7 @@ def test_the_fourth_nearest_line_of_a_cell_can_be_the_nearest_of_a_point(device:
     points = ((np.concatenate(places) - pose[:2]) @ np.array([[c, -s], [s, c]])).astype(np.float32)
     fit = FieldPoseRefinement(map=field_map)(points, pose[None].astype(np.float32), device=device)
     assert fit.score[0] < 1e-8
-    np.testing.assert_allclose(off(fit.poses[0], pose), 0.0, atol=1e-5)
+    np.testing.assert_allclose(pose_errors(fit.poses[0], pose), 0.0, atol=1e-5)
 
 
 def test_covariance_is_the_scatter(device: Device, rng: np.random.Generator) -> None:
@@ -336,7 +339,7 @@ def test_covariance_is_the_scatter(device: Device, rng: np.random.Generator) -> 
     for _ in range(200):
         points = view(field_map, POSE, rng, 96)
         fit = refine(points, POSE[None].astype(np.float32), device=device)
-        far = off(fit.poses[0], POSE)
+        far = pose_errors(fit.poses[0], POSE)
         distances.append(far @ fit.information[0] @ far)
         np.testing.assert_allclose(fit.information[0] @ fit.covariance[0], np.eye(3), atol=2e-3)
     assert 2.3 < np.mean(distances) < 3.7

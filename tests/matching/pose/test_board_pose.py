@@ -55,7 +55,7 @@ def operation(variant: Any = "auto", **more: Any) -> BoardPoseEstimator:
     return BoardPoseEstimator(ruler=ruler, lines=LINES, rulers_per_line=EACH, solver=SolvePose(placement=PLACE, **more))
 
 
-def laid(sigma: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def board_rulers(sigma: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     normal, point, along = artwork()
     return place_rulers(normal, point, along, MATRIX, sigma)
 
@@ -66,7 +66,7 @@ def error(result: Any, pose: np.ndarray = POSE) -> np.ndarray:
 
 
 def test_rulers_lie_where_they_say() -> None:
-    rulers, lines = laid()
+    rulers, lines = board_rulers()
     normal, point, along = artwork()
     for s in (-20.0, 0.0, 20.0):
         seen = on_board(rulers[..., :2].astype(float) + s * rulers[..., 2:4])
@@ -83,7 +83,7 @@ def test_rulers_lie_where_they_say() -> None:
 
 @VARIANTS
 def test_as_its_parts(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    image, (rulers, lines) = picture(rng), laid()
+    image, (rulers, lines) = picture(rng), board_rulers()
     fix = operation(variant)
     result = fix(image, rulers, lines, device=device)
     assert result.status == Status.OK
@@ -105,7 +105,7 @@ def test_as_its_parts(device: Device, variant: Any, rng: np.random.Generator) ->
 
 @VARIANTS
 def test_covariance_is_what_is_measured(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    fix, (rulers, lines) = operation(variant), laid()
+    fix, (rulers, lines) = operation(variant), board_rulers()
     found, covariance = [], []
     for number in range(60):
         pose = np.array([*rng.uniform(-5e-5, 5e-5, 2), rng.uniform(-0.01, 0.01)])
@@ -126,7 +126,7 @@ def test_covariance_is_what_is_measured(device: Device, variant: Any, rng: np.ra
 
 @VARIANTS
 def test_rulers_that_find_nothing(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    image, (rulers, lines) = picture(rng), laid()
+    image, (rulers, lines) = picture(rng), board_rulers()
     image[:120, 0:120] = 90
     rulers[1, 2:] = np.nan
     rulers[2, 1:] = np.nan
@@ -146,7 +146,7 @@ def test_rulers_that_find_nothing(device: Device, variant: Any, rng: np.random.G
 
 @VARIANTS
 def test_refuses(device: Device, variant: Any, rng: np.random.Generator) -> None:
-    rulers, lines = laid()
+    rulers, lines = board_rulers()
     fix = operation(variant)
     dark = fix(np.full(SHAPE, 90, np.uint8), rulers, lines, device=device)
     assert dark.status == Status.NO_DATA
@@ -163,14 +163,14 @@ def test_refuses(device: Device, variant: Any, rng: np.random.Generator) -> None
 
 def test_place_of_lines_on_the_board(device: Device, rng: np.random.Generator) -> None:
     """The position error of a line on the board limits its weight."""
-    image, (rulers, lines) = picture(rng), laid(1e-6)
+    image, (rulers, lines) = picture(rng), board_rulers(1e-6)
     result = operation()(image, rulers, lines, device=device)
     # Two rows of a line, 24 in all: about sigma^2 / 12 in each direction, taken for independent.
     assert np.sqrt(result.covariance[0, 0]) > 1e-6 / np.sqrt(12)
 
 
 def test_writes_within_its_outputs(device: Device, rng: np.random.Generator) -> None:
-    image, (rulers, lines) = picture(rng), laid()
+    image, (rulers, lines) = picture(rng), board_rulers()
     result = operation()(image, rulers, lines, device=device)
     guarded = Guarded(result)
     operation()(image, rulers, lines, device=device, out=guarded.out)

@@ -80,7 +80,7 @@ def test_errors_are_those_promised(drawn: BoardFix, device: Device, rng: np.rand
     fixes = drawn.fixes(drawn.sharp(2, rng), 100, device, rng)
     assert fixes.good.all()
     assert_as_promised(fixes.scatter / drawn.chosen.sigmas, band(100))
-    assert_as_promised(fixes.scatter / fixes.said, band(100))
+    assert_as_promised(fixes.scatter / fixes.predicted, band(100))
     assert fixes.squares.max() < GROSS
 
 
@@ -98,7 +98,7 @@ def test_no_wrong_pose_of_a_disturbed_board(
     # Boards on which few rulers determine a degree of freedom are refused in all images.
     assert np.mean(fixes.good) > (0.2 if kind in ("missing", "outliers") else 0.99)
     assert fixes.squares.max() < GROSS
-    assert_as_promised(fixes.scatter / fixes.said, band(int(fixes.good.sum())))
+    assert_as_promised(fixes.scatter / fixes.predicted, band(int(fixes.good.sum())))
     if kind == "motion":
         assert_as_promised(fixes.scatter / board.chosen.sigmas, band(60))
 
@@ -174,4 +174,4 @@ def test_no_wrong_pose_in_a_thousand_of_disturbed_real_boards(
         fixes = board.fixes(pictures, 1000, device, rng, polarity="rising")
         assert not (fixes.squares > GROSS).any()
     if fixes.good.sum() > 100:
-        assert_as_promised(fixes.scatter / fixes.said, band(int(fixes.good.sum())))
+        assert_as_promised(fixes.scatter / fixes.predicted, band(int(fixes.good.sum())))

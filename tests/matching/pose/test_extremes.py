@@ -41,7 +41,7 @@ def test_a_picture_that_shows_a_part(board: BoardFix, device: Device, rng: np.ra
     fixes = board.fixes([board.painted(narrow)], 20, device, rng)
     assert fixes.good.all()
     assert fixes.squares.max() < GROSS
-    assert (fixes.said > board.chosen.sigmas).all()
+    assert (fixes.predicted > board.chosen.sigmas).all()
 
 
 def test_no_contrast_no_pose(board: BoardFix, device: Device, rng: np.random.Generator) -> None:

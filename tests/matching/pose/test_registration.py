@@ -184,7 +184,7 @@ def off(found: Any, pose: Any) -> np.ndarray:
 
 
 @cache
-def owners(artwork: Artwork) -> np.ndarray:
+def traces_of_rulers(artwork: Artwork) -> np.ndarray:
     """Return the trace on which each ruler of the prepared registration lies."""
     outlines = [each.outline.astype(np.float32) for each in artwork.copper]
     points = np.asarray(prepared(artwork)[1].rulers.point).astype(np.float32).tolist()
@@ -192,7 +192,7 @@ def owners(artwork: Artwork) -> np.ndarray:
     return np.argmin(off_outline, axis=1)
 
 
-def there(artwork: Artwork, pose: Any, gone: set[int]) -> tuple[float, int]:
+def present_share(artwork: Artwork, pose: Any, gone: set[int]) -> tuple[float, int]:
     """Return the share of the rulers in the image whose copper is present, and the number of rulers in the image."""
     view, fix = prepared(artwork)
     turn = rotation(pose[2]).T
@@ -203,7 +203,7 @@ def there(artwork: Artwork, pose: Any, gone: set[int]) -> tuple[float, int]:
     reach = math.ceil(3.0 * fix.ruler.smoothing_px) + 1 + math.ceil(2.5 * fix.cell_px + fix.tolerance_px)
     reaches = reach * along + 2.0 * along[:, ::-1]
     inside = np.all((pixels >= reaches) & (pixels <= np.array(view.shape[::-1]) - 1 - reaches), axis=1)
-    return float(np.mean([own not in gone for own in owners(artwork)[inside]])), int(inside.sum())
+    return float(np.mean([own not in gone for own in traces_of_rulers(artwork)[inside]])), int(inside.sum())
 
 
 @settings(max_examples=6, deadline=None)
@@ -229,7 +229,7 @@ def test_a_board_is_found_wherever_it_lies(
     removed = set(np.flatnonzero(rng.uniform(size=len(artwork.copper)) < missing))
     found = fix(board_image(artwork, view, pose, MIDDLE, missing=removed, rng=rng), device=device)
     # Exactly the rulers whose copper is present agree. Two rulers touch the image border and may be in or out.
-    share, count = there(artwork, pose, removed)
+    share, count = present_share(artwork, pose, removed)
     enough, slack = fix.min_score + 1.5 / math.sqrt(count), 2.0 / count
     if found.status == Status.LOW_SIGNAL:
         # In view, the missing share may be larger than on the whole board: too large for a certain pose.

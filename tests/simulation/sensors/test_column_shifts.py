@@ -205,7 +205,7 @@ def shifts(one: SensorView, line: Exposure, glow: Exposure, whole: np.ndarray) -
     )
 
 
-def told(values: np.ndarray) -> np.ndarray:
+def percentiles(values: np.ndarray) -> np.ndarray:
     """Return median, 95th percentile and largest shift."""
     size = np.abs(values)
     return np.array([np.median(size), np.percentile(size, 95.0), size.max()])
@@ -230,7 +230,7 @@ def test_columns_of_a_camera_move_as_they_do_elsewhere(found):
     }
     for rule, expected in FOUND_ELSEWHERE[degrees].items():
         assert np.isfinite(made.camera[rule]).all(), rule
-        factor = told(made.camera[rule]) / expected
+        factor = percentiles(made.camera[rule]) / expected
         assert np.all(np.abs(np.log(factor)) < np.log(allowed[rule])), (rule, factor)
 
 
@@ -245,8 +245,8 @@ def test_secondary_light_is_a_broad_pedestal(found):
     assert np.median(made.secondary_over_direct) == pytest.approx(SECONDARY_OVER_DIRECT[degrees], rel=0.25)
     assert np.median(made.peak_ratio) == pytest.approx(PEAK_RATIO[degrees], rel=0.7)
     # A reading in a window about the line is hardly affected; a reading of the whole column is.
-    assert told(made.camera["whole column"])[0] > 1000.0 * told(made.camera["window 16"])[0]
-    assert told(made.camera["window 16"])[0] > 2.0 * told(made.camera["window 4"])[0]
+    assert percentiles(made.camera["whole column"])[0] > 1000.0 * percentiles(made.camera["window 16"])[0]
+    assert percentiles(made.camera["window 16"])[0] > 2.0 * percentiles(made.camera["window 4"])[0]
 
 
 def test_the_direct_line_is_read_where_it_is():
@@ -263,15 +263,15 @@ def test_parts_on_a_board_move_few_columns():
     pytest.importorskip("numba", reason="the extra 'profile' is not installed")
     made = of_board(256)
     # Other simulation, other parts: 0.125, 2.2, 11 pixels of the whole column, 0, 0.32, 3.3 in a window of 16.
-    median, high, largest = told(made.camera["whole column"])
+    median, high, largest = percentiles(made.camera["whole column"])
     assert 0.03 < median < 0.4
     assert 0.7 < high < 7.0
     assert 3.0 < largest < 30.0
-    median, high, largest = told(made.camera["window 16"])
+    median, high, largest = percentiles(made.camera["window 16"])
     assert median < 1e-3
     assert high < 1.0
     assert 0.5 < largest < 10.0
-    assert told(made.camera["threshold 5 %"])[1] == 0.0
+    assert percentiles(made.camera["threshold 5 %"])[1] == 0.0
     assert np.median(made.secondary_over_direct) == pytest.approx(1e-3, rel=2.0)
     assert np.median(made.peak_ratio) == pytest.approx(2e-4, rel=0.5)
     np.testing.assert_allclose(made.psd, made.camera["whole column"], atol=0.02)

@@ -90,12 +90,14 @@ def pairs(rng: np.random.Generator, count: int) -> tuple[np.ndarray, LitSegments
     return receivers, LitSegments(ends, normals, rng.uniform(0.1, 2.0, count))
 
 
-def turned(rng: np.random.Generator) -> np.ndarray:
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
     """Return a random rotation."""
     return np.linalg.qr(rng.normal(size=(3, 3)))[0]
 
 
-def moved(receivers: np.ndarray, segments: Any, rotation: np.ndarray, shift: Any) -> tuple[np.ndarray, LitSegments]:
+def moved_scene(
+    receivers: np.ndarray, segments: Any, rotation: np.ndarray, shift: Any
+) -> tuple[np.ndarray, LitSegments]:
     """Return the same scene at another place."""
     receivers, table = np.array(receivers, float), np.array(segments, float).reshape(-1, 3, 3)
     there = np.concatenate([receivers[:, :3] @ rotation + shift, receivers[:, 3:] @ rotation], axis=1)
@@ -193,7 +195,7 @@ def test_segments_that_lie_alike(device: Device, variant: Any, precision: Any, r
     ends = np.stack([start, start + rng.uniform(0.01, 0.1, (41, 1)) * [1.0, 0.0, 0.0]], axis=1)
     normals = np.tile([0.0, 0.0, 1.0], (41, 1))
     ends[::3], normals[::3] = ends[::3][:, :, [0, 2, 1]], [0.0, 1.0, 0.0]
-    rotation = turned(rng)
+    rotation = random_rotation(rng)
     segments = LitSegments(ends @ rotation + 0.3, normals @ rotation, np.ones(41))
     places = ends[:, 0] + rng.uniform(1e-4, 1e-2, (41, 3)) * normals + [1e-3, 1e-3, 1e-3]
     receivers = np.hstack([places @ rotation + 0.3, rng.normal(size=(41, 3))])
@@ -219,7 +221,7 @@ def test_at_a_millionth_of_its_length(
     ]
     receivers += [(1.5, 0.0, distance, -1.0, 0.0, 0.0), (-0.25, distance, distance, 0.9, 0.1, -0.3)]
     for shift in (0.0, 1.0):
-        assert_exact(*moved(np.array(receivers), FLOOR, turned(rng), shift), device, variant, precision)
+        assert_exact(*moved_scene(np.array(receivers), FLOOR, random_rotation(rng), shift), device, variant, precision)
     assert_exact(np.array(receivers, np.float32), lit(FLOOR), device, variant, precision)
 
 
@@ -231,7 +233,7 @@ def test_grazing(device: Device, variant: Any, precision: Any, rng: np.random.Ge
     assert np.all(assert_exact(np.array(low), lit(FLOOR), device, variant, precision) > 0.0)
     tilted = [(x, 0.3, 0.3, 0.0, -1.0, angle + 1.0) for x in (0.5, 2.0) for angle in (1e-3, 1e-6, 0.0, -1e-6)]
     assert_exact(np.array(tilted), lit(FLOOR), device, variant, precision)
-    assert_exact(*moved(np.array(low + tilted), FLOOR, turned(rng), 0.3), device, variant, precision)
+    assert_exact(*moved_scene(np.array(low + tilted), FLOOR, random_rotation(rng), 0.3), device, variant, precision)
 
 
 @TWO_WAYS
@@ -269,7 +271,7 @@ def test_through_the_receivers_plane(device: Device, variant: Any, precision: An
     assert_exact(receivers, lit(FLOOR), device, variant, precision)
     upright = np.column_stack([cuts, 0.0 * cuts, 0.0 * cuts + 0.3, np.tile([[1.0, 0.0, 0.0]], (18, 1))])
     assert_exact(upright, lit(FLOOR), device, variant, precision)
-    assert_exact(*moved(upright, FLOOR, turned(rng), 0.7), device, variant, precision)
+    assert_exact(*moved_scene(upright, FLOOR, random_rotation(rng), 0.7), device, variant, precision)
 
 
 @TWO_WAYS

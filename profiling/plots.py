@@ -42,8 +42,8 @@ def draw_plots(folder: str | Path, rows: Sequence[Row], *, overwrite: bool = Fal
             drawn[name] = (draw, some)
     if drawn:
         with Outputs("profile", overwrite=overwrite).folder(folder) as inside:
-            for name, (draw, some) in drawn.items():
-                _draw(inside / name, draw, some)
+            for name, (draw_rows, chosen_rows) in drawn.items():
+                _draw(inside / name, draw_rows, chosen_rows)
     return list(drawn)
 
 

@@ -26,6 +26,7 @@ def demo(
     the shift.
     """
     import numpy as np
+    from trimesh.exchange.ply import export_ply
 
     from gpuvision.cli.scan import progress_bar
     from gpuvision.host import Device
@@ -46,7 +47,7 @@ def demo(
     results: dict[str, Any] = {}
     with outputs.folder(out) as inside, tempfile.TemporaryDirectory() as light_folder:
         with atomic_write(inside / "part.ply") as file:
-            file.write(make_part().export(file_type="ply"))
+            file.write(export_ply(make_part()))
         for name in SENSORS:
             task = make_scan_task(name)
             with progress_bar(f"{name}: simulating") as progress:

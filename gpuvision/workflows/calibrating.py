@@ -204,7 +204,7 @@ def write_calibration(calibration: Calibration, path: Path, *, overwrite: bool =
     # The covariance of parameters that the data do not fix is infinite; json_tree replaces it, since JSON has no
     # infinity.
     report = json.dumps(json_tree(calibration.report()), indent=1) + "\n"
-    documentation = {
+    documentation: dict[str, dict[str, Any]] = {
         "image": {"size": list(calibration.image_size)},
         "uncertainty": {name: error for name, (_, error) in calibration.parameters.items()},
         "fit": {

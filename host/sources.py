@@ -107,11 +107,15 @@ class ArraySource(Source):
 
     Raises
     ------
+    TypeError
+        The array is masked.
     ValueError
         The array has fewer than 2 axes, or it has no frame to repeat.
     """
 
     def __init__(self, frames: HostArray, count: int | None = None, *, clock: Clock = time.perf_counter_ns) -> None:
+        if isinstance(frames, np.ma.MaskedArray):
+            raise TypeError("the frames are a masked array, expected a plain array; fill it with .filled(value)")
         if frames.ndim < 2:
             raise ValueError(f"expected frames along the first axis of 2 or more, got shape {frames.shape}")
         if count and not len(frames):

@@ -17,7 +17,7 @@ _DOUBTFUL_RATIO = math.sqrt(1000.0)
 
 
 def doubt_unit(part: Scene, sensor: Sensor, unit: str, units: Mapping[str, float]) -> str | None:
-    """Return a warning where another length unit of the mesh fits the sensor's view better than the given one.
+    """Return a warning where another length unit of the mesh fits the sensor's view and the given one does not.
 
     Parameters
     ----------
@@ -28,12 +28,12 @@ def doubt_unit(part: Scene, sensor: Sensor, unit: str, units: Mapping[str, float
     unit : str
         Name of the given unit.
     units : mapping of str to float
-        Metres of each unit by its name.
+        Metres of each unit by its name. Of several units that fit, the first one is named.
 
     Returns
     -------
     str or None
-        One line; None where the diagonals of part and view differ by less than a factor of 30, or no unit is better.
+        One line; None where the diagonals of part and view differ by less than a factor of 30, or no unit fits.
     """
     view = make_sensor_view(sensor)
     u, v = np.meshgrid(view.u_edges[[0, -1]], view.v_edges[[0, -1]])
@@ -42,9 +42,11 @@ def doubt_unit(part: Scene, sensor: Sensor, unit: str, units: Mapping[str, float
     if not (size > 0.0 and 0.0 < seen < math.inf):
         return None
     misfit = {name: abs(math.log(size / units[unit] * metres / seen)) for name, metres in units.items()}
-    best = min(misfit, key=lambda name: misfit[name])
-    if misfit[unit] < math.log(_DOUBTFUL_RATIO) or best == unit:
+    limit = math.log(_DOUBTFUL_RATIO)
+    likely = [name for name in units if misfit[name] < limit]
+    if unit in likely or not likely:
         return None
+    best = likely[0]
     return (
         f"the part is {size:.3g} m across with --unit {unit}, and the sensor sees {seen:.3g} m; "
         f"is the mesh in {best} (--unit {best})?"

@@ -82,6 +82,8 @@ def test_an_array_without_a_frame_axis_or_frames_to_repeat_is_refused() -> None:
         ArraySource(np.zeros(5))
     with pytest.raises(ValueError, match="no frames to make 4 of"):
         ArraySource(np.zeros((0, 3)), 4)
+    with pytest.raises(TypeError, match="the frames are a masked array"):
+        ArraySource(np.ma.masked_invalid(np.zeros((2, 3))))
 
 
 def test_iterated_frames_come_in_order_and_must_be_alike() -> None:

@@ -239,7 +239,7 @@ def draw_height_map(
     z, status = to_numpy(heights.z).astype(np.float64), to_numpy(heights.status)
     if z.shape != grid.shape:
         raise ValueError(f"heights have shape {z.shape}, the grid has {grid.shape}; expected the same")
-    span = _default_span(z) if span is None else span
+    span = height_span(z) if span is None else span
     exaggeration = choose_exaggeration(z, grid.cell_x, grid.cell_y)
     shade = shade_relief(z, grid.cell_x, grid.cell_y, exaggeration=exaggeration)
     picture, legend = paint_heights(z, status, shade, span, style)
@@ -285,7 +285,7 @@ def draw_scan(
         Whether an existing file may be replaced. Default False.
     """
     z, status = np.asarray(z, np.float64), np.asarray(status)
-    span = _default_span(z) if span is None else span
+    span = height_span(z) if span is None else span
     picture, legend = paint_heights(z, status, np.where(np.isfinite(z), 1.0, np.nan), span, "colour")
     subtitle = _subtitle(z, f"{z.shape[0]} profiles of {z.shape[1]} samples")
     labels = ("sample", "profile")
@@ -294,8 +294,16 @@ def draw_scan(
     _Page(picture, aspect, legend, title, subtitle, span, labels=labels).write(path, overwrite)
 
 
-def _default_span(z: Array) -> tuple[float, float]:
-    """Return the 0.5 % and 99.5 % percentiles of the heights [m], 1 µm apart if equal; (0, 1) without heights."""
+def height_span(z: Array) -> tuple[float, float]:
+    """Return the ends of the colour scale of heights [m]: their 0.5 % and 99.5 % percentiles.
+
+    Equal percentiles are taken apart by 1 µm. Without a height the ends are 0 and 1 m.
+
+    Parameters
+    ----------
+    z : numpy.ndarray
+        Heights [m]; NaN in holes.
+    """
     known = z[np.isfinite(z)]
     if not known.size:
         return 0.0, 1.0

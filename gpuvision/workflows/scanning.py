@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,7 @@ from gpuvision.host.recordings import open_recording
 from gpuvision.host.report import StreamReport
 from gpuvision.host.sources import ArraySource, PacedSource, Source
 from gpuvision.host.trace import Trace
-from gpuvision.plots.range_image import draw_height_map, draw_scan
+from gpuvision.plots.range_image import draw_height_map, draw_scan, height_span
 from gpuvision.ranging.line import LineReadout
 from gpuvision.ranging.psd import PsdReadout
 from gpuvision.ranging.range_image import RangeImage, RangePoints, RotatingSheet
@@ -197,9 +197,12 @@ class Scan:
             write_png16(inside / "range_image.png", z, self.grid)
             write_ply(inside / "range_image.ply", *points[:3], self.intensity, points.status)
             write_npz(inside / "range_image.npz", *self._arrays())
-            draw_height_map(inside / "picture.png", self.heights, self.grid, title=self._title())
+            # One colour scale: the two pictures show the same heights.
+            span = height_span(to_numpy(points.z).astype(np.float64))
+            draw_height_map(inside / "picture.png", self.heights, self.grid, title=self._title(), span=span)
             upright = isinstance(self.sensor.readout, LineReadout) and self.sensor.readout.along == "rows"
-            draw_scan(inside / "scan.png", points.z, points.status, samples="down" if upright else "across")
+            samples: Literal["down", "across"] = "down" if upright else "across"
+            draw_scan(inside / "scan.png", points.z, points.status, samples=samples, span=span)
             report = self.report()
             report["seconds"]["write"] = time.perf_counter() - start
             write_text_atomic(inside / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")

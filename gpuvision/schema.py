@@ -6,12 +6,13 @@ closest queried key.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 import operator
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -72,6 +73,16 @@ class Section:
     def error(self, message: str) -> DescriptionError:
         """Return an error whose message starts with the file name."""
         return DescriptionError(f"{self._source}: {message}")
+
+    @contextlib.contextmanager
+    def checking(self) -> Iterator[None]:
+        """Turn the errors of a class that checks values of this table into errors that name the file and the table."""
+        try:
+            yield
+        except DescriptionError:
+            raise
+        except (ArithmeticError, TypeError, ValueError) as error:
+            raise self.error(f"{self._name}: {error}" if self._name else str(error)) from error
 
     def section(self, key: str) -> Section:
         """Return a sub-table.

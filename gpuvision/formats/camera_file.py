@@ -61,7 +61,8 @@ def radial_lens(table: Section) -> Lens:
     k2 = table.number("k2", "sensor unit^-4", 0.0)
     column, row = table.numbers("centre", "sensor unit", (2,), (0.0, 0.0))
     table.finish()
-    return Lens(k1=k1, k2=k2, centre=(column, row))
+    with table.checking():
+        return Lens(k1=k1, k2=k2, centre=(column, row))
 
 
 def write_lens(
@@ -89,7 +90,8 @@ def _camera(table: Section) -> Camera:
     matrix = table.rows("matrix", "pixel", 3)
     distortion = tuple(table.number(name, "", 0.0) for name in COEFFICIENT_NAMES)
     table.finish()
-    return Camera(matrix=matrix, distortion=distortion)
+    with table.checking():
+        return Camera(matrix=matrix, distortion=distortion)
 
 
 def read_mounted(path: str | Path, shape: tuple[int, int]) -> MountedCamera | None:
@@ -136,13 +138,14 @@ def _mounted(table: Section, model: Lens | Camera | None, middle: tuple[float, f
         column, row = table.numbers("centre_px", "pixel", (2,), middle if model is None else model.centre)
         centre = (column, row)
     table.finish()
-    return MountedCamera(
-        height=height,
-        tilt=math.radians(tilt),
-        roll=math.radians(roll),
-        heading=math.radians(heading),
-        position=(forward, left),
-        focal_px=focal,
-        centre_px=centre,
-        model=model,
-    )
+    with table.checking():
+        return MountedCamera(
+            height=height,
+            tilt=math.radians(tilt),
+            roll=math.radians(roll),
+            heading=math.radians(heading),
+            position=(forward, left),
+            focal_px=focal,
+            centre_px=centre,
+            model=model,
+        )

@@ -114,20 +114,21 @@ def read_features(path: str | Path) -> FeatureSet:
         np.array([row[column] for row in rows], np.float64).reshape(-1, *shape)
         for column, shape in enumerate(((2,), (2,), (), (), ()))
     )
-    return FeatureSet(
-        side=side,
-        placement=placement,
-        point=point,
-        normal=normal / np.linalg.norm(normal, axis=1, keepdims=True),
-        spacing=spacing,
-        length=length,
-        sigma=sigma,
-        imaging=imaging,
-        covariance=covariance,
-        condition=condition,
-        region=bounds,
-        fiducials=fiducials,
-    )
+    with top.checking():
+        return FeatureSet(
+            side=side,
+            placement=placement,
+            point=point,
+            normal=normal / np.linalg.norm(normal, axis=1, keepdims=True),
+            spacing=spacing,
+            length=length,
+            sigma=sigma,
+            imaging=imaging,
+            covariance=covariance,
+            condition=condition,
+            region=bounds,
+            fiducials=fiducials,
+        )
 
 
 def _imaging(top: Section, table: Section) -> Imaging:

@@ -47,10 +47,8 @@ def _field(top: Section) -> Field:
     lines = tuple((*each[0], *each[1]) for each in (_ends(table) for table in top.sections("line")))
     arcs = tuple(_arc(table) for table in top.sections("arc"))
     top.finish()
-    try:
+    with top.checking():
         return Field(length=length, width=width, lines=lines, arcs=arcs, name=name)
-    except ValueError as error:
-        raise top.error(str(error)) from None
 
 
 def _ends(table: Section) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from gpuvision.schema import DescriptionError, Section, read_toml
+from gpuvision.schema import Section, read_toml
 from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.reflectance import Brdf, Ggx, Lambert, OrenNayar, Phong, Ward
 
@@ -87,4 +87,4 @@ def _gloss(table: Section) -> Brdf:
     try:
         return model(**values)
     except ValueError as error:
-        raise DescriptionError(f"{table.name}: {error}") from None
+        raise table.error(f"{table.name}: {error}") from None

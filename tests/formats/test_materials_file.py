@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from gpuvision.formats.materials_file import read_materials
@@ -68,3 +70,10 @@ def test_materials_come_in_the_order_of_the_file(tmp_path):
 def test_what_a_file_cannot_say(tmp_path, text, words):
     with pytest.raises(DescriptionError, match=words):
         read(tmp_path, text)
+
+
+def test_a_lobe_out_of_range_names_file_and_table(tmp_path: Path) -> None:
+    path = tmp_path / "paint.toml"
+    path.write_text('[[material]]\nalbedo = 0.5\ngloss = {model = "phong", albedo = 1.1, exponent = 40}\n')
+    with pytest.raises(DescriptionError, match=r"^paint\.toml: material\[0\]\.gloss: Phong\.albedo is 1\.1"):
+        read_materials(path)

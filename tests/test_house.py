@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
@@ -268,6 +269,18 @@ def test_the_library_needs_no_extra(top: str) -> None:
         and any(name.split(".")[0] == top for name in _imported(ast.parse(path.read_text())))
     ]
     assert users == []
+
+
+def test_planted_faults_have_a_place_and_a_test() -> None:
+    """The list of planted faults is that of the tree: each text is in its file once, each test is in its file."""
+    faults = tomllib.loads((ROOT / "tests" / "mutants" / "planted.toml").read_text())["fault"]
+    for fault in faults:
+        assert (ROOT / fault["file"]).read_text().count(fault["find"]) == 1, fault
+        assert fault["replace"] != fault["find"]
+        for test in fault["tests"]:
+            path, _, name = test.partition("::")
+            assert f"def {name}(" in (ROOT / path).read_text(), fault
+    assert len(faults) > 30
 
 
 def test_no_file_knows_a_machine() -> None:

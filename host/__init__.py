@@ -21,6 +21,7 @@ from gpuvision.host.recordings import open_recording
 from gpuvision.host.report import StreamReport
 from gpuvision.host.ring import Step
 from gpuvision.host.sources import ArraySource, PacedSource, Source
+from gpuvision.host.stalls import Stall
 from gpuvision.host.trace import Trace
 from gpuvision.host.work_size import (
     WorkSize,
@@ -60,6 +61,7 @@ __all__ = [
     "RecordingError",
     "Source",
     "Spec",
+    "Stall",
     "StatusArray",
     "Step",
     "StreamError",

@@ -24,9 +24,10 @@ import pyopencl as cl
 from gpuvision.host.arrays import HostArray
 from gpuvision.host.device import Device
 from gpuvision.host.errors import StreamError
+from gpuvision.host.memory import free_bytes, size_in_words
 from gpuvision.host.operation import Operation
 from gpuvision.host.report import StreamReport, StreamStatistics
-from gpuvision.host.ring import SharedSlot, Slot, StagedSlot, Step, check_chain, map_arrays, queues_of
+from gpuvision.host.ring import SharedSlot, Slot, StagedSlot, Step, check_chain, map_arrays, queues_of, slot_bytes
 from gpuvision.host.sources import ArraySource, Clock, Source
 from gpuvision.host.stalls import StallRecorder
 from gpuvision.host.trace import Trace
@@ -135,6 +136,8 @@ class Pipeline(Generic[R]):
     ------
     TypeError, ValueError
         The operation does not take such frames, or a parameter is out of its range.
+    StreamError
+        The ring takes more memory than is free.
     """
 
     def __init__(
@@ -177,7 +180,15 @@ class Pipeline(Generic[R]):
             raise ValueError(f"device {self.device.label} does not share memory with the host; use zero_copy=None")
         if self.inline and not self.device.has_inline_queues:
             raise ValueError(f"device {self.device.label} has no inline queues; use inline=False")
-        check_chain(self._steps, self.device, self.batch, self.source.shape, self.source.dtype)
+        source = self.source
+        check_chain(self._steps, self.device, self.batch, source.shape, source.dtype)
+        size = slot_bytes(self._steps, self.device, self.batch, source.shape, source.dtype, zero_copy=self.zero_copy)
+        free = free_bytes(self.device)
+        if self.ring * size > free:
+            raise StreamError(
+                f"a ring of {self.ring} x {self.batch} frames takes {size_in_words(self.ring * size)}, "
+                f"{size_in_words(free)} are free; use a smaller ring or batch"
+            )
 
     def __enter__(self) -> Pipeline[R]:
         """Bind the slots and start the producer."""

@@ -8,18 +8,17 @@ device: a stream that waits for fewer threads has fewer stalls when other proces
 from __future__ import annotations
 
 import math
-import os
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gpuvision.host.device import Device
 from gpuvision.host.errors import StreamError
+from gpuvision.host.memory import free_bytes, size_in_words
 from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Pipeline, steps_of
 from gpuvision.host.ring import Step, slot_bytes
@@ -163,7 +162,7 @@ class Plan:
         other = costs.get(not self.inline)
         against = "" if other is None else f" ({1e6 * other:.3g} us {names[not self.inline]})"
         return (
-            f"batches of {self.batch}, a ring of {self.ring} slots ({_in_words(self.ring_bytes)}) for stalls of "
+            f"batches of {self.batch}, a ring of {self.ring} slots ({size_in_words(self.ring_bytes)}) for stalls of "
             f"{self.stall:g} s at {self.rate:g} frames/s, {chosen}{against}"
         )
 
@@ -244,7 +243,7 @@ def plan_stream(
     modes = _modes(inline, device)
     steps = steps_of(operation)
     measure = _Measurement(source, steps, device, zero_copy, limits) if measure is None else measure
-    max_bytes = _free_bytes(device) // 2 if limits.max_bytes is None else limits.max_bytes
+    max_bytes = free_bytes(device) // 2 if limits.max_bytes is None else limits.max_bytes
     trials: list[Trial] = []
     for batch in batches:
         ring = _ring_for(stall, rate, batch, source, limits)
@@ -298,27 +297,9 @@ def _too_slow(trials: Sequence[Trial], asked: str) -> StreamError:
 
 def _too_large(ring: int, batch: int, ring_bytes: int, max_bytes: int, asked: str) -> StreamError:
     return StreamError(
-        f"a ring for {asked} has {ring} x {batch} frames and takes {_in_words(ring_bytes)}, the limit is "
-        f"{_in_words(max_bytes)}; plan for a shorter stall, or raise PlanLimits.max_bytes"
+        f"a ring for {asked} has {ring} x {batch} frames and takes {size_in_words(ring_bytes)}, the limit is "
+        f"{size_in_words(max_bytes)}; plan for a shorter stall, or raise PlanLimits.max_bytes"
     )
-
-
-def _in_words(size: int) -> str:
-    """Return a number of bytes with a decimal unit."""
-    for unit, name in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
-        if size >= unit:
-            return f"{size / unit:.3g} {name}"
-    return f"{size} bytes"
-
-
-def _free_bytes(device: Device) -> int:
-    """Return the memory that the system can give away without swapping, and the device has, at most [bytes]."""
-    device_bytes = int(device.handle.global_mem_size)
-    try:
-        fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        return min(int(fields["MemAvailable"].split()[0]) << 10, device_bytes)
-    except (OSError, KeyError, ValueError):  # not Linux
-        return min(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"), device_bytes)
 
 
 def _is_gaining(trials: Sequence[Trial], limits: PlanLimits) -> bool:

@@ -503,6 +503,12 @@ def test_options_out_of_range(device: Device, options: dict[str, Any], message: 
         Pipeline(currents_of(3), READOUT, device=device, **options)
 
 
+def test_a_ring_that_memory_cannot_hold_is_refused() -> None:
+    with pytest.raises(StreamError, match=r"a ring of 1000000000000 x 10 frames takes 930 TB, .* are free") as caught:
+        Pipeline(np.zeros((3, 5, 2), np.float32), READOUT, batch=10, ring=10**12)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -8,6 +8,7 @@ from gpuvision.host.errors import (
     DeviceUnusableError,
     GpuVisionError,
     NoDeviceError,
+    ReadError,
     RecordingError,
     StreamError,
 )
@@ -17,6 +18,7 @@ from gpuvision.host.operation import Operation
 from gpuvision.host.pipeline import Batch, Pipeline, PipelineLimits
 from gpuvision.host.planning import Plan, PlanLimits, plan_stream
 from gpuvision.host.program import Define
+from gpuvision.host.reading import FileLimits
 from gpuvision.host.recordings import open_recording
 from gpuvision.host.report import StreamReport
 from gpuvision.host.ring import Step
@@ -44,6 +46,7 @@ __all__ = [
     "Device",
     "DeviceArray",
     "DeviceUnusableError",
+    "FileLimits",
     "FloatArray",
     "GpuVisionError",
     "HostArray",
@@ -58,6 +61,7 @@ __all__ = [
     "Plan",
     "PlanLimits",
     "Precision",
+    "ReadError",
     "RecordingError",
     "Source",
     "Spec",

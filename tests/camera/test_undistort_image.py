@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from canary import Guarded
+from designs import all_pairs
 from gpuvision.camera.camera import Camera
 from gpuvision.camera.image_map import RUN, PackedMap, Packer, PixelMap, Taps
 from gpuvision.camera.lens import Lens
@@ -144,6 +145,18 @@ def test_every_window(device: Device, name: str, channels: int, interpolation: A
     assert_right(op(image, device=device), image, positions, channels=channels, interpolation=interpolation)
 
 
+_PRODUCT = [
+    {"dtype": dtype, "variant": variant, "channels": channels, "border": border, "interpolation": interpolation}
+    for dtype in DTYPES
+    for variant in VARIANTS
+    for channels in (1, 3)
+    for border in BORDERS
+    for interpolation in ("bilinear", "bicubic")
+]
+# Each set of options is a program of its own to compile: all pairs of options, not all combinations.
+PROGRAMS = [_PRODUCT[k] for k in all_pairs(_PRODUCT)]
+
+
 @ON_DEVICES
 @given(
     source=st.tuples(st.integers(1, 50), st.integers(1, 70)),
@@ -151,25 +164,14 @@ def test_every_window(device: Device, name: str, channels: int, interpolation: A
     turn=st.floats(-180.0, 180.0),
     scale=st.floats(0.0, 4.0),
     shift=st.tuples(st.floats(-60.0, 60.0), st.floats(-60.0, 60.0)),
-    border=st.sampled_from(BORDERS),
-    interpolation=st.sampled_from(["bilinear", "bicubic"]),
-    channels=st.sampled_from([1, 3]),
-    dtype=st.sampled_from(DTYPES),
-    variant=st.sampled_from(VARIANTS),
+    options=st.sampled_from(PROGRAMS),
 )
 def test_any_shape_and_map(
-    device: Device,
-    source: Any,
-    shape: Any,
-    turn: float,
-    scale: float,
-    shift: Any,
-    dtype: Any,
-    variant: Any,
-    **options: Any,
+    device: Device, source: Any, shape: Any, turn: float, scale: float, shift: Any, options: dict[str, Any]
 ) -> None:
     rng = np.random.default_rng(1)
-    channels = options.pop("channels")
+    dtype, variant, channels, *_ = options.values()
+    options = {name: options[name] for name in ("border", "interpolation")}
     image = pixels(rng, (*source, 3)[: 2 + channels // 3], dtype)
     positions = map_of(shape, source, turn=turn, scale=scale) + shift
     op = UndistortImage(model=positions, channels=channels, variant=variant, **options)

@@ -16,6 +16,10 @@ _MARGIN = 0.98
 # Powers of the radius of the terms k1 .. k6, p1, p2 and s1 .. s4; largest normalised radius of the search.
 _ORDERS = np.array([2.0, 4.0, 6.0, 2.0, 4.0, 6.0, 1.0, 1.0, 1.0, 3.0, 1.0, 3.0])
 _FARTHEST = 1e6
+# Largest imaginary part of a root that counts as real, as a fraction of its real part. Derived: rounding splits a
+# double root by the square root of float64's rounding, 1.5e-8, times its condition. A candidate too many does no harm,
+# because signs are compared.
+_MAX_IMAGINARY = 1e-3
 
 Float64 = npt.NDArray[np.float64]
 
@@ -117,7 +121,9 @@ def _sign_changes(terms: Iterable[float]) -> list[float]:
     roots = polynomial.polyroots(np.trim_zeros(np.asarray(terms, dtype=np.float64), "b"))
     # Rounding can make a real root complex, and a double root does not change the sign: compare signs between the
     # roots.
-    candidates = roots[(roots.real > 0.0) & (np.abs(roots.imag) <= 1e-3 * roots.real) & (roots.real < _FARTHEST**2)]
+    candidates = roots[
+        (roots.real > 0.0) & (np.abs(roots.imag) <= _MAX_IMAGINARY * roots.real) & (roots.real < _FARTHEST**2)
+    ]
     places = np.sort(candidates.real)
     if not len(places):
         return []

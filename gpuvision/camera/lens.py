@@ -13,6 +13,7 @@ import numpy.typing as npt
 from gpuvision.validation import check_keys, finite, numbers
 
 _MAX_NEWTON_STEPS = 64
+_NEWTON_TOLERANCE = 2e-16  # largest relative residual of a solution; derived: one rounding of float64
 # Derived: with these bounds the powers of the fold radius and the kernel table stay within single precision. No lens
 # reaches them, in pixels or in metres.
 _MAX_COEFFICIENT = {"k1": 1e10, "k2": 1e20}
@@ -160,7 +161,7 @@ class Lens:
         for _ in range(_MAX_NEWTON_STEPS):
             square = radius**2
             excess = radius * (1.0 + square * (self.k1 + self.k2 * square)) - target
-            if not np.any(np.abs(excess) > 2e-16 * target):
+            if not np.any(np.abs(excess) > _NEWTON_TOLERANCE * target):
                 break
             high = np.where(excess > 0.0, radius, high)
             low = np.where(excess < 0.0, radius, low)

@@ -45,6 +45,8 @@ _PARALLEL = 1e-9  # volume of three unit vectors, or sine between two, below whi
 # A vector whose length is 1 within this rounding (two epsilon) is not normalised again, so that a written vector reads
 # back unchanged.
 _UNIT_ROUNDING = 4e-16
+# Largest difference of scalar products of given axes from 0 and 1. Chosen: axes written with 6 decimals pass.
+_ORTHONORMAL = 1e-6
 
 Vector = tuple[float, float, float]
 Limits = tuple[tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -285,7 +287,7 @@ class RotatingSheet:
         if np.linalg.norm(np.cross(self.axis_direction, self.sheet_normal)) <= _PARALLEL:
             raise ValueError("RotatingSheet: the sheet's normal lies along the axis, so that turning does not move it")
         axes = numbers(self.scene_axes, (3, 3), "RotatingSheet.scene_axes")
-        if np.max(np.abs(np.array(axes) @ np.array(axes).T - np.eye(3))) > 1e-6:
+        if np.max(np.abs(np.array(axes) @ np.array(axes).T - np.eye(3))) > _ORTHONORMAL:
             raise ValueError("RotatingSheet.scene_axes are not three orthonormal vectors")
         object.__setattr__(self, "scene_axes", axes)
 

@@ -34,6 +34,12 @@ from gpuvision.camera.lines.straightness import (
 )
 from gpuvision.camera.lines.variable_projection import Minimum
 
+# Step below which a line search stops, in units of the normalised parameters. Chosen: far below `_SETTLED`, far above
+# the rounding of float64.
+_MIN_STEP = 1e-12
+# Ratio of eigenvalues of the normal equations below which the curvatures determine the centre in one direction only.
+# Chosen: the standard deviations then differ by a factor of 30.
+_MIN_EIGENVALUE_RATIO = 1e-3
 _SETTLED = 1e-6
 """Least relative decrease of the sum of squares by a round or a descent step that is followed by another one."""
 _MAX_DESCENTS = 50
@@ -112,7 +118,8 @@ def _fit_steepest_descent(objective: _Objective, lens: Float64, points: Float64)
         if length == 0.0:
             break
         while (
-            objective.cost(lens - length_of_step * gradient / length, points) >= evaluation and length_of_step > 1e-12
+            objective.cost(lens - length_of_step * gradient / length, points) >= evaluation
+            and length_of_step > _MIN_STEP
         ):
             length_of_step *= 0.5
         trial = lens - length_of_step * gradient / length
@@ -137,7 +144,7 @@ def _fit_gauss_newton(objective: _Objective, lens: Float64, points: Float64) -> 
             )[0]
         )
         after = objective.cost(lens + step, points)
-        while after >= evaluation and np.max(np.abs(step)) > 1e-12:
+        while after >= evaluation and np.max(np.abs(step)) > _MIN_STEP:
             step = 0.5 * step
             after = objective.cost(lens + step, points)
         if evaluation - after <= _SETTLED * evaluation:
@@ -244,7 +251,7 @@ def centre_from_curvature(packed: PackedLines) -> Float64:
         matrix += np.outer(tangent, tangent)
         right += tangent * (tangent @ place)
     values = np.linalg.eigvalsh(matrix)
-    if values[0] <= 1e-3 * values[1]:
+    if values[0] <= _MIN_EIGENVALUE_RATIO * values[1]:
         return np.zeros(2)
     centre = np.linalg.solve(matrix, right)
     return np.where(np.all(np.abs(centre) < packed.corner), centre, 0.0)

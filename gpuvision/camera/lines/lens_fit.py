@@ -36,6 +36,9 @@ class LensFitLimits:
     max_rms_ratio : float
         Ratio of the rms of an alternative to that of the chosen model, up to which the warnings treat it as equally
         good.
+    max_centre_sigmas : float
+        Distance of the centre of an equally good alternative [standard deviations] above which a warning names it.
+        Derived: Gaussian errors exceed 3 standard deviations in 0.3 % of the fits.
     max_centre_sigma : float
         Standard deviation of the centre [half-diagonals] above which a warning says that the data do not determine it.
     max_tail_ratio : float
@@ -47,6 +50,7 @@ class LensFitLimits:
     significance: float = 0.05
     max_rms_ratio: float = 1.01
     max_centre_sigma: float = 0.1
+    max_centre_sigmas: float = 3.0
     max_tail_ratio: float = 2.0
     min_bend_variances: float = 100.0
 
@@ -260,7 +264,10 @@ def fit_warnings(
         x, y = vectors[:, 1]
         yield f"the data fix the centre only to {values[1]:.3g} pixels along ({x:.2f}, {y:.2f})"
     for other in fit.alternatives:
-        if other.rms_px <= limits.max_rms_ratio * fit.rms_px and other.centre_distance_px > 3.0 * values[1]:
+        if (
+            other.rms_px <= limits.max_rms_ratio * fit.rms_px
+            and other.centre_distance_px > limits.max_centre_sigmas * values[1]
+        ):
             yield (
                 f"{other.model} with lines {other.lines} fits as well ({other.rms_px:.4g} to {fit.rms_px:.4g} pixels), "
                 f"but has its centre {other.centre_distance_px:.3g} pixels away"

@@ -32,6 +32,7 @@ Float64 = npt.NDArray[np.float64]
 _MAX_SEARCH_PX = 190.0  # largest search range of fiducials: their rulers fit into `MAX_LENGTH` samples
 # Start candidates of the robust pose: with 50 % outliers all four rows of a candidate are good often enough, so that
 # all candidates contain an outlier on 7 of 1e8 boards (derived).
+_SPACING_GROUP = 1.2  # largest by smallest spacing of a group of rulers (chosen: launches against room for edges)
 _TRIALS = 256
 
 
@@ -366,7 +367,7 @@ def _group_spacings(spacing_px: Float64) -> list[tuple[float, float]]:
     groups: list[tuple[float, float]] = []
     for each in np.unique(spacing_px):
         value = float(each)
-        if groups and groups[-1][0] > 0 and value <= 1.2 * groups[-1][0]:
+        if groups and groups[-1][0] > 0 and value <= _SPACING_GROUP * groups[-1][0]:
             groups[-1] = (groups[-1][0], value)
         else:
             groups.append((value, value))

@@ -16,6 +16,8 @@ from gpuvision.validation import finite, numbers
 
 COST_LEVELS = 1023
 """Steps of a point's cost in the map: 64 points fit 16 bits."""
+ANGLE_ROUNDING = 1e-9
+"""Largest difference [rad] of an arc's opening from 2 pi at which it is a circle: rounding of angles, with a margin."""
 _BLOCK, _NEAREST, _MOST_LINES = 64, 4, 256
 _MOST_CELLS = 1 << 26
 
@@ -78,7 +80,7 @@ class Field:
         if any(line[:2] == line[2:] for line in lines):
             raise ValueError("Field.lines has one that begins where it ends; leave it out")
         for arc in arcs:
-            if arc.radius <= 0.0 or not 0.0 < arc.end - arc.start <= 2.0 * math.pi + 1e-9:
+            if arc.radius <= 0.0 or not 0.0 < arc.end - arc.start <= 2.0 * math.pi + ANGLE_ROUNDING:
                 raise ValueError(f"Field.arcs has {arc}, expected a radius above 0 and start < end <= start + 2 pi")
         object.__setattr__(self, "lines", lines)
         object.__setattr__(self, "arcs", arcs)
@@ -93,7 +95,7 @@ class Field:
             rows.append((0.5 * (x0 + x1), 0.5 * (y0 + y1), *turn, half, 0.0, 0.0))
         for arc in self.arcs:
             middle, half = 0.5 * (arc.start + arc.end), 0.5 * (arc.end - arc.start)
-            ends = (-2.0, 0.0) if half > math.pi - 1e-9 else (math.cos(half), math.sin(half))
+            ends = (-2.0, 0.0) if half > math.pi - ANGLE_ROUNDING else (math.cos(half), math.sin(half))
             rows.append((arc.x, arc.y, math.cos(middle), math.sin(middle), *ends, arc.radius))
         return np.array(rows)
 
@@ -113,7 +115,7 @@ def _rounded(values: tuple[float, ...]) -> tuple[float, ...]:
 
 def _arc_key(arc: Arc) -> tuple[float, ...]:
     opening = arc.end - arc.start
-    middle = 0.0 if opening > 2.0 * math.pi - 1e-9 else 0.5 * (arc.start + arc.end)
+    middle = 0.0 if opening > 2.0 * math.pi - ANGLE_ROUNDING else 0.5 * (arc.start + arc.end)
     return _rounded((arc.x, arc.y, arc.radius, opening, math.cos(middle), math.sin(middle)))
 
 

@@ -18,13 +18,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gpuvision.matching.field.distance_map import Field
+from gpuvision.matching.field.distance_map import ANGLE_ROUNDING, Field
 
 Float64 = npt.NDArray[np.float64]
 
 # Distances, relative to the scale of the map, at which points count as on a line: octaves (each is one more test).
 _DISTANCE_RATIOS = (0.06, 0.12, 0.25, 0.5, 1.0)
 _MIN_SINE = 0.5  # of the angle at which a scan line must cross a line to find it surely: 30 degrees (chosen)
+_MIN_CROSSING_SINE = 0.02  # of the angle at which a scan line must cross a line to count: 1.1 degrees (chosen)
 _MIN_GAP = 3.0  # line widths between crossings that are expected separately (chosen)
 
 
@@ -256,7 +257,7 @@ def _across_line(start: Float64, way: Float64, line: tuple[float, ...], line_wid
     with np.errstate(divide="ignore", invalid="ignore"):
         away = (dx * ey - dy * ex) / across
         along = (dx * way[:, 1] - dy * way[:, 0]) / across
-    crossed = (np.abs(across) > 0.02) & (along > -line_width) & (along < size + line_width)
+    crossed = (np.abs(across) > _MIN_CROSSING_SINE) & (along > -line_width) & (along < size + line_width)
     clear = (along > line_width) & (along < size - line_width)
     return np.flatnonzero(crossed), away[crossed], np.abs(across)[crossed], clear[crossed]
 
@@ -272,5 +273,5 @@ def _across_arc(start: Float64, way: Float64, arc: tuple[float, ...], sign: floa
     opening, ends = last - first, line_width / radius
     turned = np.mod(angle - first, 2.0 * math.pi)
     crossed = (np.abs(across) < radius) & (turned <= opening)
-    clear = (turned > ends) & (turned < opening - ends) | (opening > 2.0 * math.pi - 1e-9)
+    clear = (turned > ends) & (turned < opening - ends) | (opening > 2.0 * math.pi - ANGLE_ROUNDING)
     return np.flatnonzero(crossed), away[crossed], (half / radius)[crossed], clear[crossed]

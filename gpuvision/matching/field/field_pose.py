@@ -50,6 +50,8 @@ MIN_SHIFTS = 1024
 _SHARES_PER_CORE, _FEWEST_ROWS = 4, 4
 # Ratio of eigenvalues of the information below which the points do not determine the pose (chosen).
 _MIN_EIGENVALUE_RATIO = 1e-3
+# Differences up to which two refined poses are the same [m], [rad] (chosen: refinements of one minimum end nearer).
+_SAME_PLACE, _SAME_HEADING = 0.03, 0.02
 
 
 class PoseCosts(NamedTuple):
@@ -451,9 +453,9 @@ def _index_of_twin(pose: npt.NDArray[np.float64], poses: list[npt.NDArray[np.flo
 
 
 def _same(pose: npt.NDArray[Any], other: npt.NDArray[Any]) -> bool:
-    """Return whether two poses are equal to 3 cm and 0.02 rad (chosen: refinements of one minimum end nearer)."""
+    """Return whether two poses are the same up to `_SAME_PLACE` and `_SAME_HEADING`."""
     dx, dy, angle = np.asarray(pose, np.float64) - other
-    return bool(math.hypot(dx, dy) < 0.03 and abs(_wrapped(angle)) < 0.02)
+    return bool(math.hypot(dx, dy) < _SAME_PLACE and abs(_wrapped(angle)) < _SAME_HEADING)
 
 
 def _wrapped(angle: Any) -> Any:

@@ -63,7 +63,8 @@ class Imaging:
             if finite(getattr(self, name), f"Imaging.{name}") <= 0.0:
                 raise ValueError(f"Imaging.{name} is {getattr(self, name)}, it must be positive")
         for name in ("etch_bias_sigma", "registration", "angle"):
-            finite(getattr(self, name), f"Imaging.{name}", minimum=0.0)
+            if finite(getattr(self, name), f"Imaging.{name}") < 0.0:
+                raise ValueError(f"Imaging.{name} is {getattr(self, name)}, it must be 0 or positive")
         numbers(self.motion_px, (2,), "Imaging.motion_px")
 
     @property

@@ -322,7 +322,7 @@ class Video(FrameSource):
         check_pixels(tuple(map(int, sides)), f"{path}: a frame", RecordingError)
         with reading(path, "video", RecordingError):
             decoded, self._colour = self._capture.retrieve()
-        if not decoded or self._colour.ndim != 3:
+        if not decoded or self._colour is None or self._colour.ndim != 3:
             raise RecordingError(f"{path}: the first frame of this video cannot be decoded")
         super().__init__(self._colour.shape[:2], self._colour.dtype)
         # Containers of unknown length report a number of frames below 1.
@@ -345,7 +345,7 @@ class Video(FrameSource):
         with reading(f"{self._path}, frame {self._next}", "frame", RecordingError):
             decoded, self._colour = self._capture.retrieve(self._colour)
         self._grabbed = False
-        if not decoded:
+        if not decoded or self._colour is None:
             raise RecordingError(f"{self._path}: frame {self._next} cannot be decoded")
         check_frame(self._colour[:, :, 0], self.shape, self.dtype, f"{self._path}, frame {self._next}")
         self._pick(self._colour, out)

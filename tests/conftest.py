@@ -1,9 +1,9 @@
 """Devices, tiers and caches of the tests; a test that needs a device fails where there is none.
 
 The option ``--tier`` selects the tests. ``fast`` runs all tests without the mark ``slow`` on the best device, and a
-smoke set on every other device: one test for each file, kernel variant and precision. Of a test with three parameters
-or more it runs an all-pairs design. ``full`` runs all tests on every device. ``nightly`` is ``full`` with more
-hypothesis examples.
+smoke set on every other device: one test for each file, kernel variant and precision. Of a kernel test with three
+parameters or more it runs an all-pairs design. ``full`` runs all tests on every device. ``nightly`` is ``full`` with
+more hypothesis examples.
 """
 
 from __future__ import annotations
@@ -106,11 +106,12 @@ def _designed(items: list[pytest.Item]) -> Iterator[pytest.Item]:
     functions: dict[Any, list[pytest.Item]] = {}
     for item in items:
         functions.setdefault((item.parent, getattr(item, "originalname", item.name), _device_of(item)), []).append(item)
-    for cases in functions.values():
+    for (_, _, device), cases in functions.items():
         parameters = [
             {name: value for name, value in _parameters_of(item).items() if name != "device"} for item in cases
         ]
-        yield from (cases[k] for k in (all_pairs(parameters) if len(parameters[0]) > 2 else range(len(cases))))
+        is_product = device is not None and len(parameters[0]) > 2
+        yield from (cases[k] for k in (all_pairs(parameters) if is_product else range(len(cases))))
 
 
 def _smoke_case(item: pytest.Item) -> tuple[Any, ...]:

@@ -99,7 +99,7 @@ def _left_to_full_tier(items: list[pytest.Item], best: Sequence[Device]) -> Iter
 
 
 def _designed(items: list[pytest.Item]) -> Iterator[pytest.Item]:
-    """Yield the tests with at most two parameters, and an all-pairs design of the cases of each other test.
+    """Yield an all-pairs design of each kernel test with three parameters or more, and all cases of other tests.
 
     The device is not one of these parameters.
     """

@@ -204,6 +204,9 @@ from .matching.pose.registration import (
 from .matching.pose.registration import (
     register_images as register_images,
 )
+from .plots.simulation import (
+    PictureScale as PictureScale,
+)
 from .ranging.line import (
     LineReading as LineReading,
 )

@@ -46,6 +46,7 @@ PACKAGES = {
     ),
     "sensor": ("Sensors", "A sensor as its description file states it: readout, light source, simulated twin."),
     "formats": ("Files", "Read and write sensor, lens, field, feature and material files, and range images."),
+    "plots": ("Pictures", "Scales of the pictures that simulations write."),
     "workflows": ("Workflows", "Whole jobs on files, called by the commands of ``gpuvision``."),
     "reference": (
         "Float64 references",

@@ -132,13 +132,14 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Any:
     ValueError
         The shape differs, or a number is infinite or NaN.
     """
+    wrong = TypeError(f"{what} must be numbers of shape {shape}, got {values!r}")
     try:
         given = np.asarray(values)
+        if given.dtype.kind not in "iufO":  # a bool, a text or a complex number is not a number here
+            raise wrong
         array = given.astype(np.float64)
     except (TypeError, ValueError):
-        raise TypeError(f"{what} must be numbers of shape {shape}, got {values!r}") from None
-    if given.dtype.kind not in "iufO":  # a bool or a text is not a number
-        raise TypeError(f"{what} must be numbers of shape {shape}, got {values!r}")
+        raise wrong from None
     if array.shape != shape:
         raise ValueError(f"{what} has shape {array.shape}, expected {shape}")
     if not np.all(np.isfinite(array)):

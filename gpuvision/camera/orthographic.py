@@ -48,8 +48,8 @@ class BoardView:
     model: Lens | Camera | None = None
 
     def __post_init__(self) -> None:
-        finite(self.scale, "BoardView.scale", above=0.0)
-        numbers(self.pose, (3,), "BoardView.pose")
+        finite(self.scale, "BoardView.scale [m/px]", above=0.0)
+        numbers(self.pose, (3,), "BoardView.pose (x [m], y [m], theta [rad])")
 
     @property
     def centre_px(self) -> Float64:

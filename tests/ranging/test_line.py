@@ -284,7 +284,7 @@ def test_not_finite(device, rng, variant, along):
         parameters = {
             "method": method,
             "peak_selection": peak_selection,
-            "threshold": -40.0,
+            "threshold": 0.0,
             "window": 6,
             "along": along,
             "saturation": 1e9,
@@ -317,7 +317,7 @@ def test_nothing_finite(device, along, variant, method):
 def test_sums_beyond_the_largest_number(device, along, variant, peak_selection):
     """Finite samples whose sum overflows in single precision."""
     frame = column(*[0.0] * 20, 2e38, 3e38, 2e38, *[0.0] * 41, dtype=np.float32)
-    for threshold, method in itertools.product((-1e38, 1.0), ("windowed", "centroid", "gauss3")):
+    for threshold, method in itertools.product((0.0, 1.0), ("windowed", "centroid", "gauss3")):
         if method == "centroid" and peak_selection == "last":
             continue
         readout = LineReadout(

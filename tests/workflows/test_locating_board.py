@@ -192,10 +192,10 @@ def test_what_shows_no_board_is_refused(artwork: Artwork, image: np.ndarray, wor
     ("change", "words"),
     [
         ({"initial_pose": (0.5, 0.5, 0.0)}, "0 edges of the top artwork in view"),
-        ({"scale": 0.0}, "expected metres per pixel"),
+        ({"scale": 0.0}, r"BoardView.scale \[m/px\] is 0.0, expected a number > 0"),
         ({"copper": "green"}, "expected one of auto, bright, dark"),
         ({"search_range": (-1e-3, 0.0)}, "expected metres above 0"),
-        ({"initial_pose": (math.nan, 0.0, 0.0)}, "expected x, y"),
+        ({"initial_pose": (math.nan, 0.0, 0.0)}, r"x \[m\], y \[m\], theta \[rad\]\) has a number that is not finite"),
     ],
 )
 def test_a_wrong_parameter_is_told(artwork: Artwork, change: dict[str, Any], words: str) -> None:

@@ -6,7 +6,7 @@ CACHES := XDG_CACHE_HOME="$(CURDIR)/build/cache" MPLCONFIGDIR="$(CURDIR)/build/c
 # PYTEST_ARGS: more options, such as PYTEST_ARGS="-k line"
 PYTEST = .venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
 
-.PHONY: demo test test-full nightly fuzz lint docs clean
+.PHONY: demo test test-full nightly fuzz mutants lint docs clean
 
 demo: .venv/ready
 	.venv/bin/gpuvision demo
@@ -21,12 +21,19 @@ test-full: .venv/ready-tests
 nightly: .venv/ready-tests
 	$(PYTEST) --tier nightly
 	$(MAKE) fuzz FUZZ_ARGS="--engine atheris --runs 20000 --seconds 60"
+	$(MAKE) mutants
 
 # Fuzz the readers of files: see tests/fuzz/run.py. FUZZ_ARGS: its options, and readers such as sensor.toml.
 FUZZ_ARGS ?= --runs 100000
 fuzz: .venv/ready-tests
 	.venv/bin/python -m pip --quiet --disable-pip-version-check install --editable ".[fuzz]"
 	.venv/bin/python tests/fuzz/run.py $(FUZZ_ARGS)
+
+# Plant faults one at a time and count those that the tests find: see tests/mutants/run.py. MUTANTS_ARGS: its options.
+MUTANTS_ARGS ?= --sample 100 --seed 1
+mutants: .venv/ready-tests
+	.venv/bin/python -m pip --quiet --disable-pip-version-check install --editable ".[mutants]"
+	.venv/bin/python tests/mutants/run.py $(MUTANTS_ARGS)
 
 # Type checkers do not understand setuptools' package-dir or its import hook for editable installs. Symbolic links in
 # build/lint give the package the layout of an installed wheel, so that messages name the real files.

@@ -1,0 +1,121 @@
+"""Map from the lines of the source to the tests that run them, from one run of the fast tier."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree
+from collections import defaultdict
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+
+import coverage
+
+from mutants.faults import ROOT, Fault
+
+OUT = ROOT / "build" / "mutants"
+_DATA, _TIMES = OUT / "coverage", OUT / "times.xml"
+
+
+def record_lines(arguments: Iterable[str] = ()) -> None:
+    """Run the fast tier with a record of the lines that each test runs."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    settings = OUT / "coveragerc"
+    settings.write_text(f"[run]\ndata_file = {_DATA}\nomit = {ROOT}/tests/*\n")
+    measured = ["--cov", str(ROOT), "--cov-config", str(settings), "--cov-context=test", "--cov-report="]
+    words = ["-n", "logical", "--tier", "fast", "-q", *measured, "--junitxml", str(_TIMES), *arguments]
+    subprocess.run([sys.executable, "-m", "pytest", *words], cwd=ROOT, env=environment(ROOT), check=True)
+
+
+def is_recorded() -> bool:
+    """Return whether the map is there."""
+    return _DATA.exists() and _TIMES.exists()
+
+
+def environment(tree: Path) -> dict[str, str]:
+    """Return the environment of tests in a copy of the repository: its package comes before an installed one."""
+    return {**os.environ, "PYTHONPATH": str(tree), "GPUVISION_DEBUG": ""}
+
+
+def tests_of(fault: Fault, budget: float) -> list[str]:
+    """Return the tests that run the place of a fault, up to `budget` seconds: those of the file first, then quick ones.
+
+    Lines that run only while a module is imported have no tests: all tests that run a line of the file are taken.
+    """
+    path = ROOT / fault.file
+    places = [(path, fault.lines(path.read_text()))] if path.suffix == ".py" else list(_launches(fault.file))
+    names = {name for file, lines in places for name in _contexts(file, lines)}
+    names = names or {name for file, _ in places for name in _contexts(file, None)}
+    stems = {f"test_{file.stem}" for file, _ in places} | {f"test_{path.parent.name}", f"test_{path.stem}"}
+    times = _seconds()
+    order = sorted(names, key=lambda name: (Path(name.partition("::")[0]).stem not in stems, times[_key(name)], name))
+    chosen, total = [], 0.0
+    for name in order:
+        total += times[_key(name)]
+        if chosen and total > budget:
+            break
+        chosen.append(name)
+    return chosen
+
+
+def _contexts(path: Path, lines: range | None) -> set[str]:
+    by_line = _contexts_of(path)
+    found = (by_line.get(line, ()) for line in (by_line if lines is None else lines))
+    return {name for contexts in found for name in contexts}
+
+
+@cache
+def _contexts_of(path: Path) -> dict[int, list[str]]:
+    """Return the tests of each line of a Python file."""
+    data = coverage.CoverageData(str(_DATA))
+    data.read()
+    return {
+        line: [context.partition("|")[0] for context in contexts if context]
+        for line, contexts in data.contexts_by_lineno(str(path)).items()
+    }
+
+
+@cache
+def _launches(kernel: str) -> tuple[tuple[Path, range], ...]:
+    """Return the places of operations that launch a kernel whose source includes a file of ``kernels/``."""
+    sources = {f'"{name}"' for name in _sources(kernel)}
+    found = []
+    for path in sorted((ROOT / "gpuvision").rglob("*.py")):
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            if any(source in line for source in sources):
+                # The call of the builder begins up to a few lines above the name of the source.
+                found.append((path, range(number - 2, number + 2)))
+    return tuple(found)
+
+
+def _sources(kernel: str) -> set[str]:
+    """Return the kernel files that include a file, directly or not."""
+    folder = ROOT / "kernels"
+    users = defaultdict(set)
+    for path in folder.rglob("*"):
+        if path.suffix in (".cl", ".h"):
+            for name in re.findall(r'#include "([^"]+)"', path.read_text()):
+                users[name].add(str(path.relative_to(folder)))
+    found, new = set(), {kernel.removeprefix("kernels/")}
+    while new:
+        found |= new
+        new = {user for name in new for user in users[name]} - found
+    return {name for name in found if name.endswith(".cl")}
+
+
+@cache
+def _seconds() -> defaultdict[str, float]:
+    """Return the time of each test [s]."""
+    times: defaultdict[str, float] = defaultdict(lambda: 1.0)
+    for case in xml.etree.ElementTree.parse(_TIMES).iter("testcase"):
+        times[f"{case.get('classname')}.{case.get('name')}"] = float(case.get("time", "1"))
+    return times
+
+
+def _key(name: str) -> str:
+    """Return the name of a test as in the report of times."""
+    file, _, test = name.partition("::")
+    return f"{file.removesuffix('.py').replace('/', '.')}.{test.replace('::', '.')}"

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-import gpuvision
 from gpuvision.host import Device
 from gpuvision.host.outputs import Outputs
 from gpuvision.profiling import ceiling
@@ -287,10 +286,7 @@ def describe_machine(devices: Sequence[Device]) -> dict[str, Any]:
         "processor": _processor(),
         "system": platform.platform(terse=True),
         "python": platform.python_version(),
-        "packages": {
-            "gpuvision": gpuvision.__version__,
-            **{name: version(name) for name in ("numpy", "pyopencl", "numba")},
-        },
+        "packages": {name: version(name) for name in ("gpuvision", "numpy", "pyopencl", "numba")},
         "devices": {
             each.label: {
                 "name": each.name,

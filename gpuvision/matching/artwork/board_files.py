@@ -19,9 +19,11 @@ from typing import Any
 from gerbonara import LayerStack
 from gerbonara.cam import LazyCamFile
 from gerbonara.excellon import ExcellonFile
+from gerbonara.rs274x import GerberFile
 
 from gpuvision.host.errors import ReadError
 from gpuvision.host.reading import check_archive, check_limit, reading
+from gpuvision.matching.artwork.gerber_parser import parse_gerber
 
 # A command, as gerbonara splits a file: a comment, an extended command between %, or text up to an asterisk.
 _COMMAND = re.compile(r"G04[^*]*+\*|%[^%]*+%|[^*%]*+\*")
@@ -87,14 +89,18 @@ def parsed(layer: Any) -> Any:
     ReadError
         gerbonara cannot read the file, or it exceeds a limit of `FileLimits`.
     """
-    if not isinstance(layer, LazyCamFile):
+    read_as = layer._class if isinstance(layer, LazyCamFile) else type(layer)
+    if read_as is not GerberFile and not isinstance(layer, LazyCamFile):
         return layer
     path = layer.original_path
-    kind = "drill file" if layer._class is ExcellonFile else "Gerber file"
+    kind = "Gerber file" if read_as is GerberFile else "drill file"
     with warnings.catch_warnings(), reading(path.name, kind):
         warnings.simplefilter("ignore")
         text = path.read_text()
-        (check_drill if layer._class is ExcellonFile else check_gerber)(text, path.name)
+        if read_as is GerberFile:
+            check_gerber(text, path.name)
+            return parse_gerber(text, path)
+        check_drill(text, path.name)
         return layer.instance
 
 

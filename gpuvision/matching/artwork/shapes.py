@@ -15,6 +15,7 @@ from gerbonara.apertures import ApertureMacroInstance, CircleAperture, ExcellonT
 from gerbonara.utils import MM
 
 from gpuvision.host.reading import check_limit
+from gpuvision.matching.artwork.gerber_parser import TransformedAperture
 
 Float64 = npt.NDArray[np.float64]
 Crossings = list[tuple[bool, Float64]]
@@ -27,7 +28,9 @@ _MOST_LINES = 10_000  # of an arc that is drawn with an aperture; a circle with 
 _MOST_CORNERS = 5_000_000  # of a layer. Chosen: they take 300 MiB with the arrays of `Layer`
 _MOST_VERTICES = 1000  # of a regular polygon; the Gerber format allows 12
 _POLYGON_CODE = 5
-_UNSUPPORTED_MACROS = {6: "moiré", 7: "thermal"}  # gerbonara 1.5 reads them and cannot draw them
+# Codes of primitives of aperture macros that gerbonara 1.5 draws wrongly, or cannot draw.
+_MOIRE_CODE = 6
+_THERMAL_CODE = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +152,8 @@ def drawn_objects(layer: Any) -> tuple[DrawnObject, ...]:
     Raises
     ------
     ValueError
-        An aperture macro has a moiré or a thermal: these are obsolete or for inner layers, and are not supported. Or an
-        object lies or extends beyond `FileLimits.max_board_size`, or the layer has too many corners.
+        An aperture macro has a moiré, which is obsolete and not supported. Or an object lies or extends beyond
+        `FileLimits.max_board_size`, or the layer has too many corners.
     """
     drawn, corners = [], 0
     for item in layer.objects:
@@ -208,24 +211,84 @@ def _round_width(aperture: Any) -> float:
 
 
 def _flashed(aperture: Any, place: Float64, dark: bool) -> Iterator[Shape]:
-    # Draw at the origin and move afterwards: gerbonara 1.5 ignores the position of regular polygons in macros.
-    for primitive in _primitives(aperture, dark):
-        yield Shape(_outline(primitive) + place, bool(primitive.polarity_dark))
+    for shape in _shapes(aperture, dark):
+        yield Shape(shape.outline + place, shape.dark)
 
 
-def _primitives(aperture: Any, dark: bool) -> Any:
-    """Return the primitives of an aperture at the origin."""
-    if isinstance(aperture, ApertureMacroInstance):
+def _shapes(aperture: Any, dark: bool) -> Iterator[Shape]:
+    """Yield the areas of an aperture at the origin."""
+    if isinstance(aperture, TransformedAperture):
+        for shape in _shapes(aperture.aperture, dark):
+            yield Shape(shape.outline @ aperture.matrix.T, shape.dark)
+    elif isinstance(aperture, ApertureMacroInstance):
         values = dict(enumerate(aperture.parameters, start=1))
         for primitive in aperture.macro.primitives:
-            code = getattr(primitive, "code", 0)
-            if name := _UNSUPPORTED_MACROS.get(code):
-                raise ValueError(f"aperture macro {aperture.macro.name}: a {name} is not supported; draw it as regions")
-            if code == _POLYGON_CODE and not primitive.n_vertices.calculate(values) <= _MOST_VERTICES:
-                raise ValueError(
-                    f"aperture macro {aperture.macro.name}: a polygon of more than {_MOST_VERTICES} corners"
-                )
-    return aperture.flash(0.0, 0.0, MM, dark)
+            yield from _macro_shapes(primitive, aperture.macro.name, values, dark)
+    else:
+        for each in aperture.flash(0.0, 0.0, MM, dark):
+            yield Shape(_outline(each), bool(each.polarity_dark))
+
+
+def _macro_shapes(primitive: Any, macro: str, values: dict[int, float], dark: bool) -> Iterator[Shape]:
+    """Yield the areas of a primitive of an aperture macro."""
+    code = getattr(primitive, "code", 0)
+    if code == _MOIRE_CODE:
+        raise ValueError(f"aperture macro {macro}: a moiré is not supported; draw it as regions")
+    if code == _THERMAL_CODE:
+        for outline in _thermal(primitive, values):
+            yield Shape(outline, dark)
+    elif code == _POLYGON_CODE:
+        corners = primitive.n_vertices.calculate(values)
+        if not corners <= _MOST_VERTICES:
+            raise ValueError(f"aperture macro {macro}: a polygon of more than {_MOST_VERTICES} corners")
+        yield Shape(_macro_polygon(primitive, values), bool(primitive.exposure.calculate(values)) == dark)
+    else:
+        for each in primitive.to_graphic_primitives((0.0, 0.0), 0.0, values, MM, dark):
+            yield Shape(_outline(each), bool(each.polarity_dark))
+
+
+def _macro_polygon(primitive: Any, values: dict[int, float]) -> Float64:
+    """Return the corners [m] of a regular polygon, rotated about the origin of the macro.
+
+    gerbonara 1.5 does not rotate the polygon's centre. Gerber format specification 2024.05, section 4.5.1.7.
+    """
+    x, y, diameter = (getattr(primitive, name).calculate(values, MM) for name in ("x", "y", "diameter"))
+    angle = math.radians(primitive.rotation.calculate(values))
+    x, y = _rotated(np.array([x, y]), angle)
+    count = int(primitive.n_vertices.calculate(values))
+    return _outline(graphic_primitives.ArcPoly.from_regular_polygon(x, y, diameter / 2, count, angle))
+
+
+def _thermal(primitive: Any, values: dict[int, float]) -> Iterator[Float64]:
+    """Yield the outlines [m] of the parts of a thermal: a ring, cut by a cross of gaps into four.
+
+    gerbonara 1.5 reads an exposure, which a thermal does not have, before the centre: its fields are shifted by one.
+    Gerber format specification 2024.05, section 4.5.1.8.
+    """
+    shifted = (primitive.exposure, primitive.x, primitive.y, primitive.d_outer, primitive.d_inner, primitive.gap_w)
+    x, y, outer, inner, gap, degrees = (float(each.calculate(values)) for each in shifted)
+    x, y, outer, inner, half = (MM(each, primitive.unit) * _METRE for each in (x, y, outer / 2, inner / 2, gap / 2))
+    if not outer > half * math.sqrt(2):
+        return
+    origin = np.zeros(2)
+    along, across = math.sqrt(outer**2 - half**2), half
+    corners = _arc(np.array([along, across]), np.array([across, along]), origin, clockwise=False)
+    quarter = [corners, [[across, along]]]
+    if inner > half * math.sqrt(2):
+        along = math.sqrt(inner**2 - half**2)
+        quarter += [_arc(np.array([across, along]), np.array([along, across]), origin, clockwise=True)]
+        quarter += [[[along, across]]]
+    else:
+        quarter += [[[across, across]]]
+    for turns in range(4):
+        part = _rotated(np.concatenate(quarter), turns * math.pi / 2)
+        yield _rotated(part + (x, y), math.radians(degrees))
+
+
+def _rotated(points: Float64, angle: float) -> Float64:
+    """Return points rotated about the origin, counter-clockwise."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]))
 
 
 def _swept(aperture: Any, ends: Float64, dark: bool) -> Iterator[Shape]:
@@ -236,9 +299,8 @@ def _swept(aperture: Any, ends: Float64, dark: bool) -> Iterator[Shape]:
         return
     if aperture is None:
         return
-    for primitive in _primitives(aperture, dark):
-        outline = _outline(primitive)
-        yield Shape(hull(np.concatenate([outline + ends[0], outline + ends[1]])), dark)
+    for shape in _shapes(aperture, dark):
+        yield Shape(hull(np.concatenate([shape.outline + ends[0], shape.outline + ends[1]])), dark)
 
 
 def _outline(primitive: Any) -> Float64:
@@ -246,9 +308,8 @@ def _outline(primitive: Any) -> Float64:
     if isinstance(primitive, graphic_primitives.Circle):
         return disk(np.array([primitive.x, primitive.y]) * _METRE, primitive.r * _METRE)
     if isinstance(primitive, graphic_primitives.Rectangle):
-        cos, sin = math.cos(primitive.rotation), math.sin(primitive.rotation)
         half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array([primitive.w, primitive.h]) / 2
-        return np.asarray((half @ np.array([[cos, sin], [-sin, cos]]) + (primitive.x, primitive.y)) * _METRE)
+        return np.asarray((_rotated(half, primitive.rotation) + (primitive.x, primitive.y)) * _METRE)
     if isinstance(primitive, graphic_primitives.Line):
         start, end = np.array([[primitive.x1, primitive.y1], [primitive.x2, primitive.y2]]) * _METRE
         return capsule(start, end, primitive.width / 2 * _METRE)

@@ -30,6 +30,10 @@ _COMMAND = re.compile(r"G04[^*]*+\*|%[^%]*+%|[^*%]*+\*")
 _STEP_REPEAT = re.compile(r"SRX0*(\d+)Y0*(\d+)I")
 _POLYGON = re.compile(r"ADD\d+P,[^X*]*X([^X*]*)")
 _REPEATED_HOLE = re.compile(r"^\s*R0*(\d+)", re.MULTILINE)
+# G85 drills a slot from the point before it to the point after it. gerbonara 1.5 refuses it, and reads the same slot as
+# a route: G00 to its start, M15 tool down, G01 to its end, M16 tool up, G05 drill mode.
+_POINT = r"((?:X[-+.\d]+)?(?:Y[-+.\d]+)?)"
+_CANNED_SLOT = re.compile(rf"^[ \t]*{_POINT}G85{_POINT}[ \t]*$", re.MULTILINE)
 _LONG_NUMBER = re.compile(r"\d{101}")  # digits: coordinates have up to 9, hashes of attributes up to 64 characters
 _LONG_SPACE = re.compile(r"\s{1001}")
 # Characters of a block of an aperture macro (Gerber format specification 2024.05, section 4.5) and of a number's
@@ -101,7 +105,8 @@ def parsed(layer: Any) -> Any:
             check_gerber(text, path.name)
             return parse_gerber(text, path)
         check_drill(text, path.name)
-        return layer.instance
+        routed = _CANNED_SLOT.sub(r"G00\1\nM15\nG01\2\nM16\nG05", text)
+        return layer.instance if routed == text else ExcellonFile.from_string(routed, filename=path, **layer._kwargs)
 
 
 @contextlib.contextmanager

@@ -131,7 +131,7 @@ class _Parser(GerberParser):  # type: ignore[misc]
         self.graphics_state.aperture = aperture
 
     def _parse_step_repeat(self, match: re.Match[str]) -> None:
-        """Close the open block, and open the next one (section 4.11).
+        """Close the open block, and open the next one (section 4.12).
 
         gerbonara draws the block only once: it tests a list of objects, empty at first, for its truth.
         """

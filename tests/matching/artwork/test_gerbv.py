@@ -17,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from gpuvision.matching.artwork.artwork import Artwork, read_artwork
-from gpuvision.matching.artwork.shapes import Layer, Shape, capsule, is_covered
+from gpuvision.matching.artwork.artwork import Artwork, Holes, read_artwork
+from gpuvision.matching.artwork.board_files import open_board, parsed
+from gpuvision.matching.artwork.shapes import Layer, Shape, capsule, drawn_objects, is_covered
 
 Picture = npt.NDArray[np.bool_]
 
@@ -281,7 +282,7 @@ TWINS = {
         macro("7,0,0,2.4,0.5,0.4,0"),
         macro("1,1,2.4,0,0", "21,0,3,0.4,0,0,0", "21,0,0.4,3,0,0,0"),
     ),
-    # Section 4.11: each copy is dark and clear as a whole. gerbv draws the dark parts of all copies first.
+    # Section 4.12: each copy is dark and clear as a whole. gerbv draws the dark parts of all copies first.
     "repeated polarity": (
         gerber("%ADD10C,0.5*%", "%ADD12C,1.6*%", "%SRX3Y1I0.9J0*%", "D12*", at(1.2, 2, "D03"), "%LPC*%", "D10*",
                at(1.2, 2, "D03"), "%LPD*%", "%SR*%"),
@@ -338,3 +339,65 @@ def test_hole_shows_the_copper_below(tmp_path: Path, ring: str) -> None:
                   "D11*", CENTRE)  # fmt: skip
     board = read(tmp_path, copper=text)
     check_equal(rasterised(board.copper, SMALL), drawn_by_gerbv(tmp_path / "copper.gbr", SMALL))
+
+
+ROUND_AND_SLOT = "T1\nX1.0Y1.0\n{slot}\nT2\nX1.0Y3.0\n"
+G85_SLOT = "X3.0Y1.0G85X4.5Y2.0"
+ROUTED_SLOT = "G00X3.0Y1.0\nM15\nG01X4.5Y2.0\nM16\nG05"
+
+
+def drills(body: str, units: str = "METRIC", tools: tuple[float, float] = (0.6, 0.4)) -> str:
+    return f"M48\n{units}\nT1C{tools[0]:.4f}\nT2C{tools[1]:.4f}\n%\nG90\nG05\n{body}T0\nM30\n"
+
+
+MILLIMETRES = drills(ROUND_AND_SLOT.format(slot=G85_SLOT))
+# The file, and one for gerbv, which ignores routes.
+DRILLS = {
+    "slot by G85": (MILLIMETRES, MILLIMETRES),
+    "routed slot": (drills(ROUND_AND_SLOT.format(slot=ROUTED_SLOT)), MILLIMETRES),
+    "inches": (drills("T1\nX0.05Y0.05\nX0.15Y0.05G85X0.2Y0.1\nT2\nX0.1Y0.12\n", "INCH", (0.03, 0.02)),) * 2,
+    "trailing zeros kept": (drills("T1\nX1000Y1000\nX3000Y1500\n", "METRIC,TZ,000.000"),) * 2,
+    "leading zeros kept": (drills("T1\nX001Y001\nX003Y0015\n", "METRIC,LZ,000.000"),) * 2,
+    "modal coordinates": (drills("T1\nX1.0Y1.0\nX3.0\nY3.0\n"),) * 2,
+}
+
+
+@needs_gerbv
+@pytest.mark.parametrize(("text", "twin"), DRILLS.values(), ids=DRILLS.keys())
+def test_holes_are_where_gerbv_draws_them(tmp_path: Path, text: str, twin: str) -> None:
+    board = read(tmp_path, copper=flashes("C,1"), holes=text)
+    path = tmp_path / "twin.drl"
+    path.write_text(twin)
+    check_equal(rasterised(drilled(board.holes), SMALL), drawn_by_gerbv(path, SMALL))
+
+
+def drilled(holes: Holes) -> tuple[Shape, ...]:
+    ends = zip(holes.start, holes.end, holes.diameter, strict=True)
+    return tuple(Shape(capsule(start, end, across / 2)) for start, end, across in ends)
+
+
+BOARDS = ("upverter", "eagle", "fritzing", *(f"kicad-x2-tests/{each}" for each in ("x2ap", "nox2ap", "x2noap", "nox2noap")))
+SLOW_BOARDS = [pytest.param(each, marks=[] if each == "upverter" else pytest.mark.slow) for each in BOARDS]
+
+
+@needs_gerbv
+@pytest.mark.realdata
+@pytest.mark.parametrize("name", SLOW_BOARDS)
+def test_boards_are_drawn_as_gerbv_draws_them(data: Path, tmp_path: Path, name: str) -> None:
+    with open_board(data / "gerber" / name, None) as stack:
+        for (side, use), file in stack.graphic_layers.items():
+            shapes = tuple(shape for each in drawn_objects(parsed(file)) for shape in each.shapes)
+            if shapes:
+                print(side, use, name)
+                window = around(shapes)
+                path = Path(shutil.copy(file.original_path, tmp_path))
+                check_equal(rasterised(shapes, window), drawn_by_gerbv(path, window))
+
+
+def around(shapes: tuple[Shape, ...]) -> Window:
+    """Return a window around shapes, with pixels of 20 micrometres."""
+    dpi = 1270
+    low, high = (np.array([each(shape.outline, axis=0) for shape in shapes]) for each in (np.min, np.max))
+    first = np.floor(np.min(low, axis=0) / INCH * 100) / 100
+    columns, rows = np.ceil((np.max(high, axis=0) / INCH - first) * dpi).astype(int) + 2
+    return Window(first[0] - 1 / 127, first[1] - 1 / 127, dpi, columns + 12, rows + 12)

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -69,9 +69,9 @@ class TransformedAperture:
 
 
 class _Parser(GerberParser):  # type: ignore[misc]
-    """Parser that also reads step-and-repeat, transforms of apertures, rotated polygons and modal codes without zero."""
+    """Parser that also draws step-and-repeat, transformed apertures and rotated polygons, and reads G1, G2 and G3."""
 
-    STATEMENT_REGEXES = {
+    STATEMENT_REGEXES: ClassVar[dict[str, str]] = {
         "load_mirroring": r"LM(?P<axes>N|XY|X|Y)$",
         "load_rotation": rf"LR(?P<degrees>{_DECIMAL})$",
         "load_scaling": rf"LS(?P<factor>{_DECIMAL})$",

@@ -282,7 +282,7 @@ def _thermal(primitive: Any, values: dict[int, float]) -> Iterator[Float64]:
         quarter += [[[across, across]]]
     for turns in range(4):
         part = _rotated(np.concatenate(quarter), turns * math.pi / 2)
-        yield _rotated(part + (x, y), math.radians(degrees))
+        yield _rotated(part + np.array([x, y]), math.radians(degrees))
 
 
 def _rotated(points: Float64, angle: float) -> Float64:
@@ -309,7 +309,7 @@ def _outline(primitive: Any) -> Float64:
         return disk(np.array([primitive.x, primitive.y]) * _METRE, primitive.r * _METRE)
     if isinstance(primitive, graphic_primitives.Rectangle):
         half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array([primitive.w, primitive.h]) / 2
-        return np.asarray((_rotated(half, primitive.rotation) + (primitive.x, primitive.y)) * _METRE)
+        return np.asarray((_rotated(half, primitive.rotation) + np.array([primitive.x, primitive.y])) * _METRE)
     if isinstance(primitive, graphic_primitives.Line):
         start, end = np.array([[primitive.x1, primitive.y1], [primitive.x2, primitive.y2]]) * _METRE
         return capsule(start, end, primitive.width / 2 * _METRE)

@@ -1,7 +1,7 @@
 """Artwork against the program gerbv, an independent reader of Gerber and Excellon files.
 
-gerbv draws a file with antialiasing: a pixel is set where half of it is covered. `Layer` answers at the same pixels, from
-the polygons of `read_artwork`, whether the centre is covered. Pixels within one pixel of an edge may differ, others not.
+gerbv draws a file with antialiasing: a pixel is set where half of it is covered. `Layer` answers for the same pixels,
+from the polygons of the artwork, whether the centre is covered. Only pixels beside an edge may differ.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ def rasterised(shapes: tuple[Shape, ...], window: Window) -> Picture:
 def check_equal(ours: Picture, theirs: Picture, *, error: float = CHORD_ERROR) -> None:
     """Compare pixels outside one-pixel bands along the edges of both pictures, and areas.
 
-    An edge that differs by up to two pixels lies in both bands. An edge differs by the error [px] at most, and the area by this error times the length of the edges. An edge has a
-    pixel on either side for each pixel of its length, or more where it is slanted.
+    The bands hide an edge that is displaced by two pixels at most. The area differs by at most the error [px] times the
+    length of the edges. An edge has a pixel on either side for each pixel of its length, or more where it is slanted.
     """
     at_edges = edges(ours) | edges(theirs)
     assert ours.any()
@@ -279,8 +279,8 @@ CENTRE = at(3, 2, "D03")
 # Of commands that gerbv 2.9.6 ignores or draws wrongly: the file, and one for gerbv that draws the same without them.
 # The sections are of the Gerber Layer Format Specification, revision 2024.05 (Ucamco).
 TWINS = {
-    # Section 4.5.1: primitives turn about the origin of the macro. gerbv does not turn the centre of a circle, and turns
-    # polygons and thermals about their own centres.
+    # Section 4.5.3: primitives turn about the origin of the macro. gerbv does not turn the centre of a circle, and
+    # turns polygons and thermals about their own centres.
     "macro circle turned": (macro("1,1,1.0,1.2,0.3,40"), macro(f"1,1,1.0,{turned(1.2, 0.3, 40)}")),
     "macro polygon turned": (macro("5,1,5,0.8,0.3,1.4,50"), macro(f"5,1,5,{turned(0.8, 0.3, 50)},1.4,50")),
     "macro thermal turned": (macro("7,0.5,0.3,2.4,1.4,0.4,30"), macro(f"7,{turned(0.5, 0.3, 30)},2.4,1.4,0.4,30")),

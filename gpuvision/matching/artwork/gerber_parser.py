@@ -19,7 +19,7 @@ from gerbonara.apertures import CircleAperture, PolygonAperture
 from gerbonara.graphic_objects import Region
 from gerbonara.rs274x import GerberFile, GerberParser
 
-_LEADING_ZERO = re.compile(r"G(?=[1-3](?!\d))")  # of G1, G2 and G3; gerbonara reads G01, G02 and G03
+_SHORT_CODE = re.compile(r"\AG(?=[1-3](?!\d))")  # G1, G2 and G3; gerbonara reads G01, G02 and G03
 _DECIMAL = r"[+-]?\d*\.?\d+"
 
 
@@ -75,6 +75,7 @@ class _Parser(GerberParser):  # type: ignore[misc]
         "load_mirroring": r"LM(?P<axes>N|XY|X|Y)$",
         "load_rotation": rf"LR(?P<degrees>{_DECIMAL})$",
         "load_scaling": rf"LS(?P<factor>{_DECIMAL})$",
+        "block_aperture": r"AB",
         **GerberParser.STATEMENT_REGEXES,
     }
 
@@ -88,7 +89,7 @@ class _Parser(GerberParser):  # type: ignore[misc]
 
     def _split_commands(self, data: str) -> Iterator[str]:
         for command in super()._split_commands(data):
-            yield _LEADING_ZERO.sub("G0", command, count=1) if command.startswith("G") else command
+            yield _SHORT_CODE.sub("G0", command)
 
     def _parse_aperture_definition(self, match: re.Match[str]) -> None:
         """Define an aperture; the rotation of a polygon is in degrees (section 4.4.5), gerbonara's in radians."""
@@ -116,6 +117,10 @@ class _Parser(GerberParser):  # type: ignore[misc]
         if not self._scale > 0:
             raise ValueError(f"a scale of {match['factor']}, expected above 0")
         self._transform()
+
+    def _parse_block_aperture(self, match: re.Match[str]) -> None:
+        """Refuse block apertures (section 4.11); gerbonara ignores the command, and draws the block at once."""
+        raise ValueError("a block aperture (AB) is not supported")
 
     def _transform(self) -> None:
         """Apply mirroring, then rotation, then scaling to the selected aperture (section 4.9.1)."""

@@ -251,6 +251,18 @@ def test_a_moire_is_refused(tmp_path: Path) -> None:
         read(tmp_path, copper=COPPER + moire)
 
 
+def test_a_block_aperture_is_refused(tmp_path: Path) -> None:
+    block = "%ABD20*%\nD10*\n" + at(0, 0, "D03") + "%AB*%\nD20*\n" + at(10, 8, "D03")
+    with pytest.raises(ValueError, match=r"block aperture \(AB\) is not supported"):
+        read(tmp_path, copper=COPPER + block)
+
+
+@pytest.mark.parametrize("scale", ["0", "-1"])
+def test_a_scale_of_an_aperture_must_be_positive(tmp_path: Path, scale: str) -> None:
+    with pytest.raises(ValueError, match=f"a scale of {scale}, expected above 0"):
+        read(tmp_path, copper=COPPER + f"%LS{scale}*%\n" + at(10, 8, "D03"))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -271,18 +271,22 @@ def _thermal(primitive: Any, values: dict[int, float]) -> Iterator[Float64]:
     if not outer > half * math.sqrt(2):
         return
     origin = np.zeros(2)
-    along, across = math.sqrt(outer**2 - half**2), half
-    corners = _arc(np.array([along, across]), np.array([across, along]), origin, clockwise=False)
-    quarter = [corners, [[across, along]]]
+
+    def ends(radius: float) -> tuple[Float64, Float64]:
+        """Return the points of a circle on the sides of the gaps, counter-clockwise."""
+        along = math.sqrt(radius**2 - half**2)
+        return np.array([along, half]), np.array([half, along])
+
+    first, last = ends(outer)
+    quarter = [_arc(first, last, origin, clockwise=False), last[None]]
     if inner > half * math.sqrt(2):
-        along = math.sqrt(inner**2 - half**2)
-        quarter += [_arc(np.array([across, along]), np.array([along, across]), origin, clockwise=True)]
-        quarter += [[[along, across]]]
+        last, first = ends(inner)
+        quarter += [_arc(first, last, origin, clockwise=True), last[None]]
     else:
-        quarter += [[[across, across]]]
+        quarter += [np.array([[half, half]])]
+    part = np.concatenate(quarter)
     for turns in range(4):
-        part = _rotated(np.concatenate(quarter), turns * math.pi / 2)
-        yield _rotated(part + np.array([x, y]), math.radians(degrees))
+        yield _rotated(_rotated(part, turns * math.pi / 2) + np.array([x, y]), math.radians(degrees))
 
 
 def _rotated(points: Float64, angle: float) -> Float64:

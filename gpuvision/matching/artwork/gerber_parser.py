@@ -20,6 +20,9 @@ from gerbonara.graphic_objects import Region
 from gerbonara.rs274x import GerberFile, GerberParser
 
 _SHORT_CODE = re.compile(r"\AG(?=[1-3](?!\d))")  # G1, G2 and G3; gerbonara reads G01, G02 and G03
+# Name of a macro (section 3.4.5), and the statements with one; gerbonara expects two characters or more.
+_NAME = r"[a-zA-Z_$.][a-zA-Z_$.0-9+\-]*"
+_NAMED = ("aperture_definition", "aperture_macro")
 _DECIMAL = r"[+-]?\d*\.?\d+"
 
 
@@ -77,6 +80,7 @@ class _Parser(GerberParser):  # type: ignore[misc]
         "load_scaling": rf"LS(?P<factor>{_DECIMAL})$",
         "block_aperture": r"AB",
         **GerberParser.STATEMENT_REGEXES,
+        **{name: GerberParser.STATEMENT_REGEXES[name].replace(GerberParser.NAME, _NAME) for name in _NAMED},
     }
 
     def __init__(self, target: GerberFile) -> None:

@@ -290,6 +290,8 @@ TWINS = {
         macro("7,0,0,2.4,0.5,0.4,0"),
         macro("1,1,2.4,0,0", "21,0,3,0.4,0,0,0", "21,0,0.4,3,0,0,0"),
     ),
+    # Section 3.4.5: a name has one character or more. gerbv takes a single letter for a type of aperture.
+    "macro of one letter": (macro("21,1,1.8,0.6,0,0,10").replace("SHAPE", "M"), macro("21,1,1.8,0.6,0,0,10")),
     # Section 4.12: each copy is dark and clear as a whole. gerbv draws the dark parts of all copies first.
     "repeated polarity": (
         gerber("%ADD10C,0.5*%", "%ADD12C,1.6*%", "%SRX3Y1I0.9J0*%", "D12*", at(1.2, 2, "D03"), "%LPC*%", "D10*",

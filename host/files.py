@@ -132,7 +132,7 @@ def atomic_write(path: str | os.PathLike[str], *, overwrite: bool = False, mode:
         The disk is full; no file is left.
     """
     path = Path(path)
-    if path.exists() and not path.is_file() and not path.is_dir():
+    if is_device(path):
         with path.open("wb") as device:
             yield device
         return
@@ -192,8 +192,13 @@ def check_writable_folder(folder: str | Path) -> None:
         raise type(error)(f"cannot write into {folder}: {place}: {error.strerror}; give another folder") from error
 
 
+def is_device(path: Path) -> bool:
+    """Return whether a path is a device or a pipe: neither a file nor a folder."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
 def check_writable_file(file: str | Path) -> None:
-    """Check that a file can be written at a path.
+    """Check that a file can be written at a path; a device such as ``/dev/null`` needs no writable folder.
 
     Raises
     ------
@@ -206,7 +211,8 @@ def check_writable_file(file: str | Path) -> None:
         raise ValueError("the name of the file to write is empty; give one")
     if Path(file).is_dir():
         raise IsADirectoryError(f"cannot write {file}: it is a folder, expected a file")
-    check_writable_folder(Path(file).parent)
+    if not is_device(Path(file)):
+        check_writable_folder(Path(file).parent)
 
 
 @contextlib.contextmanager

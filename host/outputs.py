@@ -20,6 +20,7 @@ from gpuvision.host.files import (
     atomic_write,
     check_writable_file,
     check_writable_folder,
+    is_device,
     locked_folder,
 )
 
@@ -77,7 +78,7 @@ class Outputs:
                 check_writable_file(each)
             path = Path(each)
             checked.add(path.parent)
-            if _is_device(path):
+            if is_device(path):
                 continue
             self.check_replaceable(path, job=job)
             same = self._claimed.setdefault(path.resolve(), path)
@@ -152,7 +153,7 @@ class Outputs:
             The file is an input, or exists and is not an output of the job.
         """
         path = Path(path)
-        if _is_device(path):
+        if is_device(path):
             with atomic_write(path) as device:
                 yield device
             return
@@ -205,10 +206,6 @@ def _files(path: Path) -> Iterator[Path]:
 def _is_output(path: Path, entry: Any) -> bool:
     """Return whether a file is as the entry of the manifest says."""
     return isinstance(entry, dict) and entry == _entry(path, entry.get("job", ""))
-
-
-def _is_device(path: Path) -> bool:
-    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def _entry(path: Path, job: str) -> dict[str, Any]:

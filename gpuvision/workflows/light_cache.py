@@ -6,13 +6,11 @@ A block depends only on its task and its profiles: computed again, or on another
 from __future__ import annotations
 
 import functools
-import hashlib
 import io
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +21,6 @@ from gpuvision.host import Device
 from gpuvision.host.errors import ReadError, RecordingError
 from gpuvision.host.files import atomic_write
 from gpuvision.host.reading import check_archive, reading
-from gpuvision.ranging.psd import PsdReadout
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.sensor.simulated import make_light_sheet, make_sensor_view, minimum_sample_power, require_light
 from gpuvision.simulation.light_paths import LightPaths
@@ -31,24 +28,10 @@ from gpuvision.simulation.scene.material import Material
 from gpuvision.simulation.scene.scene import Scene
 from gpuvision.simulation.sensors.readings import GroundTruth
 from gpuvision.simulation.sensors.sensor_view import Exposure
+from gpuvision.workflows.light_key import key_of, source_digest
 
 PROFILES_PER_BLOCK = 16
 """Profiles in a file: some seconds of work, so that little is lost when a run stops."""
-
-# Fields of the sensor's light source that the simulated light depends on.
-_OPTICAL = (
-    "lens",
-    "aperture",
-    "power",
-    "thickness",
-    "source",
-    "width",
-    "profile",
-    "sub_sheets",
-    "blur",
-    "bins",
-    "nodes",
-)
 
 Float64 = npt.NDArray[np.float64]
 Progress = Callable[[int, int | None], object]
@@ -81,19 +64,10 @@ class SimulationTask:
 
     @functools.cached_property
     def fingerprint(self) -> str:
-        """Name of the light: equal for equal tasks, independent of the electronics."""
-        sensor, readout = self.sensor, self.sensor.readout
-        assert self.part.material is not None  # set by Scene itself
-        length = readout.strip_length if isinstance(readout, PsdReadout) else readout.along
-        optics = [readout.triangulation, readout.axes, length, sensor.transport, sensor.frame]
-        light = [getattr(sensor.light, name) for name in _OPTICAL]
+        """Name of the light: equal for equal tasks and sources of gpuvision, independent of the electronics."""
         # The light that may be omitted depends on the least readable power, which depends on the electronics.
-        least = minimum_sample_power(sensor) if self.tolerance > 0.0 else None
-        words = repr([version("gpuvision"), self.materials, optics, light, self.paths, self.tolerance, least])
-        digest = hashlib.sha256(words.encode())
-        for array in (self.part.corners, self.part.material, self.transports):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        return digest.hexdigest()[:16]
+        least = minimum_sample_power(self.sensor) if self.tolerance > 0.0 else None
+        return key_of(self, least)
 
     def blocks(self) -> list[range]:
         """Return the profiles of each block."""
@@ -221,6 +195,8 @@ def compute_missing_blocks(
         Dask is not installed.
     OSError
         There is no scheduler at that address, or a block cannot be written.
+    ValueError
+        A worker has other sources of gpuvision than this machine.
     """
     task, missing = store.task, store.missing()
     blocks = task.blocks()
@@ -282,11 +258,20 @@ def _compute_on_dask(task: SimulationTask, numbers: list[int], address: str) -> 
         everywhere = client.scatter(task, broadcast=True)
         # A block that is requested twice is computed twice; the second file replaces an equal one.
         futures = {
-            client.submit(compute_block, everywhere, number, key=f"{task.fingerprint}-{number}"): number
+            client.submit(
+                _compute_on_worker, everywhere, number, source_digest(), key=f"{task.fingerprint}-{number}"
+            ): number
             for number in numbers
         }
         for future, content in dask.as_completed(futures, with_results=True):
             yield futures[future], content
+
+
+def _compute_on_worker(task: SimulationTask, number: int, sources: str) -> bytes:
+    """Compute a block on a worker with the client's sources; other sources compute other light under the same key."""
+    if source_digest() != sources:
+        raise ValueError("a Dask worker has other sources of gpuvision than this machine; install the same version")
+    return compute_block(task, number)
 
 
 # Kernels are built once per task. A bound kernel may be used by one thread at a time.

@@ -29,7 +29,7 @@ fuzz: .venv/ready-tests
 	.venv/bin/python -m pip --quiet --disable-pip-version-check install --editable ".[fuzz]"
 	.venv/bin/python tests/fuzz/run.py $(FUZZ_ARGS)
 
-# Plant faults one at a time and count those that the tests find: see tests/mutants/run.py. MUTANTS_ARGS: its options.
+# Mutation tests: plant faults one at a time, run the tests: see tests/mutants/run.py. MUTANTS_ARGS: its options.
 MUTANTS_ARGS ?= --sample 100 --seed 1
 mutants: .venv/ready-tests
 	.venv/bin/python -m pip --quiet --disable-pip-version-check install --editable ".[mutants]"

@@ -1,7 +1,7 @@
 """Cache folder of gpuvision: verdicts of devices, lists of vendors. Only its user may write into it.
 
-The files in it decide which drivers are loaded and which devices are used, so that a file counts only if the user owns
-it and nobody else may write it.
+The files in it decide which drivers are loaded and which devices are used. Therefore a file is used only if the user
+owns it and nobody else may write it.
 """
 
 from __future__ import annotations
@@ -106,12 +106,12 @@ def write_private(path: Path, text: str) -> None:
 
 
 def private_folder(folder: Path, entries: dict[str, str]) -> Path:
-    """Return a folder of the cache with exactly the given files; replace it where it is not private or has others.
+    """Return a folder of the cache with exactly the given files; replace a folder with other files or other owners.
 
     Parameters
     ----------
     folder : pathlib.Path
-        Folder whose name stands for its content.
+        Folder whose name is a hash of its content.
     entries : dict of str to str
         Text of each file by name.
     """

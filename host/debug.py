@@ -119,7 +119,7 @@ class _Flattener:
         self.written: set[Path] = set()  # guarded headers that the compiler has seen, whatever the macros are
 
     def text(self, path: Path, name: str, including: tuple[Path, ...] = (), *, conditional: bool = False) -> str:
-        """Return the text of a file that the files `including` include, one the other."""
+        """Return the text of a file; `including` is the chain of files whose includes led to it."""
         if (path, name) not in self.known:
             # The main file is compiled from memory: only a header is searched beside the including file.
             places = (path.parent, *self.folders) if including else self.folders

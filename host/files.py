@@ -186,7 +186,7 @@ def check_writable_folder(folder: str | Path) -> None:
     trial = _temporary_name(place)
     try:
         trial.mkdir()
-        with contextlib.suppress(FileNotFoundError):  # another process took the empty folder for a left one
+        with contextlib.suppress(FileNotFoundError):  # another process removed the folder as a left-over
             trial.rmdir()
     except OSError as error:
         raise type(error)(f"cannot write into {folder}: {place}: {error.strerror}; give another folder") from error

@@ -118,7 +118,7 @@ class Outputs:
         entry = _entry(path, job or self.job)
         if not any(self._manifest(each.parent).get(each.name) == entry for each in (path, path.resolve())):
             raise FileExistsError(
-                f"cannot write {path}: the file exists, and is no unchanged output of an earlier "
+                f"cannot write {path}: the file exists, and is not an unchanged output of an earlier "
                 f"{job or self.job}; give another name, or allow it with --overwrite (Python: overwrite=True)"
             )
 

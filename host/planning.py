@@ -278,7 +278,7 @@ def _tried(measure: Measure, batch: int, inline: bool, rate: float) -> Trial:
 
 
 def _runs_inline(sufficient: Sequence[Trial], limits: PlanLimits) -> bool:
-    """Decide between inline and worker threads for the trials of a batch size that keep up."""
+    """Return whether kernels run inline, from the trials of one batch size that keep up with the sensor."""
     by_mode = {trial.inline: trial for trial in sufficient}
     if len(by_mode) == 1:
         return sufficient[0].inline

@@ -80,8 +80,8 @@ def _build(
 ) -> Any:
     # The compilers' caches know a program by its text and options. With the headers in the text, no comments in it and
     # no path in the options, all copies of the kernels (checkouts, an installed package) share the cached programs, and
-    # a changed comment needs no compilation. Only the line of a header that is not found stays: the compiler reports
-    # it, or finds it by its own search.
+    # a changed comment needs no compilation. The #include line of a header that is not in these folders stays in the
+    # text: the compiler searches its include path for the header, and reports an error if it finds none.
     text = _COMMENT.sub("", flatten_includes(folder, source, include_folders))
     folders = (folder, *include_folders) if "#include" in text else ()
     includes = [word for each in folders for word in ("-I", os.fspath(each))]

@@ -56,7 +56,7 @@ class Stall:
 
 
 class CollectorPauses:
-    """Times at which Python's garbage collector ran, while `start` to `stop`.
+    """Times at which Python's garbage collector ran between `start` and `stop`.
 
     Parameters
     ----------

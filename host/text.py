@@ -7,7 +7,7 @@ import unicodedata
 
 # Escape sequences of a terminal: CSI (colours, cursor), OSC (title, links), and sequences of two characters.
 _ESCAPES = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]|\x1b\][^\x07\x1b]*(?:\x07|\x1b\\)|\x1b[ -/]*[0-~]")
-_UNSAFE = ("Cc", "Cf", "Cs")  # control characters, formats such as changes of direction, half characters
+_UNSAFE = ("Cc", "Cf", "Cs")  # control characters, format characters (such as changes of direction), surrogates
 
 
 def printable(text: str) -> str:

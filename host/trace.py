@@ -57,7 +57,7 @@ class Trace:
         Raises
         ------
         FileExistsError
-            The file exists and is no unchanged output of a trace; see `gpuvision.host.outputs`.
+            The file exists, and is not an unchanged output of an earlier trace; see `gpuvision.host.outputs`.
         """
         lanes = list(dict.fromkeys(_LANES.values()))
         origin = min((start for _, start, *_ in self._spans), default=0)

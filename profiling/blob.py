@@ -3,7 +3,7 @@
 The 8-bit frame shows bright discs with a radius of 8 px, a blur of 1 px, a contrast of 100 and noise of 2 grey levels,
 each up to 2 px from its nominal position. Numba uses the same rulers, start, robust fit, match of the pixels, centre of
 gravity and covariance on all cores. OpenCV crops each blob, applies Otsu's threshold, and computes the moments of the
-grey levels above it, the most accurate of its fast methods; it returns the centre alone. The metadata also list the
+grey levels above it, the most accurate of its fast methods; it returns only the centre. The metadata also list the
 deviation of `findContours` with `fitEllipse`.
 """
 

@@ -4,8 +4,7 @@ The peer is this library without clustering: `OccludedIrradiance` over all pairs
 device. Our time includes the traversal of the light tree. `error` is the largest error of the range among the strips
 [m], against all pairs in double; ``within`` is the share of strips that keep the tolerance, ``bound`` the largest bound
 of a strip. Strips lie across the sheet and see the lit line and its surroundings; one metre of their reading is one
-metre of range. Where ``traversed`` is false all pairs are computed, as at tolerance 0: no tolerance takes longer than
-that.
+metre of range. If ``traversed`` is false, all pairs are computed, as at tolerance 0: no tolerance takes longer.
 
 ``groove``: a line through a groove of 90 degrees, whose sides light each other without occlusion. ``valley``: a curved
 surface that occludes parts of itself. ``board``: a board with parts. ``small-...``, ``large-...``: the same with fewer

@@ -2,8 +2,8 @@
 
 Mitsuba runs in its fastest variant on the machine (LLVM where it works, else scalar) with next-event estimation, which
 suits these scenes best. Its time is extrapolated: the time for ``samples`` per pixel times (its median error / 1 %)^2,
-because the error is inversely proportional to the root of the number of samples. Our time is that for the centres of
-all pixels and strips as lines, in single precision. Errors are relative to the closed form in double with strips
+because the error is inversely proportional to the root of the number of samples. Our time is the time for the centres
+of all pixels and strips as lines, in single precision. Errors are relative to the closed form in double with strips
 0.1 mm wide, averaged over each pixel; ``error`` is the median error of gpuvision and ``peer_error`` the median error of
 Mitsuba, over the pixels that see one plane and get light.
 """

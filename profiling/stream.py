@@ -4,8 +4,8 @@ A thread delivers frames of 512 x 1024 pixels at a fixed rate. The stream holds 
 frame waits longer for its slot than the buffers of a sensor last. Latency is the time from the arrival of a frame until
 its positions are in host memory.
 
-One case runs beside a second process that loads one core half of the time. Its settings are those of `plan_stream`,
-planned before the load begins. ``python -m gpuvision.profiling.stream`` repeats this case.
+One case runs beside a second process that loads one core half of the time. The stream of this case has the settings
+that `plan_stream` finds before the load begins. ``python -m gpuvision.profiling.stream`` repeats this case.
 """
 
 from __future__ import annotations

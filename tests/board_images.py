@@ -39,7 +39,7 @@ class View:
     mask_shift, silk_shift
         x, y [m] Displacement of the mask openings and of the silk.
     etch_bias
-        Distance by which copper extends beyond its drawn edge [m]; < 0 for over-etching.
+        Distance from the drawn edge to the copper's edge [m]: > 0 for under-etched copper, < 0 for over-etched.
     levels
         Grey levels of laminate and copper under the mask, laminate and copper in its openings, silk, holes.
     """

@@ -1,4 +1,4 @@
-"""Devices, tiers and caches of the tests; a test that needs a device fails where there is none.
+"""Devices, tiers and caches of the tests. Without an OpenCL device, tests that need one fail.
 
 The option ``--tier`` selects the tests. ``fast`` runs all tests without the mark ``slow`` on the best device, and a
 smoke set on every other device: one test for each file, kernel variant and precision. Of a kernel test with three
@@ -37,12 +37,12 @@ WITHOUT_INLINE = pytest.StashKey[bool]()
 TIERS = ("fast", "full", "nightly")
 # Factor on the examples of every hypothesis test in the tier "nightly".
 NIGHTLY_EXAMPLES = 20
-# New draws in every run; a failure prints how to repeat it. Without a clock: a busy machine is no fault of the code.
+# New draws in every run; a failure prints how to repeat it. No deadline: a busy machine must not fail a test.
 hypothesis.settings.register_profile("unhurried", deadline=None, print_blob=True)
 hypothesis.settings.load_profile("unhurried")
 
 DATA = ROOT.parent / "shared" / "data"
-# Reasons of skips that are right on a machine with all extras and both CPU runtimes; ``--strict-skips`` refuses others.
+# Reasons of skips that are expected with all extras and both CPU runtimes; ``--strict-skips`` fails on other reasons.
 ALLOWED_SKIPS = (
     "the recordings in ../shared/data are not here",
     "`make docs` ran this example after the last change",

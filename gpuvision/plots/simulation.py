@@ -150,7 +150,7 @@ def draw_causes(
 
 
 def _colours_of(causes: Sequence[str]) -> list[str]:
-    """Return the colours of causes: a cause of `CAUSES` always has the same one, others take what is left in order."""
+    """Return the colours of causes: fixed ones for `CAUSES`, the remaining colours in order for other causes."""
     others = [each for each in causes if each not in CAUSES]
     return [
         _COLOURS[(CAUSES.index(each) if each in CAUSES else len(CAUSES) + others.index(each)) % len(_COLOURS)]

@@ -159,7 +159,7 @@ class Regrid:
         Scene direction in which the profiles advance: along y if the samples advance along x, and vice versa. ``None``:
         the positive direction.
     fold_tolerance : float
-        Distance by which a line may run backwards before it counts as folded [m], >= 0, default 0.
+        Largest distance that a line may run backwards without being folded [m], >= 0, default 0.
     folded : {"drop", "top"}
         ``"drop"``: NOT_INVERTIBLE cells are NaN. ``"top"``: they keep the highest surface, with the flag.
     precision : {"single", "double", None}

@@ -196,8 +196,8 @@ def write_calibration(calibration: Calibration, path: Path, *, overwrite: bool =
     ValueError
         The calibration has no model: the lines are straight without a lens.
     FileExistsError
-        A file is an image of the calibration; or it exists and is no unchanged output of a calibration; see
-        `gpuvision.host.outputs`.
+        A file is an image of the calibration; or it exists, and is not an unchanged output of an earlier calibration;
+        see `gpuvision.host.outputs`.
     """
     if calibration.model is None:
         raise ValueError("the lines are straight without a lens; no correction is needed, nothing was written")

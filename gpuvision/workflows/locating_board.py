@@ -63,8 +63,8 @@ class LocalizationLimits:
     registered_range_px
         The same shift in pixels, where that is more [px].
     max_other_share
-        The runner-up of an ambiguous coarse registration is excluded where at most this share of the rulers and
-        fiducials agree with it, relative to those that agree with the best pose (chosen).
+        The second best pose of an ambiguous coarse registration is excluded if its number of agreeing rulers and
+        fiducials is at most this fraction of the number for the best pose (chosen).
     """
 
     known_range: tuple[float, float] = (1e-4, 0.3 * math.pi / 180)

@@ -186,7 +186,7 @@ class Scan:
         Raises
         ------
         FileExistsError
-            A file exists and is no unchanged output of a scan; see `gpuvision.host.outputs`.
+            A file exists, and is not an unchanged output of an earlier scan; see `gpuvision.host.outputs`.
         OSError
             The folder cannot be written.
         """

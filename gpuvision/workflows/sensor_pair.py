@@ -121,7 +121,7 @@ class SensorPair:
         Raises
         ------
         FileExistsError
-            A file exists and is no unchanged output of a simulation; see `gpuvision.host.outputs`.
+            A file exists, and is not an unchanged output of an earlier simulation; see `gpuvision.host.outputs`.
         OSError
             The folders cannot be written.
         """

@@ -148,7 +148,7 @@ class Simulation:
         Raises
         ------
         FileExistsError
-            A file exists and is no unchanged output of a simulation; see `gpuvision.host.outputs`.
+            A file exists, and is not an unchanged output of an earlier simulation; see `gpuvision.host.outputs`.
         OSError
             The folder cannot be written.
         """

@@ -66,7 +66,7 @@ def undistort_files(
     FileNotFoundError
         An input does not exist.
     FileExistsError
-        An output is an input; or it exists and is no unchanged output of an undistortion; see
+        An output is an input; or it exists, and is not an unchanged output of an earlier undistortion; see
         `gpuvision.host.outputs`.
     RecordingError
         An input is neither an image nor an array of points, or two inputs have the same name.

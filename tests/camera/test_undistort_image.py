@@ -153,7 +153,7 @@ _PRODUCT = [
     for border in BORDERS
     for interpolation in ("bilinear", "bicubic")
 ]
-# Each set of options is a program of its own to compile: all pairs of options, not all combinations.
+# Each combination of options compiles a separate program. Test all pairs of options, not all combinations.
 PROGRAMS = [_PRODUCT[k] for k in all_pairs(_PRODUCT)]
 
 

@@ -83,7 +83,7 @@ def test_a_calibration_replaces_its_own_files_and_no_edited_one(done: Calibratio
     edited = file.read_text() + "[mount]\nheight = 0.4\ntilt_degrees = 30\n"
     file.write_text(edited)
     before = contents(tmp_path)
-    with pytest.raises(FileExistsError, match=rf"cannot write {file}: the file exists, and is no unchanged output"):
+    with pytest.raises(FileExistsError, match=rf"cannot write {file}: the file exists, and is not an unchanged output"):
         write_calibration(done, file)
     assert contents(tmp_path) == before
     write_calibration(done, file, overwrite=True)
@@ -139,7 +139,7 @@ def test_undistortion_replaces_its_own_images_alone(image: Path, tmp_path: Path)
     run(*arguments)
     run(*arguments)
     (tmp_path / "out" / "x.png").write_text(FOREIGN)
-    with pytest.raises(FileExistsError, match="no unchanged output of an earlier undistort"):
+    with pytest.raises(FileExistsError, match="not an unchanged output of an earlier undistort"):
         run(*arguments)
     assert (tmp_path / "out" / "x.png").read_text() == FOREIGN
     run(*arguments, "--overwrite")
@@ -185,7 +185,7 @@ def test_files_that_no_earlier_run_wrote_are_refused_before_the_work(
     Path(file).parent.mkdir(parents=True, exist_ok=True)
     Path(file).write_text(FOREIGN)
     before = contents(tmp_path)
-    with pytest.raises(FileExistsError, match=rf"cannot write {file}: the file exists, and is no unchanged output"):
+    with pytest.raises(FileExistsError, match=rf"cannot write {file}: the file exists, and is not an unchanged output"):
         run(*arguments)
     assert contents(tmp_path) == before
 

@@ -1,4 +1,4 @@
-"""The page on environment variables lists those that the code reads and sets, and no others."""
+"""The page on environment variables lists exactly the variables that the code reads and sets."""
 
 from __future__ import annotations
 

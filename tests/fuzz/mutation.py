@@ -43,7 +43,7 @@ def change(content: bytearray, rng: random.Random) -> None:
 
 
 def _replace_number(content: bytearray, at: int, rng: random.Random) -> None:
-    """Replace the next number in text, or the next byte where there is none."""
+    """Replace the next decimal number; if none follows, replace the next byte."""
     found = re.compile(rb"\d+").search(content, at)
     if found:
         value = int(found[0][:18])

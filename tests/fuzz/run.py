@@ -1,9 +1,9 @@
 """Fuzz the readers: ``python tests/fuzz/run.py [--runs N] [--seconds S] [READER ...]``; `make fuzz` calls it.
 
-Each reader runs in a process of its own. A run fails if it raises anything but a refusal of one line, ends the process,
-takes longer than 10 s, or lets the memory of the process grow by more than 256 MiB. Failures are written to
-``build/fuzz``; the exit code is 1 where there is one. With ``--engine atheris`` the mutations follow the coverage of
-the package's code.
+Each reader runs in a separate process. A run fails if it raises anything except an error with a message of one line,
+ends the process, takes longer than 10 s, or raises the memory of the process by more than 256 MiB. Failures are written
+to ``build/fuzz``, and the exit code is then 1. With ``--engine atheris`` the mutations follow the coverage of the
+package's code.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fuzz.mutation import mutated  # noqa: E402
 
 OUT = ROOT / "build" / "fuzz"
 _SECONDS = 10  # of one run
-_GROWTH = 256 << 10  # KiB of memory of the process, over that after the seed; seeds take less than 1 MiB
+_GROWTH = 256 << 10  # [KiB] limit on the memory above that after the first run; seeds take less than 1 MiB
 
 
 class TooSlow(BaseException):
@@ -49,7 +49,7 @@ def _report(name: str, content: bytes, problem: str) -> None:
 
 
 def _work(name: str, first: int, runs: int, end: float, shared: mmap.mmap) -> None:
-    """Run mutations until their number or the time is reached; write the number done and of failures to `shared`."""
+    """Run mutations until their number or the time is reached; write the number of runs and of failures to `shared`."""
     from fuzz.readers import READERS
 
     reader = READERS[name]
@@ -107,7 +107,7 @@ def _fuzz(name: str, runs: int, seconds: float) -> int:
 
 
 def _follow_coverage(name: str, runs: int, seconds: float) -> int:
-    """Fuzz one reader with atheris in a process of its own; return 1 where it finds a failure."""
+    """Fuzz one reader with atheris in a child process; return 1 if it finds a failure, else 0."""
     child = os.fork()
     if child:
         return int(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) != 0)

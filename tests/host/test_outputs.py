@@ -43,7 +43,9 @@ def test_other_files_stay_unless_overwriting_is_allowed(tmp_path: Path, change: 
     elif change == "manifest broken":
         (out / "sub" / MANIFEST).write_text('{"files": [1]}')
     before = {each: each.read_bytes() for each in out.rglob("*") if each.is_file()}
-    wrong = rf"cannot write {out / 'sub' / 'picture.png'}: the file exists, and is no unchanged output of an earlier "
+    wrong = (
+        rf"cannot write {out / 'sub' / 'picture.png'}: the file exists, and is not an unchanged output of an earlier "
+    )
     if change == "of another job":
         wrong = wrong.replace("sub/picture.png", "(sub/picture.png|report.json)")
     with pytest.raises(FileExistsError, match=wrong):

@@ -41,9 +41,9 @@ def environment(tree: Path) -> dict[str, str]:
 
 
 def tests_of(fault: Fault, budget: float) -> list[str]:
-    """Return the tests that run the place of a fault, up to `budget` seconds: those of the file first, then quick ones.
+    """Return tests that run the lines of a fault, up to `budget` seconds: tests of the same file first, then by time.
 
-    Lines that run only while a module is imported have no tests: all tests that run a line of the file are taken.
+    Lines that run only at import have no tests; for them, take all tests that run any line of the file.
     """
     path = ROOT / fault.file
     places = [(path, fault.lines(path.read_text()))] if path.suffix == ".py" else list(_launches(fault.file))

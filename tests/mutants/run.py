@@ -1,9 +1,9 @@
-"""Plant faults, one at a time, and count those that the tests find: ``python tests/mutants/run.py [--help]``.
+"""Mutation tests: plant faults one at a time, and count the killed ones: ``python tests/mutants/run.py [--help]``.
 
-The faults are those of ``planted.toml``, which once slipped through the tests, and a sample drawn from Python files and
-kernels. Each is planted in a copy of the repository in ``build/mutants``; the tests that run its place are taken from
-a record of the fast tier. A fault is killed if a test fails or does not end. Faults with which the package cannot be
-imported, or a kernel not be built, prove nothing about the tests: they are counted apart.
+The faults are the list in ``planted.toml``, which earlier tests did not find, and a random sample of changes in Python
+files and kernels. Each fault is planted in a copy of the repository in ``build/mutants``. A record of the fast tier
+lists the tests that run its lines. A fault is killed if one of these tests fails or does not end. A fault that breaks
+the import of the package, or the build of a kernel, says nothing about the tests and is counted separately.
 """
 
 from __future__ import annotations

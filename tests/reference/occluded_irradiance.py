@@ -90,7 +90,7 @@ def visible_from_receiver(corners: Float64, receiver: Float64, segment: Float64,
 
 
 def irradiance(corners: Float64, receivers: Float64, segments: Float64, clearance: float) -> tuple[Float64, Float64]:
-    """Return the irradiance (n,) of receivers (n, 6) by segments (m, 10), and the sum of E0 of those that face them."""
+    """Return the irradiance (n,) of receivers (n, 6) by segments (m, 10), and the sum of E0 of facing segments."""
     total, largest = np.zeros(len(receivers)), np.zeros(len(receivers))
     for number, receiver in enumerate(receivers):
         for segment in segments:

@@ -113,7 +113,7 @@ class LensFit:
     sigma_px : float
         Standard deviation of a coordinate [px]: given, or estimated from the residuals and the degrees of freedom.
     degrees_of_freedom : int
-        Residuals minus parameters, including those of the lines.
+        Degrees of freedom: residuals minus parameters, the parameters of the lines included.
     iterations : int
         Number of steps of the minimisation.
     alternatives : tuple of LensAlternative

@@ -108,7 +108,7 @@ def diagnose(
     if _folds(fit, size):
         warnings.append("the lens polynomial folds within the image: points beyond the fold cannot be undistorted")
     if not converged:
-        warnings.append("the fit stopped before it converged: the uncertainties are those of the last step")
+        warnings.append("the fit stopped before it converged; the uncertainties were computed at its last step")
     if noise > limits.max_noise_ratio * fit.sigma_px:
         warnings.append(f"the residual is {noise / fit.sigma_px:.1f} times the given noise: the model does not suffice")
     if outliers:

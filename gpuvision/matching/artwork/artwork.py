@@ -83,8 +83,8 @@ class Pad:
     hole
         Diameter of its hole, or width of its slot [m]; 0 without one.
     opening
-        Distance by which the mask opening extends beyond the copper [m], the least of four sides: negative where the
-        mask lies on the copper, NaN without a concentric opening (a covered via).
+        Distance from the copper's edge to the edge of the mask opening [m], the least of four sides: negative where
+        the mask covers copper, NaN without a concentric opening (a covered via).
     function, net, part, pin
         Attributes of Gerber X2; ``""`` where the file does not have them.
     """

@@ -1,6 +1,6 @@
 """Parser of Gerber files: gerbonara's parser, with the commands that gerbonara 1.5 draws wrongly or ignores.
 
-Sections are those of the Gerber Layer Format Specification, revision 2024.05 (Ucamco).
+Section numbers refer to the Gerber Layer Format Specification, revision 2024.05 (Ucamco).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def parse_gerber(text: str, path: Path) -> GerberFile:
     Raises
     ------
     SyntaxError
-        The text is no Gerber.
+        The text is not a Gerber file.
     """
     file = GerberFile()
     _Parser(file).parse(text, filename=path)

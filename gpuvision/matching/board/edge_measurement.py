@@ -55,7 +55,7 @@ class MeasurementLimits:
     max_residual_px
         Largest accepted scale of the residuals [px]: more is another board or a wrong scale (chosen).
     fiducial_slack_px
-        Distance by which a fiducial may lie beyond its expected search range, besides the etch bias [px] (chosen).
+        Largest accepted distance of a fiducial beyond its expected search range, besides the etch bias [px] (chosen).
     range_factor, min_angle
         A pose of the first pass is refused beyond this multiple of the expected search range (rulers find no edge
         farther away), with at least this angle [rad] (chosen).

@@ -42,8 +42,8 @@ class LocatedBoard:
     features
         Features that were searched.
     etch_bias
-        Distance by which copper reaches beyond its drawn edges [m], negative for over-etched copper, solved together
-        with the pose; NaN where only centres of traces and fiducials were measured.
+        Distance from the drawn edges to the copper's edges [m], negative for over-etched copper, solved together with
+        the pose; NaN where only centres of traces and fiducials were measured.
     residual_scale
         Scale of the residuals in standard deviations: about 1 where these are right.
     condition

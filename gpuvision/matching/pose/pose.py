@@ -83,7 +83,7 @@ class BoardPose(NamedTuple):
         that checks it (``leverage``). OUT_OF_RANGE (refused): the pose lies outside ``search_range``. NOT_FINITE: the
         initial pose is not finite.
     etch_bias : float, (...,)
-        Distance by which copper reaches beyond its drawn edges, all over the board [m]; 0 without ``etch_bias_sigma``.
+        Distance from the drawn edges to the copper's edges [m], one value for the board; 0 without ``etch_bias_sigma``.
     inlier_fraction : float, (...,)
         Share of the information of all rows that agrees with the pose, for the parameter combination with the least
         share, 0 to 1. Also valid where it is the reason of a refusal, like ``leverage``.

@@ -51,7 +51,7 @@ _FIRST_CAPACITY = 64
 # Many pairs have a bound of 0 and leave their share of the tolerance unused. All shares are multiplied by this factor;
 # a strip whose error sum then exceeds the tolerance is traversed again with the factor 1. Speed only (chosen).
 _SHARE_FACTOR = 2.0
-# Classes of errors, in powers of two below the tolerance, by which the smallest errors are found without a sort.
+# Error classes, in powers of two below the tolerance: a histogram over them finds the smallest errors without a sort.
 _ERROR_CLASSES = 64
 
 

@@ -258,7 +258,7 @@ def turned(x: float, y: float, degrees: float) -> str:
 
 
 def l_shape(mirror: tuple[int, int] = (1, 1), degrees: float = 0, scale: float = 1) -> str:
-    """Return the outline that the L is after mirroring, rotation and scaling, in this order."""
+    """Return the outline of the L after mirroring, rotation and scaling, in this order."""
     corners = [
         turned(scale * mirror[0] * x, scale * mirror[1] * y, degrees)
         for x, y in ((0, 0), (1.4, 0), (1.4, 0.5), (0.5, 0.5), (0.5, 1), (0, 1), (0, 0))
@@ -277,8 +277,9 @@ def alone(outline: str, *commands: str) -> str:
 
 CENTRE = at(3, 2, "D03")
 DIAGONAL = math.dist((1, 1), (3, 3))
-# Of commands that gerbv 2.9.6 ignores or draws wrongly: the file, and one for gerbv that draws the same without them.
-# The sections are of the Gerber Layer Format Specification, revision 2024.05 (Ucamco).
+# Pairs of files for commands that gerbv 2.9.6 ignores or draws wrongly: the first file has the command; the second, for
+# gerbv, draws the same without it. Section numbers refer to the Gerber Layer Format Specification, revision 2024.05
+# (Ucamco).
 TWINS = {
     # Section 4.5.3: primitives turn about the origin of the macro. gerbv does not turn the centre of a circle, and
     # turns polygons and thermals about their own centres.
@@ -420,7 +421,7 @@ def test_boards_are_drawn_as_gerbv_draws_them(data: Path, tmp_path: Path, name: 
 def around(shapes: tuple[Shape, ...]) -> Window:
     """Return a window around shapes, with pixels of 20 micrometres.
 
-    Its corner lies at a fraction of a pixel on no CAD grid, so that no edge passes exactly through pixel centres.
+    The window is offset by a fraction of a pixel, so that edges on a CAD grid never pass through pixel centres.
     """
     dpi = 1270
     low, high = (np.array([each(shape.outline, axis=0) for shape in shapes]) for each in (np.min, np.max))

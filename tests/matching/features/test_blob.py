@@ -129,7 +129,7 @@ def test_edges_alone_as_their_circle_has_it(device: Device, variant: Any, radius
 
 @pytest.mark.parametrize(("spokes", "match"), [(8, True), (20, True), (44, False)])
 def test_any_number_of_rulers(device: Device, spokes: int, match: bool) -> None:
-    """Numbers that fill vectors, and numbers that do not."""
+    """Numbers of fiducials that fill the kernel's vectors, and other numbers."""
     blobs = replace(PLAIN, spokes=spokes, match=match)(a_disc().astype(np.float32), place(), device=device)
     assert blobs.status[0] == 0
     assert blobs.inliers[0] == spokes

@@ -21,7 +21,7 @@ NOISE = 0.05
 def scene(
     rng: np.random.Generator, lines: int, count: int, bad: float = 0.0, size: float = 1000.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return normals, points of the lines, and noisy points along them, the first ones are gross errors."""
+    """Return normals, points of the lines, and noisy points along them; the first points are gross errors."""
     angle, middle = rng.uniform(-np.pi / 2, np.pi / 2, lines), rng.uniform(0.0, size, (lines, 2))
     along = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     normal = np.stack([-along[:, 1], along[:, 0]], axis=-1)

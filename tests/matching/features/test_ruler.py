@@ -144,7 +144,7 @@ def test_any_direction(device: Device, angle: float, x: float, y: float) -> None
     ours = STRONGEST(image, ruler, device=device)
     (theirs,) = expected(STRONGEST, image, ruler)
     ranked = sorted(theirs, key=lambda edge: -abs(edge["gradient"]))
-    # Not about the threshold, and not two edges of which either may be the strongest by rounding.
+    # Exclude edges close to the threshold, and pairs of edges so equal that rounding decides which is the strongest.
     assume(ranked)
     assume(abs(abs(ranked[0]["amplitude"]) - STRONGEST.threshold) >= 5.0)
     assume(len(ranked) == 1 or abs(ranked[1]["gradient"]) <= 0.9999 * abs(ranked[0]["gradient"]))
@@ -219,7 +219,7 @@ def test_pairs_have_the_middle_whatever_the_width(device: Device, variant: Any, 
 
 
 def test_pairs_of_a_spacing(device: Device) -> None:
-    """Of two stripes, the stripe with the requested width is found."""
+    """If an image shows two stripes, the stripe with the requested width is found."""
     image = reference.stripe_image(SHAPE, 0.0, 60.0, 8.0, 0.8) + reference.stripe_image(SHAPE, 0.0, 90.0, 14.0, 0.8)
     for limits, place in (((6.0, 10.0), -15.0), ((12.0, 16.0), 15.0)):
         operation = RulerEdges(threshold=15.0, pairs=True, polarity="rising", spacing_px=limits, length=72)

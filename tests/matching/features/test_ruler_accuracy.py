@@ -60,8 +60,8 @@ def bound(noise: float, width: int) -> float:
 def test_close_to_the_bound(device: Device, noise: float, angles: Sequence[float], rng: np.random.Generator) -> None:
     """The deviation is 1.2 times the bound at the best smoothing (theory; 1.17 to 1.18 measured).
 
-    With 250 rulers or more, the deviation is known to 4.5 % and the bias to sigma / 16. Granted are one such margin of
-    the deviation, and three of the bias plus 0.002 px.
+    With 250 rulers or more, the deviation is known to 4.5 % and the bias to sigma / 16. The limits allow one such
+    margin for the deviation, and three for the bias plus 0.002 px.
     """
     operation = RulerEdges(threshold=30.0, length=41, smoothing_px=best_smoothing(BLUR), noise=noise)
     error, _ = errors(device, operation, noise, rng, angles=angles)

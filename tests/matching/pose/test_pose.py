@@ -31,7 +31,7 @@ def scene(
     turn: float = 0.03,
     deformation: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return true parameters (boards, 6), and rows of edges in all directions, the first ones are gross errors."""
+    """Return true parameters (boards, 6), and rows of edges in all directions; the first rows are gross errors."""
     angle = rng.uniform(0.0, np.pi, (boards, count))
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     along = np.stack([normal[..., 1], -normal[..., 0]], axis=-1)
@@ -121,7 +121,7 @@ def test_covariance_is_what_is_measured(
     operation = SolvePose(transform=transform, scale=scale, placement=PLACE, variant=variant, max_trials=256)
     result = operation(rows, device=device)
     good = result.status == Status.OK
-    # Refused are poses that the good rows do not support, up to the effect of the weights.
+    # Poses that the good rows do not support are refused, up to the effect of the weights.
     agreement, leverage = np.transpose([carried(each, int(bad * count), transform) for each in rows])
     allowed = np.where(agreement > 0.75, 1.0, 0.5) * operation.max_leverage
     spare = np.minimum(agreement - operation.min_inlier_fraction, allowed - leverage)

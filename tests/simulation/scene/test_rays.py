@@ -164,7 +164,7 @@ kernel void boxes_met(global const real *rays, global const real *nodes, global 
 def test_boxes_that_a_ray_touches_at_an_edge(
     device: Device, variant: Any, dtype: Any, rng: np.random.Generator, tmp_path: Path
 ) -> None:
-    """In whole numbers the ray is at an edge of the box exactly: rounding in the slab test must not cull the box."""
+    """The ray hits an edge of the box exactly (integer coordinates): rounding must not make the slab test miss."""
     if dtype == np.float64 and not device.has_double:
         pytest.skip(f"{device.label} has no doubles")
     count, pairs = 301, list(itertools.permutations(range(3), 2))

@@ -45,7 +45,7 @@ def test_corner_through_a_mask(beta: int, expected: float) -> None:
 
 
 def test_windows_within_bins_converge() -> None:
-    """Of windows that end anywhere within the bins the error falls with the square of the bins' width."""
+    """The windows end anywhere within bins; the error falls with the square of the bins' width."""
     a = 1e-3
     beta = np.linspace(3.0, 8.0, 40)
     slant = np.sqrt(1.0 + beta**2)

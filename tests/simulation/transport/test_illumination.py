@@ -258,7 +258,7 @@ def test_joined(rng: np.random.Generator) -> None:
 
 
 def test_coincident_faces_share_nothing() -> None:
-    """Of two faces in one place the first one gets all the light."""
+    """If two faces coincide, the first one gets all the light."""
     lit = LightSheet(transport=UPRIGHT).illuminate(Scene(np.concatenate([plate(1.0, 1.0), plate(1.0, 1.0)])), 0.3)
     np.testing.assert_array_equal(np.sort(lit.triangle), [0, 1])
     assert lit.total() == 2.0

@@ -32,7 +32,7 @@ _SUMS = {"contract", "reassoc", "nsz", "arcp"}
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _edge(pixels, pitch, x, y, cosine, sine, table, profile, slopes):  # type: ignore[no-untyped-def]  # Numba infers types
+def _edge(pixels, pitch, x, y, cosine, sine, table, profile, slopes):
     """Return position, amplitude, squared width and variance of the strongest falling edge; zeros without an edge."""
     middle, one = _F(0.5 * (LENGTH - 1)), np.uint32(1)
     first_x, first_y = x - middle * cosine, y - middle * sine
@@ -69,7 +69,7 @@ def _edge(pixels, pitch, x, y, cosine, sine, table, profile, slopes):  # type: i
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _start(ex, ey, there, count, shape, reach):  # type: ignore[no-untyped-def]  # Numba infers types
+def _start(ex, ey, there, count, shape, reach):
     """Return the circle through three edges that has the smallest truncated loss over all edges."""
     best_x, best_y, best_r, least = shape[0], shape[1], shape[2], _F(SPOKES) * reach * reach
     one = _F(1.0)
@@ -100,7 +100,7 @@ def _start(ex, ey, there, count, shape, reach):  # type: ignore[no-untyped-def] 
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _circle_sums(ex, ey, there, widths, shape, blur, per_scale, sums):  # type: ignore[no-untyped-def]  # Numba infers types
+def _circle_sums(ex, ey, there, widths, shape, blur, per_scale, sums):
     """Sum the weighted normal equations of the edges; return the sums of the weights and of the weighted widths."""
     a, b, c, d, e = _F(0.0), _F(0.0), _F(0.0), _F(0.0), _F(0.0)
     f, g, h, k = _F(0.0), _F(0.0), _F(0.0), _F(0.0)
@@ -130,7 +130,7 @@ def _circle_sums(ex, ey, there, widths, shape, blur, per_scale, sums):  # type: 
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _circle_step(ex, ey, there, widths, shape, blur, scale, sums):  # type: ignore[no-untyped-def]  # Numba infers types
+def _circle_step(ex, ey, there, widths, shape, blur, scale, sums):
     """Move the circle by a Gauss-Newton step; return the squared blur."""
     weights, wide = _circle_sums(ex, ey, there, widths, shape, blur, _F(1.0) / scale, sums)
     a, b, c, d, e, f, g, h = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]
@@ -143,7 +143,7 @@ def _circle_step(ex, ey, there, widths, shape, blur, scale, sums):  # type: igno
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _fit(ex, ey, there, widths, noises, shape, count, sums, room):  # type: ignore[no-untyped-def]  # Numba infers types
+def _fit(ex, ey, there, widths, noises, shape, count, sums, room):
     """Fit a circle robustly to the edges; return squared blur and residual scale."""
     noise, blur = _F(0.0), _F(0.0)
     for m in range(SPOKES):
@@ -179,7 +179,7 @@ def _fit(ex, ey, there, widths, noises, shape, count, sums, room):  # type: igno
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _rows_of(pixels, pitch, x, y, shape, grey, slopes, scale, equation):  # type: ignore[no-untyped-def]  # Numba infers types
+def _rows_of(pixels, pitch, x, y, shape, grey, slopes, scale, equation):
     """Fill the equations of the pixels, scaled by the root of their weights; return the number of pixels."""
     reach, one = shape[2] + _F(5.0) * grey[2] + _F(2.0), _F(1.0)
     per_blur, per_size, per_scale = one / grey[2], one / shape[2], _F(1.0 / TUNING_CONSTANT) / scale
@@ -223,7 +223,7 @@ def _rows_of(pixels, pitch, x, y, shape, grey, slopes, scale, equation):  # type
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _factor(matrix):  # type: ignore[no-untyped-def]  # Numba infers types
+def _factor(matrix):
     for i in range(_UNKNOWNS):
         for j in range(i + 1):
             total = matrix[i, j]
@@ -233,7 +233,7 @@ def _factor(matrix):  # type: ignore[no-untyped-def]  # Numba infers types
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _solve(matrix, right, to):  # type: ignore[no-untyped-def]  # Numba infers types
+def _solve(matrix, right, to):
     for i in range(_UNKNOWNS):
         total = right[i]
         for k in range(i):
@@ -247,7 +247,7 @@ def _solve(matrix, right, to):  # type: ignore[no-untyped-def]  # Numba infers t
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _match(pixels, pitch, x, y, shape, grey, noise, equation, matrix, right, to, covariance):  # type: ignore[no-untyped-def]  # Numba infers types
+def _match(pixels, pitch, x, y, shape, grey, noise, equation, matrix, right, to, covariance):
     """Refine circle, blur and grey levels by a least-squares match of the pixels; fill the covariance."""
     slopes = np.zeros(2, np.float32)
     for step in range(3):
@@ -290,7 +290,7 @@ def _match(pixels, pitch, x, y, shape, grey, noise, equation, matrix, right, to,
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _gravity(pixels, pitch, x, y, reach):  # type: ignore[no-untyped-def]  # Numba infers types
+def _gravity(pixels, pitch, x, y, reach):
     """Return the centre of gravity within `reach` of (x, y), with the background of the surrounding ring subtracted."""
     outer, zero, one = reach + _F(2.0), _F(0.0), _F(1.0)
     level = _F(pixels[np.uint32(y) * pitch + np.uint32(x)])
@@ -320,7 +320,7 @@ def _gravity(pixels, pitch, x, y, reach):  # type: ignore[no-untyped-def]  # Num
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, found):  # type: ignore[no-untyped-def]  # Numba infers types
+def _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, found):
     """Fill residual, inliers and symmetry of the fit, and the initial grey levels of the match."""
     ex, ey, is_found, heights, room = edges[0], edges[1], edges[2], edges[3], edges[6]
     weights, squares, amplitude, inside, noise_sum = _F(0.0), _F(0.0), _F(0.0), _F(0.0), _F(0.0)
@@ -348,7 +348,7 @@ def _describe(pixels, pitch, x, y, shape, edges, directions, blur, scale, grey, 
 
 
 @numba.njit(parallel=True, error_model="numpy", fastmath=_SUMS)
-def _find(image, places, table, directions, noise, found, covariance, status):  # type: ignore[no-untyped-def]  # Numba infers types
+def _find(image, places, table, directions, noise, found, covariance, status):
     """Fill blobs (n, 13): x, y, size, residual, inliers, symmetry, gravity, distance, contrast, blur, shift."""
     pixels, pitch = image.reshape(-1), np.uint32(image.shape[1])
     for n in numba.prange(places.shape[0]):

@@ -60,7 +60,7 @@ def _points(field_map: DistanceMap, pose: tuple[float, ...], sigma: float) -> ND
 
 
 @numba.njit(error_model="numpy")
-def _shifts(points, headings, per_cell, border):  # type: ignore[no-untyped-def]  # Numba infers types
+def _shifts(points, headings, per_cell, border):
     columns = np.empty((headings.shape[0], points.shape[0]), np.int64)
     rows = np.empty((headings.shape[0], points.shape[0]), np.int64)
     for turn in range(headings.shape[0]):
@@ -73,7 +73,7 @@ def _shifts(points, headings, per_cell, border):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_shifts(level, columns, rows, scores, sums, least, where):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_shifts(level, columns, rows, scores, sums, least, where):
     """Add rows of the map in 16 bits; a task is a row of positions for one heading."""
     turns, height, width = scores.shape
     scale = np.float32(1.0 / (1023.0 * columns.shape[1]))
@@ -100,7 +100,7 @@ def _numba_shifts(level, columns, rows, scores, sums, least, where):  # type: ig
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_poses(level, columns, rows, scores, least, where):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_poses(level, columns, rows, scores, least, where):
     """Look up every ray of every pose."""
     _, height, width = scores.shape
     scale = np.float32(1.0 / (1023.0 * columns.shape[1]))

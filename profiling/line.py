@@ -29,7 +29,7 @@ Frames = NDArray[np.uint8]
 
 
 @numba.njit(error_model="numpy")
-def _add_row(line, totals, moments, tops, threshold):  # type: ignore[no-untyped-def]  # Numba infers types
+def _add_row(line, totals, moments, tops, threshold):
     """Add a row of a strip. The moment is the sum of the running totals, which needs no multiplication."""
     for c in range(line.size):
         x = line[c]
@@ -40,7 +40,7 @@ def _add_row(line, totals, moments, tops, threshold):  # type: ignore[no-untyped
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_centroid(frames, threshold, saturation, position, total, status):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_centroid(frames, threshold, saturation, position, total, status):
     count, rows, columns = frames.shape
     strips = (columns + _STRIP - 1) // _STRIP
     for item in numba.prange(count * strips):
@@ -61,7 +61,7 @@ def _numba_centroid(frames, threshold, saturation, position, total, status):  # 
 
 
 @numba.njit(error_model="numpy")
-def _raise_tops(line, row, tops, at):  # type: ignore[no-untyped-def]  # Numba infers types
+def _raise_tops(line, row, tops, at):
     for c in range(line.size):
         x = line[c]
         at[c] = row if x > tops[c] else at[c]
@@ -69,7 +69,7 @@ def _raise_tops(line, row, tops, at):  # type: ignore[no-untyped-def]  # Numba i
 
 
 @numba.njit(error_model="numpy")
-def _add_window(line, row, at, totals, moments, threshold, window):  # type: ignore[no-untyped-def]  # Numba infers types
+def _add_window(line, row, at, totals, moments, threshold, window):
     for c in range(line.size):
         d = row - np.int32(at[c])
         v = max(np.int32(line[c]) - threshold, 0)
@@ -79,7 +79,7 @@ def _add_window(line, row, at, totals, moments, threshold, window):  # type: ign
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_windowed(frames, threshold, saturation, window, position, total, status):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_windowed(frames, threshold, saturation, window, position, total, status):
     count, rows, columns = frames.shape
     strips = (columns + _STRIP - 1) // _STRIP
     for item in numba.prange(count * strips):

@@ -38,7 +38,7 @@ def scene(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba(points, sigma, pairs, out):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba(points, sigma, pairs, out):
     """Fit the lines one after another in each thread, with separate buffers per thread."""
     threads, lines = numba.get_num_threads(), points.shape[0]
     for part in numba.prange(threads):

@@ -31,7 +31,7 @@ A5, A6, A7, A8 = F(0.062501694), F(-0.035871539), F(0.013507771), F(-0.002386997
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba(receivers, table, out):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba(receivers, table, out):
     """Sum over segments for blocks of receivers. Blocks are transposed and the code is unrolled for LLVM."""
     count = receivers.shape[0]
     for block in numba.prange((count + _BLOCK - 1) // _BLOCK):

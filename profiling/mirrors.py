@@ -103,7 +103,7 @@ def _corner_table(lens: Array, corners: Array, normals: Array) -> Array:
 
 
 @numba.njit(error_model="numpy", inline="always")
-def _law_at(t, k, n, x, y, z):  # type: ignore[no-untyped-def]  # Numba infers types
+def _law_at(t, k, n, x, y, z):
     qx, qy, qz = x - t[k, n, 0], y - t[k, n, 1], z - t[k, n, 2]
     up, c = qx * t[k, n, 3] + qy * t[k, n, 4] + qz * t[k, n, 5], t[k, n, 6]
     one = t[k, n, 7] * up + c * (qx * t[k, n, 9] + qy * t[k, n, 10] + qz * t[k, n, 11])
@@ -112,7 +112,7 @@ def _law_at(t, k, n, x, y, z):  # type: ignore[no-untyped-def]  # Numba infers t
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba(points, lens, corners, normals, table, found, places):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba(points, lens, corners, normals, table, found, places):
     """Test all triangles for each point: law of reflection at the corners, then Newton's method on the candidates."""
     count, kept = found.shape
     for i in numba.prange(count):
@@ -143,7 +143,7 @@ def _numba(points, lens, corners, normals, table, found, places):  # type: ignor
 
 
 @numba.njit(error_model="numpy", inline="always")
-def _law(point, lens, place, normal, corners, out):  # type: ignore[no-untyped-def]  # Numba infers types
+def _law(point, lens, place, normal, corners, out):
     square, c, q = 0.0, 0.0, 0.0
     for j in range(3):
         square += normal[j] * normal[j]
@@ -160,7 +160,7 @@ def _law(point, lens, place, normal, corners, out):  # type: ignore[no-untyped-d
 
 
 @numba.njit(error_model="numpy")
-def _surface(corners, normals, x, y):  # type: ignore[no-untyped-def]  # Numba infers types
+def _surface(corners, normals, x, y):
     weights = (1.0 - x - y, x, y)
     flat = weights[0] * corners[0] + x * corners[1] + y * corners[2]
     place, normal = flat.copy(), np.zeros(3)
@@ -175,7 +175,7 @@ def _surface(corners, normals, x, y):  # type: ignore[no-untyped-def]  # Numba i
 
 
 @numba.njit(error_model="numpy")
-def _newton(point, lens, corners, normals, x, y):  # type: ignore[no-untyped-def]  # Numba infers types
+def _newton(point, lens, corners, normals, x, y):
     residual, residual_x, residual_y = np.empty(2), np.empty(2), np.empty(2)
     for _ in range(16):
         for out, dx, dy in ((residual, 0.0, 0.0), (residual_x, 1e-6, 0.0), (residual_y, 0.0, 1e-6)):

@@ -70,7 +70,7 @@ def scene() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def fit_line(u, v, w, pairs):  # type: ignore[no-untyped-def]  # Numba infers types
+def fit_line(u, v, w, pairs):
     """Return centre, direction and variances of the robust line through points with inverse standard deviations."""
     best_x, best_y, best_c, best_s, least = _ZERO, _ZERO, _ONE, _ZERO, np.float32(np.inf)
     for t in range(pairs.shape[0]):
@@ -118,7 +118,7 @@ def fit_line(u, v, w, pairs):  # type: ignore[no-untyped-def]  # Numba infers ty
 
 
 @numba.njit(error_model="numpy")
-def _solve3(m, r, d):  # type: ignore[no-untyped-def]  # Numba infers types
+def _solve3(m, r, d):
     """Solve a symmetric 3 x 3 system, triangle (00, 10, 11, 20, 21, 22), by Cramer's rule; return its determinant."""
     a, b, c = m[2] * m[5] - m[4] * m[4], m[3] * m[4] - m[1] * m[5], m[1] * m[4] - m[2] * m[3]
     e, f, g = m[0] * m[5] - m[3] * m[3], m[1] * m[3] - m[0] * m[4], m[0] * m[2] - m[1] * m[1]
@@ -131,7 +131,7 @@ def _solve3(m, r, d):  # type: ignore[no-untyped-def]  # Numba infers types
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _add(rows, i, pose, weight, m, r):  # type: ignore[no-untyped-def]  # Numba infers types
+def _add(rows, i, pose, weight, m, r):
     """Add the weighted normal equation of a row at a pose (cosine - 1, sine, x, y)."""
     less, sine = pose[0], pose[1]
     wx = rows[4, i] - pose[2] - (less * rows[2, i] - sine * rows[3, i])
@@ -152,7 +152,7 @@ def _add(rows, i, pose, weight, m, r):  # type: ignore[no-untyped-def]  # Numba 
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _left(rows, i, pose):  # type: ignore[no-untyped-def]  # Numba infers types
+def _left(rows, i, pose):
     less, sine = pose[0], pose[1]
     wx = rows[4, i] - pose[2] - (less * rows[2, i] - sine * rows[3, i])
     wy = rows[5, i] - pose[3] - (sine * rows[2, i] + less * rows[3, i])
@@ -160,7 +160,7 @@ def _left(rows, i, pose):  # type: ignore[no-untyped-def]  # Numba infers types
 
 
 @numba.njit(error_model="numpy")
-def _move(pose, d):  # type: ignore[no-untyped-def]  # Numba infers types
+def _move(pose, d):
     c = _ONE / np.sqrt(_ONE + d[2] * d[2])
     s = d[2] * c
     less = -s * s / (_ONE + c)
@@ -172,7 +172,7 @@ def _move(pose, d):  # type: ignore[no-untyped-def]  # Numba infers types
 
 
 @numba.njit(error_model="numpy", fastmath=_SUMS)
-def _fit_pose(rows, starts, placement, pose, covariance):  # type: ignore[no-untyped-def]  # Numba infers types
+def _fit_pose(rows, starts, placement, pose, covariance):
     """Solve the pose from rows (7, n), relative to their centre, and its covariance at the placement point."""
     count = rows.shape[1]
     m, r, d = np.empty(6, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
@@ -237,7 +237,7 @@ def _fit_pose(rows, starts, placement, pose, covariance):  # type: ignore[no-unt
 
 
 @numba.njit(parallel=True, error_model="numpy", fastmath=_SUMS)
-def _fused(image, plain, rulers, lines, taps, numbers, pairs, starts, edges, status, pose, covariance):  # type: ignore[no-untyped-def]  # Numba infers types
+def _fused(image, plain, rulers, lines, taps, numbers, pairs, starts, edges, status, pose, covariance):
     """Compute the board pose in one call: edges along all rulers and line fits on all cores, then the pose."""
     _rulers(image, plain, taps, numbers, edges, status)
     count = lines.shape[0]

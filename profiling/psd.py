@@ -18,7 +18,7 @@ _IN_A_ROW = 8
 
 
 @numba.njit(error_model="numpy")
-def _read_out(a, b, half, minimum, saturation):  # type: ignore[no-untyped-def]  # Numba infers types
+def _read_out(a, b, half, minimum, saturation):
     """Read out one sample; without a branch, so that LLVM vectorises the loops below."""
     total = a + b
     difference = b - a
@@ -32,7 +32,7 @@ def _read_out(a, b, half, minimum, saturation):  # type: ignore[no-untyped-def] 
 
 
 @numba.njit(error_model="numpy")
-def _read_out_codes(a, b, half, minimum, saturation):  # type: ignore[no-untyped-def]  # Numba infers types
+def _read_out_codes(a, b, half, minimum, saturation):
     """Read out one sample of codes, which are finite and not negative."""
     total = a + b
     dark = total <= minimum
@@ -42,26 +42,26 @@ def _read_out_codes(a, b, half, minimum, saturation):  # type: ignore[no-untyped
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_planar(left, right, position, status, half, minimum, saturation):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_planar(left, right, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         position[i], status[i] = _read_out(left[i], right[i], half, minimum, saturation)
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_planar_codes(left, right, position, status, half, minimum, saturation):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_planar_codes(left, right, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         a, b = np.float32(left[i]), np.float32(right[i])
         position[i], status[i] = _read_out_codes(a, b, half, minimum, saturation)
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_pairs(currents, position, status, half, minimum, saturation):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_pairs(currents, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         position[i], status[i] = _read_out(currents[2 * i], currents[2 * i + 1], half, minimum, saturation)
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_pairs_codes(currents, position, status, half, minimum, saturation):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_pairs_codes(currents, position, status, half, minimum, saturation):
     for i in numba.prange(position.shape[0]):
         a, b = np.float32(currents[2 * i]), np.float32(currents[2 * i + 1])
         position[i], status[i] = _read_out_codes(a, b, half, minimum, saturation)

@@ -30,7 +30,7 @@ SHAPE = (1000, 1000)
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_straight(g, h, transport, given, table, x, y, z, status):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_straight(g, h, transport, given, table, x, y, z, status):
     nan = table.dtype.type(np.nan)
     for profile in numba.prange(g.shape[0]):
         for sample in range(g.shape[1]):
@@ -53,7 +53,7 @@ def _numba_straight(g, h, transport, given, table, x, y, z, status):  # type: ig
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_rotating(position, transport, given, table, x, y, z, status):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_rotating(position, transport, given, table, x, y, z, status):
     nan = table.dtype.type(np.nan)
     for profile in numba.prange(position.shape[0]):
         cosine, sine = np.cos(transport[profile]), np.sin(transport[profile])
@@ -118,7 +118,7 @@ def _numpy_flags(points: list[Array], known: Array, given: Array, low: Array, hi
 
 
 @numba.njit(error_model="numpy")
-def _fill(n, a, b, one, two, flags, grid, out, status):  # type: ignore[no-untyped-def]  # Numba infers types
+def _fill(n, a, b, one, two, flags, grid, out, status):
     """Fill the cells between two neighbouring points at a and b, if they are close enough to be joined."""
     length, rise, cells = b - a, two[0] - one[0], status.shape[0]
     if (abs(length) > grid[3]) | (abs(rise) > grid[4]):
@@ -135,7 +135,7 @@ def _fill(n, a, b, one, two, flags, grid, out, status):  # type: ignore[no-untyp
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_lines(at, values, given, grid, out, status):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_lines(at, values, given, grid, out, status):
     """Resample lines (n, samples) and their values (k, n, samples) onto cells: (k, cells, n) and flags (cells, n)."""
     for n in numba.prange(at.shape[0]):
         one, two = np.empty(values.shape[0], np.float32), np.empty(values.shape[0], np.float32)

@@ -24,7 +24,7 @@ ZERO, HALF, ONE, TINY, PI = F(0.0), F(0.5), F(1.0), F(1e-30), F(math.pi)
 
 
 @numba.njit(inline="always")
-def _ggx(ix, iy, iz, ox, oy, oz, a):  # type: ignore[no-untyped-def]  # Numba infers types
+def _ggx(ix, iy, iz, ox, oy, oz, a):
     square, rest = a[0] * a[0], ONE - a[0] * a[0]
     x, y, z = ix + ox, iy + oy, iz + oz
     length = x * x + y * y + z * z
@@ -37,7 +37,7 @@ def _ggx(ix, iy, iz, ox, oy, oz, a):  # type: ignore[no-untyped-def]  # Numba in
 
 
 @numba.njit(inline="always")
-def _ward(ix, iy, iz, ox, oy, oz, a):  # type: ignore[no-untyped-def]  # Numba infers types
+def _ward(ix, iy, iz, ox, oy, oz, a):
     x, y, z = ix + ox, iy + oy, iz + oz
     upright = z * z
     lobe = np.exp(-(x * x / (a[1] * a[1]) + y * y / (a[2] * a[2])) / upright)
@@ -46,7 +46,7 @@ def _ward(ix, iy, iz, ox, oy, oz, a):  # type: ignore[no-untyped-def]  # Numba i
 
 def _numba(model: Any) -> Callable[..., None]:
     @numba.njit(parallel=True, error_model="numpy")
-    def run(directions, a, value, status):  # type: ignore[no-untyped-def]  # Numba infers types
+    def run(directions, a, value, status):
         count = directions.shape[0]
         for block in numba.prange((count + _BLOCK - 1) // _BLOCK):
             begin = block * _BLOCK

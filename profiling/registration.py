@@ -42,7 +42,7 @@ def cases(device: Device) -> Iterator[Case]:
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_search(level, shifts, columns, least, where):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_search(level, shifts, columns, least, where):
     """Add rows of the map in 16 bits; a task is a row of positions for one heading, padded for vectorisation."""
     turns, rows, blocks = least.shape
     stride = level.shape[2]

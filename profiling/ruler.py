@@ -36,7 +36,7 @@ _LEAST = THRESHOLD / math.sqrt(2.0 * math.pi * _VARIANCE)
 
 
 @numba.njit(error_model="numpy", fastmath={"contract"})
-def _sample(image, pixels, pitch, x, y):  # type: ignore[no-untyped-def]  # Numba infers types
+def _sample(image, pixels, pitch, x, y):
     """Return a bilinear sample. Unsigned indices avoid the test for negative ones."""
     column, row = np.int32(x), np.int32(y)
     dx, dy = x - np.float32(column), y - np.float32(row)
@@ -49,7 +49,7 @@ def _sample(image, pixels, pitch, x, y):  # type: ignore[no-untyped-def]  # Numb
 
 
 @numba.njit(error_model="numpy", fastmath={"contract"})
-def _sample_flat(image, pixels, pitch, x, y):  # type: ignore[no-untyped-def]  # Numba infers types
+def _sample_flat(image, pixels, pitch, x, y):
     """Return a bilinear sample by 32-bit indices into a flat image."""
     column, row = np.int32(x), np.int32(y)
     dx, dy = x - np.float32(column), y - np.float32(row)
@@ -65,7 +65,7 @@ def _compiled(sample: Any) -> Any:
     """Return a Numba function ``(image, rulers, taps, numbers, edges, status)`` that fills the edges (4, n)."""
 
     @numba.njit(parallel=True, error_model="numpy", fastmath={"contract"})
-    def measure(image, rulers, taps, numbers, edges, status):  # type: ignore[no-untyped-def]  # Numba infers types
+    def measure(image, rulers, taps, numbers, edges, status):
         pixels, pitch = image.reshape(-1), np.uint32(image.shape[1])
         half, one = np.float32(0.5), np.float32(1.0)
         least, smoothing, noise = numbers[0], numbers[1], numbers[2]

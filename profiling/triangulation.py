@@ -21,7 +21,7 @@ LENS = Lens(k1=-2e-7, k2=5e-14, centre=(650.0, 500.0))
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba(u, v, table, g, h, status):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba(u, v, table, g, h, status):
     """Triangulate on all cores with the same conditioned table; branch-free, so that LLVM vectorises it."""
     one, nan = table.dtype.type(1), table.dtype.type(np.nan)
     for i in numba.prange(u.shape[0]):
@@ -38,7 +38,7 @@ def _numba(u, v, table, g, h, status):  # type: ignore[no-untyped-def]  # Numba 
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba_lens(u, v, table, g, h, status):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba_lens(u, v, table, g, h, status):
     """Triangulate on all cores, with correction of the lens distortion."""
     one, nan = table.dtype.type(1), table.dtype.type(np.nan)
     for i in numba.prange(u.shape[0]):

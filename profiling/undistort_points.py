@@ -44,7 +44,7 @@ _CONVERGED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 
 
 @numba.njit(error_model="numpy")
-def _newton_step(x, y, at_x, at_y, one, k1, k2, p1, p2, k3):  # type: ignore[no-untyped-def]  # Numba infers types
+def _newton_step(x, y, at_x, at_y, one, k1, k2, p1, p2, k3):
     q = at_x * at_x + at_y * at_y
     scale = one + q * (k1 + q * (k2 + q * k3)) + (one + one) * (p1 * at_y + p2 * at_x)
     slope = (one + one) * (k1 + q * (k2 + k2 + (one + one + one) * q * k3))
@@ -57,7 +57,7 @@ def _newton_step(x, y, at_x, at_y, one, k1, k2, p1, p2, k3):  # type: ignore[no-
 
 
 @numba.njit(parallel=True, error_model="numpy")
-def _numba(columns, rows, table, ideal_columns, ideal_rows):  # type: ignore[no-untyped-def]  # Numba infers types
+def _numba(columns, rows, table, ideal_columns, ideal_rows):
     """Take four Newton steps from the measured point, on all cores.
 
     The loop is unrolled, with separate arrays of columns and rows (ours takes pairs), so that LLVM vectorises it.

@@ -249,6 +249,19 @@ def test_no_import_is_circular() -> None:
     assert list(TopologicalSorter(graph).static_order())
 
 
+def test_functions_without_types_are_compiled_by_numba() -> None:
+    """Mypy accepts functions without annotations in ``profiling``, because Numba infers the types of compiled ones."""
+    bare = [
+        (path.name, node.name, any(ast.unparse(each).startswith("numba.njit(") for each in node.decorator_list))
+        for path in _files("profiling")
+        if path.suffix == ".py"
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef) and node.returns is None
+    ]
+    assert len(bare) > 20
+    assert [each for each in bare if not each[2]] == []
+
+
 def test_no_module_imports_private_names_of_another() -> None:
     wrong = [
         f"{module} imports {name}"

@@ -99,6 +99,7 @@ MODULES = (
     "gpuvision.workflows.calibrating",
     "gpuvision.workflows.locating_board",
     "gpuvision.workflows.locating_robot",
+    "gpuvision.workflows.scan_result",
     "gpuvision.workflows.scanning",
     "gpuvision.workflows.sensor_pair",
     "gpuvision.workflows.simulating",

@@ -33,7 +33,8 @@ def demo(
     from gpuvision.host.files import atomic_write, write_text_atomic
     from gpuvision.host.outputs import Outputs
     from gpuvision.workflows.demo import SENSORS, make_part, make_scan_task
-    from gpuvision.workflows.scanning import SCAN_FILES, scan
+    from gpuvision.workflows.scan_result import SCAN_FILES
+    from gpuvision.workflows.scanning import scan
     from gpuvision.workflows.simulating import simulate, simulate_recording
     from gpuvision.workflows.simulation_result import simulation_files
 

@@ -90,7 +90,7 @@ def scan(
     from gpuvision.host import Device
     from gpuvision.host.outputs import Outputs
     from gpuvision.sensor.sensor import Sensor
-    from gpuvision.workflows.scanning import SCAN_FILES
+    from gpuvision.workflows.scan_result import SCAN_FILES
     from gpuvision.workflows.scanning import scan as run
 
     described = Sensor.load(sensor)

@@ -30,7 +30,8 @@ from gpuvision.simulation.sensors.readings import PATHS, GroundTruth, Reading
 from gpuvision.simulation.sensors.sensor_view import Exposure
 from gpuvision.status import Status
 from gpuvision.workflows.light_cache import LightBlock, LightStore, Progress, SimulationTask, compute_missing_blocks
-from gpuvision.workflows.scanning import ScanLimits, assemble_points, resample_heights
+from gpuvision.workflows.scan_result import ScanLimits
+from gpuvision.workflows.scanning import assemble_points, resample_heights
 from gpuvision.workflows.simulation_result import Simulation, light_strength
 
 DEFAULT_PATHS = ("direct", "specular", "diffuse-specular", "diffuse-diffuse")

@@ -50,9 +50,9 @@ def test_an_interrupt_while_it_loads_is_an_exit_code(module: str, number: int, c
 @posix
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_command_that_is_ended_leaves_nothing(number: int, code: int, tmp_path: Path) -> None:
-    slow = "import gpuvision.workflows.scanning, time\n"
+    slow = "import gpuvision.workflows.scan_result, time\n"
     slow += "def still(*a, **k):\n    print('writing', flush=True)\n    time.sleep(60)\n"
-    slow += "gpuvision.workflows.scanning.write_npz = still\n"
+    slow += "gpuvision.workflows.scan_result.write_npz = still\n"
     np.save(tmp_path / "plane.npy", currents(4))
     out = tmp_path / "deep" / "out"
     ran = started(slow + MAIN, "scan", tmp_path / "plane.npy", "--sensor", "psd_line", "--out", out)
@@ -122,10 +122,10 @@ def test_an_interrupt_while_a_device_is_probed(
 
 @posix
 def test_a_swallowed_signal_leaves_no_temporary_file(tmp_path: Path) -> None:
-    slow = "import gpuvision.cli.main, gpuvision.workflows.scanning, time\ngpuvision.cli.main._GRACE = 0.5\n"
+    slow = "import gpuvision.cli.main, gpuvision.workflows.scan_result, time\ngpuvision.cli.main._GRACE = 0.5\n"
     slow += "def still(*a, **k):\n    print('writing', flush=True)\n    while True:\n"
     slow += "        try: time.sleep(60)\n        except BaseException: pass\n"
-    slow += "gpuvision.workflows.scanning.write_npz = still\n"
+    slow += "gpuvision.workflows.scan_result.write_npz = still\n"
     np.save(tmp_path / "plane.npy", currents(4))
     ran = started(slow + MAIN, "scan", tmp_path / "plane.npy", "--sensor", "psd_line", "--out", tmp_path)
     assert ran.stdout is not None

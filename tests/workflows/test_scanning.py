@@ -24,7 +24,8 @@ from gpuvision.host.sources import ArraySource, PacedSource
 from gpuvision.sensor.sensor import Sensor
 from gpuvision.status import Status
 from gpuvision.workflows import scanning
-from gpuvision.workflows.scanning import Scan, scan
+from gpuvision.workflows.scan_result import Scan
+from gpuvision.workflows.scanning import scan
 from scanning import Ran, check_refused, currents, line_frames
 
 FILES = {

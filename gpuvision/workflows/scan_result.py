@@ -1,0 +1,214 @@
+"""Result of a scan: range image, height map, report, and the files that hold them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from gpuvision.formats.range_image import write_npz, write_ply, write_png16, write_tiff
+from gpuvision.host import Device, to_numpy
+from gpuvision.host.files import write_text_atomic
+from gpuvision.host.outputs import Outputs
+from gpuvision.host.report import StreamReport
+from gpuvision.plots.range_image import draw_height_map, draw_scan, height_span
+from gpuvision.ranging.line import LineReadout
+from gpuvision.ranging.range_image import RangePoints
+from gpuvision.ranging.regrid import Grid, HeightMap
+from gpuvision.sensor.sensor import Sensor
+from gpuvision.status import Status
+
+Array = npt.NDArray[Any]
+
+SCAN_FILES = (
+    "range_image.tiff",
+    "range_image.png",
+    "range_image.ply",
+    "range_image.npz",
+    "picture.png",
+    "scan.png",
+    "report.json",
+)
+"""Names of the files that `Scan.write` writes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanLimits:
+    """Limits of a scan.
+
+    Attributes
+    ----------
+    max_delay : float
+        Delay of a frame [s] from which on the summary says that the replay did not hold the requested rate. Chosen.
+    max_cells : int
+        Largest number of cells of a height map. Chosen: bounds the memory, 256 MiB of float32 heights.
+    """
+
+    max_delay: float = 0.01
+    max_cells: int = 1 << 26
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scan:
+    """Range image of a recording, with its height map and the report of the stream.
+
+    Attributes
+    ----------
+    sensor : Sensor
+        Sensor of the recording.
+    points : RangePoints
+        Organised range image, NumPy arrays (profiles, samples); the status flags say why a point is missing.
+    intensity : numpy.ndarray
+        Intensity of the light, (profiles, samples): grey levels of a camera, amperes of a PSD.
+    heights : HeightMap
+        Height map, NumPy arrays of the shape of the grid.
+    grid : Grid
+        Cells of the height map.
+    frame_numbers : numpy.ndarray
+        Number of each profile's frame in the recording, (profiles,); not consecutive where frames were dropped.
+    device : Device
+        Device of the computation.
+    stream : StreamReport
+        Frame counts, times and latencies of the stream.
+    seconds : dict of str to float
+        Duration [s] of the steps after the stream, by name.
+    metadata : dict
+        Further entries of the report: recording, sensor, rates [frames/s], delay of the replay [s].
+    limits : ScanLimits
+        Limits of the scan.
+    """
+
+    sensor: Sensor
+    points: RangePoints
+    intensity: Array
+    heights: HeightMap
+    grid: Grid
+    frame_numbers: Array
+    device: Device
+    stream: StreamReport
+    seconds: dict[str, float]
+    metadata: dict[str, Any]
+    limits: ScanLimits = ScanLimits()
+
+    @property
+    def valid_fraction(self) -> float:
+        """Fraction of the samples that have a point, 0 to 1."""
+        return float(np.mean(np.isfinite(to_numpy(self.points.z))))
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of samples without a flag (``OK``) and with each flag; a sample may have several flags."""
+        status = to_numpy(self.points.status)
+        flags = {str(flag.name): int(np.count_nonzero(status & flag)) for flag in Status if flag}
+        return {"OK": int(np.count_nonzero(status == 0))} | flags
+
+    def summary(self) -> str:
+        """Return one line: frames, throughput, fraction of valid samples, size of the height map.
+
+        A replay at a rate also names its longest stall and the part of the stream that spent it.
+        """
+        stream, sensor_rate, delay = self.stream, self.sensor.recording.rate, self.metadata["late"]
+        dropped = f" ({stream.dropped} dropped)" if stream.dropped else ""
+        speed = f"{self.throughput:,.0f} frames/s on {self.device.label}"
+        if sensor_rate is not None and self.metadata["rate"] is None:
+            speed += f" ({self.throughput / sensor_rate:.1f} times the sensor's rate)"
+        valid = f"{100 * self.valid_fraction:.1f} % of the samples valid"
+        overdue = (
+            f"; frames were read up to {1e3 * delay:.0f} ms late" if delay and delay > self.limits.max_delay else ""
+        )
+        stall = stream.longest_stall if self.metadata["rate"] is not None else None
+        stalled = "" if stall is None else f"; longest stall {stall}"
+        size = f"{self.grid.columns} x {self.grid.rows} cells"
+        return f"{stream.frames} frames{dropped} at {speed}, {valid}, {size}{overdue}{stalled}"
+
+    @property
+    def throughput(self) -> float:
+        """Frames per second."""
+        # A short recording ends within the warm-up of the stream, which then has no throughput: use the whole time.
+        measured = self.stream.throughput
+        return measured if measured > 0 else self.stream.frames / max(self.stream.seconds, 1e-9)
+
+    def report(self) -> dict[str, Any]:
+        """Return the content of ``report.json``; times in seconds, rates in frames per second."""
+        stream = self.stream.to_dict()
+        valid_cells = float(np.mean(np.isfinite(to_numpy(self.heights.z))))
+        stream.pop("throughput")
+        return {
+            "gpuvision": version("gpuvision"),
+            **self.metadata,
+            "device": {"label": self.device.label, "name": self.device.name, "driver": self.device.driver},
+            "precision": "double" if self.points.z.dtype == np.float64 else "single",
+            "frames": self.stream.frames,
+            "dropped": stream.pop("dropped"),
+            "samples_per_frame": self.points.z.shape[1],
+            "valid_fraction": self.valid_fraction,
+            "status": self.counts(),
+            "throughput": self.throughput,
+            "latency": stream.pop("latency"),
+            "stages": stream.pop("stages"),
+            "seconds": {"stream": stream.pop("seconds")} | self.seconds,
+            "stream": stream,
+            "map": dataclasses.asdict(self.grid) | {"valid_fraction": valid_cells},
+        }
+
+    def write(self, folder: str | Path, *, overwrite: bool = False) -> None:
+        """Write the range image, pictures and the report into a folder; after an error no file remains.
+
+        ``range_image.tiff``, ``range_image.png`` (16 bit) and ``picture.png`` show the height map. ``range_image.ply``
+        and ``scan.png`` show the organised points. ``range_image.npz`` holds both. ``report.json`` holds the report.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Output folder; created if it is missing.
+        overwrite : bool
+            Whether files may be replaced that no earlier scan wrote. Default False.
+
+        Raises
+        ------
+        FileExistsError
+            A file exists, and is not an unchanged output of an earlier scan; see `gpuvision.host.outputs`.
+        OSError
+            The folder cannot be written.
+        """
+        with Outputs("scan", overwrite=overwrite).folder(folder) as inside:
+            start = time.perf_counter()
+            z, points = self.heights.z, self.points
+            write_tiff(inside / "range_image.tiff", z, self.grid)
+            write_png16(inside / "range_image.png", z, self.grid)
+            write_ply(inside / "range_image.ply", *points[:3], self.intensity, points.status)
+            write_npz(inside / "range_image.npz", *self._arrays())
+            # One colour scale: the two pictures show the same heights.
+            span = height_span(to_numpy(points.z).astype(np.float64))
+            draw_height_map(inside / "picture.png", self.heights, self.grid, title=self._title(), span=span)
+            upright = isinstance(self.sensor.readout, LineReadout) and self.sensor.readout.along == "rows"
+            samples: Literal["down", "across"] = "down" if upright else "across"
+            draw_scan(inside / "scan.png", points.z, points.status, samples=samples, span=span)
+            report = self.report()
+            report["seconds"]["write"] = time.perf_counter() - start
+            write_text_atomic(inside / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
+
+    def _title(self) -> str:
+        return self.sensor.name or "Height map"
+
+    def _arrays(self) -> tuple[dict[str, Array], dict[str, str]]:
+        """Return the arrays of ``range_image.npz`` and their units, by name."""
+        light = "grey level" if self.sensor.kind == "camera" else "A"
+        held: dict[str, tuple[Any, str]] = {
+            **{name: (getattr(self.points, name), "m") for name in ("x", "y", "z")},
+            "status": (self.points.status, "flags"),
+            "intensity": (self.intensity, light),
+            "frame": (self.frame_numbers, ""),
+            "map_x": (self.grid.x, "m"),
+            "map_y": (self.grid.y, "m"),
+            "map_z": (self.heights.z, "m"),
+            "map_status": (self.heights.status, "flags"),
+            "map_intensity": (self.heights.intensity, light),
+        }
+        return {name: array for name, (array, _) in held.items()}, {name: unit for name, (_, unit) in held.items()}

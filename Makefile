@@ -4,7 +4,9 @@ SHELL := /bin/bash
 # Compiled kernels and other caches: in the clone, so that a second run is warm and nothing is written in the home.
 CACHES := XDG_CACHE_HOME="$(CURDIR)/build/cache" MPLCONFIGDIR="$(CURDIR)/build/cache/matplotlib"
 # PYTEST_ARGS: more options, such as PYTEST_ARGS="-k line"
-PYTEST = .venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
+# Python caches its bytecode also where the environment forbids it: pytest compiles the tests anew in each process
+# otherwise.
+PYTEST = PYTHONDONTWRITEBYTECODE= .venv/bin/python -m pytest -n logical --maxprocesses 4 --dist worksteal $(PYTEST_ARGS)
 
 .PHONY: demo test test-full nightly fuzz mutants lint docs clean
 

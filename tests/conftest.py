@@ -8,9 +8,10 @@ more hypothesis examples.
 
 from __future__ import annotations
 
+import gc
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,9 @@ import hypothesis.configuration
 import numpy as np
 import pytest
 
-from designs import all_pairs
 from gpuvision.host import Device, debug
 from gpuvision.host.discovery import INSTALL_HINT
+from tiers import LEFT, device_of, select_fast
 
 ROOT = Path(__file__).resolve().parents[1]
 # Compiled kernels of all runtimes, verdicts of devices, fonts of matplotlib: kept in the clone, so that a second run is
@@ -32,7 +33,7 @@ os.environ |= {"XDG_CACHE_HOME": str(CACHE), "MPLCONFIGDIR": str(CACHE / "matplo
 os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 hypothesis.configuration.set_hypothesis_home_dir(CACHE / "hypothesis")
 
-LEFT = pytest.StashKey[dict[str, int]]()
+LEFT_COUNTS = pytest.StashKey[dict[str, int]]()
 WITHOUT_INLINE = pytest.StashKey[bool]()
 TIERS = ("fast", "full", "nightly")
 # Factor on the examples of every hypothesis test in the tier "nightly".
@@ -66,71 +67,23 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         _draw_more_examples(items)
     if tier != "fast":
         return
-    best = Device.all()[:1]
-    left = list(_left_to_full_tier(items, best))
+    chosen, left, without_inline = select_fast(items, Device.all()[:1])
+    for item in without_inline:
+        item.stash[WITHOUT_INLINE] = True
     if left:
         config.hook.pytest_deselected(items=left)
-        labels = ((_device_of(item), item.get_closest_marker("slow")) for item in left)
-        config.stash[LEFT] = dict(
+        labels = ((device_of(item), item.get_closest_marker("slow")) for item in left)
+        config.stash[LEFT] = left
+        config.stash[LEFT_COUNTS] = dict(
             Counter("slow" if slow else device.label if device else "without a device" for device, slow in labels)
         )
-        out = set(left)
-        items[:] = [item for item in items if item not in out]
+        items[:] = chosen
 
 
-def _left_to_full_tier(items: list[pytest.Item], best: Sequence[Device]) -> Iterator[pytest.Item]:
-    """Yield slow tests, cases beyond an all-pairs design and, on all devices but the best, tests beyond the smoke set.
-
-    PoCL compiles each kernel once more for its inline device: beyond the smoke set, tests outside ``tests/host`` run
-    without that device.
-    """
-    fast = [item for item in items if item.get_closest_marker("slow") is None]
-    designed = set(_designed(fast))
-    seen = set()
-    for item in items:
-        device = _device_of(item)
-        case = _smoke_case(item)
-        is_more = device is not None and case in seen
-        if item not in designed or (is_more and device not in best):
-            yield item
-            continue
-        seen.add(case)
-        item.stash[WITHOUT_INLINE] = is_more and "host" not in item.path.parts
-
-
-def _designed(items: list[pytest.Item]) -> Iterator[pytest.Item]:
-    """Yield an all-pairs design of each kernel test with three parameters or more, and all cases of other tests.
-
-    The device is not one of these parameters.
-    """
-    functions: dict[Any, list[pytest.Item]] = {}
-    for item in items:
-        functions.setdefault((item.parent, getattr(item, "originalname", item.name), _device_of(item)), []).append(item)
-    for (_, _, device), cases in functions.items():
-        parameters = [
-            {name: value for name, value in _parameters_of(item).items() if name != "device"} for item in cases
-        ]
-        is_product = device is not None and len(parameters[0]) > 2
-        yield from (cases[k] for k in (all_pairs(parameters) if is_product else range(len(cases))))
-
-
-def _smoke_case(item: pytest.Item) -> tuple[Any, ...]:
-    """Return a key: file, device, kernel variant and precision; the smoke set has the first test of each key.
-
-    Runtimes differ most in queues and memory: in ``tests/host`` the key also has the test function.
-    """
-    parameters = _parameters_of(item)
-    chosen = (parameters.get(name) for name in ("device", "variant", "precision"))
-    function = getattr(item, "originalname", item.name) if "host" in item.path.parts else ""
-    return (item.path, function, *map(str, chosen))
-
-
-def _device_of(item: pytest.Item) -> Device | None:
-    return _parameters_of(item).get("device")
-
-
-def _parameters_of(item: pytest.Item) -> Mapping[str, Any]:
-    return item.callspec.params if hasattr(item, "callspec") else {}
+def pytest_collection_finish() -> None:
+    """Exempt the modules and collected tests from the garbage collector: a collection is 100 times faster then."""
+    gc.collect()
+    gc.freeze()
 
 
 def _draw_more_examples(items: list[pytest.Item]) -> None:
@@ -147,7 +100,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     """Hand the counts of a worker to the main process; fail there for skips that hide a missing extra or device."""
     config = session.config
     if hasattr(config, "workeroutput"):
-        config.workeroutput["left"] = config.stash.get(LEFT, {})
+        config.workeroutput["left"] = config.stash.get(LEFT_COUNTS, {})
     elif config.getoption("strict_skips") and _unexpected_skips(config) and session.exitstatus == pytest.ExitCode.OK:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
@@ -155,7 +108,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any) -> None:
     """Take the counts of a worker; every worker collects the same tests."""
-    node.config.stash[LEFT] = getattr(node, "workeroutput", {}).get("left", {})
+    node.config.stash[LEFT_COUNTS] = getattr(node, "workeroutput", {}).get("left", {})
 
 
 def _unexpected_skips(config: pytest.Config) -> list[str]:
@@ -201,7 +154,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     passed = terminalreporter.getreports("passed")
     labels = Counter(label for each in passed for name, label in each.user_properties if name == "device")
     terminalreporter.write_line(f"kernel tests passed: {_counts(labels) or 'on no device'}")
-    left = config.stash.get(LEFT, {})
+    left = config.stash.get(LEFT_COUNTS, {})
     if left:
         terminalreporter.write_line(f"left to the full tier (make test-full): {_counts(left)}")
     if config.getoption("strict_skips"):

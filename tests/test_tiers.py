@@ -1,0 +1,31 @@
+"""The fast tier has the tests that find the planted faults."""
+
+from __future__ import annotations
+
+import ast
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from gpuvision.host import Device
+from tiers import collected_items, device_of, function_of, select_fast
+
+ROOT = Path(__file__).resolve().parents[1]
+PLANTED = tomllib.loads((ROOT / "tests" / "mutants" / "planted.toml").read_text())["fault"]
+KILLING = sorted({name for fault in PLANTED for name in fault["tests"]})
+
+
+@pytest.mark.parametrize("name", KILLING)
+def test_the_fast_tier_has_each_killing_test(request: pytest.FixtureRequest, name: str) -> None:
+    path, _, function = name.partition("::")
+    function = function.partition("[")[0]
+    tree = ast.parse((ROOT / path).read_text())
+    assert not function or function in {each.name for each in ast.walk(tree) if isinstance(each, ast.FunctionDef)}
+
+    of_file = [item for item in collected_items(request.session) if item.path == ROOT / path]
+    named = {item for item in of_file if function_of(item) == function or not function}
+    best = Device.all()[:1]
+    chosen = named.intersection(select_fast(of_file, best).chosen)
+    # A run of other files collects none of them.
+    assert not named or any(device_of(item) in (None, *best) for item in chosen)

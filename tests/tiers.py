@@ -1,4 +1,4 @@
-"""Selection of the fast tier: all tests on the best device, a smoke set on the others, all-pairs designs of products."""
+"""Selection of the fast tier: tests of the best device, a smoke set of the others, all-pairs designs of products."""
 
 from __future__ import annotations
 

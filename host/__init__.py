@@ -1,6 +1,7 @@
 """Run kernels: find devices, build programs, bind operations, stream frames. Knows no vision."""
 
 from gpuvision.host.arrays import Array, DeviceArray, FloatArray, HostArray, IntArray, StatusArray, host_view, to_numpy
+from gpuvision.host.batch import Batch
 from gpuvision.host.bound import Bound
 from gpuvision.host.device import Device
 from gpuvision.host.errors import (
@@ -15,7 +16,7 @@ from gpuvision.host.errors import (
 from gpuvision.host.launch import Launch, Precision, Spec, Variant, real_defines, real_of, uses_vectors
 from gpuvision.host.launch_builder import LaunchBuilder, flags, opencl_type, table_offsets, type_defines
 from gpuvision.host.operation import Operation
-from gpuvision.host.pipeline import Batch, Pipeline, PipelineLimits
+from gpuvision.host.pipeline import Pipeline, PipelineLimits
 from gpuvision.host.planning import Plan, PlanLimits, plan_stream
 from gpuvision.host.program import Define
 from gpuvision.host.reading import FileLimits

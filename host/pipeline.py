@@ -9,7 +9,6 @@ share memory, the source writes the kernel's input and the consumer reads the ke
 
 from __future__ import annotations
 
-import math
 import queue
 import threading
 import time
@@ -22,23 +21,20 @@ import numpy as np
 import pyopencl as cl
 
 from gpuvision.host.arrays import HostArray
+from gpuvision.host.batch import Batch, default_batch
 from gpuvision.host.device import Device
+from gpuvision.host.device_clock import DeviceClock
 from gpuvision.host.errors import StreamError
 from gpuvision.host.memory import free_bytes, size_in_words
 from gpuvision.host.operation import Operation
 from gpuvision.host.report import StreamReport, StreamStatistics
-from gpuvision.host.ring import SharedSlot, Slot, StagedSlot, Step, check_chain, map_arrays, queues_of, slot_bytes
+from gpuvision.host.ring import SharedSlot, Slot, StagedSlot, Step, check_chain, queues_of, slot_bytes, steps_of
 from gpuvision.host.sources import ArraySource, Clock, Source
 from gpuvision.host.stalls import StallRecorder
 from gpuvision.host.trace import Trace
 
 Policy = Literal["block", "drop_oldest", "raise"]
 R = TypeVar("R", bound=tuple[Any, ...])
-
-# Size of the default batch [bytes]: enough work for a launch, small enough for the last-level cache (speed only).
-_DEFAULT_BATCH_BYTES = 1 << 22
-# Empty launches that measure the offset between the clocks of device and host; the result is the best of them.
-_CLOCK_LAUNCHES = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,46 +48,6 @@ class PipelineLimits:
     """
 
     stop_timeout: float = 10.0
-
-
-@dataclass(slots=True)
-class Batch(Generic[R]):
-    """Consecutive frames and their results in the memory of the stream.
-
-    The arrays are valid until the next batch is requested; `copy` keeps them.
-
-    Attributes
-    ----------
-    number : int
-        Number of the first frame, counted from 0.
-    frames : (count, ...) array
-    result : Result of arrays
-        Result of the last operation, with the frames along the first axis.
-    arrived : (count,) int64 array
-        Arrival time of each frame [ns of the stream's clock], as all times here.
-    launched, delivered : int
-        Times of the launch, and of the arrival of the results in host memory.
-    started, ended : int or None
-        Start and end of the computation on the device, on the host's clock, where the stream profiles.
-    """
-
-    number: int
-    frames: HostArray
-    result: R
-    arrived: HostArray
-    launched: int
-    started: int | None
-    ended: int | None
-    delivered: int
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def copy(self) -> Batch[R]:
-        """Return a copy of the batch that stays valid."""
-        result = map_arrays(self.result, np.copy)
-        times = (self.launched, self.started, self.ended, self.delivered)
-        return Batch(self.number, self.frames.copy(), result, self.arrived.copy(), *times)
 
 
 class Pipeline(Generic[R]):
@@ -206,7 +162,7 @@ class Pipeline(Generic[R]):
                 for queues in self._queues
             ]
             self._computes_inline = slots[0].inline
-            self._offset = self._calibrated(slots[0]) if self.profile else 0
+            self._device_clock = DeviceClock(slots[0], self._clock) if self.profile else None
         except BaseException:
             self._state = "closed"
             source.close()
@@ -378,8 +334,8 @@ class Pipeline(Generic[R]):
         statistics.add_stage("wait", delivered - taken)
         started = ended = None
         spans: dict[str, tuple[int, int]] = {}
-        if self.profile:
-            spans = self._device_spans(slot, delivered)
+        if self._device_clock is not None:
+            spans = self._device_clock.spans(slot, delivered)
             for stage, (start, end) in spans.items():
                 statistics.add_stage(stage, end - start)
             started, ended = spans["compute"]
@@ -452,36 +408,6 @@ class Pipeline(Generic[R]):
             longest_stall=self._stalls.longest,
         )
 
-    # The device's clock ----------------------------------------------------------------------------------------
-
-    def _calibrated(self, slot: Slot[R]) -> int:
-        """Return the offset from the device's clock to the host's [ns], measured with a few empty launches."""
-        offsets = []
-        for _ in range(_CLOCK_LAUNCHES):
-            slot.launch()
-            slot.wait()
-            now = self._clock()
-            offsets.append(now - max(end for _, end in slot.spans().values()))
-        return min(offsets)
-
-    def _device_spans(self, slot: Slot[R], delivered: int) -> dict[str, tuple[int, int]]:
-        """Return the device's stages on the host's clock.
-
-        No stage ends after the wait for it has returned, so each delivery gives an upper bound of the clocks' offset.
-        The smallest bound is the estimate.
-        """
-        spans = slot.spans()
-        self._offset = min(self._offset, delivered - max(end for _, end in spans.values()))
-        low, offset = slot.filled, self._offset
-        return {stage: (max(start + offset, low), max(end + offset, low)) for stage, (start, end) in spans.items()}
-
-
-def default_batch(source: Source, ring: int) -> int:
-    """Return a batch size of about 4 MB, smaller where a short recording would not fill the ring."""
-    size = max(math.prod(source.shape) * source.dtype.itemsize, 1)
-    batch = max(_DEFAULT_BATCH_BYTES // size, 1)
-    return batch if source.length is None else max(min(batch, -(-source.length // ring)), 1)
-
 
 def _source(given: Source | HostArray) -> Source:
     if isinstance(given, np.ndarray):
@@ -505,11 +431,3 @@ def _whole(value: object, name: str, least: int, unit: str = "") -> int:
 
 def _stopped(number: int, stage: str, error: BaseException) -> StreamError:
     return StreamError(f"the stream stopped at frame {number} ({stage}): {error or type(error).__name__}")
-
-
-def steps_of(operation: Operation[Any] | Sequence[Operation[Any] | Step]) -> list[Step]:
-    """Return the steps of an operation or a chain."""
-    given = [operation] if isinstance(operation, Operation) else list(operation)
-    if not given:
-        raise ValueError("expected an operation, or a chain of at least one")
-    return [each if isinstance(each, Step) else Step(each) for each in given]

@@ -20,8 +20,8 @@ from gpuvision.host.device import Device
 from gpuvision.host.errors import StreamError
 from gpuvision.host.memory import free_bytes, size_in_words
 from gpuvision.host.operation import Operation
-from gpuvision.host.pipeline import Pipeline, steps_of
-from gpuvision.host.ring import Step, slot_bytes
+from gpuvision.host.pipeline import Pipeline
+from gpuvision.host.ring import Step, slot_bytes, steps_of
 from gpuvision.host.sources import ArraySource, Source
 
 # Default batch sizes [frames] that are tried, doubling: the chosen one is at most twice the smallest that suffices.

@@ -34,6 +34,14 @@ class Step:
     takes: tuple[str, ...] = ()
 
 
+def steps_of(operation: Operation[Any] | Sequence[Operation[Any] | Step]) -> list[Step]:
+    """Return the steps of an operation or a chain."""
+    given = [operation] if isinstance(operation, Operation) else list(operation)
+    if not given:
+        raise ValueError("expected an operation, or a chain of at least one")
+    return [each if isinstance(each, Step) else Step(each) for each in given]
+
+
 class Queues:
     """Command queues of a stream: one queue where memory is shared, else one each for upload, compute and download.
 

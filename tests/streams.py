@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gpuvision.host.pipeline import Batch
+from gpuvision.host.batch import Batch
 from gpuvision.host.sources import Source
 from gpuvision.ranging.psd import PsdReadout
 

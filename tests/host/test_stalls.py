@@ -312,7 +312,7 @@ def test_with_device_times_the_wake_up_after_the_kernel_is_the_consumer_s(
     monkeypatch.setattr(SharedSlot, "spans", lambda slot: {"compute": (clock.now - 250 * MS, clock.now - 240 * MS)})
     source = Timed(2, clock)
     with Pipeline(source, READOUT, device=device, batch=1, ring=2, clock=clock, profile=True) as stream:
-        stream._offset = 0
+        stream._device_clock.offset = 0
         source.let(1)
         next(stream)
     stall = stream.report().longest_stall

@@ -1,4 +1,4 @@
-"""Locating a camera over boards, and robots on fields: as a library, and as the command."""
+"""Locating a camera over boards as a library; boards and robots by the commands."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from gpuvision.host import Device
 from gpuvision.matching.artwork.artwork import Artwork, read_artwork
 from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.workflows.locating_board import locate_board
-from gpuvision.workflows.locating_robot import default_line_width, floor_points, locate_robot
+from gpuvision.workflows.locating_robot import floor_points
 
 PIXEL, SHAPE, NOISE = 40e-6, (300, 400), 2.0
 FINE, FINE_SHAPE = 25e-6, (480, 640)  # for boards of narrow traces, and few of them
@@ -378,54 +378,6 @@ def test_quantities_have_units() -> None:
     for wrong in ("", "1", "1,2,3,4", "1,2,3mm", "nan,1,2", "1,2,inf"):
         with pytest.raises(ValueError, match="expected 3 numbers"):
             quantities(wrong, "--initial-pose", "m,m,rad")
-
-
-@pytest.mark.parametrize(
-    ("name", "pose", "scale"),
-    [("robocup_msl", (-6.0, 2.0, 0.7), 0.03), ("robocup_junior", (0.4, -0.3, -2.0), 4e-3)],
-)
-def test_a_robot_is_located_with_its_twin(
-    name: str, pose: tuple[float, float, float], scale: float, device: Device, rng: np.random.Generator
-) -> None:
-    field = read_field(name)
-    wide = default_line_width(field)
-    image = floor_image(field, pose, scale=scale, shape=(400, 440), line_width=wide, rng=rng)
-    points = floor_points(image, scale=scale, line_width=wide, device=device)
-    assert len(points) > 30
-    found = locate_robot(points, field, device=device)
-    assert found.reason == ""
-    first, second = found.candidates[:2]
-    assert (first.symmetric_twin, second.symmetric_twin) == (1, 0)
-    twins = [each.pose for each in (first, second)]
-    true = min(twins, key=lambda each: abs(math.remainder(each[2] - pose[2], 2 * math.pi)))
-    # 0.1 px, and its effect at a distance of 200 px: 80 points, each accurate to a few tenths of a pixel.
-    np.testing.assert_allclose(true[:2], pose[:2], atol=0.2 * scale)
-    assert math.remainder(true[2] - pose[2], 2 * math.pi) == pytest.approx(0.0, abs=2e-3)
-    # With an initial pose the twin is not examined.
-    tracked = locate_robot(points, field, initial_pose=(pose[0] + 0.02, pose[1], pose[2] + 0.05), device=device)
-    assert len(tracked.candidates) == 1
-    np.testing.assert_allclose(tracked.candidates[0].pose[:2], pose[:2], atol=0.2 * scale)
-
-
-def test_floor_points_lie_on_the_lines(rng: np.random.Generator) -> None:
-    """Through a lens, with the robot hiding the middle of the image: every stripe is found once along each ray."""
-    field = read_field("robocup_msl")
-    pose, scale = (1.0, 3.0, 0.3), 0.02
-    image = floor_image(field, pose, scale=scale, shape=(500, 500), line_width=0.125, rng=rng)
-    lens = Lens(k1=2e-7, centre=(250.0, 250.0))
-    columns, rows = np.meshgrid(np.arange(500), np.arange(500))
-    at = lens.undistort(np.stack([columns, rows], axis=-1)).astype(np.float32)
-    bent = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    points = floor_points(bent, scale=scale, line_width=0.125, blind=0.5, model=lens)
-    assert len(points) > 60
-    assert np.hypot(*points.T).min() > 0.5
-    found = locate_robot(points, field)
-    assert found.candidates[0].inlier_fraction > 0.95
-    assert found.candidates[0].residual_std < 0.5 * scale
-    angle = np.arctan2(points[:, 1], points[:, 0])
-    for each in np.unique(np.round(angle, 3)):
-        away = np.sort(np.hypot(*points[np.abs(angle - each) < 1e-3].T))
-        assert np.all(np.diff(away) > 0.06)
 
 
 def test_points_of_any_camera_will_do(tmp_path: Path, run: Locate, rng: np.random.Generator) -> None:

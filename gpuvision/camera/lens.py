@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -16,21 +16,64 @@ _MAX_NEWTON_STEPS = 64
 _NEWTON_TOLERANCE = 2e-16  # largest relative residual of a solution; derived: one rounding of float64
 # Derived: with these bounds the powers of the fold radius and the kernel table stay within single precision. No lens
 # reaches them, in pixels or in metres.
-_MAX_COEFFICIENT = {"k1": 1e10, "k2": 1e20}
+_MAX_COEFFICIENT = {"k1": 1e10, "k2": 1e20, "k3": 1e30, "k4": 1e37}
 _MAX_CENTRE = 1e9
+
+# Imaginary part of a computed root, relative to its size, up to which the root counts as real. Derived: roots of a
+# quartic are computed to about 1e-14; a double root, which is no fold, splits by the square root of that.
+_REAL_ROOT = 1e-9
+# Scaled coefficient below which a term is left out of the search for a fold: the fold would lie at 1e7 scale radii.
+_FAINT_TERM = 1e-60
+_Number = TypeVar("_Number", float, npt.NDArray[np.float64])
+
+
+def _horner(coefficients: Sequence[float], square: _Number) -> _Number:
+    """Return c0 + c1 square + c2 square^2 + ..."""
+    *lower, total = coefficients
+    result: Any = total
+    for coefficient in reversed(lower):
+        result = coefficient + result * square
+    return cast("_Number", result)
+
+
+def _scaled_slope(coefficients: Sequence[float]) -> tuple[np.polynomial.Polynomial, float]:
+    """Return d/dr of r (1 + k1 r^2 + ...) as a polynomial in z = r^2 / unit with coefficients of about 1, and unit."""
+    factors = [(2 * order + 1) * k for order, k in enumerate(coefficients, 1)]
+    rates = [abs(factor) ** (1.0 / order) for order, factor in enumerate(factors, 1)]
+    rate = max(rates)
+    powers = [
+        math.copysign((each / rate) ** order, k) for order, (each, k) in enumerate(zip(rates, factors, strict=True), 1)
+    ]
+    scaled = [1.0, *powers]
+    while abs(scaled[-1]) < _FAINT_TERM:
+        scaled.pop()
+    return np.polynomial.Polynomial(scaled), 1.0 / rate
+
+
+def _fold_radius(coefficients: Sequence[float]) -> float:
+    """Return the least radius at which r (1 + k1 r^2 + ...) stops rising; infinite if it rises everywhere."""
+    slope, unit = _scaled_slope(coefficients)
+    roots = [z.real for z in slope.roots() if abs(z.imag) <= _REAL_ROOT * abs(z) and z.real > 0.0]
+    if not roots:
+        return math.inf
+    z = min(roots)
+    change = slope.deriv()(z)
+    return math.sqrt(unit * (z - slope(z) / change if change != 0.0 else z))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lens:
     """Radial distortion about a centre, as a polynomial from measured to undistorted coordinates.
 
-    ``C = C_c + (C' - C_c)(1 + k1 r^2 + k2 r^4)``, the same for R, with ``r^2 = (R' - R_c)^2 + (C' - C_c)^2``. The model
-    is isotropic: it holds in any square sensor coordinates, such as pixels, or metres on a PSD.
+    ``C = C_c + (C' - C_c)(1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8)``, the same for R, with ``r^2 = (R' - R_c)^2 + (C' -
+    C_c)^2``. The model is isotropic: it holds in any square sensor coordinates, such as pixels, or metres on a PSD. The
+    thesis has k1 and k2; wide-angle lenses need k3 and k4.
 
     Parameters
     ----------
-    k1, k2 : float
-        Distortion coefficients [unit^-2] and [unit^-4] of the sensor coordinates (pixels or metres). Default of k2: 0.
+    k1, k2, k3, k4 : float
+        Distortion coefficients [unit^-2], [unit^-4], [unit^-6] and [unit^-8] of the sensor coordinates (pixels or
+        metres). Default of k2, k3 and k4: 0.
     centre : (float, float)
         (C_c, R_c): column and row of the distortion centre, in sensor coordinates. Default (0, 0).
 
@@ -46,12 +89,17 @@ class Lens:
     F. de Jong, *Range Imaging and Visual Servoing for industrial applications*, TU Delft 2008, eq. 3.11-3.13.
     """
 
+    TABLE_SIZE: ClassVar[int] = 7
+    """Entries of the table of ``kernels/common/lens.h`` that undistortion needs."""
+
     k1: float
     k2: float = 0.0
     centre: tuple[float, float] = (0.0, 0.0)
+    k3: float = 0.0
+    k4: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("k1", "k2"):
+        for name in _MAX_COEFFICIENT:
             object.__setattr__(self, name, finite(getattr(self, name), f"Lens.{name}"))
             if abs(getattr(self, name)) > _MAX_COEFFICIENT[name]:
                 raise ValueError(
@@ -63,8 +111,15 @@ class Lens:
 
     @property
     def defines(self) -> dict[str, None]:
-        """Defines of ``kernels/common/lens.h``: ``LENS``, and ``LENS_K2`` only if k2 is not 0."""
-        return {"LENS": None, "LENS_K2": None} if self.k2 != 0.0 else {"LENS": None}
+        """Defines of ``kernels/common/lens.h``: ``LENS``, and the option of the last coefficient that is not 0."""
+        order = len(self.coefficients)
+        return {"LENS": None, f"LENS_K{order}": None} if order > 1 else {"LENS": None}
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """k1 and the further coefficients up to the last one that is not 0."""
+        every = (self.k1, self.k2, self.k3, self.k4)
+        return every[: max([1, *(order for order, k in enumerate(every, 1) if k != 0.0)])]
 
     def packed(self, origin: Sequence[float], scale: float, *, inverse: bool = False) -> npt.NDArray[np.float64]:
         """Return the parameter table of ``kernels/common/lens.h`` for kernel coordinates (point - origin) * scale.
@@ -81,13 +136,14 @@ class Lens:
         Returns
         -------
         numpy.ndarray
-            Both coordinates of the centre, k1, k2 and the squared fold radius, in kernel units; with ``inverse`` also
+            Both coordinates of the centre, k1 to k4 and the squared fold radius, in kernel units; with ``inverse`` also
             the squared undistorted radius of the fold.
         """
         centre = [(c - o) * scale for c, o in zip(self.centre, origin, strict=True)]
         fold = self.fold_radius
-        table = [*centre, self.k1 / scale**2, self.k2 / scale**4, (fold * scale) ** 2]
-        return np.array([*table, (self._undistorted_radius(fold) * scale) ** 2] if inverse else table)
+        terms = [k / scale**power for power, k in zip((2, 4, 6, 8), (self.k1, self.k2, self.k3, self.k4), strict=True)]
+        table = [*centre, *terms, (fold * scale) ** 2]
+        return np.array([*table, (self.undistorted_radius(fold) * scale) ** 2] if inverse else table)
 
     def swapped(self) -> Lens:
         """Return the same lens for points in (row, column) order."""
@@ -96,6 +152,8 @@ class Lens:
     @property
     def fold_radius(self) -> float:
         """Measured radius up to which the polynomial increases; no scene point lies beyond it (inf: no limit)."""
+        if len(self.coefficients) > 2:
+            return _fold_radius(self.coefficients)
         # d/dr of r (1 + k1 r^2 + k2 r^4) is 1 + 3 k1 s + 5 k2 s^2 in s = r^2; no 0/0 where k2 is 0.
         discriminant = 9.0 * self.k1**2 - 20.0 * self.k2
         if discriminant < 0.0:
@@ -114,16 +172,15 @@ class Lens:
         inside = square < self.fold_radius**2
         # Add the small displacement to the point instead of scaling the offset: the rounding error is smaller.
         with np.errstate(invalid="ignore", over="ignore"):
-            displacement = offset * (square * (self.k1 + self.k2 * square))
-        undistorted: npt.NDArray[np.float64] = np.where(inside, np.asarray(points) + displacement, np.nan)
+            moved = np.asarray(points) + offset * self._stretch(square)
+        undistorted: npt.NDArray[np.float64] = np.where(inside, moved, np.nan)
         return undistorted
 
     def jacobian(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Return d(undistorted) / d(measured), (..., 2, 2), at measured points (..., 2)."""
         offset = np.asarray(points, dtype=np.float64) - self.centre
         square = np.sum(offset**2, axis=-1)[..., None, None]
-        scale = 1.0 + square * (self.k1 + self.k2 * square)
-        slope = 2.0 * (self.k1 + 2.0 * self.k2 * square)
+        scale, slope = 1.0 + self._stretch(square), 2.0 * self._stretch_slope(square)
         return np.asarray(scale * np.eye(2) + slope * offset[..., :, None] * offset[..., None, :])
 
     def distort(self, points: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -138,49 +195,69 @@ class Lens:
             shrink = np.where(target > 0.0, radius / np.where(target > 0.0, target, 1.0), 1.0)
         return self.centre + offset * np.where(np.isfinite(target), shrink, np.nan)[..., None]
 
-    def _undistorted_radius(self, radius: float) -> float:
+    def undistorted_radius(self, radius: float) -> float:
         """Return the undistorted radius of a measured radius; infinite for an infinite one (no fold)."""
         if math.isinf(radius):
             return math.inf
-        return radius * (1.0 + radius**2 * (self.k1 + self.k2 * radius**2))
+        return radius * (1.0 + self._stretch(radius**2))
+
+    def _stretch(self, square: _Number) -> _Number:
+        """Return k1 r^2 + k2 r^4 + ... at r^2 = square."""
+        return square * _horner(self.coefficients, square)
+
+    def _stretch_slope(self, square: _Number) -> _Number:
+        """Return the derivative of k1 r^2 + k2 r^4 + ... by r^2."""
+        return _horner([order * k for order, k in enumerate(self.coefficients, 1)], square)
 
     def _measured_radius(self, target: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Solve r (1 + k1 r^2 + k2 r^4) = target on the monotonic interval [0, fold)."""
+        """Solve r (1 + k1 r^2 + k2 r^4 + ...) = target on the monotonic interval [0, fold)."""
         fold = self.fold_radius
         if math.isfinite(fold):
             high = np.full_like(target, fold)
-            reachable = target < self._undistorted_radius(fold)
+            reachable = target < self.undistorted_radius(fold)
         else:
-            # Without a fold the slope has this lower bound, so the root is at most target / slope. (With k2 = 0, any k1
-            # below 0 folds; the fold radius of a tiny one overflows to infinity.)
-            least_slope = 1.0 - 9.0 * self.k1**2 / (20.0 * self.k2) if self.k1 < 0.0 < self.k2 else 1.0
-            high = target / least_slope
+            # Without a fold the slope has a positive lower bound, so the root is at most target / bound. (With k1
+            # alone, any k1 below 0 folds; the fold radius of a tiny one overflows to infinity.)
+            high = target / self._least_slope
             reachable = np.isfinite(target)
         low = np.zeros_like(target)
         radius = np.where(reachable, np.minimum(target, high), np.nan)
         for _ in range(_MAX_NEWTON_STEPS):
             square = radius**2
-            excess = radius * (1.0 + square * (self.k1 + self.k2 * square)) - target
+            stretch = self._stretch(square)
+            excess = radius * (1.0 + stretch) - target
             if not np.any(np.abs(excess) > _NEWTON_TOLERANCE * target):
                 break
             high = np.where(excess > 0.0, radius, high)
             low = np.where(excess < 0.0, radius, low)
             with np.errstate(divide="ignore", invalid="ignore"):
-                step = radius - excess / (1.0 + square * (3.0 * self.k1 + 5.0 * self.k2 * square))
+                step = radius - excess / (1.0 + stretch + 2.0 * square * self._stretch_slope(square))
             radius = np.where((step >= low) & (step <= high), step, np.where(reachable, 0.5 * (low + high), np.nan))
         return radius
 
+    @property
+    def _least_slope(self) -> float:
+        """Least slope of r (1 + k1 r^2 + ...) over all radii of a lens without a fold."""
+        if len(self.coefficients) <= 2:
+            return 1.0 - 9.0 * self.k1**2 / (20.0 * self.k2) if self.k1 < 0.0 < self.k2 else 1.0
+        slope, _ = _scaled_slope(self.coefficients)
+        extrema = slope.deriv().roots()
+        return float(
+            min([1.0, *(slope(z.real) for z in extrema if abs(z.imag) <= _REAL_ROOT * abs(z) and z.real > 0.0)])
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Return the lens as a table of numbers and lists for TOML."""
-        return {"k1": self.k1, "k2": self.k2, "centre": list(self.centre)}
+        further = {name: value for name, value in (("k3", self.k3), ("k4", self.k4)) if value != 0.0}
+        return {"k1": self.k1, "k2": self.k2, **further, "centre": list(self.centre)}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Lens:
-        """Build a lens from ``{"k1": ..., "k2": ..., "centre": [column, row]}``.
+        """Build a lens from ``{"k1": ..., "k2": ..., "k3": ..., "k4": ..., "centre": [column, row]}``.
 
         Raises
         ------
         ValueError
             A key is unknown or missing, or a value is no finite number.
         """
-        return cls(**check_keys(table, ("k1", "k2", "centre"), ("k1",), "lens"))
+        return cls(**check_keys(table, ("k1", "k2", "k3", "k4", "centre"), ("k1",), "lens"))

@@ -77,7 +77,7 @@ Model = Annotated[
     str,
     typer.Option(
         metavar="MODEL",
-        help="auto: the smallest model that the data do not reject (F test). lines: none, k1 or k1,k2. "
+        help="auto: the smallest model that the data do not reject (F test). lines: none, or k1 up to k1,k2,k3,k4. "
         "views: some of k1,k2,p1,p2,k3,tilt.",
     ),
 ]

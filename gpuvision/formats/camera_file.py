@@ -59,10 +59,11 @@ def radial_lens(table: Section) -> Lens:
     """Return the lens of a table ``[lens]``; refuse unknown keys."""
     k1 = table.number("k1", "sensor unit^-2")
     k2 = table.number("k2", "sensor unit^-4", 0.0)
+    k3, k4 = table.number("k3", "sensor unit^-6", 0.0), table.number("k4", "sensor unit^-8", 0.0)
     column, row = table.numbers("centre", "sensor unit", (2,), (0.0, 0.0))
     table.finish()
     with table.checking():
-        return Lens(k1=k1, k2=k2, centre=(column, row))
+        return Lens(k1=k1, k2=k2, k3=k3, k4=k4, centre=(column, row))
 
 
 def write_lens(

@@ -162,7 +162,7 @@ class Triangulation(VisionOperation[SheetPoints]):
         scale = (pitch / half).astype(real).astype(np.float64)
         start = first + pitch * origin
         terms = self._displacement(start, pitch / scale)
-        lens = np.zeros(5)
+        lens = np.zeros(Lens.TABLE_SIZE)
         if self.sensor_lens is not None:
             # The two scales differ by a rounding only, which moves a distorted point by less than a rounding.
             lens = self.sensor_lens.packed(start, 1.0 / half[0])

@@ -67,7 +67,7 @@ def calibrate(
         ``focal_length`` is given; otherwise lines.
     model : str
         "auto" (default): the smallest model that an F test accepts. Otherwise a model of `fit_lens` ("none", "k1",
-        "k1,k2") or of `fit_camera` ("k1,k2", "tilt", ...).
+        "k1,k2", "k1,k2,k3", "k1,k2,k3,k4") or of `fit_camera` ("k1,k2", "tilt", ...).
     inner_corners : (int, int), optional
         Inner corners of the chessboard along its two sides, in any order. Default: accept any number.
     pitch : float, optional

@@ -1,10 +1,12 @@
 // Radial lens distortion: measured -> undistorted position, its inverse, and gradients through it.
 //
-//     x' = x + (x - cx)(k1 r^2 + k2 r^4),  y' likewise,  r^2 = (x - cx)^2 + (y - cy)^2      (F. de Jong, eq. 3.11-3.13)
+//     x' = x + (x - cx)(k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8),  y' likewise,  r^2 = (x - cx)^2 + (y - cy)^2
+//
+// F. de Jong, eq. 3.11-3.13, has k1 and k2; wide-angle lenses need k3 and k4.
 //
 // The formula adds a small displacement to the point itself, which keeps single precision within a few roundings.
 // Positions, the centre and r are in one unit, chosen by the host (Lens.packed in gpuvision/camera/lens.py).
-// Build options: LENS compiles this file, LENS_K2 the k2 term.
+// Build options: LENS compiles this file; LENS_K2, LENS_K3, LENS_K4 the terms up to k2, k3 or k4 (one of the three).
 #ifndef LENS_H
 #define LENS_H
 #include "common/lanes.h"
@@ -15,12 +17,30 @@
 #define LENS_CENTRE_Y 1
 #define LENS_K1_TERM 2
 #define LENS_K2_TERM 3
-#define LENS_FOLD_SQUARE 4   // squared radius at which the polynomial stops rising
-#define LENS_REACH_SQUARE 5  // squared undistorted radius of the fold; only in the table for lens_distort
+#define LENS_K3_TERM 4
+#define LENS_K4_TERM 5
+#define LENS_FOLD_SQUARE 6   // squared radius at which the polynomial stops rising; the last of the 7 entries that
+                             // lens_undistort and lens_pull_back need (Lens.TABLE_SIZE)
+#define LENS_REACH_SQUARE 7  // squared undistorted radius of the fold; only in the table for lens_distort
 
-// k1 r^2 + k2 r^4 at r^2 = square, and its derivative by r^2. Macros instead of functions: a compiler contracts a*b + c
-// to one rounding only within an expression, and the expressions around these are kept as accurate as they are.
-#ifdef LENS_K2
+// k1 r^2 + k2 r^4 + ... at r^2 = square, and its derivative by r^2, in Horner's form. Macros instead of functions: a
+// compiler contracts a*b + c to one rounding only within an expression, and the expressions around these are kept as
+// accurate as they are.
+#if defined(LENS_K4)
+#define LENS_STRETCH(square, lens)                       \
+    ((square) * ((lens)[LENS_K1_TERM] +                  \
+                 (square) * ((lens)[LENS_K2_TERM] +      \
+                             (square) * ((lens)[LENS_K3_TERM] + (lens)[LENS_K4_TERM] * (square)))))
+#define LENS_STRETCH_SLOPE(square, lens)                 \
+    ((lens)[LENS_K1_TERM] +                              \
+     (square) * (2 * (lens)[LENS_K2_TERM] +              \
+                 (square) * (3 * (lens)[LENS_K3_TERM] + 4 * (lens)[LENS_K4_TERM] * (square))))
+#elif defined(LENS_K3)
+#define LENS_STRETCH(square, lens) \
+    ((square) * ((lens)[LENS_K1_TERM] + (square) * ((lens)[LENS_K2_TERM] + (lens)[LENS_K3_TERM] * (square))))
+#define LENS_STRETCH_SLOPE(square, lens) \
+    ((lens)[LENS_K1_TERM] + (square) * (2 * (lens)[LENS_K2_TERM] + 3 * (lens)[LENS_K3_TERM] * (square)))
+#elif defined(LENS_K2)
 #define LENS_STRETCH(square, lens) ((square) * ((lens)[LENS_K1_TERM] + (lens)[LENS_K2_TERM] * (square)))
 #define LENS_STRETCH_SLOPE(square, lens) ((lens)[LENS_K1_TERM] + 2 * (lens)[LENS_K2_TERM] * (square))
 #else
@@ -68,7 +88,7 @@ static inline void LANED(lens_pull_back)(reals x, reals y, constant real *lens, 
 #define LENS_SETTLED 3e-5f
 #endif
 
-// Compute a Newton step for e in (1 + e)(1 + k1 r^2 (1 + e)^2 + k2 r^4 (1 + e)^4) = 1. The measured radius is (1 + e) r
+// Compute a Newton step for e in (1 + e)(1 + k1 r^2 (1 + e)^2 + k2 r^4 (1 + e)^4 + ...) = 1. The measured radius is (1 + e) r
 // for the undistorted radius r. `residual` is the left side minus 1. Return where the polynomial still rises.
 static inline masks LANED(lens_newton)(reals square, reals e, constant real *lens, reals *step, reals *residual) {
     const reals part = 1 + e, measured = square * part * part;

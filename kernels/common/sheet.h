@@ -9,7 +9,8 @@
 //
 // The host folds all other constants into these numbers in double precision. Origins and scales are rounded to the
 // kernel's real type before that, so a single-precision result is within a few roundings of the double-precision one.
-// Build options: LENS, LENS_K2 (lens.h); SHEET_COVARIANCE adds the covariance of the parameters to the sigmas.
+// Build options: LENS, LENS_K2, LENS_K3, LENS_K4 (lens.h); SHEET_COVARIANCE adds the covariance of the parameters to
+// the sigmas.
 #ifndef SHEET_H
 #define SHEET_H
 
@@ -24,7 +25,7 @@ typedef struct {
     real horizon;                          // smallest denominator w that counts
     real w_terms[2];                       // dx, dy
     real g_terms[3], h_terms[3];           // g0, gx, gy and h0, hx, hy [m]
-    real lens[5];                          // table of lens.h, for x and y
+    real lens[7];                          // table of lens.h, for x and y
     real factor_g[15], factor_h[15];       // triangular factors of the covariance of (g0, gx, gy, dx, dy) and of
                                            // (h0, hx, hy, dx, dy), column by column
 } SheetTable;

@@ -19,7 +19,7 @@
 // REACH
 // (window that counts, and window that is read), FIR_HALF, CANDIDATES with SELECT_... (line_peak.h), AMBIGUITY,
 //          WIDTH_LIMITS, COUNT_WIDTH, LONG_MOMENT, PREFETCH, WITH_POSITION/PEAK/WIDTH/TOTAL/STATUS/SHEET/G/H, LENS,
-//          LENS_K2, PAST_CACHES, VECTOR_VARIANT.
+//          LENS_K2, LENS_K3, LENS_K4, PAST_CACHES, VECTOR_VARIANT.
 // Work:    global size (work-items of a frame, frames). Vector variant: a work-item reads a strip of columns, or 16
 // rows;
 //          under CANDIDATES 16 profiles. Otherwise: one work-item per profile, padded to whole work-groups.

@@ -13,8 +13,8 @@
 //          g, h real [m] (point in the sheet of light)
 // Build options: INPUT, INPUT16 (float, double or ushort), REAL_IS_DOUBLE, PLANAR, DARK_LEVEL (subtract dark currents),
 //          GAIN (equalise the channels), LINEARITY, SIGNED (a current can be negative or not finite, or the load
-//          resistors shrink the range), WITH_POSITION/TOTAL/STATUS/SIGMA/SHEET/G/H, LENS, LENS_K2, PAST_CACHES,
-//          VECTOR_VARIANT.
+//          resistors shrink the range), WITH_POSITION/TOTAL/STATUS/SIGMA/SHEET/G/H, LENS, LENS_K2, LENS_K3,
+//          LENS_K4, PAST_CACHES, VECTOR_VARIANT.
 // Work:    vector variant: a work-item processes `each` consecutive samples, the last one up to 2 `each` - 1.
 //          Otherwise: one work-item per sample.
 #include "common/load.h"

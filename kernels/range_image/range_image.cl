@@ -13,8 +13,8 @@
 //          table       RangeTable
 // Outputs: x, y, z     (profiles, samples) real [m]; NaN under a flag other than SATURATED and AMBIGUOUS
 // status      (profiles, samples) uchar: the given flags, and NOT_FINITE, NOT_INVERTIBLE, HORIZON, OUT_OF_RANGE Build
-// options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, GEOMETRY_ROTATING, LENS, LENS_K2, PAST_CACHES,
-//          VECTOR_VARIANT.
+// options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, GEOMETRY_ROTATING, LENS, LENS_K2, LENS_K3, LENS_K4,
+//          PAST_CACHES, VECTOR_VARIANT.
 // Work:    vector variant: global size (strips of SAMPLES_PER_STRIP samples, profiles), the last strip up to twice as
 // long.
 //          Otherwise: one work-item per sample, (samples, profiles).
@@ -39,7 +39,7 @@ typedef struct {
     real normal[9];                   // n = normal[0..2] + normal[3..5] cos(angle) + normal[6..8] sin(angle)
     real reach[3];                    // e + n.p, in the same way [m]
 #ifdef LENS
-    real lens[5];                     // table of lens.h, for (a, b)
+    real lens[7];                     // table of lens.h, for (a, b)
 #endif
 #endif
 } RangeTable;

@@ -7,8 +7,8 @@
 // Outputs: g, h        (points,) real [m]; NaN where the status is not 0
 //          status      (points,) uchar
 //          sigma_g, sigma_h  (points,) real [m], under SHEET_SIGMAS
-// Build options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, LENS, LENS_K2, SHEET_SIGMAS, SHEET_COVARIANCE,
-//          PAST_CACHES, VECTOR_VARIANT.
+// Build options: INPUT, INPUT16 (float or double), REAL_IS_DOUBLE, LENS, LENS_K2, LENS_K3, LENS_K4,
+//          SHEET_SIGMAS, SHEET_COVARIANCE, PAST_CACHES, VECTOR_VARIANT.
 // Work:    vector variant: a work-item processes `each` consecutive points in vectors of 16. Otherwise: one work-item
 // per
 //          point, in work-groups of `each` points.

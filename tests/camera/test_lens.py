@@ -20,7 +20,18 @@ LENSES = [
     Lens(k1=2e-7, k2=-2e-13, centre=CENTRE),
     Lens(k1=0.0, k2=1e-13, centre=CENTRE),
     Lens(k1=-4e-7, k2=8e-14, centre=CENTRE),
+    Lens(k1=-3e-7, k2=1e-13, k3=-3e-20, centre=CENTRE),
+    Lens(k1=3e-7, k2=-2e-13, k3=1e-19, centre=CENTRE),
+    Lens(k1=-5e-7, k2=4e-13, k3=-2.5e-19, k4=9e-26, centre=CENTRE),
+    Lens(k1=0.0, k4=-1e-25, centre=CENTRE),
 ]
+
+
+def polynomial(lens: Lens, square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """1 + k1 r^2 + ... and the slope of r (1 + k1 r^2 + ...), in extended precision, term by term."""
+    s = np.asarray(square, dtype=np.longdouble)
+    terms = [k * s**power for power, k in enumerate((lens.k1, lens.k2, lens.k3, lens.k4), 1)]
+    return 1.0 + sum(terms), 1.0 + sum((2 * power + 1) * term for power, term in enumerate(terms, 1))
 
 
 def field(lens: Lens, reach: float = 0.999) -> np.ndarray:
@@ -34,9 +45,13 @@ def field(lens: Lens, reach: float = 0.999) -> np.ndarray:
 @pytest.mark.parametrize("lens", LENSES)
 def test_polynomial(lens: Lens) -> None:
     points = field(lens)
-    expected = reference.undistort(points[:, 0], points[:, 1], lens.k1, lens.k2, lens.centre)
-    # Two forms of a cubic of 1e3 pixels agree to a few roundings of 1e-13.
-    np.testing.assert_allclose(lens.undistort(points), np.stack(expected, -1), rtol=0, atol=1e-12)
+    offset = points - lens.centre
+    expected = np.array(lens.centre) + offset * polynomial(lens, np.sum(offset**2, axis=1))[0][:, None]
+    # Two forms of a polynomial of 1e3 pixels agree to a few roundings of 1e-13.
+    np.testing.assert_allclose(lens.undistort(points), expected.astype(float), rtol=0, atol=1e-12)
+    if len(lens.coefficients) < 3:
+        cubic = reference.undistort(points[:, 0], points[:, 1], lens.k1, lens.k2, lens.centre)
+        np.testing.assert_allclose(lens.undistort(points), np.stack(cubic, -1), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -73,9 +88,9 @@ def test_fold_is_where_the_slope_vanishes(lens: Lens) -> None:
     if math.isinf(fold):
         square = np.linspace(0.0, 1e4, 100_001) ** 2
     else:
-        assert abs(1.0 + 3.0 * lens.k1 * fold**2 + 5.0 * lens.k2 * fold**4) < 1e-12
+        assert abs(polynomial(lens, np.array(fold**2))[1]) < 1e-12
         square = np.linspace(0.0, fold, 1000, endpoint=False) ** 2
-    assert np.all(1.0 + 3.0 * lens.k1 * square + 5.0 * lens.k2 * square**2 > 0.0)
+    assert np.all(polynomial(lens, square)[1] > 0.0)
 
 
 def test_beyond_the_fold_there_is_nothing() -> None:
@@ -101,6 +116,19 @@ def test_any_lens_inverts_inside_its_fold(k1: float, k2: float, part: float, tur
     np.testing.assert_allclose(lens.distort(lens.undistort(point)), point, rtol=0, atol=1e-9)
 
 
+@given(
+    k=st.tuples(*(st.floats(-(scale**power), scale**power) for power, scale in enumerate([1e-6] * 4, 1))),
+    part=st.floats(0.01, 0.9),
+)
+def test_any_lens_of_four_coefficients_inverts_inside_its_fold(k: tuple[float, ...], part: float) -> None:
+    lens = Lens(k1=k[0], k2=k[1], k3=k[2], k4=k[3])
+    radius = part * min(lens.fold_radius, 2000.0)
+    squares = np.linspace(0.0, radius, 1001) ** 2
+    assert np.all(polynomial(lens, squares)[1] > 0.0)
+    point = np.array([0.6 * radius, -0.8 * radius])
+    np.testing.assert_allclose(lens.distort(lens.undistort(point)), point, rtol=0, atol=1e-9)
+
+
 def test_swapped_is_the_same_lens_in_the_other_order() -> None:
     lens = Lens(k1=-2e-7, k2=5e-14, centre=CENTRE)
     points = field(lens)
@@ -110,15 +138,20 @@ def test_swapped_is_the_same_lens_in_the_other_order() -> None:
 def test_code_is_compiled_only_where_needed() -> None:
     assert Lens(k1=-1e-7).defines == {"LENS": None}
     assert Lens(k1=-1e-7, k2=1e-14).defines == {"LENS": None, "LENS_K2": None}
+    assert Lens(k1=-1e-7, k3=1e-21).defines == {"LENS": None, "LENS_K3": None}
+    assert Lens(k1=-1e-7, k4=1e-28).defines == {"LENS": None, "LENS_K4": None}
 
 
 def test_table_round_trip() -> None:
     lens = Lens(k1=-2e-7, k2=5e-14, centre=CENTRE)
     assert Lens.from_dict(lens.to_dict()) == lens
     assert Lens.from_dict({"k1": 1e-7}) == Lens(k1=1e-7)
+    wide = Lens(k1=-2e-7, k2=5e-14, k3=1e-20, k4=-2e-27, centre=CENTRE)
+    assert Lens.from_dict(wide.to_dict()) == wide
 
 
 def test_a_fold_too_far_out_for_a_float_is_none() -> None:
+    assert Lens(k1=0.0, k3=-5e-324, k4=-5e-324).fold_radius > 1e30
     lens = Lens(k1=-5e-324)
     assert lens.fold_radius == math.inf
     np.testing.assert_array_equal(lens.distort([3.0, 4.0]), [3.0, 4.0])
@@ -127,7 +160,7 @@ def test_a_fold_too_far_out_for_a_float_is_none() -> None:
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({"k1": 0.0, "k3": 1.0}, "unknown key 'k3'"),
+        ({"k1": 0.0, "k5": 1.0}, "unknown key 'k5'"),
         ({"k2": 0.0}, "'k1' is missing"),
         ({"k1": "x"}, "k1 must be a number"),
         ({"k1": math.nan}, "k1 must be finite"),

@@ -50,6 +50,8 @@ LENSES = {
     "lens k1": Lens(k1=-2e-7, centre=(650.0, 500.0)),
     "lens k1 k2": Lens(k1=-2e-7, k2=5e-14, centre=(650.0, 500.0)),
     "lens out": Lens(k1=3e-7, k2=1e-13, centre=(650.0, 500.0)),
+    "lens k3": Lens(k1=-3e-7, k2=1e-13, k3=-3e-20, centre=(650.0, 500.0)),
+    "lens k4": Lens(k1=-5e-7, k2=4e-13, k3=-2.5e-19, k4=9e-26, centre=(650.0, 500.0)),
     "lens k2": Lens(k1=0.0, k2=-1e-13, centre=(650.0, 500.0)),
 }
 MODELS = CAMERAS | LENSES

@@ -14,10 +14,10 @@ from gpuvision.camera.lines.line_families import Float64, LineFamilies, PackedLi
 from gpuvision.camera.lines.straightness import pencil_basis
 from gpuvision.camera.lines.variable_projection import Minimum, vanishing_start
 
-LensModel = Literal["none", "k1", "k1,k2"]
+LensModel = Literal["none", "k1", "k1,k2", "k1,k2,k3", "k1,k2,k3,k4"]
 LineConstraint = Literal["auto", "vanishing", "free"]
 
-MODELS: tuple[LensModel, ...] = ("none", "k1", "k1,k2")
+MODELS: tuple[LensModel, ...] = ("none", "k1", "k1,k2", "k1,k2,k3", "k1,k2,k3,k4")
 """Lens models by number of distortion coefficients."""
 # Standard deviation of a normal distribution over its median absolute deviation.
 _NORMAL_MAD = 1.4826
@@ -44,7 +44,8 @@ class LensFitLimits:
     max_tail_ratio : float
         Ratio of the rms to the standard deviation estimated from the median, above which outliers are reported.
     min_bend_variances : float
-        Decrease of the sum of squares [variances] below which the linear uncertainties of k1 and k2 together are rough.
+        Decrease of the sum of squares [variances] below which the linear uncertainties of several coefficients are
+        rough.
     """
 
     significance: float = 0.05
@@ -61,7 +62,7 @@ class LensAlternative:
 
     Attributes
     ----------
-    model : {"none", "k1", "k1,k2"}
+    model : {"none", "k1", "k1,k2", "k1,k2,k3", "k1,k2,k3,k4"}
         Distortion coefficients.
     lines : {"vanishing", "free"}
         "vanishing": the lines of a family meet in one point. "free": no constraint.
@@ -95,7 +96,7 @@ class LensFit:
     ----------
     lens : Lens or None
         Lens from measured to undistorted pixels; None if the data need no lens.
-    model : {"none", "k1", "k1,k2"}
+    model : {"none", "k1", "k1,k2", "k1,k2,k3", "k1,k2,k3,k4"}
         Distortion coefficients.
     lines : {"vanishing", "free"}
         "vanishing": the lines of each family were constrained to meet in one point. "free": no constraint.
@@ -103,8 +104,8 @@ class LensFit:
         (families, 3): unit homogeneous (column, row, 1), undistorted; the last component of a point at infinity is 0.
         NaN for a family of fewer than two lines.
     names, values, covariance
-        Names, values (m,) and covariance (m, m) of the parameters: k1 [px^-2], k2 [px^-4], C_c, R_c [px] and, with
-        vanishing points, the three components of each.
+        Names, values (m,) and covariance (m, m) of the parameters: k1 [px^-2], k2 [px^-4], k3 [px^-6], k4 [px^-8], C_c,
+        R_c [px] and, with vanishing points, the three components of each.
     residuals_px : tuple
         Per family and line an array (n,) of signed distances from the line in the measured image [px]; NaN for points
         that were not used.
@@ -256,8 +257,11 @@ def fit_warnings(
         yield "the centre moved to its bound, far outside the data: the distortion is too small to determine it"
     if straight > limits.significance:
         yield f"the lines are as straight without a lens (p = {straight:.2g}): its parameters are noise"
-    elif fit.model == "k1,k2" and bends < limits.min_bend_variances:
-        yield "the distortion is faint for two coefficients: their uncertainties are rough; use more data, or model k1"
+    elif len(found.parameters.k) > 1 and bends < limits.min_bend_variances:
+        yield (
+            "the distortion is faint for several coefficients: their uncertainties are rough; use more data, or model "
+            "k1"
+        )
     row = fit.names.index("C_c")
     values, vectors = _axes(fit.covariance[row : row + 2, row : row + 2])
     if values[1] > limits.max_centre_sigma * packed.unit:

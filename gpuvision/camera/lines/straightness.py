@@ -16,6 +16,7 @@ L. Kaufman, A variable projection method for solving separable nonlinear least s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -61,7 +62,7 @@ class Undistorted(NamedTuple):
     square: Float64
     growth: Float64
     slope: Float64 | float
-    bend: float
+    bend: Float64 | float
     x: Float64
     y: Float64
 
@@ -120,31 +121,59 @@ def inner_products(first: Float64, second: Float64) -> Float64:
 
 
 def undistort(packed: PackedLines, k: Float64, centre: Float64) -> Undistorted:
-    """Undistort the points with a lens of order 0, 1 or 2."""
-    k1, k2 = (*k.tolist(), 0.0, 0.0)[:2]
+    """Undistort the points with a lens of any order."""
     dx, dy = packed.x - centre[0], packed.y - centre[1]
     square = dx * dx + dy * dy
+    k1, k2, *further = (*k.tolist(), 0.0, 0.0)[: max(len(k), 2)]
     stretch = k1 * square
     slope: Float64 | float = k1
+    bend: Float64 | float = 2.0 * k2
+    power = square
     if len(k) > 1:
         tail = k2 * square
         slope = k1 + 2.0 * tail
         tail *= square
         stretch += tail
+    for order, term in enumerate(further, 3):
+        # `power` is s^(order - 2).
+        bend = bend + (order * (order - 1) * term) * power
+        power = power * square
+        slope = slope + (order * term) * power
+        stretch += term * (power * square)
     x, y = dx * stretch, dy * stretch
     x += packed.x
     y += packed.y
     stretch += 1.0
-    return Undistorted(dx, dy, square, stretch, slope, 2.0 * k2, x, y)
+    return Undistorted(dx, dy, square, stretch, slope, bend, x, y)
 
 
 def is_monotonic(k: Float64, square: float, *, least: float = 0.0) -> bool:
-    """Return whether the slope of ``r (1 + k1 r^2 + k2 r^4)`` exceeds ``least`` for all r^2 up to ``square``."""
-    k1, k2 = (*k.tolist(), 0.0, 0.0)[:2]
-    places = [square]
-    if k2 != 0.0 and 0.0 < -0.3 * k1 / k2 < square:
-        places.append(-0.3 * k1 / k2)
-    return all(1.0 + s * (3.0 * k1 + 5.0 * k2 * s) > least for s in places)
+    """Return whether the slope of ``r (1 + k1 r^2 + k2 r^4 + ...)`` exceeds ``least`` for all r^2 up to ``square``."""
+    factors = [1.0, *((2 * order + 1) * term for order, term in enumerate(k.tolist(), 1))]
+    places = [square, *(s for s in _extrema(factors) if 0.0 < s < square)]
+    return all(_polynomial(factors, s) > least for s in places)
+
+
+def _polynomial(coefficients: Sequence[float], s: float) -> float:
+    """Evaluate c0 + c1 s + c2 s^2 + ..."""
+    total = 0.0
+    for coefficient in reversed(coefficients):
+        total = coefficient + total * s
+    return total
+
+
+def _extrema(coefficients: Sequence[float]) -> list[float]:
+    """Return the real places at which the derivative of c0 + c1 s + c2 s^2 + ... vanishes."""
+    derivative = [order * c for order, c in enumerate(coefficients)][1:]
+    while len(derivative) > 1 and derivative[-1] == 0.0:
+        derivative.pop()
+    if len(derivative) < 2:
+        return []
+    if len(derivative) == 2:
+        return [-derivative[0] / derivative[1]]
+    roots = np.roots(derivative[::-1])
+    # A pair of complex roots close to the axis is a flat place of the slope as well: test it too.
+    return [float(root) for root in roots.real]
 
 
 def moments(packed: PackedLines, x: Float64, y: Float64, weight: Float64 | None) -> Float64:
@@ -328,11 +357,14 @@ def residual_jacobian(order: int, evaluation: Evaluation) -> ResidualJacobian:
     plain -= 1.5 * by_slope
     np.multiply(square, plain, out=lens[0])
     lens[0] -= by_growth
-    if order > 1:
+    # d/dk_m = s^(m-1) (s (q / sqrt(W) - 2 h g - 4 (2 m + 1) h q^2 g') - 4 m h q^2 g), with h = r / 2W.
+    power = square
+    for higher in range(2, order + 1):
         plain -= by_slope
-        plain *= square
-        plain -= 2.0 * by_growth
-        np.multiply(square, plain, out=lens[1])
+        column = plain * square
+        column -= float(higher) * by_growth
+        np.multiply(power, column, out=lens[higher - 1])
+        power = power * square
     by_q += each * (1.0 - growth)
     for row, (normal, offset) in enumerate(((nx, points.dx), (ny, points.dy)), order):
         np.multiply(normal, by_q, out=lens[row])

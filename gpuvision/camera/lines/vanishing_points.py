@@ -52,6 +52,9 @@ from gpuvision.camera.lines.straightness import Evaluation, Parameters, evaluate
 from gpuvision.camera.lines.variable_projection import Minimum, linear_start, minimise, vanishing_start
 from gpuvision.validation import finite, numbers
 
+# Largest number of coefficients that are fitted from the closed-form start.
+_MAX_DIRECT_ORDER = 2
+
 Solver = Literal["variable_projection", "nelder_mead", "steepest_descent", "gauss_newton"]
 
 
@@ -98,7 +101,7 @@ def fit_lens(
         Families of lines that are parallel in the scene, each line an array (n, 2) of (column, row) [px], from one or
         several images of one lens. `gpuvision.camera.lines.line_families.grid_lines` makes them from a grid. NaN points
         and lines of fewer than three points are ignored.
-    model : {"auto", "none", "k1", "k1,k2"}
+    model : {"auto", "none", "k1", "k1,k2", "k1,k2,k3", "k1,k2,k3,k4"}
         Distortion coefficients. "auto" (default): the smallest model that an F test accepts against the largest.
     lines : {"auto", "vanishing", "free"}
         "vanishing": the undistorted lines of a family meet in one point, possibly at infinity. "free": the lines are
@@ -225,7 +228,7 @@ class _ModelSearch:
     def possible_orders(self) -> list[int]:
         """Return the orders that "auto" chooses from; at least 0 and 1 must be possible."""
         self.check(1, concurrent=False)
-        return [order for order in (0, 1, 2) if self.free_dimensions > self.count_lens_parameters(order)]
+        return [order for order in range(len(MODELS)) if self.free_dimensions > self.count_lens_parameters(order)]
 
     def fit(self, order: int, concurrent: bool) -> Minimum:
         """Return the fit of a model."""
@@ -270,8 +273,9 @@ class _ModelSearch:
             return parameters._replace(vanishing=vanishing_start(self.packed, lines)), None
         if order == 0:
             return Parameters(np.empty(0), self.centre, None), None
-        smaller = self.fits.get((order - 1, False))
-        if order == 2 and smaller is not None:
+        # The first-order start is far from the minimum of a wide-angle lens: approach it one coefficient at a time.
+        smaller = self.fit(order - 1, False) if order > _MAX_DIRECT_ORDER else self.fits.get((order - 1, False))
+        if order > 1 and smaller is not None:
             return smaller.parameters._replace(k=np.append(smaller.parameters.k, 0.0)), smaller.evaluation
         start = self.linear.parameters
         return start._replace(k=np.append(start.k, np.zeros(order - 1))), None
@@ -321,7 +325,7 @@ def _report(search: _ModelSearch, order: int, concurrent: bool, families: LineFa
     names, values, scaled = parameters_px(packed, found, spread)
     lens = None
     if order:
-        lens = Lens(k1=values[0], k2=values[1] if order > 1 else 0.0, centre=centre_px(packed, found))
+        lens = Lens(**dict(zip(names[:order], values[:order].tolist(), strict=True)), centre=centre_px(packed, found))
     fit = LensFit(
         lens=lens,
         model=MODELS[order],

@@ -312,8 +312,7 @@ class ProjectedLines:
         return parts if self.lens is None or math.isinf(self.lens.fold_radius) else self._clip_to_fold(parts, self.lens)
 
     def _clip_to_fold(self, parts: Parts, lens: Lens) -> Parts:
-        fold = lens.fold_radius
-        radius = (1.0 - _VIEW_MARGIN) * fold * (1.0 + fold**2 * (lens.k1 + lens.k2 * fold**2))
+        radius = (1.0 - _VIEW_MARGIN) * lens.undistorted_radius(lens.fold_radius)
         start, direction = self.start[parts.segment], self.way[parts.segment]
         ends = [start + share[:, None] * direction for share in (parts.start, parts.end)]
         vectors = [each[:, :2] - each[:, 2:] * np.array(lens.centre) for each in ends]

@@ -62,6 +62,29 @@ def test_slopes_are_those_of_the_distances(packed: PackedLines, anywhere: Parame
         np.testing.assert_allclose(column, (moved(change) - moved(-change)) / (2.0 * STEP), atol=CLOSE)
 
 
+def test_slopes_of_a_lens_of_four_coefficients(packed: PackedLines) -> None:
+    """Derivatives by k1 to k4 and by the centre, against differences of distances computed by the chain rule."""
+    k, centre = np.array([0.1, -0.05, 0.03, 0.02]), np.array([0.1, -0.2])
+
+    def residual(change: np.ndarray, lines: LineSet) -> np.ndarray:
+        d = np.stack([packed.x, packed.y], axis=-1) - (centre + change[4:])
+        s = np.sum(d**2, axis=-1)
+        terms = [each * s**power for power, each in enumerate(k + change[:4], 1)]
+        scale, slope = 1.0 + sum(terms), sum(power * term / s for power, term in enumerate(terms, 1))
+        jacobian = scale[:, None, None] * np.eye(2) + 2.0 * slope[:, None, None] * d[:, :, None] * d[:, None, :]
+        normal = np.stack([lines.nx, lines.ny], axis=-1)[packed.line]
+        value = np.sum(normal * (centre + change[4:] + d * scale[:, None]), axis=-1) + lines.offset[packed.line]
+        return value / np.linalg.norm(np.einsum("nij,ni->nj", jacobian, normal), axis=-1)
+
+    evaluation = straightness.evaluate(packed, Parameters(k, centre, None))
+    np.testing.assert_allclose(evaluation.residual, residual(np.zeros(6), evaluation.lines), atol=1e-14)
+    slopes = straightness.residual_jacobian(4, evaluation)
+    for number, column in enumerate(slopes.lens[:6]):
+        change = STEP * np.eye(6)[number]
+        difference = (residual(change, evaluation.lines) - residual(-change, evaluation.lines)) / (2.0 * STEP)
+        np.testing.assert_allclose(column, difference, atol=CLOSE)
+
+
 def test_lines_move_with_their_points(packed: PackedLines, anywhere: Parameters) -> None:
     """The derivatives of a line by its vanishing point keep the line in the pencil of the point."""
     lines = straightness.evaluate(packed, anywhere).lines
@@ -126,7 +149,17 @@ def test_pencil_lines_are_the_best(packed: PackedLines, anywhere: Parameters) ->
 
 @pytest.mark.parametrize(
     ("k", "square", "holds"),
-    [((-0.3,), 1.0, True), ((-0.3,), 1.2, False), ((-1.0, 1.0), 1.0, True), ((-1.5, 0.9), 1.0, False), ((), 9.0, True)],
+    [
+        ((-0.3,), 1.0, True),
+        ((-0.3,), 1.2, False),
+        ((-1.0, 1.0), 1.0, True),
+        ((-1.5, 0.9), 1.0, False),
+        ((), 9.0, True),
+        ((-1.0, 1.0, -0.3), 1.0, True),
+        ((-1.0, 1.0, -0.45), 1.0, False),
+        ((-1.2, 1.2, -0.6, 0.15), 1.0, True),
+        ((-1.6, 1.0, 0.0, 0.2), 1.0, False),
+    ],
 )
 def test_monotone(k: tuple[float, ...], square: float, holds: bool) -> None:
     radius = np.linspace(0.0, np.sqrt(square), 2001)

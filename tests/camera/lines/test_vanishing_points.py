@@ -157,6 +157,41 @@ def test_several_images_share_a_lens(rng: np.random.Generator) -> None:
     assert np.all(np.sqrt(np.diag(together.covariance))[:4] < np.sqrt(np.diag(one.covariance))[:4])
 
 
+def wide_angle_lens(order: int) -> Lens:
+    """Return a lens of 3 or 4 coefficients whose highest term moves the corner of a 1024 px image by 8 px or more."""
+    half = 512.0 * np.sqrt(2.0)
+    shares = ((-0.14, 0.06, 0.03), (-0.20, 0.12, -0.05, 0.011))[order - 3]
+    terms = {f"k{power}": share / half ** (2 * power) for power, share in enumerate(shares, 1)}
+    return Lens(**terms, centre=(530.0, 500.0))
+
+
+@pytest.mark.parametrize("lines", ["free", "vanishing"])
+@pytest.mark.parametrize("order", [3, 4])
+def test_exact_lines_give_a_wide_angle_lens(rng: np.random.Generator, order: int, lines: str) -> None:
+    lens = wide_angle_lens(order)
+    points = lens.distort(plane_grid(rng, 20.0))
+    model = ",".join(f"k{power}" for power in range(1, order + 1))
+    fit = fit_lens(grid_lines(points), model=model, lines=lines)
+    assert fit.names[:order] == tuple(model.split(","))
+    np.testing.assert_allclose(fit.lens.coefficients, lens.coefficients, rtol=1e-6)
+    assert fit.lens.centre == pytest.approx(lens.centre, abs=1e-6)
+    assert fit.rms_px < 1e-10
+
+
+@pytest.mark.parametrize("order", [3, 4])
+def test_a_wide_angle_lens_gets_the_coefficients_it_needs(order: int) -> None:
+    """The residual is the noise; k1 and k2 alone leave more."""
+    rng, lens, chosen = np.random.default_rng(11), wide_angle_lens(order), []
+    for _ in range(10):
+        ideal = plane_grid(rng, 20.0, rows=31, columns=41)
+        points = lens.distort(ideal) + rng.normal(0.0, 0.02, ideal.shape)
+        fit = fit_lens(grid_lines(points))
+        chosen.append(len(fit.lens.coefficients))
+        assert fit.sigma_px == pytest.approx(0.02, rel=0.1)
+        assert fit_lens(grid_lines(points), model="k1,k2").sigma_px > 1.08 * fit.sigma_px
+    assert chosen.count(order) >= 7
+
+
 @pytest.mark.parametrize(
     ("border", "k2_part", "sigma", "model"),
     [(0.0, 0.0, 0.05, "none"), (5.0, 0.0, 0.05, "k1"), (5.0, -0.6, 0.02, "k1,k2"), (5.0, -0.6, 0.0, "k1,k2")],

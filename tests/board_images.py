@@ -96,7 +96,11 @@ class BoardPicture:
         painter = _Painter(view, pose, about, margin)
         each = np.broadcast_to(np.asarray(growths, np.float64) + view.etch_bias, len(artwork.copper))
         left = [
-            Shape(grown(shape.outline, etch_bias if shape.dark else -etch_bias), shape.dark)
+            Shape(
+                grown(shape.outline, etch_bias if shape.dark else -etch_bias),
+                shape.dark,
+                tuple(grown(each, -etch_bias if shape.dark else etch_bias) for each in shape.holes),
+            )
             for index, (shape, etch_bias) in enumerate(zip(artwork.copper, each, strict=True))
             if index not in missing
         ]
@@ -191,6 +195,12 @@ class _Painter:
         pixels = seen * (1 / self._view.pixel, -1 / self._view.pixel)
         return np.asarray((pixels + 0.5 + self._margin) * SAMPLES)
 
+    def _slanted(self, points: Float64) -> Float64:
+        """Return points in samples, descending by one sample every eighth column."""
+        corners = self.samples(points)
+        corners[:, 1] += self.shape[1] - corners[:, 0] / SAMPLES
+        return corners
+
     def painted(self, shapes: Collection[Shape], shift: tuple[float, float]) -> npt.NDArray[np.bool_]:
         """Return which samples a shape covers, (rows, columns).
 
@@ -199,14 +209,16 @@ class _Painter:
         rows, columns = (SAMPLES * each for each in self.shape)
         slanted = np.zeros((rows + self.shape[1], columns), dtype=bool)
         for each in shapes:
-            corners = self.samples(each.outline + shift)
-            if not (np.all(corners.max(axis=0) > 0) and np.all(corners.min(axis=0) < (columns, rows))):
+            straight = self.samples(each.outline + shift)
+            if not (np.all(straight.max(axis=0) > 0) and np.all(straight.min(axis=0) < (columns, rows))):
                 continue
-            corners[:, 1] += self.shape[1] - corners[:, 0] / SAMPLES
+            corners = self._slanted(each.outline + shift)
             low = np.maximum(np.floor(corners.min(axis=0)) - 1, 0).astype(int)
             high = np.minimum(np.ceil(corners.max(axis=0)) + 1, slanted.shape[::-1]).astype(int)
             if np.all(high > low):
                 inside = _inside(corners, low, high)
+                for hole in each.holes:
+                    inside &= ~_inside(self._slanted(hole + shift), low, high)
                 slanted[low[1] : high[1], low[0] : high[0]][inside] = each.dark
         picture = np.empty((rows, columns), dtype=bool)
         for column in range(self.shape[1]):

@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
+from matplotlib.path import Path as Outline
 
 from gpuvision.camera.orthographic import BoardView
 from gpuvision.host.files import atomic_write
 from gpuvision.matching.artwork.artwork import Artwork
-from gpuvision.matching.artwork.shapes import Shape, capsule
+from gpuvision.matching.artwork.shapes import Shape, area, capsule
 from gpuvision.matching.board.located_board import LocatedBoard
 from gpuvision.matching.features.feature_set import FeatureSet
 
@@ -92,7 +93,16 @@ def _fill(
         if np.all(each.outline.max(axis=0) >= window[0]) and np.all(each.outline.min(axis=0) <= window[1])
     ]
     colours = [dark if each.dark else clear for each in visible]
-    axes.add_collection(PolyCollection([_MM * each.outline for each in visible], facecolors=colours, alpha=alpha))
+    axes.add_collection(
+        PathCollection([_path(each) for each in visible], facecolors=colours, linewidths=0, alpha=alpha)
+    )
+
+
+def _path(shape: Shape) -> Outline:
+    """Return the contours of a shape [mm]; a hole runs clockwise, an outline counter-clockwise, so that it is free."""
+    outlines = (shape.outline if area(shape.outline) >= 0 else shape.outline[::-1],)
+    holes = (each if area(each) <= 0 else each[::-1] for each in shape.holes)
+    return Outline.make_compound_path(*(Outline(_MM * each, closed=False) for each in (*outlines, *holes)))
 
 
 def draw_located_board(

@@ -107,7 +107,11 @@ def test_marks_beside_rulers_promise_more(mixed: Artwork) -> None:
 def shifted(artwork: Artwork, which: np.ndarray, by: np.ndarray) -> list[Shape]:
     """Areas of the copper, some of them moved by (n, 2) [m]."""
     moves = dict(zip(which.tolist(), by, strict=True))
-    return [Shape(each.outline + moves.get(n, 0.0), each.dark) for n, each in enumerate(artwork.copper)]
+    return [
+        Shape(each.outline + by, each.dark, tuple(hole + by for hole in each.holes))
+        for n, each in enumerate(artwork.copper)
+        for by in (moves.get(n, np.zeros(2)),)
+    ]
 
 
 @pytest.mark.parametrize(

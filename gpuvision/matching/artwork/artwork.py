@@ -112,8 +112,7 @@ class Artwork:
     side
         "top" or "bottom".
     copper, mask, silk
-        Areas in drawing order; of the mask these are the *openings*. A hole of an aperture also clears areas drawn
-        before it: under the hole of a pad the board is drilled in any case.
+        Areas in drawing order; of the mask these are the *openings*.
     holes
         `Holes`.
     pads
@@ -318,8 +317,8 @@ def _pads(copper: tuple[DrawnObject, ...], finder: _Finder) -> tuple[Pad, ...]:
     """Return flashes, and regions that the mask opens; of several about one centre the largest."""
     found = [each for each in copper if each.kind != "stroke" and each.shapes[-1].outline.size]
     spots = [each for each in found if each.kind == "flash" or _is_opened(each, finder)]
-    spots = [each for each in spots if any(shape.dark for shape in each.shapes)]
-    spots.sort(key=lambda each: -max(abs(area(shape.outline)) for shape in each.shapes if shape.dark))
+    spots = [each for each in spots if each.shapes[0].dark]
+    spots.sort(key=lambda each: -max(abs(area(shape.outline)) for shape in each.shapes))
     chosen = [spots[index] for index in _first_of_equals(_centres(spots))]
     chosen.sort(key=copper.index)
     return tuple(_pad(each, finder) for each in chosen)
@@ -335,8 +334,8 @@ def _is_opened(spot: DrawnObject, finder: _Finder) -> bool:
 
 
 def _pad(spot: DrawnObject, finder: _Finder) -> Pad:
-    dark = [each.outline for each in spot.shapes if each.dark]
-    outline = _counter_clockwise(dark[0]) if len(dark) == 1 else hull(np.concatenate(dark))
+    outlines = [each.outline for each in spot.shapes]
+    outline = _counter_clockwise(outlines[0]) if len(outlines) == 1 else hull(np.concatenate(outlines))
     shape, size, angle = _described(outline)
     index, opening = finder.hole(spot.centre), finder.opening(spot.centre)
     hole = 0.0 if index is None else float(finder.holes.diameter[index])

@@ -44,10 +44,13 @@ class Shape:
         inside.
     dark
         True where the layer's material (copper, ink, mask opening) is added, False where it is cleared.
+    holes
+        Outlines (n, 2) of areas [m] that do not belong to the shape: earlier shapes of the layer are visible there.
     """
 
     outline: Float64
     dark: bool = True
+    holes: tuple[Float64, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +62,7 @@ class DrawnObject:
     kind
         "flash", "stroke" or "region".
     shapes
-        Its areas.
+        Its areas, all of them added or all of them cleared.
     ends : (2, 2), optional
         Ends of the centre line of a straight stroke [m]; None for all else.
     width
@@ -81,9 +84,8 @@ class DrawnObject:
 
     @cached_property
     def bounds(self) -> Float64:
-        """(2, 2) least and greatest x, y [m] of the added areas (of all areas if no area is added)."""
-        dark = [each.outline for each in self.shapes if each.dark] or [each.outline for each in self.shapes]
-        points = np.concatenate(dark)
+        """(2, 2) least and greatest x, y [m] of the areas."""
+        points = np.concatenate([each.outline for each in self.shapes])
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
     @property
@@ -128,14 +130,35 @@ class Layer:
         along = end - start
         for index in overlapping:
             span = slice(self._start[index], self._stop[index])
-            a, b = self._from[span] - start, self._to[span] - start
-            side_a = along[0] * a[:, 1] - along[1] * a[:, 0]
-            side_b = along[0] * b[:, 1] - along[1] * b[:, 0]
-            crossing = (side_a > 0) != (side_b > 0)
-            share = side_a[crossing] / (side_a[crossing] - side_b[crossing])
-            points = a[crossing] + share[:, None] * (b[crossing] - a[crossing])
-            found.append((self.shapes[index].dark, np.sort(points @ along / (along @ along))))
+            where = _places_on_line(self._from[span] - start, self._to[span] - start, along)
+            shape = self.shapes[index]
+            if shape.holes and len(where):
+                holes = [
+                    _places_on_line(each - start, np.roll(each, -1, axis=0) - start, along) for each in shape.holes
+                ]
+                where = _without(where, holes)
+            found.append((shape.dark, where))
         return found
+
+
+def _places_on_line(a: Float64, b: Float64, along: Float64) -> Float64:
+    """Return where the sides from a to b cross the line from the origin along a vector (1 at its end), ascending."""
+    side_a = along[0] * a[:, 1] - along[1] * a[:, 0]
+    side_b = along[0] * b[:, 1] - along[1] * b[:, 0]
+    crossing = (side_a > 0) != (side_b > 0)
+    share = side_a[crossing] / (side_a[crossing] - side_b[crossing])
+    points = a[crossing] + share[:, None] * (b[crossing] - a[crossing])
+    return np.sort(points @ along / (along @ along))
+
+
+def _without(where: Float64, holes: list[Float64]) -> Float64:
+    """Return the crossings of a shape without its holes, from the crossings of its outline and of each hole."""
+    cuts = np.sort(np.concatenate([where, *holes]))
+    middle = (cuts[1:] + cuts[:-1]) / 2
+    inside = np.searchsorted(where, middle) % 2 == 1
+    for each in holes:
+        inside &= np.searchsorted(each, middle) % 2 == 0
+    return np.asarray(cuts[np.diff(inside, prepend=False, append=False)])
 
 
 def is_covered(crossings: Crossings, at: Float64) -> npt.NDArray[np.bool_]:
@@ -160,7 +183,7 @@ def drawn_objects(layer: Any) -> tuple[DrawnObject, ...]:
         each = _drawn(item)
         if each is None:
             continue
-        corners += sum(len(shape.outline) for shape in each.shapes)
+        corners += sum(len(outline) for shape in each.shapes for outline in (shape.outline, *shape.holes))
         if corners > _MOST_CORNERS:
             raise ValueError(f"a layer of more than {_MOST_CORNERS} corners; are its arcs and apertures too large?")
         farthest = float(np.max(np.abs(each.bounds))) if corners else 0.0
@@ -176,7 +199,8 @@ def _drawn(item: Any) -> DrawnObject | None:
     attributes = _attributes(item)
     if isinstance(item, graphic_objects.Flash):
         place = np.array([MM(item.x, item.unit), MM(item.y, item.unit)]) * _METRE
-        return DrawnObject("flash", tuple(_flashed(item.aperture, place, bool(item.polarity_dark))), **attributes)
+        areas = tuple(_flashed(item.aperture, place, bool(item.polarity_dark)))
+        return DrawnObject("flash", areas, **attributes) if areas else None
     if not isinstance(item, graphic_objects.Line):
         _check_arc(item)
     lines = [item] if isinstance(item, graphic_objects.Line) else item.approximate(SAGITTA / _METRE, MM)
@@ -211,40 +235,55 @@ def _round_width(aperture: Any) -> float:
 
 
 def _flashed(aperture: Any, place: Float64, dark: bool) -> Iterator[Shape]:
-    for shape in _shapes(aperture, dark):
-        yield Shape(shape.outline + place, shape.dark)
+    """Yield the areas of a flashed aperture; a hole of the aperture does not affect earlier objects.
+
+    Gerber format specification 2024.05, section 4.4.6: "Standard apertures may have a round hole in them. When an
+    aperture is flashed only the solid part affects the image, the hole does not." Likewise an area that a macro erases
+    is erased from the macro only (section 4.5.1). An area belongs to the aperture if it lies in an exposed primitive
+    and in no later erasing one.
+    """
+    areas = list(_areas(aperture))
+    for index, (outline, exposed) in enumerate(areas):
+        if exposed:
+            holes = (hole for hole, later in areas[index + 1 :] if not later and _may_overlap(hole, outline))
+            yield Shape(outline + place, dark, tuple(hole + place for hole in holes))
 
 
-def _shapes(aperture: Any, dark: bool) -> Iterator[Shape]:
-    """Yield the areas of an aperture at the origin."""
+def _may_overlap(one: Float64, other: Float64) -> bool:
+    """Return whether the bounding boxes of two outlines overlap."""
+    return bool(np.all(one.min(axis=0) < other.max(axis=0)) and np.all(one.max(axis=0) > other.min(axis=0)))
+
+
+def _areas(aperture: Any) -> Iterator[tuple[Float64, bool]]:
+    """Yield the outlines of the primitives of an aperture at the origin in order, and whether they are exposed."""
     if isinstance(aperture, TransformedAperture):
-        for shape in _shapes(aperture.aperture, dark):
-            yield Shape(shape.outline @ aperture.matrix.T, shape.dark)
+        for outline, exposed in _areas(aperture.aperture):
+            yield outline @ aperture.matrix.T, exposed
     elif isinstance(aperture, ApertureMacroInstance):
         values = dict(enumerate(aperture.parameters, start=1))
         for primitive in aperture.macro.primitives:
-            yield from _macro_shapes(primitive, aperture.macro.name, values, dark)
+            yield from _macro_areas(primitive, aperture.macro.name, values)
     else:
-        for each in aperture.flash(0.0, 0.0, MM, dark):
-            yield Shape(_outline(each), bool(each.polarity_dark))
+        for each in aperture.flash(0.0, 0.0, MM, True):
+            yield _outline(each), bool(each.polarity_dark)
 
 
-def _macro_shapes(primitive: Any, macro: str, values: dict[int, float], dark: bool) -> Iterator[Shape]:
-    """Yield the areas of a primitive of an aperture macro."""
+def _macro_areas(primitive: Any, macro: str, values: dict[int, float]) -> Iterator[tuple[Float64, bool]]:
+    """Yield the outlines of a primitive of an aperture macro, and whether they are exposed."""
     code = getattr(primitive, "code", 0)
     if code == _MOIRE_CODE:
         raise ValueError(f"aperture macro {macro}: a moiré is not supported; draw it as regions")
     if code == _THERMAL_CODE:
         for outline in _thermal(primitive, values):
-            yield Shape(outline, dark)
+            yield outline, True
     elif code == _POLYGON_CODE:
         corners = primitive.n_vertices.calculate(values)
         if not corners <= _MOST_VERTICES:
             raise ValueError(f"aperture macro {macro}: a polygon of more than {_MOST_VERTICES} corners")
-        yield Shape(_macro_polygon(primitive, values), bool(primitive.exposure.calculate(values)) == dark)
+        yield _macro_polygon(primitive, values), bool(primitive.exposure.calculate(values))
     else:
-        for each in primitive.to_graphic_primitives((0.0, 0.0), 0.0, values, MM, dark):
-            yield Shape(_outline(each), bool(each.polarity_dark))
+        for each in primitive.to_graphic_primitives((0.0, 0.0), 0.0, values, MM, True):
+            yield _outline(each), bool(each.polarity_dark)
 
 
 def _macro_polygon(primitive: Any, values: dict[int, float]) -> Float64:
@@ -303,8 +342,9 @@ def _swept(aperture: Any, ends: Float64, dark: bool) -> Iterator[Shape]:
         return
     if aperture is None:
         return
-    for shape in _shapes(aperture, dark):
-        yield Shape(hull(np.concatenate([shape.outline + ends[0], shape.outline + ends[1]])), dark)
+    for outline, exposed in _areas(aperture):
+        if exposed:
+            yield Shape(hull(np.concatenate([outline + ends[0], outline + ends[1]])), dark)
 
 
 def _outline(primitive: Any) -> Float64:

@@ -245,6 +245,20 @@ def test_holes_are_counted_once(tmp_path: Path) -> None:
     assert board.holes.diameter == pytest.approx([0.3e-3, 0.9e-3, 3e-3])
 
 
+@pytest.mark.parametrize("polarity", ["D", "C"])
+@pytest.mark.parametrize("ring", ["C,2.0X1.0", "RING"])
+def test_hole_of_an_aperture_changes_nothing_below(tmp_path: Path, ring: str, polarity: str) -> None:
+    """A ring over copper, and over laminate: inside its hole the copper stays as it was (sections 4.4.6, 4.5.1)."""
+    drawn = f"%AMRING*1,1,2.0,0,0*1,0,1.0,0,0*%\n%ADD20R,3X3*%\n%ADD21{ring}*%\n"
+    drawn += "D20*\n" + at(5, 5, "D03") + f"%LP{polarity}*%\nD21*\n" + at(5, 5, "D03") + at(15, 5, "D03")
+    layer = Layer(read(tmp_path, copper=drawn).copper)
+    places = np.array([5.0, 5.75, 6.25, 15.0, 15.75, 16.25]) * 1e-3
+    found = is_covered(layer.crossings(np.array([0.0, 5e-3]), np.array([20e-3, 5e-3])), places / 20e-3)
+    on_copper = [True, polarity == "D", True]
+    on_laminate = [False, polarity == "D", False]
+    assert found.tolist() == on_copper + on_laminate
+
+
 def test_a_moire_is_refused(tmp_path: Path) -> None:
     moire = "%AMMARK*6,0,0,5,0.5,0.5,2,0.1,6,0*%\n%ADD20MARK*%\nD20*\n" + at(10, 8, "D03")
     with pytest.raises(ValueError, match="moiré is not supported"):
@@ -306,15 +320,22 @@ def test_capsules_have_straight_sides() -> None:
 
 
 def test_what_lies_along_a_line_is_what_lies_at_its_points(rng: np.random.Generator) -> None:
-    """Random polygons, dark and clear over each other, against an independent point-in-polygon test."""
+    """Random polygons with holes, dark and clear over each other, against an independent point-in-polygon test."""
     for _ in range(40):
-        shapes = tuple(Shape(star(rng), bool(rng.random() < 0.7)) for _ in range(6))
+        shapes = tuple(
+            Shape(star(rng), bool(rng.random() < 0.7), tuple(star(rng) for _ in range(rng.integers(0, 3))))
+            for _ in range(6)
+        )
         start, end = rng.uniform(-2, 2, (2, 2))
         places = rng.uniform(0, 1, 200)
         points = start + places[:, None] * (end - start)
         covered = np.zeros(len(points), dtype=bool)
         for each in shapes:
-            covered[Outline(each.outline).contains_points(points)] = each.dark
+            in_holes = [Outline(hole).contains_points(points) for hole in each.holes]
+            inside = Outline(each.outline).contains_points(points) & ~np.any(
+                [np.zeros_like(covered), *in_holes], axis=0
+            )
+            covered[inside] = each.dark
         np.testing.assert_array_equal(is_covered(Layer(shapes).crossings(start, end), places), covered)
 
 
@@ -365,8 +386,10 @@ def test_edges_lie_between_copper_and_laminate_in_a_picture(data: Path, name: st
     copper, silk = np.zeros((rows, columns), np.uint8), np.zeros((rows, columns), np.uint8)
     for picture, shapes in ((copper, board.copper), (silk, board.silk)):
         for each in shapes:
-            corners = np.round((each.outline - low) / pixel * 16).astype(np.int32)
-            cv2.fillPoly(picture, [corners], int(each.dark), shift=4)
+            corners = [
+                np.round((contour - low) / pixel * 16).astype(np.int32) for contour in (each.outline, *each.holes)
+            ]
+            cv2.fillPoly(picture, corners, int(each.dark), shift=4)
     edges = board.edges
     share = np.linspace(0, 1, 20)[:, None, None]
     along = edges.start + share * (edges.end - edges.start)

@@ -349,11 +349,9 @@ def test_gerber_is_drawn_as_gerbv_draws_its_twin(tmp_path: Path, text: str, twin
 
 
 @needs_gerbv
-@pytest.mark.xfail(
-    strict=True, reason="a hole of an aperture also clears areas drawn before it (sections 4.4.6, 4.5.2)"
-)
 @pytest.mark.parametrize("ring", ["C,1.5X0.9", "RING"])
 def test_hole_shows_the_copper_below(tmp_path: Path, ring: str) -> None:
+    """A hole of an aperture, and an area that a macro erases, do not affect earlier objects (sections 4.4.6, 4.5.1)."""
     text = gerber("%AMRING*", "1,1,1.5,0,0*", "1,0,0.9,0,0*%", "%ADD10R,5X0.4*%", f"%ADD11{ring}*%", "D10*", CENTRE,
                   "D11*", CENTRE)  # fmt: skip
     board = read(tmp_path, copper=text)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import platformdirs
 
-from gpuvision.host.files import write_text_atomic
+from gpuvision.host.files import atomic_write
 
 _VARIABLE = "XDG_CACHE_HOME"
 # Largest file that is read [bytes] (chosen): the verdicts of a thousand devices take less.
@@ -89,20 +89,35 @@ def is_private(path: Path) -> bool:
 
 def read_private(path: Path) -> str | None:
     """Return the text of a private file of the cache; None if it is missing, too large, no text, or not private."""
+    content = read_private_bytes(path, _MAX_FILE)
+    try:
+        return None if content is None else content.decode()
+    except UnicodeDecodeError:
+        return None
+
+
+def read_private_bytes(path: Path, max_bytes: int) -> bytes | None:
+    """Return the content of a private file of the cache; None if it is missing, too large, or not private."""
     if not is_private(path):
         return None
     try:
         with path.open("rb") as file:
-            content = file.read(_MAX_FILE + 1)
-        return content.decode() if len(content) <= _MAX_FILE else None
-    except (OSError, UnicodeDecodeError):
+            content = file.read(max_bytes + 1)
+    except OSError:
         return None
+    return content if len(content) <= max_bytes else None
 
 
 def write_private(path: Path, text: str) -> None:
     """Write a private file of the cache, whole or not at all, and make its folder where it is missing."""
+    write_private_bytes(path, text.encode())
+
+
+def write_private_bytes(path: Path, content: bytes) -> None:
+    """Write a private file of the cache, whole or not at all, and make its folder where it is missing."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    write_text_atomic(path, text, overwrite=True, mode=0o600)
+    with atomic_write(path, overwrite=True, mode=0o600) as file:
+        file.write(content)
 
 
 def private_folder(folder: Path, entries: dict[str, str]) -> Path:

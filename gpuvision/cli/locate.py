@@ -14,6 +14,7 @@ from gpuvision.cli.arguments import (
     LayerNames,
     Overwrite,
     ReportFile,
+    echo,
     layers_of,
     named_path,
     quantities,
@@ -171,6 +172,8 @@ def locate(
         copper=copper.value,
         device=None if device is None else Device.named(device),
     )
+    for each in located.warnings:
+        echo(f"warning: {each}", err=True)
     report_pose(located, lambda path: draw_located_board(path, picture, artwork, located), out, as_json, outputs)
 
 

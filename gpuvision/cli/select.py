@@ -127,6 +127,8 @@ def select(
     outputs = Outputs("select", inputs=[gerbers], overwrite=overwrite)
     outputs.claim_folder(out, ("features.toml", "features.png"))
     artwork = read_artwork(gerbers, side=side.value, layers=layers_of(layers), clearance=edge_clearance(imaging))
+    for each in artwork.warnings:
+        echo(f"warning: {each}", err=True)
     features = choose_features(
         artwork,
         box,

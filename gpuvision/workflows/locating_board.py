@@ -337,6 +337,7 @@ class _Job:
             coarse_registration=coarse_registration,
             device=self.device,
             seconds=self.clock.seconds,
+            warnings=self.artwork.warnings,
         )
 
 

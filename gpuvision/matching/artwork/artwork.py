@@ -8,10 +8,10 @@ and without the attributes of X2, and Excellon.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -22,12 +22,13 @@ from scipy.spatial import cKDTree
 
 from gpuvision.host.errors import ReadError
 from gpuvision.host.reading import reading
-from gpuvision.matching.artwork.board_files import open_board, parsed
-from gpuvision.matching.artwork.edges import BoardEdges, board_edges
-from gpuvision.matching.artwork.shapes import DrawnObject, Float64, Layer, Shape, area, drawn_objects, hull
+from gpuvision.matching.artwork.artwork_cache import artwork_key, load_artwork, store_artwork
+from gpuvision.matching.artwork.board_artwork import Artwork, Holes, Pad, Role, Side
+from gpuvision.matching.artwork.board_files import board_folder, layer_warnings, open_layers, parsed
+from gpuvision.matching.artwork.edges import board_edges
+from gpuvision.matching.artwork.shapes import DrawnObject, Float64, Layer, area, drawn_objects, hull
 
-Side = Literal["top", "bottom"]
-Role = Literal["via", "component", "fiducial"]
+__all__ = ["Artwork", "Holes", "Pad", "Role", "Side", "read_artwork"]
 
 # Values of ``.AperFunction`` in Gerber X2; all others are component pads.
 _ROLES: Mapping[str, Role] = {"ViaPad": "via", "FiducialPad": "fiducial"}
@@ -40,112 +41,8 @@ _CONCENTRIC = 50e-6
 _FIDUCIAL_OPENING = 1.5
 # Least ratio of the area to the area of the enclosing circle: a polygon of 16 corners has 0.974, one of 24 has 0.989.
 _ROUND_AREA = 0.985
+_MIN_CACHED = 0.2  # processor time from which on parsed artwork is stored in the cache [s] (chosen)
 _RECTANGLE_AREA = 0.995  # least ratio of the area to the area of the enclosing rectangle
-
-
-class Holes(NamedTuple):
-    """Holes and slots of all drill files together, without duplicates.
-
-    Attributes
-    ----------
-    start, end : (n, 2)
-        Ends of a slot [m]; equal for a round hole.
-    diameter : (n,)
-        Diameter of the tool [m]; plating makes the hole smaller.
-    plated : (n,), int8
-        1 plated, 0 not plated, -1 where the files do not say it.
-    """
-
-    start: Float64
-    end: Float64
-    diameter: Float64
-    plated: npt.NDArray[np.int8]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Pad:
-    """Spot of copper: a via's pad, a component's pad, or a fiducial.
-
-    Attributes
-    ----------
-    role
-        "via", "component" or "fiducial": from the file's attributes, and without them by the rules of `read_artwork`.
-    shape
-        "circle", "rectangle" or "other" (rounded corners, obrounds, crosses).
-    centre : (2,)
-        Centre of the bounding box [m].
-    size : (2,)
-        Side lengths of the smallest enclosing rectangle [m]; for a circle twice the diameter.
-    angle
-        Angle of its first axis [rad], in [0, pi/2); 0 for a circle.
-    outline : (n, 2)
-        Corners, counter-clockwise [m]; the convex hull where several areas make one pad.
-    hole
-        Diameter of its hole, or width of its slot [m]; 0 without one.
-    opening
-        Distance from the copper's edge to the edge of the mask opening [m], the least of four sides: negative where
-        the mask covers copper, NaN without a concentric opening (a covered via).
-    function, net, part, pin
-        Attributes of Gerber X2; ``""`` where the file does not have them.
-    """
-
-    role: Role
-    shape: Literal["circle", "rectangle", "other"]
-    centre: Float64
-    size: Float64
-    angle: float
-    outline: Float64
-    hole: float = 0.0
-    opening: float = math.nan
-    function: str = ""
-    net: str = ""
-    part: str = ""
-    pin: str = ""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Artwork:
-    """One side of a board.
-
-    Attributes
-    ----------
-    side
-        "top" or "bottom".
-    copper, mask, silk
-        Areas in drawing order; of the mask these are the *openings*.
-    holes
-        `Holes`.
-    pads
-        Pads of all roles.
-    edges
-        `BoardEdges`: visible straight edges of traces and pads.
-    bounds : (2, 2)
-        Least and greatest x, y [m] of the board's outline; of the copper where there is no outline file.
-    """
-
-    side: Side
-    copper: tuple[Shape, ...]
-    mask: tuple[Shape, ...]
-    silk: tuple[Shape, ...]
-    holes: Holes
-    pads: tuple[Pad, ...]
-    edges: BoardEdges
-    bounds: Float64
-
-    @property
-    def vias(self) -> tuple[Pad, ...]:
-        """Pads of vias."""
-        return tuple(each for each in self.pads if each.role == "via")
-
-    @property
-    def component_pads(self) -> tuple[Pad, ...]:
-        """Pads of components."""
-        return tuple(each for each in self.pads if each.role == "component")
-
-    @property
-    def fiducials(self) -> tuple[Pad, ...]:
-        """Pads that are fiducials."""
-        return tuple(each for each in self.pads if each.role == "fiducial")
 
 
 class _Finder:
@@ -222,13 +119,34 @@ def read_artwork(
     ReadError
         The layers of the files cannot be determined, the side has no copper, gerbonara cannot read a file of the side,
         or the board exceeds a limit of `gpuvision.host.reading.FileLimits`.
+
+    Notes
+    -----
+    Artwork that takes 0.2 s or more of processor time to parse is kept in the user's cache folder, up to 256 MiB of all
+    boards. An entry is used again only for equal files, parameters, limits and versions of the parser.
     """
     if side not in ("top", "bottom"):
         raise ValueError(f"side must be 'top' or 'bottom', not {side!r}")
     if not (clearance > 0 and math.isfinite(clearance) and via_drill >= 0):
         raise ValueError(f"clearance must be positive and via_drill not negative, not {clearance} and {via_drill}")
     path = Path(path)
-    with open_board(path, layers) as stack, reading(path, "board"):
+    with board_folder(path) as place:
+        key = artwork_key(place, [side, sorted((layers or {}).items()), clearance, via_drill])
+        artwork = load_artwork(key)
+        if artwork is None:
+            began = time.process_time()
+            artwork = _parse_artwork(place, path, side, layers, clearance, via_drill)
+            if time.process_time() - began >= _MIN_CACHED:
+                store_artwork(key, artwork)
+        return artwork
+
+
+def _parse_artwork(
+    place: Path, path: Path, side: Side, layers: Mapping[str, str] | None, clearance: float, via_drill: float
+) -> Artwork:
+    """Read one side of a board from the files in a folder; parameters as in `read_artwork`."""
+    stack = open_layers(place, path, layers)
+    with reading(path, "board"):
         drawn = {use: _layer(stack, side, use) for use in ("copper", "mask", "silk", "paste")}
         if not drawn["copper"]:
             raise ReadError(f"{path}: no copper on the {side} side; name the file of '{side} copper' with layers")
@@ -253,6 +171,7 @@ def read_artwork(
             pads=pads,
             edges=edges,
             bounds=_bounds(stack, drawn["copper"]),
+            warnings=layer_warnings(stack, place, side, layers),
         )
 
 

@@ -7,8 +7,13 @@ the length of a number or of text that is no command. The checks here take a tim
 from __future__ import annotations
 
 import contextlib
+import glob
+import io
+import itertools
+import operator
 import os
 import re
+import shlex
 import tempfile
 import warnings
 import zipfile
@@ -19,10 +24,13 @@ from typing import Any
 from gerbonara import LayerStack
 from gerbonara.cam import LazyCamFile
 from gerbonara.excellon import ExcellonFile
+from gerbonara.layer_rules import MATCH_RULES
+from gerbonara.layers import _best_match, _do_autoguess, identify_file
 from gerbonara.rs274x import GerberFile
 
 from gpuvision.host.errors import ReadError
 from gpuvision.host.reading import check_archive, check_limit, reading
+from gpuvision.host.text import printable
 from gpuvision.matching.artwork.gerber_parser import parse_gerber
 
 # A command, as gerbonara splits a file: a comment, an extended command between %, or text up to an asterisk.
@@ -42,6 +50,30 @@ _MACRO_BLOCK = re.compile(r"[0-9.,+\-xX/()$=eE\s]*+")
 _LONGEST_LINE = 1000  # characters of a line of a drill file, and of Gerber text that is no command
 _LONGEST_BLOCK = 100_000  # characters of a block of a macro: an outline of 5000 corners (section 4.5.1.6) fits
 _MOST_VERTICES = 1000  # of a regular polygon; the specification allows 12
+_HEAD_CHARACTERS = 16384  # of a file, to determine its kind; gerbonara reads as many of a header
+_MOST_NAMES = 12  # of files in a message
+_KNOWN_LAYER = re.compile(
+    r"(top|bottom) (copper|mask|silk|paste)|mechanical outline|drill (plated|nonplated|unknown)|inner_\w+ copper"
+)
+_HEADER_RULES = {name: list(rules["header regex"]) for name, rules in MATCH_RULES.items() if "header regex" in rules}
+
+
+@contextlib.contextmanager
+def board_folder(path: Path) -> Iterator[Path]:
+    """Check the files of a board, and yield their folder: the folder itself, or the unpacked ZIP.
+
+    Raises
+    ------
+    FileNotFoundError
+        There is no such folder or file.
+    ReadError
+        The ZIP is damaged, or the board exceeds a limit of `FileLimits`.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such folder or ZIP of Gerber files")
+    with _unpacked(path) as place:
+        _check_files(place, path)
+        yield place
 
 
 @contextlib.contextmanager
@@ -66,23 +98,150 @@ def open_board(path: Path, layers: Mapping[str, str] | None) -> Iterator[LayerSt
     ReadError
         The layers cannot be determined, the ZIP is damaged, or the board exceeds a limit of `FileLimits`.
     """
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such folder or ZIP of Gerber files")
-    hint = "name its files with layers"
-    with _unpacked(path) as place:
-        _check_files(place, path)
-        with warnings.catch_warnings(), reading(path, "board", hint=hint):
-            warnings.simplefilter("ignore")  # of old spellings, and of layers determined by contents
-            how = {"overrides": dict(layers) if layers else None, "autoguess": not layers}
+    with board_folder(path) as place:
+        yield open_layers(place, path, layers)
+
+
+def open_layers(place: Path, path: Path, layers: Mapping[str, str] | None) -> LayerStack:
+    """Return the layers of the files in a folder, not parsed yet.
+
+    Parameters
+    ----------
+    place, path : pathlib.Path
+        Folder of the files, and the name of the board in messages.
+    layers : mapping of str to str, optional
+        As in `gpuvision.matching.artwork.artwork.read_artwork`.
+
+    Raises
+    ------
+    ReadError
+        The layers cannot be determined; the message proposes ``--layers``.
+    """
+    how = {"overrides": dict(layers) if layers else None, "autoguess": not layers}
+    with warnings.catch_warnings(), reading(path, "board", hint="name its files with layers"):
+        warnings.simplefilter("ignore")  # of old spellings, and of layers determined by contents
+        _restore_layer_rules()
+        # gerbonara prints the files of Allegro's boards.
+        with contextlib.redirect_stdout(io.StringIO()):
             try:
-                stack = LayerStack.open(place, lazy=True, **how)
+                return LayerStack.open(place, lazy=True, **how)
+            except (ValueError, SystemError) as problem:
+                if layers or isinstance(problem, UnicodeDecodeError):
+                    raise
+                raise ReadError(f"{path}: not a readable board: {propose_layers(board_layer_files(place))}") from None
             except AttributeError:
                 # gerbonara scales Allegro's drill files to the copper: it has to parse them at once.
                 for file in _files(place):
                     with contextlib.suppress(UnicodeDecodeError):
                         check_gerber(file.read_text(), file.name)
-                stack = LayerStack.open(place, **how)
-        yield stack
+                return LayerStack.open(place, **how)
+
+
+def _restore_layer_rules() -> None:
+    """Restore gerbonara's rules of file headers, which it removes when it opens the first board of a process."""
+    for generator, rules in _HEADER_RULES.items():
+        MATCH_RULES[generator]["header regex"] = list(rules)
+
+
+def board_layer_files(place: Path) -> list[Path]:
+    """Return the files with the content of a Gerber or drill file, sorted."""
+    return sorted(each for each in _files(place) if each.is_file() and identify_file(_head(each)) is not None)
+
+
+def _head(path: Path) -> str:
+    with path.open(errors="ignore") as file:
+        return file.read(_HEAD_CHARACTERS)
+
+
+def unrecognised_files(stack: LayerStack, place: Path) -> list[str]:
+    """Return the names of Gerber and drill files that are no layer of an opened board, sorted."""
+    graphic = [layer for (side, _), layer in stack.graphic_layers.items() if side != "unknown"]
+    used = {each.original_path for each in (*graphic, stack.drill_pth, stack.drill_npth, *stack._drill_layers) if each}
+    return sorted(each.name for each in board_layer_files(place) if each not in used)
+
+
+def propose_layers(files: list[Path]) -> str:
+    """Return why the layers of files are uncertain, with the options ``--layers`` for the layers that names suggest.
+
+    Parameters
+    ----------
+    files
+        Gerber and drill files of a folder.
+    """
+    if not files:
+        return "no file with the content of a Gerber or drill file; name its files with layers"
+    guessed = _guess_layers(files)
+    doubled = {layer: found for layer, found in guessed.items() if len(found) > 1 and not layer.startswith("drill")}
+    if doubled:
+        layer = "top copper" if "top copper" in doubled else min(doubled)
+        boards = doubled[layer]
+        folders = sorted({str(each.parent.relative_to(_common_folder(boards))) for each in boards})
+        which = f"two boards in one folder or more ({layer}: {', '.join(each.name for each in boards)}); "
+        if len(folders) > 1:
+            return f"{which}give one of its folders: {', '.join(folders)}"
+        line = _layer_options({layer: _of_board(found, boards) for layer, found in guessed.items()})
+        return f"{which}name the files of one with layers, for the board of {boards[0].name}: {line}"
+    line = _layer_options(guessed)
+    known = {each for found in guessed.values() for each in found}
+    others = [each.name for each in files if each not in known]
+    rest = f" (layers unknown: {_some_names(others)})" if others else ""
+    example = line or f"--layers {shlex.quote(f'{glob.escape(files[0].name)}=top copper')}"
+    return f"the names of {len(files)} files do not determine the layers; name its files with layers: {example}{rest}"
+
+
+def _guess_layers(files: list[Path]) -> dict[str, list[Path]]:
+    """Return the files of each layer that their names suggest."""
+    _restore_layer_rules()
+    by_program, by_words = _best_match(files)[1], _do_autoguess(files)
+    guess = by_program if len(by_program) >= len(by_words) else by_words
+    return {layer: sorted(found) for layer, found in sorted(guess.items()) if _KNOWN_LAYER.fullmatch(layer)}
+
+
+def _of_board(files: list[Path], boards: list[Path]) -> list[Path]:
+    """Return the files whose names begin like the first of several boards, more than like another one."""
+
+    def shared(file: Path, board: Path) -> int:
+        return sum(itertools.accumulate((a == b for a, b in zip(file.name, board.name, strict=False)), operator.and_))
+
+    return [each for each in files if shared(each, boards[0]) == max(shared(each, other) for other in boards)][:1]
+
+
+def _common_folder(files: list[Path]) -> Path:
+    return Path(os.path.commonpath([each.parent for each in files]))
+
+
+def _layer_options(layers: Mapping[str, list[Path]]) -> str:
+    names = [f"{glob.escape(each.name)}={layer}" for layer, found in layers.items() for each in found]
+    return " ".join(f"--layers {shlex.quote(each)}" for each in names)
+
+
+def _some_names(names: list[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(map(printable, names[:_MOST_NAMES])) + more
+
+
+def layer_warnings(stack: LayerStack, place: Path, side: str, layers: Mapping[str, str] | None) -> tuple[str, ...]:
+    """Return warnings of a missing mask, and of files that are no layer.
+
+    Parameters
+    ----------
+    stack, place
+        Layers, and the folder of their files.
+    side
+        "top" or "bottom".
+    layers
+        Layers as the user named them: then all other files are ignored as intended. None: gerbonara recognised them.
+    """
+    found = []
+    if (side, "mask") not in stack.graphic_layers:
+        found.append(
+            f"no solder mask on the {side} side: all of its copper counts as bare; name the file of the mask with "
+            f"layers ('FILE={side} mask'), if there is one"
+        )
+    others = [] if layers else unrecognised_files(stack, place)
+    if others:
+        found.append(f"files that are not recognised as a layer: {_some_names(others)}; name them with layers")
+    return tuple(found)
 
 
 def parsed(layer: Any) -> Any:

@@ -60,6 +60,8 @@ class LocatedBoard:
         Device of the computation.
     seconds
         Duration of each step, by name [s].
+    warnings
+        What may be wrong although a pose was found: layers of the board that are missing.
     """
 
     view: BoardView
@@ -80,6 +82,7 @@ class LocatedBoard:
     coarse_registration: Registration | None
     device: Device
     seconds: dict[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
     @property
     def pose(self) -> tuple[float, float, float]:
@@ -116,6 +119,7 @@ class LocatedBoard:
             "gpuvision": version("gpuvision"),
             "status": "refused" if self.reason else "located",
             "reason": self.reason or None,
+            "warnings": list(self.warnings),
             "side": self.features.side,
             "pose": _named(self.pose),
             "sigmas": _named(self.sigmas),
